@@ -1,0 +1,34 @@
+"""What casest says when it cannot go on: one line that names the thing and the way out."""
+
+from __future__ import annotations
+
+
+class CasestError(Exception):
+    """Base of everything casest raises on purpose; its text is meant for the user's eyes.
+
+    `exit_code` is what the command line ends with.
+    """
+
+    exit_code = 1
+
+
+class DeclarationError(CasestError):
+    """A model, signal, parameter or effect is declared in a way that makes no sense."""
+
+
+class DataError(CasestError):
+    """A record cannot be used: names file, column, row, value and the way out."""
+
+
+class UnitError(CasestError):
+    """A unit is unknown, or does not fit where it is used."""
+
+
+class UsageError(CasestError):
+    """A command or call asks for something that does not exist or does not fit."""
+
+
+class NotTrusted(CasestError):
+    """There is no estimate that deserves belief; the text gives the reasons."""
+
+    exit_code = 2
