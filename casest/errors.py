@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 
 class CasestError(Exception):
     """Base of everything casest raises on purpose; its text is meant for the user's eyes.
@@ -29,6 +31,10 @@ class UsageError(CasestError):
 
 
 class NotTrusted(CasestError):
-    """There is no estimate that deserves belief; the text gives the reasons."""
+    """There is no estimate that deserves belief; the text gives the reasons.
+
+    `estimate` is the refused one, where there was any.
+    """
 
     exit_code = 2
+    estimate: Any = None

@@ -1,0 +1,155 @@
+"""Records that are arrays already: NumPy, MATLAB, Parquet."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from casest.data.column import Column, numeric_column, text_column
+from casest.data.delimited import Contents
+from casest.errors import DataError
+
+
+def read_npy(file: Path) -> Contents:
+    """Read one array: (N, k) gives columns "0".."k-1"; a structured (N,) its fields."""
+    array = _loaded(file)
+    if array.dtype.names:
+        return _from_arrays(file, {name: array[name] for name in array.dtype.names})
+    return _from_arrays(file, {"": array})
+
+
+def read_npz(file: Path) -> Contents:
+    """Read named arrays: (N,) each a column, (N, 3) `v` gives v[0] v[1] v[2], scalars are kept."""
+    with _loaded(file) as archive:
+        try:
+            arrays = {name: archive[name] for name in archive.files}
+        except ValueError as error:
+            raise _pickled(file) from error
+    if len(arrays) == 1 and next(iter(arrays)).startswith("arr_"):
+        arrays = {"": next(iter(arrays.values()))}
+    return _from_arrays(file, arrays)
+
+
+def read_matlab(file: Path) -> Contents:
+    """Read the vectors and matrices of a .mat file, and those one level down in structs."""
+    from scipy.io import loadmat
+
+    try:
+        found = loadmat(str(file), squeeze_me=True, struct_as_record=False)
+    except NotImplementedError as error:
+        raise DataError(
+            f"{file}: is MATLAB v7.3 (HDF5), which is not read; "
+            f"save it again with save('{file.name}', ..., '-v7')"
+        ) from error
+    except (ValueError, TypeError, OSError) as error:
+        raise DataError(f"{file}: cannot be read as MATLAB ({error})") from error
+    arrays: dict[str, Any] = {}
+    for name, value in found.items():
+        if name.startswith("__"):
+            continue
+        fields = getattr(value, "_fieldnames", None)
+        arrays |= {f: getattr(value, f) for f in fields} if fields else {name: value}
+    if len(arrays) == 1 and np.ndim(next(iter(arrays.values()))) == 2:
+        arrays = {"": next(iter(arrays.values()))}
+    return _from_arrays(file, arrays)
+
+
+def read_parquet(file: Path) -> Contents:
+    """Read a Parquet table; a field's metadata may hold its `unit`; times become seconds."""
+    import pyarrow
+    import pyarrow.parquet
+
+    try:
+        table = pyarrow.parquet.read_table(str(file))
+    except (pyarrow.ArrowException, OSError) as error:
+        text = str(error).splitlines()[0]
+        raise DataError(f"{file}: cannot be read as Parquet ({text})") from error
+    columns, notes = [], []
+    for entry in table.schema:
+        kind, values = str(entry.type), table.column(table.schema.get_field_index(entry.name))
+        unit = (entry.metadata or {}).get(b"unit", b"").decode()
+        header = f"{entry.name} [{unit}]" if unit else entry.name
+        if kind.startswith("timestamp"):
+            values = values.cast(pyarrow.timestamp("ns")).cast(pyarrow.int64())
+            columns.append(numeric_column(f"{entry.name} [ns]", _floats(values), None))
+        elif kind in ("bool", "string", "large_string") or kind.startswith("dictionary"):
+            texts = ["" if v is None else str(v) for v in values.to_pylist()]
+            columns.append(text_column(header, texts))
+        elif kind.startswith(("int", "uint", "float", "double", "halffloat", "decimal")):
+            columns.append(numeric_column(header, _floats(values), None))
+        else:
+            notes.append(f"column {entry.name} of type {kind} left out")
+    return Contents(columns, notes)
+
+
+def _floats(values: Any) -> NDArray[np.float64]:
+    return np.array(values.to_numpy(), dtype=np.float64)
+
+
+def _loaded(file: Path) -> Any:
+    try:
+        return np.load(file, allow_pickle=False)
+    except ValueError as error:
+        if "pickle" in str(error).lower():
+            raise _pickled(file) from error
+        raise DataError(f"{file}: cannot be read as NumPy ({error})") from error
+    except (OSError, EOFError) as error:
+        raise DataError(f"{file}: cannot be read as NumPy ({error})") from error
+
+
+def _pickled(file: Path) -> DataError:
+    return DataError(
+        f"{file}: holds Python objects, which are not read (they could run code); "
+        f"save plain arrays of numbers"
+    )
+
+
+def _from_arrays(file: Path, arrays: Mapping[str, Any]) -> Contents:
+    """Make columns from vectors and matrices of one common length; keep scalars as preamble."""
+    found = {name: np.asarray(value) for name, value in arrays.items()}
+    preamble = {name: str(value) for name, value in found.items() if value.size <= 1}
+    series = {name: value for name, value in found.items() if value.size > 1}
+    n_rows = _common_length(file, series)
+    columns: list[Column] = []
+    notes: list[str] = []
+    for name, value in series.items():
+        if value.ndim > 2 or value.dtype.kind not in "fiubU":
+            notes.append(f"{name or 'array'} of shape {value.shape} ({value.dtype}) left out")
+        elif value.ndim == 1:
+            columns.append(_column(name or "0", value))
+        else:
+            rows = value if value.shape[0] == n_rows else value.T
+            columns += [
+                _column(f"{name}[{i}]" if name else str(i), rows[:, i])
+                for i in range(rows.shape[1])
+            ]
+    return Contents(columns, notes, preamble)
+
+
+def _common_length(file: Path, series: Mapping[str, NDArray[Any]]) -> int:
+    if not series:
+        raise DataError(f"{file}: holds no array with more than one number")
+    if len(series) == 1:
+        value = next(iter(series.values()))
+        # a lone matrix is samples by channels, unless it is far wider than long (MATLAB rows)
+        wide = value.ndim == 2 and value.shape[0] <= 16 < value.shape[1]
+        return int(value.shape[1] if wide else value.shape[0])
+    longest = {name: max(value.shape) for name, value in series.items()}
+    n_rows = next(iter(longest.values()))
+    for name, length in longest.items():
+        if length != n_rows:
+            raise DataError(
+                f"{file}: {name} has {length} samples and {next(iter(longest))} has {n_rows}; "
+                f"all arrays of a record need one length"
+            )
+    return n_rows
+
+
+def _column(name: str, values: NDArray[Any]) -> Column:
+    if values.dtype.kind == "U":
+        return text_column(name, [str(value) for value in values])
+    return numeric_column(name, values.astype(np.float64), None)

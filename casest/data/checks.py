@@ -1,0 +1,89 @@
+"""What a record's values themselves give away: a signal that never changes, clipped readings."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from casest.errors import DataError
+
+Array = NDArray[np.float64]
+
+_FEWEST = 8  # readings at an extreme before it is called clipping
+_CROWDING = 5.0  # times as many as on the levels next to it (a smooth crest gives 2.4)
+_STEEP = 3.0  # resolutions jumped on the way in (rest toggles by one)
+
+
+def refuse_constant(file: str, name: str, values: Array, columns: tuple[str, ...]) -> None:
+    """Raise DataError where all samples of a signal (N, size) are identical."""
+    if len(values) > 1 and bool((values == values[0]).all()):
+        shown = ", ".join(f"{value:g}" for value in values[0])
+        raise DataError(
+            f"{file}: signal {name} (columns {' '.join(columns)}) is {shown} in all "
+            f"{len(values)} rows; a dead channel or the wrong column: see --columns {name}=…"
+        )
+
+
+def constant_columns(values: Array, columns: tuple[str, ...]) -> list[str]:
+    """Return a note for each component that never changes while others do."""
+    if len(values) < 2:
+        return []
+    still = (values == values[0]).all(axis=0)
+    return [
+        f"{column}: {values[0, i]:g} in all {len(values)} rows; a dead channel?"
+        for i, column in enumerate(columns)
+        if still[i]
+    ]
+
+
+def clipped(values: Array, columns: tuple[str, ...]) -> list[str]:
+    """Return a note for each component of (N, size) that looks clipped at full scale.
+
+    An extreme is suspect where its value is repeated far more than the levels next to it. At rest
+    that happens too (a quiet reading on one level), so besides, either the readings jump onto it
+    in steps far above the resolution while the other components keep changing, or the same
+    happens at the opposite extreme (a symmetric full scale).
+    """
+    notes = []
+    for i, column in enumerate(columns):
+        others = np.delete(values, i, axis=1)
+        found = {sign: _suspect(sign * values[:, i], sign * others) for sign in (1, -1)}
+        symmetric = all(count for count, _ in found.values()) and _symmetric(values[:, i])
+        for sign, (count, moving) in found.items():
+            if count and (moving or symmetric):
+                extreme = sign * (sign * values[:, i]).max()
+                which = "largest" if sign > 0 else "smallest"
+                notes.append(
+                    f"{column}: {count} readings at the {which} value {extreme:.6g} "
+                    f"— clipped at full scale?"
+                )
+    return notes
+
+
+def _symmetric(x: Array) -> bool:
+    """Whether the extremes are +F and -F, up to one part in a hundred."""
+    return bool(abs(x.max() + x.min()) < 0.01 * (x.max() - x.min()))
+
+
+def _suspect(x: Array, others: Array) -> tuple[int, bool]:
+    """Return how many readings crowd at the largest value, and whether that was in motion."""
+    levels, counts = np.unique(x, return_counts=True)
+    if len(levels) < 5 or counts[-1] < max(_FEWEST, _CROWDING * float(counts[-4:-1].mean())):
+        return 0, False
+    at_top = x == levels[-1]
+    entries = np.flatnonzero(at_top[1:] & ~at_top[:-1])
+    resolution = float(np.median(np.diff(levels[-20:])))
+    floats = counts[:-1].max() == 1  # no other level repeats: nothing is quantised
+    jumps = levels[-1] - x[entries]
+    steep = floats or (jumps.size > 0 and float(np.median(jumps)) > _STEEP * resolution)
+    return int(counts[-1]), bool(steep and _changing(others, at_top))
+
+
+def _changing(others: Array, at_top: NDArray[np.bool_]) -> bool:
+    """Whether the other components change while this one stands still (True if there are none)."""
+    if others.shape[1] == 0:
+        return True
+    pairs = np.flatnonzero(at_top[1:] & at_top[:-1])
+    if pairs.size == 0:
+        return True  # never two in a row: the signal was only passing, and in motion
+    return bool((others[pairs + 1] != others[pairs]).any(axis=1).mean() > 0.5)

@@ -1,0 +1,149 @@
+"""Which columns of a table make up a signal."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Mapping, Sequence
+
+from casest.data.table import Table
+from casest.declaring.symbols import Signal
+from casest.errors import DataError
+
+Choice = Mapping[str, Sequence[str] | str]
+
+_ANGLES = ("roll", "pitch", "yaw")
+_QUATERNIONS = tuple(
+    tuple(f"{stem}{part}" for part in "wxyz") for stem in ("q", "quat", "quaternion", "orientation")
+)
+
+
+def find_columns(table: Table, signal: Signal, chosen: Choice) -> tuple[str, ...]:
+    """Return the names of the columns that hold `signal`, in order.
+
+    `chosen` names them (or gives positions from 0) where the file's own names do not tell:
+    {"v": ("ax", "ay", "az")}, {"v": "0,1,2"}. Raises DataError that lists what the file has.
+    """
+    if signal.name in chosen:
+        names = as_names(chosen[signal.name])
+        _check_number(table, signal, names)
+        return tuple(find_column(table, name, f"signal {signal.name}") for name in names)
+    for candidate in _candidates(signal):
+        found = [find_by_name(table, name) for name in candidate]
+        if all(found):
+            return tuple(name for name in found if name)
+    raise _missing(table, signal)
+
+
+def as_names(choice: Sequence[str] | str) -> tuple[str, ...]:
+    """Split "ax,ay,az" where it has not been split."""
+    names = choice.split(",") if isinstance(choice, str) else choice
+    return tuple(str(name).strip() for name in names)
+
+
+def find_column(table: Table, name: str, purpose: str) -> str:
+    """Return the column called `name` (upper or lower case, or a position from 0)."""
+    found = find_by_name(table, name)
+    if found:
+        return found
+    names = list(table.columns)
+    if re.fullmatch(r"\d+", name):
+        if int(name) < len(names):
+            return names[int(name)]
+        raise DataError(
+            f"{table.file}: {purpose} asks for column {name}, and the columns are 0 to "
+            f"{len(names) - 1} ({_listed(names)})"
+        )
+    near = _nearest(name, names)
+    hint = f"did you mean {near}? " if near else ""
+    raise DataError(f"{table.file}: no column {name} for {purpose}; {hint}it has {_listed(names)}")
+
+
+def find_by_name(table: Table, name: str) -> str | None:
+    """Return the column called so: exactly, else without regard to case and punctuation."""
+    if name in table.columns:
+        return name
+    return next((have for have in table.columns if _plain(have) == _plain(name)), None)
+
+
+def _plain(name: str) -> str:
+    """v_x, v.x, V[x] and "v x" are one name."""
+    return re.sub(r"[\s_.\[\]()\-]", "", name).casefold() or name
+
+
+def _candidates(signal: Signal) -> list[Sequence[str]]:
+    name, size = signal.name, signal.size
+    if signal.kind == "rotation":
+        own = [[f"{name}{part}" for part in _ANGLES], [f"{name}{part}" for part in "wxyz"]]
+        nine = [f"{name}{i}" for i in range(9)]
+        return [*own, _ANGLES, *_QUATERNIONS, nine]
+    if size == 1:
+        return [(name,), (f"{name}0",)]
+    counted = [[f"{name}{i + first}" for i in range(size)] for first in (0, 1)]
+    return ([[f"{name}{axis}" for axis in "xyz"]] if size == 3 else []) + counted
+
+
+def _check_number(table: Table, signal: Signal, names: Sequence[str]) -> None:
+    if signal.kind == "rotation":
+        right, wanted = len(names) in (3, 4, 9), "3 (roll, pitch, yaw), 4 (qw, qx, qy, qz) or 9"
+    else:
+        right, wanted = len(names) == signal.size, str(signal.size)
+    if not right:
+        raise DataError(
+            f"{table.file}: signal {signal.name} needs {wanted} columns and "
+            f"--columns {signal.name}={','.join(names)} gives {len(names)}"
+        )
+    for name in names:
+        if names.count(name) > 1:
+            raise DataError(
+                f"{table.file}: --columns {signal.name}={','.join(names)} names {name} twice"
+            )
+
+
+def _missing(table: Table, signal: Signal) -> DataError:
+    names = list(table.columns)
+    wanted = " ".join(_candidates(signal)[0])
+    if signal.kind == "rotation":
+        wanted = "roll pitch yaw or qw qx qy qz"
+    near = _near_group(table, signal)
+    hint = f"; try --columns {signal.name}={','.join(near)}" if near else ""
+    return DataError(
+        f"{table.file}: no columns {wanted} for signal {signal.name}; "
+        f"the file has {_listed(names)}{hint}"
+    )
+
+
+def _near_group(table: Table, signal: Signal) -> list[str]:
+    """Return columns that could hold the signal: x y z of one stem, else the first numbers."""
+    numbers = [name for name, column in table.columns.items() if not column.is_text]
+    if signal.kind == "rotation":
+        angles = [_nearest(angle, numbers) for angle in _ANGLES]
+        return [a for a in angles if a] if all(angles) and len(set(angles)) == 3 else []
+    if signal.size == 1:
+        near = _nearest(signal.name, numbers)
+        return [near] if near else []
+    groups = [g for g in map(list, _stems(numbers)) if len(g) == signal.size]
+    if groups:
+        wanted = "".join(_candidates(signal)[0])
+        return max(groups, key=lambda g: difflib.SequenceMatcher(None, wanted, "".join(g)).ratio())
+    return numbers[: signal.size] if len(numbers) >= signal.size else []
+
+
+def _stems(names: list[str]) -> list[list[str]]:
+    """Group names that differ in their last letter x y z (or digit) only."""
+    groups: dict[str, list[str]] = {}
+    for name in names:
+        plain = _plain(name)
+        if len(plain) > 1 and plain[-1] in "xyz0123":
+            groups.setdefault(plain[:-1], []).append(name)
+    return list(groups.values())
+
+
+def _nearest(name: str, names: list[str]) -> str | None:
+    plain = {_plain(have): have for have in names}
+    near = difflib.get_close_matches(_plain(name), list(plain), n=1, cutoff=0.5)
+    return plain[near[0]] if near else None
+
+
+def _listed(names: list[str]) -> str:
+    return ", ".join(names[:12]) + (f", … ({len(names)} in all)" if len(names) > 12 else "")

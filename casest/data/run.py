@@ -1,0 +1,91 @@
+"""One continuous record, bound to a model's signals: what everything above the data works on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from casest.errors import DataError
+
+Array = NDArray[np.float64]
+Labels = NDArray[np.str_]
+Index = NDArray[np.int_]
+
+
+@dataclass(frozen=True)
+class Run:
+    """N samples of one record.
+
+    signals: per signal (N, size), in the model's units, which `units` names (None: unknown).
+    columns: every other column of the file, (N,) numbers or labels, in `column_units`.
+    time: (N,) in s, None where the record has none.
+    rows: (N,) data row in the input from 0, or the index of the rest interval.
+    block: (N,) number of the gap-separated stretch, burst, pose or rest interval, from 0.
+    count: (N,) samples averaged into each (1 in a raw record).
+    spread: per signal (N, size), standard error of each mean; empty for a raw record.
+    notes: what was assumed, skipped or looks wrong, one sentence each.
+    """
+
+    name: str
+    file: str
+    signals: Mapping[str, Array]
+    units: Mapping[str, str | None]
+    columns: Mapping[str, Array | Labels]
+    column_units: Mapping[str, str | None]
+    time: Array | None
+    rows: Index
+    block: Index
+    count: Index
+    spread: Mapping[str, Array]
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Refuse parts of unequal length: they would be matched wrongly without a sign."""
+        n = len(self.rows)
+        parts = {**self.signals, **self.columns, **self.spread}
+        parts |= {"block": self.block, "count": self.count}
+        if self.time is not None:
+            parts["time"] = self.time
+        for name, values in parts.items():
+            if len(values) != n:
+                raise DataError(f"{self.name}: {name} has {len(values)} samples, the run has {n}")
+        for name, values in self.signals.items():
+            if values.ndim != 2:
+                raise DataError(f"{self.name}: signal {name} has shape {values.shape}, not (N, k)")
+
+    @classmethod
+    def raw(
+        cls,
+        name: str,
+        signals: Mapping[str, Array],
+        *,
+        units: Mapping[str, str | None],
+        time: Array | None = None,
+        file: str = "",
+        notes: tuple[str, ...] = (),
+    ) -> Run:
+        """Make a run of one block from arrays alone, as a simulation does."""
+        n = len(next(iter(signals.values())))
+        zeros = np.zeros(n, dtype=np.int_)
+        ones, rows = np.ones(n, dtype=np.int_), np.arange(n)
+        return cls(name, file, signals, units, {}, {}, time, rows, zeros, ones, {}, notes)
+
+    def __len__(self) -> int:
+        """Return the number of samples N."""
+        return len(self.rows)
+
+    def take(self, chosen: NDArray[np.int_] | NDArray[np.bool_] | slice) -> Run:
+        """Return the samples given by an index, a mask or a slice, as a run of the same name."""
+        return replace(
+            self,
+            signals={name: values[chosen] for name, values in self.signals.items()},
+            columns={name: values[chosen] for name, values in self.columns.items()},
+            time=None if self.time is None else self.time[chosen],
+            rows=self.rows[chosen],
+            block=self.block[chosen],
+            count=self.count[chosen],
+            spread={name: values[chosen] for name, values in self.spread.items()},
+        )

@@ -1,0 +1,114 @@
+"""Reading a record, whatever its format, into named columns."""
+
+from __future__ import annotations
+
+import difflib
+import gzip
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from casest.data.arrays import read_matlab, read_npy, read_npz, read_parquet
+from casest.data.column import BadCell, Column
+from casest.data.delimited import Contents, read_delimited
+from casest.errors import DataError
+
+__all__ = ["BadCell", "Column", "Table", "read_table"]
+
+
+@dataclass(frozen=True)
+class Table:
+    """The columns of one file by name, in the file's order.
+
+    `preamble` keeps what stood before the table ("Fs": "100"); `notes` say what was skipped.
+    """
+
+    file: str
+    columns: Mapping[str, Column]
+    notes: tuple[str, ...]
+    preamble: Mapping[str, str]
+    n_rows: int
+
+
+def read_table(path: str | os.PathLike[str]) -> Table:
+    """Read CSV (any delimiter, header or not), Parquet, NumPy (.npy, .npz) or MATLAB (.mat).
+
+    Raises DataError where the file is missing, empty, of another format, has rows of unequal
+    width or two columns of one name. Bad cells raise nothing here: see `Column.bad`.
+    """
+    file = Path(path)
+    _refuse_unreadable(file)
+    contents = _READERS.get(file.suffix.lower(), _read_text)(file)
+    columns = {column.name: column for column in contents.columns}
+    if len(columns) < len(contents.columns):
+        names = [column.name for column in contents.columns]
+        twice = next(name for name in names if names.count(name) > 1)
+        raise DataError(f"{file}: two columns are named '{twice}'; rename one of them")
+    if not columns:
+        raise DataError(f"{file}: holds no columns of numbers; check the export")
+    n_rows = len(next(iter(columns.values())).values)
+    if n_rows == 0:
+        raise DataError(f"{file}: holds a header but no rows below it; check the export")
+    return Table(str(path), columns, tuple(contents.notes), contents.preamble, n_rows)
+
+
+def _refuse_unreadable(file: Path) -> None:
+    if file.is_dir():
+        raise DataError(f"{file}: is a folder; name the files in it, for example {file}/*.csv")
+    if not file.exists():
+        raise DataError(f"{file}: no such file; {_near_names(file)}")
+    if file.stat().st_size == 0:
+        raise DataError(f"{file}: the file is empty (0 bytes); check the export")
+
+
+def _near_names(file: Path) -> str:
+    if not file.parent.is_dir():
+        return f"there is no folder {file.parent} either"
+    names = sorted(path.name for path in file.parent.iterdir() if path.is_file())
+    near = difflib.get_close_matches(file.name, names, n=3, cutoff=0.6)
+    if near:
+        return f"did you mean {' or '.join(near)}?"
+    shown = ", ".join(names[:5]) + (", …" if names[5:] else "")
+    return f"that folder holds {shown}" if names else "that folder holds no files"
+
+
+def _read_text(file: Path) -> Contents:
+    try:
+        raw = gzip.decompress(file.read_bytes()) if file.suffix == ".gz" else file.read_bytes()
+    except (OSError, EOFError) as error:
+        raise DataError(f"{file}: cannot be read ({error})") from error
+    return read_delimited(str(file), _decoded(file, raw))
+
+
+def _decoded(file: Path, raw: bytes) -> str:
+    if raw.startswith((b"\xff\xfe", b"\xfe\xff")):
+        return raw.decode("utf-16")
+    if b"\x00" in raw[:4096]:
+        raise DataError(f"{file}: is no text but binary; export it as CSV, Parquet, .npy or .mat")
+    try:
+        return raw.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return raw.decode("latin-1")  # headers such as "µT" or "°C" from Windows
+
+
+def _refused(reason: str) -> Callable[[Path], Contents]:
+    def refuse(file: Path) -> Contents:
+        raise DataError(f"{file}: {reason}; export it as CSV, Parquet, .npy or .mat")
+
+    return refuse
+
+
+_READERS: dict[str, Callable[[Path], Contents]] = {
+    ".npy": read_npy,
+    ".npz": read_npz,
+    ".mat": read_matlab,
+    ".parquet": read_parquet,
+    ".pq": read_parquet,
+    ".xlsx": _refused("a spreadsheet is not read"),
+    ".xls": _refused("a spreadsheet is not read"),
+    ".h5": _refused("HDF5 is not read"),
+    ".hdf5": _refused("HDF5 is not read"),
+    ".bag": _refused("a ROS bag is not read"),
+    ".json": _refused("JSON is not read"),
+}

@@ -1,0 +1,1 @@
+"""Floor 1: symbols, shapes and the vocabulary of physics."""

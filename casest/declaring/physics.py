@@ -1,0 +1,171 @@
+"""The vocabulary of a model's body: CasADi's functions, and the few that physics needs besides."""
+
+from __future__ import annotations
+
+from contextvars import ContextVar
+from dataclasses import dataclass, field
+from typing import Any
+
+import casadi as ca
+
+from casest.errors import DeclarationError
+
+#: What a model's body handles; CasADi ships no type annotations.
+SX = Any
+
+acos, asin, atan, atan2, cos, cosh = ca.acos, ca.asin, ca.atan, ca.atan2, ca.cos, ca.cosh
+exp, log, sin, sinh, sqrt, tan, tanh = ca.exp, ca.log, ca.sin, ca.sinh, ca.sqrt, ca.tan, ca.tanh
+fabs, fmax, fmin, sign, if_else = ca.fabs, ca.fmax, ca.fmin, ca.sign, ca.if_else
+cross, dot, norm_2, vertcat, horzcat = ca.cross, ca.dot, ca.norm_2, ca.vertcat, ca.horzcat
+diag, skew, sum1 = ca.diag, ca.skew, ca.sum1
+pi, inf = ca.pi, float("inf")
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A named inner value of a model: `declared` before, `value` after the effects on it."""
+
+    name: str
+    unit: str
+    declared: SX
+    value: SX
+
+    @property
+    def dims(self) -> tuple[int, ...]:
+        """() for a scalar, (n,) for a vector."""
+        return () if self.declared.is_scalar() else (self.declared.numel(),)
+
+
+@dataclass
+class Trace:
+    """One run of a model's body; collects the quantities and lets effects and cuts in."""
+
+    effects: dict[str, list[Any]] = field(default_factory=dict)
+    cut: str | None = None
+    naming: bool = False
+    reserved: frozenset[str] = frozenset()
+    quantities: dict[str, Quantity] = field(default_factory=dict)
+    handed: dict[str, SX] = field(default_factory=dict)
+
+    def enter(self, name: str, expression: Any, unit: str) -> SX:
+        """Record a quantity and hand back what the rest of the body shall see."""
+        if name in self.quantities or name in self.reserved:
+            raise DeclarationError(f"name {name!r} is used twice: a quantity needs a name of its own")
+        declared = ca.SX(expression)
+        if self.cut == name:
+            declared = ca.SX.sym(name, *declared.shape)
+        value = declared
+        for apply in self.effects.get(name, ()):
+            value = apply(value)
+        self.quantities[name] = Quantity(name, unit, declared, value)
+        self.handed[name] = ca.SX.sym(name, *declared.shape) if self.naming else value
+        return self.handed[name]
+
+
+current_trace: ContextVar[Trace | None] = ContextVar("current_trace", default=None)
+
+
+def quantity(name: str, expression: Any, unit: str = "") -> SX:
+    """Name an inner value of the model, so that effects can enter there and reports can show it."""
+    trace = current_trace.get()
+    if trace is None:
+        raise DeclarationError(f"quantity({name!r}, …) belongs in the body of a @model function")
+    return trace.enter(name, expression, unit)
+
+
+def polynomial(coefficients: Any, variable: SX) -> SX:
+    """c[0] + c[1]·x + c[2]·x² + …, by Horner's rule."""
+    coefficients = ca.SX(coefficients)
+    value = ca.SX(0)
+    for i in reversed(range(coefficients.numel())):
+        value = value * variable + coefficients[i]
+    return value
+
+
+def integral(expression: SX, variable: SX) -> SX:
+    """∫₀ˣ of an expression that is a polynomial in the variable (exact, symbolic)."""
+    try:
+        coefficients = ca.poly_coeff(ca.SX(expression), variable)
+    except RuntimeError:
+        raise DeclarationError(
+            f"integral of {expression} over {variable}: only polynomials are integrated; "
+            "declare the integral itself and use der() for what it integrates"
+        ) from None
+    degree = coefficients.numel() - 1
+    value = ca.SX(0)
+    for i in range(degree + 1):
+        power = degree - i
+        value = value * variable + coefficients[i] / (power + 1)
+    return value * variable
+
+
+def der(expression: SX, variable: SX) -> SX:
+    """Derivative with respect to a scalar signal, usually time."""
+    trace = current_trace.get()
+    if trace is not None and trace.naming and expression.is_symbolic():
+        return ca.SX.sym(f"der({expression})")
+    return ca.jtimes(ca.SX(expression), variable, ca.SX.ones(*variable.shape))
+
+
+def rotation(angles: SX) -> SX:
+    """R = Rx(θ)·Ry(φ)·Rz(ψ): the rotation matrix of Euler angles (θ, φ, ψ), radians.
+
+    Pedersini leaves the order of `rotmat[θ,φ,ψ]` open; this is casest's convention.
+    """
+    c, s = [cos(angles[i]) for i in range(3)], [sin(angles[i]) for i in range(3)]
+    rx = vertcat(horzcat(1, 0, 0), horzcat(0, c[0], -s[0]), horzcat(0, s[0], c[0]))
+    ry = vertcat(horzcat(c[1], 0, s[1]), horzcat(0, 1, 0), horzcat(-s[1], 0, c[1]))
+    rz = vertcat(horzcat(c[2], -s[2], 0), horzcat(s[2], c[2], 0), horzcat(0, 0, 1))
+    return rx @ ry @ rz
+
+
+class Residual:
+    """What a model's body returns: how readings and parameters are tied together.
+
+    Explicit: `Residual(measured=v, predicted=reading)` with residual v − reading. Implicit:
+    `Residual(implicit=expression, unit="m/s^2")`, an expression that is zero but for noise; its
+    unit should be that of the reading. `corrected` is the quantity that `apply` gives back.
+    """
+
+    def __init__(
+        self,
+        *,
+        measured: SX | None = None,
+        predicted: SX | None = None,
+        implicit: SX | None = None,
+        corrected: SX | str | None = None,
+        unit: str = "",
+        axes: tuple[str, ...] = (),
+    ) -> None:
+        explicit = measured is not None and predicted is not None
+        if explicit == (implicit is not None):
+            raise DeclarationError("Residual takes measured= and predicted=, or implicit= alone")
+        self.measured, self.predicted, self.implicit = measured, predicted, implicit
+        self.corrected, self.unit, self.axes = corrected, unit, axes
+
+    @property
+    def expression(self) -> SX:
+        """The residual, as a column."""
+        if self.implicit is not None:
+            return ca.vec(ca.SX(self.implicit))
+        if self.measured.shape != ca.SX(self.predicted).shape:
+            raise DeclarationError(
+                f"measured has shape {self.measured.shape}, predicted {ca.SX(self.predicted).shape}"
+            )
+        return ca.vec(self.measured - self.predicted)
+
+
+def chart(kind: str, coordinates: SX, reference: SX) -> SX:
+    """Point of a curved set from chart coordinates around a reference (zero gives the reference).
+
+    Sphere: stereographic projection from the antipode; rotations: Cayley map, R₀·C(δ). Both have
+    unit derivative at zero, so a coordinate is an angle in radians there.
+    """
+    if kind == "unit":
+        d2 = ca.sumsqr(coordinates)
+        tangent = reference[3:6] * coordinates[0] + reference[6:9] * coordinates[1]
+        return ((4 - d2) * reference[0:3] + 4 * tangent) / (4 + d2)
+    half = coordinates / 2
+    h2 = ca.sumsqr(half)
+    cayley = ((1 - h2) * ca.SX.eye(3) + 2 * ca.skew(half) + 2 * (half @ half.T)) / (1 + h2)
+    return ca.reshape(reference, 3, 3).T @ cayley

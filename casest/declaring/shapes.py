@@ -1,0 +1,140 @@
+"""The forms a parameter's value can take, and the coordinates in which a solver moves it.
+
+Most forms are plain arrays: the coordinates are the entries. A unit vector is a point on the
+sphere and a rotation a point of SO(3): a solver moves those in a chart around a reference value
+(stereographic, Cayley), which has no pole and no redundant coordinate.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from casest.errors import DeclarationError
+
+Array = NDArray[np.float64]
+Kind = Literal["array", "lower", "unit", "rotation", "each"]
+
+
+@dataclass(frozen=True)
+class Shape:
+    """Form of a parameter: `dims` is the shape of its value, `kind` its structure."""
+
+    kind: Kind
+    dims: tuple[int, ...]
+    positive_diagonal: bool = False
+
+    @property
+    def entries(self) -> tuple[tuple[int, ...], ...]:
+        """Index of every stored entry, in order (a triangular matrix stores no zeros)."""
+        indices = [tuple(int(k) for k in i) for i in np.ndindex(*self.dims)]
+        if self.kind == "lower":
+            indices = [i for i in indices if i[0] >= i[1]]
+        return tuple(indices)
+
+    @property
+    def size(self) -> int:
+        """Number of stored entries."""
+        return len(self.entries)
+
+    @property
+    def coordinates(self) -> int:
+        """Number of coordinates a solver moves (2 on the sphere, 3 for a rotation)."""
+        return {"unit": 2, "rotation": 3}.get(self.kind, self.size)
+
+    @property
+    def curved(self) -> bool:
+        """True where the value lives on a curved set and needs a chart."""
+        return self.kind in ("unit", "rotation")
+
+    def pack(self, value: Any) -> Array:
+        """Stored entries (size,) of a value of shape `dims`."""
+        array = np.asarray(value, dtype=float)
+        if array.ndim == 0 and self.dims:
+            array = np.full(self.dims, float(array))
+        elif array.ndim == 1 and len(self.dims) == 2 and self.dims == (array.size,) * 2:
+            array = np.diag(array)
+        if array.shape != self.dims:
+            raise DeclarationError(f"a value of shape {array.shape} does not fit shape {self.dims}")
+        if self.kind == "lower" and np.any(np.triu(array, 1)) and value_is_array(value):
+            raise DeclarationError("a lower triangular value must have zeros above its diagonal")
+        return np.array([array[i] for i in self.entries], dtype=float)
+
+    def unpack(self, entries: Array) -> Array:
+        """Value of shape `dims` from its stored entries."""
+        value = np.zeros(self.dims)
+        for index, entry in zip(self.entries, entries, strict=True):
+            value[index] = entry
+        return value
+
+    def default(self) -> Array:
+        """Neutral value: identity for square matrices and rotations, north for directions."""
+        if self.kind == "unit":
+            return np.array([0.0, 0.0, 1.0])
+        if len(self.dims) == 2 and self.dims[0] == self.dims[1]:
+            return np.eye(self.dims[0])
+        return np.zeros(self.dims)
+
+    def reference(self, value: Array) -> Array:
+        """Numbers that describe the chart around `value`: the point itself, for a direction
+        followed by an orthonormal basis of its tangent plane. Empty for plain arrays."""
+        if self.kind == "unit":
+            point = np.asarray(value, dtype=float)
+            point = point / np.linalg.norm(point)
+            # Rows 2 and 3 of Vᵀ complete the point to an orthonormal frame.
+            basis = np.linalg.svd(point[None, :])[2][1:]
+            return np.concatenate([point, basis[0], basis[1]])
+        if self.kind == "rotation":
+            u, _, vt = np.linalg.svd(np.asarray(value, dtype=float))
+            return np.asarray(u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt).ravel()
+        return np.zeros(0)
+
+    def entry_names(self, name: str) -> tuple[str, ...]:
+        """Names such as `gain[2]` or `scale[1,0]`, one per stored entry."""
+        if not self.dims:
+            return (name,)
+        return tuple(f"{name}[{','.join(map(str, i))}]" for i in self.entries)
+
+
+def value_is_array(value: Any) -> bool:
+    """False for a plain number, which stands for all entries alike."""
+    return bool(np.ndim(value))
+
+
+def array_shape(dims: int | tuple[int, ...] | Shape | None) -> Shape:
+    """A shape from what `param` was given: nothing, a length, a pair, or a shape."""
+    if isinstance(dims, Shape):
+        return dims
+    if dims is None:
+        return Shape("array", ())
+    if isinstance(dims, int):
+        dims = (dims,)
+    if not dims or any(not isinstance(d, int) or d < 1 for d in dims) or len(dims) > 2:
+        raise DeclarationError(f"shape {dims!r} is not a length or a pair of lengths, all >= 1")
+    return Shape("array", tuple(dims))
+
+
+def diagonal(n: int) -> Shape:
+    """A diagonal n×n matrix with positive entries, stored and given as its n entries."""
+    return Shape("array", (n,), positive_diagonal=True)
+
+
+def lower(n: int) -> Shape:
+    """A lower triangular n×n matrix with positive diagonal."""
+    return Shape("lower", (n, n), positive_diagonal=True)
+
+
+def full(n: int) -> Shape:
+    """A full n×n matrix with positive diagonal (which fixes its sign)."""
+    return Shape("array", (n, n), positive_diagonal=True)
+
+
+#: A direction: a point on the unit sphere in space (3 numbers, 2 unknowns).
+unit_vector = Shape("unit", (3,))
+#: A rotation matrix (9 numbers, 3 unknowns).
+rotation_matrix = Shape("rotation", (3, 3))
+#: In an effect: one entry for each component of the quantity it acts on.
+each = Shape("each", ())

@@ -1,0 +1,486 @@
+"""Replay a CasADi SX function over many samples with NumPy.
+
+CasADi evaluates an SX function one sample at a time. Here its instruction list is read once, put
+into single-assignment form, split into what depends on the parameters only (computed once per
+call, as scalars) and what depends on the sample (computed for a block of samples at a time, one
+NumPy call per instruction and block). Memory is constant in the number of samples.
+
+The way down: `Replay` (what users hold) > `Plan` (which values to compute, and in which register)
+> `_Workspace` (the registers themselves) > kernels (one per CasADi operation).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from casest.errors import CasestError
+
+Floats = NDArray[np.float64]
+Kernel = Callable[..., object]
+Entry = tuple[int, int]  # (output, index of the nonzero in CasADi's column-major order)
+
+BLOCK = 8192  # samples per block: long enough to hide the cost of NumPy's calls
+
+
+# Kernels: f(operand, ..., out). An operand is a row of samples or a 0-d array. The composite ones
+# finish every read of their operands before they write, since `out` may be one of them.
+
+
+def _twice(a: Floats, out: Floats) -> None:
+    np.add(a, a, out)
+
+
+def _sign(a: Floats, out: Floats) -> None:
+    # Not np.sign, which loses the sign of -0.0.
+    np.copyto(out, np.where(a < 0, -1.0, np.where(a > 0, 1.0, a)))
+
+
+def _if_else_zero(condition: Floats, a: Floats, out: Floats) -> None:
+    # Not a product: 0 * inf is nan.
+    np.copyto(out, np.where(condition != 0, a, 0.0))
+
+
+def _fmin(a: Floats, b: Floats, out: Floats) -> None:
+    # Not np.fmin: of 0.0 and -0.0 it takes either, CasADi the first.
+    np.copyto(out, np.where((a <= b) | (b != b), a, b))
+
+
+def _fmax(a: Floats, b: Floats, out: Floats) -> None:
+    np.copyto(out, np.where((a >= b) | (b != b), a, b))
+
+
+def _remainder(a: Floats, b: Floats, out: Floats) -> None:
+    """IEEE 754 remainder, exact (np.remainder is Python's %): the algorithm of FreeBSD's libm."""
+    y = np.abs(b)
+    # 2y overflows only where |a| < 2y holds anyway, and fmod(x, inf) is x.
+    r = np.fmod(np.abs(a), y + y)
+    # r > y/2, in a form that is exact for both tiny and huge y.
+    tiny = y < 1.0
+    over = np.where(tiny, r + r > y, r > 0.5 * y)
+    r = np.where(over, r - y, r)
+    over &= np.where(tiny, r + r >= y, r >= 0.5 * y)
+    r = np.where(over, r - y, r)
+    np.copyto(out, np.where(np.signbit(a), -r, r))
+
+
+def _pow(a: Floats, b: Floats, out: Floats) -> None:
+    # For a single exponent of 0.5 NumPy takes the square root, which is -0.0 of -0.0 and nan of
+    # -inf, where pow is 0.0 and inf.
+    if b.ndim == 0 and b == 0.5:
+        np.copyto(out, np.where(np.isinf(a), np.abs(a), np.sqrt(a) + 0.0))
+    else:
+        np.power(a, b, out)
+
+
+def _erf(a: Floats, out: Floats) -> None:
+    from scipy.special import erf  # imported late: few models use it, and SciPy loads slowly
+
+    erf(a, out)
+
+
+_KERNELS: dict[int, Kernel] = {
+    ca.OP_ADD: np.add,
+    ca.OP_SUB: np.subtract,
+    ca.OP_MUL: np.multiply,
+    ca.OP_DIV: np.divide,
+    ca.OP_NEG: np.negative,
+    ca.OP_EXP: np.exp,
+    ca.OP_LOG: np.log,
+    ca.OP_LOG1P: np.log1p,
+    ca.OP_EXPM1: np.expm1,
+    ca.OP_POW: _pow,
+    ca.OP_CONSTPOW: _pow,
+    ca.OP_SQRT: np.sqrt,
+    ca.OP_SQ: np.square,
+    ca.OP_TWICE: _twice,
+    ca.OP_INV: np.reciprocal,
+    ca.OP_SIN: np.sin,
+    ca.OP_COS: np.cos,
+    ca.OP_TAN: np.tan,
+    ca.OP_ASIN: np.arcsin,
+    ca.OP_ACOS: np.arccos,
+    ca.OP_ATAN: np.arctan,
+    ca.OP_SINH: np.sinh,
+    ca.OP_COSH: np.cosh,
+    ca.OP_TANH: np.tanh,
+    ca.OP_ASINH: np.arcsinh,
+    ca.OP_ACOSH: np.arccosh,
+    ca.OP_ATANH: np.arctanh,
+    ca.OP_ATAN2: np.arctan2,
+    ca.OP_HYPOT: np.hypot,
+    ca.OP_FMIN: _fmin,
+    ca.OP_FMAX: _fmax,
+    ca.OP_FABS: np.fabs,
+    ca.OP_FLOOR: np.floor,
+    ca.OP_CEIL: np.ceil,
+    ca.OP_FMOD: np.fmod,
+    ca.OP_REMAINDER: _remainder,
+    ca.OP_SIGN: _sign,
+    ca.OP_COPYSIGN: np.copysign,
+    ca.OP_ERF: _erf,
+    ca.OP_LT: np.less,
+    ca.OP_LE: np.less_equal,
+    ca.OP_EQ: np.equal,
+    ca.OP_NE: np.not_equal,
+    ca.OP_NOT: np.logical_not,
+    ca.OP_AND: np.logical_and,
+    ca.OP_OR: np.logical_or,
+    ca.OP_IF_ELSE_ZERO: _if_else_zero,
+}
+_COMMUTATIVE = {ca.OP_ADD, ca.OP_MUL}
+_SAME = {ca.OP_ASSIGN, ca.OP_LIFT}  # the value of the (first) operand, unchanged
+_PARAMETER = 0  # which input
+_SAMPLE = 1
+
+
+@dataclass(frozen=True)
+class _Value:
+    """One value of the single-assignment form: a constant, an input entry or an operation."""
+
+    kind: str  # "constant", "parameter", "sample" or "operation"
+    code: int = 0  # index into the input, or CasADi's operation
+    operands: tuple[int, ...] = ()
+    constant: float = 0.0
+    per_sample: bool = False
+
+
+class _Graph:
+    """The instruction list in single-assignment form, with equal values merged.
+
+    `values` are in order of computation; `outputs[i][j]` is the value of nonzero j of output i.
+    """
+
+    def __init__(self, function: Any) -> None:
+        self.values: list[_Value] = []
+        self.outputs = [[-1] * function.nnz_out(i) for i in range(function.n_out())]
+        self._known: dict[object, int] = {}
+        register: dict[int, int] = {}
+        for k in range(function.n_instructions()):
+            code = function.instruction_id(k)
+            source = function.instruction_input(k)
+            target = function.instruction_output(k)
+            if code == ca.OP_OUTPUT:
+                self.outputs[target[0]][target[1]] = register[source[0]]
+            elif code in _SAME:
+                register[target[0]] = register[source[0]]
+            elif code == ca.OP_CONST:
+                constant = float(function.instruction_constant(k))
+                register[target[0]] = self._add(_Value("constant", constant=constant))
+            elif code == ca.OP_INPUT:
+                register[target[0]] = self._add(_input(source[0], source[1]))
+            elif code in _KERNELS:
+                operands = tuple(register[i] for i in source)
+                register[target[0]] = self._add(self._operation(code, operands))
+            else:
+                raise CasestError(
+                    f"function {function.name()!r} uses the operation {_name(code)}, which replay"
+                    " does not know: write the expression without it"
+                )
+
+    def _operation(self, code: int, operands: tuple[int, ...]) -> _Value:
+        if code in _COMMUTATIVE:
+            operands = tuple(sorted(operands))
+        per_sample = any(self.values[i].per_sample for i in operands)
+        return _Value("operation", code, operands, per_sample=per_sample)
+
+    def _add(self, value: _Value) -> int:
+        # Constants by their bits, to keep -0.0 from 0.0.
+        bits = np.float64(value.constant).tobytes() if value.kind == "constant" else b""
+        key = (value.kind, value.code, value.operands, bits)
+        if key not in self._known:
+            self._known[key] = len(self.values)
+            self.values.append(value)
+        return self._known[key]
+
+
+def _input(which: int, index: int) -> _Value:
+    if which == _PARAMETER:
+        return _Value("parameter", index)
+    return _Value("sample", index, per_sample=True)
+
+
+def _name(code: int) -> str:
+    names = [name for name in dir(ca) if name.startswith("OP_") and getattr(ca, name) == code]
+    return names[0] if names else f"number {code}"
+
+
+class Plan:
+    """What to compute for some entries of the outputs, and where each value lives.
+
+    A per-sample value lives in a row: one of the result's if it is wanted, else one that is taken
+    over as soon as its last reader has run. The other values live in `scalars`.
+    """
+
+    def __init__(self, graph: _Graph, wanted: Sequence[Entry]) -> None:
+        self.graph = graph
+        self.wanted = [graph.outputs[output][nonzero] for output, nonzero in wanted]
+        needed = self._needed()
+        values = graph.values
+        self.scalars = [i for i in needed if not values[i].per_sample]
+        self.inputs = [i for i in needed if values[i].kind == "sample"]
+        self.steps = [i for i in needed if values[i].per_sample and values[i].kind == "operation"]
+        # The first place a computed value is wanted in is its home; the others get copies.
+        self.home: dict[int, int] = {}
+        computed = set(self.steps)
+        for row, i in enumerate(self.wanted):
+            if i in computed:
+                self.home.setdefault(i, row)
+        self.register, self.n_registers = self._assign_registers()
+        self._idle: list[_Workspace] = []
+
+    def _needed(self) -> list[int]:
+        needed: set[int] = set()
+        stack = list(self.wanted)
+        while stack:
+            i = stack.pop()
+            if i not in needed:
+                needed.add(i)
+                stack.extend(self.graph.values[i].operands)
+        return sorted(needed)
+
+    def _assign_registers(self) -> tuple[dict[int, int], int]:
+        values = self.graph.values
+        last_reader = {j: i for i in self.steps for j in values[i].operands}
+        register: dict[int, int] = {}
+        free: list[int] = []
+        count = 0
+        for i in self.steps:
+            # Freed before the result is placed, and last in first out: works in place where it can.
+            for j in dict.fromkeys(values[i].operands):
+                if last_reader[j] == i and j in register:
+                    free.append(register[j])
+            if i in self.home:
+                continue
+            if not free:
+                free.append(count)
+                count += 1
+            register[i] = free.pop()
+        return register, count
+
+    def blocks(
+        self, parameters: Floats, samples: Floats, block: int = BLOCK
+    ) -> Iterator[tuple[slice, Floats]]:
+        """Yield, per block, the slice of samples and the wanted entries, (wanted, in block).
+
+        parameters: (n,). samples: (N, k), in memory or mapped. The array is a view of a buffer
+        that the next block, and the next call, overwrite.
+        """
+        if block < 1:
+            raise CasestError(f"block is {block}: give the number of samples per block, at least 1")
+        total = len(samples)
+        if total == 0:
+            return
+        # Blocks of equal length: a short last one would cost as many calls as a long one.
+        length = -(-total // -(-total // block))
+        workspace = self._take(length)
+        try:
+            workspace.set_parameters(parameters)
+            for start in range(0, total, length):
+                span = slice(start, min(start + length, total))
+                yield span, workspace.run(samples[span])
+        finally:
+            self._idle[:] = [workspace]
+
+    def _take(self, length: int) -> _Workspace:
+        # Taken off the list while in use, so that interleaved iterations do not share a buffer.
+        while self._idle:
+            workspace = self._idle.pop()
+            if workspace.length == length:
+                return workspace
+        return _Workspace(self, length)
+
+
+class _Workspace:
+    """The registers of one plan for blocks of up to `length` samples, and the bound calls."""
+
+    def __init__(self, plan: Plan, length: int) -> None:
+        self.plan = plan
+        self.length = length
+        self._scalars = np.empty(len(plan.scalars))
+        self._scalar = {i: self._scalars[k, ...] for k, i in enumerate(plan.scalars)}
+        self._results = _aligned(len(plan.wanted), length)
+        self._inputs = _aligned(len(plan.inputs), length)
+        self._registers = _aligned(plan.n_registers, length)
+        values = plan.graph.values
+        self._scalar_calls = [
+            self._call(i, self._scalar) for i in plan.scalars if values[i].kind == "operation"
+        ]
+        self._bound: dict[int, list[tuple[Kernel, tuple[Floats, ...]]]] = {}
+
+    def set_parameters(self, parameters: Floats) -> None:
+        """Evaluate once what does not depend on the sample."""
+        for i in self.plan.scalars:
+            value = self.plan.graph.values[i]
+            if value.kind == "constant":
+                self._scalar[i][...] = value.constant
+            elif value.kind == "parameter":
+                self._scalar[i][...] = parameters[value.code]
+        _run(self._scalar_calls)
+        for row, i in enumerate(self.plan.wanted):
+            if i in self._scalar:
+                self._results[row] = self._scalar[i]
+
+    def run(self, samples: Floats) -> Floats:
+        """Evaluate a block, (rows, k) to (wanted, rows)."""
+        length = len(samples)
+        for row, i in zip(self._inputs, self.plan.inputs, strict=True):
+            row[:length] = samples[:, self.plan.graph.values[i].code]
+        if length not in self._bound:
+            self._bound[length] = self._bind(length)
+        _run(self._bound[length])
+        return self._results[:, :length]
+
+    def _bind(self, length: int) -> list[tuple[Kernel, tuple[Floats, ...]]]:
+        plan = self.plan
+        place = dict(self._scalar)
+        place.update((i, self._inputs[k, :length]) for k, i in enumerate(plan.inputs))
+        place.update((i, self._registers[k, :length]) for i, k in plan.register.items())
+        place.update((i, self._results[k, :length]) for i, k in plan.home.items())
+        calls = [self._call(i, place) for i in plan.steps]
+        for row, i in enumerate(plan.wanted):
+            if i not in self._scalar and plan.home.get(i) != row:
+                calls.append((np.positive, (place[i], self._results[row, :length])))
+        return calls
+
+    def _call(self, i: int, place: dict[int, Floats]) -> tuple[Kernel, tuple[Floats, ...]]:
+        value = self.plan.graph.values[i]
+        return _KERNELS[value.code], (*(place[j] for j in value.operands), place[i])
+
+
+def _run(calls: list[tuple[Kernel, tuple[Floats, ...]]]) -> None:
+    with np.errstate(all="ignore"):
+        for kernel, arguments in calls:
+            kernel(*arguments)
+
+
+def _aligned(rows: int, length: int) -> Floats:
+    """An uninitialised (rows, >= length) array whose rows start on cache lines.
+
+    An odd number of cache lines per row: rows a power of two apart would fight for the same sets.
+    """
+    stride = 8 * ((length + 7) // 8 | 1)
+    raw = np.empty(rows * stride + 7)
+    start = -(raw.ctypes.data // 8) % 8
+    return raw[start : start + rows * stride].reshape(rows, stride)
+
+
+class Replay:
+    """A CasADi SX function of (parameters, sample), evaluated over all samples of a record.
+
+    The function has exactly two inputs, `parameters` (n×1, dense) and `sample` (k×1, dense), and
+    any number of outputs of any sparsity. Values equal CasADi's to a few units in the last place;
+    non-finite ones are returned as they come, without a warning. Only the sign of a nan, which no
+    standard fixes but copysign can see, may differ.
+    """
+
+    def __init__(self, function: Any) -> None:
+        _check_function(function)
+        self.name = str(function.name())
+        self.n_parameters = int(function.numel_in(_PARAMETER))
+        self.n_sample = int(function.numel_in(_SAMPLE))
+        self._graph = _Graph(function)
+        self.shapes: list[tuple[int, int]] = [
+            (int(function.size1_out(i)), int(function.size2_out(i)))
+            for i in range(function.n_out())
+        ]
+        # Of every nonzero of each output, in CasADi's order: row and column.
+        self.sparsity: list[tuple[NDArray[np.intp], NDArray[np.intp]]] = [
+            _triplet(function.sparsity_out(i)) for i in range(function.n_out())
+        ]
+        self._plans: dict[tuple[Entry, ...], Plan] = {}
+
+    def plan(self, wanted: Sequence[Entry]) -> Plan:
+        """How to compute the (output, nonzero) entries `wanted`, in that order; made once."""
+        key = tuple(wanted)
+        if key not in self._plans:
+            self._plans[key] = Plan(self._graph, key)
+        return self._plans[key]
+
+    def blocks(
+        self, parameters: Floats, samples: Floats, block: int = BLOCK
+    ) -> Iterator[tuple[slice, list[Floats]]]:
+        """Yield, per block, the slice of samples and each output's nonzeros, (nnz, in block).
+
+        parameters: (n,). samples: (N, k), in memory or mapped. Nonzeros are in CasADi's
+        column-major order. The arrays are views of a buffer that the next block, and the next
+        call on this object, overwrite: copy what is to be kept.
+        """
+        parameters, samples = self.check(parameters, samples)
+        counts = [len(row) for row, _ in self.sparsity]
+        ends = np.cumsum(counts)
+        plan = self.plan([(i, j) for i, count in enumerate(counts) for j in range(count)])
+        for span, values in plan.blocks(parameters, samples, block):
+            yield (
+                span,
+                [values[end - count : end] for end, count in zip(ends, counts, strict=True)],
+            )
+
+    def __call__(self, parameters: Floats, samples: Floats) -> list[Floats]:
+        """Each output of every sample, dense: (N, rows, columns)."""
+        results = [np.zeros((len(samples), *shape)) for shape in self.shapes]
+        for span, outputs in self.blocks(parameters, samples):
+            for result, values, (row, column) in zip(results, outputs, self.sparsity, strict=True):
+                result[span, row, column] = values.T
+        return results
+
+    def sum(self, parameters: Floats, samples: Floats, output: int = 0) -> Floats:
+        """The sum of one output over all samples, dense: (rows, columns)."""
+        parameters, samples = self.check(parameters, samples)
+        row, column = self.sparsity[output]
+        output %= len(self.shapes)
+        total = np.zeros(self.shapes[output])
+        plan = self.plan([(output, j) for j in range(len(row))])
+        with np.errstate(all="ignore"):
+            for _, values in plan.blocks(parameters, samples):
+                total[row, column] += values.sum(axis=1)
+        return total
+
+    def check(self, parameters: Floats, samples: Floats) -> tuple[Floats, Floats]:
+        """Return both as arrays, or raise if a shape is wrong: (n,) and (N, k)."""
+        parameters = np.asarray(parameters, dtype=np.float64)
+        samples = np.asanyarray(samples)
+        if parameters.shape != (self.n_parameters,):
+            raise CasestError(
+                f"parameters of {self.name!r} have the shape {parameters.shape}:"
+                f" give ({self.n_parameters},)"
+            )
+        if samples.ndim != 2 or samples.shape[1] != self.n_sample:
+            raise CasestError(
+                f"samples of {self.name!r} have the shape {samples.shape}:"
+                f" give (N, {self.n_sample}), one row per sample"
+            )
+        return parameters, samples
+
+
+def _triplet(sparsity: Any) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    row, column = sparsity.get_triplet()
+    return np.array(row, dtype=np.intp), np.array(column, dtype=np.intp)
+
+
+def _check_function(function: Any) -> None:
+    name = function.name()
+    if not function.is_a("SXFunction"):
+        raise CasestError(
+            f"function {name!r} is a {function.class_name()}: build it from SX, or call .expand()"
+        )
+    if function.name_in() != ["parameters", "sample"]:
+        raise CasestError(
+            f"function {name!r} has the inputs {function.name_in()}:"
+            " replay needs exactly ['parameters', 'sample']"
+        )
+    if function.has_free():
+        raise CasestError(
+            f"function {name!r} has free symbols {function.get_free()}: make them inputs"
+        )
+    for i, word in enumerate(function.name_in()):
+        if not function.sparsity_in(i).is_dense() or function.size2_in(i) != 1:
+            raise CasestError(
+                f"input {word!r} of function {name!r} is {function.sparsity_in(i).dim(True)}:"
+                " replay needs a dense column"
+            )

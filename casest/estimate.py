@@ -1,0 +1,298 @@
+"""Fit a model to runs, prove the answer, and say how sure it is."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from casest.data.run import Run
+from casest.declaring.shapes import Array
+from casest.errors import DataError, NotTrusted, UsageError
+from casest.identify import Identifiability, Weak, identify, weak_directions
+from casest.modelling.model import Model
+from casest.solve.certificate import Certificate, certify
+from casest.solve.covariance import inverse_normal, sandwich
+from casest.solve.ipopt import ipopt
+from casest.solve.outcome import Outcome
+from casest.solve.trust_region import trust_region
+from casest.stack import Point, Problem
+
+#: Solvers of the least-squares problem; estimators of a model's own are named besides.
+SOLVERS = ("ipopt", "ipopt-exact", "trust-region")
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Standard deviation of one residual, with where it comes from.
+
+    `sigma` is what the covariance uses; `residual` the root of RSS over degrees of freedom;
+    `repeats` the scatter that rest intervals show by themselves (None without any).
+    """
+
+    sigma: float
+    residual: float
+    repeats: float | None
+    degrees_of_freedom: int
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Parameters by name with covariance, certificate, residuals.
+
+    `values` and `std` have the parameters' shapes (a leading run axis for per-run ones if there
+    are several runs); `robust` is the standard deviation from the sandwich form. `covariance`
+    (n, n) is of the unknowns `names`. Where the data do not determine a value its std is NaN.
+    """
+
+    problem: Problem
+    point: Point
+    values: Mapping[str, Array]
+    std: Mapping[str, Array]
+    robust: Mapping[str, Array]
+    covariance: Array
+    noise: Noise
+    rmse: float
+    certificate: Certificate
+    identifiability: Identifiability
+    weak: tuple[Weak, ...]
+    outcomes: tuple[Outcome, ...]
+    seconds: float
+    notes: tuple[str, ...] = ()
+    extra: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def model(self) -> Model:
+        """The model that was fitted."""
+        return self.problem.model
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the unknowns, in the order of the covariance."""
+        return self.problem.names
+
+
+def calibrate(
+    model: Model,
+    runs: Sequence[Run],
+    *,
+    start: Mapping[str, Any] | None = None,
+    solver: str = "ipopt",
+    seed: int = 0,
+) -> Estimate:
+    """Fit the model; return an estimate whose certificate is trusted.
+
+    `start` overrides the automatic start values; `solver` is one of SOLVERS or an estimator of
+    the model's own (`closed-form`), which is judged against the least-squares optimum. Raises
+    NotTrusted, with the refused estimate as its attribute `estimate`, where no answer deserves
+    belief; DataError where there are fewer residuals than unknowns.
+    """
+    found = attempt(model, runs, start=start, solver=solver, seed=seed)
+    if not found.certificate.trusted:
+        error = NotTrusted("no trustworthy estimate: " + "; ".join(found.certificate.reasons))
+        error.estimate = found
+        raise error
+    return found
+
+
+def attempt(
+    model: Model,
+    runs: Sequence[Run],
+    *,
+    start: Mapping[str, Any] | None = None,
+    solver: str = "ipopt",
+    seed: int = 0,
+) -> Estimate:
+    """The same as `calibrate`, but a refused estimate is returned instead of raised."""
+    began = time.perf_counter()
+    problem = Problem(model, tuple(runs))
+    _enough(problem)
+    estimators = dict(model.estimators)
+    if solver not in SOLVERS and solver not in estimators:
+        known = ", ".join([*SOLVERS, *estimators])
+        raise UsageError(f"unknown solver {solver!r} for {model.name}; it has {known}")
+    first = problem.start() if start is None else problem.point(_merged(problem, start))
+    outcomes = _solve(problem, first, solver if solver in SOLVERS else "ipopt", seed, start is None)
+    best = min(outcomes, key=_cost)
+    if solver in estimators:
+        return _own_estimator(problem, estimators[solver], solver, best, outcomes, began)
+    return _estimate(problem, best, outcomes, began)
+
+
+def _enough(problem: Problem) -> None:
+    if problem.residual_count < problem.unknowns:
+        what = "rest intervals" if problem.runs[0].spread else "rows"
+        raise DataError(
+            f"{problem.runs[0].file}: {sum(map(len, problem.runs))} {what} give "
+            f"{problem.residual_count} equations for the {problem.unknowns} unknowns of "
+            f"{problem.model.name}; record more, or fix some with --fix name=value"
+        )
+    if problem.unknowns == 0:
+        raise UsageError(f"model {problem.model.name} has nothing left to estimate; --free something")
+
+
+def _merged(problem: Problem, start: Mapping[str, Any]) -> dict[str, Any]:
+    automatic = problem.values(problem.start()) if problem.model.starter else {}
+    return {**automatic, **start}
+
+
+def _cost(outcome: Outcome) -> float:
+    return outcome.cost if np.isfinite(outcome.cost) else np.inf
+
+
+def _solve(
+    problem: Problem, first: Point, solver: str, seed: int, automatic: bool
+) -> tuple[Outcome, ...]:
+    """The solver asked for with a polish, and a second way that must agree with it.
+
+    The polished outcome comes first and carries the time of both.
+    """
+    if solver == "trust-region" or _singular(problem, first):
+        # IPOPT wanders along a direction that changes nothing; the damped steps do not.
+        main = trust_region(problem, first)
+    else:
+        main = ipopt(problem, first, exact=solver == "ipopt-exact")
+    polished = trust_region(problem, main.point)
+    polished = replace(
+        polished,
+        solver=main.solver,
+        iterations=main.iterations + polished.iterations,
+        evaluations=main.evaluations + polished.evaluations,
+        seconds=main.seconds + polished.seconds,
+    )
+    second = trust_region(problem, first)
+    outcomes = [polished, second]
+    if not automatic:
+        # A start of the user's may lie in a wrong valley: the automatic one must agree.
+        outcomes.append(trust_region(problem, problem.start()))
+    costs = [_cost(o) for o in outcomes]
+    if max(costs) - min(costs) > 1e-6 * max(min(costs), 1e-300):
+        outcomes += _perturbed(problem, first, seed)
+    return (*outcomes,)
+
+
+def _singular(problem: Problem, first: Point) -> bool:
+    """Is a direction undetermined at the start and at what damped steps reach from there?"""
+    if identify(problem, first).rank == problem.unknowns:
+        return False
+    reached = trust_region(problem, first, max_iterations=50).point
+    return identify(problem, reached).rank < problem.unknowns
+
+
+def _perturbed(problem: Problem, first: Point, seed: int) -> list[Outcome]:
+    """Starts around the first one, when two ways disagree."""
+    rng = np.random.default_rng(seed)
+    found = []
+    for _ in range(4):
+        step = 0.1 * np.maximum(np.abs(first.x), 0.1) * rng.standard_normal(len(first.x))
+        moved = problem.moved(first, step)
+        found.append(trust_region(problem, Point(problem.inside(moved.x), moved.references)))
+    return found
+
+
+def _estimate(
+    problem: Problem, best: Outcome, outcomes: Sequence[Outcome], began: float
+) -> Estimate:
+    point = best.point
+    factor = problem.factor(point)
+    R, _, rest = factor
+    identified = identify(problem, point, R)
+    dof = problem.residual_count - identified.rank
+    noise = _noise(problem, point, float(np.sqrt(2 * best.cost)), dof)
+    covariance = noise.sigma**2 * inverse_normal(R)
+    robust = sandwich(problem, point, R)
+    certificate = certify(problem, best, outcomes, identified, (R, factor[1], rest), noise.sigma)
+    unknown = identified.touched
+    covariance[unknown, :] = covariance[:, unknown] = np.nan
+    robust[unknown, :] = robust[:, unknown] = np.nan
+    return Estimate(
+        problem,
+        point,
+        problem.values(point),
+        problem.spread(point, covariance),
+        problem.spread(point, robust),
+        covariance,
+        noise,
+        float(np.sqrt(2 * best.cost / problem.residual_count)),
+        certificate,
+        identified,
+        weak_directions(problem, R, noise.sigma, identified.rank),
+        tuple(outcomes),
+        time.perf_counter() - began,
+    )
+
+
+def _noise(problem: Problem, point: Point, length: float, dof: int) -> Noise:
+    """Noise of one residual: what is left over, but never less than repeats show."""
+    residual = length / np.sqrt(dof) if dof > 0 else float("nan")
+    repeats = problem.repeat_noise(point)
+    candidates = [s for s in (residual, repeats) if s is not None and np.isfinite(s)]
+    return Noise(max(candidates, default=float("nan")), residual, repeats, dof)
+
+
+def _own_estimator(
+    problem: Problem,
+    function: Callable[..., Any],
+    name: str,
+    best: Outcome,
+    outcomes: Sequence[Outcome],
+    began: float,
+) -> Estimate:
+    """An estimator of the model's own, judged by its distance from the least-squares optimum."""
+    optimum = _estimate(problem, best, outcomes, began)
+    started = time.perf_counter()
+    try:
+        values = function(problem.model, problem.runs)
+    except NotTrusted as error:
+        refused = replace(optimum.certificate, trusted=False, reasons=(str(error),))
+        return replace(optimum, certificate=refused, extra={"estimator": name})
+    seconds = time.perf_counter() - started
+    point = problem.point(values)
+    certificate = judge_estimator(optimum, problem, point, values, name)
+    least_squares = sum(o.seconds for o in outcomes[:1])
+    return replace(
+        optimum,
+        point=point,
+        values=problem.values(point),
+        rmse=float(np.sqrt(2 * problem.cost(point) / problem.residual_count)),
+        certificate=certificate,
+        extra={"estimator": name, "seconds": seconds, "least_squares_seconds": least_squares},
+        seconds=time.perf_counter() - began,
+    )
+
+
+def judge_estimator(
+    optimum: Estimate, problem: Problem, point: Point, values: Mapping[str, Any], name: str
+) -> Certificate:
+    """Trust an estimator's values only near a trusted optimum; say how far from it they are."""
+    if not optimum.certificate.trusted:
+        return optimum.certificate
+    raw = np.concatenate([s.parameter.shape.pack(values[s.parameter.name]) for s in problem.slots])
+    if not np.allclose(raw, point.x, rtol=1e-6, atol=1e-6 * np.abs(raw).max()):
+        reason = f"{name}: the solution collapsed; it lies outside the bounds of the model"
+        return replace(optimum.certificate, trusted=False, reasons=(reason,))
+    distance = (point.x - optimum.point.x) / np.sqrt(np.diag(optimum.covariance))
+    worst = int(np.argmax(np.abs(distance)))
+    far = (
+        f"{name}: `{problem.names[worst]}` is {abs(distance[worst]):.2g} standard deviations from "
+        "the certified least-squares optimum"
+    )
+    if not abs(distance[worst]) <= 3:
+        return replace(optimum.certificate, trusted=False, reasons=(far,))
+    return replace(optimum.certificate, reasons=(far, *optimum.certificate.reasons))
+
+
+def score(found: Estimate, runs: Sequence[Run]) -> float:
+    """Root mean square residual of the estimate on runs that it did not see, residual unit."""
+    per_run = [p.name for p in found.model.parameters if p.scope == "run"]
+    if per_run:
+        raise UsageError(
+            f"a held-out record has a {per_run[0]} of its own, which nothing determines yet; "
+            "leave --holdout out"
+        )
+    problem = Problem(found.model, tuple(runs))
+    cost = problem.cost(problem.point(found.values))
+    return float(np.sqrt(2 * cost / problem.residual_count))

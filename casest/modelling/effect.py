@@ -1,0 +1,160 @@
+"""Effects: something physical that a model lacks, null at zero, attachable wherever it fits."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from casest.declaring.physics import SX
+from casest.declaring.symbols import Constant, Parameter, Signal, Undecided, named
+from casest.errors import DeclarationError
+
+Kind = Literal["quantity", "signal", "noise", "sequence"]
+
+#: What an effect on the noise acts on, instead of a quantity.
+NOISE = "noise"
+
+
+@dataclass(frozen=True)
+class Effect:
+    """A function of one quantity, signal, the noise, or the sequence of samples.
+
+    `on` names what it acts on; `extras` are further signals or columns it reads; `null` maps each
+    parameter to the value at which the effect vanishes (0 unless told).
+    """
+
+    name: str
+    function: Callable[..., Any]
+    on: str
+    kind: Kind
+    extras: tuple[Signal, ...]
+    declarations: tuple[Any, ...]
+    null: tuple[tuple[str, float], ...]
+    doc: str = ""
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        """Evaluate the effect's own function."""
+        return self.function(*args, **kwargs)
+
+    def null_of(self, parameter: str) -> float:
+        """Value of a parameter at which the effect is absent."""
+        return dict(self.null).get(parameter, 0.0)
+
+
+def effect(
+    *,
+    on: str,
+    kind: Kind | None = None,
+    null: Mapping[str, float] | None = None,
+) -> Callable[[Callable[..., Any]], Effect]:
+    """Declare an effect: first argument the value acted on, further ones signals or columns.
+
+    The kind follows from `on`: the name of a quantity or of a signal of the model, or `"noise"`
+    (then the function returns the weight of a sample whose residual is r standard deviations).
+    `kind="sequence"`: the arguments are (value, previous, dt), where `previous` is the result for
+    the sample before and `dt` the time since then in seconds; the function gives the next one.
+    """
+
+    def declare(function: Callable[..., Any]) -> Effect:
+        positional, keyword = _signature(function)
+        extras = []
+        for name, default in positional[1:]:
+            if kind == "sequence" and name in ("previous", "dt"):
+                continue
+            extras.append(named(default, name) if isinstance(default, Signal) else Signal(name, 1, None))
+        declared_kind: Kind = kind or ("noise" if on == NOISE else "quantity")
+        declarations = tuple(_declaration(function.__name__, name, d) for name, d in keyword)
+        return Effect(
+            function.__name__,
+            function,
+            on,
+            declared_kind,
+            tuple(extras),
+            declarations,
+            tuple(sorted((null or {}).items())),
+            inspect.getdoc(function) or "",
+        )
+
+    return declare
+
+
+def _signature(function: Callable[..., Any]) -> tuple[list[tuple[str, Any]], list[tuple[str, Any]]]:
+    """Positional and keyword-only arguments with their defaults."""
+    parameters = inspect.signature(function).parameters.values()
+    positional = [(p.name, p.default) for p in parameters if p.kind is p.POSITIONAL_OR_KEYWORD]
+    keyword = [(p.name, p.default) for p in parameters if p.kind is p.KEYWORD_ONLY]
+    if not positional:
+        raise DeclarationError(f"effect {function.__name__}: its first argument is what it acts on")
+    return positional, keyword
+
+
+def _declaration(effect_name: str, name: str, declared: Any) -> tuple[str, Any]:
+    if isinstance(declared, Parameter | Undecided | Constant):
+        return (name, declared)
+    if isinstance(declared, int | float):
+        return (name, Constant(name, (float(declared),), ""))
+    raise DeclarationError(
+        f"effect {effect_name}: {name} must be param(…) or a number, not {declared!r}"
+    )
+
+
+@dataclass(frozen=True)
+class Attached:
+    """An effect at its place in a model: what it acts on, which columns it reads, its unknowns."""
+
+    effect: Effect
+    on: str
+    kind: Kind
+    label: str
+    columns: tuple[tuple[str, str], ...]
+    parameters: tuple[Parameter, ...]
+
+    @property
+    def signals(self) -> tuple[Signal, ...]:
+        """Signals that the effect reads, under the names they have in the data."""
+        renamed = dict(self.columns)
+        return tuple(replace(s, name=renamed.get(s.name, s.name)) for s in self.effect.extras)
+
+    def apply(self, value: SX, symbols: Mapping[str, SX], **more: SX) -> SX:
+        """The value with the effect in it, from the model's symbols by name."""
+        extras = [symbols[s.name] for s in self.signals]
+        unknowns = {p.name.rpartition(".")[2]: symbols[p.name] for p in self.parameters}
+        numbers = {n: d.array for n, d in self.effect.declarations if isinstance(d, Constant)}
+        numbers = {n: float(a) if a.ndim == 0 else a for n, a in numbers.items()}
+        return self.effect.function(value, *more.values(), *extras, **unknowns, **numbers)
+
+
+def attach(
+    declared: Effect,
+    on: str,
+    kind: Kind,
+    dims: tuple[int, ...],
+    units: Mapping[str, str],
+    columns: Mapping[str, str],
+    label: str,
+) -> Attached:
+    """An effect with its unknowns sized and named for the place where it is attached.
+
+    `units` gives the unit of the value acted on under the name of the effect's first argument.
+    """
+    parameters = []
+    for name, declaration in declared.declarations:
+        if isinstance(declaration, Constant):
+            continue
+        parameter = declaration.decided(dims) if isinstance(declaration, Undecided) else declaration
+        parameter = replace(parameter, name=f"{label}.{name}")
+        if parameter.start is None:
+            null = tuple(np.full(parameter.shape.size, declared.null_of(name)))
+            if not parameter.shape.curved:
+                parameter = replace(parameter, start=null)
+        first = next(iter(inspect.signature(declared.function).parameters))
+        renamed = tuple(u.replace(f"[{first}]", f"({units[on]})" if on in units else f"[{on}]")
+                        for u in parameter.units)
+        parameters.append(replace(parameter, units=renamed))
+    return Attached(
+        declared, on, kind, label, tuple(sorted(columns.items())), tuple(parameters)
+    )

@@ -1,0 +1,394 @@
+"""Models: the declared relation between signals and parameters, as an immutable value."""
+
+from __future__ import annotations
+
+import difflib
+import inspect
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from casest.declaring.physics import SX, Quantity, Residual
+from casest.declaring.shapes import Array
+from casest.declaring.symbols import Constant, Parameter, Scope, Signal, constant, named
+from casest.modelling.effect import NOISE, Attached, Effect, Kind, attach
+from casest.errors import DeclarationError, UnitError, UsageError
+from casest.modelling.tracing import Traced, describe, function_of, trace
+
+
+@dataclass(frozen=True)
+class Model:
+    """Signals, parameters, constants, the body that relates them, and the effects added to it.
+
+    A value: `having` and `with_effect` return new models, and two models are equal when they
+    were declared by the same function with the same symbols and effects.
+    """
+
+    name: str
+    function: Callable[..., Residual]
+    declared: tuple[Signal | Parameter | Constant, ...]
+    effects: tuple[Attached, ...] = ()
+    starter: Callable[..., Any] | None = None
+    limiter: Callable[..., Any] | None = None
+    estimators: tuple[tuple[str, Callable[..., Any]], ...] = ()
+
+    # -- the symbol table ----------------------------------------------------------------------
+
+    @cached_property
+    def signals(self) -> tuple[Signal, ...]:
+        """Signals of the body, then those that effects read, each once."""
+        own = [s for s in self.declared if isinstance(s, Signal)]
+        for attached in self.effects:
+            own += [s for s in attached.signals if s.name not in {o.name for o in own}]
+        return tuple(own)
+
+    @cached_property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Declared parameters, then those of the effects (`quadratic.k`)."""
+        own = [p for p in self.declared if isinstance(p, Parameter)]
+        changed = {p.name: p for p in own if "." in p.name}
+        return tuple(
+            [p for p in own if "." not in p.name]
+            + [changed.get(p.name, p) for attached in self.effects for p in attached.parameters]
+        )
+
+    @cached_property
+    def constants(self) -> tuple[Constant, ...]:
+        """Plain numbers of the model."""
+        return tuple(c for c in self.declared if isinstance(c, Constant))
+
+    @property
+    def quantities(self) -> Mapping[str, Quantity]:
+        """Named inner values, in the order in which the body computes them."""
+        return self.traced.quantities
+
+    @property
+    def implicit(self) -> bool:
+        """True where the residual is no signal, so that readings cannot be simulated from it."""
+        return self.traced.residual.implicit is not None
+
+    @property
+    def axes(self) -> tuple[str, ...]:
+        """Name of each component of the residual."""
+        given, size = self.traced.residual.axes, self.traced.expression.numel()
+        if given:
+            return given
+        return ("x", "y", "z") if size == 3 else tuple(map(str, range(size))) if size > 1 else ("value",)
+
+    @property
+    def residual_unit(self) -> str:
+        """Unit of the residual; `[v]` stands for the unit of signal v."""
+        traced = self.traced
+        if traced.measured is not None and not traced.residual.unit:
+            return self[traced.measured].unit or f"[{traced.measured}]"
+        return traced.residual.unit
+
+    def __getitem__(self, name: str) -> Any:
+        """Signal, parameter or constant of that name."""
+        for symbol in (*self.signals, *self.parameters, *self.constants):
+            if symbol.name == name:
+                return symbol
+        raise UsageError(self._unknown(name))
+
+    def _unknown(self, name: str) -> str:
+        names = [s.name for s in (*self.signals, *self.parameters, *self.constants)]
+        near = difflib.get_close_matches(name, names, 1)
+        hint = f"; did you mean {near[0]!r}?" if near else f"; it has {', '.join(names)}"
+        return f"model {self.name} has no {name!r}{hint}"
+
+    # -- new models from this one --------------------------------------------------------------
+
+    def having(self, **changes: Any) -> Model:
+        """A model with constants set, parameters redeclared, or either turned into the other.
+
+        A number fixes (`radius=0.3`), a `param(…)` frees (`radius=param("m", start=0.28)`), a
+        `constant(…)` sets value and unit.
+        """
+        model = self
+        for name, change in changes.items():
+            model = model._with(name, model._changed(name, change))
+        return model
+
+    def _changed(self, name: str, change: Any) -> Parameter | Constant:
+        old = self[name]
+        if isinstance(old, Signal):
+            raise UsageError(f"{name} is a signal of model {self.name}: data give it, not having()")
+        if isinstance(change, Parameter):
+            _fitting_unit(name, old.unit, change.unit)
+            return replace(change, name=name)
+        new = change if isinstance(change, Constant) else constant(change, old.unit)
+        new = _converted(name, new, old.unit)
+        if isinstance(old, Parameter):
+            try:
+                value = old.shape.unpack(old.shape.pack(new.array))
+            except DeclarationError as error:
+                raise UsageError(f"{name} of model {self.name}: {error}") from None
+            new = constant(value, new.unit)
+            return replace(new, name=name, frozen=old)
+        if new.array.shape != old.array.shape:
+            raise UsageError(f"{name} has shape {old.array.shape}, not {new.array.shape}")
+        return replace(new, name=name, frozen=old.frozen)
+
+    def _with(self, name: str, symbol: Any) -> Model:
+        if name in {s.name for s in self.declared}:
+            declared = tuple(symbol if s.name == name else s for s in self.declared)
+        else:  # a parameter of an effect
+            declared = (*self.declared, symbol)
+        return replace(self, declared=declared)
+
+    def freed(self, name: str) -> Model:
+        """A model in which the constant is an unknown, starting from its value."""
+        old = self[name]
+        if isinstance(old, Parameter):
+            return self
+        if isinstance(old, Signal):
+            raise UsageError(f"{name} is a signal of model {self.name}, not a constant")
+        from casest.declaring.symbols import param
+
+        if old.frozen is not None:
+            return self._with(name, replace(old.frozen, start=tuple(old.frozen.shape.pack(old.array))))
+        shape: Any = old.array.shape if old.dims else None
+        return self._with(name, named(param(shape, old.unit, start=old.array), name))
+
+    def scoped(self, name: str, scope: Scope) -> Model:
+        """A model in which the parameter is shared by all runs ("all") or one per run ("run")."""
+        old = self[name]
+        if not isinstance(old, Parameter):
+            raise UsageError(f"{name} is not a parameter of model {self.name}: it has no scope")
+        return self._with(name, replace(old, scope=scope))
+
+    def with_effect(
+        self,
+        added: Effect,
+        *,
+        on: str | None = None,
+        columns: Mapping[str, str] | None = None,
+    ) -> Model:
+        """A model with one more effect. `on` and `columns` say where, if not as declared.
+
+        Raises UsageError where the effect is not applicable: its quantity or signal does not
+        exist here.
+        """
+        target = on or added.on
+        columns = dict(columns or {})
+        kind, dims, unit = self._place(added, target)
+        label = added.name + "".join(f"({c})" for c in columns.values())
+        label = label if on is None or on == added.on else f"{label}@{on}"
+        taken = {a.label for a in self.effects}
+        if label in taken:
+            raise UsageError(f"model {self.name} already has the effect {label}")
+        attached = attach(added, target, kind, dims, {target: unit}, columns, label)
+        model = replace(self, effects=(*self.effects, attached))
+        model._check_null(attached)
+        return model
+
+    def _place(self, added: Effect, target: str) -> tuple[Kind, tuple[int, ...], str]:
+        if target == NOISE:
+            return "noise", (), "1"
+        if target in self.quantities:
+            found = self.quantities[target]
+            return ("sequence" if added.kind == "sequence" else "quantity"), found.dims, found.unit
+        signals = {s.name: s for s in self.signals}
+        if target in signals:
+            dims = () if signals[target].size == 1 else (signals[target].size,)
+            return "signal", dims, signals[target].unit or f"[{target}]"
+        raise UsageError(
+            f"effect {added.name} is not applicable to model {self.name}: "
+            f"it acts on {target!r}, and the model has {', '.join([*self.quantities, *signals])}"
+        )
+
+    def _check_null(self, attached: Attached) -> None:
+        """An effect must vanish at its null value: shown at random points."""
+        if attached.kind in ("noise", "sequence"):
+            return
+        symbols = self.with_symbols_of(attached)
+        base = ca.SX.sym("value", *self._target_shape(attached))
+        value = attached.apply(base, {**symbols, attached.on: base})
+        free = [symbols[s.name] for s in attached.signals]
+        unknowns = [symbols[p.name] for p in attached.parameters]
+        f = ca.Function("null", [base, *free, *unknowns], [ca.SX(value) - base])
+        rng = np.random.default_rng(0)
+        nulls = [attached.effect.null_of(p.name.rpartition(".")[2]) for p in attached.parameters]
+        for _ in range(3):
+            numbers = [rng.normal(size=base.shape), *(rng.normal(size=s.shape) for s in free)]
+            at_null = [np.full(u.shape, n) for u, n in zip(unknowns, nulls, strict=True)]
+            change = np.abs(np.array(f(*numbers, *at_null)))
+            if not change.max(initial=0.0) <= 1e-12:
+                raise DeclarationError(
+                    f"effect {attached.label} is not null at its null value "
+                    f"({', '.join(f'{p.name} = {n:g}' for p, n in zip(attached.parameters, nulls, strict=True))}): "
+                    f"it changes {attached.on} by {np.nanmax(change):.3g}; declare null={{…}}"
+                )
+
+    def _target_shape(self, attached: Attached) -> tuple[int, int]:
+        if attached.on in self.quantities:
+            shape = self.quantities[attached.on].declared.shape
+            return (int(shape[0]), int(shape[1]))
+        return (self[attached.on].size, 1)
+
+    def with_symbols_of(self, attached: Attached) -> dict[str, SX]:
+        """Fresh symbols for what an effect reads and for its unknowns."""
+        symbols = {s.name: ca.SX.sym(s.name, s.size) for s in attached.signals}
+        for p in attached.parameters:
+            symbols[p.name] = ca.SX.sym(p.name, *(p.shape.dims or (1,)))
+        return symbols
+
+    def start(self, function: Callable[..., Any]) -> Model:
+        """Decorator: start values from the data, `def NAME(model, runs) -> {parameter: value}`.
+
+        As with a property's setter, the decorated name becomes the model, so it must be the
+        model's own name.
+        """
+        if function.__name__ != self.function.__name__:
+            raise DeclarationError(
+                f"@{self.function.__name__}.start decorates a function of the same name "
+                f"(`def {self.function.__name__}(model, runs)`), not {function.__name__!r}: "
+                "the name becomes the model with its start values"
+            )
+        return self.starting(function)
+
+    def starting(self, function: Callable[..., Any]) -> Model:
+        """A model with start values from the data: `function(model, runs) -> {name: value}`."""
+        return replace(self, starter=function)
+
+    def bounded(self, function: Callable[..., Any]) -> Model:
+        """A model with bounds from the data: `function(model, runs) -> {name: (lower, upper)}`."""
+        return replace(self, limiter=function)
+
+    def with_estimator(self, name: str, function: Callable[..., Any]) -> Model:
+        """A model that also knows the estimator `name` (model, runs) -> {parameter: value}."""
+        return replace(self, estimators=(*self.estimators, (name, function)))
+
+    # -- the body in symbols -------------------------------------------------------------------
+
+    @cached_property
+    def traced(self) -> Traced:
+        """The body in CasADi symbols, with every effect in place."""
+        return trace(self)
+
+    # -- numbers -------------------------------------------------------------------------------
+
+    def __call__(self, **values: Any) -> dict[str, Array]:
+        """Evaluate on plain numbers: signals (N, size) or (size,), parameters by name.
+
+        Parameters that are not given take their declared start. Returns every quantity, the
+        prediction (explicit models) and the residual, each with the sample axis first.
+        """
+        known = {s.name for s in (*self.signals, *self.parameters)}
+        for name in values:
+            if name not in known:
+                raise UsageError(self._unknown(name))
+        missing = [s.name for s in self.signals if s.name not in values]
+        if missing:
+            raise UsageError(f"model {self.name} needs the signal {missing[0]!r}")
+        traced = self.traced
+        outputs = {q.name: q.value for q in traced.quantities.values()}
+        if traced.predicted is not None:
+            outputs["predicted"] = traced.predicted
+        outputs["residual"] = traced.expression
+        f = function_of(self, outputs)
+        samples = np.hstack([_rows(values[s.name], s) for s in self.signals])
+        given = {p.name: values.get(p.name) for p in self.parameters}
+        point = np.concatenate([np.zeros(0), *self.point(given)])
+        results = [f.call([point, row]) for row in samples]
+        return {
+            name: np.array([np.array(result[k]).ravel() for result in results])
+            for k, name in enumerate(outputs)
+        }
+
+    def point(self, values: Mapping[str, Any]) -> tuple[Array, Array]:
+        """Coordinates and chart references of given parameter values (declared start if None)."""
+        coordinates, references = [np.zeros(0)], [np.zeros(0)]
+        for p in self.parameters:
+            value = values.get(p.name)
+            packed = p.start_value() if value is None else p.shape.pack(value)
+            if p.shape.curved:
+                coordinates.append(np.zeros(p.shape.coordinates))
+                references.append(p.shape.reference(p.shape.unpack(packed)))
+            else:
+                coordinates.append(packed)
+        return np.concatenate(coordinates), np.concatenate(references)
+
+    def __str__(self) -> str:
+        """Table of the model's symbols, and its equations."""
+        return describe(self)
+
+
+def model(function: Callable[..., Residual]) -> Model:
+    """Declare a model: positional arguments are signals, keyword-only ones unknowns or numbers.
+
+    Raises DeclarationError naming the argument whose declaration makes no sense.
+    """
+    name = function.__name__.replace("_", "-")
+    declared: list[Signal | Parameter | Constant] = []
+    for argument in inspect.signature(function).parameters.values():
+        declared.append(_declared(name, argument))
+    made = Model(name, function, tuple(declared))
+    _check_names(made)
+    return made
+
+
+def _declared(model_name: str, argument: inspect.Parameter) -> Signal | Parameter | Constant:
+    default = argument.default
+    where = f"model {model_name}: {argument.name}"
+    if argument.kind is argument.POSITIONAL_OR_KEYWORD:
+        if not isinstance(default, Signal):
+            raise DeclarationError(f"{where} comes before the * and must be signal(…), not {default!r}")
+        return replace(default, name=argument.name)
+    if argument.kind is not argument.KEYWORD_ONLY:
+        raise DeclarationError(f"{where}: a model takes signals, then *, then parameters and constants")
+    if isinstance(default, Parameter | Constant):
+        return replace(default, name=argument.name)
+    if isinstance(default, Signal):
+        raise DeclarationError(f"{where} is a signal: signals come before the *")
+    if isinstance(default, int | float) and not isinstance(default, bool):
+        return replace(constant(default), name=argument.name)
+    raise DeclarationError(f"{where} must be param(…), constant(…) or a number, not {default!r}")
+
+
+def _check_names(made: Model) -> None:
+    from casest import units
+
+    for symbol in made.declared:
+        every = symbol.units if isinstance(symbol, Parameter) else (symbol.unit,)
+        for unit in every:
+            if unit and "[" not in unit and not units.known(unit):
+                units_error = f"model {made.name}: {symbol.name} has unknown unit {unit!r}"
+                raise UnitError(f"{units_error}; write it as in 'm/s^2', 'rad', 'degC', '1/count'")
+
+
+def _converted(name: str, new: Constant, unit: str) -> Constant:
+    """The constant in the declared unit; left alone where that depends on the data."""
+    _fitting_unit(name, unit, new.unit)
+    if not new.unit or new.unit == unit or "[" in unit + new.unit or "," in unit:
+        return new
+    from casest import units
+
+    factor, offset = units.conversion(new.unit, unit or "1")
+    return constant(factor * new.array + offset, unit)
+
+
+def _fitting_unit(name: str, old: str, new: str) -> None:
+    """Refuse a unit of another dimension than the declared one."""
+    if not new or new == old or "[" in old or "[" in new or "," in old:
+        return
+    from casest import units
+
+    try:
+        units.conversion(new, old or "1")
+    except UnitError:
+        raise UnitError(f"{name} is declared in {old or 'no unit'!r}: {new!r} does not fit") from None
+
+
+
+
+def _rows(value: Any, declared: Signal) -> Array:
+    return np.asarray(value, dtype=float).reshape(-1, declared.size)
+
+
+
+

@@ -1,0 +1,237 @@
+"""A model's body written out in CasADi symbols, with every effect in its place."""
+
+from __future__ import annotations
+
+import inspect
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+import numpy as np
+
+from casest.declaring.physics import SX, Quantity, Residual, Trace, chart, current_trace
+from casest.modelling.effect import Attached
+from casest.errors import DeclarationError
+
+if TYPE_CHECKING:
+    from casest.modelling.model import Model
+
+
+@dataclass(frozen=True)
+class Traced:
+    """What a model's body computes.
+
+    `coordinates` are the solver's unknowns and `references` the numbers that describe the charts
+    of directions and rotations; `expression` is the residual column, `predicted` the reading of
+    an explicit model, `measured` and `corrected` name a signal and a quantity.
+    """
+
+    symbols: Mapping[str, SX]
+    coordinates: SX
+    references: SX
+    quantities: Mapping[str, Quantity]
+    residual: Residual
+    expression: SX
+    predicted: SX | None
+    measured: str | None
+    corrected: str | None
+
+
+def trace(model: Model, cut: str | None = None, naming: bool = False) -> Traced:
+    """Run the model's body on symbols.
+
+    `cut` replaces a quantity (before its effects) by a free symbol; `naming` replaces every
+    quantity by a symbol of its name after it is computed, for printing.
+    """
+    symbols, coordinates, references = _symbols(model)
+    running = Trace(cut=cut, naming=naming, reserved=frozenset(symbols))
+    for attached in model.effects:
+        if attached.kind == "quantity":
+            running.effects.setdefault(attached.on, []).append(_applied(attached, symbols))
+    residual = _run_body(model, running, symbols)
+    measured = _name_of(residual.measured, symbols)
+    if residual.measured is not None and measured is None:
+        raise DeclarationError(f"model {model.name}: measured= must be one of the model's signals")
+    traced = Traced(
+        symbols,
+        ca.vertcat(*coordinates),
+        ca.vertcat(*references),
+        running.quantities,
+        residual,
+        residual.expression,
+        None if residual.predicted is None else ca.vec(ca.SX(residual.predicted)),
+        measured,
+        _corrected(model, residual, running),
+    )
+    for attached in model.effects:
+        if attached.kind == "signal":
+            traced = _with_signal_effect(traced, attached)
+    return traced
+
+
+def _symbols(model: Model) -> tuple[dict[str, SX], list[SX], list[SX]]:
+    symbols: dict[str, SX] = {}
+    for s in model.signals:
+        flat = ca.SX.sym(s.name, s.size)
+        symbols[s.name] = ca.reshape(flat, 3, 3).T if s.kind == "rotation" else flat
+    coordinates, references = [], []
+    for p in model.parameters:
+        c = ca.SX.sym(p.name, p.shape.coordinates)
+        coordinates.append(c)
+        if p.shape.curved:
+            r = ca.SX.sym(f"{p.name}_ref", len(p.shape.reference(p.shape.default())))
+            references.append(r)
+            symbols[p.name] = chart(p.shape.kind, c, r)
+        elif len(p.shape.dims) == 2:
+            matrix = ca.SX(*p.shape.dims)
+            for k, index in enumerate(p.shape.entries):
+                matrix[index] = c[k]
+            symbols[p.name] = matrix
+        else:
+            symbols[p.name] = c
+    for k in model.constants:
+        symbols[k.name] = float(k.array) if not k.dims else ca.SX(ca.DM(k.array))
+    return symbols, coordinates, references
+
+
+def _applied(attached: Attached, symbols: Mapping[str, SX]) -> Callable[[SX], SX]:
+    def apply(value: SX) -> SX:
+        return attached.apply(value, symbols)
+
+    return apply
+
+
+def _run_body(model: Model, running: Trace, symbols: Mapping[str, SX]) -> Residual:
+    arguments = {s.name: symbols[s.name] for s in model.declared if "." not in s.name}
+    token = current_trace.set(running)
+    try:
+        residual = model.function(**arguments)
+    except DeclarationError as error:
+        raise DeclarationError(f"model {model.name}: {error}") from None
+    except NameError as error:
+        raise DeclarationError(
+            f"model {model.name}, {_where(model.function)}: {error}; "
+            "declare it in the model's signature, or import it"
+        ) from None
+    except Exception as error:
+        raise DeclarationError(
+            f"model {model.name}, {_where(model.function)}: {_last_line(error)}"
+        ) from error
+    finally:
+        current_trace.reset(token)
+    if not isinstance(residual, Residual):
+        raise DeclarationError(
+            f"model {model.name} must return Residual(…), not {type(residual).__name__}"
+        )
+    return residual
+
+
+def _with_signal_effect(traced: Traced, attached: Attached) -> Traced:
+    """Effects on a signal act after the body, because der(…, t) needs the bare symbol."""
+    symbol = traced.symbols[attached.on]
+    changed = ca.vec(ca.SX(attached.apply(symbol, traced.symbols)))
+    if traced.measured == attached.on:
+        # A changed reading: the prediction stays, what is compared with it does not.
+        return replace(traced, expression=changed - traced.predicted)
+    flat = _flat(symbol)
+
+    def late(expression: SX) -> SX:
+        return ca.substitute(expression, flat, changed)
+
+    quantities = {
+        name: replace(q, declared=late(q.declared), value=late(q.value))
+        for name, q in traced.quantities.items()
+    }
+    return replace(
+        traced,
+        quantities=quantities,
+        expression=late(traced.expression),
+        predicted=None if traced.predicted is None else late(traced.predicted),
+    )
+
+
+def _corrected(model: Model, residual: Residual, running: Trace) -> str | None:
+    if residual.corrected is None:
+        return None
+    for name, found in running.quantities.items():
+        if residual.corrected is found.value or residual.corrected is running.handed.get(name):
+            return name
+    if isinstance(residual.corrected, str) and residual.corrected in running.quantities:
+        return residual.corrected
+    raise DeclarationError(f"model {model.name}: corrected= must be a quantity of the model")
+
+
+def function_of(model: Model, outputs: Mapping[str, SX], traced: Traced | None = None) -> Any:
+    """CasADi function (parameters, sample) -> outputs, one sample at a time.
+
+    `parameters` holds the solver's coordinates and then the chart references; `sample` the
+    signals one after the other.
+    """
+    traced = traced or model.traced
+    inputs = [ca.vertcat(traced.coordinates, traced.references), sample_symbol(model, traced)]
+    values = [ca.SX(v) for v in outputs.values()]
+    return ca.Function(
+        model.function.__name__, inputs, values, ["parameters", "sample"], list(outputs)
+    )
+
+
+def sample_symbol(model: Model, traced: Traced | None = None) -> SX:
+    """All signals of one sample as one column, in the order in which data hold them."""
+    symbols = (traced or model.traced).symbols
+    return ca.vertcat(*[_flat(symbols[s.name]) for s in model.signals])
+
+
+def equations(model: Model) -> list[str]:
+    """One line per quantity and for the residual, in terms of the quantities before."""
+    traced = trace(model, naming=True)
+    lines = [f"{q.name} = {_expression(q.value)}" for q in traced.quantities.values()]
+    return [*lines, f"residual = {_expression(traced.expression)}"]
+
+
+def describe(model: Model) -> str:
+    """Table of the model's symbols, and its equations."""
+    summary = (inspect.getdoc(model.function) or "").partition("\n")[0]
+    rows = [("signal", s.name, s.size, s.unit or "any unit", "") for s in model.signals]
+    for p in model.parameters:
+        rows.append(("parameter", p.name, p.shape.size, p.unit, "per run" * (p.scope == "run")))
+    for c in model.constants:
+        value = np.array2string(c.array, precision=6, separator=", ").replace("\n", "")
+        rows.append(("constant", c.name, c.array.size, c.unit, f"= {value}"))
+    for a in model.effects:
+        rows.append(("effect", a.label, sum(p.shape.size for p in a.parameters), f"on {a.on}", ""))
+    width = max(len(row[1]) for row in rows)
+    table = [f"  {k:<10} {n:<{width}} {s:>3}  {u} {more}".rstrip() for k, n, s, u, more in rows]
+    return "\n".join([f"{model.name}: {summary}", *table, *(f"  {e}" for e in equations(model))])
+
+
+def _name_of(symbol: SX | None, symbols: Mapping[str, SX]) -> str | None:
+    return next((n for n, s in symbols.items() if s is symbol), None) if symbol is not None else None
+
+
+def _flat(symbol: SX) -> SX:
+    """A signal's numbers in the order in which data hold them (matrices row by row)."""
+    return ca.vec(symbol.T) if symbol.shape == (3, 3) else symbol
+
+
+def _where(function: Callable[..., Any]) -> str:
+    """File and line of the function in the traceback of the current exception."""
+    traceback = sys.exc_info()[2]
+    line = function.__code__.co_firstlineno
+    while traceback is not None:
+        if traceback.tb_frame.f_code is function.__code__:
+            line = traceback.tb_lineno
+        traceback = traceback.tb_next
+    return f"{function.__code__.co_filename}, line {line}"
+
+
+def _last_line(error: Exception) -> str:
+    lines = [line for line in str(error).splitlines() if line.strip()]
+    return lines[-1].strip() if lines else type(error).__name__
+
+
+def _expression(value: SX) -> str:
+    """A readable expression, component by component."""
+    parts = [str(value[i]) for i in range(value.numel())]
+    return parts[0] if len(parts) == 1 else "[" + ", ".join(parts) + "]"

@@ -1,0 +1,103 @@
+"""Find a model by its shipped name, or in any Python file."""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import sys
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
+from types import ModuleType
+
+from casest.modelling.effect import Effect
+from casest.errors import CasestError, DeclarationError, UsageError
+from casest.modelling.model import Model
+
+#: Shipped models: name on the command line -> module and attribute in `casest_problems`.
+SHIPPED = {
+    "norm-diagonal": ("norm", "norm_diagonal"),
+    "norm-triangular": ("norm", "norm_triangular"),
+    "norm-full": ("norm", "norm_full"),
+}
+
+
+def find_model(name: str) -> Model:
+    """The shipped model of that name, or the one in `file.py` (`file.py:name` if it has several)."""
+    if name in SHIPPED:
+        module, attribute = SHIPPED[name]
+        found: Model = getattr(importlib.import_module(f"casest_problems.{module}"), attribute)
+        return found
+    path, _, wanted = name.partition(":")
+    if path.endswith(".py"):
+        return _one(load_file(Path(path)), Model, "model", path, wanted)
+    near = difflib.get_close_matches(name, SHIPPED, 1)
+    hint = f"; did you mean {near[0]!r}?" if near else ""
+    raise UsageError(
+        f"no model {name!r}{hint} (shipped: {', '.join(SHIPPED)}; or give the path of a .py file)"
+    )
+
+
+def find_effects(name: str) -> tuple[Effect, ...]:
+    """All effects declared in `file.py`, or the one of `file.py:name`."""
+    path, _, wanted = name.partition(":")
+    module = load_file(Path(path))
+    if wanted:
+        return (_one(module, Effect, "effect", path, wanted),)
+    found = tuple(v for v in vars(module).values() if isinstance(v, Effect))
+    if not found:
+        raise UsageError(f"{path} declares no @effect")
+    return found
+
+
+def _one(module: ModuleType, kind: type, word: str, path: str, wanted: str) -> object:
+    own = {n: v for n, v in vars(module).items() if isinstance(v, kind)}
+    names = {n: v for n, v in own.items() if getattr(v, "function").__module__ == module.__name__}
+    names = names or own
+    if wanted:
+        for label in (wanted, wanted.replace("-", "_")):
+            if label in names:
+                return names[label]
+        near = difflib.get_close_matches(wanted, names, 1)
+        hint = f"; did you mean {near[0]!r}?" if near else ""
+        raise UsageError(f"{path} has no {word} {wanted!r}{hint} (it has {', '.join(names) or 'none'})")
+    if not names:
+        raise UsageError(f"{path} declares no @{word}")
+    if len(names) > 1:
+        raise UsageError(f"{path} declares {', '.join(names)}: say which, as {path}:{next(iter(names))}")
+    return next(iter(names.values()))
+
+
+def load_file(path: Path) -> ModuleType:
+    """Run a Python file of declarations; whatever is wrong in it becomes one line with its place."""
+    if not path.exists():
+        raise UsageError(f"{path}: no such file")
+    spec = spec_from_file_location(f"casest_user_{path.stem}", path)
+    assert spec is not None and spec.loader is not None
+    module = module_from_spec(spec)
+    sys.modules[spec.name] = module
+    sys.path.insert(0, str(path.parent))
+    try:
+        spec.loader.exec_module(module)
+    except SyntaxError as error:
+        raise DeclarationError(
+            f"{error.filename}, line {error.lineno}: {error.msg}: {(error.text or '').strip()!r}"
+        ) from None
+    except CasestError as error:
+        raise type(error)(f"{path}, line {_line(error, path)}: {error}") from None
+    except Exception as error:
+        raise DeclarationError(
+            f"{path}, line {_line(error, path)}: {type(error).__name__}: {error}"
+        ) from None
+    finally:
+        sys.path.remove(str(path.parent))
+    return module
+
+
+def _line(error: BaseException, path: Path) -> int:
+    """Last line of the user's file in the error's traceback."""
+    line, traceback = 0, error.__traceback__
+    while traceback is not None:
+        if traceback.tb_frame.f_code.co_filename == str(path):
+            line = traceback.tb_lineno
+        traceback = traceback.tb_next
+    return line

@@ -1,0 +1,206 @@
+"""`result.json` and `residuals.csv`: what a calibration leaves behind, in the fixed form."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+import json
+import platform
+from collections.abc import Mapping, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from casest import __version__
+from casest.data.run import Run
+from casest.data.write import write_atomically
+from casest.declaring.shapes import Array
+from casest.errors import DataError
+from casest.estimate import Estimate
+from casest.naming import entry_units, unit_table
+
+RESULT, RESIDUALS = "result.json", "residuals.csv"
+
+
+def calibration_result(
+    estimate: Estimate,
+    *,
+    model_name: str,
+    data: Sequence[str],
+    command: str = "",
+    holdout: float | None = None,
+) -> dict[str, Any]:
+    """The content of `result.json` for `calibrate`. `verdict` is null: nothing was diagnosed."""
+    problem, certificate = estimate.problem, estimate.certificate
+    table = unit_table(problem.model, problem.runs)
+    return {
+        "casest": __version__,
+        "model": model_name,
+        "data": list(data),
+        "runs": [run.name for run in problem.runs],
+        "constants": {c.name: _plain(c.array) for c in problem.model.constants},
+        "verdict": None,
+        "trusted": certificate.trusted,
+        "noise": {
+            "sigma": [_plain(estimate.noise.sigma)] * len(problem.model.axes),
+            "unit": table["residual"],
+            "from_residual": _plain(estimate.noise.residual),
+            "from_repeats": _plain(estimate.noise.repeats),
+            "degrees_of_freedom": estimate.noise.degrees_of_freedom,
+        },
+        "estimate": {
+            "rmse_fit": _plain(estimate.rmse),
+            "rmse_holdout": _plain(holdout),
+            "certificate": {
+                "trusted": certificate.trusted,
+                "reasons": list(certificate.reasons),
+                "step_left_in_std": _plain(certificate.step),
+                "relative_curvature": _plain(certificate.curvature),
+                "agreeing_starts": [certificate.agreeing, certificate.starts],
+                "at_bound": list(certificate.at_bound),
+            },
+            "parameters": _parameters(estimate, table),
+            "correlation": {
+                "names": list(estimate.names),
+                "matrix": _plain(_correlation(estimate.covariance)),
+            },
+        },
+        "effects": [],
+        "identifiability": {
+            "rank": estimate.identifiability.rank,
+            "unknowns": estimate.identifiability.unknowns,
+            "unobservable": list(estimate.identifiability.unobservable),
+            "weak": [
+                {"direction": w.words, "inflation": _plain(w.inflation), "std": _plain(w.std)}
+                for w in estimate.weak
+            ],
+        },
+        "invisible": None,
+        "unexplained": None,
+        "units": {name: unit for name, unit in table.items() if "[" not in name},
+        "solver": _solver(estimate),
+        "samples": [_sample_note(run) for run in problem.runs],
+        "notes": [note for run in problem.runs for note in run.notes] + list(estimate.notes),
+        "reproduce": _reproduce(command, data),
+    }
+
+
+def _parameters(estimate: Estimate, table: Mapping[str, str]) -> dict[str, Any]:
+    half = half_width(estimate.noise.degrees_of_freedom)
+    known = {n: u for n, u in table.items() if "[" not in n}
+    found = {}
+    for p in estimate.model.parameters:
+        value, std = estimate.values[p.name], estimate.std[p.name]
+        own = entry_units(p, known)
+        found[p.name] = {
+            "value": _plain(value),
+            "std": _plain(std),
+            "robust_std": _plain(estimate.robust[p.name]),
+            "interval95": [_plain(value - half * std), _plain(value + half * std)],
+            "unit": own[0] if len(set(own)) == 1 else own,
+        }
+    return found
+
+
+def half_width(degrees_of_freedom: int) -> float:
+    """Half width of a 95 % interval in standard deviations: Student's t."""
+    from scipy.special import stdtrit
+
+    return float(stdtrit(max(degrees_of_freedom, 1), 0.975))
+
+
+def _correlation(covariance: Array) -> Array:
+    std = np.sqrt(np.diag(covariance))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray(covariance / np.outer(std, std))
+
+
+def _solver(estimate: Estimate) -> dict[str, Any]:
+    first = estimate.outcomes[0]
+    return {
+        "name": estimate.extra.get("estimator", first.solver),
+        "iterations": first.iterations,
+        "evaluations": first.evaluations,
+        "seconds": _plain(estimate.extra.get("seconds", first.seconds)),
+        **{k: _plain(v) for k, v in estimate.extra.items() if k == "least_squares_seconds"},
+    }
+
+
+def _sample_note(run: Run) -> dict[str, Any]:
+    return {"run": run.name, "samples": len(run), "readings": int(np.sum(run.count))}
+
+
+def _reproduce(command: str, data: Sequence[str]) -> dict[str, Any]:
+    return {
+        "command": command,
+        "python": platform.python_version(),
+        **{name: version(name) for name in ("casadi", "numpy", "scipy")},
+        "sha256": {name: hashlib.sha256(Path(name).read_bytes()).hexdigest() for name in data},
+    }
+
+
+def _plain(value: Any) -> Any:
+    """Numbers and nested lists for JSON; what is not finite becomes null."""
+    if value is None or isinstance(value, str | bool | int):
+        return value
+    if isinstance(value, np.ndarray) and value.ndim:
+        return [_plain(v) for v in value]
+    number = float(value)
+    return number if np.isfinite(number) else None
+
+
+def residual_rows(estimate: Estimate) -> str:
+    """`residuals.csv` of a calibration: the column `after` is empty, nothing was added."""
+    problem = estimate.problem
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["file", "run", "row", "t", "axis", "split", "before", "after"])
+    for run, residual in zip(problem.runs, problem.residuals(estimate.point), strict=True):
+        for k, row in enumerate(residual):
+            t = "" if run.time is None else repr(float(run.time[k]))
+            for axis, value in zip(problem.model.axes, row, strict=True):
+                writer.writerow(
+                    [run.file, run.name, int(run.rows[k]), t, axis, "fit", repr(float(value)), ""]
+                )
+    return text.getvalue()
+
+
+def save(folder: Path, result: Mapping[str, Any], residuals: str | None) -> None:
+    """Write both files into a folder (made if missing), each whole or not at all."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DataError(f"{folder}: cannot be made ({error.strerror}); give another -o") from None
+    if residuals is not None:
+        write_atomically(folder / RESIDUALS, residuals)
+    write_atomically(folder / RESULT, as_json(result))
+
+
+def as_json(result: Mapping[str, Any]) -> str:
+    """The result as text: strict JSON, two blanks of indentation."""
+    return json.dumps(result, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def load_result(path: Path) -> dict[str, Any]:
+    """A saved result (a folder stands for the `result.json` in it)."""
+    if path.is_dir():
+        path = path / RESULT
+    try:
+        result = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise DataError(f"{path}: no such result; calibrate with -o {path.parent} first") from None
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise DataError(f"{path}: not a result.json ({error})") from None
+    if not isinstance(result, dict) or "model" not in result:
+        raise DataError(f"{path}: not a casest result: it names no model")
+    return result
+
+
+def saved_parameters(result: Mapping[str, Any]) -> dict[str, Any]:
+    """Parameters of a saved result, after the loop was closed if it was."""
+    block = result.get("after") or result.get("estimate") or {}
+    found: dict[str, Any] = block.get("parameters", {})
+    return found

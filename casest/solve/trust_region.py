@@ -1,0 +1,132 @@
+"""Scaled Levenberg-Marquardt within bounds, on triangular factors (Moré 1978; Nielsen 1999).
+
+Works on R and Qᵀr instead of JᵀJ, so that it can polish a solution to the last digits: the
+condition number is not squared.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import NamedTuple
+
+import numpy as np
+
+from casest.declaring.shapes import Array
+from casest.solve.outcome import Outcome
+from casest.stack import Point, Problem
+
+
+class _Local(NamedTuple):
+    """Linearisation at a point: J = QR, t = Qᵀr, cost."""
+
+    R: Array
+    t: Array
+    cost: float
+
+
+def trust_region(problem: Problem, start: Point, *, max_iterations: int = 300) -> Outcome:
+    """Minimise the cost from `start` until steps and gains are at rounding."""
+    began = time.perf_counter()
+    point, here = start, _linearise(problem, start)
+    scale = _column_norms(here.R)
+    damping, growth, evaluations, status = 1e-3, 2.0, 1, "iteration limit"
+    iteration = 0
+    for iteration in range(1, max_iterations + 1):
+        if not np.isfinite(here.cost):
+            status = "cost is not finite"
+            break
+        scale = np.maximum(scale, _column_norms(here.R))
+        step = _bounded_step(problem, point, here, scale, damping)
+        gain = here.cost - 0.5 * float(np.sum((here.t + here.R @ step) ** 2)) - _rest(here)
+        if _negligible(step, point, scale, here, gain):
+            status = "converged"
+            break
+        trial = problem.moved(point, step)
+        there = problem.cost(trial)
+        evaluations += 1
+        if np.isfinite(there) and there < here.cost:
+            ratio = (here.cost - there) / max(gain, 1e-300)
+            point, here = trial, _linearise(problem, trial)
+            damping *= max(1 / 5, 1 - (2 * min(ratio, 2.0) - 1) ** 3)
+            growth = 2.0
+        else:
+            damping, growth = damping * growth, growth * 2
+            if damping > 1e20:
+                status = "no descent"
+                break
+    point, here = _refine(problem, point, here, scale)
+    claims = status in ("converged", "no descent")
+    seconds = time.perf_counter() - began
+    return Outcome(
+        "trust-region", point, here.cost, iteration, evaluations, claims, status, seconds
+    )
+
+
+def _linearise(problem: Problem, point: Point) -> _Local:
+    R, t, rest = problem.factor(point)
+    return _Local(R, t, 0.5 * (float(t @ t) + rest**2))
+
+
+def _rest(here: _Local) -> float:
+    """Part of the cost that no step can remove in the linearisation."""
+    return here.cost - 0.5 * float(here.t @ here.t)
+
+
+def _column_norms(R: Array) -> Array:
+    norms = np.linalg.norm(R, axis=0)
+    return np.where(np.isfinite(norms) & (norms > 0), norms, 1.0)
+
+
+def _bounded_step(
+    problem: Problem, point: Point, here: _Local, scale: Array, damping: float
+) -> Array:
+    """Levenberg-Marquardt step; unknowns that would leave their bounds stop there."""
+    lower, upper = problem.bounds
+    n = len(point.x)
+    free, step = np.ones(n, dtype=bool), np.zeros(n)
+    for _ in range(n + 1):
+        step[free] = _damped(here, scale, damping, free, step)
+        target = point.x + step
+        out = free & ((target < lower) | (target > upper))
+        if not out.any():
+            return step
+        step[out] = np.clip(target, lower, upper)[out] - point.x[out]
+        free &= ~out
+        if not free.any():
+            return step
+    return step
+
+
+def _damped(here: _Local, scale: Array, damping: float, free: Array, step: Array) -> Array:
+    fixed = ~free
+    right = -(here.t + here.R[:, fixed] @ step[fixed])
+    A = np.vstack([here.R[:, free], np.diag(np.sqrt(damping) * scale[free])])
+    b = np.concatenate([right, np.zeros(int(free.sum()))])
+    # Unit columns: scales that differ by orders of magnitude must not reach the rank decision.
+    return np.linalg.lstsq(A / scale[free], b, rcond=None)[0] / scale[free]
+
+
+def _negligible(step: Array, point: Point, scale: Array, here: _Local, gain: float) -> bool:
+    size = np.linalg.norm(scale * step)
+    reach = np.linalg.norm(scale * point.x) + np.sqrt(2 * here.cost)
+    return bool(size <= 1e-15 * reach or gain <= 1e-17 * here.cost)
+
+
+def _refine(problem: Problem, point: Point, here: _Local, scale: Array) -> tuple[Point, _Local]:
+    """A few undamped steps: cost differences drown in rounding before the gradient does."""
+    for _ in range(3):
+        step = _bounded_step(problem, point, here, scale, 0.0)
+        if not np.all(np.isfinite(step)):
+            break
+        trial = problem.moved(point, step)
+        there = _linearise(problem, trial)
+        better = _slope(there) < _slope(here) and there.cost <= here.cost * (1 + 1e-12)
+        if not (np.isfinite(there.cost) and better):
+            break
+        point, here = trial, there
+    return point, here
+
+
+def _slope(here: _Local) -> float:
+    """Length of the residual's part that the Jacobian can still reach."""
+    return float(np.linalg.norm(here.t))

@@ -1,0 +1,151 @@
+"""What a command prints: plain text that fits 80 columns."""
+
+from __future__ import annotations
+
+import json
+import textwrap
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from casest.estimate import Estimate
+from casest.modelling.model import Model
+from casest.naming import entry_units, unit_table
+
+WIDTH = 80
+
+
+def listing(models: Sequence[tuple[str, Model]], *, as_json: bool = False) -> str:
+    """Shipped problems, a paragraph each."""
+    if as_json:
+        return json.dumps({"problems": {name: _summary(m) for name, m in models}, "effects": []}, indent=2)
+    lines = ["Problems (casest calibrate NAME DATA):"]
+    for name, m in models:
+        about = (m.function.__doc__ or "").strip().splitlines()[0]
+        lines += ["", f"  {name}", f"      {about}"]
+        for word, symbols in (("signals", m.signals), ("unknowns", m.parameters), ("constants", m.constants)):
+            lines.append(f"      {word + ':':<11}{', '.join(s.name for s in symbols)}")
+        lines.append(f"      {'estimators:':<11} ipopt, trust-region, {', '.join(n for n, _ in m.estimators)}")
+    return "\n".join([*lines, "", "Your own: casest calibrate file.py[:name] DATA"])
+
+
+def _summary(m: Model) -> dict[str, Any]:
+    return {
+        "about": (m.function.__doc__ or "").strip().splitlines()[0],
+        "signals": [s.name for s in m.signals],
+        "parameters": [p.name for p in m.parameters],
+        "constants": {c.name: c.array.tolist() for c in m.constants},
+        "estimators": [n for n, _ in m.estimators],
+    }
+
+
+def calibration_text(found: Estimate, content: Mapping[str, Any], output: Path | None) -> str:
+    """Verdict, values with uncertainty, what was not determined, why it is believed."""
+    blocks = [_head(found, content), *_wrapped_notes(content["notes"])]
+    blocks.append("\n".join(_table(found)))
+    blocks.append("\n".join(_fit_lines(found, content)))
+    blocks += _determined(found)
+    title = "Believed because" if found.certificate.trusted else "Refused because"
+    blocks.append("\n".join([f"{title}:", *(_item(r) for r in found.certificate.reasons)]))
+    blocks.append(_next(found, output))
+    return "\n\n".join(b for b in blocks if b)
+
+
+def _head(found: Estimate, content: Mapping[str, Any]) -> str:
+    samples = sum(len(run) for run in found.problem.runs)
+    what = "rest intervals" if found.problem.runs[0].spread else "samples"
+    verdict = "trusted" if found.certificate.trusted else "NOT TRUSTED"
+    files = ", ".join(Path(name).name for name in content["data"])
+    line = (
+        f"{found.model.name} on {files}: {samples} {what}, "
+        f"{found.identifiability.unknowns} unknowns, rank {found.identifiability.rank}: {verdict}"
+    )
+    return textwrap.fill(line, WIDTH)
+
+
+def _wrapped_notes(notes: Sequence[str]) -> Iterator[str]:
+    if notes:
+        yield "\n".join(_item(note) for note in notes)
+
+
+def _item(text: str) -> str:
+    return textwrap.fill(text, WIDTH, initial_indent="  - ", subsequent_indent="    ")
+
+
+def _table(found: Estimate) -> Iterator[str]:
+    """One line per value: name, value ± standard deviation, unit."""
+    known = unit_table(found.model, found.problem.runs)
+    known = {n: u for n, u in known.items() if "[" not in n}
+    rows = []
+    for p in found.model.parameters:
+        units = entry_units(p, known)
+        value, std = found.values[p.name], found.std[p.name]
+        several = value.ndim > len(p.shape.dims)
+        stacked = zip(value, std, strict=True) if several else [(value, std)]
+        for r, (v, s) in enumerate(stacked):
+            run = f" ({found.problem.runs[r].name})" if several else ""
+            for name, i, unit in zip(p.entry_names, p.shape.entries, units, strict=True):
+                rows.append((name + run, *rounded(float(v[i]), float(s[i])), "" if unit == "1" else unit))
+    width = max(len(r[0]) for r in rows)
+    left = max(len(r[1]) for r in rows)
+    middle = max(len(r[2]) for r in rows)
+    yield f"  {'parameter':<{width}}  {'value':>{left}}   {'std':<{middle}}  unit"
+    for name, value_text, std_text, unit in rows:
+        yield f"  {name:<{width}}  {value_text:>{left}} ± {std_text:<{middle}}  {unit}".rstrip()
+
+
+def rounded(value: float, std: float) -> tuple[str, str]:
+    """Value and standard deviation to two digits of the latter, as a metrologist writes them."""
+    if not np.isfinite(std):
+        return f"{value:.6g}", "not determined"
+    if std == 0:
+        return f"{value:.9g}", "0"
+    digits = 1 - int(np.floor(np.log10(std)))
+    if -6 <= digits <= 9 and abs(value) < 1e7:
+        places = max(digits, 0)
+        return f"{value:.{places}f}", f"{std:.{places}f}"
+    exponent = int(np.floor(np.log10(max(abs(value), std))))
+    places = max(exponent + digits, 0)
+    return f"{value:.{places}e}", f"{std:.1e}"
+
+
+def _fit_lines(found: Estimate, content: Mapping[str, Any]) -> Iterator[str]:
+    unit = content["noise"]["unit"]
+    unit = "" if unit == "1" else f" {unit}"
+    yield f"  residual rms {found.rmse:.3g}{unit}; noise of one residual {found.noise.sigma:.3g}{unit}"
+    if content["estimate"]["rmse_holdout"] is not None:
+        yield f"  held-out residual rms {content['estimate']['rmse_holdout']:.3g}{unit}"
+    repeats, residual = found.noise.repeats, found.noise.residual
+    if repeats and np.isfinite(residual) and residual > 2 * repeats:
+        yield _item(
+            f"the residual is {residual / repeats:.1f} times what the scatter within the rest "
+            f"intervals explains ({repeats:.2g}{unit}): the model lacks something; the standard "
+            "deviations above include that misfit as if it were noise"
+        )
+    if "seconds" in found.extra:
+        ratio = found.extra["least_squares_seconds"] / found.extra["seconds"]
+        yield (
+            f"  {found.extra['estimator']} took {1e3 * found.extra['seconds']:.2g} ms; the "
+            f"least-squares solution {ratio:.0f} times as long"
+        )
+
+
+def _determined(found: Estimate) -> Iterator[str]:
+    if found.identifiability.unobservable:
+        lines = [_item(words) for words in found.identifiability.unobservable]
+        yield "\n".join(["These data do not determine:", *lines])
+    if found.weak:
+        lines = [_item(f"{w.words}: {w.inflation:.0f} times worse than each alone") for w in found.weak]
+        yield "\n".join(["Weakly determined (one standard deviation of the combination):", *lines])
+    if not found.identifiability.unobservable and not found.weak:
+        yield "The data determine every unknown; no weak combination."
+
+
+def _next(found: Estimate, output: Path | None) -> str:
+    if not found.certificate.trusted:
+        return ""
+    if output is None:
+        return "Next: add -o out to keep the result, then `casest apply out DATA`."
+    return f"Written: {output}/result.json, {output}/residuals.csv. Next: casest apply {output} DATA"

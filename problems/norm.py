@@ -1,0 +1,304 @@
+"""Calibration to a constant norm: accelerometers at rest, magnetometers in a uniform field.
+
+Ren & Liu, "Calibration of MEMS Accelerometers and Magnetometers for Rotor UAV Attitude
+Estimation", eqs. (4)-(15); Burkhard, Sharma & Skaloud, "Linear Estimation of Deterministic
+Accelerometer Errors", NAVIGATION 71(3), 2024, eqs. (1)-(7), in the notation of each.
+
+corrected = scale·(v − offset) has the known length `norm`. The residual is taken in the unit of the
+reading, (‖S(v−o)‖ − g)/‖Sᵀn‖ with n the corrected direction: it is, to first order, the noise of
+the reading along n, and it does not vanish when the scale does. (‖S(v−o)‖ − g and its square both
+tend to a smaller cost the further the solution collapses, for any data.)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from casest import (
+    Model,
+    NotTrusted,
+    Residual,
+    Run,
+    constant,
+    diag,
+    diagonal,
+    full,
+    lower,
+    model,
+    norm_2,
+    param,
+    quantity,
+    signal,
+)
+
+Array = NDArray[np.float64]
+
+
+def _norm_residual(corrected: Any, scale: Any, norm: float) -> Residual:
+    """How far the corrected reading is from its known length, in the unit of the reading."""
+    corrected = quantity("corrected", corrected, "[norm]")
+    length = norm_2(corrected)
+    return Residual(
+        implicit=(length - norm) / norm_2(scale.T @ (corrected / length)),
+        unit="[v]",
+        corrected=corrected,
+        axes=("norm",),
+    )
+
+
+@model
+def norm_diagonal(
+    v=signal(3),
+    *,
+    scale=param(diagonal(3), "[norm]/[v]"),
+    offset=param(3, "[v]"),
+    norm=constant(1.0, "[v]"),
+):
+    """Scale of each axis and offset (Ren & Liu, eqs. 5-6): 6 unknowns."""
+    return _norm_residual(diag(scale) @ (v - offset), diag(scale), norm)
+
+
+@model
+def norm_triangular(
+    v=signal(3),
+    *,
+    scale=param(lower(3), "[norm]/[v]"),
+    offset=param(3, "[v]"),
+    norm=constant(1.0, "[v]"),
+):
+    """Scale, non-orthogonality and offset (Burkhard et al., eq. 1, A = M⁻¹): 9 unknowns."""
+    return _norm_residual(scale @ (v - offset), scale, norm)
+
+
+@model
+def norm_full(
+    v=signal(3),
+    *,
+    scale=param(full(3), "[norm]/[v]"),
+    offset=param(3, "[v]"),
+    norm=constant(1.0, "[v]"),
+):
+    """Full 3×3 scale and offset (Ren & Liu, eq. 4): 12 unknowns, of which a norm sees 9."""
+    return _norm_residual(scale @ (v - offset), scale, norm)
+
+
+# -- Burkhard et al.: closed forms ------------------------------------------------------------
+
+
+def readings(runs: Sequence[Run]) -> Array:
+    """All readings v, (N, 3)."""
+    return np.vstack([run.signals["v"] for run in runs])
+
+
+def burkhard_full(z: Array, g: float) -> tuple[Array, Array]:
+    """Full linear least squares: (A lower triangular, b) with ‖A(z − b)‖ = g, eqs. (2)-(6).
+
+    z is (N, 3) with N ≥ 9 poses. The null vector of zᵀSz − 2zᵀr + d = 0 is found in units of the
+    readings' size, so that the result does not depend on the unit of z. Raises NotTrusted where
+    the quadric through the readings is no ellipsoid.
+    """
+    size = np.sqrt(np.mean(z**2))
+    x, y, w = (z / size).T
+    columns = [x * x, y * y, w * w, 2 * x * y, 2 * x * w, 2 * y * w, -2 * x, -2 * y, -2 * w, x**0]
+    return _from_null_vector(np.column_stack(columns), list(range(6)), g, size)
+
+
+def burkhard_diagonal(z: Array, g: float) -> tuple[Array, Array]:
+    """The same without non-orthogonality: S diagonal, 7 columns, N ≥ 6 poses."""
+    size = np.sqrt(np.mean(z**2))
+    x, y, w = (z / size).T
+    columns = [x * x, y * y, w * w, -2 * x, -2 * y, -2 * w, x**0]
+    return _from_null_vector(np.column_stack(columns), list(range(3)), g, size)
+
+
+def _from_null_vector(X: Array, quadratic: list[int], g: float, size: float) -> tuple[Array, Array]:
+    theta = np.linalg.svd(X, full_matrices=X.shape[0] < X.shape[1])[2][-1]
+    s, r, d = theta[quadratic], theta[-4:-1], theta[-1]
+    S = np.diag(s[:3])
+    if len(s) == 6:
+        S[0, 1] = S[1, 0] = s[3]
+        S[0, 2] = S[2, 0] = s[4]
+        S[1, 2] = S[2, 1] = s[5]
+    if np.trace(S) < 0:
+        S, r, d = -S, -r, -d
+    if np.min(np.linalg.eigvalsh(S)) <= 0:
+        raise NotTrusted(
+            "closed form: the readings do not lie near an ellipsoid (the fitted quadric is open); "
+            "they cover too few orientations, or the axes are not those of one sensor"
+        )
+    b = np.linalg.solve(S, r)  # (4): needs neither g nor λ
+    lam = g**2 / (b @ S @ b - d) / size**2  # (5), back in the unit of z
+    if not lam > 0:
+        raise NotTrusted("closed form: the fitted ellipsoid is imaginary; the readings contradict it")
+    # λS = AᵀA with A lower triangular: the Cholesky factor of the matrix read backwards.
+    flipped = np.linalg.cholesky(lam * S[::-1, ::-1])
+    return flipped.T[::-1, ::-1], b * size
+
+
+def burkhard_bias(z: Array) -> tuple[Array, float]:
+    """Bias-only linear least squares: (b, radius), ‖z‖² = 2zᵀb + c, eq. (7). Needs no g."""
+    size = np.sqrt(np.mean(z**2))
+    u = z / size
+    X = np.column_stack([2 * u, np.ones(len(u))])
+    solution = np.linalg.lstsq(X, np.sum(u**2, axis=1), rcond=None)[0]
+    b = solution[:3]
+    return b * size, float(np.sqrt(max(solution[3] + b @ b, 0.0)) * size)
+
+
+# -- Ren & Liu: six positions, and Levenberg-Marquardt on their own objective -------------------
+
+
+def six_positions(v: Array, g: float) -> tuple[Array, Array]:
+    """(scale, offset), each (3,), from poses with one axis up or down (Ren & Liu, IV).
+
+    Poses are assigned by their largest component; several of one face are averaged. Exact only
+    where an axis is aligned with gravity. Raises NotTrusted where a face is missing.
+    """
+    axis = np.argmax(np.abs(v - np.median(v, axis=0)), axis=1)
+    scale, offset = np.zeros(3), np.zeros(3)
+    for i, name in enumerate("xyz"):
+        own = v[axis == i, i]
+        middle = 0.5 * (own.min() + own.max()) if own.size else 0.0
+        up, down = own[own > middle], own[own <= middle]
+        if not up.size or not down.size:
+            raise NotTrusted(f"six positions: no pose has {name} {'up' if not up.size else 'down'}")
+        offset[i] = 0.5 * (up.mean() + down.mean())
+        scale[i] = 2 * g / (up.mean() - down.mean())
+    return scale, offset
+
+
+def levenberg_marquardt(
+    v: Array, g: float, A: Array, o: Array, free: Array, squared: bool, epsilon: float = 1e-10
+) -> tuple[Array, Array, int]:
+    """Ren & Liu's iteration (13) with the stop (15) on their objective (10) or the plain norm.
+
+    `free` marks the entries of A that are unknown. λ is divided or multiplied by ten as the cost
+    falls or rises. Returns (A, o, iterations). Both objectives have their global optimum at
+    A → 0, so what comes out must be judged by another one.
+    """
+    x, damping = np.concatenate([o, A[free]]), 1e-3
+    for iteration in range(1, 501):
+        r, J = _paper_residual(x, v, g, free, squared)
+        JtJ = J.T @ J
+        while True:
+            step = np.linalg.solve(JtJ + damping * np.diag(np.diag(JtJ) + 1e-300), -J.T @ r)
+            trial = _paper_residual(x + step, v, g, free, squared)[0]
+            if trial @ trial <= r @ r or damping > 1e12:
+                break
+            damping *= 10
+        x, damping = x + step, max(damping / 10, 1e-15)
+        if np.linalg.norm(step) < epsilon * (1 + np.linalg.norm(x)):
+            break
+    A = np.zeros((3, 3))
+    A[free] = x[3:]
+    return A, x[:3], iteration
+
+
+def _paper_residual(
+    x: Array, v: Array, g: float, free: Array, squared: bool
+) -> tuple[Array, Array]:
+    """‖A(v−o)‖² − g² of (10), or ‖A(v−o)‖ − g, with its Jacobian."""
+    A = np.zeros((3, 3))
+    A[free] = x[3:]
+    d = v - x[:3]
+    a = d @ A.T
+    rows, columns = np.nonzero(free)
+    J = np.hstack([-2 * a @ A, 2 * a[:, rows] * d[:, columns]])
+    r = np.sum(a**2, axis=1)
+    if squared:
+        return r - g**2, J
+    length = np.sqrt(r)
+    return length - g, J / (2 * length[:, None])
+
+
+# -- what casest calls ------------------------------------------------------------------------
+
+
+def _values(declared: Model, A: Array, b: Array) -> dict[str, Array]:
+    diagonal_only = declared.function.__name__ == "norm_diagonal"
+    return {"scale": np.diag(A) if diagonal_only else A, "offset": b}
+
+
+def _known_scale(declared: Model) -> Array | None:
+    fixed = {c.name: c.array for c in declared.constants}.get("scale")
+    return None if fixed is None else (np.diag(fixed) if fixed.ndim == 1 else fixed)
+
+
+def closed_form(declared: Model, runs: Sequence[Run]) -> dict[str, Array]:
+    """Burkhard's closed form for whichever of scale and offset is unknown."""
+    z, g = readings(runs), float(declared["norm"].array)
+    known = _known_scale(declared)
+    if known is not None:  # (7), in the corrected frame: ‖A z − A b‖ = g
+        return {"offset": np.linalg.solve(known, burkhard_bias(z @ known.T)[0])}
+    if declared.function.__name__ == "norm_diagonal":
+        return _values(declared, *burkhard_diagonal(z, g))
+    return _values(declared, *burkhard_full(z, g))
+
+
+def bias_only(declared: Model, runs: Sequence[Run]) -> dict[str, Array]:
+    """Burkhard's bias-only closed form: the scale is one number for all axes, g over the radius."""
+    b, radius = burkhard_bias(readings(runs))
+    return _values(declared, np.eye(3) * float(declared["norm"].array) / radius, b)
+
+
+def six_position(declared: Model, runs: Sequence[Run]) -> dict[str, Array]:
+    """Ren & Liu's closed form for six aligned poses."""
+    scale, offset = six_positions(readings(runs), float(declared["norm"].array))
+    return _values(declared, np.diag(scale), offset)
+
+
+def _paper(declared: Model, runs: Sequence[Run], squared: bool) -> dict[str, Array]:
+    v, g = readings(runs), float(declared["norm"].array)
+    free = np.eye(3, dtype=bool)
+    if declared.function.__name__ != "norm_diagonal":
+        free = np.tri(3, dtype=bool)
+    b, radius = burkhard_bias(v)
+    A, o, _ = levenberg_marquardt(v, g, np.eye(3) * g / radius, b, free, squared)
+    return _values(declared, A, o)
+
+
+def ren_liu(declared: Model, runs: Sequence[Run]) -> dict[str, Array]:
+    """Ren & Liu's objective (10) with their iteration (13) and stop (15)."""
+    return _paper(declared, runs, squared=True)
+
+
+def plain_norm(declared: Model, runs: Sequence[Run]) -> dict[str, Array]:
+    """The same iteration on ‖S(v−o)‖ − g."""
+    return _paper(declared, runs, squared=False)
+
+
+def automatic_start(declared: Model, runs: Sequence[Run]) -> dict[str, Array]:
+    """Closed form where it exists, else a sphere through the readings."""
+    try:
+        return closed_form(declared, runs)
+    except NotTrusted:
+        return bias_only(declared, runs)
+
+
+def inside_the_ball(declared: Model, runs: Sequence[Run]) -> dict[str, tuple[Any, Any]]:
+    """The offset lies inside the ball that the readings span: the collapsed solution does not."""
+    radius = float(np.max(np.linalg.norm(readings(runs), axis=1)))
+    return {"offset": (-radius, radius)}
+
+
+def _complete(declared: Model) -> Model:
+    declared = declared.starting(automatic_start).bounded(inside_the_ball)
+    named = {
+        "closed-form": closed_form,
+        "bias-only": bias_only,
+        "six-position": six_position,
+        "ren-liu": ren_liu,
+        "plain-norm": plain_norm,
+    }
+    for name, function in named.items():
+        declared = declared.with_estimator(name, function)
+    return declared
+
+
+norm_diagonal = _complete(norm_diagonal)
+norm_triangular = _complete(norm_triangular)
+norm_full = _complete(norm_full)
