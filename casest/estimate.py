@@ -7,10 +7,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import casadi as ca
 import numpy as np
 
 from casest.data.run import Run
 from casest.declaring.shapes import Array
+from casest.engine import Replay
 from casest.errors import DataError, NotTrusted, UsageError
 from casest.identify import Identifiability, Weak, identify, weak_directions
 from casest.modelling.model import Model
@@ -115,11 +117,51 @@ def attempt(
         known = ", ".join([*SOLVERS, *estimators])
         raise UsageError(f"unknown solver {solver!r} for {model.name}; it has {known}")
     first = problem.start() if start is None else problem.point(_merged(problem, start))
-    outcomes = _solve(problem, first, solver if solver in SOLVERS else "ipopt", seed, start is None)
+    method = solver if solver in SOLVERS else "ipopt"
+    outcomes = _solve(problem, first, method, seed, start is None)
     best = min(outcomes, key=_cost)
+    if any(a.kind == "noise" for a in model.effects):
+        problem, outcomes, best = _reweighted(problem, best, method, seed)
     if solver in estimators:
         return _own_estimator(problem, estimators[solver], solver, best, outcomes, began)
     return _estimate(problem, best, outcomes, began)
+
+
+def _reweighted(
+    problem: Problem, best: Outcome, method: str, seed: int
+) -> tuple[Problem, tuple[Outcome, ...], Outcome]:
+    """Iterate weights and fit: effects on the noise say how much each residual counts."""
+    for _ in range(30):
+        problem = problem.with_weights(noise_weights(problem, best.point))
+        moved = trust_region(problem, best.point)
+        shift = problem.factor(moved.point)[0] @ (moved.point.x - best.point.x)
+        best = moved
+        if float(shift @ shift) <= 1e-10 * 2 * moved.cost:
+            break
+    outcomes = _solve(problem, best.point, method, seed, automatic=True)
+    return problem, outcomes, min(outcomes, key=_cost)
+
+
+def noise_weights(problem: Problem, point: Point) -> tuple[Array, ...]:
+    """Weight of every residual, from the model's effects on the noise.
+
+    The scale is the normalised median of absolute residuals, which outliers do not move.
+    """
+    residuals = problem.residuals(point)
+    scale = float(np.median(np.abs(np.concatenate([r.ravel() for r in residuals])))) / 0.6745
+    weights = [np.ones_like(r) for r in residuals]
+    for attached in problem.model.effects:
+        if attached.kind == "noise":
+            r = ca.SX.sym("r")
+            one = Replay(
+                ca.Function(
+                    "w", [ca.SX.sym("none", 0), r], [ca.SX(attached.apply(r, {}))], ["parameters", "sample"], ["w"]
+                )
+            )
+            for k, residual in enumerate(residuals):
+                flat = (residual / max(scale, 1e-300)).reshape(-1, 1)
+                weights[k] = weights[k] * one(np.zeros(0), flat)[0].reshape(residual.shape)
+    return tuple(weights)
 
 
 def _enough(problem: Problem) -> None:

@@ -22,6 +22,7 @@ from casest.engine import Normal, Replay, cost, normal_equations, rows, triangul
 from casest.errors import DataError, UsageError
 from casest.modelling.model import Model
 from casest.modelling.tracing import function_of, sample_symbol
+from casest.sequence import Recursion
 
 
 @dataclass(frozen=True)
@@ -255,6 +256,48 @@ class Problem:
         parameters = ca.vertcat(t.coordinates, t.references)
         return Replay(ca.Function("h", [parameters, sample], [hessian], ["parameters", "sample"], ["H"]))
 
+    @cached_property
+    def _recursion(self) -> Recursion | None:
+        """Where an effect acts on the sequence of samples, rows come from a recursion."""
+        sequential = any(a.kind == "sequence" for a in self.model.effects)
+        return Recursion(self.model) if sequential else None
+
+    def _rows(self, point: Point, r: int) -> tuple[Array, Array]:
+        """Residuals (N, m) and Jacobians (N, m, n of the run) of one run, unweighted."""
+        parameters = self._parameters(point, r)
+        if self._recursion is not None:
+            return self._recursion.rows(parameters, self.samples[r], self.runs[r])
+        return rows(self._with_jacobian, parameters, self.samples[r])
+
+    def _weighted_rows(self, point: Point, r: int) -> Array:
+        """[J r] of one run, weighted, (N·m, n + 1)."""
+        residual, jacobian = self._rows(point, r)
+        both = np.concatenate([jacobian, residual[:, :, None]], axis=2)
+        weights = self._weight(r)
+        if weights is not None:
+            both = both * np.sqrt(weights)[:, :, None]
+        return both.reshape(-1, both.shape[2])
+
+    def _run_cost(self, point: Point, r: int) -> float:
+        if self._recursion is not None:
+            return 0.5 * float(np.sum(self._weighted_rows(point, r)[:, -1] ** 2))
+        parameters = self._parameters(point, r)
+        return cost(self._with_jacobian, parameters, self.samples[r], self._weight(r))
+
+    def _run_normal(self, point: Point, r: int) -> Normal:
+        if self._recursion is not None:
+            both = self._weighted_rows(point, r)
+            product = both.T @ both
+            return Normal(0.5 * float(product[-1, -1]), product[:-1, -1], product[:-1, :-1])
+        parameters = self._parameters(point, r)
+        return normal_equations(self._with_jacobian, parameters, self.samples[r], self._weight(r))
+
+    def _run_factor(self, point: Point, r: int) -> Array:
+        if self._recursion is not None:
+            return np.asarray(np.linalg.qr(self._weighted_rows(point, r), mode="r"))
+        parameters = self._parameters(point, r)
+        return triangular_factor(self._with_jacobian, parameters, self.samples[r], self._weight(r))
+
     def _parameters(self, point: Point, r: int) -> Array:
         x, ref = self._selections[r]
         return np.concatenate([point.x[x], point.references[ref]])
@@ -264,20 +307,15 @@ class Problem:
 
     def cost(self, point: Point) -> float:
         """½ Σ w r²."""
-        return sum(
-            cost(self._with_jacobian, self._parameters(point, r), samples, self._weight(r))
-            for r, samples in enumerate(self.samples)
-        )
+        return sum(self._run_cost(point, r) for r in range(len(self.runs)))
 
     def normal(self, point: Point) -> Normal:
         """Cost, gradient (n,) and Gauss-Newton matrix (n, n)."""
         total, gradient = 0.0, np.zeros(self.unknowns)
         matrix = np.zeros((self.unknowns, self.unknowns))
-        for r, samples in enumerate(self.samples):
+        for r in range(len(self.runs)):
             x = self._selections[r][0]
-            own = normal_equations(
-                self._with_jacobian, self._parameters(point, r), samples, self._weight(r)
-            )
+            own = self._run_normal(point, r)
             total += own.cost
             gradient[x] += own.gradient
             matrix[np.ix_(x, x)] += own.matrix
@@ -289,11 +327,9 @@ class Problem:
         JᵀJ = RᵀR, Jᵀr = Rᵀ(Qᵀr), ‖r‖² = ‖Qᵀr‖² + rest².
         """
         n, blocks = self.unknowns, []
-        for r, samples in enumerate(self.samples):
+        for r in range(len(self.runs)):
             x = self._selections[r][0]
-            own = triangular_factor(
-                self._with_jacobian, self._parameters(point, r), samples, self._weight(r)
-            )
+            own = self._run_factor(point, r)
             block = np.zeros((len(own), n + 1))
             block[:, [*x, n]] = own
             blocks.append(block)
@@ -305,7 +341,9 @@ class Problem:
         return full[:n, :n], full[:n, n], float(abs(full[n, n]))
 
     def hessian(self, point: Point) -> Array:
-        """Exact second derivative of the cost, (n, n)."""
+        """Exact second derivative of the cost, (n, n); Gauss-Newton where samples are a sequence."""
+        if self._recursion is not None:
+            return self.normal(point).matrix
         matrix = np.zeros((self.unknowns, self.unknowns))
         for r, samples in enumerate(self.samples):
             x = self._selections[r][0]
@@ -319,16 +357,13 @@ class Problem:
 
     def residuals(self, point: Point) -> tuple[Array, ...]:
         """Residuals of each run, (N, m)."""
-        return tuple(
-            rows(self._with_jacobian, self._parameters(point, r), samples)[0]
-            for r, samples in enumerate(self.samples)
-        )
+        return tuple(self._rows(point, r)[0] for r in range(len(self.runs)))
 
     def jacobian(self, point: Point) -> Array:
         """The whole Jacobian, (residuals, n), unweighted; for small problems and tests."""
         parts = []
-        for r, samples in enumerate(self.samples):
-            _, own = rows(self._with_jacobian, self._parameters(point, r), samples)
+        for r in range(len(self.runs)):
+            _, own = self._rows(point, r)
             part = np.zeros((own.shape[0] * own.shape[1], self.unknowns))
             part[:, self._selections[r][0]] = own.reshape(-1, own.shape[2])
             parts.append(part)
@@ -337,9 +372,9 @@ class Problem:
     def squares_of_gradients(self, point: Point) -> Array:
         """Σ (Σ_axis w r ∂r)(…)ᵀ over samples: the middle of the sandwich covariance, (n, n)."""
         middle = np.zeros((self.unknowns, self.unknowns))
-        for r, samples in enumerate(self.samples):
+        for r in range(len(self.runs)):
             x, weights = self._selections[r][0], self._weight(r)
-            residual, jacobian = rows(self._with_jacobian, self._parameters(point, r), samples)
+            residual, jacobian = self._rows(point, r)
             if weights is not None:
                 residual = residual * weights
             scores = np.einsum("nm,nmk->nk", residual, jacobian)

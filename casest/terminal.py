@@ -137,7 +137,10 @@ def _determined(found: Estimate) -> Iterator[str]:
         lines = [_item(words) for words in found.identifiability.unobservable]
         yield "\n".join(["These data do not determine:", *lines])
     if found.weak:
-        lines = [_item(f"{w.words}: {w.inflation:.0f} times worse than each alone") for w in found.weak]
+        worst = sorted(found.weak, key=lambda w: -w.inflation)[:3]
+        lines = [_item(f"{w.words}: {w.inflation:.0f} times worse than each alone") for w in worst]
+        if len(found.weak) > 3:
+            lines.append(f"  - and {len(found.weak) - 3} more, in result.json")
         yield "\n".join(["Weakly determined (one standard deviation of the combination):", *lines])
     if not found.identifiability.unobservable and not found.weak:
         yield "The data determine every unknown; no weak combination."

@@ -138,7 +138,7 @@ def _common_length(file: Path, series: Mapping[str, NDArray[Any]]) -> int:
         # a lone matrix is samples by channels, unless it is far wider than long (MATLAB rows)
         wide = value.ndim == 2 and value.shape[0] <= 16 < value.shape[1]
         return int(value.shape[1] if wide else value.shape[0])
-    longest = {name: max(value.shape) for name, value in series.items()}
+    longest = {name: int(max(value.shape)) for name, value in series.items()}
     n_rows = next(iter(longest.values()))
     for name, length in longest.items():
         if length != n_rows:

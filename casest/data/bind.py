@@ -64,7 +64,7 @@ def load_runs(
 
     columns: per signal its columns by name or position, {"v": ("ax", "ay", "az")}; also
         "t", "run" and "pose" where those columns are called otherwise.
-    units: per signal or column the unit of the file's values, where it states none (or a wrong one).
+    units: per signal or column the unit of its values, where the file states none or a wrong one.
     scales: per signal or column how raw counts become values, {"temp": "int16/256+25"}.
     rate: samples per second, instead of a time column or a rate stated above the table.
     at_rest: average the rest intervals; names of further columns that must be at rest too.
@@ -244,10 +244,7 @@ def _unit_of(table: Table, column: Column, signal: str, options: _Options) -> st
 
 
 def _scale_of(column: str, signal: str | None, options: _Options) -> Scale | None:
-    for name in (column, signal):
-        if name in options.scales:
-            return options.scales[name]
-    return None
+    return options.scales.get(column) or (options.scales.get(signal) if signal else None)
 
 
 def _numbers(table: Table, column: Column, purpose: str, way_out: str) -> Array:
@@ -322,9 +319,7 @@ def _with_time_column(
     try:
         if not column.is_text:
             _numbers(table, column, "time", "--columns t=… or --rate HZ")
-        time, note = timing.seconds(
-            table, column, timing.time_units_declared(options.units, name)
-        )
+        time, note = timing.seconds(table, column, timing.time_units_declared(options.units, name))
     except UnitError as error:
         raise UnitError(f"{table.file}: column {name} as time: {error}; --unit t=ms") from error
     except DataError as error:
@@ -411,12 +406,11 @@ def _labels(table: Table, name: str | None) -> Array | Labels | None:
     return column.values
 
 
-def _in_order(labels: Array | Labels) -> list[float] | list[str]:
+def _in_order(labels: Array | Labels) -> list[float | int | str]:
     _, first = np.unique(labels, return_index=True)
-    found: list[float] | list[str] = labels[np.sort(first)].tolist()
-    if all(isinstance(label, float) and label.is_integer() for label in found):
-        return [int(label) for label in found]  # a run called 1, not 1.0
-    return found
+    found = labels[np.sort(first)].tolist()
+    # a run called 1, not 1.0
+    return [int(x) if isinstance(x, float) and x.is_integer() else x for x in found]
 
 
 def _others(

@@ -71,7 +71,7 @@ def _plain(name: str) -> str:
     return re.sub(r"[\s_.\[\]()\-]", "", name).casefold() or name
 
 
-def _candidates(signal: Signal) -> list[Sequence[str]]:
+def _candidates(signal: Signal) -> Sequence[Sequence[str]]:
     name, size = signal.name, signal.size
     if signal.kind == "rotation":
         own = [[f"{name}{part}" for part in _ANGLES], [f"{name}{part}" for part in "wxyz"]]

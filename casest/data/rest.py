@@ -14,9 +14,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from casest.data.run import Array, Index, Run
+from casest.data.run import Array, Index, Labels, Run
 from casest.errors import DataError, UsageError
 
 _WINDOW = 25  # samples, where the rate is unknown
@@ -27,6 +26,7 @@ _FLOOR_QUANTILE = 0.10  # of the windowed variances: rest must make up more of t
 _BAND = 6.0  # robust standard deviations of the log variance at rest
 _RANGE = 1.5  # largest range of the windowed means inside an interval, in noise sigmas
 _DRIFT = 1.0  # largest change along a straight line through them
+_KEPT = 0.25  # of the quiet samples must not drift, or nothing is believed
 _STEP = 6.0  # a change of the mean by this many sigmas is another position
 _HYSTERESIS = 10.0  # a variance this many times the limit of rest breaks a rest in any case
 _NARROWEST = 0.02  # of the log variance, so that a record without noise keeps a band
@@ -73,7 +73,8 @@ def at_rest(
     Raises DataError where nothing rests, or rest cannot be told from motion.
     """
     names, channels = _channels(run, also)
-    found = find_rests(channels, run.block, _window(run, window), shortest, run.name)
+    n_averaged = channels.shape[1] - len(also)
+    found = find_rests(channels, run.block, _window(run, window), shortest, run.name, n_averaged)
     return _averaged(run, found, names, channels)
 
 
@@ -83,9 +84,11 @@ def find_rests(
     window: int = _WINDOW,
     shortest: int | None = None,
     name: str = "record",
+    n_averaged: int | None = None,
 ) -> Rests:
     """Find the rest intervals of (N, K) channels; an interval never crosses a change of `block`.
 
+    Only the first `n_averaged` channels must keep their mean (a gyro's bias may wander at rest).
     Invariant to scale and offset of each channel. Raises DataError where there is none.
     """
     fewest = shortest or _SHORTEST * window
@@ -108,30 +111,35 @@ def find_rests(
             if last - first + 1 >= fewest
         ]
         at += len(stretch)
-    return _without_drift(channels, candidates, window, fewest, name)
+    return _without_drift(channels[:, :n_averaged], candidates, window, fewest, name)
 
 
 def _channels(run: Run, also: Sequence[str]) -> tuple[list[str], Array]:
     """Stack what must be still: every signal that is no time and no rotation, then `also`."""
     if run.spread:
         raise UsageError(f"{run.name}: is averaged already; leave --at-rest out")
-    names, parts = [], []
+    names: list[str] = []
+    parts: list[Array] = []
     for name, values in run.signals.items():
         if name == "t" or values.shape[1] == 9:
             continue
-        axes = "xyz" if values.shape[1] == 3 else "0123456789"
-        names += [name if values.shape[1] == 1 else f"{name}{axis}" for axis in axes]
-        names = names[: sum(p.shape[1] for p in parts) + values.shape[1]]
+        names += _component_names(name, values.shape[1])
         parts.append(values)
     for name in also:
-        values = run.columns.get(name)
-        if values is None or values.dtype.kind == "U":
+        column = run.columns.get(name)
+        if column is None or column.dtype.kind == "U":
             raise UsageError(f"{run.name}: no column {name} of numbers to look for rest in")
         names.append(name)
-        parts.append(np.asarray(values, dtype=np.float64)[:, None])
+        parts.append(np.asarray(column, dtype=np.float64)[:, None])
     if not parts:
         raise UsageError(f"{run.name}: no signal to look for rest in; leave --at-rest out")
     return names, np.concatenate(parts, axis=1)
+
+
+def _component_names(name: str, size: int) -> list[str]:
+    if size == 1:
+        return [name]
+    return [f"{name}{axis}" for axis in ("xyz" if size == 3 else map(str, range(size)))]
 
 
 def _window(run: Run, window: int | None) -> int:
@@ -155,7 +163,7 @@ def _moving_variance(x: Array, window: int) -> Array:
     mean = (sums[window:] - sums[:-window]) / window
     full = (squares[window:] - squares[:-window]) / window - mean**2
     half = window // 2
-    return np.pad(np.maximum(full, 0.0), ((half, half), (0, 0)), mode="edge")
+    return np.asarray(np.pad(np.maximum(full, 0.0), ((half, half), (0, 0)), mode="edge"))
 
 
 def resolution(x: Array) -> float:
@@ -172,7 +180,7 @@ def _level(variance: Array, channels: Array) -> Array:
     for k in range(channels.shape[1]):
         x = channels[:, k]
         floor[k] = max(floor[k], resolution(x) ** 2 / 12, (1e-9 * float(np.ptp(x))) ** 2, 1e-300)
-    return np.log(np.maximum((variance / floor).mean(axis=1), 1e-3))
+    return np.asarray(np.log(np.maximum((variance / floor).mean(axis=1), 1e-3)))
 
 
 def _thresholds(level: Array) -> tuple[float, float]:
@@ -193,6 +201,8 @@ def _thresholds(level: Array) -> tuple[float, float]:
 
 def _otsu(level: Array, bins: int = 200) -> float:
     """Return the split of a histogram that maximises the variance between its two parts."""
+    if float(np.ptp(level)) < _NARROWEST:
+        return float(level.max())  # nothing but rest
     counts, edges = np.histogram(level, bins)
     centres = (edges[1:] + edges[:-1]) / 2
     below = np.cumsum(counts)[:-1]
@@ -241,6 +251,7 @@ def _without_drift(
             f"{name}: no rest interval of {fewest} samples found{drifting}; hold the sensor still "
             f"for a second or more in each position, or leave --at-rest out"
         )
+    _refuse_slow_motion(sum(map(len, intervals)), sum(map(len, candidates)), name)
     lost = [
         len(c) - sum(map(len, parts)) >= window
         for c, parts in zip(candidates, kept, strict=True)
@@ -250,10 +261,20 @@ def _without_drift(
     return Rests(intervals, sum(lost), split, dropped)
 
 
+def _refuse_slow_motion(kept: int, quiet: int, name: str) -> None:
+    """Refuse a record whose quiet stretches mostly drift: chance leaves a few that do not."""
+    if kept < _KEPT * quiet:
+        raise DataError(
+            f"{name}: rest cannot be told from slow motion: the mean stays put in only {kept} of "
+            f"{quiet} quiet samples, the noise hides the rest; hold the sensor still for longer in "
+            f"each position, or leave --at-rest out"
+        )
+
+
 def _noise_floor(channels: Array) -> Array:
     """Return the smallest noise a channel can show: its resolution, or rounding."""
     steps = [resolution(channels[:, k]) for k in range(channels.shape[1])]
-    return np.maximum(steps, 1e-9 * np.ptp(channels, axis=0) + 1e-300)
+    return np.asarray(np.maximum(steps, 1e-9 * np.ptp(channels, axis=0) + 1e-300))
 
 
 def _settled(
@@ -265,7 +286,9 @@ def _settled(
     cut = x[: n * window].reshape(n, window, -1)
     noise = np.maximum(np.sqrt(np.median(cut.var(axis=1), axis=0)), noise_floor)
     parts = []
-    for first, last in _steady_parts(cut.mean(axis=1) / noise, 0, n - 1, -(-fewest // window)):
+    for first, last in _steady_parts(
+        (cut.mean(axis=1) - x.mean(axis=0)) / noise, 0, n - 1, -(-fewest // window)
+    ):
         end = interval.last if last == n - 1 else interval.first + (last + 1) * window - 1
         parts.append(Interval(interval.first + first * window, end))
     return _longest_of_each_pose(x, noise, interval.first, parts)
@@ -325,10 +348,9 @@ def _longest_steady(means: Array) -> tuple[int, int]:
 def _averaged(run: Run, found: Rests, names: list[str], channels: Array) -> Run:
     spans = found.intervals
     index = np.arange(len(spans))
-    columns = {
-        name: np.array([values[s.samples].mean() for s in spans])
+    columns: dict[str, Array | Labels] = {
+        name: np.array([_mean_or_label(values[s.samples]) for s in spans])
         for name, values in run.columns.items()
-        if values.dtype.kind != "U"
     }
     columns["first_row"] = np.array([float(run.rows[s.first]) for s in spans])
     columns["last_row"] = np.array([float(run.rows[s.last]) for s in spans])
@@ -346,12 +368,19 @@ def _averaged(run: Run, found: Rests, names: list[str], channels: Array) -> Run:
     )
 
 
+def _mean_or_label(values: Array | Labels) -> float | str:
+    """Return the mean of numbers; of labels the one they share, or nothing."""
+    if values.dtype.kind == "U":
+        return str(values[0]) if bool((values == values[0]).all()) else ""
+    return float(np.asarray(values, dtype=np.float64).mean())
+
+
 def _means(values: Array, spans: Sequence[Interval]) -> Array:
     means = np.array([values[s.samples].mean(axis=0) for s in spans])
     if values.shape[1] != 9:
         return means
     u, _, vt = np.linalg.svd(means.reshape(-1, 3, 3))  # the rotation nearest to the mean matrix
-    return np.asarray((u @ vt).reshape(-1, 9))
+    return np.asarray((u @ vt).reshape(-1, 9), dtype=np.float64)
 
 
 def _spreads(values: Array, spans: Sequence[Interval]) -> Array:
@@ -379,7 +408,7 @@ def standard_error(x: Array, step: float = 0.0) -> float:
     if covariance[0] <= 0.0:
         return float(rough)
     rho = covariance / covariance[0]
-    pairs = rho[0 : n - n % 2 : 2] + rho[1 : n : 2]
+    pairs = rho[0 : n - n % 2 : 2] + rho[1:n:2]
     positive = len(pairs) if (pairs > 0).all() else int(np.argmax(pairs <= 0))
     inflation = max(2.0 * float(pairs[:positive].sum()) - 1.0, 1.0)
     return float(np.hypot(np.sqrt(covariance[0] * inflation / (n - 1)), rough))
@@ -395,6 +424,8 @@ def _notes(run: Run, found: Rests, names: list[str], channels: Array) -> list[st
         f"({100 * covered / len(run):.0f} %)",
         "noise at rest: " + ", ".join(f"{n} {s:.3g}" for n, s in zip(names, sigma, strict=True)),
     ]
+    if run.time is None:
+        notes.append(f"rate unknown, rest judged over {_WINDOW} samples; --rate HZ may do better")
     if found.shortened:
         notes.append(f"{found.shortened} rest intervals shortened: they drift at one end")
     if found.split:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,7 +46,7 @@ class Run:
     def __post_init__(self) -> None:
         """Refuse parts of unequal length: they would be matched wrongly without a sign."""
         n = len(self.rows)
-        parts = {**self.signals, **self.columns, **self.spread}
+        parts: dict[str, NDArray[Any]] = {**self.signals, **self.columns, **self.spread}
         parts |= {"block": self.block, "count": self.count}
         if self.time is not None:
             parts["time"] = self.time

@@ -104,7 +104,10 @@ def _from_dates(table: Table, column: Column) -> Array:
     """Read ISO dates (2020-03-07 15:45:00.123) or clock times (15:45:00.1) as s since row 0."""
     days = ["" if "-" in str(text)[1:] else "2000-01-01T" for text in column.values]
     try:
-        texts = [day + str(text).strip().rstrip("Z") for day, text in zip(days, column.values, strict=True)]
+        texts = [
+            day + str(text).strip().rstrip("Z")
+            for day, text in zip(days, column.values, strict=True)
+        ]
         dates = np.array(texts, dtype="datetime64[ns]")
     except ValueError:
         raise DataError(

@@ -1,7 +1,7 @@
 """Least-squares sums over all samples, from a replay of residual and Jacobian.
 
 In every function `replay` has the outputs r (m×1, dense) and J (m×n, any sparsity), in this
-order; `parameters` is (n,), `samples` (N, k), `weights` (N, m) or None for ones. Non-finite values
+order (n may be less than the number of parameters: some only describe charts); `samples` (N, k), `weights` (N, m) or None for ones. Non-finite values
 are not an error: they appear in the results. A weight of zero does not hide them.
 """
 
@@ -60,8 +60,8 @@ def normal_equations(
     replay: Replay, parameters: Floats, samples: Floats, weights: Floats | None = None
 ) -> Normal:
     """½ Σ w r², Jᵀ W r and Jᵀ W J, accumulated by block in constant memory."""
-    n = replay.n_parameters
     components = _components(replay)
+    n = replay.shapes[_JACOBIAN][1]
     sums = [np.zeros((len(c.columns),) * 2) for c in components]
     with np.errstate(all="ignore"):
         for block, w in _weighted_blocks(replay, components, parameters, samples, weights):
@@ -96,8 +96,8 @@ def triangular_factor(
     Sequential Householder QR: R of each block stacked under the R so far. It does not square the
     condition number of J, as the normal equations do. Signs of the rows are arbitrary.
     """
-    n = replay.n_parameters
     components = _components(replay)
+    n = replay.shapes[_JACOBIAN][1]
     factor = np.zeros((n + 1, n + 1))
     with np.errstate(all="ignore"):
         for block, w in _weighted_blocks(replay, components, parameters, samples, weights):
@@ -149,12 +149,13 @@ def _entries(replay: Replay) -> list[tuple[int, int]]:
 
 
 def _components(replay: Replay) -> list[_Component]:
-    m, n = _count_residuals(replay), replay.n_parameters
-    if len(replay.shapes) < 2 or replay.shapes[_JACOBIAN] != (m, n):
+    m = _count_residuals(replay)
+    if len(replay.shapes) < 2 or replay.shapes[_JACOBIAN][0] != m:
         raise CasestError(
             f"function {replay.name!r} has outputs of shape {replay.shapes}:"
-            f" the second must be the Jacobian, ({m}, {n})"
+            f" the second must be the Jacobian, ({m}, n)"
         )
+    n = replay.shapes[_JACOBIAN][1]
     row, column = replay.sparsity[_JACOBIAN]
     components = []
     start = 0

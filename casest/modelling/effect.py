@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
+import casadi as ca
 import numpy as np
 
 from casest.declaring.physics import SX
@@ -124,6 +125,10 @@ class Attached:
         extras = [symbols[s.name] for s in self.signals]
         unknowns = {p.name.rpartition(".")[2]: symbols[p.name] for p in self.parameters}
         numbers = {n: d.array for n, d in self.effect.declarations if isinstance(d, Constant)}
+        if self.kind == "noise":  # the scatter's own parameters are no unknowns of a fit
+            for n, d in self.effect.declarations:
+                if isinstance(d, Parameter):
+                    numbers[n] = d.shape.unpack(d.start_value())
         numbers = {n: float(a) if a.ndim == 0 else a for n, a in numbers.items()}
         return self.effect.function(value, *more.values(), *extras, **unknowns, **numbers)
 
@@ -143,7 +148,7 @@ def attach(
     """
     parameters = []
     for name, declaration in declared.declarations:
-        if isinstance(declaration, Constant):
+        if isinstance(declaration, Constant) or kind == "noise":
             continue
         parameter = declaration.decided(dims) if isinstance(declaration, Undecided) else declaration
         parameter = replace(parameter, name=f"{label}.{name}")
@@ -152,9 +157,44 @@ def attach(
             if not parameter.shape.curved:
                 parameter = replace(parameter, start=null)
         first = next(iter(inspect.signature(declared.function).parameters))
-        renamed = tuple(u.replace(f"[{first}]", f"({units[on]})" if on in units else f"[{on}]")
-                        for u in parameter.units)
+        own = units.get(on, f"[{on}]")
+        own = f"({own})" if set("/*") & set(own) else own
+        renamed = tuple(u.replace(f"[{first}]", own) for u in parameter.units)
         parameters.append(replace(parameter, units=renamed))
     return Attached(
         declared, on, kind, label, tuple(sorted(columns.items())), tuple(parameters)
     )
+
+
+def check_null(attached: Attached, shape: tuple[int, int]) -> None:
+    """An effect must vanish at its null value: tried at random points.
+
+    Raises DeclarationError naming the effect, its null value, and by how much it misses.
+    """
+    value = ca.SX.sym("value", *shape)
+    symbols = {s.name: ca.SX.sym(s.name, s.size) for s in attached.signals}
+    nulls, unknowns = {}, {}
+    for name, declaration in attached.effect.declarations:
+        if isinstance(declaration, Constant):
+            nulls[name] = declaration.array
+        else:
+            dims = next((p.shape.dims for p in attached.parameters if p.name.endswith(f".{name}")), ())
+            nulls[name] = np.full(dims or (1,), attached.effect.null_of(name))
+            unknowns[name] = attached.effect.null_of(name)
+    if attached.kind == "noise" and not unknowns:
+        return  # weights without a parameter: there is nothing that could vanish
+    more = [ca.SX.sym("previous", *shape), ca.SX.sym("dt")] if attached.kind == "sequence" else []
+    numbers = {n: float(v.ravel()[0]) if v.size == 1 else ca.SX(ca.DM(v)) for n, v in nulls.items()}
+    changed = attached.effect.function(value, *more, *symbols.values(), **numbers)
+    expected = ca.SX.ones(*shape) if attached.kind == "noise" else value
+    f = ca.Function("vanishes", [value, *more, *symbols.values()], [ca.SX(changed) - expected])
+    rng = np.random.default_rng(0)
+    for _ in range(3):
+        point = [rng.uniform(0.5, 2.0, size=f.size_in(i)) for i in range(f.n_in())]
+        change = float(np.max(np.abs(np.array(f(*point)))))
+        if not change <= 1e-12:
+            where = ", ".join(f"{n} = {v:g}" for n, v in unknowns.items())
+            raise DeclarationError(
+                f"effect {attached.label} is not null at {where}: it changes {attached.on} by "
+                f"{change:.3g}; give the value at which it vanishes, @effect(…, null={{…}})"
+            )

@@ -15,7 +15,7 @@ import numpy as np
 from casest.declaring.physics import SX, Quantity, Residual
 from casest.declaring.shapes import Array
 from casest.declaring.symbols import Constant, Parameter, Scope, Signal, constant, named
-from casest.modelling.effect import NOISE, Attached, Effect, Kind, attach
+from casest.modelling.effect import NOISE, Attached, Effect, Kind, attach, check_null
 from casest.errors import DeclarationError, UnitError, UsageError
 from casest.modelling.tracing import Traced, describe, function_of, trace
 
@@ -182,16 +182,24 @@ class Model:
         if label in taken:
             raise UsageError(f"model {self.name} already has the effect {label}")
         attached = attach(added, target, kind, dims, {target: unit}, columns, label)
-        model = replace(self, effects=(*self.effects, attached))
-        model._check_null(attached)
-        return model
+        check_null(attached, self._target_shape(target))
+        return replace(self, effects=(*self.effects, attached))
+
+    def _target_shape(self, target: str) -> tuple[int, int]:
+        if target in self.quantities:
+            shape = self.quantities[target].declared.shape
+            return (int(shape[0]), int(shape[1]))
+        return (1 if target == NOISE else self[target].size, 1)
 
     def _place(self, added: Effect, target: str) -> tuple[Kind, tuple[int, ...], str]:
         if target == NOISE:
             return "noise", (), "1"
         if target in self.quantities:
             found = self.quantities[target]
-            return ("sequence" if added.kind == "sequence" else "quantity"), found.dims, found.unit
+            if added.kind != "sequence":
+                return "quantity", found.dims, found.unit
+            self._check_sequence(added, found)
+            return "sequence", found.dims, found.unit
         signals = {s.name: s for s in self.signals}
         if target in signals:
             dims = () if signals[target].size == 1 else (signals[target].size,)
@@ -201,41 +209,14 @@ class Model:
             f"it acts on {target!r}, and the model has {', '.join([*self.quantities, *signals])}"
         )
 
-    def _check_null(self, attached: Attached) -> None:
-        """An effect must vanish at its null value: shown at random points."""
-        if attached.kind in ("noise", "sequence"):
-            return
-        symbols = self.with_symbols_of(attached)
-        base = ca.SX.sym("value", *self._target_shape(attached))
-        value = attached.apply(base, {**symbols, attached.on: base})
-        free = [symbols[s.name] for s in attached.signals]
-        unknowns = [symbols[p.name] for p in attached.parameters]
-        f = ca.Function("null", [base, *free, *unknowns], [ca.SX(value) - base])
-        rng = np.random.default_rng(0)
-        nulls = [attached.effect.null_of(p.name.rpartition(".")[2]) for p in attached.parameters]
-        for _ in range(3):
-            numbers = [rng.normal(size=base.shape), *(rng.normal(size=s.shape) for s in free)]
-            at_null = [np.full(u.shape, n) for u, n in zip(unknowns, nulls, strict=True)]
-            change = np.abs(np.array(f(*numbers, *at_null)))
-            if not change.max(initial=0.0) <= 1e-12:
-                raise DeclarationError(
-                    f"effect {attached.label} is not null at its null value "
-                    f"({', '.join(f'{p.name} = {n:g}' for p, n in zip(attached.parameters, nulls, strict=True))}): "
-                    f"it changes {attached.on} by {np.nanmax(change):.3g}; declare null={{…}}"
-                )
-
-    def _target_shape(self, attached: Attached) -> tuple[int, int]:
-        if attached.on in self.quantities:
-            shape = self.quantities[attached.on].declared.shape
-            return (int(shape[0]), int(shape[1]))
-        return (self[attached.on].size, 1)
-
-    def with_symbols_of(self, attached: Attached) -> dict[str, SX]:
-        """Fresh symbols for what an effect reads and for its unknowns."""
-        symbols = {s.name: ca.SX.sym(s.name, s.size) for s in attached.signals}
-        for p in attached.parameters:
-            symbols[p.name] = ca.SX.sym(p.name, *(p.shape.dims or (1,)))
-        return symbols
+    def _check_sequence(self, added: Effect, found: Quantity) -> None:
+        if any(a.kind == "sequence" for a in self.effects):
+            raise UsageError(f"model {self.name} already has an effect on the sequence of samples")
+        if self.traced.residual.predicted is not found.value:
+            raise UsageError(
+                f"effect {added.name} is not applicable to model {self.name}: it acts on the "
+                f"sequence of predicted readings, and {found.name} is not what the model predicts"
+            )
 
     def start(self, function: Callable[..., Any]) -> Model:
         """Decorator: start values from the data, `def NAME(model, runs) -> {parameter: value}`.

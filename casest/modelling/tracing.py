@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import ast
 import inspect
 import sys
+import textwrap
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -60,7 +62,7 @@ def trace(model: Model, cut: str | None = None, naming: bool = False) -> Traced:
         ca.vertcat(*references),
         running.quantities,
         residual,
-        residual.expression,
+        ca.densify(residual.expression),
         None if residual.predicted is None else ca.vec(ca.SX(residual.predicted)),
         measured,
         _corrected(model, residual, running),
@@ -172,8 +174,9 @@ def function_of(model: Model, outputs: Mapping[str, SX], traced: Traced | None =
     traced = traced or model.traced
     inputs = [ca.vertcat(traced.coordinates, traced.references), sample_symbol(model, traced)]
     values = [ca.SX(v) for v in outputs.values()]
+    # Not the model's own name: CasADi reserves some, and refuses two underscores in a row.
     return ca.Function(
-        model.function.__name__, inputs, values, ["parameters", "sample"], list(outputs)
+        "one_sample", inputs, values, ["parameters", "sample"], list(outputs)
     )
 
 
@@ -184,10 +187,28 @@ def sample_symbol(model: Model, traced: Traced | None = None) -> SX:
 
 
 def equations(model: Model) -> list[str]:
-    """One line per quantity and for the residual, in terms of the quantities before."""
-    traced = trace(model, naming=True)
-    lines = [f"{q.name} = {_expression(q.value)}" for q in traced.quantities.values()]
-    return [*lines, f"residual = {_expression(traced.expression)}"]
+    """The body of the model and of its effects, as declared.
+
+    Where the source is not at hand, the traced expressions in terms of the quantities before.
+    """
+    try:
+        lines = _body(model.function)
+        for attached in model.effects:
+            lines += ["", f"# effect {attached.label} on {attached.on}", *_body(attached.effect.function)]
+    except (OSError, TypeError):
+        traced = trace(model, naming=True)
+        lines = [f"{q.name} = {_expression(q.value)}" for q in traced.quantities.values()]
+        lines.append(f"residual = {_expression(traced.expression)}")
+    return lines
+
+
+def _body(function: Callable[..., Any]) -> list[str]:
+    """Source lines of a function without its signature and docstring."""
+    source = textwrap.dedent(inspect.getsource(function))
+    declared = next(n for n in ast.parse(source).body if isinstance(n, ast.FunctionDef))
+    statements = declared.body[1:] if ast.get_docstring(declared) else declared.body
+    lines = source.splitlines()[statements[0].lineno - 1 : statements[-1].end_lineno]
+    return textwrap.dedent("\n".join(lines)).splitlines()
 
 
 def describe(model: Model) -> str:

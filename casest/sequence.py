@@ -1,0 +1,92 @@
+"""Effects on the sequence of samples: predictions that depend on the sample before.
+
+A filter in the sensor makes the reading a recursion y[k] = F(y[k−1], x[k], dt[k]; θ) over the
+model's prediction x. Its derivative follows the same recursion (forward sensitivity), and CasADi
+runs both in one accumulated map.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from casest.data.run import Run
+from casest.declaring.shapes import Array
+from casest.engine import Replay, rows
+from casest.errors import DataError
+from casest.modelling.model import Model
+from casest.modelling.tracing import function_of
+
+#: Samples per accumulated map: long enough to hide the call, short enough to build at once.
+CHUNK = 512
+
+
+@dataclass(frozen=True)
+class Recursion:
+    """Residual and Jacobian of an explicit model whose effects include sequences."""
+
+    model: Model
+
+    @cached_property
+    def _prediction(self) -> Replay:
+        t = self.model.traced
+        jacobian = ca.jacobian(t.predicted, t.coordinates)
+        return Replay(function_of(self.model, {"x": ca.densify(t.predicted), "J": jacobian}))
+
+    @cached_property
+    def _steps(self) -> Any:
+        """(state, inputs) -> state, state = [y, dy/dθ], accumulated over CHUNK samples."""
+        t = self.model.traced
+        m, n = t.predicted.numel(), t.coordinates.numel()
+        y, S = ca.SX.sym("y", m), ca.SX.sym("S", m, n)
+        x, J, dt = ca.SX.sym("x", m), ca.SX.sym("J", m, n), ca.SX.sym("dt")
+        value, slope, previous, memory = x, J, y, S
+        for attached in self.model.effects:
+            if attached.kind == "sequence":
+                new = ca.vec(ca.SX(attached.apply(value, t.symbols, previous=previous, dt=dt)))
+                slope = (
+                    ca.jacobian(new, value) @ slope
+                    + ca.jacobian(new, previous) @ memory
+                    + ca.jacobian(new, t.coordinates)
+                )
+                value = new
+                break  # one recursion: a second would need a memory of its own
+        state = ca.vertcat(y, ca.vec(S))
+        sample = ca.vertcat(x, ca.vec(J), dt)
+        constants = ca.vertcat(t.coordinates, t.references)
+        after = ca.vertcat(value, ca.vec(slope))
+        step = ca.Function("step", [state, sample, constants], [after])
+        return step.mapaccum("steps", CHUNK)
+
+    def rows(self, parameters: Array, samples: Array, run: Run) -> tuple[Array, Array]:
+        """Residuals (N, m) and Jacobians (N, m, n) with the recursion applied block by block."""
+        if run.time is None:
+            raise DataError(f"{run.file}: a sequence effect needs time: give a time column or --rate")
+        x, J = rows(self._prediction, parameters, samples)
+        dt = np.diff(run.time, prepend=run.time[:1])
+        measured = run.signals[str(self.model.traced.measured)]
+        y, S = np.empty_like(x), np.empty_like(J)
+        for block in np.unique(run.block):
+            own = np.flatnonzero(run.block == block)
+            dt[own[0]] = np.median(np.diff(run.time[own])) if len(own) > 1 else 0.0
+            y[own], S[own] = self._block(x[own], J[own], dt[own], parameters)
+        return measured - y, -S
+
+    def _block(self, x: Array, J: Array, dt: Array, parameters: Array) -> tuple[Array, Array]:
+        count, m, n = J.shape
+        state = np.concatenate([x[0], J[0].T.ravel()])
+        inputs = np.hstack([x, J.transpose(0, 2, 1).reshape(count, -1), dt[:, None]])
+        padded = -count % CHUNK
+        inputs = np.vstack([inputs, np.repeat(inputs[-1:], padded, axis=0)])
+        constants = np.repeat(parameters[:, None], CHUNK, axis=1)
+        found = []
+        for k in range(0, len(inputs), CHUNK):
+            states = np.array(self._steps(state, inputs[k : k + CHUNK].T, constants))
+            found.append(states.T)
+            state = states[:, -1]
+        states = np.vstack(found)[:count]
+        return states[:, :m], states[:, m:].reshape(count, n, m).transpose(0, 2, 1)

@@ -1,0 +1,156 @@
+"""Independent simulators of triaxial sensors of a vector of constant length: plain NumPy.
+
+Nothing here knows casest. A sensor reads z = M x + b + noise (Burkhard et al., eq. 1) of a true
+vector x with ‖x‖ = norm, M lower triangular; the truth in casest's words is scale = M⁻¹, offset = b.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+GRAVITY = 9.80665
+
+
+# -- directions of the true vector in the sensor's frame, (n, 3) unit vectors ---------------------
+
+
+def _unit(vectors: Array) -> Array:
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
+def random_rotation(rng: np.random.Generator) -> Array:
+    """A rotation matrix, uniform over SO(3)."""
+    q, r = np.linalg.qr(rng.standard_normal((3, 3)))
+    q = q * np.sign(np.diag(r))
+    return q * np.linalg.det(q)
+
+
+def sphere(n: int, rng: np.random.Generator) -> Array:
+    """Independent directions, uniform over the sphere."""
+    return _unit(rng.standard_normal((n, 3)))
+
+
+def spread_poses(n: int, rng: np.random.Generator, jitter: float = 0.1) -> Array:
+    """Directions spread evenly over the sphere, as a careful hand does it.
+
+    A Fibonacci lattice, randomly rotated, each direction moved by about `jitter` rad.
+    """
+    k = np.arange(n) + 0.5
+    height, turn = 1 - 2 * k / n, np.pi * (1 + np.sqrt(5)) * k
+    side = np.sqrt(1 - height**2)
+    lattice = np.column_stack([side * np.cos(turn), side * np.sin(turn), height])
+    return _unit(lattice @ random_rotation(rng).T + jitter * rng.standard_normal((n, 3)))
+
+
+def six_faces(rng: np.random.Generator, tilt: float = 0.0) -> Array:
+    """Each axis up and down, off by about `tilt` rad."""
+    faces = np.vstack([np.eye(3), -np.eye(3)])
+    return _unit(faces + tilt * rng.standard_normal((6, 3)))
+
+
+def ring(n: int, rng: np.random.Generator) -> Array:
+    """A great circle: the sensor turned about one horizontal axis only."""
+    angle = rng.uniform(0, 2 * np.pi, n)
+    circle = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(n)])
+    return circle @ random_rotation(rng).T
+
+
+def cap(n: int, rng: np.random.Generator, tilt: float = np.radians(10)) -> Array:
+    """Uniform over the cap of directions within `tilt` of one axis (π/2: a half sphere)."""
+    height = rng.uniform(np.cos(tilt), 1, n)
+    turn, side = rng.uniform(0, 2 * np.pi, n), np.sqrt(1 - height**2)
+    return np.column_stack([side * np.cos(turn), side * np.sin(turn), height]) @ (
+        random_rotation(rng).T
+    )
+
+
+# -- sensors --------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """z = M x + b + noise, with ‖x‖ = norm; M (3, 3) lower triangular, b (3,) in the unit of z."""
+
+    M: Array
+    b: Array
+    norm: float
+
+    @property
+    def scale(self) -> Array:
+        """(3, 3): x = scale (z − b)."""
+        return np.linalg.inv(self.M)
+
+    def read(self, directions: Array, sigma: float | Array, rng: np.random.Generator) -> Array:
+        """Readings (n, 3); sigma is one number, or (n,) one per pose."""
+        noise = rng.standard_normal(directions.shape) * np.reshape(sigma, (-1, 1))
+        return self.norm * directions @ self.M.T + self.b + noise
+
+
+def accelerometer(rng: np.random.Generator, *, skew: bool = True) -> Sensor:
+    """A MEMS accelerometer in m/s²: offsets of ±0.5 m/s², scale ±3 %, skew ±1° (or none)."""
+    M = np.diag(1 + rng.uniform(-0.03, 0.03, 3))
+    if skew:
+        M += np.tril(rng.uniform(-0.017, 0.017, (3, 3)), -1)
+    return Sensor(M, rng.uniform(-0.5, 0.5, 3), GRAVITY)
+
+
+def adis16475(rng: np.random.Generator) -> Sensor:
+    """Burkhard's simulated sensor: bias 0.9-1.3 mg, scale 300-600 ppm, skew 0.02-0.04°."""
+    M = np.diag(1 + rng.uniform(300e-6, 600e-6, 3))
+    M += np.tril(np.radians(rng.uniform(0.02, 0.04, (3, 3))), -1)
+    return Sensor(M, rng.uniform(0.9e-3, 1.3e-3, 3) * 9.8055, 9.8055)
+
+
+def magnetometer(rng: np.random.Generator, *, counts_per_gauss: float = 3000.0) -> Sensor:
+    """A magnetometer in counts in a field of 0.48 gauss.
+
+    Hard iron moves the centre by up to half the field on each axis; soft iron is symmetric, 15 %.
+    The rotation in it is invisible to a norm: M = L Q with Q a rotation, and L is kept.
+    """
+    iron = rng.uniform(-0.15, 0.15, (3, 3))
+    soft = np.eye(3) + 0.5 * (iron + iron.T)
+    gains = np.diag(counts_per_gauss * (1 + rng.uniform(-0.05, 0.05, 3)))
+    _, upper = np.linalg.qr((gains @ soft).T)
+    L = upper.T * np.sign(np.diag(upper))
+    return Sensor(L, counts_per_gauss * rng.uniform(-0.24, 0.24, 3), 0.48)
+
+
+# -- a raw record -----------------------------------------------------------------------------------
+
+
+def handheld(
+    sensor: Sensor,
+    poses: Array,
+    sigma: float,
+    rng: np.random.Generator,
+    *,
+    rate: float = 100.0,
+    rest: float = 3.0,
+    move: float = 1.5,
+) -> tuple[Array, list[tuple[int, int]]]:
+    """A hand-held raw record (N, 3): rests in each pose, turning and shaking between them.
+
+    Also returns the samples (first, last) of each true rest.
+    """
+    parts: list[Array] = []
+    rests: list[tuple[int, int]] = []
+    count = 0
+    for k, pose in enumerate(poses):
+        n = round(rate * rest * rng.uniform(0.8, 1.2))
+        parts.append(np.tile(sensor.norm * pose, (n, 1)))
+        rests.append((count, count + n - 1))
+        count += n
+        if k + 1 < len(poses):
+            m = round(rate * move)
+            s = (np.arange(m) + 0.5) / m
+            blend = np.outer(1 - s, pose) + np.outer(s, poses[k + 1])
+            blend += np.outer(np.sin(np.pi * s), 0.3 * rng.standard_normal(3))
+            shake = np.sin(np.pi * s)[:, None] * rng.normal(0, 0.2 * sensor.norm, (m, 3))
+            parts.append(sensor.norm * _unit(blend) + shake)
+            count += m
+    x = np.vstack(parts)
+    return x @ sensor.M.T + sensor.b + sigma * rng.standard_normal(x.shape), rests
