@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-import casadi as ca
 import numpy as np
 
 from casest.data.run import Run
 from casest.declaring.shapes import Array
-from casest.engine import Replay
 from casest.errors import DataError, NotTrusted, UsageError
 from casest.identify import Identifiability, Weak, identify, weak_directions
 from casest.modelling.model import Model
+from casest.noise import has_noise_effects, variance_factor, weights
 from casest.solve.certificate import Certificate, certify
+from casest.solve.correlation import correlation_time
 from casest.solve.covariance import inverse_normal, sandwich
 from casest.solve.ipopt import ipopt
 from casest.solve.outcome import Outcome
@@ -46,8 +46,9 @@ class Estimate:
     """Parameters by name with covariance, certificate, residuals.
 
     `values` and `std` have the parameters' shapes (a leading run axis for per-run ones if there
-    are several runs); `robust` is the standard deviation from the sandwich form. `covariance`
-    (n, n) is of the unknowns `names`. Where the data do not determine a value its std is NaN.
+    are several runs); `robust` is the standard deviation from the sandwich form, which `std` equals
+    where residuals are correlated over more than one sample. `covariance` (n, n) is of the
+    unknowns `names`. Where the data do not determine a value its std is NaN.
     """
 
     problem: Problem
@@ -63,6 +64,7 @@ class Estimate:
     weak: tuple[Weak, ...]
     outcomes: tuple[Outcome, ...]
     seconds: float
+    correlated_over: float = 1.0
     notes: tuple[str, ...] = ()
     extra: Mapping[str, Any] = field(default_factory=dict)
 
@@ -119,8 +121,9 @@ def attempt(
     first = problem.start() if start is None else problem.point(_merged(problem, start))
     method = solver if solver in SOLVERS else "ipopt"
     outcomes = _solve(problem, first, method, seed, start is None)
+    outcomes += _along_the_weakest(problem, min(outcomes, key=_cost))
     best = min(outcomes, key=_cost)
-    if any(a.kind == "noise" for a in model.effects):
+    if has_noise_effects(model):
         problem, outcomes, best = _reweighted(problem, best, method, seed)
     if solver in estimators:
         return _own_estimator(problem, estimators[solver], solver, best, outcomes, began)
@@ -132,7 +135,7 @@ def _reweighted(
 ) -> tuple[Problem, tuple[Outcome, ...], Outcome]:
     """Iterate weights and fit: effects on the noise say how much each residual counts."""
     for _ in range(30):
-        problem = problem.with_weights(noise_weights(problem, best.point))
+        problem = problem.with_weights(weights(problem, best.point))
         moved = trust_region(problem, best.point)
         shift = problem.factor(moved.point)[0] @ (moved.point.x - best.point.x)
         best = moved
@@ -140,28 +143,6 @@ def _reweighted(
             break
     outcomes = _solve(problem, best.point, method, seed, automatic=True)
     return problem, outcomes, min(outcomes, key=_cost)
-
-
-def noise_weights(problem: Problem, point: Point) -> tuple[Array, ...]:
-    """Weight of every residual, from the model's effects on the noise.
-
-    The scale is the normalised median of absolute residuals, which outliers do not move.
-    """
-    residuals = problem.residuals(point)
-    scale = float(np.median(np.abs(np.concatenate([r.ravel() for r in residuals])))) / 0.6745
-    weights = [np.ones_like(r) for r in residuals]
-    for attached in problem.model.effects:
-        if attached.kind == "noise":
-            r = ca.SX.sym("r")
-            one = Replay(
-                ca.Function(
-                    "w", [ca.SX.sym("none", 0), r], [ca.SX(attached.apply(r, {}))], ["parameters", "sample"], ["w"]
-                )
-            )
-            for k, residual in enumerate(residuals):
-                flat = (residual / max(scale, 1e-300)).reshape(-1, 1)
-                weights[k] = weights[k] * one(np.zeros(0), flat)[0].reshape(residual.shape)
-    return tuple(weights)
 
 
 def _enough(problem: Problem) -> None:
@@ -216,6 +197,26 @@ def _solve(
     return (*outcomes,)
 
 
+def _along_the_weakest(problem: Problem, best: Outcome) -> tuple[Outcome, ...]:
+    """Two more starts far along the least determined direction: a second valley would lie there."""
+    if not np.isfinite(best.cost):
+        return ()
+    R = problem.factor(best.point)[0]
+    norms = np.linalg.norm(R, axis=0)
+    if not np.all(norms > 0):
+        return ()
+    _, singular, Vt = np.linalg.svd(R / norms)
+    if singular[-1] > 0.1 * singular[0] or singular[-1] < 1e-8 * singular[0]:
+        return ()
+    sigma = np.sqrt(2 * best.cost / max(problem.residual_count - problem.unknowns, 1))
+    step = 6 * sigma / singular[-1] * Vt[-1] / norms
+    found = []
+    for sign in (1, -1):
+        moved = problem.moved(best.point, sign * step)
+        found.append(trust_region(problem, Point(problem.inside(moved.x), moved.references)))
+    return tuple(found)
+
+
 def _singular(problem: Problem, first: Point) -> bool:
     """Is a direction undetermined at the start and at what damped steps reach from there?"""
     if identify(problem, first).rank == problem.unknowns:
@@ -244,8 +245,9 @@ def _estimate(
     identified = identify(problem, point, R)
     dof = problem.residual_count - identified.rank
     noise = _noise(problem, point, float(np.sqrt(2 * best.cost)), dof)
-    covariance = noise.sigma**2 * inverse_normal(R)
-    robust = sandwich(problem, point, R)
+    correlated = correlation_time(problem, point)
+    robust = sandwich(problem, point, R, correlated)
+    covariance = _covariance(problem, point, R, noise.sigma, correlated, robust)
     certificate = certify(problem, best, outcomes, identified, (R, factor[1], rest), noise.sigma)
     unknown = identified.touched
     covariance[unknown, :] = covariance[:, unknown] = np.nan
@@ -264,7 +266,30 @@ def _estimate(
         weak_directions(problem, R, noise.sigma, identified.rank),
         tuple(outcomes),
         time.perf_counter() - began,
+        correlated,
+        tuple(_correlation_note(problem, correlated)),
     )
+
+
+def _covariance(
+    problem: Problem, point: Point, R: Array, sigma: float, correlated: float, robust: Array
+) -> Array:
+    """The covariance that is printed: plain, unless the noise is known to be otherwise."""
+    if has_noise_effects(problem.model):
+        plain = problem.with_weights(None)
+        return np.asarray(variance_factor(problem, point) * inverse_normal(plain.factor(point)[0]))
+    if correlated > 1:
+        return robust.copy()
+    return np.asarray(sigma**2 * inverse_normal(R))
+
+
+def _correlation_note(problem: Problem, correlated: float) -> Iterator[str]:
+    if correlated > 1:
+        count = sum(len(run) for run in problem.runs)
+        yield (
+            f"residuals are correlated over {correlated:.3g} samples: the {count} samples count as "
+            f"{count / correlated:.0f}, and standard deviations are from batches of samples (sandwich)"
+        )
 
 
 def _noise(problem: Problem, point: Point, length: float, dof: int) -> Noise:

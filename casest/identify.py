@@ -37,7 +37,8 @@ class Identifiability:
     """Rank of the Jacobian among the unknowns, and what it lacks.
 
     `null` (n, k) is an orthonormal basis of the null space in the unknowns (unscaled); `touched`
-    marks the unknowns that it moves.
+    marks the unknowns that it moves; `weakest` describes the direction of the smallest singular
+    value.
     """
 
     rank: int
@@ -46,6 +47,7 @@ class Identifiability:
     null: Array
     unobservable: tuple[str, ...]
     touched: Array
+    weakest: str
 
 
 def identify(problem: Problem, point: Point, R: Array | None = None) -> Identifiability:
@@ -62,9 +64,9 @@ def identify(problem: Problem, point: Point, R: Array | None = None) -> Identifi
     unscaled = null / scale[:, None]
     norms = np.linalg.norm(unscaled, axis=0)
     touched = np.linalg.norm(null, axis=1) > 1e-6
-    return Identifiability(
-        rank, problem.unknowns, singular, unscaled / np.where(norms > 0, norms, 1), words, touched
-    )
+    basis = unscaled / np.where(norms > 0, norms, 1)
+    weakest = _combination(problem, Vt[-1], scale)
+    return Identifiability(rank, problem.unknowns, singular, basis, words, touched, weakest)
 
 
 def _null_words(problem: Problem, point: Point, null: Array, scale: Array) -> Iterator[str]:

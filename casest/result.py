@@ -50,6 +50,7 @@ def calibration_result(
             "from_residual": _plain(estimate.noise.residual),
             "from_repeats": _plain(estimate.noise.repeats),
             "degrees_of_freedom": estimate.noise.degrees_of_freedom,
+            "correlated_over_samples": _plain(estimate.correlated_over),
         },
         "estimate": {
             "rmse_fit": _plain(estimate.rmse),
@@ -89,7 +90,8 @@ def calibration_result(
 
 
 def _parameters(estimate: Estimate, table: Mapping[str, str]) -> dict[str, Any]:
-    half = half_width(estimate.noise.degrees_of_freedom)
+    dof = estimate.noise.degrees_of_freedom / estimate.correlated_over
+    half = half_width(int(dof))
     known = {n: u for n, u in table.items() if "[" not in n}
     found = {}
     for p in estimate.model.parameters:

@@ -369,8 +369,11 @@ class Problem:
             parts.append(part)
         return np.vstack(parts)
 
-    def squares_of_gradients(self, point: Point) -> Array:
-        """Σ (Σ_axis w r ∂r)(…)ᵀ over samples: the middle of the sandwich covariance, (n, n)."""
+    def squares_of_gradients(self, point: Point, batches: Sequence[Array]) -> Array:
+        """Σ_batch (Σ w r ∂r)(Σ w r ∂r)ᵀ: the middle of the sandwich covariance, (n, n).
+
+        `batches` numbers the samples of each run; those of one batch may be correlated.
+        """
         middle = np.zeros((self.unknowns, self.unknowns))
         for r in range(len(self.runs)):
             x, weights = self._selections[r][0], self._weight(r)
@@ -378,7 +381,9 @@ class Problem:
             if weights is not None:
                 residual = residual * weights
             scores = np.einsum("nm,nmk->nk", residual, jacobian)
-            middle[np.ix_(x, x)] += scores.T @ scores
+            sums = np.zeros((int(batches[r].max(initial=-1)) + 1, scores.shape[1]))
+            np.add.at(sums, batches[r], scores)
+            middle[np.ix_(x, x)] += sums.T @ sums
         return middle
 
     def repeat_noise(self, point: Point) -> float | None:
@@ -402,9 +407,9 @@ class Problem:
             count += G.shape[0] * G.shape[1]
         return float(np.sqrt(squares / count))
 
-    def with_weights(self, weights: Sequence[Array]) -> Problem:
+    def with_weights(self, weights: Sequence[Array] | None) -> Problem:
         """The same problem with other weights on the squares."""
-        return replace(self, weights=tuple(weights))
+        return replace(self, weights=None if weights is None else tuple(weights))
 
 
 def _indices(slices: Any) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -91,13 +92,16 @@ def _floats(values: Any) -> NDArray[np.float64]:
 
 
 def _loaded(file: Path) -> Any:
+    with file.open("rb") as start:
+        if not start.read(6).startswith((b"\x93NUMPY", b"PK")):
+            raise DataError(f"{file}: cannot be read as NumPy: it does not begin like one")
     try:
         return np.load(file, allow_pickle=False)
     except ValueError as error:
         if "pickle" in str(error).lower():
             raise _pickled(file) from error
         raise DataError(f"{file}: cannot be read as NumPy ({error})") from error
-    except (OSError, EOFError) as error:
+    except (OSError, EOFError, zipfile.BadZipFile) as error:
         raise DataError(f"{file}: cannot be read as NumPy ({error})") from error
 
 

@@ -101,8 +101,12 @@ def _layout(lines: list[str]) -> Layout:
     best, best_score = Layout(",", False, 1), 0.0
     for delimiter in _DELIMITERS:
         decimal = delimiter != "," and not any("." in line for line in sample)
-        rows = [Layout(delimiter, decimal, 0).cells(line) for line in sample]
-        width, agree = Counter(len(row) for row in rows).most_common(1)[0]
+        cut = Layout(delimiter, decimal, 0).cells
+        rows = [cut(line) for line in sample]
+        widths = Counter(len(row) for row in rows)
+        overall = Counter(len(cut(line)) for line in lines[:_SAMPLE])  # decides between equals
+        width = max(widths, key=lambda w: (widths[w], overall[w]))
+        agree = widths[width]
         cells = [cell for row in rows for cell in row]
         right = sum(not cell or _is_number(cell) for cell in cells) / len(cells)
         score = right * agree / len(rows) * (1.0 if width > 1 else 0.5)
@@ -128,12 +132,14 @@ def _find_table(
     for at, row in enumerate(head[: first + 1]):
         if not _is_header(row, layout) or (at + 1 < len(head) and at + 1 < first):
             continue
+        _refuse_too_few_names(file, row, lines[first:], layout)
         if at > 0 and _is_units_row(row) and _is_header(head[at - 1], layout):
             return at + 1, _with_units(head[at - 1], row)
         return at + 1, row
     if first == len(head):
         raise DataError(f"{file}: no table of numbers found in its first {len(head)} lines")
-    _refuse_header_of_other_width(file, head, first, layout)
+    if first > 0 and layout.width > 2 and len(head[first - 1]) > layout.width:
+        _refuse_header(file, head[first - 1], layout)
     if head[first] == [str(i) for i in range(len(head[first]))] and len(head[first]) > 1:
         return first + 1, head[first]  # pandas writes positions as names
     return first, _commented_header(comments, layout)
@@ -178,13 +184,15 @@ def _with_units(names: list[str], row: list[str]) -> list[str]:
     return [f"{n} [{u}]" if u else n for n, u in zip(names, marks, strict=False)]
 
 
-def _refuse_header_of_other_width(
-    file: str, head: list[list[str]], first: int, layout: Layout
-) -> None:
-    if first == 0 or layout.width < 3:
-        return
-    row = head[first - 1]
-    if len(row) >= 3 and row[-1] and not any(_is_number(cell) for cell in row):
+def _refuse_too_few_names(file: str, row: list[str], below: list[str], layout: Layout) -> None:
+    """One name less than cells is right only where each line ends with a delimiter."""
+    ends = [layout.cells(line)[-1] for line in below[:_SAMPLE]]
+    if len(row) == layout.width - 1 and any(ends):
+        _refuse_header(file, row, layout)
+
+
+def _refuse_header(file: str, row: list[str], layout: Layout) -> None:
+    if row[-1] and not any(_is_number(cell) for cell in row):
         raise DataError(
             f"{file}: the header names {len(row)} columns and the rows have {layout.width} cells "
             f"({_NAMES[layout.delimiter]} between them); give every column one name"

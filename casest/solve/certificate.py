@@ -16,6 +16,7 @@ import numpy as np
 from casest.declaring.shapes import Array
 from casest.identify import Identifiability
 from casest.solve.outcome import Outcome
+from casest.solve.profile import profiled
 from casest.stack import Point, Problem
 
 #: Share of the residual that the Jacobian can still reach (Bates & Watts' relative offset).
@@ -24,8 +25,12 @@ SLOPE = 1e-5
 STEP = 1e-4
 #: Two solutions are the same when they differ by less than this many standard deviations.
 SAME = 1e-2
-#: Cost two standard deviations away from the optimum, over what the intervals assume.
+#: Rise of the cost two standard deviations from the optimum, over what the intervals assume. Below,
+#: they are too narrow and the estimate is refused; above, they are wider than need be.
 SHAPE = (0.5, 2.0)
+#: Singular values of the column-scaled Jacobian below this leave a direction undetermined for all
+#: practical purposes: its standard deviation is 10⁵ times that of each parameter alone.
+PRACTICALLY_NULL = 1e-5
 
 
 @dataclass(frozen=True)
@@ -62,11 +67,14 @@ def certify(
     missing = identified.unknowns - identified.rank
     if missing:
         against += [f"not determined: {words}" for words in identified.unobservable]
-    else:
-        against += [_bound_words(problem, name) for name in at_bound]
+    elif identified.singular_values[-1] < PRACTICALLY_NULL * identified.singular_values[0]:
+        against.append(
+            f"practically not determined: {identified.weakest}; the motion does not separate them"
+        )
+    against += [] if against else [_bound_words(problem, name) for name in at_bound]
     if not np.isfinite(best.cost):
         against.append("the residual is not finite at the best point found")
-    elif slope > SLOPE and step > STEP and not at_bound and not missing:
+    elif slope > SLOPE and step > STEP and not against:
         against.append(
             f"not a stationary point: the last step was still {step:.2g} standard deviations long"
         )
@@ -82,7 +90,7 @@ def certify(
         )
     if not against:
         shape, words = _shape(problem, best, R, sigma)
-        against += words
+        against += words or _ambiguous(problem, best, others, R, sigma)
     reasons = tuple(against) or _for(slope, step, curvature, agreeing, len(others), shape)
     return Certificate(
         not against, reasons, slope, step, curvature, len(others), agreeing, shape, at_bound
@@ -146,41 +154,65 @@ def _same(problem: Problem, best: Outcome, other: Outcome, R: Array, sigma: floa
 def _shape(
     problem: Problem, best: Outcome, R: Array, sigma: float
 ) -> tuple[tuple[float, float], list[str]]:
-    """Walk two standard deviations along every principal direction: is the cost what intervals say?
+    """Go two standard deviations along every principal direction: is the cost what intervals say?
 
-    The ratio of the true rise of the cost to the quadratic one is 1 for a linear problem. Outside
-    (0.5, 2), or outside the bounds, the printed intervals would be false.
+    The ratio of the cost's rise to the quadratic one is 1 for a linear problem. Where a straight
+    walk disagrees, the valley may only be curved: the others are then fitted again with this
+    direction held (profile; Bates & Watts 1988, ch. 6). Below SHAPE the intervals are false; above,
+    they are wider than need be.
     """
     sigma = max(sigma, _rounding(problem, best.point, R))
     norms = np.linalg.norm(R, axis=0)
     _, singular, Vt = np.linalg.svd(R / norms)
-    lower, upper = problem.bounds
-    low, high, worst, outside = 1.0, 1.0, "", ""
+    ratios, words = [1.0], []
     for k in range(len(norms)):
-        step = 2 * sigma / singular[k] * Vt[k] / norms
-        for s in (step, -step):
-            there = best.point.x + s
-            leaving = (there < lower) | (there > upper)
-            if leaving.any():
-                outside = problem.names[int(np.argmax(leaving))]
-                continue
-            ratio = (problem.cost(problem.moved(best.point, s)) - best.cost) / (2 * sigma**2)
-            ratio = ratio if np.isfinite(ratio) else np.inf
-            if ratio < low or ratio > high:
-                low, high = min(low, ratio), max(high, ratio)
-                worst = _largest(problem, s, norms)
-    words = []
-    if outside:
-        words.append(
-            f"too uncertain: two standard deviations reach beyond the bounds of `{outside}`; "
-            "the motion does not determine it"
-        )
-    if low < SHAPE[0] or high > SHAPE[1]:
-        words.append(
-            f"too uncertain for its intervals: two standard deviations away along {worst} the cost "
-            f"rises {low:.2g} to {high:.2g} times as much as they assume; more varied motion is needed"
-        )
-    return (float(low), float(high)), words
+        for sign in (1, -1):
+            step = sign * 2 * sigma / singular[k] * Vt[k] / norms
+            ratio = _rise(problem, best, best.point, step, sigma)
+            if not SHAPE[0] <= ratio <= SHAPE[1]:
+                there = profiled(problem, best.point, step, Vt[k] * norms * singular[k], sigma)
+                ratio = _rise(problem, best, there, np.zeros_like(step), sigma)
+                if not SHAPE[0] <= ratio < np.inf:
+                    words.append(_misshapen(problem, step, norms, ratio))
+            ratios.append(ratio)
+    return (float(min(ratios)), float(max(ratios))), words[:1]
+
+
+def _ambiguous(
+    problem: Problem, best: Outcome, others: Sequence[Outcome], R: Array, sigma: float
+) -> list[str]:
+    """Another solution that the data hardly distinguish from the best one, by a 95 % test."""
+    for other in others:
+        near = other.cost - best.cost < 1.92 * sigma**2
+        # Rough where the problem is curved, but a different valley is many deviations away.
+        away = float(np.linalg.norm(R @ (other.point.x - best.point.x))) / sigma
+        if near and away > 10:
+            i = int(np.argmax(np.abs(other.point.x - best.point.x) * np.linalg.norm(R, axis=0)))
+            return [
+                f"two solutions fit alike: `{problem.names[i]}` = {best.point.x[i]:.6g} and "
+                f"{other.point.x[i]:.6g}; give --start, or vary the motion"
+            ]
+    return []
+
+
+def _rise(problem: Problem, best: Outcome, point: Point, step: Array, sigma: float) -> float:
+    """Rise of the cost over the 2σ² of a quadratic; infinite outside the bounds."""
+    lower, upper = problem.bounds
+    x = point.x + step
+    if np.any((x < lower) | (x > upper)):
+        return float("inf")
+    ratio = (problem.cost(problem.moved(point, step)) - best.cost) / (2 * sigma**2)
+    return float(ratio) if np.isfinite(ratio) else float("inf")
+
+
+def _misshapen(problem: Problem, step: Array, norms: Array, ratio: float) -> str:
+    where = _largest(problem, step, norms)
+    if not np.isfinite(ratio):
+        return f"too uncertain: two standard deviations ({where}) reach beyond the bounds; vary the motion"
+    return (
+        f"too uncertain for its intervals: two standard deviations away ({where}) the cost rises "
+        f"{ratio:.2g} times as much as they assume; vary the motion"
+    )
 
 
 def _largest(problem: Problem, step: Array, norms: Array) -> str:
@@ -193,9 +225,15 @@ def _for(
 ) -> tuple[str, ...]:
     """The case for the estimate."""
     found = "the same optimum from another start or algorithm"
+    intervals = f"intervals describe the cost two standard deviations away within {shape[0]:.2f}-{shape[1]:.2f}"
+    if shape[1] > SHAPE[1]:
+        intervals = (
+            f"intervals are cautious: two standard deviations away the cost rises up to {shape[1]:.2g} "
+            "times as much as they assume"
+        )
     return (
         f"stationary: the step left is {step:.1g} standard deviations",
         f"a minimum: exact curvature at least {curvature:.3g} of the Gauss-Newton one",
         f"{found}: {agreeing} of {others}",
-        f"intervals describe the cost two standard deviations away within {shape[0]:.2f}-{shape[1]:.2f}",
+        intervals,
     )

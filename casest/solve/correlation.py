@@ -1,0 +1,64 @@
+"""Correlated residuals: how many independent ones they are worth."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from casest.data.run import Run
+from casest.declaring.shapes import Array
+from casest.stack import Point, Problem
+
+#: Fewer samples in a run say nothing about correlation.
+ENOUGH = 100
+
+
+def correlation_time(problem: Problem, point: Point) -> float:
+    """Samples per independent residual: 1 + 2·Σ autocorrelations, 1 where they are not significant.
+
+    Averages over poses and rest intervals are independent of each other and give 1. The sum stops
+    where pairs of neighbouring autocorrelations stop being positive (Geyer 1992).
+    """
+    times, weights = [], []
+    for run, residual in zip(problem.runs, problem.residuals(point), strict=True):
+        if not is_series(run):
+            continue
+        for k in range(residual.shape[1]):
+            times.append(_integrated(residual[:, k]))
+            weights.append(float(np.sum(residual[:, k] ** 2)))
+    total = sum(weights)
+    return float(np.dot(times, weights) / total) if times and total > 0 else 1.0
+
+
+def is_series(run: Run) -> bool:
+    """Are the samples consecutive readings (and not averages over poses)?"""
+    return len(run) >= ENOUGH and bool(np.all(run.count == 1))
+
+
+def _integrated(r: Array) -> float:
+    count = len(r)
+    r = r - r.mean()
+    size = 1 << (2 * count - 1).bit_length()
+    power = np.abs(np.fft.rfft(r, size)) ** 2
+    autocovariance = np.fft.irfft(power, size)[: count // 2]
+    if not autocovariance[0] > 0:
+        return 1.0
+    rho = autocovariance / autocovariance[0]
+    if abs(rho[1]) < 3.3 / np.sqrt(count):  # one white series in a thousand gets past
+        return 1.0
+    pairs = rho[: len(rho) // 2 * 2].reshape(-1, 2).sum(axis=1)
+    negative = np.flatnonzero(pairs <= 0)
+    pairs = pairs[: negative[0]] if negative.size else pairs
+    return float(max(2 * pairs.sum() - 1, 1.0))
+
+
+def batches(run: Run, length: int) -> Array:
+    """Batch number of every sample: consecutive ones share a batch, blocks never do."""
+    if not is_series(run) or length <= 1:
+        return np.arange(len(run))
+    number = np.zeros(len(run), dtype=int)
+    last = -1
+    for block in np.unique(run.block):
+        own = np.flatnonzero(run.block == block)
+        number[own] = last + 1 + np.arange(len(own)) // length
+        last = int(number[own[-1]])
+    return number

@@ -1,0 +1,724 @@
+"""Columns matched to signals: names, units, time, groups, rotations, raw counts, and refusals."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from casest.data import Run, load_runs
+from casest.declaring.symbols import Signal
+from casest.errors import CasestError, DataError, UnitError, UsageError
+
+V = Signal("v", 3, "m/s^2")
+ANY = Signal("v", 3, None)
+T = Signal("t", 1, "s")
+TEMPERATURE = Signal("temperature", 1, "degC")
+ATTITUDE = Signal("attitude", 9, None, kind="rotation")
+
+THREE = "1,2,3\n1.5,2.5,3.5\n2,3,5\n"
+
+
+def runs_of(
+    folder: Path, text: str, signals: Sequence[Signal] = (V,), **options: Any
+) -> tuple[Run, ...]:
+    file = folder / "imu.csv"
+    file.write_text(text)
+    return load_runs([file], signals, **options)
+
+
+def run_of(folder: Path, text: str, signals: Sequence[Signal] = (V,), **options: Any) -> Run:
+    (run,) = runs_of(folder, text, signals, **options)
+    return run
+
+
+def refusal(
+    kind: type[CasestError],
+    folder: Path,
+    text: str,
+    signals: Sequence[Signal] = (V,),
+    **options: Any,
+) -> str:
+    with pytest.raises(kind) as caught:
+        runs_of(folder, text, signals, **options)
+    message = str(caught.value)
+    assert "\n" not in message
+    return message
+
+
+# --- finding columns ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        "vx,vy,vz",
+        "v_x,v_y,v_z",
+        "V_X,V_Y,V_Z",
+        "v[0],v[1],v[2]",
+        "v0,v1,v2",
+        "v1,v2,v3",
+        "v.x,v.y,v.z",
+        "v[x],v[y],v[z]",
+        "vx [m/s^2],vy [m/s^2],vz [m/s^2]",
+        "vz,vy,vx",
+    ],
+)
+def test_a_vector_is_found_by_the_names_people_give_it(tmp_path: Path, header: str) -> None:
+    expected = np.array([[1, 2, 3], [1.5, 2.5, 3.5], [2, 3, 5]])
+    if header == "vz,vy,vx":
+        expected = expected[:, ::-1]
+    run = run_of(tmp_path, f"{header}\n{THREE}")
+    np.testing.assert_array_equal(run.signals["v"], expected)
+    assert run.signals["v"].dtype == np.float64
+
+
+@pytest.mark.parametrize("choice", [("az", "ay", "AX"), "az,ay,ax", ("2", "1", "0"), "2,1,0"])
+def test_columns_are_chosen_by_name_or_position(tmp_path: Path, choice: Any) -> None:
+    run = run_of(tmp_path, f"ax,ay,az\n{THREE}", columns={"v": choice})
+    np.testing.assert_array_equal(run.signals["v"][0], [3, 2, 1])
+
+
+def test_a_file_without_header_is_read_by_position(tmp_path: Path) -> None:
+    run = run_of(tmp_path, THREE, columns={"v": "0,1,2"})
+    assert run.signals["v"].shape == (3, 3)
+
+
+@pytest.mark.parametrize(
+    ("text", "options", "words"),
+    [
+        (
+            f"ax,ay,az\n{THREE}",
+            {},
+            "no columns vx vy vz for signal v; the file has ax, ay, az; try --columns v=ax,ay,az",
+        ),
+        (THREE, {}, "try --columns v=0,1,2"),
+        (
+            f"gx,gy,gz,accx,accy,accz\n{THREE.replace(chr(10), ',1,2,3' + chr(10))}",
+            {"columns": {"v": "accx,accy,acz"}},
+            "no column acz for signal v; did you mean accz?",
+        ),
+        (THREE, {"columns": {"v": "0,1,7"}}, "asks for column 7, and the columns are 0 to 2"),
+        (THREE, {"columns": {"v": "0,1"}}, "signal v needs 3 columns and --columns v=0,1 gives 2"),
+        (THREE, {"columns": {"v": "0,1,1"}}, "names 1 twice"),
+    ],
+)
+def test_a_missing_column_is_answered_with_what_to_type(
+    tmp_path: Path, text: str, options: dict[str, Any], words: str
+) -> None:
+    assert words in refusal(DataError, tmp_path, text, **options)
+
+
+def test_a_near_scalar_column_is_suggested(tmp_path: Path) -> None:
+    text = "temp,b\n20,1\n21,2\n"
+    message = refusal(DataError, tmp_path, text, [TEMPERATURE])
+    assert "try --columns temperature=temp" in message
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"units": {"w": "g"}}, "--unit w=…: no signal or column w"),
+        ({"scales": {"vxx": "/2"}}, "--scale vxx=…: no signal or column vxx; did you mean vx?"),
+        ({"columns": {"vv": "0,1,2"}}, "--columns vv=…: no signal or column vv; did you mean v?"),
+        ({"rate": 0.0}, "rate 0.0 Hz makes no sense"),
+        ({"rate": float("nan")}, "makes no sense"),
+        ({"scales": {"v": "int16^2"}}, "scale 'int16^2' is not understood at '^2'"),
+        ({"scales": {"v": "int12/2"}}, "scale 'int12/2' is not understood"),
+        ({"scales": {"v": "/0"}}, "is not understood at '/0'"),
+        ({"scales": {"v": ""}}, "is not understood"),
+    ],
+)
+def test_options_that_fit_nothing_are_refused(
+    tmp_path: Path, options: dict[str, Any], words: str
+) -> None:
+    assert words in refusal(UsageError, tmp_path, f"vx,vy,vz\n{THREE}", **options)
+
+
+def test_no_file_at_all_is_refused() -> None:
+    with pytest.raises(UsageError, match="no data file given"):
+        load_runs([], [V])
+
+
+# --- bad cells ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("cell", "words"), [("nan", "'nan'"), ("inf", "'inf'"), ("oops", "'oops'"), ("", "is empty")]
+)
+def test_a_bad_cell_in_a_used_column_is_named(tmp_path: Path, cell: str, words: str) -> None:
+    text = f"vx,vy,vz\n1,2,3\n4,{cell},6\n7,8,9\n"
+    message = refusal(DataError, tmp_path, text)
+    assert "imu.csv: column vy row 1" in message
+    assert words in message
+    assert "repair or delete that row" in message
+
+
+def test_a_bad_cell_elsewhere_costs_only_its_column_and_is_noted(tmp_path: Path) -> None:
+    run = run_of(tmp_path, "vx,vy,vz,temp,n\n1,2,3,20,1\n4,5,6,,2\n7,8,9,21,3\n")
+    assert list(run.columns) == ["n"]
+    assert "column temp left out: row 1 is empty" in run.notes
+
+
+def test_extra_columns_must_be_there_and_whole(tmp_path: Path) -> None:
+    text = "vx,vy,vz,temp\n1,2,3,20\n4,5,6,\n7,8,9,21\n"
+    assert "column temp row 1 is empty" in refusal(DataError, tmp_path, text, extra=["temp"])
+    assert "did you mean temp?" in refusal(DataError, tmp_path, text, extra=["tmep"])
+
+
+def test_labels_where_numbers_are_needed_are_refused(tmp_path: Path) -> None:
+    text = "part,vx,vy\na,1,2\nb,2,3\n"
+    message = refusal(DataError, tmp_path, text, columns={"v": "part,vx,vy"})
+    assert "column part row 0 holds 'a', and signal v needs numbers" in message
+
+
+@pytest.mark.parametrize("signal", [V, ANY])
+def test_a_signal_that_never_changes_is_refused(tmp_path: Path, signal: Signal) -> None:
+    message = refusal(DataError, tmp_path, "vx,vy,vz\n1,2,3\n1,2,3\n1,2,3\n", [signal])
+    assert "signal v (columns vx vy vz) is 1, 2, 3 in all 3 rows; a dead channel" in message
+
+
+def test_one_dead_axis_is_noted(tmp_path: Path) -> None:
+    run = run_of(tmp_path, "vx,vy,vz\n1,2,3\n1,3,3.5\n1,4,2\n")
+    assert "vx: 1 in all 3 rows; a dead channel?" in run.notes
+
+
+def test_a_rotation_may_be_constant(tmp_path: Path) -> None:
+    run = run_of(tmp_path, "roll [rad],pitch [rad],yaw [rad]\n0,0,0\n0,0,0\n", [ATTITUDE])
+    np.testing.assert_array_equal(run.signals["attitude"], np.tile(np.eye(3).ravel(), (2, 1)))
+
+
+# --- units -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("header", "options"),
+    [
+        ("vx [g],vy [g],vz [g]", {}),
+        ("vx (g),vy (g),vz (g)", {}),
+        ("vx g,vy g,vz g", {}),
+        ("vx,vy,vz", {"units": {"v": "g"}}),
+        ("vx,vy,vz", {"units": {"vx": "g", "vy": "g", "vz": "g"}}),
+        ("vx [m/s^2],vy [m/s^2],vz [m/s^2]", {"units": {"v": "g"}}),
+        ("vx [huh],vy [huh],vz [huh]", {"units": {"v": "g"}}),
+    ],
+)
+def test_units_of_header_or_user_are_converted_to_the_declared(
+    tmp_path: Path, header: str, options: dict[str, Any]
+) -> None:
+    run = run_of(tmp_path, f"{header}\n{THREE}", **options)
+    np.testing.assert_allclose(run.signals["v"][0], np.array([1, 2, 3]) * 9.80665)
+    assert run.units["v"] == "m/s^2"
+
+
+def test_a_temperature_converts_with_its_offset(tmp_path: Path) -> None:
+    run = run_of(tmp_path, "temperature [degF],b\n32,1\n212,2\n", [TEMPERATURE])
+    np.testing.assert_allclose(run.signals["temperature"][:, 0], [0, 100], atol=1e-9)
+
+
+def test_a_signal_of_any_unit_keeps_that_of_the_data(tmp_path: Path) -> None:
+    run = run_of(tmp_path, f"vx [LSB],vy [LSB],vz [LSB]\n{THREE}", [ANY])
+    assert run.units["v"] == "count"
+    silent = run_of(tmp_path, f"vx,vy,vz\n{THREE}", [ANY])
+    assert silent.units["v"] is None
+
+
+def test_mixed_units_in_a_vector_are_converted_to_the_first(tmp_path: Path) -> None:
+    run = run_of(tmp_path, f"vx [g],vy [mg],vz [m/s^2]\n{THREE}", [ANY])
+    np.testing.assert_allclose(run.signals["v"][0], [1, 2e-3, 3 / 9.80665])
+    assert run.units["v"] == "g"
+
+
+def test_a_silent_file_is_taken_at_the_declared_unit_and_says_so(tmp_path: Path) -> None:
+    run = run_of(tmp_path, f"vx,vy,vz\n{THREE}")
+    (note,) = run.notes
+    assert note.startswith("v: no unit stated for vx vy vz, taken as m/s^2 (median length 4.55")
+    assert "--unit v=…" in note
+
+
+@pytest.mark.parametrize(
+    ("header", "words"),
+    [
+        ("vx [rad/s],vy [rad/s],vz [rad/s]", "column vx is in rad/s and signal v wants m/s^2"),
+        ("vx [m/s^2],vy [LSB],vz [m/s^2]", "column vy is in count and signal v wants m/s^2"),
+        ("vx [m/s^2],vy [m/s^3^],vz", "column vy: unknown unit 'm/s^3^': did you mean"),
+    ],
+)
+def test_a_unit_that_does_not_fit_is_refused_by_column(
+    tmp_path: Path, header: str, words: str
+) -> None:
+    message = refusal(UnitError, tmp_path, f"{header}\n{THREE}")
+    assert "imu.csv" in message
+    assert words in message
+    assert "--unit v=" in message
+
+
+def test_axes_of_different_kind_are_refused(tmp_path: Path) -> None:
+    message = refusal(UnitError, tmp_path, f"vx [g],vy [T],vz [g]\n{THREE}", [ANY])
+    assert "column vy is in T and its axes mix" in message
+
+
+def test_an_unknown_unit_from_the_user_names_the_option(tmp_path: Path) -> None:
+    message = refusal(UnitError, tmp_path, f"vx,vy,vz\n{THREE}", units={"v": "gg"})
+    assert "--unit v=gg: unknown unit 'gg'" in message
+
+
+@given(st.floats(1e-3, 1e3))
+@settings(max_examples=20, deadline=None)
+def test_the_unit_of_the_file_does_not_change_the_signal(
+    tmp_path_factory: pytest.TempPathFactory, size: float
+) -> None:
+    folder = tmp_path_factory.mktemp("units")
+    values = size * np.random.default_rng(0).normal(size=(5, 3))
+
+    def written(unit: str, factor: float) -> Run:
+        body = "\n".join(",".join(repr(float(x)) for x in row / factor) for row in values)
+        return run_of(folder, f"vx [{unit}],vy [{unit}],vz [{unit}]\n{body}")
+
+    np.testing.assert_allclose(
+        written("g", 9.80665).signals["v"], written("m/s²", 1.0).signals["v"], rtol=1e-14
+    )
+
+
+# --- raw counts --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("scale", "stored", "expected"),
+    [
+        ("int16/256+25", 65236, -300 / 256 + 25),
+        ("int16/256+25", 256, 26.0),
+        ("int16", -300, -300),
+        ("int8*2", 255, -2),
+        ("uint16", -1, 65535),
+        ("int32/2", 4294967295, -0.5),
+        ("/131", 262, 2.0),
+        ("*0.01-5", 500, 0.0),
+        ("+1e1", 1, 11.0),
+        ("int16 / 340 + 36.53", 0, 36.53),
+    ],
+)
+def test_raw_counts_become_values_step_by_step(
+    tmp_path: Path, scale: str, stored: int, expected: float
+) -> None:
+    text = f"temp,n\n{stored},1\n7,2\n"
+    for name in ("temp", "temperature"):  # by column, by signal
+        run = run_of(
+            tmp_path,
+            text,
+            [TEMPERATURE],
+            columns={"temperature": "temp"},
+            scales={name: scale},
+        )
+        assert run.signals["temperature"][0, 0] == pytest.approx(expected)
+
+
+def test_scaled_counts_are_counts_no_more(tmp_path: Path) -> None:
+    text = "vx [LSB],vy [LSB],vz [LSB]\n2,4,6\n4,6,65534\n"
+    told = run_of(tmp_path, text, scales={"v": "int16/2"}, units={"v": "g"})
+    np.testing.assert_allclose(told.signals["v"], np.array([[1, 2, 3], [2, 3, -1]]) * 9.80665)
+    assumed = run_of(tmp_path, text, scales={"v": "int16/2"})
+    np.testing.assert_allclose(assumed.signals["v"], [[1, 2, 3], [2, 3, -1]])
+
+
+@pytest.mark.parametrize("cell", ["1.5", "70000", "-40000"])
+def test_a_value_that_is_no_such_count_is_named(tmp_path: Path, cell: str) -> None:
+    text = f"temp,n\n20,1\n{cell},2\n"
+    message = refusal(
+        DataError,
+        tmp_path,
+        text,
+        [TEMPERATURE],
+        columns={"temperature": "temp"},
+        scales={"temp": "int16/256"},
+    )
+    assert f"column temp row 1 holds {float(cell):g}, which is no int16" in message
+
+
+def test_columns_that_no_signal_takes_are_scaled_too(tmp_path: Path) -> None:
+    text = "vx,vy,vz,temp [raw]\n1,2,3,65236\n4,5,6,65233\n"
+    run = run_of(tmp_path, text, scales={"temp": "int16/256+25"}, units={"temp": "°C"})
+    assert run.columns["temp"][0] == pytest.approx(23.828125)
+    assert run.column_units["temp"] == "degC"
+
+
+# --- time --------------------------------------------------------------------------------------
+
+
+def timed(steps: Sequence[float], header: str = "t", start: float = 0.0) -> str:
+    time = start + np.cumsum([0.0, *steps])
+    rows = (f"{t!r},{i},{i * i},{-i}" for i, t in enumerate(time.tolist()))
+    return f"{header},vx,vy,vz\n" + "\n".join(rows)
+
+
+@pytest.mark.parametrize(
+    ("header", "size"),
+    [
+        ("t [s]", 1.0),
+        ("time (ms)", 1e-3),
+        ("Timestamp [us]", 1e-6),
+        ("time_ms", 1e-3),
+        ("t_us", 1e-6),
+        ("TIME", 1.0),
+    ],
+)
+def test_time_is_found_and_converted_and_starts_at_zero(
+    tmp_path: Path, header: str, size: float
+) -> None:
+    run = run_of(tmp_path, timed([10, 10, 10], header, start=1000.0), [T, V])
+    np.testing.assert_allclose(run.signals["t"][:, 0], np.arange(4) * 10 * size)
+    assert run.time is not None
+    np.testing.assert_array_equal(run.time, run.signals["t"][:, 0])
+    assert any("that sample is t = 0" in note for note in run.notes)
+    assert not {"t", "time"} & {name.lower() for name in run.columns}
+
+
+def test_the_columns_own_zero_is_kept_when_told(tmp_path: Path) -> None:
+    run = run_of(tmp_path, timed([1, 1], start=5.0), [T, V], time_zero="column")
+    np.testing.assert_array_equal(run.signals["t"][:, 0], [5, 6, 7])
+
+
+def test_the_unit_of_time_may_be_stated(tmp_path: Path) -> None:
+    run = run_of(tmp_path, timed([20, 20]), [T, V], units={"t": "ms"})
+    np.testing.assert_allclose(run.signals["t"][:, 0], [0, 0.02, 0.04])
+
+
+def test_time_without_a_unit_is_taken_as_seconds_and_says_so(tmp_path: Path) -> None:
+    run = run_of(tmp_path, timed([20, 20]), [T, V])
+    assert "t: no unit stated, taken as s (median step 20 s)" in run.notes
+
+
+@pytest.mark.parametrize(
+    "texts",
+    [
+        ("2020-03-07 15:45:00.000", "2020-03-07 15:45:00.250", "2020-03-07 15:45:01"),
+        ("15:45:00.000", "15:45:00.250", "15:45:01.000"),
+        ("2020-03-07T15:45:00Z", "2020-03-07T15:45:00.25Z", "2020-03-07T15:45:01Z"),
+    ],
+)
+def test_dates_and_clock_times_are_times(tmp_path: Path, texts: Sequence[str]) -> None:
+    rows = "\n".join(f"{text},{i},{i},{2 * i}" for i, text in enumerate(texts))
+    run = run_of(tmp_path, f"time,vx,vy,vz\n{rows}\n", [T, V])
+    np.testing.assert_allclose(run.signals["t"][:, 0], [0, 0.25, 1.0])
+
+
+def test_a_rate_makes_time_without_a_column(tmp_path: Path) -> None:
+    run = run_of(tmp_path, f"vx,vy,vz\n{THREE}", [T, V], rate=50)
+    np.testing.assert_allclose(run.signals["t"][:, 0], [0, 0.02, 0.04])
+
+
+def test_a_rate_above_the_table_is_used_and_reported(tmp_path: Path) -> None:
+    text = f"Fs,100\nvx,vy,vz\n{THREE}"
+    run = run_of(tmp_path, text, [T, V])
+    np.testing.assert_allclose(run.signals["t"][:, 0], [0, 0.01, 0.02])
+    assert "time from the entry 'Fs,100': 100 Hz" in run.notes
+    told = run_of(tmp_path, text, [T, V], rate=10)
+    np.testing.assert_allclose(told.signals["t"][:, 0], [0, 0.1, 0.2])
+
+
+def test_a_stated_rate_wins_over_a_column_and_says_so(tmp_path: Path) -> None:
+    run = run_of(tmp_path, timed([1, 0, 1]), [T, V], rate=10)
+    np.testing.assert_allclose(run.signals["t"][:, 0], [0, 0.1, 0.2, 0.3])
+    assert "time column t not used: rate 10 Hz is given" in run.notes
+
+
+def test_time_is_kept_for_models_that_do_not_ask_for_it(tmp_path: Path) -> None:
+    run = run_of(tmp_path, timed([0.1, 0.1]), [V])
+    assert run.time is not None
+    assert list(run.signals) == ["v"]
+    assert run_of(tmp_path, f"vx,vy,vz\n{THREE}").time is None
+
+
+@pytest.mark.parametrize(
+    ("steps", "words"),
+    [
+        ([1, -2, 1], "column t row 2: time -1 s goes backward from 1 s in row 1 (1 such rows)"),
+        ([1, 0, 0], "column t row 2: time 1 s repeats 1 s in row 1 (2 such rows)"),
+    ],
+)
+def test_time_must_increase(tmp_path: Path, steps: Sequence[float], words: str) -> None:
+    message = refusal(DataError, tmp_path, timed(steps), [T, V])
+    assert words in message
+    assert "--rate HZ" in message
+
+
+def test_a_bad_time_that_no_signal_needs_is_only_noted(tmp_path: Path) -> None:
+    run = run_of(tmp_path, timed([1, -2, 1]), [V])
+    assert run.time is None
+    assert any(note.startswith("time not used:") for note in run.notes)
+
+
+@pytest.mark.parametrize(
+    ("text", "kind", "words"),
+    [
+        (f"vx,vy,vz\n{THREE}", DataError, "no time column (t, time, timestamp) for signal t"),
+        ("t [m],vx,vy,vz\n0,1,2,3\n1,2,3,4\n", UnitError, "column t as time: m does not convert"),
+        ("t,vx,vy,vz\na,1,2,3\nb,2,3,4\n", DataError, "column t row 0 holds 'a', which is no time"),
+        ("t,vx,vy,vz\n0,1,2,3\n,2,3,4\n2,4,5,6\n", DataError, "column t row 1 is empty"),
+    ],
+)
+def test_a_time_that_is_none_is_refused(
+    tmp_path: Path, text: str, kind: type[CasestError], words: str
+) -> None:
+    assert words in refusal(kind, tmp_path, text, [T, V])
+
+
+def test_a_gap_in_time_starts_a_block(tmp_path: Path) -> None:
+    run = run_of(tmp_path, timed([1, 1, 6, 1, 1, 4, 1, 40, 1]), [T, V])
+    assert run.block.tolist() == [0, 0, 0, 1, 1, 1, 1, 1, 2, 2]
+
+
+# --- groups ------------------------------------------------------------------------------------
+
+
+def test_a_run_column_splits_the_file_into_runs(tmp_path: Path) -> None:
+    text = "run,t,vx,vy,vz\n1,5,1,2,3\n1,6,2,3,4\n2,0.5,3,4,5\n2,1.5,5,6,7\n2,2.5,5,6,8\n"
+    first, second = runs_of(tmp_path, text, [T, V])
+    assert (first.name, second.name) == ("imu:1", "imu:2")
+    assert (len(first), len(second)) == (2, 3)
+    np.testing.assert_array_equal(second.rows, [2, 3, 4])
+    np.testing.assert_array_equal(second.signals["t"][:, 0], [0, 1, 2])
+
+
+def test_a_pose_column_makes_blocks_and_a_return_makes_another(tmp_path: Path) -> None:
+    text = "pose,vx,vy,vz\na,1,2,3\na,2,3,4\nb,3,4,5\na,4,5,6\na,5,6,8\n"
+    run = run_of(tmp_path, text)
+    assert run.block.tolist() == [0, 0, 1, 2, 2]
+    assert "pose" not in run.columns
+
+
+def test_groups_may_be_called_otherwise(tmp_path: Path) -> None:
+    text = "part,vx,vy,vz\na,1,2,3\na,2,3,4\nb,3,4,5\nb,5,6,7\n"
+    assert run_of(tmp_path, text, columns={"pose": "part"}).block.tolist() == [0, 0, 1, 1]
+    assert len(runs_of(tmp_path, text, columns={"run": "part"})) == 2
+
+
+def test_a_row_without_its_group_is_refused(tmp_path: Path) -> None:
+    text = "run,vx,vy,vz\n1,1,2,3\n,2,3,4\n2,3,4,5\n"
+    assert "column run row 1 is empty" in refusal(DataError, tmp_path, text)
+
+
+def test_files_of_one_name_are_told_apart(tmp_path: Path) -> None:
+    files = []
+    for folder in ("a", "b"):
+        (tmp_path / folder).mkdir()
+        files.append(tmp_path / folder / "imu.csv")
+        files[-1].write_text(f"vx,vy,vz\n{THREE}")
+    assert [run.name for run in load_runs(files, [V])] == ["imu#1", "imu#2"]
+
+
+def test_every_other_column_is_kept_with_its_unit(tmp_path: Path) -> None:
+    text = "part,vx,vy,vz,temp [°C],volt\na,1,2,3,20,5\nb,2,3,4,21,5\n"
+    run = run_of(tmp_path, text)
+    assert list(run.columns) == ["part", "temp", "volt"]
+    assert run.column_units == {"part": None, "temp": "degC", "volt": None}
+    assert run.columns["part"].tolist() == ["a", "b"]
+
+
+def test_a_raw_run_counts_one_sample_each_and_has_no_spread(tmp_path: Path) -> None:
+    run = run_of(tmp_path, f"vx,vy,vz\n{THREE}")
+    assert run.count.tolist() == [1, 1, 1]
+    assert run.spread == {}
+    assert run.rows.tolist() == [0, 1, 2]
+
+
+def test_taking_samples_keeps_all_parts_together(tmp_path: Path) -> None:
+    run = run_of(tmp_path, timed([1, 1, 20, 1]) + "\n", [T, V])
+    for part in (run.take(np.array([1, 3])), run.take(np.array([0, 1, 0, 1, 0], dtype=bool))):
+        assert part.rows.tolist() == [1, 3]
+        assert part.signals["v"][:, 0].tolist() == [1, 3]
+        assert part.block.tolist() == [0, 1]
+        assert len(part) == 2
+
+
+def test_a_run_of_unequal_parts_is_refused() -> None:
+    with pytest.raises(DataError, match="x: w has 3 samples, the run has 4"):
+        Run.raw("x", {"v": np.zeros((4, 3)), "w": np.zeros((3, 3))}, units={})
+    with pytest.raises(DataError, match=r"signal v has shape \(4,\), not \(N, k\)"):
+        Run.raw("x", {"v": np.zeros(4)}, units={})
+
+
+# --- rotations ---------------------------------------------------------------------------------
+
+ANGLES = np.array([[10.0, -20.0, 30.0], [-170.0, 80.0, 5.0], [0.0, 45.0, -90.0]])
+
+
+def matrices(angles: np.ndarray) -> np.ndarray:
+    """Intrinsic z-y-x from SciPy, which wants yaw first."""
+    return Rotation.from_euler("ZYX", angles[:, ::-1], degrees=True).as_matrix().reshape(-1, 9)
+
+
+def rotation_text(header: str, rows: np.ndarray) -> str:
+    return header + "\n" + "\n".join(",".join(map(repr, row)) for row in rows.tolist())
+
+
+@pytest.mark.parametrize(
+    ("header", "factor", "options"),
+    [
+        ("roll [deg],pitch [deg],yaw [deg]", 1.0, {}),
+        ("Roll (°),Pitch (°),Yaw (°)", 1.0, {}),
+        ("roll,pitch,yaw", 1.0, {"units": {"attitude": "deg"}}),
+        ("roll [rad],pitch [rad],yaw [rad]", np.pi / 180, {}),
+        ("roll,pitch,yaw", np.pi / 180, {}),
+        ("attitude_roll [deg],attitude_pitch [deg],attitude_yaw [deg]", 1.0, {}),
+        ("a [deg],b [deg],c [deg]", 1.0, {"columns": {"attitude": "a,b,c"}}),
+    ],
+)
+def test_angles_become_body_to_reference_matrices(
+    tmp_path: Path, header: str, factor: float, options: dict[str, Any]
+) -> None:
+    run = run_of(tmp_path, rotation_text(header, ANGLES * factor), [ATTITUDE], **options)
+    np.testing.assert_allclose(run.signals["attitude"], matrices(ANGLES), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "header", ["qw,qx,qy,qz", "q_w,q_x,q_y,q_z", "quat_w,quat_x,quat_y,quat_z"]
+)
+def test_quaternions_become_matrices_and_are_normalised(tmp_path: Path, header: str) -> None:
+    rotations = Rotation.from_matrix(matrices(ANGLES).reshape(-1, 3, 3))
+    q = np.roll(rotations.as_quat(), 1, axis=1) * 1.004
+    run = run_of(tmp_path, rotation_text(header, q), [ATTITUDE])
+    np.testing.assert_allclose(run.signals["attitude"], matrices(ANGLES), atol=1e-12)
+
+
+def test_nine_columns_are_a_matrix_row_by_row(tmp_path: Path) -> None:
+    text = rotation_text(",".join(f"attitude{i}" for i in range(9)), matrices(ANGLES))
+    run = run_of(tmp_path, text, [ATTITUDE])
+    np.testing.assert_allclose(run.signals["attitude"], matrices(ANGLES))
+
+
+@pytest.mark.parametrize(
+    ("text", "options", "words"),
+    [
+        ("qw,qx,qy,qz\n1,0,0,0\n1,1,0,0\n", {}, "qw qx qy qz row 1: a norm of 1.414"),
+        ("roll,pitch,yaw\n0,0,0\n0,90,0\n", {}, "column pitch row 1 holds 90 without a unit"),
+        ("roll,pich,yaw\n0,0,0\n0,1,0\n", {}, "try --columns attitude=roll,pich,yaw"),
+        ("a,b\n0,0\n1,1\n", {}, "no columns roll pitch yaw or qw qx qy qz for signal attitude"),
+        ("a,b\n0,0\n1,1\n", {"columns": {"attitude": "a,b"}}, "needs 3 (roll, pitch, yaw), 4"),
+    ],
+)
+def test_what_is_no_rotation_is_refused(
+    tmp_path: Path, text: str, options: dict[str, Any], words: str
+) -> None:
+    assert words in refusal(DataError, tmp_path, text, [ATTITUDE], **options)
+
+
+def test_angles_in_a_unit_that_is_no_angle_are_refused(tmp_path: Path) -> None:
+    text = "roll [g],pitch [g],yaw [g]\n0,0,0\n0,1,0\n"
+    assert "column roll is in g" in refusal(UnitError, tmp_path, text, [ATTITUDE])
+
+
+# --- clipping ----------------------------------------------------------------------------------
+
+
+def circling(n: int = 4000, size: float = 25.0, noise: float = 0.05) -> np.ndarray:
+    """A sensor on a wheel: three axes, in motion all the time."""
+    rng = np.random.default_rng(3)
+    phase = np.linspace(0, 40 * np.pi, n)
+    clean = size * np.stack([np.cos(phase), np.sin(phase), 0.1 * np.cos(phase / 3)], axis=1)
+    return clean + noise * rng.normal(size=(n, 3))
+
+
+def clipping_notes(folder: Path, values: np.ndarray) -> list[str]:
+    np.savetxt(folder / "imu.csv", values, delimiter=",", header="vx,vy,vz", fmt="%.10g")
+    (run,) = load_runs([folder / "imu.csv"], [ANY])
+    return [note for note in run.notes if "clipped" in note]
+
+
+def test_readings_clipped_on_one_side_are_counted(tmp_path: Path) -> None:
+    values = circling()
+    values[:, 0] = np.minimum(values[:, 0], 19.6)
+    count = np.count_nonzero(values[:, 0] == 19.6)
+    assert clipping_notes(tmp_path, values) == [
+        f"vx: {count} readings at the largest value 19.6 — clipped at full scale?"
+    ]
+
+
+@pytest.mark.parametrize("resolution", [0.0, 0.01, 0.1])
+def test_symmetric_clipping_is_seen_on_both_sides(tmp_path: Path, resolution: float) -> None:
+    values = np.clip(circling(), -19.6, 19.6)
+    if resolution:
+        values = np.round(values / resolution) * resolution
+    found = clipping_notes(tmp_path, values)
+    assert [note[:2] for note in found] == ["vx", "vx", "vy", "vy"]
+
+
+@pytest.mark.parametrize("resolution", [0.0, 1e-3, 0.05, 0.5])
+@pytest.mark.parametrize("noise", [0.0, 0.02, 0.5])
+def test_a_sensor_within_its_range_is_not_called_clipped(
+    tmp_path: Path, resolution: float, noise: float
+) -> None:
+    values = circling(noise=noise)
+    if resolution:
+        values = np.round(values / resolution) * resolution
+    assert clipping_notes(tmp_path, values) == []
+
+
+@pytest.mark.parametrize("resolution", [0.02, 0.1, 0.5])
+@pytest.mark.parametrize("noise", [0.0, 0.01, 0.1])
+def test_coarse_readings_at_rest_are_not_called_clipped(
+    tmp_path: Path, resolution: float, noise: float
+) -> None:
+    rng = np.random.default_rng(5)
+    down = np.concatenate([np.eye(3), -np.eye(3)]) * 9.81
+    poses = np.repeat(down, 300, axis=0) + noise * rng.normal(size=(1800, 3))
+    assert clipping_notes(tmp_path, np.round(poses / resolution) * resolution) == []
+
+
+# --- measured files ----------------------------------------------------------------------------
+
+
+def test_the_cold_test_is_bursts_in_seconds_with_a_temperature(shared_data: Path) -> None:
+    (run,) = load_runs(
+        [shared_data / "psim-thermal" / "TVCtest3_7_20.csv"],
+        [T, Signal("omega", 3, "rad/s")],
+        columns={"omega": "gyrox,gyroy,gyroz"},
+        scales={"temp": "int16/256+25"},
+        units={"temp": "degC"},
+    )
+    assert run.block.max() + 1 == 25
+    temperature = np.asarray(run.columns["temp"], dtype=float)
+    assert temperature.max() == pytest.approx(23.9, abs=0.1)
+    assert temperature.min() == pytest.approx(15.6, abs=0.1)
+    assert run.column_units["mag1x"] == "T"
+    assert run.time is not None
+    assert run.time[-1] == pytest.approx(2 * 3600, rel=0.05)
+
+
+def test_measured_gyro_readings_are_no_accelerations(shared_data: Path) -> None:
+    with pytest.raises(UnitError, match="column gyrox is in rad/s and signal v wants m/s\\^2"):
+        load_runs(
+            [shared_data / "psim-thermal" / "TVCtest3_7_20.csv"],
+            [V],
+            columns={"v": "gyrox,gyroy,gyroz"},
+        )
+
+
+@pytest.mark.parametrize(
+    ("name", "columns"),
+    [
+        ("ckexplorer/acc_log.csv", "0,1,2"),
+        ("ckexplorer/acc_mag_log.csv", "0,1,2"),
+        ("ckexplorer/acc_mag_log.csv", "3,4,5"),
+        ("mpu9150-mikoff/imu0.log", "0,1,2"),
+        ("mpu9150-mikoff/imu1.log", "3,4,5"),
+        ("mpu6050-tomisuarez/example_data_calibration.csv", "0,1,2"),
+        ("mpu6050-tomisuarez/example_data_tinit_calc.csv", "3,4,5"),
+        ("mpu6050-tomisuarez/imu_static_test.csv", "3,4,5"),
+        ("qmc5883l-tomisuarez/noisy_raw_data.csv", "0,1,2"),
+        ("psim-thermal/TVCtest3_7_20.csv", "4,5,6"),
+        ("imucal/example_ferraris_session.csv", "acc_x,acc_y,acc_z"),
+        ("imucal/annotated_session.csv", "gyr_x,gyr_y,gyr_z"),
+    ],
+)
+def test_measured_records_within_their_range_raise_no_clipping_note(
+    shared_data: Path, name: str, columns: str
+) -> None:
+    (run,) = load_runs([shared_data / name], [ANY], columns={"v": columns})
+    assert not [note for note in run.notes if "clipped" in note]
