@@ -21,9 +21,7 @@ _HOME = {
     "casest.modelling.model": "Model model",
     "casest.data.run": "Run",
     "casest.data": "load_runs read_table",
-    "casest.errors": (
-        "CasestError DataError DeclarationError NotTrusted UnitError UsageError"
-    ),
+    "casest.errors": ("CasestError DataError DeclarationError NotTrusted UnitError UsageError"),
     "casest.estimate": "Estimate calibrate",
 }
 _WHERE = {name: module for module, names in _HOME.items() for name in names.split()}

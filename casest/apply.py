@@ -50,7 +50,9 @@ def _inverted(model: Model, name: str, run: Run, parameters: Array, samples: Arr
     sample = ca.vertcat(sample_symbol(model, cut), wanted)
     point = ca.vertcat(cut.coordinates, cut.references)
     step = -ca.solve(slope, rest)
-    f = Replay(ca.Function("inverse", [point, sample], [step, rest], ["parameters", "sample"], ["s", "r"]))
+    f = Replay(
+        ca.Function("inverse", [point, sample], [step, rest], ["parameters", "sample"], ["s", "r"])
+    )
     value = run.signals[str(model.traced.measured)].copy()
     for _ in range(1 if affine else 50):
         move, _ = (out[:, :, 0] for out in f(parameters, np.hstack([samples, value])))
@@ -62,9 +64,9 @@ def _inverted(model: Model, name: str, run: Run, parameters: Array, samples: Arr
     bad = ~np.all(np.isfinite(value) & (np.abs(left) <= scale), axis=1)
     if bad.any():
         row = int(np.argmax(bad))
-        reading = run.signals[str(model.traced.measured)][row]
+        reading = np.array2string(run.signals[str(model.traced.measured)][row], precision=6)
         raise DataError(
-            f"{run.file}: row {int(run.rows[row])}: reading {np.array2string(reading, precision=6)} "
+            f"{run.file}: row {int(run.rows[row])}: reading {reading} "
             f"has no {name} in the model ({int(bad.sum())} such rows): it lies outside the range "
             "that the model can produce"
         )

@@ -51,7 +51,9 @@ def corrected_csv(
     for k, run in enumerate(runs):
         per_run = {p.name for p in model.parameters if p.scope == "run"}
         if per_run & _reached(model):
-            raise UsageError(f"{sorted(per_run)[0]} differs from run to run: nothing to apply it to")
+            raise UsageError(
+                f"{sorted(per_run)[0]} differs from run to run: nothing to apply it to"
+            )
         value = corrected(model, run, {n: v for n, v in values.items() if n not in per_run})
         _write(writer, model, run, value, result, header=k == 0, several=len(runs) > 1)
     return text.getvalue()
@@ -65,7 +67,9 @@ def _reached(model: Model) -> set[str]:
 
     name = model.traced.corrected
     cut = trace(model, cut=name)
-    expression = model.traced.quantities[name].declared if model.implicit and name else cut.expression
+    expression = (
+        model.traced.quantities[name].declared if model.implicit and name else cut.expression
+    )
     symbols = model.traced.symbols if model.implicit else cut.symbols
     return {
         p.name
@@ -85,7 +89,13 @@ def _same_units(result: Mapping[str, Any], runs: tuple[Run, ...], data: str) -> 
 
 
 def _write(
-    writer: Any, model: Model, run: Run, value: Any, result: Mapping[str, Any], header: bool, several: bool
+    writer: Any,
+    model: Model,
+    run: Run,
+    value: Any,
+    result: Mapping[str, Any],
+    header: bool,
+    several: bool,
 ) -> None:
     name = str(model.traced.corrected)
     unit = result.get("units", {}).get(model.quantities[name].unit.strip("[]"), "")

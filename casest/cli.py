@@ -64,10 +64,14 @@ def commands() -> None:
 
 def reading_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Options that say how columns become signals."""
-    many = {"multiple": True, "metavar": "NAME=…"}
+    many: Options = {"multiple": True, "metavar": "NAME=…"}
     for option in (
-        click.option("--time-zero", type=click.Choice(["first", "column"]), default="first",
-                     help="t = 0 at each run's first sample, or where the column has it."),
+        click.option(
+            "--time-zero",
+            type=click.Choice(["first", "column"]),
+            default="first",
+            help="t = 0 at each run's first sample, or where the column has it.",
+        ),
         click.option("--at-rest", is_flag=True, help="Find and average the rest intervals."),
         click.option("--rate", type=float, help="Samples per second, where no column is the time."),
         click.option("--scale", "scales", help="Raw counts: temp=int16/256+25.", **many),
@@ -80,17 +84,31 @@ def reading_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 def model_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Options that change what is unknown."""
-    many = {"multiple": True}
+    many: Options = {"multiple": True}
     for option in (
-        click.option("--effects", "effects", metavar="FILE", help="Your own effects, added to the model.",
-                     **many),
+        click.option(
+            "--effects",
+            "effects",
+            metavar="FILE",
+            help="Your own effects, added to the model.",
+            **many,
+        ),
         click.option("--per-run", metavar="NAME", help="One value for each run.", **many),
         click.option("--shared", metavar="NAME", help="One value for all runs.", **many),
-        click.option("--fix", metavar="NAME=VALUE|@RESULT", **many,
-                     help="Hold a parameter: a number, 1,2,3, rows a,b;c,d, or @result.json."),
+        click.option(
+            "--fix",
+            metavar="NAME=VALUE|@RESULT",
+            **many,
+            help="Hold a parameter: a number, 1,2,3, rows a,b;c,d, or @result.json.",
+        ),
         click.option("--free", metavar="NAME", help="Make a constant an unknown.", **many),
-        click.option("--set", "constants", metavar="NAME=VALUE", **many,
-                     help="Set a constant: radius=0.28 or 'norm=9.80665 m/s^2'."),
+        click.option(
+            "--set",
+            "constants",
+            metavar="NAME=VALUE",
+            **many,
+            help="Set a constant: radius=0.28 or 'norm=9.80665 m/s^2'.",
+        ),
     ):
         command = option(command)
     return command
@@ -99,16 +117,37 @@ def model_options(command: Callable[..., Any]) -> Callable[..., Any]:
 def output_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Options for solving and for where results go."""
     for option in (
-        click.option("--json", "as_json", is_flag=True, help="Print result.json instead of a table."),
-        click.option("-o", "--output", type=click.Path(path_type=Path), metavar="DIR",
-                     help="Folder for result.json and residuals.csv."),
+        click.option(
+            "--json", "as_json", is_flag=True, help="Print result.json instead of a table."
+        ),
+        click.option(
+            "-o",
+            "--output",
+            type=click.Path(path_type=Path),
+            metavar="DIR",
+            help="Folder for result.json and residuals.csv.",
+        ),
         click.option("--seed", type=int, default=0, show_default=True, help="For random restarts."),
-        click.option("--start", "starts", multiple=True, metavar="NAME=VALUE",
-                     help="Start value in place of the automatic one."),
-        click.option("--solver", default="ipopt", show_default=True,
-                     help="ipopt, ipopt-exact, trust-region, or an estimator of the model's own."),
-        click.option("--holdout", multiple=True, type=click.Path(), metavar="FILE",
-                     help="Score the estimate on this record, which the fit does not see."),
+        click.option(
+            "--start",
+            "starts",
+            multiple=True,
+            metavar="NAME=VALUE",
+            help="Start value in place of the automatic one.",
+        ),
+        click.option(
+            "--solver",
+            default="ipopt",
+            show_default=True,
+            help="ipopt, ipopt-exact, trust-region, or an estimator of the model's own.",
+        ),
+        click.option(
+            "--holdout",
+            multiple=True,
+            type=click.Path(),
+            metavar="FILE",
+            help="Score the estimate on this record, which the fit does not see.",
+        ),
     ):
         command = option(command)
     return command
@@ -135,6 +174,11 @@ def calibrate(model_name: str, data: tuple[str, ...], **options: Any) -> int:
 
     Exit code 0: trusted; 1: bad input; 2: no trustworthy estimate (result.json says why).
     """
+    return calibration(model_name, data, options, "casest " + " ".join(sys.argv[1:]))
+
+
+def calibration(model_name: str, data: Sequence[str], options: Options, command: str) -> int:
+    """Read, fit, save, print; the exit code says whether the estimate is trusted."""
     from casest import estimate, result, terminal
 
     model = declared_model(model_name, options)
@@ -144,7 +188,6 @@ def calibrate(model_name: str, data: tuple[str, ...], **options: Any) -> int:
         model, runs, start=start, solver=options["solver"], seed=options["seed"]
     )
     holdout = held_out(found, model, options) if options["holdout"] else None
-    command = " ".join(["casest", *sys.argv[1:]])
     content = result.calibration_result(
         found, model_name=model_name, data=data, command=command, holdout=holdout
     )
@@ -161,11 +204,59 @@ def calibrate(model_name: str, data: tuple[str, ...], **options: Any) -> int:
 
 
 @commands.command()
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path),
+    metavar="DIR",
+    help="Folder for result.json and residuals.csv.",
+)
+def demo(output: Path | None) -> int:
+    """Calibrate a shipped simulated record, and compare the answer with the truth."""
+    from casest import demonstration
+
+    record = demonstration.RECORD
+    options: Options = {
+        "effects": (),
+        "constants": ("norm=9.80665 m/s^2",),
+        "free": (),
+        "fix": (),
+        "shared": (),
+        "per_run": (),
+        "columns": ("v=ax,ay,az",),
+        "units": (),
+        "scales": (),
+        "rate": 50.0,
+        "at_rest": True,
+        "time_zero": "first",
+        "holdout": (),
+        "solver": "ipopt",
+        "starts": (),
+        "seed": 0,
+        "output": output or Path("out"),
+        "as_json": False,
+    }
+    words = (
+        f"casest calibrate norm-triangular {record} \\\n    --columns v=ax,ay,az --rate 50 "
+        f"--at-rest --set 'norm=9.80665 m/s^2' -o {options['output']}"
+    )
+    click.echo(f"$ {words}\n")
+    code = calibration("norm-triangular", (str(record),), options, words)
+    click.echo("\n" + demonstration.comparison(options["output"]))
+    return code
+
+
+@commands.command()
 @click.argument("result_path", metavar="RESULT", type=click.Path(path_type=Path))
 @click.argument("data", type=click.Path())
 @reading_options
-@click.option("-o", "--output", type=click.Path(path_type=Path), metavar="FILE|DIR",
-              help="A .csv file, or a folder for corrected.csv; without it, standard output.")
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path),
+    metavar="FILE|DIR",
+    help="A .csv file, or a folder for corrected.csv; without it, standard output.",
+)
 @click.option("--force", is_flag=True, help="Apply a result that was refused.")
 def apply(result_path: Path, data: str, **options: Any) -> None:
     """Correct the readings in DATA with a saved RESULT (result.json, or its folder)."""
@@ -192,7 +283,9 @@ def declared_model(name: str, options: Options) -> Model:
     for text in options["constants"]:
         key, value = named_value(text, "--set", model)
         if isinstance(model[key], Parameter):
-            raise UsageError(f"{key} is an unknown of {name}, not a constant; hold it with --fix {text}")
+            raise UsageError(
+                f"{key} is an unknown of {name}, not a constant; hold it with --fix {text}"
+            )
         model = model.having(**{key: value if isinstance(value, Constant) else constant(value, "")})
     for key in options["free"]:
         model = model.freed(key)

@@ -25,6 +25,8 @@ from casest.stack import Point, Problem
 
 #: Solvers of the least-squares problem; estimators of a model's own are named besides.
 SOLVERS = ("ipopt", "ipopt-exact", "trust-region")
+#: From this many degrees of freedom on the residual alone says how large the noise is.
+ENOUGH_FREEDOM = 10
 
 
 @dataclass(frozen=True)
@@ -154,7 +156,9 @@ def _enough(problem: Problem) -> None:
             f"{problem.model.name}; record more, or fix some with --fix name=value"
         )
     if problem.unknowns == 0:
-        raise UsageError(f"model {problem.model.name} has nothing left to estimate; --free something")
+        raise UsageError(
+            f"model {problem.model.name} has nothing left to estimate; --free something"
+        )
 
 
 def _merged(problem: Problem, start: Mapping[str, Any]) -> dict[str, Any]:
@@ -288,14 +292,17 @@ def _correlation_note(problem: Problem, correlated: float) -> Iterator[str]:
         count = sum(len(run) for run in problem.runs)
         yield (
             f"residuals are correlated over {correlated:.3g} samples: the {count} samples count as "
-            f"{count / correlated:.0f}, and standard deviations are from batches of samples (sandwich)"
+            f"{count / correlated:.0f}, and standard deviations come from batches of samples"
         )
 
 
 def _noise(problem: Problem, point: Point, length: float, dof: int) -> Noise:
-    """Noise of one residual: what is left over, but never less than repeats show."""
+    """Noise of one residual: what is left over; with few degrees of freedom to judge that by,
+    never less than what repeats (rest intervals) show."""
     residual = length / np.sqrt(dof) if dof > 0 else float("nan")
     repeats = problem.repeat_noise(point)
+    if dof >= ENOUGH_FREEDOM:
+        return Noise(residual, residual, repeats, dof)
     candidates = [s for s in (residual, repeats) if s is not None and np.isfinite(s)]
     return Noise(max(candidates, default=float("nan")), residual, repeats, dof)
 

@@ -96,8 +96,8 @@ def _rotations(problem: Problem, point: Point) -> Iterator[tuple[str, Array]]:
             direction = np.zeros(problem.unknowns)
             direction[slot.x] = shape.pack(turn)
             yield (
-                f"a rotation of the sensor frame about {name}: turning `{slot.parameter.name}` from "
-                "the left changes no residual; declare it triangular, or give directions",
+                f"a rotation of the sensor frame about {name}: turning `{slot.parameter.name}` "
+                "from the left changes no residual; declare it triangular, or give directions",
                 direction,
             )
 
@@ -105,7 +105,7 @@ def _rotations(problem: Problem, point: Point) -> Iterator[tuple[str, Array]]:
 def _without(basis: Array, direction: Array) -> Array:
     """Orthonormal basis of the part of a space orthogonal to one of its directions."""
     rest = basis - np.outer(direction, direction @ basis)
-    u, s, _ = np.linalg.svd(rest, full_matrices=False)
+    u, _, _ = np.linalg.svd(rest, full_matrices=False)
     return u[:, : basis.shape[1] - 1] if basis.shape[1] > 1 else u[:, :0]
 
 
@@ -124,7 +124,7 @@ def _sparsest(basis: Array) -> Array:
             if j != k:
                 matrix[:, j] -= matrix[row, j] * matrix[:, k]
         done.append(row)
-    return matrix / np.linalg.norm(matrix, axis=0)
+    return np.asarray(matrix / np.linalg.norm(matrix, axis=0))
 
 
 def _combination(problem: Problem, scaled: Array, scale: Array) -> str:

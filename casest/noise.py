@@ -45,8 +45,13 @@ def _curve(model: Model) -> Replay:
         if attached.kind == "noise":
             w = w * attached.apply(r, {})
     slope = ca.jacobian(w * r, r)
-    f = ca.Function("noise", [ca.SX.sym("none", 0), r], [ca.densify(w), ca.densify(slope)],
-                    ["parameters", "sample"], ["w", "slope"])
+    f = ca.Function(
+        "noise",
+        [ca.SX.sym("none", 0), r],
+        [ca.densify(w), ca.densify(slope)],
+        ["parameters", "sample"],
+        ["w", "slope"],
+    )
     return Replay(f)
 
 

@@ -8,9 +8,10 @@ import sys
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
-from casest.modelling.effect import Effect
 from casest.errors import CasestError, DeclarationError, UsageError
+from casest.modelling.effect import Effect
 from casest.modelling.model import Model
 
 #: Shipped models: name on the command line -> module and attribute in `casest_problems`.
@@ -22,14 +23,15 @@ SHIPPED = {
 
 
 def find_model(name: str) -> Model:
-    """The shipped model of that name, or the one in `file.py` (`file.py:name` if it has several)."""
+    """The shipped model of that name, or the one in `file.py` (`file.py:name` out of several)."""
     if name in SHIPPED:
         module, attribute = SHIPPED[name]
         found: Model = getattr(importlib.import_module(f"casest_problems.{module}"), attribute)
         return found
     path, _, wanted = name.partition(":")
     if path.endswith(".py"):
-        return _one(load_file(Path(path)), Model, "model", path, wanted)
+        own: Model = _one(load_file(Path(path)), Model, "model", path, wanted)
+        return own
     near = difflib.get_close_matches(name, SHIPPED, 1)
     hint = f"; did you mean {near[0]!r}?" if near else ""
     raise UsageError(
@@ -49,9 +51,9 @@ def find_effects(name: str) -> tuple[Effect, ...]:
     return found
 
 
-def _one(module: ModuleType, kind: type, word: str, path: str, wanted: str) -> object:
-    own = {n: v for n, v in vars(module).items() if isinstance(v, kind)}
-    names = {n: v for n, v in own.items() if getattr(v, "function").__module__ == module.__name__}
+def _one(module: ModuleType, kind: type, word: str, path: str, wanted: str) -> Any:
+    own: dict[str, Any] = {n: v for n, v in vars(module).items() if isinstance(v, kind)}
+    names = {n: v for n, v in own.items() if v.function.__module__ == module.__name__}
     names = names or own
     if wanted:
         for label in (wanted, wanted.replace("-", "_")):
@@ -59,20 +61,25 @@ def _one(module: ModuleType, kind: type, word: str, path: str, wanted: str) -> o
                 return names[label]
         near = difflib.get_close_matches(wanted, names, 1)
         hint = f"; did you mean {near[0]!r}?" if near else ""
-        raise UsageError(f"{path} has no {word} {wanted!r}{hint} (it has {', '.join(names) or 'none'})")
+        raise UsageError(
+            f"{path} has no {word} {wanted!r}{hint} (it has {', '.join(names) or 'none'})"
+        )
     if not names:
         raise UsageError(f"{path} declares no @{word}")
     if len(names) > 1:
-        raise UsageError(f"{path} declares {', '.join(names)}: say which, as {path}:{next(iter(names))}")
+        raise UsageError(
+            f"{path} declares {', '.join(names)}: say which, as {path}:{next(iter(names))}"
+        )
     return next(iter(names.values()))
 
 
 def load_file(path: Path) -> ModuleType:
-    """Run a Python file of declarations; whatever is wrong in it becomes one line with its place."""
+    """Run a Python file of declarations; whatever is wrong in it becomes one line with place."""
     if not path.exists():
         raise UsageError(f"{path}: no such file")
     spec = spec_from_file_location(f"casest_user_{path.stem}", path)
-    assert spec is not None and spec.loader is not None
+    if spec is None or spec.loader is None:
+        raise UsageError(f"{path}: not a Python file")
     module = module_from_spec(spec)
     sys.modules[spec.name] = module
     sys.path.insert(0, str(path.parent))

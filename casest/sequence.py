@@ -65,7 +65,9 @@ class Recursion:
     def rows(self, parameters: Array, samples: Array, run: Run) -> tuple[Array, Array]:
         """Residuals (N, m) and Jacobians (N, m, n) with the recursion applied block by block."""
         if run.time is None:
-            raise DataError(f"{run.file}: a sequence effect needs time: give a time column or --rate")
+            raise DataError(
+                f"{run.file}: a sequence effect needs time: give a time column or --rate"
+            )
         x, J = rows(self._prediction, parameters, samples)
         dt = np.diff(run.time, prepend=run.time[:1])
         measured = run.signals[str(self.model.traced.measured)]

@@ -13,6 +13,7 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from casest.data.run import Run
 from casest.declaring.physics import chart
@@ -63,12 +64,12 @@ class Problem:
         order: list[tuple[Parameter, int | None]] = [
             (p, None) for p in self.model.parameters if p.scope == "all"
         ]
-        for r in range(len(self.runs)):
-            order += [(p, r) for p in self.model.parameters if p.scope == "run"]
+        for k in range(len(self.runs)):
+            order += [(p, k) for p in self.model.parameters if p.scope == "run"]
         slots, x, ref = [], 0, 0
-        for p, r in order:
+        for p, run in order:
             width, numbers = p.shape.coordinates, len(p.shape.reference(p.shape.default()))
-            slots.append(Slot(p, r, slice(x, x + width), slice(ref, ref + numbers)))
+            slots.append(Slot(p, run, slice(x, x + width), slice(ref, ref + numbers)))
             x, ref = x + width, ref + numbers
         return tuple(slots)
 
@@ -100,9 +101,12 @@ class Problem:
             own = s.parameter.entry_names
             if s.parameter.shape.curved:
                 own = tuple(
-                    f"{s.parameter.name} (tangent {k})" for k in range(s.parameter.shape.coordinates)
+                    f"{s.parameter.name} (tangent {k})"
+                    for k in range(s.parameter.shape.coordinates)
                 )
-            suffix = f" ({self.runs[s.run].name})" if s.run is not None and len(self.runs) > 1 else ""
+            suffix = (
+                f" ({self.runs[s.run].name})" if s.run is not None and len(self.runs) > 1 else ""
+            )
             names += [name + suffix for name in own]
         return tuple(names)
 
@@ -254,7 +258,9 @@ class Problem:
         hessian = ca.hessian(ca.dot(w * t.expression, t.expression) / 2, t.coordinates)[0]
         sample = ca.vertcat(sample_symbol(self.model), w)
         parameters = ca.vertcat(t.coordinates, t.references)
-        return Replay(ca.Function("h", [parameters, sample], [hessian], ["parameters", "sample"], ["H"]))
+        return Replay(
+            ca.Function("h", [parameters, sample], [hessian], ["parameters", "sample"], ["H"])
+        )
 
     @cached_property
     def _recursion(self) -> Recursion | None:
@@ -335,13 +341,13 @@ class Problem:
             blocks.append(block)
         whole = np.vstack(blocks)
         if len(self.runs) > 1:
-            whole = np.linalg.qr(whole, mode="r")
+            whole = np.asarray(np.linalg.qr(whole, mode="r"))
         full = np.zeros((n + 1, n + 1))
         full[: len(whole)] = whole[: n + 1]
         return full[:n, :n], full[:n, n], float(abs(full[n, n]))
 
     def hessian(self, point: Point) -> Array:
-        """Exact second derivative of the cost, (n, n); Gauss-Newton where samples are a sequence."""
+        """Exact second derivative of the cost, (n, n); Gauss-Newton for sequences of samples."""
         if self._recursion is not None:
             return self.normal(point).matrix
         matrix = np.zeros((self.unknowns, self.unknowns))
@@ -369,7 +375,7 @@ class Problem:
             parts.append(part)
         return np.vstack(parts)
 
-    def squares_of_gradients(self, point: Point, batches: Sequence[Array]) -> Array:
+    def squares_of_gradients(self, point: Point, batches: Sequence[NDArray[np.int_]]) -> Array:
         """Σ_batch (Σ w r ∂r)(Σ w r ∂r)ᵀ: the middle of the sandwich covariance, (n, n).
 
         `batches` numbers the samples of each run; those of one batch may be correlated.
@@ -400,7 +406,10 @@ class Problem:
         for r, run in enumerate(self.runs):
             zero = np.zeros(len(run))
             spread = np.hstack(
-                [run.spread.get(s.name, np.outer(zero, np.ones(s.size))) for s in self.model.signals]
+                [
+                    run.spread.get(s.name, np.outer(zero, np.ones(s.size)))
+                    for s in self.model.signals
+                ]
             )
             G = replay(self._parameters(point, r), self.samples[r])[0]
             squares += float(np.sum((G * spread[:, None, :]) ** 2))

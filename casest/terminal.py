@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from casest.estimate import Estimate
+from casest.estimate import SOLVERS, Estimate
 from casest.modelling.model import Model
 from casest.naming import entry_units, unit_table
 
@@ -20,14 +20,22 @@ WIDTH = 80
 def listing(models: Sequence[tuple[str, Model]], *, as_json: bool = False) -> str:
     """Shipped problems, a paragraph each."""
     if as_json:
-        return json.dumps({"problems": {name: _summary(m) for name, m in models}, "effects": []}, indent=2)
+        return json.dumps(
+            {"problems": {name: _summary(m) for name, m in models}, "effects": []}, indent=2
+        )
     lines = ["Problems (casest calibrate NAME DATA):"]
     for name, m in models:
         about = (m.function.__doc__ or "").strip().splitlines()[0]
         lines += ["", f"  {name}", f"      {about}"]
-        for word, symbols in (("signals", m.signals), ("unknowns", m.parameters), ("constants", m.constants)):
+        for word, symbols in (
+            ("signals", m.signals),
+            ("unknowns", m.parameters),
+            ("constants", m.constants),
+        ):
             lines.append(f"      {word + ':':<11}{', '.join(s.name for s in symbols)}")
-        lines.append(f"      {'estimators:':<11} ipopt, trust-region, {', '.join(n for n, _ in m.estimators)}")
+        lines.append(
+            f"      {'solvers:':<11} {', '.join([*SOLVERS, *(n for n, _ in m.estimators)])}"
+        )
     return "\n".join([*lines, "", "Your own: casest calibrate file.py[:name] DATA"])
 
 
@@ -87,7 +95,9 @@ def _table(found: Estimate) -> Iterator[str]:
         for r, (v, s) in enumerate(stacked):
             run = f" ({found.problem.runs[r].name})" if several else ""
             for name, i, unit in zip(p.entry_names, p.shape.entries, units, strict=True):
-                rows.append((name + run, *rounded(float(v[i]), float(s[i])), "" if unit == "1" else unit))
+                rows.append(
+                    (name + run, *rounded(float(v[i]), float(s[i])), "" if unit == "1" else unit)
+                )
     width = max(len(r[0]) for r in rows)
     left = max(len(r[1]) for r in rows)
     middle = max(len(r[2]) for r in rows)
@@ -114,7 +124,8 @@ def rounded(value: float, std: float) -> tuple[str, str]:
 def _fit_lines(found: Estimate, content: Mapping[str, Any]) -> Iterator[str]:
     unit = content["noise"]["unit"]
     unit = "" if unit == "1" else f" {unit}"
-    yield f"  residual rms {found.rmse:.3g}{unit}; noise of one residual {found.noise.sigma:.3g}{unit}"
+    sigma = found.noise.sigma
+    yield f"  residual rms {found.rmse:.3g}{unit}; noise of one residual {sigma:.3g}{unit}"
     if content["estimate"]["rmse_holdout"] is not None:
         yield f"  held-out residual rms {content['estimate']['rmse_holdout']:.3g}{unit}"
     repeats, residual = found.noise.repeats, found.noise.residual
@@ -151,4 +162,6 @@ def _next(found: Estimate, output: Path | None) -> str:
         return ""
     if output is None:
         return "Next: add -o out to keep the result, then `casest apply out DATA`."
-    return f"Written: {output}/result.json, {output}/residuals.csv. Next: casest apply {output} DATA"
+    return (
+        f"Written: {output}/result.json, {output}/residuals.csv. Next: casest apply {output} DATA"
+    )

@@ -16,12 +16,12 @@ from casest.result import load_result, saved_parameters
 
 def parse_value(name: str, text: str, option: str, model: Model) -> Constant:
     """`0.28`, `28 cm`, `1,2,3`, `1,0;0.1,1` or `@result.json` as a constant of the model."""
-    old = model[name]  # raises, with a suggestion, where there is no such name
+    old: Any = model[name]  # raises, with a suggestion, where there is no such name
     if text.startswith("@"):
         return _from_result(name, text[1:])
     if "," not in text and ";" not in text:
         number, unit = units.parse_quantity(text)
-        return constant(number, unit or _declared_unit(old))
+        return _constant(number, unit or _declared_unit(old))
     try:
         rows = [[float(cell) for cell in row.split(",")] for row in text.split(";")]
         array = np.array(rows if len(rows) > 1 else rows[0])
@@ -29,7 +29,7 @@ def parse_value(name: str, text: str, option: str, model: Model) -> Constant:
         raise UsageError(
             f"{option} {name}={text}: not a number, a list 1,2,3 or rows 1,0;0,1"
         ) from None
-    return constant(array, _declared_unit(old))
+    return _constant(array, _declared_unit(old))
 
 
 def _declared_unit(symbol: Any) -> str:
@@ -41,11 +41,20 @@ def _from_result(name: str, path: str) -> Constant:
     result = load_result(Path(path))
     parameters = saved_parameters(result)
     if name not in parameters:
-        raise UsageError(f"{path} has no parameter {name!r} (it has {', '.join(parameters) or 'none'})")
+        raise UsageError(
+            f"{path} has no parameter {name!r} (it has {', '.join(parameters) or 'none'})"
+        )
     if result.get("trusted") is False:
-        raise UsageError(f"{path}: its estimate was refused; calibrate again before using its {name}")
+        raise UsageError(
+            f"{path}: its estimate was refused; calibrate again before using its {name}"
+        )
     found = parameters[name]
     if any(v is None for v in np.ravel(np.array(found["value"], dtype=object))):
         raise UsageError(f"{path}: its {name} has no value")
     unit = found["unit"]
-    return constant(found["value"], unit if isinstance(unit, str) else unit[0])
+    return _constant(found["value"], unit if isinstance(unit, str) else unit[0])
+
+
+def _constant(value: Any, unit: str) -> Constant:
+    made: Constant = constant(value, unit)
+    return made

@@ -133,7 +133,9 @@ def _from_null_vector(X: Array, quadratic: list[int], g: float, size: float) -> 
     b = np.linalg.solve(S, r)  # (4): needs neither g nor λ
     lam = g**2 / (b @ S @ b - d) / size**2  # (5), back in the unit of z
     if not lam > 0:
-        raise NotTrusted("closed form: the fitted ellipsoid is imaginary; the readings contradict it")
+        raise NotTrusted(
+            "closed form: the fitted ellipsoid is imaginary; the readings contradict it"
+        )
     # λS = AᵀA with A lower triangular: the Cholesky factor of the matrix read backwards.
     flipped = np.linalg.cholesky(lam * S[::-1, ::-1])
     return flipped.T[::-1, ::-1], b * size
@@ -181,7 +183,9 @@ def levenberg_marquardt(
     A → 0, so what comes out must be judged by another one.
     """
     x, damping = np.concatenate([o, A[free]]), 1e-3
-    for iteration in range(1, 501):
+    iterations = 0
+    while iterations < 500:
+        iterations += 1
         r, J = _paper_residual(x, v, g, free, squared)
         JtJ = J.T @ J
         while True:
@@ -195,7 +199,7 @@ def levenberg_marquardt(
             break
     A = np.zeros((3, 3))
     A[free] = x[3:]
-    return A, x[:3], iteration
+    return A, x[:3], iterations
 
 
 def _paper_residual(

@@ -27,9 +27,10 @@ _BAND = 6.0  # robust standard deviations of the log variance at rest
 _RANGE = 1.5  # largest range of the windowed means inside an interval, in noise sigmas
 _DRIFT = 1.0  # largest change along a straight line through them
 _KEPT = 0.25  # of the quiet samples must not drift, or nothing is believed
+_STEP_WINDOWS = 2  # within so many windows
 _STEP = 6.0  # a change of the mean by this many sigmas is another position
 _HYSTERESIS = 10.0  # a variance this many times the limit of rest breaks a rest in any case
-_NARROWEST = 0.02  # of the log variance, so that a record without noise keeps a band
+_NARROWEST = 0.231  # times _BAND: factor 4, between a fixed reading and one that toggles
 
 
 @dataclass(frozen=True)
@@ -170,17 +171,15 @@ def resolution(x: Array) -> float:
     """Return the step in which a channel is quantised, 0 where it takes any value."""
     levels = np.unique(x)
     steps = np.diff(levels)
-    steps = steps[steps > 1e-9 * max(float(np.abs(levels).max()), 1e-300)]
+    steps = steps[steps > 1e-9 * max(float(np.abs(levels).max()), 1e-100)]
     return float(steps.min()) if steps.size else 0.0
 
 
 def _level(variance: Array, channels: Array) -> Array:
     """Return the log of the mean over channels of variance / its own floor, (n,)."""
+    variance = variance + _noise_floor(channels) ** 2 / 12  # what a fixed reading may hide
     floor = np.quantile(variance, _FLOOR_QUANTILE, axis=0)
-    for k in range(channels.shape[1]):
-        x = channels[:, k]
-        floor[k] = max(floor[k], resolution(x) ** 2 / 12, (1e-9 * float(np.ptp(x))) ** 2, 1e-300)
-    return np.asarray(np.log(np.maximum((variance / floor).mean(axis=1), 1e-3)))
+    return np.asarray(np.log((variance / floor).mean(axis=1)))
 
 
 def _thresholds(level: Array) -> tuple[float, float]:
@@ -262,7 +261,7 @@ def _without_drift(
 
 
 def _refuse_slow_motion(kept: int, quiet: int, name: str) -> None:
-    """Refuse a record whose quiet stretches mostly drift: chance leaves a few that do not."""
+    """Refuse a record whose quiet stretches mostly drift."""
     if kept < _KEPT * quiet:
         raise DataError(
             f"{name}: rest cannot be told from slow motion: the mean stays put in only {kept} of "
@@ -274,7 +273,7 @@ def _refuse_slow_motion(kept: int, quiet: int, name: str) -> None:
 def _noise_floor(channels: Array) -> Array:
     """Return the smallest noise a channel can show: its resolution, or rounding."""
     steps = [resolution(channels[:, k]) for k in range(channels.shape[1])]
-    return np.asarray(np.maximum(steps, 1e-9 * np.ptp(channels, axis=0) + 1e-300))
+    return np.asarray(np.maximum(steps, 1e-9 * np.ptp(channels, axis=0) + 1e-100))
 
 
 def _settled(
@@ -291,22 +290,28 @@ def _settled(
     ):
         end = interval.last if last == n - 1 else interval.first + (last + 1) * window - 1
         parts.append(Interval(interval.first + first * window, end))
-    return _longest_of_each_pose(x, noise, interval.first, parts)
+    kept = _longest_of_each_pose(x, noise, interval.first, parts, _STEP_WINDOWS * window)
+    # a few windows of a slow motion agree by chance
+    return kept if sum(map(len, kept)) >= _KEPT * len(interval) else []
 
 
 def _longest_of_each_pose(
-    x: Array, noise: Array, origin: int, parts: Sequence[Interval]
+    x: Array, noise: Array, origin: int, parts: Sequence[Interval], step: int
 ) -> list[Interval]:
-    """Keep one part where neighbours differ by little: one position, creeping or settling."""
+    """Keep one part of each position: a new one is reached by a large change within `step`.
+
+    Parts that differ by little, or with a long way between them, are one position that creeps.
+    """
     kept: list[Interval] = []
-    before = None
+    before, end = None, 0
     for part in sorted(parts, key=lambda part: part.first):
         mean = x[part.first - origin : part.last + 1 - origin].mean(axis=0) / noise
-        if before is not None and bool((np.abs(mean - before) < _STEP).all()):
-            kept[-1] = max(kept[-1], part, key=len)
-        else:
+        far = before is None or bool((np.abs(mean - before) > _STEP).any())
+        if far and (before is None or part.first - end <= step):
             kept.append(part)
-        before = mean
+        else:
+            kept[-1] = max(kept[-1], part, key=len)
+        before, end = mean, part.last
     return kept
 
 

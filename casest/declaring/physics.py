@@ -50,7 +50,9 @@ class Trace:
     def enter(self, name: str, expression: Any, unit: str) -> SX:
         """Record a quantity and hand back what the rest of the body shall see."""
         if name in self.quantities or name in self.reserved:
-            raise DeclarationError(f"name {name!r} is used twice: a quantity needs a name of its own")
+            raise DeclarationError(
+                f"name {name!r} is used twice: a quantity needs a name of its own"
+            )
         declared = ca.SX(expression)
         if self.cut == name:
             declared = ca.SX.sym(name, *declared.shape)
@@ -130,10 +132,10 @@ class Residual:
     def __init__(
         self,
         *,
-        measured: SX | None = None,
-        predicted: SX | None = None,
-        implicit: SX | None = None,
-        corrected: SX | str | None = None,
+        measured: SX = None,
+        predicted: SX = None,
+        implicit: SX = None,
+        corrected: SX = None,
         unit: str = "",
         axes: tuple[str, ...] = (),
     ) -> None:

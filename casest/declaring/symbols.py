@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -31,7 +30,7 @@ class Signal:
 def signal(shape: int | str = 1, unit: str | None = None) -> Any:
     """Declare a measured input: `signal("s")`, `signal(3, "m/s^2")`, `signal(3)` (any unit)."""
     if isinstance(shape, str):
-        shape, unit = 1, shape
+        return Signal("", 1, shape)
     return Signal("", shape, unit)
 
 
@@ -77,7 +76,9 @@ class Parameter:
         value = self.shape.pack(self.shape.default())
         lower, upper = np.array(self.lower), np.array(self.upper)
         finite = np.isfinite(lower) & np.isfinite(upper)
-        middle = np.where(finite, 0.5 * (np.where(finite, lower, 0) + np.where(finite, upper, 0)), 0)
+        middle = np.where(
+            finite, 0.5 * (np.where(finite, lower, 0) + np.where(finite, upper, 0)), 0
+        )
         inside = np.where(finite, middle, np.where(np.isfinite(lower), lower + 1.0, upper - 1.0))
         return np.where((value > lower) & (value < upper), value, inside)
 
@@ -115,8 +116,9 @@ def param(
     (lower, upper), numbers or arrays of the value's shape. `per="run"`: each run has its own.
     """
     if isinstance(shape, str):
-        shape, unit = None, shape
-    form = array_shape(shape)
+        form, unit = array_shape(None), shape
+    else:
+        form = array_shape(shape)
     if form.kind == "each":
         return Undecided(unit if isinstance(unit, str) else unit[0], start, bounds, per)
     return make_parameter(form, unit, start, bounds, "run" if per == "run" else "all")
@@ -143,7 +145,9 @@ def make_parameter(
     """A checked, still nameless parameter."""
     units = (unit,) * shape.size if isinstance(unit, str) else tuple(unit)
     if len(units) != shape.size:
-        raise DeclarationError(f"{len(units)} units for {shape.size} entries: give one, or one each")
+        raise DeclarationError(
+            f"{len(units)} units for {shape.size} entries: give one, or one each"
+        )
     lower, upper = _bounds(shape, bounds)
     packed = None
     if start is not None:
@@ -151,7 +155,9 @@ def make_parameter(
         outside = [i for i in range(shape.size) if not lower[i] <= packed[i] <= upper[i]]
         if outside:
             i = outside[0]
-            raise DeclarationError(f"start {packed[i]:g} is outside bounds ({lower[i]:g}, {upper[i]:g})")
+            raise DeclarationError(
+                f"start {packed[i]:g} is outside bounds ({lower[i]:g}, {upper[i]:g})"
+            )
     return Parameter("", shape, units, packed, lower, upper, scope)
 
 
@@ -171,7 +177,8 @@ def _bounds(shape: Shape, bounds: Any) -> tuple[tuple[float, ...], tuple[float, 
     bad = np.flatnonzero(~(lower < upper))
     if bad.size:
         raise DeclarationError(
-            f"bounds ({lower[bad[0]]:g}, {upper[bad[0]]:g}) leave no room: lower must be below upper"
+            f"bounds ({lower[bad[0]]:g}, {upper[bad[0]]:g}) leave no room: "
+            "lower must be below upper"
         )
     return tuple(map(float, lower)), tuple(map(float, upper))
 

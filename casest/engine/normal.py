@@ -1,7 +1,8 @@
 """Least-squares sums over all samples, from a replay of residual and Jacobian.
 
 In every function `replay` has the outputs r (m×1, dense) and J (m×n, any sparsity), in this
-order (n may be less than the number of parameters: some only describe charts); `samples` (N, k), `weights` (N, m) or None for ones. Non-finite values
+order (n may be less than the number of parameters: some only describe charts); `samples` (N, k),
+`weights` (N, m) or None for ones. Non-finite values
 are not an error: they appear in the results. A weight of zero does not hide them.
 """
 

@@ -66,7 +66,9 @@ def effect(
         for name, default in positional[1:]:
             if kind == "sequence" and name in ("previous", "dt"):
                 continue
-            extras.append(named(default, name) if isinstance(default, Signal) else Signal(name, 1, None))
+            extras.append(
+                named(default, name) if isinstance(default, Signal) else Signal(name, 1, None)
+            )
         declared_kind: Kind = kind or ("noise" if on == NOISE else "quantity")
         declarations = tuple(_declaration(function.__name__, name, d) for name, d in keyword)
         return Effect(
@@ -124,7 +126,9 @@ class Attached:
         """The value with the effect in it, from the model's symbols by name."""
         extras = [symbols[s.name] for s in self.signals]
         unknowns = {p.name.rpartition(".")[2]: symbols[p.name] for p in self.parameters}
-        numbers = {n: d.array for n, d in self.effect.declarations if isinstance(d, Constant)}
+        numbers: dict[str, Any] = {
+            n: d.array for n, d in self.effect.declarations if isinstance(d, Constant)
+        }
         if self.kind == "noise":  # the scatter's own parameters are no unknowns of a fit
             for n, d in self.effect.declarations:
                 if isinstance(d, Parameter):
@@ -161,9 +165,7 @@ def attach(
         own = f"({own})" if set("/*") & set(own) else own
         renamed = tuple(u.replace(f"[{first}]", own) for u in parameter.units)
         parameters.append(replace(parameter, units=renamed))
-    return Attached(
-        declared, on, kind, label, tuple(sorted(columns.items())), tuple(parameters)
-    )
+    return Attached(declared, on, kind, label, tuple(sorted(columns.items())), tuple(parameters))
 
 
 def check_null(attached: Attached, shape: tuple[int, int]) -> None:
@@ -178,7 +180,9 @@ def check_null(attached: Attached, shape: tuple[int, int]) -> None:
         if isinstance(declaration, Constant):
             nulls[name] = declaration.array
         else:
-            dims = next((p.shape.dims for p in attached.parameters if p.name.endswith(f".{name}")), ())
+            dims = next(
+                (p.shape.dims for p in attached.parameters if p.name.endswith(f".{name}")), ()
+            )
             nulls[name] = np.full(dims or (1,), attached.effect.null_of(name))
             unknowns[name] = attached.effect.null_of(name)
     if attached.kind == "noise" and not unknowns:

@@ -9,15 +9,16 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
-import casadi as ca
 import numpy as np
 
-from casest.declaring.physics import SX, Quantity, Residual
+from casest.declaring.physics import Quantity, Residual
 from casest.declaring.shapes import Array
 from casest.declaring.symbols import Constant, Parameter, Scope, Signal, constant, named
-from casest.modelling.effect import NOISE, Attached, Effect, Kind, attach, check_null
 from casest.errors import DeclarationError, UnitError, UsageError
+from casest.modelling.effect import NOISE, Attached, Effect, Kind, attach, check_null
 from casest.modelling.tracing import Traced, describe, function_of, trace
+
+Symbol = Signal | Parameter | Constant
 
 
 @dataclass(frozen=True)
@@ -30,7 +31,7 @@ class Model:
 
     name: str
     function: Callable[..., Residual]
-    declared: tuple[Signal | Parameter | Constant, ...]
+    declared: tuple[Symbol, ...]
     effects: tuple[Attached, ...] = ()
     starter: Callable[..., Any] | None = None
     limiter: Callable[..., Any] | None = None
@@ -77,7 +78,13 @@ class Model:
         given, size = self.traced.residual.axes, self.traced.expression.numel()
         if given:
             return given
-        return ("x", "y", "z") if size == 3 else tuple(map(str, range(size))) if size > 1 else ("value",)
+        return (
+            ("x", "y", "z")
+            if size == 3
+            else tuple(map(str, range(size)))
+            if size > 1
+            else ("value",)
+        )
 
     @property
     def residual_unit(self) -> str:
@@ -89,13 +96,18 @@ class Model:
 
     def __getitem__(self, name: str) -> Any:
         """Signal, parameter or constant of that name."""
-        for symbol in (*self.signals, *self.parameters, *self.constants):
-            if symbol.name == name:
-                return symbol
+        if name in self.symbols:
+            return self.symbols[name]
         raise UsageError(self._unknown(name))
 
+    @cached_property
+    def symbols(self) -> Mapping[str, Symbol]:
+        """Every signal, parameter and constant by name."""
+        every: list[Symbol] = [*self.signals, *self.parameters, *self.constants]
+        return {symbol.name: symbol for symbol in every}
+
     def _unknown(self, name: str) -> str:
-        names = [s.name for s in (*self.signals, *self.parameters, *self.constants)]
+        names = list(self.symbols)
         near = difflib.get_close_matches(name, names, 1)
         hint = f"; did you mean {near[0]!r}?" if near else f"; it has {', '.join(names)}"
         return f"model {self.name} has no {name!r}{hint}"
@@ -127,8 +139,8 @@ class Model:
                 value = old.shape.unpack(old.shape.pack(new.array))
             except DeclarationError as error:
                 raise UsageError(f"{name} of model {self.name}: {error}") from None
-            new = constant(value, new.unit)
-            return replace(new, name=name, frozen=old)
+            fixed: Constant = constant(value, new.unit)
+            return replace(fixed, name=name, frozen=old)
         if new.array.shape != old.array.shape:
             raise UsageError(f"{name} has shape {old.array.shape}, not {new.array.shape}")
         return replace(new, name=name, frozen=old.frozen)
@@ -150,7 +162,9 @@ class Model:
         from casest.declaring.symbols import param
 
         if old.frozen is not None:
-            return self._with(name, replace(old.frozen, start=tuple(old.frozen.shape.pack(old.array))))
+            return self._with(
+                name, replace(old.frozen, start=tuple(old.frozen.shape.pack(old.array)))
+            )
         shape: Any = old.array.shape if old.dims else None
         return self._with(name, named(param(shape, old.unit, start=old.array), name))
 
@@ -259,10 +273,9 @@ class Model:
         Parameters that are not given take their declared start. Returns every quantity, the
         prediction (explicit models) and the residual, each with the sample axis first.
         """
-        known = {s.name for s in (*self.signals, *self.parameters)}
         for name in values:
-            if name not in known:
-                raise UsageError(self._unknown(name))
+            if isinstance(self[name], Constant):
+                raise UsageError(f"{name} is a constant of model {self.name}: having({name}=…)")
         missing = [s.name for s in self.signals if s.name not in values]
         if missing:
             raise UsageError(f"model {self.name} needs the signal {missing[0]!r}")
@@ -305,7 +318,7 @@ def model(function: Callable[..., Residual]) -> Model:
     Raises DeclarationError naming the argument whose declaration makes no sense.
     """
     name = function.__name__.replace("_", "-")
-    declared: list[Signal | Parameter | Constant] = []
+    declared: list[Symbol] = []
     for argument in inspect.signature(function).parameters.values():
         declared.append(_declared(name, argument))
     made = Model(name, function, tuple(declared))
@@ -313,21 +326,26 @@ def model(function: Callable[..., Residual]) -> Model:
     return made
 
 
-def _declared(model_name: str, argument: inspect.Parameter) -> Signal | Parameter | Constant:
-    default = argument.default
+def _declared(model_name: str, argument: inspect.Parameter) -> Symbol:
+    default: object = argument.default
     where = f"model {model_name}: {argument.name}"
     if argument.kind is argument.POSITIONAL_OR_KEYWORD:
         if not isinstance(default, Signal):
-            raise DeclarationError(f"{where} comes before the * and must be signal(…), not {default!r}")
+            raise DeclarationError(
+                f"{where} comes before the * and must be signal(…), not {default!r}"
+            )
         return replace(default, name=argument.name)
     if argument.kind is not argument.KEYWORD_ONLY:
-        raise DeclarationError(f"{where}: a model takes signals, then *, then parameters and constants")
+        raise DeclarationError(
+            f"{where}: a model takes signals, then *, then parameters and constants"
+        )
     if isinstance(default, Parameter | Constant):
         return replace(default, name=argument.name)
     if isinstance(default, Signal):
         raise DeclarationError(f"{where} is a signal: signals come before the *")
     if isinstance(default, int | float) and not isinstance(default, bool):
-        return replace(constant(default), name=argument.name)
+        plain: Constant = constant(default)
+        return replace(plain, name=argument.name)
     raise DeclarationError(f"{where} must be param(…), constant(…) or a number, not {default!r}")
 
 
@@ -350,7 +368,8 @@ def _converted(name: str, new: Constant, unit: str) -> Constant:
     from casest import units
 
     factor, offset = units.conversion(new.unit, unit or "1")
-    return constant(factor * new.array + offset, unit)
+    converted: Constant = constant(factor * new.array + offset, unit)
+    return converted
 
 
 def _fitting_unit(name: str, old: str, new: str) -> None:
@@ -362,14 +381,10 @@ def _fitting_unit(name: str, old: str, new: str) -> None:
     try:
         units.conversion(new, old or "1")
     except UnitError:
-        raise UnitError(f"{name} is declared in {old or 'no unit'!r}: {new!r} does not fit") from None
-
-
+        raise UnitError(
+            f"{name} is declared in {old or 'no unit'!r}: {new!r} does not fit"
+        ) from None
 
 
 def _rows(value: Any, declared: Signal) -> Array:
     return np.asarray(value, dtype=float).reshape(-1, declared.size)
-
-
-
-

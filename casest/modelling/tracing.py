@@ -14,8 +14,8 @@ import casadi as ca
 import numpy as np
 
 from casest.declaring.physics import SX, Quantity, Residual, Trace, chart, current_trace
-from casest.modelling.effect import Attached
 from casest.errors import DeclarationError
+from casest.modelling.effect import Attached
 
 if TYPE_CHECKING:
     from casest.modelling.model import Model
@@ -36,7 +36,7 @@ class Traced:
     quantities: Mapping[str, Quantity]
     residual: Residual
     expression: SX
-    predicted: SX | None
+    predicted: SX
     measured: str | None
     corrected: str | None
 
@@ -93,8 +93,8 @@ def _symbols(model: Model) -> tuple[dict[str, SX], list[SX], list[SX]]:
             symbols[p.name] = matrix
         else:
             symbols[p.name] = c
-    for k in model.constants:
-        symbols[k.name] = float(k.array) if not k.dims else ca.SX(ca.DM(k.array))
+    for fixed in model.constants:
+        symbols[fixed.name] = float(fixed.array) if not fixed.dims else ca.SX(ca.DM(fixed.array))
     return symbols, coordinates, references
 
 
@@ -175,9 +175,7 @@ def function_of(model: Model, outputs: Mapping[str, SX], traced: Traced | None =
     inputs = [ca.vertcat(traced.coordinates, traced.references), sample_symbol(model, traced)]
     values = [ca.SX(v) for v in outputs.values()]
     # Not the model's own name: CasADi reserves some, and refuses two underscores in a row.
-    return ca.Function(
-        "one_sample", inputs, values, ["parameters", "sample"], list(outputs)
-    )
+    return ca.Function("one_sample", inputs, values, ["parameters", "sample"], list(outputs))
 
 
 def sample_symbol(model: Model, traced: Traced | None = None) -> SX:
@@ -194,7 +192,11 @@ def equations(model: Model) -> list[str]:
     try:
         lines = _body(model.function)
         for attached in model.effects:
-            lines += ["", f"# effect {attached.label} on {attached.on}", *_body(attached.effect.function)]
+            lines += [
+                "",
+                f"# effect {attached.label} on {attached.on}",
+                *_body(attached.effect.function),
+            ]
     except (OSError, TypeError):
         traced = trace(model, naming=True)
         lines = [f"{q.name} = {_expression(q.value)}" for q in traced.quantities.values()]
@@ -228,7 +230,9 @@ def describe(model: Model) -> str:
 
 
 def _name_of(symbol: SX | None, symbols: Mapping[str, SX]) -> str | None:
-    return next((n for n, s in symbols.items() if s is symbol), None) if symbol is not None else None
+    return (
+        next((n for n, s in symbols.items() if s is symbol), None) if symbol is not None else None
+    )
 
 
 def _flat(symbol: SX) -> SX:

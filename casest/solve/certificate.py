@@ -60,7 +60,7 @@ def certify(
 
     `sigma` is the standard deviation of one residual, NaN where nothing shows it.
     """
-    R, t, rest = factor
+    R = factor[0]
     against: list[str] = []
     slope, step = _slope_and_step(problem, best.point, factor, sigma)
     at_bound = _active(problem, best.point)
@@ -85,8 +85,8 @@ def certify(
     shape = (1.0, 1.0)
     if not against and not np.isfinite(sigma):
         against.append(
-            f"no redundancy: {problem.residual_count} equations for {problem.unknowns} unknowns fit "
-            "whatever the noise is; record more, or rest intervals whose scatter shows the noise"
+            f"no redundancy: {problem.residual_count} equations for {problem.unknowns} unknowns "
+            "fit whatever the noise is; record more, or rest intervals whose scatter shows the noise"
         )
     if not against:
         shape, words = _shape(problem, best, R, sigma)
@@ -127,8 +127,8 @@ def _bound_words(problem: Problem, name: str) -> str:
     i = problem.names.index(name)
     lower, upper = problem.bounds[0][i], problem.bounds[1][i]
     return (
-        f"`{name}` ended on its bound ({lower:.4g}, {upper:.4g}): the data ask for a value outside, "
-        "or do not determine it"
+        f"`{name}` ended on its bound ({lower:.4g}, {upper:.4g}): the data ask for a value "
+        "outside, or do not determine it"
     )
 
 
@@ -208,7 +208,10 @@ def _rise(problem: Problem, best: Outcome, point: Point, step: Array, sigma: flo
 def _misshapen(problem: Problem, step: Array, norms: Array, ratio: float) -> str:
     where = _largest(problem, step, norms)
     if not np.isfinite(ratio):
-        return f"too uncertain: two standard deviations ({where}) reach beyond the bounds; vary the motion"
+        return (
+            f"too uncertain: two standard deviations ({where}) reach beyond the bounds; "
+            "vary the motion"
+        )
     return (
         f"too uncertain for its intervals: two standard deviations away ({where}) the cost rises "
         f"{ratio:.2g} times as much as they assume; vary the motion"
@@ -221,15 +224,23 @@ def _largest(problem: Problem, step: Array, norms: Array) -> str:
 
 
 def _for(
-    slope: float, step: float, curvature: float, agreeing: int, others: int, shape: tuple[float, float]
+    slope: float,
+    step: float,
+    curvature: float,
+    agreeing: int,
+    others: int,
+    shape: tuple[float, float],
 ) -> tuple[str, ...]:
     """The case for the estimate."""
     found = "the same optimum from another start or algorithm"
-    intervals = f"intervals describe the cost two standard deviations away within {shape[0]:.2f}-{shape[1]:.2f}"
+    intervals = (
+        "intervals describe the cost two standard deviations away within "
+        f"{shape[0]:.2f}-{shape[1]:.2f}"
+    )
     if shape[1] > SHAPE[1]:
         intervals = (
-            f"intervals are cautious: two standard deviations away the cost rises up to {shape[1]:.2g} "
-            "times as much as they assume"
+            "intervals are cautious: two standard deviations away the cost rises up to "
+            f"{shape[1]:.2g} times as much as they assume"
         )
     return (
         f"stationary: the step left is {step:.1g} standard deviations",

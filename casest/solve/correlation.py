@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from casest.data.run import Run
 from casest.declaring.shapes import Array
@@ -51,7 +52,7 @@ def _integrated(r: Array) -> float:
     return float(max(2 * pairs.sum() - 1, 1.0))
 
 
-def batches(run: Run, length: int) -> Array:
+def batches(run: Run, length: int) -> NDArray[np.int_]:
     """Batch number of every sample: consecutive ones share a batch, blocks never do."""
     if not is_series(run) or length <= 1:
         return np.arange(len(run))

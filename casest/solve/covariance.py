@@ -34,4 +34,3 @@ def sandwich(problem: Problem, point: Point, R: Array, correlated_over: float) -
     if length == 1:
         correction = samples / max(samples - n, 1)
     return np.asarray(correction * bread @ problem.squares_of_gradients(point, numbers) @ bread)
-

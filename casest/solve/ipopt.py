@@ -33,8 +33,13 @@ def ipopt(
     began = time.perf_counter()
     scaled = _Scaled(problem, start, exact)
     settings = {
-        "print_level": 0, "sb": "yes", "max_iter": 500, "tol": 1e-10,
-        "bound_relax_factor": 0.0, "mu_strategy": "adaptive", **(options or {}),
+        "print_level": 0,
+        "sb": "yes",
+        "max_iter": 500,
+        "tol": 1e-10,
+        "bound_relax_factor": 0.0,
+        "mu_strategy": "adaptive",
+        **(options or {}),
     }
     z0 = start.x / scaled.scale
     lower, upper = problem.bounds

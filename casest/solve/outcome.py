@@ -3,8 +3,27 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
+from casest.declaring.shapes import Array
 from casest.stack import Point
+
+
+class LeastSquares(Protocol):
+    """What a solver needs to know of a least-squares problem; see casest.stack.Problem."""
+
+    @property
+    def bounds(self) -> tuple[Array, Array]:
+        """Lower and upper bound of every unknown."""
+
+    def moved(self, point: Point, step: Array) -> Point:
+        """The point after a step."""
+
+    def cost(self, point: Point) -> float:
+        """Half the sum of squares."""
+
+    def factor(self, point: Point) -> tuple[Array, Array, float]:
+        """Triangular factor of the Jacobian, Qᵀr, and the norm of the rest of r."""
 
 
 @dataclass(frozen=True)

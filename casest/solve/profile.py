@@ -47,7 +47,7 @@ class Held:
         stack = np.zeros((n + 2, n + 1))
         stack[:n, :n], stack[:n, n], stack[n, n] = R, t, rest
         stack[n + 1, :n], stack[n + 1, n] = HOLD * self.row, self._miss(point)
-        whole = np.linalg.qr(stack, mode="r")
+        whole = np.asarray(np.linalg.qr(stack, mode="r"))
         return whole[:n, :n], whole[:n, n], float(abs(whole[n, n]))
 
     def _miss(self, point: Point) -> float:

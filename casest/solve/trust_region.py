@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from casest.declaring.shapes import Array
-from casest.solve.outcome import Outcome
-from casest.stack import Point, Problem
+from casest.solve.outcome import LeastSquares, Outcome
+from casest.stack import Point
 
 
 class _Local(NamedTuple):
@@ -24,14 +24,15 @@ class _Local(NamedTuple):
     cost: float
 
 
-def trust_region(problem: Problem, start: Point, *, max_iterations: int = 300) -> Outcome:
+def trust_region(problem: LeastSquares, start: Point, *, max_iterations: int = 300) -> Outcome:
     """Minimise the cost from `start` until steps and gains are at rounding."""
     began = time.perf_counter()
     point, here = start, _linearise(problem, start)
     scale = _column_norms(here.R)
     damping, growth, evaluations, status = 1e-3, 2.0, 1, "iteration limit"
-    iteration = 0
-    for iteration in range(1, max_iterations + 1):
+    iterations = 0
+    while iterations < max_iterations:
+        iterations += 1
         if not np.isfinite(here.cost):
             status = "cost is not finite"
             break
@@ -58,11 +59,11 @@ def trust_region(problem: Problem, start: Point, *, max_iterations: int = 300) -
     claims = status in ("converged", "no descent")
     seconds = time.perf_counter() - began
     return Outcome(
-        "trust-region", point, here.cost, iteration, evaluations, claims, status, seconds
+        "trust-region", point, here.cost, iterations, evaluations, claims, status, seconds
     )
 
 
-def _linearise(problem: Problem, point: Point) -> _Local:
+def _linearise(problem: LeastSquares, point: Point) -> _Local:
     R, t, rest = problem.factor(point)
     return _Local(R, t, 0.5 * (float(t @ t) + rest**2))
 
@@ -78,7 +79,7 @@ def _column_norms(R: Array) -> Array:
 
 
 def _bounded_step(
-    problem: Problem, point: Point, here: _Local, scale: Array, damping: float
+    problem: LeastSquares, point: Point, here: _Local, scale: Array, damping: float
 ) -> Array:
     """Levenberg-Marquardt step; unknowns that would leave their bounds stop there."""
     lower, upper = problem.bounds
@@ -98,12 +99,13 @@ def _bounded_step(
 
 
 def _damped(here: _Local, scale: Array, damping: float, free: Array, step: Array) -> Array:
-    fixed = ~free
+    fixed = np.logical_not(free)
     right = -(here.t + here.R[:, fixed] @ step[fixed])
     A = np.vstack([here.R[:, free], np.diag(np.sqrt(damping) * scale[free])])
     b = np.concatenate([right, np.zeros(int(free.sum()))])
     # Unit columns: scales that differ by orders of magnitude must not reach the rank decision.
-    return np.linalg.lstsq(A / scale[free], b, rcond=None)[0] / scale[free]
+    step_z: Array = np.linalg.lstsq(A / scale[free], b, rcond=None)[0]
+    return np.asarray(step_z / scale[free])
 
 
 def _negligible(step: Array, point: Point, scale: Array, here: _Local, gain: float) -> bool:
@@ -112,7 +114,9 @@ def _negligible(step: Array, point: Point, scale: Array, here: _Local, gain: flo
     return bool(size <= 1e-15 * reach or gain <= 1e-17 * here.cost)
 
 
-def _refine(problem: Problem, point: Point, here: _Local, scale: Array) -> tuple[Point, _Local]:
+def _refine(
+    problem: LeastSquares, point: Point, here: _Local, scale: Array
+) -> tuple[Point, _Local]:
     """A few undamped steps: cost differences drown in rounding before the gradient does."""
     for _ in range(3):
         step = _bounded_step(problem, point, here, scale, 0.0)
