@@ -17,6 +17,7 @@ _HOME = {
         "if_else inf integral log norm_2 pi polynomial quantity rotation sign sin sinh skew sqrt "
         "sum1 tan tanh vertcat"
     ),
+    "casest.modelling.dimensions": "check_units",
     "casest.modelling.effect": "Effect effect",
     "casest.modelling.model": "Model model",
     "casest.data.run": "Run",

@@ -274,12 +274,14 @@ def apply(result_path: Path, data: str, **options: Any) -> None:
 def declared_model(name: str, options: Options) -> Model:
     """The model with --set, --free, --fix, --shared, --per-run and --effects applied."""
     from casest.declaring.symbols import Constant, Parameter, constant
+    from casest.modelling.dimensions import check_units
     from casest.problem import find_effects, find_model
 
     model = find_model(name)
     for path in options["effects"]:
         for effect in find_effects(path):
             model = model.with_effect(effect)
+            check_units(model)
     for text in options["constants"]:
         key, value = named_value(text, "--set", model)
         if isinstance(model[key], Parameter):

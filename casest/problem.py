@@ -11,6 +11,7 @@ from types import ModuleType
 from typing import Any
 
 from casest.errors import CasestError, DeclarationError, UsageError
+from casest.modelling.dimensions import check_units
 from casest.modelling.effect import Effect
 from casest.modelling.model import Model
 
@@ -31,6 +32,7 @@ def find_model(name: str) -> Model:
     path, _, wanted = name.partition(":")
     if path.endswith(".py"):
         own: Model = _one(load_file(Path(path)), Model, "model", path, wanted)
+        check_units(own)
         return own
     near = difflib.get_close_matches(name, SHIPPED, 1)
     hint = f"; did you mean {near[0]!r}?" if near else ""

@@ -206,6 +206,15 @@ def conversion(from_unit: str, to_unit: str) -> tuple[float, float]:
     return old.factor / new.factor, (old.offset - new.offset) / new.factor
 
 
+def size(unit: str) -> tuple[float, Dimension]:
+    """Return the factor to SI base units and the powers of these: "cm" -> (0.01, (("m", 1),)).
+
+    Angle (rad) and count are bases of their own. Raises UnitError where the unit is unknown.
+    """
+    found = _size(canonical(unit), unit)
+    return found.factor, found.dimension
+
+
 def quotient(a: str, b: str) -> str:
     """Return the unit of a / b in readable form: "1/count", "1", "(m/s^2)/count"."""
     if b == "1":

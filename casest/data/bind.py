@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import os
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -14,26 +13,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casest import units as unit_names
-from casest.data import attitude, checks, timing
+from casest.data import checks, timing
+from casest.data.converting import numbers, rotation, vector
 from casest.data.finding import Choice, as_names, find_by_name, find_column, find_columns
+from casest.data.options import Options, refuse_unknown_names, stated_unit
 from casest.data.rest import at_rest as averaged_at_rest
 from casest.data.run import Array, Labels, Run
-from casest.data.scaling import Scale, parse_scale
-from casest.data.table import Column, Table, read_table
+from casest.data.scaling import parse_scale
+from casest.data.table import Table, read_table
 from casest.declaring.symbols import Signal
 from casest.errors import DataError, UnitError, UsageError
 
 Path_ = str | os.PathLike[str]
-
-
-@dataclass(frozen=True)
-class _Options:
-    columns: Choice
-    units: Mapping[str, str]
-    scales: Mapping[str, Scale]
-    rate: float | None
-    time_zero: Literal["first", "column"]
-    extra: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -77,16 +68,16 @@ def load_runs(
     listed = [paths] if isinstance(paths, str | os.PathLike) else list(paths)
     if not listed:
         raise UsageError("no data file given; name at least one")
-    options = _Options(
+    options = Options(
         dict(columns or {}),
-        {name: _stated_unit(name, unit) for name, unit in (units or {}).items()},
+        {name: stated_unit(name, unit) for name, unit in (units or {}).items()},
         {name: parse_scale(text) for name, text in (scales or {}).items()},
         None if rate is None else timing.checked_rate(rate),
         time_zero,
         tuple(extra),
     )
     tables = [read_table(path) for path in listed]
-    _refuse_unknown_names(tables, wanted, options)
+    refuse_unknown_names(tables, wanted, options)
     runs = [run for table in tables for run in _runs(table, wanted, options)]
     runs = _named_apart(runs)
     if at_rest is not False:
@@ -95,35 +86,7 @@ def load_runs(
     return tuple(runs)
 
 
-def _stated_unit(name: str, unit: str) -> str:
-    try:
-        return unit_names.canonical(unit)
-    except UnitError as error:
-        raise UnitError(f"--unit {name}={unit}: {error}") from error
-
-
-def _refuse_unknown_names(
-    tables: Sequence[Table], signals: Sequence[Signal], options: _Options
-) -> None:
-    """Refuse an option for a signal or column that exists nowhere: a typing error."""
-    names = [s.name for s in signals]
-    headers = [name for table in tables for name in table.columns]
-    for option, given, allowed in (
-        ("columns", options.columns, [*names, "t", "run", "pose"]),
-        ("unit", options.units, [*names, "t", *headers]),
-        ("scale", options.scales, [*names, *headers]),
-    ):
-        for name in given:
-            if name in allowed:
-                continue
-            if option != "columns" and any(find_by_name(table, name) for table in tables):
-                continue
-            near = difflib.get_close_matches(name, allowed, n=1, cutoff=0.5)
-            hint = f"did you mean {near[0]}?" if near else f"there is {', '.join(allowed[:12])}"
-            raise UsageError(f"--{option} {name}=…: no signal or column {name}; {hint}")
-
-
-def _runs(table: Table, signals: Sequence[Signal], options: _Options) -> list[Run]:
+def _runs(table: Table, signals: Sequence[Signal], options: Options) -> list[Run]:
     """Bind one table and cut it into its runs."""
     bound = _bind(table, signals, options)
     groups = {kind: _group(table, kind, options) for kind in ("run", "pose")}
@@ -156,7 +119,7 @@ def _runs(table: Table, signals: Sequence[Signal], options: _Options) -> list[Ru
     return runs
 
 
-def _bind(table: Table, signals: Sequence[Signal], options: _Options) -> _Bound:
+def _bind(table: Table, signals: Sequence[Signal], options: Options) -> _Bound:
     """Find, scale and convert the columns of every signal but time."""
     found = _Bound({}, {}, {}, None, None, [])
     for signal in signals:
@@ -165,16 +128,16 @@ def _bind(table: Table, signals: Sequence[Signal], options: _Options) -> _Bound:
         names = find_columns(table, signal, options.columns)
         found.sources[signal.name] = names
         if signal.kind == "rotation":
-            values, notes = _rotation(table, signal, names, options)
+            values, notes = rotation(table, signal, names, options)
             found.units[signal.name] = None
         else:
-            values, unit, notes = _vector(table, signal, names, options)
+            values, unit, notes = vector(table, signal, names, options)
             found.units[signal.name] = unit
         found.signals[signal.name] = values
         found.notes.extend(notes)
     for name in options.extra:
         column = table.columns[find_column(table, name, "the model")]
-        _numbers(table, column, f"column {name}", f"--columns {name}=…")
+        numbers(table, column, f"column {name}", f"--columns {name}=…")
     return _with_time_column(table, signals, options, found)
 
 
@@ -182,124 +145,8 @@ def _is_time(signal: Signal) -> bool:
     return signal.name == "t" and signal.size == 1 and signal.kind == "plain"
 
 
-def _vector(
-    table: Table, signal: Signal, names: tuple[str, ...], options: _Options
-) -> tuple[Array, str | None, list[str]]:
-    """Return a plain signal (N, size), its unit, and notes on what was assumed."""
-    stated = [_unit_of(table, table.columns[name], signal.name, options) for name in names]
-    target = unit_names.canonical(signal.unit) if signal.unit else next(filter(None, stated), None)
-    parts = []
-    for name, unit in zip(names, stated, strict=True):
-        values = _scaled(table, table.columns[name], signal.name, options)
-        if unit is not None and target is not None:
-            values = _converted(table, name, signal, values, unit, target, stated)
-        parts.append(values)
-    values = np.stack(parts, axis=1)
-    notes = []
-    if target is not None and None in stated:
-        silent = " ".join(n for n, u in zip(names, stated, strict=True) if u is None)
-        size = f"median length {np.median(np.linalg.norm(values, axis=1)):.4g}"
-        notes.append(
-            f"{signal.name}: no unit stated for {silent}, taken as {target} ({size}); "
-            f"if that is wrong say --unit {signal.name}=…"
-        )
-    return values, target, notes
-
-
-def _converted(
-    table: Table,
-    name: str,
-    signal: Signal,
-    values: Array,
-    unit: str,
-    target: str,
-    stated: Sequence[str | None],
-) -> Array:
-    try:
-        factor, offset = unit_names.conversion(unit, target)
-    except UnitError as error:
-        wants = f"signal {signal.name} wants {target}" if signal.unit else f"its axes mix {stated}"
-        raise UnitError(
-            f"{table.file}: column {name} is in {unit} and {wants}: {error}; "
-            f"say --unit {signal.name}=… if the file is wrong, or choose other columns"
-        ) from error
-    return values if (factor, offset) == (1.0, 0.0) else factor * values + offset
-
-
-def _unit_of(table: Table, column: Column, signal: str, options: _Options) -> str | None:
-    """Return the unit of a column: as the user states it, else the header; None if silent."""
-    for name in (column.name, signal):
-        if name in options.units:
-            return options.units[name]
-    if column.unit is None:
-        return None
-    try:
-        unit = unit_names.canonical(column.unit)
-    except UnitError as error:
-        raise UnitError(
-            f"{table.file}: column {column.name}: {error} (or state it: --unit {signal}=…)"
-        ) from error
-    scaled = _scale_of(column.name, signal, options) is not None
-    return None if unit == "count" and scaled else unit  # after scaling they are counts no more
-
-
-def _scale_of(column: str, signal: str | None, options: _Options) -> Scale | None:
-    return options.scales.get(column) or (options.scales.get(signal) if signal else None)
-
-
-def _numbers(table: Table, column: Column, purpose: str, way_out: str) -> Array:
-    """Return a column's numbers; raise DataError where one of them is none."""
-    if column.is_text:
-        raise DataError(
-            f"{table.file}: column {column.name} row 0 holds '{column.values[0]}', and {purpose} "
-            f"needs numbers; choose another column: {way_out}"
-        )
-    if column.bad is not None:
-        raise DataError(
-            f"{table.file}: column {column.name} {column.bad}, and {purpose} needs finite numbers; "
-            f"repair or delete that row, or choose another column: {way_out}"
-        )
-    return np.asarray(column.values, dtype=np.float64)
-
-
-def _scaled(table: Table, column: Column, signal: str, options: _Options) -> Array:
-    values = _numbers(table, column, f"signal {signal}", f"--columns {signal}=…")
-    scale = _scale_of(column.name, signal, options)
-    return values if scale is None else scale.apply(values, table.file, column.name)
-
-
-def _rotation(
-    table: Table, signal: Signal, names: tuple[str, ...], options: _Options
-) -> tuple[Array, list[str]]:
-    """Return a rotation signal (N, 9), body to reference frame, row by row."""
-    parts = [_scaled(table, table.columns[name], signal.name, options) for name in names]
-    values = np.stack(parts, axis=1)
-    if len(names) == 4:
-        return attitude.from_quaternions(values, table.file, names), []
-    if len(names) == 9:
-        return attitude.from_matrices(values, table.file, names), []
-    notes = []
-    for i, name in enumerate(names):
-        unit = _unit_of(table, table.columns[name], signal.name, options)
-        if unit is None:
-            _refuse_degrees(table, signal, name, values[:, i])
-            notes.append(f"{name}: no unit stated, taken as rad")
-        else:
-            values[:, i] = _converted(table, name, signal, values[:, i], unit, "rad", (unit, "rad"))
-    return attitude.from_angles(values), notes
-
-
-def _refuse_degrees(table: Table, signal: Signal, name: str, values: Array) -> None:
-    largest = int(np.argmax(np.abs(values)))
-    if abs(values[largest]) > 2 * np.pi * 1.01:
-        raise DataError(
-            f"{table.file}: column {name} row {largest} holds {values[largest]:g} without a unit, "
-            f"too much for rad; say --unit {signal.name}=deg (or rad)"
-        )
-
-
 def _with_time_column(
-    table: Table, signals: Sequence[Signal], options: _Options, found: _Bound
+    table: Table, signals: Sequence[Signal], options: Options, found: _Bound
 ) -> _Bound:
     """Add the time column in s, where there is one and no rate is given."""
     needed = any(_is_time(signal) for signal in signals)
@@ -318,13 +165,16 @@ def _with_time_column(
     column = table.columns[name]
     try:
         if not column.is_text:
-            _numbers(table, column, "time", "--columns t=… or --rate HZ")
+            numbers(table, column, "time", "--columns t=… or --rate HZ")
         time, note = timing.seconds(table, column, timing.time_units_declared(options.units, name))
-    except UnitError as error:
-        raise UnitError(f"{table.file}: column {name} as time: {error}; --unit t=ms") from error
-    except DataError as error:
+    except (UnitError, DataError) as error:
         if needed or chosen:
-            raise
+            if isinstance(error, DataError):
+                raise
+            raise UnitError(
+                f"{table.file}: column {name} as time: {error}; "
+                f"name another column with --columns t=… or say its unit with --unit t=…"
+            ) from error
         found.notes.append(f"time not used: {error}")
         return replace(found, time_source=name)
     found.notes.extend([note] if note else [])
@@ -336,7 +186,7 @@ def _run_time(
     bound: _Bound,
     rows: NDArray[np.int_],
     signals: Sequence[Signal],
-    options: _Options,
+    options: Options,
 ) -> tuple[Array | None, list[str]]:
     """Return the time of one run in s, (N,), and notes; None where nothing tells it."""
     needed = any(_is_time(signal) for signal in signals)
@@ -357,7 +207,7 @@ def _run_time(
 
 
 def _from_column(
-    table: Table, bound: _Bound, rows: NDArray[np.int_], needed: bool, options: _Options
+    table: Table, bound: _Bound, rows: NDArray[np.int_], needed: bool, options: Options
 ) -> tuple[Array | None, list[str]]:
     assert bound.time is not None
     time = bound.time[rows]
@@ -390,7 +240,7 @@ def _time_unit(signals: Sequence[Signal]) -> dict[str, str | None]:
     return {s.name: unit_names.canonical(s.unit or "s") for s in signals if _is_time(s)}
 
 
-def _group(table: Table, kind: str, options: _Options) -> str | None:
+def _group(table: Table, kind: str, options: Options) -> str | None:
     """Return the column that groups rows into runs or poses."""
     if kind in options.columns:
         return find_column(table, as_names(options.columns[kind])[0], f"group {kind}")
@@ -414,7 +264,7 @@ def _in_order(labels: Array | Labels) -> list[float | int | str]:
 
 
 def _others(
-    table: Table, used: set[str], options: _Options
+    table: Table, used: set[str], options: Options
 ) -> tuple[dict[str, Array | Labels], dict[str, str | None], list[str]]:
     """Return the columns that no signal takes: each may be the cause of a residual."""
     columns: dict[str, Array | Labels] = {}

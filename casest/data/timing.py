@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from casest import units
 from casest.data.finding import find_by_name
 from casest.data.table import Column, Table
-from casest.errors import DataError, UsageError
+from casest.errors import DataError, UnitError, UsageError
 
 Array = NDArray[np.float64]
 
@@ -26,9 +26,20 @@ def find_time(table: Table, chosen: str | None) -> str | None:
     if chosen is not None:
         return chosen
     for name in _NAMES:
-        if found := find_by_name(table, name):
+        found = find_by_name(table, name)
+        if found and not _is_temperature(table.columns[found]):
             return found
     return next((name for name in table.columns if _unit_in_name(name)), None)
+
+
+def _is_temperature(column: Column) -> bool:
+    """A capital T is a time only where its unit is one."""
+    try:
+        return column.name == "T" and (
+            column.unit is None or not units.conversion(column.unit, "s")
+        )
+    except UnitError:
+        return True
 
 
 def seconds(table: Table, column: Column, stated: str | None) -> tuple[Array, str | None]:

@@ -86,7 +86,7 @@ def certify(
     if not against and not np.isfinite(sigma):
         against.append(
             f"no redundancy: {problem.residual_count} equations for {problem.unknowns} unknowns "
-            "fit whatever the noise is; record more, or rest intervals whose scatter shows the noise"
+            "fit whatever the noise is; record more, or rest intervals whose scatter shows it"
         )
     if not against:
         shape, words = _shape(problem, best, R, sigma)

@@ -1,0 +1,56 @@
+"""What the user says about files that do not say it themselves."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from casest import units as unit_names
+from casest.data.finding import Choice, find_by_name
+from casest.data.scaling import Scale
+from casest.data.table import Table
+from casest.declaring.symbols import Signal
+from casest.errors import UnitError, UsageError
+
+
+@dataclass(frozen=True)
+class Options:
+    """Checked options of `load_runs`, by signal or column name."""
+
+    columns: Choice
+    units: Mapping[str, str]
+    scales: Mapping[str, Scale]
+    rate: float | None
+    time_zero: Literal["first", "column"]
+    extra: tuple[str, ...]
+
+
+def stated_unit(name: str, unit: str) -> str:
+    """Return the canonical name of a unit the user states; a UnitError names the option."""
+    try:
+        return unit_names.canonical(unit)
+    except UnitError as error:
+        raise UnitError(f"--unit {name}={unit}: {error}") from error
+
+
+def refuse_unknown_names(
+    tables: Sequence[Table], signals: Sequence[Signal], options: Options
+) -> None:
+    """Refuse an option for a signal or column that exists nowhere: a typing error."""
+    names = [s.name for s in signals]
+    headers = [name for table in tables for name in table.columns]
+    for option, given, allowed in (
+        ("columns", options.columns, [*names, "t", "run", "pose"]),
+        ("unit", options.units, [*names, "t", *headers]),
+        ("scale", options.scales, [*names, *headers]),
+    ):
+        for name in given:
+            if name in allowed:
+                continue
+            if option != "columns" and any(find_by_name(table, name) for table in tables):
+                continue
+            near = difflib.get_close_matches(name, allowed, n=1, cutoff=0.5)
+            hint = f"did you mean {near[0]}?" if near else f"there is {', '.join(allowed[:12])}"
+            raise UsageError(f"--{option} {name}=…: no signal or column {name}; {hint}")
