@@ -3,71 +3,191 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from casest.data.run import Run
+from casest.declaring.physics import SX
 from casest.declaring.shapes import Array
+from casest.declaring.symbols import Signal
 from casest.engine import Replay
 from casest.errors import DataError, UsageError
 from casest.modelling.model import Model
-from casest.modelling.tracing import function_of, sample_symbol, trace
+from casest.modelling.tracing import (
+    Traced,
+    function_of,
+    reached_parameters,
+    reached_signals,
+    sample_symbol,
+    trace,
+)
+
+#: Newton steps, each halved up to HALVINGS times until it gains.
+STEPS, HALVINGS = 60, 30
 
 
-def corrected(model: Model, run: Run, values: Mapping[str, Any]) -> Array:
-    """The model's corrected quantity for every sample of a run, (N, size).
+@dataclass(frozen=True)
+class Correction:
+    """From reading to corrected quantity, for a model that names one.
 
-    Explicit models: the reading is solved for the corrected quantity, in one step where it enters
-    linearly, else by Newton's method from the reading itself. Implicit ones compute it directly.
-    Raises DataError naming the row where there is no solution.
+    Explicit models are solved for it: in one step where it enters linearly, else by damped Newton
+    steps from several starts. Implicit models compute it directly.
     """
-    name = model.traced.corrected
-    if name is None:
-        raise UsageError(f"model {model.name} names no corrected quantity: Residual(corrected=…)")
-    coordinates, references = model.point(values)
-    parameters = np.concatenate([coordinates, references])
-    samples = np.hstack([run.signals[s.name] for s in model.signals])
-    if model.implicit:
-        declared = model.traced.quantities[name].declared
-        replay = Replay(function_of(model, {"c": ca.vec(declared)}))
-        return replay(parameters, samples)[0][:, :, 0]
-    return _inverted(model, name, run, parameters, samples)
+
+    model: Model
+
+    def __post_init__(self) -> None:
+        """Refuse what has no inverse, sample by sample."""
+        if self.model.traced.corrected is None:
+            raise UsageError(f"model {self.model.name} names no corrected quantity: Residual(…)")
+        if any(a.kind == "sequence" for a in self.model.effects):
+            raise UsageError(
+                f"model {self.model.name} has an effect on the sequence of samples: undoing it "
+                "would amplify the noise without bound; calibrate without it to apply the rest"
+            )
+
+    @property
+    def name(self) -> str:
+        """Name of the corrected quantity."""
+        return str(self.model.traced.corrected)
+
+    @cached_property
+    def _cut(self) -> Traced:
+        return trace(self.model, cut=self.name)
+
+    @cached_property
+    def _wanted(self) -> SX:
+        """The corrected quantity: a free symbol (explicit), or its expression (implicit)."""
+        traced = self.model.traced if self.model.implicit else self._cut
+        return traced.quantities[self.name].declared
+
+    @property
+    def size(self) -> int:
+        """Number of components of the corrected quantity."""
+        return int(self._wanted.numel())
+
+    @property
+    def signals(self) -> tuple[Signal, ...]:
+        """The signals that the correction needs: not all that a fit needs."""
+        if self.model.implicit:
+            needed = reached_signals(self.model, self.model.traced, self._wanted)
+        else:
+            needed = reached_signals(self.model, self._cut, self._cut.expression)
+        return tuple(s for s in self.model.signals if s.name in needed)
+
+    @property
+    def parameters(self) -> set[str]:
+        """Names of the parameters that the correction needs."""
+        if self.model.implicit:
+            return reached_parameters(self.model, self.model.traced, self._wanted)
+        return reached_parameters(self.model, self._cut, self._cut.expression)
+
+    def __call__(
+        self, run: Run, values: Mapping[str, Any], around: tuple[float, float] | None = None
+    ) -> Array:
+        """The corrected quantity of every sample, (N, size).
+
+        `around` is the range it had in the fit: where several values give the same reading, the
+        one nearest to its middle is taken. Raises DataError naming the row without any.
+        """
+        parameters = np.concatenate(self.model.point(values))
+        blank = {s.name: np.zeros((len(run), s.size)) for s in self.model.signals}
+        samples = np.hstack([run.signals.get(s.name, blank[s.name]) for s in self.model.signals])
+        if self.model.implicit:
+            replay = Replay(function_of(self.model, {"c": ca.densify(ca.vec(self._wanted))}))
+            return replay(parameters, samples)[0][:, :, 0]
+        return self._solved(run, parameters, samples, around)
+
+    def _solved(
+        self, run: Run, parameters: Array, samples: Array, around: tuple[float, float] | None
+    ) -> Array:
+        rest, wanted = self._cut.expression, self._wanted
+        if rest.numel() != wanted.numel():
+            raise UsageError(
+                f"model {self.model.name}: {rest.numel()} readings do not determine the "
+                f"{wanted.numel()} components of {self.name}"
+            )
+        newton = self._newton()
+        affine = not ca.jacobian(ca.vec(ca.jacobian(rest, wanted)), wanted).nnz()
+        reading = run.signals[str(self._cut.measured)]
+        best = np.full((len(run), self.size), np.nan)
+        middle = 0.0 if around is None else 0.5 * sum(around)
+        for start in [np.zeros_like(best)] if affine else _starts(reading, best, around):
+            found = _damped_newton(newton, parameters, samples, start, 1 if affine else STEPS)
+            good = _solves(newton, parameters, samples, found, reading)
+            closer = np.abs(found - middle).max(axis=1) < np.abs(best - middle).max(axis=1)
+            better = good & (closer | np.isnan(best).any(axis=1))
+            best[better] = found[better]
+        self._refuse_unsolved(run, reading, best)
+        return best
+
+    def _newton(self) -> Replay:
+        """(parameters, [sample, value]) -> step to the solution, and what is left."""
+        rest, wanted = self._cut.expression, self._wanted
+        step = -ca.solve(ca.jacobian(rest, wanted), rest)
+        sample = ca.vertcat(sample_symbol(self.model, self._cut), wanted)
+        point = ca.vertcat(self._cut.coordinates, self._cut.references)
+        outputs = [ca.densify(step), ca.densify(rest)]
+        return Replay(ca.Function("inverse", [point, sample], outputs))
+
+    def _refuse_unsolved(self, run: Run, reading: Array, best: Array) -> None:
+        bad = np.asarray(np.isnan(best).any(axis=1))
+        if bad.any():
+            row = int(np.argmax(bad))
+            value = np.array2string(reading[row], precision=6)
+            raise DataError(
+                f"{run.file}: row {int(run.rows[row])}: reading {value} has no {self.name} in the "
+                f"model ({int(bad.sum())} of {len(bad)} rows): it lies outside what the model can "
+                "produce; remove the rows, or calibrate over a wider range"
+            )
 
 
-def _inverted(model: Model, name: str, run: Run, parameters: Array, samples: Array) -> Array:
-    cut = trace(model, cut=name)
-    wanted = cut.quantities[name].declared
-    rest = cut.expression
-    slope = ca.jacobian(rest, wanted)
-    if rest.numel() != wanted.numel():
-        raise UsageError(
-            f"model {model.name}: {rest.numel()} readings do not determine the "
-            f"{wanted.numel()} components of {name}"
-        )
-    affine = not ca.depends_on(slope, wanted)
-    sample = ca.vertcat(sample_symbol(model, cut), wanted)
-    point = ca.vertcat(cut.coordinates, cut.references)
-    step = -ca.solve(slope, rest)
-    f = Replay(
-        ca.Function("inverse", [point, sample], [step, rest], ["parameters", "sample"], ["s", "r"])
-    )
-    value = run.signals[str(model.traced.measured)].copy()
-    for _ in range(1 if affine else 50):
-        move, _ = (out[:, :, 0] for out in f(parameters, np.hstack([samples, value])))
-        value = value + move
-        if affine or np.all(np.abs(move) <= 1e-14 * (1 + np.abs(value))):
+def _starts(reading: Array, like: Array, around: tuple[float, float] | None) -> list[Array]:
+    """Where Newton's method begins: the range of the fit first, then the reading, then decades."""
+    levels = [] if around is None else [0.5 * sum(around), around[0], around[1]]
+    starts = [np.full_like(like, level) for level in levels]
+    if reading.shape == like.shape:
+        starts.append(reading.copy())
+    return starts + [np.full_like(like, level) for level in (0.0, 1.0, -1.0, 100.0, -100.0)]
+
+
+def _damped_newton(
+    newton: Replay, parameters: Array, samples: Array, start: Array, steps: int
+) -> Array:
+    value = start
+    step, left = _at(newton, parameters, samples, value)
+    for _ in range(steps):
+        share = np.ones((len(value), 1))
+        for _ in range(HALVINGS if steps > 1 else 1):
+            trial = value + share * step
+            next_step, next_left = _at(newton, parameters, samples, trial)
+            worse = ~(np.linalg.norm(next_left, axis=1) <= np.linalg.norm(left, axis=1))
+            if steps == 1 or not worse.any():
+                break
+            share[worse] *= 0.5
+        if steps > 1:
+            trial[worse], next_step[worse] = value[worse], 0.0
+            next_left[worse] = left[worse]
+        moved = np.abs(trial - value)
+        value, step, left = trial, next_step, next_left
+        if np.all(moved <= 1e-14 * (1 + np.abs(value))):
             break
-    left = f(parameters, np.hstack([samples, value]))[1][:, :, 0]
-    scale = 1e-9 * (1 + np.abs(samples).max())
-    bad = ~np.all(np.isfinite(value) & (np.abs(left) <= scale), axis=1)
-    if bad.any():
-        row = int(np.argmax(bad))
-        reading = np.array2string(run.signals[str(model.traced.measured)][row], precision=6)
-        raise DataError(
-            f"{run.file}: row {int(run.rows[row])}: reading {reading} "
-            f"has no {name} in the model ({int(bad.sum())} such rows): it lies outside the range "
-            "that the model can produce"
-        )
     return value
+
+
+def _at(newton: Replay, parameters: Array, samples: Array, value: Array) -> tuple[Array, Array]:
+    step, left = newton(parameters, np.hstack([samples, value]))
+    return step[:, :, 0], left[:, :, 0]
+
+
+def _solves(
+    newton: Replay, parameters: Array, samples: Array, value: Array, reading: Array
+) -> Array:
+    """Which samples are solved to rounding of the reading."""
+    left = _at(newton, parameters, samples, value)[1]
+    close = np.abs(left) <= 1e-9 * (np.abs(reading).max() + 1e-300)
+    return np.asarray(np.isfinite(value).all(axis=1) & close.all(axis=1))

@@ -11,10 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from casest.apply import corrected
+from casest.apply import Correction
 from casest.data import load_runs
 from casest.data.run import Run
 from casest.data.write import write_atomically
+from casest.declaring.shapes import Array
 from casest.declaring.symbols import constant
 from casest.errors import DataError, UsageError
 from casest.modelling.model import Model
@@ -44,38 +45,22 @@ def corrected_csv(
     if not result.get("trusted", True) and not force:
         raise UsageError(f"{path}: this estimate was refused; --force applies it all the same")
     model, values = saved_model(result)
-    runs = load_runs([data], model.signals, **arguments)
+    correction = Correction(model)
+    per_run = {p.name for p in model.parameters if p.scope == "run"}
+    if len(result["runs"]) > 1 and per_run & correction.parameters:
+        name = sorted(per_run & correction.parameters)[0]
+        raise UsageError(f"{name} differs from run to run: calibrate with --shared {name} to apply")
+    needed = {n: v for n, v in values.items() if n in correction.parameters}
+    runs = load_runs([data], correction.signals, **arguments)
     _same_units(result, runs, data)
+    found = result.get("corrected") or {}
+    around = (found["low"], found["high"]) if "low" in found else None
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     for k, run in enumerate(runs):
-        per_run = {p.name for p in model.parameters if p.scope == "run"}
-        if per_run & _reached(model):
-            raise UsageError(
-                f"{sorted(per_run)[0]} differs from run to run: nothing to apply it to"
-            )
-        value = corrected(model, run, {n: v for n, v in values.items() if n not in per_run})
-        _write(writer, model, run, value, result, header=k == 0, several=len(runs) > 1)
+        value = correction(run, needed, around)
+        _write(writer, correction, run, value, result, header=k == 0, several=len(runs) > 1)
     return text.getvalue()
-
-
-def _reached(model: Model) -> set[str]:
-    """Per-run parameters that the correction itself depends on."""
-    import casadi as ca
-
-    from casest.modelling.tracing import trace
-
-    name = model.traced.corrected
-    cut = trace(model, cut=name)
-    expression = (
-        model.traced.quantities[name].declared if model.implicit and name else cut.expression
-    )
-    symbols = model.traced.symbols if model.implicit else cut.symbols
-    return {
-        p.name
-        for p in model.parameters
-        if p.scope == "run" and ca.depends_on(expression, ca.vec(symbols[p.name]))
-    }
 
 
 def _same_units(result: Mapping[str, Any], runs: tuple[Run, ...], data: str) -> None:
@@ -90,31 +75,36 @@ def _same_units(result: Mapping[str, Any], runs: tuple[Run, ...], data: str) -> 
 
 def _write(
     writer: Any,
-    model: Model,
+    correction: Correction,
     run: Run,
-    value: Any,
+    value: Array,
     result: Mapping[str, Any],
     header: bool,
     several: bool,
 ) -> None:
-    name = str(model.traced.corrected)
-    unit = result.get("units", {}).get(model.quantities[name].unit.strip("[]"), "")
-    unit = unit or model.quantities[name].unit
-    unit = f" [{unit}]" if unit and "[" not in unit and unit != "1" else ""
-    readings = run.signals[model.traced.measured or model.signals[-1].name]
-    reading = model.traced.measured or model.signals[-1].name
-    own = run.units.get(reading)
-    axes = "xyz" if readings.shape[1] == 3 else [str(i) for i in range(readings.shape[1])]
+    """Rows of one run: run, row, time, the reading, the corrected quantity."""
+    reading = correction.model.traced.measured or correction.signals[-1].name
+    readings, own = run.signals[reading], run.units.get(reading)
     if header:
         names = ["run"] * several + ["row"] + ["t [s]"] * (run.time is not None)
-        names += [f"{reading}{a}" + (f" [{own}]" if own else "") for a in axes]
-        out = "xyz" if value.shape[1] == 3 else [str(i) for i in range(value.shape[1])]
-        writer.writerow([*names, *(f"{name}_{a}{unit}" for a in out)])
+        names += [f"{reading}{a}" + _bracket(own) for a in _axes(readings)]
+        unit = _bracket(result.get("units", {}).get(correction.name))
+        names += [f"{correction.name}{'_' * bool(a)}{a}{unit}" for a in _axes(value)]
+        writer.writerow(names)
     for i in range(len(run)):
         row: list[Any] = [run.name] * several + [int(run.rows[i])]
         if run.time is not None:
             row.append(f"{float(run.time[i]):.9g}")
         writer.writerow([*row, *(f"{x:.9g}" for x in readings[i]), *(f"{x:.9g}" for x in value[i])])
+
+
+def _axes(values: Array) -> list[str]:
+    size = values.shape[1]
+    return [""] if size == 1 else list("xyz") if size == 3 else [str(i) for i in range(size)]
+
+
+def _bracket(unit: str | None) -> str:
+    return f" [{unit}]" if unit and "[" not in unit and unit != "1" else ""
 
 
 def write_or_print(text: str, output: Path | None) -> None:

@@ -33,6 +33,9 @@ def run(arguments: Sequence[str] | None = None) -> int:
     except CasestError as error:
         click.echo(f"casest: {error}", err=True)
         return error.exit_code
+    except click.exceptions.NoArgsIsHelpError as error:
+        click.echo(error.format_message())
+        return 1
     except click.ClickException as error:
         click.echo(f"casest: {error.format_message()}", err=True)
         return 1
@@ -183,7 +186,7 @@ def calibration(model_name: str, data: Sequence[str], options: Options, command:
 
     model = declared_model(model_name, options)
     runs = records(model, data, options)
-    start = dict(named_value(text, "--start", model) for text in options["starts"]) or None
+    start = dict(start_value(text, model) for text in options["starts"]) or None
     found = estimate.attempt(
         model, runs, start=start, solver=options["solver"], seed=options["seed"]
     )
@@ -309,6 +312,16 @@ def named_value(text: str, option: str, model: Model) -> tuple[str, Any]:
     if not equals or not value:
         raise UsageError(f"{option} {text}: write it as {option} name=value")
     return key, parse_value(key, value, option, model)
+
+
+def start_value(text: str, model: Model) -> tuple[str, Any]:
+    """`name=value` as a start value in the parameter's own unit."""
+    from casest.declaring.symbols import Parameter
+
+    key, value = named_value(text, "--start", model)
+    if not isinstance(model[key], Parameter):
+        raise UsageError(f"--start {text}: {key} is no unknown of {model.name}")
+    return key, model.having(**{key: value})[key].array
 
 
 def reading_arguments(options: Options) -> Options:

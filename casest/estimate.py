@@ -121,6 +121,9 @@ def attempt(
         known = ", ".join([*SOLVERS, *estimators])
         raise UsageError(f"unknown solver {solver!r} for {model.name}; it has {known}")
     first = problem.start() if start is None else problem.point(_merged(problem, start))
+    nowhere = _not_finite(problem, first)
+    if nowhere:
+        return _refused(problem, first, nowhere, began)
     method = solver if solver in SOLVERS else "ipopt"
     outcomes = _solve(problem, first, method, seed, start is None)
     outcomes += _along_the_weakest(problem, min(outcomes, key=_cost))
@@ -159,6 +162,42 @@ def _enough(problem: Problem) -> None:
         raise UsageError(
             f"model {problem.model.name} has nothing left to estimate; --free something"
         )
+
+
+def _not_finite(problem: Problem, start: Point) -> str:
+    """Where the residual or its derivative is not finite at the start, in words; else empty."""
+    if np.isfinite(problem.cost(start)) and np.all(np.isfinite(problem.normal(start).gradient)):
+        return ""
+    for run, residual in zip(problem.runs, problem.residuals(start), strict=True):
+        bad = np.flatnonzero(~np.isfinite(residual).all(axis=1))
+        if bad.size:
+            return (
+                f"the residual is not finite at the start values in {bad.size} of {len(run)} rows, "
+                f"first in {run.file} row {int(run.rows[bad[0]])}; give other ones with --start"
+            )
+    return "a derivative of the residual is not finite at the start values; give --start"
+
+
+def _refused(problem: Problem, point: Point, reason: str, began: float) -> Estimate:
+    """An estimate that says nothing but why there is none."""
+    nothing = np.full((problem.unknowns, problem.unknowns), np.nan)
+    nan = float("nan")
+    everything = np.ones(problem.unknowns, dtype=bool)
+    return Estimate(
+        problem,
+        point,
+        problem.values(point),
+        problem.spread(point, nothing),
+        problem.spread(point, nothing),
+        nothing,
+        Noise(nan, nan, None, problem.residual_count - problem.unknowns),
+        nan,
+        Certificate(False, (reason,), nan, nan, nan, 0, 0, (nan, nan), ()),
+        Identifiability(0, problem.unknowns, nothing[0], nothing, (), everything, ""),
+        (),
+        (),
+        time.perf_counter() - began,
+    )
 
 
 def _merged(problem: Problem, start: Mapping[str, Any]) -> dict[str, Any]:

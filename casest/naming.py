@@ -34,6 +34,8 @@ def unit_table(model: Model, runs: Sequence[Run]) -> dict[str, str]:
     table = dict(known)
     for p in model.parameters:
         table.update(zip(p.entry_names, entry_units(p, known), strict=True))
+    for q in model.quantities.values():
+        table.setdefault(q.name, resolved(q.unit, known) if q.unit else "")
     table["residual"] = resolved(model.residual_unit, known)
     return table
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import importlib
+import linecache
 import sys
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
@@ -92,21 +93,20 @@ def load_file(path: Path) -> ModuleType:
             f"{error.filename}, line {error.lineno}: {error.msg}: {(error.text or '').strip()!r}"
         ) from None
     except CasestError as error:
-        raise type(error)(f"{path}, line {_line(error, path)}: {error}") from None
+        raise type(error)(f"{_place(error, path)}: {error}") from None
     except Exception as error:
-        raise DeclarationError(
-            f"{path}, line {_line(error, path)}: {type(error).__name__}: {error}"
-        ) from None
+        raise DeclarationError(f"{_place(error, path)}: {type(error).__name__}: {error}") from None
     finally:
         sys.path.remove(str(path.parent))
     return module
 
 
-def _line(error: BaseException, path: Path) -> int:
-    """Last line of the user's file in the error's traceback."""
+def _place(error: BaseException, path: Path) -> str:
+    """File, line and text of the last line of the user's file in the error's traceback."""
     line, traceback = 0, error.__traceback__
     while traceback is not None:
-        if traceback.tb_frame.f_code.co_filename == str(path):
+        if Path(traceback.tb_frame.f_code.co_filename).resolve() == path.resolve():
             line = traceback.tb_lineno
         traceback = traceback.tb_next
-    return line
+    text = linecache.getline(str(path), line).strip().rstrip(",")
+    return f"{path}, line {line}" + (f", {text!r}" if text else "")

@@ -12,6 +12,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import casadi as ca
 import numpy as np
 
 from casest import __version__
@@ -81,6 +82,7 @@ def calibration_result(
         },
         "invisible": None,
         "unexplained": None,
+        "corrected": _corrected_range(estimate),
         "units": {name: unit for name, unit in table.items() if "[" not in name},
         "solver": _solver(estimate),
         "samples": [_sample_note(run) for run in problem.runs],
@@ -120,7 +122,22 @@ def _correlation(covariance: Array) -> Array:
         return np.asarray(covariance / np.outer(std, std))
 
 
+def _corrected_range(estimate: Estimate) -> dict[str, Any] | None:
+    """Name of the corrected quantity and the range it had in the fit, for inverting it later."""
+    name = estimate.model.traced.corrected
+    if name is None:
+        return None
+    declared = ca.densify(ca.vec(estimate.model.traced.quantities[name].declared))
+    values = estimate.problem.evaluate(estimate.point, {"c": declared})
+    finite = np.concatenate([v[0][np.isfinite(v[0])] for v in values])
+    if not finite.size:
+        return {"name": name}
+    return {"name": name, "low": float(finite.min()), "high": float(finite.max())}
+
+
 def _solver(estimate: Estimate) -> dict[str, Any]:
+    if not estimate.outcomes:
+        return {"name": None}
     first = estimate.outcomes[0]
     return {
         "name": estimate.extra.get("estimator", first.solver),

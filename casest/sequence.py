@@ -16,10 +16,10 @@ import numpy as np
 
 from casest.data.run import Run
 from casest.declaring.shapes import Array
-from casest.engine import Replay, rows
+from casest.engine import Replay
 from casest.errors import DataError
 from casest.modelling.model import Model
-from casest.modelling.tracing import function_of
+from casest.modelling.tracing import function_of, sample_symbol
 
 #: Samples per accumulated map: long enough to hide the call, short enough to build at once.
 CHUNK = 512
@@ -27,39 +27,38 @@ CHUNK = 512
 
 @dataclass(frozen=True)
 class Recursion:
-    """Residual and Jacobian of an explicit model whose effects include sequences."""
+    """Residual and Jacobian of an explicit model with an effect on the sequence of samples."""
 
     model: Model
 
     @cached_property
-    def _prediction(self) -> Replay:
+    def _both_sides(self) -> Replay:
+        """Prediction and reading of one sample, with their Jacobians."""
         t = self.model.traced
-        jacobian = ca.jacobian(t.predicted, t.coordinates)
-        return Replay(function_of(self.model, {"x": ca.densify(t.predicted), "J": jacobian}))
+        outputs = {
+            "x": ca.densify(t.predicted),
+            "Jx": ca.jacobian(t.predicted, t.coordinates),
+            "z": ca.densify(t.reading),
+            "Jz": ca.jacobian(t.reading, t.coordinates),
+        }
+        return Replay(function_of(self.model, outputs))
 
     @cached_property
     def _steps(self) -> Any:
-        """(state, inputs) -> state, state = [y, dy/dθ], accumulated over CHUNK samples."""
+        """(state, inputs, parameters) -> state, state = [y, dy/dθ], over CHUNK samples."""
         t = self.model.traced
         m, n = t.predicted.numel(), t.coordinates.numel()
         y, S = ca.SX.sym("y", m), ca.SX.sym("S", m, n)
         x, J, dt = ca.SX.sym("x", m), ca.SX.sym("J", m, n), ca.SX.sym("dt")
-        value, slope, previous, memory = x, J, y, S
-        for attached in self.model.effects:
-            if attached.kind == "sequence":
-                new = ca.vec(ca.SX(attached.apply(value, t.symbols, previous=previous, dt=dt)))
-                slope = (
-                    ca.jacobian(new, value) @ slope
-                    + ca.jacobian(new, previous) @ memory
-                    + ca.jacobian(new, t.coordinates)
-                )
-                value = new
-                break  # one recursion: a second would need a memory of its own
-        state = ca.vertcat(y, ca.vec(S))
-        sample = ca.vertcat(x, ca.vec(J), dt)
-        constants = ca.vertcat(t.coordinates, t.references)
-        after = ca.vertcat(value, ca.vec(slope))
-        step = ca.Function("step", [state, sample, constants], [after])
+        attached = next(a for a in self.model.effects if a.kind == "sequence")
+        new = ca.vec(ca.SX(attached.apply(x, t.symbols, previous=y, dt=dt)))
+        slope = ca.jacobian(new, x) @ J + ca.jacobian(new, y) @ S + ca.jacobian(new, t.coordinates)
+        inputs = ca.vertcat(x, ca.vec(J), dt, sample_symbol(self.model))
+        step = ca.Function(
+            "step",
+            [ca.vertcat(y, ca.vec(S)), inputs, ca.vertcat(t.coordinates, t.references)],
+            [ca.vertcat(new, ca.vec(slope))],
+        )
         return step.mapaccum("steps", CHUNK)
 
     def rows(self, parameters: Array, samples: Array, run: Run) -> tuple[Array, Array]:
@@ -68,20 +67,22 @@ class Recursion:
             raise DataError(
                 f"{run.file}: a sequence effect needs time: give a time column or --rate"
             )
-        x, J = rows(self._prediction, parameters, samples)
+        x, Jx, z, Jz = self._both_sides(parameters, samples)
         dt = np.diff(run.time, prepend=run.time[:1])
-        measured = run.signals[str(self.model.traced.measured)]
-        y, S = np.empty_like(x), np.empty_like(J)
+        y, S = np.empty_like(x[:, :, 0]), np.empty_like(Jx)
         for block in np.unique(run.block):
             own = np.flatnonzero(run.block == block)
+            # The first sample of a block starts from a settled filter.
             dt[own[0]] = np.median(np.diff(run.time[own])) if len(own) > 1 else 0.0
-            y[own], S[own] = self._block(x[own], J[own], dt[own], parameters)
-        return measured - y, -S
+            y[own], S[own] = self._block(x[own, :, 0], Jx[own], dt[own], samples[own], parameters)
+        return z[:, :, 0] - y, Jz - S
 
-    def _block(self, x: Array, J: Array, dt: Array, parameters: Array) -> tuple[Array, Array]:
+    def _block(
+        self, x: Array, J: Array, dt: Array, samples: Array, parameters: Array
+    ) -> tuple[Array, Array]:
         count, m, n = J.shape
         state = np.concatenate([x[0], J[0].T.ravel()])
-        inputs = np.hstack([x, J.transpose(0, 2, 1).reshape(count, -1), dt[:, None]])
+        inputs = np.hstack([x, J.transpose(0, 2, 1).reshape(count, -1), dt[:, None], samples])
         padded = -count % CHUNK
         inputs = np.vstack([inputs, np.repeat(inputs[-1:], padded, axis=0)])
         constants = np.repeat(parameters[:, None], CHUNK, axis=1)

@@ -392,6 +392,11 @@ class Problem:
             middle[np.ix_(x, x)] += sums.T @ sums
         return middle
 
+    def evaluate(self, point: Point, outputs: Mapping[str, Any]) -> list[list[Array]]:
+        """Expressions of the trace for every sample of every run, each (N, rows, columns)."""
+        replay = Replay(function_of(self.model, outputs))
+        return [replay(self._parameters(point, r), s) for r, s in enumerate(self.samples)]
+
     def repeat_noise(self, point: Point) -> float | None:
         """Root mean square of the residual's noise that the scatter within rest intervals implies.
 
@@ -401,7 +406,7 @@ class Problem:
             return None
         expression = self.model.traced.expression
         slope = ca.jacobian(expression, sample_symbol(self.model))
-        replay = Replay(function_of(self.model, {"G": slope}))
+        slopes = self.evaluate(point, {"G": slope})
         squares, count = 0.0, 0
         for r, run in enumerate(self.runs):
             zero = np.zeros(len(run))
@@ -411,7 +416,7 @@ class Problem:
                     for s in self.model.signals
                 ]
             )
-            G = replay(self._parameters(point, r), self.samples[r])[0]
+            G = slopes[r][0]
             squares += float(np.sum((G * spread[:, None, :]) ** 2))
             count += G.shape[0] * G.shape[1]
         return float(np.sqrt(squares / count))

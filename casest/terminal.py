@@ -153,7 +153,7 @@ def _determined(found: Estimate) -> Iterator[str]:
         if len(found.weak) > 3:
             lines.append(f"  - and {len(found.weak) - 3} more, in result.json")
         yield "\n".join(["Weakly determined (one standard deviation of the combination):", *lines])
-    if not found.identifiability.unobservable and not found.weak:
+    if found.identifiability.rank == found.identifiability.unknowns and not found.weak:
         yield "The data determine every unknown; no weak combination."
 
 

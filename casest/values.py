@@ -9,7 +9,7 @@ import numpy as np
 
 from casest import units
 from casest.declaring.symbols import Constant, constant
-from casest.errors import UsageError
+from casest.errors import CasestError, UsageError
 from casest.modelling.model import Model
 from casest.result import load_result, saved_parameters
 
@@ -20,7 +20,10 @@ def parse_value(name: str, text: str, option: str, model: Model) -> Constant:
     if text.startswith("@"):
         return _from_result(name, text[1:])
     if "," not in text and ";" not in text:
-        number, unit = units.parse_quantity(text)
+        try:
+            number, unit = units.parse_quantity(text)
+        except CasestError as error:
+            raise type(error)(f"{option} {name}={text}: {error}") from None
         return _constant(number, unit or _declared_unit(old))
     try:
         rows = [[float(cell) for cell in row.split(",")] for row in text.split(";")]

@@ -227,6 +227,12 @@ def _values(declared: Model, A: Array, b: Array) -> dict[str, Array]:
     return {"scale": np.diag(A) if diagonal_only else A, "offset": b}
 
 
+def _length(declared: Model) -> float:
+    """The known length, or where the search for it starts."""
+    symbol = declared["norm"]
+    return float(symbol.start_value()[0] if hasattr(symbol, "start_value") else symbol.array)
+
+
 def _known_scale(declared: Model) -> Array | None:
     fixed = {c.name: c.array for c in declared.constants}.get("scale")
     return None if fixed is None else (np.diag(fixed) if fixed.ndim == 1 else fixed)
@@ -234,7 +240,7 @@ def _known_scale(declared: Model) -> Array | None:
 
 def closed_form(declared: Model, runs: Sequence[Run]) -> dict[str, Array]:
     """Burkhard's closed form for whichever of scale and offset is unknown."""
-    z, g = readings(runs), float(declared["norm"].array)
+    z, g = readings(runs), _length(declared)
     known = _known_scale(declared)
     if known is not None:  # (7), in the corrected frame: ‖A z − A b‖ = g
         return {"offset": np.linalg.solve(known, burkhard_bias(z @ known.T)[0])}
@@ -246,17 +252,17 @@ def closed_form(declared: Model, runs: Sequence[Run]) -> dict[str, Array]:
 def bias_only(declared: Model, runs: Sequence[Run]) -> dict[str, Array]:
     """Burkhard's bias-only closed form: the scale is one number for all axes, g over the radius."""
     b, radius = burkhard_bias(readings(runs))
-    return _values(declared, np.eye(3) * float(declared["norm"].array) / radius, b)
+    return _values(declared, np.eye(3) * _length(declared) / radius, b)
 
 
 def six_position(declared: Model, runs: Sequence[Run]) -> dict[str, Array]:
     """Ren & Liu's closed form for six aligned poses."""
-    scale, offset = six_positions(readings(runs), float(declared["norm"].array))
+    scale, offset = six_positions(readings(runs), _length(declared))
     return _values(declared, np.diag(scale), offset)
 
 
 def _paper(declared: Model, runs: Sequence[Run], squared: bool) -> dict[str, Array]:
-    v, g = readings(runs), float(declared["norm"].array)
+    v, g = readings(runs), _length(declared)
     free = np.eye(3, dtype=bool)
     if declared.function.__name__ != "norm_diagonal":
         free = np.tri(3, dtype=bool)

@@ -469,6 +469,20 @@ def test_a_time_that_is_none_is_refused(
     assert words in refusal(kind, tmp_path, text, [T, V])
 
 
+def test_a_time_of_another_unit_matters_only_where_time_is_needed(tmp_path: Path) -> None:
+    run = run_of(tmp_path, "time [LSB],vx,vy,vz\n0,1,2,3\n1,2,3,4\n", [V])
+    assert run.time is None
+    assert any("count does not convert to s" in note for note in run.notes)
+
+
+def test_a_capital_t_without_a_unit_of_time_is_a_temperature(tmp_path: Path) -> None:
+    for header in ("T", "T [°C]"):
+        run = run_of(tmp_path, f"{header},vx,vy,vz\n20,1,2,3\n19,2,3,4\n", [V])
+        assert run.time is None
+        assert "T" in run.columns
+    assert run_of(tmp_path, "T [s],vx,vy,vz\n0,1,2,3\n1,2,3,4\n", [V]).time is not None
+
+
 def test_a_gap_in_time_starts_a_block(tmp_path: Path) -> None:
     run = run_of(tmp_path, timed([1, 1, 6, 1, 1, 4, 1, 40, 1]), [T, V])
     assert run.block.tolist() == [0, 0, 0, 1, 1, 1, 1, 1, 2, 2]

@@ -77,6 +77,31 @@ def test_a_file_without_header_has_columns_by_position(tmp_path: Path, delimiter
     np.testing.assert_array_equal(table.columns["1"].values, ROWS[:, 1])
 
 
+def test_files_of_other_programs_are_read(tmp_path: Path) -> None:
+    xsens = "// Sample rate: 100.0Hz\nPacketCounter\tAcc_X\n1\t0.1\n2\t0.2\n"
+    table = table_of(tmp_path, xsens)
+    assert list(table.columns) == ["PacketCounter", "Acc_X"]
+    assert table.preamble == {"Sample rate": "100.0Hz"}
+    phyphox = '"Time (s)";"Linear Acceleration x (m/s^2)"\n1,008E-2;-1,02E0\n2,0E-2;1,5E0\n'
+    table = table_of(tmp_path, phyphox)
+    assert [(c.name, c.unit) for c in table.columns.values()] == [
+        ("Time", "s"),
+        ("Linear Acceleration x", "m/s^2"),
+    ]
+    assert table.columns["Time"].values.tolist() == [0.01008, 0.02]
+    rostopic = "%time,field.x\n1583,0.1\n1584,0.3\n"
+    assert list(table_of(tmp_path, rostopic).columns) == ["time", "field.x"]
+    excel = "sep=;\nt;v\n0;1\n1;2\n"
+    assert table_of(tmp_path, excel).n_rows == 2
+    unnamed_index = ",ax,ay\n0,1.5,2\n1,2.5,3\n"
+    assert list(table_of(tmp_path, unnamed_index).columns) == ["0", "ax", "ay"]
+
+
+def test_a_single_row_is_a_table(tmp_path: Path) -> None:
+    assert table_of(tmp_path, "0,1,2\n").n_rows == 1
+    assert table_of(tmp_path, "t,v\n0,1\n").n_rows == 1
+
+
 def test_positions_written_as_names_are_no_sample(tmp_path: Path) -> None:
     table = table_of(tmp_path, "0,1,2\n5.5,6,7\n5.6,6,7\n")
     assert table.n_rows == 2
@@ -160,7 +185,7 @@ def test_text_columns_are_kept_as_labels(tmp_path: Path) -> None:
 def test_nameless_empty_columns_are_left_out_and_counted(tmp_path: Path) -> None:
     table = table_of(tmp_path, "t,v,,,\n0,1,,,\n1,2,,,\n")
     assert list(table.columns) == ["t", "v"]
-    assert any("columns without name and content left out" in note for note in table.notes)
+    assert any("3 columns without name and content left out" in note for note in table.notes)
 
 
 @pytest.mark.parametrize(

@@ -64,6 +64,11 @@ SPELLINGS = [
 ]
 
 
+@pytest.fixture(scope="module")
+def registry() -> pint.UnitRegistry:
+    return pint.UnitRegistry()
+
+
 @pytest.mark.parametrize(("spelling", "name"), SPELLINGS)
 def test_each_spelling_has_one_canonical_name(spelling: str, name: str) -> None:
     assert canonical(spelling) == name
@@ -102,8 +107,9 @@ def test_known_spellings_and_their_conversions_need_no_pint() -> None:
         ("furlong", "m", "furlong", "m"),
     ],
 )
-def test_factors_agree_with_pint(old: str, new: str, pint_old: str, pint_new: str) -> None:
-    registry = pint.UnitRegistry()
+def test_factors_agree_with_pint(
+    registry: pint.UnitRegistry, old: str, new: str, pint_old: str, pint_new: str
+) -> None:
     expected = registry(pint_old).to(pint_new).magnitude
     assert conversion(old, new) == pytest.approx((expected, 0.0), rel=1e-12)
 

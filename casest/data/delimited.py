@@ -78,7 +78,7 @@ def read_delimited(file: str, text: str) -> Contents:
     before = lines[: start - (1 if names and not _is_comment_header(comments, names) else 0)]
     preamble, notes = _preamble(before, comments, layout)
     if dropped:
-        notes.append(f"{dropped} columns without name and content left out")
+        notes.append(f"{_counted(dropped, 'column')} without name and content left out")
     return Contents(columns, notes, preamble)
 
 
@@ -140,7 +140,8 @@ def _find_table(
         raise DataError(f"{file}: no table of numbers found in its first {len(head)} lines")
     if first > 0 and layout.width > 2 and len(head[first - 1]) > layout.width:
         _refuse_header(file, head[first - 1], layout)
-    if head[first] == [str(i) for i in range(len(head[first]))] and len(head[first]) > 1:
+    positions = [str(i) for i in range(layout.width)]
+    if head[first] == positions and layout.width > 1 and first + 1 < len(head):
         return first + 1, head[first]  # pandas writes positions as names
     return first, _commented_header(comments, layout)
 
@@ -221,14 +222,18 @@ def _preamble(
         if len(found) != 2 or layout.delimiter is None:
             found = [part.strip() for part in re.split(r"[:=,;\t]", line, maxsplit=1)]
         if len(found) == 2 and found[0] and found[1]:
-            pairs.setdefault(found[0], found[1])
+            pairs.setdefault(found[0].lstrip("/ "), found[1])
     notes = []
     if before:
         shown = " / ".join(line.strip() for line in before[:5]) + (" / …" if before[5:] else "")
-        notes.append(f"{len(before)} lines before the table skipped: {shown[:200]}")
+        notes.append(f"{_counted(len(before), 'line')} before the table skipped: {shown[:200]}")
     if comments:
-        notes.append(f"{len(comments)} comment lines skipped")
+        notes.append(f"{_counted(len(comments), 'comment line')} skipped")
     return pairs, notes
+
+
+def _counted(n: int, thing: str) -> str:
+    return f"{n} {thing}" if n == 1 else f"{n} {thing}s"
 
 
 @dataclass(frozen=True)

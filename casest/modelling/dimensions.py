@@ -72,8 +72,11 @@ def check_units(model: Model) -> None:
     for k, q in enumerate(traced.quantities.values()):
         if q.unit:
             for found in sizes[k]:
-                declared = _size(q.unit, open_model)
                 where = f"model {model.name}: quantity {q.name} is declared in {q.unit}"
+                try:
+                    declared = _size(q.unit, open_model)
+                except UnitError as error:
+                    raise UnitError(f"{where}: {error}") from None
                 _fits(found, declared, where)
     if traced.measured is not None:
         unit = model.residual_unit

@@ -12,7 +12,8 @@ import numpy as np
 
 from casest.declaring.physics import SX
 from casest.declaring.symbols import Constant, Parameter, Signal, Undecided, named
-from casest.errors import DeclarationError
+from casest.errors import DeclarationError, UnitError
+from casest.units import known
 
 Kind = Literal["quantity", "signal", "noise", "sequence"]
 
@@ -134,7 +135,24 @@ class Attached:
                 if isinstance(d, Parameter):
                     numbers[n] = d.shape.unpack(d.start_value())
         numbers = {n: float(a) if a.ndim == 0 else a for n, a in numbers.items()}
-        return self.effect.function(value, *more.values(), *extras, **unknowns, **numbers)
+        return evaluated(self.effect, value, *more.values(), *extras, **unknowns, **numbers)
+
+
+def evaluated(declared: Effect, *args: Any, **kwargs: Any) -> SX:
+    """The effect's function, its own errors turned into one line with their place."""
+    try:
+        return declared.function(*args, **kwargs)
+    except Exception as error:
+        code = declared.function.__code__
+        line, traceback = code.co_firstlineno, error.__traceback__
+        while traceback is not None:
+            if traceback.tb_frame.f_code is code:
+                line = traceback.tb_lineno
+            traceback = traceback.tb_next
+        text = [part for part in str(error).splitlines() if part.strip()] or [type(error).__name__]
+        raise DeclarationError(
+            f"effect {declared.name}, {code.co_filename}, line {line}: {text[-1].strip()}"
+        ) from None
 
 
 def attach(
@@ -164,6 +182,9 @@ def attach(
         own = units.get(on, f"[{on}]")
         own = f"({own})" if set("/*") & set(own) else own
         renamed = tuple(u.replace(f"[{first}]", own) for u in parameter.units)
+        for unit in renamed:
+            if "[" not in unit and unit and not known(unit):
+                raise UnitError(f"effect {label}: {name} has unknown unit {unit!r}")
         parameters.append(replace(parameter, units=renamed))
     return Attached(declared, on, kind, label, tuple(sorted(columns.items())), tuple(parameters))
 
@@ -189,9 +210,14 @@ def check_null(attached: Attached, shape: tuple[int, int]) -> None:
         return  # weights without a parameter: there is nothing that could vanish
     more = [ca.SX.sym("previous", *shape), ca.SX.sym("dt")] if attached.kind == "sequence" else []
     numbers = {n: float(v.ravel()[0]) if v.size == 1 else ca.SX(ca.DM(v)) for n, v in nulls.items()}
-    changed = attached.effect.function(value, *more, *symbols.values(), **numbers)
+    changed = ca.SX(evaluated(attached.effect, value, *more, *symbols.values(), **numbers))
+    if changed.shape != shape:
+        raise DeclarationError(
+            f"effect {attached.label} changes the shape of {attached.on} from {shape} to "
+            f"{changed.shape}"
+        )
     expected = ca.SX.ones(*shape) if attached.kind == "noise" else value
-    f = ca.Function("vanishes", [value, *more, *symbols.values()], [ca.SX(changed) - expected])
+    f = ca.Function("vanishes", [value, *more, *symbols.values()], [changed - expected])
     rng = np.random.default_rng(0)
     for _ in range(3):
         point = [rng.uniform(0.5, 2.0, size=f.size_in(i)) for i in range(f.n_in())]

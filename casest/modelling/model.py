@@ -16,7 +16,7 @@ from casest.declaring.shapes import Array
 from casest.declaring.symbols import Constant, Parameter, Scope, Signal, constant, named
 from casest.errors import DeclarationError, UnitError, UsageError
 from casest.modelling.effect import NOISE, Attached, Effect, Kind, attach, check_null
-from casest.modelling.tracing import Traced, describe, function_of, trace
+from casest.modelling.tracing import Traced, describe, function_of, reached_parameters, trace
 
 Symbol = Signal | Parameter | Constant
 
@@ -130,8 +130,7 @@ class Model:
         if isinstance(old, Signal):
             raise UsageError(f"{name} is a signal of model {self.name}: data give it, not having()")
         if isinstance(change, Parameter):
-            _fitting_unit(name, old.unit, change.unit)
-            return replace(change, name=name)
+            return replace(_converted_parameter(name, change, old), name=name)
         new = change if isinstance(change, Constant) else constant(change, old.unit)
         new = _converted(name, new, old.unit)
         if isinstance(old, Parameter):
@@ -197,7 +196,13 @@ class Model:
             raise UsageError(f"model {self.name} already has the effect {label}")
         attached = attach(added, target, kind, dims, {target: unit}, columns, label)
         check_null(attached, self._target_shape(target))
-        return replace(self, effects=(*self.effects, attached))
+        made = replace(self, effects=(*self.effects, attached))
+        if kind in ("quantity", "signal") and not _reaches_residual(made, attached):
+            raise UsageError(
+                f"effect {label} is not applicable to model {self.name}: "
+                f"its residual does not depend on {target}"
+            )
+        return made
 
     def _target_shape(self, target: str) -> tuple[int, int]:
         if target in self.quantities:
@@ -279,6 +284,11 @@ class Model:
         missing = [s.name for s in self.signals if s.name not in values]
         if missing:
             raise UsageError(f"model {self.name} needs the signal {missing[0]!r}")
+        if any(a.kind == "sequence" for a in self.effects):
+            raise UsageError(
+                f"model {self.name} has an effect on the sequence of samples: single samples have "
+                "no prediction of their own; evaluate it on a run (casest.stack.Problem.residuals)"
+            )
         traced = self.traced
         outputs = {q.name: q.value for q in traced.quantities.values()}
         if traced.predicted is not None:
@@ -360,6 +370,13 @@ def _check_names(made: Model) -> None:
                 raise UnitError(f"{units_error}; write it as in 'm/s^2', 'rad', 'degC', '1/count'")
 
 
+def _reaches_residual(made: Model, attached: Attached) -> bool:
+    """Does the residual depend on the effect's parameters at all?"""
+    reached = reached_parameters(made, made.traced, made.traced.expression)
+    own = {p.name for p in attached.parameters}
+    return not own or bool(own & reached)
+
+
 def _converted(name: str, new: Constant, unit: str) -> Constant:
     """The constant in the declared unit; left alone where that depends on the data."""
     _fitting_unit(name, unit, new.unit)
@@ -370,6 +387,32 @@ def _converted(name: str, new: Constant, unit: str) -> Constant:
     factor, offset = units.conversion(new.unit, unit or "1")
     converted: Constant = constant(factor * new.array + offset, unit)
     return converted
+
+
+def _converted_parameter(name: str, new: Parameter, old: Symbol) -> Parameter:
+    """The parameter in the declared unit: the body computes in that one."""
+    unit = old.unit or ""
+    _fitting_unit(name, unit, new.unit)
+    if isinstance(old, Parameter) and len(set(old.units)) > 1:
+        return replace(new, units=old.units) if not new.unit else new
+    if not new.unit:
+        return replace(new, units=(unit,) * new.shape.size)
+    if new.unit == unit or "[" in unit + new.unit or "," in new.unit:
+        return new
+    from casest import units
+
+    factor, offset = units.conversion(new.unit, unit or "1")
+
+    def converted(values: tuple[float, ...]) -> tuple[float, ...]:
+        return tuple(factor * v + offset for v in values)
+
+    return replace(
+        new,
+        units=(unit,) * new.shape.size,
+        start=None if new.start is None else converted(new.start),
+        lower=converted(new.lower),
+        upper=converted(new.upper),
+    )
 
 
 def _fitting_unit(name: str, old: str, new: str) -> None:

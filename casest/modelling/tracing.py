@@ -14,7 +14,7 @@ import casadi as ca
 import numpy as np
 
 from casest.declaring.physics import SX, Quantity, Residual, Trace, chart, current_trace
-from casest.errors import DeclarationError
+from casest.errors import CasestError, DeclarationError
 from casest.modelling.effect import Attached
 
 if TYPE_CHECKING:
@@ -27,7 +27,8 @@ class Traced:
 
     `coordinates` are the solver's unknowns and `references` the numbers that describe the charts
     of directions and rotations; `expression` is the residual column, `predicted` the reading of
-    an explicit model, `measured` and `corrected` name a signal and a quantity.
+    an explicit model and `reading` what it is compared with; `measured` and `corrected` name a
+    signal and a quantity.
     """
 
     symbols: Mapping[str, SX]
@@ -37,6 +38,7 @@ class Traced:
     residual: Residual
     expression: SX
     predicted: SX
+    reading: SX
     measured: str | None
     corrected: str | None
 
@@ -64,6 +66,7 @@ def trace(model: Model, cut: str | None = None, naming: bool = False) -> Traced:
         residual,
         ca.densify(residual.expression),
         None if residual.predicted is None else ca.vec(ca.SX(residual.predicted)),
+        None if residual.measured is None else ca.vec(residual.measured),
         measured,
         _corrected(model, residual, running),
     )
@@ -110,8 +113,12 @@ def _run_body(model: Model, running: Trace, symbols: Mapping[str, SX]) -> Residu
     token = current_trace.set(running)
     try:
         residual = model.function(**arguments)
-    except DeclarationError as error:
-        raise DeclarationError(f"model {model.name}: {error}") from None
+        if not isinstance(residual, Residual):
+            found = type(residual).__name__
+            raise DeclarationError(f"the body must return Residual(…), not {found}")
+        _ = residual.expression  # raises where shapes do not match
+    except CasestError as error:
+        raise type(error)(f"model {model.name}, {_where(model.function)}: {error}") from None
     except NameError as error:
         raise DeclarationError(
             f"model {model.name}, {_where(model.function)}: {error}; "
@@ -123,10 +130,6 @@ def _run_body(model: Model, running: Trace, symbols: Mapping[str, SX]) -> Residu
         ) from error
     finally:
         current_trace.reset(token)
-    if not isinstance(residual, Residual):
-        raise DeclarationError(
-            f"model {model.name} must return Residual(…), not {type(residual).__name__}"
-        )
     return residual
 
 
@@ -136,7 +139,7 @@ def _with_signal_effect(traced: Traced, attached: Attached) -> Traced:
     changed = ca.vec(ca.SX(attached.apply(symbol, traced.symbols)))
     if traced.measured == attached.on:
         # A changed reading: the prediction stays, what is compared with it does not.
-        return replace(traced, expression=changed - traced.predicted)
+        return replace(traced, reading=changed, expression=changed - traced.predicted)
     flat = _flat(symbol)
 
     def late(expression: SX) -> SX:
@@ -182,6 +185,30 @@ def sample_symbol(model: Model, traced: Traced | None = None) -> SX:
     """All signals of one sample as one column, in the order in which data hold them."""
     symbols = (traced or model.traced).symbols
     return ca.vertcat(*[_flat(symbols[s.name]) for s in model.signals])
+
+
+def reached_parameters(model: Model, traced: Traced, expression: SX) -> set[str]:
+    """Names of the parameters that an expression of the trace depends on."""
+    columns = ca.jacobian(ca.vec(expression), traced.coordinates).sparsity().get_triplet()[1]
+    reached, place = set(), 0
+    for p in model.parameters:
+        width = p.shape.coordinates
+        if any(place <= c < place + width for c in columns):
+            reached.add(p.name)
+        place += width
+    return reached
+
+
+def reached_signals(model: Model, traced: Traced, expression: SX) -> set[str]:
+    """Names of the signals that an expression of the trace depends on."""
+    sample = sample_symbol(model, traced)
+    columns = ca.jacobian(ca.vec(expression), sample).sparsity().get_triplet()[1]
+    reached, place = set(), 0
+    for s in model.signals:
+        if any(place <= c < place + s.size for c in columns):
+            reached.add(s.name)
+        place += s.size
+    return reached
 
 
 def equations(model: Model) -> list[str]:
