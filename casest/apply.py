@@ -132,7 +132,8 @@ class Correction:
         sample = ca.vertcat(sample_symbol(self.model, self._cut), wanted)
         point = ca.vertcat(self._cut.coordinates, self._cut.references)
         outputs = [ca.densify(step), ca.densify(rest)]
-        return Replay(ca.Function("inverse", [point, sample], outputs))
+        names = ["parameters", "sample"], ["step", "left"]
+        return Replay(ca.Function("inverse", [point, sample], outputs, *names))
 
     def _refuse_unsolved(self, run: Run, reading: Array, best: Array) -> None:
         bad = np.asarray(np.isnan(best).any(axis=1))

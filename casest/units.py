@@ -38,6 +38,8 @@ def _si(factor: float, offset: float = 0.0, **powers: int) -> _Size:
     return _Size(factor, tuple(sorted((k, Fraction(p)) for k, p in powers.items())), offset)
 
 
+_MASS = _si(1.0, kg=1)
+_GRAMS = {"g": _si(1e-3, kg=1), "mg": _si(1e-6, kg=1)}
 _TESLA = {"kg": 1, "s": -2, "A": -1}
 _KELVIN_OF_0_DEGC = 273.15
 
@@ -201,6 +203,8 @@ def conversion(from_unit: str, to_unit: str) -> tuple[float, float]:
     if old_name == new_name:
         return 1.0, 0.0
     old, new = _size(old_name, from_unit), _size(new_name, to_unit)
+    if new.dimension == _MASS.dimension and old_name in _GRAMS:
+        old = _GRAMS[old_name]  # an acceleration to most, but not where a mass is wanted
     if old.dimension != new.dimension:
         raise UnitError(f"{old_name} does not convert to {new_name}: {_why(old, new)}")
     return old.factor / new.factor, (old.offset - new.offset) / new.factor

@@ -149,7 +149,6 @@ def test_there_and_back_is_where_one_was(x: float, pair: tuple[str, str]) -> Non
         ("LSB", "m/s^2", "count does not convert to m/s\\^2: one is a raw count"),
         ("count", "1", "count does not convert to 1"),
         ("rad/s", "Hz", "an angular rate, the other a frequency"),
-        ("g", "kg", "an acceleration"),
         ("T", "deg/s", "a magnetic field"),
     ],
 )
@@ -244,3 +243,9 @@ def test_a_quantity_without_a_number_is_refused() -> None:
         parse_quantity("cm")
     with pytest.raises(UnitError, match="unknown unit 'cmm'"):
         parse_quantity("28 cmm")
+
+
+def test_g_is_a_gram_where_a_mass_is_wanted():
+    assert conversion("g", "kg") == pytest.approx((1e-3, 0.0))
+    assert conversion("mg", "kg") == pytest.approx((1e-6, 0.0))
+    assert conversion("g", "m/s^2") == pytest.approx((9.80665, 0.0))

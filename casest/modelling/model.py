@@ -51,10 +51,12 @@ class Model:
     def parameters(self) -> tuple[Parameter, ...]:
         """Declared parameters, then those of the effects (`quadratic.k`)."""
         own = [p for p in self.declared if isinstance(p, Parameter)]
-        changed = {p.name: p for p in own if "." in p.name}
+        changed = {s.name: s for s in self.declared if "." in s.name}
+        added = [p for attached in self.effects for p in attached.parameters]
+        of_effects: list[Symbol] = [changed.get(p.name, p) for p in added]
         return tuple(
             [p for p in own if "." not in p.name]
-            + [changed.get(p.name, p) for attached in self.effects for p in attached.parameters]
+            + [p for p in of_effects if isinstance(p, Parameter)]
         )
 
     @cached_property
