@@ -23,7 +23,8 @@ _HOME = {
     "casest.data.run": "Run",
     "casest.data": "load_runs read_table",
     "casest.errors": ("CasestError DataError DeclarationError NotTrusted UnitError UsageError"),
-    "casest.estimate": "Estimate calibrate",
+    "casest.estimate": "Estimate attempt calibrate",
+    "casest.apply": "Correction",
 }
 _WHERE = {name: module for module, names in _HOME.items() for name in names.split()}
 

@@ -14,17 +14,14 @@ from casest.declaring.shapes import Array
 from casest.errors import DataError, NotTrusted, UsageError
 from casest.identify import Identifiability, Weak, identify, weak_directions
 from casest.modelling.model import Model
-from casest.noise import has_noise_effects, variance_factor, weights
+from casest.noise import has_noise_effects, variance_factor
 from casest.solve.certificate import Certificate, certify
 from casest.solve.correlation import correlation_time
 from casest.solve.covariance import inverse_normal, sandwich
-from casest.solve.ipopt import ipopt
 from casest.solve.outcome import Outcome
-from casest.solve.trust_region import trust_region
+from casest.solve.strategy import SOLVERS, best_of, solve
 from casest.stack import Point, Problem
 
-#: Solvers of the least-squares problem; estimators of a model's own are named besides.
-SOLVERS = ("ipopt", "ipopt-exact", "trust-region")
 #: From this many degrees of freedom on the residual alone says how large the noise is.
 ENOUGH_FREEDOM = 10
 
@@ -113,41 +110,30 @@ def attempt(
     seed: int = 0,
 ) -> Estimate:
     """The same as `calibrate`, but a refused estimate is returned instead of raised."""
-    began = time.perf_counter()
-    problem = Problem(model, tuple(runs))
+    with np.errstate(all="ignore"):  # what is not finite is found and named, not warned about
+        return _attempt(Problem(model, tuple(runs)), start, solver, seed)
+
+
+def _attempt(problem: Problem, start: Mapping[str, Any] | None, solver: str, seed: int) -> Estimate:
+    began, model = time.perf_counter(), problem.model
     _enough(problem)
-    estimators = dict(model.estimators)
-    if solver not in SOLVERS and solver not in estimators:
-        known = ", ".join([*SOLVERS, *estimators])
+    own = dict(model.estimators)
+    if solver not in SOLVERS and solver not in own:
+        known = ", ".join([*SOLVERS, *own])
         raise UsageError(f"unknown solver {solver!r} for {model.name}; it has {known}")
     first = problem.start() if start is None else problem.point(_merged(problem, start))
     nowhere = _not_finite(problem, first)
     if nowhere:
         return _refused(problem, first, nowhere, began)
-    method = solver if solver in SOLVERS else "ipopt"
-    outcomes = _solve(problem, first, method, seed, start is None)
-    outcomes += _along_the_weakest(problem, min(outcomes, key=_cost))
-    best = min(outcomes, key=_cost)
-    if has_noise_effects(model):
-        problem, outcomes, best = _reweighted(problem, best, method, seed)
-    if solver in estimators:
-        return _own_estimator(problem, estimators[solver], solver, best, outcomes, began)
-    return _estimate(problem, best, outcomes, began)
-
-
-def _reweighted(
-    problem: Problem, best: Outcome, method: str, seed: int
-) -> tuple[Problem, tuple[Outcome, ...], Outcome]:
-    """Iterate weights and fit: effects on the noise say how much each residual counts."""
-    for _ in range(30):
-        problem = problem.with_weights(weights(problem, best.point))
-        moved = trust_region(problem, best.point)
-        shift = problem.factor(moved.point)[0] @ (moved.point.x - best.point.x)
-        best = moved
-        if float(shift @ shift) <= 1e-10 * 2 * moved.cost:
-            break
-    outcomes = _solve(problem, best.point, method, seed, automatic=True)
-    return problem, outcomes, min(outcomes, key=_cost)
+    problem, outcomes = solve(
+        problem,
+        first,
+        solver="ipopt" if solver in own else solver,
+        seed=seed,
+        automatic=start is None,
+    )
+    found = _estimate(problem, best_of(outcomes), outcomes, began)
+    return _by_estimator(found, own[solver], solver) if solver in own else found
 
 
 def _enough(problem: Problem) -> None:
@@ -205,80 +191,6 @@ def _merged(problem: Problem, start: Mapping[str, Any]) -> dict[str, Any]:
     return {**automatic, **start}
 
 
-def _cost(outcome: Outcome) -> float:
-    return outcome.cost if np.isfinite(outcome.cost) else np.inf
-
-
-def _solve(
-    problem: Problem, first: Point, solver: str, seed: int, automatic: bool
-) -> tuple[Outcome, ...]:
-    """The solver asked for with a polish, and a second way that must agree with it.
-
-    The polished outcome comes first and carries the time of both.
-    """
-    if solver == "trust-region" or _singular(problem, first):
-        # IPOPT wanders along a direction that changes nothing; the damped steps do not.
-        main = trust_region(problem, first)
-    else:
-        main = ipopt(problem, first, exact=solver == "ipopt-exact")
-    polished = trust_region(problem, main.point)
-    polished = replace(
-        polished,
-        solver=main.solver,
-        iterations=main.iterations + polished.iterations,
-        evaluations=main.evaluations + polished.evaluations,
-        seconds=main.seconds + polished.seconds,
-    )
-    second = trust_region(problem, first)
-    outcomes = [polished, second]
-    if not automatic:
-        # A start of the user's may lie in a wrong valley: the automatic one must agree.
-        outcomes.append(trust_region(problem, problem.start()))
-    costs = [_cost(o) for o in outcomes]
-    if max(costs) - min(costs) > 1e-6 * max(min(costs), 1e-300):
-        outcomes += _perturbed(problem, first, seed)
-    return (*outcomes,)
-
-
-def _along_the_weakest(problem: Problem, best: Outcome) -> tuple[Outcome, ...]:
-    """Two more starts far along the least determined direction: a second valley would lie there."""
-    if not np.isfinite(best.cost):
-        return ()
-    R = problem.factor(best.point)[0]
-    norms = np.linalg.norm(R, axis=0)
-    if not np.all(norms > 0):
-        return ()
-    _, singular, Vt = np.linalg.svd(R / norms)
-    if singular[-1] > 0.1 * singular[0] or singular[-1] < 1e-8 * singular[0]:
-        return ()
-    sigma = np.sqrt(2 * best.cost / max(problem.residual_count - problem.unknowns, 1))
-    step = 6 * sigma / singular[-1] * Vt[-1] / norms
-    found = []
-    for sign in (1, -1):
-        moved = problem.moved(best.point, sign * step)
-        found.append(trust_region(problem, Point(problem.inside(moved.x), moved.references)))
-    return tuple(found)
-
-
-def _singular(problem: Problem, first: Point) -> bool:
-    """Is a direction undetermined at the start and at what damped steps reach from there?"""
-    if identify(problem, first).rank == problem.unknowns:
-        return False
-    reached = trust_region(problem, first, max_iterations=50).point
-    return identify(problem, reached).rank < problem.unknowns
-
-
-def _perturbed(problem: Problem, first: Point, seed: int) -> list[Outcome]:
-    """Starts around the first one, when two ways disagree."""
-    rng = np.random.default_rng(seed)
-    found = []
-    for _ in range(4):
-        step = 0.1 * np.maximum(np.abs(first.x), 0.1) * rng.standard_normal(len(first.x))
-        moved = problem.moved(first, step)
-        found.append(trust_region(problem, Point(problem.inside(moved.x), moved.references)))
-    return found
-
-
 def _estimate(
     problem: Problem, best: Outcome, outcomes: Sequence[Outcome], began: float
 ) -> Estimate:
@@ -314,6 +226,50 @@ def _estimate(
     )
 
 
+def _by_estimator(optimum: Estimate, function: Callable[..., Any], name: str) -> Estimate:
+    """The values of an estimator of the model's own, judged by the least-squares optimum."""
+    problem, began = optimum.problem, time.perf_counter()
+    try:
+        values = function(problem.model, problem.runs)
+    except NotTrusted as error:
+        refused = replace(optimum.certificate, trusted=False, reasons=(str(error),))
+        return replace(optimum, certificate=refused, extra={"estimator": name})
+    seconds = time.perf_counter() - began
+    point = problem.point(values)
+    return replace(
+        optimum,
+        point=point,
+        values=problem.values(point),
+        rmse=float(np.sqrt(2 * problem.cost(point) / problem.residual_count)),
+        certificate=_judged(optimum, point, values, name),
+        extra={
+            "estimator": name,
+            "seconds": seconds,
+            "least_squares_seconds": optimum.outcomes[0].seconds,
+        },
+    )
+
+
+def _judged(optimum: Estimate, point: Point, values: Mapping[str, Any], name: str) -> Certificate:
+    """Trust an estimator's values only near a trusted optimum; say how far from it they are."""
+    certificate, problem = optimum.certificate, optimum.problem
+    if not certificate.trusted:
+        return certificate
+    raw = np.concatenate([s.parameter.shape.pack(values[s.parameter.name]) for s in problem.slots])
+    if not np.allclose(raw, point.x, rtol=1e-6, atol=1e-6 * np.abs(raw).max()):
+        reason = f"{name}: the solution collapsed; it lies outside the bounds of the model"
+        return replace(certificate, trusted=False, reasons=(reason,))
+    distance = (point.x - optimum.point.x) / np.sqrt(np.diag(optimum.covariance))
+    worst = int(np.argmax(np.abs(distance)))
+    far = (
+        f"{name}: `{problem.names[worst]}` is {abs(distance[worst]):.2g} standard deviations from "
+        "the certified least-squares optimum"
+    )
+    if not abs(distance[worst]) <= 3:
+        return replace(certificate, trusted=False, reasons=(far,))
+    return replace(certificate, reasons=(far, *certificate.reasons))
+
+
 def _covariance(
     problem: Problem, point: Point, R: Array, sigma: float, correlated: float, robust: Array
 ) -> Array:
@@ -344,58 +300,6 @@ def _noise(problem: Problem, point: Point, length: float, dof: int) -> Noise:
         return Noise(residual, residual, repeats, dof)
     candidates = [s for s in (residual, repeats) if s is not None and np.isfinite(s)]
     return Noise(max(candidates, default=float("nan")), residual, repeats, dof)
-
-
-def _own_estimator(
-    problem: Problem,
-    function: Callable[..., Any],
-    name: str,
-    best: Outcome,
-    outcomes: Sequence[Outcome],
-    began: float,
-) -> Estimate:
-    """An estimator of the model's own, judged by its distance from the least-squares optimum."""
-    optimum = _estimate(problem, best, outcomes, began)
-    started = time.perf_counter()
-    try:
-        values = function(problem.model, problem.runs)
-    except NotTrusted as error:
-        refused = replace(optimum.certificate, trusted=False, reasons=(str(error),))
-        return replace(optimum, certificate=refused, extra={"estimator": name})
-    seconds = time.perf_counter() - started
-    point = problem.point(values)
-    certificate = judge_estimator(optimum, problem, point, values, name)
-    least_squares = sum(o.seconds for o in outcomes[:1])
-    return replace(
-        optimum,
-        point=point,
-        values=problem.values(point),
-        rmse=float(np.sqrt(2 * problem.cost(point) / problem.residual_count)),
-        certificate=certificate,
-        extra={"estimator": name, "seconds": seconds, "least_squares_seconds": least_squares},
-        seconds=time.perf_counter() - began,
-    )
-
-
-def judge_estimator(
-    optimum: Estimate, problem: Problem, point: Point, values: Mapping[str, Any], name: str
-) -> Certificate:
-    """Trust an estimator's values only near a trusted optimum; say how far from it they are."""
-    if not optimum.certificate.trusted:
-        return optimum.certificate
-    raw = np.concatenate([s.parameter.shape.pack(values[s.parameter.name]) for s in problem.slots])
-    if not np.allclose(raw, point.x, rtol=1e-6, atol=1e-6 * np.abs(raw).max()):
-        reason = f"{name}: the solution collapsed; it lies outside the bounds of the model"
-        return replace(optimum.certificate, trusted=False, reasons=(reason,))
-    distance = (point.x - optimum.point.x) / np.sqrt(np.diag(optimum.covariance))
-    worst = int(np.argmax(np.abs(distance)))
-    far = (
-        f"{name}: `{problem.names[worst]}` is {abs(distance[worst]):.2g} standard deviations from "
-        "the certified least-squares optimum"
-    )
-    if not abs(distance[worst]) <= 3:
-        return replace(optimum.certificate, trusted=False, reasons=(far,))
-    return replace(optimum.certificate, reasons=(far, *optimum.certificate.reasons))
 
 
 def score(found: Estimate, runs: Sequence[Run]) -> float:

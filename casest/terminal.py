@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from casest.estimate import SOLVERS, Estimate
+from casest.estimate import Estimate
 from casest.modelling.model import Model
 from casest.naming import entry_units, unit_table
+from casest.solve.strategy import SOLVERS
 
 WIDTH = 80
 

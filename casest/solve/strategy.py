@@ -1,0 +1,131 @@
+"""How a problem is solved: the solver asked for, a polish, and second opinions.
+
+No single run is believed. The polished solution must be found again by a trust region from the
+start; where two ways disagree, more starts are tried, and always two far along the direction that
+the data determine least, where a second valley would lie.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from casest.errors import UsageError
+from casest.identify import identify
+from casest.noise import has_noise_effects, weights
+from casest.solve.ipopt import ipopt
+from casest.solve.outcome import Outcome
+from casest.solve.trust_region import trust_region
+from casest.stack import Point, Problem
+
+#: Solvers of the least-squares problem.
+SOLVERS = ("ipopt", "ipopt-exact", "trust-region")
+
+
+def solve(
+    problem: Problem, first: Point, *, solver: str = "ipopt", seed: int = 0, automatic: bool = True
+) -> tuple[Problem, tuple[Outcome, ...]]:
+    """All outcomes, that of the solver asked for first; the problem with its final weights.
+
+    `automatic` says that `first` is the model's own start, not the user's.
+    """
+    if solver not in SOLVERS:
+        raise UsageError(f"unknown solver {solver!r}; there are {', '.join(SOLVERS)}")
+    outcomes = _ways(problem, first, solver, seed, automatic)
+    outcomes += _along_the_weakest(problem, best_of(outcomes))
+    if not has_noise_effects(problem.model):
+        return problem, outcomes
+    problem, point = _reweighted(problem, best_of(outcomes).point)
+    return problem, _ways(problem, point, solver, seed, automatic=True)
+
+
+def best_of(outcomes: tuple[Outcome, ...]) -> Outcome:
+    """The outcome of the lowest cost; one that is not finite loses."""
+    return min(outcomes, key=_cost)
+
+
+def _cost(outcome: Outcome) -> float:
+    return outcome.cost if np.isfinite(outcome.cost) else np.inf
+
+
+def _ways(
+    problem: Problem, first: Point, solver: str, seed: int, automatic: bool
+) -> tuple[Outcome, ...]:
+    """The solver asked for with a polish, and a second way that must agree with it.
+
+    The polished outcome comes first and carries the time of both.
+    """
+    if solver == "trust-region" or _singular(problem, first):
+        # IPOPT wanders along a direction that changes nothing; the damped steps do not.
+        main = trust_region(problem, first)
+    else:
+        main = ipopt(problem, first, exact=solver == "ipopt-exact")
+    polished = trust_region(problem, main.point)
+    polished = replace(
+        polished,
+        solver=main.solver,
+        iterations=main.iterations + polished.iterations,
+        evaluations=main.evaluations + polished.evaluations,
+        seconds=main.seconds + polished.seconds,
+    )
+    second = trust_region(problem, first)
+    outcomes = [polished, second]
+    if not automatic:
+        # A start of the user's may lie in a wrong valley: the automatic one must agree.
+        outcomes.append(trust_region(problem, problem.start()))
+    costs = [_cost(o) for o in outcomes]
+    if max(costs) - min(costs) > 1e-6 * max(min(costs), 1e-300):
+        outcomes += _perturbed(problem, first, seed)
+    return (*outcomes,)
+
+
+def _singular(problem: Problem, first: Point) -> bool:
+    """Is a direction undetermined at the start and at what damped steps reach from there?"""
+    if identify(problem, first).rank == problem.unknowns:
+        return False
+    reached = trust_region(problem, first, max_iterations=50).point
+    return identify(problem, reached).rank < problem.unknowns
+
+
+def _perturbed(problem: Problem, first: Point, seed: int) -> list[Outcome]:
+    """Starts around the first one, when two ways disagree."""
+    rng = np.random.default_rng(seed)
+    found = []
+    for _ in range(4):
+        step = 0.1 * np.maximum(np.abs(first.x), 0.1) * rng.standard_normal(len(first.x))
+        moved = problem.moved(first, step)
+        found.append(trust_region(problem, Point(problem.inside(moved.x), moved.references)))
+    return found
+
+
+def _along_the_weakest(problem: Problem, best: Outcome) -> tuple[Outcome, ...]:
+    """Two more starts far along the least determined direction: a second valley would lie there."""
+    if not np.isfinite(best.cost):
+        return ()
+    R = problem.factor(best.point)[0]
+    norms = np.linalg.norm(R, axis=0)
+    if not np.all(norms > 0):
+        return ()
+    _, singular, Vt = np.linalg.svd(R / norms)
+    if singular[-1] > 0.1 * singular[0] or singular[-1] < 1e-8 * singular[0]:
+        return ()
+    sigma = np.sqrt(2 * best.cost / max(problem.residual_count - problem.unknowns, 1))
+    step = 6 * sigma / singular[-1] * Vt[-1] / norms
+    found = []
+    for sign in (1, -1):
+        moved = problem.moved(best.point, sign * step)
+        found.append(trust_region(problem, Point(problem.inside(moved.x), moved.references)))
+    return tuple(found)
+
+
+def _reweighted(problem: Problem, point: Point) -> tuple[Problem, Point]:
+    """Iterate weights and fit: effects on the noise say how much each residual counts."""
+    for _ in range(30):
+        problem = problem.with_weights(weights(problem, point))
+        moved = trust_region(problem, point)
+        shift = problem.factor(moved.point)[0] @ (moved.point.x - point.x)
+        point = moved.point
+        if float(shift @ shift) <= 1e-10 * 2 * moved.cost:
+            break
+    return problem, point
