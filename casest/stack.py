@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import casadi as ca
@@ -213,9 +213,9 @@ class Problem:
             shape, block = s.parameter.shape, covariance[s.x, s.x]
             if shape.curved:
                 jacobian = self._chart_jacobian(s, point)
-                std = np.sqrt(np.diag(jacobian @ block @ jacobian.T)).reshape(shape.dims)
+                std = _root(np.diag(jacobian @ block @ jacobian.T)).reshape(shape.dims)
             else:
-                std = shape.unpack(np.sqrt(np.diag(block)))
+                std = shape.unpack(_root(np.diag(block)))
             found[s.parameter.name].append(std)
         several = len(self.runs) > 1
         per_run = {p.name for p in self.model.parameters if p.scope == "run"}
@@ -241,26 +241,9 @@ class Problem:
             stacked.append(np.hstack([run.signals[s.name] for s in self.model.signals]))
         return tuple(np.ascontiguousarray(s, dtype=float) for s in stacked)
 
-    @cached_property
+    @property
     def _with_jacobian(self) -> Replay:
-        t = self.model.traced
-        return Replay(
-            function_of(
-                self.model, {"r": t.expression, "J": ca.jacobian(t.expression, t.coordinates)}
-            )
-        )
-
-    @cached_property
-    def _curvature(self) -> Replay:
-        """Hessian of ½rᵀWr for one sample; the weights arrive as further signals."""
-        t = self.model.traced
-        w = ca.SX.sym("w", t.expression.numel())
-        hessian = ca.hessian(ca.dot(w * t.expression, t.expression) / 2, t.coordinates)[0]
-        sample = ca.vertcat(sample_symbol(self.model), w)
-        parameters = ca.vertcat(t.coordinates, t.references)
-        return Replay(
-            ca.Function("h", [parameters, sample], [hessian], ["parameters", "sample"], ["H"])
-        )
+        return _residual_and_jacobian(self.model)
 
     @cached_property
     def _recursion(self) -> Recursion | None:
@@ -357,7 +340,7 @@ class Problem:
             if weights is None:
                 weights = np.ones((len(samples), len(self.model.axes)))
             with_weights = np.hstack([samples, weights])
-            own = self._curvature.sum(self._parameters(point, r), with_weights)
+            own = _curvature(self.model).sum(self._parameters(point, r), with_weights)
             matrix[np.ix_(x, x)] += own
         return matrix
 
@@ -397,6 +380,18 @@ class Problem:
         replay = Replay(function_of(self.model, outputs))
         return [replay(self._parameters(point, r), s) for r, s in enumerate(self.samples)]
 
+    def second_order(self, point: Point, sigma: float) -> float:
+        """Root mean square of ½σ²·∇²r over σ: what an implicit residual neglects of the noise.
+
+        Zero for explicit models, whose residual is linear in the noise of the reading.
+        """
+        if not self.model.implicit:
+            return 0.0
+        replay = _laplacian(self.model)
+        values = [replay(self._parameters(point, r), s)[0] for r, s in enumerate(self.samples)]
+        squares = np.concatenate([v.ravel() ** 2 for v in values])
+        return float(0.5 * sigma * np.sqrt(np.mean(squares)))
+
     def repeat_noise(self, point: Point) -> float | None:
         """Root mean square of the residual's noise that the scatter within rest intervals implies.
 
@@ -424,6 +419,42 @@ class Problem:
     def with_weights(self, weights: Sequence[Array] | None) -> Problem:
         """The same problem with other weights on the squares."""
         return replace(self, weights=None if weights is None else tuple(weights))
+
+
+@lru_cache(maxsize=64)
+def _residual_and_jacobian(model: Model) -> Replay:
+    """r and ∂r/∂x of one sample; kept, for many problems may have the same model."""
+    t = model.traced
+    return Replay(
+        function_of(model, {"r": t.expression, "J": ca.jacobian(t.expression, t.coordinates)})
+    )
+
+
+@lru_cache(maxsize=64)
+def _curvature(model: Model) -> Replay:
+    """Hessian of ½rᵀWr for one sample; the weights arrive as further signals."""
+    t = model.traced
+    w = ca.SX.sym("w", t.expression.numel())
+    hessian = ca.hessian(ca.dot(w * t.expression, t.expression) / 2, t.coordinates)[0]
+    sample = ca.vertcat(sample_symbol(model), w)
+    parameters = ca.vertcat(t.coordinates, t.references)
+    return Replay(ca.Function("h", [parameters, sample], [hessian], ["parameters", "sample"], ["H"]))
+
+
+@lru_cache(maxsize=64)
+def _laplacian(model: Model) -> Replay:
+    """Σ ∂²r/∂s² over the numbers of one sample, for each residual."""
+    sample = sample_symbol(model)
+    parts = [
+        ca.trace(ca.hessian(model.traced.expression[i], sample)[0])
+        for i in range(model.traced.expression.numel())
+    ]
+    return Replay(function_of(model, {"L": ca.densify(ca.vertcat(*parts))}))
+
+
+def _root(variance: Array) -> Array:
+    """Standard deviation; rounding may leave a vanishing variance below zero, NaN stays NaN."""
+    return np.sqrt(np.where(variance < 0, 0.0, variance))
 
 
 def _indices(slices: Any) -> Any:

@@ -1,7 +1,7 @@
 """Independent simulators of triaxial sensors of a vector of constant length: plain NumPy.
 
 Nothing here knows casest. A sensor reads z = M x + b + noise (Burkhard et al., eq. 1) of a true
-vector x with ‖x‖ = norm, M lower triangular; the truth in casest's words is scale = M⁻¹, offset = b.
+vector x with ‖x‖ = norm, M lower triangular; the truth is scale = M⁻¹, offset = b.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 GRAVITY = 9.80665
 
 
-# -- directions of the true vector in the sensor's frame, (n, 3) unit vectors ---------------------
+# -- directions of the true vector in the sensor's frame, (n, 3) unit vectors ----------------------
 
 
 def _unit(vectors: Array) -> Array:
@@ -68,7 +68,7 @@ def cap(n: int, rng: np.random.Generator, tilt: float = np.radians(10)) -> Array
     )
 
 
-# -- sensors --------------------------------------------------------------------------------------
+# -- sensors ---------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ def magnetometer(rng: np.random.Generator, *, counts_per_gauss: float = 3000.0) 
     return Sensor(L, counts_per_gauss * rng.uniform(-0.24, 0.24, 3), 0.48)
 
 
-# -- a raw record -----------------------------------------------------------------------------------
+# -- a raw record ----------------------------------------------------------------------------------
 
 
 def handheld(

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
-from casest_problems import norm
 
 from casest import (
     Residual,
@@ -23,6 +22,7 @@ from casest import (
     quantity,
     signal,
 )
+from casest_problems import norm
 
 
 @model

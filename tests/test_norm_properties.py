@@ -173,7 +173,9 @@ def test_a_raw_hand_held_record_gives_the_sensor_within_its_uncertainty():
     assert found.certificate.trusted, found.certificate.reasons
     z = (found.values["offset"] - sensor.b) / found.std["offset"]
     free = np.tri(3, dtype=bool)
-    z = np.append(z, ((found.values["scale"] - sensor.scale) / np.where(free, found.std["scale"], 1))[free])
+    z = np.append(
+        z, ((found.values["scale"] - sensor.scale) / np.where(free, found.std["scale"], 1))[free]
+    )
     assert np.max(np.abs(z)) < 4
     # white noise of 0.05 over about 300 samples: 0.0029 m/s² per rest, both ways of knowing it
     assert 0.7 * 0.0029 < found.noise.repeats < 1.4 * 0.0029

@@ -100,7 +100,7 @@ def calibrations():
     return found
 
 
-# -- what is printed about uncertainty ------------------------------------------------------------
+# -- what is printed about uncertainty -------------------------------------------------------------
 
 
 def test_a_good_calibration_of_24_poses_is_always_trusted(calibrations):
@@ -111,8 +111,11 @@ def test_a_good_calibration_of_24_poses_is_always_trusted(calibrations):
 @pytest.mark.parametrize("name", ["norm-diagonal", "norm-triangular"])
 def test_the_95_percent_intervals_hold_the_truth_95_times_in_a_hundred(calibrations, name):
     covered = np.array([o.covered for o in calibrations[name]])
-    print(f"\n{name}: pooled coverage {100 * covered.mean():.2f} %,",
-          "by unknown", np.round(100 * covered.mean(axis=0), 1))
+    print(
+        f"\n{name}: pooled coverage {100 * covered.mean():.2f} %,",
+        "by unknown",
+        np.round(100 * covered.mean(axis=0), 1),
+    )
     assert 0.93 < covered.mean() < 0.97
     # No single unknown hides behind the others: binomial spread of 1000 draws is 0.7 %.
     assert covered.mean(axis=0).min() > 0.92
@@ -120,7 +123,7 @@ def test_the_95_percent_intervals_hold_the_truth_95_times_in_a_hundred(calibrati
 
 
 def test_estimates_are_unbiased_and_their_covariance_is_right(calibrations):
-    """Jointly over both models: eᵀΣ⁻¹e/n follows F(n, ν), and the whitened errors have mean zero."""
+    """Jointly over both models: eᵀΣ⁻¹e/n follows F(n, ν); whitened errors have mean zero."""
     probabilities, mean_statistic, mean_freedom = [], 0.0, 0
     for name, outcomes in calibrations.items():
         whitened = np.array(
@@ -132,16 +135,20 @@ def test_estimates_are_unbiased_and_their_covariance_is_right(calibrations):
         law = stats.f(n, nu)
         standard_error = law.std() / np.sqrt(len(ratio))
         z = whitened / np.sqrt(nu / (nu - 2))
-        print(f"\n{name}: mean of eᵀΣ⁻¹e/n {ratio.mean():.4f}, expected {law.mean():.4f} ± "
-              f"{standard_error:.4f}; pooled z-scores: mean {z.mean():+.4f}, std {z.std():.4f}")
+        print(
+            f"\n{name}: mean of eᵀΣ⁻¹e/n {ratio.mean():.4f}, expected {law.mean():.4f} ± "
+            f"{standard_error:.4f}; pooled z-scores: mean {z.mean():+.4f}, std {z.std():.4f}"
+        )
         assert abs(ratio.mean() - law.mean()) < 4 * standard_error
         probabilities.append(law.cdf(ratio))
         mean_statistic += len(z) * np.sum(z.mean(axis=0) ** 2)
         mean_freedom += n
     uniform = stats.kstest(np.concatenate(probabilities), "uniform").pvalue
     unbiased = stats.chi2.sf(mean_statistic, mean_freedom)
-    print(f"Kolmogorov-Smirnov against F: p = {uniform:.3f}; mean error zero: "
-          f"chi2 = {mean_statistic:.1f} of {mean_freedom}, p = {unbiased:.3f}")
+    print(
+        f"Kolmogorov-Smirnov against F: p = {uniform:.3f}; mean error zero: "
+        f"chi2 = {mean_statistic:.1f} of {mean_freedom}, p = {unbiased:.3f}"
+    )
     assert uniform > 1e-3
     assert unbiased > 1e-3
 
@@ -165,7 +172,7 @@ def test_the_robust_std_is_right_when_noise_differs_between_poses_and_the_plain_
     assert rms_plain > 1.3
 
 
-# -- the closed form (Burkhard et al.) ------------------------------------------------------------
+# -- the closed form (Burkhard et al.) -------------------------------------------------------------
 
 
 @pytest.mark.parametrize("sigma", [1e-7, 1e-6, 1e-5, 1e-4, 1e-3])
@@ -267,7 +274,7 @@ def test_the_null_vector_of_the_closed_form_obeys_the_printed_relations():
     assert np.all(np.diag(A) > 0)
 
 
-# -- Ren & Liu ------------------------------------------------------------------------------------
+# -- Ren & Liu -------------------------------------------------------------------------------------
 
 
 def test_six_positions_give_the_hand_computed_scale_and_offset():

@@ -26,8 +26,11 @@ STEP = 1e-4
 #: Two solutions are the same when they differ by less than this many standard deviations.
 SAME = 1e-2
 #: Rise of the cost two standard deviations from the optimum, over what the intervals assume. Below,
-#: they are too narrow and the estimate is refused; above, they are wider than need be.
-SHAPE = (0.5, 2.0)
+#: they are too narrow; far above, the optimum sits in a fold where they mean nothing.
+SHAPE = (0.5, 10.0)
+#: An implicit residual is the noise of the reading to first order only; the second-order part must
+#: stay below this share of it. (A flat ellipsoid through poses in a plane "fits" by that part.)
+SECOND_ORDER = 0.07
 #: Singular values of the column-scaled Jacobian below this leave a direction undetermined for all
 #: practical purposes: its standard deviation is 10⁵ times that of each parameter alone.
 PRACTICALLY_NULL = 1e-5
@@ -72,6 +75,11 @@ def certify(
             f"practically not determined: {identified.weakest}; the motion does not separate them"
         )
     against += [] if against else [_bound_words(problem, name) for name in at_bound]
+    if not against and not np.isfinite(sigma):
+        against.append(
+            f"no redundancy: {problem.residual_count} equations for {problem.unknowns} unknowns "
+            "fit whatever the noise is; record more, or rest intervals whose scatter shows it"
+        )
     if not np.isfinite(best.cost):
         against.append("the residual is not finite at the best point found")
     elif slope > SLOPE and step > STEP and not against:
@@ -83,10 +91,11 @@ def certify(
         against.append(f"no minimum: the exact curvature is {curvature:.2g} in some direction")
     agreeing = sum(_same(problem, best, other, R, sigma) for other in others)
     shape = (1.0, 1.0)
-    if not against and not np.isfinite(sigma):
+    second = problem.second_order(best.point, sigma) if not against else 0.0
+    if second > SECOND_ORDER:
         against.append(
-            f"no redundancy: {problem.residual_count} equations for {problem.unknowns} unknowns "
-            "fit whatever the noise is; record more, or rest intervals whose scatter shows it"
+            f"the noise is too large for the curvature of the fitted surface (second-order part "
+            f"{second:.2g} of the noise): the readings cover too little, or average more of them"
         )
     if not against:
         shape, words = _shape(problem, best, R, sigma)
@@ -158,8 +167,7 @@ def _shape(
 
     The ratio of the cost's rise to the quadratic one is 1 for a linear problem. Where a straight
     walk disagrees, the valley may only be curved: the others are then fitted again with this
-    direction held (profile; Bates & Watts 1988, ch. 6). Below SHAPE the intervals are false; above,
-    they are wider than need be.
+    direction held (profile; Bates & Watts 1988, ch. 6). Outside SHAPE the intervals are false.
     """
     sigma = max(sigma, _rounding(problem, best.point, R))
     norms = np.linalg.norm(R, axis=0)
@@ -169,10 +177,10 @@ def _shape(
         for sign in (1, -1):
             step = sign * 2 * sigma / singular[k] * Vt[k] / norms
             ratio = _rise(problem, best, best.point, step, sigma)
-            if not SHAPE[0] <= ratio <= SHAPE[1]:
+            if not SHAPE[0] <= ratio <= 2.0:
                 there = profiled(problem, best.point, step, Vt[k] * norms * singular[k], sigma)
                 ratio = _rise(problem, best, there, np.zeros_like(step), sigma)
-                if not SHAPE[0] <= ratio < np.inf:
+                if not SHAPE[0] <= ratio <= SHAPE[1]:
                     words.append(_misshapen(problem, step, norms, ratio))
             ratios.append(ratio)
     return (float(min(ratios)), float(max(ratios))), words[:1]
@@ -237,7 +245,7 @@ def _for(
         "intervals describe the cost two standard deviations away within "
         f"{shape[0]:.2f}-{shape[1]:.2f}"
     )
-    if shape[1] > SHAPE[1]:
+    if shape[1] > 2.0:
         intervals = (
             "intervals are cautious: two standard deviations away the cost rises up to "
             f"{shape[1]:.2g} times as much as they assume"

@@ -16,7 +16,7 @@ ENOUGH = 100
 def correlation_time(problem: Problem, point: Point) -> float:
     """Samples per independent residual: 1 + 2·Σ autocorrelations, 1 where they are not significant.
 
-    Averages over poses and rest intervals are independent of each other and give 1. The sum stops
+    Runs of fewer than ENOUGH samples (poses, rest intervals) count as uncorrelated. The sum stops
     where pairs of neighbouring autocorrelations stop being positive (Geyer 1992).
     """
     times, weights = [], []
@@ -31,8 +31,8 @@ def correlation_time(problem: Problem, point: Point) -> float:
 
 
 def is_series(run: Run) -> bool:
-    """Are the samples consecutive readings (and not averages over poses)?"""
-    return len(run) >= ENOUGH and bool(np.all(run.count == 1))
+    """Are there enough samples, in their order, to see correlation between neighbours?"""
+    return len(run) >= ENOUGH
 
 
 def _integrated(r: Array) -> float:

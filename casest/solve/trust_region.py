@@ -33,11 +33,14 @@ def trust_region(problem: LeastSquares, start: Point, *, max_iterations: int = 3
     iterations = 0
     while iterations < max_iterations:
         iterations += 1
-        if not np.isfinite(here.cost):
-            status = "cost is not finite"
+        if not (np.isfinite(here.cost) and np.all(np.isfinite(here.R))):
+            status = "cost or slope is not finite"
             break
         scale = np.maximum(scale, _column_norms(here.R))
         step = _bounded_step(problem, point, here, scale, damping)
+        if not np.all(np.isfinite(step)):
+            status = "step is not finite"
+            break
         gain = here.cost - 0.5 * float(np.sum((here.t + here.R @ step) ** 2)) - _rest(here)
         if _negligible(step, point, scale, here, gain):
             status = "converged"
@@ -55,7 +58,8 @@ def trust_region(problem: LeastSquares, start: Point, *, max_iterations: int = 3
             if damping > 1e20:
                 status = "no descent"
                 break
-    point, here = _refine(problem, point, here, scale)
+    if np.all(np.isfinite(here.R)):
+        point, here = _refine(problem, point, here, scale)
     claims = status in ("converged", "no descent")
     seconds = time.perf_counter() - began
     return Outcome(
@@ -104,6 +108,8 @@ def _damped(here: _Local, scale: Array, damping: float, free: Array, step: Array
     A = np.vstack([here.R[:, free], np.diag(np.sqrt(damping) * scale[free])])
     b = np.concatenate([right, np.zeros(int(free.sum()))])
     # Unit columns: scales that differ by orders of magnitude must not reach the rank decision.
+    if not (np.all(np.isfinite(A)) and np.all(np.isfinite(b))):
+        return np.full(int(free.sum()), np.nan)
     step_z: Array = np.linalg.lstsq(A / scale[free], b, rcond=None)[0]
     return np.asarray(step_z / scale[free])
 

@@ -1,0 +1,143 @@
+"""Corrections undo what lies between the corrected quantity and the reading."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from models.load_cell import curvature, load_cell, warming
+from models.thermistor import thermistor
+from models.wheel import quadratic, wheel
+
+from casest import DataError, Residual, Run, UsageError, effect, model, param, quantity, signal
+from casest.apply import Correction
+from casest.problem import find_model
+
+
+def as_run(**signals):
+    columns = {n: np.asarray(s, float).reshape(len(s), -1) for n, s in signals.items()}
+    return Run.raw("r", columns, units={}, file="r.csv")
+
+
+def test_an_affine_explicit_model_is_inverted_exactly():
+    rng = np.random.default_rng(0)
+    force = rng.uniform(-20, 20, (50, 3))
+    offset, gain = np.array([0.1, -0.2, 0.3]), np.array([1.02, 0.97, 1.01])
+    found = Correction(wheel)(as_run(v=offset + gain * force), {"offset": offset, "gain": gain})
+    np.testing.assert_allclose(found, force, rtol=1e-13, atol=1e-13)
+
+
+def test_a_quadratic_effect_is_inverted_to_rounding():
+    rng = np.random.default_rng(1)
+    force = rng.uniform(-20, 20, (200, 3))
+    k = np.array([1e-3, -2e-3, 5e-4])
+    offset, gain = np.array([0.1, -0.2, 0.3]), np.array([1.02, 0.97, 1.01])
+    reading = offset + gain * (force + k * force**2)
+    values = {"offset": offset, "gain": gain, "quadratic.k": k}
+    found = Correction(wheel.with_effect(quadratic))(as_run(v=reading), values)
+    # what is corrected is the quantity as the body declares it: before its effects
+    np.testing.assert_allclose(found, force, rtol=1e-11, atol=1e-11)
+
+
+def test_of_two_solutions_the_one_in_the_range_of_the_fit_is_taken():
+    bent = load_cell.with_effect(curvature)
+    values = {"zero": 0.0, "sensitivity": 1.0, "curvature.k": -0.04}  # top at 12.5 N
+    force = np.array([1.0, 5.0, 11.0])
+    run = as_run(output=force - 0.04 * force**2)
+    low = Correction(bent)(run, values, around=(0.0, 12.0))
+    high = Correction(bent)(run, values, around=(13.0, 25.0))
+    np.testing.assert_allclose(low[:, 0], force, rtol=1e-9)
+    np.testing.assert_allclose(high[:, 0], 25 - force, rtol=1e-9)
+
+
+def test_a_reading_out_of_reach_is_named_with_its_row():
+    bent = load_cell.with_effect(curvature)
+    values = {"zero": 0.0, "sensitivity": 1.0, "curvature.k": -0.04}  # at most 6.25 mV
+    run = as_run(output=[1.0, 6.0, 7.0, 2.0, 6.5])
+    with pytest.raises(DataError) as refused:
+        Correction(bent)(run, values)
+    text = str(refused.value)
+    assert text.startswith("r.csv: row 2: reading [7.] has no force in the model (2 of 5 rows)")
+
+
+def test_a_thermistor_gives_temperatures_back():
+    kelvin = np.linspace(250, 370, 60)
+    ohms = 10_000 * np.exp(3950 * (1 / kelvin - 1 / 298.15))
+    values = {"r25": 10_000.0, "beta": 3950.0}
+    found = Correction(thermistor)(as_run(resistance=ohms), values, around=(273.15, 353.15))
+    np.testing.assert_allclose(found[:, 0], kelvin, rtol=1e-12)
+
+
+def test_a_thermistor_gives_temperatures_back_without_knowing_the_range_of_the_fit():
+    kelvin = np.linspace(250, 370, 60)
+    ohms = 10_000 * np.exp(3950 * (1 / kelvin - 1 / 298.15))
+    found = Correction(thermistor)(as_run(resistance=ohms), {"r25": 1e4, "beta": 3950.0})
+    np.testing.assert_allclose(found[:, 0], kelvin, rtol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["norm-diagonal", "norm-triangular", "norm-full"])
+def test_an_implicit_model_computes_its_correction(name):
+    rng = np.random.default_rng(2)
+    v, offset = rng.standard_normal((30, 3)), np.array([0.1, 0.2, -0.3])
+    scale = np.diag([1.1, 0.9, 1.05])
+    if name != "norm-diagonal":
+        scale = scale + np.tril(0.1 * rng.standard_normal((3, 3)), -1)
+    values = {"scale": np.diag(scale) if name == "norm-diagonal" else scale, "offset": offset}
+    found = Correction(find_model(name))(as_run(v=v), values)
+    np.testing.assert_allclose(found, (v - offset) @ scale.T, rtol=1e-13, atol=1e-14)
+
+
+def test_a_correction_asks_only_for_the_signals_and_parameters_it_needs():
+    assert [s.name for s in Correction(wheel).signals] == ["v"]
+    assert Correction(wheel).parameters == {"offset", "gain"}
+    assert [s.name for s in Correction(thermistor).signals] == ["resistance"]
+    warm = Correction(load_cell.with_effect(warming))
+    assert [s.name for s in warm.signals] == ["output", "temperature"]
+    assert warm.parameters == {"zero", "sensitivity", "warming.drift"}
+
+
+def test_an_effect_that_reads_a_column_is_undone_with_that_column():
+    force, celsius = np.array([10.0, 20.0, 30.0]), np.array([10.0, 25.0, 40.0])
+    reading = 0.5 + 0.1 * force + 0.02 * (celsius - 20)
+    values = {"zero": 0.5, "sensitivity": 0.1, "warming.drift": 0.02}
+    run = as_run(output=reading, temperature=celsius)
+    found = Correction(load_cell.with_effect(warming))(run, values)
+    np.testing.assert_allclose(found[:, 0], force, rtol=1e-12)
+
+
+def test_an_effect_on_the_reading_itself_is_undone_too():
+    @effect(on="output")
+    def creep(output, *, k=param("1/mV")):
+        return output + k * output**2
+
+    output = np.array([1.0, 2.0, 3.0])
+    values = {"zero": 0.5, "sensitivity": 0.1, "creep.k": 0.02}
+    found = Correction(load_cell.with_effect(creep))(as_run(output=output), values)
+    np.testing.assert_allclose(found[:, 0], (output + 0.02 * output**2 - 0.5) / 0.1, rtol=1e-12)
+
+
+def test_a_model_that_names_no_corrected_quantity_says_so():
+    @model
+    def plain(y=signal("V"), *, a=param("V")):
+        return Residual(measured=y, predicted=quantity("reading", a, "V"))
+
+    with pytest.raises(UsageError, match="model plain names no corrected quantity"):
+        Correction(plain)
+
+
+def test_fewer_readings_than_components_are_refused():
+    @model
+    def projected(y=signal("V"), d=signal(3), *, a=param("V")):
+        inner = quantity("field", 1.0 * d)
+        return Residual(measured=y, predicted=a + inner[0] + inner[1], corrected=inner)
+
+    with pytest.raises(UsageError, match="1 readings do not determine the 3 components of field"):
+        Correction(projected)(as_run(y=[1.0], d=[[0, 0, 0]]), {"a": 1.0})
+
+
+def test_an_effect_on_the_sequence_is_not_undone_in_silence():
+    @effect(on="reading", kind="sequence")
+    def low_pass(value, previous, dt, *, tau=param("s")):
+        return previous + (value - previous) * dt / (dt + tau)
+
+    with pytest.raises(UsageError, match="effect on the sequence of samples"):
+        Correction(load_cell.with_effect(low_pass))

@@ -1,0 +1,145 @@
+"""Floors of the package: imports go only down; problems use public names; --help starts quickly."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+#: From the ground up. A module may import its own floor and those above it in this list.
+FLOORS = [
+    ["casest", "casest.errors"],
+    ["casest.units"],
+    ["casest.declaring"],
+    ["casest.data"],
+    ["casest.modelling"],
+    ["casest.engine"],
+    ["casest.sequence"],
+    ["casest.stack"],
+    ["casest.noise", "casest.identify"],
+    ["casest.solve"],
+    ["casest.estimate", "casest.naming", "casest.apply"],
+    ["casest.result", "casest.problem"],
+    ["casest.values", "casest.applying", "casest.demonstration"],
+    ["casest.terminal"],
+    ["casest.cli"],
+]
+
+
+def module_name(path: Path) -> str:
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def floor(name: str) -> int:
+    """Floor of a module: that of the longest listed name that it is or lies in."""
+    found = [
+        (len(listed), level)
+        for level, names in enumerate(FLOORS)
+        for listed in names
+        if name == listed or (listed != "casest" and name.startswith(listed + "."))
+    ]
+    assert found, f"{name} is on no floor: add it to FLOORS"
+    return max(found)[1]
+
+
+def imports(path: Path) -> set[str]:
+    """Modules of casest that a file imports, anywhere in it, but for type checking only."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    for node in ast.walk(tree):
+        if isinstance(node, ast.If) and ast.unparse(node.test).endswith("TYPE_CHECKING"):
+            node.body = []
+    found = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative imports hide the floor"
+            module = node.module or ""
+            for alias in node.names:
+                inner = ROOT.joinpath(*module.split("."), f"{alias.name}.py")
+                package = ROOT.joinpath(*module.split("."), alias.name)
+                own = inner.exists() or package.is_dir()
+                found.add(f"{module}.{alias.name}" if own else module)
+    return {name for name in found if name.partition(".")[0] in ("casest", "casest_problems")}
+
+
+MODULES = sorted((ROOT / "casest").rglob("*.py"))
+
+
+@pytest.mark.parametrize("path", MODULES, ids=module_name)
+def test_imports_go_only_down(path):
+    own = module_name(path)
+    climbing = {name for name in imports(path) if floor(name) > floor(own)}
+    assert climbing == set(), f"{own} (floor {floor(own)}) imports upwards: {sorted(climbing)}"
+
+
+def test_no_two_modules_import_each_other():
+    below = {module_name(p): imports(p) - {module_name(p)} for p in MODULES}
+
+    def reaches(start: str, goal: str, seen: set[str]) -> bool:
+        for name in below.get(start, set()) - seen:
+            seen.add(name)
+            if name == goal or reaches(name, goal, seen):
+                return True
+        return False
+
+    # a package's own front may name its members, which name each other
+    circles = [n for n in below if n.count(".") and reaches(n, n, set())]
+    assert circles == []
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "problems").glob("*.py")), ids=lambda p: p.stem)
+def test_problems_use_public_names_of_casest_only(path):
+    import casest
+
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            assert not any(alias.name.partition(".")[0] == "casest" for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and (node.module or "").startswith("casest"):
+            assert node.module == "casest", f"{path.name} imports {node.module}"
+            assert {alias.name for alias in node.names} <= set(casest.__all__)
+
+
+def test_every_public_name_is_there():
+    import casest
+
+    assert len(casest.__all__) == len(set(casest.__all__))
+    for name in casest.__all__:
+        assert getattr(casest, name) is not None
+    with pytest.raises(AttributeError, match="casest has no 'modle'"):
+        _ = casest.modle
+
+
+def python(code: str) -> str:
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    return done.stdout
+
+
+def test_help_needs_neither_numpy_nor_casadi():
+    code = (
+        "import sys\n"
+        "from casest.cli import run\n"
+        "assert run(['--help']) == 0\n"
+        "heavy = {'numpy', 'casadi', 'scipy', 'pint', 'pyarrow'} & set(sys.modules)\n"
+        "print('heavy:', sorted(heavy))\n"
+    )
+    text = python(code)
+    assert "Calibrate sensors, prove the answer" in text
+    assert text.endswith("heavy: []\n")
+
+
+def test_help_of_every_command_needs_neither_numpy_nor_casadi():
+    code = (
+        "import sys\n"
+        "from casest.cli import commands, run\n"
+        "assert all(run([name, '--help']) == 0 for name in commands.commands)\n"
+        "print('heavy:', sorted({'numpy', 'casadi'} & set(sys.modules)))\n"
+    )
+    assert python(code).endswith("heavy: []\n")
