@@ -94,6 +94,12 @@ class Correction:
         `around` is the range it had in the fit: where several values give the same reading, the
         one nearest to its middle is taken. Raises DataError naming the row without any.
         """
+        with np.errstate(all="ignore"):  # a trial step may leave the domain; results are checked
+            return self._corrected(run, values, around)
+
+    def _corrected(
+        self, run: Run, values: Mapping[str, Any], around: tuple[float, float] | None
+    ) -> Array:
         parameters = np.concatenate(self.model.point(values))
         blank = {s.name: np.zeros((len(run), s.size)) for s in self.model.signals}
         samples = np.hstack([run.signals.get(s.name, blank[s.name]) for s in self.model.signals])

@@ -16,25 +16,43 @@ from casest.data import load_runs
 from casest.data.run import Run
 from casest.data.write import write_atomically
 from casest.declaring.shapes import Array
-from casest.declaring.symbols import constant
+from casest.declaring.symbols import Parameter, constant
 from casest.errors import DataError, UsageError
+from casest.modelling.effect import Effect
 from casest.modelling.model import Model
-from casest.problem import find_model
+from casest.problem import find_effects, find_model
 from casest.result import load_result, saved_parameters
 
 
 def saved_model(result: Mapping[str, Any]) -> tuple[Model, dict[str, Any]]:
-    """Model and parameter values of a saved result, constants as they were."""
-    model = find_model(result["model"])
-    units = result.get("units", {})
+    """Model and parameter values of a saved result: effects, constants and scopes as they were."""
+    model, units = find_model(result["model"]), result.get("units", {})
+    for saved in result.get("effects", []):
+        effect = _found_effect(saved)
+        on = None if saved["on"] == effect.on else saved["on"]
+        model = model.with_effect(effect, on=on, columns=saved.get("columns") or {})
+    parameters = saved_parameters(result)
+    for name in parameters:
+        model = model.freed(name)
     for name, value in result["constants"].items():
         unit = units.get(name, "")
         model = model.having(**{name: constant(value, "" if "[" in unit else unit)})
-    parameters = saved_parameters(result)
+    for name, scope in result.get("scopes", {}).items():
+        model = model.scoped(name, scope)
     missing = [p.name for p in model.parameters if p.name not in parameters]
     if missing:
         raise DataError(f"the result has no value for {missing[0]!r} of model {model.name}")
     return model, {name: np.array(p["value"], dtype=float) for name, p in parameters.items()}
+
+
+def _found_effect(saved: Mapping[str, Any]) -> Effect:
+    """The effect of that name in the file that declared it."""
+    try:
+        return find_effects(f"{saved['file']}:{saved['name']}")[0]
+    except UsageError as error:
+        raise UsageError(
+            f"the result was fitted with the effect {saved['name']}: {error}"
+        ) from None
 
 
 def corrected_csv(
@@ -50,7 +68,7 @@ def corrected_csv(
     if len(result["runs"]) > 1 and per_run & correction.parameters:
         name = sorted(per_run & correction.parameters)[0]
         raise UsageError(f"{name} differs from run to run: calibrate with --shared {name} to apply")
-    needed = {n: v for n, v in values.items() if n in correction.parameters}
+    needed = {n: _of_one_run(model[n], v) for n, v in values.items() if n in correction.parameters}
     runs = load_runs([data], correction.signals, **arguments)
     _same_units(result, runs, data)
     found = result.get("corrected") or {}
@@ -61,6 +79,11 @@ def corrected_csv(
         value = correction(run, needed, around)
         _write(writer, correction, run, value, result, header=k == 0, several=len(runs) > 1)
     return text.getvalue()
+
+
+def _of_one_run(parameter: Parameter, value: Array) -> Array:
+    """The value without its run axis, which only several runs have."""
+    return value[0] if value.ndim > len(parameter.shape.dims) else value
 
 
 def _same_units(result: Mapping[str, Any], runs: tuple[Run, ...], data: str) -> None:

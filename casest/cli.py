@@ -327,8 +327,10 @@ def start_value(text: str, model: Model) -> tuple[str, Any]:
 def reading_arguments(options: Options) -> Options:
     """Keyword arguments of `load_runs`."""
     pairs = {}
-    for key in ("columns", "units", "scales"):
-        pairs[key] = dict(_pair(text, f"--{key.removesuffix('s')}") for text in options[key])
+    for key, option in (("columns", "--columns"), ("units", "--unit"), ("scales", "--scale")):
+        pairs[key] = dict(_pair(text, option) for text in options[key])
+    for name, text in pairs["scales"].items():
+        _checked_scale(name, text)
     columns = {name: tuple(value.split(",")) for name, value in pairs["columns"].items()}
     return {
         "columns": columns,
@@ -338,6 +340,15 @@ def reading_arguments(options: Options) -> Options:
         "at_rest": options["at_rest"],
         "time_zero": options["time_zero"],
     }
+
+
+def _checked_scale(name: str, text: str) -> None:
+    from casest.data.scaling import parse_scale
+
+    try:
+        parse_scale(text)
+    except CasestError as error:
+        raise type(error)(f"--scale {name}={text}: {error}") from None
 
 
 def _pair(text: str, option: str) -> tuple[str, str]:
@@ -358,4 +369,8 @@ def held_out(found: Any, model: Model, options: Options) -> float:
     """Root mean square residual on records that the fit never saw."""
     from casest.estimate import score
 
+    fitted = {Path(run.file).resolve() for run in found.problem.runs}
+    for name in options["holdout"]:
+        if Path(name).resolve() in fitted:
+            raise UsageError(f"--holdout {name}: the fit has seen this file; give another record")
     return score(found, records(model, options["holdout"], options))

@@ -137,6 +137,8 @@ def _attempt(problem: Problem, start: Mapping[str, Any] | None, solver: str, see
 
 
 def _enough(problem: Problem) -> None:
+    if not problem.runs:
+        raise DataError("there are no runs to fit; give at least one")
     if problem.residual_count < problem.unknowns:
         what = "rest intervals" if problem.runs[0].spread else "rows"
         raise DataError(
@@ -159,7 +161,7 @@ def _not_finite(problem: Problem, start: Point) -> str:
         if bad.size:
             return (
                 f"the residual is not finite at the start values in {bad.size} of {len(run)} rows, "
-                f"first in {run.file} row {int(run.rows[bad[0]])}; give other ones with --start"
+                f"first in {run.file or run.name} row {int(run.rows[bad[0]])}; give --start"
             )
     return "a derivative of the residual is not finite at the start values; give --start"
 

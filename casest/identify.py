@@ -64,6 +64,10 @@ def identify(problem: Problem, point: Point, R: Array | None = None) -> Identifi
     unscaled = null / scale[:, None]
     norms = np.linalg.norm(unscaled, axis=0)
     touched = np.linalg.norm(null, axis=1) > 1e-6
+    for slot in problem.slots:
+        # A rotation moves some entries of a matrix only to second order: they are not known either.
+        if len(slot.parameter.shape.dims) == 2 and touched[slot.x].any():
+            touched[slot.x] = True
     basis = unscaled / np.where(norms > 0, norms, 1)
     weakest = _combination(problem, Vt[-1], scale)
     return Identifiability(rank, problem.unknowns, singular, basis, words, touched, weakest)

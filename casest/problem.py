@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import difflib
 import importlib
 import linecache
@@ -83,6 +84,7 @@ def load_file(path: Path) -> ModuleType:
     spec = spec_from_file_location(f"casest_user_{path.stem}", path)
     if spec is None or spec.loader is None:
         raise UsageError(f"{path}: not a Python file")
+    _refuse_duplicates(path)
     module = module_from_spec(spec)
     sys.modules[spec.name] = module
     sys.path.insert(0, str(path.parent))
@@ -99,6 +101,25 @@ def load_file(path: Path) -> ModuleType:
     finally:
         sys.path.remove(str(path.parent))
     return module
+
+
+def _refuse_duplicates(path: Path) -> None:
+    """A second function of one name would silently replace the first."""
+    try:
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+    except (SyntaxError, UnicodeDecodeError):
+        return  # running the file says where
+    seen: dict[str, int] = {}
+    for node in tree.body:
+        if isinstance(node, ast.FunctionDef):
+            decorated = [ast.unparse(d) for d in node.decorator_list]
+            again = node.name in seen and not any(d.startswith(f"{node.name}.") for d in decorated)
+            if again:
+                raise DeclarationError(
+                    f"{path}, line {node.lineno}: {node.name!r} is declared twice (first in line "
+                    f"{seen[node.name]}); give one of them another name"
+                )
+            seen[node.name] = node.lineno
 
 
 def _place(error: BaseException, path: Path) -> str:

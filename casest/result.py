@@ -21,6 +21,7 @@ from casest.data.write import write_atomically
 from casest.declaring.shapes import Array
 from casest.errors import DataError
 from casest.estimate import Estimate
+from casest.modelling.effect import Attached
 from casest.naming import entry_units, unit_table
 
 RESULT, RESIDUALS = "result.json", "residuals.csv"
@@ -43,6 +44,7 @@ def calibration_result(
         "data": list(data),
         "runs": [run.name for run in problem.runs],
         "constants": {c.name: _plain(c.array) for c in problem.model.constants},
+        "scopes": {p.name: p.scope for p in problem.model.parameters},
         "verdict": None,
         "trusted": certificate.trusted,
         "noise": {
@@ -70,7 +72,7 @@ def calibration_result(
                 "matrix": _plain(_correlation(estimate.covariance)),
             },
         },
-        "effects": [],
+        "effects": [_effect(a) for a in problem.model.effects],
         "identifiability": {
             "rank": estimate.identifiability.rank,
             "unknowns": estimate.identifiability.unknowns,
@@ -120,6 +122,16 @@ def _correlation(covariance: Array) -> Array:
     std = np.sqrt(np.diag(covariance))
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.asarray(covariance / np.outer(std, std))
+
+
+def _effect(attached: Attached) -> dict[str, Any]:
+    """What is needed to attach the effect again."""
+    return {
+        "name": attached.effect.name,
+        "on": attached.on,
+        "columns": dict(attached.columns),
+        "file": str(Path(attached.effect.function.__code__.co_filename).resolve()),
+    }
 
 
 def _corrected_range(estimate: Estimate) -> dict[str, Any] | None:

@@ -130,8 +130,8 @@ class Problem:
             lower[s.x], upper[s.x] = s.parameter.lower, s.parameter.upper
             if s.parameter.name in from_data:
                 low, high = from_data[s.parameter.name]
-                lower[s.x] = np.maximum(lower[s.x], s.parameter.shape.pack(low))
-                upper[s.x] = np.minimum(upper[s.x], s.parameter.shape.pack(high))
+                lower[s.x] = np.maximum(lower[s.x], s.parameter.shape.spread(low))
+                upper[s.x] = np.minimum(upper[s.x], s.parameter.shape.spread(high))
         return lower, upper
 
     # -- points --------------------------------------------------------------------------------
@@ -358,15 +358,20 @@ class Problem:
             parts.append(part)
         return np.vstack(parts)
 
-    def squares_of_gradients(self, point: Point, batches: Sequence[NDArray[np.int_]]) -> Array:
+    def squares_of_gradients(
+        self, point: Point, batches: Sequence[NDArray[np.int_]], bread: Array | None = None
+    ) -> Array:
         """Σ_batch (Σ w r ∂r)(Σ w r ∂r)ᵀ: the middle of the sandwich covariance, (n, n).
 
-        `batches` numbers the samples of each run; those of one batch may be correlated.
+        `batches` numbers the samples of each run; those of one batch may be correlated. With
+        `bread` = (JᵀWJ)⁻¹ every residual is first divided by what the fit leaves of it, 1 − h.
         """
         middle = np.zeros((self.unknowns, self.unknowns))
         for r in range(len(self.runs)):
             x, weights = self._selections[r][0], self._weight(r)
             residual, jacobian = self._rows(point, r)
+            if bread is not None:
+                residual = _without_leverage(residual, jacobian, bread[np.ix_(x, x)], weights)
             if weights is not None:
                 residual = residual * weights
             scores = np.einsum("nm,nmk->nk", residual, jacobian)
@@ -379,6 +384,18 @@ class Problem:
         """Expressions of the trace for every sample of every run, each (N, rows, columns)."""
         replay = Replay(function_of(self.model, outputs))
         return [replay(self._parameters(point, r), s) for r, s in enumerate(self.samples)]
+
+    def rounding(self, point: Point) -> float:
+        """Rounding error of one residual: machine precision of all that was added up in it."""
+        squares, count = 0.0, 0
+        for r, samples in enumerate(self.samples):
+            parameters = self._parameters(point, r)
+            slopes, x = _slope_in_sample(self.model)(parameters, samples)[0], self._selections[r][0]
+            jacobian = self._rows(point, r)[1]
+            terms = np.sum(np.abs(slopes * samples[:, None, :]), axis=2)
+            terms += np.sum(np.abs(jacobian * point.x[x]), axis=2)
+            squares, count = squares + float(np.sum(terms**2)), count + terms.size
+        return float(4 * np.finfo(float).eps * np.sqrt(squares / max(count, 1)) + 1e-300)
 
     def second_order(self, point: Point, sigma: float) -> float:
         """Root mean square of ½σ²·∇²r over σ: what an implicit residual neglects of the noise.
@@ -399,20 +416,14 @@ class Problem:
         """
         if not any(run.spread for run in self.runs):
             return None
-        expression = self.model.traced.expression
-        slope = ca.jacobian(expression, sample_symbol(self.model))
-        slopes = self.evaluate(point, {"G": slope})
         squares, count = 0.0, 0
         for r, run in enumerate(self.runs):
-            zero = np.zeros(len(run))
-            spread = np.hstack(
-                [
-                    run.spread.get(s.name, np.outer(zero, np.ones(s.size)))
-                    for s in self.model.signals
-                ]
-            )
-            G = slopes[r][0]
-            squares += float(np.sum((G * spread[:, None, :]) ** 2))
+            G = _slope_in_sample(self.model)(self._parameters(point, r), self.samples[r])[0]
+            first = 0
+            for s in self.model.signals:
+                own, first = G[:, :, first : first + s.size], first + s.size
+                if s.name in run.spread:
+                    squares += float(np.einsum("nmi,nij,nmj->", own, run.covariance(s.name), own))
             count += G.shape[0] * G.shape[1]
         return float(np.sqrt(squares / count))
 
@@ -438,7 +449,9 @@ def _curvature(model: Model) -> Replay:
     hessian = ca.hessian(ca.dot(w * t.expression, t.expression) / 2, t.coordinates)[0]
     sample = ca.vertcat(sample_symbol(model), w)
     parameters = ca.vertcat(t.coordinates, t.references)
-    return Replay(ca.Function("h", [parameters, sample], [hessian], ["parameters", "sample"], ["H"]))
+    return Replay(
+        ca.Function("h", [parameters, sample], [hessian], ["parameters", "sample"], ["H"])
+    )
 
 
 @lru_cache(maxsize=64)
@@ -450,6 +463,27 @@ def _laplacian(model: Model) -> Replay:
         for i in range(model.traced.expression.numel())
     ]
     return Replay(function_of(model, {"L": ca.densify(ca.vertcat(*parts))}))
+
+
+@lru_cache(maxsize=64)
+def _slope_in_sample(model: Model) -> Replay:
+    """∂r/∂s of one sample with respect to its signals, (m, k)."""
+    slope = ca.jacobian(model.traced.expression, sample_symbol(model))
+    return Replay(function_of(model, {"G": slope}))
+
+
+def _without_leverage(
+    residual: Array, jacobian: Array, bread: Array, weights: Array | None
+) -> Array:
+    """(I − H)⁻¹r sample by sample: what the residual would be had the fit not seen it."""
+    leverage = np.einsum("nmi,ij,nkj->nmk", jacobian, bread, jacobian)
+    if weights is not None:
+        leverage = leverage * weights[:, None, :]
+    left = np.eye(residual.shape[1]) - np.where(np.isfinite(leverage), leverage, 0.0)
+    # A residual that the fit follows entirely says nothing: keep the inverse finite.
+    values, vectors = np.linalg.eigh(0.5 * (left + left.transpose(0, 2, 1)))
+    inverse = (vectors / np.maximum(values, 1e-3)[:, None, :]) @ vectors.transpose(0, 2, 1)
+    return np.asarray(np.einsum("nmk,nk->nm", inverse, residual))
 
 
 def _root(variance: Array) -> Array:

@@ -97,12 +97,12 @@ def test_batches_hold_consecutive_samples_and_never_span_two_blocks():
 
 
 def test_the_robust_std_of_a_white_series_is_whites():
-    """White (1980), HC1: for a mean, the root of n/(n−1) Σr²/n²."""
+    """MacKinnon & White (1985), HC3: for a mean, the root of Σ(r/(1 − 1/n))²/n²."""
     rng = np.random.default_rng(6)
     y = rng.standard_normal(300) * np.repeat([0.1, 3.0], 150)
     found = fitted(y)
     r = y - y.mean()
-    expected = np.sqrt(300 / 299 * np.sum(r**2)) / 300
+    expected = np.sqrt(np.sum((r / (1 - 1 / 300)) ** 2)) / 300
     assert float(found.robust["a"]) == pytest.approx(expected, rel=1e-9)
 
 

@@ -333,7 +333,7 @@ def test_a_wrong_shape_is_named():
 
 def test_outputs_that_are_not_residual_and_jacobian_are_refused():
     p, s = ca.SX.sym("p", 2), ca.SX.sym("s")
-    with pytest.raises(CasestError, match=r"the second must be the Jacobian, \(1, 2\)"):
+    with pytest.raises(CasestError, match=r"the second must be the Jacobian, \(1, n\)"):
         normal_equations(Replay(function(p, s, p[0] * s)), np.zeros(2), record(2, 1))
     with pytest.raises(CasestError, match="not a dense column of residuals"):
         cost(Replay(function(p, s, p.T * s)), np.zeros(2), record(2, 1))

@@ -106,10 +106,10 @@ def _missing(table: Table, signal: Signal) -> DataError:
     if signal.kind == "rotation":
         wanted = "roll pitch yaw or qw qx qy qz"
     near = _near_group(table, signal)
-    hint = f"; try --columns {signal.name}={','.join(near)}" if near else ""
+    some = ",".join(near) if near else ",".join("…" * min(signal.size, 3))
     return DataError(
         f"{table.file}: no columns {wanted} for signal {signal.name}; "
-        f"the file has {_listed(names)}{hint}"
+        f"the file has {_listed(names)}; try --columns {signal.name}={some}"
     )
 
 

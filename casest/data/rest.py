@@ -93,6 +93,7 @@ def _averaged(run: Run, found: Rests, names: list[str], channels: Array) -> Run:
         count=np.array([len(s) for s in spans]),
         spread={k: _spreads(v, spans) for k, v in run.signals.items() if k != "t"},
         notes=(*run.notes, *_notes(run, found, names, channels)),
+        correlation={k: _correlations(v, spans) for k, v in run.signals.items() if k != "t"},
     )
 
 
@@ -119,6 +120,26 @@ def _spreads(values: Array, spans: Sequence[Interval]) -> Array:
             for s in spans
         ]
     )
+
+
+def _correlations(values: Array, spans: Sequence[Interval], batches: int = 10) -> Array:
+    """Correlation of a mean's components, (n, k, k), from the means of batches of the interval.
+
+    A trembling hand moves the axes together, and along a direction that a norm does not see.
+    """
+    found = []
+    for s in spans:
+        inside = values[s.samples]
+        parts = np.array(
+            [p.mean(axis=0) for p in np.array_split(inside, min(batches, len(inside)))]
+        )
+        away = parts - parts.mean(axis=0)
+        covariance = away.T @ away
+        scale = np.sqrt(np.where(np.diag(covariance) > 0, np.diag(covariance), 1.0))
+        correlation = covariance / np.outer(scale, scale)
+        np.fill_diagonal(correlation, 1.0)
+        found.append(correlation)
+    return np.array(found).reshape(len(spans), values.shape[1], values.shape[1])
 
 
 def standard_error(x: Array, step: float = 0.0) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -27,6 +27,7 @@ class Run:
     block: (N,) number of the gap-separated stretch, burst, pose or rest interval, from 0.
     count: (N,) samples averaged into each (1 in a raw record).
     spread: per signal (N, size), standard error of each mean; empty for a raw record.
+    correlation: per signal (N, size, size), of the errors of one mean's components; may be missing.
     notes: what was assumed, skipped or looks wrong, one sentence each.
     """
 
@@ -42,6 +43,7 @@ class Run:
     count: Index
     spread: Mapping[str, Array]
     notes: tuple[str, ...] = ()
+    correlation: Mapping[str, Array] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Refuse parts of unequal length: they would be matched wrongly without a sign."""
@@ -89,4 +91,11 @@ class Run:
             block=self.block[chosen],
             count=self.count[chosen],
             spread={name: values[chosen] for name, values in self.spread.items()},
+            correlation={name: values[chosen] for name, values in self.correlation.items()},
         )
+
+    def covariance(self, name: str) -> Array:
+        """Return the covariance of a signal's means, (N, size, size)."""
+        spread = self.spread[name]
+        outer = spread[:, :, None] * spread[:, None, :]
+        return outer * self.correlation.get(name, np.eye(spread.shape[1]))

@@ -53,14 +53,46 @@ class Shape:
     def pack(self, value: Any) -> Array:
         """Stored entries (size,) of a value of shape `dims`."""
         array = np.asarray(value, dtype=float)
+        square = len(self.dims) == 2 and self.dims[0] == self.dims[1]
         if array.ndim == 0 and self.dims:
-            array = np.full(self.dims, float(array))
-        elif array.ndim == 1 and len(self.dims) == 2 and self.dims == (array.size,) * 2:
+            array = float(array) * np.eye(self.dims[0]) if square else np.full(self.dims, array)
+        elif array.ndim == 1 and square and self.dims[0] == array.size:
             array = np.diag(array)
         if array.shape != self.dims:
             raise DeclarationError(f"a value of shape {array.shape} does not fit shape {self.dims}")
-        if self.kind == "lower" and np.any(np.triu(array, 1)) and value_is_array(value):
+        if self.kind == "lower" and np.any(np.triu(array, 1)):
             raise DeclarationError("a lower triangular value must have zeros above its diagonal")
+        array = self._on_the_set(array)
+        return np.array([array[i] for i in self.entries], dtype=float)
+
+    def _on_the_set(self, array: Array) -> Array:
+        """A direction of length one, an orthonormal rotation; refused where far from it."""
+        if self.kind == "unit":
+            length = float(np.linalg.norm(array))
+            if not abs(length - 1) <= 0.01:
+                raise DeclarationError(
+                    f"a direction has length 1, and {array.tolist()} has {length:.4g}"
+                )
+            return array / length
+        if self.kind == "rotation":
+            away = float(np.abs(array.T @ array - np.eye(3)).max())
+            if not (away <= 0.01 and np.linalg.det(array) > 0):
+                raise DeclarationError(
+                    f"a rotation matrix has orthonormal columns and determinant 1; this one is off "
+                    f"by {away:.4g}"
+                )
+            return self.reference(array).reshape(3, 3)
+        return array
+
+    def spread(self, value: Any) -> Array:
+        """Stored entries of a bound: a number stands for all entries alike."""
+        array = np.asarray(value, dtype=float)
+        try:
+            array = np.broadcast_to(array, self.dims)
+        except ValueError:
+            raise DeclarationError(
+                f"a bound of shape {array.shape} does not fit shape {self.dims}"
+            ) from None
         return np.array([array[i] for i in self.entries], dtype=float)
 
     def unpack(self, entries: Array) -> Array:
@@ -92,16 +124,15 @@ class Shape:
             return np.asarray(u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt).ravel()
         return np.zeros(0)
 
+    def at_reference(self, reference: Array) -> Array:
+        """The value in the middle of the chart that the reference describes."""
+        return reference[:3] if self.kind == "unit" else reference.reshape(3, 3)
+
     def entry_names(self, name: str) -> tuple[str, ...]:
         """Names such as `gain[2]` or `scale[1,0]`, one per stored entry."""
         if not self.dims:
             return (name,)
         return tuple(f"{name}[{','.join(map(str, i))}]" for i in self.entries)
-
-
-def value_is_array(value: Any) -> bool:
-    """False for a plain number, which stands for all entries alike."""
-    return bool(np.ndim(value))
 
 
 def array_shape(dims: int | tuple[int, ...] | Shape | None) -> Shape:

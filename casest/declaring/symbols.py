@@ -173,7 +173,7 @@ def _bounds(shape: Shape, bounds: Any) -> tuple[tuple[float, ...], tuple[float, 
             low, high = bounds
         except (TypeError, ValueError):
             raise DeclarationError(f"bounds {bounds!r} are not a pair (lower, upper)") from None
-        lower, upper = shape.pack(low), shape.pack(high)
+        lower, upper = shape.spread(low), shape.spread(high)
     bad = np.flatnonzero(~(lower < upper))
     if bad.size:
         raise DeclarationError(

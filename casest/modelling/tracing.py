@@ -70,8 +70,13 @@ def trace(model: Model, cut: str | None = None, naming: bool = False) -> Traced:
         measured,
         _corrected(model, residual, running),
     )
-    for attached in model.effects:
-        if attached.kind == "signal":
+    on_signals = [a for a in model.effects if a.kind == "signal"]
+    for attached in on_signals:
+        if attached.on == traced.measured:
+            traced = _with_changed_reading(traced, attached)
+    # What is substituted last acts first: so that the first effect added does, go backwards.
+    for attached in reversed(on_signals):
+        if attached.on != traced.measured:
             traced = _with_signal_effect(traced, attached)
     return traced
 
@@ -133,13 +138,16 @@ def _run_body(model: Model, running: Trace, symbols: Mapping[str, SX]) -> Residu
     return residual
 
 
+def _with_changed_reading(traced: Traced, attached: Attached) -> Traced:
+    """The prediction stays; what is compared with it does not."""
+    changed = ca.vec(ca.SX(attached.apply(traced.reading, traced.symbols)))
+    return replace(traced, reading=changed, expression=changed - traced.predicted)
+
+
 def _with_signal_effect(traced: Traced, attached: Attached) -> Traced:
     """Effects on a signal act after the body, because der(…, t) needs the bare symbol."""
     symbol = traced.symbols[attached.on]
     changed = ca.vec(ca.SX(attached.apply(symbol, traced.symbols)))
-    if traced.measured == attached.on:
-        # A changed reading: the prediction stays, what is compared with it does not.
-        return replace(traced, reading=changed, expression=changed - traced.predicted)
     flat = _flat(symbol)
 
     def late(expression: SX) -> SX:

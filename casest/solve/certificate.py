@@ -25,9 +25,10 @@ SLOPE = 1e-5
 STEP = 1e-4
 #: Two solutions are the same when they differ by less than this many standard deviations.
 SAME = 1e-2
-#: Rise of the cost two standard deviations from the optimum, over what the intervals assume. Below,
-#: they are too narrow; far above, the optimum sits in a fold where they mean nothing.
+#: Rise of the cost two standard deviations from the optimum, over what the intervals assume.
 SHAPE = (0.5, 10.0)
+#: From this ratio on a valley is too bent to be looked along: about 45 standard deviations aside.
+BENT = 1e3
 #: An implicit residual is the noise of the reading to first order only; the second-order part must
 #: stay below this share of it. (A flat ellipsoid through poses in a plane "fits" by that part.)
 SECOND_ORDER = 0.07
@@ -65,7 +66,10 @@ def certify(
     """
     R = factor[0]
     against: list[str] = []
-    slope, step = _slope_and_step(problem, best.point, factor, sigma)
+    rounding = problem.rounding(best.point)
+    slope, step = _slope_and_step(factor, sigma, rounding)
+    # What cannot be told from rounding is no slope, however small the residual.
+    exact = float(np.linalg.norm(factor[1])) <= 10 * rounding * np.sqrt(problem.residual_count)
     at_bound = _active(problem, best.point)
     missing = identified.unknowns - identified.rank
     if missing:
@@ -82,14 +86,14 @@ def certify(
         )
     if not np.isfinite(best.cost):
         against.append("the residual is not finite at the best point found")
-    elif slope > SLOPE and step > STEP and not against:
+    elif slope > SLOPE and step > STEP and not exact and not against:
         against.append(
             f"not a stationary point: the last step was still {step:.2g} standard deviations long"
         )
     curvature = _curvature(problem, best.point, R) if not against else float("nan")
     if not against and not curvature > 1e-9:
         against.append(f"no minimum: the exact curvature is {curvature:.2g} in some direction")
-    agreeing = sum(_same(problem, best, other, R, sigma) for other in others)
+    agreeing = sum(_same(problem, best, other, sigma, rounding) for other in others)
     shape = (1.0, 1.0)
     second = problem.second_order(best.point, sigma) if not against else 0.0
     if second > SECOND_ORDER:
@@ -107,21 +111,13 @@ def certify(
 
 
 def _slope_and_step(
-    problem: Problem, point: Point, factor: tuple[Array, Array, float], sigma: float
+    factor: tuple[Array, Array, float], sigma: float, rounding: float
 ) -> tuple[float, float]:
     """Share of the residual still in the Jacobian's reach; the step left in standard deviations."""
-    R, t, rest = factor
+    _, t, rest = factor
     left = float(np.linalg.norm(t))
     slope = left / max(float(np.hypot(left, rest)), 1e-300)
-    # A perfect fit has no noise to compare with: rounding of the readings takes its place.
-    noise = max(sigma if np.isfinite(sigma) else 0.0, _rounding(problem, point, R))
-    return slope, float(left / noise)
-
-
-def _rounding(problem: Problem, point: Point, R: Array) -> float:
-    """Size of one residual's rounding error: machine precision of what was subtracted in it."""
-    size = float(np.linalg.norm(np.linalg.norm(R, axis=0) * np.maximum(np.abs(point.x), 1e-300)))
-    return float(1e-14 * size / np.sqrt(problem.residual_count) + 1e-300)
+    return slope, left / max(sigma if np.isfinite(sigma) else 0.0, rounding)
 
 
 def _active(problem: Problem, point: Point) -> tuple[str, ...]:
@@ -151,37 +147,39 @@ def _curvature(problem: Problem, point: Point, R: Array) -> float:
     return float(np.min(np.linalg.eigvalsh(0.5 * (relative + relative.T))))
 
 
-def _same(problem: Problem, best: Outcome, other: Outcome, R: Array, sigma: float) -> bool:
+def _same(problem: Problem, best: Outcome, other: Outcome, sigma: float, rounding: float) -> bool:
     """Do two outcomes differ by less than SAME standard deviations?"""
     if not np.isfinite(other.cost):
         return False
     excess = np.sqrt(2 * max(other.cost - best.cost, 0.0))
-    floor = _rounding(problem, best.point, R) * np.sqrt(problem.residual_count)
+    floor = 10 * rounding * np.sqrt(problem.residual_count)
     return bool(excess <= max(SAME * sigma if np.isfinite(sigma) else 0.0, floor))
 
 
 def _shape(
     problem: Problem, best: Outcome, R: Array, sigma: float
 ) -> tuple[tuple[float, float], list[str]]:
-    """Go two standard deviations along every principal direction: is the cost what intervals say?
+    """Walk two standard deviations along every principal direction: is the cost what intervals say?
 
-    The ratio of the cost's rise to the quadratic one is 1 for a linear problem. Where a straight
-    walk disagrees, the valley may only be curved: the others are then fitted again with this
-    direction held (profile; Bates & Watts 1988, ch. 6). Outside SHAPE the intervals are false.
+    The ratio of the cost's rise to the quadratic one is 1 for a linear problem. Below SHAPE the
+    intervals are too narrow. Above, the valley may only be bent: up to BENT the other unknowns are
+    fitted again with this direction held (profile; Bates & Watts 1988, ch. 6). A valley bent more
+    than that is a curve, for which standard deviations and correlations mean nothing.
     """
-    sigma = max(sigma, _rounding(problem, best.point, R))
+    sigma = max(sigma, problem.rounding(best.point))
     norms = np.linalg.norm(R, axis=0)
     _, singular, Vt = np.linalg.svd(R / norms)
     ratios, words = [1.0], []
-    for k in range(len(norms)):
+    for k in range(len(norms) - 1, -1, -1):
         for sign in (1, -1):
             step = sign * 2 * sigma / singular[k] * Vt[k] / norms
             ratio = _rise(problem, best, best.point, step, sigma)
-            if not SHAPE[0] <= ratio <= 2.0:
-                there = profiled(problem, best.point, step, Vt[k] * norms * singular[k], sigma)
+            if SHAPE[1] < ratio <= BENT:
+                row = Vt[k] * norms * singular[k]
+                there = profiled(problem, best.point, step, row)
                 ratio = _rise(problem, best, there, np.zeros_like(step), sigma)
-                if not SHAPE[0] <= ratio <= SHAPE[1]:
-                    words.append(_misshapen(problem, step, norms, ratio))
+            if not SHAPE[0] <= ratio <= SHAPE[1]:
+                words.append(_misshapen(problem, step, norms, ratio))
             ratios.append(ratio)
     return (float(min(ratios)), float(max(ratios))), words[:1]
 

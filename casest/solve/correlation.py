@@ -9,14 +9,15 @@ from casest.data.run import Run
 from casest.declaring.shapes import Array
 from casest.stack import Point, Problem
 
-#: Fewer samples in a run say nothing about correlation.
-ENOUGH = 100
+#: Fewer samples in a run say nothing about correlation: of readings, and of rest intervals, which
+#: are known to have followed each other.
+ENOUGH, ENOUGH_RESTS = 100, 30
 
 
 def correlation_time(problem: Problem, point: Point) -> float:
     """Samples per independent residual: 1 + 2·Σ autocorrelations, 1 where they are not significant.
 
-    Runs of fewer than ENOUGH samples (poses, rest intervals) count as uncorrelated. The sum stops
+    Runs of fewer than ENOUGH samples (a table of poses) count as uncorrelated. The sum stops
     where pairs of neighbouring autocorrelations stop being positive (Geyer 1992).
     """
     times, weights = [], []
@@ -32,7 +33,7 @@ def correlation_time(problem: Problem, point: Point) -> float:
 
 def is_series(run: Run) -> bool:
     """Are there enough samples, in their order, to see correlation between neighbours?"""
-    return len(run) >= ENOUGH
+    return len(run) >= (ENOUGH_RESTS if run.spread else ENOUGH)
 
 
 def _integrated(r: Array) -> float:
@@ -44,7 +45,7 @@ def _integrated(r: Array) -> float:
     if not autocovariance[0] > 0:
         return 1.0
     rho = autocovariance / autocovariance[0]
-    if abs(rho[1]) < 3.3 / np.sqrt(count):  # one white series in a thousand gets past
+    if rho[1] < 2.33 / np.sqrt(count):  # one white series in a hundred gets past
         return 1.0
     pairs = rho[: len(rho) // 2 * 2].reshape(-1, 2).sum(axis=1)
     negative = np.flatnonzero(pairs <= 0)

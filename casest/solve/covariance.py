@@ -8,6 +8,9 @@ from casest.declaring.shapes import Array
 from casest.solve.correlation import batches
 from casest.stack import Point, Problem
 
+#: Fewer batches than this say too little; the plain covariance is then widened as a whole.
+FEWEST_BATCHES = 30
+
 
 def inverse_normal(R: Array) -> Array:
     """(JᵀJ)⁻¹ from the triangular factor, with unit columns inside; pseudo-inverse if singular."""
@@ -22,15 +25,23 @@ def inverse_normal(R: Array) -> Array:
 def sandwich(problem: Problem, point: Point, R: Array, correlated_over: float) -> Array:
     """Covariance (n, n) that holds when noise differs from place to place, or is correlated.
 
-    HC1 (White 1980; MacKinnon & White 1985); over batches of samples ten correlation times long
-    where residuals are correlated (Liang & Zeger 1986).
+    HC3 (MacKinnon & White 1985); over batches of samples ten correlation times long where residuals
+    are correlated (Liang & Zeger 1986). Too few batches for n² numbers give standard deviations
+    but no correlations: those are then taken from the plain covariance.
     """
     bread = inverse_normal(R)
-    length = int(np.ceil(10 * correlated_over)) if correlated_over > 1 else 1
+    if correlated_over <= 1:
+        alone = [np.arange(len(run)) for run in problem.runs]
+        return np.asarray(bread @ problem.squares_of_gradients(point, alone, bread) @ bread)
+    length = int(np.ceil(10 * correlated_over))
     numbers = [batches(run, length) for run in problem.runs]
     groups = sum(int(b.max(initial=-1)) + 1 for b in numbers)
-    samples, n = sum(len(run) for run in problem.runs), problem.unknowns
-    correction = groups / max(groups - 1, 1) * samples / max(samples - n, 1)
-    if length == 1:
-        correction = samples / max(samples - n, 1)
-    return np.asarray(correction * bread @ problem.squares_of_gradients(point, numbers) @ bread)
+    if groups < FEWEST_BATCHES:
+        plain = 2 * problem.cost(point) / max(problem.residual_count - problem.unknowns, 1)
+        return np.asarray(correlated_over * plain * bread)
+    correction = groups / max(groups - 1, 1)
+    robust = correction * bread @ problem.squares_of_gradients(point, numbers) @ bread
+    if groups >= 20 * problem.unknowns:
+        return np.asarray(robust)
+    ratio = np.sqrt(np.diag(robust) / np.diag(bread))
+    return np.asarray(bread * np.outer(ratio, ratio))

@@ -54,7 +54,7 @@ class Held:
         return HOLD * float(self.row @ (point.x - self.target))
 
 
-def profiled(problem: Problem, point: Point, step: Array, row: Array, sigma: float) -> Point:
+def profiled(problem: Problem, point: Point, step: Array, row: Array) -> Point:
     """Best point with the combination rowᵀx at its value after the step, all else fitted again."""
     held = Held(problem, row, point.x + step)
     lower, upper = problem.bounds

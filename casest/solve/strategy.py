@@ -33,6 +33,7 @@ def solve(
     if solver not in SOLVERS:
         raise UsageError(f"unknown solver {solver!r}; there are {', '.join(SOLVERS)}")
     outcomes = _ways(problem, first, solver, seed, automatic)
+    outcomes += _around_the_sphere(problem, first)
     outcomes += _along_the_weakest(problem, best_of(outcomes))
     if not has_noise_effects(problem.model):
         return problem, outcomes
@@ -73,7 +74,7 @@ def _ways(
     outcomes = [polished, second]
     if not automatic:
         # A start of the user's may lie in a wrong valley: the automatic one must agree.
-        outcomes.append(trust_region(problem, problem.start()))
+        outcomes.append(trust_region(problem, problem.start(), max_iterations=50))
     costs = [_cost(o) for o in outcomes]
     if max(costs) - min(costs) > 1e-6 * max(min(costs), 1e-300):
         outcomes += _perturbed(problem, first, seed)
@@ -97,6 +98,24 @@ def _perturbed(problem: Problem, first: Point, seed: int) -> list[Outcome]:
         moved = problem.moved(first, step)
         found.append(trust_region(problem, Point(problem.inside(moved.x), moved.references)))
     return found
+
+
+def _around_the_sphere(problem: Problem, first: Point) -> tuple[Outcome, ...]:
+    """Starts with every direction and rotation turned half about each axis.
+
+    On a sphere even a linear residual may have a second, false minimum.
+    """
+    found = []
+    for slot in problem.slots:
+        shape = slot.parameter.shape
+        if shape.curved:
+            value = shape.at_reference(first.references[slot.ref])
+            for turn in (np.diag([1.0, -1, -1]), np.diag([-1.0, 1, -1]), np.diag([-1.0, -1, 1])):
+                references = first.references.copy()
+                references[slot.ref] = shape.reference(turn @ value)
+                start = Point(first.x, references)
+                found.append(trust_region(problem, start, max_iterations=50))
+    return tuple(found)
 
 
 def _along_the_weakest(problem: Problem, best: Outcome) -> tuple[Outcome, ...]:
