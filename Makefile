@@ -10,7 +10,7 @@ demo: $(READY)
 	$(BIN)/casest demo
 
 test: $(READY)
-	$(BIN)/pytest -n 2
+	$(BIN)/pytest -n 2 --dist loadgroup
 
 lint: $(READY)
 	$(BIN)/ruff check .

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import warnings
-from concurrent.futures import ProcessPoolExecutor
 from functools import cache
-from multiprocessing import get_context
 
 import numpy as np
 import pytest
@@ -114,7 +111,6 @@ def test_an_estimator_that_returns_the_collapsed_solution_is_refused():
 def poor_case(task):
     """One calibration on poor data: (trusted, probability of the error, covered unknowns)."""
     name, kind, seed, sigma = task
-    warnings.simplefilter("error")  # as pytest does; this runs in a process of its own
     rng, n = np.random.default_rng(seed), 6 if name == "norm-diagonal" else 9
     sensor = sim.accelerometer(rng, skew=n == 9)
     v = sensor.read(POOR[kind](n, rng), sigma, rng)
@@ -138,16 +134,21 @@ def poor(kind):
         for seed in range(COUNTS.get(kind, 60))
         for name in ("norm-diagonal", "norm-triangular")
     ]
-    with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
-        return list(pool.map(poor_case, tasks, chunksize=4))
+    return [poor_case(task) for task in tasks]
 
 
+# One process makes these calibrations, once.
+together = pytest.mark.xdist_group("poor motion")
+
+
+@together
 @pytest.mark.parametrize("kind", POOR)
 def test_poor_motion_never_ends_in_an_internal_error(kind):
     crashes = [found for found in poor(kind) if isinstance(found, str)]
     assert not crashes, "\n".join(crashes)
 
 
+@together
 @pytest.mark.parametrize("kind", POOR)
 def test_poor_motion_never_gives_a_trusted_answer_that_is_wrong(kind):
     """Each trusted error, as Fisher's F, must not have a probability below 1e-4."""
@@ -158,6 +159,7 @@ def test_poor_motion_never_gives_a_trusted_answer_that_is_wrong(kind):
     assert not wrong, wrong
 
 
+@together
 def test_intervals_of_what_is_trusted_on_poor_motion_hold_the_truth_as_often_as_they_say():
     covered = [
         c

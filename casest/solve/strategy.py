@@ -19,6 +19,8 @@ from casest.solve.outcome import Outcome
 from casest.solve.trust_region import trust_region
 from casest.stack import Point, Problem
 
+#: Iterations after which a second opinion has nothing to say.
+OPINION = 50
 #: Solvers of the least-squares problem.
 SOLVERS = ("ipopt", "ipopt-exact", "trust-region")
 
@@ -74,7 +76,7 @@ def _ways(
     outcomes = [polished, second]
     if not automatic:
         # A start of the user's may lie in a wrong valley: the automatic one must agree.
-        outcomes.append(trust_region(problem, problem.start(), max_iterations=50))
+        outcomes.append(trust_region(problem, problem.start(), max_iterations=OPINION))
     costs = [_cost(o) for o in outcomes]
     if max(costs) - min(costs) > 1e-6 * max(min(costs), 1e-300):
         outcomes += _perturbed(problem, first, seed)
@@ -85,7 +87,7 @@ def _singular(problem: Problem, first: Point) -> bool:
     """Is a direction undetermined at the start and at what damped steps reach from there?"""
     if identify(problem, first).rank == problem.unknowns:
         return False
-    reached = trust_region(problem, first, max_iterations=50).point
+    reached = trust_region(problem, first, max_iterations=OPINION).point
     return identify(problem, reached).rank < problem.unknowns
 
 
@@ -96,7 +98,8 @@ def _perturbed(problem: Problem, first: Point, seed: int) -> list[Outcome]:
     for _ in range(4):
         step = 0.1 * np.maximum(np.abs(first.x), 0.1) * rng.standard_normal(len(first.x))
         moved = problem.moved(first, step)
-        found.append(trust_region(problem, Point(problem.inside(moved.x), moved.references)))
+        start = Point(problem.inside(moved.x), moved.references)
+        found.append(trust_region(problem, start, max_iterations=OPINION))
     return found
 
 
@@ -114,7 +117,7 @@ def _around_the_sphere(problem: Problem, first: Point) -> tuple[Outcome, ...]:
                 references = first.references.copy()
                 references[slot.ref] = shape.reference(turn @ value)
                 start = Point(first.x, references)
-                found.append(trust_region(problem, start, max_iterations=50))
+                found.append(trust_region(problem, start, max_iterations=OPINION))
     return tuple(found)
 
 
@@ -134,7 +137,8 @@ def _along_the_weakest(problem: Problem, best: Outcome) -> tuple[Outcome, ...]:
     found = []
     for sign in (1, -1):
         moved = problem.moved(best.point, sign * step)
-        found.append(trust_region(problem, Point(problem.inside(moved.x), moved.references)))
+        start = Point(problem.inside(moved.x), moved.references)
+        found.append(trust_region(problem, start, max_iterations=OPINION))
     return tuple(found)
 
 
