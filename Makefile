@@ -10,7 +10,7 @@ demo: $(READY)
 	$(BIN)/casest demo
 
 test: $(READY)
-	$(BIN)/pytest -n 2 --dist loadgroup
+	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist loadfile
 
 lint: $(READY)
 	$(BIN)/ruff check .

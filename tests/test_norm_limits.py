@@ -137,18 +137,12 @@ def poor(kind):
     return [poor_case(task) for task in tasks]
 
 
-# One process makes these calibrations, once.
-together = pytest.mark.xdist_group("poor motion")
-
-
-@together
 @pytest.mark.parametrize("kind", POOR)
 def test_poor_motion_never_ends_in_an_internal_error(kind):
     crashes = [found for found in poor(kind) if isinstance(found, str)]
     assert not crashes, "\n".join(crashes)
 
 
-@together
 @pytest.mark.parametrize("kind", POOR)
 def test_poor_motion_never_gives_a_trusted_answer_that_is_wrong(kind):
     """Each trusted error, as Fisher's F, must not have a probability below 1e-4."""
@@ -159,7 +153,6 @@ def test_poor_motion_never_gives_a_trusted_answer_that_is_wrong(kind):
     assert not wrong, wrong
 
 
-@together
 def test_intervals_of_what_is_trusted_on_poor_motion_hold_the_truth_as_often_as_they_say():
     covered = [
         c

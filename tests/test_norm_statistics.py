@@ -85,10 +85,6 @@ def simulated(task):
     return name, outcomes
 
 
-# One process makes the thousands of calibrations, once.
-together = pytest.mark.xdist_group("calibrations")
-
-
 @pytest.fixture(scope="module")
 def calibrations():
     """{model: outcomes} of 2000 calibrations, on two processes."""
@@ -107,13 +103,11 @@ def calibrations():
 # -- what is printed about uncertainty -------------------------------------------------------------
 
 
-@together
 def test_a_good_calibration_of_24_poses_is_always_trusted(calibrations):
     refused = [o for outcomes in calibrations.values() for o in outcomes if not o.trusted]
     assert not refused
 
 
-@together
 @pytest.mark.parametrize("name", ["norm-diagonal", "norm-triangular"])
 def test_the_95_percent_intervals_hold_the_truth_95_times_in_a_hundred(calibrations, name):
     covered = np.array([o.covered for o in calibrations[name]])
@@ -128,7 +122,6 @@ def test_the_95_percent_intervals_hold_the_truth_95_times_in_a_hundred(calibrati
     assert covered.mean(axis=0).max() < 0.98
 
 
-@together
 def test_estimates_are_unbiased_and_their_covariance_is_right(calibrations):
     """Jointly over both models: eᵀΣ⁻¹e/n follows F(n, ν); whitened errors have mean zero."""
     probabilities, mean_statistic, mean_freedom = [], 0.0, 0
