@@ -110,7 +110,7 @@ def _table(found: Estimate) -> Iterator[str]:
 def rounded(value: float, std: float) -> tuple[str, str]:
     """Value and standard deviation to two digits of the latter, as a metrologist writes them."""
     if not np.isfinite(std):
-        return f"{value:.6g}", "not determined"
+        return "–", "not determined"
     if std == 0:
         return f"{value:.9g}", "0"
     digits = 1 - int(np.floor(np.log10(std)))

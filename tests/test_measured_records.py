@@ -298,6 +298,23 @@ def test_imucals_gain_and_bias_of_the_ferraris_session_lie_within_three_std_of_o
     )
 
 
+def test_imucals_example_calibration_of_the_raw_counts_lies_within_three_std_of_ours(shared_data):
+    """`example_cal.json`: K_a in counts per m/s² and b_a in counts, of another tool's method."""
+    runs = record(
+        shared_data,
+        "imucal/annotated_session.csv",
+        ("acc_x", "acc_y", "acc_z"),
+        "count",
+        rate=102.4,
+        at_rest=True,
+    )
+    published = json.loads((shared_data / "imucal/example_cal.json").read_text(encoding="utf-8"))
+    found = fitted(runs, "norm-diagonal", norm=9.81)
+    scale = 1 / np.diag(np.array(published["K_a"]))
+    assert np.max(np.abs(found.values["scale"] - scale) / found.std["scale"]) < 3
+    assert np.max(np.abs(found.values["offset"] - published["b_a"]) / found.std["offset"]) < 3
+
+
 def test_six_orientations_of_a_ferraris_session_do_not_determine_nine_unknowns(shared_data):
     """Thirteen rests, but six directions: a skew model must be refused, not solved."""
     found = attempt(model_of("norm-triangular", 9.81), (ferraris(shared_data),))
