@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from casest.declaring.shapes import Array
+from casest.engine import Normal
 from casest.stack import Point
 
 
@@ -21,6 +22,9 @@ class LeastSquares(Protocol):
 
     def cost(self, point: Point) -> float:
         """Half the sum of squares."""
+
+    def normal(self, point: Point) -> Normal:
+        """Cost, gradient and Gauss-Newton matrix."""
 
     def factor(self, point: Point) -> tuple[Array, Array, float]:
         """Triangular factor of the Jacobian, Qᵀr, and the norm of the rest of r."""

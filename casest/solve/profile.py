@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from casest.declaring.shapes import Array
+from casest.engine import Normal
 from casest.solve.trust_region import trust_region
 from casest.stack import Point, Problem
 
@@ -39,6 +40,12 @@ class Held:
     def cost(self, point: Point) -> float:
         """Cost with the hold's square."""
         return self.problem.cost(point) + 0.5 * self._miss(point) ** 2
+
+    def normal(self, point: Point) -> Normal:
+        """Normal equations with the hold's row."""
+        cost, gradient, matrix = self.problem.normal(point)
+        row, miss = HOLD * self.row, self._miss(point)
+        return Normal(cost + 0.5 * miss**2, gradient + row * miss, matrix + np.outer(row, row))
 
     def factor(self, point: Point) -> tuple[Array, Array, float]:
         """Triangular factor with one more row."""

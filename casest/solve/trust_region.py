@@ -15,6 +15,9 @@ from casest.declaring.shapes import Array
 from casest.solve.outcome import LeastSquares, Outcome
 from casest.stack import Point
 
+#: Relative gain from which on the normal equations' squared condition number may tell.
+ROUGH = 1e-5
+
 
 class _Local(NamedTuple):
     """Linearisation at a point: J = QR, t = Qᵀr, cost."""
@@ -27,7 +30,7 @@ class _Local(NamedTuple):
 def trust_region(problem: LeastSquares, start: Point, *, max_iterations: int = 300) -> Outcome:
     """Minimise the cost from `start` until steps and gains are at rounding."""
     began = time.perf_counter()
-    point, here = start, _linearise(problem, start)
+    point, here, precise = start, _linearise(problem, start, precise=False), False
     scale = _column_norms(here.R)
     damping, growth, evaluations, status = 1e-3, 2.0, 1, "iteration limit"
     iterations = 0
@@ -41,7 +44,10 @@ def trust_region(problem: LeastSquares, start: Point, *, max_iterations: int = 3
         if not np.all(np.isfinite(step)):
             status = "step is not finite"
             break
-        gain = here.cost - 0.5 * float(np.sum((here.t + here.R @ step) ** 2)) - _rest(here)
+        gain = 0.5 * float(here.t @ here.t - np.sum((here.t + here.R @ step) ** 2))
+        if not precise and gain <= ROUGH * here.cost:
+            precise, here = True, _linearise(problem, point, precise=True)
+            continue
         if _negligible(step, point, scale, here, gain):
             status = "converged"
             break
@@ -50,7 +56,7 @@ def trust_region(problem: LeastSquares, start: Point, *, max_iterations: int = 3
         evaluations += 1
         if np.isfinite(there) and there < here.cost:
             ratio = (here.cost - there) / max(gain, 1e-300)
-            point, here = trial, _linearise(problem, trial)
+            point, here = trial, _linearise(problem, trial, precise)
             damping *= max(1 / 5, 1 - (2 * min(ratio, 2.0) - 1) ** 3)
             growth = 2.0
         else:
@@ -58,6 +64,8 @@ def trust_region(problem: LeastSquares, start: Point, *, max_iterations: int = 3
             if damping > 1e20:
                 status = "no descent"
                 break
+    if not precise:
+        here = _linearise(problem, point, precise=True)
     if np.all(np.isfinite(here.R)):
         point, here = _refine(problem, point, here, scale)
     claims = status in ("converged", "no descent")
@@ -67,14 +75,20 @@ def trust_region(problem: LeastSquares, start: Point, *, max_iterations: int = 3
     )
 
 
-def _linearise(problem: LeastSquares, point: Point) -> _Local:
+def _linearise(problem: LeastSquares, point: Point, precise: bool) -> _Local:
+    """From JᵀJ, which is quick, while far away; from a QR factor where the last digits count."""
+    if not precise:
+        normal = problem.normal(point)
+        scale = np.sqrt(np.where(np.diag(normal.matrix) > 0, np.diag(normal.matrix), 1.0))
+        try:
+            lower = np.linalg.cholesky(normal.matrix / np.outer(scale, scale))
+        except np.linalg.LinAlgError:
+            lower = np.full_like(normal.matrix, np.nan)
+        if np.all(np.isfinite(lower)) and np.diag(lower).min(initial=1.0) > 1e-6:
+            t = np.asarray(np.linalg.solve(lower, normal.gradient / scale), dtype=float)
+            return _Local(lower.T * scale, t, normal.cost)
     R, t, rest = problem.factor(point)
     return _Local(R, t, 0.5 * (float(t @ t) + rest**2))
-
-
-def _rest(here: _Local) -> float:
-    """Part of the cost that no step can remove in the linearisation."""
-    return here.cost - 0.5 * float(here.t @ here.t)
 
 
 def _column_norms(R: Array) -> Array:
@@ -129,7 +143,7 @@ def _refine(
         if not np.all(np.isfinite(step)):
             break
         trial = problem.moved(point, step)
-        there = _linearise(problem, trial)
+        there = _linearise(problem, trial, precise=True)
         better = _slope(there) < _slope(here) and there.cost <= here.cost * (1 + 1e-12)
         if not (np.isfinite(there.cost) and better):
             break

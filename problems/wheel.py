@@ -1,0 +1,255 @@
+"""A hand-spun, tilted wheel calibrates an accelerometer.
+
+F. Pedersini, "Dynamic Calibration of Triaxial Accelerometers with Simple Setup": model (1)-(7),
+the four-step algorithm (14)-(35). Conventions that the paper leaves open: the misalignment is
+R = Rx(θ)·Ry(φ)·Rz(ψ), and the tilt lies between 0 and π/2. Spinning the other way round with the
+sensor's y and z turned over gives the same readings with an offset that differs by 2g·cos α along
+the wheel's axis; of the two, the smaller offset is taken.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from casest import (
+    Model,
+    NotTrusted,
+    Residual,
+    Run,
+    constant,
+    cos,
+    der,
+    inf,
+    integral,
+    model,
+    param,
+    pi,
+    polynomial,
+    quantity,
+    rotation,
+    signal,
+    sin,
+    vertcat,
+)
+
+Array = NDArray[np.float64]
+
+
+@model
+def wheel(
+    t=signal("s"),
+    v=signal(3, "m/s^2"),
+    *,
+    offset=param(3, "m/s^2"),
+    gain=param(3, start=1.0, bounds=(0, inf)),
+    misalignment=param(3, "rad", per="run"),
+    tilt=param("rad", start=0.8, bounds=(0, pi / 2), per="run"),
+    phase=param("rad", per="run"),
+    speed=param(4, ("rad/s", "rad/s^2", "rad/s^3", "rad/s^4"), per="run"),
+    radius=constant(0.28, "m"),
+    gravity=constant(9.80665, "m/s^2"),
+):
+    """Accelerometer on a tilted, freely rotating wheel (Pedersini, eqs. 1-7)."""
+    angle = quantity("angle", phase + integral(polynomial(speed, t), t), "rad")
+    rate, acceleration = der(angle, t), der(der(angle, t), t)
+    a = vertcat(
+        radius * rate**2 + gravity * sin(tilt) * cos(angle),
+        radius * acceleration + gravity * sin(tilt) * sin(angle),
+        gravity * cos(tilt),
+    )
+    force = quantity("specific_force", rotation(misalignment) @ a, "m/s^2")
+    reading = quantity("reading", offset + gain * force, "m/s^2")
+    return Residual(measured=v, predicted=reading, corrected=force)
+
+
+# -- the motion, from the readings alone ----------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Phase ϑ(t) as a polynomial of degree four, lowest coefficient first (rad, t in s)."""
+
+    coefficients: Array
+
+    def phase(self, t: Array) -> Array:
+        """ϑ(t), rad."""
+        return np.polynomial.polynomial.polyval(t, self.coefficients)
+
+    def rate(self, t: Array, order: int = 1) -> Array:
+        """Derivative of ϑ(t) of the given order."""
+        derived = np.polynomial.polynomial.polyder(self.coefficients, order)
+        return np.polynomial.polynomial.polyval(t, derived)
+
+    def shifted(self, angle: float, sign: int = 1) -> Motion:
+        """±ϑ(t) + angle."""
+        coefficients = sign * self.coefficients
+        coefficients[0] += angle
+        return Motion(coefficients)
+
+
+def find_motion(t: Array, v: Array) -> Motion:
+    """Phase of the turning, up to a constant and its sign, from readings (N, 3).
+
+    What is left of the readings when the slow part (a polynomial of degree six, eq. 2 squared) is
+    taken out goes round an ellipse. Its angular rate, averaged over windows, gives a cubic; the
+    phase that remains after turning back by this cubic is slow and cannot slip.
+    """
+    z = _phasor(t, v)
+    step = float(np.median(np.diff(t)))
+    advance = z[1:] * np.conj(z[:-1])
+    middle = 0.5 * (t[1:] + t[:-1])
+    rates = np.angle(_window_sums(advance, _windows(len(advance), step))) / step
+    centres = _window_sums(middle, _windows(len(advance), step)).real
+    counts = _window_sums(np.ones(len(advance)), _windows(len(advance), step)).real
+    order = min(3, len(rates) - 1)
+    cubic = _robust_fit(centres / counts, rates, order)
+    motion = Motion(np.polynomial.polynomial.polyint(np.pad(cubic, (0, 3 - order))))
+    for _ in range(3):
+        motion = _corrected(motion, t, z, step)
+    return motion
+
+
+def _phasor(t: Array, v: Array) -> Any:
+    """Complex numbers going round the unit circle once per turn."""
+    x = 2 * (t - t[0]) / (t[-1] - t[0]) - 1
+    slow = np.polynomial.legendre.legvander(x, 6)
+    rest = v - slow @ np.linalg.lstsq(slow, v, rcond=None)[0]
+    u, s, _ = np.linalg.svd(rest, full_matrices=False)
+    if not s[1] > 1e-3 * s[0]:
+        raise NotTrusted("wheel: the readings do not go round: no turning seen in them")
+    return np.sqrt(len(t) / 2) * 2**0.5 * (u[:, 0] + 1j * u[:, 1]) / 2**0.5
+
+
+def _windows(count: int, step: float, seconds: float = 1.5) -> Any:
+    """First index of every window of about the given length; at least eight windows."""
+    length = max(1, min(round(seconds / step), count // 8))
+    return np.arange(0, count - length + 1, length)
+
+
+def _window_sums(values: Any, first: Any) -> Any:
+    return np.add.reduceat(values, first)
+
+
+def _robust_fit(x: Array, y: Array, degree: int) -> Array:
+    """Polynomial through most points: those far off the last fit are left out, three times."""
+    keep = np.ones(len(x), dtype=bool)
+    fit = np.polynomial.polynomial.polyfit(x, y, degree)
+    for _ in range(3):
+        away = np.abs(y - np.polynomial.polynomial.polyval(x, fit))
+        limit = 4 * np.median(away[keep]) + 1e-12
+        keep = away <= limit
+        if keep.sum() <= degree + 1:
+            break
+        fit = np.polynomial.polynomial.polyfit(x[keep], y[keep], degree)
+    return np.asarray(fit)
+
+
+def _corrected(motion: Motion, t: Array, z: Any, step: float) -> Motion:
+    """The motion with the slow phase added that is left after turning back by it."""
+    left = z * np.exp(-1j * motion.phase(t))
+    first = _windows(len(t), step, 1.0)
+    counts = np.diff(np.append(first, len(t)))
+    slow = np.unwrap(np.angle(_window_sums(left, first)))
+    centres = np.add.reduceat(t, first) / counts
+    more = np.polynomial.polynomial.polyfit(centres, slow, min(4, len(first) - 1))
+    return Motion(motion.coefficients + np.pad(more, (0, 5 - len(more))))
+
+
+# -- everything else, linear once the motion is known ----------------------------------------------
+
+
+def closed_form(declared: Model, runs: Sequence[Run]) -> dict[str, Array]:
+    """Start values of all parameters from the readings, run by run; sensor parameters averaged."""
+    found = [_one_run(declared, run) for run in runs]
+    values: dict[str, Array] = {}
+    for name in found[0]:
+        stacked = np.stack([f[name] for f in found])
+        per_run = any(p.name == name and p.scope == "run" for p in declared.parameters)
+        values[name] = stacked if per_run and len(runs) > 1 else stacked.mean(axis=0)
+        if per_run and len(runs) == 1:
+            values[name] = stacked[0]
+    return values
+
+
+def _number(declared: Model, name: str) -> float | None:
+    """The value of a constant; None where it is an unknown."""
+    symbol = declared[name]
+    return float(symbol.array) if hasattr(symbol, "array") else None
+
+
+def _one_run(declared: Model, run: Run) -> dict[str, Array]:
+    t, v = run.signals["t"][:, 0], run.signals["v"]
+    motion = find_motion(t, v)
+    both = [_from_motion(declared, t, v, motion.shifted(0.0, sign)) for sign in (1, -1)]
+    return min(both, key=lambda values: float(np.linalg.norm(values["offset"])))
+
+
+def _from_motion(declared: Model, t: Array, v: Array, motion: Motion) -> dict[str, Array]:
+    """v = o + ΓR a(t) is linear in ΓR's first two columns once ϑ(t) is known (1, 6)."""
+    phase, rate = motion.phase(t), motion.rate(t)
+    size = np.mean(rate**2)
+    columns = np.column_stack([np.ones_like(t), rate**2 / size, np.cos(phase), np.sin(phase)])
+    level, radial, c, s = np.linalg.lstsq(columns, v, rcond=None)[0]
+    radial = radial / size  # ΓR₁·r
+    # The phase counts from where gravity pulls along the radial axis: c·cos δ + s·sin δ ∥ radial.
+    shift = float(np.arctan2(s @ radial, c @ radial))
+    along, across = c * np.cos(shift) + s * np.sin(shift), s * np.cos(shift) - c * np.sin(shift)
+    gravity = _number(declared, "gravity") or 9.80665
+    radius, tilt = _number(declared, "radius"), _number(declared, "tilt")
+    if radius is None and tilt is not None:
+        first = along / (gravity * np.sin(tilt))
+    else:
+        first = radial / (radius or 0.28)
+    pull = float(along @ first / (first @ first))  # g·sin α
+    tilt = float(np.arcsin(np.clip(pull / gravity, 0.02, 0.999)))
+    second = across / (gravity * np.sin(tilt))
+    gain, R = _gain_and_rotation(first, second)
+    offset = level - gain * (R[:, 2] * gravity * np.cos(tilt))
+    turned = motion.shifted(-shift)
+    phase0 = float(np.angle(np.exp(1j * turned.coefficients[0])))
+    speed = turned.coefficients[1:] * np.arange(1, 5)
+    return {
+        "offset": offset,
+        "gain": gain,
+        "misalignment": euler(R),
+        "tilt": np.array(tilt),
+        "phase": np.array(phase0),
+        "speed": speed,
+        "radius": np.array(radius or float(np.linalg.norm(radial / (gain * R[:, 0])) / 3**0.5)),
+    }
+
+
+def _gain_and_rotation(first: Array, second: Array) -> tuple[Array, Array]:
+    """Γ and R from the first two columns of ΓR: their orthonormality is linear in 1/γ²."""
+    system = np.array([first**2, second**2, first * second])
+    try:
+        inverse_squares = np.linalg.solve(system, [1.0, 1.0, 0.0])
+    except np.linalg.LinAlgError:
+        inverse_squares = np.full(3, np.nan)
+    usable = np.all(np.isfinite(inverse_squares)) and np.all(inverse_squares > 0.25)
+    usable = usable and np.all(inverse_squares < 4)
+    gain = 1 / np.sqrt(inverse_squares) if usable else np.ones(3)
+    x = first / gain
+    x = x / np.linalg.norm(x)
+    y = second / gain - x * (x @ (second / gain))
+    y = y / np.linalg.norm(y)
+    return gain, np.column_stack([x, y, np.cross(x, y)])
+
+
+def euler(R: Array) -> Array:
+    """(θ, φ, ψ) of R = Rx(θ)·Ry(φ)·Rz(ψ), with φ in [−π/2, π/2]."""
+    return np.array(
+        [
+            np.arctan2(-R[1, 2], R[2, 2]),
+            np.arcsin(np.clip(R[0, 2], -1, 1)),
+            np.arctan2(-R[0, 1], R[0, 0]),
+        ]
+    )
+
+
+wheel = wheel.starting(closed_form).with_estimator("closed-form", closed_form)
