@@ -11,6 +11,7 @@ import numpy as np
 
 from casest.data.run import Run
 from casest.declaring.shapes import Array
+from casest.engine.threads import one_thread
 from casest.errors import DataError, NotTrusted, UsageError
 from casest.identify import Identifiability, Weak, identify, weak_directions
 from casest.modelling.model import Model
@@ -110,7 +111,8 @@ def attempt(
     seed: int = 0,
 ) -> Estimate:
     """The same as `calibrate`, but a refused estimate is returned instead of raised."""
-    with np.errstate(all="ignore"):  # what is not finite is found and named, not warned about
+    # What is not finite is found and named, not warned about.
+    with np.errstate(all="ignore"), one_thread():
         return _attempt(Problem(model, tuple(runs)), start, solver, seed)
 
 

@@ -252,4 +252,151 @@ def euler(R: Array) -> Array:
     )
 
 
-wheel = wheel.starting(closed_form).with_estimator("closed-form", closed_form)
+# -- the paper's four steps ------------------------------------------------------------------------
+
+
+def four_step(declared: Model, runs: Sequence[Run]) -> dict[str, Array]:
+    """Pedersini's algorithm (14)-(35), run by run, sensor parameters averaged.
+
+    Where the text leaves something open: the rotation of least variance (24) is the eigenvector of
+    the readings' smallest variance; searches begin at the closed form; the amplitude A of (28) is
+    the fitted one, because the standard deviation in (31) includes the noise; (32) is the
+    pseudo-inverse (UᵀU)⁻¹Uᵀb.
+    """
+    if _number(declared, "radius") is None:
+        raise NotTrusted("four-step: the algorithm needs the radius; fix it with --set radius=…")
+    found = [_four_steps(declared, run) for run in runs]
+    values: dict[str, Array] = {}
+    for p in declared.parameters:
+        stacked = np.stack([f[p.name] for f in found])
+        if p.scope == "run":
+            values[p.name] = stacked if len(runs) > 1 else stacked[0]
+        else:
+            values[p.name] = stacked.mean(axis=0)
+    return values
+
+
+def _four_steps(declared: Model, run: Run) -> dict[str, Array]:
+    t, v = run.signals["t"][:, 0], run.signals["v"]
+    start = _one_run(declared, run)
+    T = _realignment(v, start)  # A
+    motion, amplitude = _bench_rotation(t, v @ T[1], start)  # B
+    g, r = _number(declared, "gravity") or 9.80665, _number(declared, "radius") or 0.28
+    R, tilt, gain = _gain_search(t, v, T, motion, amplitude, start, g, r)  # C
+    phase, rate = motion.phase(t), motion.rate(t)
+    a = np.column_stack(
+        [
+            r * rate**2 + g * np.sin(tilt) * np.cos(phase),
+            r * motion.rate(t, 2) + g * np.sin(tilt) * np.sin(phase),
+            np.full_like(t, g * np.cos(tilt)),
+        ]
+    )
+    offset = np.mean(v - gain * (a @ R.T), axis=0)  # D, (35)
+    return {
+        "offset": offset,
+        "gain": gain,
+        "misalignment": euler(R),
+        "tilt": np.array(tilt),
+        "phase": np.array(np.angle(np.exp(1j * motion.coefficients[0]))),
+        "speed": motion.coefficients[1:] * np.arange(1, 5),
+    }
+
+
+def _realignment(v: Array, start: dict[str, Array]) -> Array:
+    """T of (24) and (26): z′ constant, y′ of least excursion; signs as in the start's R."""
+    from scipy.optimize import minimize_scalar
+
+    W = start["gain"][:, None] * rotation_matrix(start["misalignment"])
+    z = np.linalg.eigh(np.cov(v.T))[1][:, 0]
+    z = z * np.sign(z @ W[:, 2])
+    x = np.linalg.svd(z[None, :])[2][1]
+    y = np.cross(z, x)
+    plane = v @ np.column_stack([x, y])
+
+    def excursion(angle: float) -> float:
+        return float(np.ptp(plane @ [np.cos(angle), np.sin(angle)]))
+
+    guess = float(np.arctan2(y @ W[:, 1], x @ W[:, 1]))
+    angle = minimize_scalar(excursion, bracket=(guess - 0.1, guess + 0.1), tol=1e-10).x
+    second = np.cos(angle) * x + np.sin(angle) * y
+    second = second * np.sign(second @ W[:, 1])
+    return np.array([np.cross(second, z), second, z])
+
+
+def _bench_rotation(t: Array, y: Array, start: dict[str, Array]) -> tuple[Motion, float]:
+    """(29): k + A·sin ϑ(t) fitted to the re-aligned y, seven unknowns."""
+    from scipy.optimize import least_squares
+
+    length = float(t[-1])
+    powers = (t[:, None] / length) ** np.arange(5)
+    phase = np.concatenate([[start["phase"]], start["speed"] / np.arange(1, 5)])
+    first = phase * length ** np.arange(5)
+    columns = np.column_stack([np.ones_like(t), np.sin(powers @ first)])
+    k, A = np.linalg.lstsq(columns, y, rcond=None)[0]
+
+    def residual(x: Array) -> Array:
+        return np.asarray(x[5] + x[6] * np.sin(powers @ x[:5]) - y)
+
+    def jacobian(x: Array) -> Array:
+        angle = powers @ x[:5]
+        slope = (x[6] * np.cos(angle))[:, None] * powers
+        return np.column_stack([slope, np.ones_like(t), np.sin(angle)])
+
+    best = least_squares(residual, [*first, k, A], jac=jacobian, x_scale="jac").x
+    return Motion(best[:5] / length ** np.arange(5)), float(best[6])
+
+
+def _gain_search(
+    t: Array,
+    v: Array,
+    T: Array,
+    motion: Motion,
+    amplitude: float,
+    start: dict[str, Array],
+    g: float,
+    r: float,
+) -> tuple[Array, float, Array]:
+    """(30)-(34): misalignment and tilt by search, the gain of each candidate by (32)."""
+    from scipy.optimize import minimize
+
+    phase = motion.phase(t)
+    basis = [motion.rate(t) ** 2, np.cos(phase), motion.rate(t, 2), np.sin(phase)]
+    features = np.column_stack(basis)
+    both = np.hstack([features - features.mean(axis=0), v - v.mean(axis=0)])
+    gram = both.T @ both  # all that (34) needs of the samples
+    FF, FV, VV = gram[:4, :4], gram[:4, 4:], gram[4:, 4:]
+
+    def gain_of(R: Array, tilt: float) -> Array:
+        rows = [T[1] * R[:, 0], T[2] * R[:, 0], T[2] * R[:, 1], T[1] * R[:, 1]]
+        right = np.array([0, 0, 0, amplitude / (g * np.sin(tilt))])
+        return np.asarray(np.linalg.lstsq(np.array(rows), right, rcond=None)[0])
+
+    def objective(x: Array) -> float:
+        R, tilt = rotation_matrix(x[:3]), x[3]
+        a = np.zeros((4, 3))
+        a[0, 0], a[1, 0] = r, g * np.sin(tilt)
+        a[2, 1], a[3, 1] = r, g * np.sin(tilt)
+        M = a @ (gain_of(R, tilt)[:, None] * R).T
+        return float(np.trace(VV - 2 * M.T @ FV + M.T @ FF @ M))
+
+    first = [*start["misalignment"], float(start["tilt"])]
+    options = {"xatol": 1e-9, "fatol": 1e-12 * gram[4:, 4:].trace(), "maxiter": 4000}
+    best = minimize(objective, first, method="Nelder-Mead", options=options).x
+    R = rotation_matrix(best[:3])
+    return R, float(best[3]), gain_of(R, best[3])
+
+
+def rotation_matrix(angles: Array) -> Array:
+    """R = Rx(θ)·Ry(φ)·Rz(ψ) of plain numbers."""
+    c, s = np.cos(angles), np.sin(angles)
+    x = np.array([[1, 0, 0], [0, c[0], -s[0]], [0, s[0], c[0]]])
+    y = np.array([[c[1], 0, s[1]], [0, 1, 0], [-s[1], 0, c[1]]])
+    z = np.array([[c[2], -s[2], 0], [s[2], c[2], 0], [0, 0, 1]])
+    return np.asarray(x @ y @ z)
+
+
+wheel = (
+    wheel.starting(closed_form)
+    .with_estimator("four-step", four_step)
+    .with_estimator("closed-form", closed_form)
+)
