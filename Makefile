@@ -10,7 +10,7 @@ demo: $(READY)
 	$(BIN)/casest demo
 
 test: $(READY)
-	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist loadfile
+	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist loadfile -rs
 
 lint: $(READY)
 	$(BIN)/ruff check .

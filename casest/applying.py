@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import hashlib
 import io
 import sys
 from collections.abc import Mapping
@@ -26,7 +27,7 @@ from casest.result import load_result, saved_parameters
 
 def saved_model(result: Mapping[str, Any]) -> tuple[Model, dict[str, Any]]:
     """Model and parameter values of a saved result: effects, constants and scopes as they were."""
-    model, units = find_model(result["model"]), result.get("units", {})
+    model, units = _found_model(result), result.get("units", {})
     for saved in result.get("effects", []):
         effect = _found_effect(saved)
         on = None if saved["on"] == effect.on else saved["on"]
@@ -43,6 +44,25 @@ def saved_model(result: Mapping[str, Any]) -> tuple[Model, dict[str, Any]]:
     if missing:
         raise DataError(f"the result has no value for {missing[0]!r} of model {model.name}")
     return model, {name: np.array(p["value"], dtype=float) for name, p in parameters.items()}
+
+
+def _found_model(result: Mapping[str, Any]) -> Model:
+    """The model where it was when the result was made, and as it was."""
+    name, declared = str(result["model"]), result.get("declared_in") or {}
+    path, colon, own = name.partition(":")
+    if path.endswith(".py") and not Path(path).exists() and Path(declared.get("file", "")).exists():
+        name = declared["file"] + colon + own
+    model = find_model(name)
+    source = Path(model.function.__code__.co_filename)
+    shipped = not name.partition(":")[0].endswith(".py")
+    if not shipped and declared and source.exists():
+        now = hashlib.sha256(source.read_bytes()).hexdigest()
+        if now != declared["sha256"]:
+            raise UsageError(
+                f"{source} has changed since the result was made: calibrate again (the parameters "
+                "belong to the old declaration)"
+            )
+    return model
 
 
 def _found_effect(saved: Mapping[str, Any]) -> Effect:
@@ -64,11 +84,10 @@ def corrected_csv(
         raise UsageError(f"{path}: this estimate was refused; --force applies it all the same")
     model, values = saved_model(result)
     correction = Correction(model)
-    per_run = {p.name for p in model.parameters if p.scope == "run"}
-    if len(result["runs"]) > 1 and per_run & correction.parameters:
-        name = sorted(per_run & correction.parameters)[0]
-        raise UsageError(f"{name} differs from run to run: calibrate with --shared {name} to apply")
-    needed = {n: _of_one_run(model[n], v) for n, v in values.items() if n in correction.parameters}
+    which = _run_number(model, correction, result, data)
+    needed = {
+        n: _of_one_run(model[n], v, which) for n, v in values.items() if n in correction.parameters
+    }
     runs = load_runs([data], correction.signals, **arguments)
     _same_units(result, runs, data)
     found = result.get("corrected") or {}
@@ -81,9 +100,24 @@ def corrected_csv(
     return text.getvalue()
 
 
-def _of_one_run(parameter: Parameter, value: Array) -> Array:
-    """The value without its run axis, which only several runs have."""
-    return value[0] if value.ndim > len(parameter.shape.dims) else value
+def _run_number(model: Model, correction: Correction, result: Mapping[str, Any], data: str) -> int:
+    """Which fitted run the data are: matters where the correction differs from run to run."""
+    differing = {p.name for p in model.parameters if p.scope == "run"} & correction.parameters
+    if len(result["runs"]) == 1 or not differing:
+        return 0
+    files = [Path(name).resolve() for name in result["data"]]
+    if len(files) == len(result["runs"]) and Path(data).resolve() in files:
+        return files.index(Path(data).resolve())
+    name = sorted(differing)[0]
+    raise UsageError(
+        f"{name} differs from run to run, and {data} is none of the fitted files; calibrate with "
+        f"--shared {name} to apply the result to new data"
+    )
+
+
+def _of_one_run(parameter: Parameter, value: Array, which: int) -> Array:
+    """The value of one run; only several runs have a run axis."""
+    return value[which] if value.ndim > len(parameter.shape.dims) else value
 
 
 def _same_units(result: Mapping[str, Any], runs: tuple[Run, ...], data: str) -> None:

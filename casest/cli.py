@@ -201,7 +201,11 @@ def calibration(model_name: str, data: Sequence[str], options: Options, command:
     else:
         click.echo(terminal.calibration_text(found, content, options["output"]))
     if not found.certificate.trusted:
-        click.echo("casest: no trustworthy estimate: " + found.certificate.reasons[0], err=True)
+        if options["as_json"]:
+            reason = found.certificate.reasons[0]
+            click.echo(f"casest: no trustworthy estimate: {reason}", err=True)
+        else:
+            click.echo("casest: no trustworthy estimate, see above", err=True)
         return NotTrusted.exit_code
     return 0
 
@@ -362,6 +366,11 @@ def records(model: Model, data: Sequence[str], options: Options) -> tuple[Run, .
     """The runs in the files."""
     from casest.data import load_runs
 
+    seen: set[Path] = set()
+    for name in data:
+        if Path(name).resolve() in seen:
+            raise UsageError(f"{name} is given twice: it would count as two records")
+        seen.add(Path(name).resolve())
     return load_runs(list(data), model.signals, **reading_arguments(options))
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -16,6 +16,7 @@ from casest.errors import DataError, NotTrusted, UsageError
 from casest.identify import Identifiability, Weak, identify, weak_directions
 from casest.modelling.model import Model
 from casest.noise import has_noise_effects, variance_factor
+from casest.remarks import NOTABLE_BIAS, notes
 from casest.solve.certificate import Certificate, certify
 from casest.solve.correlation import correlation_time
 from casest.solve.covariance import inverse_normal, sandwich
@@ -207,6 +208,11 @@ def _estimate(
     correlated = correlation_time(problem, point)
     robust = sandwich(problem, point, R, correlated)
     covariance = _covariance(problem, point, R, noise.sigma, correlated, robust)
+    bias = problem.second_order_bias(point, noise.sigma, inverse_normal(R))
+    relative = float(np.max(np.abs(bias) / np.sqrt(np.diag(covariance)), initial=0.0))
+    if relative > NOTABLE_BIAS:
+        covariance = covariance + np.outer(bias, bias)
+        robust = robust + np.outer(bias, bias)
     certificate = certify(problem, best, outcomes, identified, (R, factor[1], rest), noise.sigma)
     unknown = identified.touched
     covariance[unknown, :] = covariance[:, unknown] = np.nan
@@ -226,7 +232,7 @@ def _estimate(
         tuple(outcomes),
         time.perf_counter() - began,
         correlated,
-        tuple(_correlation_note(problem, correlated)),
+        tuple(notes(problem, point, dof, correlated, relative)),
     )
 
 
@@ -284,15 +290,6 @@ def _covariance(
     if correlated > 1:
         return robust.copy()
     return np.asarray(sigma**2 * inverse_normal(R))
-
-
-def _correlation_note(problem: Problem, correlated: float) -> Iterator[str]:
-    if correlated > 1:
-        count = sum(len(run) for run in problem.runs)
-        yield (
-            f"residuals are correlated over {correlated:.3g} samples: the {count} samples count as "
-            f"{count / correlated:.0f}, and standard deviations come from batches of samples"
-        )
 
 
 def _noise(problem: Problem, point: Point, length: float, dof: int) -> Noise:

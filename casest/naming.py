@@ -29,6 +29,8 @@ def unit_table(model: Model, runs: Sequence[Run]) -> dict[str, str]:
         counted = c.unit in {f"[{n}]" for n, u in known.items() if u == "count"}
         known[c.name] = "1" if counted else resolved(c.unit, known)
     for c in model.constants:
+        if c.like:
+            _check_like(c.name, c.unit, resolved(c.like, known))
         if c.frozen is not None:
             _check_fixed(c.name, c.unit, resolved(c.frozen.units[0], known))
     table = dict(known)
@@ -68,6 +70,18 @@ def _quotient(a: str, b: str) -> str:
     if "[" in a + b:
         return f"{a}/{b}" if b != "1" else a
     return units.quotient(a, b)
+
+
+def _check_like(name: str, stated: str, like: str) -> None:
+    """A norm in kg for readings in m/s² is a mistake; for raw counts any unit may be right."""
+    if not stated or "[" in stated + like or like in ("count", "1"):
+        return
+    try:
+        units.conversion(stated, like)
+    except UnitError as error:
+        raise UnitError(
+            f"{name} is set in {stated}, and the readings are in {like}: {error}"
+        ) from None
 
 
 def _check_fixed(name: str, stated: str, needed: str) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import hashlib
+import inspect
 import io
 import json
 import platform
@@ -22,6 +23,7 @@ from casest.declaring.shapes import Array
 from casest.errors import DataError
 from casest.estimate import Estimate
 from casest.modelling.effect import Attached
+from casest.modelling.model import Model
 from casest.naming import entry_units, unit_table
 
 RESULT, RESIDUALS = "result.json", "residuals.csv"
@@ -89,6 +91,8 @@ def calibration_result(
         "solver": _solver(estimate),
         "samples": [_sample_note(run) for run in problem.runs],
         "notes": [note for run in problem.runs for note in run.notes] + list(estimate.notes),
+        "convention": inspect.getdoc(problem.model.function) or "",
+        "declared_in": _declared_in(problem.model),
         "reproduce": _reproduce(command, data),
     }
 
@@ -162,6 +166,14 @@ def _solver(estimate: Estimate) -> dict[str, Any]:
 
 def _sample_note(run: Run) -> dict[str, Any]:
     return {"run": run.name, "samples": len(run), "readings": int(np.sum(run.count))}
+
+
+def _declared_in(model: Model) -> dict[str, str]:
+    """File of the model's declaration and its digest, so that an edited model is noticed."""
+    path = Path(model.function.__code__.co_filename).resolve()
+    if not path.exists():
+        return {}
+    return {"file": str(path), "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
 
 
 def _reproduce(command: str, data: Sequence[str]) -> dict[str, Any]:

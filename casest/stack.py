@@ -409,6 +409,21 @@ class Problem:
         squares = np.concatenate([v.ravel() ** 2 for v in values])
         return float(0.5 * sigma * np.sqrt(np.mean(squares)))
 
+    def second_order_bias(self, point: Point, sigma: float, bread: Array) -> Array:
+        """Shift of the unknowns (n,) by what an implicit residual neglects of the noise.
+
+        Noise of σ in every component of the reading shifts each residual by ½σ²·∇²r on average.
+        """
+        slope = np.zeros(self.unknowns)
+        if not self.model.implicit:
+            return slope
+        replay = _laplacian(self.model)
+        for r, samples in enumerate(self.samples):
+            shift = 0.5 * sigma**2 * replay(self._parameters(point, r), samples)[0][:, :, 0]
+            jacobian, x = self._rows(point, r)[1], self._selections[r][0]
+            np.add.at(slope, x, np.einsum("nm,nmk->k", shift, jacobian))
+        return np.asarray(-bread @ slope)
+
     def repeat_noise(self, point: Point) -> float | None:
         """Root mean square of the residual's noise that the scatter within rest intervals implies.
 

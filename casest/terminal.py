@@ -54,6 +54,7 @@ def calibration_text(found: Estimate, content: Mapping[str, Any], output: Path |
     """Verdict, values with uncertainty, what was not determined, why it is believed."""
     blocks = [_head(found, content), *_wrapped_notes(content["notes"])]
     blocks.append("\n".join(_table(found)))
+    blocks.append("\n".join(_held(found, content)))
     blocks.append("\n".join(_fit_lines(found, content)))
     blocks += _determined(found)
     title = "Believed because" if found.certificate.trusted else "Refused because"
@@ -107,6 +108,18 @@ def _table(found: Estimate) -> Iterator[str]:
         yield f"  {name:<{width}}  {value_text:>{left}} ± {std_text:<{middle}}  {unit}".rstrip()
 
 
+def _held(found: Estimate, content: Mapping[str, Any]) -> Iterator[str]:
+    """Constants, and parameters held at a value: as much a part of the answer as the unknowns."""
+    fixed = False
+    for c in found.model.constants:
+        unit = content["units"].get(c.name, "")
+        value = np.array2string(c.array, precision=9, separator=", ").replace("\n", "")
+        fixed = fixed or c.frozen is not None
+        yield f"  {c.name} = {value} {'' if unit == '1' else unit}".rstrip() + " (held)"
+    if fixed:
+        yield "  (the uncertainty of held values is not in the standard deviations above)"
+
+
 def rounded(value: float, std: float) -> tuple[str, str]:
     """Value and standard deviation to two digits of the latter, as a metrologist writes them."""
     if not np.isfinite(std):
@@ -138,6 +151,7 @@ def _fit_lines(found: Estimate, content: Mapping[str, Any]) -> Iterator[str]:
         )
     if "seconds" in found.extra:
         ratio = found.extra["least_squares_seconds"] / found.extra["seconds"]
+        yield "  (standard deviations are those of the least-squares solution)"
         yield (
             f"  {found.extra['estimator']} took {1e3 * found.extra['seconds']:.2g} ms; the "
             f"least-squares solution {ratio:.0f} times as long"
@@ -145,7 +159,7 @@ def _fit_lines(found: Estimate, content: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _determined(found: Estimate) -> Iterator[str]:
-    if found.identifiability.unobservable:
+    if found.identifiability.unobservable and found.certificate.trusted:
         lines = [_item(words) for words in found.identifiability.unobservable]
         yield "\n".join(["These data do not determine:", *lines])
     if found.weak:
@@ -161,6 +175,8 @@ def _determined(found: Estimate) -> Iterator[str]:
 def _next(found: Estimate, output: Path | None) -> str:
     if not found.certificate.trusted:
         return ""
+    if found.model.traced.corrected is None:
+        return "" if output is None else f"Written: {output}/result.json, {output}/residuals.csv."
     if output is None:
         return "Next: add -o out to keep the result, then `casest apply out DATA`."
     return (

@@ -23,6 +23,7 @@ from casest import (
     NotTrusted,
     Residual,
     Run,
+    UsageError,
     constant,
     diag,
     diagonal,
@@ -58,7 +59,10 @@ def norm_diagonal(
     offset=param(3, "[v]"),
     norm=constant(1.0, "[v]"),
 ):
-    """Scale of each axis and offset (Ren & Liu, eqs. 5-6): 6 unknowns."""
+    """Scale of each axis and offset (Ren & Liu, eqs. 5-6): 6 unknowns.
+
+    corrected = scale·(v − offset), and the length of corrected is `norm`.
+    """
     return _norm_residual(diag(scale) @ (v - offset), diag(scale), norm)
 
 
@@ -70,7 +74,10 @@ def norm_triangular(
     offset=param(3, "[v]"),
     norm=constant(1.0, "[v]"),
 ):
-    """Scale, non-orthogonality and offset (Burkhard et al., eq. 1, A = M⁻¹): 9 unknowns."""
+    """Scale, non-orthogonality and offset (Burkhard et al., eq. 1, A = M⁻¹): 9 unknowns.
+
+    corrected = scale·(v − offset), and the length of corrected is `norm`.
+    """
     return _norm_residual(scale @ (v - offset), scale, norm)
 
 
@@ -82,7 +89,10 @@ def norm_full(
     offset=param(3, "[v]"),
     norm=constant(1.0, "[v]"),
 ):
-    """Full 3×3 scale and offset (Ren & Liu, eq. 4): 12 unknowns, of which a norm sees 9."""
+    """Full 3×3 scale and offset (Ren & Liu, eq. 4): 12 unknowns, of which a norm sees 9.
+
+    corrected = scale·(v − offset), and the length of corrected is `norm`.
+    """
     return _norm_residual(scale @ (v - offset), scale, norm)
 
 
@@ -230,7 +240,10 @@ def _values(declared: Model, A: Array, b: Array) -> dict[str, Array]:
 def _length(declared: Model) -> float:
     """The known length, or where the search for it starts."""
     symbol = declared["norm"]
-    return float(symbol.start_value()[0] if hasattr(symbol, "start_value") else symbol.array)
+    value = float(symbol.start_value()[0] if hasattr(symbol, "start_value") else symbol.array)
+    if not value > 0:
+        raise UsageError(f"norm = {value:g}: a length must be positive; --set norm=…")
+    return value
 
 
 def _known_scale(declared: Model) -> Array | None:
@@ -295,8 +308,32 @@ def inside_the_ball(declared: Model, runs: Sequence[Run]) -> dict[str, tuple[Any
     return {"offset": (-radius, radius)}
 
 
+def remarks(declared: Model, runs: Sequence[Run], values: dict[str, Array]) -> list[str]:
+    """What an engineer would notice: a unit mixed up, poses in a plane, a record in motion."""
+    v, norm = readings(runs), _length(declared)
+    found = []
+    unit = runs[0].units.get("v")
+    symbol = declared["norm"]
+    same = unit is not None and unit != "count" and symbol.unit in (unit, "[v]")
+    length = float(np.median(np.linalg.norm(v - values.get("offset", np.zeros(3)), axis=1)))
+    if same and not 1 / 3 < length / norm < 3:
+        found.append(
+            f"readings are {length / norm:.3g} times the norm ({norm:g}), both in {unit}: is "
+            "one of the two in another unit? (--unit v=…, --set 'norm=… m/s^2')"
+        )
+    spread = np.linalg.svd(v - v.mean(axis=0), compute_uv=False) / np.sqrt(len(v))
+    if spread[2] < 0.15 * spread[0]:
+        found.append(
+            f"the readings lie close to a plane (thickness {spread[2] / spread[0]:.1%} of their "
+            "extent): tilt the sensor about another axis too"
+        )
+    if np.all(runs[0].count == 1) and len(v) > 1000 and unit in ("m/s^2", "g"):
+        found.append("single readings are used as they are: if the sensor moved, add --at-rest")
+    return found
+
+
 def _complete(declared: Model) -> Model:
-    declared = declared.starting(automatic_start).bounded(inside_the_ball)
+    declared = declared.starting(automatic_start).bounded(inside_the_ball).remarking(remarks)
     named = {
         "closed-form": closed_form,
         "bias-only": bias_only,

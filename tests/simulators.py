@@ -154,3 +154,64 @@ def handheld(
             count += m
     x = np.vstack(parts)
     return x @ sensor.M.T + sensor.b + sigma * rng.standard_normal(x.shape), rests
+
+
+# -- a hand-spun wheel --------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Spin:
+    """An accelerometer on a tilted wheel: what Pedersini's bench does, written from the geometry.
+
+    Angles in rad, lengths in m; `turn` (3, 3) takes bench axes to sensor axes.
+    """
+
+    offset: Array
+    gain: Array
+    turn: Array
+    tilt: float
+    radius: float = 0.28
+    gravity: float = GRAVITY
+
+    def read(self, angle: Array, rate: Array, change: Array) -> Array:
+        """Noise-free readings (N, 3) for given angle, angular rate and acceleration."""
+        down = np.array([np.sin(self.tilt), 0.0, np.cos(self.tilt)])  # in the bench's plane at 0
+        x = self.gravity * down[0] * np.cos(angle) + self.radius * rate**2
+        y = self.gravity * down[0] * np.sin(angle) + self.radius * change
+        z = np.full_like(angle, self.gravity * down[2])
+        return self.offset + self.gain * np.einsum("ij,jn->ni", self.turn, np.array([x, y, z]))
+
+
+def cubic_motion(t: Array, start: float, speed: Array) -> tuple[Array, Array, Array]:
+    """Angle, rate and acceleration of a wheel whose rate is exactly a cubic in t."""
+    rate = sum(c * t**k for k, c in enumerate(speed))
+    angle = start + sum(c * t ** (k + 1) / (k + 1) for k, c in enumerate(speed))
+    change = sum(k * c * t ** (k - 1) for k, c in enumerate(speed) if k)
+    return angle, rate, change
+
+
+def physical_motion(
+    t: Array,
+    start: float,
+    rate: float,
+    *,
+    drag: float = 4e-4,
+    friction: float = 0.004,
+    eccentric: float = 0.0,
+) -> tuple[Array, Array, Array]:
+    """Angle, rate, acceleration of a wheel slowed by air and bearing, by integration.
+
+    Per unit of inertia: `drag` (1/rad) times rate², `friction` (rad/s²), and `eccentric` (rad/s²)
+    the pull of an unbalanced mass, which speeds the wheel up and slows it down once per turn.
+    """
+    from scipy.integrate import solve_ivp
+
+    def motion(_: float, state: Array) -> Array:
+        angle, omega = state
+        sign = np.sign(omega)
+        torque = -drag * omega * abs(omega) - friction * sign - eccentric * np.sin(angle)
+        return np.array([omega, torque])
+
+    found = solve_ivp(motion, (t[0], t[-1]), [start, rate], "DOP853", t, rtol=1e-11, atol=1e-11)
+    angle, omega = found.y
+    return angle, omega, np.array([motion(0.0, s)[1] for s in found.y.T])

@@ -29,7 +29,7 @@ def vector(
             values = _converted(table, name, signal, values, unit, target, stated)
         parts.append(values)
     values = np.stack(parts, axis=1)
-    notes = []
+    notes = _overruled(table, signal, names, options)
     if target is not None and None in stated:
         silent = " ".join(n for n, u in zip(names, stated, strict=True) if u is None)
         size = f"median length {np.median(np.linalg.norm(values, axis=1)):.4g}"
@@ -38,6 +38,18 @@ def vector(
             f"if that is wrong say --unit {signal.name}=…"
         )
     return values, target, notes
+
+
+def _overruled(table: Table, signal: Signal, names: tuple[str, ...], options: Options) -> list[str]:
+    """A unit that the user states against the header is followed, and said."""
+    notes = []
+    for name in names:
+        column = table.columns[name]
+        stated = options.units.get(name, options.units.get(signal.name))
+        known = column.unit is not None and unit_names.known(column.unit)
+        if known and stated and unit_names.canonical(column.unit or "") != stated:
+            notes.append(f"{name}: the header says {column.unit}, --unit says {stated}: followed")
+    return notes
 
 
 def _converted(

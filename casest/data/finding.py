@@ -6,6 +6,7 @@ import difflib
 import re
 from collections.abc import Mapping, Sequence
 
+from casest.data.column import name_and_unit
 from casest.data.table import Table
 from casest.declaring.symbols import Signal
 from casest.errors import DataError
@@ -63,6 +64,9 @@ def find_by_name(table: Table, name: str) -> str | None:
     """Return the column called so: exactly, else without regard to case and punctuation."""
     if name in table.columns:
         return name
+    bare = name_and_unit(name)[0]  # as the header is written, unit and all
+    if bare in table.columns:
+        return bare
     return next((have for have in table.columns if _plain(have) == _plain(name)), None)
 
 

@@ -174,7 +174,9 @@ def _notes(run: Run, found: Rests, names: list[str], channels: Array) -> list[st
         "noise at rest: " + ", ".join(f"{n} {s:.3g}" for n, s in zip(names, sigma, strict=True)),
     ]
     if run.time is None:
-        notes.append(f"rate unknown, rest judged over {WINDOW} samples; --rate HZ may do better")
+        notes.append(
+            f"rate unknown, rest judged over {WINDOW} samples; say --rate HZ or --columns t=NAME"
+        )
     if found.shortened:
         notes.append(f"{found.shortened} rest intervals shortened: they drift at one end")
     if found.split:

@@ -91,6 +91,8 @@ class Constant:
     value: tuple[float, ...]
     unit: str
     dims: tuple[int, ...] = ()
+    #: Declared unit such as `[v]`, where the user has stated another.
+    like: str = ""
     #: The declaration as a parameter it was fixed from, so that it can be freed again.
     frozen: Parameter | None = field(default=None, compare=False)
 

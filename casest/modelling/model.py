@@ -35,6 +35,7 @@ class Model:
     effects: tuple[Attached, ...] = ()
     starter: Callable[..., Any] | None = None
     limiter: Callable[..., Any] | None = None
+    remarker: Callable[..., Any] | None = None
     estimators: tuple[tuple[str, Callable[..., Any]], ...] = ()
 
     # -- the symbol table ----------------------------------------------------------------------
@@ -144,7 +145,8 @@ class Model:
             return replace(fixed, name=name, frozen=old)
         if new.array.shape != old.array.shape:
             raise UsageError(f"{name} has shape {old.array.shape}, not {new.array.shape}")
-        return replace(new, name=name, frozen=old.frozen)
+        like = old.like or (old.unit if "[" in old.unit and new.unit != old.unit else "")
+        return replace(new, name=name, frozen=old.frozen, like=like)
 
     def _with(self, name: str, symbol: Any) -> Model:
         if name in {s.name for s in self.declared}:
@@ -260,6 +262,10 @@ class Model:
     def bounded(self, function: Callable[..., Any]) -> Model:
         """A model with bounds from the data: `function(model, runs) -> {name: (lower, upper)}`."""
         return replace(self, limiter=function)
+
+    def remarking(self, function: Callable[..., Any]) -> Model:
+        """A model that comments on its fits: `function(model, runs, values) -> sentences`."""
+        return replace(self, remarker=function)
 
     def with_estimator(self, name: str, function: Callable[..., Any]) -> Model:
         """A model that also knows the estimator `name` (model, runs) -> {parameter: value}."""

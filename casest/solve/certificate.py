@@ -87,8 +87,12 @@ def certify(
     if not np.isfinite(best.cost):
         against.append("the residual is not finite at the best point found")
     elif slope > SLOPE and step > STEP and not exact and not against:
+        weak = identified.singular_values[-1] < 1e-3 * identified.singular_values[0]
         against.append(
-            f"not a stationary point: the last step was still {step:.2g} standard deviations long"
+            f"not determined well enough to settle: {identified.weakest}; vary the motion"
+            if weak
+            else "not a stationary point: the last step was still "
+            f"{step:.2g} standard deviations long"
         )
     curvature = _curvature(problem, best.point, R) if not against else float("nan")
     if not against and not curvature > 1e-9:

@@ -1,0 +1,56 @@
+"""What an engineer should know beside the numbers: sentences about data, noise and fit."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from casest.noise import robust_scale
+from casest.stack import Point, Problem
+
+#: Second-order shift, in standard deviations, from which on it is added to them.
+NOTABLE_BIAS = 0.3
+#: Gaussian noise passes six standard deviations once in 10⁹ samples.
+FAR_OUT = 6.0
+
+
+def notes(
+    problem: Problem, point: Point, dof: int, correlated: float, bias: float
+) -> Iterator[str]:
+    """All that there is to say. `bias` is the second-order shift in standard deviations."""
+    if problem.model.remarker is not None:
+        yield from problem.model.remarker(problem.model, problem.runs, problem.values(point))
+    if dof == 0:
+        yield (
+            "as many unknowns as equations: nothing checks the model; the standard deviations rest "
+            "on the scatter within the rest intervals alone"
+        )
+    if correlated > 1:
+        count = sum(len(run) for run in problem.runs)
+        yield (
+            f"residuals are correlated over {correlated:.3g} samples: the {count} samples count as "
+            f"{count / correlated:.0f}, and standard deviations come from batches of samples"
+        )
+    if bias > NOTABLE_BIAS:
+        yield (
+            f"the noise of single readings shifts the values by up to {bias:.1f} standard "
+            "deviations (second order), which the printed ones contain: average readings at rest "
+            "(--at-rest), or filter them"
+        )
+    yield from _furthest_out(problem, point)
+
+
+def _furthest_out(problem: Problem, point: Point) -> Iterator[str]:
+    """The sample that lies far outside what the others show."""
+    residuals = problem.residuals(point)
+    scale = robust_scale(residuals)
+    size, k = max((float(np.max(np.abs(r), initial=0.0)), k) for k, r in enumerate(residuals))
+    if problem.residual_count > 2 * problem.unknowns and size > FAR_OUT * scale:
+        run = problem.runs[k]
+        row = int(np.argmax(np.max(np.abs(residuals[k]), axis=1)))
+        what = "rest interval" if run.spread else "row"
+        yield (
+            f"{what} {int(run.rows[row])} of {run.name} is off by {size / scale:.0f} robust "
+            "standard deviations of the residual: look at it first"
+        )

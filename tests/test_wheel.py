@@ -1,0 +1,222 @@
+"""Pedersini's wheel: any sensor, either spin direction, from raw readings alone."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import simulators as sim
+from scipy.spatial.transform import Rotation
+
+from casest import Run, attempt, load_runs, param
+from casest.problem import find_model
+from casest_problems.wheel import closed_form, euler, find_motion, four_step, wheel
+
+TABLE_1 = {
+    "offset": np.array([1.0, -1.0, 1.0]),
+    "gain": np.array([0.9, 1.0, 1.1]),
+    "misalignment": np.radians([30.0, 20.0, 25.0]),
+    "tilt": np.radians(45.0),
+    "phase": np.radians(30.0),
+    "speed": np.array([9.0, -0.09, 5e-4, 2e-6]),
+}
+
+
+def turn(angles):
+    """Rx(θ)·Ry(φ)·Rz(ψ): intrinsic x, y, z."""
+    return Rotation.from_euler("XYZ", angles).as_matrix()
+
+
+def spun(truth, rng, sigma=0.08, seconds=30.0, rate=100.0, name="run"):
+    t = np.arange(0, seconds, 1 / rate)
+    bench = sim.Spin(truth["offset"], truth["gain"], turn(truth["misalignment"]), truth["tilt"])
+    v = bench.read(*sim.cubic_motion(t, truth["phase"], truth["speed"]))
+    return as_run(t, v + sigma * rng.standard_normal(v.shape), name)
+
+
+def as_run(t, v, name="run"):
+    return Run.raw(name, {"t": t[:, None], "v": v}, units={"t": "s", "v": "m/s^2"}, time=t)
+
+
+def random_truth(rng, seconds):
+    """Any sensor in general position, either direction, losing up to 60 % of its speed."""
+    direction = rng.choice([-1, 1])
+    start = rng.uniform(5, 20)
+    loss = rng.uniform(0.2, 0.6) * start / seconds
+    speed = direction * np.array(
+        [start, -1.3 * loss, 0.3 * loss / seconds, 1e-3 * loss / seconds**2]
+    )
+    return {
+        "offset": rng.uniform(-1, 1, 3),
+        "gain": rng.uniform(0.9, 1.1, 3),
+        "misalignment": rng.uniform(0.25, 0.6, 3) * rng.choice([-1, 1], 3),
+        "tilt": rng.uniform(0.35, 1.0),
+        "phase": rng.uniform(-np.pi, np.pi),
+        "speed": speed,
+    }
+
+
+def packed(values):
+    names = ("offset", "gain", "misalignment", "tilt", "phase", "speed")
+    return np.concatenate([np.ravel(values[n]) for n in names])
+
+
+def test_the_models_readings_are_those_of_the_bench():
+    t = np.linspace(0, 20, 200)
+    bench = sim.Spin(
+        TABLE_1["offset"], TABLE_1["gain"], turn(TABLE_1["misalignment"]), TABLE_1["tilt"]
+    )
+    v = bench.read(*sim.cubic_motion(t, TABLE_1["phase"], TABLE_1["speed"]))
+    found = wheel(t=t, v=v, **TABLE_1)
+    np.testing.assert_allclose(found["residual"], 0, atol=1e-11)
+
+
+def test_euler_angles_are_those_of_the_rotation():
+    angles = np.random.default_rng(0).uniform(-1.4, 1.4, (20, 3))
+    for a in angles:
+        np.testing.assert_allclose(euler(turn(a)), a, atol=1e-12)
+
+
+@pytest.mark.parametrize("rate", [50.0, 1000.0])
+@pytest.mark.parametrize("speed", [2.5, -20.0])
+def test_the_phase_does_not_slip_a_turn(rate, speed):
+    """After ninety seconds the phase found is that of the bench, but for its origin and sign."""
+    rng = np.random.default_rng(3)
+    truth = {**TABLE_1, "speed": np.array([speed, -speed / 300, 0.0, 0.0])}
+    run = spun(truth, rng, seconds=90.0, rate=rate, sigma=0.2)
+    t = run.time
+    angle, *_ = sim.cubic_motion(t, truth["phase"], truth["speed"])
+    found = find_motion(t, run.signals["v"]).phase(t)
+    found = found * np.sign(found[-1] - found[0]) * np.sign(speed)
+    slip = (found - found[0]) - (angle - angle[0])
+    assert np.abs(slip).max() < 0.3
+
+
+def test_any_sensor_and_motion_is_calibrated_from_its_readings_alone():
+    """Thirty random wheels: all trusted, and jointly as far from the truth as they say."""
+    rng, distance, unknowns = np.random.default_rng(1), [], 0
+    for k in range(30):
+        seconds = float(rng.choice([30, 60]))
+        truth = random_truth(rng, seconds)
+        found = attempt(wheel, [spun(truth, rng, seconds=seconds)], solver="trust-region", seed=k)
+        assert found.certificate.trusted, (k, truth, found.certificate.reasons)
+        error = packed(found.values) - packed(truth)
+        error[10] = np.angle(np.exp(1j * error[10]))
+        distance.append(error @ np.linalg.solve(found.covariance, error))
+        unknowns = len(error)
+    # A χ² of 15 degrees of freedom, thirty times: its mean within four of its standard errors.
+    assert abs(np.mean(distance) - unknowns) < 4 * np.sqrt(2 * unknowns / 30)
+
+
+def test_with_the_radius_free_one_direction_is_lost_and_it_is_the_papers():
+    """Eqs. (9)-(13): r and sin α grow by β, the gains shrink, the offset takes up the rest."""
+    run = spun(TABLE_1, np.random.default_rng(0), sigma=0.0)
+    free = wheel.having(radius=param("m", start=0.28))
+    found = attempt(free, [run], start=TABLE_1)
+    assert (found.identifiability.rank, found.identifiability.unknowns) == (15, 16)
+    assert not found.certificate.trusted
+    (words,) = found.identifiability.unobservable
+    assert all(name in words for name in ("radius", "tilt", "gain[0]", "offset[2]"))
+    values, null = found.values, found.identifiability.null[:, 0]
+    gain, tilt = values["gain"], float(values["tilt"])
+    axis = turn(values["misalignment"])[:, 2]
+    change = dict.fromkeys(found.names, 0.0)
+    for i in range(3):
+        change[f"gain[{i}]"] = -gain[i]
+        change[f"offset[{i}]"] = gain[i] * axis[i] * sim.GRAVITY / np.cos(tilt)
+    change["radius"], change["tilt"] = float(values["radius"]), np.tan(tilt)
+    expected = np.array([change[name] for name in found.names])
+    expected /= np.linalg.norm(expected)
+    assert abs(null @ expected) == pytest.approx(1.0, abs=1e-7)
+
+
+def test_with_the_tilt_fixed_the_radius_is_determined():
+    run = spun(TABLE_1, np.random.default_rng(0))
+    declared = wheel.having(radius=param("m", start=0.3), tilt=TABLE_1["tilt"])
+    found = attempt(declared, [run])
+    assert found.certificate.trusted, found.certificate.reasons
+    assert found.identifiability.rank == found.identifiability.unknowns == 15
+    assert abs(found.values["radius"] - 0.28) < 4 * found.std["radius"]
+
+
+@pytest.mark.parametrize("angles", [[0.0, 0.0, 0.5], [0.5, 0.0, 0.0], [0.0, 0.0, 0.0]])
+def test_a_mounting_turned_about_a_single_axis_is_refused_in_words(angles):
+    truth = {**TABLE_1, "misalignment": np.array(angles)}
+    found = attempt(wheel, [spun(truth, np.random.default_rng(2))])
+    assert not found.certificate.trusted
+    assert "determine" in found.certificate.reasons[0]
+    assert "offset" in found.certificate.reasons[0]
+
+
+def test_two_spins_share_the_sensor_and_say_more_about_it_than_one():
+    rng = np.random.default_rng(4)
+    first = spun(TABLE_1, rng, name="a")
+    slower = {**TABLE_1, "speed": TABLE_1["speed"] * 0.7, "phase": -1.0}
+    second = spun(slower, rng, name="b")
+    both = attempt(wheel, [first, second])
+    alone = attempt(wheel, [first])
+    assert both.certificate.trusted, both.certificate.reasons
+    assert both.values["offset"].shape == (3,)
+    assert both.values["speed"].shape == (2, 4)
+    assert np.all(both.std["offset"] < alone.std["offset"])
+    assert np.all(np.abs(both.values["offset"] - TABLE_1["offset"]) < 4 * both.std["offset"])
+    mounted_once = wheel.scoped("misalignment", "all").scoped("tilt", "all")
+    shared = attempt(mounted_once, [first, second])
+    assert shared.values["misalignment"].shape == (3,)
+    assert shared.identifiability.unknowns == both.identifiability.unknowns - 4
+
+
+def test_the_four_steps_come_near_the_truth_and_are_judged_by_the_optimum():
+    """Errors of the order that the paper publishes (Table I), far above the bound's."""
+    rng, errors = np.random.default_rng(5), []
+    for _ in range(6):
+        run = spun(TABLE_1, rng, seconds=90.0, rate=200.0)
+        errors.append(packed(four_step(wheel, [run])) - packed(TABLE_1))
+    spread = np.sqrt(np.mean(np.square(errors), axis=0))
+    assert spread[:3].max() < 0.3  # offset, m/s²
+    assert spread[3:6].max() < 0.01  # gain
+    assert spread[6:9].max() < np.radians(2)
+    assert spread[9] < np.radians(0.2)  # tilt
+    np.testing.assert_array_less(spread[11:], [1e-3, 1e-4, 2e-6, 2e-8])
+
+
+def test_the_closed_form_recovers_a_noise_free_wheel():
+    """But for the tangential acceleration r·ω̇, which it neglects."""
+    truth = {**TABLE_1, "speed": np.array([15.0, -0.02, 0.0, 0.0])}
+    values = closed_form(wheel, [spun(truth, np.random.default_rng(0), sigma=0.0, seconds=60.0)])
+    assert np.abs(values["speed"] - truth["speed"])[0] < 1e-3
+    assert abs(values["tilt"] - truth["tilt"]) < 0.02
+    assert np.abs(values["misalignment"] - truth["misalignment"]).max() < 0.1
+
+
+def test_a_wheel_slowed_by_air_is_fitted_by_the_cubic_for_a_minute():
+    """The physical wheel, integrated: within the noise the cubic law holds, as the paper found."""
+    rng, t = np.random.default_rng(6), np.arange(0, 60, 0.01)
+    bench = sim.Spin(
+        TABLE_1["offset"], TABLE_1["gain"], turn(TABLE_1["misalignment"]), TABLE_1["tilt"]
+    )
+    v = bench.read(*sim.physical_motion(t, 0.5, 10.0))
+    found = attempt(wheel, [as_run(t, v + 0.08 * rng.standard_normal(v.shape))])
+    assert found.certificate.trusted, found.certificate.reasons
+    assert found.rmse == pytest.approx(0.08, rel=0.03)
+    assert np.all(np.abs(found.values["offset"] - TABLE_1["offset"]) < 4 * found.std["offset"])
+
+
+def test_a_record_that_does_not_turn_is_refused():
+    t = np.arange(0, 30, 0.01)
+    v = np.ones((len(t), 3)) * [1.0, 2.0, 9.0] + np.outer(np.sin(t), [1, 0, 0])
+    with pytest.raises(Exception, match="go round"):
+        attempt(wheel, [as_run(t, v)])
+
+
+def test_the_wheel_is_found_by_its_name_and_reads_time_in_any_unit(tmp_path):
+    run = spun(TABLE_1, np.random.default_rng(7), seconds=30.0, rate=50.0)
+    lines = ["time (ms),vx [g],vy [g],vz [g]"]
+    g = 9.80665
+    for t, v in zip(run.time, run.signals["v"] / g, strict=True):
+        lines.append(f"{1000 * t:.1f},{v[0]:.9f},{v[1]:.9f},{v[2]:.9f}")
+    path = tmp_path / "spin.csv"
+    path.write_text("\n".join(lines), encoding="utf-8")
+    declared = find_model("wheel")
+    (read,) = load_runs(path, declared.signals, columns={"t": ("time",)})
+    np.testing.assert_allclose(read.signals["v"], run.signals["v"], atol=1e-7)
+    np.testing.assert_allclose(read.signals["t"][:, 0], run.time, atol=1e-9)
