@@ -201,11 +201,8 @@ def calibration(model_name: str, data: Sequence[str], options: Options, command:
     else:
         click.echo(terminal.calibration_text(found, content, options["output"]))
     if not found.certificate.trusted:
-        if options["as_json"]:
-            reason = found.certificate.reasons[0]
-            click.echo(f"casest: no trustworthy estimate: {reason}", err=True)
-        else:
-            click.echo("casest: no trustworthy estimate, see above", err=True)
+        reason = found.certificate.reasons[0]
+        click.echo(f"casest: no trustworthy estimate: {reason}", err=True)
         return NotTrusted.exit_code
     return 0
 

@@ -315,7 +315,7 @@ def remarks(declared: Model, runs: Sequence[Run], values: dict[str, Array]) -> l
     unit = runs[0].units.get("v")
     symbol = declared["norm"]
     same = unit is not None and unit != "count" and symbol.unit in (unit, "[v]")
-    length = float(np.median(np.linalg.norm(v - values.get("offset", np.zeros(3)), axis=1)))
+    length = float(np.median(np.linalg.norm(v, axis=1)))
     if same and not 1 / 3 < length / norm < 3:
         found.append(
             f"readings are {length / norm:.3g} times the norm ({norm:g}), both in {unit}: is "

@@ -319,7 +319,8 @@ def test_a_correction_that_differs_from_run_to_run_is_not_applied(records, tmp_p
     code, _ = calibrated(tmp_path, "norm-triangular", *both, *G, "--per-run", "offset")
     assert code == 0
     capsys.readouterr()
-    assert run(["apply", str(tmp_path / "out"), str(records / "lab_acc.csv")]) == 1
+    other = str(records / "other_acc.csv")
+    assert run(["apply", str(tmp_path / "out"), other]) == 1
     assert "offset differs from run to run" in capsys.readouterr().err
 
 

@@ -22,6 +22,7 @@ FLOORS = [
     ["casest.sequence"],
     ["casest.stack"],
     ["casest.noise", "casest.identify"],
+    ["casest.remarks"],
     ["casest.solve"],
     ["casest.estimate", "casest.naming", "casest.apply"],
     ["casest.result", "casest.problem"],

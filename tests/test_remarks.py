@@ -212,19 +212,8 @@ def test_without_redundancy_rest_intervals_are_all_that_speaks(tmp_path):
     sensor = sim.accelerometer(rng, skew=False)
     v, _ = sim.handheld(sensor, sim.spread_poses(6, rng), 0.02, rng)
     path = table(tmp_path / "six.csv", "vx,vy,vz", v)
-    code = run(
-        [
-            "calibrate",
-            "norm-diagonal",
-            path,
-            "--rate",
-            "100",
-            "--at-rest",
-            "-o",
-            str(tmp_path / "o"),
-        ]
-        + ["--unit", "v=m/s^2", "--set", "norm=9.80665"]
-    )
-    assert code == 0
+    command = ["calibrate", "norm-diagonal", path, "--rate", "100", "--at-rest"]
+    options = ["--unit", "v=m/s^2", "--set", "norm=9.80665", "-o", str(tmp_path / "o")]
+    assert run([*command, *options]) == 0
     result = json.loads((tmp_path / "o" / "result.json").read_text(encoding="utf-8"))
     assert any("nothing checks the model" in note for note in result["notes"])

@@ -219,8 +219,8 @@ def _misshapen(problem: Problem, step: Array, norms: Array, ratio: float) -> str
     where = _largest(problem, step, norms)
     if not np.isfinite(ratio):
         return (
-            f"too uncertain: two standard deviations ({where}) reach beyond the bounds; "
-            "vary the motion"
+            f"not determined well enough: two standard deviations ({where}) reach beyond the "
+            "bounds; vary the motion"
         )
     return (
         f"too uncertain for its intervals: two standard deviations away ({where}) the cost rises "
