@@ -14,8 +14,8 @@ _HOME = {
     "casest.declaring.symbols": "attitude constant param signal",
     "casest.declaring.physics": (
         "Residual acos asin atan atan2 cos cosh cross der diag dot exp fabs fmax fmin horzcat "
-        "if_else inf integral log norm_2 pi polynomial quantity rotation sign sin sinh skew sqrt "
-        "sum1 tan tanh vertcat"
+        "if_else inf integral inverse log norm_2 pi polynomial quantity rotation sign sin sinh "
+        "skew sqrt sum1 tan tanh vertcat"
     ),
     "casest.modelling.dimensions": "check_units",
     "casest.modelling.effect": "Effect effect",

@@ -34,8 +34,8 @@ STEPS, HALVINGS = 60, 30
 class Correction:
     """From reading to corrected quantity, for a model that names one.
 
-    Explicit models are solved for it: in one step where it enters linearly, else by damped Newton
-    steps from several starts. Implicit models compute it directly.
+    Explicit models are solved for it: by a closed form of their own, in one step where it enters
+    linearly, else by damped Newton steps from several starts. Implicit models compute it directly.
     """
 
     model: Model
@@ -106,7 +106,18 @@ class Correction:
         if self.model.implicit:
             replay = Replay(function_of(self.model, {"c": ca.densify(ca.vec(self._wanted))}))
             return replay(parameters, samples)[0][:, :, 0]
+        if self.model.inverter is not None and not self.model.effects:
+            return self._in_closed_form(run, parameters, samples)
         return self._solved(run, parameters, samples, around)
+
+    def _in_closed_form(self, run: Run, parameters: Array, samples: Array) -> Array:
+        """The model's own inverse; NaN outside its domain becomes an error that names the row."""
+        traced = self.model.traced
+        assert self.model.inverter is not None
+        value = ca.vec(self.model.inverter(dict(traced.symbols), traced.reading))
+        found = Replay(function_of(self.model, {"c": ca.densify(value)}))(parameters, samples)[0]
+        self._refuse_unsolved(run, run.signals[str(traced.measured)], found[:, :, 0])
+        return found[:, :, 0]
 
     def _solved(
         self, run: Run, parameters: Array, samples: Array, around: tuple[float, float] | None

@@ -265,11 +265,12 @@ def _judged(optimum: Estimate, point: Point, values: Mapping[str, Any], name: st
     certificate, problem = optimum.certificate, optimum.problem
     if not certificate.trusted:
         return certificate
-    raw = np.concatenate([s.parameter.shape.pack(values[s.parameter.name]) for s in problem.slots])
-    if not np.allclose(raw, point.x, rtol=1e-6, atol=1e-6 * np.abs(raw).max()):
+    kept = problem.values(point)
+    if not all(np.allclose(kept[name], values[name], rtol=1e-6, atol=1e-9) for name in kept):
         reason = f"{name}: the solution collapsed; it lies outside the bounds of the model"
         return replace(certificate, trusted=False, reasons=(reason,))
-    distance = (point.x - optimum.point.x) / np.sqrt(np.diag(optimum.covariance))
+    away = problem.difference(point, optimum.point)
+    distance = away / np.sqrt(np.diag(optimum.covariance))
     worst = int(np.argmax(np.abs(distance)))
     far = (
         f"{name}: `{problem.names[worst]}` is {abs(distance[worst]):.2g} standard deviations from "

@@ -20,6 +20,7 @@ from casest.modelling.model import Model
 #: Shipped models: name on the command line -> module and attribute in `casest_problems`.
 SHIPPED = {
     "wheel": ("wheel", "wheel"),
+    "rate-table": ("rate_table", "rate_table"),
     "norm-diagonal": ("norm", "norm_diagonal"),
     "norm-triangular": ("norm", "norm_triangular"),
     "norm-full": ("norm", "norm_full"),

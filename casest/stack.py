@@ -188,6 +188,19 @@ class Problem:
                 references[s.ref], x[s.x] = shape.reference(value), 0.0
         return Point(x, references)
 
+    def difference(self, point: Point, other: Point) -> Array:
+        """Unknowns of `point` minus those of `other`, (n,); on curved sets in the latter's chart,
+        to first order."""
+        away = point.x - other.x
+        for s in self.slots:
+            shape = s.parameter.shape
+            if shape.curved:
+                here, there = (
+                    self._charted(s, p.x[s.x], p.references[s.ref]) for p in (point, other)
+                )
+                away[s.x] = shape.tangent(here, shape.reference(there))
+        return away
+
     def _charted(self, slot: Slot, x: Array, reference: Array) -> Array:
         value = ca.evalf(chart(slot.parameter.shape.kind, ca.SX(ca.DM(x)), ca.SX(ca.DM(reference))))
         return np.array(value).reshape(slot.parameter.shape.dims)

@@ -215,3 +215,44 @@ def physical_motion(
     found = solve_ivp(motion, (t[0], t[-1]), [start, rate], "DOP853", t, rtol=1e-11, atol=1e-11)
     angle, omega = found.y
     return angle, omega, np.array([motion(0.0, s)[1] for s in found.y.T])
+
+
+# -- a rate table ----------------------------------------------------------------------------------
+
+
+def table_steps(
+    n: int,
+    rng: np.random.Generator,
+    *,
+    step: float = 22.0,
+    transition: float = 2.0,
+    sampled: float = 4.0,
+    rate: float = 100.0,
+) -> tuple[Array, Array]:
+    """Batista's trajectory: (t, R), the table stepping through n attitudes, sampled at rest.
+
+    Each step lasts `step` seconds, `transition` of them moving; `sampled` seconds at rest are kept.
+    R (N, 3, 3) takes body to table axes.
+    """
+    from scipy.spatial.transform import Rotation
+
+    attitudes = Rotation.random(n, random_state=int(rng.integers(1 << 31))).as_matrix()
+    inside = transition + (step - transition - sampled) / 2 + np.arange(0, sampled, 1 / rate)
+    t = (np.arange(n) * step)[:, None] + inside
+    return t.ravel(), np.repeat(attitudes, len(inside), axis=0)
+
+
+def table_readings(
+    R: Array,
+    down: Array,
+    inverse_scale: Array,
+    quadratic: Array,
+    bias: Array,
+    sigma: float,
+    rng: np.random.Generator,
+) -> tuple[Array, Array]:
+    """(readings, true forces), each (N, 3): F⁻¹·a_m = a + F2·a² + b′ with a = −g (Batista, 2)."""
+    force = -GRAVITY * np.einsum("nji,j->ni", R, down / np.linalg.norm(down))
+    bent = force + quadratic * force**2 + bias
+    noise = sigma * rng.standard_normal(force.shape)
+    return np.linalg.solve(inverse_scale, bent.T).T + noise, force

@@ -17,7 +17,7 @@ acos, asin, atan, atan2, cos, cosh = ca.acos, ca.asin, ca.atan, ca.atan2, ca.cos
 exp, log, sin, sinh, sqrt, tan, tanh = ca.exp, ca.log, ca.sin, ca.sinh, ca.sqrt, ca.tan, ca.tanh
 fabs, fmax, fmin, sign, if_else = ca.fabs, ca.fmax, ca.fmin, ca.sign, ca.if_else
 cross, dot, norm_2, vertcat, horzcat = ca.cross, ca.dot, ca.norm_2, ca.vertcat, ca.horzcat
-diag, skew, sum1 = ca.diag, ca.skew, ca.sum1
+diag, skew, sum1, inverse = ca.diag, ca.skew, ca.sum1, ca.inv
 pi, inf = ca.pi, float("inf")
 
 

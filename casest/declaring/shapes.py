@@ -124,6 +124,14 @@ class Shape:
             return np.asarray(u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt).ravel()
         return np.zeros(0)
 
+    def tangent(self, value: Array, reference: Array) -> Array:
+        """Coordinates of a value near the reference, to first order: angles in rad."""
+        if self.kind == "unit":
+            return np.asarray(reference[3:].reshape(2, 3) @ value)
+        turn = reference.reshape(3, 3).T @ value
+        skew = 0.5 * (turn - turn.T)
+        return np.array([skew[2, 1], skew[0, 2], skew[1, 0]])
+
     def at_reference(self, reference: Array) -> Array:
         """The value in the middle of the chart that the reference describes."""
         return reference[:3] if self.kind == "unit" else reference.reshape(3, 3)

@@ -98,7 +98,8 @@ def _input_sizes(model: Model) -> dict[tuple[int, int], Size]:
     k = 0
     for s in model.signals:
         for _ in range(s.size):
-            own = _size(s.unit if s.unit is not None else f"[{s.name}]", model)
+            unit = "" if s.kind == "rotation" else f"[{s.name}]"
+            own = _size(s.unit if s.unit is not None else unit, model)
             sizes[1, k] = _named(own, s.name, s.unit or "")
             k += 1
     return sizes

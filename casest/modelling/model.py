@@ -36,6 +36,7 @@ class Model:
     starter: Callable[..., Any] | None = None
     limiter: Callable[..., Any] | None = None
     remarker: Callable[..., Any] | None = None
+    inverter: Callable[..., Any] | None = None
     estimators: tuple[tuple[str, Callable[..., Any]], ...] = ()
 
     # -- the symbol table ----------------------------------------------------------------------
@@ -266,6 +267,13 @@ class Model:
     def remarking(self, function: Callable[..., Any]) -> Model:
         """A model that comments on its fits: `function(model, runs, values) -> sentences`."""
         return replace(self, remarker=function)
+
+    def with_inverse(self, function: Callable[..., Any]) -> Model:
+        """A model with a closed form of its correction: `function(values, reading) -> corrected`.
+
+        It is used as long as no effect has been added; without one the model is solved for it.
+        """
+        return replace(self, inverter=function)
 
     def with_estimator(self, name: str, function: Callable[..., Any]) -> Model:
         """A model that also knows the estimator `name` (model, runs) -> {parameter: value}."""
