@@ -110,7 +110,7 @@ def model_options(command: Callable[..., Any]) -> Callable[..., Any]:
             "constants",
             metavar="NAME=VALUE",
             **many,
-            help="Set a constant: radius=0.28 or 'norm=9.80665 m/s^2'.",
+            help="Set a constant: radius=0.28, 'norm=9.80665 m/s^2', 'gravity=gravity(45.5, 120)'.",
         ),
     ):
         command = option(command)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +16,13 @@ from casest.result import load_result, saved_parameters
 
 
 def parse_value(name: str, text: str, option: str, model: Model) -> Constant:
-    """`0.28`, `28 cm`, `1,2,3`, `1,0;0.1,1` or `@result.json` as a constant of the model."""
+    """`0.28`, `28 cm`, `1,2,3`, `1,0;0.1,1`, `@result.json`, `gravity(45.5, 120)`: a constant."""
     old: Any = model[name]  # raises, with a suggestion, where there is no such name
     if text.startswith("@"):
         return _from_result(name, text[1:])
+    place = re.fullmatch(r"(gravity|field)\(([^()]*)\)", text.replace(" ", ""))
+    if place:
+        return _of_place(place[1], place[2], f"{option} {name}={text}")
     if "," not in text and ";" not in text:
         try:
             number, unit = units.parse_quantity(text)
@@ -33,6 +37,23 @@ def parse_value(name: str, text: str, option: str, model: Model) -> Constant:
             f"{option} {name}={text}: not a number, a list 1,2,3 or rows 1,0;0,1"
         ) from None
     return _constant(array, _declared_unit(old))
+
+
+def _of_place(what: str, arguments: str, where: str) -> Constant:
+    """`gravity(latitude, height)` in m/s² or `field(latitude, longitude, height, year)` in uT."""
+    from casest.earth import magnetic_field, normal_gravity
+
+    try:
+        numbers = [float(x) for x in arguments.split(",")]
+        if what == "gravity":
+            latitude, height = numbers
+            return _constant(normal_gravity(latitude, height), "m/s^2")
+        return _constant(magnetic_field(*numbers).strength, "uT")
+    except (ValueError, TypeError):
+        raise UsageError(
+            f"{where}: write gravity(latitude, height) or "
+            "field(latitude, longitude, height, year), in degrees and metres"
+        ) from None
 
 
 def _declared_unit(symbol: Any) -> str:

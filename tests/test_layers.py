@@ -25,7 +25,7 @@ FLOORS = [
     ["casest.remarks"],
     ["casest.solve"],
     ["casest.estimate", "casest.naming", "casest.apply"],
-    ["casest.result", "casest.problem"],
+    ["casest.result", "casest.problem", "casest.earth"],
     ["casest.values", "casest.applying", "casest.demonstration"],
     ["casest.terminal"],
     ["casest.cli"],
