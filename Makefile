@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: demo test lint types format wheel bench clean
+.PHONY: demo test lint types format wheel bench study clean
 
 demo: $(READY)
 	$(BIN)/casest demo
@@ -28,6 +28,9 @@ wheel: $(READY)
 
 bench: $(READY)
 	$(BIN)/python benchmarks/evaluate.py
+
+study: $(READY)
+	$(BIN)/python studies/bound.py
 
 clean:
 	rm -rf $(VENV) build dist *.egg-info out

@@ -95,6 +95,9 @@ def _loaded(file: Path) -> Any:
     with file.open("rb") as start:
         if not start.read(6).startswith((b"\x93NUMPY", b"PK")):
             raise DataError(f"{file}: cannot be read as NumPy: it does not begin like one")
+        start.seek(0)
+        if start.read(2) == b"PK" and not zipfile.is_zipfile(start):
+            raise DataError(f"{file}: cannot be read as NumPy: the archive is damaged")
     try:
         return np.load(file, allow_pickle=False)
     except ValueError as error:
