@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import Any
 
 import casadi as ca
@@ -22,7 +22,8 @@ from casest.declaring.symbols import Parameter
 from casest.engine import Normal, Replay, cost, normal_equations, rows, triangular_factor
 from casest.errors import DataError, UsageError
 from casest.modelling.model import Model
-from casest.modelling.tracing import function_of, sample_symbol
+from casest.modelling.tracing import function_of
+from casest.persample import curvature, laplacian, residual_and_jacobian, slope_in_sample
 from casest.sequence import Recursion
 
 
@@ -256,7 +257,7 @@ class Problem:
 
     @property
     def _with_jacobian(self) -> Replay:
-        return _residual_and_jacobian(self.model)
+        return residual_and_jacobian(self.model)
 
     @cached_property
     def _recursion(self) -> Recursion | None:
@@ -353,7 +354,7 @@ class Problem:
             if weights is None:
                 weights = np.ones((len(samples), len(self.model.axes)))
             with_weights = np.hstack([samples, weights])
-            own = _curvature(self.model).sum(self._parameters(point, r), with_weights)
+            own = curvature(self.model).sum(self._parameters(point, r), with_weights)
             matrix[np.ix_(x, x)] += own
         return matrix
 
@@ -403,7 +404,7 @@ class Problem:
         squares, count = 0.0, 0
         for r, samples in enumerate(self.samples):
             parameters = self._parameters(point, r)
-            slopes, x = _slope_in_sample(self.model)(parameters, samples)[0], self._selections[r][0]
+            slopes, x = slope_in_sample(self.model)(parameters, samples)[0], self._selections[r][0]
             jacobian = self._rows(point, r)[1]
             terms = np.sum(np.abs(slopes * samples[:, None, :]), axis=2)
             terms += np.sum(np.abs(jacobian * point.x[x]), axis=2)
@@ -417,7 +418,7 @@ class Problem:
         """
         if not self.model.implicit:
             return 0.0
-        replay = _laplacian(self.model)
+        replay = laplacian(self.model)
         values = [replay(self._parameters(point, r), s)[0] for r, s in enumerate(self.samples)]
         squares = np.concatenate([v.ravel() ** 2 for v in values])
         return float(0.5 * sigma * np.sqrt(np.mean(squares)))
@@ -430,7 +431,7 @@ class Problem:
         slope = np.zeros(self.unknowns)
         if not self.model.implicit:
             return slope
-        replay = _laplacian(self.model)
+        replay = laplacian(self.model)
         for r, samples in enumerate(self.samples):
             shift = 0.5 * sigma**2 * replay(self._parameters(point, r), samples)[0][:, :, 0]
             jacobian, x = self._rows(point, r)[1], self._selections[r][0]
@@ -446,7 +447,7 @@ class Problem:
             return None
         squares, count = 0.0, 0
         for r, run in enumerate(self.runs):
-            G = _slope_in_sample(self.model)(self._parameters(point, r), self.samples[r])[0]
+            G = slope_in_sample(self.model)(self._parameters(point, r), self.samples[r])[0]
             first = 0
             for s in self.model.signals:
                 own, first = G[:, :, first : first + s.size], first + s.size
@@ -458,46 +459,6 @@ class Problem:
     def with_weights(self, weights: Sequence[Array] | None) -> Problem:
         """The same problem with other weights on the squares."""
         return replace(self, weights=None if weights is None else tuple(weights))
-
-
-@lru_cache(maxsize=64)
-def _residual_and_jacobian(model: Model) -> Replay:
-    """r and ∂r/∂x of one sample; kept, for many problems may have the same model."""
-    t = model.traced
-    return Replay(
-        function_of(model, {"r": t.expression, "J": ca.jacobian(t.expression, t.coordinates)})
-    )
-
-
-@lru_cache(maxsize=64)
-def _curvature(model: Model) -> Replay:
-    """Hessian of ½rᵀWr for one sample; the weights arrive as further signals."""
-    t = model.traced
-    w = ca.SX.sym("w", t.expression.numel())
-    hessian = ca.hessian(ca.dot(w * t.expression, t.expression) / 2, t.coordinates)[0]
-    sample = ca.vertcat(sample_symbol(model), w)
-    parameters = ca.vertcat(t.coordinates, t.references)
-    return Replay(
-        ca.Function("h", [parameters, sample], [hessian], ["parameters", "sample"], ["H"])
-    )
-
-
-@lru_cache(maxsize=64)
-def _laplacian(model: Model) -> Replay:
-    """Σ ∂²r/∂s² over the numbers of one sample, for each residual."""
-    sample = sample_symbol(model)
-    parts = [
-        ca.trace(ca.hessian(model.traced.expression[i], sample)[0])
-        for i in range(model.traced.expression.numel())
-    ]
-    return Replay(function_of(model, {"L": ca.densify(ca.vertcat(*parts))}))
-
-
-@lru_cache(maxsize=64)
-def _slope_in_sample(model: Model) -> Replay:
-    """∂r/∂s of one sample with respect to its signals, (m, k)."""
-    slope = ca.jacobian(model.traced.expression, sample_symbol(model))
-    return Replay(function_of(model, {"G": slope}))
 
 
 def _without_leverage(

@@ -19,7 +19,7 @@ FLOORS = [
     ["casest.data"],
     ["casest.modelling"],
     ["casest.engine"],
-    ["casest.sequence"],
+    ["casest.sequence", "casest.persample"],
     ["casest.stack"],
     ["casest.noise", "casest.identify"],
     ["casest.remarks"],

@@ -14,11 +14,15 @@ import numpy as np
 from casest.declaring.physics import Quantity, Residual
 from casest.declaring.shapes import Array
 from casest.declaring.symbols import Constant, Parameter, Scope, Signal, constant, named
-from casest.errors import DeclarationError, UnitError, UsageError
+from casest.errors import DeclarationError, UsageError
+from casest.modelling.changing import (
+    Symbol,
+    check_units_known,
+    converted_constant,
+    converted_parameter,
+)
 from casest.modelling.effect import NOISE, Attached, Effect, Kind, attach, check_null
 from casest.modelling.tracing import Traced, describe, function_of, reached_parameters, trace
-
-Symbol = Signal | Parameter | Constant
 
 
 @dataclass(frozen=True)
@@ -134,9 +138,9 @@ class Model:
         if isinstance(old, Signal):
             raise UsageError(f"{name} is a signal of model {self.name}: data give it, not having()")
         if isinstance(change, Parameter):
-            return replace(_converted_parameter(name, change, old), name=name)
+            return replace(converted_parameter(name, change, old), name=name)
         new = change if isinstance(change, Constant) else constant(change, old.unit)
-        new = _converted(name, new, old.unit)
+        new = converted_constant(name, new, old.unit)
         if isinstance(old, Parameter):
             try:
                 value = old.shape.unpack(old.shape.pack(new.array))
@@ -348,7 +352,7 @@ def model(function: Callable[..., Residual]) -> Model:
     for argument in inspect.signature(function).parameters.values():
         declared.append(_declared(name, argument))
     made = Model(name, function, tuple(declared))
-    _check_names(made)
+    check_units_known(made.name, made.declared)
     return made
 
 
@@ -375,74 +379,11 @@ def _declared(model_name: str, argument: inspect.Parameter) -> Symbol:
     raise DeclarationError(f"{where} must be param(…), constant(…) or a number, not {default!r}")
 
 
-def _check_names(made: Model) -> None:
-    from casest import units
-
-    for symbol in made.declared:
-        every = symbol.units if isinstance(symbol, Parameter) else (symbol.unit,)
-        for unit in every:
-            if unit and "[" not in unit and not units.known(unit):
-                units_error = f"model {made.name}: {symbol.name} has unknown unit {unit!r}"
-                raise UnitError(f"{units_error}; write it as in 'm/s^2', 'rad', 'degC', '1/count'")
-
-
 def _reaches_residual(made: Model, attached: Attached) -> bool:
     """Does the residual depend on the effect's parameters at all?"""
     reached = reached_parameters(made, made.traced, made.traced.expression)
     own = {p.name for p in attached.parameters}
     return not own or bool(own & reached)
-
-
-def _converted(name: str, new: Constant, unit: str) -> Constant:
-    """The constant in the declared unit; left alone where that depends on the data."""
-    _fitting_unit(name, unit, new.unit)
-    if not new.unit or new.unit == unit or "[" in unit + new.unit or "," in unit:
-        return new
-    from casest import units
-
-    factor, offset = units.conversion(new.unit, unit or "1")
-    converted: Constant = constant(factor * new.array + offset, unit)
-    return converted
-
-
-def _converted_parameter(name: str, new: Parameter, old: Symbol) -> Parameter:
-    """The parameter in the declared unit: the body computes in that one."""
-    unit = old.unit or ""
-    _fitting_unit(name, unit, new.unit)
-    if isinstance(old, Parameter) and len(set(old.units)) > 1:
-        return replace(new, units=old.units) if not new.unit else new
-    if not new.unit:
-        return replace(new, units=(unit,) * new.shape.size)
-    if new.unit == unit or "[" in unit + new.unit or "," in new.unit:
-        return new
-    from casest import units
-
-    factor, offset = units.conversion(new.unit, unit or "1")
-
-    def converted(values: tuple[float, ...]) -> tuple[float, ...]:
-        return tuple(factor * v + offset for v in values)
-
-    return replace(
-        new,
-        units=(unit,) * new.shape.size,
-        start=None if new.start is None else converted(new.start),
-        lower=converted(new.lower),
-        upper=converted(new.upper),
-    )
-
-
-def _fitting_unit(name: str, old: str, new: str) -> None:
-    """Refuse a unit of another dimension than the declared one."""
-    if not new or new == old or "[" in old or "[" in new or "," in old:
-        return
-    from casest import units
-
-    try:
-        units.conversion(new, old or "1")
-    except UnitError:
-        raise UnitError(
-            f"{name} is declared in {old or 'no unit'!r}: {new!r} does not fit"
-        ) from None
 
 
 def _rows(value: Any, declared: Signal) -> Array:

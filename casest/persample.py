@@ -1,0 +1,55 @@
+"""What a problem asks of a model for one sample, ready to be evaluated over all of them.
+
+Kept per model: many problems may have the same one, and building an evaluation takes longer than a
+small fit.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import casadi as ca
+
+from casest.engine import Replay
+from casest.modelling.model import Model
+from casest.modelling.tracing import function_of, sample_symbol
+
+
+@lru_cache(maxsize=64)
+def residual_and_jacobian(model: Model) -> Replay:
+    """r and ∂r/∂x of one sample; kept, for many problems may have the same model."""
+    t = model.traced
+    return Replay(
+        function_of(model, {"r": t.expression, "J": ca.jacobian(t.expression, t.coordinates)})
+    )
+
+
+@lru_cache(maxsize=64)
+def curvature(model: Model) -> Replay:
+    """Hessian of ½rᵀWr for one sample; the weights arrive as further signals."""
+    t = model.traced
+    w = ca.SX.sym("w", t.expression.numel())
+    hessian = ca.hessian(ca.dot(w * t.expression, t.expression) / 2, t.coordinates)[0]
+    sample = ca.vertcat(sample_symbol(model), w)
+    parameters = ca.vertcat(t.coordinates, t.references)
+    return Replay(
+        ca.Function("h", [parameters, sample], [hessian], ["parameters", "sample"], ["H"])
+    )
+
+
+@lru_cache(maxsize=64)
+def laplacian(model: Model) -> Replay:
+    """Σ ∂²r/∂s² over the numbers of one sample, for each residual."""
+    sample = sample_symbol(model)
+    parts = [
+        ca.trace(ca.hessian(model.traced.expression[i], sample)[0])
+        for i in range(model.traced.expression.numel())
+    ]
+    return Replay(function_of(model, {"L": ca.densify(ca.vertcat(*parts))}))
+
+
+@lru_cache(maxsize=64)
+def slope_in_sample(model: Model) -> Replay:
+    """∂r/∂s of one sample with respect to its signals, (m, k)."""
+    slope = ca.jacobian(model.traced.expression, sample_symbol(model))
+    return Replay(function_of(model, {"G": slope}))
