@@ -7,12 +7,15 @@ from collections.abc import Iterator
 import numpy as np
 
 from casest.noise import robust_scale
+from casest.scatter import between_runs
 from casest.stack import Point, Problem
 
 #: Second-order shift, in standard deviations, from which on it is added to them.
 NOTABLE_BIAS = 0.3
 #: Gaussian noise passes six standard deviations once in 10⁹ samples.
 FAR_OUT = 6.0
+#: Probability under agreement below which runs are said to disagree.
+DISAGREE = 1e-3
 
 
 def notes(
@@ -38,7 +41,19 @@ def notes(
             "deviations (second order), which the printed ones contain: average readings at rest "
             "(--at-rest), or filter them"
         )
+    yield from _runs_that_disagree(problem, point, correlated)
     yield from _furthest_out(problem, point)
+
+
+def _runs_that_disagree(problem: Problem, point: Point, correlated: float) -> Iterator[str]:
+    """Shared parameters that the runs do not agree on."""
+    found = between_runs(problem, point, correlated)
+    if found is not None and found.p_value < DISAGREE:
+        yield (
+            f"the runs disagree on what they share (scatter {found.F:.3g} times that of the noise, "
+            f"p = {found.p_value:.1g}): {found.worst} is {found.away:.0f} standard deviations off; "
+            "say --per-run for what differs, or find what changed"
+        )
 
 
 def _furthest_out(problem: Problem, point: Point) -> Iterator[str]:

@@ -25,6 +25,7 @@ from casest.estimate import Estimate
 from casest.modelling.effect import Attached
 from casest.modelling.model import Model
 from casest.naming import entry_units, unit_table
+from casest.scatter import between_runs
 
 RESULT, RESIDUALS = "result.json", "residuals.csv"
 
@@ -84,6 +85,7 @@ def calibration_result(
                 for w in estimate.weak
             ],
         },
+        "scatter_between_runs": _scatter(estimate),
         "invisible": None,
         "unexplained": None,
         "corrected": _corrected_range(estimate),
@@ -126,6 +128,21 @@ def _correlation(covariance: Array) -> Array:
     std = np.sqrt(np.diag(covariance))
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.asarray(covariance / np.outer(std, std))
+
+
+def _scatter(estimate: Estimate) -> dict[str, Any] | None:
+    """Agreement of several runs on what they share; null for one run, or a refused estimate."""
+    if not estimate.certificate.trusted:
+        return None
+    found = between_runs(estimate.problem, estimate.point, estimate.correlated_over)
+    if found is None:
+        return None
+    return {
+        "F": _plain(found.F),
+        "freedom": [_plain(f) for f in found.freedom],
+        "p_value": _plain(found.p_value),
+        "furthest": found.worst,
+    }
 
 
 def _effect(attached: Attached) -> dict[str, Any]:

@@ -324,6 +324,10 @@ class Problem:
             matrix[np.ix_(x, x)] += own.matrix
         return Normal(total, gradient, matrix)
 
+    def run_normals(self, point: Point) -> list[tuple[Any, Normal]]:
+        """For each run the unknowns it sees and its own normal equations in them."""
+        return [(self._selections[r][0], self._run_normal(point, r)) for r in range(len(self.runs))]
+
     def factor(self, point: Point) -> tuple[Array, Array, float]:
         """Triangular factor of J, Qᵀr (n,), and the norm of the rest of r: no squared condition.
 

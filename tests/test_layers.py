@@ -21,7 +21,7 @@ FLOORS = [
     ["casest.engine"],
     ["casest.sequence", "casest.persample"],
     ["casest.stack"],
-    ["casest.noise", "casest.identify"],
+    ["casest.noise", "casest.identify", "casest.scatter"],
     ["casest.remarks"],
     ["casest.solve"],
     ["casest.estimate", "casest.naming", "casest.apply"],
