@@ -410,3 +410,17 @@ def test_with_little_freedom_the_scatter_within_rest_counts_when_it_is_larger():
     assert found.noise.repeats == pytest.approx(0.05, rel=1e-12)
     assert found.noise.sigma == pytest.approx(0.05, rel=1e-12)
     assert attempt(straight, [plain]).noise.sigma == pytest.approx(np.sqrt(2e-6), rel=1e-6)
+
+
+@pytest.mark.parametrize("norm", [5e-5, 1.0, 5e4])
+def test_a_scale_of_any_size_is_not_taken_for_one_on_its_bound_at_zero(norm):
+    """Counts calibrated to tesla: a scale of 5e-8 is as far from zero as one of 5."""
+    from casest.problem import find_model
+
+    rng = np.random.default_rng(1)
+    d = rng.standard_normal((30, 3))
+    v = 1000 * d / np.linalg.norm(d, axis=1)[:, None] + 20 + rng.standard_normal((30, 3))
+    run = Run.raw("counts", {"v": v}, units={"v": "count"})
+    found = attempt(find_model("norm-triangular").having(norm=norm), [run])
+    assert found.certificate.trusted, found.certificate.reasons
+    assert found.values["scale"][0, 0] == pytest.approx(norm / 1000, rel=0.01)

@@ -70,7 +70,7 @@ def certify(
     slope, step = _slope_and_step(factor, sigma, rounding)
     # What cannot be told from rounding is no slope, however small the residual.
     exact = float(np.linalg.norm(factor[1])) <= 10 * rounding * np.sqrt(problem.residual_count)
-    at_bound = _active(problem, best.point)
+    at_bound = _active(problem, best.point, R, max(sigma if np.isfinite(sigma) else 0, rounding))
     missing = identified.unknowns - identified.rank
     if missing:
         against += [f"not determined: {words}" for words in identified.unobservable]
@@ -124,10 +124,11 @@ def _slope_and_step(
     return slope, left / max(sigma if np.isfinite(sigma) else 0.0, rounding)
 
 
-def _active(problem: Problem, point: Point) -> tuple[str, ...]:
+def _active(problem: Problem, point: Point, R: Array, noise: float) -> tuple[str, ...]:
+    """Unknowns on a bound: nearer to it than a thousandth of their standard deviation alone."""
     lower, upper = problem.bounds
-    width = 1e-6 * np.maximum(1.0, np.abs(point.x))
-    width = np.minimum(width, 1e-3 * np.where(np.isfinite(upper - lower), upper - lower, np.inf))
+    norms = np.linalg.norm(R, axis=0)
+    width = 1e-3 * noise / np.where(norms > 0, norms, np.inf)
     active = (point.x <= lower + width) | (point.x >= upper - width)
     return tuple(problem.names[i] for i in np.flatnonzero(active))
 

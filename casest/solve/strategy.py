@@ -94,9 +94,13 @@ def _singular(problem: Problem, first: Point) -> bool:
 def _perturbed(problem: Problem, first: Point, seed: int) -> list[Outcome]:
     """Starts around the first one, when two ways disagree."""
     rng = np.random.default_rng(seed)
+    normal = problem.normal(first)
+    columns = np.sqrt(np.where(np.diag(normal.matrix) > 0, np.diag(normal.matrix), np.inf))
+    # An unknown that is zero has no size of its own: what changes the residual by its own length.
+    size = np.maximum(np.abs(first.x), np.sqrt(2 * normal.cost) / columns)
     found = []
     for _ in range(4):
-        step = 0.1 * np.maximum(np.abs(first.x), 0.1) * rng.standard_normal(len(first.x))
+        step = 0.1 * size * rng.standard_normal(len(first.x))
         moved = problem.moved(first, step)
         start = Point(problem.inside(moved.x), moved.references)
         found.append(trust_region(problem, start, max_iterations=OPINION))
