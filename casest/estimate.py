@@ -199,6 +199,8 @@ def _merged(problem: Problem, start: Mapping[str, Any]) -> dict[str, Any]:
 def _estimate(
     problem: Problem, best: Outcome, outcomes: Sequence[Outcome], began: float
 ) -> Estimate:
+    best = _canonical(problem, best)
+    outcomes = [_canonical(problem, outcome) for outcome in outcomes]
     point = best.point
     factor = problem.factor(point)
     R, _, rest = factor
@@ -234,6 +236,19 @@ def _estimate(
         correlated,
         tuple(notes(problem, point, dof, correlated, relative)),
     )
+
+
+def _canonical(problem: Problem, best: Outcome) -> Outcome:
+    """The same solution in the model's own convention, as long as it is the same."""
+    convention = problem.model.canonicaliser
+    if convention is None or not np.isfinite(best.cost):
+        return best
+    values = problem.values(best.point)
+    chosen = {k: v for k, v in convention(values).items() if k in values}
+    point = problem.point({**values, **chosen})
+    cost = problem.cost(point)
+    same = abs(cost - best.cost) <= 1e-6 * best.cost + 1e-20
+    return replace(best, point=point, cost=min(cost, best.cost)) if same else best
 
 
 def _by_estimator(optimum: Estimate, function: Callable[..., Any], name: str) -> Estimate:

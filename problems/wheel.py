@@ -395,8 +395,21 @@ def rotation_matrix(angles: Array) -> Array:
     return np.asarray(x @ y @ z)
 
 
+def convention(values: dict[str, Array]) -> dict[str, Array]:
+    """Phase in (−π, π], Euler angles as of their rotation: φ in [−π/2, π/2]."""
+    chosen = {}
+    if "phase" in values:
+        chosen["phase"] = -((-values["phase"] + np.pi) % (2 * np.pi) - np.pi)
+    if "misalignment" in values:
+        angles = np.atleast_2d(values["misalignment"])
+        found = np.array([euler(rotation_matrix(a)) for a in angles])
+        chosen["misalignment"] = found.reshape(values["misalignment"].shape)
+    return chosen
+
+
 wheel = (
     wheel.starting(closed_form)
+    .canonical(convention)
     .with_estimator("four-step", four_step)
     .with_estimator("closed-form", closed_form)
 )

@@ -220,3 +220,16 @@ def test_the_wheel_is_found_by_its_name_and_reads_time_in_any_unit(tmp_path):
     (read,) = load_runs(path, declared.signals, columns={"t": ("time",)})
     np.testing.assert_allclose(read.signals["v"], run.signals["v"], atol=1e-7)
     np.testing.assert_allclose(read.signals["t"][:, 0], run.time, atol=1e-9)
+
+
+def test_the_phase_is_within_a_turn_and_the_angles_are_canonical_from_any_start():
+    """Whole turns off, and the other Euler triple of the same rotation: one solution, one name."""
+    run = spun(TABLE_1, np.random.default_rng(8))
+    theta, phi, psi = TABLE_1["misalignment"]
+    other = np.array([theta + np.pi, np.pi - phi, psi + np.pi])
+    np.testing.assert_allclose(turn(other), turn(TABLE_1["misalignment"]), atol=1e-12)
+    start = {**TABLE_1, "phase": TABLE_1["phase"] + 4 * np.pi, "misalignment": other}
+    found = attempt(wheel, [run], start=start)
+    assert found.certificate.trusted, found.certificate.reasons
+    assert abs(found.values["phase"] - TABLE_1["phase"]) < 0.01
+    np.testing.assert_allclose(found.values["misalignment"], TABLE_1["misalignment"], atol=0.01)

@@ -41,6 +41,7 @@ class Model:
     limiter: Callable[..., Any] | None = None
     remarker: Callable[..., Any] | None = None
     inverter: Callable[..., Any] | None = None
+    canonicaliser: Callable[..., Any] | None = None
     estimators: tuple[tuple[str, Callable[..., Any]], ...] = ()
 
     # -- the symbol table ----------------------------------------------------------------------
@@ -271,6 +272,14 @@ class Model:
     def remarking(self, function: Callable[..., Any]) -> Model:
         """A model that comments on its fits: `function(model, runs, values) -> sentences`."""
         return replace(self, remarker=function)
+
+    def canonical(self, function: Callable[..., Any]) -> Model:
+        """A model that says which of equivalent values it means: `function(values) -> values`.
+
+        An angle within a turn, say. Per-run values come with a leading run axis if there are
+        several runs.
+        """
+        return replace(self, canonicaliser=function)
 
     def with_inverse(self, function: Callable[..., Any]) -> Model:
         """A model with a closed form of its correction: `function(values, reading) -> corrected`.

@@ -196,14 +196,22 @@ def _ambiguous(
     for other in others:
         near = other.cost - best.cost < 1.92 * sigma**2
         # Rough where the problem is curved, but a different valley is many deviations away.
-        away = float(np.linalg.norm(R @ (other.point.x - best.point.x))) / sigma
+        difference = _unturned(problem, other.point.x - best.point.x)
+        away = float(np.linalg.norm(R @ difference)) / sigma
         if near and away > 10:
-            i = int(np.argmax(np.abs(other.point.x - best.point.x) * np.linalg.norm(R, axis=0)))
+            i = int(np.argmax(np.abs(difference) * np.linalg.norm(R, axis=0)))
             return [
                 f"two solutions fit alike: `{problem.names[i]}` = {best.point.x[i]:.6g} and "
                 f"{other.point.x[i]:.6g}; give --start, or vary the motion"
             ]
     return []
+
+
+def _unturned(problem: Problem, difference: Array) -> Array:
+    """Differences of angles without their whole turns: 0.5 and 0.5 + 2π are one solution."""
+    angle = np.array([unit == "rad" for unit in problem.units])
+    wrapped = (difference + np.pi) % (2 * np.pi) - np.pi
+    return np.where(angle, wrapped, difference)
 
 
 def _rise(problem: Problem, best: Outcome, point: Point, step: Array, sigma: float) -> float:
