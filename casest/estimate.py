@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ from casest.solve.covariance import inverse_normal, sandwich
 from casest.solve.outcome import Outcome
 from casest.solve.strategy import SOLVERS, best_of, solve
 from casest.stack import Point, Problem
+from casest.sums import repeat_noise, second_order_bias
 
 #: From this many degrees of freedom on the residual alone says how large the noise is.
 ENOUGH_FREEDOM = 10
@@ -48,15 +50,16 @@ class Estimate:
 
     `values` and `std` have the parameters' shapes (a leading run axis for per-run ones if there
     are several runs); `robust` is the standard deviation from the sandwich form, which `std` equals
-    where residuals are correlated over more than one sample. `covariance` (n, n) is of the
-    unknowns `names`. Where the data do not determine a value its std is NaN.
+    where residuals are correlated over more than one sample. Both are taken at the least-squares
+    `optimum`, where `point` is not it; `shift` (n, n) is what second-order noise adds.
+    `covariance` (n, n) is of the unknowns `names`. Where the data do not determine a value its std
+    is NaN.
     """
 
     problem: Problem
     point: Point
     values: Mapping[str, Array]
     std: Mapping[str, Array]
-    robust: Mapping[str, Array]
     covariance: Array
     noise: Noise
     rmse: float
@@ -67,12 +70,26 @@ class Estimate:
     seconds: float
     correlated_over: float = 1.0
     notes: tuple[str, ...] = ()
+    shift: Array | float = 0.0
+    optimum: Point | None = None
     extra: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def model(self) -> Model:
         """The model that was fitted."""
         return self.problem.model
+
+    @cached_property
+    def robust(self) -> Mapping[str, Array]:
+        """Standard deviations from the sandwich form, shaped like `std`."""
+        if self.identifiability.rank == 0:
+            return self.std
+        at = self.optimum or self.point
+        R = self.problem.factor(at)[0]
+        covariance = sandwich(self.problem, at, R, self.correlated_over) + self.shift
+        unknown = self.identifiability.touched
+        covariance[unknown, :] = covariance[:, unknown] = np.nan
+        return self.problem.spread(at, covariance)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -179,7 +196,6 @@ def _refused(problem: Problem, point: Point, reason: str, began: float) -> Estim
         point,
         problem.values(point),
         problem.spread(point, nothing),
-        problem.spread(point, nothing),
         nothing,
         Noise(nan, nan, None, problem.residual_count - problem.unknowns),
         nan,
@@ -208,23 +224,19 @@ def _estimate(
     dof = problem.residual_count - identified.rank
     noise = _noise(problem, point, float(np.sqrt(2 * best.cost)), dof)
     correlated = correlation_time(problem, point)
-    robust = sandwich(problem, point, R, correlated)
-    covariance = _covariance(problem, point, R, noise.sigma, correlated, robust)
-    bias = problem.second_order_bias(point, noise.sigma, inverse_normal(R))
+    covariance = _covariance(problem, point, R, noise.sigma, correlated)
+    bias = second_order_bias(problem, point, noise.sigma, inverse_normal(R))
     relative = float(np.max(np.abs(bias) / np.sqrt(np.diag(covariance)), initial=0.0))
-    if relative > NOTABLE_BIAS:
-        covariance = covariance + np.outer(bias, bias)
-        robust = robust + np.outer(bias, bias)
+    shift = np.outer(bias, bias) if relative > NOTABLE_BIAS else 0.0
+    covariance = covariance + shift
     certificate = certify(problem, best, outcomes, identified, (R, factor[1], rest), noise.sigma)
     unknown = identified.touched
     covariance[unknown, :] = covariance[:, unknown] = np.nan
-    robust[unknown, :] = robust[:, unknown] = np.nan
     return Estimate(
         problem,
         point,
         problem.values(point),
         problem.spread(point, covariance),
-        problem.spread(point, robust),
         covariance,
         noise,
         float(np.sqrt(2 * best.cost / problem.residual_count)),
@@ -235,6 +247,7 @@ def _estimate(
         time.perf_counter() - began,
         correlated,
         tuple(notes(problem, point, dof, correlated, relative)),
+        shift,
     )
 
 
@@ -264,6 +277,7 @@ def _by_estimator(optimum: Estimate, function: Callable[..., Any], name: str) ->
     return replace(
         optimum,
         point=point,
+        optimum=optimum.point,
         values=problem.values(point),
         rmse=float(np.sqrt(2 * problem.cost(point) / problem.residual_count)),
         certificate=_judged(optimum, point, values, name),
@@ -296,15 +310,13 @@ def _judged(optimum: Estimate, point: Point, values: Mapping[str, Any], name: st
     return replace(certificate, reasons=(far, *certificate.reasons))
 
 
-def _covariance(
-    problem: Problem, point: Point, R: Array, sigma: float, correlated: float, robust: Array
-) -> Array:
+def _covariance(problem: Problem, point: Point, R: Array, sigma: float, correlated: float) -> Array:
     """The covariance that is printed: plain, unless the noise is known to be otherwise."""
     if has_noise_effects(problem.model):
         plain = problem.with_weights(None)
         return np.asarray(variance_factor(problem, point) * inverse_normal(plain.factor(point)[0]))
     if correlated > 1:
-        return robust.copy()
+        return sandwich(problem, point, R, correlated)
     return np.asarray(sigma**2 * inverse_normal(R))
 
 
@@ -312,7 +324,7 @@ def _noise(problem: Problem, point: Point, length: float, dof: int) -> Noise:
     """Noise of one residual: what is left over; with few degrees of freedom to judge that by,
     never less than what repeats (rest intervals) show."""
     residual = length / np.sqrt(dof) if dof > 0 else float("nan")
-    repeats = problem.repeat_noise(point)
+    repeats = repeat_noise(problem, point)
     if dof >= ENOUGH_FREEDOM:
         return Noise(residual, residual, repeats, dof)
     candidates = [s for s in (residual, repeats) if s is not None and np.isfinite(s)]

@@ -15,6 +15,7 @@ from casest.declaring.shapes import Array
 from casest.engine import Replay
 from casest.modelling.model import Model
 from casest.stack import Point, Problem
+from casest.sums import some_residuals
 
 
 def has_noise_effects(model: Model) -> bool:
@@ -57,7 +58,7 @@ def _curve(model: Model) -> Replay:
 
 def variance_factor(problem: Problem, point: Point) -> float:
     """σ² that multiplies the unweighted (JᵀJ)⁻¹: Huber's (1973) mean(ψ²)/mean(ψ′)²."""
-    residuals = problem.residuals(point)
+    residuals = some_residuals(problem, point)
     scale = robust_scale(residuals)
     r = np.concatenate([x.ravel() for x in residuals]) / scale
     w, slope = (out.ravel() for out in _curve(problem.model)(np.zeros(0), r.reshape(-1, 1)))

@@ -7,8 +7,10 @@ small fit.
 from __future__ import annotations
 
 from functools import lru_cache
+from itertools import pairwise
 
 import casadi as ca
+import numpy as np
 
 from casest.engine import Replay
 from casest.modelling.model import Model
@@ -39,13 +41,14 @@ def curvature(model: Model) -> Replay:
 
 @lru_cache(maxsize=64)
 def laplacian(model: Model) -> Replay:
-    """Σ ∂²r/∂s² over the numbers of one sample, for each residual."""
-    sample = sample_symbol(model)
-    parts = [
-        ca.trace(ca.hessian(model.traced.expression[i], sample)[0])
-        for i in range(model.traced.expression.numel())
-    ]
-    return Replay(function_of(model, {"L": ca.densify(ca.vertcat(*parts))}))
+    """Σ ∂²r/∂s² over the numbers of each signal, (m, signals): for each residual and signal."""
+    sample, expression = sample_symbol(model), model.traced.expression
+    rows = []
+    for i in range(expression.numel()):
+        second = ca.diag(ca.hessian(expression[i], sample)[0])
+        ends = np.cumsum([0, *(s.size for s in model.signals)])
+        rows.append([ca.sum1(second[a:b]) for a, b in pairwise(ends.tolist())])
+    return Replay(function_of(model, {"L": ca.densify(ca.blockcat(rows))}))
 
 
 @lru_cache(maxsize=64)

@@ -24,6 +24,7 @@ SHIPPED = {
     "norm-diagonal": ("norm", "norm_diagonal"),
     "norm-triangular": ("norm", "norm_triangular"),
     "norm-full": ("norm", "norm_full"),
+    "norm-pair": ("pair", "norm_pair"),
 }
 
 

@@ -6,9 +6,11 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from casest.declaring.shapes import Array
 from casest.noise import robust_scale
 from casest.scatter import between_runs
 from casest.stack import Point, Problem
+from casest.sums import rounding, some_residuals
 
 #: Second-order shift, in standard deviations, from which on it is added to them.
 NOTABLE_BIAS = 0.3
@@ -58,14 +60,20 @@ def _runs_that_disagree(problem: Problem, point: Point, correlated: float) -> It
 
 def _furthest_out(problem: Problem, point: Point) -> Iterator[str]:
     """The sample that lies far outside what the others show."""
-    residuals = problem.residuals(point)
-    scale = robust_scale(residuals)
-    size, k = max((float(np.max(np.abs(r), initial=0.0)), k) for k, r in enumerate(residuals))
-    if problem.residual_count > 2 * problem.unknowns and size > FAR_OUT * scale:
+    scale = robust_scale(some_residuals(problem, point))
+    size, k, row = max(_largest(block) for block in problem.residual_blocks(point))
+    exact = 10 * rounding(problem, point)  # noise-free data have no outliers
+    if problem.residual_count > 2 * problem.unknowns and size > FAR_OUT * max(scale, exact):
         run = problem.runs[k]
-        row = int(np.argmax(np.max(np.abs(residuals[k]), axis=1)))
         what = "rest interval" if run.spread else "row"
         yield (
             f"{what} {int(run.rows[row])} of {run.name} is off by {size / scale:.0f} robust "
             "standard deviations of the residual: look at it first"
         )
+
+
+def _largest(block: tuple[int, slice, Array]) -> tuple[float, int, int]:
+    """Size, run and row of the largest residual of a block."""
+    run, span, residual = block
+    worst = int(np.argmax(np.abs(residual)))
+    return float(np.abs(residual).flat[worst]), run, span.start + worst // residual.shape[1]

@@ -6,24 +6,33 @@ parameters that each run has for itself, run after run. Every run sees its own s
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from casest.data.run import Run
 from casest.declaring.physics import chart
 from casest.declaring.shapes import Array
 from casest.declaring.symbols import Parameter
-from casest.engine import Normal, Replay, cost, normal_equations, rows, triangular_factor
+from casest.engine import (
+    Columns,
+    Normal,
+    Replay,
+    cost,
+    normal_equations,
+    residuals,
+    rows,
+    summed,
+    triangular_factor,
+)
 from casest.errors import DataError, UsageError
 from casest.modelling.model import Model
 from casest.modelling.tracing import function_of
-from casest.persample import curvature, laplacian, residual_and_jacobian, slope_in_sample
+from casest.persample import curvature, residual_and_jacobian
 from casest.sequence import Recursion
 
 
@@ -43,6 +52,28 @@ class Point:
 
     x: Array
     references: Array
+
+
+class Block(NamedTuple):
+    """Consecutive samples of one run: `run` its number, `x` the unknowns that it sees.
+
+    residual (N, m), jacobian (N, m, len(x)), weights (N, m) or None.
+    """
+
+    run: int
+    x: Any
+    span: slice
+    residual: Array
+    jacobian: Array
+    weights: Array | None
+
+
+#: Samples that are evaluated at once where every residual is looked at on its own.
+BLOCK = 32_768
+#: Records smaller than this (numbers) are copied once into columns, which are quicker to read.
+COPIED = 4_000_000
+#: From this condition of the scaled Jacobian on a triangular factor is computed from the rows.
+ROUGH = 1e4
 
 
 @dataclass(frozen=True)
@@ -74,7 +105,7 @@ class Problem:
             x, ref = x + width, ref + numbers
         return tuple(slots)
 
-    @property
+    @cached_property
     def unknowns(self) -> int:
         """Number n of unknowns."""
         return sum(s.parameter.shape.coordinates for s in self.slots)
@@ -175,6 +206,10 @@ class Problem:
 
     def start(self) -> Point:
         """The automatic start: the model's function of the data, else the declared values."""
+        return self._start
+
+    @cached_property
+    def _start(self) -> Point:
         values = self.model.starter(self.model, self.runs) if self.model.starter else {}
         known = {p.name for p in self.model.parameters}
         return self.point({k: v for k, v in values.items() if k in known})
@@ -245,15 +280,30 @@ class Problem:
     # -- evaluation ----------------------------------------------------------------------------
 
     @cached_property
-    def samples(self) -> tuple[Array, ...]:
-        """Signals of each run side by side, (N, k)."""
+    def samples(self) -> tuple[Columns, ...]:
+        """Signals of each run side by side, by column."""
         stacked = []
         for run in self.runs:
             missing = [s.name for s in self.model.signals if s.name not in run.signals]
             if missing:
                 raise DataError(f"{run.file}: no data for signal {missing[0]!r}; add --columns")
-            stacked.append(np.hstack([run.signals[s.name] for s in self.model.signals]))
-        return tuple(np.ascontiguousarray(s, dtype=float) for s in stacked)
+            parts = [np.asanyarray(run.signals[s.name]) for s in self.model.signals]
+            if sum(part.size for part in parts) <= COPIED:
+                # Columns first: the kernel reads them in order.
+                parts = [np.ascontiguousarray(part.T, dtype=float).T for part in parts]
+            stacked.append(Columns(parts))
+        return tuple(stacked)
+
+    def thinned(self, every: int) -> Problem:
+        """The same problem on one sample in `every`: for a start, never for a result."""
+        runs = tuple(run.take(slice(None, None, every)) for run in self.runs)
+        weights = None if self.weights is None else tuple(w[::every] for w in self.weights)
+        return Problem(self.model, runs, weights)
+
+    @property
+    def sequential(self) -> bool:
+        """Does a sample's residual depend on the samples before?"""
+        return self._recursion is not None
 
     @property
     def _with_jacobian(self) -> Replay:
@@ -265,12 +315,25 @@ class Problem:
         sequential = any(a.kind == "sequence" for a in self.model.effects)
         return Recursion(self.model) if sequential else None
 
-    def _rows(self, point: Point, r: int) -> tuple[Array, Array]:
+    def _rows(self, point: Point, r: int, span: slice = slice(None)) -> tuple[Array, Array]:
         """Residuals (N, m) and Jacobians (N, m, n of the run) of one run, unweighted."""
-        parameters = self._parameters(point, r)
+        parameters = self.parameters(point, r)
         if self._recursion is not None:
-            return self._recursion.rows(parameters, self.samples[r], self.runs[r])
-        return rows(self._with_jacobian, parameters, self.samples[r])
+            found = self._recursion.rows(parameters, self.samples[r].dense, self.runs[r])
+            return found[0][span], found[1][span]
+        return rows(self._with_jacobian, parameters, self.samples[r][span])
+
+    def blocks(self, point: Point) -> Iterator[Block]:
+        """Residuals and Jacobians of all samples, piece by piece, unweighted."""
+        for r, samples in enumerate(self.samples):
+            # A recursion has to be run through as a whole anyway.
+            length = max(len(samples), 1) if self.sequential else BLOCK
+            for start in range(0, len(samples), length):
+                span = slice(start, min(start + length, len(samples)))
+                weights = self._weight(r)
+                residual, jacobian = self._rows(point, r, span)
+                own = None if weights is None else weights[span]
+                yield Block(r, self._selections[r][0], span, residual, jacobian, own)
 
     def _weighted_rows(self, point: Point, r: int) -> Array:
         """[J r] of one run, weighted, (N·m, n + 1)."""
@@ -284,7 +347,7 @@ class Problem:
     def _run_cost(self, point: Point, r: int) -> float:
         if self._recursion is not None:
             return 0.5 * float(np.sum(self._weighted_rows(point, r)[:, -1] ** 2))
-        parameters = self._parameters(point, r)
+        parameters = self.parameters(point, r)
         return cost(self._with_jacobian, parameters, self.samples[r], self._weight(r))
 
     def _run_normal(self, point: Point, r: int) -> Normal:
@@ -292,16 +355,17 @@ class Problem:
             both = self._weighted_rows(point, r)
             product = both.T @ both
             return Normal(0.5 * float(product[-1, -1]), product[:-1, -1], product[:-1, :-1])
-        parameters = self._parameters(point, r)
+        parameters = self.parameters(point, r)
         return normal_equations(self._with_jacobian, parameters, self.samples[r], self._weight(r))
 
     def _run_factor(self, point: Point, r: int) -> Array:
         if self._recursion is not None:
             return np.asarray(np.linalg.qr(self._weighted_rows(point, r), mode="r"))
-        parameters = self._parameters(point, r)
+        parameters = self.parameters(point, r)
         return triangular_factor(self._with_jacobian, parameters, self.samples[r], self._weight(r))
 
-    def _parameters(self, point: Point, r: int) -> Array:
+    def parameters(self, point: Point, r: int) -> Array:
+        """What the per-sample functions of one run are given: its unknowns and its references."""
         x, ref = self._selections[r]
         return np.concatenate([point.x[x], point.references[ref]])
 
@@ -329,10 +393,14 @@ class Problem:
         return [(self._selections[r][0], self._run_normal(point, r)) for r in range(len(self.runs))]
 
     def factor(self, point: Point) -> tuple[Array, Array, float]:
-        """Triangular factor of J, Qᵀr (n,), and the norm of the rest of r: no squared condition.
+        """Triangular factor of J, Qᵀr (n,), and the norm of the rest of r.
 
-        JᵀJ = RᵀR, Jᵀr = Rᵀ(Qᵀr), ‖r‖² = ‖Qᵀr‖² + rest².
+        JᵀJ = RᵀR, Jᵀr = Rᵀ(Qᵀr), ‖r‖² = ‖Qᵀr‖² + rest². From the normal equations where the
+        squared condition number leaves eight digits, else from the rows.
         """
+        return factored(self.normal(point)) or self._factor_of_rows(point)
+
+    def _factor_of_rows(self, point: Point) -> tuple[Array, Array, float]:
         n, blocks = self.unknowns, []
         for r in range(len(self.runs)):
             x = self._selections[r][0]
@@ -357,14 +425,28 @@ class Problem:
             weights = self._weight(r)
             if weights is None:
                 weights = np.ones((len(samples), len(self.model.axes)))
-            with_weights = np.hstack([samples, weights])
-            own = curvature(self.model).sum(self._parameters(point, r), with_weights)
+            with_weights = samples.with_more(weights)
+            own = summed(curvature(self.model), self.parameters(point, r), with_weights)
             matrix[np.ix_(x, x)] += own
         return matrix
 
     def residuals(self, point: Point) -> tuple[Array, ...]:
         """Residuals of each run, (N, m)."""
-        return tuple(self._rows(point, r)[0] for r in range(len(self.runs)))
+        return tuple(self._residuals(point, r) for r in range(len(self.runs)))
+
+    def _residuals(self, point: Point, r: int, span: slice = slice(None)) -> Array:
+        if self.sequential:
+            return self._rows(point, r, span)[0]
+        parameters = self.parameters(point, r)
+        return residuals(self._with_jacobian, parameters, self.samples[r][span])
+
+    def residual_blocks(self, point: Point) -> Iterator[tuple[int, slice, Array]]:
+        """Run, span and residuals (N, m) of all samples, piece by piece."""
+        for r, samples in enumerate(self.samples):
+            length = max(len(samples), 1) if self.sequential else BLOCK
+            for start in range(0, len(samples), length):
+                span = slice(start, min(start + length, len(samples)))
+                yield r, span, self._residuals(point, r, span)
 
     def jacobian(self, point: Point) -> Array:
         """The whole Jacobian, (residuals, n), unweighted; for small problems and tests."""
@@ -376,107 +458,28 @@ class Problem:
             parts.append(part)
         return np.vstack(parts)
 
-    def squares_of_gradients(
-        self, point: Point, batches: Sequence[NDArray[np.int_]], bread: Array | None = None
-    ) -> Array:
-        """Σ_batch (Σ w r ∂r)(Σ w r ∂r)ᵀ: the middle of the sandwich covariance, (n, n).
-
-        `batches` numbers the samples of each run; those of one batch may be correlated. With
-        `bread` = (JᵀWJ)⁻¹ every residual is first divided by what the fit leaves of it, 1 − h.
-        """
-        middle = np.zeros((self.unknowns, self.unknowns))
-        for r in range(len(self.runs)):
-            x, weights = self._selections[r][0], self._weight(r)
-            residual, jacobian = self._rows(point, r)
-            if bread is not None:
-                residual = _without_leverage(residual, jacobian, bread[np.ix_(x, x)], weights)
-            if weights is not None:
-                residual = residual * weights
-            scores = np.einsum("nm,nmk->nk", residual, jacobian)
-            sums = np.zeros((int(batches[r].max(initial=-1)) + 1, scores.shape[1]))
-            np.add.at(sums, batches[r], scores)
-            middle[np.ix_(x, x)] += sums.T @ sums
-        return middle
-
     def evaluate(self, point: Point, outputs: Mapping[str, Any]) -> list[list[Array]]:
         """Expressions of the trace for every sample of every run, each (N, rows, columns)."""
         replay = Replay(function_of(self.model, outputs))
-        return [replay(self._parameters(point, r), s) for r, s in enumerate(self.samples)]
-
-    def rounding(self, point: Point) -> float:
-        """Rounding error of one residual: machine precision of all that was added up in it."""
-        squares, count = 0.0, 0
-        for r, samples in enumerate(self.samples):
-            parameters = self._parameters(point, r)
-            slopes, x = slope_in_sample(self.model)(parameters, samples)[0], self._selections[r][0]
-            jacobian = self._rows(point, r)[1]
-            terms = np.sum(np.abs(slopes * samples[:, None, :]), axis=2)
-            terms += np.sum(np.abs(jacobian * point.x[x]), axis=2)
-            squares, count = squares + float(np.sum(terms**2)), count + terms.size
-        return float(4 * np.finfo(float).eps * np.sqrt(squares / max(count, 1)) + 1e-300)
-
-    def second_order(self, point: Point, sigma: float) -> float:
-        """Root mean square of ½σ²·∇²r over σ: what an implicit residual neglects of the noise.
-
-        Zero for explicit models, whose residual is linear in the noise of the reading.
-        """
-        if not self.model.implicit:
-            return 0.0
-        replay = laplacian(self.model)
-        values = [replay(self._parameters(point, r), s)[0] for r, s in enumerate(self.samples)]
-        squares = np.concatenate([v.ravel() ** 2 for v in values])
-        return float(0.5 * sigma * np.sqrt(np.mean(squares)))
-
-    def second_order_bias(self, point: Point, sigma: float, bread: Array) -> Array:
-        """Shift of the unknowns (n,) by what an implicit residual neglects of the noise.
-
-        Noise of σ in every component of the reading shifts each residual by ½σ²·∇²r on average.
-        """
-        slope = np.zeros(self.unknowns)
-        if not self.model.implicit:
-            return slope
-        replay = laplacian(self.model)
-        for r, samples in enumerate(self.samples):
-            shift = 0.5 * sigma**2 * replay(self._parameters(point, r), samples)[0][:, :, 0]
-            jacobian, x = self._rows(point, r)[1], self._selections[r][0]
-            np.add.at(slope, x, np.einsum("nm,nmk->k", shift, jacobian))
-        return np.asarray(-bread @ slope)
-
-    def repeat_noise(self, point: Point) -> float | None:
-        """Root mean square of the residual's noise that the scatter within rest intervals implies.
-
-        None where no signal carries a spread of its own.
-        """
-        if not any(run.spread for run in self.runs):
-            return None
-        squares, count = 0.0, 0
-        for r, run in enumerate(self.runs):
-            G = slope_in_sample(self.model)(self._parameters(point, r), self.samples[r])[0]
-            first = 0
-            for s in self.model.signals:
-                own, first = G[:, :, first : first + s.size], first + s.size
-                if s.name in run.spread:
-                    squares += float(np.einsum("nmi,nij,nmj->", own, run.covariance(s.name), own))
-            count += G.shape[0] * G.shape[1]
-        return float(np.sqrt(squares / count))
+        return [replay(self.parameters(point, r), s) for r, s in enumerate(self.samples)]
 
     def with_weights(self, weights: Sequence[Array] | None) -> Problem:
         """The same problem with other weights on the squares."""
         return replace(self, weights=None if weights is None else tuple(weights))
 
 
-def _without_leverage(
-    residual: Array, jacobian: Array, bread: Array, weights: Array | None
-) -> Array:
-    """(I − H)⁻¹r sample by sample: what the residual would be had the fit not seen it."""
-    leverage = np.einsum("nmi,ij,nkj->nmk", jacobian, bread, jacobian)
-    if weights is not None:
-        leverage = leverage * weights[:, None, :]
-    left = np.eye(residual.shape[1]) - np.where(np.isfinite(leverage), leverage, 0.0)
-    # A residual that the fit follows entirely says nothing: keep the inverse finite.
-    values, vectors = np.linalg.eigh(0.5 * (left + left.transpose(0, 2, 1)))
-    inverse = (vectors / np.maximum(values, 1e-3)[:, None, :]) @ vectors.transpose(0, 2, 1)
-    return np.asarray(np.einsum("nmk,nk->nm", inverse, residual))
+def factored(normal: Normal) -> tuple[Array, Array, float] | None:
+    """R, Qᵀr and the norm of the rest of r from normal equations; None where they are too rough."""
+    scale = np.sqrt(np.where(np.diag(normal.matrix) > 0, np.diag(normal.matrix), 1.0))
+    try:
+        lower = np.linalg.cholesky(normal.matrix / np.outer(scale, scale))
+        t = np.linalg.solve(lower, normal.gradient / scale)
+    except np.linalg.LinAlgError:
+        return None
+    rest = 2 * normal.cost - float(t @ t)
+    # A residual that the Jacobian nearly explains loses its digits in the difference.
+    rough = not np.diag(lower).min(initial=1.0) > 1 / ROUGH or not rest > 1e-6 * normal.cost
+    return None if rough else (np.asarray(lower.T * scale), np.asarray(t), float(np.sqrt(rest)))
 
 
 def _root(variance: Array) -> Array:

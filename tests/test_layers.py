@@ -21,6 +21,7 @@ FLOORS = [
     ["casest.engine"],
     ["casest.sequence", "casest.persample"],
     ["casest.stack"],
+    ["casest.sums"],
     ["casest.noise", "casest.identify", "casest.scatter"],
     ["casest.remarks"],
     ["casest.solve"],

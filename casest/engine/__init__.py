@@ -6,17 +6,23 @@ from casest.engine.normal import (
     Normal,
     cost,
     normal_equations,
+    residuals,
     rows,
+    summed,
     triangular_factor,
 )
-from casest.engine.replay import Plan, Replay
+from casest.engine.replay import Columns, Plan, Replay, Samples
 
 __all__ = [
+    "Columns",
     "Normal",
     "Plan",
     "Replay",
+    "Samples",
     "cost",
     "normal_equations",
+    "residuals",
     "rows",
+    "summed",
     "triangular_factor",
 ]

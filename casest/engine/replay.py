@@ -210,6 +210,44 @@ def _name(code: int) -> str:
     return names[0] if names else f"number {code}"
 
 
+class Columns:
+    """Samples as columns (N,) of numbers, wherever they lie: views of arrays or of mapped files.
+
+    Nothing is copied, so a record may be larger than memory allows twice.
+    """
+
+    def __init__(self, parts: Sequence[Floats]) -> None:
+        """From arrays (N,) or (N, k), side by side."""
+        self.columns: list[Floats] = []
+        for part in parts:
+            self.columns += [part] if part.ndim == 1 else [part[:, j] for j in range(part.shape[1])]
+        self._length = len(parts[0]) if parts else 0
+
+    def __len__(self) -> int:
+        """Return the number of samples N."""
+        return self._length
+
+    def __getitem__(self, span: slice) -> Columns:
+        """Return the samples of a slice, still as views."""
+        found = Columns([column[span] for column in self.columns])
+        found._length = len(range(*span.indices(self._length)))
+        return found
+
+    def with_more(self, part: Floats) -> Columns:
+        """Return these columns and those of an array (N, k)."""
+        return Columns([*self.columns, part])
+
+    @property
+    def dense(self) -> Floats:
+        """All of it in one array, (N, k)."""
+        if not self.columns:
+            return np.zeros((self._length, 0))
+        return np.column_stack([np.asarray(c, dtype=np.float64) for c in self.columns])
+
+
+Samples = Floats | Columns
+
+
 class Plan:
     """What to compute for some entries of the outputs, and where each value lives.
 
@@ -264,12 +302,12 @@ class Plan:
         return register, count
 
     def blocks(
-        self, parameters: Floats, samples: Floats, block: int = BLOCK
+        self, parameters: Floats, samples: Columns, block: int = BLOCK
     ) -> Iterator[tuple[slice, Floats]]:
         """Yield, per block, the slice of samples and the wanted entries, (wanted, in block).
 
-        parameters: (n,). samples: (N, k), in memory or mapped. The array is a view of a buffer
-        that the next block, and the next call, overwrite.
+        parameters: (n,). samples: N of k numbers, in memory or mapped. The array is a view of a
+        buffer that the next block, and the next call, overwrite.
         """
         if block < 1:
             raise CasestError(f"block is {block}: give the number of samples per block, at least 1")
@@ -326,11 +364,11 @@ class _Workspace:
             if i in self._scalar:
                 self._results[row] = self._scalar[i]
 
-    def run(self, samples: Floats) -> Floats:
-        """Evaluate a block, (rows, k) to (wanted, rows)."""
+    def run(self, samples: Columns) -> Floats:
+        """Evaluate a block, k columns to (wanted, rows)."""
         length = len(samples)
         for row, i in zip(self._inputs, self.plan.inputs, strict=True):
-            row[:length] = samples[:, self.plan.graph.values[i].code]
+            row[:length] = samples.columns[self.plan.graph.values[i].code]
         if length not in self._bound:
             self._bound[length] = self._bind(length)
         _run(self._bound[length])
@@ -394,6 +432,8 @@ class Replay:
             _triplet(function.sparsity_out(i)) for i in range(function.n_out())
         ]
         self._plans: dict[tuple[Entry, ...], Plan] = {}
+        #: Compiled forms, by output (−1: least-squares sums); None where compiling failed.
+        self.kernels: dict[int, Any] = {}
 
     def plan(self, wanted: Sequence[Entry]) -> Plan:
         """How to compute the (output, nonzero) entries `wanted`, in that order; made once."""
@@ -403,7 +443,7 @@ class Replay:
         return self._plans[key]
 
     def blocks(
-        self, parameters: Floats, samples: Floats, block: int = BLOCK
+        self, parameters: Floats, samples: Samples, block: int = BLOCK
     ) -> Iterator[tuple[slice, list[Floats]]]:
         """Yield, per block, the slice of samples and each output's nonzeros, (nnz, in block).
 
@@ -411,17 +451,17 @@ class Replay:
         column-major order. The arrays are views of a buffer that the next block, and the next
         call on this object, overwrite: copy what is to be kept.
         """
-        parameters, samples = self.check(parameters, samples)
+        parameters, columns = self.check(parameters, samples)
         counts = [len(row) for row, _ in self.sparsity]
         ends = np.cumsum(counts)
         plan = self.plan([(i, j) for i, count in enumerate(counts) for j in range(count)])
-        for span, values in plan.blocks(parameters, samples, block):
+        for span, values in plan.blocks(parameters, columns, block):
             yield (
                 span,
                 [values[end - count : end] for end, count in zip(ends, counts, strict=True)],
             )
 
-    def __call__(self, parameters: Floats, samples: Floats) -> list[Floats]:
+    def __call__(self, parameters: Floats, samples: Samples) -> list[Floats]:
         """Each output of every sample, dense: (N, rows, columns)."""
         results = [np.zeros((len(samples), *shape)) for shape in self.shapes]
         for span, outputs in self.blocks(parameters, samples):
@@ -429,33 +469,41 @@ class Replay:
                 result[span, row, column] = values.T
         return results
 
-    def sum(self, parameters: Floats, samples: Floats, output: int = 0) -> Floats:
+    def sum(self, parameters: Floats, samples: Samples, output: int = 0) -> Floats:
         """The sum of one output over all samples, dense: (rows, columns)."""
-        parameters, samples = self.check(parameters, samples)
+        parameters, columns = self.check(parameters, samples)
         row, column = self.sparsity[output]
         output %= len(self.shapes)
         total = np.zeros(self.shapes[output])
         plan = self.plan([(output, j) for j in range(len(row))])
         with np.errstate(all="ignore"):
-            for _, values in plan.blocks(parameters, samples):
+            for _, values in plan.blocks(parameters, columns):
                 total[row, column] += values.sum(axis=1)
         return total
 
-    def check(self, parameters: Floats, samples: Floats) -> tuple[Floats, Floats]:
-        """Return both as arrays, or raise if a shape is wrong: (n,) and (N, k)."""
+    def check(self, parameters: Floats, samples: Samples) -> tuple[Floats, Columns]:
+        """Return parameters (n,) and samples by column, or raise if a shape is wrong."""
         parameters = np.asarray(parameters, dtype=np.float64)
-        samples = np.asanyarray(samples)
         if parameters.shape != (self.n_parameters,):
             raise CasestError(
                 f"parameters of {self.name!r} have the shape {parameters.shape}:"
                 f" give ({self.n_parameters},)"
             )
-        if samples.ndim != 2 or samples.shape[1] != self.n_sample:
+        shape = (
+            (len(samples), len(samples.columns))
+            if isinstance(samples, Columns)
+            else np.shape(samples)
+        )
+        if len(shape) != 2 or shape[1] != self.n_sample:
             raise CasestError(
-                f"samples of {self.name!r} have the shape {samples.shape}:"
+                f"samples of {self.name!r} have the shape {shape}:"
                 f" give (N, {self.n_sample}), one row per sample"
             )
-        return parameters, samples
+        if isinstance(samples, Columns):
+            return parameters, samples
+        columns = Columns([np.asanyarray(samples)])
+        columns._length = shape[0]
+        return parameters, columns
 
 
 def _triplet(sparsity: Any) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

@@ -18,6 +18,8 @@ from casest.identify import Identifiability
 from casest.solve.outcome import Outcome
 from casest.solve.profile import profiled
 from casest.stack import Point, Problem
+from casest.sums import rounding as rounding_error
+from casest.sums import second_order
 
 #: Share of the residual that the Jacobian can still reach (Bates & Watts' relative offset).
 SLOPE = 1e-5
@@ -66,7 +68,7 @@ def certify(
     """
     R = factor[0]
     against: list[str] = []
-    rounding = problem.rounding(best.point)
+    rounding = rounding_error(problem, best.point)
     slope, step = _slope_and_step(factor, sigma, rounding)
     # What cannot be told from rounding is no slope, however small the residual.
     exact = float(np.linalg.norm(factor[1])) <= 10 * rounding * np.sqrt(problem.residual_count)
@@ -99,14 +101,14 @@ def certify(
         against.append(f"no minimum: the exact curvature is {curvature:.2g} in some direction")
     agreeing = sum(_same(problem, best, other, sigma, rounding) for other in others)
     shape = (1.0, 1.0)
-    second = problem.second_order(best.point, sigma) if not against else 0.0
+    second = second_order(problem, best.point, sigma) if not against else 0.0
     if second > SECOND_ORDER:
         against.append(
             f"the noise is too large for the curvature of the fitted surface (second-order part "
             f"{second:.2g} of the noise): the readings cover too little, or average more of them"
         )
     if not against:
-        shape, words = _shape(problem, best, R, sigma)
+        shape, words = _shape(problem, best, R, max(sigma, rounding))
         against += words or _ambiguous(problem, best, others, R, sigma)
     reasons = tuple(against) or _for(slope, step, curvature, agreeing, len(others), shape)
     return Certificate(
@@ -171,7 +173,6 @@ def _shape(
     fitted again with this direction held (profile; Bates & Watts 1988, ch. 6). A valley bent more
     than that is a curve, for which standard deviations and correlations mean nothing.
     """
-    sigma = max(sigma, problem.rounding(best.point))
     norms = np.linalg.norm(R, axis=0)
     _, singular, Vt = np.linalg.svd(R / norms)
     ratios, words = [1.0], []

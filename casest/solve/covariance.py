@@ -7,6 +7,7 @@ import numpy as np
 from casest.declaring.shapes import Array
 from casest.solve.correlation import batches
 from casest.stack import Point, Problem
+from casest.sums import squares_of_gradients
 
 #: Fewer batches than this say too little; the plain covariance is then widened as a whole.
 FEWEST_BATCHES = 30
@@ -31,16 +32,15 @@ def sandwich(problem: Problem, point: Point, R: Array, correlated_over: float) -
     """
     bread = inverse_normal(R)
     if correlated_over <= 1:
-        alone = [np.arange(len(run)) for run in problem.runs]
-        return np.asarray(bread @ problem.squares_of_gradients(point, alone, bread) @ bread)
+        return np.asarray(bread @ squares_of_gradients(problem, point, bread=bread) @ bread)
     length = int(np.ceil(10 * correlated_over))
-    numbers = [batches(run, length) for run in problem.runs]
-    groups = sum(int(b.max(initial=-1)) + 1 for b in numbers)
+    firsts = [batches(run, length) for run in problem.runs]
+    groups = sum(len(first) for first in firsts)
     if groups < FEWEST_BATCHES:
         plain = 2 * problem.cost(point) / max(problem.residual_count - problem.unknowns, 1)
         return np.asarray(correlated_over * plain * bread)
     correction = groups / max(groups - 1, 1)
-    robust = correction * bread @ problem.squares_of_gradients(point, numbers) @ bread
+    robust = correction * bread @ squares_of_gradients(problem, point, firsts) @ bread
     if groups >= 20 * problem.unknowns:
         return np.asarray(robust)
     ratio = np.sqrt(np.diag(robust) / np.diag(bread))

@@ -7,6 +7,8 @@ the data determine least, where a second valley would lie.
 
 from __future__ import annotations
 
+import time
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -21,6 +23,10 @@ from casest.stack import Point, Problem
 
 #: Iterations after which a second opinion has nothing to say.
 OPINION = 50
+#: Samples that are enough to come near a solution of a longer record.
+NEARBY = 2000
+#: Rise of the cost over that of a parabola within which there is no second valley.
+PARABOLA = (0.8, 1.25)
 #: Solvers of the least-squares problem.
 SOLVERS = ("ipopt", "ipopt-exact", "trust-region")
 
@@ -57,30 +63,56 @@ def _ways(
 ) -> tuple[Outcome, ...]:
     """The solver asked for with a polish, and a second way that must agree with it.
 
-    The polished outcome comes first and carries the time of both.
+    The polished outcome comes first and carries the time of both. The second way begins with a
+    few of the samples, where the record is long.
     """
     if solver == "trust-region" or _singular(problem, first):
         # IPOPT wanders along a direction that changes nothing; the damped steps do not.
         main = trust_region(problem, first)
     else:
-        main = ipopt(problem, first, exact=solver == "ipopt-exact")
+        main = _polished(problem, ipopt(problem, first, exact=solver == "ipopt-exact"))
+    outcomes = [main, _opinion(problem, first)]
+    if not automatic:
+        # A start of the user's may lie in a wrong valley: the automatic one must agree.
+        outcomes.append(_opinion(problem, problem.start()))
+    costs = [_cost(o) for o in outcomes]
+    if max(costs) - min(costs) > 1e-6 * max(min(costs), 1e-300):
+        outcomes += [_opinion(problem, start) for start in _perturbations(problem, first, seed)]
+    return (*outcomes,)
+
+
+def _polished(problem: Problem, main: Outcome) -> Outcome:
     polished = trust_region(problem, main.point)
-    polished = replace(
+    return replace(
         polished,
         solver=main.solver,
         iterations=main.iterations + polished.iterations,
         evaluations=main.evaluations + polished.evaluations,
         seconds=main.seconds + polished.seconds,
     )
-    second = trust_region(problem, first)
-    outcomes = [polished, second]
-    if not automatic:
-        # A start of the user's may lie in a wrong valley: the automatic one must agree.
-        outcomes.append(trust_region(problem, problem.start(), max_iterations=OPINION))
-    costs = [_cost(o) for o in outcomes]
-    if max(costs) - min(costs) > 1e-6 * max(min(costs), 1e-300):
-        outcomes += _perturbed(problem, first, seed)
-    return (*outcomes,)
+
+
+def _nearby(problem: Problem, start: Point) -> Outcome:
+    """The solution for a few of the samples, or the start where that does not lower the cost."""
+    began = time.perf_counter()
+    every = problem.residual_count // (NEARBY * len(problem.model.axes) * len(problem.runs))
+    here = problem.cost(start)
+    stay = Outcome("trust-region", start, here, 0, 1, False, "start", 0.0)
+    if every < 2 or problem.sequential:
+        return stay
+    thinned = problem.thinned(every)
+    few = trust_region(thinned, start, max_iterations=OPINION, tolerance=_fine(thinned))
+    there = problem.cost(few.point)
+    near = few if np.isfinite(there) and there < here else stay
+    return replace(near, cost=min(here, there), seconds=time.perf_counter() - began)
+
+
+def _opinion(problem: Problem, start: Point) -> Outcome:
+    """Where a trust region ends from a start: near a solution to a fraction of its deviations."""
+    near = _nearby(problem, start)
+    tolerance = _fine(problem)
+    found = trust_region(problem, near.point, max_iterations=OPINION, tolerance=tolerance)
+    return replace(found, seconds=near.seconds + found.seconds)
 
 
 def _singular(problem: Problem, first: Point) -> bool:
@@ -91,20 +123,22 @@ def _singular(problem: Problem, first: Point) -> bool:
     return identify(problem, reached).rank < problem.unknowns
 
 
-def _perturbed(problem: Problem, first: Point, seed: int) -> list[Outcome]:
-    """Starts around the first one, when two ways disagree."""
+def _fine(problem: Problem) -> float:
+    """Gain over cost from which on a step is below 0.001 standard deviations."""
+    return 1e-6 / max(problem.residual_count, 1)
+
+
+def _perturbations(problem: Problem, first: Point, seed: int) -> Iterator[Point]:
+    """Starts around the first one."""
     rng = np.random.default_rng(seed)
     normal = problem.normal(first)
     columns = np.sqrt(np.where(np.diag(normal.matrix) > 0, np.diag(normal.matrix), np.inf))
     # An unknown that is zero has no size of its own: what changes the residual by its own length.
     size = np.maximum(np.abs(first.x), np.sqrt(2 * normal.cost) / columns)
-    found = []
     for _ in range(4):
         step = 0.1 * size * rng.standard_normal(len(first.x))
         moved = problem.moved(first, step)
-        start = Point(problem.inside(moved.x), moved.references)
-        found.append(trust_region(problem, start, max_iterations=OPINION))
-    return found
+        yield Point(problem.inside(moved.x), moved.references)
 
 
 def _around_the_sphere(problem: Problem, first: Point) -> tuple[Outcome, ...]:
@@ -121,7 +155,7 @@ def _around_the_sphere(problem: Problem, first: Point) -> tuple[Outcome, ...]:
                 references = first.references.copy()
                 references[slot.ref] = shape.reference(turn @ value)
                 start = Point(first.x, references)
-                found.append(trust_region(problem, start, max_iterations=OPINION))
+                found.append(_opinion(problem, start))
     return tuple(found)
 
 
@@ -142,7 +176,9 @@ def _along_the_weakest(problem: Problem, best: Outcome) -> tuple[Outcome, ...]:
     for sign in (1, -1):
         moved = problem.moved(best.point, sign * step)
         start = Point(problem.inside(moved.x), moved.references)
-        found.append(trust_region(problem, start, max_iterations=OPINION))
+        rise = (problem.cost(start) - best.cost) / (18 * sigma**2) if sigma > 0 else np.inf
+        if not PARABOLA[0] <= rise <= PARABOLA[1]:
+            found.append(_opinion(problem, start))
     return tuple(found)
 
 

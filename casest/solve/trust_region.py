@@ -27,8 +27,13 @@ class _Local(NamedTuple):
     cost: float
 
 
-def trust_region(problem: LeastSquares, start: Point, *, max_iterations: int = 300) -> Outcome:
-    """Minimise the cost from `start` until steps and gains are at rounding."""
+def trust_region(
+    problem: LeastSquares, start: Point, *, max_iterations: int = 300, tolerance: float = 0.0
+) -> Outcome:
+    """Minimise the cost from `start` until steps and gains are at rounding.
+
+    With a `tolerance` only until an undamped step gains no more than this share of the cost.
+    """
     began = time.perf_counter()
     point, here, precise = start, _linearise(problem, start, precise=False), False
     scale = _column_norms(here.R)
@@ -48,7 +53,9 @@ def trust_region(problem: LeastSquares, start: Point, *, max_iterations: int = 3
         if not precise and gain <= ROUGH * here.cost:
             precise, here = True, _linearise(problem, point, precise=True)
             continue
-        if _negligible(step, point, scale, here, gain):
+        if _negligible(step, point, scale, here, gain) or (
+            damping < 1 and gain <= tolerance * here.cost
+        ):
             status = "converged"
             break
         trial = problem.moved(point, step)
@@ -64,9 +71,9 @@ def trust_region(problem: LeastSquares, start: Point, *, max_iterations: int = 3
             if damping > 1e20:
                 status = "no descent"
                 break
-    if not precise:
+    if not precise and not tolerance:
         here = _linearise(problem, point, precise=True)
-    if np.all(np.isfinite(here.R)):
+    if np.all(np.isfinite(here.R)) and not tolerance:
         point, here = _refine(problem, point, here, scale)
     claims = status in ("converged", "no descent")
     seconds = time.perf_counter() - began
