@@ -259,9 +259,10 @@ def four_step(declared: Model, runs: Sequence[Run]) -> dict[str, Array]:
     """Pedersini's algorithm (14)-(35), run by run, sensor parameters averaged.
 
     Where the text leaves something open: the rotation of least variance (24) is the eigenvector of
-    the readings' smallest variance; searches begin at the closed form; the amplitude A of (28) is
-    the fitted one, because the standard deviation in (31) includes the noise; (32) is the
-    pseudo-inverse (UᵀU)⁻¹Uᵀb.
+    the readings' smallest variance; the excursion (26) is that of the low-passed signal, for
+    that of the raw one follows the noise's extremes; searches begin at the closed form; the
+    amplitude A of (28) is the fitted one, because the standard deviation in (31) includes the
+    noise; (32) is the pseudo-inverse (UᵀU)⁻¹Uᵀb.
     """
     if _number(declared, "radius") is None:
         raise NotTrusted("four-step: the algorithm needs the radius; fix it with --set radius=…")
@@ -279,7 +280,7 @@ def four_step(declared: Model, runs: Sequence[Run]) -> dict[str, Array]:
 def _four_steps(declared: Model, run: Run) -> dict[str, Array]:
     t, v = run.signals["t"][:, 0], run.signals["v"]
     start = _one_run(declared, run)
-    T = _realignment(v, start)  # A
+    T = _realignment(t, v, start)  # A
     motion, amplitude = _bench_rotation(t, v @ T[1], start)  # B
     g, r = _number(declared, "gravity") or 9.80665, _number(declared, "radius") or 0.28
     R, tilt, gain = _gain_search(t, v, T, motion, amplitude, start, g, r)  # C
@@ -302,7 +303,7 @@ def _four_steps(declared: Model, run: Run) -> dict[str, Array]:
     }
 
 
-def _realignment(v: Array, start: dict[str, Array]) -> Array:
+def _realignment(t: Array, v: Array, start: dict[str, Array]) -> Array:
     """T of (24) and (26): z′ constant, y′ of least excursion; signs as in the start's R."""
     from scipy.optimize import minimize_scalar
 
@@ -311,16 +312,39 @@ def _realignment(v: Array, start: dict[str, Array]) -> Array:
     z = z * np.sign(z @ W[:, 2])
     x = np.linalg.svd(z[None, :])[2][1]
     y = np.cross(z, x)
-    plane = v @ np.column_stack([x, y])
+    plane = _low_passed(t, v @ np.column_stack([x, y]), start["speed"])
 
     def excursion(angle: float) -> float:
-        return float(np.ptp(plane @ [np.cos(angle), np.sin(angle)]))
+        return _excursion(plane @ [np.cos(angle), np.sin(angle)])
 
     guess = float(np.arctan2(y @ W[:, 1], x @ W[:, 1]))
     angle = minimize_scalar(excursion, bracket=(guess - 0.1, guess + 0.1), tol=1e-10).x
     second = np.cos(angle) * x + np.sin(angle) * y
     second = second * np.sign(second @ W[:, 1])
     return np.array([np.cross(second, z), second, z])
+
+
+def _excursion(y: Array) -> float:
+    """max − min, in the unit of y."""
+    return float(np.ptp(y))
+
+
+def _low_passed(t: Array, y: Array, speed: Array, turns: float = 4.0) -> Array:
+    """Readings (N, k) without what is faster than `turns` times the wheel; both ends cut off.
+
+    The paper names no filter; this one is chosen because with it (26) gives the spread of its
+    Table I (all but the phase's). The raw signal's max − min follows the noise, and the offsets
+    scatter three to six times as much as published. See studies/wheel_bound.md.
+    """
+    from scipy.signal import butter, sosfiltfilt
+
+    rate = np.abs(np.polynomial.polynomial.polyval(t, speed)).max() / (2 * np.pi)  # turns/s
+    cutoff = turns * rate * float(np.median(np.diff(t)))  # cycles per sample
+    end = round(1 / cutoff)
+    if cutoff > 0.4 or len(y) < 10 * end:
+        return y  # too few samples a turn, or too few turns
+    smooth = sosfiltfilt(butter(4, 2 * cutoff, output="sos"), y, axis=0)
+    return np.asarray(smooth[end:-end])
 
 
 def _bench_rotation(t: Array, y: Array, start: dict[str, Array]) -> tuple[Motion, float]:
