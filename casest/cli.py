@@ -208,6 +208,75 @@ def calibration(model_name: str, data: Sequence[str], options: Options, command:
 
 
 @commands.command()
+@click.argument("model_name", metavar="MODEL")
+@click.argument("data", nargs=-1, required=True, type=click.Path())
+@model_options
+@reading_options
+@output_options
+def close(model_name: str, data: tuple[str, ...], **options: Any) -> int:
+    """Fit, trace the residual to missing effects, add them, judge by held-out data.
+
+    Verdict `adequate`: nothing that these data can show is missing; `extended`: effects were added
+    and what is left is noise; `unexplained`: a misfit remains. Exit code 0 whatever the verdict.
+    """
+    return closing(model_name, data, options, "casest " + " ".join(sys.argv[1:]))
+
+
+def closing(model_name: str, data: Sequence[str], options: Options, command: str) -> int:
+    """Read, close the loop, save, print."""
+    from casest import result
+    from casest.closing import loop, text, unseen, written
+    from casest.effects import CATALOGUE
+    from casest.problem import find_effects
+
+    own = tuple(e for path in options["effects"] for e in find_effects(path))
+    model = declared_model(model_name, {**options, "effects": ()})
+    runs = records(model, data, options)
+    start = dict(start_value(words, model) for words in options["starts"]) or None
+    try:
+        found = loop.close(
+            model,
+            runs,
+            catalogue=(*CATALOGUE, *own),
+            start=start,
+            seed=options["seed"],
+            say=lambda words: click.echo(f"casest: {words}", err=True),
+        )
+    except NotTrusted as error:
+        return refused(error, model_name, data, options, command)
+    hidden = None
+    if options["holdout"]:
+        hidden = unseen.scored(found, records(model, options["holdout"], options))
+    content = written.closing_result(
+        found, model_name=model_name, data=data, command=command, held_out=hidden and hidden[1:]
+    )
+    if options["output"]:
+        result.save(options["output"], content, written.residual_rows(found, hidden))
+    if options["as_json"]:
+        click.echo(result.as_json(content), nl=False)
+    else:
+        click.echo(text.closing_text(found, content, options["output"]))
+    return 0
+
+
+def refused(
+    error: NotTrusted, model_name: str, data: Sequence[str], options: Options, command: str
+) -> int:
+    """Write and say what there is where the declared model itself has no trustworthy fit."""
+    from casest import result
+
+    if error.estimate is not None and options["output"]:
+        content = result.calibration_result(
+            error.estimate, model_name=model_name, data=data, command=command
+        )
+        result.save(options["output"], content, result.residual_rows(error.estimate))
+        if options["as_json"]:
+            click.echo(result.as_json(content), nl=False)
+    click.echo(f"casest: {error}", err=True)
+    return NotTrusted.exit_code
+
+
+@commands.command()
 @click.option(
     "-o",
     "--output",

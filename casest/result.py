@@ -46,33 +46,33 @@ def calibration_result(
         "model": model_name,
         "data": list(data),
         "runs": [run.name for run in problem.runs],
-        "constants": {c.name: _plain(c.array) for c in problem.model.constants},
+        "constants": {c.name: plain(c.array) for c in problem.model.constants},
         "scopes": {p.name: p.scope for p in problem.model.parameters},
         "verdict": None,
         "trusted": certificate.trusted,
         "noise": {
-            "sigma": [_plain(estimate.noise.sigma)] * len(problem.model.axes),
+            "sigma": [plain(estimate.noise.sigma)] * len(problem.model.axes),
             "unit": table["residual"],
-            "from_residual": _plain(estimate.noise.residual),
-            "from_repeats": _plain(estimate.noise.repeats),
+            "from_residual": plain(estimate.noise.residual),
+            "from_repeats": plain(estimate.noise.repeats),
             "degrees_of_freedom": estimate.noise.degrees_of_freedom,
-            "correlated_over_samples": _plain(estimate.correlated_over),
+            "correlated_over_samples": plain(estimate.correlated_over),
         },
         "estimate": {
-            "rmse_fit": _plain(estimate.rmse),
-            "rmse_holdout": _plain(holdout),
+            "rmse_fit": plain(estimate.rmse),
+            "rmse_holdout": plain(holdout),
             "certificate": {
                 "trusted": certificate.trusted,
                 "reasons": list(certificate.reasons),
-                "step_left_in_std": _plain(certificate.step),
-                "relative_curvature": _plain(certificate.curvature),
+                "step_left_in_std": plain(certificate.step),
+                "relative_curvature": plain(certificate.curvature),
                 "agreeing_starts": [certificate.agreeing, certificate.starts],
                 "at_bound": list(certificate.at_bound),
             },
-            "parameters": _parameters(estimate, table),
+            "parameters": parameter_table(estimate, table),
             "correlation": {
                 "names": list(estimate.names),
-                "matrix": _plain(_correlation(estimate.covariance)),
+                "matrix": plain(_correlation(estimate.covariance)),
             },
         },
         "effects": [_effect(a) for a in problem.model.effects],
@@ -81,7 +81,7 @@ def calibration_result(
             "unknowns": estimate.identifiability.unknowns,
             "unobservable": list(estimate.identifiability.unobservable),
             "weak": [
-                {"direction": w.words, "inflation": _plain(w.inflation), "std": _plain(w.std)}
+                {"direction": w.words, "inflation": plain(w.inflation), "std": plain(w.std)}
                 for w in estimate.weak
             ],
         },
@@ -99,7 +99,8 @@ def calibration_result(
     }
 
 
-def _parameters(estimate: Estimate, table: Mapping[str, str]) -> dict[str, Any]:
+def parameter_table(estimate: Estimate, table: Mapping[str, str]) -> dict[str, Any]:
+    """Value, standard deviations, interval and unit of every parameter, for JSON."""
     dof = estimate.noise.degrees_of_freedom / estimate.correlated_over
     half = half_width(int(dof))
     known = {n: u for n, u in table.items() if "[" not in n}
@@ -108,10 +109,10 @@ def _parameters(estimate: Estimate, table: Mapping[str, str]) -> dict[str, Any]:
         value, std = estimate.values[p.name], estimate.std[p.name]
         own = entry_units(p, known)
         found[p.name] = {
-            "value": _plain(value),
-            "std": _plain(std),
-            "robust_std": _plain(estimate.robust[p.name]),
-            "interval95": [_plain(value - half * std), _plain(value + half * std)],
+            "value": plain(value),
+            "std": plain(std),
+            "robust_std": plain(estimate.robust[p.name]),
+            "interval95": [plain(value - half * std), plain(value + half * std)],
             "unit": own[0] if len(set(own)) == 1 else own,
         }
     return found
@@ -138,9 +139,9 @@ def _scatter(estimate: Estimate) -> dict[str, Any] | None:
     if found is None:
         return None
     return {
-        "F": _plain(found.F),
-        "freedom": [_plain(f) for f in found.freedom],
-        "p_value": _plain(found.p_value),
+        "F": plain(found.F),
+        "freedom": [plain(f) for f in found.freedom],
+        "p_value": plain(found.p_value),
         "furthest": found.worst,
     }
 
@@ -176,8 +177,8 @@ def _solver(estimate: Estimate) -> dict[str, Any]:
         "name": estimate.extra.get("estimator", first.solver),
         "iterations": first.iterations,
         "evaluations": first.evaluations,
-        "seconds": _plain(estimate.extra.get("seconds", first.seconds)),
-        **{k: _plain(v) for k, v in estimate.extra.items() if k == "least_squares_seconds"},
+        "seconds": plain(estimate.extra.get("seconds", first.seconds)),
+        **{k: plain(v) for k, v in estimate.extra.items() if k == "least_squares_seconds"},
     }
 
 
@@ -202,12 +203,12 @@ def _reproduce(command: str, data: Sequence[str]) -> dict[str, Any]:
     }
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """Numbers and nested lists for JSON; what is not finite becomes null."""
     if value is None or isinstance(value, str | bool | int):
         return value
     if isinstance(value, np.ndarray) and value.ndim:
-        return [_plain(v) for v in value]
+        return [plain(v) for v in value]
     number = float(value)
     return number if np.isfinite(number) else None
 

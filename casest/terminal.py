@@ -53,12 +53,12 @@ def _summary(m: Model) -> dict[str, Any]:
 def calibration_text(found: Estimate, content: Mapping[str, Any], output: Path | None) -> str:
     """Verdict, values with uncertainty, what was not determined, why it is believed."""
     blocks = [_head(found, content), *_wrapped_notes(content["notes"])]
-    blocks.append("\n".join(_table(found)))
+    blocks.append("\n".join(value_table(found)))
     blocks.append("\n".join(_held(found, content)))
     blocks.append("\n".join(_fit_lines(found, content)))
     blocks += _determined(found)
     title = "Believed because" if found.certificate.trusted else "Refused because"
-    blocks.append("\n".join([f"{title}:", *(_item(r) for r in found.certificate.reasons)]))
+    blocks.append("\n".join([f"{title}:", *(item(r) for r in found.certificate.reasons)]))
     blocks.append(_next(found, output))
     return "\n\n".join(b for b in blocks if b)
 
@@ -77,14 +77,15 @@ def _head(found: Estimate, content: Mapping[str, Any]) -> str:
 
 def _wrapped_notes(notes: Sequence[str]) -> Iterator[str]:
     if notes:
-        yield "\n".join(_item(note) for note in notes)
+        yield "\n".join(item(note) for note in notes)
 
 
-def _item(text: str) -> str:
+def item(text: str) -> str:
+    """A point of a list, wrapped."""
     return textwrap.fill(text, WIDTH, initial_indent="  - ", subsequent_indent="    ")
 
 
-def _table(found: Estimate) -> Iterator[str]:
+def value_table(found: Estimate) -> Iterator[str]:
     """One line per value: name, value ± standard deviation, unit."""
     known = unit_table(found.model, found.problem.runs)
     known = {n: u for n, u in known.items() if "[" not in n}
@@ -144,7 +145,7 @@ def _fit_lines(found: Estimate, content: Mapping[str, Any]) -> Iterator[str]:
         yield f"  held-out residual rms {content['estimate']['rmse_holdout']:.3g}{unit}"
     repeats, residual = found.noise.repeats, found.noise.residual
     if repeats and np.isfinite(residual) and residual > 2 * repeats:
-        yield _item(
+        yield item(
             f"the residual is {residual / repeats:.1f} times what the scatter within the rest "
             f"intervals explains ({repeats:.2g}{unit}): the model lacks something; the standard "
             "deviations above include that misfit as if it were noise"
@@ -160,11 +161,11 @@ def _fit_lines(found: Estimate, content: Mapping[str, Any]) -> Iterator[str]:
 
 def _determined(found: Estimate) -> Iterator[str]:
     if found.identifiability.unobservable and found.certificate.trusted:
-        lines = [_item(words) for words in found.identifiability.unobservable]
+        lines = [item(words) for words in found.identifiability.unobservable]
         yield "\n".join(["These data do not determine:", *lines])
     if found.weak:
         worst = sorted(found.weak, key=lambda w: -w.inflation)[:3]
-        lines = [_item(f"{w.words}: {w.inflation:.0f} times worse than each alone") for w in worst]
+        lines = [item(f"{w.words}: {w.inflation:.0f} times worse than each alone") for w in worst]
         if len(found.weak) > 3:
             lines.append(f"  - and {len(found.weak) - 3} more, in result.json")
         yield "\n".join(["Weakly determined (one standard deviation of the combination):", *lines])

@@ -26,9 +26,11 @@ FLOORS = [
     ["casest.remarks"],
     ["casest.solve"],
     ["casest.estimate", "casest.naming", "casest.apply"],
-    ["casest.result", "casest.problem", "casest.earth"],
+    ["casest.result", "casest.problem", "casest.earth", "casest.effects"],
+    ["casest.closing"],
     ["casest.values", "casest.applying", "casest.demonstration"],
     ["casest.terminal"],
+    ["casest.closing.text"],
     ["casest.cli"],
 ]
 

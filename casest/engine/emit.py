@@ -70,6 +70,8 @@ _ALONE = {
     ca.OP_COSH, ca.OP_TANH, ca.OP_ASINH, ca.OP_ACOSH, ca.OP_ATANH, ca.OP_ATAN2, ca.OP_HYPOT,
     ca.OP_FMOD, ca.OP_REMAINDER, ca.OP_ERF,
 }  # fmt: skip
+#: Instructions of one loop: compilers take time that grows with its square to place more.
+_LONGEST = 200
 #: Bytes of a chunk's values: they stay in the first-level cache.
 _CACHE = 24_000
 #: Chunks after which the lanes are emptied into the total: sums of sums keep rounding small.
@@ -93,18 +95,19 @@ typedef double lanes __attribute__((vector_size(64), aligned(8), may_alias));
 """
 
 _PRODUCTS = """\
+#define UNROLLED _Pragma("GCC unroll 4") for
 #define TILE(R, C) \\
   static __attribute__((noinline)) void tile_##R##_##C( \\
       const double (*x)[B], const double (*y)[B], lanes *sum) { \\
     lanes s[R][C]; \\
-    for (int i = 0; i < R; ++i) \\
-      for (int j = 0; j < C; ++j) s[i][j] = sum[i * C + j]; \\
+    UNROLLED (int i = 0; i < R; ++i) \\
+      UNROLLED (int j = 0; j < C; ++j) s[i][j] = sum[i * C + j]; \\
     for (int l = 0; l < B; l += LANES) \\
-      for (int i = 0; i < R; ++i) \\
-        for (int j = 0; j < C; ++j) \\
+      UNROLLED (int i = 0; i < R; ++i) \\
+        UNROLLED (int j = 0; j < C; ++j) \\
           s[i][j] += *(const lanes *)(x[i] + l) * *(const lanes *)(y[j] + l); \\
-    for (int i = 0; i < R; ++i) \\
-      for (int j = 0; j < C; ++j) sum[i * C + j] = s[i][j]; \\
+    UNROLLED (int i = 0; i < R; ++i) \\
+      UNROLLED (int j = 0; j < C; ++j) sum[i * C + j] = s[i][j]; \\
   }
 static inline double total(lanes s) {
   return ((s[0] + s[1]) + (s[2] + s[3])) + ((s[4] + s[5]) + (s[6] + s[7]));
@@ -150,11 +153,14 @@ def _block(name: str, plan: Plan, wanted: int) -> Iterator[str]:
     for i, k in scalars.items():
         lines.append(f"  c[{k}] = {_scalar(values[i], scalars)};")
     lines.append("}")
-    lines.append(
-        f"static void block_{name}(const double *restrict c, double (*restrict in)[B], "
-        "double (*restrict out)[B]) {"
-    )
-    lines += _loops(plan, scalars)
+    loops, kept = _loops(plan, scalars)
+    # Functions, not loops of one function, keep the compiler's time from growing with a square.
+    for k, loop in enumerate(loops):
+        lines += [f"static __attribute__((noinline)) void block_{name}_{k}({_PLACES}) {{"]
+        lines += ["  for (int l = 0; l < B; ++l) {", *loop, "  }", "}"]
+    lines.append(f"static void block_{name}(const double *c, double (*in)[B], double (*out)[B]) {{")
+    lines.append(f"  double kept[{max(kept, 1)}][B] __attribute__((aligned(64)));")
+    lines += [f"  block_{name}_{k}(c, in, kept, out);" for k in range(len(loops))]
     for row, i in enumerate(plan.wanted):
         if i in scalars:
             lines.append(f"  for (int l = 0; l < B; ++l) out[{row}][l] = c[{scalars[i]}];")
@@ -170,6 +176,13 @@ def _block(name: str, plan: Plan, wanted: int) -> Iterator[str]:
     lines.append(f"static const int input_{name}[] = {{{which}}};")
     lines.append(f"static const int inputs_{name} = {len(plan.inputs)};")
     yield "\n".join(lines)
+
+
+#: What a part of a chunk's instructions is given: scalars, signals, values of other parts, results.
+_PLACES = (
+    "const double *restrict c, const double (*restrict in)[B], double (*restrict kept)[B], "
+    "double (*restrict out)[B]"
+)
 
 
 def _scalar(value: object, place: dict[int, int]) -> str:
@@ -190,15 +203,10 @@ def _number(constant: float) -> str:
     return f"({constant.hex()})"
 
 
-def _loops(plan: Plan, scalars: dict[int, int]) -> list[str]:
-    """The per-sample instructions, in loops that each can be vectorised."""
-    values = plan.graph.values
-    segments: list[list[int]] = [[]]
-    for i in plan.steps:
-        if values[i].code in _ALONE:
-            segments += [[i], []]
-        else:
-            segments[-1].append(i)
+def _loops(plan: Plan, scalars: dict[int, int]) -> tuple[list[list[str]], int]:
+    """The per-sample instructions, in loops that each can be vectorised; rows kept between them."""
+    values, inputs = plan.graph.values, {i: k for k, i in enumerate(plan.inputs)}
+    segments = _segments(plan)
     segment_of = {i: k for k, segment in enumerate(segments) for i in segment}
     crossing = {
         j
@@ -207,23 +215,19 @@ def _loops(plan: Plan, scalars: dict[int, int]) -> list[str]:
         if j in segment_of and segment_of[j] != segment_of[i]
     }
     rows = {i: k for k, i in enumerate(sorted(crossing - set(plan.home)))}
-    lines = []
-    if rows:
-        lines.append(f"  double kept[{len(rows)}][B] __attribute__((aligned(64)));")
 
     def operand(j: int, segment: int) -> str:
         if j in scalars:
             return f"c[{scalars[j]}]"
-        if values[j].kind == "sample":
-            return f"in[{plan.inputs.index(j)}][l]"
+        if j in inputs:
+            return f"in[{inputs[j]}][l]"
         if segment_of[j] == segment:
             return f"v{j}"
         return f"out[{plan.home[j]}][l]" if j in plan.home else f"kept[{rows[j]}][l]"
 
+    loops = []
     for k, segment in enumerate(segments):
-        if not segment:
-            continue
-        lines.append("  for (int l = 0; l < B; ++l) {")
+        lines = []
         for i in segment:
             expression = _C[values[i].code].format(*(operand(j, k) for j in values[i].operands))
             lines.append(f"    const double v{i} = {expression};")
@@ -231,8 +235,21 @@ def _loops(plan: Plan, scalars: dict[int, int]) -> list[str]:
                 lines.append(f"    out[{plan.home[i]}][l] = v{i};")
             elif i in rows:
                 lines.append(f"    kept[{rows[i]}][l] = v{i};")
-        lines.append("  }")
-    return lines
+        loops.append(lines)
+    return loops, len(rows)
+
+
+def _segments(plan: Plan) -> list[list[int]]:
+    """The per-sample instructions in order, cut where a loop must end."""
+    segments: list[list[int]] = [[]]
+    for i in plan.steps:
+        if plan.graph.values[i].code in _ALONE:
+            segments += [[i], []]
+            continue
+        if len(segments[-1]) == _LONGEST:
+            segments.append([])
+        segments[-1].append(i)
+    return [segment for segment in segments if segment]
 
 
 #: Signals arrive as one pointer and one stride (in numbers) per column.

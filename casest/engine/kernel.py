@@ -17,8 +17,10 @@ import platform
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import lru_cache
 from pathlib import Path
 
@@ -43,6 +45,21 @@ _FLAGS = (
     ["-O2"],
 )  # fmt: skip
 _POINTER = ctypes.POINTER(ctypes.c_double)
+
+
+#: Samples from which on a kernel is built for a model that is only tried.
+TRIED = 400_000
+_impatient: ContextVar[bool] = ContextVar("impatient", default=False)
+
+
+@contextmanager
+def patient() -> Iterator[None]:
+    """While many models are tried, none is compiled unless the record is very long."""
+    token = _impatient.set(True)
+    try:
+        yield
+    finally:
+        _impatient.reset(token)
 
 
 class Kernel:
@@ -158,7 +175,7 @@ def _kernel(
     if wish == "off":
         return None
     if which not in replay.kernels:
-        if samples < enough and wish != "always":
+        if samples < (TRIED if _impatient.get() else enough) and wish != "always":
             return None
         replay.kernels[which] = _made(text())
     found: Kernel | None = replay.kernels[which]

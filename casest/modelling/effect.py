@@ -25,8 +25,11 @@ NOISE = "noise"
 class Effect:
     """A function of one quantity, signal, the noise, or the sequence of samples.
 
-    `on` names what it acts on; `extras` are further signals or columns it reads; `null` maps each
-    parameter to the value at which the effect vanishes (0 unless told).
+    `on` names what it acts on; `extras` are further signals, columns or quantities it reads;
+    `null` maps each parameter to the value at which the effect vanishes (0 unless told).
+    For tracing a residual: `typical` sizes of the parameters, each in its unit; `profile` the
+    parameters that are searched over a grid (name -> "frequency", "time" or "level"), because the
+    effect is not smooth in them or has many valleys; `shown_by` the measurement that shows it.
     """
 
     name: str
@@ -37,6 +40,11 @@ class Effect:
     declarations: tuple[Any, ...]
     null: tuple[tuple[str, float], ...]
     doc: str = ""
+    typical: tuple[tuple[str, float], ...] = ()
+    profile: tuple[tuple[str, str], ...] = ()
+    shown_by: str = ""
+    #: What it does as a formula, where the source is not what a reader should see.
+    formula: str = ""
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         """Evaluate the effect's own function."""
@@ -46,12 +54,31 @@ class Effect:
         """Value of a parameter at which the effect is absent."""
         return dict(self.null).get(parameter, 0.0)
 
+    def holding(self, **values: float) -> Effect:
+        """The same effect with parameters or numbers held at values (in their own units)."""
+        held = tuple(
+            (n, Constant(n, (float(values[n]),), getattr(d, "unit", "")) if n in values else d)
+            for n, d in self.declarations
+        )
+        return replace(self, declarations=held)
+
+    def starting(self, **values: float) -> Effect:
+        """The same effect with other start values of scalar parameters."""
+        moved = tuple(
+            (n, replace(d, start=(float(values[n]),)) if n in values else d)
+            for n, d in self.declarations
+        )
+        return replace(self, declarations=moved)
+
 
 def effect(
     *,
     on: str,
     kind: Kind | None = None,
     null: Mapping[str, float] | None = None,
+    typical: Mapping[str, float] | None = None,
+    profile: Mapping[str, str] | None = None,
+    shown_by: str = "",
 ) -> Callable[[Callable[..., Any]], Effect]:
     """Declare an effect: first argument the value acted on, further ones signals or columns.
 
@@ -81,6 +108,9 @@ def effect(
             declarations,
             tuple(sorted((null or {}).items())),
             inspect.getdoc(function) or "",
+            tuple((typical or {}).items()),
+            tuple((profile or {}).items()),
+            shown_by,
         )
 
     return declare
@@ -116,16 +146,22 @@ class Attached:
     label: str
     columns: tuple[tuple[str, str], ...]
     parameters: tuple[Parameter, ...]
+    inner: tuple[str, ...] = ()
 
     @property
-    def signals(self) -> tuple[Signal, ...]:
-        """Signals that the effect reads, under the names they have in the data."""
+    def reads(self) -> tuple[Signal, ...]:
+        """All that the effect reads, under the names of data and model."""
         renamed = dict(self.columns)
         return tuple(replace(s, name=renamed.get(s.name, s.name)) for s in self.effect.extras)
 
+    @property
+    def signals(self) -> tuple[Signal, ...]:
+        """Those of them that data give; `inner` are quantities of the model."""
+        return tuple(s for s in self.reads if s.name not in self.inner)
+
     def apply(self, value: SX, symbols: Mapping[str, SX], **more: SX) -> SX:
         """The value with the effect in it, from the model's symbols by name."""
-        extras = [symbols[s.name] for s in self.signals]
+        extras = [symbols[s.name] for s in self.reads]
         unknowns = {p.name.rpartition(".")[2]: symbols[p.name] for p in self.parameters}
         numbers: dict[str, Any] = {
             n: d.array for n, d in self.effect.declarations if isinstance(d, Constant)
@@ -163,6 +199,7 @@ def attach(
     units: Mapping[str, str],
     columns: Mapping[str, str],
     label: str,
+    inner: tuple[str, ...] = (),
 ) -> Attached:
     """An effect with its unknowns sized and named for the place where it is attached.
 
@@ -186,16 +223,25 @@ def attach(
             if "[" not in unit and unit and not known(unit):
                 raise UnitError(f"effect {label}: {name} has unknown unit {unit!r}")
         parameters.append(replace(parameter, units=renamed))
-    return Attached(declared, on, kind, label, tuple(sorted(columns.items())), tuple(parameters))
+    renamed_columns = tuple(sorted(columns.items()))
+    return Attached(declared, on, kind, label, renamed_columns, tuple(parameters), inner)
 
 
-def check_null(attached: Attached, shape: tuple[int, int]) -> None:
+def check_null(
+    attached: Attached, shape: tuple[int, int], inner: Mapping[str, tuple[int, int]]
+) -> None:
     """An effect must vanish at its null value: tried at random points.
+
+    `inner` gives the shape of every quantity of the model that it may read.
 
     Raises DeclarationError naming the effect, its null value, and by how much it misses.
     """
-    value = ca.SX.sym("value", *shape)
-    symbols = {s.name: ca.SX.sym(s.name, s.size) for s in attached.signals}
+    symbols = {s.name: ca.SX.sym(s.name, *inner.get(s.name, (s.size, 1))) for s in attached.reads}
+    free = [ca.SX.sym("value", *shape), *symbols.values()]
+    value = free[0]
+    if "t" in symbols:  # so that rates of change are not zero
+        value = value + 3 * symbols["t"]
+        symbols = {n: s + 3 * symbols["t"] if n in inner else s for n, s in symbols.items()}
     nulls, unknowns = {}, {}
     for name, declaration in attached.effect.declarations:
         if isinstance(declaration, Constant):
@@ -217,7 +263,7 @@ def check_null(attached: Attached, shape: tuple[int, int]) -> None:
             f"{changed.shape}"
         )
     expected = ca.SX.ones(*shape) if attached.kind == "noise" else value
-    f = ca.Function("vanishes", [value, *more, *symbols.values()], [changed - expected])
+    f = ca.Function("vanishes", [free[0], *more, *free[1:]], [changed - expected])
     rng = np.random.default_rng(0)
     for _ in range(3):
         point = [rng.uniform(0.5, 2.0, size=f.size_in(i)) for i in range(f.n_in())]

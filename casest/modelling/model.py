@@ -198,21 +198,29 @@ class Model:
         """
         target = on or added.on
         columns = dict(columns or {})
-        kind, dims, unit = self._place(added, target)
         label = added.name + "".join(f"({c})" for c in columns.values())
         label = label if on is None or on == added.on else f"{label}@{on}"
         taken = {a.label for a in self.effects}
         if label in taken:
             raise UsageError(f"model {self.name} already has the effect {label}")
-        attached = attach(added, target, kind, dims, {target: unit}, columns, label)
-        check_null(attached, self._target_shape(target))
+        attached = self._attached(added, target, columns, label)
+        shapes = {n: (q.declared.size1(), q.declared.size2()) for n, q in self.quantities.items()}
+        check_null(attached, self._target_shape(target), shapes)
         made = replace(self, effects=(*self.effects, attached))
-        if kind in ("quantity", "signal") and not _reaches_residual(made, attached):
+        if attached.kind in ("quantity", "signal") and not _reaches_residual(made, attached):
             raise UsageError(
                 f"effect {label} is not applicable to model {self.name}: "
                 f"its residual does not depend on {target}"
             )
         return made
+
+    def _attached(
+        self, added: Effect, target: str, columns: Mapping[str, str], label: str
+    ) -> Attached:
+        kind, dims, unit = self._place(added, target)
+        signals = {s.name for s in self.signals}
+        inner = tuple(name for name in self.quantities if name not in signals)
+        return attach(added, target, kind, dims, {target: unit}, columns, label, inner)
 
     def _target_shape(self, target: str) -> tuple[int, int]:
         if target in self.quantities:

@@ -53,7 +53,7 @@ def trace(model: Model, cut: str | None = None, naming: bool = False) -> Traced:
     running = Trace(cut=cut, naming=naming, reserved=frozenset(symbols))
     for attached in model.effects:
         if attached.kind == "quantity":
-            running.effects.setdefault(attached.on, []).append(_applied(attached, symbols))
+            running.effects.setdefault(attached.on, []).append(_applied(attached, symbols, running))
     residual = _run_body(model, running, symbols)
     measured = _name_of(residual.measured, symbols)
     if residual.measured is not None and measured is None:
@@ -106,9 +106,9 @@ def _symbols(model: Model) -> tuple[dict[str, SX], list[SX], list[SX]]:
     return symbols, coordinates, references
 
 
-def _applied(attached: Attached, symbols: Mapping[str, SX]) -> Callable[[SX], SX]:
+def _applied(attached: Attached, symbols: Mapping[str, SX], running: Trace) -> Callable[[SX], SX]:
     def apply(value: SX) -> SX:
-        return attached.apply(value, symbols)
+        return attached.apply(value, {**running.handed, **symbols})
 
     return apply
 
@@ -148,10 +148,10 @@ def _with_signal_effect(traced: Traced, attached: Attached) -> Traced:
     """Effects on a signal act after the body, because der(…, t) needs the bare symbol."""
     symbol = traced.symbols[attached.on]
     changed = ca.vec(ca.SX(attached.apply(symbol, traced.symbols)))
-    flat = _flat(symbol)
+    plain = flat(symbol)
 
     def late(expression: SX) -> SX:
-        return ca.substitute(expression, flat, changed)
+        return ca.substitute(expression, plain, changed)
 
     quantities = {
         name: replace(q, declared=late(q.declared), value=late(q.value))
@@ -192,7 +192,7 @@ def function_of(model: Model, outputs: Mapping[str, SX], traced: Traced | None =
 def sample_symbol(model: Model, traced: Traced | None = None) -> SX:
     """All signals of one sample as one column, in the order in which data hold them."""
     symbols = (traced or model.traced).symbols
-    return ca.vertcat(*[_flat(symbols[s.name]) for s in model.signals])
+    return ca.vertcat(*[flat(symbols[s.name]) for s in model.signals])
 
 
 def reached_parameters(model: Model, traced: Traced, expression: SX) -> set[str]:
@@ -225,12 +225,12 @@ def equations(model: Model) -> list[str]:
     Where the source is not at hand, the traced expressions in terms of the quantities before.
     """
     try:
-        lines = _body(model.function)
+        lines = body(model.function)
         for attached in model.effects:
             lines += [
                 "",
                 f"# effect {attached.label} on {attached.on}",
-                *_body(attached.effect.function),
+                *body(attached.effect.function),
             ]
     except (OSError, TypeError):
         traced = trace(model, naming=True)
@@ -239,7 +239,7 @@ def equations(model: Model) -> list[str]:
     return lines
 
 
-def _body(function: Callable[..., Any]) -> list[str]:
+def body(function: Callable[..., Any]) -> list[str]:
     """Source lines of a function without its signature and docstring."""
     source = textwrap.dedent(inspect.getsource(function))
     declared = next(n for n in ast.parse(source).body if isinstance(n, ast.FunctionDef))
@@ -270,7 +270,7 @@ def _name_of(symbol: SX | None, symbols: Mapping[str, SX]) -> str | None:
     )
 
 
-def _flat(symbol: SX) -> SX:
+def flat(symbol: SX) -> SX:
     """A signal's numbers in the order in which data hold them (matrices row by row)."""
     return ca.vec(symbol.T) if symbol.shape == (3, 3) else symbol
 

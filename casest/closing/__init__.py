@@ -1,0 +1,1 @@
+"""Closing the loop: trace a residual to the missing effect, add it, judge by new data."""

@@ -1,0 +1,237 @@
+"""Which effects could be missing: the catalogue at every place and column where it applies."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from casest.data.run import Run
+from casest.declaring.shapes import Array
+from casest.declaring.symbols import Parameter
+from casest.errors import CasestError
+from casest.modelling.effect import NOISE, Effect
+from casest.modelling.model import Model
+
+#: Columns whose name or unit says that they are temperatures.
+_TEMPERATURE = re.compile(r"temp|(^|_)t_?(deg)?c$|celsius|kelvin", re.IGNORECASE)
+_DEGREES = {"degC", "K", "kelvin", "degree_Celsius", "°C"}
+#: Columns that number things instead of measuring them.
+_LABELS = re.compile(r"^(run|pose|index|row|count|sample|seq|id|nr|no)$", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One effect at one place: `freed` names a constant instead, for one that is wrong.
+
+    `trials` says at how many grid values of its profile it was tried, for the p-value.
+    """
+
+    effect: Effect | None
+    columns: tuple[tuple[str, str], ...] = ()
+    freed: str = ""
+    trials: int = 1
+
+    @property
+    def name(self) -> str:
+        """The bare catalogue name, or that of the constant."""
+        return self.freed or (self.effect.name if self.effect else "")
+
+    @property
+    def column(self) -> str | None:
+        """The column that it reads besides time."""
+        return self.columns[0][1] if self.columns else None
+
+    @property
+    def on(self) -> str:
+        """The quantity or signal it acts on."""
+        return self.freed or (self.effect.on if self.effect else "")
+
+    @property
+    def label(self) -> str:
+        """Name and column, as in the parameters' names: `temperature_bias(temp)`."""
+        return self.name + (f"({self.column})" if self.column else "")
+
+    def added_to(self, model: Model) -> Model:
+        """The model with it. Raises where it does not apply."""
+        if self.freed:
+            return model.freed(self.freed)
+        assert self.effect is not None
+        return model.with_effect(self.effect, columns=dict(self.columns))
+
+    def parameters(self, extended: Model) -> list[Parameter]:
+        """Its unknowns in the extended model."""
+        own = self.label + "."
+        return [p for p in extended.parameters if p.name.startswith(own) or p.name == self.freed]
+
+
+@dataclass(frozen=True)
+class Skipped:
+    """An effect that could not be tried, and why."""
+
+    name: str
+    reason: str
+
+
+def prepared(model: Model, runs: Sequence[Run]) -> tuple[Run, ...]:
+    """Runs whose time and usable columns can be read like signals."""
+    names = set.intersection(*[set(_usable(run)) for run in runs]) if runs else set()
+    found = []
+    for run in runs:
+        more = {name: values for name, values in _usable(run).items() if name in names}
+        units = {name: run.column_units.get(name, "s" if name == "t" else None) for name in more}
+        found.append(replace(run, signals={**more, **run.signals}, units={**units, **run.units}))
+    return tuple(found)
+
+
+def _usable(run: Run) -> dict[str, Array]:
+    """Numeric columns, and the time, as signals (N, 1)."""
+    found = {} if run.time is None else {"t": np.asarray(run.time, float)[:, None]}
+    for name, values in run.columns.items():
+        if np.issubdtype(values.dtype, np.number):
+            found[name] = np.asarray(values, float)[:, None]
+    return found
+
+
+def candidates(
+    model: Model, runs: Sequence[Run], catalogue: Sequence[Effect]
+) -> tuple[list[Candidate], list[Skipped]]:
+    """All that can be tried on these data, and what cannot with the reason.
+
+    `runs` come from `prepared`.
+    """
+    found: list[Candidate] = []
+    skipped: list[Skipped] = []
+    channels, unusable = _channels(model, runs)
+    skipped += unusable
+    for effect in catalogue:
+        if effect.on == NOISE:
+            continue
+        try:
+            placed = _placed(effect, model)
+        except CasestError as error:
+            skipped.append(Skipped(effect.name, str(error)))
+            continue
+        for columns in _columns_for(placed, channels, runs):
+            candidate = Candidate(_with_numbers(placed, columns, runs), columns)
+            why = _refused(candidate, model, runs)
+            if why:
+                skipped.append(Skipped(candidate.label, why))
+            else:
+                found.append(candidate)
+    for constant in model.constants:
+        candidate = Candidate(None, freed=constant.name)
+        if constant.frozen is None and not constant.dims:
+            found.append(candidate)
+    return found, skipped
+
+
+def _placed(effect: Effect, model: Model) -> Effect:
+    """The effect on the model's own quantity instead of "input" or "output"."""
+    corrected = model.traced.corrected
+    predicted = next(
+        (q.name for q in model.quantities.values() if model.traced.residual.predicted is q.value),
+        None,
+    )
+    if effect.on == "input":
+        place = corrected
+    elif effect.on == "output":
+        place = predicted or (corrected if model.implicit else None)
+    else:
+        place = effect.on
+    if place is None:
+        word = "declares no corrected quantity" if effect.on == "input" else "names no prediction"
+        raise CasestError(f"model {model.name} {word}")
+    return replace(effect, on=place)
+
+
+def _columns_for(
+    effect: Effect, channels: Mapping[str, bool], runs: Sequence[Run]
+) -> list[tuple[tuple[str, str], ...]]:
+    """For effects that read a channel: every column that may be it."""
+    if not any(s.name == "channel" for s in effect.extras):
+        return [()]
+    warm = effect.name.startswith("temperature")
+    return [(("channel", name),) for name, is_warm in channels.items() if is_warm == warm]
+
+
+def _channels(model: Model, runs: Sequence[Run]) -> tuple[dict[str, bool], list[Skipped]]:
+    """Columns that measure something (is it a temperature?), and those that cannot be used."""
+    used = {s.name for s in model.signals} | {"t"}
+    found: dict[str, bool] = {}
+    skipped: list[Skipped] = []
+    values: dict[str, Array] = {}
+    for name in runs[0].columns if runs else ():
+        if name in used or _LABELS.match(name):
+            continue
+        if any(name not in run.signals for run in runs):
+            skipped.append(Skipped(name, "column is not numeric in every file"))
+            continue
+        x = np.concatenate([run.signals[name][:, 0] for run in runs])
+        why = _useless(name, x, values)
+        if why:
+            skipped.append(Skipped(name, why))
+            continue
+        values[name] = x
+        unit = runs[0].column_units.get(name) or ""
+        found[name] = bool(_TEMPERATURE.search(name)) or unit in _DEGREES
+    return found, skipped
+
+
+def _useless(name: str, x: Array, others: Mapping[str, Array]) -> str:
+    """Why a column can explain nothing, in words; else empty."""
+    if not np.all(np.isfinite(x)):
+        return f"column has {int(np.sum(~np.isfinite(x)))} values that are not finite"
+    if np.ptp(x) <= 1e-12 * np.abs(x).max(initial=1e-300):
+        return "column is constant"
+    for other, y in others.items():
+        if abs(np.corrcoef(x, y)[0, 1]) > 1 - 1e-10:
+            return f"column is a copy of {other} (up to scale and offset)"
+    return ""
+
+
+def _with_numbers(
+    effect: Effect, columns: tuple[tuple[str, str], ...], runs: Sequence[Run]
+) -> Effect:
+    """Numbers that come from the data: the channel's mean, the record's duration."""
+    names = {n for n, _ in effect.declarations}
+    values: dict[str, float] = {}
+    if "at" in names and columns:
+        x = np.concatenate([run.signals[columns[0][1]][:, 0] for run in runs])
+        values["at"] = float(f"{np.mean(x):.6g}")
+    if "duration" in names:
+        ends = [float(np.ptp(run.signals["t"])) for run in runs if "t" in run.signals]
+        values["duration"] = float(f"{max(ends, default=1.0) or 1.0:.6g}")
+    return effect.holding(**values) if values else effect
+
+
+def _refused(candidate: Candidate, model: Model, runs: Sequence[Run]) -> str:
+    """Why a candidate does not apply here, in words; else empty."""
+    if any(a.label == candidate.label for a in model.effects):
+        return "already in the model"
+    try:
+        extended = candidate.added_to(model)
+    except CasestError as error:
+        return str(error)
+    for s in extended.signals:
+        if any(s.name not in run.signals for run in runs):
+            return f"the data have no {s.name!r}"
+    return ""
+
+
+def typical_sizes(candidate: Candidate, parameters: Sequence[Parameter], model: Model) -> Any:
+    """A typical size of each of its unknowns (packed), or None where nobody knows one."""
+    if candidate.freed:
+        value = float(model[candidate.freed].array)
+        return np.array([0.01 * abs(value) or 1.0])
+    assert candidate.effect is not None
+    typical = dict(candidate.effect.typical)
+    sizes = [typical.get(p.name.rpartition(".")[2]) for p in parameters]
+    if any(size is None for size in sizes):
+        return None
+    return np.concatenate(
+        [np.full(p.shape.coordinates, s) for p, s in zip(parameters, sizes, strict=True)]
+    )

@@ -1,0 +1,118 @@
+"""Error on data that the fit never saw: every block predicted by a fit to the others."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from casest.data.run import Run
+from casest.data.splits import interleaved_blocks
+from casest.declaring.shapes import Array
+from casest.errors import DataError
+from casest.modelling.model import Model
+from casest.solve.trust_region import trust_region
+from casest.stack import Problem
+
+#: Fits of a cross-fit: each sees all blocks but one in FOLDS.
+FOLDS = 4
+#: Stretches that a continuous record is cut into.
+STRETCHES = 40
+
+
+@dataclass(frozen=True)
+class Folds:
+    """The fold of every sample of every run, and the first sample of each batch."""
+
+    of: tuple[NDArray[np.int_], ...]
+    batches: tuple[NDArray[np.int_], ...]
+    count: int
+
+
+def folded(runs: Sequence[Run], correlated_over: float = 1.0, seed: int = 0) -> Folds:
+    """Folds of interleaved stretches, poses or bursts; batches are those stretches.
+
+    Stretches are at least ten correlation times long. Raises DataError where there is nothing left
+    to hold out.
+    """
+    of, batches = [], []
+    for run in runs:
+        stretches = STRETCHES
+        if correlated_over > 1:
+            stretches = int(np.clip(len(run) / (10 * correlated_over), 2 * FOLDS, STRETCHES))
+        of.append(interleaved_blocks(run, stretches, FOLDS, seed))
+        change = np.flatnonzero(_changes(run, of[-1]))
+        batches.append(change)
+    return Folds(tuple(of), tuple(batches), FOLDS)
+
+
+def _changes(run: Run, fold: NDArray[np.int_]) -> NDArray[np.bool_]:
+    """Where a new batch begins: another fold, or another block."""
+    changed = np.ones(len(run), dtype=bool)
+    changed[1:] = (fold[1:] != fold[:-1]) | (run.block[1:] != run.block[:-1])
+    if (run.count > 1).any():
+        changed[:] = True
+    return changed
+
+
+def cross_fitted(
+    model: Model, runs: Sequence[Run], values: Mapping[str, Array], folds: Folds
+) -> tuple[Array, ...]:
+    """Residuals (N, m) of each run, each from a fit that did not see its block.
+
+    `values` are those of the fit to everything: where each fit begins. Effects on the noise count
+    through the weights of that fit.
+    """
+    whole = Problem(model, tuple(runs))
+    found = tuple(np.full((len(run), len(model.axes)), np.nan) for run in runs)
+    for k in range(folds.count):
+        seen = tuple(run.take(fold != k) for run, fold in zip(runs, folds.of, strict=True))
+        if any(len(run) == 0 for run in seen):
+            raise DataError("a run is too short to hold any of it out; record a longer one")
+        problem = _robust(Problem(model, seen), values)
+        fit = trust_region(
+            problem, problem.point(values), tolerance=1e-6 / max(problem.residual_count, 1)
+        )
+        point = whole.point(problem.values(fit.point))
+        for r, fold in enumerate(folds.of):
+            hidden = Problem(
+                model, tuple(run.take(f == k) for run, f in zip(runs, folds.of, strict=True))
+            )
+            found[r][fold == k] = hidden.residuals(point)[r]
+    return found
+
+
+def _robust(problem: Problem, values: Mapping[str, Array]) -> Problem:
+    from casest.noise import has_noise_effects, weights
+
+    if not has_noise_effects(problem.model):
+        return problem
+    return problem.with_weights(weights(problem, problem.point(values)))
+
+
+def batch_losses(residuals: Sequence[Array], folds: Folds, limit: float) -> Array:
+    """Mean squared residual of every batch, residuals beyond `limit` counted as it, (batches,)."""
+    losses = []
+    for residual, first in zip(residuals, folds.batches, strict=True):
+        squares = np.sum(np.minimum(residual**2, limit**2), axis=1)
+        sizes = np.diff(np.append(first, len(squares))) * residual.shape[1]
+        losses.append(np.add.reduceat(squares, first) / sizes)
+    return np.concatenate(losses)
+
+
+def batch_sizes(residuals: Sequence[Array], folds: Folds) -> Array:
+    """Number of residuals in every batch, (batches,)."""
+    return np.concatenate(
+        [
+            np.diff(np.append(first, len(r))) * r.shape[1]
+            for r, first in zip(residuals, folds.batches, strict=True)
+        ]
+    ).astype(float)
+
+
+def rms(residuals: Sequence[Array]) -> float:
+    """Root mean square of all residuals."""
+    count = sum(r.size for r in residuals)
+    return float(np.sqrt(sum(float(np.sum(r**2)) for r in residuals) / count))

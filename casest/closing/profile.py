@@ -1,0 +1,141 @@
+"""Where to look for effects that have a frequency, a moment or a level: a few values of each.
+
+The residual itself says where: its periodogram, its cumulative sum, the largest readings. What was
+looked through is counted as trials, and makes the p-value larger.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from casest.closing.candidates import Candidate
+from casest.closing.score import CLIPPED
+from casest.data.run import Run
+from casest.declaring.shapes import Array
+
+#: Lines of the periodogram, moments and levels that are tried.
+LINES, MOMENTS, LEVELS = 4, 3, (0.9, 0.95, 0.98, 0.995)
+#: Samples of the longest periodogram.
+LONGEST = 1 << 18
+
+
+def profiled(
+    found: Sequence[Candidate],
+    runs: Sequence[Run],
+    residuals: Sequence[Array],
+    readings: Sequence[Array] | None,
+    sigma: float,
+) -> list[Candidate]:
+    """Candidates with a profile replaced by some with its value held."""
+    expanded: list[Candidate] = []
+    clipped = [np.clip(r, -CLIPPED * sigma, CLIPPED * sigma) for r in residuals]
+    for candidate in found:
+        profile = dict(candidate.effect.profile) if candidate.effect else {}
+        if not profile:
+            expanded.append(candidate)
+            continue
+        assert candidate.effect is not None
+        ((name, kind),) = profile.items()
+        values, trials = _values(kind, runs, clipped, readings)
+        for value in values:
+            effect = candidate.effect.holding(**{name: float(f"{value:.9g}")})
+            expanded.append(replace(candidate, effect=effect, trials=trials))
+    return expanded
+
+
+def freed_again(candidate: Candidate, original: Candidate) -> Candidate:
+    """The candidate with its frequency unknown again, starting where the search found it."""
+    if candidate.effect is None or original.effect is None:
+        return candidate
+    profile = dict(original.effect.profile)
+    frequencies = [n for n, kind in profile.items() if kind == "frequency"]
+    if not frequencies:
+        return candidate
+    held = {n: float(d.array) for n, d in candidate.effect.declarations if n in frequencies}
+    return replace(candidate, effect=original.effect.starting(**held))
+
+
+def _values(
+    kind: str,
+    runs: Sequence[Run],
+    residuals: Sequence[Array],
+    readings: Sequence[Array] | None,
+) -> tuple[list[float], int]:
+    if kind == "frequency":
+        return _lines(runs, residuals)
+    if kind == "time":
+        return _moments(runs, residuals)
+    if readings is None:
+        return [], 1
+    size = np.abs(np.concatenate([r.ravel() for r in readings]))
+    return [float(np.quantile(size, q)) for q in LEVELS], len(LEVELS)
+
+
+def _lines(runs: Sequence[Run], residuals: Sequence[Array]) -> tuple[list[float], int]:
+    """Frequencies (rad/s) that stand out of their neighbourhood, of the longest run."""
+    run, r = max(zip(runs, residuals, strict=True), key=lambda pair: len(pair[0]))
+    if "t" not in run.signals or len(run) < 64:
+        return [], 1
+    t = run.signals["t"][:, 0]
+    step = float(np.median(np.diff(t)))
+    if not step > 0:
+        return [], 1
+    # On an even grid; gaps stay empty.
+    place = np.round((t - t[0]) / step).astype(int)
+    keep = (place >= 0) & (place < LONGEST)
+    length = int(place[keep].max()) + 1
+    power = np.zeros(length // 2 + 1)
+    for k in range(r.shape[1]):
+        even = np.zeros(length)
+        even[place[keep]] = r[keep, k]
+        power += np.abs(np.fft.rfft(even)) ** 2
+    power[:2] = 0
+    width = max(8, length // 200)
+    level = np.convolve(power, np.ones(2 * width + 1) / (2 * width + 1), "same")
+    ratio = power / np.maximum(level, 1e-300 + 1e-12 * power.max(initial=0.0))
+    best: list[int] = []
+    for k in np.argsort(-ratio * (power > 0)):
+        if len(best) == LINES:
+            break
+        if all(abs(int(k) - b) > 2 for b in best):
+            best.append(int(k))
+    return [2 * np.pi * _refined(power, k) / (length * step) for k in best], length // 2
+
+
+def _refined(power: Array, k: int) -> float:
+    """The maximum between the bins, from its neighbours (parabola of the logarithm)."""
+    if not 0 < k < len(power) - 1 or not np.all(power[k - 1 : k + 2] > 0):
+        return float(k)
+    a, b, c = np.log(power[k - 1 : k + 2])
+    bend = a - 2 * b + c
+    return k + 0.5 * (a - c) / bend if bend < 0 else float(k)
+
+
+def _moments(runs: Sequence[Run], residuals: Sequence[Array]) -> tuple[list[float], int]:
+    """Moments (s) at which the cumulative sum of the residual bends most."""
+    found: list[tuple[float, float]] = []
+    for run, r in zip(runs, residuals, strict=True):
+        if "t" not in run.signals or len(run) < 8:
+            continue
+        found += list(_bends(run.signals["t"][:, 0], r))
+    found.sort(reverse=True)
+    count = max((len(run) for run in runs), default=2)
+    return [when for _, when in found[:MOMENTS]], max(int(8 * np.log(max(count, 2))), 1)
+
+
+def _bends(t: Array, r: Array) -> Iterator[tuple[float, float]]:
+    n = len(t)
+    k = np.arange(1, n)
+    total = np.cumsum(r - r.mean(axis=0), axis=0)[:-1]
+    size = np.sum(total**2, axis=1) / (k * (n - k) / n)
+    edge = max(2, n // 50)
+    size[:edge] = size[-edge:] = 0
+    for _ in range(MOMENTS):
+        at = int(np.argmax(size))
+        if not size[at] > 0:
+            return
+        yield float(size[at]), float(0.5 * (t[at] + t[at + 1]))
+        size[max(0, at - n // 20) : at + n // 20] = 0

@@ -1,0 +1,123 @@
+"""What `casest close` prints: the verdict first, then the evidence."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from casest.closing.loop import Closing
+from casest.terminal import WIDTH, item, value_table
+
+#: Lists longer than this are left to result.json.
+SHOWN = 4
+
+
+def closing_text(closing: Closing, content: Mapping[str, Any], output: Path | None) -> str:
+    """Verdict, error before and after, effects, parameters, what stays invisible."""
+    blocks = [
+        _head(closing, content),
+        "\n".join(_errors(content)),
+        "\n".join(_effects(content)),
+        "\n".join(value_table(closing.after)),
+        "\n".join(_moved(content)),
+        "\n".join(_invisible(content)),
+        "\n".join(_unexplained(content)),
+        "\n".join(_notes(content)),
+    ]
+    if output is not None:
+        blocks.append(
+            f"Written: {output}/result.json, {output}/residuals.csv. "
+            f"Next: casest apply {output} DATA"
+        )
+    else:
+        blocks.append("Next: add -o out to keep the result, then `casest apply out DATA`.")
+    return "\n\n".join(b for b in blocks if b)
+
+
+def sentence(content: Mapping[str, Any]) -> str:
+    """The verdict in one sentence."""
+    names = [e["name"] + (f" ({e['column']})" if e["column"] else "") for e in content["effects"]]
+    if content["verdict"] is None:
+        return "no trustworthy estimate"
+    if content["verdict"] == "adequate":
+        return "adequate: nothing that these data can show is missing" + (
+            f"; {', '.join(names)} belong to the noise" if names else ""
+        )
+    if content["verdict"] == "extended":
+        return f"extended: {', '.join(names)} was missing; what is left is noise"
+    found = f" beside {', '.join(names)}" if names else ""
+    return f"unexplained: a misfit remains{found} that no candidate explains"
+
+
+def _head(closing: Closing, content: Mapping[str, Any]) -> str:
+    files = ", ".join(Path(name).name for name in content["data"])
+    return textwrap.fill(f"{closing.before.model.name} on {files}: {sentence(content)}", WIDTH)
+
+
+def _errors(content: Mapping[str, Any]) -> Iterator[str]:
+    unit = content["noise"]["unit"]
+    unit = "" if unit == "1" else f" {unit}"
+    before, after = content["before"], content["after"]
+    yield f"  residual rms{unit:<12} {'before':>12} {'after':>12}"
+    rows = [("fit", "rmse_fit"), ("held-out", "rmse_holdout")]
+    for word, key in rows:
+        yield f"    {word:<22} {before[key]:>12.5g} {after[key]:>12.5g}"
+    axes = before["rmse_holdout_by_axis"]
+    if len(axes) > 1:
+        for axis, value in axes.items():
+            there = after["rmse_holdout_by_axis"][axis]
+            yield f"    held-out, {axis:<12} {value:>12.5g} {there:>12.5g}"
+
+
+def _effects(content: Mapping[str, Any]) -> Iterator[str]:
+    if content["effects"]:
+        yield "Added:"
+    for e in content["effects"]:
+        column = f" of column {e['column']}" if e["column"] else ""
+        yield item(f"{e['name']} on {e['on']}{column} (p = {e['p_value']:.1g}): {e['formula']}")
+        if e["indistinguishable_from"]:
+            yield item(f"not told apart from {', '.join(e['indistinguishable_from'])}")
+            yield from (item(words) for words in e["would_separate"][:SHOWN])
+
+
+def _moved(content: Mapping[str, Any]) -> Iterator[str]:
+    if not content["effects"]:
+        return
+    moved = {n: _largest(z) for n, z in content["moved"].items()}
+    far = sorted(((z, n) for n, z in moved.items() if z is not None and z >= 1), reverse=True)
+    if far:
+        words = ", ".join(f"{n} by {z:.1f}" for z, n in far)
+        yield item(f"Moved by the addition, in standard deviations before it: {words}")
+
+
+def _largest(z: Any) -> float | None:
+    if isinstance(z, list):
+        found = [x for x in map(_largest, z) if x is not None]
+        return max(found, default=None)
+    return None if z is None else abs(z)
+
+
+def _invisible(content: Mapping[str, Any]) -> Iterator[str]:
+    hidden = content["invisible"]
+    if hidden:
+        yield "Could be wrong without showing (shift by a typical size):"
+    for i in hidden[:SHOWN]:
+        moves = ", ".join(f"{n} by {v:.2g}" for n, v in i["would_move"].items())
+        size = ", ".join(f"{n} = {v:g}" for n, v in i["typical"].items())
+        yield item(f"{i['name']} ({size}): {moves}; shown by {i['shown_by']}")
+    if len(hidden) > SHOWN:
+        yield f"  - and {len(hidden) - SHOWN} more, in result.json"
+
+
+def _unexplained(content: Mapping[str, Any]) -> Iterator[str]:
+    left = content["unexplained"]
+    if content["verdict"] == "unexplained":
+        yield item(f"Unexplained: {left['fraction']:.0%} of the held-out variance, {left['where']}")
+
+
+def _notes(content: Mapping[str, Any]) -> Iterator[str]:
+    yield from (item(note) for note in content["notes"])
+    for refused in content["refused"][:SHOWN]:
+        yield item(f"{refused['name']} was not added: {refused['reason']}")

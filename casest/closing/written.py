@@ -1,0 +1,204 @@
+"""`result.json` and `residuals.csv` of a closed loop, in the fixed form."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from casest.closing.adequacy import Misfit, misfit
+from casest.closing.crossfit import rms
+from casest.closing.loop import Closing, Found
+from casest.closing.summary import detectable, invisible
+from casest.declaring.shapes import Array
+from casest.estimate import Estimate
+from casest.modelling.effect import Attached
+from casest.naming import unit_table
+from casest.result import calibration_result, parameter_table, plain
+from casest.stack import Problem
+
+
+def closing_result(
+    closing: Closing,
+    *,
+    model_name: str,
+    data: Sequence[str],
+    command: str = "",
+    held_out: tuple[Sequence[Array], Sequence[Array]] | None = None,
+) -> dict[str, Any]:
+    """The content of `result.json` for `close`: see the design, 10.
+
+    `held_out` are residuals before and after on a record of its own; else the cross-fitted ones.
+    """
+    left = misfit(closing)
+    common = calibration_result(closing.after, model_name=model_name, data=data, command=command)
+    estimate = common.pop("estimate")
+    before, after = held_out or (closing.before_held_out, closing.after_held_out)
+    sections = {
+        "before": _section(closing.before, closing, before),
+        "after": _section(closing.after, closing, after) | {"correlation": estimate["correlation"]},
+    }
+    first = list(common)
+    place = first.index("noise") + 1
+    ordered = {k: common[k] for k in first[:place]} | sections
+    ordered |= {k: common[k] for k in first[place:]}
+    ordered["trusted"] = closing.after.certificate.trusted
+    ordered["verdict"] = verdict(closing, left) if ordered["trusted"] else None
+    ordered["noise"] |= left.noise
+    ordered["effects"] = [_effect(f, closing) for f in closing.effects]
+    ordered["invisible"] = [
+        {
+            "name": i.name,
+            "column": i.column,
+            "typical": {k: plain(v) for k, v in i.typical.items()},
+            "would_move": {k: plain(v) for k, v in i.would_move.items()},
+            "share_left": plain(i.share),
+            "shown_by": i.shown_by,
+        }
+        for i in invisible(closing)
+    ]
+    ordered["unexplained"] = {"fraction": plain(left.fraction), "where": left.where}
+    ordered["moved"] = _moved(closing)
+    ordered["smallest_detectable"] = [
+        {"name": d.name, "parameter": d.parameter, "size": plain(d.size), "unit": d.unit}
+        for d in detectable(closing)
+    ]
+    ordered["refused"] = [{"name": s.name, "reason": s.reason} for s in closing.refused]
+    ordered["not_tried"] = [{"name": s.name, "reason": s.reason} for s in closing.skipped]
+    return ordered
+
+
+def verdict(closing: Closing, left: Misfit) -> str:
+    """adequate, extended or unexplained."""
+    if left.significant:
+        return "unexplained"
+    of_noise = {"outliers", "bias_wander"}
+    named = {f.candidate.name for f in closing.effects}
+    return "extended" if named - of_noise else "adequate"
+
+
+def _section(estimate: Estimate, closing: Closing, held_out: Sequence[Array]) -> dict[str, Any]:
+    problem = Problem(estimate.model, closing.runs)
+    residuals = problem.residuals(estimate.point)
+    axes = estimate.model.axes
+    by_axis = {axis: plain(rms([r[:, [k]] for r in held_out])) for k, axis in enumerate(axes)}
+    certificate = estimate.certificate
+    table = unit_table(estimate.model, closing.runs)
+    return {
+        "rmse_fit": plain(rms(residuals)),
+        "rmse_holdout": plain(rms(held_out)),
+        "rmse_holdout_by_axis": by_axis,
+        "certificate": {"trusted": certificate.trusted, "reasons": list(certificate.reasons)},
+        "parameters": parameter_table(estimate, table),
+    }
+
+
+def _effect(found: Found, closing: Closing) -> dict[str, Any]:
+    table = unit_table(closing.after.model, closing.runs)
+    everything = parameter_table(closing.after, table)
+    attached = _attached(found, closing)
+    return {
+        "name": found.candidate.name,
+        "on": found.candidate.on,
+        "column": found.candidate.column,
+        "parameters": {
+            n.removeprefix(found.candidate.label + "."): everything[n] for n in found.names
+        },
+        "p_value": plain(found.p_value),
+        "holdout_gain": plain(found.gain),
+        "formula": _formula(found, attached),
+        "indistinguishable_from": list(found.indistinguishable_from),
+        "would_separate": _separating(found, closing),
+        "columns": dict(found.candidate.columns),
+        "file": _file(attached),
+    }
+
+
+def _attached(found: Found, closing: Closing) -> Attached | None:
+    labels = {a.label: a for a in closing.after.model.effects}
+    return labels.get(found.candidate.label)
+
+
+def _file(attached: Attached | None) -> str:
+    if attached is None:
+        return ""
+    return str(attached.effect.function.__code__.co_filename)
+
+
+def _formula(found: Found, attached: Attached | None) -> str:
+    """The last line of the effect's body, as declared."""
+    if attached is None:
+        return f"{found.candidate.freed} is an unknown"
+    effect = attached.effect
+    if effect.formula:
+        return effect.formula
+    lines = equations_of(attached)
+    return " ; ".join(line.strip() for line in lines if line.strip())
+
+
+def equations_of(attached: Attached) -> list[str]:
+    """Source lines of an effect."""
+    from casest.modelling.tracing import body
+
+    function = getattr(attached.effect.function, "__wrapped__", attached.effect.function)
+    try:
+        return body(function)
+    except (OSError, TypeError):
+        return [attached.effect.doc.partition("\n")[0]]
+
+
+def _separating(found: Found, closing: Closing) -> list[str]:
+    """Measurements that would separate the effect from those that explain the data as well."""
+    by_label = {s.candidate.label: s.candidate for s in closing.first}
+    said = []
+    for label in found.indistinguishable_from:
+        other = by_label.get(label)
+        if other is not None and other.effect is not None and other.effect.shown_by:
+            said.append(f"{label}: {other.effect.shown_by}")
+    return said
+
+
+def _moved(closing: Closing) -> dict[str, Any]:
+    """How far each declared parameter moved, in its own standard deviations before."""
+    moved = {}
+    for name, value in closing.before.values.items():
+        if name in closing.after.values:
+            with np.errstate(all="ignore"):
+                z = (closing.after.values[name] - value) / closing.before.std[name]
+            moved[name] = plain(np.where(np.isfinite(z), z, np.nan))
+    return moved
+
+
+def residual_rows(
+    closing: Closing,
+    held_out: tuple[Sequence[Any], Sequence[Array], Sequence[Array]] | None = None,
+) -> str:
+    """`residuals.csv`: `fit` rows from the fit to everything, `holdout` rows cross-fitted.
+
+    `held_out`: runs, residuals before and after of a record of its own, in place of the latter.
+    """
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["file", "run", "row", "t", "axis", "split", "before", "after"])
+    axes = closing.before.model.axes
+    fits = [
+        Problem(e.model, closing.runs).residuals(e.point) for e in (closing.before, closing.after)
+    ]
+    hidden = held_out or (closing.runs, closing.before_held_out, closing.after_held_out)
+    for split, runs, before, after in (("fit", closing.runs, *fits), ("holdout", *hidden)):
+        for run, b, a in zip(runs, before, after, strict=True):
+            for k in range(len(run)):
+                t = "" if run.time is None else repr(float(run.time[k]))
+                for j, axis in enumerate(axes):
+                    pair = repr(float(b[k, j])), repr(float(a[k, j]))
+                    row = [run.file, run.name, int(run.rows[k]), t, axis, split, *pair]
+                    writer.writerow(row)
+    return text.getvalue()
+
+
+def formula_lines(content: Mapping[str, Any]) -> list[str]:
+    """A line per effect for the terminal."""
+    return [f"{e['name']}: {e['formula']}" for e in content["effects"]]

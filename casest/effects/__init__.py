@@ -1,0 +1,68 @@
+"""The catalogue: physical effects that a model may lack, each a few lines with its source.
+
+An effect on "input" applies to the quantity that a model declares as `corrected`, one on "output"
+to what it predicts (an implicit model: to what it corrects); others to the quantity or signal of
+that name. So a user's own model gets every effect whose quantity it has.
+"""
+
+from __future__ import annotations
+
+from casest.effects.bias import (
+    bias_drift,
+    bias_step,
+    channel_bias,
+    channel_gain,
+    reference_drift,
+    temperature_bias,
+    temperature_gain,
+)
+from casest.effects.motion import (
+    axis_wobble,
+    imbalance,
+    lever_arm,
+    speed_polynomial,
+    vibration,
+)
+from casest.effects.noise import outliers
+from casest.effects.reference import table_angle
+from casest.effects.response import (
+    cross_axis,
+    cross_quadratic,
+    cubic,
+    quadratic,
+    saturation,
+    signed_cubic,
+    signed_quadratic,
+)
+from casest.effects.timing import axis_delay, hysteresis, low_pass, time_delay
+from casest.modelling.effect import Effect
+
+CATALOGUE: tuple[Effect, ...] = (
+    cross_axis,
+    quadratic,
+    signed_quadratic,
+    cubic,
+    signed_cubic,
+    cross_quadratic,
+    bias_drift,
+    bias_step,
+    temperature_bias,
+    temperature_gain,
+    channel_bias,
+    channel_gain,
+    time_delay,
+    axis_delay,
+    low_pass,
+    saturation,
+    vibration,
+    lever_arm,
+    imbalance,
+    axis_wobble,
+    speed_polynomial,
+    hysteresis,
+    table_angle,
+    reference_drift,
+    outliers,
+)
+
+__all__ = ["CATALOGUE", *(e.name for e in CATALOGUE)]

@@ -1,0 +1,21 @@
+"""What the sensor is compared with: the table's angles."""
+
+from __future__ import annotations
+
+from casest.declaring.physics import SX, atan2, cos, horzcat, sin, vertcat
+from casest.declaring.symbols import param
+from casest.modelling.effect import effect
+
+
+@effect(
+    on="attitude",
+    typical={"cosine": 1e-4, "sine": 1e-4},
+    shown_by="the same attitude reached by other angles of the table",
+)
+def table_angle(attitude: SX, *, cosine: SX = param("rad"), sine: SX = param("rad")) -> SX:
+    """The table's outer angle is wrong by a first harmonic: an eccentric encoder."""
+    yaw = atan2(attitude[1, 0], attitude[0, 0])
+    off = cosine * cos(yaw) + sine * sin(yaw)
+    c, s = cos(off), sin(off)
+    turn = vertcat(horzcat(c, -s, 0), horzcat(s, c, 0), horzcat(0, 0, 1))
+    return turn @ attitude

@@ -1,0 +1,82 @@
+"""How a sensor answers: cross-axis sensitivity, nonlinearity, saturation."""
+
+from __future__ import annotations
+
+from casest.declaring.physics import SX, fabs, fmax, sign, vertcat
+from casest.declaring.shapes import each
+from casest.declaring.symbols import param
+from casest.modelling.effect import effect
+
+
+@effect(
+    on="input",
+    typical={"k": 0.01},
+    shown_by="a second mounting or tilt (wheel), poses that cover the sphere (norm)",
+)
+def cross_axis(u: SX, *, k: SX = param(3)) -> SX:
+    """Axes that are not orthogonal: y sees k[0] of x; z sees k[1] of x and k[2] of y.
+
+    Three terms, because a rotation is the mounting's (Burkhard et al., eq. 1: M lower triangular).
+    """
+    return vertcat(u[0], u[1] + k[0] * u[0], u[2] + k[1] * u[0] + k[2] * u[1])
+
+
+@effect(
+    on="input",
+    typical={"k": 2e-4},
+    shown_by="inputs of several sizes and both signs on each axis",
+)
+def quadratic(u: SX, *, k: SX = param(each, "1/[u]")) -> SX:
+    """Second-order response of each axis (Batista, eq. 2)."""
+    return u + k * u**2
+
+
+@effect(
+    on="input",
+    typical={"k": 2e-4},
+    shown_by="inputs of several sizes and both signs on each axis",
+)
+def signed_quadratic(u: SX, *, k: SX = param(each, "1/[u]")) -> SX:
+    """Odd second-order response k·u·|u| (IEEE Std 1293, odd quadratic)."""
+    return u + k * u * fabs(u)
+
+
+@effect(
+    on="input",
+    typical={"k": 2e-5},
+    shown_by="inputs up to the end of the range, of both signs",
+)
+def cubic(u: SX, *, k: SX = param(each, "1/([u])^2")) -> SX:
+    """Third-order response of each axis (IEEE Std 1293, K3)."""
+    return u + k * u**3
+
+
+@effect(
+    on="input",
+    typical={"k": 2e-5},
+    shown_by="inputs up to the end of the range, of both signs",
+)
+def signed_cubic(u: SX, *, k: SX = param(each, "1/([u])^2")) -> SX:
+    """Even third-order response k·|u|³."""
+    return u + k * fabs(u) ** 3
+
+
+@effect(
+    on="input",
+    typical={"k": 2e-4},
+    shown_by="poses between the axes: two axes loaded at once",
+)
+def cross_quadratic(u: SX, *, k: SX = param(3, "1/[u]")) -> SX:
+    """Products of the two other axes in each axis (IEEE Std 1293, cross-coupling)."""
+    return u + vertcat(k[0] * u[1] * u[2], k[1] * u[0] * u[2], k[2] * u[0] * u[1])
+
+
+@effect(
+    on="output",
+    typical={"share": 1.0},
+    profile={"level": "level"},
+    shown_by="readings that reach the end of the range",
+)
+def saturation(y: SX, *, share: SX = param(each), level: SX = param("[y]")) -> SX:
+    """Readings beyond ±level are cut off (share 1), or compressed (share below 1)."""
+    return y - share * sign(y) * fmax(fabs(y) - level, 0)
