@@ -159,11 +159,13 @@ def output_options(command: Callable[..., Any]) -> Callable[..., Any]:
 @commands.command("list")
 @click.option("--json", "as_json", is_flag=True, help="For programs.")
 def list_command(as_json: bool) -> None:
-    """Shipped problems, their signals, unknowns, constants and estimators."""
+    """Shipped problems with their symbols and estimators, and the catalogue of effects."""
+    from casest.effects import CATALOGUE
     from casest.problem import SHIPPED, find_model
     from casest.terminal import listing
 
-    click.echo(listing([(name, find_model(name)) for name in SHIPPED], as_json=as_json))
+    models = [(name, find_model(name)) for name in SHIPPED]
+    click.echo(listing(models, CATALOGUE, as_json=as_json))
 
 
 @commands.command()
@@ -240,7 +242,7 @@ def closing(model_name: str, data: Sequence[str], options: Options, command: str
             catalogue=(*CATALOGUE, *own),
             start=start,
             seed=options["seed"],
-            say=lambda words: click.echo(f"casest: {words}", err=True),
+            say=progress,
         )
     except NotTrusted as error:
         return refused(error, model_name, data, options, command)
@@ -257,6 +259,12 @@ def closing(model_name: str, data: Sequence[str], options: Options, command: str
     else:
         click.echo(text.closing_text(found, content, options["output"]))
     return 0
+
+
+def progress(words: str) -> None:
+    """Say what is going on, where somebody watches."""
+    if sys.stderr.isatty():
+        click.echo(f"casest: {words}", err=True)
 
 
 def refused(
@@ -285,36 +293,26 @@ def refused(
     help="Folder for result.json and residuals.csv.",
 )
 def demo(output: Path | None) -> int:
-    """Calibrate a shipped simulated record, and compare the answer with the truth."""
+    """Close the loop on a shipped record with an effect that its model lacks."""
     from casest import demonstration
 
-    record = demonstration.RECORD
+    record = demonstration.WHEEL
     options: Options = {
-        "effects": (),
-        "constants": ("norm=9.80665 m/s^2",),
-        "free": (),
-        "fix": (),
-        "shared": (),
-        "per_run": (),
-        "columns": ("v=ax,ay,az",),
-        "units": (),
-        "scales": (),
-        "rate": 50.0,
-        "at_rest": True,
+        **dict.fromkeys(
+            ("effects", "constants", "free", "fix", "shared", "per_run", "columns", "units"), ()
+        ),
+        **dict.fromkeys(("scales", "holdout", "starts"), ()),
+        "rate": None,
+        "at_rest": False,
         "time_zero": "first",
-        "holdout": (),
         "solver": "ipopt",
-        "starts": (),
         "seed": 0,
         "output": output or Path("out"),
         "as_json": False,
     }
-    words = (
-        f"casest calibrate norm-triangular {record} \\\n    --columns v=ax,ay,az --rate 50 "
-        f"--at-rest --set 'norm=9.80665 m/s^2' -o {options['output']}"
-    )
+    words = f"casest close wheel {record} -o {options['output']}"
     click.echo(f"$ {words}\n")
-    code = calibration("norm-triangular", (str(record),), options, words)
+    code = closing("wheel", (str(record),), options, words)
     click.echo("\n" + demonstration.comparison(options["output"]))
     return code
 

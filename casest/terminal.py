@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from casest.estimate import Estimate
+from casest.modelling.effect import Effect
 from casest.modelling.model import Model
 from casest.naming import entry_units, unit_table
 from casest.solve.strategy import SOLVERS
@@ -18,12 +19,17 @@ from casest.solve.strategy import SOLVERS
 WIDTH = 80
 
 
-def listing(models: Sequence[tuple[str, Model]], *, as_json: bool = False) -> str:
-    """Shipped problems, a paragraph each."""
+def listing(
+    models: Sequence[tuple[str, Model]], effects: Sequence[Effect] = (), *, as_json: bool = False
+) -> str:
+    """Shipped problems, a paragraph each, and the catalogue of effects, a line each."""
     if as_json:
-        return json.dumps(
-            {"problems": {name: _summary(m) for name, m in models}, "effects": []}, indent=2
-        )
+        problems = {name: _summary(m) for name, m in models}
+        catalogue = [
+            {"name": e.name, "about": _first_line(e.doc), "on": e.on, "formula": e.formula}
+            for e in effects
+        ]
+        return json.dumps({"problems": problems, "effects": catalogue}, indent=2)
     lines = ["Problems (casest calibrate NAME DATA):"]
     for name, m in models:
         about = (m.function.__doc__ or "").strip().splitlines()[0]
@@ -37,7 +43,18 @@ def listing(models: Sequence[tuple[str, Model]], *, as_json: bool = False) -> st
         lines.append(
             f"      {'solvers:':<11} {', '.join([*SOLVERS, *(n for n, _ in m.estimators)])}"
         )
-    return "\n".join([*lines, "", "Your own: casest calibrate file.py[:name] DATA"])
+    lines += ["", "Your own: casest calibrate file.py[:name] DATA"]
+    if effects:
+        lines += ["", "Effects that `casest close` looks for:"]
+    for e in effects:
+        lines.append(
+            textwrap.fill(f"  {e.name}: {_first_line(e.doc)}", WIDTH, subsequent_indent=" " * 6)
+        )
+    return "\n".join(lines)
+
+
+def _first_line(text: str) -> str:
+    return text.partition("\n")[0]
 
 
 def _summary(m: Model) -> dict[str, Any]:

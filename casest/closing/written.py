@@ -129,25 +129,13 @@ def _file(attached: Attached | None) -> str:
 
 
 def _formula(found: Found, attached: Attached | None) -> str:
-    """The last line of the effect's body, as declared."""
+    """What the effect does, with the name of its column."""
     if attached is None:
         return f"{found.candidate.freed} is an unknown"
-    effect = attached.effect
-    if effect.formula:
-        return effect.formula
-    lines = equations_of(attached)
-    return " ; ".join(line.strip() for line in lines if line.strip())
-
-
-def equations_of(attached: Attached) -> list[str]:
-    """Source lines of an effect."""
-    from casest.modelling.tracing import body
-
-    function = getattr(attached.effect.function, "__wrapped__", attached.effect.function)
-    try:
-        return body(function)
-    except (OSError, TypeError):
-        return [attached.effect.doc.partition("\n")[0]]
+    formula = attached.effect.formula or attached.effect.doc.partition("\n")[0]
+    for name, column in attached.columns:
+        formula = formula.replace(name, column)
+    return formula
 
 
 def _separating(found: Found, closing: Closing) -> list[str]:

@@ -12,6 +12,7 @@ from casest.modelling.effect import effect
     on="output",
     typical={"k": 1e-4},
     shown_by="the first pose repeated at the end of the record",
+    formula="y + k·t",
 )
 def bias_drift(y: SX, t: SX = signal("s"), *, k: SX = param(each, "[y]/s")) -> SX:
     """An offset that drifts linearly in time."""
@@ -23,6 +24,7 @@ def bias_drift(y: SX, t: SX = signal("s"), *, k: SX = param(each, "[y]/s")) -> S
     typical={"k": 0.02},
     profile={"when": "time"},
     shown_by="the same pose before and after the event",
+    formula="y + k from t = when on",
 )
 def bias_step(
     y: SX, t: SX = signal("s"), *, k: SX = param(each, "[y]"), when: SX = param("s")
@@ -35,6 +37,7 @@ def bias_step(
     on="output",
     typical={"k": 2e-3},
     shown_by="the same pose at two temperatures, not rising with time alone",
+    formula="y + k·(channel − at)",
 )
 def temperature_bias(
     y: SX, channel: SX, *, k: SX = param(each, "[y]/[channel]"), at: SX = constant(0.0)
@@ -47,6 +50,7 @@ def temperature_bias(
     on="input",
     typical={"k": 3e-4},
     shown_by="large inputs at two temperatures, not rising with time alone",
+    formula="u·(1 + k·(channel − at))",
 )
 def temperature_gain(
     u: SX, channel: SX, *, k: SX = param(each, "1/[channel]"), at: SX = constant(0.0)
@@ -55,7 +59,11 @@ def temperature_gain(
     return u * (1 + k * (channel - at))
 
 
-@effect(on="output", shown_by="the same input at two values of the channel")
+@effect(
+    on="output",
+    shown_by="the same input at two values of the channel",
+    formula="y + k·(channel − at)",
+)
 def channel_bias(
     y: SX, channel: SX, *, k: SX = param(each, "[y]/[channel]"), at: SX = constant(0.0)
 ) -> SX:
@@ -63,7 +71,11 @@ def channel_bias(
     return y + k * (channel - at)
 
 
-@effect(on="input", shown_by="large inputs at two values of the channel")
+@effect(
+    on="input",
+    shown_by="large inputs at two values of the channel",
+    formula="u·(1 + k·(channel − at))",
+)
 def channel_gain(
     u: SX, channel: SX, *, k: SX = param(each, "1/[channel]"), at: SX = constant(0.0)
 ) -> SX:
@@ -75,6 +87,7 @@ def channel_gain(
     on="input",
     typical={"k": 1e-6},
     shown_by="the same pose at the beginning and at the end, for large and small inputs",
+    formula="u·(1 + k·t)",
 )
 def reference_drift(u: SX, t: SX = signal("s"), *, k: SX = param("1/s")) -> SX:
     """The known reference (field, gravity, table) changes size with time."""

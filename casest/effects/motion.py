@@ -12,6 +12,7 @@ from casest.modelling.effect import effect
     on="angle",
     typical={"sine": 0.05, "cosine": 0.05},
     shown_by="a slow spin: the unevenness grows with the inverse square of the speed",
+    formula="angle + (sine·sin(angle) + cosine·cos(angle))/rate²",
 )
 def imbalance(
     angle: SX,
@@ -35,6 +36,7 @@ def imbalance(
     on="input",
     typical={"cosine": 0.02, "sine": 0.02},
     shown_by="several turns at a speed that changes, so that it is no vibration",
+    formula="u + cosine·cos(2·angle) + sine·sin(2·angle)",
 )
 def axis_wobble(
     u: SX, angle: SX, *, cosine: SX = param(each, "[u]"), sine: SX = param(each, "[u]")
@@ -47,6 +49,7 @@ def axis_wobble(
     on="angle",
     typical={"c": 0.05},
     shown_by="a record short enough for the declared speed law",
+    formula="angle + Σ c[k]·(t/duration)^(k+5)",
 )
 def speed_polynomial(
     angle: SX,
@@ -64,6 +67,7 @@ def speed_polynomial(
     on="input",
     typical={"arm": 2e-3},
     shown_by="two speeds: it grows with the square of the rate",
+    formula="u + arm·rate²",
 )
 def lever_arm(u: SX, angle: SX, t: SX = signal("s"), *, arm: SX = param(each, "m")) -> SX:
     """Each axis senses at a place of its own, `arm` away along it: rate²·arm."""
@@ -75,6 +79,7 @@ def lever_arm(u: SX, angle: SX, t: SX = signal("s"), *, arm: SX = param(each, "m
     typical={"sine": 0.02, "cosine": 0.02},
     profile={"frequency": "frequency"},
     shown_by="a record with the machine beside it switched off",
+    formula="y + sine·sin(frequency·t) + cosine·cos(frequency·t)",
 )
 def vibration(
     y: SX,

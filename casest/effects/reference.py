@@ -11,6 +11,7 @@ from casest.modelling.effect import effect
     on="attitude",
     typical={"cosine": 1e-4, "sine": 1e-4},
     shown_by="the same attitude reached by other angles of the table",
+    formula="turned about the outer axis by cosine·cos(yaw) + sine·sin(yaw)",
 )
 def table_angle(attitude: SX, *, cosine: SX = param("rad"), sine: SX = param("rad")) -> SX:
     """The table's outer angle is wrong by a first harmonic: an eccentric encoder."""

@@ -12,6 +12,7 @@ from casest.modelling.effect import effect
     on="input",
     typical={"k": 0.01},
     shown_by="a second mounting or tilt (wheel), poses that cover the sphere (norm)",
+    formula="y + k[0]·x; z + k[1]·x + k[2]·y",
 )
 def cross_axis(u: SX, *, k: SX = param(3)) -> SX:
     """Axes that are not orthogonal: y sees k[0] of x; z sees k[1] of x and k[2] of y.
@@ -25,6 +26,7 @@ def cross_axis(u: SX, *, k: SX = param(3)) -> SX:
     on="input",
     typical={"k": 2e-4},
     shown_by="inputs of several sizes and both signs on each axis",
+    formula="u + k·u²",
 )
 def quadratic(u: SX, *, k: SX = param(each, "1/[u]")) -> SX:
     """Second-order response of each axis (Batista, eq. 2)."""
@@ -35,6 +37,7 @@ def quadratic(u: SX, *, k: SX = param(each, "1/[u]")) -> SX:
     on="input",
     typical={"k": 2e-4},
     shown_by="inputs of several sizes and both signs on each axis",
+    formula="u + k·u·|u|",
 )
 def signed_quadratic(u: SX, *, k: SX = param(each, "1/[u]")) -> SX:
     """Odd second-order response k·u·|u| (IEEE Std 1293, odd quadratic)."""
@@ -45,6 +48,7 @@ def signed_quadratic(u: SX, *, k: SX = param(each, "1/[u]")) -> SX:
     on="input",
     typical={"k": 2e-5},
     shown_by="inputs up to the end of the range, of both signs",
+    formula="u + k·u³",
 )
 def cubic(u: SX, *, k: SX = param(each, "1/([u])^2")) -> SX:
     """Third-order response of each axis (IEEE Std 1293, K3)."""
@@ -55,6 +59,7 @@ def cubic(u: SX, *, k: SX = param(each, "1/([u])^2")) -> SX:
     on="input",
     typical={"k": 2e-5},
     shown_by="inputs up to the end of the range, of both signs",
+    formula="u + k·|u|³",
 )
 def signed_cubic(u: SX, *, k: SX = param(each, "1/([u])^2")) -> SX:
     """Even third-order response k·|u|³."""
@@ -65,6 +70,7 @@ def signed_cubic(u: SX, *, k: SX = param(each, "1/([u])^2")) -> SX:
     on="input",
     typical={"k": 2e-4},
     shown_by="poses between the axes: two axes loaded at once",
+    formula="x + k[0]·y·z; y + k[1]·x·z; z + k[2]·x·y",
 )
 def cross_quadratic(u: SX, *, k: SX = param(3, "1/[u]")) -> SX:
     """Products of the two other axes in each axis (IEEE Std 1293, cross-coupling)."""
@@ -76,6 +82,7 @@ def cross_quadratic(u: SX, *, k: SX = param(3, "1/[u]")) -> SX:
     typical={"share": 1.0},
     profile={"level": "level"},
     shown_by="readings that reach the end of the range",
+    formula="y − share·sign(y)·max(|y| − level, 0)",
 )
 def saturation(y: SX, *, share: SX = param(each), level: SX = param("[y]")) -> SX:
     """Readings beyond ±level are cut off (share 1), or compressed (share below 1)."""

@@ -12,6 +12,7 @@ from casest.modelling.effect import effect
     on="t",
     typical={"delay": 5e-3},
     shown_by="an independent mark of the time (a knock seen by two sensors)",
+    formula="t − delay",
 )
 def time_delay(t: SX, *, delay: SX = param("s")) -> SX:
     """All readings are stamped late by `delay`."""
@@ -22,6 +23,7 @@ def time_delay(t: SX, *, delay: SX = param("s")) -> SX:
     on="output",
     typical={"delay": 2e-3},
     shown_by="motion that changes quickly, with axes to compare",
+    formula="y(t − delay)",
 )
 def axis_delay(y: SX, t: SX = signal("s"), *, delay: SX = param(each, "s")) -> SX:
     """Each axis is read late by its own delay (Taylor series to second order)."""
@@ -33,6 +35,7 @@ def axis_delay(y: SX, t: SX = signal("s"), *, delay: SX = param(each, "s")) -> S
     on="output",
     typical={"tau": 5e-3},
     shown_by="the same motion at two speeds: a lag shrinks the faster one, a delay does not",
+    formula="y − tau·dy/dt + tau²·d²y/dt²",
 )
 def low_pass(y: SX, t: SX = signal("s"), *, tau: SX = param("s")) -> SX:
     """A first-order filter with time constant tau on all axes (series to second order)."""
@@ -44,6 +47,7 @@ def low_pass(y: SX, t: SX = signal("s"), *, tau: SX = param("s")) -> SX:
     on="output",
     typical={"k": 0.02},
     shown_by="the same input approached from above and from below",
+    formula="y − k·sign(dy/dt)",
 )
 def hysteresis(y: SX, t: SX = signal("s"), *, k: SX = param(each, "[y]")) -> SX:
     """A reading that lags behind by k, whichever way it moves."""

@@ -79,6 +79,7 @@ def effect(
     typical: Mapping[str, float] | None = None,
     profile: Mapping[str, str] | None = None,
     shown_by: str = "",
+    formula: str = "",
 ) -> Callable[[Callable[..., Any]], Effect]:
     """Declare an effect: first argument the value acted on, further ones signals or columns.
 
@@ -111,6 +112,7 @@ def effect(
             tuple((typical or {}).items()),
             tuple((profile or {}).items()),
             shown_by,
+            formula,
         )
 
     return declare
