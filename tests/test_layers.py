@@ -27,7 +27,7 @@ FLOORS = [
     ["casest.solve"],
     ["casest.estimate", "casest.naming", "casest.apply"],
     ["casest.result", "casest.problem", "casest.earth", "casest.effects"],
-    ["casest.closing"],
+    ["casest.closing", "casest.dynamics"],
     ["casest.values", "casest.applying", "casest.demonstration"],
     ["casest.terminal"],
     ["casest.closing.text"],

@@ -1,0 +1,295 @@
+"""Moving estimators, declared like sensors: states, rates, what is measured, noise intensities."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from casest import units
+from casest.declaring.physics import SX
+from casest.declaring.shapes import Array
+from casest.declaring.symbols import Constant, Signal
+from casest.errors import CasestError, DeclarationError, UsageError
+from casest.modelling.tracing import flat
+
+
+@dataclass(frozen=True)
+class State:
+    """A state: `size` numbers in `unit`; `intensity` of the white noise that drives it, unit²/s.
+
+    `start` and `std` describe what is known of it at the beginning.
+    """
+
+    name: str
+    size: int
+    unit: str
+    intensity: float
+    start: tuple[float, ...]
+    std: float
+
+
+def state(
+    shape: int | str = 1,
+    unit: str = "1",
+    *,
+    intensity: float = 0.0,
+    start: Any = 0.0,
+    std: float = 1.0,
+) -> Any:
+    """Declare a state: `state(3, "m/s", intensity=1e-3)`, `state("rad")`.
+
+    `intensity` is that of its white driving noise in unit²/s (0: driven by nothing), `start` and
+    `std` what is known of it at the beginning, in its own unit.
+    """
+    if isinstance(shape, str):
+        size, unit = 1, shape
+    else:
+        size = shape
+    values = np.broadcast_to(np.asarray(start, float), (size,))
+    if intensity < 0 or not std > 0:
+        raise DeclarationError(f"state: intensity {intensity} must be ≥ 0 and std {std} > 0")
+    return State("", size, unit, float(intensity), tuple(values.tolist()), float(std))
+
+
+@dataclass(frozen=True)
+class Measured:
+    """An output: the signal that measures it, what it should be, and its noise intensity.
+
+    `intensity` in unit²·s: variance of one reading times the time between two.
+    """
+
+    signal: SX
+    predicted: SX
+    intensity: float
+
+
+class Motion:
+    """What a @dynamics function returns: the rate of every state, in their order, and outputs."""
+
+    def __init__(self, *, rates: Mapping[str, SX], outputs: tuple[Measured, ...]) -> None:
+        self.rates, self.outputs = dict(rates), outputs
+
+
+def measured(signal: SX, predicted: SX, *, intensity: float) -> Measured:
+    """An output: `measured(v, velocity, intensity=0.1)`, intensity in unit²·s."""
+    if not intensity > 0:
+        raise DeclarationError(
+            f"measured: the noise intensity must be positive, not {intensity}: a reading without "
+            "noise makes the Riccati equation singular; give the sensor's variance times its period"
+        )
+    return Measured(signal, predicted, float(intensity))
+
+
+@dataclass(frozen=True)
+class Dynamics:
+    """ẋ = f(x, signals) + noise, y = h(x, signals) + noise, declared once; a value."""
+
+    name: str
+    function: Callable[..., Motion]
+    signals: tuple[Signal, ...]
+    states: tuple[State, ...]
+    constants: tuple[Constant, ...]
+
+    # -- new ones from this one ----------------------------------------------------------------
+
+    def having(self, **values: float) -> Dynamics:
+        """The same with other constants."""
+        names = {c.name for c in self.constants}
+        for name in values:
+            if name not in names:
+                known = ", ".join(sorted(names)) or "none"
+                raise UsageError(f"{self.name} has no constant {name!r}; it has {known}")
+        changed = tuple(
+            replace(c, value=(float(values[c.name]),)) if c.name in values else c
+            for c in self.constants
+        )
+        return replace(self, constants=changed)
+
+    def driven(self, **intensities: float) -> Dynamics:
+        """The same with other noise intensities of its states, unit²/s."""
+        return self._with_states("intensity", intensities)
+
+    def known_to(self, **stds: float) -> Dynamics:
+        """The same with other standard deviations of the states at the beginning."""
+        return self._with_states("std", stds)
+
+    def beginning(self, **starts: Any) -> Dynamics:
+        """The same with other states at the beginning."""
+        found = {
+            n: tuple(np.broadcast_to(np.asarray(v, float), (self[n].size,)).tolist())
+            for n, v in starts.items()
+        }
+        return self._with_states("start", found)
+
+    def _with_states(self, field: str, values: Mapping[str, Any]) -> Dynamics:
+        for name in values:
+            _ = self[name]
+        changed = tuple(
+            replace(s, **{field: values[s.name]}) if s.name in values else s for s in self.states
+        )
+        return replace(self, states=changed)
+
+    def __getitem__(self, name: str) -> State:
+        """The state of that name."""
+        for s in self.states:
+            if s.name == name:
+                return s
+        known = ", ".join(s.name for s in self.states)
+        raise UsageError(f"{self.name} has no state {name!r}; it has {known}")
+
+    # -- layout --------------------------------------------------------------------------------
+
+    @property
+    def size(self) -> int:
+        """Number n of states."""
+        return sum(s.size for s in self.states)
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Name of every number of the state: `gravity[2]`."""
+        return tuple(
+            s.name if s.size == 1 else f"{s.name}[{i}]" for s in self.states for i in range(s.size)
+        )
+
+    @cached_property
+    def state_units(self) -> tuple[str, ...]:
+        """Unit of every number of the state."""
+        return tuple(s.unit for s in self.states for _ in range(s.size))
+
+    def slices(self) -> dict[str, slice]:
+        """Where each state lies in the state vector."""
+        found, place = {}, 0
+        for s in self.states:
+            found[s.name] = slice(place, place + s.size)
+            place += s.size
+        return found
+
+    @property
+    def start(self) -> Array:
+        """The state at the beginning, (n,)."""
+        return np.concatenate([np.array(s.start) for s in self.states])
+
+    @property
+    def start_covariance(self) -> Array:
+        """Its covariance, (n, n)."""
+        return np.diag(np.concatenate([np.full(s.size, s.std**2) for s in self.states]))
+
+    @property
+    def process(self) -> Array:
+        """Intensity Ξ of the driving noise, (n, n)."""
+        return np.diag(np.concatenate([np.full(s.size, s.intensity) for s in self.states]))
+
+    @cached_property
+    def noise(self) -> Array:
+        """Intensity Θ of the measurement noise, (m, m)."""
+        parts = [np.full(o.predicted.numel(), o.intensity) for o in self.traced.outputs]
+        return np.diag(np.concatenate(parts))
+
+    # -- symbols -------------------------------------------------------------------------------
+
+    @cached_property
+    def traced(self) -> Traced:
+        """The body on CasADi symbols."""
+        return _trace(self)
+
+    @property
+    def measured_signals(self) -> tuple[str, ...]:
+        """Names of the signals that outputs are compared with."""
+        return self.traced.measured
+
+    @cached_property
+    def linear(self) -> bool:
+        """Are rates and outputs linear in the state?"""
+        t = self.traced
+        slopes = ca.vertcat(ca.vec(t.A), ca.vec(t.C))
+        return not ca.depends_on(slopes, t.x)
+
+
+@dataclass(frozen=True)
+class Traced:
+    """Symbols and expressions: x, signals, f(x, u), h(x, u), A = ∂f/∂x, C = ∂h/∂x, readings."""
+
+    x: SX
+    symbols: Mapping[str, SX]
+    f: SX
+    h: SX
+    A: SX
+    C: SX
+    reading: SX
+    outputs: tuple[Measured, ...]
+    measured: tuple[str, ...]
+
+
+def dynamics(function: Callable[..., Motion]) -> Dynamics:
+    """Declare a moving estimator: positional arguments are signals, keyword-only ones states
+    (`state(…)`) or constants."""
+    name = function.__name__.replace("_", "-")
+    signals, states, constants = [], [], []
+    for argument in inspect.signature(function).parameters.values():
+        default: Any = argument.default
+        where = f"dynamics {name}: {argument.name}"
+        if argument.kind is argument.POSITIONAL_OR_KEYWORD:
+            if not isinstance(default, Signal):
+                raise DeclarationError(f"{where} comes before the * and must be signal(…)")
+            signals.append(replace(default, name=argument.name))
+        elif isinstance(default, State):
+            states.append(replace(default, name=argument.name))
+        elif isinstance(default, Constant):
+            constants.append(replace(default, name=argument.name))
+        else:
+            raise DeclarationError(f"{where} must be state(…) or constant(…), not {default!r}")
+    for s in states:
+        if not units.known(s.unit):
+            raise DeclarationError(f"dynamics {name}: {s.name} has unknown unit {s.unit!r}")
+    return Dynamics(name, function, tuple(signals), tuple(states), tuple(constants))
+
+
+def _trace(declared: Dynamics) -> Traced:
+    symbols: dict[str, SX] = {}
+    for s in declared.signals:
+        plain = ca.SX.sym(s.name, s.size)
+        symbols[s.name] = ca.reshape(plain, 3, 3).T if s.kind == "rotation" else plain
+    xs = {s.name: ca.SX.sym(s.name, s.size) for s in declared.states}
+    numbers = {c.name: float(c.array) for c in declared.constants}
+    try:
+        motion = declared.function(**symbols, **xs, **numbers)
+    except CasestError:
+        raise
+    except Exception as error:
+        text = str(error).strip().splitlines()
+        raise DeclarationError(
+            f"dynamics {declared.name}: {text[-1] if text else type(error).__name__}"
+        ) from None
+    if not isinstance(motion, Motion):
+        raise DeclarationError(f"dynamics {declared.name} must return Motion(rates=…, outputs=…)")
+    rates = []
+    for s in declared.states:
+        rate = ca.SX(motion.rates.get(s.name, ca.SX.zeros(s.size)))
+        if rate.numel() != s.size:
+            raise DeclarationError(
+                f"dynamics {declared.name}: the rate of {s.name} has {rate.numel()} numbers, "
+                f"the state {s.size}"
+            )
+        rates.append(ca.densify(rate))
+    for name in motion.rates:
+        if name not in xs:
+            raise DeclarationError(f"dynamics {declared.name}: rate of {name!r}, which is no state")
+    names = []
+    for o in motion.outputs:
+        found = [n for n, s in symbols.items() if s is o.signal]
+        if not found:
+            raise DeclarationError(f"dynamics {declared.name}: measured(…) needs a signal first")
+        names.append(found[0])
+    x, f = ca.vertcat(*xs.values()), ca.vertcat(*rates)
+    h = ca.vertcat(*[ca.densify(ca.vec(ca.SX(o.predicted))) for o in motion.outputs])
+    reading = ca.vertcat(*[flat(o.signal) for o in motion.outputs])
+    if reading.numel() != h.numel():
+        raise DeclarationError(f"dynamics {declared.name}: outputs and signals differ in shape")
+    A, C = ca.jacobian(f, x), ca.jacobian(h, x)
+    return Traced(x, symbols, f, h, A, C, reading, motion.outputs, tuple(names))

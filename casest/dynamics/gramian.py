@@ -1,0 +1,200 @@
+"""What a trajectory makes observable: the finite-horizon observability Gramian.
+
+W(t₀, t₁) = ∫Φ(t, t₀)ᵀCᵀΘ⁻¹CΦ(t, t₀) dt, weighted by the measurement noise, is the information that
+the readings hold about the state at t₀: its inverse bounds any estimator's covariance. Two forms:
+products of transition matrices, and the ODE −Ẇ = AᵀW + WA + CᵀΘ⁻¹C, integrated by CVODES.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from casest.declaring.shapes import Array
+from casest.dynamics.declare import Dynamics
+from casest.dynamics.transition import Linearised, transitions
+
+#: A direction counts as observable from this share of the largest scaled eigenvalue on. Rounding
+#: and the error of a fourth-order step stay below 1e-13.
+NULL = 1e-11
+
+
+@dataclass(frozen=True)
+class Observed:
+    """Rank of the Gramian among n states, scaled so that units do not count.
+
+    `eigenvalues` (n,) of the scaled Gramian, largest first; `unobservable` in words, with their
+    `directions` (n, k) in the states' units; `std` (n,) what the data alone allow at the start of
+    the record (NaN where they do not determine it).
+    """
+
+    rank: int
+    unknowns: int
+    eigenvalues: Array
+    unobservable: tuple[str, ...]
+    directions: Array
+    std: Array
+    gramian: Array
+
+
+def gramian(model: Dynamics, system: Linearised) -> Array:
+    """W of the whole record at its first sample, (n, n), from transition matrices."""
+    Phi, _ = transitions(system)
+    return _reduced(Phi, _of_steps(model, system, Phi))[1]
+
+
+def _of_steps(model: Dynamics, system: Linearised, Phi: Array) -> Array:
+    """W of every single step at its own beginning, (N − 1, n, n): Simpson's rule."""
+    weight = np.linalg.inv(model.noise)
+    half, _ = transitions(system, parts=2)
+    middle = 0.5 * (system.C[1:] + system.C[:-1]) @ half
+    first, last = system.C[:-1], system.C[1:] @ Phi
+    h = system.steps[:, None, None]
+    return np.asarray(
+        h
+        / 6
+        * sum(
+            share * (M.transpose(0, 2, 1) @ weight @ M)
+            for share, M in ((1, first), (4, middle), (1, last))
+        )
+    )
+
+
+def _reduced(Phi: Array, W: Array) -> tuple[Array, Array]:
+    """Neighbours joined pair by pair: (Φ₂, W₂)∘(Φ₁, W₁) = (Φ₂Φ₁, W₁ + Φ₁ᵀW₂Φ₁)."""
+    while len(Phi) > 1:
+        even = len(Phi) // 2 * 2
+        first, second = slice(0, even, 2), slice(1, even, 2)
+        joined = W[first] + Phi[first].transpose(0, 2, 1) @ W[second] @ Phi[first]
+        products = Phi[second] @ Phi[first]
+        W = np.concatenate([joined, W[even:]])
+        Phi = np.concatenate([products, Phi[even:]])
+    return Phi[0], 0.5 * (W[0] + W[0].T)
+
+
+def gramian_by_ode(model: Dynamics, system: Linearised, tolerance: float = 1e-11) -> Array:
+    """The same by integrating −Ẇ = AᵀW + WA + CᵀΘ⁻¹C backwards with CVODES (SUNDIALS).
+
+    Signals are straight lines between samples, as in the other form; each step is an interval of
+    its own, so that the integrator never steps over a corner.
+    """
+    n, m = model.size, system.C.shape[1]
+    W, weight = ca.SX.sym("W", n, n), ca.SX(ca.DM(np.linalg.inv(model.noise)))
+    ends = [ca.SX.sym(name, *shape) for name, shape in
+            (("A0", (n, n)), ("A1", (n, n)), ("C0", (m, n)), ("C1", (m, n)))]  # fmt: skip
+    h, s = ca.SX.sym("h"), ca.SX.sym("s")  # s runs from the end of the step (0) to its start (1)
+    A = ends[1] + s * (ends[0] - ends[1])
+    C = ends[3] + s * (ends[2] - ends[3])
+    rate = h * (A.T @ W + W @ A + C.T @ weight @ C)
+    p = ca.vertcat(*[ca.vec(e) for e in ends], h)
+    ode = {"x": ca.vec(W), "t": s, "p": p, "ode": ca.vec(rate)}
+    options = {"abstol": tolerance, "reltol": tolerance, "max_num_steps": 100_000}
+    step = ca.integrator("gramian", "cvodes", ode, 0, 1, options)
+    value = np.zeros(n * n)
+    for k in range(len(system.steps) - 1, -1, -1):
+        parts = [system.A[k], system.A[k + 1], system.C[k], system.C[k + 1]]
+        numbers = np.concatenate([*(M.T.ravel() for M in parts), [system.steps[k]]])
+        value = np.array(step(x0=value, p=numbers)["xf"]).ravel()
+    found = value.reshape(n, n)
+    return np.asarray(0.5 * (found + found.T))
+
+
+def observed(model: Dynamics, W: Array) -> Observed:
+    """Rank, unobservable directions in words, and the standard deviations that the data allow."""
+    scale = np.sqrt(np.where(np.diag(W) > 0, np.diag(W), 1.0))
+    # Scaled by what is known beforehand: so many of a state's own standard deviations are visible.
+    prior = np.sqrt(np.diag(model.start_covariance))
+    scale = np.where(np.diag(W) > 0, scale, 1 / prior)
+    values, vectors = np.linalg.eigh(W / np.outer(scale, scale))
+    order = np.argsort(values)[::-1]
+    values, vectors = values[order], vectors[:, order]
+    rank = int(np.sum(values > NULL * values[0])) if values[0] > 0 else 0
+    null = vectors[:, rank:] / scale[:, None]
+    null = null / np.maximum(np.linalg.norm(null, axis=0), 1e-300)
+    kept = vectors[:, :rank] / np.sqrt(np.maximum(values[:rank], 1e-300))
+    std = np.sqrt(np.sum(kept**2, axis=1)) / scale
+    touched = np.linalg.norm(vectors[:, rank:], axis=1) > 1e-5
+    words = tuple(_words(model, null))
+    return Observed(rank, model.size, values, words, null, np.where(touched, np.nan, std), W)
+
+
+def _words(model: Dynamics, null: Array) -> Sequence[str]:
+    """Each unobservable direction as a sentence."""
+    basis = _sparse(null)
+    return [_sentence(model, basis[:, k]) for k in range(basis.shape[1])]
+
+
+def _sparse(null: Array) -> Array:
+    """The same space with as few states per direction as echelon form gives."""
+    matrix, done = null.copy(), list[int]()
+    for k in range(matrix.shape[1]):
+        size = np.abs(matrix[:, k:]).max(axis=1)
+        size[done] = 0
+        row = int(np.argmax(size))
+        pivot = k + int(np.argmax(np.abs(matrix[row, k:])))
+        matrix[:, [k, pivot]] = matrix[:, [pivot, k]]
+        matrix[:, k] /= matrix[row, k]
+        for j in range(matrix.shape[1]):
+            if j != k:
+                matrix[:, j] -= matrix[row, j] * matrix[:, k]
+        done.append(row)
+    return np.asarray(matrix / np.linalg.norm(matrix, axis=0))
+
+
+def _sentence(model: Dynamics, direction: Array) -> str:
+    """ "gravity and bias along (0.27, 0.53, 0.80) move together" """
+    largest = np.abs(direction).max()
+    parts: list[tuple[str, Array]] = []
+    for name, where in model.slices().items():
+        own = direction[where]
+        if np.abs(own).max(initial=0.0) > 1e-6 * largest:
+            parts.append((name, own))
+    vectors = [v for _, v in parts if len(v) == 3]
+    if len(parts) > 1 and len(vectors) == len(parts):
+        unit = vectors[0] / np.linalg.norm(vectors[0])
+        unit = unit * np.sign(unit[np.argmax(np.abs(unit))])
+        along = [float(v @ unit) for v in vectors]
+        if all(np.linalg.norm(v - a * unit) < 1e-5 * np.linalg.norm(v)
+               for v, a in zip(vectors, along, strict=True)):  # fmt: skip
+            axis = ", ".join(f"{u:.2f}" for u in unit)
+            names = " and ".join(name for name, _ in parts)
+            same = all(abs(a - along[0]) < 1e-4 * abs(along[0]) for a in along)
+            how = "move together" if same else "move in proportion"
+            return f"{names} along the body axis ({axis}) {how}: no reading changes"
+    words = []
+    for name, own in parts:
+        for i, value in enumerate(own):
+            if abs(value) > 1e-6 * largest:
+                label = name if len(own) == 1 else f"{name}[{i}]"
+                words.append(f"{label} {value / largest:+.3g}")
+    return f"{', '.join(words)} together change no reading"
+
+
+def smallest_eigenvalue(
+    model: Dynamics, system: Linearised, window: float, count: int = 60
+) -> tuple[Array, Array]:
+    """Smallest eigenvalue of the Gramian over windows of that length (s) along the record.
+
+    Returned: the windows' ends (s) and the eigenvalues, scaled by the states' prior standard
+    deviations, so that they are squared signal over noise: above 1 a window alone teaches more
+    than was known.
+    """
+    Phi, _ = transitions(system)
+    W = _of_steps(model, system, Phi)
+    prior = np.sqrt(np.diag(model.start_covariance))
+    time = system.time
+    ends = (
+        np.linspace(time[0] + window, time[-1], count)
+        if time[-1] - time[0] > window
+        else (time[-1:])
+    )
+    found = []
+    for end in ends:
+        first = int(np.searchsorted(time, end - window - 1e-12))
+        last = max(int(np.searchsorted(time, end + 1e-12)) - 1, first + 1)
+        own = _reduced(Phi[first:last], W[first:last])[1]
+        found.append(float(np.linalg.eigvalsh(own * np.outer(prior, prior))[0]))
+    return np.asarray(ends, float), np.array(found)
