@@ -101,14 +101,17 @@ def test_no_two_modules_import_each_other():
 @pytest.mark.parametrize("path", sorted((ROOT / "problems").glob("*.py")), ids=lambda p: p.stem)
 def test_problems_use_public_names_of_casest_only(path):
     import casest
+    import casest.dynamics
 
     tree = ast.parse(path.read_text(encoding="utf-8"))
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             assert not any(alias.name.partition(".")[0] == "casest" for alias in node.names)
         elif isinstance(node, ast.ImportFrom) and (node.module or "").startswith("casest"):
-            assert node.module == "casest", f"{path.name} imports {node.module}"
-            assert {alias.name for alias in node.names} <= set(casest.__all__)
+            # The decorator of moving estimators bears its package's name, so it lives there.
+            homes = {"casest": casest, "casest.dynamics": casest.dynamics}
+            assert node.module in homes, f"{path.name} imports {node.module}"
+            assert {alias.name for alias in node.names} <= set(homes[node.module].__all__)
 
 
 def test_every_public_name_is_there():

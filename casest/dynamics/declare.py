@@ -269,12 +269,12 @@ def _trace(declared: Dynamics) -> Traced:
     if not isinstance(motion, Motion):
         raise DeclarationError(f"dynamics {declared.name} must return Motion(rates=…, outputs=…)")
     rates = []
-    for s in declared.states:
-        rate = ca.SX(motion.rates.get(s.name, ca.SX.zeros(s.size)))
-        if rate.numel() != s.size:
+    for own in declared.states:
+        rate = ca.SX(motion.rates.get(own.name, ca.SX.zeros(own.size)))
+        if rate.numel() != own.size:
             raise DeclarationError(
-                f"dynamics {declared.name}: the rate of {s.name} has {rate.numel()} numbers, "
-                f"the state {s.size}"
+                f"dynamics {declared.name}: the rate of {own.name} has {rate.numel()} numbers, "
+                f"the state {own.size}"
             )
         rates.append(ca.densify(rate))
     for name in motion.rates:
