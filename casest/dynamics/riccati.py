@@ -1,0 +1,65 @@
+"""The Riccati equation of the Kalman-Bucy filter: Ṗ = AP + PAᵀ + Ξ − PCᵀΘ⁻¹CP.
+
+Integrated as a fraction of linear systems: with [X; Y]˙ = [[A, Ξ], [CᵀΘ⁻¹C, −Aᵀ]]·[X; Y] and
+P = XY⁻¹ every step is one matrix exponential. P stays symmetric and positive however stiff the
+equation is, where Runge-Kutta on P itself loses digits or overflows (Davison & Maki 1973; Schiff &
+Shnider 1999).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from casest.declaring.shapes import Array
+from casest.dynamics.declare import Dynamics
+from casest.dynamics.transition import Linearised, exponential
+from casest.errors import DataError
+
+
+def riccati(model: Dynamics, system: Linearised, start: Array | None = None) -> Array:
+    """P at every sample, (N, n, n), from the covariance at the first (default: the model's).
+
+    Raises DataError where the start is no covariance.
+    """
+    P = np.asarray(model.start_covariance if start is None else start, float)
+    check_covariance(P, "the covariance at the beginning")
+    steps = hamiltonian_steps(model, system)
+    n = model.size
+    found = np.empty((len(system.time), n, n))
+    found[0] = P
+    for k, step in enumerate(steps):
+        X = step[:n, :n] @ P + step[:n, n:]
+        Y = step[n:, :n] @ P + step[n:, n:]
+        P = np.linalg.solve(Y.T, X.T).T
+        P = 0.5 * (P + P.T)
+        found[k + 1] = P
+    return found
+
+
+def hamiltonian_steps(model: Dynamics, system: Linearised) -> Array:
+    """Transition of [X; Y] over every step, (N − 1, 2n, 2n), by fourth-order Magnus steps."""
+    first, last = (_hamiltonian(model, system, end) for end in (slice(None, -1), slice(1, None)))
+    h = system.steps[:, None, None]
+    magnus = 0.5 * h * (first + last) + h**2 / 12 * (last @ first - first @ last)
+    return exponential(magnus)
+
+
+def _hamiltonian(model: Dynamics, system: Linearised, where: slice) -> Array:
+    A, C = system.A[where], system.C[where]
+    n = model.size
+    both = np.zeros((len(A), 2 * n, 2 * n))
+    both[:, :n, :n], both[:, :n, n:] = A, model.process
+    both[:, n:, :n] = C.transpose(0, 2, 1) @ np.linalg.inv(model.noise) @ C
+    both[:, n:, n:] = -A.transpose(0, 2, 1)
+    return both
+
+
+def check_covariance(P: Array, what: str) -> None:
+    """Refuse what is no covariance, with the eigenvalue that shows it."""
+    if not np.all(np.isfinite(P)) or not np.allclose(P, P.T, rtol=1e-9, atol=1e-300):
+        raise DataError(f"{what} is not a finite symmetric matrix")
+    smallest = float(np.linalg.eigvalsh(P)[0])
+    if smallest < -1e-12 * float(np.abs(P).max(initial=0.0)):
+        raise DataError(
+            f"{what} is not positive: it has the eigenvalue {smallest:.3g}; give variances"
+        )
