@@ -67,7 +67,7 @@ def _furthest_out(problem: Problem, point: Point) -> Iterator[str]:
         run = problem.runs[k]
         what = "rest interval" if run.spread else "row"
         yield (
-            f"{what} {int(run.rows[row])} of {run.name} is off by {size / scale:.0f} robust "
+            f"{what} {int(run.rows[row])} of {run.name} is off by {size / max(scale, exact):.3g} robust "
             "standard deviations of the residual: look at it first"
         )
 

@@ -15,6 +15,7 @@ from casest.data.run import Run
 from casest.declaring.shapes import Array
 from casest.dynamics.declare import Dynamics
 from casest.dynamics.riccati import check_covariance
+from casest.dynamics.stepping import kalman_step, reach, run_steps
 from casest.dynamics.transition import (
     Linearised,
     linearised,
@@ -90,41 +91,27 @@ def filtered(model: Dynamics, run: Run, *, smooth: bool = True) -> Filtered:
 def _once(model: Dynamics, system: Linearised, smooth: bool) -> Filtered:
     Phi, forced = transitions(system)
     Q = process_noise(system, model.process, Phi)
-    R = model.noise[None] / steps_to(system)[:, None, None]
-    N, n = len(system.time), model.size
-    m = system.C.shape[1]
-    x, P = model.start.copy(), model.start_covariance
-    xs, Ps = np.empty((N, n)), np.empty((N, n, n))
-    before_x, before_P = np.empty((N, n)), np.empty((N, n, n))
-    innovations, S = np.full((N, m), np.nan), np.full((N, m, m), np.nan)
+    R = np.diag(model.noise)[None] / steps_to(system)[:, None]
+    N, n, m = len(system.time), model.size, system.C.shape[1]
     present = np.isfinite(system.y)
-    for k in range(N):
-        if k:
-            x = Phi[k - 1] @ x + forced[k - 1]
-            P = Phi[k - 1] @ P @ Phi[k - 1].T + Q[k - 1]
-        before_x[k], before_P[k] = x, P
-        seen = present[k]
-        if seen.all():
-            C, r, nu = system.C[k], R[k], system.y[k] - system.C[k] @ x - system.d[k]
-        elif seen.any():
-            C, r = system.C[k][seen], R[k][np.ix_(seen, seen)]
-            nu = system.y[k][seen] - C @ x - system.d[k][seen]
-        else:
-            xs[k], Ps[k] = x, P
-            continue
-        PC = P @ C.T
-        s = C @ PC + r
-        gain = np.linalg.solve(s, PC.T).T
-        x = x + gain @ nu
-        # Joseph's form: symmetric and positive to rounding.
-        left = -gain @ C
-        left[np.diag_indices(n)] += 1.0
-        P = left @ P @ left.T + gain @ r @ gain.T
-        xs[k], Ps[k] = x, P
-        innovations[k, seen] = nu
-        S[np.ix_([k], np.flatnonzero(seen), np.flatnonzero(seen))] = s
-    smoothed, smoothed_P = _smoothed(Phi, xs, Ps, before_x, before_P) if smooth else (xs, Ps)
-    return Filtered(model, system, xs, Ps, before_x, before_P, innovations, S, smoothed, smoothed_P)
+    # A reading that is missing is one that the state does not reach: no row, no innovation.
+    C = np.where(present[:, :, None], system.C, 0.0)
+    y = np.where(present, system.y - system.d, 0.0)
+    eye = np.eye(n)[None]
+    Phi_first = np.concatenate([eye, Phi])
+    moved = np.concatenate([np.zeros((1, n)), forced])
+    added = np.concatenate([np.zeros((1, n, n)), Q])
+    columns = [Phi_first, moved, added, C, R, y]
+    found = run_steps(
+        kalman_step(n, m, reach(model.traced.A)), model.start, model.start_covariance, columns
+    )
+    x, P, before_x, before_P = found
+    innovations = np.where(present, y - np.einsum("kij,kj->ki", C, before_x), np.nan)
+    S = C @ before_P @ C.transpose(0, 2, 1)
+    S[:, np.arange(m), np.arange(m)] += R
+    S = np.where(present[:, :, None] & present[:, None, :], S, np.nan)
+    smoothed, smoothed_P = _smoothed(Phi, x, P, before_x, before_P) if smooth else (x, P)
+    return Filtered(model, system, x, P, before_x, before_P, innovations, S, smoothed, smoothed_P)
 
 
 def _smoothed(
