@@ -317,6 +317,113 @@ def demo(output: Path | None) -> int:
     return code
 
 
+def motion_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Options of estimators in motion."""
+    many: Options = {"multiple": True, "metavar": "STATE=NUMBER"}
+    for option in (
+        click.option("--json", "as_json", is_flag=True, help="Print JSON instead of text."),
+        click.option(
+            "-o", "--output", type=click.Path(path_type=Path), metavar="DIR", help="Folder."
+        ),
+        click.option("--std", "stds", help="What is known of a state at the beginning.", **many),
+        click.option("--intensity", "intensities", help="Of its driving noise, unit^2/s.", **many),
+    ):
+        command = option(command)
+    return command
+
+
+@commands.command()
+@click.argument("model_name", metavar="MODEL")
+@click.argument("data", nargs=-1, required=True, type=click.Path())
+@model_options
+@reading_options
+@motion_options
+@click.option("--window", type=float, metavar="SECONDS", help="Of the sliding eigenvalue.")
+def observe(model_name: str, data: tuple[str, ...], **options: Any) -> int:
+    """What these data, or this trajectory, can see: rank, and what is hidden, in words.
+
+    Exit code 0 even where something is not observable.
+    """
+    from casest import observing, result
+    from casest.modelling.model import Model
+    from casest.problem import find_any
+
+    if isinstance(find_any(model_name), Model):
+        model = declared_model(model_name, options)
+        content, _ = observing.observe_parameters(model, records(model, data, options))
+    else:
+        moving, run = moving_record(model_name, data, options)
+        content = observing.observe_motion(moving, run, options["window"])
+    if options["output"]:
+        write(options["output"] / "observe.json", result.as_json(content))
+    click.echo(
+        result.as_json(content).rstrip() if options["as_json"] else observing.observe_text(content)
+    )
+    return 0
+
+
+@commands.command("filter")
+@click.argument("model_name", metavar="MODEL")
+@click.argument("data", nargs=-1, required=True, type=click.Path())
+@reading_options
+@motion_options
+def filter_command(model_name: str, data: tuple[str, ...], **options: Any) -> int:
+    """States over time by the Kalman filter and smoother, with innovations diagnosed."""
+    from casest import observing, result
+
+    moving, run = moving_record(model_name, data, {**options, "constants": ()})
+    content, found = observing.follow(moving, run)
+    if options["output"]:
+        write(options["output"] / "states.csv", observing.states_csv(found))
+        write(options["output"] / "filter.json", result.as_json(content))
+    click.echo(
+        result.as_json(content).rstrip() if options["as_json"] else observing.filter_text(content)
+    )
+    return 0
+
+
+def write(path: Path, text: str) -> None:
+    """A file in a folder that is made if it is missing."""
+    from casest.data.write import write_atomically
+    from casest.errors import DataError
+
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DataError(f"{path.parent}: cannot be made ({error.strerror})") from None
+    write_atomically(path, text)
+
+
+def moving_record(name: str, data: Sequence[str], options: Options) -> tuple[Any, Run]:
+    """The estimator with its options applied, and its one record."""
+    from casest.data import load_runs
+    from casest.dynamics import Dynamics
+    from casest.problem import find_any
+
+    moving = find_any(name)
+    if not isinstance(moving, Dynamics):
+        raise UsageError(f"{name} is no estimator in motion: casest calibrate, close or observe it")
+    if len(data) != 1:
+        raise UsageError(f"{name}: a trajectory is one file, not {len(data)}")
+    constants = dict(number_pair(text, "--set") for text in options["constants"])
+    moving = moving.having(**constants)
+    moving = moving.driven(**dict(number_pair(t, "--intensity") for t in options["intensities"]))
+    moving = moving.known_to(**dict(number_pair(t, "--std") for t in options["stds"]))
+    runs = load_runs(list(data), moving.signals, **reading_arguments(options))
+    if len(runs) != 1:
+        raise UsageError(f"{data[0]} holds {len(runs)} runs; a trajectory is one")
+    return moving, runs[0]
+
+
+def number_pair(text: str, option: str) -> tuple[str, float]:
+    """`name=number`."""
+    key, value = _pair(text, option)
+    try:
+        return key, float(value)
+    except ValueError:
+        raise UsageError(f"{option} {text}: {value!r} is no number") from None
+
+
 @commands.command()
 @click.argument("result_path", metavar="RESULT", type=click.Path(path_type=Path))
 @click.argument("data", type=click.Path())
@@ -337,6 +444,96 @@ def apply(result_path: Path, data: str, **options: Any) -> None:
         result_path, data, reading_arguments(options), force=options["force"]
     )
     applying.write_or_print(text, options["output"])
+
+
+@commands.command()
+@click.argument("model_name", metavar="MODEL")
+@click.argument("data", nargs=-1, required=True, type=click.Path())
+@model_options
+@reading_options
+@click.option(
+    "--solver", "solvers", multiple=True, metavar="NAME", help="Only this one (repeatable)."
+)
+@click.option(
+    "--start", multiple=True, metavar="NAME=VALUE", help="Start value in place of the automatic."
+)
+@click.option(
+    "--starts", type=int, default=8, show_default=True, help="More starts, spread around the first."
+)
+@click.option(
+    "--spread",
+    type=float,
+    multiple=True,
+    metavar="SHARE",
+    help="How far, as a share of each unknown's size (repeatable; 0.001, 0.01, 0.1 and 0.3).",
+)
+@click.option("--seed", type=int, default=0, show_default=True, help="For the spread of starts.")
+@click.option(
+    "--limit",
+    type=float,
+    default=10,
+    show_default=True,
+    metavar="SECONDS",
+    help="Stop a solver's run after this time.",
+)
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path),
+    metavar="DIR",
+    help="Folder for compare.json, compare.png and compare.svg.",
+)
+@click.option("--json", "as_json", is_flag=True, help="Print compare.json instead of tables.")
+def compare(model_name: str, data: tuple[str, ...], **options: Any) -> int:
+    """Run every solver on MODEL and DATA, from one start and from a spread of starts.
+
+    Each is judged by the certified optimum: where it ended, what it claims, what it took. Exit
+    code 0: done; 1: bad input; 2: no certified optimum to judge by, or interrupted (what is done
+    is shown and written all the same).
+    """
+    from casest import comparing_text, result
+    from casest.compare import SIZES
+    from casest.compare import compare as compared
+
+    model = declared_model(model_name, options)
+    runs = records(model, data, options)
+    found = compared(
+        model,
+        runs,
+        starts=options["starts"],
+        seed=options["seed"],
+        start=dict(start_value(text, model) for text in options["start"]) or None,
+        sizes=options["spread"] or SIZES,
+        solvers=options["solvers"],
+        limit=options["limit"],
+        say=progress,
+    )
+    command = "casest " + " ".join(sys.argv[1:])
+    content = comparing_text.comparison_result(
+        found, model_name=model_name, data=data, command=command
+    )
+    written = written_comparison(found, content, options["output"]) if options["output"] else []
+    if options["as_json"]:
+        click.echo(result.as_json(content), nl=False)
+    else:
+        click.echo(comparing_text.comparison_text(found, data, written))
+    if found.interrupted:
+        click.echo(f"casest: interrupted after {found.done} of {found.planned} runs", err=True)
+    elif not found.certified:
+        click.echo("casest: no certified optimum to judge by", err=True)
+    return 0 if found.certified and not found.interrupted else NotTrusted.exit_code
+
+
+def written_comparison(found: Any, content: Options, folder: Path) -> list[Path]:
+    """compare.json, and the plot where matplotlib is there; says so where it is not."""
+    from casest import comparing_plot, comparing_text
+
+    paths = [comparing_text.save(folder, content)]
+    try:
+        paths += comparing_plot.draw(found, folder)
+    except UsageError as error:
+        click.echo(f"casest: {error}", err=True)
+    return paths
 
 
 # -- from the command line's words to values ------------------------------------------------------

@@ -12,6 +12,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from casest.dynamics import Dynamics
 from casest.errors import CasestError, DeclarationError, UsageError
 from casest.modelling.dimensions import check_units
 from casest.modelling.effect import Effect
@@ -28,6 +29,32 @@ SHIPPED = {
 }
 
 
+#: Shipped estimators in motion.
+MOVING = {
+    "bias-gravity": ("bias_gravity", "bias_gravity"),
+    "bias-gravity-position": ("bias_gravity", "bias_gravity_position"),
+}
+
+
+def find_any(name: str) -> Model | Dynamics:
+    """The model or the estimator in motion of that name, shipped or in a `.py` file."""
+    if name in MOVING:
+        module, attribute = MOVING[name]
+        found: Dynamics = getattr(importlib.import_module(f"casest_problems.{module}"), attribute)
+        return found
+    path, _, wanted = name.partition(":")
+    if path.endswith(".py"):
+        declared = vars(load_file(Path(path)))
+        moving = {n: v for n, v in declared.items() if isinstance(v, Dynamics)}
+        chosen = moving.get(wanted.replace("-", "_")) if wanted else None
+        if chosen is None and not wanted and len(moving) == 1:
+            still = [v for v in declared.values() if isinstance(v, Model)]
+            chosen = None if still else next(iter(moving.values()))
+        if chosen is not None:
+            return chosen
+    return find_model(name)
+
+
 def find_model(name: str) -> Model:
     """The shipped model of that name, or the one in `file.py` (`file.py:name` out of several)."""
     if name in SHIPPED:
@@ -39,6 +66,8 @@ def find_model(name: str) -> Model:
         own: Model = _one(load_file(Path(path)), Model, "model", path, wanted)
         check_units(own)
         return own
+    if name in MOVING:
+        raise UsageError(f"{name} is an estimator in motion: casest observe {name}, casest filter")
     near = difflib.get_close_matches(name, SHIPPED, 1)
     hint = f"; did you mean {near[0]!r}?" if near else ""
     raise UsageError(

@@ -1,0 +1,177 @@
+"""`casest observe` and `casest filter`: what a trajectory shows, and the states along it."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from casest import __version__
+from casest.data.run import Run
+from casest.dynamics import Dynamics
+from casest.dynamics.filter import Filtered, filtered
+from casest.dynamics.gramian import gramian, observed, smallest_eigenvalue
+from casest.dynamics.transition import linearised
+from casest.estimate import Estimate, attempt
+from casest.modelling.model import Model
+from casest.result import plain
+
+#: Windows over which the smallest eigenvalue is followed: this share of the record unless told.
+WINDOW = 0.1
+
+
+def observe_parameters(model: Model, runs: Sequence[Run]) -> tuple[dict[str, Any], Estimate]:
+    """What a static model's data determine: rank, null directions in words, std of each value."""
+    found = attempt(model, runs)
+    identified = found.identifiability
+    return {
+        "casest": __version__,
+        "model": model.name,
+        "rank": identified.rank,
+        "unknowns": identified.unknowns,
+        "unobservable": list(identified.unobservable),
+        "weak": [
+            {"direction": w.words, "inflation": plain(w.inflation), "std": plain(w.std)}
+            for w in found.weak
+        ],
+        "std": {name: plain(value) for name, value in found.std.items()},
+        "trusted": found.certificate.trusted,
+    }, found
+
+
+def observe_motion(model: Dynamics, run: Run, window: float | None = None) -> dict[str, Any]:
+    """What a trajectory makes observable, by the Gramian over the whole record and over windows.
+
+    `std` is what the readings alone allow at the beginning of the record, per state.
+    """
+    system = linearised(model, run)
+    seen = observed(model, gramian(model, system))
+    duration = float(system.time[-1] - system.time[0])
+    length = min(window or WINDOW * duration, duration)
+    ends, smallest = smallest_eigenvalue(model, system, length)
+    std = {name: plain(seen.std[where]) for name, where in model.slices().items()}
+    return {
+        "casest": __version__,
+        "model": model.name,
+        "rank": seen.rank,
+        "unknowns": seen.unknowns,
+        "unobservable": list(seen.unobservable),
+        "std": std,
+        "units": {s.name: s.unit for s in model.states},
+        "eigenvalues": plain(seen.eigenvalues / max(float(seen.eigenvalues[0]), 1e-300)),
+        "tolerance": "eigenvalues of the Gramian scaled to a unit diagonal, below 1e-11 of the "
+        "largest, count as zero",
+        "windows": {
+            "length_s": plain(length),
+            "end_s": plain(ends),
+            "smallest_eigenvalue": plain(smallest),
+        },
+    }
+
+
+def follow(model: Dynamics, run: Run) -> tuple[dict[str, Any], Filtered]:
+    """States over time by the Kalman filter, and whether the innovations are as expected."""
+    found = filtered(model, run)
+    normalised = found.normalised_innovations
+    whole = normalised[np.isfinite(normalised)]
+    m = found.innovations.shape[1]
+    half = slice(len(whole) // 10, None)  # the beginning belongs to the start values
+    mean = float(np.mean(whole[half])) if len(whole[half]) else float("nan")
+    final = {
+        name: {
+            "value": plain(found.x[-1][where]),
+            "std": plain(found.std[-1][where]),
+            "smoothed_std_median": plain(_median_std(found, where)),
+            "unit": model[name].unit,
+        }
+        for name, where in model.slices().items()
+    }
+    return {
+        "casest": __version__,
+        "model": model.name,
+        "samples": len(found.time),
+        "states": final,
+        "innovations": {
+            "rms": plain(np.sqrt(np.nanmean(found.innovations**2, axis=0))),
+            "normalised_mean": plain(mean),
+            "expected": m,
+            "missing_readings": int(np.sum(~np.isfinite(normalised))),
+            "lag1_correlation": plain(_lag1(found.innovations)),
+        },
+    }, found
+
+
+def _median_std(found: Filtered, where: slice) -> Any:
+    std = np.sqrt(np.diagonal(found.smoothed_P, axis1=1, axis2=2))[:, where]
+    return np.median(std, axis=0)
+
+
+def _lag1(innovations: Any) -> Any:
+    """Correlation of neighbouring innovations, each component: zero for the right filter."""
+    r = np.where(np.isfinite(innovations), innovations, 0.0)
+    return np.sum(r[1:] * r[:-1], axis=0) / np.maximum(np.sum(r**2, axis=0), 1e-300)
+
+
+def states_csv(found: Filtered) -> str:
+    """Filtered and smoothed states with standard deviations, a row per sample."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    names, units = found.model.names, found.model.state_units
+    head = ["t [s]"]
+    for kind in ("", "std_", "smoothed_", "smoothed_std_"):
+        head += [f"{kind}{n} [{u}]" for n, u in zip(names, units, strict=True)]
+    writer.writerow(head)
+    smooth_std = np.sqrt(np.diagonal(found.smoothed_P, axis1=1, axis2=2))
+    table = np.hstack([found.time[:, None], found.x, found.std, found.smoothed, smooth_std])
+    writer.writerows([[repr(float(v)) for v in row] for row in table])
+    return text.getvalue()
+
+
+def observe_text(content: Mapping[str, Any]) -> str:
+    """Rank, what is hidden in words, and the standard deviations that the data allow."""
+    lines = [f"{content['model']}: rank {content['rank']} of {content['unknowns']}"]
+    lines += [f"  - {words}" for words in content["unobservable"]]
+    if not content["unobservable"]:
+        lines.append("  every unknown is determined by these data")
+    lines += ["", "  standard deviation that these data allow:"]
+    units = content.get("units", {})
+    for name, std in content["std"].items():
+        values = std if isinstance(std, list) else [std]
+        shown = ", ".join("not determined" if v is None else _number(v) for v in values)
+        lines.append(f"    {name:<16} {shown} {units.get(name, '')}".rstrip())
+    if "windows" in content:
+        w = content["windows"]
+        low, high = min(w["smallest_eigenvalue"]), max(w["smallest_eigenvalue"])
+        lines += [
+            "",
+            f"  over windows of {w['length_s']:.3g} s the smallest eigenvalue (information over "
+            f"prior) goes from {low:.3g} to {high:.3g}",
+        ]
+    return "\n".join(lines)
+
+
+def _number(value: Any) -> str:
+    return "…" if isinstance(value, list) else f"{value:.3g}"
+
+
+def filter_text(content: Mapping[str, Any]) -> str:
+    """Final states and the innovations' verdict."""
+    lines = [f"{content['model']}: {content['samples']} samples", "", "  at the end of the record:"]
+    for name, s in content["states"].items():
+        for k, (value, std) in enumerate(zip(s["value"], s["std"], strict=True)):
+            label = name if len(s["value"]) == 1 else f"{name}[{k}]"
+            lines.append(f"    {label:<14} {value:>12.5g} ± {std:<10.2g} {s['unit']}")
+    i = content["innovations"]
+    ratio = i["normalised_mean"] / i["expected"]
+    verdict = (
+        "as large as the noise intensities say"
+        if 0.8 < ratio < 1.25
+        else f"{ratio:.2g} times as large (squared) as the noise intensities say: match them"
+    )
+    lines += ["", f"  innovations are {verdict}"]
+    if i["missing_readings"]:
+        lines.append(f"  {i['missing_readings']} samples without a complete reading")
+    return "\n".join(lines)
