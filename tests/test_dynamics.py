@@ -1,0 +1,279 @@
+"""Estimators in motion against identities, other libraries, and an independent flight."""
+
+from __future__ import annotations
+
+import control
+import numpy as np
+import pytest
+import scipy.linalg
+from scipy.spatial.transform import Rotation
+
+from casest import DataError, DeclarationError, Run, signal
+from casest.dynamics import Motion, dynamics, measured, state
+from casest.dynamics.filter import filtered
+from casest.dynamics.gramian import gramian, gramian_by_ode, observed, smallest_eigenvalue
+from casest.dynamics.riccati import riccati
+from casest.dynamics.transition import linearised, transitions
+from casest_problems.bias_gravity import bias_gravity, bias_gravity_position
+
+BIAS = np.array([0.1, -0.05, 0.025])
+
+
+def turning(kind, t):
+    """Angular velocity (N, 3), rad/s."""
+    if kind == "all round":
+        return np.c_[0.5 * np.sin(0.3 * t), 0.4 * np.cos(0.21 * t), 0.3 * np.sin(0.11 * t + 1)]
+    if kind == "one axis":
+        return (1 + 0.5 * np.sin(0.2 * t))[:, None] * np.array([0.27, 0.53, 0.80])
+    return np.zeros((len(t), 3))
+
+
+def motionless(omega, t):
+    zero = np.zeros((len(t), 3))
+    return Run.raw("r", {"a": zero, "omega": omega, "v": zero}, units={}, time=t)
+
+
+def flight(seconds=40.0, rate=100, seed=0, noisy=True):
+    """A body that turns and moves: truth by SciPy's rotations, sensors with Batista's noise.
+
+    Returns the run, gravity in body axes (N, 3) and velocity in body axes.
+    """
+    t = np.arange(0, seconds, 1 / rate)
+    fine = np.arange(-1, 2 * len(t) + 1) / (2 * rate)
+    roll, pitch, yaw = 0.5 * np.sin(0.6 * fine), 0.4 * np.cos(0.42 * fine), 0.3 * np.sin(0.2 * fine)
+    R = Rotation.from_euler("ZYX", np.c_[yaw, pitch, roll])
+    step = (R[:-2].inv() * R[2:]).as_rotvec() * rate  # over two half steps
+    omega = step[0::2][: len(t)]
+    here = R[1::2][: len(t)].inv()
+    speed = np.c_[np.sin(0.4 * t), np.cos(0.3 * t), 0.2 * np.sin(0.2 * t)]
+    change = np.c_[0.4 * np.cos(0.4 * t), -0.3 * np.sin(0.3 * t), 0.04 * np.cos(0.2 * t)]
+    gravity, v = here.apply([0, 0, 9.80665]), here.apply(speed)
+    a = here.apply(change) - gravity + BIAS
+    if noisy:
+        rng = np.random.default_rng(seed)
+        a = a + 0.0013 * rng.standard_normal(a.shape)
+        omega = omega + np.radians(0.05) * rng.standard_normal(omega.shape)
+        readings = v + 0.01 * rng.standard_normal(v.shape)
+    else:
+        readings = v
+    signals = {"a": a, "omega": omega, "v": readings}
+    return Run.raw("flight", signals, units={}, time=t), gravity, v
+
+
+@dynamics
+def cart(
+    u=signal("m/s^2"),
+    y=signal("m"),
+    *,
+    position=state("m", intensity=1e-3, std=2.0),
+    velocity=state("m/s", intensity=0.02, std=1.0),
+):
+    """A damped cart on a spring: constant coefficients, stable."""
+    rates = {"position": velocity, "velocity": u - 0.8 * velocity - 1.5 * position}
+    return Motion(rates=rates, outputs=(measured(y, position, intensity=0.01),))
+
+
+A, C = np.array([[0, 1.0], [-1.5, -0.8]]), np.array([[1.0, 0]])
+XI, THETA = np.diag([1e-3, 0.02]), np.array([[0.01]])
+
+
+def cart_run(n=400, h=0.05, seed=0):
+    rng = np.random.default_rng(seed)
+    t = np.arange(n) * h
+    u, y = np.sin(t), 0.3 * np.sin(0.9 * t) + 0.3 * rng.standard_normal(n)
+    return Run.raw("cart", {"u": u[:, None], "y": y[:, None]}, units={}, time=t)
+
+
+# -- observability -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("kind", "rank"), [("all round", 9), ("one axis", 8), ("not at all", 6)])
+def test_the_rank_is_what_batista_proves(kind, rank):
+    t = np.arange(0, 60, 0.02)
+    system = linearised(bias_gravity, motionless(turning(kind, t), t))
+    assert observed(bias_gravity, gramian(bias_gravity, system)).rank == rank
+
+
+def test_the_hidden_direction_is_gravity_and_bias_along_the_axis():
+    t = np.arange(0, 60, 0.02)
+    system = linearised(bias_gravity, motionless(turning("one axis", t), t))
+    seen = observed(bias_gravity, gramian(bias_gravity, system))
+    (words,) = seen.unobservable
+    assert "gravity and bias along the body axis (0.27, 0.53, 0.80) move together" in words
+    axis = np.array([0.27, 0.53, 0.80])
+    expected = np.concatenate([np.zeros(3), axis, axis]) / (np.linalg.norm(axis) * 2**0.5)
+    assert abs(abs(expected @ seen.directions[:, 0]) - 1) < 1e-9
+
+
+def test_with_positions_the_rank_is_full_too():
+    t = np.arange(0, 60, 0.02)
+    zero, omega = np.zeros((len(t), 3)), turning("all round", t)
+    run = Run.raw("r", {"a": zero, "omega": omega, "p": zero}, units={}, time=t)
+    model = bias_gravity_position
+    assert observed(model, gramian(model, linearised(model, run))).rank == 12
+
+
+def test_both_forms_of_the_gramian_agree():
+    t = np.arange(0, 3, 0.01)
+    system = linearised(bias_gravity, motionless(turning("all round", t), t))
+    product, ode = gramian(bias_gravity, system), gramian_by_ode(bias_gravity, system)
+    assert np.abs(product - ode).max() < 1e-8 * np.abs(product).max()
+
+
+def test_a_slow_precession_shows_more_in_longer_windows():
+    t = np.arange(0, 200, 0.05)
+    axis = np.c_[np.cos(0.01 * t), np.sin(0.01 * t), np.zeros_like(t)]
+    system = linearised(bias_gravity, motionless(0.5 * axis, t))
+    smallest = [smallest_eigenvalue(bias_gravity, system, w, 5)[1].min() for w in (10, 40, 160)]
+    assert smallest[0] < 0.1 * smallest[1] < 0.01 * smallest[2] * 10
+
+
+def test_the_gramian_of_a_stable_system_is_the_lyapunov_solution_and_python_controls():
+    t = np.arange(0, 60, 0.02)
+    run = Run.raw("cart", {"u": 0 * t[:, None], "y": 0 * t[:, None]}, units={}, time=t)
+    W = gramian(cart, linearised(cart, run)) * THETA[0, 0]
+    expected = scipy.linalg.solve_continuous_lyapunov(A.T, -C.T @ C)
+    np.testing.assert_allclose(W, expected, rtol=1e-8, atol=1e-9)
+    system = control.ss(A, np.zeros((2, 1)), C, 0)
+    np.testing.assert_allclose(W, control.gram(system, "o"), rtol=1e-8, atol=1e-9)
+
+
+# -- transitions, Riccati ----------------------------------------------------------------------
+
+
+def test_transitions_of_constant_coefficients_are_scipys_exponential():
+    Phi, _ = transitions(linearised(cart, cart_run()))
+    np.testing.assert_allclose(Phi[7], scipy.linalg.expm(A * 0.05), rtol=1e-13, atol=1e-15)
+
+
+def test_without_process_noise_the_covariance_is_the_information_carried_forward():
+    """P = Φ(P₀⁻¹ + W)⁻¹Φᵀ."""
+    quiet = bias_gravity.driven(velocity=0.0, gravity=0.0, bias=0.0)
+    t = np.arange(0, 20, 0.01)
+    system = linearised(quiet, motionless(turning("all round", t), t))
+    W, P = gramian(quiet, system), riccati(quiet, system)[-1]
+    Phi = np.eye(9)
+    for step in transitions(system)[0]:
+        Phi = step @ Phi
+    expected = Phi @ np.linalg.inv(np.linalg.inv(quiet.start_covariance) + W) @ Phi.T
+    assert np.abs(P - expected).max() < 1e-8 * np.abs(expected).max()
+
+
+def test_the_riccati_equation_settles_where_scipy_and_python_control_say():
+    t = np.arange(0, 40, 0.05)
+    run = Run.raw("cart", {"u": 0 * t[:, None], "y": 0 * t[:, None]}, units={}, time=t)
+    P = riccati(cart, linearised(cart, run))[-1]
+    np.testing.assert_allclose(P, scipy.linalg.solve_continuous_are(A.T, C.T, XI, THETA), rtol=1e-8)
+    _, by_control, _ = control.lqe(A, np.eye(2), C, XI, THETA)
+    np.testing.assert_allclose(P, by_control, rtol=1e-8)
+
+
+def test_a_stiff_riccati_equation_stays_symmetric_and_positive():
+    """Measurement intensity 1e-6 against process 1e-3."""
+
+    @dynamics
+    def stiff(a=signal(3, "m/s^2"), omega=signal(3, "rad/s"), v=signal(3, "m/s"), *,
+              velocity=state(3, "m/s", intensity=1e-3), gravity=state(3, "m/s^2", intensity=1e-4),
+              bias=state(3, "m/s^2", intensity=1e-5)):  # fmt: skip
+        from casest import cross
+
+        rates = {"velocity": a - cross(omega, velocity) + gravity - bias,
+                 "gravity": -cross(omega, gravity)}  # fmt: skip
+        return Motion(rates=rates, outputs=(measured(v, velocity, intensity=1e-6),))
+
+    t = np.arange(0, 20, 0.01)
+    P = riccati(stiff, linearised(stiff, motionless(turning("all round", t), t)))
+    assert np.all(np.isfinite(P))
+    np.testing.assert_array_equal(P, P.transpose(0, 2, 1))
+    assert np.linalg.eigvalsh(P[1:]).min() > 0
+
+
+# -- filter and smoother -----------------------------------------------------------------------
+
+
+def least_squares(model, run):
+    """All states of a linear record at once, by dense normal equations."""
+    from casest.dynamics.transition import process_noise, steps_to
+
+    system = linearised(model, run)
+    Phi, forced = transitions(system)
+    Q = process_noise(system, model.process, Phi)
+    N, n = len(system.time), model.size
+    H, g = np.zeros((N * n, N * n)), np.zeros(N * n)
+    start = np.linalg.inv(model.start_covariance)
+    H[:n, :n] += start
+    g[:n] += start @ model.start
+    for k in range(N - 1):
+        rows = slice(k * n, (k + 2) * n)
+        J = np.hstack([-Phi[k], np.eye(n)])
+        weight = np.linalg.inv(Q[k])
+        H[rows, rows] += J.T @ weight @ J
+        g[rows] += J.T @ weight @ forced[k]
+    for k, dt in enumerate(steps_to(system)):
+        rows = slice(k * n, (k + 1) * n)
+        weight = np.linalg.inv(model.noise / dt)
+        H[rows, rows] += system.C[k].T @ weight @ system.C[k]
+        g[rows] += system.C[k].T @ weight @ (system.y[k] - system.d[k])
+    x = np.linalg.solve(H, g).reshape(N, n)
+    return x, np.linalg.inv(H)[-n:, -n:]
+
+
+def test_filter_smoother_and_least_squares_are_one_estimate():
+    run = cart_run(200)
+    found, (x, P) = filtered(cart, run), least_squares(cart, run)
+    np.testing.assert_allclose(found.smoothed, x, atol=1e-8)
+    np.testing.assert_allclose(found.x[-1], x[-1], atol=1e-8)
+    np.testing.assert_allclose(found.P[-1], P, rtol=1e-8)
+
+
+def test_missing_readings_say_nothing_and_do_no_harm():
+    run, gravity, _ = flight()
+    v = run.signals["v"].copy()
+    v[1000:1500] = np.nan
+    v[2000, 1] = np.nan
+    holed = Run.raw("r", {**run.signals, "v": v}, units={}, time=run.time)
+    found = filtered(bias_gravity, holed)
+    assert np.all(np.isfinite(found.x))
+    assert np.isnan(found.innovations[1200]).all()
+    assert np.isfinite(found.innovations[2000, [0, 2]]).all()
+    assert np.abs(found.x[-1, 3:6] - gravity[-1]).max() < 0.05
+
+
+def test_the_filter_finds_gravity_and_bias_from_far_away():
+    run, gravity, v = flight(noisy=False)
+    far = bias_gravity.beginning(gravity=(5.0, 5.0, -5.0), bias=(1.0, 1.0, -1.0)).known_to(bias=2)
+    found = filtered(far, run)
+    assert np.abs(found.x[-1, :3] - v[-1]).max() < 0.01
+    assert np.abs(found.x[-1, 3:6] - gravity[-1]).max() < 0.01
+    assert np.abs(found.x[-1, 6:] - BIAS).max() < 0.01
+
+
+# -- bad input ---------------------------------------------------------------------------------
+
+
+def test_time_that_goes_backwards_is_named():
+    run = cart_run(50)
+    time = run.time.copy()
+    time[20] = time[10]
+    with pytest.raises(DataError, match="row 20: time goes backwards"):
+        filtered(cart, Run.raw("r", run.signals, units={}, time=time))
+
+
+def test_a_missing_input_is_refused_and_counted():
+    run, _, _ = flight(5)
+    omega = run.signals["omega"].copy()
+    omega[100:110] = np.nan
+    with pytest.raises(DataError, match="input omega is missing in 10 of 500 rows, first in row"):
+        filtered(
+            bias_gravity, Run.raw("r", {**run.signals, "omega": omega}, units={}, time=run.time)
+        )
+
+
+def test_a_reading_without_noise_is_refused():
+    with pytest.raises(DeclarationError, match="must be positive, not 0"):
+        measured(None, None, intensity=0)
+
+
+def test_a_start_that_is_no_covariance_is_refused():
+    with pytest.raises(DataError, match="not positive"):
+        riccati(cart, linearised(cart, cart_run()), np.diag([1.0, -1.0]))
