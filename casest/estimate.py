@@ -267,8 +267,10 @@ def _canonical(problem: Problem, best: Outcome) -> Outcome:
 def _by_estimator(optimum: Estimate, function: Callable[..., Any], name: str) -> Estimate:
     """The values of an estimator of the model's own, judged by the least-squares optimum."""
     problem, began = optimum.problem, time.perf_counter()
+    known = {p.name for p in problem.model.parameters}
     try:
         values = function(problem.model, problem.runs)
+        values = {name: value for name, value in values.items() if name in known}
     except NotTrusted as error:
         refused = replace(optimum.certificate, trusted=False, reasons=(str(error),))
         return replace(optimum, certificate=refused, extra={"estimator": name})

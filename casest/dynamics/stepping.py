@@ -76,15 +76,22 @@ def run_steps(
     """
     N, n = len(parts[0]), len(x)
     flat = [p.transpose(0, 2, 1).reshape(N, -1) if p.ndim == 3 else p for p in parts]
-    numbers = np.hstack(flat)
-    padded = -N % CHUNK
-    numbers = np.vstack([numbers, np.repeat(numbers[-1:], padded, axis=0)])
-    state, after, before = np.concatenate([x, P.T.ravel()]), [], []
-    for k in range(0, N, CHUNK):
-        found = steps(state, numbers[k : k + CHUNK].T)
-        after.append(np.array(found[0]).T)
-        before.append(np.array(found[1]).T)
-        state = after[-1][-1]
-    both = [np.vstack(a)[:N] for a in (after, before)]
+    padded = -(-N // CHUNK) * CHUNK
+    numbers = np.zeros((padded, sum(f.shape[1] for f in flat)))
+    np.concatenate(flat, axis=1, out=numbers[:N])
+    numbers[N:] = numbers[N - 1]
+    state = np.concatenate([x, P.T.ravel()])
+    after, before = (np.empty((padded, len(state))) for _ in range(2))
+    # CasADi's matrices are column by column: a row of these arrays is one of its columns.
+    buffer, run = steps.buffer()
+    for k in range(0, padded, CHUNK):
+        span = slice(k, k + CHUNK)
+        arrays = (state, numbers[span]), (after[span], before[span])
+        for i in range(2):
+            buffer.set_arg(i, memoryview(arrays[0][i]))
+            buffer.set_res(i, memoryview(arrays[1][i]))
+        run()
+        state = after[k + CHUNK - 1].copy()
+    both = [a[:N] for a in (after, before)]
     matrices = [b[:, n:].reshape(N, n, n).transpose(0, 2, 1) for b in both]
     return both[0][:, :n], matrices[0], both[1][:, :n], matrices[1]

@@ -145,11 +145,13 @@ def process_noise(system: Linearised, intensity: Array, Phi: Array) -> Array:
     Φ(t₁, middle) = Φ·Φ(middle, t₀)⁻¹.
     """
     h = system.steps[:, None, None]
+    # The process noise is diagonal: a product with its roots, half the work.
+    root = np.sqrt(np.diag(intensity))
     half, _ = transitions(system, parts=2)
-    later = Phi @ np.linalg.inv(half)
-    ends = Phi @ intensity @ Phi.transpose(0, 2, 1) + intensity
-    middle = later @ intensity @ later.transpose(0, 2, 1)
-    return np.asarray(h / 6 * (ends + 4 * middle))
+    first, middle = Phi * root, np.linalg.solve(half.transpose(0, 2, 1), Phi.transpose(0, 2, 1))
+    middle = middle.transpose(0, 2, 1) * root
+    ends = first @ first.transpose(0, 2, 1) + intensity
+    return np.asarray(h / 6 * (ends + 4 * (middle @ middle.transpose(0, 2, 1))))
 
 
 def steps_to(system: Linearised) -> NDArray[np.float64]:

@@ -7,7 +7,9 @@ CasADi hands IPOPT three functions that the engine evaluates: cost, gradient and
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 
 import casadi as ca
@@ -16,6 +18,9 @@ import numpy as np
 from casest.declaring.shapes import Array
 from casest.solve.outcome import Outcome
 from casest.stack import Point, Problem
+
+#: Solvers kept for the next problem of as many unknowns.
+KEPT = 32
 
 
 def ipopt(
@@ -30,8 +35,6 @@ def ipopt(
     Unknowns are scaled by their Jacobian columns and the cost by its start value. `options` are
     IPOPT's own.
     """
-    began = time.perf_counter()
-    scaled = _Scaled(problem, start, exact)
     settings = {
         "print_level": 0,
         "sb": "yes",
@@ -44,17 +47,27 @@ def ipopt(
         "mu_init": 1e-6,
         **(options or {}),
     }
+    found = run_nlpsol("ipopt", problem, start, settings, exact=exact)
+    return replace(found, solver="ipopt-exact") if exact else found
+
+
+def run_nlpsol(
+    plugin: str, problem: Problem, start: Point, settings: dict[str, Any], *, exact: bool = False
+) -> Outcome:
+    """Minimise the cost from `start` by an nlpsol plugin of CasADi: "ipopt" or "sqpmethod"."""
+    began = time.perf_counter()
+    scaled = _Scaled(problem, start, exact)
     z0 = start.x / scaled.scale
     lower, upper = problem.bounds
-    solver = _solver(scaled, problem.unknowns, settings)
-    with np.errstate(invalid="ignore"):
-        found = solver(x0=z0, lbx=lower / scaled.scale, ubx=upper / scaled.scale)
-    stats = solver.stats()
+    with _solver(plugin, problem.unknowns, settings) as solver, np.errstate(invalid="ignore"):
+        solver.scaled = scaled
+        found = solver.nlpsol(x0=z0, lbx=lower / scaled.scale, ubx=upper / scaled.scale)
+        stats = solver.nlpsol.stats()
     z = np.array(found["x"]).ravel()
     # After Invalid_Option and the like IPOPT returns the start without a word: read its status.
     point = problem.moved(start, scaled.scale * z - start.x)
     return Outcome(
-        "ipopt-exact" if exact else "ipopt",
+        plugin,
         point,
         problem.cost(point),
         int(stats.get("iter_count", 0)),
@@ -91,11 +104,8 @@ class _Scaled:
         return Point(self.scale * z, self.start.references)
 
     def cost(self, z: Array) -> float:
-        """Scaled cost alone."""
-        if self._z is not None and np.array_equal(z, self._z):
-            return float(self._normal.cost / self.unit)
-        self.evaluations += 1
-        return self.problem.cost(self.point(z)) / self.unit
+        """Scaled cost; with its slope, for nearly every point that IPOPT tries is accepted."""
+        return float(self.normal(z).cost / self.unit)
 
     def gradient(self, z: Array) -> Array:
         """Gradient of the scaled cost, (n,)."""
@@ -107,45 +117,75 @@ class _Scaled:
         return np.asarray(matrix * np.outer(self.scale, self.scale) / self.unit)
 
 
-def _solver(scaled: _Scaled, n: int, settings: dict[str, Any]) -> Any:
-    """An nlpsol whose functions are Python callbacks into the engine."""
-    dense, triangle = ca.Sparsity.dense, ca.Sparsity.upper(n)
-    x, none = dense(n, 1), dense(0, 1)
-    rows, columns = triangle.row(), _columns(triangle)
+class _Solver:
+    """An nlpsol whose functions are Python callbacks into what `scaled` holds at the time."""
 
-    def gradient(z: Any, _p: Any) -> list[Any]:
-        z = _vector(z)
-        return [scaled.cost(z), scaled.gradient(z)]
+    def __init__(self, plugin: str, n: int, settings: dict[str, Any]) -> None:
+        self.scaled: Any = None
+        dense = ca.Sparsity.dense
+        # IPOPT takes the upper triangle, sqpmethod the whole matrix.
+        pattern = ca.Sparsity.upper(n) if plugin == "ipopt" else dense(n, n)
+        x, none = dense(n, 1), dense(0, 1)
+        rows, columns = pattern.row(), _columns(pattern)
 
-    def hessian(z: Any, _p: Any, factor: Any, _g: Any) -> list[Any]:
-        matrix = float(factor) * scaled.hessian(_vector(z))
-        return [ca.DM(triangle, matrix[rows, columns])]
+        def gradient(z: Any, _p: Any) -> list[Any]:
+            z = _vector(z)
+            return [self.scaled.cost(z), self.scaled.gradient(z)]
 
-    cost_f = _Callback("f", lambda z: [scaled.cost(_vector(z))], [x], [dense(1, 1)])
-    grad_f = _Callback("nlp_grad_f", gradient, [x, none], [dense(1, 1), x])
-    hess_l = _Callback("nlp_hess_l", hessian, [x, none, dense(1, 1), none], [triangle])
-    z, p = ca.MX.sym("x", n), ca.MX.sym("p", 0, 1)
-    factor, g = ca.MX.sym("lam_f"), ca.MX.sym("lam_g", 0, 1)
-    options = {
-        "grad_f": ca.Function(
-            "nlp_grad_f", [z, p], list(grad_f(z, p)), ["x", "p"], ["f", "grad_f_x"]
-        ),
-        "hess_lag": ca.Function(
-            "nlp_hess_l",
-            [z, p, factor, g],
-            [hess_l(z, p, factor, g)],
-            ["x", "p", "lam_f", "lam_g"],
-            ["triu_hess_gamma_x_x"],
-        ),
-        "no_nlp_grad": True,
-        "calc_lam_p": False,
-        "print_time": False,
-        "ipopt": settings,
-    }
-    solver = ca.nlpsol("solver", "ipopt", {"x": z, "f": cost_f(z)}, options)
-    # CasADi keeps no reference to Python callbacks: tie them to the solver's life.
-    scaled.keep = (cost_f, grad_f, hess_l)  # type: ignore[attr-defined]
-    return solver
+        def hessian(z: Any, _p: Any, factor: Any, _g: Any) -> list[Any]:
+            matrix = float(factor) * self.scaled.hessian(_vector(z))
+            return [ca.DM(pattern, matrix[rows, columns])]
+
+        cost_f = _Callback("f", lambda z: [self.scaled.cost(_vector(z))], [x], [dense(1, 1)])
+        grad_f = _Callback("nlp_grad_f", gradient, [x, none], [dense(1, 1), x])
+        hess_l = _Callback("nlp_hess_l", hessian, [x, none, dense(1, 1), none], [pattern])
+        z, p = ca.MX.sym("x", n), ca.MX.sym("p", 0, 1)
+        factor, g = ca.MX.sym("lam_f"), ca.MX.sym("lam_g", 0, 1)
+        f, slope = grad_f(z, p)
+        lagrangian = [z, p, factor, g], [hess_l(z, p, factor, g)], ["x", "p", "lam_f", "lam_g"]
+        if plugin == "ipopt":
+            names = ["f", "grad_f_x"]
+            own = {
+                "grad_f": ca.Function("nlp_grad_f", [z, p], [f, slope], ["x", "p"], names),
+                "hess_lag": ca.Function("nlp_hess_l", *lagrangian, ["triu_hess_gamma_x_x"]),
+                "ipopt": settings,
+            }
+        else:
+            names, nothing = ["f", "grad_f_x", "g", "jac_g_x"], [ca.MX(0, 1), ca.MX(0, n)]
+            own = {
+                "jac_fg": ca.Function("jac_fg", [z, p], [f, slope, *nothing], ["x", "p"], names),
+                "hess_lag": ca.Function("nlp_hess_l", *lagrangian, ["hess_gamma_x_x"]),
+                **settings,
+            }
+        options = {
+            "no_nlp_grad": True,
+            "calc_lam_p": False,
+            "print_time": False,
+            "show_eval_warnings": False,  # a point that is not finite is stepped back from
+            **own,
+        }
+        self.nlpsol = ca.nlpsol("solver", plugin, {"x": z, "f": cost_f(z)}, options)
+        # CasADi keeps no reference to Python callbacks: tie them to the solver's life.
+        self._keep = (cost_f, grad_f, hess_l)
+
+
+_idle: dict[tuple[str, int, str], _Solver] = {}
+
+
+@contextmanager
+def _solver(plugin: str, n: int, settings: dict[str, Any]) -> Iterator[_Solver]:
+    """A solver for n unknowns; building one takes longer than a small fit, so it is kept.
+
+    Taken off the shelf while in use: two threads, or a callback that solves, never share one.
+    """
+    key = plugin, n, repr(sorted(settings.items()))
+    solver = _idle.pop(key, None) or _Solver(plugin, n, settings)
+    try:
+        yield solver
+    finally:
+        solver.scaled = None
+        if len(_idle) < KEPT:
+            _idle[key] = solver
 
 
 def _columns(sparsity: Any) -> list[int]:

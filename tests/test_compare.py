@@ -1,0 +1,403 @@
+"""Solvers side by side: they agree on one valley, and are judged where there are several."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import threading
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import simulators as sim
+
+import casest
+from casest import NotTrusted, Residual, Run, UsageError, attitude, model, param, unit_vector
+from casest.cli import run
+from casest.compare import SOLVERS, compare
+from casest.comparing_plot import draw
+from casest.comparing_text import comparison_result, comparison_text
+from casest.problem import find_model
+from casest.solve import others
+from casest.solve.trust_region import trust_region
+from casest.stack import Problem
+
+NORM = find_model("norm-triangular").having(norm=sim.GRAVITY)
+
+
+def as_run(**signals):
+    columns = {n: np.asarray(s, float).reshape(len(s), -1) for n, s in signals.items()}
+    return Run.raw("r", columns, units={})
+
+
+def readings(seed=1, sigma=1e-2):
+    rng = np.random.default_rng(seed)
+    sensor = sim.accelerometer(rng)
+    return sensor.read(sim.spread_poses(24, rng), sigma, rng)
+
+
+@model
+def wave(t=casest.signal(), y=casest.signal(), *, rate=param(start=2.02)):
+    """A sine of unknown rate: a valley wherever it gains or loses another turn over the record."""
+    return Residual(measured=y, predicted=casest.sin(rate * t))
+
+
+@model
+def decay(x=casest.signal(), y=casest.signal(), *, k=param(start=1.0, bounds=(0.5, 2))):
+    return Residual(measured=y, predicted=casest.exp(-k * x))
+
+
+def wave_run():
+    t = np.linspace(0, 20, 200)
+    return as_run(t=t, y=np.sin(2 * t) + 0.05 * np.random.default_rng(0).standard_normal(200))
+
+
+@pytest.fixture(scope="module")
+def poses():
+    return compare(NORM, [as_run(v=readings())], starts=4, sizes=(0.01, 0.1))
+
+
+@pytest.fixture(scope="module")
+def waves():
+    return compare(wave, [wave_run()], starts=6, sizes=(0.3,))
+
+
+def row(found, name):
+    return next(r for r in found.rows if r.solver == name)
+
+
+# -- the solvers -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_every_solver_solves_a_linear_problem_as_numpy_does(name):
+    @model
+    def linear(A=casest.signal(4), y=casest.signal(), *, c=param(4)):
+        return Residual(measured=y, predicted=A.T @ c)
+
+    rng = np.random.default_rng(0)
+    A, y = rng.standard_normal((20, 4)), rng.standard_normal(20)
+    problem = Problem(linear, (as_run(A=A, y=y),))
+    found = SOLVERS[name](problem, problem.start())
+    assert found.solver == name
+    assert found.claims_success
+    np.testing.assert_allclose(found.point.x, np.linalg.lstsq(A, y, rcond=None)[0], rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_every_solver_minimises_the_weighted_sum(name):
+    rng = np.random.default_rng(0)
+    weight = rng.uniform(0.1, 10, 24)
+
+    @model
+    def level(y=casest.signal(), *, a=param(start=3.0)):
+        return Residual(measured=y, predicted=a)
+
+    y = rng.standard_normal(24)
+    problem = Problem(level, (as_run(y=y),), (weight[:, None],))
+    found = SOLVERS[name](problem, problem.start())
+    assert found.point.x[0] == pytest.approx(np.average(y, weights=weight), abs=1e-7)
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_every_solver_finds_a_direction_in_the_chart_of_its_start(name):
+    @model
+    def table(a=casest.signal(3), R=attitude(), *, up=param(unit_vector)):
+        return Residual(measured=a, predicted=R.T @ up)
+
+    rng = np.random.default_rng(2)
+    R = np.array([sim.random_rotation(rng) for _ in range(20)])
+    up = np.array([0.6, 0.0, 0.8])
+    run_ = as_run(a=np.einsum("nji,j->ni", R, up), R=R.reshape(20, 9))
+    problem = Problem(table, (run_,))
+    found = SOLVERS[name](problem, problem.start())
+    np.testing.assert_allclose(problem.values(found.point)["up"], up, atol=1e-5)
+
+
+def test_scipy_is_refused_where_its_jacobian_would_not_fit_into_memory(monkeypatch):
+    monkeypatch.setattr(others, "DENSE", 200)
+    found = compare(NORM, [as_run(v=readings())], starts=0, solvers=("scipy-lm", "trust-region"))
+    assert row(found, "scipy-lm").first.status == (
+        "scipy-lm needs the whole Jacobian, 2.2e+02 numbers (1.7e-06 GB, and copies of it); "
+        "compare on a shorter record"
+    )
+    assert row(found, "trust-region").first.right
+
+
+# -- judging ---------------------------------------------------------------------------------------
+
+
+def test_on_one_valley_all_reach_the_same_cost_from_all_starts(poses):
+    assert poses.certified
+    for name in SOLVERS:
+        own = row(poses, name)
+        for trial in (own.first, *own.spread):
+            assert 0 <= trial.excess < 1e-6 * poses.best
+            assert trial.distance < 0.01
+            assert trial.right
+            assert trial.evaluations > 1
+            assert trial.seconds > 0
+        assert (own.right, own.false_successes) == (4, 0)
+        assert [trial.size for trial in own.spread] == [0.01, 0.1, 0.01, 0.1]
+
+
+def test_the_certified_cost_is_that_of_the_printed_values(poses):
+    S, o = (poses.estimate.values[n] for n in ("scale", "offset"))
+    c = (readings() - o) @ S.T
+    length = np.linalg.norm(c, axis=1)
+    residual = (length - sim.GRAVITY) / np.linalg.norm(c / length[:, None] @ S, axis=1)
+    assert poses.best == pytest.approx(0.5 * np.sum(residual**2), rel=1e-9)
+
+
+def test_estimators_of_the_models_own_have_a_distance_and_no_claim(poses):
+    names = [name for name, _ in NORM.estimators]
+    assert [r.solver for r in poses.rows if r.own] == names
+    values = dict(NORM.estimators)["closed-form"](NORM, poses.estimate.problem.runs)
+    estimate = poses.estimate
+    away = []
+    for name in ("scale", "offset"):
+        std, difference = estimate.std[name], np.abs(values[name] - estimate.values[name])
+        away.append((difference[std > 0] / std[std > 0]).max())  # zeros above the diagonal
+    trial = row(poses, "closed-form").first
+    assert trial.distance == pytest.approx(max(away), rel=1e-6)
+    assert (trial.claims, trial.iterations, row(poses, "closed-form").spread) == (None, None, ())
+
+
+def test_a_claim_in_the_wrong_valley_is_a_false_success(waves):
+    assert waves.certified
+    for name in SOLVERS:
+        own = row(waves, name)
+        assert own.first.right
+        wrong = [t for t in own.spread if t.claims and abs(t.distance) > 1]
+        assert own.false_successes == len(wrong)
+        assert own.right + len(wrong) <= len(own.spread) == 6
+        assert all(t.excess > 0.1 * waves.best for t in wrong)
+    # 30 % of the rate is six turns over the record: most starts lie in other valleys
+    assert row(waves, "trust-region").false_successes >= 3
+
+
+def test_an_optimum_that_is_reported_as_a_failure_is_a_false_failure(monkeypatch):
+    def modest(problem, start):
+        return replace(trust_region(problem, start), claims_success=False, status="not sure")
+
+    monkeypatch.setitem(SOLVERS, "modest", modest)
+    found = compare(wave, [wave_run()], starts=3, sizes=(1e-3,), solvers=["modest"])
+    own = row(found, "modest")
+    assert (own.right, own.claimed, own.false_successes, own.false_failures) == (3, 0, 0, 3)
+    assert "modest: not sure" in comparison_text(found, ["a.csv"])
+
+
+def test_a_lower_cost_than_the_certified_one_is_told(monkeypatch):
+    """The certified fit is held in a wrong valley; a solver that jumps finds the right one."""
+    import casest.compare as module
+
+    attempt = module.attempt
+
+    def misled(model, runs, **options):
+        found = attempt(model, runs, **options)
+        wrong = trust_region(found.problem, found.problem.point({"rate": 2.35})).point
+        return replace(found, point=wrong)
+
+    monkeypatch.setattr(module, "attempt", misled)
+    found = compare(wave, [wave_run()], starts=0, solvers=["trust-region"])
+    assert not found.certified
+    assert found.best_by == "trust-region"
+    assert row(found, "trust-region").first.right
+    text = comparison_text(found, ["a.csv"])
+    assert "NO CERTIFIED OPTIMUM" in text
+    assert "found a lower cost than the certified fit" in text
+
+
+def test_a_solver_that_leaves_the_bounds_is_not_right():
+    x = np.linspace(0, 3, 20)
+    found = compare(decay, [as_run(x=x, y=np.exp(-5 * x))], starts=0)
+    lm, trf = row(found, "scipy-lm").first, row(found, "scipy-trf").first
+    assert not lm.inside
+    assert not lm.right
+    assert lm.excess < 0 < found.best
+    assert lm.status.startswith("left the bounds")
+    assert trf.inside
+    assert not found.certified
+    assert "the fit is refused: `k` ended on its bound" in " ".join(
+        comparison_text(found, ["a.csv"]).split()
+    )
+
+
+def test_equal_seeds_give_equal_starts(waves):
+    again = compare(wave, [wave_run()], starts=6, sizes=(0.3,), solvers=["scipy-lm"])
+    costs = [t.cost for t in row(again, "scipy-lm").spread]
+    assert costs == [t.cost for t in row(waves, "scipy-lm").spread]
+    other = compare(wave, [wave_run()], starts=6, seed=1, sizes=(0.3,), solvers=["scipy-lm"])
+    assert costs != [t.cost for t in row(other, "scipy-lm").spread]
+
+
+# -- what goes wrong becomes a row -----------------------------------------------------------------
+
+
+def test_an_exception_becomes_a_row_with_its_first_line(monkeypatch):
+    def broken(problem, start):
+        raise RuntimeError("plugin 'snopt' not found\n at line 3")
+
+    monkeypatch.setitem(SOLVERS, "broken", broken)
+    found = compare(wave, [wave_run()], starts=2, solvers=["broken", "trust-region"])
+    own = row(found, "broken")
+    assert own.first.status == "RuntimeError: plugin 'snopt' not found"
+    assert (own.right, own.claimed, own.false_successes) == (0, 0, 0)
+    assert "  - broken: RuntimeError: plugin 'snopt' not found" in comparison_text(found, ["a"])
+    json.dumps(comparison_result(found, model_name="wave", data=["a"]), allow_nan=False)
+
+
+@pytest.mark.parametrize("name", ["ipopt", "sqpmethod", "trust-region", "scipy-lm"])
+def test_a_run_that_takes_too_long_is_stopped(name, monkeypatch):
+    solve = SOLVERS[name]
+
+    def slow(problem, start):
+        problem.clock.deadline = 0.0 if problem.cost(start) > 0 else 1.0
+        return solve(problem, start)
+
+    monkeypatch.setitem(SOLVERS, name, slow)
+    found = compare(wave, [wave_run()], starts=0, solvers=[name], limit=3)
+    assert row(found, name).first.status == "stopped: no answer within 3 s"
+
+
+@pytest.mark.parametrize("name", ["ipopt", "ipopt-exact", "sqpmethod", "trust-region", "scipy-lm"])
+def test_ctrl_c_inside_a_solver_ends_with_what_is_done(name, monkeypatch):
+    solve, seen = SOLVERS[name], []
+
+    def pressed(problem, start):
+        seen.append(start)
+        if len(seen) == 5:  # three times the same start, and one of the spread
+            threading.Timer(0.002, os.kill, (os.getpid(), signal.SIGINT)).start()
+            for _ in range(500):
+                solve(problem, start)
+        return solve(problem, start)
+
+    monkeypatch.setitem(SOLVERS, name, pressed)
+    before = signal.getsignal(signal.SIGINT)
+    found = compare(wave, [wave_run()], starts=4, sizes=(1e-3,), solvers=[name])
+    assert found.interrupted
+    assert (found.done, found.planned) == (2, 5)
+    assert row(found, name).first.right
+    assert signal.getsignal(signal.SIGINT) is before
+    assert "interrupted after 2 of 5 runs" in comparison_text(found, ["a.csv"])
+
+
+def test_without_a_finite_start_there_is_nothing_to_compare():
+    @model
+    def rooted(y=casest.signal(), *, a=param(start=-1.0)):
+        return Residual(measured=y, predicted=casest.sqrt(a))
+
+    with pytest.raises(NotTrusted, match="nothing to compare: the residual is not finite"):
+        compare(rooted, [as_run(y=[1.0, 1.1])])
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"starts": -1}, "--starts -1: give 0 or more"),
+        ({"sizes": (0.1, 0)}, "--spread 0: give a share above 0, such as 0.1 for 10 %"),
+        ({"sizes": ()}, "no size of the spread is given; give one, such as --spread 0.1"),
+        ({"limit": 0}, "--limit 0: give a time above 0 in seconds"),
+        ({"solvers": ["snopt"]}, "unknown solver 'snopt' for wave; it has ipopt, ipopt-exact, "),
+    ],
+)
+def test_options_that_make_no_sense_are_named(options, text):
+    with pytest.raises(UsageError) as caught:
+        compare(wave, [wave_run()], **options)
+    assert str(caught.value).startswith(text)
+
+
+# -- the command -----------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def record(tmp_path_factory):
+    path = tmp_path_factory.mktemp("compare") / "poses.csv"
+    header = "vx [m/s^2],vy [m/s^2],vz [m/s^2]"
+    np.savetxt(path, readings(), delimiter=",", header=header, comments="", fmt="%.9g")
+    return path
+
+
+def arguments(record, *more):
+    return ["compare", "norm-triangular", str(record), "--set", "norm=9.80665 m/s^2", *more]
+
+
+def test_the_command_writes_what_it_prints(record, tmp_path, capsys):
+    pytest.importorskip("matplotlib")
+    out = tmp_path / "out"
+    few = ("--starts", "2", "--spread", "0.1", "--solver", "ipopt", "--solver", "closed-form")
+    assert run(arguments(record, *few, "-o", str(out), "--json")) == 0
+    printed = capsys.readouterr()
+    assert printed.err == ""
+    content = json.loads(printed.out)
+    assert content == json.loads((out / "compare.json").read_text(encoding="utf-8"))
+    assert (content["certified"], content["interrupted"]) == (True, False)
+    assert content["best"]["unit"] == "(m/s^2)^2"
+    assert content["spread"] == {"starts": 2, "sizes": [0.1], "seed": 0}
+    ipopt, closed = content["solvers"]
+    assert ipopt["same_start"]["status"] == "Solve_Succeeded"
+    assert (ipopt["spread"]["right"], ipopt["spread"]["starts"]) == (2, 2)
+    assert (closed["name"], closed["own_estimator"]) == ("closed-form", True)
+    assert (out / "compare.png").read_bytes().startswith(b"\x89PNG")
+    assert "<svg" in (out / "compare.svg").read_text(encoding="utf-8")
+
+
+def test_the_printed_tables_fit_80_columns(record, capsys):
+    assert run(arguments(record, "--starts", "4")) == 0
+    text = capsys.readouterr().out
+    assert max(map(len, text.splitlines())) <= 80
+    for name in (*SOLVERS, "closed-form", "six-position"):
+        assert f"\n  {name} " in text
+    assert "4/4" in text
+
+
+def test_without_matplotlib_the_json_is_written_and_the_way_out_said(
+    record, tmp_path, capsys, monkeypatch
+):
+    from casest import comparing_plot
+
+    def missing(name):
+        raise ImportError(name)
+
+    monkeypatch.setattr(comparing_plot, "import_module", missing)
+    out = tmp_path / "out"
+    assert run(arguments(record, "--starts", "0", "--solver", "ipopt", "-o", str(out))) == 0
+    printed = capsys.readouterr()
+    assert printed.err == (
+        "casest: no plot: matplotlib is not installed; pip install 'casest[plot]'\n"
+    )
+    assert "Written: " in printed.out
+    assert [p.name for p in out.iterdir()] == ["compare.json"]
+
+
+def test_a_refused_fit_is_exit_code_2_with_the_table_printed(tmp_path, capsys):
+    path = tmp_path / "poses.csv"
+    np.savetxt(path, readings(), delimiter=",", header="vx,vy,vz", comments="")
+    few = ("--starts", "0", "--solver", "trust-region")
+    assert run(["compare", "norm-full", str(path), "--set", "norm=9.80665", *few]) == 2
+    printed = capsys.readouterr()
+    assert "NO CERTIFIED OPTIMUM" in printed.out
+    assert printed.err == "casest: no certified optimum to judge by\n"
+
+
+def test_bad_input_is_exit_code_1(record, capsys):
+    assert run(arguments(record, "--solver", "snopt")) == 1
+    assert "unknown solver 'snopt' for norm-triangular" in capsys.readouterr().err
+
+
+def test_an_interrupted_command_is_exit_code_2(record, capsys, monkeypatch):
+    def pressed(problem, start):
+        raise KeyboardInterrupt
+
+    monkeypatch.setitem(SOLVERS, "scipy-lm", pressed)
+    assert run(arguments(record, "--starts", "0")) == 2
+    printed = capsys.readouterr()
+    assert printed.err == "casest: interrupted after 4 of 12 runs\n"
+    assert "\n  ipopt " in printed.out
+
+
+def test_a_plot_without_a_folder_is_named(poses, tmp_path):
+    pytest.importorskip("matplotlib")
+    with pytest.raises(casest.DataError, match="no plot can be written"):
+        draw(poses, tmp_path / "nowhere")
