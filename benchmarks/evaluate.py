@@ -1,94 +1,106 @@
-"""Time one evaluation of (½ Σ r², Jᵀr, JᵀJ) on a wheel-like model: replay against CasADi's map.
+"""Time one evaluation of (½ Σ r², Jᵀr, JᵀJ) of the shipped wheel, 18 000 samples of 3 axes.
 
-Run `python benchmarks/evaluate.py`. Both ways run in turns in one process, so that what else the
-machine does hits both alike; the median of the ratios is what counts.
+Run `python benchmarks/evaluate.py`. NumPy's replay of the instructions and the compiled kernel on
+one and two cores, against a C kernel written by hand for this one model (fused_wheel.c) and
+CasADi's own `map`. All run in turns in one process, so that what else the machine does hits all
+alike; the ratios of medians are what counts.
 """
 
 from __future__ import annotations
 
+import os
 import sys
+import tempfile
 from pathlib import Path
 from time import perf_counter
 from typing import Any
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import casadi as ca
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from casest.engine import Replay, normal_equations
+from benchmarks import by_hand, fused
+from casest.engine import Replay, kernel, normal_equations
+from casest.modelling.tracing import function_of
+from casest_problems.wheel import wheel
 
-N_SAMPLES = 18_000
-TURNS = 15
-REPLAYS_PER_TURN = 20
-GRAVITY = 9.81
-
-
-def rotation(angle: Any) -> Any:
-    """Rotation matrix of the Euler angles x, y, z."""
-    c, s = ca.cos(angle), ca.sin(angle)
-    rx = ca.blockcat([[1, 0, 0], [0, c[0], -s[0]], [0, s[0], c[0]]])
-    ry = ca.blockcat([[c[1], 0, s[1]], [0, 1, 0], [-s[1], 0, c[1]]])
-    rz = ca.blockcat([[c[2], -s[2], 0], [s[2], c[2], 0], [0, 0, 1]])
-    return rz @ ry @ rx
+N_SAMPLES, LONG = 18_000, 500_000
+TURNS = 41
 
 
-def wheel() -> Any:
-    """An accelerometer on a wheel: 15 parameters, 3 residuals; sample (t, vx, vy, vz)."""
-    offset, gain, euler = ca.SX.sym("o", 3), ca.SX.sym("g", 3), ca.SX.sym("e", 3)
-    radius, tilt, phase = ca.SX.sym("r"), ca.SX.sym("a"), ca.SX.sym("p")
-    rate = ca.SX.sym("w", 3)
-    parameters = ca.vertcat(offset, gain, euler, radius, tilt, phase, rate)
-    t, reading = ca.SX.sym("t"), ca.SX.sym("v", 3)
-    th = phase + t * (rate[0] + t * (rate[1] + t * rate[2]))
-    w = rate[0] + t * (2 * rate[1] + t * 3 * rate[2])
-    dw = 2 * rate[1] + 6 * rate[2] * t
-    force = ca.vertcat(
-        radius * w**2 + GRAVITY * ca.sin(tilt) * ca.cos(th),
-        radius * dw + GRAVITY * ca.sin(tilt) * ca.sin(th),
-        GRAVITY * ca.cos(tilt),
-    )
-    residual = offset + gain * (rotation(euler) @ force) - reading
-    outputs = [residual, ca.jacobian(residual, parameters)]
-    inputs = [parameters, ca.vertcat(t, reading)]
-    return ca.Function("wheel", inputs, outputs, ["parameters", "sample"], ["r", "J"])
+def function() -> Any:
+    """Residual and Jacobian of one sample of the shipped model."""
+    t = wheel.traced
+    return function_of(wheel, {"r": t.expression, "J": ca.jacobian(t.expression, t.coordinates)})
 
 
-def summed(function: Any, count: int) -> Any:
+def summed(count: int) -> Any:
     """CasADi's own way: cost, gradient and matrix per sample, mapped and summed."""
-    p, s = ca.SX.sym("p", function.numel_in(0)), ca.SX.sym("s", function.numel_in(1))
-    r, jacobian = function(p, s)
+    per_sample = function()
+    p, s = ca.SX.sym("p", 15), ca.SX.sym("s", 4)
+    r, jacobian = per_sample(p, s)
     terms = [0.5 * ca.sumsqr(r), jacobian.T @ r, jacobian.T @ jacobian]
-    each = ca.Function("each", [p, s], terms)
-    return each.map("sum", "serial", count, [0], [0, 1, 2])
+    return ca.Function("each", [p, s], terms).map("sum", "serial", count, [0], [0, 1, 2])
+
+
+def by_replay(samples: Any, wish: str, cores: int = 1) -> Any:
+    """An evaluation with or without the compiled kernel; the first call compiles."""
+    replay = Replay(function())
+
+    def evaluate(x: Any) -> Any:
+        os.environ["CASEST_KERNEL"] = wish
+        kernel._cores = lambda: cores  # type: ignore[assignment]
+        return normal_equations(replay, x, samples)
+
+    evaluate(by_hand.TRUTH)
+    return evaluate
+
+
+def timed(ways: dict[str, Any], turns: int) -> dict[str, float]:
+    """Median seconds of each."""
+    times: dict[str, list[float]] = {name: [] for name in ways}
+    for _ in range(turns):
+        for name, evaluate in ways.items():
+            began = perf_counter()
+            evaluate(by_hand.TRUTH)
+            times[name].append(perf_counter() - began)
+    return {name: float(np.median(spent)) for name, spent in times.items()}
+
+
+def report(count: int, by_c: Any, turns: int) -> None:
+    """Print medians and their ratios to the kernel written by hand."""
+    t, v = by_hand.record(count)
+    samples = np.asfortranarray(np.column_stack([t, v]))
+    ways = {
+        "NumPy replay": by_replay(samples, "off"),
+        "compiled kernel": by_replay(samples, "always"),
+        "compiled kernel, two cores": by_replay(samples, "always", cores=2),
+    }
+    matrix = ways["NumPy replay"](by_hand.TRUTH).matrix
+    if by_c is not None:
+        ways["C written by hand"] = fused.Fused(by_c, t, v)
+        scale = np.sqrt(np.outer(np.diag(matrix), np.diag(matrix)))
+        error = np.abs(ways["C written by hand"](by_hand.TRUTH)[0] - matrix) / scale
+        assert error.max() < 1e-10, error.max()
+    if count <= N_SAMPLES:
+        mapped = summed(count)
+        ways["CasADi map"] = lambda x: mapped(x, samples.T)
+    medians = timed(ways, turns)
+    least = medians.get("C written by hand", min(medians.values()))
+    print(f"{count} samples{'':22}      ms   ns/sample   ratio")
+    for name, median in medians.items():
+        print(f"  {name:32}{1e3 * median:8.3f}{1e9 * median / count:12.1f}{median / least:8.2f}")
 
 
 def main() -> None:
-    """Print both medians and the median of the ratios."""
-    rng = np.random.default_rng(0)
-    parameters = np.concatenate([rng.uniform(0.5, 1.5, 12), [6.0, 0.3, -0.01]])
-    samples = np.column_stack([np.linspace(0, 10, N_SAMPLES), rng.normal(size=(N_SAMPLES, 3))])
-    function = wheel()
-    start = perf_counter()
-    replay = Replay(function)
-    normal = normal_equations(replay, parameters, samples)
-    print(f"build and first call  {1e3 * (perf_counter() - start):8.2f} ms")
-    mapped = summed(function, N_SAMPLES)
-    matrix = np.array(mapped(parameters, samples.T)[2])
-    error = np.abs(normal.matrix - matrix).max() / np.abs(matrix).max()
-    print(f"largest difference    {error:8.1e} of the largest entry of JᵀJ")
-    times = []
-    for _ in range(TURNS):
-        start = perf_counter()
-        mapped(parameters, samples.T)
-        middle = perf_counter()
-        for _ in range(REPLAYS_PER_TURN):
-            normal_equations(replay, parameters, samples)
-        times.append((middle - start, (perf_counter() - middle) / REPLAYS_PER_TURN))
-    by_map, by_replay = np.array(times).T
-    print(f"map (serial, summed)  {1e3 * np.median(by_map):8.2f} ms")
-    print(f"normal_equations      {1e3 * np.median(by_replay):8.2f} ms")
-    print(f"ratio                 {np.median(by_map / by_replay):8.1f}")
+    """One short record and one long one."""
+    with tempfile.TemporaryDirectory() as folder:
+        by_c = fused.compiled(Path(folder))
+        report(N_SAMPLES, by_c, TURNS)
+        report(LONG, by_c, TURNS // 4)
 
 
 if __name__ == "__main__":

@@ -185,13 +185,15 @@ def calibrate(model_name: str, data: tuple[str, ...], **options: Any) -> int:
 def calibration(model_name: str, data: Sequence[str], options: Options, command: str) -> int:
     """Read, fit, save, print; the exit code says whether the estimate is trusted."""
     from casest import estimate, result, terminal
+    from casest.solve.interrupt import interruptible
 
     model = declared_model(model_name, options)
     runs = records(model, data, options)
     start = dict(start_value(text, model) for text in options["starts"]) or None
-    found = estimate.attempt(
-        model, runs, start=start, solver=options["solver"], seed=options["seed"]
-    )
+    with interruptible():
+        found = estimate.attempt(
+            model, runs, start=start, solver=options["solver"], seed=options["seed"]
+        )
     holdout = held_out(found, model, options) if options["holdout"] else None
     content = result.calibration_result(
         found, model_name=model_name, data=data, command=command, holdout=holdout

@@ -21,6 +21,7 @@ from casest.remarks import NOTABLE_BIAS, notes
 from casest.solve.certificate import Certificate, certify
 from casest.solve.correlation import correlation_time
 from casest.solve.covariance import inverse_normal, sandwich
+from casest.solve.interrupt import stopped
 from casest.solve.outcome import Outcome
 from casest.solve.strategy import SOLVERS, best_of, solve
 from casest.stack import Point, Problem
@@ -153,6 +154,10 @@ def _attempt(problem: Problem, start: Mapping[str, Any] | None, solver: str, see
         automatic=start is None,
     )
     found = _estimate(problem, best_of(outcomes), outcomes, began)
+    if stopped():
+        reason = "interrupted: this is the best point so far, not an optimum"
+        refused = replace(found.certificate, trusted=False, reasons=(reason,))
+        return replace(found, certificate=refused)
     return _by_estimator(found, own[solver], solver) if solver in own else found
 
 

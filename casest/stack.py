@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -31,8 +31,8 @@ from casest.engine import (
 )
 from casest.errors import DataError, UsageError
 from casest.modelling.model import Model
-from casest.modelling.tracing import function_of
-from casest.persample import curvature, residual_and_jacobian
+from casest.modelling.tracing import function_of, sample_symbol
+from casest.persample import residual_and_jacobian
 from casest.sequence import Recursion
 
 
@@ -377,7 +377,19 @@ class Problem:
         return sum(self._run_cost(point, r) for r in range(len(self.runs)))
 
     def normal(self, point: Point) -> Normal:
-        """Cost, gradient (n,) and Gauss-Newton matrix (n, n)."""
+        """Cost, gradient (n,) and Gauss-Newton matrix (n, n); those of the last point are kept."""
+        for known, normal in self._latest:
+            if known is point:
+                return normal
+        normal = self._normal(point)
+        self._latest[:] = [(point, normal)]
+        return normal
+
+    @cached_property
+    def _latest(self) -> list[tuple[Point, Normal]]:
+        return []
+
+    def _normal(self, point: Point) -> Normal:
         total, gradient = 0.0, np.zeros(self.unknowns)
         matrix = np.zeros((self.unknowns, self.unknowns))
         for r in range(len(self.runs)):
@@ -417,17 +429,17 @@ class Problem:
 
     def hessian(self, point: Point) -> Array:
         """Exact second derivative of the cost, (n, n); Gauss-Newton for sequences of samples."""
+        matrix = self.normal(point).matrix.copy()
         if self._recursion is not None:
-            return self.normal(point).matrix
-        matrix = np.zeros((self.unknowns, self.unknowns))
+            return matrix
         for r, samples in enumerate(self.samples):
             x = self._selections[r][0]
             weights = self._weight(r)
             if weights is None:
-                weights = np.ones((len(samples), len(self.model.axes)))
+                weights = np.broadcast_to(1.0, (len(samples), len(self.model.axes)))
             with_weights = samples.with_more(weights)
-            own = summed(curvature(self.model), self.parameters(point, r), with_weights)
-            matrix[np.ix_(x, x)] += own
+            own = summed(_bend(self.model), self.parameters(point, r), with_weights)
+            matrix[np.ix_(x, x)] += own + np.triu(own, 1).T
         return matrix
 
     def residuals(self, point: Point) -> tuple[Array, ...]:
@@ -466,6 +478,21 @@ class Problem:
     def with_weights(self, weights: Sequence[Array] | None) -> Problem:
         """The same problem with other weights on the squares."""
         return replace(self, weights=None if weights is None else tuple(weights))
+
+
+@lru_cache(maxsize=64)
+def _bend(model: Model) -> Replay:
+    """Σ w r ∂²r of one sample, upper triangle: what the Hessian of ½rᵀWr has beyond JᵀWJ.
+
+    The weights arrive as further signals.
+    """
+    t, count = model.traced, model.traced.expression.numel()
+    w, force = ca.SX.sym("w", count), ca.SX.sym("force", count)
+    second = ca.triu(ca.hessian(ca.dot(force, t.expression), t.coordinates)[0])
+    bend = ca.substitute(second, force, w * t.expression)
+    sample = ca.vertcat(sample_symbol(model), w)
+    parameters = ca.vertcat(t.coordinates, t.references)
+    return Replay(ca.Function("h", [parameters, sample], [bend], ["parameters", "sample"], ["H"]))
 
 
 def factored(normal: Normal) -> tuple[Array, Array, float] | None:

@@ -16,6 +16,8 @@ from casest.stack import Block, Point, Problem
 
 #: Residuals that are looked at where a median or a correlation is wanted of a longer record.
 SAMPLED = 1_000_000
+#: The same where an order of magnitude is wanted.
+FEW = 3_000
 
 
 def squares_of_gradients(
@@ -77,7 +79,7 @@ def rounding(problem: Problem, point: Point) -> float:
 
     Of a long record every k-th sample is looked at: an order of magnitude is wanted.
     """
-    problem = _sampled(problem, 3 * SAMPLED // 100)
+    problem = _sampled(problem, FEW)
     squares, count = 0.0, 0
     for block in problem.blocks(point):
         parameters = problem.parameters(point, block.run)

@@ -70,7 +70,7 @@ _ALONE = {
     ca.OP_COSH, ca.OP_TANH, ca.OP_ASINH, ca.OP_ACOSH, ca.OP_ATANH, ca.OP_ATAN2, ca.OP_HYPOT,
     ca.OP_FMOD, ca.OP_REMAINDER, ca.OP_ERF,
 }  # fmt: skip
-#: Instructions of one loop: compilers take time that grows with its square to place more.
+#: Instructions of one loop: the time that compilers take grows with the square of it.
 _LONGEST = 200
 #: Bytes of a chunk's values: they stay in the first-level cache.
 _CACHE = 24_000
@@ -137,7 +137,7 @@ def source(replay: Replay, components: list[list[Entry]]) -> str:
 
 def source_of_sum(replay: Replay, output: int) -> str:
     """C source with `casest_sum`: each entry of one output, added over all samples."""
-    entries = [(output, k) for k in range(len(replay.sparsity[output][0]))]
+    entries = replay.entries(output)
     chunk = max(16, min(128, _CACHE // (8 * max(len(entries), 1)) // 8 * 8))
     parts = [_HEAD.replace("{chunk}", str(chunk)), _PRODUCTS]
     parts += _block("all", replay.plan(entries), len(entries))

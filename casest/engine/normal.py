@@ -73,9 +73,7 @@ def normal_equations(
         whole = _compiled_sums(kernel, replay, parameters, samples, weights)
     else:
         whole = _replayed_sums(replay, parameters, samples, weights)
-    matrix = whole[:n, :n]
-    # Both halves were computed, each with its own rounding: make them agree to the last digit.
-    return Normal(0.5 * float(whole[n, n]), whole[:n, n].copy(), 0.5 * (matrix + matrix.T))
+    return Normal(0.5 * float(whole[n, n]), whole[:n, n].copy(), whole[:n, :n].copy())
 
 
 def _replayed_sums(
@@ -92,6 +90,9 @@ def _replayed_sums(
     whole = np.zeros((n + 1, n + 1))
     for component, total in zip(components, sums, strict=True):
         whole[np.ix_(component.columns, component.columns)] += total
+    # Both halves of JᵀJ were computed, each with its own rounding: make them agree to the last
+    # digit. The residual's own row may be left out.
+    whole[:n, :n] = 0.5 * (whole[:n, :n] + whole[:n, :n].T)
     return whole
 
 
@@ -127,8 +128,10 @@ def _compiled_sums(
     parameters, columns = replay.check(parameters, samples)
     weights = _check_weights(weights, len(columns), len(_components(replay)))
     packed, n = kernel.products(parameters, columns, weights), replay.shapes[_JACOBIAN][1]
-    whole = np.bincount(_places(replay), packed, (n + 1) ** 2).reshape(n + 1, n + 1)
-    return np.asarray(whole + np.triu(whole, 1).T)
+    upper = np.bincount(_places(replay), packed, (n + 1) ** 2).reshape(n + 1, n + 1)
+    whole = upper + upper.T
+    whole.flat[:: n + 2] *= 0.5  # the diagonal came twice
+    return np.asarray(whole)
 
 
 @lru_cache(maxsize=256)

@@ -25,7 +25,7 @@ Floats = NDArray[np.float64]
 Kernel = Callable[..., object]
 Entry = tuple[int, int]  # (output, index of the nonzero in CasADi's column-major order)
 
-BLOCK = 8192  # samples per block: long enough to hide the cost of NumPy's calls
+BLOCK = 9216  # samples per block: long enough to hide the cost of NumPy's calls
 
 
 # Kernels: f(operand, ..., out). An operand is a row of samples or a 0-d array. The composite ones
@@ -222,6 +222,8 @@ class Columns:
         for part in parts:
             self.columns += [part] if part.ndim == 1 else [part[:, j] for j in range(part.shape[1])]
         self._length = len(parts[0]) if parts else 0
+        #: Addresses and strides for compiled code, found when first wanted.
+        self.plain: list[tuple[int, int]] | None = None
 
     def __len__(self) -> int:
         """Return the number of samples N."""
@@ -442,6 +444,10 @@ class Replay:
             self._plans[key] = Plan(self._graph, key)
         return self._plans[key]
 
+    def entries(self, output: int) -> list[Entry]:
+        """All of one output."""
+        return [(output, k) for k in range(len(self.sparsity[output][0]))]
+
     def blocks(
         self, parameters: Floats, samples: Samples, block: int = BLOCK
     ) -> Iterator[tuple[slice, list[Floats]]]:
@@ -454,7 +460,7 @@ class Replay:
         parameters, columns = self.check(parameters, samples)
         counts = [len(row) for row, _ in self.sparsity]
         ends = np.cumsum(counts)
-        plan = self.plan([(i, j) for i, count in enumerate(counts) for j in range(count)])
+        plan = self.plan([entry for i in range(len(counts)) for entry in self.entries(i)])
         for span, values in plan.blocks(parameters, columns, block):
             yield (
                 span,
@@ -475,7 +481,7 @@ class Replay:
         row, column = self.sparsity[output]
         output %= len(self.shapes)
         total = np.zeros(self.shapes[output])
-        plan = self.plan([(output, j) for j in range(len(row))])
+        plan = self.plan(self.entries(output))
         with np.errstate(all="ignore"):
             for _, values in plan.blocks(parameters, columns):
                 total[row, column] += values.sum(axis=1)

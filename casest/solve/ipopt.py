@@ -16,6 +16,7 @@ import casadi as ca
 import numpy as np
 
 from casest.declaring.shapes import Array
+from casest.solve.interrupt import stopped
 from casest.solve.outcome import Outcome
 from casest.stack import Point, Problem
 
@@ -105,7 +106,8 @@ class _Scaled:
 
     def cost(self, z: Array) -> float:
         """Scaled cost; with its slope, for nearly every point that IPOPT tries is accepted."""
-        return float(self.normal(z).cost / self.unit)
+        # What is not finite makes IPOPT's line search give up, which is what Ctrl-C asks for.
+        return float("nan") if stopped() else float(self.normal(z).cost / self.unit)
 
     def gradient(self, z: Array) -> Array:
         """Gradient of the scaled cost, (n,)."""

@@ -18,7 +18,7 @@ from casest.identify import identify
 from casest.noise import has_noise_effects, weights
 from casest.solve.ipopt import ipopt
 from casest.solve.outcome import Outcome
-from casest.solve.trust_region import trust_region
+from casest.solve.trust_region import LITTLE, trust_region
 from casest.stack import Point, Problem
 
 #: Iterations after which a second opinion has nothing to say.
@@ -50,8 +50,12 @@ def solve(
 
 
 def best_of(outcomes: tuple[Outcome, ...]) -> Outcome:
-    """The outcome of the lowest cost; one that is not finite loses."""
-    return min(outcomes, key=_cost)
+    """The outcome of the lowest cost; one that is not finite loses.
+
+    Where costs differ by rounding only, the first is best: it is polished.
+    """
+    lowest, first = min(outcomes, key=_cost), outcomes[0]
+    return first if _cost(first) <= _cost(lowest) * (1 + 1e-12) else lowest
 
 
 def _cost(outcome: Outcome) -> float:
@@ -82,7 +86,7 @@ def _ways(
 
 
 def _polished(problem: Problem, main: Outcome) -> Outcome:
-    polished = trust_region(problem, main.point)
+    polished = trust_region(problem, main.point, damping=LITTLE)
     return replace(
         polished,
         solver=main.solver,
@@ -101,7 +105,8 @@ def _nearby(problem: Problem, start: Point) -> Outcome:
     if every < 2 or problem.sequential:
         return stay
     thinned = problem.thinned(every)
-    few = trust_region(thinned, start, max_iterations=OPINION, tolerance=_fine(thinned))
+    # A tenth of the deviations of so few samples is as near as they can say.
+    few = trust_region(thinned, start, max_iterations=OPINION, tolerance=1e4 * _fine(thinned))
     there = problem.cost(few.point)
     near = few if np.isfinite(there) and there < here else stay
     return replace(near, cost=min(here, there), seconds=time.perf_counter() - began)
@@ -110,8 +115,13 @@ def _nearby(problem: Problem, start: Point) -> Outcome:
 def _opinion(problem: Problem, start: Point) -> Outcome:
     """Where a trust region ends from a start: near a solution to a fraction of its deviations."""
     near = _nearby(problem, start)
-    tolerance = _fine(problem)
-    found = trust_region(problem, near.point, max_iterations=OPINION, tolerance=tolerance)
+    found = trust_region(
+        problem,
+        near.point,
+        max_iterations=OPINION,
+        tolerance=_fine(problem),
+        damping=LITTLE if near.iterations else 1e-3,
+    )
     return replace(found, seconds=near.seconds + found.seconds)
 
 

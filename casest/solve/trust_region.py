@@ -7,16 +7,20 @@ condition number is not squared.
 from __future__ import annotations
 
 import time
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 
 from casest.declaring.shapes import Array
+from casest.engine import Normal
+from casest.solve.interrupt import stopped
 from casest.solve.outcome import LeastSquares, Outcome
 from casest.stack import Point
 
 #: Relative gain from which on the normal equations' squared condition number may tell.
 ROUGH = 1e-5
+#: Damping that does not slow what data determine, yet keeps steps along what they do not short.
+LITTLE = 1e-7
 
 
 class _Local(NamedTuple):
@@ -28,18 +32,27 @@ class _Local(NamedTuple):
 
 
 def trust_region(
-    problem: LeastSquares, start: Point, *, max_iterations: int = 300, tolerance: float = 0.0
+    problem: LeastSquares,
+    start: Point,
+    *,
+    max_iterations: int = 300,
+    tolerance: float = 0.0,
+    damping: float = 1e-3,
 ) -> Outcome:
     """Minimise the cost from `start` until steps and gains are at rounding.
 
-    With a `tolerance` only until an undamped step gains no more than this share of the cost.
+    With a `tolerance` only until an undamped step gains no more than this share of the cost. Near
+    a solution begin with a small `damping`.
     """
     began = time.perf_counter()
     point, here, precise = start, _linearise(problem, start, precise=False), False
     scale = _column_norms(here.R)
-    damping, growth, evaluations, status = 1e-3, 2.0, 1, "iteration limit"
+    growth, evaluations, status = 2.0, 1, "iteration limit"
     iterations = 0
     while iterations < max_iterations:
+        if stopped():
+            status = "interrupted"
+            break
         iterations += 1
         if not (np.isfinite(here.cost) and np.all(np.isfinite(here.R))):
             status = "cost or slope is not finite"
@@ -59,12 +72,14 @@ def trust_region(
             status = "converged"
             break
         trial = problem.moved(point, step)
-        there = problem.cost(trial)
+        # Far away most steps descend, and their slope is wanted with the cost.
+        normal = None if precise else problem.normal(trial)
+        there = problem.cost(trial) if normal is None else normal.cost
         evaluations += 1
         if np.isfinite(there) and there < here.cost:
             ratio = (here.cost - there) / max(gain, 1e-300)
-            point, here = trial, _linearise(problem, trial, precise)
-            damping *= max(1 / 5, 1 - (2 * min(ratio, 2.0) - 1) ** 3)
+            point, here = trial, _linearise(problem, trial, precise, normal)
+            damping = _relieved(damping, ratio)
             growth = 2.0
         else:
             damping, growth = damping * growth, growth * 2
@@ -82,10 +97,23 @@ def trust_region(
     )
 
 
-def _linearise(problem: LeastSquares, point: Point, precise: bool) -> _Local:
+def _relieved(damping: float, ratio: float) -> float:
+    """Damping after a step that gained `ratio` times what the model promised.
+
+    Nielsen's, but where the model holds to a percent little damping is needed at all: it only
+    slows what the data determine least.
+    """
+    if abs(ratio - 1) < 0.01 and damping > LITTLE:
+        return max(damping * 1e-2, LITTLE)
+    return damping * float(max(1 / 5, 1 - (2 * min(ratio, 2.0) - 1) ** 3))
+
+
+def _linearise(
+    problem: LeastSquares, point: Point, precise: bool, normal: Normal | None = None
+) -> _Local:
     """From JᵀJ, which is quick, while far away; from a QR factor where the last digits count."""
     if not precise:
-        normal = problem.normal(point)
+        normal = normal or problem.normal(point)
         scale = np.sqrt(np.where(np.diag(normal.matrix) > 0, np.diag(normal.matrix), 1.0))
         try:
             lower = np.linalg.cholesky(normal.matrix / np.outer(scale, scale))
@@ -128,11 +156,20 @@ def _damped(here: _Local, scale: Array, damping: float, free: Array, step: Array
     right = -(here.t + here.R[:, fixed] @ step[fixed])
     A = np.vstack([here.R[:, free], np.diag(np.sqrt(damping) * scale[free])])
     b = np.concatenate([right, np.zeros(int(free.sum()))])
-    # Unit columns: scales that differ by orders of magnitude must not reach the rank decision.
     if not (np.all(np.isfinite(A)) and np.all(np.isfinite(b))):
         return np.full(int(free.sum()), np.nan)
-    step_z: Array = np.linalg.lstsq(A / scale[free], b, rcond=None)[0]
-    return np.asarray(step_z / scale[free])
+    # Unit columns: scales that differ by orders of magnitude must not reach the rank decision.
+    return np.asarray(_least_squares(A / scale[free], b) / scale[free])
+
+
+def _least_squares(A: Array, b: Array) -> Array:
+    """Shortest z of least ‖Az − b‖, (n,)."""
+    n = A.shape[1]
+    factor = cast(Array, np.linalg.qr(np.column_stack([A, b]), mode="r"))
+    pivots = np.abs(np.diag(factor))[:n]
+    if len(pivots) == n and pivots.min(initial=1.0) > 1e-8 * pivots.max(initial=1.0):
+        return np.asarray(np.linalg.solve(factor[:n, :n], factor[:n, n]))
+    return np.asarray(np.linalg.lstsq(A, b, rcond=None)[0])
 
 
 def _negligible(step: Array, point: Point, scale: Array, here: _Local, gain: float) -> bool:
