@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: demo test lint types format wheel bench study clean
+.PHONY: demo test lint types format wheel bench study study-starts study-nist study-loop figures clean
 
 demo: $(READY)
 	$(BIN)/casest demo
@@ -31,6 +31,19 @@ bench: $(READY)
 
 study: $(READY)
 	$(BIN)/python studies/bound.py
+	$(BIN)/python studies/wheel_bound.py
+
+study-starts: $(READY)
+	$(BIN)/python studies/random_starts.py
+
+study-nist: $(READY)
+	$(BIN)/python studies/nist.py
+
+study-loop: $(READY)
+	$(BIN)/python studies/loop.py
+
+figures: $(READY)
+	$(BIN)/python studies/figures.py
 
 clean:
 	rm -rf $(VENV) build dist *.egg-info out
