@@ -5,11 +5,21 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import simulators as sim
+from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from casest import Run, attempt, load_runs, param
+from casest.effects import speed_polynomial
 from casest.problem import find_model
-from casest_problems.wheel import closed_form, euler, find_motion, four_step, wheel
+from casest_problems.wheel import (
+    closed_form,
+    euler,
+    find_motion,
+    four_step,
+    law_misfit,
+    remarks,
+    wheel,
+)
 
 TABLE_1 = {
     "offset": np.array([1.0, -1.0, 1.0]),
@@ -89,6 +99,34 @@ def test_the_phase_does_not_slip_a_turn(rate, speed):
     found = found * np.sign(found[-1] - found[0]) * np.sign(speed)
     slip = (found - found[0]) - (angle - angle[0])
     assert np.abs(slip).max() < 0.3
+
+
+def hard_case(seed):
+    """A wheel from the corners of what is promised: readings, and the angle behind them."""
+    rng = np.random.default_rng(seed)
+    seconds, rate = rng.choice([30.0, 120.0]), rng.choice([50.0, 400.0])
+    first, last = rng.choice([[20.0, 2.1], [3.0, 2.0], [20.0, 14.0], [8.0, 2.5]])
+    fall = (first - last) / seconds
+    speed = rng.choice([-1, 1]) * np.array([first, -1.2 * fall, 0.2 * fall / seconds, 0.0])
+    t = np.arange(0, seconds, 1 / rate)
+    motion = sim.cubic_motion(t, rng.uniform(-np.pi, np.pi), speed)
+    bench = sim.Spin(
+        rng.uniform(-2, 2, 3),
+        rng.uniform(0.8, 1.2, 3),
+        sim.random_rotation(rng),
+        np.radians(rng.choice([15.0, 75.0])),
+    )
+    v = bench.read(*motion)
+    return t, v + 0.5 * rng.standard_normal(v.shape), motion[0]
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_the_phase_does_not_slip_at_the_corners_of_what_is_promised(seed):
+    """Noise of 0.5 m/s², 15° or 75° of tilt, gains ±20 %, either direction, any mounting."""
+    t, v, angle = hard_case(seed)
+    found = find_motion(t, v).phase(t)
+    found = found * np.sign(found[-1] - found[0]) * np.sign(angle[-1] - angle[0])
+    assert np.ptp(found - angle) < 0.5
 
 
 def test_any_sensor_and_motion_is_calibrated_from_its_readings_alone():
@@ -199,6 +237,58 @@ def test_a_wheel_slowed_by_air_is_fitted_by_the_cubic_for_a_minute():
     assert found.certificate.trusted, found.certificate.reasons
     assert found.rmse == pytest.approx(0.08, rel=0.03)
     assert np.all(np.abs(found.values["offset"] - TABLE_1["offset"]) < 4 * found.std["offset"])
+
+
+def slowed(seconds, rate, sigma=0.08, seed=0, **losses):
+    """A wheel slowed by air and bearing, from `rate` rad/s on, sampled at 50 Hz."""
+    rng, t = np.random.default_rng(seed), np.arange(0, seconds, 0.02)
+    turned = turn(TABLE_1["misalignment"])
+    bench = sim.Spin(TABLE_1["offset"], TABLE_1["gain"], turned, TABLE_1["tilt"])
+    v = bench.read(*sim.physical_motion(t, 0.5, rate, **losses))
+    return as_run(t, v + sigma * rng.standard_normal(v.shape))
+
+
+@pytest.mark.parametrize(("seconds", "rate"), [(120, 10.0), (90, 20.0), (150, -20.0)])
+def test_a_run_too_long_for_the_cubic_law_is_told_in_words(seconds, rate):
+    """The fit is an optimum all the same, with an offset several standard deviations off."""
+    found = attempt(wheel, [slowed(seconds, rate)], solver="trust-region")
+    (words,) = [note for note in found.notes if "speed_polynomial" in note]
+    assert "the cubic speed law does not hold in run" in words
+
+
+def test_ten_minutes_that_the_cubic_law_misses_by_turns_are_told_in_words():
+    """Five whole turns off at the worst: the angle is followed without the law."""
+    run = slowed(600, 20.0)
+    found = law_misfit(run.time, run.signals["v"])
+    assert 25 < found.departure < 35
+    assert list(remarks(wheel, [run], {}))
+
+
+def test_with_higher_speed_terms_in_the_model_the_law_is_no_longer_remarked():
+    run = slowed(120, 10.0)
+    assert list(remarks(wheel, [run], {}))
+    assert not list(remarks(wheel.with_effect(speed_polynomial), [run], {}))
+
+
+def test_an_unbalanced_wheel_is_not_mistaken_for_a_law_that_fails():
+    """An eccentric mass speeds it up and slows it down once per turn: whole turns average that."""
+    run = slowed(40, 8.0, sigma=0.02, eccentric=0.05)
+    assert not list(remarks(wheel, [run], {}))
+
+
+@pytest.mark.parametrize("kind", ["white", "correlated", "rounded"])
+def test_an_exact_cubic_is_not_said_to_fail(kind):
+    """Fifteen runs of each kind of noise: none is remarked on (one in a thousand would be)."""
+    rng = np.random.default_rng(12)
+    for _ in range(15):
+        truth = random_truth(rng, 40.0)
+        run = spun(truth, rng, sigma=0.0, seconds=40.0, rate=50.0)
+        noise = 0.08 * rng.standard_normal(run.signals["v"].shape)
+        if kind == "correlated":
+            noise = 0.8 * lfilter([1.0], [1.0, -0.6], noise, axis=0)
+        v = run.signals["v"] + noise
+        v = 0.2 * np.round(v / 0.2) if kind == "rounded" else v
+        assert not list(remarks(wheel, [as_run(run.time, v)], {}))
 
 
 def test_a_record_that_does_not_turn_is_refused():

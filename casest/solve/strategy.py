@@ -43,6 +43,10 @@ def solve(
     outcomes = _ways(problem, first, solver, seed, automatic)
     outcomes += _around_the_sphere(problem, first)
     outcomes += _along_the_weakest(problem, best_of(outcomes))
+    best = best_of(outcomes)
+    if best is not outcomes[0]:
+        # An opinion was better than the answer: it becomes one.
+        outcomes = (_polished(problem, best), *outcomes)
     if not has_noise_effects(problem.model):
         return problem, outcomes
     problem, point = _reweighted(problem, best_of(outcomes).point)
