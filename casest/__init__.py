@@ -24,6 +24,7 @@ _HOME = {
     "casest.data": "load_runs read_table",
     "casest.errors": ("CasestError DataError DeclarationError NotTrusted UnitError UsageError"),
     "casest.estimate": "Estimate attempt calibrate",
+    "casest.batch": "Batch calibrate_many",
     "casest.closing.loop": "Closing close",
     "casest.apply": "Correction",
 }

@@ -6,7 +6,7 @@ these weights, again and again, is M-estimation with ψ(r) = w(r)·r.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import casadi as ca
 import numpy as np
@@ -36,6 +36,13 @@ def weights(problem: Problem, point: Point) -> tuple[Array, ...]:
     return tuple(
         curve(np.zeros(0), (r / scale).reshape(-1, 1))[0].reshape(r.shape) for r in residuals
     )
+
+
+def weighted(problem: Problem, values: Mapping[str, Array]) -> Problem:
+    """The problem with the weights of its effects on the noise at these values; else as it is."""
+    if not has_noise_effects(problem.model):
+        return problem
+    return problem.with_weights(weights(problem, problem.point(values)))
 
 
 def _curve(model: Model) -> Replay:

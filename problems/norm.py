@@ -12,7 +12,7 @@ tend to a smaller cost the further the solution collapses, for any data.)
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -260,6 +260,66 @@ def closed_form(declared: Model, runs: Sequence[Run]) -> dict[str, Array]:
     if declared.function.__name__ == "norm_diagonal":
         return _values(declared, *burkhard_diagonal(z, g))
     return _values(declared, *burkhard_full(z, g))
+
+
+def closed_form_many(declared: Model, signals: Mapping[str, Array]) -> dict[str, Any]:
+    """Burkhard's closed form for many sensors at once, for `calibrate_many(…, start=…)`.
+
+    v is (S, N, 3); returns scale (S, …) and offset as (value, lower, upper), bounded as by
+    `inside_the_ball`. As (4) and (5), but in readings from which their mean is taken, and with the
+    trace of S held instead of the length of θ, so that normal equations do. A sphere around the
+    mean where that gives no ellipsoid.
+    """
+    v, g = np.ascontiguousarray(np.transpose(signals["v"], (2, 1, 0))), _length(declared)
+    ball = np.sqrt(np.max(np.sum(v**2, axis=0), axis=0))[:, None]
+    known = _known_scale(declared)
+    z = v if known is None else np.einsum("ij,jns->ins", known, v)
+    middle = np.mean(z, axis=1)
+    z = z - middle[:, None]
+    size = np.sqrt(np.mean(np.sum(z**2, axis=0), axis=0) / 3)
+    x, y, w = z = z / size
+    squares = [] if known is not None else [x * x - w * w, y * y - w * w]
+    if squares and declared.function.__name__ != "norm_diagonal":
+        squares += [x * y, x * w, y * w]
+    # θ = (s11, s22, 2·s12, 2·s13, 2·s23, −2r, d); on the right stays −3w², on a sphere −‖z‖².
+    right = 3 * w * w if squares else np.sum(z**2, axis=0)
+    X = np.stack([*squares, *z, np.ones_like(x), right])
+    n, k = len(X) - 1, len(squares)
+    A = np.empty((n, n + 1, v.shape[2]))
+    for i in range(n):
+        A[i, i:] = np.einsum("ps,jps->js", X[i], X[i:])
+    for i in range(n):  # Cholesky, on the upper triangle and the right side
+        if i:
+            A[i, i:] -= np.einsum("ks,kjs->js", A[:i, i], A[:i, i:])
+        A[i, i:] /= np.sqrt(A[i, i])
+    theta = -A[:, n]
+    for i in range(n - 1, -1, -1):
+        theta[i] -= np.einsum("ks,ks->s", A[i, i + 1 : n], theta[i + 1 :])
+        theta[i] /= A[i, i]
+    # S = LᵀL with L lower triangular, from its last entry on (each row: all sensors).
+    S = np.zeros((3, 3, v.shape[2])) + np.eye(3)[:, :, None]
+    if k:
+        S[0, 0], S[1, 1], S[2, 2] = theta[0], theta[1], 3 - theta[0] - theta[1]
+    if k == 5:
+        S[0, 1], S[0, 2], S[1, 2] = theta[2:5] / 2
+    L, b = np.zeros_like(S), theta[k : k + 3] / -2
+    for i in (2, 1, 0):
+        for j in range(i + 1):
+            L[i, j] = S[j, i] - np.sum(L[i + 1 :, i] * L[i + 1 :, j], axis=0)
+        L[i, : i + 1] /= np.sqrt(L[i, i])
+    for i in (2, 1, 0):  # Lᵀy = r, and then Lb = y
+        b[i] = (b[i] - np.sum(L[i + 1 :, i] * b[i + 1 :], axis=0)) / L[i, i]
+    square = np.sum(b**2, axis=0) - theta[-1]
+    for i in range(3):
+        b[i] = (b[i] - np.sum(L[i, :i] * b[:i], axis=0)) / L[i, i]
+    good = np.isfinite(b).all(axis=0) & (square > 0)
+    # Readings of unit size in each component lie √3 from their mean.
+    L = np.where(good, L, np.eye(3)[:, :, None]) * (g / np.sqrt(np.where(good, square, 3.0)) / size)
+    offset = (np.where(good, b, 0.0) * size + middle).T
+    if known is not None:
+        return {"offset": (offset @ np.linalg.inv(known).T, -ball, ball)}
+    scale = np.einsum("iis->si", L) if k == 2 else L.transpose(2, 0, 1)
+    return {"scale": scale, "offset": (offset, -ball, ball)}
 
 
 def bias_only(declared: Model, runs: Sequence[Run]) -> dict[str, Array]:

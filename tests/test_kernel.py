@@ -222,6 +222,7 @@ def test_what_is_not_finite_appears_in_its_sums_and_nowhere_else(weighted):
         samples[row, 0] = 1.0
     samples[7, 1] = INF
     assert cost(replay, [2.0, 3.0], samples) == INF
+    assert normal_equations(replay, [2.0, 3.0], samples).matrix[1, 1] == INF
 
 
 # -- columns of any kind ---------------------------------------------------------------------------

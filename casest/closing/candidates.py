@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ import numpy as np
 from casest.data.run import Run
 from casest.declaring.shapes import Array
 from casest.declaring.symbols import Parameter
-from casest.errors import CasestError
+from casest.errors import CasestError, UsageError
 from casest.modelling.effect import NOISE, Effect
 from casest.modelling.model import Model
 
@@ -20,7 +20,9 @@ from casest.modelling.model import Model
 _TEMPERATURE = re.compile(r"temp|(^|_)t_?(deg)?c$|celsius|kelvin", re.IGNORECASE)
 _DEGREES = {"degC", "K", "kelvin", "degree_Celsius", "°C"}
 #: Columns that number things instead of measuring them.
-_LABELS = re.compile(r"^(run|pose|index|row|count|sample|seq|id|nr|no)$", re.IGNORECASE)
+_LABELS = re.compile(
+    r"^(run|pose|index|(first_|last_)?row|count|sample|seq|id|nr|no)$", re.IGNORECASE
+)
 
 
 @dataclass(frozen=True)
@@ -34,6 +36,8 @@ class Candidate:
     columns: tuple[tuple[str, str], ...] = ()
     freed: str = ""
     trials: int = 1
+    #: The model that it was tried on, and that model with it: tracing takes longer than scoring.
+    traced: tuple[Model, Model] | None = field(default=None, compare=False, repr=False)
 
     @property
     def name(self) -> str:
@@ -57,10 +61,16 @@ class Candidate:
 
     def added_to(self, model: Model) -> Model:
         """The model with it. Raises where it does not apply."""
+        if self.traced is not None and self.traced[0] is model:
+            return self.traced[1]
         if self.freed:
             return model.freed(self.freed)
         assert self.effect is not None
         return model.with_effect(self.effect, columns=dict(self.columns))
+
+    def on_model(self, model: Model) -> Candidate:
+        """The candidate that remembers the model with it. Raises where it does not apply."""
+        return replace(self, traced=(model, replace(self, traced=None).added_to(model)))
 
     def parameters(self, extended: Model) -> list[Parameter]:
         """Its unknowns in the extended model."""
@@ -117,11 +127,10 @@ def candidates(
             continue
         for columns in _columns_for(placed, channels, runs):
             candidate = Candidate(_with_numbers(placed, columns, runs), columns)
-            why = _refused(candidate, model, runs)
-            if why:
-                skipped.append(Skipped(candidate.label, why))
-            else:
-                found.append(candidate)
+            try:
+                found.append(_tried(candidate, model, runs))
+            except CasestError as error:
+                skipped.append(Skipped(candidate.label, str(error)))
     for constant in model.constants:
         candidate = Candidate(None, freed=constant.name)
         if constant.frozen is None and not constant.dims:
@@ -156,6 +165,11 @@ def _columns_for(
         return [()]
     warm = effect.name.startswith("temperature")
     return [(("channel", name),) for name, is_warm in channels.items() if is_warm == warm]
+
+
+def usable_columns(model: Model, runs: Sequence[Run]) -> list[str]:
+    """Columns that measure something and are no signal of the model's. `runs` are prepared."""
+    return list(_channels(model, runs)[0])
 
 
 def _channels(model: Model, runs: Sequence[Run]) -> tuple[dict[str, bool], list[Skipped]]:
@@ -208,18 +222,15 @@ def _with_numbers(
     return effect.holding(**values) if values else effect
 
 
-def _refused(candidate: Candidate, model: Model, runs: Sequence[Run]) -> str:
-    """Why a candidate does not apply here, in words; else empty."""
+def _tried(candidate: Candidate, model: Model, runs: Sequence[Run]) -> Candidate:
+    """The candidate on the model. Raises where it does not apply here."""
     if any(a.label == candidate.label for a in model.effects):
-        return "already in the model"
-    try:
-        extended = candidate.added_to(model)
-    except CasestError as error:
-        return str(error)
-    for s in extended.signals:
+        raise UsageError("already in the model")
+    candidate = candidate.on_model(model)
+    for s in candidate.added_to(model).signals:
         if any(s.name not in run.signals for run in runs):
-            return f"the data have no {s.name!r}"
-    return ""
+            raise UsageError(f"the data have no {s.name!r}")
+    return candidate
 
 
 def typical_sizes(candidate: Candidate, parameters: Sequence[Parameter], model: Model) -> Any:

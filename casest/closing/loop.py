@@ -10,59 +10,72 @@ import numpy as np
 
 from casest.closing.candidates import Candidate, Skipped, candidates, prepared
 from casest.closing.crossfit import (
+    ENOUGH,
+    FAR,
+    ITERATIONS,
     Folds,
-    batch_losses,
-    batch_sizes,
     cross_fitted,
     folded,
+    gain,
     rms,
 )
 from casest.closing.profile import freed_again, profiled
 from casest.closing.restrict import restricted
-from casest.closing.score import Score, scores, widened
+from casest.closing.score import SURVIVES, Score, scores, second_freedom, widened
+from casest.closing.tails import outliers_p_value
 from casest.data.run import Run
 from casest.declaring.shapes import Array
+from casest.declaring.symbols import Parameter
 from casest.effects import CATALOGUE
 from casest.engine.kernel import patient
 from casest.engine.threads import one_thread
 from casest.errors import CasestError, NotTrusted
 from casest.estimate import Estimate, attempt
+from casest.identify import identify
 from casest.modelling.effect import Effect
 from casest.modelling.model import Model
-from casest.noise import robust_scale
+from casest.noise import robust_scale, weighted
+from casest.solve.certificate import PRACTICALLY_NULL
 from casest.solve.trust_region import trust_region
 from casest.stack import Point, Problem
 
 #: Chance, under a model that lacks nothing, that any candidate is called significant.
-FALSE_ALARM = 0.002
+FALSE_ALARM = 0.004
 #: The held-out gain must exceed this many of its own standard errors.
-HELD_OUT = 2.5
-#: Candidates whose held-out errors differ by fewer standard errors are not told apart.
-ALIKE = 2.5
-#: Candidates that are refitted in a round, and rounds.
-CONTENDERS, ROUNDS = 6, 8
+HELD_OUT = 1.64
+#: Candidates whose errors differ by fewer standard errors are not told apart; so many are named.
+ALIKE, NAMED = 2.0, 2
+#: Candidates that are refitted in a round, those that score as well as the best of them, rounds.
+CONTENDERS, MORE, ROUNDS = 6, 4, 8
+#: Levels that are tried around the best of the grid.
+LEVELS_TRIED = 15
+#: A parameter within so many standard deviations of null is nothing.
+NOTHING = 3.0
 #: Columns of the widest model that is evaluated at once.
 WIDEST = 120
 
 
 @dataclass(frozen=True)
 class Fitted:
-    """A model fitted to all data, with its cross-fitted residuals."""
+    """A model fitted to all data, with its residuals and, once they are asked for, held-out ones.
+
+    `noise` is σ of one residual, from the middle of their distribution.
+    """
 
     model: Model
     values: Mapping[str, Array]
-    cost: float
     unknowns: int
-    held_out: tuple[Array, ...]
-    losses: Array
+    residuals: tuple[Array, ...]
+    noise: float
+    held_out: tuple[Array, ...] = ()
 
 
 @dataclass(frozen=True)
 class Found:
-    """An effect that was added, with the evidence."""
+    """An effect that was added, with the evidence: a score, but for one on the noise."""
 
     candidate: Candidate
-    score: Score
+    score: Score | None
     p_value: float
     gain: float
     indistinguishable_from: tuple[str, ...]
@@ -132,11 +145,13 @@ class _Loop:
 
     def closed(self) -> Closing:
         """Run the loop."""
-        current = self._fitted(self.before.model, self.before.values)
-        assert current is not None
-        first_held_out, first_scores = current.held_out, None
+        current = self._crossed(self._fitted(self.before.model, self.before.values))
+        if current is None:
+            raise NotTrusted("no part of the record can be predicted from the rest of it")
+        first, first_scores = current, None
         ranked: list[Score] = []
         for _ in range(ROUNDS):
+            current = self._without_outliers(current)
             ranked = self._ranked(current)
             first_scores = first_scores or ranked
             better = self._better(current, ranked)
@@ -150,7 +165,7 @@ class _Loop:
         return Closing(
             self.before,
             after,
-            first_held_out,
+            first.held_out,
             current.held_out,
             tuple(self.found),
             tuple(self.skipped),
@@ -159,35 +174,59 @@ class _Loop:
             tuple(ranked),
             tuple(first_scores or ()),
             self.runs,
-            self._sigma(current),
+            current.noise,
         )
 
     # -- fits ----------------------------------------------------------------------------------
 
     def _fitted(self, model: Model, values: Mapping[str, Array]) -> Fitted | None:
-        """Fit to everything and cross-fit; None where either goes astray."""
-        problem = Problem(model, self.runs)
+        """Fit to everything; None where it goes astray."""
+        problem = weighted(Problem(model, self.runs), values)
+        count = max(problem.residual_count, 1)
         fit = trust_region(
-            problem, problem.point(values), tolerance=1e-7 / max(problem.residual_count, 1)
+            problem, problem.point(values), max_iterations=ITERATIONS, tolerance=ENOUGH / count
         )
-        if not np.isfinite(fit.cost):
+        if problem.weights is not None:  # the start had other weights
+            problem = weighted(problem, problem.values(fit.point))
+            fit = trust_region(
+                problem, fit.point, max_iterations=ITERATIONS, tolerance=ENOUGH / count
+            )
+        residuals = problem.residuals(fit.point)
+        if not (np.isfinite(fit.cost) and all(np.all(np.isfinite(r)) for r in residuals)):
             return None
-        found = problem.values(fit.point)
-        held_out = cross_fitted(model, self.runs, found, self.folds)
+        freedom = max(problem.residual_count - problem.unknowns, 1)
+        noise = robust_scale(residuals) * float(np.sqrt(problem.residual_count / freedom))
+        return Fitted(model, problem.values(fit.point), problem.unknowns, tuple(residuals), noise)
+
+    def _crossed(self, fitted: Fitted | None) -> Fitted | None:
+        """The same with held-out residuals; None where a part cannot be predicted."""
+        if fitted is None or fitted.held_out:
+            return fitted
+        held_out = cross_fitted(fitted.model, self.runs, fitted.values, self.folds)
         if not all(np.all(np.isfinite(r)) for r in held_out):
             return None
-        limit = 4 * robust_scale(held_out)
-        losses = batch_losses(held_out, self.folds, limit)
-        return Fitted(model, found, fit.cost, problem.unknowns, held_out, losses)
+        return replace(fitted, held_out=held_out)
 
     def _certified(self, current: Fitted) -> Estimate:
         return attempt(current.model, self.runs, start=current.values, seed=self.seed)
 
-    def _sigma(self, current: Fitted) -> float:
+    def _without_outliers(self, current: Fitted) -> Fitted:
+        """With the effect `outliers` where there are some: they would pull what follows."""
+        effect = next((e for e in self.catalogue if e.name == "outliers"), None)
+        if effect is None or any(a.label == effect.name for a in current.model.effects):
+            return current
         problem = Problem(current.model, self.runs)
-        residuals = problem.residuals(problem.point(current.values))
-        freedom = max(problem.residual_count - problem.unknowns, 1)
-        return robust_scale(residuals) * float(np.sqrt(problem.residual_count / freedom))
+        levels = _readings(problem, problem.point(current.values))
+        p_value = outliers_p_value(current.residuals, self.folds.batches, levels)
+        if p_value is None:
+            return current
+        fitted = self._crossed(self._fitted(current.model.with_effect(effect), current.values))
+        if fitted is None or not self._certified(fitted).certificate.trusted:
+            return current
+        gained = self._gain(current, fitted)[0]
+        self.found.append(Found(Candidate(effect), None, p_value, gained, (), ()))
+        self.say("outliers: they count less from here on")
+        return fitted
 
     # -- candidates ----------------------------------------------------------------------------
 
@@ -197,16 +236,14 @@ class _Loop:
         if not self.skipped:
             self.skipped = skipped
         problem = Problem(current.model, self.runs)
-        point = problem.point(current.values)
-        residuals, sigma = problem.residuals(point), self._sigma(current)
-        readings = _readings(problem, point)
+        readings = _readings(problem, problem.point(current.values))
         self.original = {c.label: c for c in found}
-        expanded = profiled(found, self.runs, residuals, readings, sigma)
+        expanded = profiled(found, self.runs, current.residuals, readings, current.noise)
         ranked: list[Score] = []
         for part in _parts(expanded, WIDEST // max(len(current.model.axes), 1)):
             try:
                 wide = widened(current.model, self.runs, current.values, part)
-                ranked += scores(wide, part, sigma, self.folds.batches)
+                ranked += scores(wide, part, current.noise, self.folds.batches)
             except CasestError as error:
                 self.refused += [Skipped(c.label, str(error)) for c in part]
         return sorted(ranked, key=lambda s: (s.p_value, -s.gain / max(s.inflation, 1.0)))
@@ -215,96 +252,176 @@ class _Loop:
         """The model with the best candidate that held-out data confirm; None if none does."""
         limit = FALSE_ALARM / max(len({s.candidate.label for s in ranked}), 1)
         significant = [s for s in ranked if s.p_value <= limit]
-        significant = _confirmed_by_flips(significant, ranked)
-        contenders = _best_of_each(significant)[:CONTENDERS]
-        tried: list[tuple[Score, Fitted]] = []
-        for score in contenders:
-            fitted = self._with(current, score)
-            if fitted is not None and _gain(current, fitted, self.folds)[0] > 0:
-                tried.append((score, fitted))
-        tried.sort(key=lambda pair: _criterion(pair[1], current, self.folds))
-        for score, fitted in tried:
-            mean, error = _gain(current, fitted, self.folds)
-            if not mean > HELD_OUT * error:
-                self.refused.append(
-                    Skipped(score.candidate.label, "held-out data do not confirm it")
-                )
-                continue
-            estimate = self._certified(fitted)
-            if not estimate.certificate.trusted:
-                why = estimate.certificate.reasons[0]
-                self.refused.append(Skipped(score.candidate.label, f"its fit is refused: {why}"))
-                continue
-            alike = tuple(
-                other.candidate.label
-                for other, theirs in tried
-                if theirs is not fitted and _alike(fitted, theirs, self.folds)
+        confirmed = _confirmed_by_flips(significant, ranked)
+        if significant and not confirmed:
+            self._refuse(
+                significant[0].candidate, "no more than noise that is not alike everywhere"
             )
-            self.say(f"{score.candidate.label}: held-out error falls")
-            fitted, candidate = self._pruned(fitted, estimate, score)
-            self.found.append(
-                Found(
-                    candidate,
-                    score,
-                    score.p_value,
-                    mean,
-                    alike,
-                    tuple(p.name for p in candidate.parameters(fitted.model)),
-                )
-            )
-            return fitted
+        tried = self._contenders(current, _best_of_each(confirmed, current))
+        for k, (score, fitted) in enumerate(tried):
+            if k and not _alike(tried[0][1], fitted, tried[0][0], self.folds):
+                break  # What explains the data clearly less well is not the cause.
+            accepted = self._accepted(current, score, fitted)
+            if accepted is None:
+                continue
+            others = [pair for pair in tried if pair[1] is not fitted]
+            alike = [s.candidate.label for s, f in others if _alike(fitted, f, score, self.folds)]
+            self._keep(*accepted, score, alike)
+            return accepted[0]
         return None
+
+    def _contenders(self, current: Fitted, best: list[Score]) -> list[tuple[Score, Fitted]]:
+        """The most promising candidates refitted, the best explanation first."""
+        tried = self._refitted(current, best[:CONTENDERS])
+        if not tried:
+            return []
+        winner = tried[0][0]
+        near = [s for s in best[CONTENDERS:] if _as_promising(s, winner)]
+        tried += self._refitted(current, near[:MORE])
+        return _by_evidence(tried)
+
+    def _refitted(self, current: Fitted, chosen: Sequence[Score]) -> list[tuple[Score, Fitted]]:
+        tried = [(score, self._with(current, score)) for score in chosen]
+        found = _by_evidence([(score, fitted) for score, fitted in tried if fitted is not None])
+        if found and "level" in _profile(found[0][0].candidate).values():
+            found[0] = self._sharpened(current, *found[0])
+        return found
+
+    def _sharpened(self, current: Fitted, score: Score, fitted: Fitted) -> tuple[Score, Fitted]:
+        """With the best level near the one that was found: the grid is coarse."""
+        from scipy.optimize import minimize_scalar
+
+        candidate, tried = score.candidate, {}
+        assert candidate.effect is not None
+        (name,) = _profile(candidate)
+        level = next(float(d.array) for n, d in candidate.effect.declarations if n == name)
+
+        def squares(factor: float) -> float:
+            assert candidate.effect is not None
+            effect = candidate.effect.holding(**{name: float(f"{factor * level:.9g}")})
+            moved = replace(score, candidate=replace(candidate, effect=effect, traced=None))
+            found = self._with(current, moved)
+            if found is None:
+                return 1e300
+            tried[factor] = (moved, found)
+            return sum(float(np.sum(r**2)) for r in found.residuals)
+
+        least = squares(1.0)
+        best = minimize_scalar(
+            squares, bounds=(0.93, 1.05), method="bounded", options={"maxiter": LEVELS_TRIED}
+        )
+        return tried[float(best.x)] if best.fun < least else (score, fitted)
+
+    def _accepted(
+        self, current: Fitted, score: Score, fitted: Fitted
+    ) -> tuple[Fitted, Candidate, float] | None:
+        """The fit without needless axes, its candidate and held-out gain; None if refused."""
+        crossed = self._crossed(fitted)
+        if crossed is None or not self._confirmed(current, crossed):
+            self._refuse(
+                score.candidate, "too small to matter here: held-out data do not confirm it"
+            )
+            return None
+        why = _undetermined(Problem(crossed.model, self.runs), crossed.values)
+        estimate = None if why else self._certified(crossed)
+        if estimate is not None and not estimate.certificate.trusted:
+            why = estimate.certificate.reasons[0]
+        if estimate is None or why:
+            self._refuse(score.candidate, f"its fit is refused: {why}")
+            return None
+        crossed = replace(crossed, values=estimate.values)
+        pruned, candidate = self._pruned(crossed, estimate, score)
+        return pruned, candidate, self._gain(current, pruned)[0]
+
+    def _keep(
+        self, fitted: Fitted, candidate: Candidate, gained: float, score: Score, alike: list[str]
+    ) -> None:
+        self.say(f"{candidate.label}: held-out error falls")
+        names = tuple(p.name for p in candidate.parameters(fitted.model))
+        alike = alike[:NAMED]
+        found = Found(candidate, score, score.p_value, gained, tuple(alike), names)
+        self.found.append(found)
+
+    def _refuse(self, candidate: Candidate, why: str) -> None:
+        said = Skipped(candidate.label, why)
+        if said not in self.refused:
+            self.refused.append(said)
+
+    def _gain(self, current: Fitted, better: Fitted) -> tuple[float, float]:
+        """Held-out gain in mean squared error, and its standard error."""
+        sigma = better.noise
+        count = sum(r.size for r in better.held_out) / sigma**2
+        gained, error = gain(current.held_out, better.held_out, self.folds, sigma)
+        return gained / count, error / count
+
+    def _confirmed(self, current: Fitted, better: Fitted) -> bool:
+        gained, error = self._gain(current, better)
+        return gained > HELD_OUT * error
 
     def _with(self, current: Fitted, score: Score) -> Fitted | None:
         """The model refitted with a candidate, from its first-order step."""
-        candidate = freed_again(score.candidate, self.original[score.candidate.label])
         try:
+            candidate = self._whole(score, current.model)
             model = candidate.added_to(current.model)
             problem = Problem(model, self.runs)
-            start = problem.point({k: v for k, v in current.values.items()})
+            start = problem.point(current.values)
             moved = _stepped(problem, start, candidate, score)
             best = min((start, moved), key=lambda p: _finite(problem.cost(p)))
             return self._fitted(model, problem.values(best))
         except CasestError as error:
-            self.refused.append(Skipped(candidate.label, str(error)))
+            self._refuse(score.candidate, str(error))
             return None
+
+    def _whole(self, score: Score, model: Model) -> Candidate:
+        """The candidate with its profile unknown again, on the axes where it does anything."""
+        candidate = freed_again(score.candidate, self.original[score.candidate.label])
+        if candidate.effect is None:
+            return candidate
+        kept = _living_axes(score, model)
+        if kept is None:
+            return candidate
+        effect = restricted(candidate.effect, kept, model)
+        return replace(candidate, effect=effect, traced=None)
 
     def _pruned(self, fitted: Fitted, estimate: Estimate, score: Score) -> tuple[Fitted, Candidate]:
         """Without the axes on which the effect is nothing: an axis with nothing in it stays."""
-        candidate = freed_again(score.candidate, self.original[score.candidate.label])
+        base = replace(fitted.model, effects=fitted.model.effects[:-1])
+        candidate = self._whole(score, base)
         kept = _significant_axes(candidate, estimate)
         if kept is None or candidate.effect is None:
             return fitted, candidate
-        smaller = replace(candidate, effect=restricted(candidate.effect, kept, fitted.model))
-        base = replace(fitted.model, effects=fitted.model.effects[:-1])
+        effect = restricted(candidate.effect, kept, fitted.model)
+        smaller = replace(candidate, effect=effect, traced=None)
         try:
-            again = self._fitted(smaller.added_to(base), _narrowed(fitted.values, candidate, kept))
+            again = self._crossed(
+                self._fitted(smaller.added_to(base), _narrowed(fitted.values, candidate, kept))
+            )
         except CasestError:
             return fitted, candidate
-        if again is None:
+        if again is None or self._confirmed(again, fitted):
             return fitted, candidate
-        mean, error = _gain(again, fitted, self.folds)
-        return (fitted, candidate) if mean > HELD_OUT * error else (again, smaller)
+        return again, smaller
 
     def _weeded(self, current: Fitted) -> Fitted:
         """Each kept effect must still earn its place."""
         for found in list(self.found[:-1]):
             label = found.candidate.label
-            if found.candidate.freed:
+            if found.candidate.freed or not found.names:
                 continue
             effects = tuple(a for a in current.model.effects if a.label != label)
-            without = self._fitted(
-                replace(current.model, effects=effects),
-                {k: v for k, v in current.values.items() if not k.startswith(label + ".")},
-            )
-            if without is None:
-                continue
-            mean, error = _gain(without, current, self.folds)
-            if not mean > HELD_OUT * error:
+            values = {k: v for k, v in current.values.items() if not k.startswith(label + ".")}
+            model = replace(current.model, effects=effects)
+            without = self._crossed(self._fitted(model, values))
+            if without is not None and not self._confirmed(without, current):
                 self.found.remove(found)
-                self.refused.append(Skipped(label, "no longer needed beside what came later"))
+                self._refuse(found.candidate, "no longer needed beside what came later")
                 current = without
         return current
+
+
+def _profile(candidate: Candidate) -> dict[str, str]:
+    """Which of its unknowns were searched, and how."""
+    return dict(candidate.effect.profile) if candidate.effect else {}
 
 
 def _finite(cost: float) -> float:
@@ -337,23 +454,67 @@ def _parts(found: Sequence[Candidate], size: int) -> list[list[Candidate]]:
     return [list(found[k : k + size]) for k in range(0, len(found), size)]
 
 
-def _best_of_each(ranked: Sequence[Score]) -> list[Score]:
-    """The best of several trials of one effect."""
+def _best_of_each(ranked: Sequence[Score], current: Fitted) -> list[Score]:
+    """The best of several trials of one effect, those that promise most first."""
     seen: dict[str, Score] = {}
-    for score in ranked:
+    for score in sorted(ranked, key=lambda s: -s.gain / s.inflation):
         seen.setdefault(score.candidate.label, score)
-    order = sorted(seen.values(), key=lambda s: -(s.gain / s.inflation - 2 * s.freedom))
-    return order
+    price = np.log(sum(r.size for r in current.residuals))
+    return sorted(seen.values(), key=lambda s: price * s.freedom - s.gain / s.inflation)
+
+
+def _as_promising(score: Score, winner: Score) -> bool:
+    """Could it explain as much as the winner? By the first-order gains, generously."""
+    lost = (winner.gain - score.gain) / winner.inflation
+    return lost <= 0.2 * winner.gain / winner.inflation + 4 * ALIKE**2
+
+
+def _squares(fitted: Fitted, sigma: float) -> float:
+    """Sum of squared residuals in σ², far ones counted as FAR."""
+    return sum(float(np.sum(np.minimum((r / sigma) ** 2, FAR**2))) for r in fitted.residuals)
+
+
+def _by_evidence(tried: Sequence[tuple[Score, Fitted]]) -> list[tuple[Score, Fitted]]:
+    """Best first: the sum of squares, and a price for every unknown (Schwarz 1978)."""
+    if not tried:
+        return []
+    sigma = min(fitted.noise for _, fitted in tried)
+    # What the noise's colour makes of the squares: beside the cause nothing else varies.
+    inflation = min(score.inflation for score, _ in tried)
+    price = float(np.log(sum(r.size for r in tried[0][1].residuals)))
+
+    def criterion(pair: tuple[Score, Fitted]) -> float:
+        return _squares(pair[1], sigma) / inflation + price * pair[1].unknowns
+
+    return sorted(tried, key=criterion)
+
+
+def _alike(one: Fitted, other: Fitted, score: Score, folds: Folds) -> bool:
+    """Do the data not tell two models apart? (Vuong 1989, with 2 for every unknown)."""
+    gained, error = gain(other.residuals, one.residuals, folds, one.noise)
+    lead = gained + 2 * (other.unknowns - one.unknowns) * score.inflation
+    return lead <= ALIKE * error + 1e-6 * sum(r.size for r in one.residuals)
+
+
+def _undetermined(problem: Problem, values: Mapping[str, Array]) -> str:
+    """What the data do not determine, in words: cheaper than to ask for a certificate."""
+    point = problem.point(values)
+    found = identify(problem, point, problem.factor(point)[0])
+    if found.rank < found.unknowns:
+        return f"not determined: {found.unobservable[0]}" if found.unobservable else "rank"
+    if found.singular_values[-1] < PRACTICALLY_NULL * found.singular_values[0]:
+        return f"practically not determined: {found.weakest}"
+    return ""
 
 
 def _confirmed_by_flips(significant: list[Score], ranked: list[Score]) -> list[Score]:
-    """With few batches: the smallest p-value must be rare when the batches' signs are random.
+    """The smallest p-value must be rare when the signs of the batches' noise are random.
 
     Flipping the sign of all that a batch contributes keeps unequal noise as it is, and the
     dependence between candidates (Westfall & Young 1993, with wild bootstrap weights).
     """
-    if not significant or len(significant[0].batches) >= 200:
-        return significant
+    if not significant:
+        return []
     rng = np.random.default_rng(0)
     alive = [s for s in ranked if s.freedom]
     flips = rng.choice([-1.0, 1.0], (999, len(alive[0].batches)))
@@ -363,51 +524,66 @@ def _confirmed_by_flips(significant: list[Score], ranked: list[Score]) -> list[S
     for s in alive:
         total = flips @ s.batches
         F = np.sum(total**2, axis=1) / s.freedom / s.inflation
-        p = np.minimum(1.0, fdtrc(s.freedom, 20 * len(s.batches), F) * s.candidate.trials)
+        second = second_freedom(s.freedom, s.inflation, s.effective)
+        p = np.minimum(1.0, fdtrc(s.freedom, second, F) * s.candidate.trials)
         smallest = np.minimum(smallest, p)
-    limit = float(np.quantile(smallest, 0.01))
+    limit = float(np.quantile(smallest, FALSE_ALARM))
     return [s for s in significant if s.p_value <= limit]
 
 
-def _gain(current: Fitted, better: Fitted, folds: Folds) -> tuple[float, float]:
-    """Held-out gain in mean squared error and its standard error, from batch to batch."""
-    sizes = batch_sizes(current.held_out, folds)
-    difference = current.losses - better.losses
-    weights = sizes / sizes.sum()
-    mean = float(weights @ difference)
-    error = float(np.sqrt(np.sum(weights**2 * (difference - mean) ** 2)))
-    return mean, error * float(np.sqrt(len(sizes) / max(len(sizes) - 1, 1)))
+def _living_axes(score: Score, model: Model) -> list[int] | None:
+    """Axes on which the effect changes anything of its own; None for all, or if it has no axes.
+
+    Where the declared parameters imitate it on all axes together (a delay: a phase), as many axes
+    as are left to be determined, the plainest ones.
+    """
+    own = score.candidate.parameters(score.candidate.added_to(model))
+    size = _axes_of(own)
+    if not size or len(score.survives) != size * len(own):
+        return None
+    alive = score.survives.reshape(len(own), size).max(axis=0) > SURVIVES
+    if len(own) == 1 and score.freedom < alive.sum():
+        alive = np.isin(np.arange(size), _pivots(score.information, score.freedom))
+    return _some(alive)
 
 
-def _alike(one: Fitted, other: Fitted, folds: Folds) -> bool:
-    """Do held-out data not tell two models apart?"""
-    mean, error = _gain(other, one, folds)
-    return abs(mean) <= ALIKE * error or abs(mean) <= 1e-9 * float(np.mean(one.losses))
-
-
-def _criterion(fitted: Fitted, current: Fitted, folds: Folds) -> float:
-    """Held-out loss, with a little more for every unknown: of two alike the simpler one."""
-    sizes = batch_sizes(fitted.held_out, folds)
-    loss = float(sizes @ fitted.losses)
-    return loss + (fitted.unknowns - current.unknowns) * loss / float(sizes.sum())
+def _pivots(information: Array, count: int) -> list[int]:
+    """Unknowns that are determined beside each other: the largest pivots of Cholesky's factor."""
+    left, chosen = information.copy(), []
+    for _ in range(count):
+        k = int(np.argmax(np.diag(left)))
+        chosen.append(k)
+        left -= np.outer(left[:, k], left[k]) / left[k, k]
+    return chosen
 
 
 def _significant_axes(candidate: Candidate, estimate: Estimate) -> list[int] | None:
-    """Axes on which any parameter of the effect is beyond three standard deviations.
+    """Axes on which any parameter of the effect is beyond NOTHING standard deviations.
 
     None where all are, or where the effect is no matter of axes.
     """
-    own = candidate.parameters(estimate.model)
-    own = [p for p in own if p.shape.kind == "array" and len(p.shape.dims) == 1]
-    sizes = {p.shape.size for p in own}
-    if len(sizes) != 1 or next(iter(sizes)) < 2 or any(p.scope == "run" for p in own):
+    own = [p for p in candidate.parameters(estimate.model) if p.shape.dims]
+    size = _axes_of(own)
+    if not size:
         return None
-    z = np.zeros(next(iter(sizes)))
+    z = np.zeros(size)
     for p in own:
         with np.errstate(all="ignore"):
             z = np.maximum(z, np.abs(estimate.values[p.name] / estimate.std[p.name]))
-    kept = [int(i) for i in np.flatnonzero(z > 3.0)]
-    return kept if 0 < len(kept) < len(z) else None
+    return _some(z > NOTHING)
+
+
+def _axes_of(own: Sequence[Parameter]) -> int:
+    """How many axes the parameters have, one number each; 0 where that is no matter of axes."""
+    vectors = all(p.shape.kind == "array" and len(p.shape.dims) == 1 for p in own)
+    sizes = {p.shape.size for p in own}
+    per_run = any(p.scope == "run" for p in own)
+    return 0 if not vectors or per_run or len(sizes) != 1 else next(iter(sizes))
+
+
+def _some(kept: Any) -> list[int] | None:
+    """Where it is true, unless that is everywhere or nowhere."""
+    return [int(i) for i in np.flatnonzero(kept)] if 0 < np.sum(kept) < len(kept) else None
 
 
 def _narrowed(

@@ -17,7 +17,9 @@ from casest.data.run import Run
 from casest.declaring.shapes import Array
 
 #: Lines of the periodogram, moments and levels that are tried.
-LINES, MOMENTS, LEVELS = 4, 3, (0.9, 0.95, 0.98, 0.995)
+LINES, MOMENTS, LEVELS = 4, 3, 3
+#: Share of the readings that the lowest level lets through, and fewest beyond the highest.
+LOWEST, FEWEST = 0.7, 6
 #: Samples of the longest periodogram.
 LONGEST = 1 << 18
 
@@ -39,23 +41,25 @@ def profiled(
             continue
         assert candidate.effect is not None
         ((name, kind),) = profile.items()
-        values, trials = _values(kind, runs, clipped, readings)
+        # What is cut off is far out: the level is looked for in the residual as it is.
+        seen = residuals if kind == "level" else clipped
+        values, trials = _values(kind, runs, seen, readings)
         for value in values:
             effect = candidate.effect.holding(**{name: float(f"{value:.9g}")})
-            expanded.append(replace(candidate, effect=effect, trials=trials))
+            expanded.append(replace(candidate, effect=effect, trials=trials, traced=None))
     return expanded
 
 
 def freed_again(candidate: Candidate, original: Candidate) -> Candidate:
-    """The candidate with its frequency unknown again, starting where the search found it."""
+    """The candidate with its frequency unknown again, starting where it was found."""
     if candidate.effect is None or original.effect is None:
         return candidate
     profile = dict(original.effect.profile)
-    frequencies = [n for n, kind in profile.items() if kind == "frequency"]
-    if not frequencies:
+    smooth = [n for n, kind in profile.items() if kind == "frequency"]
+    if not smooth:
         return candidate
-    held = {n: float(d.array) for n, d in candidate.effect.declarations if n in frequencies}
-    return replace(candidate, effect=original.effect.starting(**held))
+    held = {n: float(d.array) for n, d in candidate.effect.declarations if n in smooth}
+    return replace(candidate, effect=original.effect.starting(**held), traced=None)
 
 
 def _values(
@@ -70,8 +74,25 @@ def _values(
         return _moments(runs, residuals)
     if readings is None:
         return [], 1
-    size = np.abs(np.concatenate([r.ravel() for r in readings]))
-    return [float(np.quantile(size, q)) for q in LEVELS], len(LEVELS)
+    return _levels(np.concatenate(residuals), np.concatenate(readings))
+
+
+def _levels(r: Array, y: Array) -> tuple[list[float], int]:
+    """Levels beyond which the residual grows most with what the reading exceeds them by."""
+    order = np.argsort(-np.abs(y).ravel())
+    size, inward = np.abs(y).ravel()[order], (r * np.sign(y)).ravel()[order]
+    if len(size) < 4 * FEWEST:
+        return [], 1
+    beyond = np.unique(np.geomspace(FEWEST, (1 - LOWEST) * len(size), 24).astype(int))
+    beyond = beyond[beyond < len(size)]
+    # Σr(|y| − level) and Σ(|y| − level)² over the readings beyond each level, from running sums.
+    sums = np.cumsum(np.column_stack([size**0, size, size**2, inward, inward * size]), axis=0)
+    level = size[beyond]
+    n, first, second, plain, product = sums[beyond - 1].T
+    spread = second - 2 * level * first + n * level**2
+    gain = (product - level * plain) ** 2 / np.maximum(spread, 1e-300)
+    best = np.argsort(-gain)[:LEVELS]
+    return [float(level[k]) for k in best], len(beyond)
 
 
 def _lines(runs: Sequence[Run], residuals: Sequence[Array]) -> tuple[list[float], int]:

@@ -4,7 +4,9 @@ The model with all candidates in it, at their null values, has the Jacobian [J G
 declared parameters can imitate is taken out, G⊥ = (1 − P)G, and the score s = G⊥ᵀr is compared with
 its covariance under noise alone (Rao 1948). The gain in the sum of squares that a refit would bring
 is sᵀ(G⊥ᵀG⊥)⁻¹s to first order. The covariance is estimated from sums over batches of samples,
-so that noise may be coloured and differ from place to place (Liang & Zeger 1986).
+so that noise may be coloured and differ from place to place (Liang & Zeger 1986). What the
+candidate itself explains is taken out of those sums first, with its leverage given back (Bell &
+McCaffrey 2002): an effect that is strong in a few batches must not pass for unequal noise.
 """
 
 from __future__ import annotations
@@ -16,6 +18,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import fdtrc
 
 from casest.closing.candidates import Candidate
 from casest.data.run import Run
@@ -24,12 +27,21 @@ from casest.declaring.symbols import Signal
 from casest.engine import Columns, Replay
 from casest.modelling.model import Model
 from casest.modelling.tracing import flat
+from casest.noise import weighted
 from casest.stack import Point, Problem
 
 #: Share of a candidate's own length that must survive the projection: below, it is invisible.
 SURVIVES = 1e-6
 #: Samples whose slopes are held at once.
 PIECE = 8192
+#: Batches of a record: more are put together.
+MOST_BATCHES = 100
+#: Inflation from which on noise counts as coloured, and what a batch says of it if it is not.
+COLOURED, WHITE = 1.3, 20
+#: Batches that must speak for an effect: what is seen in one only may be an accident.
+LEAST_BATCHES = 2.0
+#: Share of a batch's noise that its leverage leaves, at least.
+LEAST_LEFT = 0.05
 #: A residual counts as at most this many robust standard deviations: a few bad samples ask for
 #: nothing.
 CLIPPED = 3.5
@@ -44,6 +56,8 @@ class Score:
     inflation and for the trials of the profile, not for the number of candidates. `step` (q,)
     estimates its unknowns, `survives` (q,) the share of each that the declared ones leave,
     `bias` (n, q) the shift of the declared unknowns per unit of it, `information` (q, q) G⊥ᵀG⊥/σ².
+    `batches` (batches, freedom): what noise contributes to the whitened score; `effective` how many
+    batches there would be, were each worth as much.
     """
 
     candidate: Candidate
@@ -56,6 +70,7 @@ class Score:
     bias: Array
     information: Array
     batches: Array
+    effective: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -85,7 +100,7 @@ def widened(
     Each candidate is put into the model alone; all share the symbols of the model as it is, so
     that one evaluation serves them all.
     """
-    problem = Problem(model, tuple(runs))
+    problem = weighted(Problem(model, tuple(runs)), values)
     base, signals = model.traced, list(model.signals)
     symbols = {s.name: base.symbols[s.name] for s in signals}
     slopes, columns, places, count, width = [], [], [], 0, problem.unknowns
@@ -152,6 +167,24 @@ def _slope(
     return ca.substitute(slope, ca.vertcat(*old), ca.vertcat(*new)), scopes, more
 
 
+@dataclass(frozen=True)
+class _Sums:
+    """Of every batch [J G]ᵀ[J G] (batches, n, n) and [J G]ᵀr (batches, n), scaled by `scale`.
+
+    `squares`: rᵀr of all. Far residuals are clipped, except in `unclipped`.
+    """
+
+    matrices: Array
+    gradients: Array
+    unclipped: Array
+    scale: Array
+    squares: float
+
+    @property
+    def whole(self) -> Array:
+        return np.asarray(self.matrices.sum(axis=0))
+
+
 def scores(
     wide: Wide,
     found: Sequence[Candidate],
@@ -159,35 +192,45 @@ def scores(
     batches: Sequence[NDArray[np.int_]],
 ) -> list[Score]:
     """The score of every candidate. `batches` holds the first sample of each batch of each run."""
-    normal, sums = _sums(wide, sigma, batches)
-    d = np.arange(wide.problem.unknowns)
-    scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
-    A = normal / np.outer(scale, scale)
-    inverse = np.linalg.pinv(A[np.ix_(d, d)], rcond=1e-10, hermitian=True)
+    sums = _sums(wide, sigma, [first[:: _together(batches)] for first in batches])
+    A, d = sums.whole, np.arange(wide.problem.unknowns)
+    inverse = np.asarray(np.linalg.pinv(A[np.ix_(d, d)], rcond=1e-10, hermitian=True), float)
     count = wide.problem.residual_count
     return [
-        _score(candidate, np.unique(np.concatenate(own)), A, inverse, scale, sums, d, sigma, count)
+        _score(candidate, np.unique(np.concatenate(own)), A, inverse, sums, d, sigma, count)
         for candidate, own in zip(found, wide.places, strict=True)
     ]
 
 
-def _sums(wide: Wide, sigma: float, batches: Sequence[NDArray[np.int_]]) -> tuple[Array, Array]:
-    """[J G]ᵀ[J G] (n, n), and [J G]ᵀr of every batch (batches, n), far residuals clipped."""
+def _together(batches: Sequence[NDArray[np.int_]]) -> int:
+    """How many neighbouring batches are put together."""
+    return -(-sum(map(len, batches)) // MOST_BATCHES)
+
+
+def _sums(wide: Wide, sigma: float, batches: Sequence[NDArray[np.int_]]) -> _Sums:
+    """Sums over every batch, far residuals clipped."""
     problem, n = wide.problem, wide.width
-    matrix = np.zeros((n, n))
-    sums = [np.zeros((len(first), n)) for first in batches]
+    offsets = np.cumsum([0, *map(len, batches)])
+    matrices, gradients = np.zeros((offsets[-1], n, n)), np.zeros((2, offsets[-1], n))
+    squares = 0.0
     for r, span, index, residual, J in _rows(wide):
-        flattened = J.reshape(-1, J.shape[2])
-        matrix[np.ix_(index, index)] += flattened.T @ flattened
         clipped = np.clip(residual, -CLIPPED * sigma, CLIPPED * sigma)
         if problem.weights is not None:
-            clipped = clipped * problem.weights[r][span]
-        gradient = np.einsum("nm,nmk->nk", clipped, J)
-        own = np.arange(span.start, span.stop)
-        number = np.searchsorted(batches[r], own, side="right") - 1
+            root = np.sqrt(problem.weights[r][span])
+            clipped, J = clipped * root, J * root[:, :, None]
+        squares += float(np.sum(clipped**2))
+        samples = np.arange(span.start, span.stop)
+        number = np.searchsorted(batches[r], samples, side="right") - 1
         first = np.flatnonzero(np.diff(number, prepend=-1))
-        sums[r][np.ix_(number[first], index)] += np.add.reduceat(gradient, first)
-    return matrix, np.vstack(sums)
+        for start, stop in zip(first, [*first[1:], len(samples)], strict=True):
+            part = J[start:stop].reshape(-1, J.shape[2])
+            b = offsets[r] + number[start]
+            matrices[b][np.ix_(index, index)] += part.T @ part
+            gradients[0, b][index] += part.T @ clipped[start:stop].ravel()
+            gradients[1, b][index] += part.T @ residual[start:stop].ravel()
+    scale = np.sqrt(np.maximum(np.einsum("bii->i", matrices), 1e-300))
+    clipped, unclipped = gradients / scale
+    return _Sums(matrices / np.outer(scale, scale), clipped, unclipped, scale, squares)
 
 
 def _rows(wide: Wide) -> Iterator[tuple[int, slice, NDArray[np.int_], Array, Array]]:
@@ -211,29 +254,37 @@ def _score(
     own: NDArray[np.int_],
     A: Array,
     inverse: Array,
-    scale: Array,
-    sums: Array,
+    sums: _Sums,
     d: NDArray[np.int_],
     sigma: float,
     count: int,
 ) -> Score:
+    scale = sums.scale
     absorbed = inverse @ A[np.ix_(d, own)]
     left = A[np.ix_(own, own)] - A[np.ix_(own, d)] @ absorbed
     survives = np.clip(np.diag(left), 0, None)
-    each = (sums / scale)[:, own] - (sums / scale)[:, d] @ absorbed
     size = np.sqrt(np.where(survives > 0, survives, 1.0))
     # What the declared parameters imitate is no part of the test.
     alive = np.flatnonzero(survives > SURVIVES**2)
     values, inner = np.linalg.eigh((left / np.outer(size, size))[np.ix_(alive, alive)])
     vectors, kept = np.zeros((len(own), len(values))), values > 1e-8
     vectors[alive] = inner
-    root = vectors[:, kept] / np.sqrt(values[kept])
-    whitened = (each / size) @ root / sigma
+    root = vectors[:, kept] / np.sqrt(values[kept]) / size[:, None]
+    # What of each of the two makes up the whitened score: (unknowns, freedom).
+    both = np.concatenate([d, own])
+    maker = np.vstack([-absorbed @ root, root])
+    gradients = sums.unclipped if _is_far_out(candidate) else sums.gradients
+    whitened = gradients[:, both] @ maker / sigma
     total, freedom = whitened.sum(axis=0), int(kept.sum())
-    step = -(root @ total) * sigma / size / scale[own] if freedom else np.zeros(len(own))
+    step = -(root @ total) * sigma / scale[own] if freedom else np.zeros(len(own))
     gain = float(total @ total)
-    inflation = _inflation(whitened)
-    p = _p_value(gain, freedom, inflation, len(sums), count - len(d)) if freedom else 1.0
+    noise, effective = _of_noise(whitened, sums.matrices, both, maker)
+    rest = max(count - len(d) - freedom, 1)
+    inflation, p = 1.0, 1.0
+    if freedom:
+        least = _left_over(gain * sigma**2 / sums.squares, freedom / rest)
+        inflation = float(max(np.sum(noise**2) / freedom, least))
+        p = _p_value(gain, freedom, inflation, effective, rest)
     bias = (absorbed * scale[own]) / scale[d][:, None]
     information = left * np.outer(scale[own], scale[own]) / sigma**2
     return Score(
@@ -246,22 +297,62 @@ def _score(
         np.sqrt(survives),
         bias,
         information,
-        whitened,
+        noise,
+        effective,
     )
 
 
-def _inflation(whitened: Array) -> float:
-    """Variance of the score over that under white noise: one number, its directions averaged."""
+def _is_far_out(candidate: Candidate) -> bool:
+    """Is it by its nature in few samples, and far out in them? What is cut off at a level is."""
+    return candidate.effect is not None and "level" in dict(candidate.effect.profile).values()
+
+
+def _of_noise(
+    whitened: Array, matrices: Array, both: NDArray[np.int_], maker: Array
+) -> tuple[Array, float]:
+    """Contributions of the batches without the effect itself, and the effective number of batches.
+
+    Each batch has a share Mᵦ of the information (ΣMᵦ = 1); wᵦ − Mᵦw has lost this share of its
+    noise as well, and (1 − Mᵦ)^(−½) gives it back.
+    """
     if not whitened.size:
+        return whitened, 1.0
+    shares = maker.T @ (matrices[:, both[:, None], both] @ maker)
+    values, vectors = np.linalg.eigh(0.5 * (shares + shares.transpose(0, 2, 1)))
+    without = whitened - shares @ whitened.sum(axis=0)
+    turned = np.einsum("bji,bj->bi", vectors, without)
+    given_back = turned / np.sqrt(np.clip(1 - values, LEAST_LEFT, None))
+    noise = np.einsum("bij,bj->bi", vectors, given_back)
+    by_share = whitened.shape[1] / max(float(np.sum(values**2)), 1e-12)
+    return noise, min(by_share, _as_many(noise))
+
+
+def _as_many(noise: Array) -> float:
+    """Batches of equal noise that would tell as much of its variance: some may be far noisier."""
+    squares = np.sum(noise**2, axis=1)
+    usual = 1 + 2 / noise.shape[1]  # |e|⁴ over (|e|²)² of normal noise
+    return float(usual * np.sum(squares) ** 2 / max(float(np.sum(squares**2)), 1e-300))
+
+
+def _left_over(explained: float, price: float) -> float:
+    """Variance of the noise over what it was taken for while the effect was part of it.
+
+    Of few residuals an effect is a good part: without this it would hide itself.
+    """
+    return float(np.clip((1 - explained) * (1 + price), 0.05, 1.0))
+
+
+def _p_value(gain: float, freedom: int, inflation: float, effective: float, rest: int) -> float:
+    if effective < LEAST_BATCHES:
         return 1.0
-    count, freedom = whitened.shape
-    centred = whitened - whitened.mean(axis=0)
-    return float(max(np.sum(centred**2) / freedom * count / max(count - 1, 1), 1.0))
-
-
-def _p_value(gain: float, freedom: int, inflation: float, batches: int, left: int) -> float:
-    from scipy.special import fdtrc
-
-    # What the residual's size is known by: its own freedom, or the number of batches.
-    second = max(min(left - freedom, 20 * batches), 1)
+    second = max(min(rest, second_freedom(freedom, inflation, effective)), 1)
     return float(fdtrc(freedom, second, gain / inflation / freedom))
+
+
+def second_freedom(freedom: int, inflation: float, effective: float) -> float:
+    """How well the inflation is known, as degrees of freedom.
+
+    Of coloured noise it is an estimate from the batches; of white noise it is one, and the estimate
+    is only there to be sure.
+    """
+    return effective * (freedom if inflation > COLOURED else max(freedom, WHITE))

@@ -86,7 +86,7 @@ def run_steps(
     buffer, run = steps.buffer()
     for k in range(0, padded, CHUNK):
         span = slice(k, k + CHUNK)
-        arrays = (state, numbers[span]), (after[span], before[span])
+        arrays: Any = (state, numbers[span]), (after[span], before[span])
         for i in range(2):
             buffer.set_arg(i, memoryview(arrays[0][i]))
             buffer.set_res(i, memoryview(arrays[1][i]))

@@ -49,7 +49,7 @@ def axis_wobble(
     on="angle",
     typical={"c": 0.05},
     shown_by="a record short enough for the declared speed law",
-    formula="angle + Σ c[k]·(t/duration)^(k+5)",
+    formula="angle + Σ c[k]·P[k+5](2·t/duration − 1), P Legendre's polynomials",
 )
 def speed_polynomial(
     angle: SX,
@@ -58,9 +58,17 @@ def speed_polynomial(
     c: SX = param(4, "rad", per="run"),
     duration: SX = constant(1.0, "s"),
 ) -> SX:
-    """Higher terms of the speed law: c[k]·(t/duration)^(k+5) in the angle (drag is no cubic)."""
-    x = t / duration
-    return angle + x**5 * (c[0] + x * (c[1] + x * (c[2] + x * c[3])))
+    """Higher terms of the speed law: degrees 5 to 8 in the angle (drag is no cubic).
+
+    Legendre's polynomials over the record: powers could not be told apart.
+    """
+    x = 2 * t / duration - 1
+    before, here, more = x**0, x, 0 * x
+    for degree in range(2, 9):
+        before, here = here, ((2 * degree - 1) * x * here - (degree - 1) * before) / degree
+        if degree >= 5:
+            more = more + c[degree - 5] * here
+    return angle + more
 
 
 @effect(

@@ -5,7 +5,13 @@ from __future__ import annotations
 from casest.declaring.physics import SX, fabs, fmax, sign, vertcat
 from casest.declaring.shapes import each
 from casest.declaring.symbols import param
+from casest.errors import UsageError
 from casest.modelling.effect import effect
+
+
+def _three_axes(u: SX) -> None:
+    if u.numel() != 3:
+        raise UsageError(f"not applicable: it needs three axes, and there are {u.numel()}")
 
 
 @effect(
@@ -19,6 +25,7 @@ def cross_axis(u: SX, *, k: SX = param(3)) -> SX:
 
     Three terms, because a rotation is the mounting's (Burkhard et al., eq. 1: M lower triangular).
     """
+    _three_axes(u)
     return vertcat(u[0], u[1] + k[0] * u[0], u[2] + k[1] * u[0] + k[2] * u[1])
 
 
@@ -74,6 +81,7 @@ def signed_cubic(u: SX, *, k: SX = param(each, "1/([u])^2")) -> SX:
 )
 def cross_quadratic(u: SX, *, k: SX = param(3, "1/[u]")) -> SX:
     """Products of the two other axes in each axis (IEEE Std 1293, cross-coupling)."""
+    _three_axes(u)
     return u + vertcat(k[0] * u[1] * u[2], k[1] * u[0] * u[2], k[2] * u[0] * u[1])
 
 

@@ -130,8 +130,8 @@ def _compiled_sums(
     packed, n = kernel.products(parameters, columns, weights), replay.shapes[_JACOBIAN][1]
     upper = np.bincount(_places(replay), packed, (n + 1) ** 2).reshape(n + 1, n + 1)
     whole = upper + upper.T
-    whole.flat[:: n + 2] *= 0.5  # the diagonal came twice
-    return np.asarray(whole)
+    np.fill_diagonal(whole, np.diag(upper))
+    return cast(Floats, whole)
 
 
 @lru_cache(maxsize=256)

@@ -218,7 +218,7 @@ def attach(
             if not parameter.shape.curved:
                 parameter = replace(parameter, start=null)
         first = next(iter(inspect.signature(declared.function).parameters))
-        own = units.get(on, f"[{on}]")
+        own = units.get(on) or f"[{on}]"
         own = f"({own})" if set("/*") & set(own) else own
         renamed = tuple(u.replace(f"[{first}]", own) for u in parameter.units)
         for unit in renamed:

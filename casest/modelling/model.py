@@ -226,7 +226,9 @@ class Model:
         if target in self.quantities:
             shape = self.quantities[target].declared.shape
             return (int(shape[0]), int(shape[1]))
-        return (1 if target == NOISE else self[target].size, 1)
+        if target == NOISE:
+            return (1, 1)
+        return (3, 3) if self[target].kind == "rotation" else (self[target].size, 1)
 
     def _place(self, added: Effect, target: str) -> tuple[Kind, tuple[int, ...], str]:
         if target == NOISE:

@@ -232,9 +232,10 @@ def _misshapen(problem: Problem, step: Array, norms: Array, ratio: float) -> str
             f"not determined well enough: two standard deviations ({where}) reach beyond the "
             "bounds; vary the motion"
         )
+    flat = ": the data hardly determine it" if ratio < SHAPE[0] else ""
     return (
         f"too uncertain for its intervals: two standard deviations away ({where}) the cost rises "
-        f"{ratio:.2g} times as much as they assume; vary the motion"
+        f"{ratio:.2g} times as much as they assume{flat}; vary the motion"
     )
 
 

@@ -1,0 +1,249 @@
+"""Levenberg-Marquardt for many sensors side by side, each with its own damping and its own end."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from casest.batch_linear import backward, cholesky, dot, forward, lengths, times
+from casest.batch_sums import NARROWEST, Normals, Sensors, Squares
+from casest.declaring.shapes import Array
+from casest.solve.trust_region import LITTLE
+
+#: Iterations after which a sensor is given up.
+LIMIT = 100
+#: Squared last step, and squared step expected after it, in variances of the estimate; and the
+#: squared step that is small enough without looking at the one before.
+LAST, NEXT, SMALL = 1e-6, 2.5e-13, 1e-14
+#: The same below which a step is rounding, as a share of the unknowns themselves.
+ROUNDING = 1e-29
+
+Places = NDArray[np.int_]
+
+
+class Bounds(NamedTuple):
+    """Lower and upper bound of every unknown of every sensor, (n, W)."""
+
+    lower: Array
+    upper: Array
+
+    def inside(self, x: Array) -> Array:
+        """The unknowns, moved strictly inside where they are not (as in `stack.Problem`)."""
+        both = np.isfinite(self.lower) & np.isfinite(self.upper)
+        width = np.where(both, self.upper - self.lower, np.inf)
+        margin = np.minimum(1e-8 * np.maximum(1.0, np.abs(x)), 0.1 * width)
+        x = np.where(x <= self.lower, self.lower + margin, x)
+        return np.where(x >= self.upper, self.upper - margin, x)
+
+    def some(self, chosen: Places) -> Bounds:
+        """Those of the sensors at these places."""
+        return Bounds(self.lower[:, chosen], self.upper[:, chosen])
+
+
+class Fits(NamedTuple):
+    """Where W sensors ended: unknowns (n, W), cost (W,), JᵀJ (n, n, W; lower triangle).
+
+    `left` (W,): squared length of the last step, in residuals: gᵀ(JᵀJ)⁻¹g. `shrink` (W,): its
+    ratio to the step before, not squared.
+    """
+
+    x: Array
+    cost: Array
+    matrix: Array
+    left: Array
+    shrink: Array
+
+    def some(self, chosen: Places) -> Fits:
+        """Those of the sensors at these places."""
+        return Fits(*(part[..., chosen] for part in self))
+
+
+@dataclass
+class _State:
+    """Sensors that still move; arrays with the sensor axis last."""
+
+    place: Places
+    sensors: Sensors
+    bounds: Bounds
+    freedom: Array
+    x: Array
+    here: Normals
+    damping: Array
+    growth: Array
+    before: Array
+
+    def some(self, chosen: Places) -> _State:
+        return _State(
+            self.place[chosen],
+            self.sensors.some(chosen),
+            self.bounds.some(chosen),
+            self.freedom[chosen],
+            self.x[:, chosen],
+            Normals(*(part[..., chosen] for part in self.here)),
+            self.damping[chosen],
+            self.growth[chosen],
+            self.before[chosen],
+        )
+
+
+def padded(chosen: Places) -> Places:
+    """The places, the last repeated up to a multiple of NARROWEST."""
+    missing = -len(chosen) % NARROWEST
+    return np.concatenate([chosen, np.full(missing, chosen[-1])]) if missing else chosen
+
+
+def minimise(
+    squares: Squares, sensors: Sensors, start: Array, bounds: Bounds, *, near: bool
+) -> Fits:
+    """Minimise every sensor's cost from its start (n, W). `near`: starts are near the solutions."""
+    n, width = start.shape
+    found = Fits(
+        start.copy(),
+        np.full(width, np.nan),
+        np.full((n, n, width), np.nan),
+        np.full(width, np.inf),
+        np.ones(width),
+    )
+    state = _State(
+        np.arange(width),
+        sensors,
+        bounds,
+        np.maximum(residual_counts(squares, sensors) - n, 1.0),
+        start,
+        squares.normals(start, sensors),
+        np.full(width, LITTLE if near else 1e-3),
+        np.full(width, 2.0),
+        np.full(width, np.inf),
+    )
+    for _ in range(LIMIT):
+        step, left = _steps(state)
+        settled = _settled(state, left)
+        ended = settled | ~np.isfinite(left) | (state.damping > 1e12)
+        _keep(found, state, step, left, settled, ended)
+        going = np.flatnonzero(~ended)
+        if not going.size:
+            return found
+        if going.size < len(ended):
+            going = padded(going)
+            state, step, left = state.some(going), step[:, going], left[going]
+        _move(squares, state, step, left)
+    _keep(found, state, step, left, np.zeros(len(left), bool), np.ones(len(left), bool))
+    return found
+
+
+def residual_counts(squares: Squares, sensors: Sensors) -> Array:
+    """Number of residuals of every sensor, (W,)."""
+    _, samples, width = sensors.samples.shape
+    if sensors.mask is None:
+        return np.full(width, float(samples * squares.residual_count))
+    return np.asarray(sensors.mask.sum(axis=0) * squares.residual_count)
+
+
+def _settled(state: _State, left: Array) -> Array:
+    """Is the next step, were it taken, nothing that the data could tell?"""
+    variance = 2 * state.here.cost / state.freedom
+    # Steps shrink by a factor; the first one says nothing about it.
+    expected = left * np.minimum(left / state.before, 1.0)
+    # Steps that shrink slowly soon shrink by the slowest direction alone: they must be small.
+    quick = (left <= LAST * variance) & (left <= 1e-4 * state.before) & np.isfinite(state.before)
+    fine = (quick & (expected <= NEXT * variance)) | (left <= SMALL * variance)
+    fine &= state.damping <= 1e-3
+    reach = np.einsum("iis,is->s", state.here.matrix, state.x**2)
+    return np.asarray(fine | (left <= ROUNDING * reach))
+
+
+def _keep(
+    found: Fits, state: _State, step: Array, left: Array, settled: Array, ended: Array
+) -> None:
+    """Write down the sensors that ended, after their last step if they settled."""
+    if not ended.any():
+        return
+    k = slice(None) if ended.all() else np.flatnonzero(ended)
+    place = state.place[k]
+    found.x[:, place] = np.where(settled, state.x + step, state.x)[:, k]
+    found.cost[place] = np.where(settled, state.here.cost - 0.5 * left, state.here.cost)[k]
+    found.matrix[:, :, place] = state.here.matrix[:, :, k]
+    found.left[place] = left[k]
+    ratio = np.sqrt(left / state.before)
+    found.shrink[place] = np.where(np.isfinite(state.before), ratio, 1.0)[k]
+
+
+def _steps(state: _State) -> tuple[Array, Array]:
+    """Damped step (n, W) within the bounds, and its squared length in residuals (W,)."""
+    scale = lengths(state.here.matrix)
+    matrix = state.here.matrix / scale
+    matrix /= scale[:, None]
+    for i in range(len(scale)):
+        matrix[i, i] = (matrix[i, i] > 0) + state.damping  # a column that is nil stays out
+    slope = state.here.gradient / scale
+    factor = cholesky(matrix)
+    half = forward(factor, -slope)
+    step = backward(factor, half) / scale
+    left = dot(half, half)
+    target = state.x + step
+    out = (target < state.bounds.lower) | (target > state.bounds.upper)
+    over = np.flatnonzero(out.any(axis=0))
+    if over.size:
+        k = padded(over)
+        part = _held_back(
+            matrix[:, :, k], slope[:, k], scale[:, k], state.x[:, k], state.bounds.some(k)
+        )
+        step[:, over], left[over] = (p[..., : over.size] for p in part)
+    return step, left
+
+
+def _held_back(
+    matrix: Array, slope: Array, scale: Array, x: Array, bounds: Bounds
+) -> tuple[Array, Array]:
+    """The same where unknowns that would leave their bounds stop there."""
+    n = len(x)
+    matrix = np.where(np.tri(n, dtype=bool)[:, :, None], matrix, matrix.transpose(1, 0, 2))
+    fixed, held = np.zeros(x.shape, bool), np.zeros(x.shape)
+    for _ in range(n):
+        free = ~fixed
+        own = matrix * (free[:, None] & free[None])
+        for i in range(n):
+            own[i, i] += fixed[i]
+        pull = np.where(free, -slope - times(matrix, held), held)
+        factor = cholesky(own)
+        half = forward(factor, pull)
+        scaled = backward(factor, half)
+        target = x + scaled / scale
+        out = free & ((target < bounds.lower) | (target > bounds.upper))
+        if not out.any():
+            break
+        held = np.where(out, (np.clip(target, bounds.lower, bounds.upper) - x) * scale, held)
+        fixed |= out
+    left = dot(np.where(fixed, 0.0, half), np.where(fixed, 0.0, half))
+    inside = np.clip(x + scaled / scale, bounds.lower, bounds.upper)
+    return inside - x, left
+
+
+def _move(squares: Squares, state: _State, step: Array, left: Array) -> None:
+    """Take the steps that lower the cost; damp the others more."""
+    trial = state.x + step
+    there = squares.normals(trial, state.sensors)
+    fall = state.here.cost - there.cost
+    # Near the end the fall drowns in rounding.
+    alike = (left <= 1e-6 * state.here.cost) & (np.abs(fall) <= 1e-13 * state.here.cost)
+    better = (fall > 0) | alike
+    # With damping λ the model promises left/2 and λ‖z‖²/2 more, which is the smaller part.
+    ratio = fall / np.maximum(0.5 * left, 1e-300)
+    good = (np.abs(ratio - 1) < 0.01) | alike
+    eased = state.damping * np.maximum(0.2, 1 - (2 * np.minimum(ratio, 2.0) - 1) ** 3)
+    eased = np.where(good, state.damping * 1e-2, eased)
+    state.damping = np.where(
+        better, np.maximum(eased, LITTLE), np.maximum(state.damping * state.growth, 1e-3)
+    )
+    state.growth = np.where(better, 2.0, 2 * state.growth)
+    state.before = np.where(better, left, state.before)
+    if better.all():
+        state.x, state.here = trial, there
+        return
+    state.x = np.where(better, trial, state.x)
+    state.here = Normals(
+        *(np.where(better, new, old) for new, old in zip(there, state.here, strict=True))
+    )

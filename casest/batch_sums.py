@@ -1,0 +1,229 @@
+"""Least-squares sums of many sensors at once: one NumPy call per instruction and chunk of samples.
+
+`engine` replays a model's instructions over the samples of one sensor, with its parameters as
+plain numbers. Here the sensors lie side by side: what depends on parameters only is a row (W,) of W
+sensors, computed once per call; what depends on samples is (P, W), a chunk of P samples of each.
+No value of a sensor depends on its neighbours or on its place among them: the same instructions
+act on every column, and the sums run over samples in their order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from casest.declaring.shapes import Array
+from casest.engine import Plan, Replay
+from casest.engine.replay import _KERNELS, Entry, Kernel
+
+#: Numbers per call: enough to hide the cost of the call, few enough to stay in the cache.
+NUMBERS = 12288
+#: Fewest sensors side by side: NumPy adds in another order along rows that are shorter.
+NARROWEST = 32
+
+
+class Hold(NamedTuple):
+    """One more residual of each sensor, rowᵀ(x − target); both (n, W)."""
+
+    row: Array
+    target: Array
+
+
+class Sensors(NamedTuple):
+    """Readings of W sensors side by side: samples (k, N, W), and which of them count, (N, W).
+
+    Without `mask` all do. `hold` ties a combination of unknowns, for a profile.
+    """
+
+    samples: Array
+    mask: Array | None
+    hold: Hold | None = None
+
+    def some(self, chosen: NDArray[np.int_]) -> Sensors:
+        """The sensors of these places."""
+        mask = None if self.mask is None else self.mask[:, chosen]
+        hold = None if self.hold is None else Hold(*(part[:, chosen] for part in self.hold))
+        return Sensors(self.samples[:, :, chosen], mask, hold)
+
+
+class Normals(NamedTuple):
+    """½Σr² (W,), Jᵀr (n, W) and JᵀJ (n, n, W), of which the lower triangle is filled."""
+
+    cost: Array
+    gradient: Array
+    matrix: Array
+
+
+def chunk(samples: int) -> int:
+    """Samples of each sensor that are evaluated at once.
+
+    It must not depend on the number of sensors: sums of chunks are added, and each sensor's digits
+    would depend on how many others there are.
+    """
+    return min(samples, 12 if samples <= 64 else 48 if samples <= 1024 else NUMBERS // NARROWEST)
+
+
+def widest(samples: int) -> int:
+    """Sensors side by side for records of so many samples."""
+    return NUMBERS // max(chunk(samples), 12)
+
+
+class SideBySide:
+    """Some entries of a function's outputs, for sensors side by side."""
+
+    def __init__(self, replay: Replay, entries: list[Entry]) -> None:
+        self.plan = replay.plan(entries)
+        self._places: dict[tuple[int, int], _Registers] = {}
+
+    def chunks(self, parameters: Array, sensors: Sensors) -> Iterator[tuple[slice, Array]]:
+        """Samples and their entries (entries, P, W), which the next chunk overwrites.
+
+        parameters: (n, W). Samples that do not count have entries of zero.
+        """
+        total, width = sensors.samples.shape[1:]
+        length = chunk(total)
+        for start in range(0, total, length):
+            span = slice(start, min(start + length, total))
+            registers = self._registers(span.stop - start, width)
+            if start == 0 or span.stop - start < length:
+                registers.set(parameters)
+            values = registers.run(sensors.samples[:, span])
+            if sensors.mask is not None:
+                values *= sensors.mask[span]
+            yield span, values
+
+    def _registers(self, length: int, width: int) -> _Registers:
+        if (length, width) not in self._places:
+            if len(self._places) > 16:  # records of ever new lengths must not pile up
+                self._places.clear()
+            self._places[length, width] = _Registers(self.plan, length, width)
+        return self._places[length, width]
+
+
+class _Registers:
+    """Where the values of a plan live for P samples of W sensors, and the bound calls."""
+
+    def __init__(self, plan: Plan, length: int, width: int) -> None:
+        values = plan.graph.values
+        rows = np.empty((len(plan.scalars), width))
+        place = {i: rows[k] for k, i in enumerate(plan.scalars)}
+        for i in plan.scalars:
+            if values[i].kind == "constant":
+                place[i] = np.array(values[i].constant)
+        self._parameters = [(place[i], values[i].code) for i in plan.scalars if _given(plan, i)]
+        self._once = [_call(plan, i, place) for i in plan.scalars if _computed(plan, i)]
+        self._inputs = np.empty((len(plan.inputs), length, width))
+        self._codes = [values[i].code for i in plan.inputs]
+        self._results = np.empty((len(plan.wanted), length, width))
+        registers = np.empty((plan.n_registers, length, width))
+        place.update((i, self._inputs[k]) for k, i in enumerate(plan.inputs))
+        place.update((i, registers[k]) for i, k in plan.register.items())
+        place.update((i, self._results[k]) for i, k in plan.home.items())
+        self._each = [_call(plan, i, place) for i in plan.steps]
+        for row, i in enumerate(plan.wanted):
+            if plan.home.get(i) != row:
+                self._each.append((_copied, (place[i], self._results[row])))
+
+    def set(self, parameters: Array) -> None:
+        """Evaluate once what does not depend on the sample."""
+        for row, code in self._parameters:
+            row[:] = parameters[code]
+        for kernel, arguments in self._once:
+            kernel(*arguments)
+
+    def run(self, samples: Array) -> Array:
+        """Entries (entries, P, W) of a chunk (k, P, W)."""
+        for row, code in zip(self._inputs, self._codes, strict=True):
+            row[:] = samples[code]
+        for kernel, arguments in self._each:
+            kernel(*arguments)
+        return self._results
+
+
+def _given(plan: Plan, i: int) -> bool:
+    return plan.graph.values[i].kind == "parameter"
+
+
+def _computed(plan: Plan, i: int) -> bool:
+    return plan.graph.values[i].kind == "operation"
+
+
+def _call(plan: Plan, i: int, place: dict[int, Array]) -> tuple[Kernel, tuple[Array, ...]]:
+    value = plan.graph.values[i]
+    return _KERNELS[value.code], (*(place[j] for j in value.operands), place[i])
+
+
+def _copied(value: Array, out: Array) -> None:
+    np.copyto(out, value)
+
+
+class Squares:
+    """Cost and normal equations of a model's residual r (m×1) and Jacobian J (m×n)."""
+
+    def __init__(self, replay: Replay) -> None:
+        """From a replay with the outputs r and J."""
+        m, self.n = replay.shapes[1]
+        row, column = replay.sparsity[1]
+        self.residual_count = m
+        self._columns = [[*map(int, column[row == i]), self.n] for i in range(m)]
+        entries: list[Entry] = []
+        for i in range(m):
+            entries += [*((1, int(j)) for j in np.flatnonzero(row == i)), (0, i)]
+        self._all = SideBySide(replay, entries)
+        self._residual = SideBySide(replay, [(0, i) for i in range(m)])
+
+    def normals(self, x: Array, sensors: Sensors) -> Normals:
+        """Normal equations of every sensor at its own x, (n, W)."""
+        n, width = self.n, x.shape[1]
+        sums = [np.zeros((len(c) * (len(c) + 1) // 2, width)) for c in self._columns]
+        for _, values in self._all.chunks(x, sensors):
+            first = 0
+            for columns, total in zip(self._columns, sums, strict=True):
+                own, row = values[first : first + len(columns)], 0
+                first += len(columns)
+                for i in range(len(own)):
+                    part = total[row : row + len(own) - i]
+                    part += np.einsum("ps,jps->js", own[i], own[i:])
+                    row += len(part)
+        whole = np.zeros((n + 1, n + 1, width))
+        for columns, total in zip(self._columns, sums, strict=True):
+            row = 0
+            for i, column in enumerate(columns):
+                # [J r] by columns: the first index is never below the second.
+                whole[columns[i:], column] += total[row : row + len(columns) - i]
+                row += len(columns) - i
+        if sensors.hold is not None:
+            held, target = sensors.hold
+            miss = np.einsum("is,is->s", held, x - target)
+            entries = np.concatenate([held, miss[None]])
+            whole += entries[:, None] * entries
+        return Normals(0.5 * whole[n, n], whole[n, :n], whole[:n, :n])
+
+    def cost(self, x: Array, sensors: Sensors) -> Array:
+        """½Σr² of every sensor, (W,)."""
+        total = np.zeros(x.shape[1])
+        for _, values in self._residual.chunks(x, sensors):
+            for own in values:
+                total += np.einsum("ps,ps->s", own, own)
+        return 0.5 * total
+
+    def pulled(self, x: Array, sensors: Sensors, values: Array) -> Array:
+        """Jᵀ·values (n, W) for values (m, N, W), one for every residual."""
+        total = np.zeros((self.n + 1, x.shape[1]))
+        for span, entries in self._all.chunks(x, sensors):
+            first = 0
+            for columns, own in zip(self._columns, values[:, span], strict=True):
+                part = entries[first : first + len(columns)]
+                first += len(columns)
+                total[columns] += np.einsum("ps,jps->js", own, part)
+        return total[: self.n]
+
+    def residuals(self, x: Array, sensors: Sensors) -> Array:
+        """Every residual, (m, N, W)."""
+        found = np.empty((self.residual_count, *sensors.samples.shape[1:]))
+        for span, values in self._residual.chunks(x, sensors):
+            found[:, span] = values
+        return found

@@ -1,0 +1,278 @@
+"""A misfit is told from noise of any colour, tails and inequality; outliers from heavy tails."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from casest import Residual, Run, model, param, quantity, signal
+from casest.closing.adequacy import Misfit, left_over, state_of
+from casest.closing.candidates import prepared
+from casest.closing.crossfit import folded
+from casest.closing.noise_model import equal_noise, lag_one, noise_model
+from casest.closing.tails import outlier_share, outliers_p_value, tails
+from casest.solve.correlation import correlation_time
+from casest.solve.trust_region import trust_region
+from casest.stack import Problem
+
+
+@model
+def channels(x=signal("V"), y=signal(2, "V"), *, a=param(2, "V"), b=param(2)):
+    """Two channels, each a line."""
+    return Residual(measured=y, predicted=quantity("level", a + b * x, "V"))
+
+
+@model
+def encoder(angle=signal("rad"), y=signal("V"), *, a=param("V"), b=param("V/rad")):
+    """A potentiometer that goes round many times."""
+    turned = quantity("turned", angle, "rad")
+    return Residual(measured=y, predicted=a + b * turned)
+
+
+def white(n, rng, blocks):
+    return rng.standard_normal((n, 2))
+
+
+def autoregressive(n, rng, blocks):
+    """AR(1) of unit variance, ρ = 0.6."""
+    e = rng.standard_normal((n, 2))
+    for k in range(1, n):
+        e[k] = 0.6 * e[k - 1] + 0.8 * e[k]
+    return e
+
+
+def heavy(n, rng, blocks):
+    return rng.standard_t(4, (n, 2))
+
+
+def shaking(n, rng, blocks):
+    """The table shakes at some positions, three times as much as at rest."""
+    return (
+        rng.standard_normal((n, 2))
+        * np.where(rng.random(blocks.max() + 1) < 0.2, 3, 1)[blocks, None]
+    )
+
+
+def with_outliers(n, rng, blocks):
+    """One reading in 200 is off by 10 to 20 σ."""
+    e = rng.standard_normal((n, 2))
+    bad = rng.random((n, 2)) < 0.005
+    e[bad] += rng.choice([-1, 1], bad.sum()) * rng.uniform(10, 20, bad.sum())
+    return e
+
+
+NOISE = {
+    "white": white, "AR(1)": autoregressive, "t4": heavy, "shaking": shaking, "outliers":
+    with_outliers,
+}  # fmt: skip
+
+
+def record(noise, seed, n=480, positions=24, misfit=lambda **_: 0.0, quantised=False):
+    """A record of a line in x held at `positions` (0: x goes up and down), and two columns."""
+    rng = np.random.default_rng([seed, n, positions])
+    blocks = np.arange(n) * (positions or 24) // n
+    x = rng.uniform(-1, 1, positions)[blocks] if positions else np.sin(0.05 * np.arange(n))
+    t = 0.01 * np.arange(n)
+    warm = 20 + 5 * np.sin(0.9 * t) + 0.05 * rng.standard_normal(n)
+    y = 1 + 2 * x[:, None] + noise(n, rng, blocks)
+    y = y + np.reshape(misfit(x=x, t=t, warm=warm, blocks=blocks), (-1, 1))
+    run = Run.raw("r", {"x": x[:, None], "y": np.round(y) if quantised else y}, units={}, time=t)
+    columns = {"temp": warm, "humidity": rng.standard_normal(n)}
+    return replace(
+        run, columns=columns, column_units={}, block=blocks if positions else run.block
+    )  # fmt: skip
+
+
+def judged(run, declared=channels) -> Misfit:
+    runs = prepared(declared, [run])
+    problem = Problem(declared, runs)
+    point = trust_region(problem, problem.start()).point
+    correlated = correlation_time(problem, point)
+    state = state_of(problem, point, folded(runs, correlated).batches)
+    return left_over(state, state.residuals, correlated)
+
+
+# -- no misfit -------------------------------------------------------------------------------------
+
+
+def test_noise_of_any_kind_is_no_misfit():
+    worlds = [
+        (name, positions, judged(record(noise, seed, positions=positions)))
+        for name, noise in NOISE.items()
+        for positions in (0, 24)
+        for seed in range(12)
+    ]
+    alarms = [(name, positions, f.where) for name, positions, f in worlds if f.significant]
+    # At one in a hundred 1.2 of 120 are expected; more than four come once in 130 tries.
+    assert len(alarms) <= 4, alarms
+
+
+def test_readings_rounded_to_one_sigma_are_no_misfit_and_the_step_is_found():
+    found = [judged(record(white, seed, quantised=True)) for seed in range(8)]
+    assert sum(f.significant for f in found) <= 1
+    assert all(f.noise["quantisation_step"] == 1.0 for f in found)
+
+
+# -- misfits ---------------------------------------------------------------------------------------
+
+
+def test_a_wave_in_a_column_is_a_misfit_that_names_the_column():
+    def wave(warm, **_):
+        return 0.5 * np.cos(0.7 * (warm - 20))
+
+    for seed in range(3):
+        found = judged(record(white, seed, n=1200, positions=0, misfit=wave))
+        assert found.significant
+        assert "varies with temp" in found.where
+        # Its variance over that of everything.
+        assert found.fraction == pytest.approx(0.06, abs=0.05)
+
+
+def test_a_dependence_on_the_angle_says_how_often_per_turn():
+    rng = np.random.default_rng(0)
+    angle = np.linspace(0, 80, 1500)
+    y = 1 + 0.1 * angle + 0.3 * np.cos(2 * angle) + rng.standard_normal(1500)
+    run = Run.raw("r", {"angle": angle[:, None], "y": y[:, None]}, units={})
+    found = judged(run, encoder)
+    assert found.significant
+    assert found.where.startswith("varies twice per turn of turned")
+
+
+def test_positions_that_are_off_by_more_than_their_repeats_scatter_are_a_misfit():
+    def off(blocks, **_):
+        return np.random.default_rng(5).normal(0, 1.0, 24)[blocks]
+
+    found = judged(record(white, 1, misfit=off))
+    assert found.significant
+    assert found.where.startswith("between positions: the residual is ")
+    # Variance 1 within positions, about 1 between them.
+    assert found.fraction == pytest.approx(0.5, abs=0.2)
+
+
+def test_a_narrow_line_is_a_misfit_with_its_frequency():
+    def hum(t, **_):
+        return 0.4 * np.sin(2 * np.pi * 17 * t)
+
+    found = judged(record(white, 2, n=2000, positions=0, misfit=hum))
+    assert found.significant
+    assert "a line at 17 Hz" in found.where
+
+
+def test_a_jump_is_a_misfit():
+    def jump(t, **_):
+        return 1.0 * (t > 5)
+
+    found = judged(record(white, 3, n=1000, positions=0, misfit=jump))
+    assert found.significant
+
+
+# -- the noise -------------------------------------------------------------------------------------
+
+
+def described(e, batches=40):
+    run = Run.raw("r", {"y": e}, units={}, time=0.01 * np.arange(len(e)))
+    first = np.arange(batches) * len(e) // batches
+    return noise_model([run], [e], [first])
+
+
+def test_the_correlation_of_neighbours_is_that_of_the_ar1():
+    rng = np.random.default_rng(0)
+    e = autoregressive(20_000, rng, None)
+    found = described(e)
+    # Bartlett: its standard deviation is √((1 − ρ²)/n).
+    assert found.lag1 == pytest.approx(0.6, abs=4 * np.sqrt((1 - 0.36) / 40_000) + 0.01)
+    assert found.colour_p < 1e-6
+
+
+def test_white_noise_is_called_white_whatever_its_scale_does():
+    rng, p = np.random.default_rng(1), []
+    for _ in range(300):
+        e = rng.standard_normal((400, 1)) * np.exp(np.sin(np.arange(400) / 30))[:, None]
+        p.append(lag_one([Run.raw("r", {"y": e}, units={})], [e])[1])
+    assert np.mean(np.array(p) < 0.05) == pytest.approx(0.05, abs=4 * np.sqrt(0.05 * 0.95 / 300))
+
+
+def test_a_random_walk_beside_the_noise_is_found_with_its_size():
+    rng = np.random.default_rng(2)
+    sizes = []
+    for _ in range(12):
+        walk = np.cumsum(0.05 * rng.standard_normal((4000, 2)), axis=0)
+        found = described(walk + rng.standard_normal((4000, 2)))
+        assert found.wander_p < 1e-3
+        sizes.append(found.wander)
+    # 0.05 per sample of 10 ms: 0.5 per √s; robust σ counts part of the walk.
+    assert np.mean(sizes) == pytest.approx(0.5, rel=0.3)
+
+
+def test_unequal_noise_is_told_and_equal_noise_is_not():
+    rng = np.random.default_rng(3)
+    first = np.arange(24) * 20
+    p = [equal_noise([np.clip(white(480, rng, None), -3.5, 3.5)], [first]) for _ in range(300)]
+    assert np.mean(np.array(p) < 0.05) == pytest.approx(0.05, abs=4 * np.sqrt(0.05 * 0.95 / 300))
+    e = white(480, rng, None)
+    e[100:120] *= 4
+    found = described(e, batches=24)
+    assert found.unequal_p < 1e-3
+    assert 3 < found.unequal < 12
+
+
+@pytest.mark.parametrize("freedom", [3, 4, 6])
+def test_the_degrees_of_freedom_of_the_tails_are_estimated(freedom):
+    rng = np.random.default_rng(4)
+    found = tails(rng.standard_t(freedom, 20_000))
+    # Fisher information of ν at 4 gives a standard deviation of about 1.8 % of ν² at this n.
+    assert found.freedom == pytest.approx(freedom, rel=0.15)
+    assert not found.outliers
+
+
+def test_normal_noise_has_normal_tails():
+    rng = np.random.default_rng(5)
+    heavy_ones = sum(np.isfinite(tails(rng.standard_normal(300)).freedom) for _ in range(200))
+    assert heavy_ones <= 2
+
+
+# -- outliers --------------------------------------------------------------------------------------
+
+
+def first_of(n):
+    return [np.arange(40) * n // 40]
+
+
+def test_outliers_are_found_and_counted():
+    rng = np.random.default_rng(6)
+    shares = [outlier_share([with_outliers(600, rng, None)], first_of(600)) for _ in range(100)]
+    assert np.mean(np.array(shares) > 0) >= 0.9
+    # Of samples with two readings each: 1 − 0.995².
+    assert np.mean(shares) == pytest.approx(0.01, rel=0.2)
+
+
+@pytest.mark.parametrize("freedom", [3, 4, 6])
+def test_heavy_tails_are_no_outliers(freedom):
+    rng = np.random.default_rng(7)
+    found = [
+        outliers_p_value([rng.standard_t(freedom, (400, 2))], first_of(400)) for _ in range(100)
+    ]
+    assert sum(p is not None for p in found) <= 2
+
+
+def test_positions_that_shake_have_no_outliers():
+    rng = np.random.default_rng(8)
+    blocks = np.arange(600) * 24 // 600
+    assert sum(outlier_share([shaking(600, rng, blocks)], first_of(600)) > 0 for _ in range(60)) < 3
+
+
+def test_samples_far_off_that_follow_each_other_are_no_outliers():
+    rng = np.random.default_rng(9)
+    e = rng.standard_normal((1000, 2))
+    e[400:408] += 12
+    assert outlier_share([e], first_of(1000)) == 0.0
+
+
+def test_samples_far_off_at_large_readings_are_no_outliers():
+    rng = np.random.default_rng(10)
+    e, level = rng.standard_normal((2000, 2)), rng.standard_normal((2000, 2))
+    e[level > 2.5] -= 12
+    assert outlier_share([e], first_of(2000)) > 0
+    assert outlier_share([e], first_of(2000), [level]) == 0.0

@@ -1,0 +1,102 @@
+"""The closing loop on measured records: what they can support, and what they cannot."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+import casest as c
+from casest import load_runs
+from casest.cli import run
+from casest.closing.loop import close
+from casest.problem import find_model
+
+
+def at_rest(unit):
+    """A sensor at rest reads its bias."""
+
+    @c.model
+    def constant_bias(v=c.signal(3, unit), *, bias=c.param(3, unit)):
+        return c.Residual(measured=v, predicted=c.quantity("reading", bias, unit))
+
+    return constant_bias
+
+
+def closed(shared_data, file, columns, unit, model=None, **options):
+    model = model or at_rest(unit)
+    units = {"v": unit, **options.pop("units", {})}
+    runs = load_runs(
+        shared_data / file, model.signals, columns={"v": columns}, units=units, **options
+    )
+    return close(model, runs)
+
+
+def labels(found):
+    return [e.candidate.label for e in found.effects]
+
+
+def rms(parts):
+    return np.sqrt(np.mean(np.vstack(parts) ** 2, axis=0))
+
+
+@pytest.mark.parametrize("unit", ["imu0", "imu1", "imu2"])
+def test_the_mpu9150s_skew_is_found_and_nothing_else(shared_data, tmp_path, unit):
+    """Three units of 23 or fewer positions: the model without skew lacks the skew."""
+    log = str(shared_data / "mpu9150-mikoff" / f"{unit}.log")
+    arguments = ["close", "norm-diagonal", log, "--columns", "v=0,1,2", "--rate", "100"]
+    assert run([*arguments, "--at-rest", "--set", "norm=9.80665", "-o", str(tmp_path)]) == 0
+    result = json.loads((tmp_path / "result.json").read_text())
+    assert [e["name"] for e in result["effects"]] == ["cross_axis"]
+
+
+@pytest.mark.parametrize("unit", ["imu0", "imu1", "imu2"])
+def test_with_its_skew_the_mpu9150_is_predicted_several_times_better(shared_data, unit):
+    model = find_model("norm-diagonal").having(norm=9.80665)
+    file = f"mpu9150-mikoff/{unit}.log"
+    found = closed(shared_data, file, "0,1,2", "m/s^2", model, rate=100, at_rest=True)
+    assert rms(found.after_held_out) < rms(found.before_held_out) / 4
+
+
+def test_a_cooling_gyro_has_an_offset_that_time_explains_as_well_as_temperature(shared_data):
+    """They are correlated by -0.999: whichever is kept, the other must be named."""
+    found = closed(
+        shared_data,
+        "psim-thermal/TVCtest3_7_20.csv",
+        "gyrox,gyroy,gyroz",
+        "rad/s",
+        scales={"temp": "int16/256+25"},
+        units={"temp": "degC"},
+    )
+    (moved,) = [e for e in found.effects if e.candidate.label != "outliers"]
+    named = {moved.candidate.label, *moved.indistinguishable_from}
+    assert {"temperature_bias(temp)", "bias_drift"} <= named
+    assert "outliers" in labels(found)  # two spikes in x
+    assert np.all(rms(found.after_held_out)[:2] < 0.5 * rms(found.before_held_out)[:2])
+
+
+def test_the_mpu6050_at_rest_has_no_nonlinearity_and_hardly_anything_to_gain(shared_data):
+    """100 s at rest: no input varies; drift and step are not told apart in it."""
+    file = "mpu6050-tomisuarez/imu_static_test.csv"
+    found = closed(shared_data, file, "gx,gy,gz", "count", rate=100)
+    assert set(labels(found)) <= {"vibration", "bias_step", "bias_drift"}
+    for e in found.effects:
+        if e.candidate.label in ("bias_step", "bias_drift"):
+            assert {"bias_step", "bias_drift"} & set(e.indistinguishable_from)
+    assert np.all(rms(found.after_held_out) > 0.98 * rms(found.before_held_out))
+
+
+def test_the_accelerometer_beside_it_has_nothing_but_samples_far_out(shared_data):
+    file = "mpu6050-tomisuarez/imu_static_test.csv"
+    assert set(labels(closed(shared_data, file, "ax,ay,az", "count", rate=100))) <= {"outliers"}
+
+
+@pytest.mark.parametrize("which", ["noisy", "filtered"])
+def test_a_magnetometer_turned_by_hand_asks_for_no_cubic(shared_data, which):
+    """Of its misfit of 6 % of the radius no effect explains a good part."""
+    file = f"qmc5883l-tomisuarez/{which}_raw_data.csv"
+    model = find_model("norm-triangular").having(norm=1.0)
+    found = closed(shared_data, file, "mx,my,mz", "count", model, rate=50)
+    assert not {"cubic", "signed_cubic"} & set(labels(found))
+    assert rms(found.after_held_out) > 0.85 * rms(found.before_held_out)
