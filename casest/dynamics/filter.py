@@ -1,8 +1,8 @@
-"""Kalman filter and fixed-interval smoother on a sampled record with A(t), gaps and missing readings.
+"""Kalman filter and fixed-interval smoother on a sampled record with A(t), gaps, missing readings.
 
 Between samples the exact transition of the (straight-line) signals; readings are taken as averages
-over their sampling period, so that their variance is Θ/Δt. A reading that is missing in part is used
-in part.
+over their sampling period, so that their variance is Θ/Δt. A reading that is missing in part is
+used in part.
 """
 
 from __future__ import annotations
@@ -42,11 +42,11 @@ class Filtered:
     x: Array
     P: Array
     predicted_x: Array
-    predicted_P: Array
+    predicted_P: Array  # noqa: N815
     innovations: Array
     S: Array
     smoothed: Array
-    smoothed_P: Array
+    smoothed_P: Array  # noqa: N815
 
     @property
     def time(self) -> Array:
@@ -92,7 +92,7 @@ def _once(model: Dynamics, system: Linearised, smooth: bool) -> Filtered:
     Phi, forced = transitions(system)
     Q = process_noise(system, model.process, Phi)
     R = np.diag(model.noise)[None] / steps_to(system)[:, None]
-    N, n, m = len(system.time), model.size, system.C.shape[1]
+    n, m = model.size, system.C.shape[1]
     present = np.isfinite(system.y)
     # A reading that is missing is one that the state does not reach: no row, no innovation.
     C = np.where(present[:, :, None], system.C, 0.0)
