@@ -27,7 +27,10 @@ wheel: $(READY)
 	$(BIN)/python -m build --wheel
 
 bench: $(READY)
-	$(BIN)/python benchmarks/evaluate.py
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/evaluate.py
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/wheel_solve.py
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/many.py
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/long.py
 
 study: $(READY)
 	$(BIN)/python studies/bound.py

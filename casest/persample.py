@@ -27,19 +27,6 @@ def residual_and_jacobian(model: Model) -> Replay:
 
 
 @lru_cache(maxsize=64)
-def curvature(model: Model) -> Replay:
-    """Hessian of ½rᵀWr for one sample; the weights arrive as further signals."""
-    t = model.traced
-    w = ca.SX.sym("w", t.expression.numel())
-    hessian = ca.hessian(ca.dot(w * t.expression, t.expression) / 2, t.coordinates)[0]
-    sample = ca.vertcat(sample_symbol(model), w)
-    parameters = ca.vertcat(t.coordinates, t.references)
-    return Replay(
-        ca.Function("h", [parameters, sample], [hessian], ["parameters", "sample"], ["H"])
-    )
-
-
-@lru_cache(maxsize=64)
 def laplacian(model: Model) -> Replay:
     """Σ ∂²r/∂s² over the numbers of each signal, (m, signals): for each residual and signal."""
     sample, expression = sample_symbol(model), model.traced.expression

@@ -72,8 +72,9 @@ class Run:
     ) -> Run:
         """Make a run of one block from arrays alone, as a simulation does."""
         n = len(next(iter(signals.values())))
-        zeros = np.zeros(n, dtype=np.int_)
-        ones, rows = np.ones(n, dtype=np.int_), np.arange(n)
+        # One number seen n times: a long record needs no arrays of zeros and ones.
+        zeros, ones = (np.broadcast_to(np.array([k]), (n,)) for k in (0, 1))
+        rows = np.arange(n)
         return cls(name, file, signals, units, {}, {}, time, rows, zeros, ones, {}, notes)
 
     def __len__(self) -> int:
