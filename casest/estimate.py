@@ -262,7 +262,7 @@ def _canonical(problem: Problem, best: Outcome) -> Outcome:
     if convention is None or not np.isfinite(best.cost):
         return best
     values = problem.values(best.point)
-    chosen = {k: v for k, v in convention(values).items() if k in values}
+    chosen = {k: v for k, v in convention(problem.model, values).items() if k in values}
     point = problem.point({**values, **chosen})
     cost = problem.cost(point)
     same = abs(cost - best.cost) <= 1e-6 * best.cost + 1e-20

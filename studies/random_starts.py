@@ -26,6 +26,7 @@ import numpy as np
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT / "tests"))
 
+import bodies  # noqa: E402
 import simulators as sim  # noqa: E402
 from scipy.spatial.transform import Rotation  # noqa: E402
 
@@ -33,7 +34,7 @@ from casest import CasestError, Run, attempt  # noqa: E402
 from casest.problem import find_model  # noqa: E402
 
 KEPT, TABLE = ROOT / "out" / "random_starts.jsonl", ROOT / "studies" / "random_starts.md"
-MODELS = ("wheel", "rate-table", "norm-diagonal", "norm-triangular")
+MODELS = ("wheel", "rate-table", "norm-diagonal", "norm-triangular", "norm-pair")
 STARTS, VERDICTS = ("automatic", "given"), ("right", "wrong", "refused")
 #: Printed standard deviations within which every parameter of a right answer lies.
 FAR = 6.0
@@ -130,12 +131,23 @@ def random_poses(rng: np.random.Generator, skew: bool) -> tuple[Run, dict]:
     return Run.raw("poses", {"v": v}, units={"v": None}), {"scale": scale, "offset": sensor.b}
 
 
+def random_body(rng: np.random.Generator) -> tuple[Run, dict]:
+    """Accelerometer and magnetometer, turned by any angle against each other."""
+    body = bodies.Body(rng, rng.uniform(0, np.pi))
+    poses = bodies.attitudes(int(rng.integers(16, 31)), rng)
+    louder = np.exp(rng.uniform(np.log(0.1), np.log(2)))
+    noise = (louder * bodies.NOISE[0], louder * bodies.NOISE[1])
+    return body.record(poses, rng, noise), body.truth
+
+
 def simulated(name: str, rng: np.random.Generator) -> tuple[Run, dict]:
     """One record of a model and the truth behind it."""
     if name == "wheel":
         return random_wheel(rng)
     if name == "rate-table":
         return random_table(rng)
+    if name == "norm-pair":
+        return random_body(rng)
     return random_poses(rng, name == "norm-triangular")
 
 
@@ -160,6 +172,15 @@ def far_start(name: str, truth: dict, rng: np.random.Generator) -> dict:
             "quadratic": rng.uniform(-1e-3, 1e-3, 3),
             "bias": rng.uniform(-5, 5, 3),
             "gravity_direction": sim.sphere(1, rng)[0],
+        }
+    if name == "norm-pair":
+        accelerometer = far_norm(truth["accelerometer_scale"], rng)
+        return {
+            "accelerometer_scale": accelerometer["scale"],
+            "accelerometer_offset": accelerometer["offset"],
+            "magnetometer_scale": sim.random_rotation(rng) @ np.diag(rng.uniform(0.5, 2, 3)),
+            "magnetometer_offset": rng.uniform(-0.6, 0.6, 3) * bodies.FIELD,
+            "dip": rng.uniform(-1.3, 1.3),
         }
     return far_norm(truth["scale"], rng)
 
@@ -197,7 +218,7 @@ def verdict(model, run: Run, truth: dict, start: dict | None) -> dict:
     """What came of one fit."""
     began = time.perf_counter()
     try:
-        found = attempt(model, [run], start=start, solver="trust-region")
+        found = attempt(model, [run], start=start)
     except CasestError as error:
         return {"verdict": "refused", "why": str(error), "seconds": time.perf_counter() - began}
     kept = {"seconds": time.perf_counter() - began, "distance": distance(found, truth)}
@@ -211,7 +232,10 @@ def one_record(name: str, seed: int) -> dict:
     rng = np.random.default_rng([MODELS.index(name), seed])
     run, truth = simulated(name, rng)
     model = find_model(name)
-    model = model.having(norm=sim.GRAVITY) if name.startswith("norm") else model
+    if name == "norm-pair":
+        model = model.having(field=bodies.FIELD)
+    elif name.startswith("norm"):
+        model = model.having(norm=sim.GRAVITY)
     given = far_start(name, truth, rng)
     return {
         "model": name,
