@@ -263,7 +263,7 @@ def main() -> None:
     records = kept_records()
     done = {(r["model"], r["seed"]) for r in records}
     models = [options.only] if options.only else MODELS
-    tasks = [(m, seed) for m in models for seed in range(QUICK if options.quick else COUNT)]
+    tasks = [(m, seed) for seed in range(QUICK if options.quick else COUNT) for m in models]
     left = [task for task in tasks if task not in done]
     print(f"{len(tasks)} records, {len(left)} to do")
     KEPT.parent.mkdir(exist_ok=True)

@@ -326,7 +326,7 @@ def test_the_phase_is_within_a_turn_and_the_angles_are_canonical_from_any_start(
 
 
 def test_of_two_spins_that_read_alike_the_one_of_the_smaller_offset_is_given():
-    """The other way round, with the sensor's y and z turned over: the offset differs by 2g·cos α."""
+    """The other way round, the sensor turned over: the offset differs by 2g·cos α."""
     run = spun(TABLE_1, np.random.default_rng(9))
     mounting = turn(TABLE_1["misalignment"])
     axle = TABLE_1["gain"] * mounting[:, 2] * sim.GRAVITY * np.cos(TABLE_1["tilt"])
