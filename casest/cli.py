@@ -128,7 +128,7 @@ def output_options(command: Callable[..., Any]) -> Callable[..., Any]:
             "--output",
             type=click.Path(path_type=Path),
             metavar="DIR",
-            help="Folder for result.json and residuals.csv.",
+            help="Folder for result.json, residuals.csv and report.html.",
         ),
         click.option("--seed", type=int, default=0, show_default=True, help="For random restarts."),
         click.option(
@@ -185,6 +185,7 @@ def calibrate(model_name: str, data: tuple[str, ...], **options: Any) -> int:
 def calibration(model_name: str, data: Sequence[str], options: Options, command: str) -> int:
     """Read, fit, save, print; the exit code says whether the estimate is trusted."""
     from casest import estimate, result, terminal
+    from casest.report import calibration_page
     from casest.solve.interrupt import interruptible
 
     model = declared_model(model_name, options)
@@ -200,6 +201,7 @@ def calibration(model_name: str, data: Sequence[str], options: Options, command:
     )
     if options["output"]:
         result.save(options["output"], content, result.residual_rows(found))
+        reported(options["output"], calibration_page(found, content, str(options["output"])))
     if options["as_json"]:
         click.echo(result.as_json(content), nl=False)
     else:
@@ -232,6 +234,7 @@ def closing(model_name: str, data: Sequence[str], options: Options, command: str
     from casest.closing import loop, text, unseen, written
     from casest.effects import CATALOGUE
     from casest.problem import find_effects
+    from casest.report import closing_page
 
     own = tuple(e for path in options["effects"] for e in find_effects(path))
     model = declared_model(model_name, {**options, "effects": ()})
@@ -256,6 +259,7 @@ def closing(model_name: str, data: Sequence[str], options: Options, command: str
     )
     if options["output"]:
         result.save(options["output"], content, written.residual_rows(found, hidden))
+        reported(options["output"], closing_page(found, content, str(options["output"])))
     if options["as_json"]:
         click.echo(result.as_json(content), nl=False)
     else:
@@ -274,12 +278,15 @@ def refused(
 ) -> int:
     """Write and say what there is where the declared model itself has no trustworthy fit."""
     from casest import result
+    from casest.report import calibration_page
 
     if error.estimate is not None and options["output"]:
         content = result.calibration_result(
             error.estimate, model_name=model_name, data=data, command=command
         )
         result.save(options["output"], content, result.residual_rows(error.estimate))
+        page = calibration_page(error.estimate, content, str(options["output"]))
+        reported(options["output"], page)
         if options["as_json"]:
             click.echo(result.as_json(content), nl=False)
     click.echo(f"casest: {error}", err=True)
@@ -292,7 +299,7 @@ def refused(
     "--output",
     type=click.Path(path_type=Path),
     metavar="DIR",
-    help="Folder for result.json and residuals.csv.",
+    help="Folder for result.json, residuals.csv and report.html.",
 )
 def demo(output: Path | None) -> int:
     """Close the loop on a shipped record with an effect that its model lacks."""
@@ -382,6 +389,13 @@ def filter_command(model_name: str, data: tuple[str, ...], **options: Any) -> in
         result.as_json(content).rstrip() if options["as_json"] else observing.filter_text(content)
     )
     return 0
+
+
+def reported(folder: Path, page: str) -> None:
+    """`report.html` beside the results."""
+    from casest.report import REPORT
+
+    write(folder / REPORT, page)
 
 
 def write(path: Path, text: str) -> None:
