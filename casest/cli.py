@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -179,7 +180,12 @@ def calibrate(model_name: str, data: tuple[str, ...], **options: Any) -> int:
 
     Exit code 0: trusted; 1: bad input; 2: no trustworthy estimate (result.json says why).
     """
-    return calibration(model_name, data, options, "casest " + " ".join(sys.argv[1:]))
+    return calibration(model_name, data, options, typed())
+
+
+def typed() -> str:
+    """The command as it can be typed again."""
+    return shlex.join(["casest", *sys.argv[1:]])
 
 
 def calibration(model_name: str, data: Sequence[str], options: Options, command: str) -> int:
@@ -225,7 +231,7 @@ def close(model_name: str, data: tuple[str, ...], **options: Any) -> int:
     Verdict `adequate`: nothing that these data can show is missing; `extended`: effects were added
     and what is left is noise; `unexplained`: a misfit remains. Exit code 0 whatever the verdict.
     """
-    return closing(model_name, data, options, "casest " + " ".join(sys.argv[1:]))
+    return closing(model_name, data, options, typed())
 
 
 def closing(model_name: str, data: Sequence[str], options: Options, command: str) -> int:
@@ -524,7 +530,7 @@ def compare(model_name: str, data: tuple[str, ...], **options: Any) -> int:
         limit=options["limit"],
         say=progress,
     )
-    command = "casest " + " ".join(sys.argv[1:])
+    command = typed()
     content = comparing_text.comparison_result(
         found, model_name=model_name, data=data, command=command
     )

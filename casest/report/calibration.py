@@ -10,9 +10,9 @@ import numpy as np
 
 from casest.declaring.shapes import Array
 from casest.estimate import Estimate
+from casest.report.applied import application
 from casest.report.figures import Figures, axis, panel
 from casest.report.fitted import (
-    application,
     certified,
     parameters,
     reproduction,

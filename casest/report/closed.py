@@ -7,10 +7,10 @@ from typing import Any
 
 from casest.closing.loop import Closing
 from casest.closing.text import sentence
+from casest.report.applied import application
 from casest.report.calibration import by_axis, error_picture, whole
 from casest.report.figures import Figures
 from casest.report.fitted import (
-    application,
     certified,
     parameters,
     reproduction,
@@ -131,7 +131,7 @@ def _effects(closing: Closing, story: Story, content: Mapping[str, Any]) -> str:
         )
     skipped = [[s["name"], s["reason"]] for s in content["not_tried"]]
     if skipped:
-        summary = f"{len(skipped)} candidates that do not apply to this model or these data"
+        summary = f"Candidates that do not apply to this model or these data ({len(skipped)})"
         said.append(details(summary, table(["candidate", "why"], skipped)))
     return section("effects", "Effects found", *said)
 
@@ -145,11 +145,8 @@ def _effect(e: Mapping[str, Any], doc: str, story: Story) -> str:
     ]
     evidence = [f"Chance of as much by noise alone: p = {number(e['p_value'], 2)}."]
     if gain:
-        evidence.append(
-            f"The mean square error on held-out data falls by {number(gain)} "
-            f"({printed_unit(story.unit)})²." if story.unit != "1"
-            else f"The mean square error on held-out data falls by {number(gain)}."
-        )  # fmt: skip
+        unit = "" if story.unit == "1" else f" ({printed_unit(story.unit)})²"
+        evidence.append(f"The mean square error on held-out data falls by {number(gain)}{unit}.")
     if e["indistinguishable_from"]:
         names = ", ".join(f"`{n}`" for n in e["indistinguishable_from"])
         evidence.append(f"These data do not tell it apart from {names}.")
@@ -191,10 +188,11 @@ def _invisible(story: Story, content: Mapping[str, Any]) -> str:
     if not hidden:
         said = "Every effect of the catalogue that applies here would have shown at a typical size."
         return section("invisible", "What stayed invisible", paragraph(said))
+    units = {d["parameter"]: d["unit"] for d in content["smallest_detectable"]}
     rows = [
         [
             i["name"] + (f" ({i['column']})" if i["column"] else ""),
-            ", ".join(f"`{n}` = {number(v)}" for n, v in i["typical"].items()),
+            _typical(i, story, units),
             ", ".join(
                 f"`{n}` by {with_unit(v, story.units.get(n, ''))}"
                 for n, v in i["would_move"].items()
@@ -212,5 +210,12 @@ def _invisible(story: Story, content: Mapping[str, Any]) -> str:
 
 
 def _moves(would_move: Mapping[str, float], story: Story) -> str:
-    sizes = {n: with_unit(v, story.units.get(n, "")) for n, v in would_move.items()}
+    sizes = {n: with_unit(v, story.unit_of(n)) for n, v in would_move.items()}
     return ", ".join(f"`{n}` by {size}" for n, size in sizes.items())
+
+
+def _typical(i: Mapping[str, Any], story: Story, units: Mapping[str, str]) -> str:
+    """Typical sizes with their units, where those are known."""
+    own = {n: units.get(f"{i['name']}.{n}") or story.unit_of(n) for n in i["typical"]}
+    sizes = {n: with_unit(v, own[n]) for n, v in i["typical"].items()}
+    return ", ".join(f"`{n}` = {size}" for n, size in sizes.items())

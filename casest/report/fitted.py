@@ -1,21 +1,16 @@
-"""Sections that every fit's report has: values, what is uncertain about them, certificate, use."""
+"""Sections that every fit's report has: values, what belongs together, certificate, origin."""
 
 from __future__ import annotations
 
-import inspect
 import math
-import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from casest.apply import Correction
-from casest.errors import CasestError
 from casest.estimate import Estimate
-from casest.modelling.model import Model
 from casest.report.numbers import number, printed, printed_unit, with_unit
-from casest.report.page import details, escaped, paragraph, points, section, table, tag
+from casest.report.page import escaped, paragraph, points, section, table, tag
 from casest.report.story import Story
 from casest.result import half_width
 from casest.terminal import rounded, value_rows
@@ -206,10 +201,9 @@ def _noise(story: Story, content: Mapping[str, Any]) -> Iterator[str]:
         )
         yield f"From the scatter within rest intervals: {repeats}; from the residual: {residual}."
     if noise.get("colour"):
-        yield (
-            f"Colour: {noise['colour']}; correlation of neighbours "
-            f"{number(noise.get('lag1_correlation'))}."
-        )
+        near = noise.get("lag1_correlation")
+        beside = "" if near is None else f"; correlation of neighbours {number(near)}"
+        yield f"Colour: {noise['colour']}{beside}."
     if story.correlated_over > 1:
         yield (
             f"Residuals are correlated over {number(story.correlated_over)} samples; standard "
@@ -218,89 +212,6 @@ def _noise(story: Story, content: Mapping[str, Any]) -> Iterator[str]:
     if noise.get("outlier_share"):
         yield f"Outliers: {noise['outlier_share']:.2%} of the samples."
     yield f"{noise['degrees_of_freedom']} degrees of freedom."
-
-
-# -- how to use it ---------------------------------------------------------------------------------
-
-
-def application(story: Story, content: Mapping[str, Any], folder: str) -> str:
-    """What goes in, what is done to it in which order, what comes out, with units."""
-    model = story.last.model
-    said = []
-    if not content["trusted"]:
-        said.append(paragraph("Do not apply it: the estimate was refused."))
-    said += _steps(model, story.units, folder) if content["trusted"] else []
-    said.append(tag("h3", "Conventions"))
-    words = inspect.getdoc(model.function) or "The declaration says nothing beside its formulas."
-    said += [paragraph(part.replace("\n", " ")) for part in words.split("\n\n")]
-    if any(s.name == "t" for s in model.signals):
-        said.append(
-            paragraph("t = 0 is the first sample of each run unless the column said otherwise.")
-        )
-    code = textwrap.dedent(inspect.getsource(model.function)) if _has_source(model) else ""
-    if code:
-        said.append(details("The model as it was declared", tag("pre", tag("code", escaped(code)))))
-    return section("apply", "How to apply the result", *said)
-
-
-def _has_source(model: Model) -> bool:
-    try:
-        return bool(inspect.getsource(model.function))
-    except (OSError, TypeError):
-        return False
-
-
-def _steps(model: Model, units: Mapping[str, str], folder: str) -> list[str]:
-    """The correction's order of operations, and the command."""
-    try:
-        correction = Correction(model)
-        signals, needed, name = correction.signals, correction.parameters, correction.name
-    except CasestError as error:
-        return [paragraph(str(error))]
-    into = ", ".join(f"`{s.name}` ({_size(s.size)}{_in(units, s.name)})" for s in signals)
-    used = ", ".join(f"`{p.name}`" for p in model.parameters if p.name in needed)
-    steps = [f"Bring the readings to these units and this order of components: {into}."]
-    if model.implicit:
-        steps.append(f"Compute `{name}` from them with {used}, as the convention below says.")
-    else:
-        chain = _chain(model, name)
-        steps.append(
-            f"Go back from the reading to `{name}` with {used}: the model computes "
-            f"{' → '.join(f'`{q}`' for q in chain)}; undo that from right to left."
-        )
-        inside = [a for a in model.effects if a.on in chain]
-        if inside:
-            steps.append(
-                "Undo each added effect right after the quantity that it acts on: "
-                + ", ".join(f"`{a.label}` on `{a.on}`" for a in inside) + "."
-            )  # fmt: skip
-        if not set(chain) & {a.on for a in model.effects} and model.effects:
-            other = ", ".join(f"`{a.label}` on `{a.on}`" for a in model.effects)
-            steps.append(f"{other}: changed the fit, and is not undone: it lies before `{name}`.")
-    steps.append(f"The result is `{name}`, {_size(correction.size)}{_in(units, name)}.")
-    command = f"casest apply {folder} DATA"
-    return [
-        points(steps, "ol"),
-        paragraph("In one command:"),
-        tag("pre", tag("code", escaped(command))),
-    ]
-
-
-def _chain(model: Model, corrected: str) -> list[str]:
-    """Quantities from the corrected one to the reading, in the order of the body."""
-    names = list(model.quantities)
-    return names[names.index(corrected) :] if corrected in names else [corrected]
-
-
-def _size(size: int) -> str:
-    return "one number" if size == 1 else f"{size} numbers"
-
-
-def _in(units: Mapping[str, str], name: str) -> str:
-    unit = printed_unit(units.get(name, ""))
-    if not unit or unit == "1":
-        return ""
-    return f" in the unit of {unit[1:-1]}" if unit.startswith("[") else f" in {unit}"
 
 
 # -- how to get it again ---------------------------------------------------------------------------

@@ -45,6 +45,12 @@
 
   // -- axes -----------------------------------------------------------------------------------------
   const ticks = (low, high, count) => {
+    let found = evenly(low, high, count);
+    for (let more = count + 1; found.at.length < 3 && more < count + 8; more++)
+      found = evenly(low, high, more);
+    return found;
+  };
+  const evenly = (low, high, count) => {
     const raw = (high - low) / count, size = 10 ** Math.floor(Math.log10(raw));
     const step = size * [1, 2, 5, 10].find((f) => f * size >= raw * (1 - 1e-9));
     const found = [];

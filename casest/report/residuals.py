@@ -165,7 +165,7 @@ def over_variables(story: Story, figures: Figures) -> str:
         )
     drawn = [_over(story, v, k, figures) for k, v in enumerate(ranked)]
     more = drawn[AT_ONCE:]
-    folded = details(f"{len(more)} more columns and quantities", *more) if more else ""
+    folded = details(f"More columns and quantities ({len(more)})", *more) if more else ""
     said = paragraph(
         "Each point is the mean residual of a bin of equally many samples; the shaded band holds "
         "95 % of such means if there is only noise. What the residual depends on most comes first."
@@ -182,6 +182,7 @@ def _binned(story: Story) -> bool:
 
 def _over(story: Story, variable: Variable, number: int, figures: Figures) -> str:
     unit = story.variable_unit(variable.name)
+    name = f"column {variable.name}" if variable.name.isdigit() else variable.name
     x = _place_of(variable)
     panels = []
     for a, side, title in _panels(story):
@@ -199,12 +200,12 @@ def _over(story: Story, variable: Variable, number: int, figures: Figures) -> st
             drawn = [figures.series("points", side.look, x, y=np.clip(y, -top, top))]
             bands = _band(BAND * story.sigma[a])
         label = _label(story, a).replace("residual", "mean") if _binned(story) else _label(story, a)
-        across = axis(variable.name, unit, float(x.min()), float(x.max()), room=0.02)
+        across = axis(name, unit, float(x.min()), float(x.max()), room=0.02)
         upright = axis(label, story.unit, -top, top, room=0.08)
         panels.append(panel(title, across, upright, drawn, bands=bands, height=155))
     turn = " (one turn)" if variable.turns else ""
     nobody = "" if unit else " Its unit is not stated."
-    caption = (f"Over {variable.name}{turn}.", nobody.strip())
+    caption = (f"Over {name}{turn}.", nobody.strip())
     return figures.add(f"over-variable-{number}", caption, panels, two=len(story.sides) > 1)
 
 
@@ -296,11 +297,11 @@ def _spectrum(story: Story, step: float, timed: bool, figures: Figures) -> str:
             "frequency" if timed else "cycles per sample",
             unit, float(frequency[0]), float(frequency[-1]), log=True,
         )  # fmt: skip
-        upright = axis(f"power density {story.axes[a]}", density, least, most, log=True, room=0.04)
+        upright = axis(f"density {story.axes[a]}", density, least, most, log=True, room=0.04)
         white = [{"low": low * level, "high": high * level}] if np.isfinite(level) else []
-        panels.append(panel(title, across, upright, [line], bands=white))
+        panels.append(panel(title, across, upright, [line], bands=white, height=185))
     caption = (
-        "Spectrum of the residual.",
+        "Power spectral density of the residual.",
         "Shaded: where white noise of the same size lies at 95 of 100 frequencies; so one in "
         "twenty lies outside by chance."
         + ("" if timed else " The samples are not evenly spaced in time."),

@@ -76,6 +76,11 @@ class Story:
         found = variables(problem, problem.point(side.estimate.values), names)
         return [v for v in found if v.name not in ("time", "place in the record")]
 
+    def unit_of(self, name: str) -> str:
+        """Unit of a parameter, or of its first entry."""
+        entries = (u for n, u in self.units.items() if n.startswith(f"{name}["))
+        return self.units.get(name) or next(entries, "")
+
     def variable_unit(self, name: str) -> str:
         """Unit of a variable, empty where nobody stated it."""
         if name in self.units:
@@ -104,8 +109,10 @@ def of_closing(closing: Closing, content: Mapping[str, Any]) -> Story:
 
 def _noise(estimate: Estimate, content: Mapping[str, Any]) -> tuple[Array, str, float]:
     noise = content["noise"]
-    known = noise.get("sigma_by_axis") or noise["sigma"]
-    sigma = np.array([np.nan if s is None else s for s in known], dtype=float)
+    sigma = np.array([np.nan if s is None else s for s in noise["sigma"]], dtype=float)
+    each = noise.get("sigma_by_axis")
+    if each and len(each) > 1 and all(each):  # unequal axes, with the mean square of the fit
+        sigma = sigma * np.asarray(each) / np.sqrt(np.mean(np.square(each)))
     return sigma, str(noise["unit"]), max(estimate.correlated_over, 1.0)
 
 
