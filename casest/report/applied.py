@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 import inspect
+import re
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
+
+import casadi as ca
 
 from casest.apply import Correction
 from casest.errors import CasestError
 from casest.modelling.model import Model
+from casest.modelling.tracing import trace
 from casest.report.numbers import printed_unit
 from casest.report.page import details, escaped, paragraph, points, section, tag
 from casest.report.story import Story
+
+#: Longer formulas are left to the declaration.
+READABLE = 240
 
 #: Longer formulas are left to the declaration.
 READABLE = 240
