@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import fcntl
 import json
 import os
 import select
@@ -27,17 +28,24 @@ class Browser:
         to_read, self._write = os.pipe()
         self._read, to_write = os.pipe()
         self._log = (profile.parent / "browser.log").open("wb")
-        # Chromium reads commands from file 3 and writes to file 4.
-        shell = f'exec "$0" "$@" 3<&{to_read} 4>&{to_write}'
         flags = [
             "--headless=new", "--remote-debugging-pipe", f"--user-data-dir={profile}",
             "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--no-first-run",
             "--disable-background-networking", "--disable-component-update", "--disable-sync",
             "--hide-scrollbars", "about:blank",
         ]  # fmt: skip
+
+        def numbered() -> None:
+            """Chromium reads commands from file 3 and writes to file 4."""
+            moved = [fcntl.fcntl(f, fcntl.F_DUPFD, 10) for f in (to_read, to_write)]
+            for f, number in zip(moved, (3, 4), strict=True):
+                os.dup2(f, number)
+                os.close(f)
+
         self.process = subprocess.Popen(
-            ["/bin/sh", "-c", shell, program, *flags],
-            pass_fds=(to_read, to_write),
+            [program, *flags],
+            preexec_fn=numbered,
+            close_fds=False,
             stdout=self._log,
             stderr=self._log,
             start_new_session=True,

@@ -18,9 +18,10 @@ def printed_unit(unit: str) -> str:
 
 def printed(text: str) -> str:
     """A number's text with a true minus sign and powers of ten: -3.2e-07 as −3.2·10⁻⁷."""
-    mantissa, e, exponent = text.partition("e")
-    power = f"·10{str(int(exponent)).translate(_RAISED)}" if e else ""
-    return mantissa.replace("-", "−") + power
+    power = re.fullmatch(r"([-+\d.]+)e([-+]\d+)", text)
+    if power:
+        text = f"{power[1]}·10{str(int(power[2])).translate(_RAISED)}"
+    return text.replace("-", "−")
 
 
 def number(value: float | None, digits: int = 3) -> str:
