@@ -369,8 +369,12 @@ def observe(model_name: str, data: tuple[str, ...], **options: Any) -> int:
     else:
         moving, run = moving_record(model_name, data, options)
         content = observing.observe_motion(moving, run, options["window"])
+    content |= {"data": list(data), "reproduce": result.reproduce(typed(), data)}
     if options["output"]:
+        from casest.report import observe_page
+
         write(options["output"] / "observe.json", result.as_json(content))
+        reported(options["output"], observe_page(content))
     click.echo(
         result.as_json(content).rstrip() if options["as_json"] else observing.observe_text(content)
     )
@@ -388,9 +392,13 @@ def filter_command(model_name: str, data: tuple[str, ...], **options: Any) -> in
 
     moving, run = moving_record(model_name, data, {**options, "constants": ()})
     content, found = observing.follow(moving, run)
+    content |= {"data": list(data), "reproduce": result.reproduce(typed(), data)}
     if options["output"]:
+        from casest.report import filter_page
+
         write(options["output"] / "states.csv", observing.states_csv(found))
         write(options["output"] / "filter.json", result.as_json(content))
+        reported(options["output"], filter_page(found, content))
     click.echo(
         result.as_json(content).rstrip() if options["as_json"] else observing.filter_text(content)
     )

@@ -165,13 +165,16 @@ def filter_text(content: Mapping[str, Any]) -> str:
             label = name if len(s["value"]) == 1 else f"{name}[{k}]"
             lines.append(f"    {label:<14} {value:>12.5g} ± {std:<10.2g} {s['unit']}")
     i = content["innovations"]
-    ratio = i["normalised_mean"] / i["expected"]
-    verdict = (
-        "as large as the noise intensities say"
-        if 0.8 < ratio < 1.25
-        else f"{ratio:.2g} times as large (squared) as the noise intensities say: match them"
-    )
-    lines += ["", f"  innovations are {verdict}"]
+    lines += ["", f"  innovations are {filter_verdict(content)}"]
     if i["missing_readings"]:
         lines.append(f"  {i['missing_readings']} samples without a complete reading")
     return "\n".join(lines)
+
+
+def filter_verdict(content: Mapping[str, Any]) -> str:
+    """How large the innovations are beside what the noise intensities say."""
+    said = content["innovations"]
+    ratio = (said["normalised_mean"] or float("nan")) / said["expected"]
+    if 0.8 < ratio < 1.25:
+        return "as large as the noise intensities say"
+    return f"{ratio:.2g} times as large (squared) as the noise intensities say: match them"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,18 +17,11 @@ from casest.report.fitted import (
     reproduction,
     uncertain,
 )
+from casest.report.frame import whole
 from casest.report.numbers import alike, printed_unit, with_unit
-from casest.report.page import document, escaped, paragraph, points, section, table, tag
+from casest.report.page import paragraph, points, section, table
 from casest.report.residuals import residual_figures
 from casest.report.story import Story, of_calibration
-
-#: Sections of a page, in their order: name and what the contents call it.
-CONTENTS = (
-    ("error", "Error"), ("residual", "Residual"), ("parameters", "Parameters"),
-    ("uncertain", "What belongs together"), ("effects", "Effects"),
-    ("invisible", "What stayed invisible"), ("certificate", "Certificate"), ("apply", "Applying"),
-    ("reproduce", "Reproducing"),
-)  # fmt: skip
 
 
 def calibration_page(estimate: Estimate, content: Mapping[str, Any], folder: str = "out") -> str:
@@ -61,36 +53,6 @@ def sentence(estimate: Estimate, content: Mapping[str, Any]) -> str:
     return (
         f"Trusted: {estimate.identifiability.unknowns} unknowns determined from {count} {what}, "
         f"with a residual of {rms} rms."
-    )
-
-
-def whole(
-    name: str,
-    verdict: str,
-    under: str,
-    body: list[str],
-    content: Mapping[str, Any],
-    figures: Figures,
-) -> str:
-    """The page around its sections: where it comes from, the verdict, the contents."""
-    data = ", ".join(Path(d).name for d in content.get("data") or [])
-    origin = f"casest {content['casest']} · {name}" + (f" · {data}" if data else "")
-    inside = "".join(body)
-    links = "".join(
-        tag("a", escaped(title), href=f"#{anchor}")
-        for anchor, title in CONTENTS
-        if f'<section id="{anchor}"' in inside
-    )
-    head = tag(
-        "header",
-        tag("p", escaped(origin), class_="origin"),
-        tag("h1", escaped(verdict), id="verdict"),
-        paragraph(under) if under else "",
-        tag("nav", links),
-    )
-    trusted = bool(content.get("trusted", True))
-    return document(
-        f"{name}: {verdict}", head + inside, figures.figures, figures.arrays, trusted=trusted
     )
 
 

@@ -8,7 +8,7 @@ from typing import Any
 from casest.closing.loop import Closing
 from casest.closing.text import sentence
 from casest.report.applied import application
-from casest.report.calibration import by_axis, error_picture, whole
+from casest.report.calibration import by_axis, error_picture
 from casest.report.figures import Figures
 from casest.report.fitted import (
     certified,
@@ -16,6 +16,7 @@ from casest.report.fitted import (
     reproduction,
     uncertain,
 )
+from casest.report.frame import whole
 from casest.report.numbers import alike, number, printed, printed_unit, with_unit
 from casest.report.page import details, escaped, paragraph, points, section, table, tag
 from casest.report.residuals import residual_figures

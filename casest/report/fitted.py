@@ -231,8 +231,8 @@ def reproduction(content: Mapping[str, Any], notes: Sequence[str] = ()) -> str:
     if declared:
         rows.append([f"`{declared['file']}` (the model)", f"`{declared['sha256']}`"])
     said.append(table(["file", "SHA-256"], rows))
-    samples = content.get("samples") or []
-    if samples:
+    samples = content.get("samples")
+    if isinstance(samples, list):
         shown = [[f"`{s['run']}`", str(s["samples"]), str(s["readings"])] for s in samples]
         said.append(table(["run", "samples", "readings"], shown, [1, 2]))
     if notes:
