@@ -13,7 +13,7 @@ from casest import __version__
 from casest.data.run import Run
 from casest.dynamics import Dynamics
 from casest.dynamics.filter import Filtered, filtered
-from casest.dynamics.gramian import gramian, observed, smallest_eigenvalue
+from casest.dynamics.gramian import gramian, observed, window_eigenvalues
 from casest.dynamics.transition import linearised
 from casest.estimate import Estimate, attempt
 from casest.modelling.model import Model
@@ -51,7 +51,7 @@ def observe_motion(model: Dynamics, run: Run, window: float | None = None) -> di
     seen = observed(model, gramian(model, system))
     duration = float(system.time[-1] - system.time[0])
     length = min(window or WINDOW * duration, duration)
-    ends, smallest = smallest_eigenvalue(model, system, length)
+    ends, eigenvalues = window_eigenvalues(model, system, length)
     std = {name: plain(seen.std[where]) for name, where in model.slices().items()}
     return {
         "casest": __version__,
@@ -67,7 +67,8 @@ def observe_motion(model: Dynamics, run: Run, window: float | None = None) -> di
         "windows": {
             "length_s": plain(length),
             "end_s": plain(ends),
-            "smallest_eigenvalue": plain(smallest),
+            "smallest_eigenvalue": plain(eigenvalues[:, 0]),
+            "eigenvalues": plain(eigenvalues),
         },
     }
 

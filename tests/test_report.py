@@ -135,6 +135,50 @@ def test_a_refused_calibration_has_a_report_that_says_why(browser, tmp_path):
     assert browser.complaints() == []
 
 
+def test_observe_says_what_is_hidden(browser, tmp_path):
+    assert run(["observe", "norm-full", *HANDHELD, *NORM, "-o", str(tmp_path)]) == 0
+    browser.open(tmp_path / "report.html")
+    assert text(browser, "h1") == "Not observable: these data determine 9 of 12 unknowns."
+    assert len(texts(browser, "#hidden li")) == 3
+    assert browser.complaints() == []
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory):
+    """An independent flight (tests/test_dynamics.py), observed and filtered."""
+    from test_dynamics import flight
+
+    folder = tmp_path_factory.mktemp("flown")
+    record, _, _ = flight(seconds=20)
+    signals = record.signals
+    columns = np.column_stack([record.time, signals["a"], signals["omega"], signals["v"]])
+    names = [f"{s}{axis} [{u}]" for s, u in (("a", "m/s^2"), ("omega", "rad/s"), ("v", "m/s"))
+             for axis in "xyz"]  # fmt: skip
+    header = ",".join(["t [s]", *names])
+    np.savetxt(folder / "flight.csv", columns, delimiter=",", header=header, comments="")
+    for command in ("observe", "filter"):
+        given = [command, "bias-gravity", str(folder / "flight.csv"), "-o", str(folder / command)]
+        assert run(given) == 0
+    return folder
+
+
+def test_eigenvalues_over_time_states_with_bands_and_innovations(browser, flown):
+    browser.open(flown / "observe" / "report.html")
+    assert text(browser, "h1") == "Observable: these data determine all 9 unknowns."
+    assert browser.ask("document.querySelectorAll('#windows path.line').length") == 9
+    browser.open(flown / "filter" / "report.html")
+    assert text(browser, "h1").startswith("Innovations are ")
+    for name, unit in (("velocity", "m/s"), ("gravity", "m/s²"), ("bias", "m/s²")):
+        figure = f"#state-{name}"
+        assert browser.ask(f"document.querySelectorAll('{figure} .ribbon').length") == 6
+        labels = texts(browser, f"{figure} .label.y")
+        assert len(labels) == 6
+        assert all(f"({unit})" in label or f" {unit})" in label for label in labels)
+    assert "innovation (m/s)" in " ".join(texts(browser, "#over-time .label.y"))
+    assert len(browser.requests()) == 1
+    assert browser.complaints() == []
+
+
 # -- how it behaves --------------------------------------------------------------------------------
 
 

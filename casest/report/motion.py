@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -16,7 +17,7 @@ from casest.observing import filter_verdict
 from casest.report.figures import Figures, axis, panel
 from casest.report.fitted import reproduction
 from casest.report.frame import whole
-from casest.report.numbers import alike, number, printed_unit
+from casest.report.numbers import alike, number, printed, printed_unit
 from casest.report.page import paragraph, points, section, table, tag
 from casest.report.residuals import BAND
 from casest.report.spectra import autocorrelation
@@ -69,9 +70,9 @@ def _tolerance(content: Mapping[str, Any]) -> str:
 def _deviations(content: Mapping[str, Any]) -> str:
     units, rows = content.get("units", {}), []
     for name, std in content["std"].items():
-        values = np.ravel(np.array(std, dtype=object))
-        for k, value in enumerate(values):
-            label = f"`{name}[{k}]`" if len(values) > 1 else f"`{name}`"
+        values = np.array(std, dtype=object)
+        for index, value in np.ndenumerate(values):
+            label = f"`{name}[{','.join(map(str, index))}]`" if index else f"`{name}`"
             shown = "not determined" if value is None else number(value)
             rows.append([label, shown, printed_unit(units.get(name, ""))])
     said = "One standard deviation that these data allow, before any prior knowledge."
@@ -98,7 +99,7 @@ def _windows(content: Mapping[str, Any], figures: Figures) -> str:
         axis("end of the window", "s", float(end.min()), float(end.max()), room=0.02),
         axis("information over prior", "1", least, most, log=True, room=0.05),
         lines,
-        bands=[{"low": 1.0, "high": 1.0}] if least < 1 < most else [],
+        bands=[{"low": 1.0, "high": 1.0}] if least < 1 <= most else [],
         height=240,
     )
     caption = (
@@ -127,6 +128,7 @@ def filter_page(found: Filtered, content: Mapping[str, Any]) -> str:
         reproduction(content),
     ]
     said = filter_verdict(content)
+    said = re.sub(r"\d\S*e[-+]\d+", lambda m: printed(m[0]), said)
     verdict = f"Innovations are {said}."
     under = (
         f"{content['samples']} samples; a filter that fits has innovations of the size it expects, "
@@ -207,8 +209,9 @@ def _innovations(found: Filtered, content: Mapping[str, Any], figures: Figures) 
     panels = []
     for k, (name, unit) in enumerate(zip(names, units, strict=True)):
         y = found.innovations[::every, k]
-        top = 1.1 * float(np.nanmax(np.abs(y[len(y) // 10 :]), initial=0.0)) or 1.0
-        top = max(top, 1.3 * float(np.nanmedian(half[:, k])))
+        peak = float(np.nanmax(np.abs(y[len(y) // 10 :]), initial=0.0)) or 1.0
+        # Both are seen, unless the band is many times as wide as what it should hold.
+        top = max(1.1 * peak, min(1.3 * float(np.nanmedian(half[:, k])), 6 * peak))
         drawn = [
             figures.series("ribbon", "band", t, low=-half[:, k], high=half[:, k]),
             figures.series("line", "after", t, y=y),
