@@ -12,6 +12,7 @@ import casadi as ca
 
 from casest.apply import Correction
 from casest.errors import CasestError
+from casest.modelling.effect import Attached
 from casest.modelling.model import Model
 from casest.modelling.tracing import trace
 from casest.report.numbers import printed_unit
@@ -74,16 +75,18 @@ def _steps(model: Model, units: Mapping[str, str], folder: str) -> list[str]:
         )
         inside = [a for a in model.effects if a.on in chain]
         if inside:
-            steps.append(
-                "Undo each added effect right after the quantity that it acts on: "
-                + ", ".join(f"`{a.label}` on `{a.on}`" for a in inside) + "."
-            )  # fmt: skip
+            effects = "; ".join(f"`{a.label}` makes `{a.on}` {_said(a)}" for a in inside)
+            steps.append(f"On the way each added effect is undone where it acts: {effects}.")
     steps.append(f"The result is `{name}`, {_size(correction.size)}{_in(units, name)}.")
     command = tag("pre", tag("code", escaped(f"casest apply {folder} DATA")))
     lines = "\n".join(formulas(model, chain if model.implicit else chain[1:]))
     shown = tag("pre", tag("code", escaped(lines))) if lines else ""
     said = paragraph("In one command, with all digits of the values:")
     return [shown, points([*steps, *_elsewhere(model, chain)], "ol"), said, command]
+
+
+def _said(attached: Attached) -> str:
+    return attached.effect.formula or attached.effect.doc.partition("\n")[0].rstrip(".")
 
 
 def _elsewhere(model: Model, chain: list[str]) -> Iterator[str]:
@@ -101,7 +104,8 @@ def formulas(model: Model, names: list[str]) -> Iterator[str]:
         f"{p.name}_{k}": name for p in model.parameters for k, name in enumerate(p.entry_names)
     }
     for name in names:
-        value = ca.vec(ca.SX(quantities[name].declared))
+        found = quantities[name]
+        value = ca.vec(ca.SX(found.value if model.implicit else found.declared))
         for k in range(value.numel()):
             text = re.sub(r"[A-Za-z_][\w.]*", lambda m: _entry(m[0], entries), str(value[k]))
             label = f"{name}[{k}]" if value.numel() > 1 else name
