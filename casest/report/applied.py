@@ -36,13 +36,17 @@ def application(story: Story, content: Mapping[str, Any], folder: str) -> str:
     said.append(tag("h3", "Conventions"))
     words = inspect.getdoc(model.function) or "The declaration says nothing beside its formulas."
     said += [paragraph(part.replace("\n", " ")) for part in words.split("\n\n")]
+    if model.effects and content["trusted"]:
+        said.append(
+            paragraph("So the declaration has it, without the added effects, which are told above.")
+        )
     if any(s.name == "t" for s in model.signals):
         said.append(
             paragraph("t = 0 is the first sample of each run unless the column said otherwise.")
         )
     code = textwrap.dedent(inspect.getsource(model.function)) if _has_source(model) else ""
     if code:
-        source = tag("pre", tag("code", escaped(code)), class_="source")
+        source = tag("pre", tag("code", escaped(code)))
         said.append(details("The model as it was declared", source))
     return section("apply", "How to apply the result", *said)
 
@@ -140,4 +144,5 @@ def _size(size: int) -> str:
 
 def _in(units: Mapping[str, str], name: str) -> str:
     unit = printed_unit(units.get(name, ""))
-    return f" in {unit}" if unit and unit != "1" else ""
+    article = "the " if unit.startswith("unit of") else ""
+    return f" in {article}{unit}" if unit and unit != "1" else ""

@@ -12,6 +12,8 @@ _RAISED = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 def printed_unit(unit: str) -> str:
     """The unit with raised powers: m/s^2 as m/s²."""
     text = re.sub(r"\^(?:\((-?\d+)\)|(-?\d+))", lambda m: (m[1] or m[2]).translate(_RAISED), unit)
+    text = re.sub(r"\((\([^()]*\))\)", r"\1", text)
+    text = re.sub(r"^\(([^()]*)\)$", r"\1", text)
     text = re.sub(r"^\[(\w+)\]$", r"unit of \1", text)  # nobody stated it
     return text.replace("*", "·").replace("degC", "°C")
 
