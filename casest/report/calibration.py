@@ -68,7 +68,9 @@ def error_section(story: Story, content: Mapping[str, Any], figures: Figures) ->
     cells = [[name, s, printed_unit(unit)] for (name, _), s in zip(rows, sizes, strict=True)]
     shown = table(["residual, rms", "size", "unit"], cells, [1])
     notes = points([_repeats(content, unit)] if _repeats(content, unit) else [])
-    picture = error_picture(figures, [r[0] for r in rows], [("after", [r[1] for r in rows])], unit)
+    sides = [("after", [value for _, value in rows])]
+    several = len(rows) > 1  # one number needs no picture
+    picture = error_picture(figures, [name for name, _ in rows], sides, unit) if several else ""
     return section("error", "Error", shown, notes, picture)
 
 

@@ -65,9 +65,19 @@
     const a = Math.ceil(low - 1e-9), b = Math.floor(high + 1e-9), found = [];
     const every = Math.max(1, Math.ceil((b - a + 1) / count));
     for (let k = a; k <= b; k += every) found.push(k);
-    if (found.length > 1) return { at: found, text: (v) => "10" + raised(v) };
-    const even = ticks(low, high, 3); // less than a decade: plain numbers at even places
-    return { at: even.at, text: (v) => minus(Number((10 ** v).toPrecision(2)).toString()) };
+    if (found.length > 2) return { at: found, text: (v) => "10" + raised(v) };
+    const between = []; // less than two decades: 1, 2 and 5 of each
+    for (let k = Math.floor(low); k <= high; k++)
+      for (const m of [1, 2, 5]) {
+        const at = k + Math.log10(m);
+        if (at >= low - 1e-9 && at <= high + 1e-9) between.push(at);
+      }
+    const text = (v) => {
+      const k = Math.floor(v + 1e-9), m = Math.round(10 ** (v - k));
+      if (k >= -3 && k <= 4) return minus(String(Number((m * 10 ** k).toPrecision(2))));
+      return (m === 1 ? "" : m + "·") + "10" + raised(k);
+    };
+    return { at: between, text };
   };
   // Powers of ten go to the label, so that tick texts stay short.
   const power = (axis, low, high) => {

@@ -45,7 +45,11 @@ def _panels(story: Story) -> Iterator[tuple[int, Side, str]]:
 
 
 def _label(story: Story, a: int) -> str:
-    return "residual" if len(story.axes) == 1 else f"residual {story.axes[a]}"
+    return _of_axis(story, "residual", a)
+
+
+def _of_axis(story: Story, what: str, a: int) -> str:
+    return what if len(story.axes) == 1 else f"{what} {story.axes[a]}"
 
 
 def _band(half: float) -> list[dict[str, float]]:
@@ -297,14 +301,16 @@ def _spectrum(story: Story, step: float, timed: bool, figures: Figures) -> str:
             "frequency" if timed else "cycles per sample",
             unit, float(frequency[0]), float(frequency[-1]), log=True,
         )  # fmt: skip
-        upright = axis(f"density {story.axes[a]}", density, least, most, log=True, room=0.04)
+        widen = max(1.0, np.sqrt(10 * least / most))  # a decade at least
+        least, most = least / widen, most * widen
+        upright = axis(_of_axis(story, "density", a), density, least, most, log=True, room=0.04)
         white = [{"low": low * level, "high": high * level}] if np.isfinite(level) else []
         panels.append(panel(title, across, upright, [line], bands=white, height=185))
     caption = (
         "Power spectral density of the residual.",
         "Shaded: where white noise of the same size lies at 95 of 100 frequencies; so one in "
         "twenty lies outside by chance."
-        + ("" if timed else " The samples are not evenly spaced in time."),
+        + ("" if timed else " There is no even time step: frequency counts per sample."),
     )
     return figures.add("spectrum", caption, panels, two=len(story.sides) > 1)
 
@@ -322,7 +328,7 @@ def _autocorrelation(story: Story, figures: Figures) -> str:
         low, high = min(float(every.min()), -2 * half), max(float(every.max()), 2 * half)
         stems = figures.series("stems", side.look, np.arange(1.0, lags + 1), y=rho)
         across = axis("lag, in samples", "1", 0.0, lags + 1.0)
-        upright = axis(f"autocorrelation {story.axes[a]}", "1", low, high, room=0.06)
+        upright = axis(_of_axis(story, "autocorrelation", a), "1", low, high, room=0.06)
         panels.append(
             panel(title, across, upright, [stems], bands=[{"low": -half, "high": half}], height=155)
         )
