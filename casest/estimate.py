@@ -23,6 +23,7 @@ from casest.solve.correlation import correlation_time
 from casest.solve.covariance import inverse_normal, sandwich
 from casest.solve.interrupt import stopped
 from casest.solve.outcome import Outcome
+from casest.solve.profile import half_width
 from casest.solve.strategy import SOLVERS, best_of, solve
 from casest.stack import Point, Problem
 from casest.sums import repeat_noise, second_order_bias
@@ -91,6 +92,23 @@ class Estimate:
         unknown = self.identifiability.touched
         covariance[unknown, :] = covariance[:, unknown] = np.nan
         return self.problem.spread(at, covariance)
+
+    @cached_property
+    def interval_reach(self) -> tuple[Mapping[str, Array], Mapping[str, Array]]:
+        """How far the 95 % interval of every value reaches below and above it, shaped like `std`.
+
+        Student's t times `std`, or the profile of the cost where that is no parabola (widened as
+        `std` is, where residuals are correlated).
+        """
+        profile, at = self.certificate.profile, self.optimum or self.point
+        if profile is None:
+            half = half_width(int(self.noise.degrees_of_freedom / self.correlated_over))
+            linear = {name: half * std for name, std in self.std.items()}
+            return linear, linear
+        plain = self.noise.sigma**2 * inverse_normal(self.problem.factor(at)[0])
+        wider = np.sqrt(np.diag(self.covariance) / np.diag(plain))
+        below, above = ((wider * profile[:, k]) ** 2 for k in (0, 1))
+        return self.problem.spread(at, np.diag(below)), self.problem.spread(at, np.diag(above))
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -101,28 +101,21 @@ def calibration_result(
 
 def parameter_table(estimate: Estimate, table: Mapping[str, str]) -> dict[str, Any]:
     """Value, standard deviations, interval and unit of every parameter, for JSON."""
-    dof = estimate.noise.degrees_of_freedom / estimate.correlated_over
-    half = half_width(int(dof))
+    reach = estimate.interval_reach
     known = {n: u for n, u in table.items() if "[" not in n}
     found = {}
     for p in estimate.model.parameters:
         value, std = estimate.values[p.name], estimate.std[p.name]
+        below, above = reach[0][p.name], reach[1][p.name]
         own = entry_units(p, known)
         found[p.name] = {
             "value": plain(value),
             "std": plain(std),
             "robust_std": plain(estimate.robust[p.name]),
-            "interval95": [plain(value - half * std), plain(value + half * std)],
+            "interval95": [plain(value - below), plain(value + above)],
             "unit": own[0] if len(set(own)) == 1 else own,
         }
     return found
-
-
-def half_width(degrees_of_freedom: int) -> float:
-    """Half width of a 95 % interval in standard deviations: Student's t."""
-    from scipy.special import stdtrit
-
-    return float(stdtrit(max(degrees_of_freedom, 1), 0.975))
 
 
 def _correlation(covariance: Array) -> Array:
