@@ -95,7 +95,7 @@ def calibration_result(
         "notes": [note for run in problem.runs for note in run.notes] + list(estimate.notes),
         "convention": inspect.getdoc(problem.model.function) or "",
         "declared_in": _declared_in(problem.model),
-        "reproduce": _reproduce(command, data),
+        "reproduce": reproduce(command, data),
     }
 
 
@@ -187,7 +187,8 @@ def _declared_in(model: Model) -> dict[str, str]:
     return {"file": str(path), "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
 
 
-def _reproduce(command: str, data: Sequence[str]) -> dict[str, Any]:
+def reproduce(command: str, data: Sequence[str]) -> dict[str, Any]:
+    """Command, versions and digests: what is needed to get a result again."""
     return {
         "command": command,
         "python": platform.python_version(),

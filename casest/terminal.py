@@ -102,11 +102,10 @@ def item(text: str) -> str:
     return textwrap.fill(text, WIDTH, initial_indent="  - ", subsequent_indent="    ")
 
 
-def value_table(found: Estimate) -> Iterator[str]:
-    """One line per value: name, value ± standard deviation, unit."""
+def value_rows(found: Estimate) -> Iterator[tuple[str, float, float, str]]:
+    """Name (with its run, if there are several), value, std and unit of each entry."""
     known = unit_table(found.model, found.problem.runs)
     known = {n: u for n, u in known.items() if "[" not in n}
-    rows = []
     for p in found.model.parameters:
         units = entry_units(p, known)
         value, std = found.values[p.name], found.std[p.name]
@@ -115,9 +114,12 @@ def value_table(found: Estimate) -> Iterator[str]:
         for r, (v, s) in enumerate(stacked):
             run = f" ({found.problem.runs[r].name})" if several else ""
             for name, i, unit in zip(p.entry_names, p.shape.entries, units, strict=True):
-                rows.append(
-                    (name + run, *rounded(float(v[i]), float(s[i])), "" if unit == "1" else unit)
-                )
+                yield name + run, float(v[i]), float(s[i]), "" if unit == "1" else unit
+
+
+def value_table(found: Estimate) -> Iterator[str]:
+    """One line per value: name, value ± standard deviation, unit."""
+    rows = [(name, *rounded(v, s), unit) for name, v, s, unit in value_rows(found)]
     width = max(len(r[0]) for r in rows)
     left = max(len(r[1]) for r in rows)
     middle = max(len(r[2]) for r in rows)
@@ -193,10 +195,8 @@ def _determined(found: Estimate) -> Iterator[str]:
 def _next(found: Estimate, output: Path | None) -> str:
     if not found.certificate.trusted:
         return ""
-    if found.model.traced.corrected is None:
-        return "" if output is None else f"Written: {output}/result.json, {output}/residuals.csv."
+    applies = found.model.traced.corrected is not None
     if output is None:
-        return "Next: add -o out to keep the result, then `casest apply out DATA`."
-    return (
-        f"Written: {output}/result.json, {output}/residuals.csv. Next: casest apply {output} DATA"
-    )
+        return "Next: add -o out to keep the result, then `casest apply out DATA`." * applies
+    written = f"Written: {output}/report.html, result.json, residuals.csv."
+    return written + f" Next: casest apply {output} DATA" * applies

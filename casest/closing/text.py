@@ -28,7 +28,7 @@ def closing_text(closing: Closing, content: Mapping[str, Any], output: Path | No
     ]
     if output is not None:
         blocks.append(
-            f"Written: {output}/result.json, {output}/residuals.csv. "
+            f"Written: {output}/report.html, result.json, residuals.csv. "
             f"Next: casest apply {output} DATA"
         )
     else:
