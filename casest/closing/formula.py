@@ -1,63 +1,51 @@
-"""Outside the catalogue: a formula of few terms in what is recorded, chosen with stability.
+"""Outside the catalogue: a formula of few terms in what is recorded.
 
-Every term of the library (see `terms`), on every axis of the output, gets a score in the part
-orthogonal to the declared Jacobian, as the catalogue does. Terms are taken one by one, the best
-first, each significant among all of the library; and they must be chosen again from most
-half-samples of the batches (Meinshausen & Bühlmann 2010), so that no lucky stretch decides.
+Terms may read columns, time, the quantities of the model, and products of two. Which of them a
+residual asks for is searched as in `search`; then the formula has to pass the same gate as any
+effect of the catalogue: a certificate, and the error on held-out data.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import fdtrc
 
+from casest.closing.adequacy import DOUBT, State, independent, state_of
 from casest.closing.candidates import Candidate, _placed, usable_columns
-from casest.closing.crossfit import Folds
-from casest.closing.score import LEAST_LEFT, Wide, _slope, _Sums, _sums, _together, scores, widened
-from casest.closing.terms import (
-    Shape,
-    Term,
-    Variable,
-    formula_effect,
-    formula_text,
-    library,
-    source,
+from casest.closing.dependence import slow_shapes
+from casest.closing.noise_model import (
+    MIDDLE,
+    likelihood_of_walk,
+    likelihood_of_white,
+    power,
+    slice_means,
 )
+from casest.closing.score import CLIPPED, PIECE, Score, _slope, scores, widened
+from casest.closing.search import Chosen, Rows, search
+from casest.closing.terms import Shape, Term, Variable, formula_effect, library
 from casest.data.run import Run
 from casest.declaring.physics import SX
 from casest.declaring.shapes import Array, each
 from casest.declaring.symbols import Signal, param
-from casest.engine import Replay
+from casest.engine import Columns, Replay
 from casest.errors import CasestError
 from casest.modelling.effect import effect
 from casest.modelling.model import Model
 from casest.modelling.tracing import flat
-from casest.noise import weighted
-from casest.stack import Point, Problem
+from casest.stack import Problem
 
 if TYPE_CHECKING:
-    from casest.closing.loop import Fitted, _Loop
+    from casest.closing.loop import Fitted, Found, _Loop
 
-__all__ = ["formula_candidate", "source", "try_formula"]
-
-#: Chance, under a model that lacks nothing, that any term of the library is called significant.
-FALSE_ALARM = 0.005
-#: Terms of a formula at most.
-TERMS = 4
-#: Half-samples of the batches, and the share of them that must choose a term again.
-HALVES, STABLE = 40, 0.7
-#: p-value, uncorrected, of a term that a half-sample chooses.
-AGAIN = 0.05
-#: Share of a term's squared length that the declared parameters must leave.
-LEFT = 1e-4
 #: Variables that correlate so nearly perfectly are one.
 COPY = 1e-4
+#: An angle that goes round more than this (rad) is a clock, but for its sine.
+ROUND = 2.2 * np.pi
 
 
 @effect(on="output")
@@ -66,64 +54,62 @@ def _probe(y: SX, *, k: SX = param(each, "[y]")) -> SX:
     return y + k
 
 
-def formula_candidate(
-    model: Model,
-    runs: Sequence[Run],
-    values: Mapping[str, Array],
-    folds: Folds,
-    sigma: float,
-    batches: Sequence[NDArray[np.int_]],
-) -> Candidate | None:
-    """The formula that the residual asks for, null at k = 0; None if it asks for none.
-
-    `runs` are prepared, `sigma` the noise of one residual, `batches` the first samples of the
-    batches of each run. The candidate's trials are the terms that it was chosen from.
-    """
-    try:
-        probe = Candidate(_placed(_probe, model))
-        probe.added_to(model)
-    except CasestError:
-        return None  # nothing that a term could be added to
-    assert probe.effect is not None
-    problem = weighted(Problem(model, tuple(runs)), values)
-    point, on = problem.point(values), probe.effect.on
-    shapes = library(_variables(problem, point, on))
-    if not shapes:
-        return None
-    wide, terms = _wide(problem, point, probe, shapes)
-    sums = _sums(wide, sigma, [first[:: _together(batches)] for first in batches])
-    search = _Search(sums, problem.unknowns, sigma, problem.residual_count, terms)
-    chosen = _stable(search, search.select(FALSE_ALARM / len(terms), TERMS))
-    if not chosen:
-        return None
-    quantity = model.quantities[on]
-    made = formula_effect(
-        [terms[k] for k in chosen], quantity.declared.numel(), on, _unit(quantity.unit, runs)
-    )
-    return Candidate(made, trials=len(terms))
-
-
 def try_formula(loop: _Loop, current: Fitted) -> Fitted | None:
     """The model with a formula, if the residual asks for one and held-out data confirm it."""
     if any(a.effect.name == "formula" for a in current.model.effects):
         return None
-    model, runs, folds = current.model, loop.runs, loop.folds
-    candidate = formula_candidate(
-        model, runs, current.values, folds, current.noise, folds.batches
-    )
-    if candidate is None:
+    library = _Library.of(loop, current)
+    if library is None:
         return None
-    loop.original[candidate.label] = candidate
-    wide = widened(model, runs, current.values, [candidate])
-    (score,) = scores(wide, [candidate], current.noise, folds.batches)
-    fitted = loop._with(current, score)
-    accepted = None if fitted is None else loop._accepted(current, score, fitted)
+    for wander in (False, True):
+        chosen = library.search(wander)
+        tried = chosen and _tried(loop, current, library, chosen)
+        if not tried or chosen is None:
+            return None
+        score, fitted = tried
+        if wander or not _wanders(loop.runs, current, fitted, chosen.score):
+            break
+    fitted, replaced = _alone(loop, fitted)
+    accepted = loop._accepted(current, score, fitted)
     if accepted is None:
         return None
+    for found in replaced:
+        loop.found.remove(found)
+        loop._refuse(found.candidate, "no longer needed beside the formula")
     better, candidate, gained = accepted
     better, candidate = _with_sizes(better, candidate)
     loop._keep(better, candidate, gained, score, [])
     return better
+
+
+def _alone(loop: _Loop, fitted: Fitted) -> tuple[Fitted, list[Found]]:
+    """Without the effects that only stood for what the formula says; and those."""
+    replaced = []
+    for found in loop.found:
+        label = found.candidate.label
+        if found.score is None or not found.names:
+            continue
+        effects = tuple(a for a in fitted.model.effects if a.label != label)
+        values = {k: v for k, v in fitted.values.items() if not k.startswith(label + ".")}
+        without = loop._crossed(loop._fitted(replace(fitted.model, effects=effects), values))
+        whole = loop._crossed(fitted)
+        if without is not None and (whole is None or not loop._confirmed(without, whole)):
+            fitted = without
+            replaced.append(found)
+    return fitted, replaced
+
+
+def _tried(
+    loop: _Loop, current: Fitted, library: _Library, chosen: Chosen
+) -> tuple[Score, Fitted] | None:
+    """The model refitted with the formula; its score."""
+    candidate = library.candidate(chosen)
+    loop.original[candidate.label] = candidate
+    wide = widened(current.model, loop.runs, current.values, [candidate])
+    (score,) = scores(wide, [candidate], current.noise, loop.folds.batches)
+    score = replace(score, p_value=min(1.0, chosen.score.p_value * candidate.trials))
+    fitted = loop._with(current, score)
+    return None if fitted is None else (score, fitted)
 
 
 def _with_sizes(fitted: Fitted, candidate: Candidate) -> tuple[Fitted, Candidate]:
@@ -141,63 +127,218 @@ def _with_sizes(fitted: Fitted, candidate: Candidate) -> tuple[Fitted, Candidate
     return replace(fitted, model=replace(fitted.model, effects=effects)), candidate
 
 
+def _wanders(runs: Sequence[Run], before: Fitted, after: Fitted, score: Score) -> bool:
+    """Does a random walk explain the slow part of the residual as well as the formula does?
+
+    Log-likelihoods of what is seen at slow rates, less what the fitted sizes cost.
+    """
+    q, gain = score.freedom, score.gain / score.inflation
+    cost = 0.5 * q * (1 + float(np.log1p(gain / q)))
+    walk = plain = shaped = 0.0
+    limit = CLIPPED * before.noise
+    for run, old, new in zip(runs, before.residuals, after.residuals, strict=True):
+        b, a = (slice_means(run, np.clip(r, -limit, limit)) for r in (old, new))
+        if b is not None and a is not None:
+            walk += likelihood_of_walk(power(b)) - old.shape[1]
+            plain += likelihood_of_white(power(b))
+            shaped += likelihood_of_white(power(a))
+    return walk > plain + DOUBT and walk > shaped - cost - DOUBT
+
+
 # -- what terms may read -----------------------------------------------------------------------
 
 
-def _variables(problem: Problem, point: Point, on: str) -> list[Variable]:
-    """Columns, time and components of quantities that an effect on `on` may read; no copies."""
-    model, runs = problem.model, problem.runs
-    seen: list[tuple[Variable, Array]] = []
-    for name in usable_columns(model, runs):
-        _add(seen, name, None, runs[0].column_units.get(name) or "", _column(runs, name))
-    if all("t" in run.signals for run in runs):
-        _add(seen, "t", None, "s", _column(runs, "t"))
-    readable = _readable(model, on)
-    found = problem.evaluate(point, {n: model.quantities[n].value for n in readable})
-    for k, name in enumerate(readable):
-        x = np.concatenate([values[k][:, :, 0] for values in found])
-        unit = _unit(model.quantities[name].unit, runs)
-        for i in range(x.shape[1]):
-            _add(seen, name, i if x.shape[1] > 1 else None, unit, x[:, i])
-    return [variable for variable, _ in seen]
+@dataclass(frozen=True)
+class _Library:
+    """All shapes for one model and its record, and what evaluates them.
+
+    `values` computes the residual's slope in a shift of the output (m, axes) and what the shapes
+    read, one row for each variable, one column for each axis.
+    """
+
+    state: State
+    on: str
+    unit: str
+    variables: tuple[Variable, ...]
+    shapes: tuple[Shape, ...]
+    values: Replay
+    signals: tuple[Signal, ...]
+    size: int
+
+    @classmethod
+    def of(cls, loop: _Loop, current: Fitted) -> _Library | None:
+        """None where there is no output that anything could be added to, or nothing to read."""
+        problem = Problem(current.model, loop.runs)
+        if problem.sequential:
+            return None
+        state = state_of(problem, problem.point(current.values), loop.folds.batches)
+        try:
+            probe = Candidate(_placed(_probe, current.model))
+            return _library(state, probe)
+        except CasestError:
+            return None
+
+    def search(self, wander: bool) -> Chosen | None:
+        """What the residual asks for; beside what a wander may have done, or not."""
+        problem, batches = self.state.problem, independent(self.state)
+        slow = slow_shapes(problem.runs, MIDDLE) if wander else None
+        axes = len(problem.model.axes)
+        unknowns = problem.unknowns + (MIDDLE * axes if wander else 0)
+
+        def rows(shapes: Sequence[int]) -> Iterator[Rows]:
+            return self._rows([self.shapes[k] for k in shapes], batches, slow)
+
+        reads = [shape.reads for shape in self.shapes]
+        count = sum(map(len, batches))
+        return search(
+            rows, unknowns, self.size, reads, self.state.sigma, problem.residual_count, count
+        )
+
+    def _rows(
+        self,
+        shapes: Sequence[Shape],
+        batches: Sequence[NDArray[np.int_]],
+        slow: Sequence[Array] | None,
+    ) -> Iterator[Rows]:
+        problem, limit = self.state.problem, CLIPPED * self.state.sigma
+        numbers = {v: k for k, v in enumerate(self.variables)}
+        offsets = np.cumsum([0, *map(len, batches)])
+        for block in problem.blocks(self.state.point):
+            r, run = block.run, problem.runs[block.run]
+            samples = Columns([run.signals[s.name] for s in self.signals])
+            parameters = problem.parameters(self.state.point, r)
+            for start in range(block.span.start, block.span.stop, PIECE):
+                span = slice(start, min(start + PIECE, block.span.stop))
+                local = slice(span.start - block.span.start, span.stop - block.span.start)
+                slope, X = self.values(parameters, samples[span])
+                read = [[X[:, numbers[v]] for v in s.variables] for s in shapes]
+                B = np.stack([s.values(x) for s, x in zip(shapes, read, strict=True)], axis=1)
+                J, residual = block.jacobian[local], np.clip(block.residual[local], -limit, limit)
+                place = block.x
+                if slow is not None:
+                    J, place = _beside(J, place, slow[r][span], problem.unknowns)
+                if problem.weights is not None:
+                    root = np.sqrt(problem.weights[r][span])
+                    J, residual = J * root[:, :, None], residual * root
+                    slope = slope * root[:, :, None]
+                G = slope[:, :, None, :] * np.nan_to_num(B)[:, None, :, :]
+                number = np.searchsorted(batches[r], np.arange(span.start, span.stop), "right") - 1
+                yield place, np.nan_to_num(J), G, residual, offsets[r] + np.maximum(number, 0)
+
+    def candidate(self, chosen: Chosen) -> Candidate:
+        """The formula of these shapes, null at k = 0."""
+        terms = [
+            Term(self.shapes[k], int(axis) if self.size > 1 else None)
+            for k, on in zip(chosen.shapes, chosen.axes, strict=True)
+            for axis in on
+        ]
+        made = formula_effect(terms, self.size, self.on, self.unit)
+        return Candidate(made, trials=len(self.shapes))
 
 
-def _readable(model: Model, on: str) -> list[str]:
-    """Columns of numbers among the quantities declared no later than `on`, and that itself."""
-    names = list(model.quantities)
-    taken = {s.name for s in model.signals}
-    return [
-        n
-        for n in names[: names.index(on) + 1]
-        if model.quantities[n].declared.size2() == 1 and n not in taken
-    ]
+def _beside(
+    J: Array, place: NDArray[np.int_], slow: Array, unknowns: int
+) -> tuple[Array, NDArray[np.int_]]:
+    """The Jacobian with slow shapes (N, k) of every axis of the residual after it."""
+    axes, k = J.shape[1], slow.shape[1]
+    more = np.zeros((len(J), axes, axes, k))
+    for a in range(axes):
+        more[:, a, a] = slow
+    own = unknowns + np.arange(axes * k)
+    return np.concatenate([J, more.reshape(len(J), axes, -1)], axis=2), np.append(place, own)
 
 
-def _column(runs: Sequence[Run], name: str) -> Array:
-    return np.concatenate([run.signals[name][:, 0] for run in runs])
+def _library(state: State, probe: Candidate) -> _Library | None:
+    problem, model = state.problem, state.problem.model
+    assert probe.effect is not None
+    on, signals = probe.effect.on, list(model.signals)
+    symbols: dict[str, Any] = {s.name: model.traced.symbols[s.name] for s in signals}
+    slope, _, _ = _slope(probe, model, symbols)
+    size = int(slope.size2())
+    rows = list(_readable(model, problem.runs, on, symbols, signals, size))
+    if not rows:
+        return None
+    X = ca.vertcat(*[ca.repmat(x.T if x.numel() > 1 else x, 1, 1 if x.numel() > 1 else size)
+                     for _, x in rows])  # fmt: skip
+    sample = ca.vertcat(*[flat(symbols[s.name]) for s in signals])
+    inputs = [ca.vertcat(model.traced.coordinates, model.traced.references), sample]
+    outputs = [ca.densify(slope), ca.densify(X)]
+    names = ["parameters", "sample"]
+    values = Replay(ca.Function("shapes", inputs, outputs, names, ["slope", "X"]))
+    seen = []
+    for r, run in enumerate(problem.runs):
+        samples = Columns([run.signals[s.name] for s in signals])
+        seen.append(values(problem.parameters(state.point, r), samples)[1])
+    variables = _scaled([v for v, _ in rows], np.concatenate(seen))
+    # Rows that are no variables of their own stay, so that the numbers fit.
+    shapes = tuple(library([v for v in variables if v.half > 0]))
+    if not shapes:
+        return None
+    unit = _unit(model.quantities[on].unit, problem.runs)
+    return _Library(state, on, unit, tuple(variables), shapes, values, tuple(signals), size)
 
 
-def _add(
-    seen: list[tuple[Variable, Array]], name: str, index: int | None, unit: str, x: Array
-) -> None:
-    """Unless it is constant, not finite, or a copy of another."""
-    width = float(np.ptp(x)) if np.all(np.isfinite(x)) else 0.0
-    if not width > 1e-9 * float(np.abs(x).max(initial=1e-300)):
-        return
-    if any(abs(float(np.corrcoef(x, other)[0, 1])) > 1 - COPY for _, other in seen):
-        if unit != "rad":  # an angle that grows with time still has its sine
-            return
-    centre, half = _scale(float(x.min()), float(x.max()))
-    angle = unit == "rad"
-    variable = Variable(name, index, unit, centre, half, angle, angle and width > 2.2 * np.pi)
-    seen.append((variable, x))
+def _readable(
+    model: Model,
+    runs: Sequence[Run],
+    on: str,
+    symbols: dict[str, Any],
+    signals: list[Signal],
+    size: int,
+) -> Iterator[tuple[Variable, SX]]:
+    """Columns, time, and quantities declared no later than `on`, with their symbols."""
+    names = usable_columns(model, runs)
+    names += ["t"] if all("t" in run.signals for run in runs) else []
+    for name in names:
+        if name not in symbols:
+            symbols[name] = ca.SX.sym(name)
+            signals.append(Signal(name, 1, None))
+        unit = "s" if name == "t" else runs[0].column_units.get(name) or ""
+        yield Variable(name, None, unit, 0.0, 0.0), symbols[name]
+    order, taken = list(model.quantities), {s.name for s in model.signals}
+    for name in reversed(order[: order.index(on) + 1]):
+        quantity = model.quantities[name]
+        if name in taken or quantity.declared.size2() != 1:
+            continue
+        unit, value = _unit(quantity.unit, runs), quantity.value
+        if value.numel() == size > 1:
+            yield Variable(name, None, unit, 0.0, 0.0, own=True), value
+        for i in range(value.numel()):
+            index = i if value.numel() > 1 else None
+            yield Variable(name, index, unit, 0.0, 0.0), value[i]
 
 
-def _scale(low: float, high: float) -> tuple[float, float]:
-    """Middle and half width, in few digits; the middle of what is about 0 is 0."""
-    centre, half = 0.5 * (low + high), 0.5 * (high - low)
+def _scaled(variables: Sequence[Variable], X: Array) -> list[Variable]:
+    """With centre and half width; half 0 for what is constant, not finite, or a copy."""
+    found, kept = [], list[tuple[bool, Array]]()
+    for k, variable in enumerate(variables):
+        x = X[:, k] if variable.own else X[:, k, :1]
+        width = float(np.ptp(x)) if np.all(np.isfinite(x)) else 0.0
+        if not width > 1e-9 * float(np.abs(x).max(initial=1e-300)):
+            found.append(variable)
+            continue
+        angle = variable.unit == "rad" and width > ROUND
+        centred = x - x.mean(axis=0)
+        centred /= np.maximum(np.linalg.norm(centred, axis=0), 1e-300)
+        copies = (
+            np.all(np.abs(np.sum(centred * o, axis=0)) > 1 - COPY)
+            for own, o in kept
+            if own == variable.own
+        )
+        if not angle and any(copies):  # an angle that grows with time still has its sine
+            found.append(variable)
+            continue
+        kept.append((variable.own, centred))
+        centre, half = _scale(x) if not variable.own else (0.0, float(f"{np.abs(x).max():.3g}"))
+        found.append(replace(variable, centre=centre, half=half, angle=angle))
+    return found
+
+
+def _scale(x: Array) -> tuple[float, float]:
+    """Mean and largest distance from it, in few digits; a mean near 0 is 0."""
+    centre, half = float(x.mean()), float(np.abs(x - x.mean()).max())
     if abs(centre) < 0.2 * half:
-        return 0.0, float(f"{max(-low, high):.3g}")
+        return 0.0, float(f"{np.abs(x).max():.3g}")
     digit = 10.0 ** (np.floor(np.log10(half)) - 2)
     return float(f"{round(centre / digit) * digit:.12g}"), float(f"{half:.3g}")
 
@@ -209,113 +350,4 @@ def _unit(unit: str, runs: Sequence[Run]) -> str:
     return "" if "[" in unit or unit == "1" else unit
 
 
-# -- scores of all terms together --------------------------------------------------------------
-
-
-def _wide(
-    problem: Problem, point: Point, probe: Candidate, shapes: Sequence[Shape]
-) -> tuple[Wide, list[Term]]:
-    """The slopes of the residual in the size of every term on every axis of the output."""
-    model, base, signals = problem.model, problem.model.traced, list(problem.model.signals)
-    symbols: dict[str, Any] = {s.name: base.symbols[s.name] for s in signals}
-    slope, _, _ = _slope(probe, model, symbols)
-    for v in {v.name: v for shape in shapes for v in shape.variables}.values():
-        if v.name not in symbols and v.name not in model.quantities:
-            symbols[v.name] = ca.SX.sym(v.name)
-            signals.append(Signal(v.name, 1, None))
-    axes = slope.size2()
-    terms = [Term(s, j if axes > 1 else None) for s in shapes for j in range(axes)]
-    columns = [
-        slope[:, term.axis or 0] * term.shape.expression(_read(term.shape, model, symbols))
-        for term in terms
-    ]
-    sample = ca.vertcat(*[flat(symbols[s.name]) for s in signals])
-    inputs = [ca.vertcat(base.coordinates, base.references), sample]
-    outputs = [ca.densify(ca.horzcat(*columns))]
-    function = ca.Function("slopes", inputs, outputs, ["parameters", "sample"], ["G"])
-    n, own = problem.unknowns, np.arange(len(terms))
-    places = ((n + own,) * len(problem.runs),)
-    width = n + len(terms)
-    return Wide(problem, point, Replay(function), tuple(signals), (own,), places, width), terms
-
-
-def _read(shape: Shape, model: Model, symbols: Mapping[str, Any]) -> list[SX]:
-    """What it reads, in the model's symbols."""
-    found = []
-    for v in shape.variables:
-        known = model.quantities.get(v.name)
-        value = symbols[v.name] if known is None or v.name in symbols else known.value
-        found.append(value if v.index is None else value[v.index])
-    return found
-
-
-@dataclass(frozen=True)
-class _Search:
-    """Sums over batches of the declared columns, the first `declared`, and those of the terms."""
-
-    sums: _Sums
-    declared: int
-    sigma: float
-    count: int
-    terms: Sequence[Term]
-
-    def half(self, kept: NDArray[np.int_]) -> _Search:
-        """The same of some of the batches."""
-        s = self.sums
-        some = replace(s, matrices=s.matrices[kept], gradients=s.gradients[kept])
-        return replace(self, sums=some, count=self.count * len(kept) // len(s.gradients))
-
-    def select(self, limit: float, most: int) -> list[int]:
-        """Terms one by one, each significant beside those before it, the strongest first."""
-        chosen: list[int] = []
-        while len(chosen) < most:
-            strength, p = self._scores(chosen)
-            strength = np.where(p <= limit, strength, -1.0)
-            best = int(np.argmax(strength))
-            if strength[best] < 0:
-                break
-            chosen.append(best)
-        return chosen
-
-    def _scores(self, chosen: Sequence[int]) -> tuple[Array, Array]:
-        """Gain over inflation and p-value of each term beside the chosen ones.
-
-        As `score.scores`, for many candidates of one unknown each. Terms live in few batches, and
-        there are many: the freedom of the inflation is no more than the number of batches.
-        """
-        n = self.declared
-        d = np.concatenate([np.arange(n), n + np.asarray(chosen, dtype=int)])
-        f = n + np.arange(len(self.terms))
-        B, g = self.sums.matrices, self.sums.gradients
-        A = B.sum(axis=0)
-        absorbed = np.linalg.pinv(A[np.ix_(d, d)], rcond=1e-10, hermitian=True) @ A[np.ix_(d, f)]
-        whole = np.diag(A)[f]
-        left = whole - np.sum(A[np.ix_(d, f)] * absorbed, axis=0)
-        alive = left > LEFT * np.maximum(whole, 1e-12)
-        left = np.where(alive, left, 1.0)
-        whitened = (g[:, f] - g[:, d] @ absorbed) / np.sqrt(left) / self.sigma
-        cross = B[:, d[:, None], f]
-        inner = np.einsum("bdf,df->bf", B[:, d[:, None], d] @ absorbed - 2 * cross, absorbed)
-        share = np.clip((np.einsum("bii->bi", B)[:, f] + inner) / left, 0.0, 1.0)
-        total = whitened.sum(axis=0)
-        noise = (whitened - share * total) / np.sqrt(np.clip(1 - share, LEAST_LEFT, None))
-        inflation = np.maximum(np.sum(noise**2, axis=0), 1.0)
-        effective = 1 / np.maximum(np.sum(share**2, axis=0), 1e-12)
-        second = np.maximum(np.minimum(self.count - len(d) - 1, effective), 1.0)
-        strength = np.where(alive, total**2 / inflation, 0.0)
-        return strength, np.where(alive, fdtrc(1, second, strength), 1.0)
-
-
-def _stable(search: _Search, chosen: list[int]) -> list[int]:
-    """Those that most half-samples choose again: them, or others of the same variables."""
-    batches = len(search.sums.gradients)
-    if not chosen or batches < 4:
-        return []
-    rng = np.random.default_rng(0)
-    hits = np.zeros(len(chosen))
-    for _ in range(HALVES):
-        kept = np.sort(rng.permutation(batches)[: batches // 2])
-        again = search.half(kept).select(AGAIN, len(chosen))
-        read = {search.terms[k].reads for k in again}
-        hits += [search.terms[k].reads in read for k in chosen]
-    return [k for k, hit in zip(chosen, hits, strict=True) if hit >= STABLE * HALVES]
+__all__ = ["try_formula"]

@@ -10,22 +10,42 @@ from dataclasses import dataclass, replace
 from itertools import combinations, count
 from typing import Any
 
-import casadi as ca
+import numpy as np
 
-from casest.declaring.physics import SX
 from casest.modelling.effect import Effect
 
 #: Names that the text of an effect uses itself.
-_TAKEN = frozenset("y vertcat cos sin fabs effect param signal formula".split())
+_TAKEN = frozenset(
+    [
+        "vertcat",
+        "cos",
+        "sin",
+        "exp",
+        "tanh",
+        "fabs",
+        "effect",
+        "param",
+        "signal",
+        "constant",
+        "formula",
+    ]
+)
 _FILES = count(1)
+#: Waves over the range of a variable: cycles are tried in steps of a quarter, from and up to.
+WAVES = range(3, 17)
+#: Multiples of an angle, and shapes of one variable: kind and order.
+MULTIPLES = range(1, 9)
+SHAPES = (("power", 1), ("power", 2), ("power", 3), ("abs", 1), ("exp", 2), ("exp", -2),
+          ("tanh", 1), ("tanh", 3))  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Variable:
     """What a term reads: a column, time, or a component (`index`, if it has several) of a quantity.
 
-    Powers and products are of (x − centre)/half, which lies in [−1, 1]. `angle`: x is in rad;
-    `winding`: it goes round more than once, and is then nothing but a clock, except for its sine.
+    Shapes are of z = (x − centre)/half, which lies in [−1, 1]. `own`: every axis of the output
+    reads its own component. `angle`: x is in rad, and goes round more than once: nothing but a
+    clock, except for its sine.
     """
 
     name: str
@@ -34,54 +54,63 @@ class Variable:
     centre: float
     half: float
     angle: bool = False
-    winding: bool = False
+    own: bool = False
 
     @property
     def label(self) -> str:
         """As in the formula: `force[0]`."""
         return self.name if self.index is None else f"{self.name}[{self.index}]"
 
-    def scaled(self, x: Any) -> Any:
-        """(x − centre)/half."""
-        return (x - self.centre) / self.half
+    def at(self, axis: int | None) -> Variable:
+        """The component that an axis of the output reads."""
+        return replace(self, index=axis, own=False) if self.own else self
 
 
 @dataclass(frozen=True)
 class Shape:
-    """One function of one or two variables: `kind` power (of degree `order`), abs, sin, cos
-    (of `order` times the angle) or product."""
+    """One function of one or two variables: `kind` power (of degree `order`), abs, exp, tanh (of
+    `order` times z), sin, cos (of `order` quarter cycles over the range, or times the angle), or
+    product."""
 
     kind: str
     variables: tuple[Variable, ...]
     order: int = 1
 
-    def expression(self, values: Sequence[SX]) -> SX:
-        """In symbols."""
-        if self.kind in ("sin", "cos"):
-            return getattr(ca, self.kind)(self.order * values[0])
-        scaled = [v.scaled(x) for v, x in zip(self.variables, values, strict=True)]
-        if self.kind == "abs":
-            return ca.fabs(scaled[0])
-        return scaled[0] * scaled[1] if self.kind == "product" else scaled[0] ** self.order
+    @property
+    def reads(self) -> frozenset[str]:
+        """Labels of what it reads."""
+        return frozenset(v.label for v in self.variables)
 
-    def code(self, names: Mapping[str, str]) -> str:
-        """In Python, `names` giving each variable's argument."""
-        if self.kind in ("sin", "cos"):
-            return f"{self.kind}({self.order} * {_argument(self.variables[0], names)})"
-        parts = [_scaled_code(v, names) for v in self.variables]
-        if self.kind == "abs":
-            return f"fabs({parts[0]})"
-        return " * ".join(parts) + (f"**{self.order}" if self.order > 1 else "")
+    def values(self, values: Sequence[Any], m: Any = np) -> Any:
+        """Of the variables' values, with the functions of `m`."""
+        v, x = self.variables, list(values)
+        if self.kind in ("sin", "cos") and v[0].angle:
+            return getattr(m, self.kind)(self.order * x[0])
+        z = [(a - b.centre) / b.half for a, b in zip(x, v, strict=True)]
+        if self.kind == "product":
+            return z[0] * z[1]
+        if self.kind == "power":
+            return z[0] ** self.order
+        return getattr(m, "fabs" if self.kind == "abs" else self.kind)(self._factor * z[0])
 
     @property
-    def text(self) -> str:
-        """For a reader, with units."""
-        if self.kind in ("sin", "cos"):
-            return f"{self.kind}({self.order}·{self.variables[0].label})"
-        parts = [_scaled_text(v) for v in self.variables]
+    def _factor(self) -> float:
+        """Of z, in the function's argument."""
+        wave = self.kind in ("sin", "cos") and not self.variables[0].angle
+        return round(self.order * np.pi / 4, 6) if wave else float(self.order)
+
+    def written(self, words: Sequence[str], python: bool) -> str:
+        """Of the words for x of the angle, else for z."""
+        if self.kind == "product":
+            return (" * " if python else "·").join(words)
+        if self.kind == "power":
+            power = "**" if python else "^"
+            return words[0] + (f"{power}{self.order}" if self.order > 1 else "")
         if self.kind == "abs":
-            return f"|{parts[0]}|"
-        return "·".join(f"({p})" for p in parts) + (f"^{self.order}" if self.order > 1 else "")
+            return f"fabs({words[0]})" if python else f"|{words[0]}|"
+        if self._factor == 1:
+            return f"{self.kind}({words[0]})"
+        return f"{self.kind}({self._factor:g}{' * ' if python else '·'}{words[0]})"
 
 
 @dataclass(frozen=True)
@@ -92,46 +121,23 @@ class Term:
     axis: int | None
 
     @property
-    def reads(self) -> frozenset[str]:
-        """Labels of what it reads."""
-        return frozenset(v.label for v in self.shape.variables)
+    def variables(self) -> tuple[Variable, ...]:
+        """What it reads on this axis."""
+        return tuple(v.at(self.axis) for v in self.shape.variables)
 
 
 def library(variables: Sequence[Variable]) -> list[Shape]:
-    """Powers 1 to 3 and the size, sines of 3 to 8 times an angle, products of two variables."""
-    straight = [v for v in variables if not v.winding]
-    found = [Shape("power", (v,), k) for v in straight for k in (1, 2, 3)]
-    found += [Shape("abs", (v,)) for v in straight]
+    """Powers 1 to 3, size, exponentials, saturation and waves of each; products of two."""
+    straight = [v for v in variables if not v.angle]
+    found = [Shape(kind, (v,), k) for v in straight for kind, k in SHAPES]
     found += [
         Shape(kind, (v,), k)
         for v in variables
-        if v.angle
-        for k in range(3, 9)
+        if v.name != "t"  # waves in time are the catalogue's vibration, or wander
+        for k in (MULTIPLES if v.angle else WAVES)
         for kind in ("sin", "cos")
     ]
     return found + [Shape("product", pair) for pair in combinations(straight, 2)]
-
-
-def _argument(v: Variable, names: Mapping[str, str]) -> str:
-    return names[v.name] if v.index is None else f"{names[v.name]}[{v.index}]"
-
-
-def _off(centre: float) -> str:
-    return f" {'-' if centre > 0 else '+'} {abs(centre)!r}" if centre else ""
-
-
-def _scaled_code(v: Variable, names: Mapping[str, str]) -> str:
-    off = _off(v.centre)
-    argument = _argument(v, names)
-    return f"(({argument}{off}) / {v.half!r})" if off else f"({argument} / {v.half!r})"
-
-
-def _scaled_text(v: Variable) -> str:
-    unit = f" {v.unit}" if v.unit else ""
-    if not v.centre:
-        return f"{v.label}/{v.half:g}{unit}"
-    sign = "−" if v.centre > 0 else "+"
-    return f"({v.label} {sign} {abs(v.centre):g}{unit})/{v.half:g}{unit}"
 
 
 # -- the effect --------------------------------------------------------------------------------
@@ -140,7 +146,7 @@ def _scaled_text(v: Variable) -> str:
 def formula_effect(terms: Sequence[Term], size: int, on: str, unit: str) -> Effect:
     """The effect that adds k1·(first term) + k2·… to the quantity `on` of `size` numbers.
 
-    It is run from the very text that `source` gives.
+    It is run from the very text that `source` gives; `unit` is that of the quantity.
     """
     names = _arguments(terms, on)
     text = _text(terms, size, on, unit, names)
@@ -165,24 +171,37 @@ def formula_text(
     for k, term in enumerate(terms):
         axis = "" if term.axis is None else f"[{term.axis}]"
         factor = f"k{k + 1}" if sizes is None else f"{sizes[k]:.3g}{unit}"
-        lines.append(f"{on}{axis} += {factor}·{term.shape.text}")
+        words = [v.label if v.angle else _scaled_text(v) for v in term.variables]
+        lines.append(f"{on}{axis} += {factor}·{term.shape.written(words, python=False)}")
     return "; ".join(lines)
 
 
 def source(effect: Effect) -> str:
-    """Python text that defines the same effect: to be put into a file for `--effects`."""
-    text: str = effect.function.source  # type: ignore[attr-defined]
+    """Python text that defines the same effect: to be put into a file for `--effects`.
+
+    Empty for an effect that is no formula.
+    """
+    text: str = getattr(effect.function, "source", "")
+    if not text:
+        return ""
     head, tail = text.split('formula=""', 1)
     return f"{head}formula={effect.formula!r}{tail}"
 
 
+def _scaled_text(v: Variable) -> str:
+    unit = f" {v.unit}" if v.unit else ""
+    if not v.centre:
+        return f"({v.label}/{v.half:g}{unit})"
+    sign = "−" if v.centre > 0 else "+"
+    return f"(({v.label} {sign} {abs(v.centre):g}{unit})/{v.half:g}{unit})"
+
+
 def _arguments(terms: Sequence[Term], on: str) -> dict[str, str]:
-    """The argument for each name that is read, in order; the output itself is y."""
-    names: dict[str, str] = {on: "y"}
-    for term in terms:
-        for v in term.shape.variables:
-            if v.name not in names:
-                names[v.name] = _identifier(v.name, set(names.values()) | _TAKEN)
+    """The argument for each name that is read, in order; the output itself first."""
+    names: dict[str, str] = {}
+    for name in (on, *(v.name for term in terms for v in term.variables)):
+        if name not in names:
+            names[name] = _identifier(name, set(names.values()) | _TAKEN)
     return names
 
 
@@ -190,34 +209,61 @@ def _identifier(name: str, taken: set[str]) -> str:
     """The name as Python can have it."""
     found = re.sub(r"\W", "_", name)
     found = found if found.isidentifier() else f"_{found}"
-    while found in taken or keyword.iskeyword(found) or re.fullmatch(r"k\d", found):
+    while found in taken or keyword.iskeyword(found) or re.fullmatch(r"k\d+", found):
         found += "_"
     return found
 
 
-def _text(
-    terms: Sequence[Term], size: int, on: str, unit: str, names: Mapping[str, str]
-) -> str:
+def _text(terms: Sequence[Term], size: int, on: str, unit: str, names: Mapping[str, str]) -> str:
     rows: list[list[str]] = [[] for _ in range(size)]
+    numbers: dict[str, str] = {}
     for k, term in enumerate(terms):
-        rows[term.axis or 0].append(f"k{k + 1} * {term.shape.code(names)}")
+        words = [_z(v, names, numbers) for v in term.variables]
+        rows[term.axis or 0].append(f"k{k + 1} * {term.shape.written(words, python=True)}")
     sums = [" + ".join(row) or "0" for row in rows]
     column = ",\n        ".join(sums)
     added = f"vertcat(\n        {column},\n    )" if size > 1 else sums[0]
-    read = [a for n, a in names.items() if n not in (on, "t")]
-    read += [f'{names["t"]}=signal("s")'] if "t" in names else []
+    units = {v.name: v.unit for term in terms for v in term.variables}
+    extras = [(n, a) for n, a in names.items() if n != on]
+    read = [names[on], *(a for n, a in extras if not units[n])]
+    read += [f"{a}=signal({units[n]!r})" for n, a in extras if units[n]]
     unknowns = [f"k{k + 1}=param({unit!r})" for k in range(len(terms))]
-    arguments = ",\n    ".join(["y", *read, "*", *unknowns])
+    numbered = [f"{n}={value}" for n, value in numbers.items()]
+    arguments = ",\n    ".join([*read, "*", *unknowns, *numbered])
     renamed = [
         f"# {a} stands for the column {n!r}: give the column this name\n"
         for n, a in names.items()
         if n not in (on, a)
     ]
     return (
-        "from casest import cos, effect, fabs, param, signal, sin, vertcat\n\n\n"
-        + "".join(renamed)
-        + f'@effect(on={on!r}, formula="")\n'
+        "from casest import constant, cos, effect, exp, fabs, param, signal, sin, tanh, vertcat\n"
+        "\n\n" + "".join(renamed) + f'@effect(on={on!r}, formula="")\n'
         f"def formula(\n    {arguments},\n):\n"
         '    """Terms outside the catalogue, found in the residual."""\n'
-        f"    return y + {added}\n"
+        f"    return {names[on]} + {added}\n"
     )
+
+
+def _z(v: Variable, names: Mapping[str, str], numbers: dict[str, str]) -> str:
+    """The variable in Python, scaled; its centre and half width are added to the numbers."""
+    own = "" if v.index is None else f"_{v.index}"
+    name, x = names[v.name] + own, names[v.name] + ("" if v.index is None else f"[{v.index}]")
+    if v.angle:
+        return x
+    unit = f", {v.unit!r}" if v.unit else ""
+    numbers[f"{name}_half"] = f"constant({v.half!r}{unit})"
+    if not v.centre:
+        return f"({x} / {name}_half)"
+    numbers[f"{name}_centre"] = f"constant({v.centre!r}{unit})"
+    return f"(({x} - {name}_centre) / {name}_half)"
+
+
+__all__ = [
+    "Shape",
+    "Term",
+    "Variable",
+    "formula_effect",
+    "formula_text",
+    "library",
+    "source",
+]
