@@ -42,8 +42,10 @@ from casest.stack import Problem
 if TYPE_CHECKING:
     from casest.closing.loop import Fitted, Found, _Loop
 
-#: Variables that correlate so nearly perfectly are one.
-COPY = 1e-4
+#: The name of the effect, and the terms from which on it gets no more.
+NAME, TERMS = "formula", 9
+#: Columns, and quantities, that correlate so nearly perfectly are one.
+COPY, ALMOST = 1e-4, 1e-2
 #: An angle that goes round more than this (rad) is a clock, but for its sine.
 ROUND = 2.2 * np.pi
 
@@ -55,15 +57,16 @@ def _probe(y: SX, *, k: SX = param(each, "[y]")) -> SX:
 
 
 def try_formula(loop: _Loop, current: Fitted) -> Fitted | None:
-    """The model with a formula, if the residual asks for one and held-out data confirm it."""
-    if any(a.effect.name == "formula" for a in current.model.effects):
-        return None
-    library = _Library.of(loop, current)
-    if library is None:
+    """The model with a formula, if the residual asks for one and held-out data confirm it.
+
+    A formula that is there already gets more terms.
+    """
+    library, known = _Library.of(loop, current), _terms(current.model)
+    if library is None or len(known) >= TERMS:
         return None
     for wander in (False, True):
         chosen = library.search(wander)
-        tried = chosen and _tried(loop, current, library, chosen)
+        tried = chosen and _tried(loop, current, library.candidate(chosen, known), chosen)
         if not tried or chosen is None:
             return None
         score, fitted = tried
@@ -73,8 +76,8 @@ def try_formula(loop: _Loop, current: Fitted) -> Fitted | None:
     accepted = loop._accepted(current, score, fitted)
     if accepted is None:
         return None
+    loop.found = [f for f in loop.found if f not in replaced and f.candidate.label != NAME]
     for found in replaced:
-        loop.found.remove(found)
         loop._refuse(found.candidate, "no longer needed beside the formula")
     better, candidate, gained = accepted
     better, candidate = _with_sizes(better, candidate)
@@ -82,16 +85,27 @@ def try_formula(loop: _Loop, current: Fitted) -> Fitted | None:
     return better
 
 
+def _terms(model: Model) -> tuple[Term, ...]:
+    """Those of the formula that the model has."""
+    own = [a.effect.function for a in model.effects if a.label == NAME]
+    return getattr(own[0], "terms", ()) if own else ()
+
+
+def _without(fitted: Fitted, label: str) -> tuple[Model, dict[str, Array]]:
+    """The model without an effect, and the values of what it has left."""
+    effects = tuple(a for a in fitted.model.effects if a.label != label)
+    values = {k: v for k, v in fitted.values.items() if not k.startswith(label + ".")}
+    return replace(fitted.model, effects=effects), values
+
+
 def _alone(loop: _Loop, fitted: Fitted) -> tuple[Fitted, list[Found]]:
     """Without the effects that only stood for what the formula says; and those."""
     replaced = []
     for found in loop.found:
         label = found.candidate.label
-        if found.score is None or not found.names:
+        if found.score is None or not found.names or found.candidate.freed or label == NAME:
             continue
-        effects = tuple(a for a in fitted.model.effects if a.label != label)
-        values = {k: v for k, v in fitted.values.items() if not k.startswith(label + ".")}
-        without = loop._crossed(loop._fitted(replace(fitted.model, effects=effects), values))
+        without = loop._crossed(loop._fitted(*_without(fitted, label)))
         whole = loop._crossed(fitted)
         if without is not None and (whole is None or not loop._confirmed(without, whole)):
             fitted = without
@@ -100,15 +114,15 @@ def _alone(loop: _Loop, fitted: Fitted) -> tuple[Fitted, list[Found]]:
 
 
 def _tried(
-    loop: _Loop, current: Fitted, library: _Library, chosen: Chosen
+    loop: _Loop, current: Fitted, candidate: Candidate, chosen: Chosen
 ) -> tuple[Score, Fitted] | None:
-    """The model refitted with the formula; its score."""
-    candidate = library.candidate(chosen)
+    """The model refitted with the formula, in place of one that it has; the score."""
     loop.original[candidate.label] = candidate
-    wide = widened(current.model, loop.runs, current.values, [candidate])
+    model, values = _without(current, NAME)
+    wide = widened(model, loop.runs, values, [candidate])
     (score,) = scores(wide, [candidate], current.noise, loop.folds.batches)
     score = replace(score, p_value=min(1.0, chosen.score.p_value * candidate.trials))
-    fitted = loop._with(current, score)
+    fitted = loop._with(replace(current, model=model, values=values), score)
     return None if fitted is None else (score, fitted)
 
 
@@ -225,9 +239,9 @@ class _Library:
                 number = np.searchsorted(batches[r], np.arange(span.start, span.stop), "right") - 1
                 yield place, np.nan_to_num(J), G, residual, offsets[r] + np.maximum(number, 0)
 
-    def candidate(self, chosen: Chosen) -> Candidate:
-        """The formula of these shapes, null at k = 0."""
-        terms = [
+    def candidate(self, chosen: Chosen, known: Sequence[Term]) -> Candidate:
+        """The formula of the known terms and these shapes, null at k = 0."""
+        terms = [*known] + [
             Term(self.shapes[k], int(axis) if self.size > 1 else None)
             for k, on in zip(chosen.shapes, chosen.axes, strict=True)
             for axis in on
@@ -269,7 +283,8 @@ def _library(state: State, probe: Candidate) -> _Library | None:
     for r, run in enumerate(problem.runs):
         samples = Columns([run.signals[s.name] for s in signals])
         seen.append(values(problem.parameters(state.point, r), samples)[1])
-    variables = _scaled([v for v, _ in rows], np.concatenate(seen))
+    columns = len([v for v, _ in rows if v.name not in model.quantities])
+    variables = _scaled([v for v, _ in rows], columns, np.concatenate(seen))
     # Rows that are no variables of their own stay, so that the numbers fit.
     shapes = tuple(library([v for v in variables if v.half > 0]))
     if not shapes:
@@ -308,8 +323,11 @@ def _readable(
             yield Variable(name, index, unit, 0.0, 0.0), value[i]
 
 
-def _scaled(variables: Sequence[Variable], X: Array) -> list[Variable]:
-    """With centre and half width; half 0 for what is constant, not finite, or a copy."""
+def _scaled(variables: Sequence[Variable], columns: int, X: Array) -> list[Variable]:
+    """With centre and half width; half 0 for what is constant, not finite, or a copy.
+
+    The first `columns` of them are columns of the record.
+    """
     found, kept = [], list[tuple[bool, Array]]()
     for k, variable in enumerate(variables):
         x = X[:, k] if variable.own else X[:, k, :1]
@@ -320,8 +338,9 @@ def _scaled(variables: Sequence[Variable], X: Array) -> list[Variable]:
         angle = variable.unit == "rad" and width > ROUND
         centred = x - x.mean(axis=0)
         centred /= np.maximum(np.linalg.norm(centred, axis=0), 1e-300)
+        far = COPY if k < columns else ALMOST
         copies = (
-            np.all(np.abs(np.sum(centred * o, axis=0)) > 1 - COPY)
+            np.all(np.abs(np.sum(centred * o, axis=0)) > 1 - far)
             for own, o in kept
             if own == variable.own
         )

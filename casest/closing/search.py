@@ -23,7 +23,7 @@ from casest.declaring.shapes import Array
 #: Chance, under a model that lacks nothing, that any formula is called significant.
 FALSE_ALARM = 0.002
 #: Chance that a further shape is added to a formula that needs no more.
-FURTHER = 0.01
+FURTHER = 0.05
 #: Shapes of a formula at most, and those that are looked at closely: in all, of what one reads.
 MOST, CLOSELY, OF_EACH = 3, 60, 3
 #: Half-samples of the batches, and the share of them that must choose the same variables.

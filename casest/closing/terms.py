@@ -159,6 +159,7 @@ def formula_effect(terms: Sequence[Term], size: int, on: str, unit: str) -> Effe
     by_argument = {argument: name for name, argument in names.items()}
     extras = tuple(replace(s, name=by_argument[s.name]) for s in made.extras)
     made.function.source = text  # type: ignore[attr-defined]
+    made.function.terms = tuple(terms)  # type: ignore[attr-defined]
     return replace(made, extras=extras, formula=formula_text(terms, on, unit))
 
 
