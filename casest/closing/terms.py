@@ -232,7 +232,7 @@ def _text(terms: Sequence[Term], size: int, on: str, unit: str, names: Mapping[s
     numbered = [f"{n}={value}" for n, value in numbers.items()]
     arguments = ",\n    ".join([*read, "*", *unknowns, *numbered])
     renamed = [
-        f"# {a} stands for the column {n!r}: give the column this name\n"
+        f"# {a} stands for the column {n!r}: give the column this name, or --columns {a}=…\n"
         for n, a in names.items()
         if n not in (on, a)
     ]
