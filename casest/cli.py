@@ -184,17 +184,18 @@ def calibrate(model_name: str, data: tuple[str, ...], **options: Any) -> int:
 
 def calibration(model_name: str, data: Sequence[str], options: Options, command: str) -> int:
     """Read, fit, save, print; the exit code says whether the estimate is trusted."""
-    from casest import estimate, result, terminal
+    from casest import estimate, result, terminal, unseen
     from casest.solve.interrupt import interruptible
 
     model = declared_model(model_name, options)
     runs = records(model, data, options)
+    hidden = held_out(model, data, options)
     start = dict(start_value(text, model) for text in options["starts"]) or None
     with interruptible():
         found = estimate.attempt(
             model, runs, start=start, solver=options["solver"], seed=options["seed"]
         )
-    holdout = held_out(found, model, options) if options["holdout"] else None
+    holdout = unseen.score(found, hidden) if hidden else None
     content = result.calibration_result(
         found, model_name=model_name, data=data, command=command, holdout=holdout
     )
@@ -236,6 +237,7 @@ def closing(model_name: str, data: Sequence[str], options: Options, command: str
     own = tuple(e for path in options["effects"] for e in find_effects(path))
     model = declared_model(model_name, {**options, "effects": ()})
     runs = records(model, data, options)
+    apart = held_out(model, data, options)
     start = dict(start_value(words, model) for words in options["starts"]) or None
     try:
         found = loop.close(
@@ -248,9 +250,7 @@ def closing(model_name: str, data: Sequence[str], options: Options, command: str
         )
     except NotTrusted as error:
         return refused(error, model_name, data, options, command)
-    hidden = None
-    if options["holdout"]:
-        hidden = unseen.scored(found, records(model, options["holdout"], options))
+    hidden = unseen.scored(found, apart) if apart else None
     content = written.closing_result(
         found, model_name=model_name, data=data, command=command, held_out=hidden and hidden[1:]
     )
@@ -641,12 +641,10 @@ def records(model: Model, data: Sequence[str], options: Options) -> tuple[Run, .
     return load_runs(list(data), model.signals, **reading_arguments(options))
 
 
-def held_out(found: Any, model: Model, options: Options) -> float:
-    """Root mean square residual on records that the fit never saw."""
-    from casest.estimate import score
-
-    fitted = {Path(run.file).resolve() for run in found.problem.runs}
+def held_out(model: Model, data: Sequence[str], options: Options) -> tuple[Run, ...]:
+    """Records that the fit never saw."""
+    fitted = {Path(name).resolve() for name in data}
     for name in options["holdout"]:
         if Path(name).resolve() in fitted:
             raise UsageError(f"--holdout {name}: the fit has seen this file; give another record")
-    return score(found, records(model, options["holdout"], options))
+    return records(model, options["holdout"], options) if options["holdout"] else ()

@@ -262,7 +262,7 @@ def _canonical(problem: Problem, best: Outcome) -> Outcome:
     if convention is None or not np.isfinite(best.cost):
         return best
     values = problem.values(best.point)
-    chosen = {k: v for k, v in convention(values).items() if k in values}
+    chosen = {k: v for k, v in convention(problem.model, values).items() if k in values}
     point = problem.point({**values, **chosen})
     cost = problem.cost(point)
     same = abs(cost - best.cost) <= 1e-6 * best.cost + 1e-20
@@ -336,16 +336,3 @@ def _noise(problem: Problem, point: Point, length: float, dof: int) -> Noise:
         return Noise(residual, residual, repeats, dof)
     candidates = [s for s in (residual, repeats) if s is not None and np.isfinite(s)]
     return Noise(max(candidates, default=float("nan")), residual, repeats, dof)
-
-
-def score(found: Estimate, runs: Sequence[Run]) -> float:
-    """Root mean square residual of the estimate on runs that it did not see, residual unit."""
-    per_run = [p.name for p in found.model.parameters if p.scope == "run"]
-    if per_run:
-        raise UsageError(
-            f"a held-out record has a {per_run[0]} of its own, which nothing determines yet; "
-            "leave --holdout out"
-        )
-    problem = Problem(found.model, tuple(runs))
-    cost = problem.cost(problem.point(found.values))
-    return float(np.sqrt(2 * cost / problem.residual_count))

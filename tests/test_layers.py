@@ -26,6 +26,7 @@ FLOORS = [
     ["casest.remarks"],
     ["casest.solve"],
     ["casest.estimate", "casest.naming", "casest.apply"],
+    ["casest.unseen"],
     [
         "casest.batch",
         "casest.batch_fit",

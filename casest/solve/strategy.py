@@ -25,6 +25,8 @@ from casest.stack import Point, Problem
 OPINION = 50
 #: Samples that are enough to come near a solution of a longer record.
 NEARBY = 2000
+#: Ratio of the costs of a few samples from which on there is no need to look at all of them.
+CLEARLY = 1.1
 #: Rise of the cost over that of a parabola within which there is no second valley.
 PARABOLA = (0.8, 1.25)
 #: Solvers of the least-squares problem.
@@ -85,7 +87,9 @@ def _ways(
         outcomes.append(_opinion(problem, problem.start()))
     costs = [_cost(o) for o in outcomes]
     if max(costs) - min(costs) > 1e-6 * max(min(costs), 1e-300):
-        outcomes += [_opinion(problem, start) for start in _perturbations(problem, first, seed)]
+        rival = best_of((*outcomes,))
+        starts = _perturbations(problem, first, seed)
+        outcomes += [_opinion(problem, start, rival) for start in starts]
     return (*outcomes,)
 
 
@@ -100,25 +104,34 @@ def _polished(problem: Problem, main: Outcome) -> Outcome:
     )
 
 
-def _nearby(problem: Problem, start: Point) -> Outcome:
-    """The solution for a few of the samples, or the start where that does not lower the cost."""
+def _nearby(problem: Problem, start: Point, rival: Outcome | None) -> tuple[Outcome, bool]:
+    """The solution for a few of the samples, or the start where that does not lower the cost.
+
+    And whether it is clear from the few that the rival is better.
+    """
     began = time.perf_counter()
     every = problem.residual_count // (NEARBY * len(problem.model.axes) * len(problem.runs))
     here = problem.cost(start)
     stay = Outcome("trust-region", start, here, 0, 1, False, "start", 0.0)
     if every < 2 or problem.sequential:
-        return stay
+        return stay, False
     thinned = problem.thinned(every)
     # A tenth of the deviations of so few samples is as near as they can say.
     few = trust_region(thinned, start, max_iterations=OPINION, tolerance=1e4 * _fine(thinned))
     there = problem.cost(few.point)
     near = few if np.isfinite(there) and there < here else stay
-    return replace(near, cost=min(here, there), seconds=time.perf_counter() - began)
+    worse = rival is not None and few.cost > CLEARLY * thinned.cost(rival.point)
+    return replace(near, cost=min(here, there), seconds=time.perf_counter() - began), worse
 
 
-def _opinion(problem: Problem, start: Point) -> Outcome:
-    """Where a trust region ends from a start: near a solution to a fraction of its deviations."""
-    near = _nearby(problem, start)
+def _opinion(problem: Problem, start: Point, rival: Outcome | None = None) -> Outcome:
+    """Where a trust region ends from a start: near a solution to a fraction of its deviations.
+
+    All samples are only looked at where a few of them leave it open which is better, it or a rival.
+    """
+    near, worse = _nearby(problem, start, rival)
+    if worse:
+        return near
     found = trust_region(
         problem,
         near.point,

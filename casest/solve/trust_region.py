@@ -122,8 +122,23 @@ def _linearise(
         if np.all(np.isfinite(lower)) and np.diag(lower).min(initial=1.0) > 1e-6:
             t = np.asarray(np.linalg.solve(lower, normal.gradient / scale), dtype=float)
             return _Local(lower.T * scale, t, normal.cost)
+        if np.all(np.isfinite(normal.matrix)) and np.all(np.isfinite(normal.gradient)):
+            return _by_eigenvalues(normal, scale)
     R, t, rest = problem.factor(point)
     return _Local(R, t, 0.5 * (float(t @ t) + rest**2))
+
+
+def _by_eigenvalues(normal: Normal, scale: Array) -> _Local:
+    """A factor of a JᵀJ that is singular to rounding: what it cannot tell is left out of the step.
+
+    Far away that is common (and a QR factor of all rows dear), and damped steps do not mind.
+    """
+    size, vectors = np.linalg.eigh(normal.matrix / np.outer(scale, scale))
+    told = size > 1e-13 * size[-1]
+    root = np.sqrt(np.where(told, size, 1.0))
+    t = np.where(told, vectors.T @ (normal.gradient / scale) / root, 0.0)
+    R = np.where(told, root, 0.0)[:, None] * vectors.T * scale
+    return _Local(np.asarray(R), np.asarray(t), normal.cost)
 
 
 def _column_norms(R: Array) -> Array:
