@@ -219,13 +219,14 @@ def _shapes(state: State) -> list[Finding]:
     return [Finding(best.words, best.together, sigma)]
 
 
-def independent(state: State) -> tuple[NDArray[np.int_], ...]:
+def independent(state: State, lag1: float | None = None) -> tuple[NDArray[np.int_], ...]:
     """First samples of batches whose noise is independent: blocks, or stretches of a series.
 
-    Long by the correlation of neighbours only: what reaches further is wander, or the misfit that
-    is looked for.
+    Long by the correlation of neighbours only (`lag1`, that of the residual unless told): what
+    reaches further is wander, or the misfit that is looked for.
     """
-    lag1, _ = lag_one(state.problem.runs, state.clipped)
+    if lag1 is None:
+        lag1, _ = lag_one(state.problem.runs, state.clipped)
     rho = min(max(lag1 or 0.0, 0.0), 0.98)
     shortest = 5 * (1 + rho) / (1 - rho)
     found = []

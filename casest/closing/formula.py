@@ -37,11 +37,14 @@ from casest.errors import CasestError
 from casest.modelling.effect import effect
 from casest.modelling.model import Model
 from casest.modelling.tracing import flat
+from casest.noise import robust_scale
 from casest.stack import Problem
 
 if TYPE_CHECKING:
     from casest.closing.loop import Fitted, Found, _Loop
 
+#: Searches: with other batches, or beside a wander.
+ATTEMPTS = 4
 #: The name of the effect, and the terms from which on it gets no more.
 NAME, TERMS = "formula", 9
 #: Columns, and quantities, that correlate so nearly perfectly are one.
@@ -64,14 +67,23 @@ def try_formula(loop: _Loop, current: Fitted) -> Fitted | None:
     library, known = _Library.of(loop, current), _terms(current.model)
     if library is None or len(known) >= TERMS:
         return None
-    for wander in (False, True):
-        chosen = library.search(wander)
+    # What is missing makes neighbours alike: how alike noise makes them, is seen without it.
+    batches, wander = independent(library.state, 0.0), False
+    for _ in range(ATTEMPTS):
+        chosen = library.search(batches, wander)
         tried = chosen and _tried(loop, current, library.candidate(chosen, known), chosen)
         if not tried or chosen is None:
             return None
         score, fitted = tried
-        if wander or not _wanders(loop.runs, current, fitted, chosen.score):
+        enough = library.independent_after(fitted)
+        if sum(map(len, enough)) < sum(map(len, batches)):
+            batches = enough
+        elif not wander and _wanders(loop.runs, current, fitted, chosen.score):
+            wander = True
+        else:
             break
+    else:
+        return None
     fitted, replaced = _alone(loop, fitted)
     accepted = loop._accepted(current, score, fitted)
     if accepted is None:
@@ -192,9 +204,13 @@ class _Library:
         except CasestError:
             return None
 
-    def search(self, wander: bool) -> Chosen | None:
+    def independent_after(self, fitted: Fitted) -> tuple[NDArray[np.int_], ...]:
+        """First samples of batches that are independent in what a formula leaves."""
+        return independent(replace(self.state, residuals=fitted.residuals, sigma=fitted.noise))
+
+    def search(self, batches: Sequence[NDArray[np.int_]], wander: bool) -> Chosen | None:
         """What the residual asks for; beside what a wander may have done, or not."""
-        problem, batches = self.state.problem, independent(self.state)
+        problem = self.state.problem
         slow = slow_shapes(problem.runs, MIDDLE) if wander else None
         axes = len(problem.model.axes)
         unknowns = problem.unknowns + (MIDDLE * axes if wander else 0)
@@ -214,7 +230,7 @@ class _Library:
         batches: Sequence[NDArray[np.int_]],
         slow: Sequence[Array] | None,
     ) -> Iterator[Rows]:
-        problem, limit = self.state.problem, CLIPPED * self.state.sigma
+        problem, limit = self.state.problem, self._limit()
         numbers = {v: k for k, v in enumerate(self.variables)}
         offsets = np.cumsum([0, *map(len, batches)])
         for block in problem.blocks(self.state.point):
@@ -238,6 +254,12 @@ class _Library:
                 G = slope[:, :, None, :] * np.nan_to_num(B)[:, None, :, :]
                 number = np.searchsorted(batches[r], np.arange(span.start, span.stop), "right") - 1
                 yield place, np.nan_to_num(J), G, residual, offsets[r] + np.maximum(number, 0)
+
+    def _limit(self) -> Array:
+        """What a residual counts as at most, on each axis: one may be all misfit."""
+        residuals = self.state.residuals
+        own = [robust_scale([r[:, [a]] for r in residuals]) for a in range(residuals[0].shape[1])]
+        return np.asarray(CLIPPED * np.maximum(own, self.state.sigma))
 
     def candidate(self, chosen: Chosen, known: Sequence[Term]) -> Candidate:
         """The formula of the known terms and these shapes, null at k = 0."""
@@ -331,7 +353,7 @@ def _scaled(variables: Sequence[Variable], columns: int, X: Array) -> list[Varia
     found, kept = [], list[tuple[bool, Array]]()
     for k, variable in enumerate(variables):
         x = X[:, k] if variable.own else X[:, k, :1]
-        width = float(np.ptp(x)) if np.all(np.isfinite(x)) else 0.0
+        width = float(np.ptp(x, axis=0).max()) if np.all(np.isfinite(x)) else 0.0
         if not width > 1e-9 * float(np.abs(x).max(initial=1e-300)):
             found.append(variable)
             continue

@@ -125,7 +125,7 @@ class Search:
 
     def chosen(self) -> Chosen | None:
         """The shapes that are significant and stable, without axes on which they are nothing."""
-        picked = self._earning(self.forward(MOST, slice(None)))
+        picked = self._earning(self._exchanged(self.forward(MOST, slice(None))))
         if not picked or not self._significant(picked) or not self._stable(picked):
             return None
         score = self._joint(picked)
@@ -143,19 +143,33 @@ class Search:
     def forward(self, most: int, batches: NDArray[np.int_] | slice) -> list[int]:
         """Shapes one by one, each explaining most beside those before it."""
         whole, total = self.sums.matrices[batches].sum(axis=0), self.sums.gradients[batches].sum(0)
-        own = np.arange(self.declared, len(total)).reshape(-1, self.axes)
-        blocks, picked = whole[own[:, :, None], own[:, None, :]], list[int]()
-        while len(picked) < min(most, len(own)):
-            d = self._declared(picked)
-            absorbed = np.linalg.pinv(whole[np.ix_(d, d)], rcond=1e-10, hermitian=True) @ whole[d]
-            inner = np.einsum("dka,dkb->kab", whole[d][:, own], absorbed[:, own])
-            score = (total - total[d] @ absorbed)[own]
-            gains = _gains(blocks - inner, blocks, score)
-            gains[picked] = 0.0
+        picked: list[int] = []
+        while len(picked) < min(most, len(self.reads)):
+            gains = self._gains_beside(picked, whole, total)
             best = int(np.argmax(gains))
             if not gains[best] > 0:
                 break
             picked.append(best)
+        return picked
+
+    def _gains_beside(self, picked: Sequence[int], whole: Array, total: Array) -> Array:
+        """What every shape explains beside those that are picked."""
+        d = self._declared(picked)
+        own = np.arange(self.declared, len(total)).reshape(-1, self.axes)
+        absorbed = np.linalg.pinv(whole[np.ix_(d, d)], rcond=1e-10, hermitian=True) @ whole[d]
+        blocks = whole[own[:, :, None], own[:, None, :]]
+        inner = np.einsum("dka,dkb->kab", whole[d][:, own], absorbed[:, own])
+        gains = _gains(blocks - inner, blocks, (total - total[d] @ absorbed)[own])
+        gains[list(picked)] = 0.0
+        return gains
+
+    def _exchanged(self, picked: list[int]) -> list[int]:
+        """Each in turn exchanged for the best beside the others: the first was alone at first."""
+        whole, total = self.sums.whole, self.sums.gradients.sum(axis=0)
+        for _ in picked[1:]:
+            for i in range(len(picked)):
+                rest = picked[:i] + picked[i + 1 :]
+                picked[i] = int(np.argmax(self._gains_beside(rest, whole, total)))
         return picked
 
     def _columns(self, shapes: Sequence[int]) -> NDArray[np.int_]:
@@ -166,11 +180,20 @@ class Search:
         return np.concatenate([np.arange(self.declared), self._columns(shapes)])
 
     def _joint(self, shapes: Sequence[int], beside: Sequence[int] = ()) -> Score:
-        d = self._declared(beside)
-        A = self.sums.whole
+        """The score of some shapes, of the residual that is left beside others."""
+        d, A = self._declared(beside), self.sums.whole
         inverse = np.asarray(np.linalg.pinv(A[np.ix_(d, d)], rcond=1e-10, hermitian=True))
-        own = self._columns(shapes)
-        return _score(Candidate(None), own, A, inverse, self.sums, d, self.sigma, self.count)
+        sums = self._left(d, inverse) if len(beside) else self.sums
+        own, nothing = self._columns(shapes), Candidate(None)
+        return _score(nothing, own, A, inverse, sums, d, self.sigma, self.count)
+
+    def _left(self, d: NDArray[np.int_], inverse: Array) -> _Sums:
+        """Sums with the residual that a fit of the columns d leaves."""
+        sums, total = self.sums, self.sums.gradients[:, d].sum(axis=0)
+        sizes = inverse @ total
+        gradients = sums.gradients - sums.matrices[:, :, d] @ sizes
+        squares = sums.squares - float(total @ sizes)
+        return replace(sums, gradients=gradients, unclipped=gradients, squares=squares)
 
     def _earning(self, picked: list[int]) -> list[int]:
         """Without the last ones that are no more than noise beside those before them.

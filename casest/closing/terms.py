@@ -106,10 +106,11 @@ class Shape:
         if self.kind == "power":
             power = "**" if python else "^"
             return words[0] + (f"{power}{self.order}" if self.order > 1 else "")
+        inner = words[0][1:-1] if words[0].startswith("(") else words[0]
         if self.kind == "abs":
-            return f"fabs({words[0]})" if python else f"|{words[0]}|"
+            return f"fabs({inner})" if python else f"|{inner}|"
         if self._factor == 1:
-            return f"{self.kind}({words[0]})"
+            return f"{self.kind}({inner})"
         return f"{self.kind}({self._factor:g}{' * ' if python else '·'}{words[0]})"
 
 

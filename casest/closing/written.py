@@ -19,7 +19,7 @@ from casest.declaring.shapes import Array
 from casest.estimate import Estimate
 from casest.modelling.effect import Attached
 from casest.naming import unit_table
-from casest.result import calibration_result, parameter_table, plain
+from casest.result import attachment, calibration_result, parameter_table, plain
 from casest.stack import Problem
 
 
@@ -114,9 +114,7 @@ def _effect(found: Found, closing: Closing) -> dict[str, Any]:
         "formula": _formula(found, attached),
         "indistinguishable_from": list(found.indistinguishable_from),
         "would_separate": _separating(found, closing),
-        "columns": dict(found.candidate.columns),
-        "file": _file(attached),
-    }
+    } | ({} if attached is None else attachment(attached))
 
 
 def formula_source(closing: Closing) -> str:
@@ -134,12 +132,6 @@ def name_file(content: dict[str, Any], path: Path) -> None:
 def _attached(found: Found, closing: Closing) -> Attached | None:
     labels = {a.label: a for a in closing.after.model.effects}
     return labels.get(found.candidate.label)
-
-
-def _file(attached: Attached | None) -> str:
-    if attached is None:
-        return ""
-    return str(attached.effect.function.__code__.co_filename)
 
 
 def _formula(found: Found, attached: Attached | None) -> str:
