@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,6 @@ from casest.estimate import Estimate
 from casest.report.numbers import number, printed, printed_unit, with_unit
 from casest.report.page import escaped, paragraph, points, section, table, tag
 from casest.report.story import Story
-from casest.result import half_width
 from casest.terminal import rounded, value_rows
 
 #: Correlation from which on a pair is spoken of, and how many pairs and directions are.
@@ -26,17 +26,29 @@ def parameters(story: Story) -> str:
     """Values with uncertainty; beside each other and how far they moved, where there are two."""
     found = story.last
     dof = found.noise.degrees_of_freedom / found.correlated_over
-    half = half_width(int(dof))
+    below, above = (
+        [reach for _, _, reach, _ in value_rows(replace(found, std=side))]
+        for side in found.interval_reach
+    )
     before = {}
     if len(story.sides) > 1:
         before = {n: (v, s) for n, v, s, _ in value_rows(story.sides[0].estimate)}
-    rows = [_row(row, half, before if len(story.sides) > 1 else None) for row in value_rows(found)]
+    compared = before if len(story.sides) > 1 else None
+    rows = [
+        _row(row, reach, compared)
+        for row, *reach in zip(value_rows(found), below, above, strict=True)
+    ]
     interval = ["95 % from", "to"]
     head, aligned = ["parameter", "value", "± std", *interval, "unit"], [1, 2, 3, 4]
     said = (
         "± is one standard deviation; the interval holds 95 % (Student's t with "
         f"{int(dof)} degrees of freedom)."
     )
+    if found.certificate.profile is not None:
+        said = (
+            "± is one standard deviation; the interval holds 95 % and is that of the likelihood, "
+            "each unknown profiled."
+        )
     if before:
         head = [
             "parameter",
@@ -58,13 +70,14 @@ def parameters(story: Story) -> str:
 
 def _row(
     row: tuple[str, float, float, str],
-    half: float,
+    reach: Sequence[float],
     before: Mapping[str, tuple[float, float]] | None,
 ) -> list[str]:
     name, value, std, unit = row
     shown, spread = rounded(value, std)
     known = math.isfinite(std) and std > 0
-    ends = [_places(value + k * half * std, spread) if known else "–" for k in (-1, 1)]
+    limits = value - reach[0], value + reach[1]
+    ends = [_places(limit, spread) if known else "–" for limit in limits]
     after = [shown, spread, *ends]
     label = f"`{name}`"
     if before is None:
