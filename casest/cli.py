@@ -264,6 +264,10 @@ def closing(model_name: str, data: Sequence[str], options: Options, command: str
         found, model_name=model_name, data=data, command=command, held_out=hidden and hidden[1:]
     )
     if options["output"]:
+        formula = written.formula_source(found)
+        if formula:
+            write(options["output"] / "formula.py", formula)
+            written.name_file(content, options["output"] / "formula.py")
         result.save(options["output"], content, written.residual_rows(found, hidden))
         reported(options["output"], closing_page(found, content, str(options["output"])))
     if options["as_json"]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -19,7 +19,7 @@ from casest.modelling.model import Model
 from casest.noise import has_noise_effects, variance_factor
 from casest.remarks import NOTABLE_BIAS, notes
 from casest.solve.certificate import Certificate, certify
-from casest.solve.correlation import correlation_time
+from casest.solve.correlation import ENOUGH, TABLE, correlation_time
 from casest.solve.covariance import inverse_normal, sandwich
 from casest.solve.interrupt import stopped
 from casest.solve.outcome import Outcome
@@ -269,9 +269,22 @@ def _estimate(
         tuple(outcomes),
         time.perf_counter() - began,
         correlated,
-        tuple(notes(problem, point, dof, correlated, relative)),
+        (*notes(problem, point, dof, correlated, relative), *_of_tables(problem, point)),
         shift,
     )
+
+
+def _of_tables(problem: Problem, point: Point) -> Iterator[str]:
+    """That neighbouring rows of a table are alike, in case they followed each other in time."""
+    if not any(run.time is None and ENOUGH <= len(run) < TABLE for run in problem.runs):
+        return
+    over = correlation_time(problem, point, tables=True)
+    if over > 1:
+        yield (
+            f"residuals of neighbouring rows are alike (over {over:.2g} rows), which counts for "
+            "nothing in rows without a time; if they followed each other, say so with --rate: "
+            f"standard deviations grow by about {np.sqrt(over):.2g}"
+        )
 
 
 def _canonical(problem: Problem, best: Outcome) -> Outcome:

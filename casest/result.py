@@ -20,6 +20,7 @@ from casest import __version__
 from casest.data.run import Run
 from casest.data.write import write_atomically
 from casest.declaring.shapes import Array
+from casest.declaring.symbols import Constant
 from casest.errors import DataError
 from casest.estimate import Estimate
 from casest.modelling.effect import Attached
@@ -75,7 +76,7 @@ def calibration_result(
                 "matrix": plain(_correlation(estimate.covariance)),
             },
         },
-        "effects": [_effect(a) for a in problem.model.effects],
+        "effects": [attachment(a) for a in problem.model.effects],
         "identifiability": {
             "rank": estimate.identifiability.rank,
             "unknowns": estimate.identifiability.unknowns,
@@ -139,14 +140,17 @@ def _scatter(estimate: Estimate) -> dict[str, Any] | None:
     }
 
 
-def _effect(attached: Attached) -> dict[str, Any]:
-    """What is needed to attach the effect again."""
+def attachment(attached: Attached) -> dict[str, Any]:
+    """What is needed to attach the effect again: where, and the numbers it was told."""
+    declared = attached.effect.declarations
     return {
         "name": attached.effect.name,
         "on": attached.on,
         "columns": dict(attached.columns),
-        "file": str(Path(attached.effect.function.__code__.co_filename).resolve()),
-    }
+        "numbers": {n: float(d.array) for n, d in declared
+                    if isinstance(d, Constant) and not d.dims},
+        "file": str(Path(inspect.unwrap(attached.effect.function).__code__.co_filename).resolve()),
+    }  # fmt: skip
 
 
 def _corrected_range(estimate: Estimate) -> dict[str, Any] | None:

@@ -342,6 +342,7 @@ def one_world(task: Task) -> dict[str, Any]:
         {
             "label": f.candidate.label,
             "column": f.candidate.column,
+            "on": f.candidate.on,
             "formula": f.candidate.effect.formula if f.candidate.effect else "",
             "alike": list(f.indistinguishable_from),
             "p": f.p_value,

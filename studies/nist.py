@@ -25,7 +25,7 @@ from scipy.optimize import least_squares
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT / "tests"))
 
-from nist import MODELS, Certified, fewest_digits, independent_std, read  # noqa: E402
+from nist import MODELS, Certified, fewest_digits, read  # noqa: E402
 
 from casest import Model, attempt  # noqa: E402
 from casest.engine.threads import one_thread  # noqa: E402
@@ -117,7 +117,7 @@ def by_default(certified: Certified, model: Model) -> dict[str, Any]:
     certificate = found.certificate
     return {
         "digits": fewest_digits(found.values, certified.values),
-        "std": fewest_digits(independent_std(found), certified.std),
+        "std": fewest_digits(found.std, certified.std),
         "claims": certificate.trusted,
         "profiled": certificate.profile is not None,
         "reason": certificate.reasons[0],
@@ -188,7 +188,7 @@ def page(records: list[dict[str, Any]]) -> str:
         "Statistical Reference Datasets for nonlinear regression; the models are in",
         "`tests/nist.py`. An answer is right when every parameter agrees with the certified one",
         f"to {RIGHT:.0f} digits (log relative error; solutions that only exchange equal terms",
-        "count as one). A false success is a wrong answer claimed to be the optimum, a false failure",
+        "count as one). A false success is a wrong answer claimed to be right, a false failure",
         "a right one that is not. casest claims by its certificate (`trusted`), every other solver",
         "by its own status. No solver knows more than the one start.",
         "",

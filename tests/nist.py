@@ -16,8 +16,6 @@ from typing import Any
 import numpy as np
 
 from casest import Model, Residual, Run, atan, cos, exp, model, param, pi, signal, sin
-from casest.estimate import Estimate
-from casest.solve.covariance import inverse_normal
 
 #: Certified values have eleven digits: more agreement than this is not evidence.
 DIGITS = 11.0
@@ -354,13 +352,3 @@ def digits(found: float, certified: float) -> float:
 def fewest_digits(found: Mapping[str, Any], certified: Mapping[str, float]) -> float:
     """Digits of the worst parameter."""
     return min(digits(found[name], value) for name, value in certified.items())
-
-
-def independent_std(found: Estimate) -> dict[str, float]:
-    """Standard deviations as NIST certifies them: of residuals taken as independent.
-
-    casest's own allow for residuals that are correlated along the record.
-    """
-    R = found.problem.factor(found.point)[0]
-    std = found.noise.sigma * np.sqrt(np.diag(inverse_normal(R)))
-    return dict(zip(found.names, std.tolist(), strict=True))

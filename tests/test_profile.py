@@ -1,4 +1,4 @@
-"""Where the cost is no parabola: intervals of the likelihood, against brute force and simulation."""
+"""Intervals of the likelihood where the cost is no parabola: brute force, simulation."""
 
 from __future__ import annotations
 

@@ -19,6 +19,7 @@ from casest.closing.crossfit import (
     gain,
     rms,
 )
+from casest.closing.formula import try_formula
 from casest.closing.profile import freed_again, profiled
 from casest.closing.restrict import restricted
 from casest.closing.score import SURVIVES, Score, scores, second_freedom, widened
@@ -155,6 +156,8 @@ class _Loop:
             ranked = self._ranked(current)
             first_scores = first_scores or ranked
             better = self._better(current, ranked)
+            if better is None:
+                better = try_formula(self, current)
             if better is None:
                 break
             current = better
