@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from casest.declaring.shapes import Array
 from casest.estimate import Estimate
 from casest.modelling.effect import Effect
 from casest.modelling.model import Model
@@ -102,24 +103,26 @@ def item(text: str) -> str:
     return textwrap.fill(text, WIDTH, initial_indent="  - ", subsequent_indent="    ")
 
 
-def value_rows(found: Estimate) -> Iterator[tuple[str, float, float, str]]:
-    """Name (with its run, if there are several), value, std and unit of each entry."""
+def entry_rows(
+    found: Estimate, *numbers: Mapping[str, Array]
+) -> Iterator[tuple[str, str, list[float]]]:
+    """Name (with its run, if there are several), unit and numbers of each entry of a parameter."""
     known = unit_table(found.model, found.problem.runs)
     known = {n: u for n, u in known.items() if "[" not in n}
     for p in found.model.parameters:
         units = entry_units(p, known)
-        value, std = found.values[p.name], found.std[p.name]
-        several = value.ndim > len(p.shape.dims)
-        stacked = zip(value, std, strict=True) if several else [(value, std)]
-        for r, (v, s) in enumerate(stacked):
+        several = found.values[p.name].ndim > len(p.shape.dims)
+        for r in range(len(found.values[p.name]) if several else 1):
             run = f" ({found.problem.runs[r].name})" if several else ""
+            own = [of[p.name][r] if several else of[p.name] for of in numbers]
             for name, i, unit in zip(p.entry_names, p.shape.entries, units, strict=True):
-                yield name + run, float(v[i]), float(s[i]), "" if unit == "1" else unit
+                yield name + run, "" if unit == "1" else unit, [float(v[i]) for v in own]
 
 
 def value_table(found: Estimate) -> Iterator[str]:
     """One line per value: name, value ± standard deviation, unit."""
-    rows = [(name, *rounded(v, s), unit) for name, v, s, unit in value_rows(found)]
+    entries = entry_rows(found, found.values, found.std)
+    rows = [(name, *rounded(v, s), unit) for name, unit, (v, s) in entries]
     width = max(len(r[0]) for r in rows)
     left = max(len(r[1]) for r in rows)
     middle = max(len(r[2]) for r in rows)

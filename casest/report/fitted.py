@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,7 @@ from casest.estimate import Estimate
 from casest.report.numbers import number, printed, printed_unit, with_unit
 from casest.report.page import escaped, paragraph, points, section, table, tag
 from casest.report.story import Story
-from casest.terminal import rounded, value_rows
+from casest.terminal import entry_rows, rounded
 
 #: Correlation from which on a pair is spoken of, and how many pairs and directions are.
 STRONG, SPOKEN = 0.9, 8
@@ -25,69 +24,41 @@ STRONG, SPOKEN = 0.9, 8
 def parameters(story: Story) -> str:
     """Values with uncertainty; beside each other and how far they moved, where there are two."""
     found = story.last
-    dof = found.noise.degrees_of_freedom / found.correlated_over
-    below, above = (
-        [reach for _, _, reach, _ in value_rows(replace(found, std=side))]
-        for side in found.interval_reach
-    )
-    before = {}
-    if len(story.sides) > 1:
-        before = {n: (v, s) for n, v, s, _ in value_rows(story.sides[0].estimate)}
-    compared = before if len(story.sides) > 1 else None
     rows = [
-        _row(row, reach, compared)
-        for row, *reach in zip(value_rows(found), below, above, strict=True)
+        [f"`{name}`", *map(printed, _cells(*numbers)), printed_unit(unit)]
+        for name, unit, numbers in entry_rows(found, found.values, found.std, *found.interval_reach)
     ]
-    interval = ["95 % from", "to"]
-    head, aligned = ["parameter", "value", "± std", *interval, "unit"], [1, 2, 3, 4]
-    said = (
-        "± is one standard deviation; the interval holds 95 % (Student's t with "
-        f"{int(dof)} degrees of freedom)."
-    )
-    if found.certificate.profile is not None:
-        said = (
-            "± is one standard deviation; the interval holds 95 % and is that of the likelihood, "
-            "each unknown profiled."
-        )
-    if before:
-        head = [
-            "parameter",
-            "before",
-            "± std",
-            "after",
-            "± std",
-            "95 % from",
-            "to",
-            "moved",
-            "unit",
-        ]
-        aligned = [1, 2, 3, 4, 5, 6, 7]
+    head = ["parameter", "value", "± std", "95 % from", "to", "unit"]
+    said = "± is one standard deviation; the interval holds 95 %."
+    if len(story.sides) > 1:
+        head = ["parameter", "before", "± std", "after", *head[2:5], "moved", "unit"]
+        rows = list(_beside(rows, story))
         said += " Moved: in the value's own standard deviation before."
-    return section(
-        "parameters", "Parameters", paragraph(said), table(head, rows, aligned), _held(story)
-    )
+    shown = table(head, rows, range(1, len(head) - 1))
+    return section("parameters", "Parameters", paragraph(said), shown, _held(story))
 
 
-def _row(
-    row: tuple[str, float, float, str],
-    reach: Sequence[float],
-    before: Mapping[str, tuple[float, float]] | None,
-) -> list[str]:
-    name, value, std, unit = row
+def _cells(value: float, std: float, below: float, above: float) -> list[str]:
+    """Value, standard deviation and interval, as far as they are known."""
     shown, spread = rounded(value, std)
+    ends = [value - below, value + above]
     known = math.isfinite(std) and std > 0
-    limits = value - reach[0], value + reach[1]
-    ends = [_places(limit, spread) if known else "–" for limit in limits]
-    after = [shown, spread, *ends]
-    label = f"`{name}`"
-    if before is None:
-        return [label, *map(printed, after), printed_unit(unit)]
-    if name not in before:
-        return [label, "", "", *map(printed, after), "added", printed_unit(unit)]
-    old, old_std = before[name]
-    moved = (value - old) / old_std if old_std > 0 else math.nan
-    there = f"{moved:+.1f}" if math.isfinite(moved) else "–"
-    return [label, *map(printed, [*rounded(old, old_std), *after, there]), printed_unit(unit)]
+    return [shown, spread, *(_places(end, spread) if known else "–" for end in ends)]
+
+
+def _beside(rows: Sequence[list[str]], story: Story) -> Iterator[list[str]]:
+    """Rows with the values before in front and how far they moved at the end."""
+    first, last = (side.estimate for side in story.sides)
+    before = {name: v for name, _, v in entry_rows(first, first.values, first.std)}
+    after = entry_rows(last, last.values)
+    for (label, *cells, unit), (name, _, (value,)) in zip(rows, after, strict=True):
+        if name not in before:
+            yield [label, "", "", *cells, "added", unit]
+            continue
+        old, std = before[name]
+        moved = (value - old) / std if std > 0 else math.nan
+        there = printed(f"{moved:+.1f}") if math.isfinite(moved) else "–"
+        yield [label, *map(printed, rounded(old, std)), *cells, there, unit]
 
 
 def _places(value: float, spread: str) -> str:

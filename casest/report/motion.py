@@ -19,8 +19,8 @@ from casest.report.fitted import reproduction
 from casest.report.frame import whole
 from casest.report.numbers import alike, number, printed, printed_unit
 from casest.report.page import paragraph, points, section, table, tag
-from casest.report.residuals import BAND
 from casest.report.spectra import autocorrelation
+from casest.report.story import BAND
 
 #: Samples that are drawn of one curve with its band.
 DRAWN = 20_000

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -18,6 +18,9 @@ from casest.estimate import Estimate
 from casest.naming import unit_table
 from casest.solve.correlation import is_series
 from casest.stack import Problem
+
+#: Half width of a 95 % band in standard deviations.
+BAND = 1.96
 
 
 @dataclass(frozen=True)
@@ -59,6 +62,17 @@ class Story:
     def kind(self) -> str:
         """What one sample is called."""
         return "rest interval" if self.runs[0].spread else "sample"
+
+    def panels(self) -> Iterator[tuple[int, Side, str]]:
+        """Axis number, side and title of each panel, before beside after."""
+        for a, name in enumerate(self.axes):
+            for side in self.sides:
+                component = "" if len(self.axes) == 1 else f"{name}, "
+                yield a, side, f"{component}{side.name}"
+
+    def of_axis(self, what: str, a: int) -> str:
+        """What is drawn, with the axis's name where there are several."""
+        return what if len(self.axes) == 1 else f"{what} {self.axes[a]}"
 
     @cached_property
     def units(self) -> Mapping[str, str]:
