@@ -7,6 +7,7 @@ the data determine least, where a second valley would lie.
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -28,6 +29,8 @@ PATIENCE = 1000
 #: More starts, and their spread as a share of each unknown: what reveals 19 of 20 false optima of
 #: NIST's problems (studies/nist.md).
 STARTS, SPREAD = 8, 0.3
+#: Still more of them, where these did not all end alike.
+FURTHER = 24
 #: Samples that are enough to come near a solution of a longer record.
 NEARBY = 2000
 #: Ratio of the costs of a few samples from which on there is no need to look at all of them.
@@ -95,11 +98,21 @@ def _ways(
     # From a start that was declared, not computed, two ways may end in one valley, and the wrong.
     if disagree or problem.model.starter is None:
         rival = best_of((*outcomes,))
-        starts = _perturbations(problem, first, seed)
-        outcomes += [_opinion(problem, start, rival) for start in starts]
+        starts = list(_perturbations(problem, first, seed))
+        outcomes += [_opinion(problem, start, rival) for start in starts[:STARTS]]
+    if problem.model.starter is None and _valleys(outcomes) > 1:
+        # One valley more is a reason to look for others.
+        outcomes += [_opinion(problem, start, best_of((*outcomes,))) for start in starts[STARTS:]]
     if problem.model.starter is None and best_of((*outcomes,)) is not outcomes[0]:
         outcomes.append(_wary(problem, first))
     return (*outcomes,)
+
+
+def _valleys(outcomes: list[Outcome]) -> int:
+    """In how many different costs did they end, to a thousandth?"""
+    costs = sorted(_cost(o) for o in outcomes)
+    apart = [b > a * (1 + 1e-3) + 1e-300 for a, b in itertools.pairwise(costs) if np.isfinite(b)]
+    return 1 + sum(apart)
 
 
 def _polished(problem: Problem, main: Outcome, max_iterations: int = 300) -> Outcome:
@@ -188,7 +201,7 @@ def _perturbations(problem: Problem, first: Point, seed: int) -> Iterator[Point]
     columns = np.sqrt(np.where(np.diag(normal.matrix) > 0, np.diag(normal.matrix), np.inf))
     # An unknown that is zero has no size of its own: what changes the residual by its own length.
     size = np.maximum(np.abs(first.x), np.sqrt(2 * normal.cost) / columns)
-    for _ in range(STARTS):
+    for _ in range(STARTS + FURTHER):
         step = SPREAD * size * rng.standard_normal(len(first.x))
         moved = problem.moved(first, step)
         yield Point(problem.inside(moved.x), moved.references)
