@@ -472,12 +472,46 @@ def number_pair(text: str, option: str) -> tuple[str, float]:
 @click.option("--force", is_flag=True, help="Apply a result that was refused.")
 def apply(result_path: Path, data: str, **options: Any) -> None:
     """Correct the readings in DATA with a saved RESULT (result.json, or its folder)."""
-    from casest import applying
+    from casest import applying, exporting
 
-    text = applying.corrected_csv(
-        result_path, data, reading_arguments(options), force=options["force"]
-    )
+    arguments = reading_arguments(options)
+    if exporting.is_exported(result_path):
+        text = exporting.applied(result_path, data, arguments)
+    else:
+        text = applying.corrected_csv(result_path, data, arguments, force=options["force"])
     applying.write_or_print(text, options["output"])
+
+
+@commands.command()
+@click.argument("result_path", metavar="RESULT", type=click.Path(path_type=Path))
+@click.option(
+    "--to",
+    required=True,
+    type=click.Choice(["c", "python", "json"]),
+    help="C99, a Python module with NumPy alone, or JSON that `casest apply` reads.",
+)
+@click.option("--float", "single", is_flag=True, help="C: compute with float instead of double.")
+@click.option("--run", default=0, help="Which run, where the correction differs between them.")
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Without it, standard output.",
+)
+@click.option("--force", is_flag=True, help="Export a result that was refused.")
+def export(result_path: Path, to: Any, output: Path | None, **options: Any) -> None:
+    """The correction of a saved RESULT, ready to run on the device."""
+    from casest import exporting
+
+    if options["single"] and to != "c":
+        raise UsageError("--float is for --to c")
+    text = exporting.exported(result_path, to, **options)
+    if output is None:
+        click.echo(text, nl=False)
+        return
+    write(output, text)
+    click.echo(f"written: {output}", err=True)
 
 
 @commands.command()

@@ -194,9 +194,7 @@ class Search:
         sizes = inverse @ total
         gradients = sums.gradients - sums.matrices[:, :, d] @ sizes
         squares = sums.squares[0] - float(total @ sizes)
-        return replace(
-            sums, gradients=gradients, unclipped=gradients, squares=(squares, squares)
-        )
+        return replace(sums, gradients=gradients, unclipped=gradients, squares=(squares, squares))
 
     def _earning(self, picked: list[int]) -> list[int]:
         """Without the last ones that are no more than noise beside those before them.
