@@ -30,11 +30,11 @@ def riccati(model: Dynamics, system: Linearised, start: Array | None = None) -> 
     found = np.empty((len(system.time), n, n))
     found[0] = P
     for k, (of_P, alone) in enumerate(zip(steps[:, :, :n], steps[:, :, n:], strict=True)):
-        both = of_P @ P + alone
+        both = of_P.dot(P)
+        both += alone
         # The rows of [X; Y] are the columns that LAPACK wants: P = XY⁻¹ = (Y⁻ᵀXᵀ)ᵀ.
         half = dgesv(both[n:].T, both[:n].T)[2]
-        P = 0.5 * (half + half.T)
-        found[k + 1] = P
+        found[k + 1] = P = 0.5 * (half + half.T)
     return found
 
 

@@ -152,14 +152,16 @@ def exponential(matrices: Array) -> Array:
     """
     norm = float(np.max(np.sum(np.abs(matrices), axis=2), initial=0.0))
     squarings = max(0, int(np.ceil(np.log2(max(norm / _NORM, 1e-300)))))
-    X = matrices / 2.0**squarings
-    square = X @ X
-    cube, fourth = square @ X, square @ square
-    diagonal = np.arange(X.shape[1])
-    low, middle, high = (c[1] * X + c[2] * square + c[3] * cube for c in _SERIES)
-    for part, constant in zip((low, middle, high), _SERIES[:, 0], strict=True):
-        part[:, diagonal, diagonal] += constant
-    result = low + fourth @ (middle + fourth @ high)
+    powers = np.empty((4, *matrices.shape))
+    X, square, cube, fourth = powers
+    np.divide(matrices, 2.0**squarings, out=X)
+    np.matmul(X, X, out=square)
+    np.matmul(square, X, out=cube)
+    np.matmul(square, square, out=fourth)
+    sums = (_SERIES[:, 1:] @ powers[:3].reshape(3, -1)).reshape(3, *matrices.shape)
+    diagonal = np.arange(matrices.shape[1])
+    sums[:, :, diagonal, diagonal] += _SERIES[:, :1, None]
+    result = sums[0] + fourth @ (sums[1] + fourth @ sums[2])
     for _ in range(squarings):
         result = result @ result
     return result
