@@ -193,7 +193,7 @@ def smallest_eigenvalue(
     )
     found = []
     for end in ends:
-        first = int(np.searchsorted(time, end - window - 1e-12))
+        first = min(int(np.searchsorted(time, end - window - 1e-12)), len(time) - 2)
         last = max(int(np.searchsorted(time, end + 1e-12)) - 1, first + 1)
         own = _reduced(Phi[first:last], W[first:last])[1]
         found.append(float(np.linalg.eigvalsh(own * np.outer(prior, prior))[0]))

@@ -40,7 +40,7 @@ def riccati(model: Dynamics, system: Linearised, start: Array | None = None) -> 
 
 def hamiltonian_steps(model: Dynamics, system: Linearised) -> Array:
     """Transition of [X; Y] over every step, (N − 1, 2n, 2n), by fourth-order Magnus steps."""
-    weight = np.linalg.inv(model.noise)
+    weight: Array = np.asarray(np.linalg.inv(model.noise), float)
     return magnus_steps(lambda where: _hamiltonian(model, system, where, weight), system)
 
 

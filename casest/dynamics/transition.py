@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casest.data.run import Run
+from casest.data.timing import UNUSED
 from casest.declaring.shapes import Array
 from casest.dynamics.declare import Dynamics
 from casest.engine import Columns, Replay
@@ -54,6 +55,9 @@ class Linearised:
 def checked_time(run: Run) -> Array:
     """The run's time, increasing; DataError names the first sample where it is not."""
     if run.time is None:
+        why = [note for note in run.notes if note.startswith(UNUSED)]
+        if why:
+            raise DataError(why[0].removeprefix(UNUSED))
         raise DataError(f"{run.file or run.name}: motion needs time: a time column, or --rate")
     time = np.asarray(run.time, float)
     step = np.diff(time)
@@ -164,7 +168,7 @@ def exponential(matrices: Array) -> Array:
     result = sums[0] + fourth @ (sums[1] + fourth @ sums[2])
     for _ in range(squarings):
         result = result @ result
-    return result
+    return np.asarray(result)
 
 
 def process_noise(system: Linearised, intensity: Array, Phi: Array) -> Array:
