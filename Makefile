@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: demo test lint types format wheel bench study study-starts study-loop figures clean
+.PHONY: demo test lint types format wheel bench study study-starts study-nist study-loop figures docs clean
 
 demo: $(READY)
 	$(BIN)/casest demo
@@ -40,11 +40,19 @@ study: $(READY)
 study-starts: $(READY)
 	$(BIN)/python studies/random_starts.py
 
+study-nist: $(READY)
+	$(BIN)/python studies/nist.py
+
 study-loop: $(READY)
 	$(BIN)/python studies/loop.py
 
 figures: $(READY)
 	$(BIN)/python studies/figures.py
+
+docs: $(READY)
+	$(BIN)/python docs/picture.py
+	$(BIN)/sphinx-build -q -W --keep-going docs out/docs
+	@echo "open out/docs/index.html"
 
 clean:
 	rm -rf $(VENV) build dist *.egg-info out

@@ -7,12 +7,14 @@ import hashlib
 import io
 import sys
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from casest.apply import Correction
+from casest.closing.restrict import axis_name, restricted
 from casest.data import load_runs
 from casest.data.run import Run
 from casest.data.write import write_atomically
@@ -28,11 +30,18 @@ from casest.result import load_result, saved_parameters
 def saved_model(result: Mapping[str, Any]) -> tuple[Model, dict[str, Any]]:
     """Model and parameter values of a saved result: effects, constants and scopes as they were."""
     model, units = _found_model(result), result.get("units", {})
-    for saved in result.get("effects", []):
-        effect = _found_effect(saved)
-        on = None if saved["on"] == effect.on else saved["on"]
-        model = model.with_effect(effect, on=on, columns=saved.get("columns") or {})
     parameters = saved_parameters(result)
+    for saved in result.get("effects", []):
+        if "file" not in saved:  # a constant that was freed
+            continue
+        columns, on = saved.get("columns") or {}, saved["on"]
+        label = saved["name"] + "".join(f"({c})" for c in columns.values())
+        moved = any(n.startswith(f"{label}@{on}.") for n in parameters)
+        label += f"@{on}" if moved else ""
+        own = {n.removeprefix(label + ".") for n in parameters if n.startswith(label + ".")}
+        effect = _as_it_was(_found_effect(saved), saved, own, model)
+        effect = effect if moved else replace(effect, on=on)
+        model = model.with_effect(effect, on=on, columns=columns)
     for name in parameters:
         model = model.freed(name)
     for name, value in result["constants"].items():
@@ -73,6 +82,17 @@ def _found_effect(saved: Mapping[str, Any]) -> Effect:
         raise UsageError(
             f"the result was fitted with the effect {saved['name']}: {error}"
         ) from None
+
+
+def _as_it_was(effect: Effect, saved: Mapping[str, Any], own: set[str], model: Model) -> Effect:
+    """The effect with the numbers it was told, on the axes where it has unknowns of its `own`."""
+    effect = effect.holding(**saved.get("numbers", {}))
+    if own <= {n for n, _ in effect.declarations} or saved["on"] not in model.quantities:
+        return effect
+    size = model.quantities[saved["on"]].declared.numel()
+    ends = {n.rpartition("_")[2] for n in own}
+    kept = [i for i in range(size) if axis_name(i, size) in ends]
+    return replace(restricted(replace(effect, on=saved["on"]), kept, model), on=effect.on)
 
 
 def corrected_csv(

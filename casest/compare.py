@@ -534,7 +534,7 @@ def _in_convention(problem: Problem, outcome: Outcome) -> Point:
     if convention is None:
         return outcome.point
     values = problem.values(outcome.point)
-    chosen = {k: v for k, v in convention(values).items() if k in values}
+    chosen = {k: v for k, v in convention(problem.model, values).items() if k in values}
     point = problem.point({**values, **chosen})
     same = abs(problem.cost(point) - outcome.cost) <= 1e-6 * outcome.cost
     return point if same else outcome.point

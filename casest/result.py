@@ -20,6 +20,7 @@ from casest import __version__
 from casest.data.run import Run
 from casest.data.write import write_atomically
 from casest.declaring.shapes import Array
+from casest.declaring.symbols import Constant
 from casest.errors import DataError
 from casest.estimate import Estimate
 from casest.modelling.effect import Attached
@@ -75,7 +76,7 @@ def calibration_result(
                 "matrix": plain(_correlation(estimate.covariance)),
             },
         },
-        "effects": [_effect(a) for a in problem.model.effects],
+        "effects": [attachment(a) for a in problem.model.effects],
         "identifiability": {
             "rank": estimate.identifiability.rank,
             "unknowns": estimate.identifiability.unknowns,
@@ -95,34 +96,27 @@ def calibration_result(
         "notes": [note for run in problem.runs for note in run.notes] + list(estimate.notes),
         "convention": inspect.getdoc(problem.model.function) or "",
         "declared_in": _declared_in(problem.model),
-        "reproduce": _reproduce(command, data),
+        "reproduce": reproduce(command, data),
     }
 
 
 def parameter_table(estimate: Estimate, table: Mapping[str, str]) -> dict[str, Any]:
     """Value, standard deviations, interval and unit of every parameter, for JSON."""
-    dof = estimate.noise.degrees_of_freedom / estimate.correlated_over
-    half = half_width(int(dof))
+    reach = estimate.interval_reach
     known = {n: u for n, u in table.items() if "[" not in n}
     found = {}
     for p in estimate.model.parameters:
         value, std = estimate.values[p.name], estimate.std[p.name]
+        below, above = reach[0][p.name], reach[1][p.name]
         own = entry_units(p, known)
         found[p.name] = {
             "value": plain(value),
             "std": plain(std),
             "robust_std": plain(estimate.robust[p.name]),
-            "interval95": [plain(value - half * std), plain(value + half * std)],
+            "interval95": [plain(value - below), plain(value + above)],
             "unit": own[0] if len(set(own)) == 1 else own,
         }
     return found
-
-
-def half_width(degrees_of_freedom: int) -> float:
-    """Half width of a 95 % interval in standard deviations: Student's t."""
-    from scipy.special import stdtrit
-
-    return float(stdtrit(max(degrees_of_freedom, 1), 0.975))
 
 
 def _correlation(covariance: Array) -> Array:
@@ -146,14 +140,17 @@ def _scatter(estimate: Estimate) -> dict[str, Any] | None:
     }
 
 
-def _effect(attached: Attached) -> dict[str, Any]:
-    """What is needed to attach the effect again."""
+def attachment(attached: Attached) -> dict[str, Any]:
+    """What is needed to attach the effect again: where, and the numbers it was told."""
+    declared = attached.effect.declarations
     return {
         "name": attached.effect.name,
         "on": attached.on,
         "columns": dict(attached.columns),
-        "file": str(Path(attached.effect.function.__code__.co_filename).resolve()),
-    }
+        "numbers": {n: float(d.array) for n, d in declared
+                    if isinstance(d, Constant) and not d.dims},
+        "file": str(Path(inspect.unwrap(attached.effect.function).__code__.co_filename).resolve()),
+    }  # fmt: skip
 
 
 def _corrected_range(estimate: Estimate) -> dict[str, Any] | None:
@@ -194,7 +191,8 @@ def _declared_in(model: Model) -> dict[str, str]:
     return {"file": str(path), "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
 
 
-def _reproduce(command: str, data: Sequence[str]) -> dict[str, Any]:
+def reproduce(command: str, data: Sequence[str]) -> dict[str, Any]:
+    """Command, versions and digests: what is needed to get a result again."""
     return {
         "command": command,
         "python": platform.python_version(),

@@ -127,7 +127,7 @@ def _signal_noise(problem: Problem, point: Point, sigma: float) -> Array:
 
     At most σ over the slope of the residual that sees the signal best. A signal whose spread is
     zero in all runs, or that a model takes as exact (a time, an attitude), has the same formula:
-    the residual tells no more.
+    the residual tells no more. What only effects read (a temperature, the time) is exact.
     """
     ends = np.cumsum([0, *(s.size for s in problem.model.signals)])
     squares = np.zeros((len(problem.model.axes), len(ends) - 1))
@@ -136,7 +136,8 @@ def _signal_noise(problem: Problem, point: Point, sigma: float) -> Array:
         squares += np.add.reduceat(np.sum(G**2, axis=0), ends[:-1], axis=1)
     count = sum(len(run) for run in problem.runs)
     slope = np.sqrt(squares.max(axis=0) / max(count, 1))
-    return np.asarray(sigma / np.where(slope > 0, slope, np.inf))
+    own = [s.name in {d.name for d in problem.model.declared} for s in problem.model.signals]
+    return np.asarray(sigma / np.where((slope > 0) & own, slope, np.inf))
 
 
 def repeat_noise(problem: Problem, point: Point) -> float | None:

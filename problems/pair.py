@@ -240,7 +240,7 @@ def limits(declared: Model, runs: Sequence[Run]) -> dict[str, tuple[Any, Any]]:
     return {**found, "dip": (-steepest, steepest)}
 
 
-def right_handed(values: Mapping[str, Any]) -> dict[str, Any]:
+def right_handed(declared: Model, values: Mapping[str, Any]) -> dict[str, Any]:
     """Of (scale, dip) and (−scale, −dip), which fit alike, the one that mirrors nothing."""
     if "dip" not in values or "magnetometer_scale" not in values:
         return {}

@@ -543,16 +543,46 @@ def remarks(declared: Model, runs: Sequence[Run], values: Mapping[str, Any]) -> 
             )
 
 
-def convention(values: dict[str, Array]) -> dict[str, Array]:
-    """Phase in (−π, π], Euler angles as of their rotation: φ in [−π/2, π/2]."""
-    chosen = {}
-    if "phase" in values:
-        chosen["phase"] = -((-values["phase"] + np.pi) % (2 * np.pi) - np.pi)
-    if "misalignment" in values:
-        angles = np.atleast_2d(values["misalignment"])
+def convention(declared: Model, values: Mapping[str, Array]) -> dict[str, Array]:
+    """Of two spins the smaller offset; phase in (−π, π]; φ of the misalignment in [−π/2, π/2]."""
+    chosen = _spin(declared, values)
+    if "phase" in chosen:
+        chosen["phase"] = -((-chosen["phase"] + np.pi) % (2 * np.pi) - np.pi)
+    if "misalignment" in chosen:
+        angles = np.atleast_2d(chosen["misalignment"])
         found = np.array([euler(rotation_matrix(a)) for a in angles])
-        chosen["misalignment"] = found.reshape(values["misalignment"].shape)
+        chosen["misalignment"] = found.reshape(chosen["misalignment"].shape)
     return chosen
+
+
+def _spin(declared: Model, values: Mapping[str, Array]) -> dict[str, Array]:
+    """The values, or those of the opposite spin that gives the same readings, by their offset.
+
+    With y and z of the wheel turned over, −ϑ and o + 2g·cos α·Γr₃ predict what ϑ and o do: in one
+    mounting (several would need one offset each), and as long as nothing is added to the model.
+    """
+    mirrored = ("offset", "gain", "misalignment", "tilt", "phase", "speed")
+    known = {name: values.get(name, _constant(declared, name)) for name in (*mirrored, "gravity")}
+    one_mounting = np.ndim(known["misalignment"]) == 1 and np.ndim(known["tilt"]) == 0
+    changeable = all(name in values for name in ("offset", "misalignment", "phase", "speed"))
+    if declared.effects or not (one_mounting and changeable):
+        return dict(values)
+    R = rotation_matrix(known["misalignment"])
+    axle = known["gain"] * R[:, 2] * known["gravity"] * np.cos(known["tilt"])
+    if np.linalg.norm(known["offset"]) <= np.linalg.norm(known["offset"] + 2 * axle):
+        return dict(values)
+    return {
+        **values,
+        "offset": known["offset"] + 2 * axle,
+        "misalignment": euler(R * [1, -1, -1]),
+        "phase": -known["phase"],
+        "speed": -known["speed"],
+    }
+
+
+def _constant(declared: Model, name: str) -> Array:
+    """The value of a constant, whatever its shape."""
+    return np.asarray(getattr(declared[name], "array", np.nan))
 
 
 wheel = (

@@ -26,6 +26,7 @@ FLOORS = [
     ["casest.remarks"],
     ["casest.solve"],
     ["casest.estimate", "casest.naming", "casest.apply"],
+    ["casest.unseen"],
     [
         "casest.batch",
         "casest.batch_fit",
@@ -41,6 +42,7 @@ FLOORS = [
     ["casest.terminal"],
     ["casest.comparing_text", "casest.comparing_plot"],
     ["casest.closing.text"],
+    ["casest.report"],
     ["casest.cli"],
 ]
 

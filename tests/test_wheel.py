@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 import simulators as sim
@@ -9,6 +11,7 @@ from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from casest import Run, attempt, load_runs, param
+from casest.cli import run as casest_command
 from casest.effects import speed_polynomial
 from casest.problem import find_model
 from casest_problems.wheel import (
@@ -323,3 +326,41 @@ def test_the_phase_is_within_a_turn_and_the_angles_are_canonical_from_any_start(
     assert found.certificate.trusted, found.certificate.reasons
     assert abs(found.values["phase"] - TABLE_1["phase"]) < 0.01
     np.testing.assert_allclose(found.values["misalignment"], TABLE_1["misalignment"], atol=0.01)
+
+
+def test_of_two_spins_that_read_alike_the_one_of_the_smaller_offset_is_given():
+    """The other way round, the sensor turned over: the offset differs by 2g·cos α."""
+    run = spun(TABLE_1, np.random.default_rng(9))
+    mounting = turn(TABLE_1["misalignment"])
+    axle = TABLE_1["gain"] * mounting[:, 2] * sim.GRAVITY * np.cos(TABLE_1["tilt"])
+    mirrored = {
+        **TABLE_1,
+        "offset": TABLE_1["offset"] + 2 * axle,
+        "misalignment": Rotation.from_matrix(mounting @ np.diag([1, -1, -1])).as_euler("XYZ"),
+        "phase": -TABLE_1["phase"],
+        "speed": -TABLE_1["speed"],
+    }
+    np.testing.assert_allclose(
+        spun(mirrored, np.random.default_rng(9)).signals["v"], run.signals["v"], atol=1e-9
+    )
+    found = attempt(wheel, [run], start=mirrored)
+    assert found.certificate.trusted, found.certificate.reasons
+    away = np.abs(packed(found.values) - packed(TABLE_1)) / packed(found.std)
+    assert away.max() < 5
+
+
+def test_a_spin_held_out_is_scored_with_its_own_motion_and_the_sensor_kept(tmp_path, capsys):
+    """Its motion is fitted to half of its blocks; the score of the other half is the noise."""
+    rng = np.random.default_rng(10)
+    other = {**TABLE_1, "phase": 1.0, "tilt": 0.9, "speed": np.array([14.0, -0.2, 1e-3, 1e-6])}
+    files = []
+    for name, truth in (("fitted", TABLE_1), ("apart", other)):
+        run = spun(truth, rng, sigma=0.08)
+        files.append(tmp_path / f"{name}.csv")
+        table = np.column_stack([run.signals["t"], run.signals["v"]])
+        np.savetxt(files[-1], table, delimiter=",", header="t,vx,vy,vz", comments="")
+    command = ["calibrate", "wheel", str(files[0]), "--holdout", str(files[1]), "--json"]
+    assert casest_command(command) == 0
+    estimate = json.loads(capsys.readouterr().out)["estimate"]
+    assert estimate["rmse_holdout"] == pytest.approx(0.08, rel=0.03)
+    assert estimate["rmse_fit"] == pytest.approx(0.08, rel=0.03)

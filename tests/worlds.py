@@ -191,6 +191,22 @@ ELSEWHERE: dict[str, tuple[Bend, tuple[str, ...]]] = {
         lambda y, s, _: np.sign(y) * np.maximum(np.abs(y) - s * (1 - np.exp(-(y**2) / s**2)), 0),
         ("reading", "specific_force", "corrected"),
     ),
+    "warm_sine": (
+        lambda y, s, w: (
+            y + s * SHARES * np.sin(2 * np.pi * w.columns["temperature"] / 2.5)[:, None]
+        ),
+        ("temperature",),
+    ),
+    "rectified": (
+        lambda y, s, _: y + s * SHARES * np.abs(y),
+        ("reading", "specific_force", "corrected"),
+    ),
+    "warm_force": (  # an axis takes in some of its neighbour, the more the warmer it is
+        lambda y, s, w: (
+            y + s * SHARES * np.roll(y, 1, axis=1) * _off(w.columns["temperature"])[:, None]
+        ),
+        ("temperature",),
+    ),
 }
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +25,6 @@ from casest.closing.dependence import (
     variables,
 )
 from casest.closing.lines import strongest_line
-from casest.closing.loop import Closing
 from casest.closing.noise_model import (
     MIDDLE,
     NoiseModel,
@@ -43,6 +42,9 @@ from casest.declaring.shapes import Array
 from casest.noise import robust_scale, weighted
 from casest.scatter import between_runs
 from casest.stack import Point, Problem
+
+if TYPE_CHECKING:
+    from casest.closing.loop import Closing
 
 #: Chance of each kind of test to call a misfit where there is none: together half of one percent.
 REPEATS, SHAPES, LINES, RUNS = 0.001, 0.0025, 0.001, 0.001
@@ -217,13 +219,14 @@ def _shapes(state: State) -> list[Finding]:
     return [Finding(best.words, best.together, sigma)]
 
 
-def independent(state: State) -> tuple[NDArray[np.int_], ...]:
+def independent(state: State, lag1: float | None = None) -> tuple[NDArray[np.int_], ...]:
     """First samples of batches whose noise is independent: blocks, or stretches of a series.
 
-    Long by the correlation of neighbours only: what reaches further is wander, or the misfit that
-    is looked for.
+    Long by the correlation of neighbours only (`lag1`, that of the residual unless told): what
+    reaches further is wander, or the misfit that is looked for.
     """
-    lag1, _ = lag_one(state.problem.runs, state.clipped)
+    if lag1 is None:
+        lag1, _ = lag_one(state.problem.runs, state.clipped)
     rho = min(max(lag1 or 0.0, 0.0), 0.98)
     shortest = 5 * (1 + rho) / (1 - rho)
     found = []

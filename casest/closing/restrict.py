@@ -23,7 +23,7 @@ def restricted(effect: Effect, kept: Sequence[int], model: Model) -> Effect:
         if not isinstance(parameter, Parameter) or len(parameter.shape.dims) != 1:
             declarations.append((name, declared))
             continue
-        names = [f"{name}_{_axis(i, parameter.shape.size)}" for i in kept]
+        names = [f"{name}_{axis_name(i, parameter.shape.size)}" for i in kept]
         vectors[name] = (parameter.shape.size, dict(zip(kept, names, strict=True)))
         declarations += [
             (n, make_parameter(Shape("array", ()), parameter.units[i], None, None, parameter.scope))
@@ -53,5 +53,6 @@ def restricted(effect: Effect, kept: Sequence[int], model: Model) -> Effect:
     )
 
 
-def _axis(i: int, size: int) -> str:
+def axis_name(i: int, size: int) -> str:
+    """As in the names of the restricted unknowns."""
     return "xyz"[i] if size == 3 else str(i)

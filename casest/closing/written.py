@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,11 +14,12 @@ from casest.closing.adequacy import Misfit, misfit
 from casest.closing.crossfit import rms
 from casest.closing.loop import Closing, Found
 from casest.closing.summary import detectable, invisible
+from casest.closing.terms import source
 from casest.declaring.shapes import Array
 from casest.estimate import Estimate
 from casest.modelling.effect import Attached
 from casest.naming import unit_table
-from casest.result import calibration_result, parameter_table, plain
+from casest.result import attachment, calibration_result, parameter_table, plain
 from casest.stack import Problem
 
 
@@ -112,20 +114,24 @@ def _effect(found: Found, closing: Closing) -> dict[str, Any]:
         "formula": _formula(found, attached),
         "indistinguishable_from": list(found.indistinguishable_from),
         "would_separate": _separating(found, closing),
-        "columns": dict(found.candidate.columns),
-        "file": _file(attached),
-    }
+    } | ({} if attached is None else attachment(attached))
+
+
+def formula_source(closing: Closing) -> str:
+    """Python text of the formula that was found, for `--effects`; empty where there is none."""
+    return "".join(source(a.effect) for a in closing.after.model.effects)
+
+
+def name_file(content: dict[str, Any], path: Path) -> None:
+    """Say where the formula's source has been written: `apply` reads it there."""
+    for e in content["effects"]:
+        if e["name"] == "formula":
+            e["file"] = str(path.resolve())
 
 
 def _attached(found: Found, closing: Closing) -> Attached | None:
     labels = {a.label: a for a in closing.after.model.effects}
     return labels.get(found.candidate.label)
-
-
-def _file(attached: Attached | None) -> str:
-    if attached is None:
-        return ""
-    return str(attached.effect.function.__code__.co_filename)
 
 
 def _formula(found: Found, attached: Attached | None) -> str:

@@ -53,14 +53,14 @@ def load_runs(
 ) -> tuple[Run, ...]:
     """Read files and bind their columns to `signals`: one run per file and `run` label.
 
-    columns: per signal its columns by name or position, {"v": ("ax", "ay", "az")}; also
-        "t", "run" and "pose" where those columns are called otherwise.
-    units: per signal or column the unit of its values, where the file states none or a wrong one.
-    scales: per signal or column how raw counts become values, {"temp": "int16/256+25"}.
-    rate: samples per second, instead of a time column or a rate stated above the table.
-    at_rest: average the rest intervals; names of further columns that must be at rest too.
-    extra: columns that must be there and hold numbers throughout.
-    time_zero: "first" makes each run's first sample t = 0, "column" keeps the column's own zero.
+    * columns: per signal its columns by name or position, {"v": ("ax", "ay", "az")}; also
+      "t", "run" and "pose" where those columns are called otherwise.
+    * units: per signal or column the unit of its values, where the file states none or a wrong one.
+    * scales: per signal or column how raw counts become values, {"temp": "int16/256+25"}.
+    * rate: samples per second, instead of a time column or a rate stated above the table.
+    * at_rest: average the rest intervals; names of further columns that must be at rest too.
+    * extra: columns that must be there and hold numbers throughout.
+    * time_zero: "first" makes each run's first sample t = 0, "column" keeps the column's own zero.
 
     Raises DataError, UnitError or UsageError naming file, column, row, value and the way out.
     """

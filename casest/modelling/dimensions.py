@@ -10,14 +10,16 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any
 
 import casadi as ca
 
 from casest import units
+from casest.declaring.symbols import Constant, param
 from casest.errors import UnitError
+from casest.modelling.effect import Attached
 from casest.modelling.model import Model
 from casest.modelling.tracing import function_of
 
@@ -61,6 +63,7 @@ def check_units(model: Model) -> None:
     open_model = model
     for fixed in model.constants:  # plain numbers would lose their units in the expression
         open_model = open_model.freed(fixed.name)
+    open_model = replace(open_model, effects=tuple(map(_open, open_model.effects)))
     traced = open_model.traced
     outputs = {q.name: ca.vec(q.value) for q in traced.quantities.values()}
     if traced.predicted is None:
@@ -134,6 +137,19 @@ def _replacement(name: str, model: Model) -> str:
 
 def _named(size: Size, name: str, unit: str) -> Size:
     return Size(size.powers, size.factor, frozenset({f"{name} [{unit}]" if unit else name}))
+
+
+def _open(attached: Attached) -> Attached:
+    """The effect with its numbers that have a unit as unknowns."""
+    found, more = [], []
+    for name, declared in attached.effect.declarations:
+        if isinstance(declared, Constant) and declared.unit and not declared.dims:
+            opened = param(declared.unit, start=float(declared.array))
+            more.append(replace(opened, name=f"{attached.label}.{name}"))
+            declared = more[-1]
+        found.append((name, declared))
+    effect = replace(attached.effect, declarations=tuple(found))
+    return replace(attached, effect=effect, parameters=(*attached.parameters, *more))
 
 
 def _outputs(f: Any, inputs: Mapping[tuple[int, int], Size], name: str) -> list[list[Size]]:

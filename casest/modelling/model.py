@@ -284,10 +284,10 @@ class Model:
         return replace(self, remarker=function)
 
     def canonical(self, function: Callable[..., Any]) -> Model:
-        """A model that says which of equivalent values it means: `function(values) -> values`.
+        """A model that says which of equivalent values it means.
 
-        An angle within a turn, say. Per-run values come with a leading run axis if there are
-        several runs.
+        `function(model, values) -> values`: an angle within a turn, say. Per-run values come with
+        a leading run axis if there are several runs.
         """
         return replace(self, canonicaliser=function)
 

@@ -22,6 +22,9 @@ from casest.stack import Point, Problem
 
 #: Solvers kept for the next problem of as many unknowns.
 KEPT = 32
+#: Evaluations after which a search is given up: three for each iteration allowed. From wild starts
+#: the line search may halve its step thirty times in every iteration, and get nowhere.
+PATIENCE = 1500
 
 
 def ipopt(
@@ -106,8 +109,9 @@ class _Scaled:
 
     def cost(self, z: Array) -> float:
         """Scaled cost; with its slope, for nearly every point that IPOPT tries is accepted."""
-        # What is not finite makes IPOPT's line search give up, which is what Ctrl-C asks for.
-        return float("nan") if stopped() else float(self.normal(z).cost / self.unit)
+        # What is not finite makes IPOPT's line search give up: after Ctrl-C, or at long last.
+        given_up = stopped() or self.evaluations > PATIENCE
+        return float("nan") if given_up else float(self.normal(z).cost / self.unit)
 
     def gradient(self, z: Array) -> Array:
         """Gradient of the scaled cost, (n,)."""

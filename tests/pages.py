@@ -1,0 +1,76 @@
+"""A page of Markdown as its reader uses it: the files it shows are written, its commands are run.
+
+In order: python and csv blocks that begin with `# name` are files; each line of a sh block is a
+command, whose exit code is 0 or what `# exit code N` at its end says; a text block shows what
+the commands above it have printed, with `...` where lines are left out.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).parent.parent
+BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+EXIT = re.compile(r"\s+# exit code (\d)$")
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command line, the exit code it should have, and the folder it runs in."""
+
+    line: str
+    expected: int
+
+
+def blocks(page: Path) -> list[tuple[str, str]]:
+    """Language and text of every fenced block."""
+    return BLOCK.findall(page.read_text(encoding="utf-8"))
+
+
+def folder_of_a_reader(page: Path, folder: Path) -> Path:
+    """A folder with the shipped records and the files that the page shows."""
+    shutil.copytree(ROOT / "casest" / "demo", folder / "casest" / "demo")
+    for language, text in blocks(page):
+        first, _, rest = text.partition("\n")
+        if language in ("python", "csv"):
+            assert first.startswith("# "), f"{page.name}: a block without the name of its file"
+            (folder / first[2:]).write_text(rest, encoding="utf-8")
+    return folder
+
+
+def run(line: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    """The command as in a shell of the installed environment."""
+    environment = {**os.environ, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
+    # The folder holds only the demo of casest: the installed package must win over it.
+    environment["PYTHONSAFEPATH"] = "1"
+    return subprocess.run(
+        line, shell=True, cwd=folder, env=environment, capture_output=True, text=True, check=False
+    )
+
+
+def follow(page: Path, folder: Path) -> int:
+    """Do what the page says; the number of its commands."""
+    printed: list[str] = []
+    count = 0
+    for language, text in blocks(page):
+        if language == "sh":
+            for written in text.splitlines():
+                line, expected = EXIT.sub("", written), EXIT.search(written)
+                done = run(line, folder)
+                code = int(expected[1]) if expected else 0
+                assert done.returncode == code, f"{line}\n{done.stdout}\n{done.stderr}"
+                assert code or done.stderr == "", f"{line}\n{done.stderr}"
+                printed += done.stdout.splitlines()
+                count += 1
+        elif language == "text":
+            for line in text.splitlines():
+                digits = "stationary" not in line  # rounding differs from machine to machine
+                if line.strip() and line.strip() != "..." and digits:
+                    assert line in printed, f"{page.name}: nothing printed {line!r}"
+    return count
