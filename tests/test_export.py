@@ -26,7 +26,7 @@ from casest import Residual, effect, exp, model, param, quantity, signal
 
 
 @model
-def thermistor(T=signal("K"), r=signal("ohm"), *, a=param("ohm", start=9e3), b=param("K", start=3e3)):
+def ntc(T=signal("K"), r=signal("ohm"), *, a=param("ohm", start=9e3), b=param("K", start=3e3)):
     """Two-parameter equation of a thermistor: no closed form is declared, and it is not linear."""
     temperature = quantity("temperature", T, "K")
     reading = quantity("reading", a * exp(b * (1 / temperature - 1 / 298.15)), "ohm")

@@ -38,7 +38,7 @@ FLOORS = [
     ["casest.result", "casest.problem", "casest.earth", "casest.effects"],
     ["casest.closing", "casest.observing"],
     ["casest.values", "casest.applying", "casest.demonstration", "casest.export"],
-    ["casest.exporting"],
+    ["casest.exporting", "casest.simulating"],
     ["casest.compare"],
     ["casest.terminal"],
     ["casest.comparing_text", "casest.comparing_plot"],
