@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: demo test lint types format wheel bench study study-starts study-loop figures docs clean
+.PHONY: demo test lint types format wheel bench study study-starts study-nist study-loop figures docs clean
 
 demo: $(READY)
 	$(BIN)/casest demo
@@ -38,6 +38,9 @@ study: $(READY)
 
 study-starts: $(READY)
 	$(BIN)/python studies/random_starts.py
+
+study-nist: $(READY)
+	$(BIN)/python studies/nist.py
 
 study-loop: $(READY)
 	$(BIN)/python studies/loop.py

@@ -61,9 +61,14 @@ class Correction:
 
     @cached_property
     def _wanted(self) -> SX:
-        """The corrected quantity: a free symbol (explicit), or its expression (implicit)."""
-        traced = self.model.traced if self.model.implicit else self._cut
-        return traced.quantities[self.name].declared
+        """The corrected quantity: a free symbol (explicit), or its expression (implicit).
+
+        Of an explicit model it is what goes into the effects on it, of an implicit one what comes
+        out of them: that is what the residual compares.
+        """
+        if self.model.implicit:
+            return ca.SX(self.model.traced.quantities[self.name].value)
+        return self._cut.quantities[self.name].declared
 
     @property
     def size(self) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -128,7 +129,7 @@ def output_options(command: Callable[..., Any]) -> Callable[..., Any]:
             "--output",
             type=click.Path(path_type=Path),
             metavar="DIR",
-            help="Folder for result.json and residuals.csv.",
+            help="Folder for result.json, residuals.csv and report.html.",
         ),
         click.option("--seed", type=int, default=0, show_default=True, help="For random restarts."),
         click.option(
@@ -179,12 +180,18 @@ def calibrate(model_name: str, data: tuple[str, ...], **options: Any) -> int:
 
     Exit code 0: trusted; 1: bad input; 2: no trustworthy estimate (result.json says why).
     """
-    return calibration(model_name, data, options, "casest " + " ".join(sys.argv[1:]))
+    return calibration(model_name, data, options, typed())
+
+
+def typed() -> str:
+    """The command as it can be typed again."""
+    return shlex.join(["casest", *sys.argv[1:]])
 
 
 def calibration(model_name: str, data: Sequence[str], options: Options, command: str) -> int:
     """Read, fit, save, print; the exit code says whether the estimate is trusted."""
     from casest import estimate, result, terminal, unseen
+    from casest.report import calibration_page
     from casest.solve.interrupt import interruptible
 
     model = declared_model(model_name, options)
@@ -201,6 +208,7 @@ def calibration(model_name: str, data: Sequence[str], options: Options, command:
     )
     if options["output"]:
         result.save(options["output"], content, result.residual_rows(found))
+        reported(options["output"], calibration_page(found, content, str(options["output"])))
     if options["as_json"]:
         click.echo(result.as_json(content), nl=False)
     else:
@@ -224,7 +232,7 @@ def close(model_name: str, data: tuple[str, ...], **options: Any) -> int:
     Verdict `adequate`: nothing that these data can show is missing; `extended`: effects were added
     and what is left is noise; `unexplained`: a misfit remains. Exit code 0 whatever the verdict.
     """
-    return closing(model_name, data, options, "casest " + " ".join(sys.argv[1:]))
+    return closing(model_name, data, options, typed())
 
 
 def closing(model_name: str, data: Sequence[str], options: Options, command: str) -> int:
@@ -233,6 +241,7 @@ def closing(model_name: str, data: Sequence[str], options: Options, command: str
     from casest.closing import loop, text, unseen, written
     from casest.effects import CATALOGUE
     from casest.problem import find_effects
+    from casest.report import closing_page
 
     own = tuple(e for path in options["effects"] for e in find_effects(path))
     model = declared_model(model_name, {**options, "effects": ()})
@@ -260,6 +269,7 @@ def closing(model_name: str, data: Sequence[str], options: Options, command: str
             write(options["output"] / "formula.py", formula)
             written.name_file(content, options["output"] / "formula.py")
         result.save(options["output"], content, written.residual_rows(found, hidden))
+        reported(options["output"], closing_page(found, content, str(options["output"])))
     if options["as_json"]:
         click.echo(result.as_json(content), nl=False)
     else:
@@ -278,12 +288,15 @@ def refused(
 ) -> int:
     """Write and say what there is where the declared model itself has no trustworthy fit."""
     from casest import result
+    from casest.report import calibration_page
 
     if error.estimate is not None and options["output"]:
         content = result.calibration_result(
             error.estimate, model_name=model_name, data=data, command=command
         )
         result.save(options["output"], content, result.residual_rows(error.estimate))
+        page = calibration_page(error.estimate, content, str(options["output"]))
+        reported(options["output"], page)
         if options["as_json"]:
             click.echo(result.as_json(content), nl=False)
     click.echo(f"casest: {error}", err=True)
@@ -296,7 +309,7 @@ def refused(
     "--output",
     type=click.Path(path_type=Path),
     metavar="DIR",
-    help="Folder for result.json and residuals.csv.",
+    help="Folder for result.json, residuals.csv and report.html.",
 )
 def demo(output: Path | None) -> int:
     """Close the loop on a shipped record with an effect that its model lacks."""
@@ -360,8 +373,12 @@ def observe(model_name: str, data: tuple[str, ...], **options: Any) -> int:
     else:
         moving, run = moving_record(model_name, data, options)
         content = observing.observe_motion(moving, run, options["window"])
+    content |= {"data": list(data), "reproduce": result.reproduce(typed(), data)}
     if options["output"]:
+        from casest.report import observe_page
+
         write(options["output"] / "observe.json", result.as_json(content))
+        reported(options["output"], observe_page(content))
     click.echo(
         result.as_json(content).rstrip() if options["as_json"] else observing.observe_text(content)
     )
@@ -379,13 +396,24 @@ def filter_command(model_name: str, data: tuple[str, ...], **options: Any) -> in
 
     moving, run = moving_record(model_name, data, {**options, "constants": ()})
     content, found = observing.follow(moving, run)
+    content |= {"data": list(data), "reproduce": result.reproduce(typed(), data)}
     if options["output"]:
+        from casest.report import filter_page
+
         write(options["output"] / "states.csv", observing.states_csv(found))
         write(options["output"] / "filter.json", result.as_json(content))
+        reported(options["output"], filter_page(found, content))
     click.echo(
         result.as_json(content).rstrip() if options["as_json"] else observing.filter_text(content)
     )
     return 0
+
+
+def reported(folder: Path, page: str) -> None:
+    """`report.html` beside the results."""
+    from casest.report import REPORT
+
+    write(folder / REPORT, page)
 
 
 def write(path: Path, text: str) -> None:
@@ -514,7 +542,7 @@ def compare(model_name: str, data: tuple[str, ...], **options: Any) -> int:
         limit=options["limit"],
         say=progress,
     )
-    command = "casest " + " ".join(sys.argv[1:])
+    command = typed()
     content = comparing_text.comparison_result(
         found, model_name=model_name, data=data, command=command
     )

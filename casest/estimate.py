@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -19,10 +19,11 @@ from casest.modelling.model import Model
 from casest.noise import has_noise_effects, variance_factor
 from casest.remarks import NOTABLE_BIAS, notes
 from casest.solve.certificate import Certificate, certify
-from casest.solve.correlation import correlation_time
+from casest.solve.correlation import ENOUGH, TABLE, correlation_time
 from casest.solve.covariance import inverse_normal, sandwich
 from casest.solve.interrupt import stopped
 from casest.solve.outcome import Outcome
+from casest.solve.profile import half_width
 from casest.solve.strategy import SOLVERS, best_of, solve
 from casest.stack import Point, Problem
 from casest.sums import repeat_noise, second_order_bias
@@ -91,6 +92,23 @@ class Estimate:
         unknown = self.identifiability.touched
         covariance[unknown, :] = covariance[:, unknown] = np.nan
         return self.problem.spread(at, covariance)
+
+    @cached_property
+    def interval_reach(self) -> tuple[Mapping[str, Array], Mapping[str, Array]]:
+        """How far the 95 % interval of every value reaches below and above it, shaped like `std`.
+
+        Student's t times `std`, or the profile of the cost where that is no parabola (widened as
+        `std` is, where residuals are correlated).
+        """
+        profile, at = self.certificate.profile, self.optimum or self.point
+        if profile is None:
+            half = half_width(int(self.noise.degrees_of_freedom / self.correlated_over))
+            linear = {name: half * std for name, std in self.std.items()}
+            return linear, linear
+        plain = self.noise.sigma**2 * inverse_normal(self.problem.factor(at)[0])
+        wider = np.sqrt(np.diag(self.covariance) / np.diag(plain))
+        below, above = ((wider * profile[:, k]) ** 2 for k in (0, 1))
+        return self.problem.spread(at, np.diag(below)), self.problem.spread(at, np.diag(above))
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -251,9 +269,22 @@ def _estimate(
         tuple(outcomes),
         time.perf_counter() - began,
         correlated,
-        tuple(notes(problem, point, dof, correlated, relative)),
+        (*notes(problem, point, dof, correlated, relative), *_of_tables(problem, point)),
         shift,
     )
+
+
+def _of_tables(problem: Problem, point: Point) -> Iterator[str]:
+    """That neighbouring rows of a table are alike, in case they followed each other in time."""
+    if not any(run.time is None and ENOUGH <= len(run) < TABLE for run in problem.runs):
+        return
+    over = correlation_time(problem, point, tables=True)
+    if over > 1:
+        yield (
+            f"residuals of neighbouring rows are alike (over {over:.2g} rows), which counts for "
+            "nothing in rows without a time; if they followed each other, say so with --rate: "
+            f"standard deviations grow by about {np.sqrt(over):.2g}"
+        )
 
 
 def _canonical(problem: Problem, best: Outcome) -> Outcome:

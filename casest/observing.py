@@ -13,7 +13,7 @@ from casest import __version__
 from casest.data.run import Run
 from casest.dynamics import Dynamics
 from casest.dynamics.filter import Filtered, filtered
-from casest.dynamics.gramian import gramian, observed, smallest_eigenvalue
+from casest.dynamics.gramian import gramian, observed, window_eigenvalues
 from casest.dynamics.transition import linearised
 from casest.estimate import Estimate, attempt
 from casest.modelling.model import Model
@@ -51,7 +51,7 @@ def observe_motion(model: Dynamics, run: Run, window: float | None = None) -> di
     seen = observed(model, gramian(model, system))
     duration = float(system.time[-1] - system.time[0])
     length = min(window or WINDOW * duration, duration)
-    ends, smallest = smallest_eigenvalue(model, system, length)
+    ends, eigenvalues = window_eigenvalues(model, system, length)
     std = {name: plain(seen.std[where]) for name, where in model.slices().items()}
     return {
         "casest": __version__,
@@ -67,7 +67,8 @@ def observe_motion(model: Dynamics, run: Run, window: float | None = None) -> di
         "windows": {
             "length_s": plain(length),
             "end_s": plain(ends),
-            "smallest_eigenvalue": plain(smallest),
+            "smallest_eigenvalue": plain(eigenvalues[:, 0]),
+            "eigenvalues": plain(eigenvalues),
         },
     }
 
@@ -165,13 +166,16 @@ def filter_text(content: Mapping[str, Any]) -> str:
             label = name if len(s["value"]) == 1 else f"{name}[{k}]"
             lines.append(f"    {label:<14} {value:>12.5g} ± {std:<10.2g} {s['unit']}")
     i = content["innovations"]
-    ratio = i["normalised_mean"] / i["expected"]
-    verdict = (
-        "as large as the noise intensities say"
-        if 0.8 < ratio < 1.25
-        else f"{ratio:.2g} times as large (squared) as the noise intensities say: match them"
-    )
-    lines += ["", f"  innovations are {verdict}"]
+    lines += ["", f"  innovations are {filter_verdict(content)}"]
     if i["missing_readings"]:
         lines.append(f"  {i['missing_readings']} samples without a complete reading")
     return "\n".join(lines)
+
+
+def filter_verdict(content: Mapping[str, Any]) -> str:
+    """How large the innovations are beside what the noise intensities say."""
+    said = content["innovations"]
+    ratio = (said["normalised_mean"] or float("nan")) / said["expected"]
+    if 0.8 < ratio < 1.25:
+        return "as large as the noise intensities say"
+    return f"{ratio:.2g} times as large (squared) as the noise intensities say: match them"

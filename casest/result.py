@@ -96,34 +96,27 @@ def calibration_result(
         "notes": [note for run in problem.runs for note in run.notes] + list(estimate.notes),
         "convention": inspect.getdoc(problem.model.function) or "",
         "declared_in": _declared_in(problem.model),
-        "reproduce": _reproduce(command, data),
+        "reproduce": reproduce(command, data),
     }
 
 
 def parameter_table(estimate: Estimate, table: Mapping[str, str]) -> dict[str, Any]:
     """Value, standard deviations, interval and unit of every parameter, for JSON."""
-    dof = estimate.noise.degrees_of_freedom / estimate.correlated_over
-    half = half_width(int(dof))
+    reach = estimate.interval_reach
     known = {n: u for n, u in table.items() if "[" not in n}
     found = {}
     for p in estimate.model.parameters:
         value, std = estimate.values[p.name], estimate.std[p.name]
+        below, above = reach[0][p.name], reach[1][p.name]
         own = entry_units(p, known)
         found[p.name] = {
             "value": plain(value),
             "std": plain(std),
             "robust_std": plain(estimate.robust[p.name]),
-            "interval95": [plain(value - half * std), plain(value + half * std)],
+            "interval95": [plain(value - below), plain(value + above)],
             "unit": own[0] if len(set(own)) == 1 else own,
         }
     return found
-
-
-def half_width(degrees_of_freedom: int) -> float:
-    """Half width of a 95 % interval in standard deviations: Student's t."""
-    from scipy.special import stdtrit
-
-    return float(stdtrit(max(degrees_of_freedom, 1), 0.975))
 
 
 def _correlation(covariance: Array) -> Array:
@@ -198,7 +191,8 @@ def _declared_in(model: Model) -> dict[str, str]:
     return {"file": str(path), "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
 
 
-def _reproduce(command: str, data: Sequence[str]) -> dict[str, Any]:
+def reproduce(command: str, data: Sequence[str]) -> dict[str, Any]:
+    """Command, versions and digests: what is needed to get a result again."""
     return {
         "command": command,
         "python": platform.python_version(),

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from casest.declaring.shapes import Array
 from casest.estimate import Estimate
 from casest.modelling.effect import Effect
 from casest.modelling.model import Model
@@ -102,22 +103,26 @@ def item(text: str) -> str:
     return textwrap.fill(text, WIDTH, initial_indent="  - ", subsequent_indent="    ")
 
 
-def value_table(found: Estimate) -> Iterator[str]:
-    """One line per value: name, value ± standard deviation, unit."""
+def entry_rows(
+    found: Estimate, *numbers: Mapping[str, Array]
+) -> Iterator[tuple[str, str, list[float]]]:
+    """Name (with its run, if there are several), unit and numbers of each entry of a parameter."""
     known = unit_table(found.model, found.problem.runs)
     known = {n: u for n, u in known.items() if "[" not in n}
-    rows = []
     for p in found.model.parameters:
         units = entry_units(p, known)
-        value, std = found.values[p.name], found.std[p.name]
-        several = value.ndim > len(p.shape.dims)
-        stacked = zip(value, std, strict=True) if several else [(value, std)]
-        for r, (v, s) in enumerate(stacked):
+        several = found.values[p.name].ndim > len(p.shape.dims)
+        for r in range(len(found.values[p.name]) if several else 1):
             run = f" ({found.problem.runs[r].name})" if several else ""
+            own = [of[p.name][r] if several else of[p.name] for of in numbers]
             for name, i, unit in zip(p.entry_names, p.shape.entries, units, strict=True):
-                rows.append(
-                    (name + run, *rounded(float(v[i]), float(s[i])), "" if unit == "1" else unit)
-                )
+                yield name + run, "" if unit == "1" else unit, [float(v[i]) for v in own]
+
+
+def value_table(found: Estimate) -> Iterator[str]:
+    """One line per value: name, value ± standard deviation, unit."""
+    entries = entry_rows(found, found.values, found.std)
+    rows = [(name, *rounded(v, s), unit) for name, unit, (v, s) in entries]
     width = max(len(r[0]) for r in rows)
     left = max(len(r[1]) for r in rows)
     middle = max(len(r[2]) for r in rows)
@@ -193,10 +198,8 @@ def _determined(found: Estimate) -> Iterator[str]:
 def _next(found: Estimate, output: Path | None) -> str:
     if not found.certificate.trusted:
         return ""
-    if found.model.traced.corrected is None:
-        return "" if output is None else f"Written: {output}/result.json, {output}/residuals.csv."
+    applies = found.model.traced.corrected is not None
     if output is None:
-        return "Next: add -o out to keep the result, then `casest apply out DATA`."
-    return (
-        f"Written: {output}/result.json, {output}/residuals.csv. Next: casest apply {output} DATA"
-    )
+        return "Next: add -o out to keep the result, then `casest apply out DATA`." * applies
+    written = f"Written: {output}/report.html, result.json, residuals.csv."
+    return written + f" Next: casest apply {output} DATA" * applies

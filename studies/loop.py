@@ -82,7 +82,7 @@ SIZES: dict[str, dict[str, float]] = {
         "temperature_gain": 0.0012,
         "channel_bias": 3.0,
         "channel_gain": 0.15,
-        "saturation": 0.02,
+        "saturation": 0.06,
         "table_angle": 0.002,
         "reference_drift": 5e-06,
     },

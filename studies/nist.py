@@ -25,9 +25,9 @@ from scipy.optimize import least_squares
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT / "tests"))
 
-from nist import MODELS, Certified, fewest_digits, independent_std, read  # noqa: E402
+from nist import MODELS, Certified, fewest_digits, read  # noqa: E402
 
-from casest import attempt  # noqa: E402
+from casest import Model, attempt  # noqa: E402
 from casest.engine.threads import one_thread  # noqa: E402
 from casest.solve.ipopt import ipopt  # noqa: E402
 from casest.solve.others import sqpmethod  # noqa: E402
@@ -104,37 +104,37 @@ def start_of(certified: Certified, number: int) -> dict[str, float]:
 def fit(solver: str, name: str, number: int) -> dict[str, Any]:
     """One fit, judged: digits that are right, what was claimed, how long it took."""
     certified = problem_of(name)
-    run = certified.begun_at(start_of(certified, number))
+    model = certified.begun_at(start_of(certified, number))
     record = {"solver": solver, "problem": name, "start": number}
     began = time.perf_counter()
-    own = by_default(certified, run) if solver == DEFAULT else by_itself(solver, certified, run)
+    own = by_default(certified, model) if solver == DEFAULT else by_itself(solver, certified, model)
     return record | own | {"seconds": time.perf_counter() - began}
 
 
-def by_default(certified: Certified, run: Any) -> dict[str, Any]:
+def by_default(certified: Certified, model: Model) -> dict[str, Any]:
     """casest's default way, with its certificate."""
-    found = attempt(certified.model, [run])
+    found = attempt(model, [certified.run])
     certificate = found.certificate
     return {
         "digits": fewest_digits(found.values, certified.values),
-        "std": fewest_digits(independent_std(found), certified.std),
-        "claims": certificate.optimum,
-        "trusted": certificate.trusted,
+        "std": fewest_digits(found.std, certified.std),
+        "claims": certificate.trusted,
+        "profiled": certificate.profile is not None,
         "reason": certificate.reasons[0],
     }
 
 
-def by_itself(solver: str, certified: Certified, run: Any) -> dict[str, Any]:
+def by_itself(solver: str, certified: Certified, model: Model) -> dict[str, Any]:
     """A solver's own answer and its own word."""
-    problem = Problem(certified.model, (run,))
+    problem = Problem(model, (certified.run,))
     try:
         with np.errstate(all="ignore"), one_thread():
             point, claims = ALONE[solver](problem, problem.start())
     except (ValueError, np.linalg.LinAlgError) as error:  # SciPy: not finite at the start
         return {"digits": 0.0, "claims": False, "reason": str(error)}
     values = problem.values(point)
-    if certified.model.canonicaliser is not None:
-        values |= certified.model.canonicaliser(values)
+    if model.canonicaliser is not None:
+        values |= model.canonicaliser(model, values)
     return {"digits": fewest_digits(values, certified.values), "claims": claims, "reason": ""}
 
 
@@ -149,7 +149,8 @@ def main() -> None:
     left = [task for task in tasks if task not in done]
     print(f"{len(tasks)} fits, {len(left)} to do")
     for name in MODELS:  # tracing a model is no part of a fit's time
-        attempt(problem_of(name).model, [problem_of(name).begun_at(problem_of(name).values)])
+        certified = problem_of(name)
+        attempt(certified.begun_at(certified.values), [certified.run])
     KEPT.parent.mkdir(exist_ok=True)
     began = time.time()
     with KEPT.open("a", encoding="utf-8") as kept:
@@ -186,9 +187,9 @@ def page(records: list[dict[str, Any]]) -> str:
         "Made by `make study-nist` (`python studies/nist.py`). The 27 problems of NIST's",
         "Statistical Reference Datasets for nonlinear regression; the models are in",
         "`tests/nist.py`. An answer is right when every parameter agrees with the certified one",
-        f"to {RIGHT:.0f} digits (log relative error; solutions that only exchange equal terms count",
-        "as one). A false success is a wrong answer claimed to be the optimum, a false failure",
-        "a right one that is not. casest claims by its certificate (`optimum`), every other solver",
+        f"to {RIGHT:.0f} digits (log relative error; solutions that only exchange equal terms",
+        "count as one). A false success is a wrong answer claimed to be right, a false failure",
+        "a right one that is not. casest claims by its certificate (`trusted`), every other solver",
         "by its own status. No solver knows more than the one start.",
         "",
         "## From NIST's 54 starts",
@@ -208,13 +209,12 @@ def page(records: list[dict[str, Any]]) -> str:
         "",
         *more_rows(more),
         "",
-        "## Optima whose standard deviations are refused",
+        "## Where the cost is no parabola",
         "",
-        "`trusted` asks for more than the optimum: the cost around it must be what standard",
-        "deviations and correlations describe. Where it is not, the answer is refused with that",
-        "reason although its values are proven:",
+        "There the 95 % intervals are those of the likelihood, each parameter profiled. How many",
+        "of the right and trusted answers:",
         "",
-        *refused_rows(nists + more),
+        *profiled_rows(nists + more),
         "",
         "## Every exception of the default way",
         "",
@@ -243,18 +243,18 @@ def solver_rows(records: list[dict[str, Any]]) -> list[str]:
 
 
 def more_rows(records: list[dict[str, Any]]) -> list[str]:
-    """Right or wrong against proven or not: a row per problem that has a wrong one, and the sum."""
+    """Right or wrong against trusted or not: a row per problem with a wrong one, and the sum."""
     lines = [
-        "| problem | right, proven | right, not proven | wrong, proven | wrong, not proven |",
+        "| problem | right, trusted | right, refused | wrong, trusted | wrong, refused |",
         "| --- | --- | --- | --- | --- |",
     ]
     counts = {
         name: [
             sum(
-                r["problem"] == name and is_right(r) == right and r["claims"] == proven
+                r["problem"] == name and is_right(r) == right and r["claims"] == trusted
                 for r in records
             )
-            for right, proven in ((True, True), (True, False), (False, True), (False, False))
+            for right, trusted in ((True, True), (True, False), (False, True), (False, False))
         ]
         for name in MODELS
     }
@@ -276,25 +276,25 @@ def more_rows(records: list[dict[str, Any]]) -> list[str]:
     return lines
 
 
-def refused_rows(records: list[dict[str, Any]]) -> list[str]:
-    lines = ["| problem | proven | of them refused | why |", "| --- | --- | --- | --- |"]
+def profiled_rows(records: list[dict[str, Any]]) -> list[str]:
+    lines = ["| problem | trusted | of them profiled |", "| --- | --- | --- |"]
     for name in MODELS:
-        own = [r for r in records if r["problem"] == name and r.get("trusted") is not None]
-        proven = [r for r in own if r["claims"]]
-        refused = [r for r in proven if not r["trusted"]]
-        if refused:
-            lines.append(f"| {name} | {len(proven)} | {len(refused)} | {refused[0]['reason']} |")
+        own = [r for r in records if r["problem"] == name and r["solver"] == DEFAULT]
+        trusted = [r for r in own if r["claims"]]
+        profiled = sum(r["profiled"] for r in trusted)
+        if profiled:
+            lines.append(f"| {name} | {len(trusted)} | {profiled} |")
     return lines
 
 
 def exceptions(records: list[dict[str, Any]]) -> list[str]:
-    """What the default way got wrong, or did not prove."""
-    lines = ["| problem | start | digits | proven | reason |", "| --- | --- | --- | --- | --- |"]
+    """What the default way got wrong, or did not trust."""
+    lines = ["| problem | start | digits | trusted | reason |", "| --- | --- | --- | --- | --- |"]
     for r in records:
         if r["solver"] == DEFAULT and not (is_right(r) and r["claims"]):
-            proven = "yes" if r["claims"] else "no"
+            trusted = "yes" if r["claims"] else "no"
             lines.append(
-                f"| {r['problem']} | {r['start']} | {r['digits']:.1f} | {proven} | {r['reason']} |"
+                f"| {r['problem']} | {r['start']} | {r['digits']:.1f} | {trusted} | {r['reason']} |"
             )
     return lines if len(lines) > 2 else ["None."]
 

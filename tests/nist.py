@@ -9,15 +9,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from casest import Model, Residual, Run, atan, cos, exp, model, param, pi, signal, sin
-from casest.estimate import Estimate
-from casest.solve.covariance import inverse_normal
 
 #: Certified values have eleven digits: more agreement than this is not evidence.
 DIGITS = 11.0
@@ -250,29 +248,29 @@ def sorted_terms(values: Mapping[str, Any], terms: Iterable[str], by: int) -> di
     return {n: v for term, new in zip(names, own, strict=True) for n, v in zip(term, new)}  # noqa: B905
 
 
-def decays_by_rate(values: Mapping[str, Any]) -> dict[str, Any]:
+def decays_by_rate(_model: Model, values: Mapping[str, Any]) -> dict[str, Any]:
     """The slowest decay first."""
     return sorted_terms(values, ("b1 b2", "b3 b4", "b5 b6"), by=1)
 
 
-def two_decays_by_rate(values: Mapping[str, Any]) -> dict[str, Any]:
+def two_decays_by_rate(_model: Model, values: Mapping[str, Any]) -> dict[str, Any]:
     """The slower decay first."""
     return sorted_terms(values, ("b2 b4", "b3 b5"), by=1)
 
 
-def peaks_by_place(values: Mapping[str, Any]) -> dict[str, Any]:
+def peaks_by_place(_model: Model, values: Mapping[str, Any]) -> dict[str, Any]:
     """Widths positive, the left peak first."""
     positive = {**values, "b5": abs(values["b5"]), "b8": abs(values["b8"])}
     return sorted_terms(positive, ("b3 b4 b5", "b6 b7 b8"), by=1)
 
 
-def width_positive(values: Mapping[str, Any]) -> dict[str, Any]:
+def width_positive(_model: Model, values: Mapping[str, Any]) -> dict[str, Any]:
     """Only b1/b2 and b2² appear."""
     turn = np.sign(values["b2"])
     return {"b1": turn * values["b1"], "b2": turn * values["b2"]}
 
 
-def cycles_by_period(values: Mapping[str, Any]) -> dict[str, Any]:
+def cycles_by_period(_model: Model, values: Mapping[str, Any]) -> dict[str, Any]:
     """Periods positive (time reversed: the sine turns), the longer one first."""
     turned = dict(values)
     for period, sine in (("b4", "b6"), ("b7", "b9")):
@@ -315,23 +313,12 @@ class Certified:
     std: Mapping[str, float]
     squares: float
 
-    @property
-    def model(self) -> Model:
-        """The model whose start is what `begun_at` has put beside the data, else the declared."""
-        return MODELS[self.name].starting(start_beside_data)
+    def begun_at(self, start: Mapping[str, float]) -> Model:
+        """The model with another declared start, so that a solver knows of this start alone.
 
-    def begun_at(self, start: Mapping[str, float]) -> Run:
-        """The data with a start beside them, so that a solver knows of this start alone.
-
-        (A start given by the user is compared with the model's own, which is another of NIST's.)
+        (A start given by the user is compared with the declared one, which is another of NIST's.)
         """
-        n = len(self.run)
-        return replace(self.run, columns={name: np.full(n, value) for name, value in start.items()})
-
-
-def start_beside_data(model: Model, runs: tuple[Run, ...]) -> dict[str, float]:
-    """The start that `begun_at` has put beside the data."""
-    return {name: float(column[0]) for name, column in runs[0].columns.items()}
+        return MODELS[self.name].having(**{n: param(start=value) for n, value in start.items()})
 
 
 def read(folder: Path, name: str) -> Certified:
@@ -365,13 +352,3 @@ def digits(found: float, certified: float) -> float:
 def fewest_digits(found: Mapping[str, Any], certified: Mapping[str, float]) -> float:
     """Digits of the worst parameter."""
     return min(digits(found[name], value) for name, value in certified.items())
-
-
-def independent_std(found: Estimate) -> dict[str, float]:
-    """Standard deviations as NIST certifies them: of residuals taken as independent.
-
-    casest's own allow for residuals that are correlated along the record.
-    """
-    R = found.problem.factor(found.point)[0]
-    std = found.noise.sigma * np.sqrt(np.diag(inverse_normal(R)))
-    return dict(zip(found.names, std.tolist(), strict=True))

@@ -4,12 +4,25 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import simulators as sim
 from models.load_cell import curvature, load_cell, warming
 from models.thermistor import thermistor
 from models.wheel import quadratic, wheel
 
-from casest import DataError, Residual, Run, UsageError, effect, model, param, quantity, signal
+from casest import (
+    DataError,
+    Residual,
+    Run,
+    UsageError,
+    calibrate,
+    effect,
+    model,
+    param,
+    quantity,
+    signal,
+)
 from casest.apply import Correction
+from casest.effects import CATALOGUE
 from casest.problem import find_model
 
 
@@ -141,3 +154,18 @@ def test_an_effect_on_the_sequence_is_not_undone_in_silence():
 
     with pytest.raises(UsageError, match="effect on the sequence of samples"):
         Correction(load_cell.with_effect(low_pass))
+
+
+def test_an_effect_on_an_implicit_models_corrected_quantity_is_in_the_correction():
+    """Fresh poses of a skew sensor have the known length: without its skew they would not."""
+    rng = np.random.default_rng(5)
+    sensor = sim.accelerometer(rng)
+    skew = next(e for e in CATALOGUE if e.name == "cross_axis")
+    whole = find_model("norm-diagonal").having(norm=sensor.norm).with_effect(skew, on="corrected")
+    poses, fresh = (sensor.read(sim.spread_poses(n, rng), 0.0, rng) for n in (40, 25))
+    found = calibrate(whole, [as_run(v=poses)])
+    corrected = Correction(whole)(as_run(v=fresh), found.values)
+    lengths = np.linalg.norm(corrected, axis=1)
+    np.testing.assert_allclose(lengths, sensor.norm, rtol=1e-9)
+    straight = (fresh - found.values["offset"]) * found.values["scale"]
+    assert np.std(np.linalg.norm(straight, axis=1)) > 1e-3 * sensor.norm

@@ -149,7 +149,7 @@ def test_files_are_replaced_whole_and_nothing_else_is_left(records, tmp_path, ca
     assert code == 0
     assert result["model"] == "norm-diagonal"
     assert (out / "result.json").stat().st_ino != before  # renamed into place, not written over
-    assert sorted(p.name for p in out.iterdir()) == ["residuals.csv", "result.json"]
+    assert sorted(p.name for p in out.iterdir()) == ["report.html", "residuals.csv", "result.json"]
 
 
 def test_an_untrusted_estimate_is_written_with_exit_code_two(records, tmp_path, capsys):

@@ -42,6 +42,7 @@ FLOORS = [
     ["casest.terminal"],
     ["casest.comparing_text", "casest.comparing_plot"],
     ["casest.closing.text"],
+    ["casest.report"],
     ["casest.cli"],
 ]
 

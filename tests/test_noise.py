@@ -21,7 +21,9 @@ def level(y=signal("V"), *, a=param("V")):
 
 
 def series(y, **more):
-    return replace(Run.raw("r", {"y": np.reshape(y, (-1, 1))}, units={}), **more)
+    return replace(
+        Run.raw("r", {"y": np.reshape(y, (-1, 1))}, units={}, time=np.arange(float(len(y)))), **more
+    )
 
 
 def autoregressive(rho, n, rng):

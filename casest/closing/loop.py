@@ -22,7 +22,7 @@ from casest.closing.crossfit import (
 from casest.closing.formula import try_formula
 from casest.closing.profile import freed_again, profiled
 from casest.closing.restrict import restricted
-from casest.closing.score import SURVIVES, Score, scores, second_freedom, widened
+from casest.closing.score import SURVIVES, Score, scores, second_freedom, steadied, widened
 from casest.closing.tails import outliers_p_value
 from casest.data.run import Run
 from casest.declaring.shapes import Array
@@ -50,8 +50,6 @@ HELD_OUT_DATA = "held-out data"
 ALIKE, NAMED = 2.0, 2
 #: Candidates that are refitted in a round, those that score as well as the best of them, rounds.
 CONTENDERS, MORE, ROUNDS = 6, 4, 8
-#: Levels that are tried around the best of the grid.
-LEVELS_TRIED = 15
 #: A parameter within so many standard deviations of null is nothing.
 NOTHING = 3.0
 #: Columns of the widest model that is evaluated at once.
@@ -258,12 +256,14 @@ class _Loop:
         self.original = {c.label: c for c in found}
         expanded = profiled(found, self.runs, current.residuals, readings, current.noise)
         ranked: list[Score] = []
+        known = self.before.noise.repeats
         for part in _parts(expanded, WIDEST // max(len(current.model.axes), 1)):
             try:
                 wide = widened(current.model, self.runs, current.values, part)
-                ranked += scores(wide, part, current.noise, self.folds.batches)
+                ranked += scores(wide, part, current.noise, self.folds.batches, known)
             except CasestError as error:
                 self.refused += [Skipped(c.label, str(error)) for c in part]
+        ranked = steadied(ranked)
         return sorted(ranked, key=lambda s: (s.p_value, -s.gain / max(s.inflation, 1.0)))
 
     def _better(self, current: Fitted, ranked: list[Score]) -> Fitted | None:
@@ -301,34 +301,26 @@ class _Loop:
     def _refitted(self, current: Fitted, chosen: Sequence[Score]) -> list[tuple[Score, Fitted]]:
         tried = [(score, self._with(current, score)) for score in chosen]
         found = _by_evidence([(score, fitted) for score, fitted in tried if fitted is not None])
-        if found and "level" in _profile(found[0][0].candidate).values():
+        if found:
             found[0] = self._sharpened(current, *found[0])
         return found
 
     def _sharpened(self, current: Fitted, score: Score, fitted: Fitted) -> tuple[Score, Fitted]:
-        """With the best level near the one that was found: the grid is coarse."""
-        from scipy.optimize import minimize_scalar
-
-        candidate, tried = score.candidate, {}
-        assert candidate.effect is not None
-        (name,) = _profile(candidate)
-        level = next(float(d.array) for n, d in candidate.effect.declarations if n == name)
-
-        def squares(factor: float) -> float:
-            assert candidate.effect is not None
-            effect = candidate.effect.holding(**{name: float(f"{factor * level:.9g}")})
-            moved = replace(score, candidate=replace(candidate, effect=effect, traced=None))
-            found = self._with(current, moved)
-            if found is None:
-                return 1e300
-            tried[factor] = (moved, found)
-            return sum(float(np.sum(r**2)) for r in found.residuals)
-
-        least = squares(1.0)
-        best = minimize_scalar(
-            squares, bounds=(0.93, 1.05), method="bounded", options={"maxiter": LEVELS_TRIED}
-        )
-        return tried[float(best.x)] if best.fun < least else (score, fitted)
+        """With the best level or moment near the one that was found: the grid is coarse."""
+        held = _held_value(score.candidate)
+        if held is None:
+            return score, fitted
+        name, kind, value = held
+        best, steps = (score, fitted), _steps(kind, value, self.runs)
+        for step in steps:
+            for way in (-1, 1):
+                while True:
+                    moved = _holding(score, name, value + way * step)
+                    found = self._with(current, moved)
+                    if found is None or _cost(found) >= _cost(best[1]):
+                        break
+                    best, value = (moved, found), value + way * step
+        return best
 
     def _accepted(
         self, current: Fitted, score: Score, fitted: Fitted
@@ -440,9 +432,35 @@ class _Loop:
         return current
 
 
-def _profile(candidate: Candidate) -> dict[str, str]:
-    """Which of its unknowns were searched, and how."""
-    return dict(candidate.effect.profile) if candidate.effect else {}
+def _held_value(candidate: Candidate) -> tuple[str, str, float] | None:
+    """Name, kind and value of what a profile holds: a level or a moment."""
+    profile = dict(candidate.effect.profile) if candidate.effect else {}
+    for name, kind in profile.items():
+        assert candidate.effect is not None
+        for n, d in candidate.effect.declarations:
+            if n == name and kind in ("level", "time"):
+                return name, kind, float(d.array)
+    return None
+
+
+def _steps(kind: str, value: float, runs: Sequence[Run]) -> list[float]:
+    """From coarse to fine: shares of a level; samples around a moment."""
+    if kind == "level":
+        return [abs(value) * 0.02 / 4**k for k in range(4)]
+    times = [run.signals["t"][:, 0] for run in runs if "t" in run.signals]
+    gap = min((float(np.median(np.diff(t))) for t in times if len(t) > 1), default=1.0)
+    return [gap * n for n in (8, 2, 1)]
+
+
+def _holding(score: Score, name: str, value: float) -> Score:
+    """The score's candidate with another value held."""
+    assert score.candidate.effect is not None
+    effect = score.candidate.effect.holding(**{name: float(f"{value:.9g}")})
+    return replace(score, candidate=replace(score.candidate, effect=effect, traced=None))
+
+
+def _cost(fitted: Fitted) -> float:
+    return sum(float(np.sum(r**2)) for r in fitted.residuals)
 
 
 def _finite(cost: float) -> float:

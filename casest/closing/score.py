@@ -12,7 +12,8 @@ McCaffrey 2002): an effect that is strong in a few batches must not pass for une
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import casadi as ca
@@ -32,14 +33,24 @@ from casest.stack import Point, Problem
 
 #: Share of a candidate's own length that must survive the projection: below, it is invisible.
 SURVIVES = 1e-6
+#: A direction of a candidate counts where this share of its best one is left: two delays that a
+#: phase imitates together are one, and what only rounding or noise tells apart is not told apart.
+DISTINCT = 1e-3
+#: The slopes of an implicit residual contain the residual itself: what survives must be larger
+#: than the noise by this factor.
+BEYOND_NOISE = 5.0
 #: Samples whose slopes are held at once.
 PIECE = 8192
 #: Batches of a record: more are put together.
 MOST_BATCHES = 100
 #: Inflation from which on noise counts as coloured, and what a batch says of it if it is not.
 COLOURED, WHITE = 1.3, 20
+#: Freedom of a noise that repeats show.
+KNOWN = 10_000
+#: Effective batches whose inflation counts as much as what is usual.
+STEADY = 10.0
 #: Batches that must speak for an effect: what is seen in one only may be an accident.
-LEAST_BATCHES = 2.0
+LEAST_BATCHES = 1.8
 #: Share of a batch's noise that its leverage leaves, at least.
 LEAST_LEFT = 0.05
 #: A residual counts as at most this many robust standard deviations: a few bad samples ask for
@@ -71,6 +82,7 @@ class Score:
     information: Array
     batches: Array
     effective: float = 1.0
+    rest: int = 1
 
 
 @dataclass(frozen=True)
@@ -171,16 +183,16 @@ def _slope(
 class _Sums:
     """Of every batch [J G]ᵀ[J G] (batches, n, n) and [J G]ᵀr (batches, n), scaled by `scale`.
 
-    `squares`: rᵀr of all. Far residuals are clipped, except in `unclipped`.
+    `squares`: rᵀr of all. Far residuals are clipped, except in `unclipped`, its rᵀr coming second.
     """
 
     matrices: Array
     gradients: Array
     unclipped: Array
     scale: Array
-    squares: float
+    squares: tuple[float, float]
 
-    @property
+    @cached_property
     def whole(self) -> Array:
         return np.asarray(self.matrices.sum(axis=0))
 
@@ -190,16 +202,50 @@ def scores(
     found: Sequence[Candidate],
     sigma: float,
     batches: Sequence[NDArray[np.int_]],
+    known: float | None = None,
 ) -> list[Score]:
-    """The score of every candidate. `batches` holds the first sample of each batch of each run."""
+    """The score of every candidate. `batches` holds the first sample of each batch of each run.
+
+    `sigma` is the residual's, for what is far out; `known` that of the noise where repeats show it.
+    """
     sums = _sums(wide, sigma, [first[:: _together(batches)] for first in batches])
     A, d = sums.whole, np.arange(wide.problem.unknowns)
     inverse = np.asarray(np.linalg.pinv(A[np.ix_(d, d)], rcond=1e-10, hermitian=True), float)
-    count = wide.problem.residual_count
+    test = _Test(sums, d, inverse, sigma, known, _least_survival(wide.problem, sigma))
     return [
-        _score(candidate, np.unique(np.concatenate(own)), A, inverse, sums, d, sigma, count)
+        _score(candidate, np.unique(np.concatenate(own)), test, wide.problem.residual_count)
         for candidate, own in zip(found, wide.places, strict=True)
     ]
+
+
+@dataclass(frozen=True)
+class _Test:
+    """What the scores of all candidates share: sums, the declared unknowns, the noise."""
+
+    sums: _Sums
+    declared: NDArray[np.int_]
+    inverse: Array
+    residual: float
+    known: float | None
+    least: float
+
+    @property
+    def sigma(self) -> float:
+        """Of the noise: what repeats show, where the residual is larger."""
+        return min(self.residual, self.known) if self.known else self.residual
+
+
+def _least_survival(problem: Problem, sigma: float) -> float:
+    """Share of a candidate that must survive the projection."""
+    if not problem.model.implicit:
+        return SURVIVES
+    names = [s.name for s in problem.model.signals if s.name != "t" and s.kind == "plain"]
+    sizes = [
+        float(np.sqrt(np.mean(np.concatenate([run.signals[n] for run in problem.runs]) ** 2)))
+        for n in names
+        if n not in problem.runs[0].columns
+    ]
+    return max(SURVIVES, BEYOND_NOISE * sigma / max(min(sizes, default=np.inf), 1e-300))
 
 
 def _together(batches: Sequence[NDArray[np.int_]]) -> int:
@@ -212,13 +258,14 @@ def _sums(wide: Wide, sigma: float, batches: Sequence[NDArray[np.int_]]) -> _Sum
     problem, n = wide.problem, wide.width
     offsets = np.cumsum([0, *map(len, batches)])
     matrices, gradients = np.zeros((offsets[-1], n, n)), np.zeros((2, offsets[-1], n))
-    squares = 0.0
+    squares, far = 0.0, 0.0
     for r, span, index, residual, J in _rows(wide):
         clipped = np.clip(residual, -CLIPPED * sigma, CLIPPED * sigma)
         if problem.weights is not None:
             root = np.sqrt(problem.weights[r][span])
             clipped, J = clipped * root, J * root[:, :, None]
         squares += float(np.sum(clipped**2))
+        far += float(np.sum(residual**2))
         samples = np.arange(span.start, span.stop)
         number = np.searchsorted(batches[r], samples, side="right") - 1
         first = np.flatnonzero(np.diff(number, prepend=-1))
@@ -230,7 +277,7 @@ def _sums(wide: Wide, sigma: float, batches: Sequence[NDArray[np.int_]]) -> _Sum
             gradients[1, b][index] += part.T @ residual[start:stop].ravel()
     scale = np.sqrt(np.maximum(np.einsum("bii->i", matrices), 1e-300))
     clipped, unclipped = gradients / scale
-    return _Sums(matrices / np.outer(scale, scale), clipped, unclipped, scale, squares)
+    return _Sums(matrices / np.outer(scale, scale), clipped, unclipped, scale, (squares, far))
 
 
 def _rows(wide: Wide) -> Iterator[tuple[int, slice, NDArray[np.int_], Array, Array]]:
@@ -249,31 +296,24 @@ def _rows(wide: Wide) -> Iterator[tuple[int, slice, NDArray[np.int_], Array, Arr
             yield block.run, span, index, block.residual[local], np.where(np.isfinite(J), J, 0.0)
 
 
-def _score(
-    candidate: Candidate,
-    own: NDArray[np.int_],
-    A: Array,
-    inverse: Array,
-    sums: _Sums,
-    d: NDArray[np.int_],
-    sigma: float,
-    count: int,
-) -> Score:
-    scale = sums.scale
+def _score(candidate: Candidate, own: NDArray[np.int_], test: _Test, count: int) -> Score:
+    sums, d, inverse, sigma = test.sums, test.declared, test.inverse, test.sigma
+    A, scale = sums.whole, sums.scale
     absorbed = inverse @ A[np.ix_(d, own)]
     left = A[np.ix_(own, own)] - A[np.ix_(own, d)] @ absorbed
     survives = np.clip(np.diag(left), 0, None)
     size = np.sqrt(np.where(survives > 0, survives, 1.0))
     # What the declared parameters imitate is no part of the test.
-    alive = np.flatnonzero(survives > SURVIVES**2)
+    alive = np.flatnonzero(survives > test.least**2)
     values, inner = np.linalg.eigh((left / np.outer(size, size))[np.ix_(alive, alive)])
-    vectors, kept = np.zeros((len(own), len(values))), values > 1e-8
+    vectors, kept = np.zeros((len(own), len(values))), values > DISTINCT * values.max(initial=0.0)
     vectors[alive] = inner
     root = vectors[:, kept] / np.sqrt(values[kept]) / size[:, None]
     # What of each of the two makes up the whitened score: (unknowns, freedom).
     both = np.concatenate([d, own])
     maker = np.vstack([-absorbed @ root, root])
-    gradients = sums.unclipped if _is_far_out(candidate) else sums.gradients
+    far_out = _is_far_out(candidate)
+    gradients = sums.unclipped if far_out else sums.gradients
     whitened = gradients[:, both] @ maker / sigma
     total, freedom = whitened.sum(axis=0), int(kept.sum())
     step = -(root @ total) * sigma / scale[own] if freedom else np.zeros(len(own))
@@ -282,7 +322,11 @@ def _score(
     rest = max(count - len(d) - freedom, 1)
     inflation, p = 1.0, 1.0
     if freedom:
-        least = _left_over(gain * sigma**2 / sums.squares, freedom / rest)
+        least = 1.0
+        if test.known is None:
+            least = _left_over(gain * sigma**2 / sums.squares[far_out], freedom / rest)
+        else:
+            rest = KNOWN
         inflation = float(max(np.sum(noise**2) / freedom, least))
         p = _p_value(gain, freedom, inflation, effective, rest)
     bias = (absorbed * scale[own]) / scale[d][:, None]
@@ -299,7 +343,28 @@ def _score(
         information,
         noise,
         effective,
+        rest,
     )
+
+
+def steadied(found: Sequence[Score]) -> list[Score]:
+    """Scores of few batches with an inflation that others share: three batches say little of it.
+
+    The other candidates' lower quartile is what the noise's colour makes of most of them; what is
+    above may be an effect that they do not explain.
+    """
+    known = [s.inflation for s in found if s.effective >= STEADY and s.candidate.trials == 1]
+    usual = float(np.quantile(known, 0.25)) if known else 1.0
+    return [_pulled(score, usual) for score in found]
+
+
+def _pulled(score: Score, usual: float) -> Score:
+    weight = score.effective / (score.effective + STEADY)
+    inflation = weight * score.inflation + (1 - weight) * usual
+    if not score.freedom or inflation <= score.inflation:
+        return score
+    p = _p_value(score.gain, score.freedom, inflation, score.effective, score.rest)
+    return replace(score, inflation=inflation, p_value=min(1.0, p * score.candidate.trials))
 
 
 def _is_far_out(candidate: Candidate) -> bool:
@@ -352,7 +417,9 @@ def _p_value(gain: float, freedom: int, inflation: float, effective: float, rest
 def second_freedom(freedom: int, inflation: float, effective: float) -> float:
     """How well the inflation is known, as degrees of freedom.
 
-    Of coloured noise it is an estimate from the batches; of white noise it is one, and the estimate
-    is only there to be sure.
+    Of coloured noise it is an estimate from the batches, and from what is usual; of white noise it
+    is one, and the estimate is only there to be sure.
     """
-    return effective * (freedom if inflation > COLOURED else max(freedom, WHITE))
+    if inflation <= COLOURED:
+        return effective * max(freedom, WHITE)
+    return (effective + 0.5 * STEADY) * freedom

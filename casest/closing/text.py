@@ -29,7 +29,7 @@ def closing_text(closing: Closing, content: Mapping[str, Any], output: Path | No
     ]
     if output is not None:
         blocks.append(
-            f"Written: {output}/result.json, {output}/residuals.csv. "
+            f"Written: {output}/report.html, result.json, residuals.csv. "
             f"Next: casest apply {output} DATA"
         )
     else:
@@ -51,7 +51,8 @@ def sentence(content: Mapping[str, Any]) -> str:
             f"; {', '.join(names)} belong to the noise" if names else ""
         )
     if content["verdict"] == "extended":
-        return f"extended: {', '.join(names)} was missing; what is left is noise"
+        verb = "was" if len(names) == 1 else "were"
+        return f"extended: {', '.join(names)} {verb} missing; what is left is noise"
     found = f" beside {', '.join(names)}" if names else ""
     return f"unexplained: a misfit remains{found} that no candidate explains"
 

@@ -182,6 +182,14 @@ def smallest_eigenvalue(
     deviations, so that they are squared signal over noise: above 1 a window alone teaches more
     than was known.
     """
+    ends, values = window_eigenvalues(model, system, window, count)
+    return ends, values[:, 0]
+
+
+def window_eigenvalues(
+    model: Dynamics, system: Linearised, window: float, count: int = 60
+) -> tuple[Array, Array]:
+    """All of them, ascending: the windows' ends (K,) and eigenvalues (K, n), scaled alike."""
     Phi, _ = transitions(system)
     W = _of_steps(model, system, Phi)
     prior = np.sqrt(np.diag(model.start_covariance))
@@ -196,5 +204,5 @@ def smallest_eigenvalue(
         first = int(np.searchsorted(time, end - window - 1e-12))
         last = max(int(np.searchsorted(time, end + 1e-12)) - 1, first + 1)
         own = _reduced(Phi[first:last], W[first:last])[1]
-        found.append(float(np.linalg.eigvalsh(own * np.outer(prior, prior))[0]))
+        found.append(np.linalg.eigvalsh(own * np.outer(prior, prior)))
     return np.asarray(ends, float), np.array(found)

@@ -147,7 +147,7 @@ def _with_changed_reading(traced: Traced, attached: Attached) -> Traced:
 def _with_signal_effect(traced: Traced, attached: Attached) -> Traced:
     """Effects on a signal act after the body, because der(…, t) needs the bare symbol."""
     symbol = traced.symbols[attached.on]
-    changed = ca.vec(ca.SX(attached.apply(symbol, traced.symbols)))
+    changed = flat(ca.SX(attached.apply(symbol, traced.symbols)))
     plain = flat(symbol)
 
     def late(expression: SX) -> SX:

@@ -15,8 +15,10 @@ import numpy as np
 
 from casest.declaring.shapes import Array
 from casest.identify import Identifiability
+from casest.solve.covariance import inverse_normal
 from casest.solve.outcome import Outcome
-from casest.solve.profile import profiled
+from casest.solve.profile import Profile, half_width, profiled
+from casest.solve.trust_region import LITTLE, trust_region
 from casest.stack import Point, Problem
 from casest.sums import rounding as rounding_error
 from casest.sums import second_order
@@ -29,8 +31,12 @@ STEP = 1e-4
 SAME = 1e-2
 #: Rise of the cost two standard deviations from the optimum, over what the intervals assume.
 SHAPE = (0.5, 10.0)
+#: Within this the linear intervals are as good as those of the likelihood, which are dearer.
+LINEAR = (0.7, 2.0)
 #: From this ratio on a valley is too bent to be looked along: about 45 standard deviations aside.
 BENT = 1e3
+#: Iterations in which another outcome is followed, to see whether it is a solution of its own.
+FOLLOWED = 1000
 #: An implicit residual is the noise of the reading to first order only; the second-order part must
 #: stay below this share of it. (A flat ellipsoid through poses in a plane "fits" by that part.)
 SECOND_ORDER = 0.07
@@ -41,7 +47,11 @@ PRACTICALLY_NULL = 1e-5
 
 @dataclass(frozen=True)
 class Certificate:
-    """Evidence for (or against) an estimate: the figures, and in words why it is (not) trusted."""
+    """Evidence for (or against) an estimate: the figures, and in words why it is (not) trusted.
+
+    `profile` (n, 2): how far below and above each unknown its 95 % interval reaches, by the profile
+    of the cost, where the cost is no parabola; None where the linear intervals describe it.
+    """
 
     trusted: bool
     reasons: tuple[str, ...]
@@ -52,6 +62,7 @@ class Certificate:
     agreeing: int
     shape: tuple[float, float]
     at_bound: tuple[str, ...]
+    profile: Array | None = None
 
 
 def certify(
@@ -107,13 +118,49 @@ def certify(
             f"the noise is too large for the curvature of the fitted surface (second-order part "
             f"{second:.2g} of the noise): the readings cover too little, or average more of them"
         )
+    profile = None
     if not against:
         shape, words = _shape(problem, best, R, max(sigma, rounding))
+        if not LINEAR[0] <= shape[0] <= shape[1] <= LINEAR[1]:
+            profile = _profile(problem, best, R, sigma)
+        if profile is not None:
+            words = []
         against += words or _ambiguous(problem, best, others, R, sigma)
-    reasons = tuple(against) or _for(slope, step, curvature, agreeing, len(others), shape)
+    seen = profile is not None
+    reasons = tuple(against) or _for(slope, step, curvature, agreeing, len(others), shape, seen)
     return Certificate(
-        not against, reasons, slope, step, curvature, len(others), agreeing, shape, at_bound
+        not against,
+        reasons,
+        slope,
+        step,
+        curvature,
+        len(others),
+        agreeing,
+        shape,
+        at_bound,
+        None if against else profile,
     )
+
+
+def _profile(problem: Problem, best: Outcome, R: Array, sigma: float) -> Array | None:
+    """95 % intervals of the likelihood, (n, 2), or None where one has no end.
+
+    For models that predict readings: of an implicit residual the likelihood is known to first
+    order only, and unknowns on curved sets have no interval.
+    """
+    curved = any(slot.parameter.shape.curved for slot in problem.slots)
+    if problem.model.implicit or curved or problem.sequential:
+        return None
+    around = Profile(problem, best.point, best.cost, sigma**2 * inverse_normal(R), sigma)
+    rise = half_width(problem.residual_count - problem.unknowns) ** 2
+    found = []
+    with np.errstate(all="ignore"):
+        for j in range(problem.unknowns):
+            interval = around.interval(j, rise)
+            if interval is None:
+                return None
+            found.append(interval)
+    return np.array(found)
 
 
 def _slope_and_step(
@@ -195,17 +242,29 @@ def _ambiguous(
 ) -> list[str]:
     """Another solution that the data hardly distinguish from the best one, by a 95 % test."""
     for other in others:
-        near = other.cost - best.cost < 1.92 * sigma**2
-        # Rough where the problem is curved, but a different valley is many deviations away.
-        difference = _unturned(problem, other.point.x - best.point.x)
-        away = float(np.linalg.norm(R @ difference)) / sigma
-        if near and away > 10:
-            i = int(np.argmax(np.abs(difference) * np.linalg.norm(R, axis=0)))
+        i = _apart(problem, best, other, R, sigma)
+        if i is None:
+            continue
+        # A run that stopped on its way through a bent valley is no solution: follow it.
+        other = trust_region(problem, other.point, max_iterations=FOLLOWED, damping=LITTLE)
+        i = _apart(problem, best, other, R, sigma)
+        if i is not None:
             return [
                 f"two solutions fit alike: `{problem.names[i]}` = {best.point.x[i]:.6g} and "
                 f"{other.point.x[i]:.6g}; give --start, or vary the motion"
             ]
     return []
+
+
+def _apart(problem: Problem, best: Outcome, other: Outcome, R: Array, sigma: float) -> int | None:
+    """The unknown in which an outcome that fits alike is far away; None where there is none."""
+    if not other.cost - best.cost < 1.92 * sigma**2:
+        return None
+    # Rough where the problem is curved, but a different valley is many deviations away.
+    difference = _unturned(problem, other.point.x - best.point.x)
+    if not np.linalg.norm(R @ difference) > 10 * sigma:
+        return None
+    return int(np.argmax(np.abs(difference) * np.linalg.norm(R, axis=0)))
 
 
 def _unturned(problem: Problem, difference: Array) -> Array:
@@ -251,6 +310,7 @@ def _for(
     agreeing: int,
     others: int,
     shape: tuple[float, float],
+    profiled: bool,
 ) -> tuple[str, ...]:
     """The case for the estimate."""
     found = "the same optimum from another start or algorithm"
@@ -258,7 +318,12 @@ def _for(
         "intervals describe the cost two standard deviations away within "
         f"{shape[0]:.2f}-{shape[1]:.2f}"
     )
-    if shape[1] > 2.0:
+    if profiled:
+        intervals = (
+            "the 95 % intervals are those of the likelihood, each unknown profiled: the cost is no "
+            "parabola, and standard deviations describe it only roughly"
+        )
+    elif shape[1] > 2.0:
         intervals = (
             "intervals are cautious: two standard deviations away the cost rises up to "
             f"{shape[1]:.2g} times as much as they assume"

@@ -13,17 +13,20 @@ from casest.sums import SAMPLED
 #: Fewer samples in a run say nothing about correlation: of readings, and of rest intervals, which
 #: are known to have followed each other.
 ENOUGH, ENOUGH_RESTS = 100, 30
+#: Fewer rows without a time are a table, whose order is nobody's.
+TABLE = 500
 
 
-def correlation_time(problem: Problem, point: Point) -> float:
+def correlation_time(problem: Problem, point: Point, tables: bool = False) -> float:
     """Samples per independent residual: 1 + 2·Σ autocorrelations, 1 where they are not significant.
 
-    Runs of fewer than ENOUGH samples (a table of poses) count as uncorrelated. The sum stops
-    where pairs of neighbouring autocorrelations stop being positive (Geyer 1992).
+    Runs of fewer than ENOUGH samples (of poses) count as uncorrelated, and so do `tables`, rows
+    without a time, unless asked for. The sum stops where pairs of neighbouring autocorrelations
+    stop being positive (Geyer 1992).
     """
     times, weights = [], []
     for run, pieces in zip(problem.runs, _stretches(problem, point), strict=True):
-        if not is_series(run):
+        if not (is_series(run) or (tables and len(run) >= ENOUGH)):
             continue
         for k in range(len(problem.model.axes)):
             times.append(_integrated([piece[:, k] for piece in pieces]))
@@ -34,7 +37,9 @@ def correlation_time(problem: Problem, point: Point) -> float:
 
 def is_series(run: Run) -> bool:
     """Are there enough samples, in their order, to see correlation between neighbours?"""
-    return len(run) >= (ENOUGH_RESTS if run.spread else ENOUGH)
+    if run.spread:
+        return len(run) >= ENOUGH_RESTS
+    return len(run) >= (TABLE if run.time is None else ENOUGH)
 
 
 def _stretches(problem: Problem, point: Point) -> list[list[Array]]:

@@ -17,6 +17,10 @@ class LeastSquares(Protocol):
     def bounds(self) -> tuple[Array, Array]:
         """Lower and upper bound of every unknown."""
 
+    @property
+    def residual_count(self) -> int:
+        """Number of residuals."""
+
     def moved(self, point: Point, step: Array) -> Point:
         """The point after a step."""
 

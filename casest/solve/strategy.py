@@ -7,6 +7,7 @@ the data determine least, where a second valley would lie.
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -23,6 +24,13 @@ from casest.stack import Point, Problem
 
 #: Iterations after which a second opinion has nothing to say.
 OPINION = 50
+#: Iterations in which a bent valley is followed to its end, once ways disagree.
+PATIENCE = 1000
+#: More starts, and their spread as a share of each unknown: what reveals 19 of 20 false optima of
+#: NIST's problems (studies/nist.md).
+STARTS, SPREAD = 8, 0.3
+#: Still more of them, where these did not all end alike.
+FURTHER = 24
 #: Samples that are enough to come near a solution of a longer record.
 NEARBY = 2000
 #: Ratio of the costs of a few samples from which on there is no need to look at all of them.
@@ -48,7 +56,7 @@ def solve(
     best = best_of(outcomes)
     if best is not outcomes[0]:
         # An opinion was better than the answer: it becomes one.
-        outcomes = (_polished(problem, best), *outcomes)
+        outcomes = (_polished(problem, best, PATIENCE), *outcomes)
     if not has_noise_effects(problem.model):
         return problem, outcomes
     problem, point = _reweighted(problem, best_of(outcomes).point)
@@ -86,15 +94,29 @@ def _ways(
         # A start of the user's may lie in a wrong valley: the automatic one must agree.
         outcomes.append(_opinion(problem, problem.start()))
     costs = [_cost(o) for o in outcomes]
-    if max(costs) - min(costs) > 1e-6 * max(min(costs), 1e-300):
+    disagree = max(costs) - min(costs) > 1e-6 * max(min(costs), 1e-300)
+    # From a start that was declared, not computed, two ways may end in one valley, and the wrong.
+    if disagree or problem.model.starter is None:
         rival = best_of((*outcomes,))
-        starts = _perturbations(problem, first, seed)
-        outcomes += [_opinion(problem, start, rival) for start in starts]
+        starts = list(_perturbations(problem, first, seed))
+        outcomes += [_opinion(problem, start, rival) for start in starts[:STARTS]]
+    if problem.model.starter is None and _valleys(outcomes) > 1:
+        # One valley more is a reason to look for others.
+        outcomes += [_opinion(problem, start, best_of((*outcomes,))) for start in starts[STARTS:]]
+    if problem.model.starter is None and best_of((*outcomes,)) is not outcomes[0]:
+        outcomes.append(_wary(problem, first))
     return (*outcomes,)
 
 
-def _polished(problem: Problem, main: Outcome) -> Outcome:
-    polished = trust_region(problem, main.point, damping=LITTLE)
+def _valleys(outcomes: list[Outcome]) -> int:
+    """In how many different costs did they end, to a thousandth?"""
+    costs = sorted(_cost(o) for o in outcomes)
+    apart = [b > a * (1 + 1e-3) + 1e-300 for a, b in itertools.pairwise(costs) if np.isfinite(b)]
+    return 1 + sum(apart)
+
+
+def _polished(problem: Problem, main: Outcome, max_iterations: int = 300) -> Outcome:
+    polished = trust_region(problem, main.point, max_iterations=max_iterations, damping=LITTLE)
     return replace(
         polished,
         solver=main.solver,
@@ -104,7 +126,9 @@ def _polished(problem: Problem, main: Outcome) -> Outcome:
     )
 
 
-def _nearby(problem: Problem, start: Point, rival: Outcome | None) -> tuple[Outcome, bool]:
+def _nearby(
+    problem: Problem, start: Point, rival: Outcome | None = None, wary: bool = False
+) -> tuple[Outcome, bool]:
     """The solution for a few of the samples, or the start where that does not lower the cost.
 
     And whether it is clear from the few that the rival is better.
@@ -117,7 +141,13 @@ def _nearby(problem: Problem, start: Point, rival: Outcome | None) -> tuple[Outc
         return stay, False
     thinned = problem.thinned(every)
     # A tenth of the deviations of so few samples is as near as they can say.
-    few = trust_region(thinned, start, max_iterations=OPINION, tolerance=1e4 * _fine(thinned))
+    few = trust_region(
+        thinned,
+        start,
+        max_iterations=PATIENCE if wary else OPINION,
+        tolerance=1e4 * _fine(thinned),
+        wary=wary,
+    )
     there = problem.cost(few.point)
     near = few if np.isfinite(there) and there < here else stay
     worse = rival is not None and few.cost > CLEARLY * thinned.cost(rival.point)
@@ -142,6 +172,15 @@ def _opinion(problem: Problem, start: Point, rival: Outcome | None = None) -> Ou
     return replace(found, seconds=near.seconds + found.seconds)
 
 
+def _wary(problem: Problem, start: Point) -> Outcome:
+    """Where short steps lead from a start, however long it takes."""
+    near, _ = _nearby(problem, start, wary=True)
+    found = trust_region(
+        problem, near.point, max_iterations=PATIENCE, tolerance=_fine(problem), wary=True
+    )
+    return replace(found, seconds=near.seconds + found.seconds)
+
+
 def _singular(problem: Problem, first: Point) -> bool:
     """Is a direction undetermined at the start and at what damped steps reach from there?"""
     if identify(problem, first).rank == problem.unknowns:
@@ -162,8 +201,8 @@ def _perturbations(problem: Problem, first: Point, seed: int) -> Iterator[Point]
     columns = np.sqrt(np.where(np.diag(normal.matrix) > 0, np.diag(normal.matrix), np.inf))
     # An unknown that is zero has no size of its own: what changes the residual by its own length.
     size = np.maximum(np.abs(first.x), np.sqrt(2 * normal.cost) / columns)
-    for _ in range(4):
-        step = 0.1 * size * rng.standard_normal(len(first.x))
+    for _ in range(STARTS + FURTHER):
+        step = SPREAD * size * rng.standard_normal(len(first.x))
         moved = problem.moved(first, step)
         yield Point(problem.inside(moved.x), moved.references)
 

@@ -21,6 +21,10 @@ from casest.stack import Point
 ROUGH = 1e-5
 #: Damping that does not slow what data determine, yet keeps steps along what they do not short.
 LITTLE = 1e-7
+#: Residuals from which on a QR factor is too dear for a step far away.
+LONG = 5000
+#: Range of dampings in which a wary run looks for that of its radius.
+DAMPINGS = (1e-24, 1e24)
 
 
 class _Local(NamedTuple):
@@ -38,15 +42,20 @@ def trust_region(
     max_iterations: int = 300,
     tolerance: float = 0.0,
     damping: float = 1e-3,
+    wary: bool = False,
 ) -> Outcome:
     """Minimise the cost from `start` until steps and gains are at rounding.
 
     With a `tolerance` only until an undamped step gains no more than this share of the cost. Near
-    a solution begin with a small `damping`.
+    a solution begin with a small `damping`. A `wary` run holds every step within a radius, which
+    begins at the size of the unknowns (Moré 1978): slower, but it stays in a narrow valley that
+    damping alone leaves, and does not jump across one.
     """
     began = time.perf_counter()
     point, here, precise = start, _linearise(problem, start, precise=False), False
     scale = _column_norms(here.R)
+    size = float(np.linalg.norm(scale * start.x)) or float(np.sqrt(2 * here.cost))
+    radius = size if wary else np.inf
     growth, evaluations, status = 2.0, 1, "iteration limit"
     iterations = 0
     while iterations < max_iterations:
@@ -58,6 +67,8 @@ def trust_region(
             status = "cost or slope is not finite"
             break
         scale = np.maximum(scale, _column_norms(here.R))
+        if wary:
+            damping = _damping_within(problem, point, here, scale, radius)
         step = _bounded_step(problem, point, here, scale, damping)
         if not np.all(np.isfinite(step)):
             status = "step is not finite"
@@ -76,8 +87,12 @@ def trust_region(
         normal = None if precise else problem.normal(trial)
         there = problem.cost(trial) if normal is None else normal.cost
         evaluations += 1
-        if np.isfinite(there) and there < here.cost:
-            ratio = (here.cost - there) / max(gain, 1e-300)
+        ratio = (here.cost - there) / max(gain, 1e-300) if np.isfinite(there) else -1.0
+        if ratio < 0.25:
+            radius = min(radius, 0.25 * float(np.linalg.norm(scale * step))) if wary else radius
+        elif ratio > 0.75:
+            radius = max(radius, 2 * float(np.linalg.norm(scale * step)))
+        if ratio > 0:
             point, here = trial, _linearise(problem, trial, precise, normal)
             damping = _relieved(damping, ratio)
             growth = 2.0
@@ -95,6 +110,24 @@ def trust_region(
     return Outcome(
         "trust-region", point, here.cost, iterations, evaluations, claims, status, seconds
     )
+
+
+def _damping_within(
+    problem: LeastSquares, point: Point, here: _Local, scale: Array, radius: float
+) -> float:
+    """The least damping, to a factor of two, whose step stays within the radius."""
+
+    def inside(damping: float) -> bool:
+        step = _bounded_step(problem, point, here, scale, damping)
+        return bool(np.linalg.norm(scale * step) <= radius)
+
+    low, high = DAMPINGS
+    if inside(low):
+        return low
+    while high > 2 * low:
+        middle = float(np.sqrt(low * high))
+        low, high = (low, middle) if inside(middle) else (middle, high)
+    return high
 
 
 def _relieved(damping: float, ratio: float) -> float:
@@ -122,10 +155,11 @@ def _linearise(
         if np.all(np.isfinite(lower)) and np.diag(lower).min(initial=1.0) > 1e-6:
             t = np.asarray(np.linalg.solve(lower, normal.gradient / scale), dtype=float)
             return _Local(lower.T * scale, t, normal.cost)
-        if np.all(np.isfinite(normal.matrix)) and np.all(np.isfinite(normal.gradient)):
+        finite = np.all(np.isfinite(normal.matrix)) and np.all(np.isfinite(normal.gradient))
+        if finite and problem.residual_count > LONG:
             return _by_eigenvalues(normal, scale)
     R, t, rest = problem.factor(point)
-    return _Local(R, t, 0.5 * (float(t @ t) + rest**2))
+    return _Local(R, t, 0.5 * (float(t @ t) + rest * rest))
 
 
 def _by_eigenvalues(normal: Normal, scale: Array) -> _Local:
@@ -203,7 +237,8 @@ def _refine(
             break
         trial = problem.moved(point, step)
         there = _linearise(problem, trial, precise=True)
-        better = _slope(there) < _slope(here) and there.cost <= here.cost * (1 + 1e-12)
+        # Where residuals are small beside the readings, rounding moves the cost by 1e-11 of itself.
+        better = _slope(there) < _slope(here) and there.cost <= here.cost * (1 + 1e-10)
         if not (np.isfinite(there.cost) and better):
             break
         point, here = trial, there

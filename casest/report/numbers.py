@@ -1,0 +1,47 @@
+"""Numbers and units as a person reads them."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+
+_RAISED = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
+
+
+def printed_unit(unit: str) -> str:
+    """The unit with raised powers: m/s^2 as m/s²."""
+    text = re.sub(r"\^(?:\((-?\d+)\)|(-?\d+))", lambda m: (m[1] or m[2]).translate(_RAISED), unit)
+    text = re.sub(r"\((\([^()]*\))\)", r"\1", text)
+    text = re.sub(r"^\(([^()]*)\)$", r"\1", text)
+    text = re.sub(r"^\[(\w+)\]$", r"unit of \1", text)  # nobody stated it
+    return text.replace("*", "·").replace("degC", "°C")
+
+
+def printed(text: str) -> str:
+    """A number's text with a true minus sign and powers of ten: -3.2e-07 as −3.2·10⁻⁷."""
+    power = re.fullmatch(r"([-+\d.]+)e([-+]\d+)", text)
+    if power:
+        text = f"{power[1]}·10{str(int(power[2])).translate(_RAISED)}"
+    return text.replace("-", "−")
+
+
+def number(value: float | None, digits: int = 3) -> str:
+    """A number to some digits; a dash where there is none."""
+    if value is None or not math.isfinite(value):
+        return "–"
+    return printed(f"{value:.{digits}g}")
+
+
+def with_unit(value: float | None, unit: str, digits: int = 3) -> str:
+    """A number with its unit."""
+    return f"{number(value, digits)} {printed_unit(unit)}".removesuffix(" 1").strip()
+
+
+def alike(values: Sequence[float], digits: int = 5) -> list[str]:
+    """Numbers of one column with as many decimals each: the largest has so many digits."""
+    largest = max((abs(v) for v in values if math.isfinite(v)), default=0.0)
+    if not largest or not 1e-6 < largest < 1e9:
+        return [number(v, digits) for v in values]
+    places = max(digits - 1 - math.floor(math.log10(largest)), 0)
+    return [printed(f"{v:.{places}f}") if math.isfinite(v) else "–" for v in values]
