@@ -229,11 +229,11 @@ def _tried(candidate: Candidate, model: Model, runs: Sequence[Run]) -> Candidate
         raise UsageError("already in the model")
     candidate = candidate.on_model(model)
     effect, extended = candidate.effect, candidate.added_to(model)
-    if effect is not None and not effect.function.__module__.startswith("casest.effects"):
-        check_units(extended)  # a user's own; those of the catalogue are tested
     for s in extended.signals:
         if any(s.name not in run.signals for run in runs):
             raise UsageError(f"the data have no {s.name!r}")
+    if effect is not None and not effect.function.__module__.startswith("casest.effects"):
+        check_units(extended)  # a user's own; those of the catalogue are tested
     return candidate
 
 
