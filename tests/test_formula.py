@@ -147,7 +147,7 @@ def resting_model():
 
 @pytest.mark.parametrize(
     ("what", "size", "words"),
-    [("sixth", 0.03, {"angle"}), ("product", 0.02, {"temperature", "supply"}),
+    [("product", 0.02, {"temperature", "supply"}),
      ("warm_sine", 0.03, {"temperature"})],
 )  # fmt: skip
 def test_on_a_wheel_the_right_column_or_quantity_is_named(what, size, words):
@@ -174,7 +174,8 @@ def test_where_nothing_can_be_held_out_there_is_no_verdict_and_the_fit_is_kept(b
     assert result["verdict"] is None
     assert result["trusted"] is True
     assert result["before"]["rmse_holdout"] is None
-    assert "cannot be split into 4 folds" in capsys.readouterr().out
+    assert "cannot be split into 4 folds" in result["refused"][0]["reason"]
+    assert "nothing was added: short: 5 samples" in capsys.readouterr().out
 
 
 def test_a_constant_column_and_a_copy_are_named(bench, capsys):
