@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -100,3 +101,42 @@ def test_a_magnetometer_turned_by_hand_asks_for_no_cubic(shared_data, which):
     found = closed(shared_data, file, "mx,my,mz", "count", model, rate=50)
     assert not {"cubic", "signed_cubic"} & set(labels(found))
     assert rms(found.after_held_out) > 0.85 * rms(found.before_held_out)
+
+
+def from_the_command_line(tmp_path, *arguments):
+    assert run(["close", *map(str, arguments), "-o", str(tmp_path)]) == 0
+    return json.loads((tmp_path / "result.json").read_text(encoding="utf-8"))
+
+
+def test_the_example_of_a_gyro_at_rest_traces_a_cold_test(shared_data, tmp_path):
+    """The z axis is the control: what x and y follow is not in it."""
+    example = Path(__file__).parents[1] / "examples" / "at_rest.py"
+    record = shared_data / "psim-thermal" / "TVCtest3_7_20.csv"
+    result = from_the_command_line(
+        tmp_path, example, record, "--columns", "v=gyrox,gyroy,gyroz", "--unit", "v=rad/s",
+        "--scale", "temp=int16/256+25", "--unit", "temp=degC",
+    )  # fmt: skip
+    assert result["verdict"] == "extended"
+    (moved,) = [e for e in result["effects"] if e["name"] != "outliers"]
+    assert {moved["name"], *(n.partition("(")[0] for n in moved["indistinguishable_from"])} >= {
+        "temperature_bias",
+        "bias_drift",
+    }
+    before, after = (result[k]["rmse_holdout_by_axis"] for k in ("before", "after"))
+    assert after["y"] < 0.45 * before["y"]
+    assert 0.95 < after["z"] / before["z"] < 1.0
+
+
+def test_of_the_mpu6050_at_rest_the_accelerometer_is_adequate_and_nothing_is_a_formula(
+    shared_data, tmp_path
+):
+    model = tmp_path / "rest.py"
+    example = Path(__file__).parents[1] / "examples" / "at_rest.py"
+    model.write_text(example.read_text(encoding="utf-8").replace("rad/s", "count"))
+    record = shared_data / "mpu6050-tomisuarez" / "imu_static_test.csv"
+    options = ("--unit", "v=count", "--rate", "100")
+    still = from_the_command_line(tmp_path, model, record, "--columns", "v=ax,ay,az", *options)
+    assert still["verdict"] == "adequate"
+    gyro = from_the_command_line(tmp_path, model, record, "--columns", "v=gx,gy,gz", *options)
+    assert "formula" not in [e["name"] for e in gyro["effects"]]
+    assert gyro["after"]["rmse_holdout"] > 0.99 * gyro["before"]["rmse_holdout"]

@@ -13,6 +13,7 @@ from casest.data.run import Run
 from casest.declaring.shapes import Array
 from casest.declaring.symbols import Parameter
 from casest.errors import CasestError, UsageError
+from casest.modelling.dimensions import check_units
 from casest.modelling.effect import NOISE, Effect
 from casest.modelling.model import Model
 
@@ -227,9 +228,12 @@ def _tried(candidate: Candidate, model: Model, runs: Sequence[Run]) -> Candidate
     if any(a.label == candidate.label for a in model.effects):
         raise UsageError("already in the model")
     candidate = candidate.on_model(model)
-    for s in candidate.added_to(model).signals:
+    effect, extended = candidate.effect, candidate.added_to(model)
+    for s in extended.signals:
         if any(s.name not in run.signals for run in runs):
             raise UsageError(f"the data have no {s.name!r}")
+    if effect is not None and not effect.function.__module__.startswith("casest.effects"):
+        check_units(extended)  # a user's own; those of the catalogue are tested
     return candidate
 
 

@@ -30,7 +30,7 @@ from casest.declaring.symbols import Parameter
 from casest.effects import CATALOGUE
 from casest.engine.kernel import patient
 from casest.engine.threads import one_thread
-from casest.errors import CasestError, NotTrusted
+from casest.errors import CasestError, DataError, NotTrusted
 from casest.estimate import Estimate, attempt
 from casest.identify import identify
 from casest.modelling.effect import Effect
@@ -44,6 +44,8 @@ from casest.stack import Point, Problem
 FALSE_ALARM = 0.004
 #: The held-out gain must exceed this many of its own standard errors.
 HELD_OUT = 1.64
+#: What is refused where nothing can be held out.
+HELD_OUT_DATA = "held-out data"
 #: Candidates whose errors differ by fewer standard errors are not told apart; so many are named.
 ALIKE, NAMED = 2.0, 2
 #: Candidates that are refitted in a round, those that score as well as the best of them, rounds.
@@ -111,8 +113,8 @@ def close(
 ) -> Closing:
     """Fit, trace the residual to effects of the catalogue, add those that held-out data confirm.
 
-    Raises NotTrusted, with the refused estimate, where the declared model itself has no
-    trustworthy fit, and DataError where nothing can be held out.
+    Where nothing can be held out, nothing is added, and `refused` says so. Raises NotTrusted, with
+    the refused estimate, where the declared model itself has no trustworthy fit.
     """
     before = attempt(model, runs, start=start, seed=seed)
     if not before.certificate.trusted:
@@ -120,7 +122,20 @@ def close(
         error.estimate = before
         raise error
     with np.errstate(all="ignore"), one_thread(), patient():
-        return _Loop(before, prepared(model, runs), catalogue, seed, say).closed()
+        try:
+            loop = _Loop(before, prepared(model, runs), catalogue, seed, say)
+        except DataError as error:
+            return _as_it_is(before, prepared(model, runs), str(error))
+        return loop.closed()
+
+
+def _as_it_is(before: Estimate, runs: tuple[Run, ...], why: str) -> Closing:
+    """The declared model, where nothing can be held out to judge another by."""
+    nothing = tuple(np.full((len(run), len(before.model.axes)), np.nan) for run in runs)
+    folds = Folds(tuple(np.zeros(len(r), dtype=np.int_) for r in runs),
+                  tuple(np.zeros(1, dtype=np.int_) for _ in runs), 0)  # fmt: skip
+    refused = (Skipped(HELD_OUT_DATA, why),)
+    return Closing(before, before, nothing, nothing, (), (), refused, folds, (), (), runs)
 
 
 class _Loop:
@@ -362,10 +377,13 @@ class _Loop:
             start = problem.point(current.values)
             moved = _stepped(problem, start, candidate, score)
             best = min((start, moved), key=lambda p: _finite(problem.cost(p)))
-            return self._fitted(model, problem.values(best))
-        except CasestError as error:
-            self._refuse(score.candidate, str(error))
+            fitted = self._fitted(model, problem.values(best))
+        except (CasestError, np.linalg.LinAlgError) as error:
+            self._refuse(score.candidate, f"its refit fails: {error}")
             return None
+        if fitted is None:
+            self._refuse(score.candidate, "its refit fails: the residual is not finite")
+        return fitted
 
     def _whole(self, score: Score, model: Model) -> Candidate:
         """The candidate with its profile unknown again, on the axes where it does anything."""

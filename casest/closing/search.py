@@ -105,7 +105,8 @@ def summed(rows: Iterator[Rows], unknowns: int, shapes: int, axes: int, batches:
             gradients[b][index] += part.T @ r[start:stop].ravel()
     scale = np.sqrt(np.maximum(np.einsum("bii->i", matrices), 1e-300))
     gradients /= scale
-    return _Sums(matrices / np.outer(scale, scale), gradients, gradients, scale, (squares, squares))
+    whole = matrices / np.outer(scale, scale)
+    return _Sums(whole, gradients, gradients, scale, (squares, squares))
 
 
 @dataclass(frozen=True)
@@ -184,17 +185,16 @@ class Search:
         d, A = self._declared(beside), self.sums.whole
         inverse = np.asarray(np.linalg.pinv(A[np.ix_(d, d)], rcond=1e-10, hermitian=True))
         sums = self._left(d, inverse) if len(beside) else self.sums
-        own, nothing = self._columns(shapes), Candidate(None)
         test = _Test(sums, d, inverse, self.sigma, None, SURVIVES)
-        return _score(nothing, own, test, self.count)
+        return _score(Candidate(None), self._columns(shapes), test, self.count)
 
     def _left(self, d: NDArray[np.int_], inverse: Array) -> _Sums:
         """Sums with the residual that a fit of the columns d leaves."""
         sums, total = self.sums, self.sums.gradients[:, d].sum(axis=0)
         sizes = inverse @ total
         gradients = sums.gradients - sums.matrices[:, :, d] @ sizes
-        squares = sums.squares[0] - float(total @ sizes)
-        return replace(sums, gradients=gradients, unclipped=gradients, squares=(squares, squares))
+        left = sums.squares[0] - float(total @ sizes)
+        return replace(sums, gradients=gradients, unclipped=gradients, squares=(left, left))
 
     def _earning(self, picked: list[int]) -> list[int]:
         """Without the last ones that are no more than noise beside those before them.

@@ -7,7 +7,8 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from casest.closing.loop import Closing
+from casest.closing.loop import HELD_OUT_DATA, Closing
+from casest.effects import CATALOGUE
 from casest.terminal import WIDTH, item, value_table
 
 #: Lists longer than this are left to result.json.
@@ -40,7 +41,11 @@ def sentence(content: Mapping[str, Any]) -> str:
     """The verdict in one sentence."""
     names = [e["name"] + (f" ({e['column']})" if e["column"] else "") for e in content["effects"]]
     if content["verdict"] is None:
-        return "no trustworthy estimate"
+        return (
+            "no verdict: nothing can be held out"
+            if content["trusted"]
+            else ("no trustworthy estimate")
+        )
     if content["verdict"] == "adequate":
         return "adequate: nothing that these data can show is missing" + (
             f"; {', '.join(names)} belong to the noise" if names else ""
@@ -64,12 +69,16 @@ def _errors(content: Mapping[str, Any]) -> Iterator[str]:
     yield f"  residual rms{unit:<12} {'before':>12} {'after':>12}"
     rows = [("fit", "rmse_fit"), ("held-out", "rmse_holdout")]
     for word, key in rows:
-        yield f"    {word:<22} {before[key]:>12.5g} {after[key]:>12.5g}"
+        yield f"    {word:<22} {_figure(before[key])} {_figure(after[key])}"
     axes = before["rmse_holdout_by_axis"]
-    if len(axes) > 1:
+    if len(axes) > 1 and before["rmse_holdout"] is not None:
         for axis, value in axes.items():
             there = after["rmse_holdout_by_axis"][axis]
             yield f"    held-out, {axis:<12} {value:>12.5g} {there:>12.5g}"
+
+
+def _figure(value: float | None) -> str:
+    return f"{'-' if value is None else format(value, '.5g'):>12}"
 
 
 def _effects(content: Mapping[str, Any]) -> Iterator[str]:
@@ -121,4 +130,10 @@ def _unexplained(content: Mapping[str, Any]) -> Iterator[str]:
 def _notes(content: Mapping[str, Any]) -> Iterator[str]:
     yield from (item(note) for note in content["notes"])
     for refused in content["refused"][:SHOWN]:
-        yield item(f"{refused['name']} was not added: {refused['reason']}")
+        everything = refused["name"] == HELD_OUT_DATA
+        what = "nothing was" if everything else f"{refused['name']} was not"
+        yield item(f"{what} added: {refused['reason']}")
+    shipped = {e.name for e in CATALOGUE}
+    for skipped in content["not_tried"]:  # what the user gave
+        if skipped["name"].partition("(")[0] not in shipped:
+            yield item(f"{skipped['name']} was not tried: {skipped['reason']}")

@@ -48,7 +48,8 @@ def closing_result(
     ordered = {k: common[k] for k in first[:place]} | sections
     ordered |= {k: common[k] for k in first[place:]}
     ordered["trusted"] = closing.after.certificate.trusted
-    ordered["verdict"] = verdict(closing, left) if ordered["trusted"] else None
+    judged = ordered["trusted"] and closing.folds.count > 0
+    ordered["verdict"] = verdict(closing, left) if judged else None
     ordered["noise"] |= left.noise
     ordered["effects"] = [_effect(f, closing) for f in closing.effects]
     ordered["invisible"] = [
@@ -62,7 +63,8 @@ def closing_result(
         }
         for i in invisible(closing)
     ]
-    ordered["unexplained"] = {"fraction": plain(left.fraction), "where": left.where}
+    fraction = left.fraction if judged else np.nan
+    ordered["unexplained"] = {"fraction": plain(fraction), "where": left.where}
     ordered["moved"] = _moved(closing)
     ordered["smallest_detectable"] = [
         {"name": d.name, "parameter": d.parameter, "size": plain(d.size), "unit": d.unit}

@@ -47,6 +47,8 @@ def _under(content: Mapping[str, Any]) -> str:
     """What the verdict is worth, in one line."""
     before, after = content["before"]["rmse_holdout"], content["after"]["rmse_holdout"]
     unit = content["noise"]["unit"]
+    if after is None:
+        return "Nothing could be held out: what the fit says of new data is not known."
     if not content["effects"]:
         return f"Error on data that the fit never saw: {with_unit(after, unit)} rms."
     fell = f" ({_percent(after / before - 1)})" if before else ""
@@ -101,6 +103,8 @@ def _error_rows(story: Story, content: Mapping[str, Any]) -> Iterator[tuple[str,
         there = by_axis(story, len(story.sides) - 1)
         for axis, value in by_axis(story, 0).items():
             yield f"fit, {axis}", value, there[axis]
+    if before["rmse_holdout"] is None:  # nothing could be held out
+        return
     yield "held-out", before["rmse_holdout"], after["rmse_holdout"]
     if several:
         for axis, value in before["rmse_holdout_by_axis"].items():
@@ -113,7 +117,9 @@ def _error_rows(story: Story, content: Mapping[str, Any]) -> Iterator[tuple[str,
 def _effects(closing: Closing, story: Story, content: Mapping[str, Any]) -> str:
     docs = {f.candidate.name: getattr(f.candidate.effect, "doc", "") for f in closing.effects}
     said = [_effect(e, docs.get(e["name"], ""), story) for e in content["effects"]]
-    if not said:
+    if not said and content["verdict"] is None:
+        said = [paragraph("None was tried: there is nothing to judge it by.")]
+    elif not said:
         said = [paragraph("None was needed: no candidate makes held-out data better predicted.")]
     left = content["unexplained"]
     if content["verdict"] == "unexplained":

@@ -1,0 +1,236 @@
+"""Outside the catalogue: a formula that names what the residual follows, and never noise."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import worlds
+
+from casest import Run
+from casest.cli import run
+from casest.closing.loop import close
+from casest.problem import find_model
+
+RESTING = '''
+from casest import Residual, model, param, quantity, signal
+
+
+@model
+def resting(v=signal(2, "V"), *, bias=param(2, "V")):
+    """A sensor with nothing to measure reads its offset."""
+    reading = quantity("reading", bias, "V")
+    return Residual(measured=v, predicted=reading, corrected=quantity("nothing", 0 * v, "V"))
+'''.replace(', corrected=quantity("nothing", 0 * v, "V")', "")
+#: What the first axis really does: V per K and V, about 25 degrees and 3.3 V.
+SLOPE = 0.5
+
+
+@pytest.fixture
+def bench(tmp_path, monkeypatch):
+    """A folder with the model and a record whose first axis follows temperature times supply."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "resting.py").write_text(RESTING, encoding="utf-8")
+    rng = np.random.default_rng(3)
+    n = 1200
+    t = np.arange(n) / 10
+    warm = 25 + 6 * np.sin(2 * np.pi * t / 37) + 0.05 * rng.standard_normal(n).cumsum()
+    supply = 3.3 + 0.004 * rng.standard_normal(n).cumsum()
+    v = np.array([0.4, -0.2]) + 0.02 * rng.standard_normal((n, 2))
+    v[:, 0] += SLOPE * (warm - 25) * (supply - 3.3)
+    rows = np.column_stack([t, v, warm, supply])
+    write(tmp_path / "bench.csv", "t [s],vx [V],vy [V],temperature [degC],supply [V]", rows)
+    return rows
+
+
+def write(path, header, rows):
+    lines = [header, *(",".join(f"{x:.7g}" for x in row) for row in rows)]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def closed(*more, data="bench.csv", folder="out"):
+    """Exit code and result of the command line."""
+    arguments = ["close", "resting.py", data, "--columns", "v=vx,vy", *more, "-o", folder]
+    code = run(arguments)
+    with open(f"{folder}/result.json", encoding="utf-8") as file:
+        return code, json.load(file)
+
+
+def test_a_product_of_two_columns_is_found_and_can_be_pasted(bench):
+    code, result = closed()
+    assert code == 0
+    (found,) = result["effects"]
+    assert (found["name"], found["on"]) == ("formula", "reading")
+    assert "temperature" in found["formula"]
+    assert "supply" in found["formula"]
+    assert "degC" in found["formula"]
+    assert "\n" not in found["formula"]
+    assert "reading[1]" not in found["formula"]  # an axis with nothing in it stays as declared
+    assert result["after"]["rmse_holdout"] < 1.03 * 0.02
+    # The file gives the same effect: the same fit, with other words.
+    assert run(["calibrate", "resting.py", "bench.csv", "--columns", "v=vx,vy", "--effects",
+                "out/formula.py", "-o", "again"]) == 0  # fmt: skip
+    with open("again/result.json", encoding="utf-8") as file:
+        again = json.load(file)["estimate"]["parameters"]
+    for name, parameter in again.items():
+        assert parameter["value"] == pytest.approx(
+            result["after"]["parameters"][name]["value"], rel=1e-6
+        )
+
+
+def test_the_formula_says_what_the_record_was_made_with(bench):
+    """Evaluated on its own, at other temperatures and voltages than the record's means."""
+    import casadi as ca
+
+    from casest.problem import find_effects
+
+    _, result = closed()
+    (effect,) = find_effects("out/formula.py")
+    sizes = {k: v["value"] for k, v in result["effects"][0]["parameters"].items()}
+    numbers = {n: float(d.array) for n, d in effect.declarations if n not in sizes}
+
+    def shift(warm, supply):
+        given = dict(zip([s.name for s in effect.extras], (0, 0), strict=True))
+        given |= {"temperature": warm, "supply": supply}
+        shifted = effect(ca.DM([0, 0]), *given.values(), **sizes, **numbers)
+        return np.array(ca.DM(shifted)).ravel()
+
+    twisted = shift(28, 3.4) - shift(28, 3.35) - shift(24, 3.4) + shift(24, 3.35)
+    assert twisted == pytest.approx([SLOPE * 4 * 0.05, 0], rel=0.03)
+
+
+def test_an_effect_of_the_users_own_takes_part(bench, tmp_path):
+    text = (
+        "from casest import effect, param, signal, constant\n\n\n"
+        '@effect(on="reading", formula="y + k·(T − 25)·(U − 3.3)")\n'
+        'def warm_supply(y, temperature=signal("degC"), supply=signal("V"), *, k=param(2, "1/K"),\n'
+        '                warm=constant(25.0, "degC"), nominal=constant(3.3, "V")):\n'
+        '    """The offset follows temperature and supply together."""\n'
+        "    return y + k * (temperature - warm) * (supply - nominal)\n"
+    )
+    (tmp_path / "own.py").write_text(text, encoding="utf-8")
+    _, result = closed("--effects", "own.py")
+    (found,) = result["effects"]
+    assert found["name"] == "warm_supply"
+    size = found["parameters"]["k_0"]
+    assert abs(size["value"] - SLOPE) < 4 * size["std"]
+
+
+@pytest.mark.parametrize("kind", ["white", "ar1", "student", "unequal"])
+@pytest.mark.parametrize("seed", [1])
+def test_noise_is_no_formula(kind, seed):
+    """The count over 308 worlds is in studies/formula.md."""
+    rng = np.random.default_rng([seed, 77])
+    n = 600
+    t = np.arange(n) / 10
+    noise = worlds.noise(kind, 0.02, np.zeros(n, dtype=int), rng)
+    signals = {"v": 0.3 + noise[:, :2]}
+    made = Run.raw("rest", signals, units={"v": "V"}, time=t)
+    columns = worlds.columns_of(t, "columns", rng)
+    from dataclasses import replace
+
+    record = replace(made, columns=columns, column_units=dict.fromkeys(columns))
+    found = close(resting_model(), [record])
+    assert [f.candidate.label for f in found.effects if f.candidate.label != "outliers"] == []
+
+
+def resting_model():
+    import casest as c
+
+    @c.model
+    def resting(v=c.signal(2, "V"), *, bias=c.param(2, "V")):
+        return c.Residual(measured=v, predicted=c.quantity("reading", bias, "V"))
+
+    return resting
+
+
+@pytest.mark.parametrize(
+    ("what", "size", "words"),
+    [("product", 0.02, {"temperature", "supply"}),
+     ("warm_sine", 0.03, {"temperature"})],
+)  # fmt: skip
+def test_on_a_wheel_the_right_column_or_quantity_is_named(what, size, words):
+    world = worlds.made("wheel", [40_000, *what.encode()], {what: size}, seconds=20.0)
+    from dataclasses import replace
+
+    made = Run.raw("wheel", dict(world.signals), units=dict(world.units), time=world.time)
+    record = replace(made, columns=dict(world.columns), column_units=dict.fromkeys(world.columns))
+    found = close(find_model("wheel"), [record])
+    (formula,) = [f.candidate.effect.formula for f in found.effects]
+    assert all(word in formula for word in words)
+
+
+# -- what cannot be used is named, and stops nothing -----------------------------------------------
+
+
+def test_where_nothing_can_be_held_out_there_is_no_verdict_and_the_fit_is_kept(bench, capsys):
+    write_short = bench[:5]
+    from pathlib import Path
+
+    write(Path("short.csv"), "t [s],vx [V],vy [V],temperature [degC],supply [V]", write_short)
+    code, result = closed(data="short.csv")
+    assert code == 0
+    assert result["verdict"] is None
+    assert result["trusted"] is True
+    assert result["before"]["rmse_holdout"] is None
+    assert "cannot be split into 4 folds" in result["refused"][0]["reason"]
+    assert "nothing was added: short: 5 samples" in capsys.readouterr().out
+
+
+def test_a_constant_column_and_a_copy_are_named(bench, capsys):
+    from pathlib import Path
+
+    rows = np.column_stack([bench, np.full(len(bench), 7.0), 2 * bench[:, 4] + 1])
+    header = "t [s],vx [V],vy [V],temperature [degC],supply [V],same,twice"
+    write(Path("copies.csv"), header, rows)
+    _, result = closed(data="copies.csv")
+    reasons = {s["name"]: s["reason"] for s in result["not_tried"]}
+    assert reasons["same"] == "column is constant"
+    assert reasons["twice"] == "column is a copy of supply (up to scale and offset)"
+    assert [e["name"] for e in result["effects"]] == ["formula"]
+    assert "same was not tried: column is constant" in capsys.readouterr().out
+
+
+BAD = {
+    "not_null": ("y, temperature, *, k=param('V')", "y + 1 + k", "not null at k = 0"),
+    "wrong_unit": ("y, temperature=signal('degC'), *, k=param('V')", "y + k * temperature",
+                   "units do not fit"),
+    "no_unit": ("y, *, k=param('flurb')", "y + k", "unknown unit 'flurb'"),
+    "no_column": ("y, pressure, *, k=param('V')", "y + k * pressure", "the data have no"),
+}  # fmt: skip
+
+
+def test_effects_of_the_users_own_that_cannot_be_used_are_named(bench, tmp_path, capsys):
+    text = "from casest import effect, param, signal\n"
+    for name, (arguments, value, _) in BAD.items():
+        text += f"\n\n@effect(on='reading')\ndef {name}({arguments}):\n"
+        text += f"    '''Bad.'''\n    return {value}\n"
+    (tmp_path / "bad.py").write_text(text, encoding="utf-8")
+    code, result = closed("--effects", "bad.py")
+    assert code == 0
+    reasons = {s["name"]: s["reason"] for s in result["not_tried"]}
+    for name, (_, _, words) in BAD.items():
+        assert words in reasons[name]
+    printed = capsys.readouterr().out
+    assert all(f"{name} was not tried" in printed for name in BAD)
+    assert [e["name"] for e in result["effects"]] == ["formula"]
+
+
+def test_a_candidate_whose_refit_fails_is_named_and_the_loop_goes_on(bench, tmp_path, monkeypatch):
+    """The refit of one candidate meets a matrix that cannot be solved."""
+    from casest.closing import loop
+
+    fitted = loop._Loop._fitted
+
+    def failing(self, model, values):
+        if any(a.label == "temperature_bias(temperature)" for a in model.effects):
+            raise np.linalg.LinAlgError("singular matrix")
+        return fitted(self, model, values)
+
+    monkeypatch.setattr(loop._Loop, "_fitted", failing)
+    code, result = closed()
+    assert code == 0
+    reasons = {s["name"]: s["reason"] for s in result["refused"]}
+    assert reasons["temperature_bias(temperature)"] == "its refit fails: singular matrix"
+    assert [e["name"] for e in result["effects"]] == ["formula"]
