@@ -517,9 +517,6 @@ def simulation(model_name: str, options: Options, command: str) -> None:
         raise UsageError(f"{model_name} is an estimator in motion: it needs a trajectory of yours")
     own = tuple(e for path in options["effects"] for e in find_effects(path))
     model = declared_model(model_name, {**options, "effects": ()})
-    model = simulating.with_effects(model, options["effect"], (*CATALOGUE, *own))
-    given = dict(named_value(text, "--value", model) for text in options["values"])
-    values = simulating.truth(model, {name: value.array for name, value in given.items()})
     rng = np.random.default_rng(options["seed"])
     if options["given"]:
         run = simulating.with_record(model, options["given"], reading_arguments(options))
@@ -531,6 +528,9 @@ def simulation(model_name: str, options: Options, command: str) -> None:
             directions=options["directions"],
             rng=rng,
         )
+    model = simulating.with_effects(model, run, options["effect"], (*CATALOGUE, *own))
+    given = dict(named_value(text, "--value", model) for text in options["values"])
+    values = simulating.truth(model, {name: value.array for name, value in given.items()})
     reading = simulating.simulated(model, run, values, options["noise"], rng)
     paths = simulating.written(
         options["output"], model, run, reading, values, options["noise"], options["seed"], command

@@ -21,6 +21,7 @@ import numpy as np
 
 from casest import __version__
 from casest.apply import Correction
+from casest.closing.candidates import placed_in, prepared, with_numbers
 from casest.data import load_runs
 from casest.data.run import Run
 from casest.data.write import write_atomically
@@ -32,7 +33,9 @@ from casest.result import plain
 from casest.stack import Problem
 
 
-def with_effects(model: Model, wanted: Sequence[str], catalogue: Sequence[Effect]) -> Model:
+def with_effects(
+    model: Model, run: Run, wanted: Sequence[str], catalogue: Sequence[Effect]
+) -> Model:
     """The model with effects by name, `temperature_bias(temp)` where one reads a column."""
     known = {e.name: e for e in catalogue}
     for text in wanted:
@@ -46,8 +49,9 @@ def with_effects(model: Model, wanted: Sequence[str], catalogue: Sequence[Effect
             raise UsageError(
                 f"--effect {text}: it weighs samples and makes none; add far samples yourself"
             )
-        columns = {s.name: found[2] for s in effect.extras} if found[2] else {}
-        model = model.with_effect(effect, columns=columns)
+        columns = tuple((s.name, found[2]) for s in effect.extras) if found[2] else ()
+        effect = with_numbers(placed_in(effect, model), columns, prepared(model, (run,)))
+        model = model.with_effect(effect, columns=dict(columns))
     return model
 
 
@@ -148,6 +152,7 @@ def simulated(
     """Name of the measured signal and its readings (N, m), with white noise of std `noise`."""
     if not (noise >= 0 and np.isfinite(noise)):
         raise UsageError(f"--noise {noise:g}: a standard deviation, not negative")
+    run = prepared(model, (run,))[0]
     if model.implicit:
         name, clean = _of_directions(model, run, values, rng)
     else:

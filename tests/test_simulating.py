@@ -35,8 +35,9 @@ def test_a_simulated_record_is_calibrated_back_to_its_truth(
     tmp_path, capsys, model, arguments, settings
 ):
     record, truth = made(tmp_path, model, *arguments)
+    capsys.readouterr()
     assert command(["calibrate", model, str(record), *settings, "--json"]) == 0
-    found = json.loads(capsys.readouterr().out.partition("{")[2].join(["{", ""]))["estimate"]
+    found = json.loads(capsys.readouterr().out)["estimate"]
     for name, true in truth["parameters"].items():
         value = np.ravel(found["parameters"][name]["value"])
         std = np.ravel(found["parameters"][name]["std"])
