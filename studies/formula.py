@@ -1,6 +1,6 @@
 """Effects of no catalogue: is a formula found that names the right column? And none in noise?
 
-    python studies/formula.py            # half an hour on one core
+    python studies/formula.py            # twenty minutes on one core
     python studies/formula.py --quick
     python studies/formula.py --only 'elsewhere/wheel'
 
@@ -160,7 +160,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="one seed of each")
     parser.add_argument("--only", default="", help="regular expression that a task's name contains")
-    parser.add_argument("--seeds", type=int, default=6)
+    parser.add_argument("--seeds", type=int, default=4)
     parser.add_argument("--nothing", type=int, default=4)
     parser.add_argument("--first", type=int, default=FIRST, help="first seed: others for tuning")
     parser.add_argument("--kept", type=Path, default=KEPT)

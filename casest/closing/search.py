@@ -127,18 +127,14 @@ class Search:
     def chosen(self) -> Chosen | None:
         """The shapes that are significant and stable, without axes on which they are nothing."""
         picked = self._earning(self._exchanged(self.forward(MOST, slice(None))))
-        if not picked or not self._significant(picked) or not self._stable(picked):
+        while picked and not (self._significant(picked) and self._stable(picked)):
+            picked = picked[:-1]
+        if not picked:
             return None
         score = self._joint(picked)
-        inverse = np.linalg.pinv(score.information, hermitian=True)
-        size = np.sqrt(np.maximum(np.diag(inverse) * score.inflation, 1e-300))
-        alive = (np.abs(score.step) > NOTHING * size).reshape(len(picked), self.axes)
-        kept = [
-            (k, tuple(map(int, np.flatnonzero(on)))) for k, on in zip(picked, alive, strict=True)
-        ]
-        kept = [(k, on) for k, on in kept if on]
-        if not kept:
-            return None
+        alive = _something(score).reshape(len(picked), self.axes)
+        axes = [tuple(map(int, np.flatnonzero(on))) for on in alive]
+        kept = [(k, on) for k, on in zip(picked, axes, strict=True) if on]
         return Chosen(tuple(k for k, _ in kept), tuple(on for _, on in kept), score)
 
     def forward(self, most: int, batches: NDArray[np.int_] | slice) -> list[int]:
@@ -224,6 +220,19 @@ class Search:
             again = {self.reads[k] for k in self.forward(len(picked), half)}
             hits += [self.reads[k] in again for k in picked]
         return bool(hits.min() >= STABLE * HALVES)
+
+
+def _something(score: Score) -> NDArray[np.bool_]:
+    """Which of the sizes are something beside the others; the weakest goes first."""
+    total, kept = score.information @ score.step, np.ones(len(score.step), dtype=np.bool_)
+    while kept.sum() > 1:
+        inverse = np.linalg.pinv(score.information[np.ix_(kept, kept)], hermitian=True)
+        variance = np.maximum(np.diag(inverse) * score.inflation, 1e-300)
+        z = np.abs(inverse @ total[kept]) / np.sqrt(variance)
+        if z.min() > NOTHING:
+            break
+        kept[np.flatnonzero(kept)[np.argmin(z)]] = False
+    return kept
 
 
 def search(
