@@ -580,7 +580,7 @@ def export(result_path: Path, to: Any, output: Path | None, **options: Any) -> N
         click.echo(text, nl=False)
         return
     write(output, text)
-    click.echo(f"written: {output}", err=True)
+    click.echo(f"written: {output}")
 
 
 @commands.command()
