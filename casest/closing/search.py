@@ -126,9 +126,8 @@ class Search:
 
     def chosen(self) -> Chosen | None:
         """The shapes that are significant and stable, without axes on which they are nothing."""
-        picked = self._earning(self._exchanged(self.forward(MOST, slice(None))))
-        while picked and not (self._significant(picked) and self._stable(picked)):
-            picked = picked[:-1]
+        first = self.forward(MOST, slice(None))
+        picked = self._lasting(self._exchanged(list(first))) or self._lasting(first)
         if not picked:
             return None
         score = self._joint(picked)
@@ -136,6 +135,13 @@ class Search:
         axes = [tuple(map(int, np.flatnonzero(on))) for on in alive]
         kept = [(k, on) for k, on in zip(picked, axes, strict=True) if on]
         return Chosen(tuple(k for k, _ in kept), tuple(on for _, on in kept), score)
+
+    def _lasting(self, picked: list[int]) -> list[int]:
+        """As many of them, the first ones, as are significant and stable."""
+        picked = self._earning(picked)
+        while picked and not (self._significant(picked) and self._stable(picked)):
+            picked = picked[:-1]
+        return picked
 
     def forward(self, most: int, batches: NDArray[np.int_] | slice) -> list[int]:
         """Shapes one by one, each explaining most beside those before it."""
