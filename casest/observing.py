@@ -175,9 +175,12 @@ def observe_text(content: Mapping[str, Any]) -> str:
     lines += ["", "  standard deviation that these data allow:"]
     units = content.get("units", {})
     for name, std in content["std"].items():
-        values = std if isinstance(std, list) else [std]
-        shown = ", ".join("not determined" if v is None else _number(v) for v in values)
-        lines.append(f"    {name:<16} {shown} {units.get(name, '')}".rstrip())
+        rows = std if isinstance(std, list) else [std]
+        rows = rows if rows and isinstance(rows[0], list) else [rows]
+        for k, row in enumerate(rows):
+            shown = ", ".join(map(_number, row))
+            unit = units.get(name, "") if k == 0 else ""
+            lines.append(f"    {name if k == 0 else '':<16} {shown} {unit}".rstrip())
     if "windows" in content:
         w = content["windows"]
         low, high = min(w["smallest_eigenvalue"]), max(w["smallest_eigenvalue"])
@@ -195,7 +198,7 @@ def _note_lines(content: Mapping[str, Any]) -> list[str]:
 
 
 def _number(value: Any) -> str:
-    return "…" if isinstance(value, list) else f"{value:.3g}"
+    return "not determined" if value is None else f"{value:.3g}"
 
 
 def filter_text(content: Mapping[str, Any]) -> str:

@@ -159,7 +159,7 @@ def _sentence(model: Dynamics, direction: Array) -> str:
         along = [float(v @ unit) for v in vectors]
         if all(np.linalg.norm(v - a * unit) < 1e-5 * np.linalg.norm(v)
                for v, a in zip(vectors, along, strict=True)):  # fmt: skip
-            axis = ", ".join(f"{u:.2f}" for u in unit)
+            axis = ", ".join(f"{u if abs(u) >= 5e-3 else 0.0:.2f}" for u in unit)
             names = " and ".join(name for name, _ in parts)
             same = all(abs(a - along[0]) < 1e-4 * abs(along[0]) for a in along)
             how = "move together" if same else "move in proportion"
