@@ -31,6 +31,7 @@ bench: $(READY)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/wheel_solve.py
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/many.py
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/long.py
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/motion.py
 
 study: $(READY)
 	$(BIN)/python studies/bound.py

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, Literal
 
 import casadi as ca
 import numpy as np
@@ -134,7 +134,7 @@ class Correction:
                 f"{wanted.numel()} components of {self.name}"
             )
         newton = self._newton()
-        affine = not ca.jacobian(ca.vec(ca.jacobian(rest, wanted)), wanted).nnz()
+        affine = self.affine
         reading = run.signals[str(self._cut.measured)]
         best = np.full((len(run), self.size), np.nan)
         middle = 0.0 if around is None else 0.5 * sum(around)
@@ -149,13 +149,79 @@ class Correction:
 
     def _newton(self) -> Replay:
         """(parameters, [sample, value]) -> step to the solution, and what is left."""
-        rest, wanted = self._cut.expression, self._wanted
-        step = -ca.solve(ca.jacobian(rest, wanted), rest)
-        sample = ca.vertcat(sample_symbol(self.model, self._cut), wanted)
-        point = ca.vertcat(self._cut.coordinates, self._cut.references)
+        step, rest = self._step(), self._cut.expression
+        sample = ca.vertcat(sample_symbol(self.model, self._cut), self._wanted)
         outputs = [ca.densify(step), ca.densify(rest)]
         names = ["parameters", "sample"], ["step", "left"]
-        return Replay(ca.Function("inverse", [point, sample], outputs, *names))
+        return Replay(ca.Function("inverse", [self._point(), sample], outputs, *names))
+
+    def _step(self) -> SX:
+        rest, wanted = self._cut.expression, self._wanted
+        return -ca.solve(ca.jacobian(rest, wanted), rest)
+
+    def _point(self) -> SX:
+        return ca.vertcat(self._cut.coordinates, self._cut.references)
+
+    @property
+    def affine(self) -> bool:
+        """Does the reading depend linearly on the corrected quantity?"""
+        rest, wanted = self._cut.expression, self._wanted
+        return not ca.jacobian(ca.vec(ca.jacobian(rest, wanted)), wanted).nnz()
+
+    def as_function(self) -> tuple[Literal["direct", "newton"], Any]:
+        """How it is computed, for export, as a CasADi function.
+
+        direct: (parameters, sample) -> corrected. newton: (parameters, [sample, trial value]) ->
+        [step to the solution, what is left].
+        """
+        if self.model.implicit:
+            return "direct", function_of(self.model, {"c": ca.densify(ca.vec(self._wanted))})
+        if self.model.inverter is not None and not self.model.effects:
+            traced = self.model.traced
+            value = ca.vec(self.model.inverter(dict(traced.symbols), traced.reading))
+            return "direct", function_of(self.model, {"c": ca.densify(value)})
+        rest, wanted, step = self._cut.expression, self._wanted, self._step()
+        if rest.numel() != wanted.numel():
+            raise UsageError(
+                f"model {self.model.name}: {rest.numel()} readings do not determine the "
+                f"{wanted.numel()} components of {self.name}"
+            )
+        sample = sample_symbol(self.model, self._cut)
+        if self.affine:
+            value = ca.densify(ca.substitute(step, wanted, ca.SX.zeros(wanted.numel())))
+            return "direct", ca.Function("inverse", [self._point(), sample], [value])
+        outputs = [ca.densify(ca.vertcat(step, rest))]
+        trial = ca.vertcat(sample, wanted)
+        return "newton", ca.Function("inverse", [self._point(), trial], outputs)
+
+    def readings(self, values: Mapping[str, Any], wanted: Array) -> Array:
+        """Readings (N, m) that an explicit model predicts for corrected values (N, size).
+
+        Signals other than the reading are zero.
+        """
+        model, rest = self.model, ca.densify(self._cut.expression)
+        sample = sample_symbol(model, self._cut)
+        f = ca.Function("rest", [self._point(), sample, self._wanted], [rest])
+        place = 0
+        for s in model.signals:
+            if s.name == self.measured:
+                break
+            place += s.size
+        zero = np.zeros(sum(s.size for s in model.signals))
+        one = zero.copy()
+        one[place : place + rest.numel()] = 1.0
+        point = np.concatenate(model.point(values))
+        rows = []
+        for value in wanted:
+            # What is left is ± (reading − prediction): two readings tell which.
+            a, b = (np.array(f(point, x, value)).ravel() for x in (zero, one))
+            rows.append(-a / (b - a))
+        return np.array(rows)
+
+    @property
+    def measured(self) -> str:
+        """The signal that is compared with the prediction; empty for an implicit model."""
+        return self._cut.measured or ""
 
     def _refuse_unsolved(self, run: Run, reading: Array, best: Array) -> None:
         bad = np.asarray(np.isnan(best).any(axis=1))

@@ -53,7 +53,8 @@ class Estimate:
     `values` and `std` have the parameters' shapes (a leading run axis for per-run ones if there
     are several runs); `robust` is the standard deviation from the sandwich form, which `std` equals
     where residuals are correlated over more than one sample. Both are taken at the least-squares
-    `optimum`, where `point` is not it; `shift` (n, n) is what second-order noise adds.
+    `optimum`, where `point` is not it; `shift` (n, n) is what second-order noise adds, a
+    bias of up to `bias` standard deviations.
     `covariance` (n, n) is of the unknowns `names`. Where the data do not determine a value its std
     is NaN.
     """
@@ -71,7 +72,7 @@ class Estimate:
     outcomes: tuple[Outcome, ...]
     seconds: float
     correlated_over: float = 1.0
-    notes: tuple[str, ...] = ()
+    bias: float = 0.0
     shift: Array | float = 0.0
     optimum: Point | None = None
     extra: Mapping[str, Any] = field(default_factory=dict)
@@ -92,6 +93,20 @@ class Estimate:
         unknown = self.identifiability.touched
         covariance[unknown, :] = covariance[:, unknown] = np.nan
         return self.problem.spread(at, covariance)
+
+    @cached_property
+    def notes(self) -> tuple[str, ...]:
+        """What an engineer should know beside the numbers, a sentence each; looked for when asked.
+
+        (The test of a wheel's speed law takes as long as its fit.)
+        """
+        if not self.outcomes:
+            return ()
+        problem, at = self.problem, self.optimum or self.point
+        dof = problem.residual_count - self.identifiability.rank
+        with np.errstate(all="ignore"):
+            found = notes(problem, at, dof, self.correlated_over, self.bias)
+            return (*found, *_of_tables(problem, at))
 
     @cached_property
     def interval_reach(self) -> tuple[Mapping[str, Array], Mapping[str, Array]]:
@@ -269,7 +284,7 @@ def _estimate(
         tuple(outcomes),
         time.perf_counter() - began,
         correlated,
-        (*notes(problem, point, dof, correlated, relative), *_of_tables(problem, point)),
+        relative,
         shift,
     )
 

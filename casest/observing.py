@@ -11,10 +11,12 @@ import numpy as np
 
 from casest import __version__
 from casest.data.run import Run
+from casest.data.timing import GAP
 from casest.dynamics import Dynamics
 from casest.dynamics.filter import Filtered, filtered
-from casest.dynamics.gramian import gramian, observed, window_eigenvalues
+from casest.dynamics.gramian import Observed, gramian, observed, window_eigenvalues
 from casest.dynamics.transition import linearised
+from casest.errors import UsageError
 from casest.estimate import Estimate, attempt
 from casest.modelling.model import Model
 from casest.result import plain
@@ -50,12 +52,18 @@ def observe_motion(model: Dynamics, run: Run, window: float | None = None) -> di
     system = linearised(model, run)
     seen = observed(model, gramian(model, system))
     duration = float(system.time[-1] - system.time[0])
+    if window is not None and not 2 * float(np.median(system.steps)) <= window < np.inf:
+        raise UsageError(
+            f"--window {window:g} s: a window must hold two steps of "
+            f"{float(np.median(system.steps)):.3g} s at least; the record lasts {duration:.3g} s"
+        )
     length = min(window or WINDOW * duration, duration)
     ends, eigenvalues = window_eigenvalues(model, system, length)
     std = {name: plain(seen.std[where]) for name, where in model.slices().items()}
     return {
         "casest": __version__,
         "model": model.name,
+        "notes": [*assumed(run), *_too_short(seen, len(run), duration)],
         "rank": seen.rank,
         "unknowns": seen.unknowns,
         "unobservable": list(seen.unobservable),
@@ -71,6 +79,32 @@ def observe_motion(model: Dynamics, run: Run, window: float | None = None) -> di
             "eigenvalues": plain(eigenvalues),
         },
     }
+
+
+def assumed(run: Run) -> list[str]:
+    """What was assumed of a record, gaps included, one sentence each."""
+    notes = list(run.notes)
+    time = np.asarray(run.time, float)
+    step = np.diff(time)
+    gaps = np.flatnonzero(step > GAP * np.median(step))
+    if gaps.size:
+        worst = int(gaps[np.argmax(step[gaps])])
+        notes.append(
+            f"{gaps.size} {'gap' if gaps.size == 1 else 'gaps'} in time, the longest of "
+            f"{step[worst]:.3g} s after row {int(run.rows[worst])} (t = {time[worst]:.6g} s): "
+            "inputs were taken as straight lines across; the driving noise does not cover what "
+            "happened there"
+        )
+    return notes
+
+
+def _too_short(seen: Observed, samples: int, duration: float) -> list[str]:
+    if seen.rank == seen.unknowns or samples > seen.unknowns:
+        return []
+    return [
+        f"the trajectory is too short for the question: {samples} samples over {duration:.3g} s "
+        f"for {seen.unknowns} unknowns; what is called unobservable may only need a longer one"
+    ]
 
 
 def follow(model: Dynamics, run: Run) -> tuple[dict[str, Any], Filtered]:
@@ -93,6 +127,7 @@ def follow(model: Dynamics, run: Run) -> tuple[dict[str, Any], Filtered]:
     return {
         "casest": __version__,
         "model": model.name,
+        "notes": assumed(run),
         "samples": len(found.time),
         "states": final,
         "innovations": {
@@ -151,7 +186,12 @@ def observe_text(content: Mapping[str, Any]) -> str:
             f"  over windows of {w['length_s']:.3g} s the smallest eigenvalue (information over "
             f"prior) goes from {low:.3g} to {high:.3g}",
         ]
-    return "\n".join(lines)
+    return "\n".join([*lines, *_note_lines(content)])
+
+
+def _note_lines(content: Mapping[str, Any]) -> list[str]:
+    notes = content.get("notes", [])
+    return ["", *(f"  note: {note}" for note in notes)] if notes else []
 
 
 def _number(value: Any) -> str:
@@ -169,7 +209,7 @@ def filter_text(content: Mapping[str, Any]) -> str:
     lines += ["", f"  innovations are {filter_verdict(content)}"]
     if i["missing_readings"]:
         lines.append(f"  {i['missing_readings']} samples without a complete reading")
-    return "\n".join(lines)
+    return "\n".join([*lines, *_note_lines(content)])
 
 
 def filter_verdict(content: Mapping[str, Any]) -> str:

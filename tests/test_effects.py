@@ -10,7 +10,7 @@ from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
 from casest import effects
-from casest.closing.candidates import _placed
+from casest.closing.candidates import placed_in
 from casest.declaring.symbols import Constant
 from casest.errors import CasestError
 from casest.modelling.effect import NOISE
@@ -51,7 +51,7 @@ def states_no_place(effect, model):
 def attached(effect, model):
     """The model with the effect at its place, reading a column where it needs one."""
     columns = {s.name: "warmth" for s in effect.extras if s.name == "channel"}
-    return model.with_effect(_placed(effect, model), columns=columns)
+    return model.with_effect(placed_in(effect, model), columns=columns)
 
 
 # -- all of them -----------------------------------------------------------------------------------

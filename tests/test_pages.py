@@ -20,7 +20,7 @@ def test_a_reader_who_does_what_a_page_says_sees_what_it_shows(page, tmp_path):
 def test_every_question_has_a_page_with_commands():
     index = (ROOT / "docs" / "index.md").read_text(encoding="utf-8")
     questions = set(re.findall(r"\[\]\((\w+)\.md\)", index))
-    assert questions == {"calibrate", "motion_enough", "close", "invisible", "in_motion"}
+    assert questions == {"calibrate", "motion_enough", "close", "invisible", "export", "in_motion"}
     assert questions <= {page.stem for page in WITH_COMMANDS}
 
 

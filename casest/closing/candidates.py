@@ -122,12 +122,12 @@ def candidates(
         if effect.on == NOISE:
             continue
         try:
-            placed = _placed(effect, model)
+            placed = placed_in(effect, model)
         except CasestError as error:
             skipped.append(Skipped(effect.name, str(error)))
             continue
         for columns in _columns_for(placed, channels, runs):
-            candidate = Candidate(_with_numbers(placed, columns, runs), columns)
+            candidate = Candidate(with_numbers(placed, columns, runs), columns)
             try:
                 found.append(_tried(candidate, model, runs))
             except CasestError as error:
@@ -139,7 +139,7 @@ def candidates(
     return found, skipped
 
 
-def _placed(effect: Effect, model: Model) -> Effect:
+def placed_in(effect: Effect, model: Model) -> Effect:
     """The effect on the model's own quantity instead of "input" or "output"."""
     corrected = model.traced.corrected
     predicted = next(
@@ -208,7 +208,7 @@ def _useless(name: str, x: Array, others: Mapping[str, Array]) -> str:
     return ""
 
 
-def _with_numbers(
+def with_numbers(
     effect: Effect, columns: tuple[tuple[str, str], ...], runs: Sequence[Run]
 ) -> Effect:
     """Numbers that come from the data: the channel's mean, the record's duration."""

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casest.closing.adequacy import DOUBT, State, independent, state_of
-from casest.closing.candidates import Candidate, _placed, usable_columns
+from casest.closing.candidates import Candidate, placed_in, usable_columns
 from casest.closing.dependence import slow_shapes
 from casest.closing.noise_model import (
     MIDDLE,
@@ -199,7 +199,7 @@ class _Library:
             return None
         state = state_of(problem, problem.point(current.values), loop.folds.batches)
         try:
-            probe = Candidate(_placed(_probe, current.model))
+            probe = Candidate(placed_in(_probe, current.model))
             return _library(state, probe)
         except CasestError:
             return None

@@ -175,7 +175,7 @@ def _with_time_column(
                 f"{table.file}: column {name} as time: {error}; "
                 f"name another column with --columns t=… or say its unit with --unit t=…"
             ) from error
-        found.notes.append(f"time not used: {error}")
+        found.notes.append(f"{timing.UNUSED}{error}")
         return replace(found, time_source=name)
     found.notes.extend([note] if note else [])
     return replace(found, time=time, time_source=name)
@@ -216,7 +216,7 @@ def _from_column(
     except DataError as error:
         if needed:
             raise
-        return None, [f"time not used: {error}"]
+        return None, [f"{timing.UNUSED}{error}"]
     if options.time_zero == "column" or time[0] == 0.0:
         return time, []
     return time - time[0], [f"time starts at {time[0]:.9g} s; that sample is t = 0"]

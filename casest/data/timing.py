@@ -17,6 +17,9 @@ Array = NDArray[np.float64]
 
 GAP = 5.0  # times the median step
 
+#: How the note begins that tells why a time column was left aside.
+UNUSED = "time not used: "
+
 _NAMES = ("t", "time", "timestamp", "timestamps")
 _RATE_NAMES = ("fs", "rate", "samplerate", "samplingrate", "samplefrequency", "samplingfrequency")
 

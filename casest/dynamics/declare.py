@@ -52,9 +52,23 @@ def state(
     else:
         size = shape
     values = np.broadcast_to(np.asarray(start, float), (size,))
-    if intensity < 0 or not std > 0:
-        raise DeclarationError(f"state: intensity {intensity} must be ≥ 0 and std {std} > 0")
+    for field, number in (("intensity", intensity), ("std", std)):
+        wrong = _wrong(field, number)
+        if wrong:
+            raise DeclarationError(f"state: {wrong}")
     return State("", size, unit, float(intensity), tuple(values.tolist()), float(std))
+
+
+def _wrong(field: str, number: Any) -> str | None:
+    """What makes a number no intensity or no standard deviation, if anything does."""
+    if field == "intensity" and not 0 <= number < np.inf:
+        return f"the intensity {number:g} must be finite and not negative (unit²/s)"
+    if field == "std" and not 0 < number < np.inf:
+        return (
+            f"the std {number:g} at the beginning must be positive and finite, or the covariance "
+            "is not positive definite"
+        )
+    return None
 
 
 @dataclass(frozen=True)
@@ -128,8 +142,11 @@ class Dynamics:
         return self._with_states("start", found)
 
     def _with_states(self, field: str, values: Mapping[str, Any]) -> Dynamics:
-        for name in values:
+        for name, value in values.items():
             _ = self[name]
+            wrong = _wrong(field, value)
+            if wrong:
+                raise UsageError(f"{self.name}: {name}: {wrong}")
         changed = tuple(
             replace(s, **{field: values[s.name]}) if s.name in values else s for s in self.states
         )

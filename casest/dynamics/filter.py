@@ -120,8 +120,12 @@ def _smoothed(
     """Rauch, Tung & Striebel (1965), backwards over the record."""
     smooth_x, smooth_P = x.copy(), P.copy()
     gains = np.linalg.solve(before_P[1:], Phi @ P[:-1]).transpose(0, 2, 1)
+    # What does not depend on later samples, all at once.
+    own_x = x[:-1] - np.einsum("kij,kj->ki", gains, before_x[1:])
+    own_P = P[:-1] - gains @ before_P[1:] @ gains.transpose(0, 2, 1)
+    later_x, later_P = x[-1], P[-1]
     for k in range(len(x) - 2, -1, -1):
         G = gains[k]
-        smooth_x[k] = x[k] + G @ (smooth_x[k + 1] - before_x[k + 1])
-        smooth_P[k] = P[k] + G @ (smooth_P[k + 1] - before_P[k + 1]) @ G.T
+        smooth_x[k] = later_x = own_x[k] + G.dot(later_x)
+        smooth_P[k] = later_P = own_P[k] + G.dot(later_P).dot(G.T)
     return smooth_x, smooth_P

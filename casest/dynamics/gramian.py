@@ -49,7 +49,7 @@ def gramian(model: Dynamics, system: Linearised) -> Array:
 def _of_steps(model: Dynamics, system: Linearised, Phi: Array) -> Array:
     """W of every single step at its own beginning, (N − 1, n, n): Simpson's rule."""
     weight = np.linalg.inv(model.noise)
-    half, _ = transitions(system, parts=2)
+    half, _ = transitions(system, (0.0, 0.5))
     middle = 0.5 * (system.C[1:] + system.C[:-1]) @ half
     first, last = system.C[:-1], system.C[1:] @ Phi
     h = system.steps[:, None, None]
@@ -201,7 +201,7 @@ def window_eigenvalues(
     )
     found = []
     for end in ends:
-        first = int(np.searchsorted(time, end - window - 1e-12))
+        first = min(int(np.searchsorted(time, end - window - 1e-12)), len(time) - 2)
         last = max(int(np.searchsorted(time, end + 1e-12)) - 1, first + 1)
         own = _reduced(Phi[first:last], W[first:last])[1]
         found.append(np.linalg.eigvalsh(own * np.outer(prior, prior)))

@@ -12,7 +12,7 @@ import numpy as np
 
 from casest.declaring.shapes import Array
 from casest.dynamics.declare import Dynamics
-from casest.dynamics.transition import Linearised, exponential
+from casest.dynamics.transition import Linearised, magnus_steps
 from casest.errors import DataError
 
 
@@ -21,35 +21,35 @@ def riccati(model: Dynamics, system: Linearised, start: Array | None = None) -> 
 
     Raises DataError where the start is no covariance.
     """
+    from scipy.linalg.lapack import dgesv
+
     P = np.asarray(model.start_covariance if start is None else start, float)
     check_covariance(P, "the covariance at the beginning")
     steps = hamiltonian_steps(model, system)
     n = model.size
     found = np.empty((len(system.time), n, n))
     found[0] = P
-    for k, step in enumerate(steps):
-        X = step[:n, :n] @ P + step[:n, n:]
-        Y = step[n:, :n] @ P + step[n:, n:]
-        P = np.linalg.solve(Y.T, X.T).T
-        P = 0.5 * (P + P.T)
-        found[k + 1] = P
+    for k, (of_P, alone) in enumerate(zip(steps[:, :, :n], steps[:, :, n:], strict=True)):
+        both = of_P.dot(P)
+        both += alone
+        # The rows of [X; Y] are the columns that LAPACK wants: P = XY⁻¹ = (Y⁻ᵀXᵀ)ᵀ.
+        half = dgesv(both[n:].T, both[:n].T)[2]
+        found[k + 1] = P = 0.5 * (half + half.T)
     return found
 
 
 def hamiltonian_steps(model: Dynamics, system: Linearised) -> Array:
     """Transition of [X; Y] over every step, (N − 1, 2n, 2n), by fourth-order Magnus steps."""
-    first, last = (_hamiltonian(model, system, end) for end in (slice(None, -1), slice(1, None)))
-    h = system.steps[:, None, None]
-    magnus = 0.5 * h * (first + last) + h**2 / 12 * (last @ first - first @ last)
-    return exponential(magnus)
+    weight: Array = np.asarray(np.linalg.inv(model.noise), float)
+    return magnus_steps(lambda where: _hamiltonian(model, system, where, weight), system)
 
 
-def _hamiltonian(model: Dynamics, system: Linearised, where: slice) -> Array:
+def _hamiltonian(model: Dynamics, system: Linearised, where: slice, weight: Array) -> Array:
     A, C = system.A[where], system.C[where]
     n = model.size
     both = np.zeros((len(A), 2 * n, 2 * n))
     both[:, :n, :n], both[:, :n, n:] = A, model.process
-    both[:, n:, :n] = C.transpose(0, 2, 1) @ np.linalg.inv(model.noise) @ C
+    both[:, n:, :n] = C.transpose(0, 2, 1) @ weight @ C
     both[:, n:, n:] = -A.transpose(0, 2, 1)
     return both
 

@@ -1,0 +1,159 @@
+"""`casest export`: the correction of a saved result for the device, and JSON ones applied again."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from casest import __version__
+from casest.apply import Correction
+from casest.applying import saved_model
+from casest.data import load_runs
+from casest.declaring.shapes import Array
+from casest.declaring.symbols import Signal
+from casest.errors import DataError, UsageError
+from casest.export import runtime
+from casest.export.c import c_source
+from casest.export.numpy_module import as_data, python_source
+from casest.export.program import Program, program
+from casest.result import load_result, plain
+
+#: What the JSON form calls itself; its schema is `casest/export/correction.schema.json`.
+FORMAT = "casest-correction-1"
+#: Samples of the self-test.
+TESTED = 16
+
+
+def exported(
+    path: Path,
+    to: Literal["c", "python", "json"],
+    *,
+    single: bool = False,
+    run: int = 0,
+    force: bool = False,
+) -> str:
+    """Text of the exported correction. `run` chooses among runs whose corrections differ."""
+    result = load_result(path)
+    if not result.get("trusted", True) and not force:
+        raise UsageError(f"{path}: this estimate was refused; --force exports it all the same")
+    model, values = saved_model(result)
+    correction = Correction(model)
+    several = len(result["runs"]) > 1
+    own = {p.name for p in model.parameters if p.scope == "run"} & correction.parameters
+    if several and own and not 0 <= run < len(result["runs"]):
+        raise UsageError(f"--run {run}: there are runs 0 to {len(result['runs']) - 1}")
+    known = {n: _of_run(model[n], np.asarray(v), run) for n, v in values.items()}
+    found = result.get("corrected") or {}
+    around = (found["low"], found["high"]) if "low" in found else None
+    samples, largest = _samples(correction, known, around)
+    built = program(correction, known, result.get("units", {}), around, largest)
+    expected = runtime.corrected(as_data(built), samples)
+    if to == "json":
+        return _as_json(built, result, known)
+    if to == "python":
+        return python_source(built)
+    name = "correct_" + re.sub(r"\W", "_", model.name)
+    return c_source(built, name, single, (samples, expected))
+
+
+def _of_run(parameter: Any, value: Array, run: int) -> Array:
+    return value[run] if value.ndim > len(parameter.shape.dims) else value
+
+
+def _samples(
+    correction: Correction, values: Mapping[str, Any], around: tuple[float, float] | None
+) -> tuple[Array, float]:
+    """Samples (TESTED, width) whose corrected values lie in the range of the fit; largest reading.
+
+    An explicit model predicts the readings; an implicit one is given readings of that size.
+    """
+    low, high = around or (-1.0, 1.0)
+    rng = np.random.default_rng(0)
+    wanted = rng.uniform(low, high, (TESTED, correction.size))
+    width = sum(s.size for s in correction.signals)
+    if correction.model.implicit:
+        found = rng.uniform(low, high, (TESTED, width))
+        return found, float(np.abs(found).max())
+    readings = correction.readings(values, wanted)
+    samples, place = np.zeros((TESTED, width)), 0
+    for s in correction.signals:
+        if s.name == correction.measured:
+            samples[:, place : place + s.size] = readings
+        place += s.size
+    return samples, float(np.abs(readings).max())
+
+
+def _as_json(built: Program, result: Mapping[str, Any], values: Mapping[str, Any]) -> str:
+    content = {
+        "format": FORMAT,
+        "casest": __version__,
+        "model": result["model"],
+        "convention": result.get("convention", ""),
+        "data": result["data"],
+        "parameters": {
+            name: {**p, "value": plain(values.get(name, p["value"]))}
+            for name, p in _with_std(result).items()
+        },
+        "constants": result["constants"],
+        "program": as_data(built),
+    }
+    return json.dumps(content, indent=1) + "\n"
+
+
+def _with_std(result: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    estimate = result.get("estimate") or result.get("after") or {}
+    found = estimate.get("parameters", {})
+    return {n: {k: p[k] for k in ("value", "std", "unit")} for n, p in found.items()}
+
+
+def is_exported(path: Path) -> bool:
+    """Is this file a correction that was exported as JSON?"""
+    if not path.is_file() or path.suffix != ".json":
+        return False
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    return isinstance(content, dict) and str(content.get("format", "")).startswith("casest-corr")
+
+
+def applied(path: Path, data: str, arguments: Mapping[str, Any]) -> str:
+    """CSV of readings and corrected values by an exported JSON correction alone."""
+    content = json.loads(path.read_text(encoding="utf-8"))
+    if content["format"] != FORMAT:
+        raise UsageError(f"{path}: format {content['format']!r}; this casest reads {FORMAT}")
+    steps = content["program"]
+    signals = [Signal(i["name"], i["size"], i["unit"] or None) for i in steps["inputs"]]
+    runs = load_runs([data], signals, **arguments)
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    out = steps["output"]
+    names = [f"{s.name}{_axis(k, s.size)}" for s in signals for k in range(s.size)]
+    wanted = [
+        f"{out['name']}{_axis(k, out['size'], '_')} [{out['unit'] or '1'}]"
+        for k in range(out["size"])
+    ]
+    writer.writerow(["run", "row", *names, *wanted])
+    for run in runs:
+        x = np.hstack([np.asarray(run.signals[s.name]) for s in signals])
+        try:
+            found = runtime.corrected(steps, x)
+        except ValueError as error:
+            raise DataError(f"{run.file}: {error}") from None
+        for k in range(len(run)):
+            row = [f"{v:.9g}" for v in (*x[k], *found[k])]
+            writer.writerow([run.name, int(run.rows[k]), *row])
+    return text.getvalue()
+
+
+def _axis(k: int, size: int, before: str = "") -> str:
+    if size == 1:
+        return ""
+    return before + ("xyz"[k] if size == 3 else f"[{k}]")

@@ -1,0 +1,215 @@
+"""Exported C, Python and JSON give what `casest apply` gives, and refuse what it refuses."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from importlib.resources import files
+
+import numpy as np
+import pytest
+import simulators as sim
+
+from casest import Correction, Run
+from casest.applying import saved_model
+from casest.cli import run as command
+from casest.demonstration import RECORD, WHEEL
+from casest.exporting import is_exported
+
+HANDHELD = [str(RECORD), "--columns", "v=ax,ay,az", "--rate", "50", "--at-rest"]
+G = ["--set", "norm=9.80665 m/s^2"]
+CELL = '''
+from casest import Residual, effect, exp, model, param, quantity, signal
+
+
+@model
+def ntc(T=signal("K"), r=signal("ohm"), *, a=param("ohm", start=9e3), b=param("K", start=3e3)):
+    """Two-parameter equation of a thermistor: no closed form is declared, and it is not linear."""
+    temperature = quantity("temperature", T, "K")
+    reading = quantity("reading", a * exp(b * (1 / temperature - 1 / 298.15)), "ohm")
+    return Residual(measured=r, predicted=reading, corrected=temperature)
+'''
+
+
+def table_record(path):
+    rng = np.random.default_rng(3)
+    t, R = sim.table_steps(24, rng, sampled=0.2)
+    F = np.eye(3) * 1.02
+    down = np.array([0.0, 0.0, 1.0])
+    a, _ = sim.table_readings(R, down, F, np.array([2e-4, -1e-4, 1e-4]), np.full(3, 0.1), 5e-3, rng)
+    from scipy.spatial.transform import Rotation
+
+    q = Rotation.from_matrix(R).as_quat()
+    columns = np.column_stack([t, a, q[:, 3], q[:, 0], q[:, 1], q[:, 2]])
+    header = "t [s],ax [m/s^2],ay [m/s^2],az [m/s^2],qw,qx,qy,qz"
+    np.savetxt(path, columns, delimiter=",", header=header, comments="")
+    return path
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory):
+    """Folders of results of all kinds: implicit, linear, closed form, Newton, with an effect."""
+    folder = tmp_path_factory.mktemp("results")
+    (folder / "thermistor.py").write_text(CELL, encoding="utf-8")
+    kelvin = np.linspace(270.0, 345.0, 30)
+    ohm = 1e4 * np.exp(3950 * (1 / kelvin - 1 / 298.15))
+    ohm *= 1 + 1e-4 * np.random.default_rng(0).standard_normal(30)
+    np.savetxt(
+        folder / "bath.csv",
+        np.column_stack([kelvin, ohm]),
+        delimiter=",",
+        header="T [K],r [ohm]",
+        comments="",
+    )
+    made = {
+        "norm-diagonal": ["calibrate", "norm-diagonal", *HANDHELD, *G],
+        "norm-triangular": ["calibrate", "norm-triangular", *HANDHELD, *G],
+        "closed": ["close", "norm-diagonal", *HANDHELD, *G],
+        "wheel": ["calibrate", "wheel", str(WHEEL)],
+        "rate-table": ["calibrate", "rate-table", str(table_record(folder / "table.csv"))],
+        "thermistor": ["calibrate", str(folder / "thermistor.py"), str(folder / "bath.csv")],
+    }
+    for name, arguments in made.items():
+        assert command([*arguments, "-o", str(folder / name)]) == 0, name
+    return folder
+
+
+NAMES = ["norm-diagonal", "norm-triangular", "closed", "wheel", "rate-table", "thermistor"]
+
+
+def by_apply(folder, inputs):
+    """What the model itself makes of inputs (N, width) in the order of the JSON's inputs."""
+    result = json.loads((folder / "result.json").read_text(encoding="utf-8"))
+    model, values = saved_model(result)
+    correction = Correction(model)
+    signals, place = {}, 0
+    for s in correction.signals:
+        signals[s.name] = inputs[:, place : place + s.size]
+        place += s.size
+    run = Run.raw("new", signals, units={})
+    found = result["corrected"]
+    return correction(replace(run, file="new"), values, (found["low"], found["high"]))
+
+
+def readings(folder, program, count=200):
+    """Readings within the range of the fit: predicted by the model, or at random (implicit)."""
+    result = json.loads((folder / "result.json").read_text(encoding="utf-8"))
+    model, values = saved_model(result)
+    rng = np.random.default_rng(5)
+    low, high = result["corrected"]["low"], result["corrected"]["high"]
+    if model.implicit:
+        return rng.uniform(low, high, (count, sum(i["size"] for i in program["inputs"])))
+    wanted = rng.uniform(low, high, (count, program["output"]["size"]))
+    return Correction(model).readings(values, wanted)
+
+
+def exported(folder, to, path, *more):
+    assert command(["export", str(folder), "--to", to, "-o", str(path), *more]) == 0
+    return path
+
+
+def compiled(source, folder, *flags):
+    compiler = shutil.which("cc")
+    if compiler is None:
+        pytest.skip("no C compiler on this machine: the exported source is not compiled")
+    program = folder / "a.out"
+    strict = ["-std=c99", "-Wall", "-Wextra", "-Werror", "-O2"]
+    subprocess.run([compiler, *strict, *flags, str(source), "-o", str(program), "-lm"], check=True)
+    return program
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_c_python_and_json_give_what_apply_gives(results, tmp_path, name):
+    folder = results / name
+    content = json.loads(exported(folder, "json", tmp_path / "c.json").read_text(encoding="utf-8"))
+    x = readings(folder, content["program"])
+    truth = by_apply(folder, x)
+    module = exported(folder, "python", tmp_path / "correction.py")
+    np.save(tmp_path / "x.npy", x)
+    code = (
+        "import numpy as np, correction; "
+        "np.save('c.npy', correction.correct(np.load('x.npy'))); "
+        "import sys; assert not any(m.startswith(('casest', 'casadi')) for m in sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code], cwd=tmp_path, check=True)
+    np.testing.assert_allclose(np.load(tmp_path / "c.npy"), truth, rtol=1e-9, atol=1e-12)
+    assert module.exists()
+    source = exported(folder, "c", tmp_path / "c.c")
+    function = source.read_text(encoding="utf-8").split("int correct_")[1].split("(")[0]
+    main = tmp_path / "main.c"
+    main.write_text(
+        f'#include <stdio.h>\n#include "c.c"\n'
+        f"int main(void) {{ double x[{x.shape[1]}], c[{truth.shape[1]}]; for (;;) {{\n"
+        f'for (int i = 0; i < {x.shape[1]}; ++i) if (scanf("%lf", x + i) != 1) return 0;\n'
+        f"if (correct_{function}(x, c)) return 1;\n"
+        f'for (int i = 0; i < {truth.shape[1]}; ++i) printf("%.17g ", c[i]); }} }}\n',
+        encoding="utf-8",
+    )
+    text = " ".join(f"{v:.17g}" for v in x.ravel())
+    done = subprocess.run(
+        [compiled(main, tmp_path)], input=text, capture_output=True, text=True, check=True
+    )
+    found = np.array(done.stdout.split(), dtype=float).reshape(truth.shape)
+    np.testing.assert_allclose(found, truth, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("flag", [(), ("--float",)])
+@pytest.mark.parametrize("name", ["closed", "wheel", "rate-table", "thermistor"])
+def test_the_self_test_of_the_source_passes(results, tmp_path, name, flag):
+    source = exported(results / name, "c", tmp_path / "c.c", *flag)
+    program = compiled(source, tmp_path, "-DCASEST_SELF_TEST")
+    done = subprocess.run([program], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout
+
+
+def test_the_json_is_applied_without_the_model(results, tmp_path, capsys):
+    path = exported(results / "thermistor", "json", tmp_path / "c.json")
+    assert is_exported(path)
+    assert not is_exported(results / "thermistor" / "result.json")
+    capsys.readouterr()
+    assert command(["apply", str(path), str(results / "bath.csv")]) == 0
+    rows = capsys.readouterr().out.splitlines()
+    assert rows[0] == "run,row,r,temperature [K]"
+    table = np.array([row.split(",")[1:] for row in rows[1:]], dtype=float)
+    np.testing.assert_allclose(table[:, 2], np.linspace(270.0, 345.0, 30), atol=0.05)
+
+
+def test_outside_the_domain_every_form_says_so(results, tmp_path, capsys):
+    """No temperature gives a negative resistance."""
+    exported(results / "thermistor", "python", tmp_path / "correction.py")
+    code = "import numpy as np, correction; correction.correct(np.array([[1e4], [-5.0]]))"
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert "row 1: outside what the model can produce" in done.stderr
+    path = exported(results / "thermistor", "json", tmp_path / "c.json")
+    bad = tmp_path / "bad.csv"
+    bad.write_text("r [ohm]\n10000\n-5\n", encoding="utf-8")
+    capsys.readouterr()
+    assert command(["apply", str(path), str(bad)]) == 1
+    assert "row 1" in capsys.readouterr().err
+
+
+def test_the_json_follows_its_published_schema(results, tmp_path):
+    jsonschema = pytest.importorskip("jsonschema")
+    schema = json.loads(
+        files("casest.export").joinpath("correction.schema.json").read_text("utf-8")
+    )
+    for name in NAMES:
+        path = exported(results / name, "json", tmp_path / "c.json")
+        jsonschema.validate(json.loads(path.read_text(encoding="utf-8")), schema)
+
+
+def test_a_refused_result_is_not_exported(tmp_path, capsys):
+    assert command(["calibrate", "norm-full", *HANDHELD, *G, "-o", str(tmp_path)]) == 2
+    capsys.readouterr()
+    assert command(["export", str(tmp_path), "--to", "c"]) == 1
+    assert "this estimate was refused; --force" in capsys.readouterr().err
+
+
+def test_float_is_for_c_alone(results, capsys):
+    assert command(["export", str(results / "wheel"), "--to", "json", "--float"]) == 1
+    assert "--float is for --to c" in capsys.readouterr().err

@@ -1,0 +1,111 @@
+"""Simulated records are read and calibrated back to their truth; what cannot be made is said."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from casest.cli import run as command
+
+WHEEL = [
+    "--duration", "60", "--rate", "100", "--noise", "0.05",
+    "--value", "speed=10,-0.05,1e-4,1e-7", "--value", "misalignment=0.5,0.4,0.3",
+    "--value", "tilt=0.8", "--value", "offset=0.2,-0.1,0.3", "--value", "phase=1",
+]  # fmt: skip
+G = ["--set", "norm=9.80665"]
+
+
+def made(folder, model, *arguments):
+    assert command(["simulate", model, *arguments, "-o", str(folder)]) == 0
+    return folder / "record.csv", json.loads((folder / "truth.json").read_text(encoding="utf-8"))
+
+
+@pytest.mark.parametrize(
+    ("model", "arguments", "settings"),
+    [
+        ("wheel", WHEEL, []),
+        ("norm-diagonal", ["--directions", "30", "--noise", "0.01", *G], G),
+        ("norm-triangular", ["--directions", "30", "--noise", "0.01", *G], G),
+        ("rate-table", ["--directions", "40", "--noise", "0.002", "--value", "bias=0.1,0,0"], []),
+    ],
+)
+def test_a_simulated_record_is_calibrated_back_to_its_truth(
+    tmp_path, capsys, model, arguments, settings
+):
+    record, truth = made(tmp_path, model, *arguments)
+    capsys.readouterr()
+    assert command(["calibrate", model, str(record), *settings, "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)["estimate"]
+    for name, true in truth["parameters"].items():
+        value = np.ravel(found["parameters"][name]["value"])
+        std = np.ravel(found["parameters"][name]["std"])
+        away = np.abs(value - np.ravel(true))[std > 0] / std[std > 0]
+        assert away.max() < 6, name
+
+
+def test_an_effect_that_was_added_is_what_the_loop_finds(tmp_path, capsys):
+    effect = ["--effect", "imbalance", "--value", "imbalance.sine=0.3"]
+    record, truth = made(tmp_path, "wheel", *WHEEL, *effect)
+    assert truth["effects"] == ["imbalance"]
+    assert command(["close", "wheel", str(record), "-o", str(tmp_path / "out")]) == 0
+    result = json.loads((tmp_path / "out" / "result.json").read_text(encoding="utf-8"))
+    assert [e["name"] for e in result["effects"]] == ["imbalance"]
+    sine = result["after"]["parameters"]["imbalance.sine"]
+    assert abs(sine["value"] - 0.3) < 5 * sine["std"]
+
+
+def test_other_signals_and_columns_come_from_a_file(tmp_path, capsys):
+    (tmp_path / "cell.py").write_text(
+        "from casest import Residual, model, param, quantity, signal\n"
+        "@model\n"
+        'def cell(force=signal("N"), v=signal("mV"), *, zero=param("mV"), '
+        'gain=param("mV/N", start=2.0)):\n'
+        '    """Linear."""\n'
+        '    load = quantity("load", force, "N")\n'
+        '    reading = quantity("reading", zero + gain * load, "mV")\n'
+        "    return Residual(measured=v, predicted=reading, corrected=load)\n",
+        encoding="utf-8",
+    )
+    force, warm = np.linspace(0, 20, 60), 20 + 5 * np.sin(np.arange(60))
+    loads = tmp_path / "loads.csv"
+    table = np.column_stack([force, warm])
+    np.savetxt(loads, table, delimiter=",", header="force [N],temp", comments="")
+    model = str(tmp_path / "cell.py")
+    arguments = ["--input", str(loads), "--effect", "temperature_bias(temp)", "--noise", "0.01"]
+    record, truth = made(tmp_path / "out", model, *arguments, "--value", "zero=0.5")
+    head, *rows = record.read_text(encoding="utf-8").splitlines()
+    assert head == "force [N],v [mV],temp"
+    assert len(rows) == 60
+    assert truth["effects"] == ["temperature_bias(temp)"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["norm-diagonal"], "give --directions N"),
+        (["wheel"], "say --duration and --rate"),
+        (["wheel", "--duration", "-1", "--rate", "10"], "both must be positive"),
+        (["wheel", *WHEEL, "--effect", "nothing"], "no such effect"),
+        (["wheel", *WHEEL, "--effect", "outliers"], "it weighs samples and makes none"),
+        (["wheel", *WHEEL, "--noise", "-1"], "a standard deviation, not negative"),
+        (["wheel", *WHEEL, "--value", "radius=1"], "unknowns are gain"),
+        (["bias-gravity"], "estimator in motion"),
+        (["norm-pair", "--directions", "5"], "cannot be simulated"),
+    ],
+)
+def test_what_cannot_be_simulated_is_said(tmp_path, capsys, arguments, words):
+    assert command(["simulate", *arguments, "-o", str(tmp_path)]) == 1
+    error = capsys.readouterr().err
+    assert words in error
+    assert "Traceback" not in error
+    assert not (tmp_path / "record.csv").exists()
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_completion_is_a_script_for_the_shell(capsys, shell):
+    assert command(["completion", shell]) == 0
+    script = capsys.readouterr().out
+    assert "_CASEST_COMPLETE" in script
+    assert shell in script
