@@ -314,7 +314,7 @@ class _Loop:
         best, steps = (score, fitted), _steps(kind, value, self.runs)
         for step in steps:
             for way in (-1, 1):
-                while True:
+                for _ in range(STRIDES):
                     moved = _holding(score, name, value + way * step)
                     found = self._with(current, moved)
                     if found is None or _cost(found) >= _cost(best[1]):
