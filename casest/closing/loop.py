@@ -50,6 +50,8 @@ HELD_OUT_DATA = "held-out data"
 ALIKE, NAMED = 2.0, 2
 #: Candidates that are refitted in a round, those that score as well as the best of them, rounds.
 CONTENDERS, MORE, ROUNDS = 6, 4, 8
+#: Steps of one size that a level or moment may take from where the grid found it.
+STRIDES = 6
 #: A parameter within so many standard deviations of null is nothing.
 NOTHING = 3.0
 #: Columns of the widest model that is evaluated at once.
