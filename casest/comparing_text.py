@@ -11,6 +11,7 @@ import numpy as np
 
 from casest import __version__
 from casest.compare import Comparison, Row, Trial
+from casest.data.logs import file_name
 from casest.data.write import write_atomically
 from casest.errors import DataError
 from casest.naming import unit_table
@@ -42,7 +43,7 @@ def _head(found: Comparison, data: Sequence[str]) -> str:
     unit = _unit(found)
     verdict = "certified optimum" if found.certified else "NO CERTIFIED OPTIMUM; best point"
     line = (
-        f"{problem.model.name} on {', '.join(Path(name).name for name in data)}: {samples} "
+        f"{problem.model.name} on {', '.join(file_name(name) for name in data)}: {samples} "
         f"samples, {problem.unknowns} unknowns; {verdict}: cost {found.best:.6g}"
         f"{_squared(unit)}, one residual's noise {found.sigma:.3g}{unit and ' ' + unit}; certified "
         f"fit {seconds_text(estimate.seconds)}"

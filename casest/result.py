@@ -17,6 +17,7 @@ import casadi as ca
 import numpy as np
 
 from casest import __version__
+from casest.data.logs import file_and_topics
 from casest.data.run import Run
 from casest.data.write import write_atomically
 from casest.declaring.shapes import Array
@@ -197,8 +198,22 @@ def reproduce(command: str, data: Sequence[str]) -> dict[str, Any]:
         "command": command,
         "python": platform.python_version(),
         **{name: version(name) for name in ("casadi", "numpy", "scipy")},
-        "sha256": {name: hashlib.sha256(Path(name).read_bytes()).hexdigest() for name in data},
+        "sha256": {name: _digest(name) for name in data},
     }
+
+
+def _digest(name: str) -> str:
+    """SHA-256 of a data file; of a folder (a ROS 2 bag), of its files' in order of their names."""
+    path = file_and_topics(name)[0]
+    whole = hashlib.sha256()
+    for file in sorted(path.iterdir()) if path.is_dir() else [path]:
+        if file.is_file():
+            with file.open("rb") as stream:
+                part = hashlib.file_digest(stream, "sha256")
+            if not path.is_dir():
+                return part.hexdigest()
+            whole.update(part.digest())
+    return whole.hexdigest()
 
 
 def plain(value: Any) -> Any:

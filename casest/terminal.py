@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from casest.data.logs import file_name
 from casest.declaring.shapes import Array
 from casest.estimate import Estimate
 from casest.modelling.effect import Effect
@@ -85,7 +86,7 @@ def _head(found: Estimate, content: Mapping[str, Any]) -> str:
     samples = sum(len(run) for run in found.problem.runs)
     what = "rest intervals" if found.problem.runs[0].spread else "samples"
     verdict = "trusted" if found.certificate.trusted else "NOT TRUSTED"
-    files = ", ".join(Path(name).name for name in content["data"])
+    files = ", ".join(file_name(name) for name in content["data"])
     line = (
         f"{found.model.name} on {files}: {samples} {what}, "
         f"{found.identifiability.unknowns} unknowns, rank {found.identifiability.rank}: {verdict}"

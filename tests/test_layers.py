@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[1]
 #: From the ground up. A module may import its own floor and those above it in this list.
 FLOORS = [
     ["casest", "casest.errors"],
-    ["casest.units"],
+    ["casest.libraries", "casest.units"],
     ["casest.declaring"],
     ["casest.data"],
     ["casest.modelling"],

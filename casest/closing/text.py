@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from casest.closing.loop import HELD_OUT_DATA, Closing
+from casest.data.logs import file_name
 from casest.effects import CATALOGUE
 from casest.terminal import WIDTH, item, value_table
 
@@ -58,7 +59,7 @@ def sentence(content: Mapping[str, Any]) -> str:
 
 
 def _head(closing: Closing, content: Mapping[str, Any]) -> str:
-    files = ", ".join(Path(name).name for name in content["data"])
+    files = ", ".join(file_name(name) for name in content["data"])
     return textwrap.fill(f"{closing.before.model.name} on {files}: {sentence(content)}", WIDTH)
 
 
