@@ -80,7 +80,7 @@ def reading_options(command: Callable[..., Any]) -> Callable[..., Any]:
         click.option("--rate", type=float, help="Samples per second, where no column is the time."),
         click.option("--scale", "scales", help="Raw counts: temp=int16/256+25.", **many),
         click.option("--unit", "units", help="Unit of a signal's columns: v=g.", **many),
-        click.option("--columns", help="Columns of a signal: v=ax,ay,az or v=0,1,2.", **many),
+        click.option("--columns", help="Columns of a signal: v=ax,ay,az, v=a or v=0,1,2.", **many),
     ):
         command = option(command)
     return command
