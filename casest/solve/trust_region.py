@@ -203,11 +203,11 @@ def _bounded_step(
 
 
 def _damped(here: _Local, scale: Array, damping: float, free: Array, step: Array) -> Array:
-    count = int(free.sum())
+    count, fixed = int(free.sum()), np.logical_not(free)
     # Unit columns: scales that differ by orders of magnitude must not reach the rank decision.
     system = np.zeros((len(here.R) + count, count + 1))
     system[:-count, :-1] = here.R[:, free] / scale[free]
-    system[:-count, -1] = -(here.t + here.R[:, ~free] @ step[~free])
+    system[:-count, -1] = -(here.t + here.R[:, fixed] @ step[fixed])
     np.fill_diagonal(system[-count:], np.sqrt(damping))
     if not np.isfinite(system).all():
         return np.full(count, np.nan)
