@@ -201,7 +201,7 @@ def _run_time(
         listed = ", ".join(list(table.columns)[:12])
         raise DataError(
             f"{table.file}: no time column (t, time, timestamp) for signal t; the file has "
-            f"{listed}; give --rate HZ or --columns t=NAME"
+            f"{listed}; give --rate HZ or --columns t={timing.increasing(table) or 'NAME'}"
         )
     return None, []
 

@@ -136,13 +136,14 @@ def _near_group(table: Table, signal: Signal) -> list[str]:
         angles = [_nearest(angle, numbers) for angle in _ANGLES]
         return [a for a in angles if a] if all(angles) and len(set(angles)) == 3 else []
     if signal.size == 1:
-        near = _nearest(signal.name, numbers)
+        fitting = [n for n in numbers if signal.unit and _in_unit(table, [n], signal.unit)]
+        near = fitting[0] if len(fitting) == 1 else _nearest(signal.name, fitting or numbers)
         return [near] if near else []
     groups = [g for g in map(list, _stems(numbers)) if len(g) == signal.size]
     if groups:
         wanted = "".join(_candidates(signal)[0])
-        fitting = [g for g in groups if signal.unit and _in_unit(table, g, signal.unit)] or groups
-        return max(fitting, key=lambda g: difflib.SequenceMatcher(None, wanted, "".join(g)).ratio())
+        alike = [g for g in groups if signal.unit and _in_unit(table, g, signal.unit)] or groups
+        return max(alike, key=lambda g: difflib.SequenceMatcher(None, wanted, "".join(g)).ratio())
     return numbers[: signal.size] if len(numbers) >= signal.size else []
 
 
