@@ -20,6 +20,9 @@ if TYPE_CHECKING:
 
 Options = dict[str, Any]
 
+#: A file in its place is refused before anything is computed.
+FOLDER = click.Path(path_type=Path, file_okay=False)
+
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point: exit code 0 done, 1 bad input, 2 no trustworthy estimate."""
@@ -127,7 +130,7 @@ def output_options(command: Callable[..., Any]) -> Callable[..., Any]:
         click.option(
             "-o",
             "--output",
-            type=click.Path(path_type=Path),
+            type=FOLDER,
             metavar="DIR",
             help="Folder for result.json, residuals.csv and report.html.",
         ),
@@ -307,7 +310,7 @@ def refused(
 @click.option(
     "-o",
     "--output",
-    type=click.Path(path_type=Path),
+    type=FOLDER,
     metavar="DIR",
     help="Folder for result.json, residuals.csv and report.html.",
 )
@@ -341,9 +344,7 @@ def motion_options(command: Callable[..., Any]) -> Callable[..., Any]:
     many: Options = {"multiple": True, "metavar": "STATE=NUMBER"}
     for option in (
         click.option("--json", "as_json", is_flag=True, help="Print JSON instead of text."),
-        click.option(
-            "-o", "--output", type=click.Path(path_type=Path), metavar="DIR", help="Folder."
-        ),
+        click.option("-o", "--output", type=FOLDER, metavar="DIR", help="Folder."),
         click.option("--std", "stds", help="What is known of a state at the beginning.", **many),
         click.option("--intensity", "intensities", help="Of its driving noise, unit^2/s.", **many),
     ):
@@ -493,9 +494,7 @@ def apply(result_path: Path, data: str, **options: Any) -> None:
 @click.option("--directions", type=int, metavar="N", help="N random directions or attitudes.")
 @click.option("--input", "given", type=click.Path(), help="Record with the signals it needs.")
 @click.option("--seed", type=int, default=0, show_default=True)
-@click.option(
-    "-o", "--output", type=click.Path(path_type=Path), default=Path("simulated"), metavar="DIR"
-)
+@click.option("-o", "--output", type=FOLDER, default=Path("simulated"), metavar="DIR")
 def simulate(model_name: str, **options: Any) -> None:
     """A record with known truth: DIR/record.csv and DIR/truth.json.
 
@@ -616,7 +615,7 @@ def export(result_path: Path, to: Any, output: Path | None, **options: Any) -> N
 @click.option(
     "-o",
     "--output",
-    type=click.Path(path_type=Path),
+    type=FOLDER,
     metavar="DIR",
     help="Folder for compare.json, compare.png and compare.svg.",
 )

@@ -264,13 +264,42 @@ def load_result(path: Path) -> dict[str, Any]:
         path = path / RESULT
     try:
         result = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise DataError(f"{path}: no such result; calibrate with -o {path.parent} first") from None
+    except (FileNotFoundError, NotADirectoryError):
+        raise DataError(f"{path}: no such result; {_instead(path.parent)}") from None
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise DataError(f"{path}: not a result.json ({error})") from None
+        near = path.with_name(RESULT)
+        hint = f"; did you mean {near}?" if near.exists() and near != path else ""
+        raise DataError(f"{path}: not a result.json ({error}){hint}") from None
     if not isinstance(result, dict) or "model" not in result:
         raise DataError(f"{path}: not a casest result: it names no model")
+    if "format" in result:
+        raise DataError(
+            f"{path}: is a correction exported already, which `casest apply` reads; here the "
+            "result.json is needed that it was exported from"
+        )
+    if not result.keys() & {"estimate", "before", "after"}:
+        writer = _WRITERS.get(path.name)
+        by = f", but what `casest {writer}` writes" if writer else ": it holds no estimate"
+        raise DataError(f"{path}: not a result of calibrate or close{by}")
     return result
+
+
+#: What other commands leave in their folders.
+_WRITERS = {
+    "observe.json": "observe",
+    "filter.json": "filter",
+    "compare.json": "compare",
+    "truth.json": "simulate",
+}
+
+
+def _instead(folder: Path) -> str:
+    """What a folder without a result holds, and how one is made."""
+    make = f"casest calibrate (or close) MODEL DATA -o {folder} makes one"
+    found = next((name for name in _WRITERS if (folder / name).exists()), None)
+    if found:
+        return f"the folder holds {found} of `casest {_WRITERS[found]}`; {make}"
+    return make
 
 
 def saved_parameters(result: Mapping[str, Any]) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from casest.data.logs import file_name
-from casest.declaring.shapes import Array
+from casest.declaring.shapes import Array, in_digits
 from casest.estimate import Estimate
 from casest.modelling.effect import Effect
 from casest.modelling.model import Model
@@ -137,7 +137,7 @@ def _held(found: Estimate, content: Mapping[str, Any]) -> Iterator[str]:
     fixed = False
     for c in found.model.constants:
         unit = content["units"].get(c.name, "")
-        value = np.array2string(c.array, precision=9, separator=", ").replace("\n", "")
+        value = in_digits(c.array, 9)
         fixed = fixed or c.frozen is not None
         yield f"  {c.name} = {value} {'' if unit == '1' else unit}".rstrip() + " (held)"
     if fixed:

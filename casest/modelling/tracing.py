@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import casadi as ca
-import numpy as np
 
 from casest.declaring.physics import SX, Quantity, Residual, Trace, chart, current_trace
+from casest.declaring.shapes import in_digits
 from casest.errors import CasestError, DeclarationError
 from casest.modelling.effect import Attached
 
@@ -255,7 +255,7 @@ def describe(model: Model) -> str:
     for p in model.parameters:
         rows.append(("parameter", p.name, p.shape.size, p.unit, "per run" * (p.scope == "run")))
     for c in model.constants:
-        value = np.array2string(c.array, precision=6, separator=", ").replace("\n", "")
+        value = in_digits(c.array, 6)
         rows.append(("constant", c.name, c.array.size, c.unit, f"= {value}"))
     for a in model.effects:
         rows.append(("effect", a.label, sum(p.shape.size for p in a.parameters), f"on {a.on}", ""))
