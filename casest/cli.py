@@ -32,7 +32,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def run(arguments: Sequence[str] | None = None) -> int:
     """Run a command and return its exit code; no traceback reaches the user."""
     try:
-        result = commands.main(arguments, prog_name="casest", standalone_mode=False)
+        words = list(sys.argv[1:] if arguments is None else arguments)
+        result = commands.main(words, prog_name="casest", standalone_mode=False, obj=words)
         return result if isinstance(result, int) else 0
     except CasestError as error:
         click.echo(f"casest: {error}", err=True)
@@ -188,7 +189,7 @@ def calibrate(model_name: str, data: tuple[str, ...], **options: Any) -> int:
 
 def typed() -> str:
     """The command as it can be typed again."""
-    return shlex.join(["casest", *sys.argv[1:]])
+    return shlex.join(["casest", *click.get_current_context().obj])
 
 
 def calibration(model_name: str, data: Sequence[str], options: Options, command: str) -> int:
@@ -368,7 +369,8 @@ def observe(model_name: str, data: tuple[str, ...], **options: Any) -> int:
     from casest.modelling.model import Model
     from casest.problem import find_any
 
-    if isinstance(find_any(model_name), Model):
+    fits = isinstance(find_any(model_name), Model)
+    if fits:
         model = declared_model(model_name, options)
         content, _ = observing.observe_parameters(model, records(model, data, options))
     else:
@@ -380,9 +382,12 @@ def observe(model_name: str, data: tuple[str, ...], **options: Any) -> int:
 
         write(options["output"] / "observe.json", result.as_json(content))
         reported(options["output"], observe_page(content))
-    click.echo(
-        result.as_json(content).rstrip() if options["as_json"] else observing.observe_text(content)
-    )
+    if options["as_json"]:
+        click.echo(result.as_json(content), nl=False)
+        return 0
+    click.echo(observing.observe_text(content))
+    seen = content["rank"] == content["unknowns"]
+    last_words(options["output"], "report.html, observe.json", trusted=seen, applies=fits)
     return 0
 
 
@@ -404,10 +409,22 @@ def filter_command(model_name: str, data: tuple[str, ...], **options: Any) -> in
         write(options["output"] / "states.csv", observing.states_csv(found))
         write(options["output"] / "filter.json", result.as_json(content))
         reported(options["output"], filter_page(found, content))
-    click.echo(
-        result.as_json(content).rstrip() if options["as_json"] else observing.filter_text(content)
-    )
+    if options["as_json"]:
+        click.echo(result.as_json(content), nl=False)
+        return 0
+    click.echo(observing.filter_text(content))
+    last_words(options["output"], "report.html, filter.json, states.csv")
     return 0
+
+
+def last_words(output: Path | None, files: str, **known: Any) -> None:
+    """What has been written, and what to type next."""
+    from casest.following import following
+
+    if output is not None:
+        click.echo(f"\nWritten: {output}/{files}")
+    if words := following(typed(), output, **known):
+        click.echo(f"\n{words}")
 
 
 def reported(folder: Path, page: str) -> None:
@@ -510,6 +527,7 @@ def simulation(model_name: str, options: Options, command: str) -> None:
     from casest import simulating
     from casest.dynamics import Dynamics
     from casest.effects import CATALOGUE
+    from casest.following import following
     from casest.problem import find_any, find_effects
 
     if isinstance(find_any(model_name), Dynamics):
@@ -535,8 +553,8 @@ def simulation(model_name: str, options: Options, command: str) -> None:
         options["output"], model, run, reading, values, options["noise"], options["seed"], command
     )
     for path in paths:
-        click.echo(f"written: {path}")
-    click.echo(f"Next: casest calibrate {model_name} {paths[0]}")
+        click.echo(f"Written: {path}")
+    click.echo(f"\n{following(command, file=paths[0])}")
 
 
 @commands.command()
@@ -571,6 +589,7 @@ def completion(shell: str) -> None:
 def export(result_path: Path, to: Any, output: Path | None, **options: Any) -> None:
     """The correction of a saved RESULT, ready to run on the device."""
     from casest import exporting
+    from casest.following import following
 
     if options["single"] and to != "c":
         raise UsageError("--float is for --to c")
@@ -579,7 +598,9 @@ def export(result_path: Path, to: Any, output: Path | None, **options: Any) -> N
         click.echo(text, nl=False)
         return
     write(output, text)
-    click.echo(f"written: {output}")
+    click.echo(f"Written: {output}")
+    if words := following(typed(), file=output):
+        click.echo(f"\n{words}")
 
 
 @commands.command()
@@ -652,7 +673,7 @@ def compare(model_name: str, data: tuple[str, ...], **options: Any) -> int:
     if options["as_json"]:
         click.echo(result.as_json(content), nl=False)
     else:
-        click.echo(comparing_text.comparison_text(found, data, written))
+        click.echo(comparing_text.comparison_text(found, data, written, command))
     if found.interrupted:
         click.echo(f"casest: interrupted after {found.done} of {found.planned} runs", err=True)
     elif not found.certified:

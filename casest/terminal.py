@@ -13,6 +13,7 @@ import numpy as np
 from casest.data.logs import file_name
 from casest.declaring.shapes import Array, in_digits
 from casest.estimate import Estimate
+from casest.following import following
 from casest.modelling.effect import Effect
 from casest.modelling.model import Model
 from casest.naming import entry_units, unit_table
@@ -78,7 +79,7 @@ def calibration_text(found: Estimate, content: Mapping[str, Any], output: Path |
     blocks += _determined(found)
     title = "Believed because" if found.certificate.trusted else "Refused because"
     blocks.append("\n".join([f"{title}:", *(item(r) for r in found.certificate.reasons)]))
-    blocks.append(_next(found, output))
+    blocks += _written(found, content, output)
     return "\n\n".join(b for b in blocks if b)
 
 
@@ -196,11 +197,13 @@ def _determined(found: Estimate) -> Iterator[str]:
         yield "The data determine every unknown; no weak combination."
 
 
-def _next(found: Estimate, output: Path | None) -> str:
-    if not found.certificate.trusted:
-        return ""
-    applies = found.model.traced.corrected is not None
-    if output is None:
-        return "Next: add -o out to keep the result, then `casest apply out DATA`." * applies
-    written = f"Written: {output}/report.html, result.json, residuals.csv."
-    return written + f" Next: casest apply {output} DATA" * applies
+def _written(found: Estimate, content: Mapping[str, Any], output: Path | None) -> Iterator[str]:
+    """Files written, and what to type next."""
+    if output is not None:
+        yield f"Written: {output}/report.html, result.json, residuals.csv"
+    yield following(
+        content["reproduce"]["command"],
+        output,
+        trusted=found.certificate.trusted,
+        applies=found.model.traced.corrected is not None,
+    )
