@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from casest.declaring.shapes import Array
 from casest.engine import Plan, Replay
-from casest.engine.replay import _KERNELS, Entry, Kernel
+from casest.engine.replay import KERNELS, Entry, Kernel
 
 #: Numbers per call: enough to hide the cost of the call, few enough to stay in the cache.
 NUMBERS = 16384
@@ -153,7 +153,7 @@ def _computed(plan: Plan, i: int) -> bool:
 
 def _call(plan: Plan, i: int, place: dict[int, Array]) -> tuple[Kernel, tuple[Array, ...]]:
     value = plan.graph.values[i]
-    return _KERNELS[value.code], (*(place[j] for j in value.operands), place[i])
+    return KERNELS[value.code], (*(place[j] for j in value.operands), place[i])
 
 
 def _copied(value: Array, out: Array) -> None:

@@ -175,7 +175,10 @@ def _attempt(problem: Problem, start: Mapping[str, Any] | None, solver: str, see
     if solver not in SOLVERS and solver not in own:
         known = ", ".join([*SOLVERS, *own])
         raise UsageError(f"unknown solver {solver!r} for {model.name}; it has {known}")
-    first = problem.start() if start is None else problem.point(_merged(problem, start))
+    try:
+        first = problem.start() if start is None else problem.point(_merged(problem, start))
+    except NotTrusted as error:
+        return _refused(problem, problem.point({}), str(error), began)
     nowhere = _not_finite(problem, first)
     if nowhere:
         return _refused(problem, first, nowhere, began)

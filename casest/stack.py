@@ -30,7 +30,7 @@ from casest.engine import (
     summed,
     triangular_factor,
 )
-from casest.errors import DataError, UsageError
+from casest.errors import DataError, NotTrusted, UsageError
 from casest.modelling.model import Model
 from casest.modelling.tracing import function_of, sample_symbol
 from casest.persample import residual_and_jacobian
@@ -220,7 +220,13 @@ class Problem:
 
     @cached_property
     def _start(self) -> Point:
-        values = self.model.starter(self.model, self.runs) if self.model.starter else {}
+        try:
+            values = self.model.starter(self.model, self.runs) if self.model.starter else {}
+        except np.linalg.LinAlgError as error:
+            raise NotTrusted(
+                f"{self.model.name}: no start values follow from these readings ({error}); are "
+                "they all alike?"
+            ) from error
         known = {p.name for p in self.model.parameters}
         return self.point({k: v for k, v in values.items() if k in known})
 
