@@ -196,12 +196,13 @@ def _bracket(unit: str | None) -> str:
     return f" [{unit}]" if unit and "[" not in unit and unit != "1" else ""
 
 
-def write_or_print(text: str, output: Path | None) -> None:
-    """To a .csv file, to corrected.csv in a folder, or to standard output."""
+def write_or_print(text: str, output: Path | None) -> Path | None:
+    """To a .csv file, to corrected.csv in a folder (returns which), or to standard output."""
     if output is None:
         sys.stdout.write(text)
-        return
+        return None
     if output.suffix != ".csv":
         output.mkdir(parents=True, exist_ok=True)
         output = output / "corrected.csv"
     write_atomically(output, text)
+    return output

@@ -13,6 +13,7 @@ import click
 
 from casest import __version__
 from casest.errors import CasestError, NotTrusted, UsageError
+from casest.waiting import Waiting
 
 if TYPE_CHECKING:
     from casest.data.run import Run
@@ -22,6 +23,16 @@ Options = dict[str, Any]
 
 #: A file in its place is refused before anything is computed.
 FOLDER = click.Path(path_type=Path, file_okay=False)
+
+_waiting = Waiting()
+#: Say what is going on, where somebody watches.
+progress = _waiting.say
+
+
+def echo(text: str, **how: Any) -> None:
+    """Print, after what was said of the waiting is wiped away."""
+    _waiting.done()
+    click.echo(text, **how)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -36,16 +47,16 @@ def run(arguments: Sequence[str] | None = None) -> int:
         result = commands.main(words, prog_name="casest", standalone_mode=False, obj=words)
         return result if isinstance(result, int) else 0
     except CasestError as error:
-        click.echo(f"casest: {error}", err=True)
+        echo(f"casest: {error}", err=True)
         return error.exit_code
     except click.exceptions.NoArgsIsHelpError as error:
-        click.echo(error.format_message())
+        echo(error.format_message())
         return 1
     except click.ClickException as error:
-        click.echo(f"casest: {error.format_message()}", err=True)
+        echo(f"casest: {error.format_message()}", err=True)
         return 1
     except (click.Abort, KeyboardInterrupt):
-        click.echo("casest: interrupted; nothing was written", err=True)
+        echo("casest: interrupted; nothing was written", err=True)
         return 2
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -54,11 +65,13 @@ def run(arguments: Sequence[str] | None = None) -> int:
         if os.environ.get("CASEST_TRACEBACK"):
             raise
         text = f"{type(error).__name__}: {error}".splitlines()[0]
-        click.echo(
+        echo(
             f"casest: internal error, please report it ({text}); CASEST_TRACEBACK=1 shows where",
             err=True,
         )
         return 2
+    finally:
+        _waiting.done()
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
@@ -166,11 +179,12 @@ def output_options(command: Callable[..., Any]) -> Callable[..., Any]:
 def list_command(as_json: bool) -> None:
     """Shipped problems with their symbols and estimators, and the catalogue of effects."""
     from casest.effects import CATALOGUE
-    from casest.problem import SHIPPED, find_model
+    from casest.problem import MOVING, SHIPPED, find_any, find_model
     from casest.terminal import listing
 
     models = [(name, find_model(name)) for name in SHIPPED]
-    click.echo(listing(models, CATALOGUE, as_json=as_json))
+    moving: list[Any] = [(name, find_any(name)) for name in MOVING]
+    echo(listing(models, CATALOGUE, moving, as_json=as_json))
 
 
 @commands.command()
@@ -202,6 +216,7 @@ def calibration(model_name: str, data: Sequence[str], options: Options, command:
     runs = records(model, data, options)
     hidden = held_out(model, data, options)
     start = dict(start_value(text, model) for text in options["starts"]) or None
+    progress(f"fitting {model_name}")
     with interruptible():
         found = estimate.attempt(
             model, runs, start=start, solver=options["solver"], seed=options["seed"]
@@ -211,15 +226,16 @@ def calibration(model_name: str, data: Sequence[str], options: Options, command:
         found, model_name=model_name, data=data, command=command, holdout=holdout
     )
     if options["output"]:
+        progress(f"writing {options['output']}")
         result.save(options["output"], content, result.residual_rows(found))
         reported(options["output"], calibration_page(found, content, str(options["output"])))
     if options["as_json"]:
-        click.echo(result.as_json(content), nl=False)
+        echo(result.as_json(content), nl=False)
     else:
-        click.echo(terminal.calibration_text(found, content, options["output"]))
+        echo(terminal.calibration_text(found, content, options["output"]))
     if not found.certificate.trusted:
         reason = found.certificate.reasons[0]
-        click.echo(f"casest: no trustworthy estimate: {reason}", err=True)
+        echo(f"casest: no trustworthy estimate: {reason}", err=True)
         return NotTrusted.exit_code
     return 0
 
@@ -252,6 +268,7 @@ def closing(model_name: str, data: Sequence[str], options: Options, command: str
     runs = records(model, data, options)
     apart = held_out(model, data, options)
     start = dict(start_value(words, model) for words in options["starts"]) or None
+    progress(f"fitting {model_name}, looking for effects")
     try:
         found = loop.close(
             model,
@@ -268,6 +285,7 @@ def closing(model_name: str, data: Sequence[str], options: Options, command: str
         found, model_name=model_name, data=data, command=command, held_out=hidden and hidden[1:]
     )
     if options["output"]:
+        progress(f"writing {options['output']}")
         formula = written.formula_source(found)
         if formula:
             write(options["output"] / "formula.py", formula)
@@ -275,16 +293,10 @@ def closing(model_name: str, data: Sequence[str], options: Options, command: str
         result.save(options["output"], content, written.residual_rows(found, hidden))
         reported(options["output"], closing_page(found, content, str(options["output"])))
     if options["as_json"]:
-        click.echo(result.as_json(content), nl=False)
+        echo(result.as_json(content), nl=False)
     else:
-        click.echo(text.closing_text(found, content, options["output"]))
+        echo(text.closing_text(found, content, options["output"]))
     return 0
-
-
-def progress(words: str) -> None:
-    """Say what is going on, where somebody watches."""
-    if sys.stderr.isatty():
-        click.echo(f"casest: {words}", err=True)
 
 
 def refused(
@@ -302,8 +314,8 @@ def refused(
         page = calibration_page(error.estimate, content, str(options["output"]))
         reported(options["output"], page)
         if options["as_json"]:
-            click.echo(result.as_json(content), nl=False)
-    click.echo(f"casest: {error}", err=True)
+            echo(result.as_json(content), nl=False)
+    echo(f"casest: {error}", err=True)
     return NotTrusted.exit_code
 
 
@@ -334,9 +346,9 @@ def demo(output: Path | None) -> int:
         "as_json": False,
     }
     words = f"casest close wheel {record} -o {options['output']}"
-    click.echo(f"$ {words}\n")
+    echo(f"$ {words}\n")
     code = closing("wheel", (str(record),), options, words)
-    click.echo("\n" + demonstration.comparison(options["output"]))
+    echo("\n" + demonstration.comparison(options["output"]))
     return code
 
 
@@ -372,9 +384,12 @@ def observe(model_name: str, data: tuple[str, ...], **options: Any) -> int:
     fits = isinstance(find_any(model_name), Model)
     if fits:
         model = declared_model(model_name, options)
-        content, _ = observing.observe_parameters(model, records(model, data, options))
+        runs = records(model, data, options)
+        progress(f"fitting {model_name}")
+        content, _ = observing.observe_parameters(model, runs)
     else:
         moving, run = moving_record(model_name, data, options)
+        progress("what the trajectory shows")
         content = observing.observe_motion(moving, run, options["window"])
     content |= {"data": list(data), "reproduce": result.reproduce(typed(), data)}
     if options["output"]:
@@ -383,9 +398,9 @@ def observe(model_name: str, data: tuple[str, ...], **options: Any) -> int:
         write(options["output"] / "observe.json", result.as_json(content))
         reported(options["output"], observe_page(content))
     if options["as_json"]:
-        click.echo(result.as_json(content), nl=False)
+        echo(result.as_json(content), nl=False)
         return 0
-    click.echo(observing.observe_text(content))
+    echo(observing.observe_text(content))
     seen = content["rank"] == content["unknowns"]
     last_words(options["output"], "report.html, observe.json", trusted=seen, applies=fits)
     return 0
@@ -401,6 +416,7 @@ def filter_command(model_name: str, data: tuple[str, ...], **options: Any) -> in
     from casest import observing, result
 
     moving, run = moving_record(model_name, data, {**options, "constants": ()})
+    progress("filter and smoother")
     content, found = observing.follow(moving, run)
     content |= {"data": list(data), "reproduce": result.reproduce(typed(), data)}
     if options["output"]:
@@ -410,9 +426,9 @@ def filter_command(model_name: str, data: tuple[str, ...], **options: Any) -> in
         write(options["output"] / "filter.json", result.as_json(content))
         reported(options["output"], filter_page(found, content))
     if options["as_json"]:
-        click.echo(result.as_json(content), nl=False)
+        echo(result.as_json(content), nl=False)
         return 0
-    click.echo(observing.filter_text(content))
+    echo(observing.filter_text(content))
     last_words(options["output"], "report.html, filter.json, states.csv")
     return 0
 
@@ -422,9 +438,9 @@ def last_words(output: Path | None, files: str, **known: Any) -> None:
     from casest.following import following
 
     if output is not None:
-        click.echo(f"\nWritten: {output}/{files}")
+        echo(f"\nWritten: {output}/{files}")
     if words := following(typed(), output, **known):
-        click.echo(f"\n{words}")
+        echo(f"\n{words}")
 
 
 def reported(folder: Path, page: str) -> None:
@@ -461,6 +477,7 @@ def moving_record(name: str, data: Sequence[str], options: Options) -> tuple[Any
     moving = moving.having(**constants)
     moving = moving.driven(**dict(number_pair(t, "--intensity") for t in options["intensities"]))
     moving = moving.known_to(**dict(number_pair(t, "--std") for t in options["stds"]))
+    progress(f"reading {data[0]}")
     runs = load_runs(list(data), moving.signals, **reading_arguments(options))
     if len(runs) != 1:
         raise UsageError(f"{data[0]} holds {len(runs)} runs; a trajectory is one")
@@ -493,11 +510,14 @@ def apply(result_path: Path, data: str, **options: Any) -> None:
     from casest import applying, exporting
 
     arguments = reading_arguments(options)
+    progress(f"correcting {data}")
     if exporting.is_exported(result_path):
         text = exporting.applied(result_path, data, arguments)
     else:
         text = applying.corrected_csv(result_path, data, arguments, force=options["force"])
-    applying.write_or_print(text, options["output"])
+    _waiting.done()
+    if path := applying.write_or_print(text, options["output"]):
+        echo(f"Written: {path}")
 
 
 @commands.command()
@@ -548,13 +568,14 @@ def simulation(model_name: str, options: Options, command: str) -> None:
     model = simulating.with_effects(model, run, options["effect"], (*CATALOGUE, *own))
     given = dict(named_value(text, "--value", model) for text in options["values"])
     values = simulating.truth(model, {name: value.array for name, value in given.items()})
+    progress(f"simulating {model_name}")
     reading = simulating.simulated(model, run, values, options["noise"], rng)
     paths = simulating.written(
         options["output"], model, run, reading, values, options["noise"], options["seed"], command
     )
     for path in paths:
-        click.echo(f"Written: {path}")
-    click.echo(f"\n{following(command, file=paths[0])}")
+        echo(f"Written: {path}")
+    echo(f"\n{following(command, file=paths[0])}")
 
 
 @commands.command()
@@ -565,7 +586,7 @@ def completion(shell: str) -> None:
 
     made = get_completion_class(shell)
     assert made is not None
-    click.echo(made(commands, {}, "casest", "_CASEST_COMPLETE").source())
+    echo(made(commands, {}, "casest", "_CASEST_COMPLETE").source())
 
 
 @commands.command()
@@ -593,14 +614,15 @@ def export(result_path: Path, to: Any, output: Path | None, **options: Any) -> N
 
     if options["single"] and to != "c":
         raise UsageError("--float is for --to c")
+    progress(f"exporting {result_path}")
     text = exporting.exported(result_path, to, **options)
     if output is None:
-        click.echo(text, nl=False)
+        echo(text, nl=False)
         return
     write(output, text)
-    click.echo(f"Written: {output}")
+    echo(f"Written: {output}")
     if words := following(typed(), file=output):
-        click.echo(f"\n{words}")
+        echo(f"\n{words}")
 
 
 @commands.command()
@@ -671,13 +693,13 @@ def compare(model_name: str, data: tuple[str, ...], **options: Any) -> int:
     )
     written = written_comparison(found, content, options["output"]) if options["output"] else []
     if options["as_json"]:
-        click.echo(result.as_json(content), nl=False)
+        echo(result.as_json(content), nl=False)
     else:
-        click.echo(comparing_text.comparison_text(found, data, written, command))
+        echo(comparing_text.comparison_text(found, data, written, command))
     if found.interrupted:
-        click.echo(f"casest: interrupted after {found.done} of {found.planned} runs", err=True)
+        echo(f"casest: interrupted after {found.done} of {found.planned} runs", err=True)
     elif not found.certified:
-        click.echo("casest: no certified optimum to judge by", err=True)
+        echo("casest: no certified optimum to judge by", err=True)
     return 0 if found.certified and not found.interrupted else NotTrusted.exit_code
 
 
@@ -689,7 +711,7 @@ def written_comparison(found: Any, content: Options, folder: Path) -> list[Path]
     try:
         paths += comparing_plot.draw(found, folder)
     except UsageError as error:
-        click.echo(f"casest: {error}", err=True)
+        echo(f"casest: {error}", err=True)
     return paths
 
 
@@ -784,6 +806,7 @@ def records(model: Model, data: Sequence[str], options: Options) -> tuple[Run, .
     """The runs in the files."""
     from casest.data import load_runs
 
+    progress(f"reading {', '.join(data)}")
     seen: set[Path] = set()
     for name in data:
         if Path(name).resolve() in seen:

@@ -40,7 +40,7 @@ class Typed:
             words.append(flag if value is None else f"{flag} {shlex.quote(value)}")
         lines = [" "]
         for word in words:
-            if len(lines[-1]) + len(word) > WIDTH - 4 and lines[-1].strip():
+            if len(lines[-1]) + len(word) > WIDTH - 3 and lines[-1].strip():
                 lines[-1] += " \\"
                 lines.append("     ")
             lines[-1] += f" {word}"

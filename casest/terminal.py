@@ -12,6 +12,7 @@ import numpy as np
 
 from casest.data.logs import file_name
 from casest.declaring.shapes import Array, in_digits
+from casest.dynamics import Dynamics
 from casest.estimate import Estimate
 from casest.following import following
 from casest.modelling.effect import Effect
@@ -23,29 +24,45 @@ WIDTH = 80
 
 
 def listing(
-    models: Sequence[tuple[str, Model]], effects: Sequence[Effect] = (), *, as_json: bool = False
+    models: Sequence[tuple[str, Model]],
+    effects: Sequence[Effect] = (),
+    moving: Sequence[tuple[str, Dynamics]] = (),
+    *,
+    as_json: bool = False,
 ) -> str:
-    """Shipped problems, a paragraph each, and the catalogue of effects, a line each."""
+    """Shipped problems and estimators in motion, a paragraph each; a line for each effect."""
     if as_json:
         problems = {name: _summary(m) for name, m in models}
         catalogue = [
             {"name": e.name, "about": _first_line(e.doc), "on": e.on, "formula": e.formula}
             for e in effects
         ]
-        return json.dumps({"problems": problems, "effects": catalogue}, indent=2)
+        motion = {
+            name: {
+                "about": _about(d),
+                "signals": [s.name for s in d.signals],
+                "states": [s.name for s in d.states],
+            }
+            for name, d in moving
+        }
+        return json.dumps({"problems": problems, "motion": motion, "effects": catalogue}, indent=2)
     lines = ["Problems (casest calibrate NAME DATA):"]
     for name, m in models:
-        about = (m.function.__doc__ or "").strip().splitlines()[0]
-        lines += ["", f"  {name}", f"      {about}"]
+        lines += ["", f"  {name}", _under(_about(m), "")]
         for word, symbols in (
             ("signals", m.signals),
             ("unknowns", m.parameters),
             ("constants", m.constants),
         ):
-            lines.append(f"      {word + ':':<11}{', '.join(s.name for s in symbols)}")
-        lines.append(
-            f"      {'solvers:':<11} {', '.join([*SOLVERS, *(n for n, _ in m.estimators)])}"
-        )
+            lines.append(_under(", ".join(s.name for s in symbols), f"{word + ':':<11}"))
+        solvers = ", ".join([*SOLVERS, *(n for n, _ in m.estimators)])
+        lines.append(_under(solvers, f"{'solvers:':<11}"))
+    if moving:
+        lines += ["", "In motion (casest observe NAME DATA, casest filter NAME DATA):"]
+    for name, d in moving:
+        lines += ["", f"  {name}", _under(_about(d), "")]
+        lines.append(_under(", ".join(s.name for s in d.signals), "signals:   "))
+        lines.append(_under(", ".join(s.name for s in d.states), "states:    "))
     lines += ["", "Your own: casest calibrate file.py[:name] DATA"]
     if effects:
         lines += ["", "Effects that `casest close` looks for:"]
@@ -56,13 +73,29 @@ def listing(
     return "\n".join(lines)
 
 
+def _about(declared: Model | Dynamics) -> str:
+    return _first_line((declared.function.__doc__ or "").strip())
+
+
+def _under(text: str, head: str) -> str:
+    """A wrapped line under a problem's name, what it is in front."""
+    indent = " " * 6
+    return textwrap.fill(
+        text,
+        WIDTH,
+        initial_indent=indent + head,
+        subsequent_indent=indent + " " * len(head),
+        break_on_hyphens=False,
+    )
+
+
 def _first_line(text: str) -> str:
     return text.partition("\n")[0]
 
 
 def _summary(m: Model) -> dict[str, Any]:
     return {
-        "about": (m.function.__doc__ or "").strip().splitlines()[0],
+        "about": _about(m),
         "signals": [s.name for s in m.signals],
         "parameters": [p.name for p in m.parameters],
         "constants": {c.name: c.array.tolist() for c in m.constants},

@@ -41,7 +41,7 @@ FLOORS = [
     ["casest.values", "casest.applying", "casest.demonstration", "casest.export"],
     ["casest.exporting", "casest.simulating"],
     ["casest.compare"],
-    ["casest.following"],
+    ["casest.following", "casest.waiting"],
     ["casest.terminal"],
     ["casest.comparing_text", "casest.comparing_plot"],
     ["casest.closing.text"],
