@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from casest import __version__
+from casest.completing import EffectName, ModelName, SolverName
 from casest.errors import CasestError, NotTrusted, UsageError
 from casest.waiting import Waiting
 
@@ -160,6 +161,7 @@ def output_options(command: Callable[..., Any]) -> Callable[..., Any]:
             "--solver",
             default="ipopt",
             show_default=True,
+            type=SolverName(),
             help="ipopt, ipopt-exact, trust-region, or an estimator of the model's own.",
         ),
         click.option(
@@ -188,7 +190,7 @@ def list_command(as_json: bool) -> None:
 
 
 @commands.command()
-@click.argument("model_name", metavar="MODEL")
+@click.argument("model_name", metavar="MODEL", type=ModelName())
 @click.argument("data", nargs=-1, required=True, type=click.Path())
 @model_options
 @reading_options
@@ -241,7 +243,7 @@ def calibration(model_name: str, data: Sequence[str], options: Options, command:
 
 
 @commands.command()
-@click.argument("model_name", metavar="MODEL")
+@click.argument("model_name", metavar="MODEL", type=ModelName())
 @click.argument("data", nargs=-1, required=True, type=click.Path())
 @model_options
 @reading_options
@@ -366,7 +368,7 @@ def motion_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 @commands.command()
-@click.argument("model_name", metavar="MODEL")
+@click.argument("model_name", metavar="MODEL", type=ModelName())
 @click.argument("data", nargs=-1, required=True, type=click.Path())
 @model_options
 @reading_options
@@ -407,7 +409,7 @@ def observe(model_name: str, data: tuple[str, ...], **options: Any) -> int:
 
 
 @commands.command("filter")
-@click.argument("model_name", metavar="MODEL")
+@click.argument("model_name", metavar="MODEL", type=ModelName())
 @click.argument("data", nargs=-1, required=True, type=click.Path())
 @reading_options
 @motion_options
@@ -521,11 +523,17 @@ def apply(result_path: Path, data: str, **options: Any) -> None:
 
 
 @commands.command()
-@click.argument("model_name", metavar="MODEL")
+@click.argument("model_name", metavar="MODEL", type=ModelName())
 @model_options
 @reading_options
 @click.option("--value", "values", multiple=True, metavar="NAME=VALUE", help="True value.")
-@click.option("--effect", multiple=True, metavar="NAME[(COLUMN)]", help="An effect to add.")
+@click.option(
+    "--effect",
+    multiple=True,
+    type=EffectName(),
+    metavar="NAME[(COLUMN)]",
+    help="An effect to add.",
+)
 @click.option("--noise", type=float, default=0.0, help="Standard deviation of each reading.")
 @click.option("--duration", type=float, help="Seconds, with --rate, where time is all it needs.")
 @click.option("--directions", type=int, metavar="N", help="N random directions or attitudes.")
@@ -581,7 +589,7 @@ def simulation(model_name: str, options: Options, command: str) -> None:
 @commands.command()
 @click.argument("shell", type=click.Choice(["bash", "zsh", "fish"]))
 def completion(shell: str) -> None:
-    """A script that completes commands and options: eval "$(casest completion bash)"."""
+    """A script that completes what is typed: eval "$(casest completion bash)"."""
     from click.shell_completion import get_completion_class
 
     made = get_completion_class(shell)
@@ -626,7 +634,7 @@ def export(result_path: Path, to: Any, output: Path | None, **options: Any) -> N
 
 
 @commands.command()
-@click.argument("model_name", metavar="MODEL")
+@click.argument("model_name", metavar="MODEL", type=ModelName())
 @click.argument("data", nargs=-1, required=True, type=click.Path())
 @model_options
 @reading_options

@@ -46,6 +46,7 @@ FLOORS = [
     ["casest.comparing_text", "casest.comparing_plot"],
     ["casest.closing.text"],
     ["casest.report"],
+    ["casest.completing"],
     ["casest.cli"],
 ]
 
