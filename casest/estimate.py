@@ -312,9 +312,9 @@ def _looked_at_for_a_better_one(found: Estimate) -> Estimate:
     if timed or over <= ALIKE:
         return found
     reason = (
-        f"{len(found.outcomes)} starts ended in {places} places, and even the best leaves residuals "
-        f"that are alike over {over:.2g} rows: there may be a better one, or the model lacks "
-        "something; give --start near the solution"
+        f"{len(found.outcomes)} starts ended in {places} places, and even the best leaves "
+        f"residuals that are alike over {over:.2g} rows: there may be a better one, or the model "
+        "lacks something; give --start near the solution"
     )
     return replace(found, certificate=replace(found.certificate, trusted=False, reasons=(reason,)))
 
