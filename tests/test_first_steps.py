@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -105,3 +106,48 @@ def test_held_numbers_are_printed_as_written(folder, capsys):
     assert "\n  norm = 1 g (held)\n" in capsys.readouterr().out
     assert run(["calibrate", *words, "--fix", "scale=1,1.01,1"]) == 0
     assert "\n  scale = [1, 1.01, 1] " in capsys.readouterr().out
+
+
+ODOMETER = '''
+from casest import Residual, constant, model, param, pi, quantity, signal
+
+@model
+def odometer(distance=signal("m"), load=signal("kg"), ticks=signal("count"), *,
+             radius=param("m", start=0.3, bounds=(0.1, 1.0)), softness=param("m/kg"),
+             per_turn=constant(1024, "count")):
+    """Ticks of a wheel that gives way under load."""
+    travelled = quantity("travelled", distance, "m")
+    turns = travelled / (2 * pi * (radius - softness * load))
+    return Residual(measured=ticks, predicted=quantity("predicted", per_turn * turns, "count"),
+                    corrected=travelled)
+'''
+
+
+def test_a_sensor_never_heard_of_is_closed_with_units_and_numbers_of_its_columns(tmp_path):
+    """A wheel odometer whose tyre grows by 4e-4/K, which nobody declared, in the user's own file.
+
+    Decimal commas, semicolons, cm; the truth is the simulation's.
+    """
+    rng = np.random.default_rng(8)
+    d, load, T = rng.uniform(10, 400, 80), rng.choice([0, 150, 300], 80), rng.uniform(5, 35, 80)
+    radius = (0.305 - 3e-6 * load) * (1 + 4e-4 * (T - 20))
+    ticks = np.round(1024 * d / (2 * np.pi * radius) + 3 * rng.standard_normal(80))
+    rows = [
+        f"{100 * a:.2f};{b};{c:.3f};{e:.0f}" for a, b, c, e in zip(d, load, T, ticks, strict=True)
+    ]
+    lines = ["Strecke [cm];payload [kg];tyre temp [°C];encoder [LSB]", *rows]
+    (tmp_path / "drive.csv").write_text("\n".join(lines).replace(".", ","), encoding="utf-8")
+    (tmp_path / "odometer.py").write_text(ODOMETER, encoding="utf-8")
+    words = ["--columns", "distance=Strecke", "--columns", "load=payload"]
+    files = [str(tmp_path / "odometer.py"), str(tmp_path / "drive.csv")]
+    out = tmp_path / "out"
+    assert run(["close", *files, *words, "--columns", "ticks=encoder", "-o", str(out)]) == 0
+    result = json.loads((out / "result.json").read_text(encoding="utf-8"))
+    assert result["verdict"] == "extended"
+    (found,) = result["effects"]
+    assert (found["name"], found["column"]) == ("temperature_gain", "tyre temp")
+    k = found["parameters"]["k"]
+    assert k["unit"] == "1/K"
+    # The distance belongs to a larger tyre: fewer ticks, by the growth from the mean temperature.
+    assert abs(k["value"] + 4e-4) < 5 * k["std"] + 4e-4**2 * 15
+    assert found["formula"] == f"u·(1 + k·(tyre temp − {np.mean(T.round(3)):.6g}))"

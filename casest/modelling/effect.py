@@ -220,13 +220,21 @@ def attach(
         first = next(iter(inspect.signature(declared.function).parameters))
         own = units.get(on) or f"[{on}]"
         own = f"({own})" if set("/*") & set(own) else own
-        renamed = tuple(u.replace(f"[{first}]", own) for u in parameter.units)
+        renamed = tuple(_of_columns(u.replace(f"[{first}]", own), columns) for u in parameter.units)
         for unit in renamed:
             if "[" not in unit and unit and not known(unit):
                 raise UnitError(f"effect {label}: {name} has unknown unit {unit!r}")
         parameters.append(replace(parameter, units=renamed))
     renamed_columns = tuple(sorted(columns.items()))
     return Attached(declared, on, kind, label, renamed_columns, tuple(parameters), inner)
+
+
+def _of_columns(unit: str, columns: Mapping[str, str]) -> str:
+    """The unit with the names of the columns that an effect reads: [channel] is [tyre temp]."""
+    for name, column in columns.items():
+        if not set("[]") & set(column):
+            unit = unit.replace(f"[{name}]", f"[{column}]")
+    return unit
 
 
 def check_null(
