@@ -234,7 +234,8 @@ def calibration(model_name: str, data: Sequence[str], options: Options, command:
     if options["as_json"]:
         echo(result.as_json(content), nl=False)
     else:
-        echo(terminal.calibration_text(found, content, options["output"]))
+        words = terminal.calibration_text(found, content, options["output"])
+        echo(terminal.coloured(words, sys.stdout))
     if not found.certificate.trusted:
         reason = found.certificate.reasons[0]
         echo(f"casest: no trustworthy estimate: {reason}", err=True)
@@ -264,6 +265,7 @@ def closing(model_name: str, data: Sequence[str], options: Options, command: str
     from casest.effects import CATALOGUE
     from casest.problem import find_effects
     from casest.report import closing_page
+    from casest.terminal import coloured
 
     own = tuple(e for path in options["effects"] for e in find_effects(path))
     model = declared_model(model_name, {**options, "effects": ()})
@@ -297,7 +299,7 @@ def closing(model_name: str, data: Sequence[str], options: Options, command: str
     if options["as_json"]:
         echo(result.as_json(content), nl=False)
     else:
-        echo(text.closing_text(found, content, options["output"]))
+        echo(coloured(text.closing_text(found, content, options["output"]), sys.stdout))
     return 0
 
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import os
+import re
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import numpy as np
 
@@ -21,6 +23,26 @@ from casest.naming import entry_units, unit_table
 from casest.solve.strategy import SOLVERS
 
 WIDTH = 80
+
+
+#: Verdicts and their colours (SGR codes): red, green, yellow.
+_COLOURS = {
+    r"NOT\s+TRUSTED|unexplained(?=:)|no\s+trustworthy\s+estimate": 31,
+    r"trusted$|adequate(?=:)": 32,
+    r"extended(?=:)": 33,
+}
+
+
+def coloured(text: str, stream: TextIO) -> str:
+    """The text with its verdict in colour on a terminal, where NO_COLOR does not forbid it."""
+    if not stream.isatty() or os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb":
+        return text
+    head, gap, rest = text.partition("\n\n")
+    for verdict, code in _COLOURS.items():
+        head, found = re.subn(verdict, f"\x1b[1;{code}m\\g<0>\x1b[0m", head, count=1)
+        if found:
+            break
+    return head + gap + rest
 
 
 def listing(

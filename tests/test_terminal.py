@@ -14,6 +14,7 @@ import simulators as sim
 
 from casest.cli import commands, run
 from casest.following import following, typed_words
+from casest.terminal import coloured
 from casest.waiting import Waiting
 
 ROOT = Path(__file__).parents[1]
@@ -188,6 +189,27 @@ def test_what_is_going_on_is_said_on_a_terminal_and_wiped_away(impatient, monkey
     assert waited(terminal, "casest: fitting a model with")
     waiting.done()
     assert max(map(len, terminal.getvalue().splitlines())) < 80
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "verdict"),
+    [
+        ("m on a.csv: 9 samples, rank 9:\ntrusted", 32, "trusted"),
+        ("m on a.csv: 9 samples, rank 8: NOT\nTRUSTED", 31, "NOT\nTRUSTED"),
+        ("m on a.csv: adequate: nothing is missing", 32, "adequate"),
+        ("m on a.csv: extended: cubic was missing", 33, "extended"),
+        ("m on a.csv: unexplained: a misfit remains", 31, "unexplained"),
+    ],
+)
+def test_the_verdict_is_coloured_on_a_terminal_that_wants_it(words, code, verdict, monkeypatch):
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    monkeypatch.setenv("TERM", "xterm")
+    text = f"{words}\n\n  trusted and adequate: words of the rest"
+    shown = coloured(text, Terminal())
+    assert shown == text.replace(verdict, f"\x1b[1;{code}m{verdict}\x1b[0m", 1)
+    assert coloured(text, io.StringIO()) == text
+    monkeypatch.setenv("NO_COLOR", "1")
+    assert coloured(text, Terminal()) == text
 
 
 def test_nothing_is_said_where_nobody_watches_or_within_a_second(impatient, monkeypatch):
