@@ -151,3 +151,43 @@ def test_a_sensor_never_heard_of_is_closed_with_units_and_numbers_of_its_columns
     # The distance belongs to a larger tyre: fewer ticks, by the growth from the mean temperature.
     assert abs(k["value"] + 4e-4) < 5 * k["std"] + 4e-4**2 * 15
     assert found["formula"] == f"u·(1 + k·(tyre temp − {np.mean(T.round(3)):.6g}))"
+
+
+BODY = """
+import math
+import numpy as np
+from casest import Residual, model, param, signal
+
+@model
+def line(x=signal("1"), y=signal("1"), *, k=param("1", start=1.0), c=param("1")):
+    return Residual(measured=y, predicted={})
+"""
+
+
+@pytest.mark.parametrize(
+    ("formula", "words"),
+    [
+        ("k * x if x > 0 else c", "write if_else(condition, one, other)"),
+        ("k * math.sin(x) + c", "functions of `math` take numbers alone: use casest's"),
+    ],
+)
+def test_python_where_casadi_is_meant_is_explained(formula, words, tmp_path, capsys):
+    (tmp_path / "line.py").write_text(BODY.format(formula), encoding="utf-8")
+    (tmp_path / "d.csv").write_text("x,y\n1,2\n2,3\n3,4.1\n4,5\n", encoding="utf-8")
+    text = said(capsys, 1, "calibrate", tmp_path / "line.py", tmp_path / "d.csv")
+    assert words in text
+    assert "line.py, line " in text
+
+
+def test_a_function_of_numpy_does_what_it_says(tmp_path, capsys):
+    (tmp_path / "line.py").write_text(BODY.format("k * np.sin(x) + c"), encoding="utf-8")
+    x = np.linspace(0, 3, 20)
+    rows = "\n".join(f"{a},{2 * np.sin(a) - 1 + 1e-3 * (-1) ** i}" for i, a in enumerate(x))
+    (tmp_path / "d.csv").write_text(f"x,y\n{rows}\n", encoding="utf-8")
+    out = tmp_path / "out"
+    files = [str(tmp_path / "line.py"), str(tmp_path / "d.csv")]
+    assert run(["calibrate", *files, "-o", str(out)]) == 0
+    assert capsys.readouterr().err == ""
+    found = json.loads((out / "result.json").read_text(encoding="utf-8"))["estimate"]["parameters"]
+    assert abs(found["k"]["value"] - 2) < 5e-3
+    assert abs(found["c"]["value"] + 1) < 5e-3

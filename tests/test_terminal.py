@@ -14,7 +14,7 @@ import simulators as sim
 
 from casest.cli import commands, run
 from casest.following import following, typed_words
-from casest.terminal import coloured
+from casest.terminal import coloured, rounded
 from casest.waiting import Waiting
 
 ROOT = Path(__file__).parents[1]
@@ -238,3 +238,15 @@ def test_the_line_is_wiped_away_before_an_error(impatient, monkeypatch, tmp_path
     last = terminal.getvalue().rpartition("\r")[2]
     assert last.startswith("casest: ")
     assert "reading poses.csv" in terminal.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("value", "std", "text"),
+    [
+        (2.01, 9.7e-17, ("2.01", "1e-16")),
+        (9.80665, 0.0, ("9.80665", "0")),
+        (0.98957, 0.00023, ("0.98957", "0.00023")),
+    ],
+)
+def test_digits_end_where_the_standard_deviation_or_the_double_does(value, std, text):
+    assert rounded(value, std) == text

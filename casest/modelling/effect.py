@@ -12,7 +12,7 @@ import numpy as np
 
 from casest.declaring.physics import SX
 from casest.declaring.symbols import Constant, Parameter, Signal, Undecided, named
-from casest.errors import DeclarationError, UnitError
+from casest.errors import DeclarationError, UnitError, last_line
 from casest.units import known
 
 Kind = Literal["quantity", "signal", "noise", "sequence"]
@@ -187,9 +187,8 @@ def evaluated(declared: Effect, *args: Any, **kwargs: Any) -> SX:
             if traceback.tb_frame.f_code is code:
                 line = traceback.tb_lineno
             traceback = traceback.tb_next
-        text = [part for part in str(error).splitlines() if part.strip()] or [type(error).__name__]
         raise DeclarationError(
-            f"effect {declared.name}, {code.co_filename}, line {line}: {text[-1].strip()}"
+            f"effect {declared.name}, {code.co_filename}, line {line}: {last_line(error)}"
         ) from None
 
 
