@@ -108,7 +108,7 @@ def corrected_csv(
     needed = {
         n: _of_one_run(model[n], v, which) for n, v in values.items() if n in correction.parameters
     }
-    runs = load_runs([data], correction.signals, **arguments)
+    runs = load_runs([data], correction.signals, **_needed(arguments, model, correction))
     _same_units(result, runs, data)
     found = result.get("corrected") or {}
     around = (found["low"], found["high"]) if "low" in found else None
@@ -118,6 +118,18 @@ def corrected_csv(
         value = correction(run, needed, around)
         _write(writer, correction, run, value, result, header=k == 0, several=len(runs) > 1)
     return text.getvalue()
+
+
+def _needed(
+    arguments: Mapping[str, Any], model: Model, correction: Correction
+) -> Mapping[str, Any]:
+    """Options of the fit may be typed again: those of signals that are not needed fall away."""
+    spare = {s.name for s in model.signals} - {s.name for s in correction.signals}
+    kept = dict(arguments)
+    for option in ("columns", "units", "scales"):
+        given = arguments.get(option) or {}
+        kept[option] = {name: value for name, value in given.items() if name not in spare}
+    return kept
 
 
 def _run_number(model: Model, correction: Correction, result: Mapping[str, Any], data: str) -> int:
@@ -184,12 +196,13 @@ def _bracket(unit: str | None) -> str:
     return f" [{unit}]" if unit and "[" not in unit and unit != "1" else ""
 
 
-def write_or_print(text: str, output: Path | None) -> None:
-    """To a .csv file, to corrected.csv in a folder, or to standard output."""
+def write_or_print(text: str, output: Path | None) -> Path | None:
+    """To a .csv file, to corrected.csv in a folder (returns which), or to standard output."""
     if output is None:
         sys.stdout.write(text)
-        return
+        return None
     if output.suffix != ".csv":
         output.mkdir(parents=True, exist_ok=True)
         output = output / "corrected.csv"
     write_atomically(output, text)
+    return output

@@ -12,13 +12,28 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from casest import __version__
+from casest.completing import EffectName, ModelName, SolverName
 from casest.errors import CasestError, NotTrusted, UsageError
+from casest.waiting import Waiting
 
 if TYPE_CHECKING:
     from casest.data.run import Run
     from casest.modelling.model import Model
 
 Options = dict[str, Any]
+
+#: A file in its place is refused before anything is computed.
+FOLDER = click.Path(path_type=Path, file_okay=False)
+
+_waiting = Waiting()
+#: Say what is going on, where somebody watches.
+progress = _waiting.say
+
+
+def echo(text: str, **how: Any) -> None:
+    """Print, after what was said of the waiting is wiped away."""
+    _waiting.done()
+    click.echo(text, **how)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -29,19 +44,20 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def run(arguments: Sequence[str] | None = None) -> int:
     """Run a command and return its exit code; no traceback reaches the user."""
     try:
-        result = commands.main(arguments, prog_name="casest", standalone_mode=False)
+        words = list(sys.argv[1:] if arguments is None else arguments)
+        result = commands.main(words, prog_name="casest", standalone_mode=False, obj=words)
         return result if isinstance(result, int) else 0
     except CasestError as error:
-        click.echo(f"casest: {error}", err=True)
+        echo(f"casest: {error}", err=True)
         return error.exit_code
     except click.exceptions.NoArgsIsHelpError as error:
-        click.echo(error.format_message())
+        echo(error.format_message())
         return 1
     except click.ClickException as error:
-        click.echo(f"casest: {error.format_message()}", err=True)
+        echo(f"casest: {error.format_message()}", err=True)
         return 1
     except (click.Abort, KeyboardInterrupt):
-        click.echo("casest: interrupted; nothing was written", err=True)
+        echo("casest: interrupted; nothing was written", err=True)
         return 2
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -50,11 +66,13 @@ def run(arguments: Sequence[str] | None = None) -> int:
         if os.environ.get("CASEST_TRACEBACK"):
             raise
         text = f"{type(error).__name__}: {error}".splitlines()[0]
-        click.echo(
+        echo(
             f"casest: internal error, please report it ({text}); CASEST_TRACEBACK=1 shows where",
             err=True,
         )
         return 2
+    finally:
+        _waiting.done()
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
@@ -80,7 +98,7 @@ def reading_options(command: Callable[..., Any]) -> Callable[..., Any]:
         click.option("--rate", type=float, help="Samples per second, where no column is the time."),
         click.option("--scale", "scales", help="Raw counts: temp=int16/256+25.", **many),
         click.option("--unit", "units", help="Unit of a signal's columns: v=g.", **many),
-        click.option("--columns", help="Columns of a signal: v=ax,ay,az or v=0,1,2.", **many),
+        click.option("--columns", help="Columns of a signal: v=ax,ay,az, v=a or v=0,1,2.", **many),
     ):
         command = option(command)
     return command
@@ -127,7 +145,7 @@ def output_options(command: Callable[..., Any]) -> Callable[..., Any]:
         click.option(
             "-o",
             "--output",
-            type=click.Path(path_type=Path),
+            type=FOLDER,
             metavar="DIR",
             help="Folder for result.json, residuals.csv and report.html.",
         ),
@@ -143,6 +161,7 @@ def output_options(command: Callable[..., Any]) -> Callable[..., Any]:
             "--solver",
             default="ipopt",
             show_default=True,
+            type=SolverName(),
             help="ipopt, ipopt-exact, trust-region, or an estimator of the model's own.",
         ),
         click.option(
@@ -162,15 +181,16 @@ def output_options(command: Callable[..., Any]) -> Callable[..., Any]:
 def list_command(as_json: bool) -> None:
     """Shipped problems with their symbols and estimators, and the catalogue of effects."""
     from casest.effects import CATALOGUE
-    from casest.problem import SHIPPED, find_model
+    from casest.problem import MOVING, SHIPPED, find_any, find_model
     from casest.terminal import listing
 
     models = [(name, find_model(name)) for name in SHIPPED]
-    click.echo(listing(models, CATALOGUE, as_json=as_json))
+    moving: list[Any] = [(name, find_any(name)) for name in MOVING]
+    echo(listing(models, CATALOGUE, moving, as_json=as_json))
 
 
 @commands.command()
-@click.argument("model_name", metavar="MODEL")
+@click.argument("model_name", metavar="MODEL", type=ModelName())
 @click.argument("data", nargs=-1, required=True, type=click.Path())
 @model_options
 @reading_options
@@ -185,7 +205,7 @@ def calibrate(model_name: str, data: tuple[str, ...], **options: Any) -> int:
 
 def typed() -> str:
     """The command as it can be typed again."""
-    return shlex.join(["casest", *sys.argv[1:]])
+    return shlex.join(["casest", *click.get_current_context().obj])
 
 
 def calibration(model_name: str, data: Sequence[str], options: Options, command: str) -> int:
@@ -198,6 +218,7 @@ def calibration(model_name: str, data: Sequence[str], options: Options, command:
     runs = records(model, data, options)
     hidden = held_out(model, data, options)
     start = dict(start_value(text, model) for text in options["starts"]) or None
+    progress(f"fitting {model_name}")
     with interruptible():
         found = estimate.attempt(
             model, runs, start=start, solver=options["solver"], seed=options["seed"]
@@ -207,21 +228,23 @@ def calibration(model_name: str, data: Sequence[str], options: Options, command:
         found, model_name=model_name, data=data, command=command, holdout=holdout
     )
     if options["output"]:
+        progress(f"writing {options['output']}")
         result.save(options["output"], content, result.residual_rows(found))
         reported(options["output"], calibration_page(found, content, str(options["output"])))
     if options["as_json"]:
-        click.echo(result.as_json(content), nl=False)
+        echo(result.as_json(content), nl=False)
     else:
-        click.echo(terminal.calibration_text(found, content, options["output"]))
+        words = terminal.calibration_text(found, content, options["output"])
+        echo(terminal.coloured(words, sys.stdout))
     if not found.certificate.trusted:
         reason = found.certificate.reasons[0]
-        click.echo(f"casest: no trustworthy estimate: {reason}", err=True)
+        echo(f"casest: no trustworthy estimate: {reason}", err=True)
         return NotTrusted.exit_code
     return 0
 
 
 @commands.command()
-@click.argument("model_name", metavar="MODEL")
+@click.argument("model_name", metavar="MODEL", type=ModelName())
 @click.argument("data", nargs=-1, required=True, type=click.Path())
 @model_options
 @reading_options
@@ -242,12 +265,14 @@ def closing(model_name: str, data: Sequence[str], options: Options, command: str
     from casest.effects import CATALOGUE
     from casest.problem import find_effects
     from casest.report import closing_page
+    from casest.terminal import coloured
 
     own = tuple(e for path in options["effects"] for e in find_effects(path))
     model = declared_model(model_name, {**options, "effects": ()})
     runs = records(model, data, options)
     apart = held_out(model, data, options)
     start = dict(start_value(words, model) for words in options["starts"]) or None
+    progress(f"fitting {model_name}, looking for effects")
     try:
         found = loop.close(
             model,
@@ -264,6 +289,7 @@ def closing(model_name: str, data: Sequence[str], options: Options, command: str
         found, model_name=model_name, data=data, command=command, held_out=hidden and hidden[1:]
     )
     if options["output"]:
+        progress(f"writing {options['output']}")
         formula = written.formula_source(found)
         if formula:
             write(options["output"] / "formula.py", formula)
@@ -271,16 +297,10 @@ def closing(model_name: str, data: Sequence[str], options: Options, command: str
         result.save(options["output"], content, written.residual_rows(found, hidden))
         reported(options["output"], closing_page(found, content, str(options["output"])))
     if options["as_json"]:
-        click.echo(result.as_json(content), nl=False)
+        echo(result.as_json(content), nl=False)
     else:
-        click.echo(text.closing_text(found, content, options["output"]))
+        echo(coloured(text.closing_text(found, content, options["output"]), sys.stdout))
     return 0
-
-
-def progress(words: str) -> None:
-    """Say what is going on, where somebody watches."""
-    if sys.stderr.isatty():
-        click.echo(f"casest: {words}", err=True)
 
 
 def refused(
@@ -298,8 +318,8 @@ def refused(
         page = calibration_page(error.estimate, content, str(options["output"]))
         reported(options["output"], page)
         if options["as_json"]:
-            click.echo(result.as_json(content), nl=False)
-    click.echo(f"casest: {error}", err=True)
+            echo(result.as_json(content), nl=False)
+    echo(f"casest: {error}", err=True)
     return NotTrusted.exit_code
 
 
@@ -307,7 +327,7 @@ def refused(
 @click.option(
     "-o",
     "--output",
-    type=click.Path(path_type=Path),
+    type=FOLDER,
     metavar="DIR",
     help="Folder for result.json, residuals.csv and report.html.",
 )
@@ -330,9 +350,9 @@ def demo(output: Path | None) -> int:
         "as_json": False,
     }
     words = f"casest close wheel {record} -o {options['output']}"
-    click.echo(f"$ {words}\n")
+    echo(f"$ {words}\n")
     code = closing("wheel", (str(record),), options, words)
-    click.echo("\n" + demonstration.comparison(options["output"]))
+    echo("\n" + demonstration.comparison(options["output"]))
     return code
 
 
@@ -341,9 +361,7 @@ def motion_options(command: Callable[..., Any]) -> Callable[..., Any]:
     many: Options = {"multiple": True, "metavar": "STATE=NUMBER"}
     for option in (
         click.option("--json", "as_json", is_flag=True, help="Print JSON instead of text."),
-        click.option(
-            "-o", "--output", type=click.Path(path_type=Path), metavar="DIR", help="Folder."
-        ),
+        click.option("-o", "--output", type=FOLDER, metavar="DIR", help="Folder."),
         click.option("--std", "stds", help="What is known of a state at the beginning.", **many),
         click.option("--intensity", "intensities", help="Of its driving noise, unit^2/s.", **many),
     ):
@@ -352,7 +370,7 @@ def motion_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 @commands.command()
-@click.argument("model_name", metavar="MODEL")
+@click.argument("model_name", metavar="MODEL", type=ModelName())
 @click.argument("data", nargs=-1, required=True, type=click.Path())
 @model_options
 @reading_options
@@ -367,11 +385,15 @@ def observe(model_name: str, data: tuple[str, ...], **options: Any) -> int:
     from casest.modelling.model import Model
     from casest.problem import find_any
 
-    if isinstance(find_any(model_name), Model):
+    fits = isinstance(find_any(model_name), Model)
+    if fits:
         model = declared_model(model_name, options)
-        content, _ = observing.observe_parameters(model, records(model, data, options))
+        runs = records(model, data, options)
+        progress(f"fitting {model_name}")
+        content, _ = observing.observe_parameters(model, runs)
     else:
         moving, run = moving_record(model_name, data, options)
+        progress("what the trajectory shows")
         content = observing.observe_motion(moving, run, options["window"])
     content |= {"data": list(data), "reproduce": result.reproduce(typed(), data)}
     if options["output"]:
@@ -379,14 +401,17 @@ def observe(model_name: str, data: tuple[str, ...], **options: Any) -> int:
 
         write(options["output"] / "observe.json", result.as_json(content))
         reported(options["output"], observe_page(content))
-    click.echo(
-        result.as_json(content).rstrip() if options["as_json"] else observing.observe_text(content)
-    )
+    if options["as_json"]:
+        echo(result.as_json(content), nl=False)
+        return 0
+    echo(observing.observe_text(content))
+    seen = content["rank"] == content["unknowns"]
+    last_words(options["output"], "report.html, observe.json", trusted=seen, applies=fits)
     return 0
 
 
 @commands.command("filter")
-@click.argument("model_name", metavar="MODEL")
+@click.argument("model_name", metavar="MODEL", type=ModelName())
 @click.argument("data", nargs=-1, required=True, type=click.Path())
 @reading_options
 @motion_options
@@ -395,6 +420,7 @@ def filter_command(model_name: str, data: tuple[str, ...], **options: Any) -> in
     from casest import observing, result
 
     moving, run = moving_record(model_name, data, {**options, "constants": ()})
+    progress("filter and smoother")
     content, found = observing.follow(moving, run)
     content |= {"data": list(data), "reproduce": result.reproduce(typed(), data)}
     if options["output"]:
@@ -403,10 +429,22 @@ def filter_command(model_name: str, data: tuple[str, ...], **options: Any) -> in
         write(options["output"] / "states.csv", observing.states_csv(found))
         write(options["output"] / "filter.json", result.as_json(content))
         reported(options["output"], filter_page(found, content))
-    click.echo(
-        result.as_json(content).rstrip() if options["as_json"] else observing.filter_text(content)
-    )
+    if options["as_json"]:
+        echo(result.as_json(content), nl=False)
+        return 0
+    echo(observing.filter_text(content))
+    last_words(options["output"], "report.html, filter.json, states.csv")
     return 0
+
+
+def last_words(output: Path | None, files: str, **known: Any) -> None:
+    """What has been written, and what to type next."""
+    from casest.following import following
+
+    if output is not None:
+        echo(f"\nWritten: {output}/{files}")
+    if words := following(typed(), output, **known):
+        echo(f"\n{words}")
 
 
 def reported(folder: Path, page: str) -> None:
@@ -443,6 +481,7 @@ def moving_record(name: str, data: Sequence[str], options: Options) -> tuple[Any
     moving = moving.having(**constants)
     moving = moving.driven(**dict(number_pair(t, "--intensity") for t in options["intensities"]))
     moving = moving.known_to(**dict(number_pair(t, "--std") for t in options["stds"]))
+    progress(f"reading {data[0]}")
     runs = load_runs(list(data), moving.signals, **reading_arguments(options))
     if len(runs) != 1:
         raise UsageError(f"{data[0]} holds {len(runs)} runs; a trajectory is one")
@@ -475,27 +514,34 @@ def apply(result_path: Path, data: str, **options: Any) -> None:
     from casest import applying, exporting
 
     arguments = reading_arguments(options)
+    progress(f"correcting {data}")
     if exporting.is_exported(result_path):
         text = exporting.applied(result_path, data, arguments)
     else:
         text = applying.corrected_csv(result_path, data, arguments, force=options["force"])
-    applying.write_or_print(text, options["output"])
+    _waiting.done()
+    if path := applying.write_or_print(text, options["output"]):
+        echo(f"Written: {path}")
 
 
 @commands.command()
-@click.argument("model_name", metavar="MODEL")
+@click.argument("model_name", metavar="MODEL", type=ModelName())
 @model_options
 @reading_options
 @click.option("--value", "values", multiple=True, metavar="NAME=VALUE", help="True value.")
-@click.option("--effect", multiple=True, metavar="NAME[(COLUMN)]", help="An effect to add.")
+@click.option(
+    "--effect",
+    multiple=True,
+    type=EffectName(),
+    metavar="NAME[(COLUMN)]",
+    help="An effect to add.",
+)
 @click.option("--noise", type=float, default=0.0, help="Standard deviation of each reading.")
 @click.option("--duration", type=float, help="Seconds, with --rate, where time is all it needs.")
 @click.option("--directions", type=int, metavar="N", help="N random directions or attitudes.")
 @click.option("--input", "given", type=click.Path(), help="Record with the signals it needs.")
 @click.option("--seed", type=int, default=0, show_default=True)
-@click.option(
-    "-o", "--output", type=click.Path(path_type=Path), default=Path("simulated"), metavar="DIR"
-)
+@click.option("-o", "--output", type=FOLDER, default=Path("simulated"), metavar="DIR")
 def simulate(model_name: str, **options: Any) -> None:
     """A record with known truth: DIR/record.csv and DIR/truth.json.
 
@@ -511,6 +557,7 @@ def simulation(model_name: str, options: Options, command: str) -> None:
     from casest import simulating
     from casest.dynamics import Dynamics
     from casest.effects import CATALOGUE
+    from casest.following import following
     from casest.problem import find_any, find_effects
 
     if isinstance(find_any(model_name), Dynamics):
@@ -531,24 +578,25 @@ def simulation(model_name: str, options: Options, command: str) -> None:
     model = simulating.with_effects(model, run, options["effect"], (*CATALOGUE, *own))
     given = dict(named_value(text, "--value", model) for text in options["values"])
     values = simulating.truth(model, {name: value.array for name, value in given.items()})
+    progress(f"simulating {model_name}")
     reading = simulating.simulated(model, run, values, options["noise"], rng)
     paths = simulating.written(
         options["output"], model, run, reading, values, options["noise"], options["seed"], command
     )
     for path in paths:
-        click.echo(f"written: {path}")
-    click.echo(f"Next: casest calibrate {model_name} {paths[0]}")
+        echo(f"Written: {path}")
+    echo(f"\n{following(command, file=paths[0])}")
 
 
 @commands.command()
 @click.argument("shell", type=click.Choice(["bash", "zsh", "fish"]))
 def completion(shell: str) -> None:
-    """A script that completes commands and options: eval "$(casest completion bash)"."""
+    """A script that completes what is typed: eval "$(casest completion bash)"."""
     from click.shell_completion import get_completion_class
 
     made = get_completion_class(shell)
     assert made is not None
-    click.echo(made(commands, {}, "casest", "_CASEST_COMPLETE").source())
+    echo(made(commands, {}, "casest", "_CASEST_COMPLETE").source())
 
 
 @commands.command()
@@ -572,19 +620,23 @@ def completion(shell: str) -> None:
 def export(result_path: Path, to: Any, output: Path | None, **options: Any) -> None:
     """The correction of a saved RESULT, ready to run on the device."""
     from casest import exporting
+    from casest.following import following
 
     if options["single"] and to != "c":
         raise UsageError("--float is for --to c")
+    progress(f"exporting {result_path}")
     text = exporting.exported(result_path, to, **options)
     if output is None:
-        click.echo(text, nl=False)
+        echo(text, nl=False)
         return
     write(output, text)
-    click.echo(f"written: {output}")
+    echo(f"Written: {output}")
+    if words := following(typed(), file=output):
+        echo(f"\n{words}")
 
 
 @commands.command()
-@click.argument("model_name", metavar="MODEL")
+@click.argument("model_name", metavar="MODEL", type=ModelName())
 @click.argument("data", nargs=-1, required=True, type=click.Path())
 @model_options
 @reading_options
@@ -616,7 +668,7 @@ def export(result_path: Path, to: Any, output: Path | None, **options: Any) -> N
 @click.option(
     "-o",
     "--output",
-    type=click.Path(path_type=Path),
+    type=FOLDER,
     metavar="DIR",
     help="Folder for compare.json, compare.png and compare.svg.",
 )
@@ -651,13 +703,13 @@ def compare(model_name: str, data: tuple[str, ...], **options: Any) -> int:
     )
     written = written_comparison(found, content, options["output"]) if options["output"] else []
     if options["as_json"]:
-        click.echo(result.as_json(content), nl=False)
+        echo(result.as_json(content), nl=False)
     else:
-        click.echo(comparing_text.comparison_text(found, data, written))
+        echo(comparing_text.comparison_text(found, data, written, command))
     if found.interrupted:
-        click.echo(f"casest: interrupted after {found.done} of {found.planned} runs", err=True)
+        echo(f"casest: interrupted after {found.done} of {found.planned} runs", err=True)
     elif not found.certified:
-        click.echo("casest: no certified optimum to judge by", err=True)
+        echo("casest: no certified optimum to judge by", err=True)
     return 0 if found.certified and not found.interrupted else NotTrusted.exit_code
 
 
@@ -669,7 +721,7 @@ def written_comparison(found: Any, content: Options, folder: Path) -> list[Path]
     try:
         paths += comparing_plot.draw(found, folder)
     except UsageError as error:
-        click.echo(f"casest: {error}", err=True)
+        echo(f"casest: {error}", err=True)
     return paths
 
 
@@ -764,6 +816,7 @@ def records(model: Model, data: Sequence[str], options: Options) -> tuple[Run, .
     """The runs in the files."""
     from casest.data import load_runs
 
+    progress(f"reading {', '.join(data)}")
     seen: set[Path] = set()
     for name in data:
         if Path(name).resolve() in seen:

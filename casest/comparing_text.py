@@ -11,15 +11,19 @@ import numpy as np
 
 from casest import __version__
 from casest.compare import Comparison, Row, Trial
+from casest.data.logs import file_name
 from casest.data.write import write_atomically
 from casest.errors import DataError
+from casest.following import following
 from casest.naming import unit_table
 from casest.result import as_json, plain
 from casest.solve.certificate import SAME
 from casest.terminal import WIDTH, item
 
 
-def comparison_text(found: Comparison, data: Sequence[str], written: Sequence[Path] = ()) -> str:
+def comparison_text(
+    found: Comparison, data: Sequence[str], written: Sequence[Path] = (), command: str = ""
+) -> str:
     """Head, table from the same start, table of the spread, who gave no answer and why."""
     solvers = [row for row in found.rows if row.first is not None and not row.own]
     own = [row for row in found.rows if row.own]
@@ -32,7 +36,8 @@ def comparison_text(found: Comparison, data: Sequence[str], written: Sequence[Pa
     if words:
         blocks.append("\n".join(["In words:", *map(item, words)]))
     if written:
-        blocks.append(textwrap.fill(f"Written: {', '.join(map(str, written))}.", WIDTH))
+        blocks.append(textwrap.fill(f"Written: {', '.join(map(str, written))}", WIDTH))
+    blocks.append(following(command, trusted=found.certified))
     return "\n\n".join(b for b in blocks if b)
 
 
@@ -42,7 +47,7 @@ def _head(found: Comparison, data: Sequence[str]) -> str:
     unit = _unit(found)
     verdict = "certified optimum" if found.certified else "NO CERTIFIED OPTIMUM; best point"
     line = (
-        f"{problem.model.name} on {', '.join(Path(name).name for name in data)}: {samples} "
+        f"{problem.model.name} on {', '.join(file_name(name) for name in data)}: {samples} "
         f"samples, {problem.unknowns} unknowns; {verdict}: cost {found.best:.6g}"
         f"{_squared(unit)}, one residual's noise {found.sigma:.3g}{unit and ' ' + unit}; certified "
         f"fit {seconds_text(estimate.seconds)}"

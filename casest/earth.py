@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from importlib import import_module
-from typing import Any
 
 import numpy as np
 
 from casest.errors import UsageError
+from casest.libraries import library
 
 
 @dataclass(frozen=True)
@@ -28,7 +27,7 @@ def normal_gravity(latitude: float, height: float) -> float:
     """
     _check("latitude", latitude, -90, 90)
     _check("height", height, 0, 20_000)
-    boule = _library("boule")
+    boule = library("boule", "earth")
     milligal = boule.WGS84.normal_gravity((0.0, latitude, height))
     return float(milligal) * 1e-5
 
@@ -41,7 +40,7 @@ def magnetic_field(latitude: float, longitude: float, height: float, year: float
     """
     _check("latitude", latitude, -90, 90)
     _check("longitude", longitude, -180, 360)
-    pygeomag = _library("pygeomag")
+    pygeomag = library("pygeomag", "earth")
     try:
         found = pygeomag.GeoMag().calculate(
             glat=latitude, glon=longitude, alt=height / 1000, time=year
@@ -51,13 +50,6 @@ def magnetic_field(latitude: float, longitude: float, height: float, year: float
     return MagneticField(
         float(found.total_intensity) * 1e-3, float(np.radians(found.d)), float(np.radians(found.i))
     )
-
-
-def _library(name: str) -> Any:
-    try:
-        return import_module(name)
-    except ImportError:
-        raise UsageError(f"this needs the library {name}: pip install 'casest[earth]'") from None
 
 
 def _check(name: str, value: float, low: float, high: float) -> None:

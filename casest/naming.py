@@ -52,16 +52,21 @@ def resolved(unit: str, known: Mapping[str, str]) -> str:
     quotient = re.fullmatch(r"\[([^\]]+)\]/\[([^\]]+)\]", unit)
     if quotient:
         a, b = (known.get(name, f"[{name}]") for name in quotient.groups())
-        return _quotient(a, b)
+        return _quotient(a, _difference(b))
     alone = _PLACEHOLDER.fullmatch(unit)
     if alone:
         return known.get(alone[1], unit)
 
     def replacement(match: re.Match[str]) -> str:
-        value = known.get(match[1], match[0])
+        value = _difference(known.get(match[1], match[0]))
         return f"({value})" if "/" in value or "*" in value else value
 
     return _PLACEHOLDER.sub(replacement, unit) or "1"
+
+
+def _difference(unit: str) -> str:
+    """In a compound unit a temperature is a difference: per kelvin."""
+    return "K" if unit == "degC" else unit
 
 
 def _quotient(a: str, b: str) -> str:

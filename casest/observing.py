@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import textwrap
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -189,7 +190,14 @@ def observe_text(content: Mapping[str, Any]) -> str:
             f"  over windows of {w['length_s']:.3g} s the smallest eigenvalue (information over "
             f"prior) goes from {low:.3g} to {high:.3g}",
         ]
-    return "\n".join([*lines, *_note_lines(content)])
+    return "\n".join(_wrapped([*lines, *_note_lines(content)]))
+
+
+def _wrapped(lines: list[str]) -> list[str]:
+    """Lines that fit 80 columns."""
+    return [
+        textwrap.fill(line, 80, subsequent_indent=" " * 4, break_on_hyphens=False) for line in lines
+    ]
 
 
 def _note_lines(content: Mapping[str, Any]) -> list[str]:
@@ -212,7 +220,7 @@ def filter_text(content: Mapping[str, Any]) -> str:
     lines += ["", f"  innovations are {filter_verdict(content)}"]
     if i["missing_readings"]:
         lines.append(f"  {i['missing_readings']} samples without a complete reading")
-    return "\n".join([*lines, *_note_lines(content)])
+    return "\n".join(_wrapped([*lines, *_note_lines(content)]))
 
 
 def filter_verdict(content: Mapping[str, Any]) -> str:

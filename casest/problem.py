@@ -68,10 +68,11 @@ def find_model(name: str) -> Model:
         return own
     if name in MOVING:
         raise UsageError(f"{name} is an estimator in motion: casest observe {name}, casest filter")
-    near = difflib.get_close_matches(name, SHIPPED, 1)
+    near = difflib.get_close_matches(name, [*SHIPPED, *MOVING], 1)
     hint = f"; did you mean {near[0]!r}?" if near else ""
     raise UsageError(
-        f"no model {name!r}{hint} (shipped: {', '.join(SHIPPED)}; or give the path of a .py file)"
+        f"no model {name!r}{hint} (shipped: {', '.join([*SHIPPED, *MOVING])}; or give the path "
+        "of a .py file)"
     )
 
 

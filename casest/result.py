@@ -17,6 +17,7 @@ import casadi as ca
 import numpy as np
 
 from casest import __version__
+from casest.data.logs import file_and_topics
 from casest.data.run import Run
 from casest.data.write import write_atomically
 from casest.declaring.shapes import Array
@@ -197,8 +198,22 @@ def reproduce(command: str, data: Sequence[str]) -> dict[str, Any]:
         "command": command,
         "python": platform.python_version(),
         **{name: version(name) for name in ("casadi", "numpy", "scipy")},
-        "sha256": {name: hashlib.sha256(Path(name).read_bytes()).hexdigest() for name in data},
+        "sha256": {name: _digest(name) for name in data},
     }
+
+
+def _digest(name: str) -> str:
+    """SHA-256 of a data file; of a folder (a ROS 2 bag), of its files' in order of their names."""
+    path = file_and_topics(name)[0]
+    whole = hashlib.sha256()
+    for file in sorted(path.iterdir()) if path.is_dir() else [path]:
+        if file.is_file():
+            with file.open("rb") as stream:
+                part = hashlib.file_digest(stream, "sha256")
+            if not path.is_dir():
+                return part.hexdigest()
+            whole.update(part.digest())
+    return whole.hexdigest()
 
 
 def plain(value: Any) -> Any:
@@ -249,13 +264,42 @@ def load_result(path: Path) -> dict[str, Any]:
         path = path / RESULT
     try:
         result = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise DataError(f"{path}: no such result; calibrate with -o {path.parent} first") from None
+    except (FileNotFoundError, NotADirectoryError):
+        raise DataError(f"{path}: no such result; {_instead(path.parent)}") from None
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise DataError(f"{path}: not a result.json ({error})") from None
+        near = path.with_name(RESULT)
+        hint = f"; did you mean {near}?" if near.exists() and near != path else ""
+        raise DataError(f"{path}: not a result.json ({error}){hint}") from None
     if not isinstance(result, dict) or "model" not in result:
         raise DataError(f"{path}: not a casest result: it names no model")
+    if "format" in result:
+        raise DataError(
+            f"{path}: is a correction exported already, which `casest apply` reads; here the "
+            "result.json is needed that it was exported from"
+        )
+    if not result.keys() & {"estimate", "before", "after"}:
+        writer = _WRITERS.get(path.name)
+        by = f", but what `casest {writer}` writes" if writer else ": it holds no estimate"
+        raise DataError(f"{path}: not a result of calibrate or close{by}")
     return result
+
+
+#: What other commands leave in their folders.
+_WRITERS = {
+    "observe.json": "observe",
+    "filter.json": "filter",
+    "compare.json": "compare",
+    "truth.json": "simulate",
+}
+
+
+def _instead(folder: Path) -> str:
+    """What a folder without a result holds, and how one is made."""
+    make = f"casest calibrate (or close) MODEL DATA -o {folder} makes one"
+    found = next((name for name in _WRITERS if (folder / name).exists()), None)
+    if found:
+        return f"the folder holds {found} of `casest {_WRITERS[found]}`; {make}"
+    return make
 
 
 def saved_parameters(result: Mapping[str, Any]) -> dict[str, Any]:

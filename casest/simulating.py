@@ -159,7 +159,12 @@ def simulated(
         name = str(model.traced.measured)
         clean = _predicted(model, run, name, values)
     if not np.all(np.isfinite(clean)):
-        raise UsageError(f"{model.name}: these values give readings that are not finite: --value")
+        zero = [name for name, value in values.items() if not np.any(value)]
+        way = f"{', '.join(zero)} are 0" if len(zero) > 1 else f"{zero[0]} is 0" if zero else ""
+        raise UsageError(
+            f"{model.name}: the readings are not finite with these values{way and f' ({way})'}; "
+            f"give others: --value {zero[0] if zero else 'NAME'}=…"
+        )
     return name, clean + noise * rng.standard_normal(clean.shape)
 
 

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import json
+import os
+import re
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import numpy as np
 
-from casest.declaring.shapes import Array
+from casest.data.logs import file_name
+from casest.declaring.shapes import Array, in_digits
+from casest.dynamics import Dynamics
 from casest.estimate import Estimate
+from casest.following import following
 from casest.modelling.effect import Effect
 from casest.modelling.model import Model
 from casest.naming import entry_units, unit_table
@@ -20,30 +25,66 @@ from casest.solve.strategy import SOLVERS
 WIDTH = 80
 
 
+#: Verdicts and their colours (SGR codes): red, green, yellow.
+_COLOURS = {
+    r"NOT\s+TRUSTED|unexplained(?=:)|no\s+trustworthy\s+estimate": 31,
+    r"trusted$|adequate(?=:)": 32,
+    r"extended(?=:)": 33,
+}
+
+
+def coloured(text: str, stream: TextIO) -> str:
+    """The text with its verdict in colour on a terminal, where NO_COLOR does not forbid it."""
+    if not stream.isatty() or os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb":
+        return text
+    head, gap, rest = text.partition("\n\n")
+    for verdict, code in _COLOURS.items():
+        head, found = re.subn(verdict, f"\x1b[1;{code}m\\g<0>\x1b[0m", head, count=1)
+        if found:
+            break
+    return head + gap + rest
+
+
 def listing(
-    models: Sequence[tuple[str, Model]], effects: Sequence[Effect] = (), *, as_json: bool = False
+    models: Sequence[tuple[str, Model]],
+    effects: Sequence[Effect] = (),
+    moving: Sequence[tuple[str, Dynamics]] = (),
+    *,
+    as_json: bool = False,
 ) -> str:
-    """Shipped problems, a paragraph each, and the catalogue of effects, a line each."""
+    """Shipped problems and estimators in motion, a paragraph each; a line for each effect."""
     if as_json:
         problems = {name: _summary(m) for name, m in models}
         catalogue = [
             {"name": e.name, "about": _first_line(e.doc), "on": e.on, "formula": e.formula}
             for e in effects
         ]
-        return json.dumps({"problems": problems, "effects": catalogue}, indent=2)
+        motion = {
+            name: {
+                "about": _about(d),
+                "signals": [s.name for s in d.signals],
+                "states": [s.name for s in d.states],
+            }
+            for name, d in moving
+        }
+        return json.dumps({"problems": problems, "motion": motion, "effects": catalogue}, indent=2)
     lines = ["Problems (casest calibrate NAME DATA):"]
     for name, m in models:
-        about = (m.function.__doc__ or "").strip().splitlines()[0]
-        lines += ["", f"  {name}", f"      {about}"]
+        lines += ["", f"  {name}", _under(_about(m), "")]
         for word, symbols in (
             ("signals", m.signals),
             ("unknowns", m.parameters),
             ("constants", m.constants),
         ):
-            lines.append(f"      {word + ':':<11}{', '.join(s.name for s in symbols)}")
-        lines.append(
-            f"      {'solvers:':<11} {', '.join([*SOLVERS, *(n for n, _ in m.estimators)])}"
-        )
+            lines.append(_under(", ".join(s.name for s in symbols), f"{word + ':':<11}"))
+        solvers = ", ".join([*SOLVERS, *(n for n, _ in m.estimators)])
+        lines.append(_under(solvers, f"{'solvers:':<11}"))
+    if moving:
+        lines += ["", "In motion (casest observe NAME DATA, casest filter NAME DATA):"]
+    for name, d in moving:
+        lines += ["", f"  {name}", _under(_about(d), "")]
+        lines.append(_under(", ".join(s.name for s in d.signals), "signals:   "))
+        lines.append(_under(", ".join(s.name for s in d.states), "states:    "))
     lines += ["", "Your own: casest calibrate file.py[:name] DATA"]
     if effects:
         lines += ["", "Effects that `casest close` looks for:"]
@@ -54,13 +95,29 @@ def listing(
     return "\n".join(lines)
 
 
+def _about(declared: Model | Dynamics) -> str:
+    return _first_line((declared.function.__doc__ or "").strip())
+
+
+def _under(text: str, head: str) -> str:
+    """A wrapped line under a problem's name, what it is in front."""
+    indent = " " * 6
+    return textwrap.fill(
+        text,
+        WIDTH,
+        initial_indent=indent + head,
+        subsequent_indent=indent + " " * len(head),
+        break_on_hyphens=False,
+    )
+
+
 def _first_line(text: str) -> str:
     return text.partition("\n")[0]
 
 
 def _summary(m: Model) -> dict[str, Any]:
     return {
-        "about": (m.function.__doc__ or "").strip().splitlines()[0],
+        "about": _about(m),
         "signals": [s.name for s in m.signals],
         "parameters": [p.name for p in m.parameters],
         "constants": {c.name: c.array.tolist() for c in m.constants},
@@ -77,7 +134,7 @@ def calibration_text(found: Estimate, content: Mapping[str, Any], output: Path |
     blocks += _determined(found)
     title = "Believed because" if found.certificate.trusted else "Refused because"
     blocks.append("\n".join([f"{title}:", *(item(r) for r in found.certificate.reasons)]))
-    blocks.append(_next(found, output))
+    blocks += _written(found, content, output)
     return "\n\n".join(b for b in blocks if b)
 
 
@@ -85,7 +142,7 @@ def _head(found: Estimate, content: Mapping[str, Any]) -> str:
     samples = sum(len(run) for run in found.problem.runs)
     what = "rest intervals" if found.problem.runs[0].spread else "samples"
     verdict = "trusted" if found.certificate.trusted else "NOT TRUSTED"
-    files = ", ".join(Path(name).name for name in content["data"])
+    files = ", ".join(file_name(name) for name in content["data"])
     line = (
         f"{found.model.name} on {files}: {samples} {what}, "
         f"{found.identifiability.unknowns} unknowns, rank {found.identifiability.rank}: {verdict}"
@@ -136,7 +193,7 @@ def _held(found: Estimate, content: Mapping[str, Any]) -> Iterator[str]:
     fixed = False
     for c in found.model.constants:
         unit = content["units"].get(c.name, "")
-        value = np.array2string(c.array, precision=9, separator=", ").replace("\n", "")
+        value = in_digits(c.array, 9)
         fixed = fixed or c.frozen is not None
         yield f"  {c.name} = {value} {'' if unit == '1' else unit}".rstrip() + " (held)"
     if fixed:
@@ -147,8 +204,8 @@ def rounded(value: float, std: float) -> tuple[str, str]:
     """Value and standard deviation to two digits of the latter, as a metrologist writes them."""
     if not np.isfinite(std):
         return "–", "not determined"
-    if std == 0:
-        return f"{value:.9g}", "0"
+    if std <= 1e-15 * abs(value):  # below what a double holds
+        return f"{value:.9g}", f"{std:.1g}"
     digits = 1 - int(np.floor(np.log10(std)))
     if -6 <= digits <= 9 and abs(value) < 1e7:
         places = max(digits, 0)
@@ -195,11 +252,13 @@ def _determined(found: Estimate) -> Iterator[str]:
         yield "The data determine every unknown; no weak combination."
 
 
-def _next(found: Estimate, output: Path | None) -> str:
-    if not found.certificate.trusted:
-        return ""
-    applies = found.model.traced.corrected is not None
-    if output is None:
-        return "Next: add -o out to keep the result, then `casest apply out DATA`." * applies
-    written = f"Written: {output}/report.html, result.json, residuals.csv."
-    return written + f" Next: casest apply {output} DATA" * applies
+def _written(found: Estimate, content: Mapping[str, Any], output: Path | None) -> Iterator[str]:
+    """Files written, and what to type next."""
+    if output is not None:
+        yield f"Written: {output}/report.html, result.json, residuals.csv"
+    yield following(
+        content["reproduce"]["command"],
+        output,
+        trusted=found.certificate.trusted,
+        applies=found.model.traced.corrected is not None,
+    )

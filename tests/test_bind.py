@@ -121,6 +121,18 @@ def test_a_near_scalar_column_is_suggested(tmp_path: Path) -> None:
     assert "try --columns temperature=temp" in message
 
 
+def test_the_only_column_of_a_signals_unit_is_suggested(tmp_path: Path) -> None:
+    mass = Signal("mass", 1, "kg")
+    message = refusal(DataError, tmp_path, "out [mV],weight [g],T [degC]\n1,2,3\n2,3,4\n", [mass])
+    assert "try --columns mass=weight" in message
+
+
+def test_columns_may_be_named_by_what_they_have_in_common(tmp_path: Path) -> None:
+    text = "AccX,AccY,AccZ,w\n1,2,3,0\n4,5,6,0\n"
+    run = run_of(tmp_path, text, columns={"v": ("Acc",)})
+    np.testing.assert_array_equal(run.signals["v"], [[1, 2, 3], [4, 5, 6]])
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [
@@ -365,6 +377,8 @@ def timed(steps: Sequence[float], header: str = "t", start: float = 0.0) -> str:
         ("Timestamp [us]", 1e-6),
         ("time_ms", 1e-3),
         ("t_us", 1e-6),
+        ("millis", 1e-3),
+        ("micros()", 1e-6),
         ("TIME", 1.0),
     ],
 )
@@ -391,7 +405,13 @@ def test_the_unit_of_time_may_be_stated(tmp_path: Path) -> None:
 
 def test_time_without_a_unit_is_taken_as_seconds_and_says_so(tmp_path: Path) -> None:
     run = run_of(tmp_path, timed([20, 20]), [T, V])
-    assert "t: no unit stated, taken as s (median step 20 s)" in run.notes
+    words = "t: no unit stated, taken as s (median step 20 s); if that is wrong say --unit t=ms"
+    assert words in run.notes
+
+
+def test_a_column_that_always_grows_is_suggested_as_the_time(tmp_path: Path) -> None:
+    text = "vx,vy,vz,Zeit\n1,2,3,10\n2,1,4,11\n0,5,2,12\n"
+    assert "give --rate HZ or --columns t=Zeit" in refusal(DataError, tmp_path, text, [T, V])
 
 
 @pytest.mark.parametrize(

@@ -354,6 +354,30 @@ def test_intervals_that_do_not_describe_the_cost_are_refused():
     assert "too uncertain" in found.certificate.reasons[0]
 
 
+def test_starts_that_end_in_worse_minima_are_told_from_those_that_agree():
+    """A step response of 2 % that is slow beside its record: from some starts it is lost."""
+
+    @model
+    def creeping(
+        t=signal("s"),
+        y=signal("mV"),
+        *,
+        size=param("mV", start=1.0),
+        creep=param(start=0.01),
+        tau=param("s", start=60, bounds=(1, 1e5)),
+    ):
+        return Residual(measured=y, predicted=size * (1 + creep * (1 - exp(-t / tau))))
+
+    rng, t = np.random.default_rng(1), np.arange(0, 600, 2.0)
+    y = 5 * (1 + 0.02 * (1 - np.exp(-t / 80))) + 1e-3 * rng.standard_normal(t.size)
+    record = {"t": t[:, None], "y": y[:, None]}
+    found = attempt(creeping, [Run.raw("r", record, units={"t": "s", "y": "mV"}, time=t)])
+    assert found.certificate.trusted
+    assert abs(found.values["tau"] - 80) < 5 * found.std["tau"]
+    assert found.certificate.agreeing < found.certificate.starts
+    assert found.certificate.reasons[2].endswith("; the others end higher")
+
+
 def test_the_reasons_for_belief_are_figures():
     reasons = attempt(decay, [decay_run()]).certificate.reasons
     assert len(reasons) == 4

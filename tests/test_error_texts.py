@@ -25,7 +25,8 @@ from casest import (
 from casest.cli import run
 from casest.data.rest import at_rest
 from casest.data.write import write_atomically
-from casest.earth import _library, normal_gravity
+from casest.earth import normal_gravity
+from casest.libraries import library
 from casest.problem import find_effects, find_model
 from casest.solve.strategy import solve
 from casest.stack import Problem
@@ -234,7 +235,7 @@ def test_a_model_declared_twice_in_one_file(tmp_path):
 
 def test_a_library_that_is_missing_is_named():
     with pytest.raises(UsageError, match=r"library no_such_library: pip install 'casest\[earth\]'"):
-        _library("no_such_library")
+        library("no_such_library", "earth")
     with pytest.raises(UsageError, match="height -5"):
         normal_gravity(0.0, -5.0)
 

@@ -15,7 +15,7 @@ ROOT = Path(__file__).parents[1]
 #: From the ground up. A module may import its own floor and those above it in this list.
 FLOORS = [
     ["casest", "casest.errors"],
-    ["casest.units"],
+    ["casest.libraries", "casest.units"],
     ["casest.declaring"],
     ["casest.data"],
     ["casest.modelling"],
@@ -41,10 +41,12 @@ FLOORS = [
     ["casest.values", "casest.applying", "casest.demonstration", "casest.export"],
     ["casest.exporting", "casest.simulating"],
     ["casest.compare"],
+    ["casest.following", "casest.waiting"],
     ["casest.terminal"],
     ["casest.comparing_text", "casest.comparing_plot"],
     ["casest.closing.text"],
     ["casest.report"],
+    ["casest.completing"],
     ["casest.cli"],
 ]
 

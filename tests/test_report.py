@@ -78,6 +78,7 @@ def test_the_verdict_of_a_closed_loop_is_one_sentence_on_top(browser, closed):
 def test_the_verdict_of_a_calibration_says_what_was_determined(browser, calibrated):
     browser.open(calibrated / "report.html")
     assert text(browser, "h1").startswith("Trusted: 9 unknowns determined from 24 rest intervals")
+    assert "whether the model is right is what casest close asks" in text(browser, "h1 + p")
 
 
 def test_every_section_is_there_and_the_contents_lead_to_it(browser, closed):

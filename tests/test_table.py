@@ -241,7 +241,7 @@ def test_a_folder_is_not_a_file(tmp_path: Path) -> None:
         read_table(tmp_path)
 
 
-@pytest.mark.parametrize("name", ["a.xlsx", "a.h5", "a.bag", "a.json"])
+@pytest.mark.parametrize("name", ["a.xlsx", "a.h5", "a.json"])
 def test_formats_that_are_not_read_say_so(tmp_path: Path, name: str) -> None:
     assert "export it as CSV" in error_of(tmp_path, b"something", name)
 

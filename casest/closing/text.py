@@ -8,7 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from casest.closing.loop import HELD_OUT_DATA, Closing
+from casest.data.logs import file_name
 from casest.effects import CATALOGUE
+from casest.following import following
 from casest.terminal import WIDTH, item, value_table
 
 #: Lists longer than this are left to result.json.
@@ -28,12 +30,9 @@ def closing_text(closing: Closing, content: Mapping[str, Any], output: Path | No
         "\n".join(_notes(content)),
     ]
     if output is not None:
-        blocks.append(
-            f"Written: {output}/report.html, result.json, residuals.csv. "
-            f"Next: casest apply {output} DATA"
-        )
-    else:
-        blocks.append("Next: add -o out to keep the result, then `casest apply out DATA`.")
+        blocks.append(f"Written: {output}/report.html, result.json, residuals.csv")
+    applies = closing.after.model.traced.corrected is not None
+    blocks.append(following(content["reproduce"]["command"], output, applies=applies))
     return "\n\n".join(b for b in blocks if b)
 
 
@@ -58,7 +57,7 @@ def sentence(content: Mapping[str, Any]) -> str:
 
 
 def _head(closing: Closing, content: Mapping[str, Any]) -> str:
-    files = ", ".join(Path(name).name for name in content["data"])
+    files = ", ".join(file_name(name) for name in content["data"])
     return textwrap.fill(f"{closing.before.model.name} on {files}: {sentence(content)}", WIDTH)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from casest.closing.loop import Closing, Found
 from casest.closing.summary import detectable, invisible
 from casest.closing.terms import source
 from casest.declaring.shapes import Array
+from casest.declaring.symbols import Constant
 from casest.estimate import Estimate
 from casest.modelling.effect import Attached
 from casest.naming import unit_table
@@ -143,6 +145,9 @@ def _formula(found: Found, attached: Attached | None) -> str:
     formula = attached.effect.formula or attached.effect.doc.partition("\n")[0]
     for name, column in attached.columns:
         formula = formula.replace(name, column)
+    for name, declared in attached.effect.declarations:
+        if isinstance(declared, Constant) and not declared.dims:
+            formula = re.sub(rf"\b{name}\b", f"{float(declared.array):.6g}", formula)
     return formula
 
 

@@ -6,7 +6,6 @@ import os
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -16,6 +15,7 @@ from casest import units as unit_names
 from casest.data import checks, timing
 from casest.data.converting import numbers, rotation, vector
 from casest.data.finding import Choice, as_names, find_by_name, find_column, find_columns
+from casest.data.logs import file_and_topics
 from casest.data.options import Options, refuse_unknown_names, stated_unit
 from casest.data.rest import at_rest as averaged_at_rest
 from casest.data.run import Array, Labels, Run
@@ -95,7 +95,7 @@ def _runs(table: Table, signals: Sequence[Signal], options: Options) -> list[Run
     others, other_units, notes = _others(table, sources, options)
     labels = _labels(table, groups["run"])
     pose = _labels(table, groups["pose"])
-    stem = Path(table.file).stem
+    stem = file_and_topics(table.file)[0].stem
     runs = []
     for label in [None] if labels is None else _in_order(labels):
         rows = np.arange(table.n_rows) if labels is None else np.flatnonzero(labels == label)
@@ -201,7 +201,7 @@ def _run_time(
         listed = ", ".join(list(table.columns)[:12])
         raise DataError(
             f"{table.file}: no time column (t, time, timestamp) for signal t; the file has "
-            f"{listed}; give --rate HZ or --columns t=NAME"
+            f"{listed}; give --rate HZ or --columns t={timing.increasing(table) or 'NAME'}"
         )
     return None, []
 

@@ -5,11 +5,13 @@ from __future__ import annotations
 import difflib
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
+from casest import units
 from casest.data.column import name_and_unit
 from casest.data.table import Table
 from casest.declaring.symbols import Signal
-from casest.errors import DataError
+from casest.errors import DataError, UnitError
 
 Choice = Mapping[str, Sequence[str] | str]
 
@@ -23,17 +25,27 @@ def find_columns(table: Table, signal: Signal, chosen: Choice) -> tuple[str, ...
     """Return the names of the columns that hold `signal`, in order.
 
     `chosen` names them (or gives positions from 0) where the file's own names do not tell:
-    {"v": ("ax", "ay", "az")}, {"v": "0,1,2"}. Raises DataError that lists what the file has.
+    {"v": ("ax", "ay", "az")}, {"v": "0,1,2"}, or what they have in common, {"v": "a"}. Raises
+    DataError that lists what the file has.
     """
     if signal.name in chosen:
         names = as_names(chosen[signal.name])
+        if len(names) == 1 and (found := _by_stem(table, signal, names[0])):
+            return found
         _check_number(table, signal, names)
         return tuple(find_column(table, name, f"signal {signal.name}") for name in names)
-    for candidate in _candidates(signal):
+    if found := _by_stem(table, signal, signal.name):
+        return found
+    raise _missing(table, signal)
+
+
+def _by_stem(table: Table, signal: Signal, stem: str) -> tuple[str, ...] | None:
+    """Return the columns of a signal whose names begin with `stem`: ax ay az, gyro[0] … gyro[2]."""
+    for candidate in _candidates(replace(signal, name=stem)):
         found = [find_by_name(table, name) for name in candidate]
         if all(found):
             return tuple(name for name in found if name)
-    raise _missing(table, signal)
+    return None
 
 
 def as_names(choice: Sequence[str] | str) -> tuple[str, ...]:
@@ -124,13 +136,23 @@ def _near_group(table: Table, signal: Signal) -> list[str]:
         angles = [_nearest(angle, numbers) for angle in _ANGLES]
         return [a for a in angles if a] if all(angles) and len(set(angles)) == 3 else []
     if signal.size == 1:
-        near = _nearest(signal.name, numbers)
+        fitting = [n for n in numbers if signal.unit and _in_unit(table, [n], signal.unit)]
+        near = fitting[0] if len(fitting) == 1 else _nearest(signal.name, fitting or numbers)
         return [near] if near else []
     groups = [g for g in map(list, _stems(numbers)) if len(g) == signal.size]
     if groups:
         wanted = "".join(_candidates(signal)[0])
-        return max(groups, key=lambda g: difflib.SequenceMatcher(None, wanted, "".join(g)).ratio())
+        alike = [g for g in groups if signal.unit and _in_unit(table, g, signal.unit)] or groups
+        return max(alike, key=lambda g: difflib.SequenceMatcher(None, wanted, "".join(g)).ratio())
     return numbers[: signal.size] if len(numbers) >= signal.size else []
+
+
+def _in_unit(table: Table, names: Sequence[str], unit: str) -> bool:
+    """Whether all these columns state a unit that converts to `unit`."""
+    try:
+        return all(units.conversion(table.columns[n].unit or "", unit) for n in names)
+    except UnitError:
+        return False
 
 
 def _stems(names: list[str]) -> list[list[str]]:

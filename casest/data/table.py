@@ -12,6 +12,7 @@ from pathlib import Path
 from casest.data.arrays import read_matlab, read_npy, read_npz, read_parquet
 from casest.data.column import BadCell, Column
 from casest.data.delimited import Contents, read_delimited
+from casest.data.logs import file_and_topics, is_log, read_log
 from casest.errors import DataError
 
 __all__ = ["BadCell", "Column", "Table", "read_table"]
@@ -34,12 +35,20 @@ class Table:
 def read_table(path: str | os.PathLike[str]) -> Table:
     """Read CSV (any delimiter, header or not), Parquet, NumPy (.npy, .npz) or MATLAB (.mat).
 
+    ROS bags and PX4 logs hold several topics, of which one is named behind the file:
+    `flight.bag:/imu/data`; several with commas between them are put on the slowest one's clock.
+
     Raises DataError where the file is missing, empty, of another format, has rows of unequal
     width or two columns of one name. Bad cells raise nothing here: see `Column.bad`.
     """
-    file = Path(path)
+    file, topics = file_and_topics(path)
     _refuse_unreadable(file)
-    contents = _READERS.get(file.suffix.lower(), _read_text)(file)
+    if is_log(file):
+        contents = read_log(file, topics)
+    elif topics:
+        raise DataError(f"{file}: holds no topics; leave ':{','.join(topics)}' out")
+    else:
+        contents = _READERS.get(file.suffix.lower(), _read_text)(file)
     columns = {column.name: column for column in contents.columns}
     if len(columns) < len(contents.columns):
         names = [column.name for column in contents.columns]
@@ -54,7 +63,7 @@ def read_table(path: str | os.PathLike[str]) -> Table:
 
 
 def _refuse_unreadable(file: Path) -> None:
-    if file.is_dir():
+    if file.is_dir() and not is_log(file):
         raise DataError(f"{file}: is a folder; name the files in it, for example {file}/*.csv")
     if not file.exists():
         raise DataError(f"{file}: no such file; {_near_names(file)}")
@@ -109,6 +118,5 @@ _READERS: dict[str, Callable[[Path], Contents]] = {
     ".xls": _refused("a spreadsheet is not read"),
     ".h5": _refused("HDF5 is not read"),
     ".hdf5": _refused("HDF5 is not read"),
-    ".bag": _refused("a ROS bag is not read"),
     ".json": _refused("JSON is not read"),
 }

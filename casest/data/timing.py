@@ -21,6 +21,7 @@ GAP = 5.0  # times the median step
 UNUSED = "time not used: "
 
 _NAMES = ("t", "time", "timestamp", "timestamps")
+_CLOCKS = {"millis": "ms", "milliseconds": "ms", "micros": "us", "microseconds": "us"}
 _RATE_NAMES = ("fs", "rate", "samplerate", "samplingrate", "samplefrequency", "samplingfrequency")
 
 
@@ -45,6 +46,16 @@ def _is_temperature(column: Column) -> bool:
         return True
 
 
+def increasing(table: Table) -> str | None:
+    """Return the first column of numbers that always grows: it may be the time."""
+    for name, column in table.columns.items():
+        if not column.is_text and column.bad is None and table.n_rows > 1:
+            values = np.asarray(column.values, dtype=np.float64)
+            if (np.diff(values) > 0).all():
+                return name
+    return None
+
+
 def seconds(table: Table, column: Column, stated: str | None) -> tuple[Array, str | None]:
     """Return a time column in s and a note on what was assumed.
 
@@ -56,7 +67,8 @@ def seconds(table: Table, column: Column, stated: str | None) -> tuple[Array, st
     values = np.asarray(column.values, dtype=np.float64)
     if unit is None:
         step = f"{np.median(np.diff(values)):g}" if len(values) > 1 else "unknown"
-        return values, f"{column.name}: no unit stated, taken as s (median step {step} s)"
+        note = f"{column.name}: no unit stated, taken as s (median step {step} s); "
+        return values, note + "if that is wrong say --unit t=ms"
     factor, _ = units.conversion(unit, "s")
     return values * factor, None
 
@@ -104,7 +116,9 @@ def blocks(time: Array | None, pose: NDArray[np.generic] | None, n: int) -> NDAr
 
 
 def _unit_in_name(name: str) -> str | None:
-    """Return the unit in names like time_ms, t_s, timestampUs, time.sec."""
+    """Return the unit in names like time_ms, t_s, timestampUs, time.sec, millis (Arduino)."""
+    if unit := _CLOCKS.get(name.lower().rstrip("()")):
+        return unit
     found = re.fullmatch(r"(?:t|time|time_?stamp)[_.\s]?(s|sec|ms|msec|us|usec|ns)", name.lower())
     return found[1] if found and name.lower() != "ts" else None
 

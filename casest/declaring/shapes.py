@@ -177,3 +177,9 @@ unit_vector = Shape("unit", (3,))
 rotation_matrix = Shape("rotation", (3, 3))
 #: In an effect: one entry for each component of the quantity it acts on.
 each = Shape("each", ())
+
+
+def in_digits(value: Array, digits: int) -> str:
+    """A number, or numbers in brackets on one line, to so many digits: 1 and not 1."""
+    form: Any = {"float_kind": f"{{:.{digits}g}}".format}
+    return np.array2string(value, separator=", ", formatter=form).replace("\n", "")

@@ -230,7 +230,15 @@ def _fits(a: Size, b: Size, where: str) -> None:
     if dict(a.powers) == dict(b.powers) and same_factor:
         return
     sides = [f"{s}" + (f" (from {', '.join(sorted(s.names))})" if s.names else "") for s in (a, b)]
-    raise UnitError(f"{where}: units do not fit: {sides[0]} against {sides[1]}")
+    raise UnitError(f"{where}: units do not fit: {sides[0]} against {sides[1]}; {_way_out(a, b)}")
+
+
+def _way_out(a: Size, b: Size) -> str:
+    """What to mend: a factor between two units of one kind, or the formula."""
+    if a.powers == b.powers and a.factor and b.factor:
+        low, high = sorted((a.factor, b.factor))
+        return f"one kind in two units, {high / low:.4g} to 1: declare both in one of them"
+    return "declare another unit, or mend the formula"
 
 
 def _word(op: int) -> str:

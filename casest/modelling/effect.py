@@ -12,7 +12,7 @@ import numpy as np
 
 from casest.declaring.physics import SX
 from casest.declaring.symbols import Constant, Parameter, Signal, Undecided, named
-from casest.errors import DeclarationError, UnitError
+from casest.errors import DeclarationError, UnitError, last_line
 from casest.units import known
 
 Kind = Literal["quantity", "signal", "noise", "sequence"]
@@ -192,9 +192,8 @@ def evaluated(declared: Effect, *args: Any, **kwargs: Any) -> SX:
             if traceback.tb_frame.f_code is code:
                 line = traceback.tb_lineno
             traceback = traceback.tb_next
-        text = [part for part in str(error).splitlines() if part.strip()] or [type(error).__name__]
         raise DeclarationError(
-            f"effect {declared.name}, {code.co_filename}, line {line}: {text[-1].strip()}"
+            f"effect {declared.name}, {code.co_filename}, line {line}: {last_line(error)}"
         ) from None
 
 
@@ -225,13 +224,21 @@ def attach(
         first = next(iter(inspect.signature(declared.function).parameters))
         own = units.get(on) or f"[{on}]"
         own = f"({own})" if set("/*") & set(own) else own
-        renamed = tuple(u.replace(f"[{first}]", own) for u in parameter.units)
+        renamed = tuple(_of_columns(u.replace(f"[{first}]", own), columns) for u in parameter.units)
         for unit in renamed:
             if "[" not in unit and unit and not known(unit):
                 raise UnitError(f"effect {label}: {name} has unknown unit {unit!r}")
         parameters.append(replace(parameter, units=renamed))
     renamed_columns = tuple(sorted(columns.items()))
     return Attached(declared, on, kind, label, renamed_columns, tuple(parameters), inner)
+
+
+def _of_columns(unit: str, columns: Mapping[str, str]) -> str:
+    """The unit with the names of the columns that an effect reads: [channel] is [tyre temp]."""
+    for name, column in columns.items():
+        if not set("[]") & set(column):
+            unit = unit.replace(f"[{name}]", f"[{column}]")
+    return unit
 
 
 def check_null(

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import ast
 import inspect
+import math
 import sys
 import textwrap
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import casadi as ca
-import numpy as np
 
 from casest.declaring.physics import SX, Quantity, Residual, Trace, chart, current_trace
-from casest.errors import CasestError, DeclarationError
+from casest.declaring.shapes import in_digits
+from casest.errors import CasestError, DeclarationError, last_line
 from casest.modelling.effect import Attached
 
 if TYPE_CHECKING:
@@ -117,11 +119,14 @@ def _run_body(model: Model, running: Trace, symbols: Mapping[str, SX]) -> Residu
     arguments = {s.name: symbols[s.name] for s in model.declared if "." not in s.name}
     token = current_trace.set(running)
     try:
-        residual = model.function(**arguments)
+        with warnings.catch_warnings():
+            # CasADi remarks on NumPy's functions, which give the right expression.
+            warnings.simplefilter("ignore", FutureWarning)
+            residual = model.function(**arguments)
         if not isinstance(residual, Residual):
             found = type(residual).__name__
             raise DeclarationError(f"the body must return Residual(…), not {found}")
-        _ = residual.expression  # raises where shapes do not match
+        _refuse_not_a_number(residual.expression)  # also raises where shapes do not match
     except CasestError as error:
         raise type(error)(f"model {model.name}, {_where(model.function)}: {error}") from None
     except NameError as error:
@@ -131,7 +136,7 @@ def _run_body(model: Model, running: Trace, symbols: Mapping[str, SX]) -> Residu
         ) from None
     except Exception as error:
         raise DeclarationError(
-            f"model {model.name}, {_where(model.function)}: {_last_line(error)}"
+            f"model {model.name}, {_where(model.function)}: {last_line(error)}"
         ) from error
     finally:
         current_trace.reset(token)
@@ -255,7 +260,7 @@ def describe(model: Model) -> str:
     for p in model.parameters:
         rows.append(("parameter", p.name, p.shape.size, p.unit, "per run" * (p.scope == "run")))
     for c in model.constants:
-        value = np.array2string(c.array, precision=6, separator=", ").replace("\n", "")
+        value = in_digits(c.array, 6)
         rows.append(("constant", c.name, c.array.size, c.unit, f"= {value}"))
     for a in model.effects:
         rows.append(("effect", a.label, sum(p.shape.size for p in a.parameters), f"on {a.on}", ""))
@@ -286,9 +291,16 @@ def _where(function: Callable[..., Any]) -> str:
     return f"{function.__code__.co_filename}, line {line}"
 
 
-def _last_line(error: Exception) -> str:
-    lines = [line for line in str(error).splitlines() if line.strip()]
-    return lines[-1].strip() if lines else type(error).__name__
+def _refuse_not_a_number(expression: SX) -> None:
+    """Functions of Python's math module turn a symbol into NaN without a word."""
+    f = ca.Function("one_sample", ca.symvar(expression), [expression])
+    for k in range(f.n_instructions()):
+        constant = f.instruction_id(k) == ca.OP_CONST
+        if constant and math.isnan(float(f.instruction_constant(k))):
+            raise DeclarationError(
+                "the body computes what is not a number; functions of `math` take numbers alone: "
+                "use casest's (from casest import sin, sqrt, exp, …)"
+            )
 
 
 def _expression(value: SX) -> str:

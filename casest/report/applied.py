@@ -12,6 +12,7 @@ import casadi as ca
 
 from casest.apply import Correction
 from casest.errors import CasestError
+from casest.following import applying, typed_words
 from casest.modelling.effect import Attached
 from casest.modelling.model import Model
 from casest.modelling.tracing import trace
@@ -32,7 +33,11 @@ def application(story: Story, content: Mapping[str, Any], folder: str) -> str:
     said = []
     if not content["trusted"]:
         said.append(paragraph("Do not apply it: the estimate was refused."))
-    said += _steps(model, story.units, folder) if content["trusted"] else []
+    said += (
+        _steps(model, story.units, content["reproduce"]["command"], folder)
+        if content["trusted"]
+        else []
+    )
     said.append(tag("h3", "Conventions"))
     words = inspect.getdoc(model.function) or "The declaration says nothing beside its formulas."
     said += [paragraph(part.replace("\n", " ")) for part in words.split("\n\n")]
@@ -58,7 +63,7 @@ def _has_source(model: Model) -> bool:
         return False
 
 
-def _steps(model: Model, units: Mapping[str, str], folder: str) -> list[str]:
+def _steps(model: Model, units: Mapping[str, str], typed: str, folder: str) -> list[str]:
     """The correction's order of operations, and the command."""
     try:
         correction = Correction(model)
@@ -82,11 +87,17 @@ def _steps(model: Model, units: Mapping[str, str], folder: str) -> list[str]:
             effects = "; ".join(f"`{a.label}` makes `{a.on}` {_said(a)}" for a in inside)
             steps.append(f"On the way each added effect is undone where it acts: {effects}.")
     steps.append(f"The result is `{name}`, {_size(correction.size)}{_in(units, name)}.")
-    command = tag("pre", tag("code", escaped(f"casest apply {folder} DATA")))
+    command = tag("pre", tag("code", escaped(_command(typed, folder))))
     lines = "\n".join(formulas(model, chain if model.implicit else chain[1:]))
     shown = tag("pre", tag("code", escaped(lines))) if lines else ""
     said = paragraph("In one command, with all digits of the values:")
     return [shown, points([*steps, *_elsewhere(model, chain)], "ol"), said, command]
+
+
+def _command(typed: str, folder: str) -> str:
+    words = typed_words(typed)
+    line = applying(words, folder).lines() if words else f"casest apply {folder} DATA"
+    return textwrap.dedent(line)
 
 
 def _said(attached: Attached) -> str:

@@ -40,7 +40,9 @@ def calibration_page(estimate: Estimate, content: Mapping[str, Any], folder: str
         application(story, content, folder),
         reproduction(content, content["notes"]),
     ]  # fmt: skip
-    return whole(story.last.model.name, sentence(estimate, content), "", body, content, figures)
+    proved = "The optimum is proved; whether the model is right is what `casest close` asks."
+    under = proved if estimate.certificate.trusted else ""
+    return whole(story.last.model.name, sentence(estimate, content), under, body, content, figures)
 
 
 def sentence(estimate: Estimate, content: Mapping[str, Any]) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from casest.closing.crossfit import FAR
 from casest.closing.loop import Closing
 from casest.closing.text import sentence
 from casest.report.applied import application
@@ -153,7 +154,10 @@ def _effect(e: Mapping[str, Any], doc: str, story: Story) -> str:
     evidence = [f"Chance of as much by noise alone: p = {number(e['p_value'], 2)}."]
     if gain:
         unit = "" if story.unit == "1" else f" ({printed_unit(story.unit)})²"
-        evidence.append(f"The mean square error on held-out data falls by {number(gain)}{unit}.")
+        evidence.append(
+            f"The mean square error on held-out data falls by {number(gain)}{unit}, residuals "
+            f"beyond {FAR:g} standard deviations of the noise counted as {FAR:g}."
+        )
     if e["indistinguishable_from"]:
         names = ", ".join(f"`{n}`" for n in e["indistinguishable_from"])
         evidence.append(f"These data do not tell it apart from {names}.")

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
+from casest.data.logs import file_name
 from casest.report.figures import Figures
 from casest.report.page import document, escaped, paragraph, tag
 
@@ -20,7 +20,7 @@ def whole(
     figures: Figures,
 ) -> str:
     """The page around its sections: where it comes from, the verdict, the contents."""
-    data = ", ".join(Path(d).name for d in content.get("data") or [])
+    data = ", ".join(file_name(d) for d in content.get("data") or [])
     origin = f"casest {content['casest']} · {name}" + (f" · {data}" if data else "")
     inside = "".join(body)
     sections = re.findall(r'<section id="(\w+)"><h2>(.*?)</h2>', inside)

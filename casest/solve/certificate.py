@@ -358,6 +358,6 @@ def _for(
     return (
         f"stationary: the step left is {step:.1g} standard deviations",
         f"a minimum: exact curvature at least {curvature:.3g} of the Gauss-Newton one",
-        f"{found}: {agreeing} of {others}",
+        f"{found}: {agreeing} of {others}" + "; the others end higher" * (agreeing < others),
         intervals,
     )

@@ -1,0 +1,33 @@
+"""How a topic of a log is named: `flight.bag:/imu/data`, as a model in a file is."""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+
+BAGS = (".bag", ".mcap", ".db3")
+PX4 = (".ulg", ".ulog")
+
+
+def is_log(file: Path) -> bool:
+    """Whether a file is a ROS bag (ROS 2: also its folder) or a PX4 log."""
+    return file.suffix.lower() in (*BAGS, *PX4) or (file / "metadata.yaml").is_file()
+
+
+def file_and_topics(path: str | os.PathLike[str]) -> tuple[Path, tuple[str, ...]]:
+    """Split `flight.bag:/imu/data,/imu/mag` into the file and the topics named behind it."""
+    text = os.fspath(path)
+    found = re.fullmatch(r"((?:[A-Za-z]:(?=[\\/]))?[^:]+):(.*)", text)
+    if found is None or Path(text).exists():
+        return Path(text), ()
+    file = Path(found[1])
+    if not (is_log(file) or file.exists()):
+        return Path(text), ()
+    return file, tuple(name.strip() for name in found[2].split(",") if name.strip())
+
+
+def file_name(path: str | os.PathLike[str]) -> str:
+    """Name of a record without its folder: "flight.bag:/imu/data" keeps its topic."""
+    file, topics = file_and_topics(path)
+    return f"{file.name}:{','.join(topics)}" if topics else file.name

@@ -1,0 +1,153 @@
+"""The command to type next, made of the words that were typed: it can be pasted as it stands."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+WIDTH = 80
+
+_FLAGS = ("--at-rest", "--json", "--force", "--float")
+_READING = ("--columns", "--unit", "--scale", "--rate", "--time-zero")
+_MODEL = ("--set", "--free", "--fix", "--shared", "--per-run", "--effects", "--at-rest")
+_FIT = ("--start", "--solver", "--seed", "--holdout")
+
+
+@dataclass(frozen=True)
+class Typed:
+    """A command line: the command, its arguments, its options with their values."""
+
+    name: str
+    arguments: tuple[str, ...]
+    options: tuple[tuple[str, str | None], ...]
+
+    def keeping(self, name: str, flags: Sequence[str], *arguments: str) -> Typed:
+        """Another command with the same options, as far as it has them."""
+        kept = tuple((flag, value) for flag, value in self.options if flag in flags)
+        return Typed(name, arguments or self.arguments, kept)
+
+    def into(self, output: str | Path) -> Typed:
+        """The same command with results written to `output`."""
+        kept = tuple(pair for pair in self.options if pair[0] not in ("-o", "--output"))
+        return replace(self, options=(*kept, ("-o", str(output))))
+
+    def lines(self) -> str:
+        """The command, indented; a long one continues on the next line as a shell reads it."""
+        words = ["casest", self.name, *map(shlex.quote, self.arguments)]
+        for flag, value in self.options:
+            words.append(flag if value is None else f"{flag} {shlex.quote(value)}")
+        lines = [" "]
+        for word in words:
+            if len(lines[-1]) + len(word) > WIDTH - 3 and lines[-1].strip():
+                lines[-1] += " \\"
+                lines.append("     ")
+            lines[-1] += f" {word}"
+        return "\n".join(lines)
+
+
+def typed_words(command: str) -> Typed | None:
+    """Read a command line as it was typed; None where it is none of casest's."""
+    words = shlex.split(command)
+    if len(words) < 2 or words[0] != "casest":
+        return None
+    arguments: list[str] = []
+    options: list[tuple[str, str | None]] = []
+    rest = iter(words[2:])
+    for word in rest:
+        if word.startswith("--") and "=" in word:
+            flag, _, value = word.partition("=")
+            options.append((flag, value))
+        elif word in _FLAGS:
+            options.append((word, None))
+        elif word.startswith("-o") and len(word) > 2:
+            options.append(("-o", word[2:]))
+        elif word.startswith("-") and len(word) > 1:
+            options.append((word, next(rest, "")))
+        else:
+            arguments.append(word)
+    return Typed(words[1], tuple(arguments), tuple(options))
+
+
+def following(
+    command: str,
+    output: str | Path | None = None,
+    *,
+    trusted: bool = True,
+    applies: bool = True,
+    file: str | Path = "",
+) -> str:
+    """What to type after `command`, a line of words and the command each; empty where unknown.
+
+    output: folder of its results; trusted: whether there is an estimate to go on with; applies:
+    whether the model says what readings correct to; file: what simulate or export has written.
+    """
+    typed = typed_words(command)
+    if typed is None or not typed.arguments:
+        return ""
+    if typed.name in ("calibrate", "close"):
+        steps = _after_fit(typed, output, trusted, applies)
+    elif typed.name in ("simulate", "export"):
+        steps = _after_simulate(typed, file) if typed.name == "simulate" else _device(typed, file)
+    else:
+        steps = _after_look(typed, output, trusted, applies)
+    return "\n".join(f"Next: {words}\n{step}" for words, step in steps)
+
+
+def applying(typed: Typed, output: str | Path) -> Typed:
+    """`casest apply` on the first of the fitted files, with the words that read it."""
+    data = typed.arguments[1] if len(typed.arguments) > 1 else "DATA"
+    return typed.keeping("apply", _READING, str(output), data).into(Path(output) / "corrected.csv")
+
+
+_Steps = Iterator[tuple[str, str]]
+
+
+def _after_fit(typed: Typed, output: str | Path | None, trusted: bool, applies: bool) -> _Steps:
+    flags = (*_MODEL, *_READING, *_FIT)
+    if not trusted:
+        yield "what can these data see?", typed.keeping("observe", (*_MODEL, *_READING)).lines()
+        return
+    if typed.name == "calibrate":
+        into = Path(output) / "closed" if output else "out"
+        yield "does the model lack an effect?", typed.keeping("close", flags).into(into).lines()
+    if output is None:
+        yield "keep the result", typed.keeping(typed.name, flags).into("out").lines()
+    elif applies:
+        yield "correct readings", applying(typed, output).lines()
+        made = Typed("export", (str(output),), (("--to", "c"),)).into(Path(output) / "correction.c")
+        yield "the correction for a device", made.lines()
+
+
+def _after_look(typed: Typed, output: str | Path | None, trusted: bool, applies: bool) -> _Steps:
+    """After observe, filter and compare; only estimators in motion have nothing to apply."""
+    motion = (*_READING, "--std", "--intensity")
+    if typed.name == "filter":
+        if output is None:
+            yield "keep the states", typed.keeping("filter", motion).into("out").lines()
+        yield "what can this trajectory see?", typed.keeping("observe", motion).lines()
+    elif not applies:
+        yield "estimate the states", typed.keeping("filter", motion).into("out").lines()
+    elif trusted:
+        fit = typed.keeping("calibrate", (*_MODEL, *_READING)).into("out")
+        yield "estimate the parameters", fit.lines()
+
+
+def _after_simulate(typed: Typed, file: str | Path) -> _Steps:
+    model = tuple(flag for flag in _MODEL if flag != "--at-rest")
+    fit = typed.keeping("calibrate", model, typed.arguments[0], str(file))
+    folder = Path(file).parent
+    yield "what does the record give back?", fit.into(folder / "fit").lines()
+    if any(flag == "--effect" for flag, _ in typed.options):
+        closed = replace(fit, name="close").into(folder / "closed")
+        yield "is the effect found?", closed.lines()
+
+
+def _device(typed: Typed, file: str | Path) -> _Steps:
+    to, name = dict(typed.options).get("--to"), shlex.quote(str(file))
+    if to == "c":
+        compiled = f"  cc -DCASEST_SELF_TEST {name} -lm -o self-test && ./self-test"
+        yield "compile it and run its self-test", compiled
+    elif to == "json":
+        yield "correct readings", f"  casest apply {name} DATA"
