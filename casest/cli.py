@@ -16,6 +16,7 @@ from casest.errors import CasestError, NotTrusted, UsageError
 
 if TYPE_CHECKING:
     from casest.data.run import Run
+    from casest.dynamics import Dynamics
     from casest.modelling.model import Model
 
 Options = dict[str, Any]
@@ -353,7 +354,7 @@ def motion_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 @commands.command()
 @click.argument("model_name", metavar="MODEL")
-@click.argument("data", nargs=-1, required=True, type=click.Path())
+@click.argument("data", nargs=-1, type=click.Path())
 @model_options
 @reading_options
 @motion_options
@@ -361,7 +362,8 @@ def motion_options(command: Callable[..., Any]) -> Callable[..., Any]:
 def observe(model_name: str, data: tuple[str, ...], **options: Any) -> int:
     """What these data, or this trajectory, can see: rank, and what is hidden, in words.
 
-    Exit code 0 even where something is not observable.
+    Without DATA: what any record of an estimator in motion could show (structural rank). Exit
+    code 0 even where something is not observable.
     """
     from casest import observing, result
     from casest.modelling.model import Model
@@ -369,7 +371,11 @@ def observe(model_name: str, data: tuple[str, ...], **options: Any) -> int:
 
     if isinstance(find_any(model_name), Model):
         model = declared_model(model_name, options)
+        if not data:
+            raise UsageError(f"{model_name}: what can be seen depends on the record: give DATA")
         content, _ = observing.observe_parameters(model, records(model, data, options))
+    elif not data:
+        content = observing.observe_structure(moving_model(model_name, options))
     else:
         moving, run = moving_record(model_name, data, options)
         content = observing.observe_motion(moving, run, options["window"])
@@ -428,21 +434,27 @@ def write(path: Path, text: str) -> None:
     write_atomically(path, text)
 
 
-def moving_record(name: str, data: Sequence[str], options: Options) -> tuple[Any, Run]:
-    """The estimator with its options applied, and its one record."""
-    from casest.data import load_runs
+def moving_model(name: str, options: Options) -> Dynamics:
+    """The estimator with its options applied."""
     from casest.dynamics import Dynamics
     from casest.problem import find_any
 
     moving = find_any(name)
     if not isinstance(moving, Dynamics):
         raise UsageError(f"{name} is no estimator in motion: casest calibrate, close or observe it")
-    if len(data) != 1:
-        raise UsageError(f"{name}: a trajectory is one file, not {len(data)}")
     constants = dict(number_pair(text, "--set") for text in options["constants"])
     moving = moving.having(**constants)
     moving = moving.driven(**dict(number_pair(t, "--intensity") for t in options["intensities"]))
-    moving = moving.known_to(**dict(number_pair(t, "--std") for t in options["stds"]))
+    return moving.known_to(**dict(number_pair(t, "--std") for t in options["stds"]))
+
+
+def moving_record(name: str, data: Sequence[str], options: Options) -> tuple[Dynamics, Run]:
+    """The estimator with its options applied, and its one record."""
+    from casest.data import load_runs
+
+    moving = moving_model(name, options)
+    if len(data) != 1:
+        raise UsageError(f"{name}: a trajectory is one file, not {len(data)}")
     runs = load_runs(list(data), moving.signals, **reading_arguments(options))
     if len(runs) != 1:
         raise UsageError(f"{data[0]} holds {len(runs)} runs; a trajectory is one")

@@ -15,8 +15,9 @@ from casest.data.timing import GAP
 from casest.dynamics import Dynamics
 from casest.dynamics.filter import Filtered, filtered
 from casest.dynamics.gramian import Observed, gramian, observed, window_eigenvalues
+from casest.dynamics.structural import Structure, structure
 from casest.dynamics.transition import linearised
-from casest.errors import UsageError
+from casest.errors import DeclarationError, UsageError
 from casest.estimate import Estimate, attempt
 from casest.modelling.model import Model
 from casest.result import plain
@@ -44,6 +45,47 @@ def observe_parameters(model: Model, runs: Sequence[Run]) -> tuple[dict[str, Any
     }, found
 
 
+def observe_structure(model: Dynamics) -> dict[str, Any]:
+    """What any record could show: structural rank with inputs that vary freely, and held constant.
+
+    `std` is empty: how well needs a record.
+    """
+    free = structure(model)
+    held = structure(model, varying=False) if free.inputs else free
+    return {
+        "casest": __version__,
+        "model": model.name,
+        "notes": [],
+        "rank": free.rank,
+        "unknowns": free.unknowns,
+        "unobservable": list(free.unobservable),
+        "std": {},
+        "structural": _structural(free),
+        "constant_inputs": _structural(held),
+        "tolerance": "singular values below 1e-10 of the largest count as zero; the smallest that "
+        f"counts is {min(free.gap, held.gap):.1g} times the largest that does not",
+    }
+
+
+def _structural(found: Structure) -> dict[str, Any]:
+    return {
+        "rank": found.rank,
+        "undetermined": list(found.undetermined),
+        "unobservable": list(found.unobservable),
+        "order": found.order,
+        "inputs": list(found.inputs),
+        "gap": plain(found.gap),
+    }
+
+
+def _structural_rank(model: Dynamics) -> int | None:
+    """What a better record could reach; None where it cannot be said."""
+    try:
+        return structure(model).rank
+    except DeclarationError:
+        return None
+
+
 def observe_motion(model: Dynamics, run: Run, window: float | None = None) -> dict[str, Any]:
     """What a trajectory makes observable, by the Gramian over the whole record and over windows.
 
@@ -66,6 +108,7 @@ def observe_motion(model: Dynamics, run: Run, window: float | None = None) -> di
         "notes": [*assumed(run), *_too_short(seen, len(run), duration)],
         "rank": seen.rank,
         "unknowns": seen.unknowns,
+        "structural_rank": _structural_rank(model),
         "unobservable": list(seen.unobservable),
         "std": std,
         "units": {s.name: s.unit for s in model.states},
@@ -168,8 +211,11 @@ def states_csv(found: Filtered) -> str:
 
 def observe_text(content: Mapping[str, Any]) -> str:
     """Rank, what is hidden in words, and the standard deviations that the data allow."""
+    if "structural" in content:
+        return structure_text(content)
     lines = [f"{content['model']}: rank {content['rank']} of {content['unknowns']}"]
     lines += [f"  - {words}" for words in content["unobservable"]]
+    lines += [f"  {could}" for could in [could_reach(content)] if could]
     if not content["unobservable"]:
         lines.append("  every unknown is determined by these data")
     lines += ["", "  standard deviation that these data allow:"]
@@ -190,6 +236,40 @@ def observe_text(content: Mapping[str, Any]) -> str:
             f"prior) goes from {low:.3g} to {high:.3g}",
         ]
     return "\n".join([*lines, *_note_lines(content)])
+
+
+def could_reach(content: Mapping[str, Any]) -> str:
+    """Whether another record could show what this one hides; empty where it hides nothing."""
+    could = content.get("structural_rank")
+    if could is None or content["rank"] == content["unknowns"]:
+        return ""
+    if could > content["rank"]:
+        return f"another motion could show more: the structural rank is {could}"
+    return f"no motion shows more: the structural rank is {could} too"
+
+
+def structure_text(content: Mapping[str, Any]) -> str:
+    """Structural rank and what no record can determine, in words."""
+    free, held, n = content["structural"], content["constant_inputs"], content["unknowns"]
+    order = f"{free['order']} {'derivative' if free['order'] == 1 else 'derivatives'}"
+    lines = [
+        f"{content['model']}: structural rank {free['rank']} of {n} "
+        f"(readings and {order} of them, at random points)"
+    ]
+    inputs = " and ".join(free["inputs"])
+    if free["rank"] == n:
+        how = ""
+        if inputs:
+            how = f" where {inputs} vary" if held["rank"] < n else f" even with {inputs} constant"
+        lines.append(f"  suitable data determine every state and parameter{how}")
+    else:
+        lines += [f"  - {words}" for words in free["unobservable"]]
+        lines.append(f"  not determined by any record: {', '.join(free['undetermined'])}")
+    if held["rank"] < free["rank"]:
+        lines += ["", f"  with {inputs} held constant: rank {held['rank']} of {n}"]
+        lines += [f"  - {words}" for words in held["unobservable"]]
+        lines.append(f"  then not determined: {', '.join(held['undetermined'])}")
+    return "\n".join(lines)
 
 
 def _note_lines(content: Mapping[str, Any]) -> list[str]:

@@ -124,7 +124,7 @@ def observed(model: Dynamics, W: Array) -> Observed:
 def _words(model: Dynamics, null: Array) -> Sequence[str]:
     """Each unobservable direction as a sentence."""
     basis = _sparse(null)
-    return [_sentence(model, basis[:, k]) for k in range(basis.shape[1])]
+    return [sentence(model, basis[:, k]) for k in range(basis.shape[1])]
 
 
 def _sparse(null: Array) -> Array:
@@ -144,7 +144,7 @@ def _sparse(null: Array) -> Array:
     return np.asarray(matrix / np.linalg.norm(matrix, axis=0))
 
 
-def _sentence(model: Dynamics, direction: Array) -> str:
+def sentence(model: Dynamics, direction: Array) -> str:
     """ "gravity and bias along (0.27, 0.53, 0.80) move together" """
     largest = np.abs(direction).max()
     parts: list[tuple[str, Array]] = []

@@ -13,7 +13,7 @@ from casest.data.run import Run
 from casest.declaring.shapes import Array
 from casest.dynamics import Dynamics
 from casest.dynamics.filter import Filtered
-from casest.observing import filter_verdict
+from casest.observing import could_reach, filter_verdict
 from casest.report.figures import Figures, axis, panel
 from casest.report.fitted import reproduction
 from casest.report.frame import whole
@@ -31,6 +31,7 @@ def observe_page(content: Mapping[str, Any]) -> str:
     figures = Figures()
     body = [
         _directions(content),
+        _constant_inputs(content),
         _deviations(content),
         _windows(content, figures),
         reproduction(content),
@@ -41,6 +42,10 @@ def observe_page(content: Mapping[str, Any]) -> str:
 def observe_sentence(content: Mapping[str, Any]) -> str:
     """The verdict: how many unknowns these data determine."""
     rank, unknowns = content["rank"], content["unknowns"]
+    if "structural" in content:
+        if rank == unknowns:
+            return f"Observable: suitable data determine all {unknowns} unknowns."
+        return f"Not observable: no data determine more than {rank} of {unknowns} unknowns."
     if rank == unknowns:
         return f"Observable: these data determine all {unknowns} unknowns."
     return f"Not observable: these data determine {rank} of {unknowns} unknowns."
@@ -58,16 +63,29 @@ def _directions(content: Mapping[str, Any]) -> str:
         "What is hidden",
         points(content["unobservable"]),
         tag("h3", "Weak combinations") + points(weak) if weak else "",
-        paragraph(_tolerance(content), "soft") if content.get("tolerance") else "",
+        paragraph(_sentence(could_reach(content))) if could_reach(content) else "",
+        paragraph(_sentence(content["tolerance"]), "soft") if content.get("tolerance") else "",
     )
 
 
-def _tolerance(content: Mapping[str, Any]) -> str:
-    said = str(content["tolerance"])
-    return said[0].upper() + said[1:] + "."
+def _sentence(words: str) -> str:
+    return words[0].upper() + words[1:] + "."
+
+
+def _constant_inputs(content: Mapping[str, Any]) -> str:
+    """What the motion must change to show everything."""
+    held = content.get("constant_inputs")
+    if not held or held["rank"] == content["rank"]:
+        return ""
+    inputs = " and ".join(f"`{name}`" for name in held["inputs"])
+    said = f"Rank {held['rank']} of {content['unknowns']} while {inputs} stay as they are."
+    hidden = points(held["unobservable"])
+    return section("constant", "With constant inputs", paragraph(said), hidden)
 
 
 def _deviations(content: Mapping[str, Any]) -> str:
+    if not content["std"]:
+        return ""
     units, rows = content.get("units", {}), []
     for name, std in content["std"].items():
         values = np.array(std, dtype=object)
