@@ -3,5 +3,17 @@
 from __future__ import annotations
 
 from casest.dynamics.declare import Dynamics, Motion, State, dynamics, measured, state
+from casest.dynamics.statespace import to_statespace
+from casest.dynamics.structural import Structure, structure
 
-__all__ = ["Dynamics", "Motion", "State", "dynamics", "measured", "state"]
+__all__ = [
+    "Dynamics",
+    "Motion",
+    "State",
+    "Structure",
+    "dynamics",
+    "measured",
+    "state",
+    "structure",
+    "to_statespace",
+]
