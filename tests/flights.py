@@ -20,7 +20,7 @@ UNITS = {"a": "m/s^2", "omega": "rad/s", "v": "m/s"}
 
 @dataclass(frozen=True)
 class Sines:
-    """Three functions of time, each a sum of K sines: amplitude, frequency (rad/s), phase (3, K)."""
+    """Three sums of K sines over time: amplitude, frequency (rad/s) and phase, (3, K)."""
 
     amplitude: np.ndarray
     frequency: np.ndarray

@@ -52,8 +52,8 @@ def state(
     else:
         size = shape
     values = np.broadcast_to(np.asarray(start, float), (size,))
-    for field, number in (("intensity", intensity), ("std", std)):
-        wrong = _wrong(field, number)
+    for what, number in (("intensity", intensity), ("std", std)):
+        wrong = _wrong(what, number)
         if wrong:
             raise DeclarationError(f"state: {wrong}")
     return State("", size, unit, float(intensity), tuple(values.tolist()), float(std))
