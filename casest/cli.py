@@ -346,7 +346,12 @@ def motion_options(command: Callable[..., Any]) -> Callable[..., Any]:
             "-o", "--output", type=click.Path(path_type=Path), metavar="DIR", help="Folder."
         ),
         click.option("--std", "stds", help="What is known of a state at the beginning.", **many),
-        click.option("--intensity", "intensities", help="Of its driving noise, unit^2/s.", **many),
+        click.option(
+            "--intensity",
+            "intensities",
+            help="Of a state's driving noise, unit^2/s, or of a signal's noise, unit^2 s.",
+            **{**many, "metavar": "NAME=NUMBER"},
+        ),
     ):
         command = option(command)
     return command
@@ -444,7 +449,9 @@ def moving_model(name: str, options: Options) -> Dynamics:
         raise UsageError(f"{name} is no estimator in motion: casest calibrate, close or observe it")
     constants = dict(number_pair(text, "--set") for text in options["constants"])
     moving = moving.having(**constants)
-    moving = moving.driven(**dict(number_pair(t, "--intensity") for t in options["intensities"]))
+    intensities = dict(number_pair(text, "--intensity") for text in options["intensities"])
+    sensed = {s.name: intensities.pop(s.name) for s in moving.signals if s.name in intensities}
+    moving = moving.driven(**intensities).sensing(**sensed)
     return moving.known_to(**dict(number_pair(t, "--std") for t in options["stds"]))
 
 

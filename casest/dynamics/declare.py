@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -52,8 +52,8 @@ def state(
     else:
         size = shape
     values = np.broadcast_to(np.asarray(start, float), (size,))
-    for field, number in (("intensity", intensity), ("std", std)):
-        wrong = _wrong(field, number)
+    for what, number in (("intensity", intensity), ("std", std)):
+        wrong = _wrong(what, number)
         if wrong:
             raise DeclarationError(f"state: {wrong}")
     return State("", size, unit, float(intensity), tuple(values.tolist()), float(std))
@@ -109,6 +109,8 @@ class Dynamics:
     signals: tuple[Signal, ...]
     states: tuple[State, ...]
     constants: tuple[Constant, ...]
+    #: Intensity of the white noise of signals, unit²·s, where `sensing` has said it.
+    sensors: Mapping[str, float] = field(default_factory=dict, hash=False)
 
     # -- new ones from this one ----------------------------------------------------------------
 
@@ -128,6 +130,27 @@ class Dynamics:
     def driven(self, **intensities: float) -> Dynamics:
         """The same with other noise intensities of its states, unit²/s."""
         return self._with_states("intensity", intensities)
+
+    def sensing(self, **intensities: float) -> Dynamics:
+        """The same with other noise intensities of its signals, unit²·s: variance of one reading
+        times the time between two.
+
+        Noise of an output is the measurement noise Θ. Noise of an input, none where nothing is
+        said, drives the states: it adds G·q·Gᵀ to Ξ with G = ∂f/∂input, which may depend on them.
+        """
+        for name, value in intensities.items():
+            if name not in {s.name for s in self.signals}:
+                known = ", ".join(s.name for s in self.signals)
+                raise UsageError(f"{self.name} has no signal {name!r}; it has {known}")
+            wrong = _wrong("intensity", value) or (
+                "a reading without noise makes the Riccati equation singular; give the sensor's "
+                "variance times its period"
+                if value == 0 and name in self.measured_signals
+                else None
+            )
+            if wrong:
+                raise UsageError(f"{self.name}: {name}: {wrong}")
+        return replace(self, sensors={**self.sensors, **intensities})
 
     def known_to(self, **stds: float) -> Dynamics:
         """The same with other standard deviations of the states at the beginning."""
@@ -205,8 +228,22 @@ class Dynamics:
     @cached_property
     def noise(self) -> Array:
         """Intensity Θ of the measurement noise, (m, m)."""
-        parts = [np.full(o.predicted.numel(), o.intensity) for o in self.traced.outputs]
+        t = self.traced
+        parts = [
+            np.full(o.predicted.numel(), self.sensors.get(name, o.intensity))
+            for name, o in zip(t.measured, t.outputs, strict=True)
+        ]
         return np.diag(np.concatenate(parts))
+
+    @cached_property
+    def input_noise(self) -> SX | None:
+        """What the noise of the inputs adds to Ξ, ΣG·q·Gᵀ, as an expression; None: nothing."""
+        t = self.traced
+        slopes = [
+            (ca.jacobian(t.f, flat(t.symbols[name])), q) for name, q in self.sensors.items() if q
+        ]
+        found = [q * (G @ G.T) for G, q in slopes if G.nnz()]
+        return sum(found[1:], found[0]) if found else None
 
     # -- symbols -------------------------------------------------------------------------------
 

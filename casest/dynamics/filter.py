@@ -71,13 +71,18 @@ class Filtered:
 def filtered(model: Dynamics, run: Run, *, smooth: bool = True) -> Filtered:
     """Kalman filter over a record; an extended one, iterated, for a nonlinear model.
 
+    Where the inputs' noise reaches the states through the states themselves, it is taken along
+    the estimates of a first pass.
+
     Raises DataError where time or inputs are not usable, or a covariance is none.
     """
     check_covariance(model.start_covariance, "the covariance at the beginning")
     system = linearised(model, run)
-    found = _once(model, system, smooth or not model.linear)
+    found = _once(model, system, not model.linear or (smooth and model.input_noise is None))
     if model.linear:
-        return found
+        if model.input_noise is None:
+            return found
+        return _once(model, linearised(model, run, along=found.x), smooth)
     for _ in range(ROUNDS):
         system = linearised(model, run, along=found.smoothed)
         again = _once(model, system, True)
@@ -90,7 +95,7 @@ def filtered(model: Dynamics, run: Run, *, smooth: bool = True) -> Filtered:
 
 def _once(model: Dynamics, system: Linearised, smooth: bool) -> Filtered:
     Phi, forced = transitions(system)
-    Q = process_noise(system, model.process, Phi)
+    Q = process_noise(system, system.process, Phi)
     R = np.diag(model.noise)[None] / steps_to(system)[:, None]
     n, m = model.size, system.C.shape[1]
     present = np.isfinite(system.y)

@@ -36,7 +36,8 @@ _BLOCK = 256
 class Linearised:
     """ẋ = A x + c, y = C x + d along a record, at every sample.
 
-    time (N,); A (N, n, n), c (N, n), C (N, m, n), d (N, m); y (N, m) with NaN where it is missing.
+    time (N,); A (N, n, n), c (N, n), C (N, m, n), d (N, m); y (N, m) with NaN where it is missing;
+    process noise intensity Ξ (n, n), or (N, n, n) where inputs have noise of their own.
     """
 
     time: Array
@@ -45,6 +46,7 @@ class Linearised:
     C: Array
     d: Array
     y: Array
+    process: Array
 
     @property
     def steps(self) -> Array:
@@ -88,14 +90,17 @@ def linearised(model: Dynamics, run: Run, along: Array | None = None) -> Lineari
         along = np.broadcast_to(model.start, (len(time), model.size))
     sample = ca.vertcat(t.x, *[flat(t.symbols[s.name]) for s in model.signals])
     c, d = t.f - t.A @ t.x, t.h - t.C @ t.x
-    outputs = [ca.densify(e) for e in (t.A, c, t.C, d, t.reading)]
+    added = model.input_noise
+    expressions = [t.A, c, t.C, d, t.reading] + ([] if added is None else [added])
+    outputs = [ca.densify(e) for e in expressions]
     none = ca.SX.sym("none", 0)
     function = ca.Function(
-        "along", [none, sample], outputs, ["parameters", "sample"], list("AcCdy")
+        "along", [none, sample], outputs, ["parameters", "sample"], list("AcCdyQ")[: len(outputs)]
     )
     columns = Columns([np.ascontiguousarray(along), *(run.signals[s.name] for s in model.signals)])
-    A, c_, C, d_, y = Replay(function)(np.zeros(0), columns)
-    return Linearised(time, A, c_[:, :, 0], C, d_[:, :, 0], y[:, :, 0])
+    A, c_, C, d_, y, *more = Replay(function)(np.zeros(0), columns)
+    process = model.process + more[0] if more else model.process
+    return Linearised(time, A, c_[:, :, 0], C, d_[:, :, 0], y[:, :, 0], process)
 
 
 def _refuse_missing_inputs(model: Dynamics, run: Run) -> None:
@@ -172,13 +177,24 @@ def exponential(matrices: Array) -> Array:
 
 
 def process_noise(system: Linearised, intensity: Array, Phi: Array) -> Array:
-    """∫Φ(t₁, s)ΞΦ(t₁, s)ᵀ ds of every step, (N − 1, n, n): Simpson's rule."""
+    """∫Φ(t₁, s)ΞΦ(t₁, s)ᵀ ds of every step, (N − 1, n, n): Simpson's rule.
+
+    Ξ constant and diagonal (n, n), or any at every sample (N, n, n).
+    """
     h = system.steps[:, None, None]
-    # The process noise is diagonal: a product with its roots, half the work.
-    root = np.sqrt(np.diag(intensity))
-    first, middle = Phi * root, transitions(system, (0.5, 1.0))[0] * root
-    ends = first @ first.transpose(0, 2, 1) + intensity
-    return np.asarray(h / 6 * (ends + 4 * (middle @ middle.transpose(0, 2, 1))))
+    middle = transitions(system, (0.5, 1.0))[0]
+    if intensity.ndim == 3:
+        last = intensity[1:]
+        between = 0.5 * (intensity[:-1] + last)
+        ends = Phi @ intensity[:-1] @ Phi.transpose(0, 2, 1) + last
+        inner = middle @ between @ middle.transpose(0, 2, 1)
+    else:
+        # A diagonal one: a product with its roots, half the work.
+        root = np.sqrt(np.diag(intensity))
+        first, middle = Phi * root, middle * root
+        ends = first @ first.transpose(0, 2, 1) + intensity
+        inner = middle @ middle.transpose(0, 2, 1)
+    return np.asarray(h / 6 * (ends + 4 * inner))
 
 
 def steps_to(system: Linearised) -> NDArray[np.float64]:
