@@ -14,8 +14,9 @@ import numpy as np
 from casest.data.run import Run
 from casest.declaring.shapes import Array
 from casest.dynamics.declare import Dynamics
+from casest.dynamics.discrete import Steps, kalman, smoothed
 from casest.dynamics.riccati import check_covariance
-from casest.dynamics.stepping import kalman_step, reach, run_steps
+from casest.dynamics.stepping import entries, reach
 from casest.dynamics.transition import (
     Linearised,
     linearised,
@@ -93,44 +94,18 @@ def filtered(model: Dynamics, run: Run, *, smooth: bool = True) -> Filtered:
     return found
 
 
-def _once(model: Dynamics, system: Linearised, smooth: bool) -> Filtered:
+def discretised(model: Dynamics, system: Linearised) -> Steps:
+    """The record in discrete time: exact transitions, readings as averages over their period."""
     Phi, forced = transitions(system)
     Q = process_noise(system, system.process, Phi)
     R = np.diag(model.noise)[None] / steps_to(system)[:, None]
-    n, m = model.size, system.C.shape[1]
-    present = np.isfinite(system.y)
-    # A reading that is missing is one that the state does not reach: no row, no innovation.
-    C = np.where(present[:, :, None], system.C, 0.0)
-    y = np.where(present, system.y - system.d, 0.0)
-    eye = np.eye(n)[None]
-    Phi_first = np.concatenate([eye, Phi])
-    moved = np.concatenate([np.zeros((1, n)), forced])
-    added = np.concatenate([np.zeros((1, n, n)), Q])
-    columns = [Phi_first, moved, added, C, R, y]
-    found = run_steps(
-        kalman_step(n, m, reach(model.traced.A)), model.start, model.start_covariance, columns
-    )
-    x, P, before_x, before_P = found
-    innovations = np.where(present, y - np.einsum("kij,kj->ki", C, before_x), np.nan)
-    S = C @ before_P @ C.transpose(0, 2, 1)
-    S[:, np.arange(m), np.arange(m)] += R
-    S = np.where(present[:, :, None] & present[:, None, :], S, np.nan)
-    smoothed, smoothed_P = _smoothed(Phi, x, P, before_x, before_P) if smooth else (x, P)
-    return Filtered(model, system, x, P, before_x, before_P, innovations, S, smoothed, smoothed_P)
+    patterns = reach(model.traced.A), entries(model.traced.C)
+    return Steps(Phi, forced, Q, system.C, system.d, R, system.y, *patterns)
 
 
-def _smoothed(
-    Phi: Array, x: Array, P: Array, before_x: Array, before_P: Array
-) -> tuple[Array, Array]:
-    """Rauch, Tung & Striebel (1965), backwards over the record."""
-    smooth_x, smooth_P = x.copy(), P.copy()
-    gains = np.linalg.solve(before_P[1:], Phi @ P[:-1]).transpose(0, 2, 1)
-    # What does not depend on later samples, all at once.
-    own_x = x[:-1] - np.einsum("kij,kj->ki", gains, before_x[1:])
-    own_P = P[:-1] - gains @ before_P[1:] @ gains.transpose(0, 2, 1)
-    later_x, later_P = x[-1], P[-1]
-    for k in range(len(x) - 2, -1, -1):
-        G = gains[k]
-        smooth_x[k] = later_x = own_x[k] + G.dot(later_x)
-        smooth_P[k] = later_P = own_P[k] + G.dot(later_P).dot(G.T)
-    return smooth_x, smooth_P
+def _once(model: Dynamics, system: Linearised, smooth: bool) -> Filtered:
+    steps = discretised(model, system)
+    found = kalman(steps, model.start, model.start_covariance)
+    both = smoothed(steps, found) if smooth else (found.x, found.P)
+    parts = (found.x, found.P, found.predicted_x, found.predicted_P)
+    return Filtered(model, system, *parts, found.innovations, found.S, *both)

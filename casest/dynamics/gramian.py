@@ -15,7 +15,7 @@ import numpy as np
 
 from casest.declaring.shapes import Array
 from casest.dynamics.declare import Dynamics
-from casest.dynamics.transition import Linearised, transitions
+from casest.dynamics.transition import Linearised, half_transitions, transitions
 
 #: A direction counts as observable from this share of the largest scaled eigenvalue on. Rounding
 #: and the error of a fourth-order step stay below 1e-13.
@@ -49,7 +49,7 @@ def gramian(model: Dynamics, system: Linearised) -> Array:
 def _of_steps(model: Dynamics, system: Linearised, Phi: Array) -> Array:
     """W of every single step at its own beginning, (N − 1, n, n): Simpson's rule."""
     weight = np.linalg.inv(model.noise)
-    half, _ = transitions(system, (0.0, 0.5))
+    half = half_transitions(system, (0.0, 0.5))
     middle = 0.5 * (system.C[1:] + system.C[:-1]) @ half
     first, last = system.C[:-1], system.C[1:] @ Phi
     h = system.steps[:, None, None]

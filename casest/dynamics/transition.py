@@ -23,10 +23,10 @@ from casest.engine import Columns, Replay
 from casest.errors import DataError
 from casest.modelling.tracing import flat
 
-#: Coefficients of the exponential's series to degree 11, four at a time: below this norm the rest
-#: is under 1e-17.
-_SERIES = np.array([1 / factorial(k) for k in range(12)]).reshape(3, 4)
-_NORM = 0.2
+#: Coefficients of the exponential's series to degree 11, three at a time; and the norms below which
+#: six, nine or all twelve of them leave less than 1e-17.
+_SERIES = np.array([1 / factorial(k) for k in range(12)]).reshape(4, 3)
+_NORMS = np.array([0.004, 0.05, 0.2])
 
 #: Matrices that are worked on together: they stay in the processor's cache.
 _BLOCK = 256
@@ -126,6 +126,11 @@ def transitions(system: Linearised, part: tuple[float, float] = (0.0, 1.0)) -> t
     return both[:, :n, :n], both[:, :n, n]
 
 
+def half_transitions(system: Linearised, part: tuple[float, float]) -> Array:
+    """Φ alone over a part of every step, for rules that need the middle."""
+    return magnus_steps(lambda where: system.A[where], system, part)
+
+
 def magnus_steps(
     coefficients: Callable[[slice], Array],
     system: Linearised,
@@ -157,20 +162,24 @@ def _augmented(A: Array, c: Array) -> Array:
 def exponential(matrices: Array) -> Array:
     """exp of every matrix, (N, n, n): scaling, Taylor series, squaring.
 
-    The series of degree 11 takes five products (Paterson & Stockmeyer 1973).
+    Degree 5 takes three products, 8 four, 11 five (Paterson & Stockmeyer 1973): as many as needed.
     """
     norm = float(np.max(np.sum(np.abs(matrices), axis=2), initial=0.0))
-    squarings = max(0, int(np.ceil(np.log2(max(norm / _NORM, 1e-300)))))
-    powers = np.empty((4, *matrices.shape))
-    X, square, cube, fourth = powers
-    np.divide(matrices, 2.0**squarings, out=X)
+    squarings = max(0, int(np.ceil(np.log2(max(norm / _NORMS[-1], 1e-300)))))
+    rows = 2 + int(np.searchsorted(_NORMS, norm / 2.0**squarings))
+    powers = np.empty((3, *matrices.shape))
+    X, square, cube = powers
+    np.multiply(matrices, 0.5**squarings, out=X)
     np.matmul(X, X, out=square)
     np.matmul(square, X, out=cube)
-    np.matmul(square, square, out=fourth)
-    sums = (_SERIES[:, 1:] @ powers[:3].reshape(3, -1)).reshape(3, *matrices.shape)
+    series = _SERIES[:rows]
+    # In three terms each: (1, X, X²) times powers of X³.
+    sums = (series[:, 1:] @ powers[:2].reshape(2, -1)).reshape(rows, *matrices.shape)
     diagonal = np.arange(matrices.shape[1])
-    sums[:, :, diagonal, diagonal] += _SERIES[:, :1, None]
-    result = sums[0] + fourth @ (sums[1] + fourth @ sums[2])
+    sums[:, :, diagonal, diagonal] += series[:, :1, None]
+    result = sums[-1]
+    for k in range(rows - 2, -1, -1):
+        result = sums[k] + cube @ result
     for _ in range(squarings):
         result = result @ result
     return np.asarray(result)
@@ -182,7 +191,7 @@ def process_noise(system: Linearised, intensity: Array, Phi: Array) -> Array:
     Ξ constant and diagonal (n, n), or any at every sample (N, n, n).
     """
     h = system.steps[:, None, None]
-    middle = transitions(system, (0.5, 1.0))[0]
+    middle = half_transitions(system, (0.5, 1.0))
     if intensity.ndim == 3:
         last = intensity[1:]
         between = 0.5 * (intensity[:-1] + last)
