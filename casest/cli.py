@@ -399,13 +399,16 @@ def observe(model_name: str, data: tuple[str, ...], **options: Any) -> int:
 @commands.command("filter")
 @click.argument("model_name", metavar="MODEL")
 @click.argument("data", nargs=-1, required=True, type=click.Path())
+@click.option(
+    "--set", "constants", metavar="NAME=VALUE", multiple=True, help="Set a constant of the model."
+)
 @reading_options
 @motion_options
 def filter_command(model_name: str, data: tuple[str, ...], **options: Any) -> int:
     """States over time by the Kalman filter and smoother, with innovations diagnosed."""
     from casest import observing, result
 
-    moving, run = moving_record(model_name, data, {**options, "constants": ()})
+    moving, run = moving_record(model_name, data, options)
     content, found = observing.follow(moving, run)
     content |= {"data": list(data), "reproduce": result.reproduce(typed(), data)}
     if options["output"]:

@@ -89,9 +89,11 @@ def _structural_rank(model: Dynamics) -> int | None:
 def observe_motion(model: Dynamics, run: Run, window: float | None = None) -> dict[str, Any]:
     """What a trajectory makes observable, by the Gramian over the whole record and over windows.
 
-    `std` is what the readings alone allow at the beginning of the record, per state.
+    `std` is what the readings alone allow at the beginning of the record, per state. A nonlinear
+    model is linearised along its smoothed states.
     """
-    system = linearised(model, run)
+    along = None if model.linear else filtered(model, run).smoothed
+    system = linearised(model, run, along)
     seen = observed(model, gramian(model, system))
     duration = float(system.time[-1] - system.time[0])
     if window is not None and not 2 * float(np.median(system.steps)) <= window < np.inf:

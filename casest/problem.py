@@ -32,6 +32,7 @@ SHIPPED = {
 #: Shipped estimators in motion.
 MOVING = {
     "bias-gravity": ("bias_gravity", "bias_gravity"),
+    "bias-gravity-magnitude": ("bias_gravity", "bias_gravity_magnitude"),
     "bias-gravity-position": ("bias_gravity", "bias_gravity_position"),
 }
 

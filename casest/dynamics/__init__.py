@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from casest.dynamics.declare import Dynamics, Motion, State, dynamics, measured, state
+from casest.dynamics.declare import Dynamics, Motion, State, constraint, dynamics, measured, state
 from casest.dynamics.statespace import to_statespace
 from casest.dynamics.structural import Structure, structure
 
@@ -11,6 +11,7 @@ __all__ = [
     "Motion",
     "State",
     "Structure",
+    "constraint",
     "dynamics",
     "measured",
     "state",

@@ -83,11 +83,23 @@ class Measured:
     intensity: float
 
 
-class Motion:
-    """What a @dynamics function returns: the rate of every state, in their order, and outputs."""
+@dataclass(frozen=True)
+class Constraint:
+    """What is known of the state without noise: `expression` is zero at every instant."""
 
-    def __init__(self, *, rates: Mapping[str, SX], outputs: tuple[Measured, ...]) -> None:
-        self.rates, self.outputs = dict(rates), outputs
+    expression: SX
+
+
+@dataclass(frozen=True, kw_only=True)
+class Motion:
+    """What a @dynamics function returns: rates of the states, outputs, and what is known exactly.
+
+    A state without a rate is constant but for its driving noise.
+    """
+
+    rates: Mapping[str, SX]
+    outputs: tuple[Measured, ...]
+    constraints: tuple[Constraint, ...] = ()
 
 
 def measured(signal: SX, predicted: SX, *, intensity: float) -> Measured:
@@ -98,6 +110,11 @@ def measured(signal: SX, predicted: SX, *, intensity: float) -> Measured:
             "noise makes the Riccati equation singular; give the sensor's variance times its period"
         )
     return Measured(signal, predicted, float(intensity))
+
+
+def constraint(expression: SX, value: float | SX) -> Constraint:
+    """Known without noise: `constraint(norm_2(gravity), 9.80665)`; every estimate keeps to it."""
+    return Constraint(ca.densify(ca.SX(expression) - value))
 
 
 @dataclass(frozen=True)
@@ -267,7 +284,8 @@ class Dynamics:
 
 @dataclass(frozen=True)
 class Traced:
-    """Symbols and expressions: x, signals, f(x, u), h(x, u), A = ∂f/∂x, C = ∂h/∂x, readings."""
+    """Symbols and expressions: x, signals, f(x, u), h(x, u), A = ∂f/∂x, C = ∂h/∂x, readings;
+    constraints g(x, u) = 0 and G = ∂g/∂x."""
 
     x: SX
     symbols: Mapping[str, SX]
@@ -276,6 +294,8 @@ class Traced:
     A: SX
     C: SX
     reading: SX
+    g: SX
+    G: SX
     outputs: tuple[Measured, ...]
     measured: tuple[str, ...]
 
@@ -345,5 +365,6 @@ def _trace(declared: Dynamics) -> Traced:
     reading = ca.vertcat(*[flat(o.signal) for o in motion.outputs])
     if reading.numel() != h.numel():
         raise DeclarationError(f"dynamics {declared.name}: outputs and signals differ in shape")
-    A, C = ca.jacobian(f, x), ca.jacobian(h, x)
-    return Traced(x, symbols, f, h, A, C, reading, motion.outputs, tuple(names))
+    g = ca.vertcat(*[ca.vec(c.expression) for c in motion.constraints])
+    A, C, G = ca.jacobian(f, x), ca.jacobian(h, x), ca.jacobian(g, x)
+    return Traced(x, symbols, f, h, A, C, reading, g, G, motion.outputs, tuple(names))

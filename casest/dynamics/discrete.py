@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from casest.declaring.shapes import Array
 from casest.dynamics.stepping import Pattern, kalman_step, run_steps, unpacked
@@ -34,9 +35,9 @@ class Steps:
     of_C: Pattern | None = None  # noqa: N815
 
     @property
-    def present(self) -> Array:
+    def present(self) -> NDArray[np.bool_]:
         """Which readings there are, (N, m)."""
-        return np.isfinite(self.y)
+        return np.asarray(np.isfinite(self.y))
 
     @property
     def seen(self) -> Array:

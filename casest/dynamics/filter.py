@@ -15,6 +15,8 @@ from casest.data.run import Run
 from casest.declaring.shapes import Array
 from casest.dynamics.declare import Dynamics
 from casest.dynamics.discrete import Steps, kalman, smoothed
+from casest.dynamics.extended import extended, relinearised
+from casest.dynamics.known import known
 from casest.dynamics.riccati import check_covariance
 from casest.dynamics.stepping import entries, reach
 from casest.dynamics.transition import (
@@ -24,9 +26,11 @@ from casest.dynamics.transition import (
     steps_to,
     transitions,
 )
+from casest.errors import DataError
 
-#: Rounds of an extended filter: linearised along its own smoothed states.
-ROUNDS = 20
+#: Rounds of an extended smoother, linearised along its own states; a change of this share of a
+#: standard deviation ends them.
+ROUNDS, SETTLED = 30, 1e-5
 
 
 @dataclass(frozen=True)
@@ -70,28 +74,62 @@ class Filtered:
 
 
 def filtered(model: Dynamics, run: Run, *, smooth: bool = True) -> Filtered:
-    """Kalman filter over a record; an extended one, iterated, for a nonlinear model.
+    """Kalman filter over a record, and smoother; for a nonlinear model the extended ones.
 
-    Where the inputs' noise reaches the states through the states themselves, it is taken along
-    the estimates of a first pass.
-
+    The extended filter linearises at each prediction; its smoother is iterated: the record is
+    linearised along the smoothed states until they stay (the most probable trajectory). Where the
+    noise of inputs reaches a linear model through its states, it is taken along the estimates of a
+    first pass. What is known exactly (`constraint`) is put into every estimate and not fed back.
     Raises DataError where time or inputs are not usable, or a covariance is none.
     """
     check_covariance(model.start_covariance, "the covariance at the beginning")
+    if not model.linear:
+        return _extended(model, run, smooth)
     system = linearised(model, run)
-    found = _once(model, system, not model.linear or (smooth and model.input_noise is None))
-    if model.linear:
-        if model.input_noise is None:
-            return found
-        return _once(model, linearised(model, run, along=found.x), smooth)
+    if model.input_noise is not None:
+        first = _once(model, run, system, smooth=False)
+        system = linearised(model, run, along=first.x)
+    return _once(model, run, system, smooth)
+
+
+def _extended(model: Dynamics, run: Run, smooth: bool) -> Filtered:
+    x, P, before_x, before_P, innovations, S = extended(model, run)
+    if not np.all(np.isfinite(x)):
+        row = int(run.rows[np.flatnonzero(~np.isfinite(x).all(axis=1))[0]])
+        raise DataError(
+            f"{run.file or run.name}: the extended filter of {model.name} diverges at row {row}: "
+            "start= and std= must lie where the model holds"
+        )
+    along, smooth_P = trajectory(model, run, x) if smooth else (x, P)
+    return Filtered(
+        model,
+        linearised(model, run, along),
+        x,
+        P,
+        before_x,
+        before_P,
+        innovations,
+        S,
+        along,
+        smooth_P,
+    )
+
+
+def trajectory(model: Dynamics, run: Run, along: Array) -> tuple[Array, Array]:
+    """The most probable states (N, n) and their covariances, by smoothing again and again.
+
+    Gauss-Newton on all states of the record, from states `along`.
+    """
     for _ in range(ROUNDS):
-        system = linearised(model, run, along=found.smoothed)
-        again = _once(model, system, True)
-        change = np.max(np.abs(again.smoothed - found.smoothed) / np.maximum(again.std, 1e-300))
-        found = again
-        if change < 1e-6:
+        steps = relinearised(model, run, along)
+        before, (along, P) = (
+            along,
+            smoothed(steps, kalman(steps, model.start, model.start_covariance)),
+        )
+        std = np.sqrt(np.maximum(np.diagonal(P, axis1=1, axis2=2), 1e-300))
+        if np.max(np.abs(along - before) / std) < SETTLED:
             break
-    return found
+    return along, P
 
 
 def discretised(model: Dynamics, system: Linearised) -> Steps:
@@ -99,13 +137,14 @@ def discretised(model: Dynamics, system: Linearised) -> Steps:
     Phi, forced = transitions(system)
     Q = process_noise(system, system.process, Phi)
     R = np.diag(model.noise)[None] / steps_to(system)[:, None]
-    patterns = reach(model.traced.A), entries(model.traced.C)
-    return Steps(Phi, forced, Q, system.C, system.d, R, system.y, *patterns)
+    t = model.traced
+    return Steps(Phi, forced, Q, system.C, system.d, R, system.y, reach(t.A), entries(t.C))
 
 
-def _once(model: Dynamics, system: Linearised, smooth: bool) -> Filtered:
+def _once(model: Dynamics, run: Run, system: Linearised, smooth: bool) -> Filtered:
     steps = discretised(model, system)
     found = kalman(steps, model.start, model.start_covariance)
-    both = smoothed(steps, found) if smooth else (found.x, found.P)
-    parts = (found.x, found.P, found.predicted_x, found.predicted_P)
-    return Filtered(model, system, *parts, found.innovations, found.S, *both)
+    before = found.predicted_x, found.predicted_P, found.innovations, found.S
+    after = known(model, run, found.x, found.P)
+    both = known(model, run, *smoothed(steps, found)) if smooth else after
+    return Filtered(model, system, *after, *before, *both)

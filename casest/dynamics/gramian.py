@@ -164,12 +164,15 @@ def sentence(model: Dynamics, direction: Array) -> str:
             same = all(abs(a - along[0]) < 1e-4 * abs(along[0]) for a in along)
             how = "move together" if same else "move in proportion"
             return f"{names} along the body axis ({axis}) {how}: no reading changes"
-    words = []
+    words: list[str] = []
+    label = ""
     for name, own in parts:
         for i, value in enumerate(own):
             if abs(value) > 1e-6 * largest:
                 label = name if len(own) == 1 else f"{name}[{i}]"
                 words.append(f"{label} {value / largest:+.3g}")
+    if len(words) == 1:
+        return f"{label} changes no reading"
     return f"{', '.join(words)} together change no reading"
 
 

@@ -106,8 +106,8 @@ def run_steps(steps: Any, state: Array, parts: Sequence[Array]) -> list[Array]:
     state = np.ascontiguousarray(state, float)
     for k in range(0, padded, CHUNK):
         span = slice(k, k + CHUNK)
-        given = (state, numbers[span])
-        results = [f[span] for f in found]
+        given: list[Any] = [state, numbers[span]]
+        results: list[Any] = [f[span] for f in found]
         for i, array in enumerate(given):
             buffer.set_arg(i, memoryview(array))
         for i, array in enumerate(results):

@@ -103,14 +103,15 @@ class _Lie:
 
     def __init__(self, model: Dynamics, varying: bool) -> None:
         t = model.traced
-        used = ca.vertcat(t.f, t.h)
+        used = ca.vertcat(t.f, t.h, t.g)
         names = [s.name for s in model.signals]
         self.model, self.varying = model, varying
         self.inputs = tuple(n for n in names if ca.depends_on(used, flat(t.symbols[n])))
         self.clock = [s.name == "t" for s in model.signals if s.name in self.inputs]
         first = [flat(t.symbols[n]) for n in self.inputs]
         self.chain: list[SX] = [ca.vertcat(*first)] if first else [ca.SX(0, 1)]
-        self.derivatives: list[SX] = [t.h]
+        # What is known exactly is a reading too.
+        self.derivatives: list[SX] = [ca.vertcat(t.h, t.g)]
 
     def _next(self) -> None:
         """One more derivative: ∂L/∂x·f + Σ ∂L/∂u⁽ʲ⁾·u⁽ʲ⁺¹⁾."""

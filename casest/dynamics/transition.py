@@ -76,16 +76,22 @@ def checked_time(run: Run) -> Array:
     return time
 
 
+def checked_record(model: Dynamics, run: Run) -> Array:
+    """The run's time; DataError where it, a signal or an input is not usable."""
+    time = checked_time(run)
+    for s in model.signals:
+        if s.name not in run.signals:
+            raise DataError(f"{run.file or run.name}: no data for signal {s.name!r}; add --columns")
+    _refuse_missing_inputs(model, run)
+    return time
+
+
 def linearised(model: Dynamics, run: Run, along: Array | None = None) -> Linearised:
     """The model along a record; a nonlinear one along states `along` (N, n).
 
     Signals that only outputs use may be missing (NaN); inputs may not.
     """
-    time, t = checked_time(run), model.traced
-    for s in model.signals:
-        if s.name not in run.signals:
-            raise DataError(f"{run.file or run.name}: no data for signal {s.name!r}; add --columns")
-    _refuse_missing_inputs(model, run)
+    time, t = checked_record(model, run), model.traced
     if along is None:
         along = np.broadcast_to(model.start, (len(time), model.size))
     sample = ca.vertcat(t.x, *[flat(t.symbols[s.name]) for s in model.signals])
@@ -206,7 +212,7 @@ def process_noise(system: Linearised, intensity: Array, Phi: Array) -> Array:
     return np.asarray(h / 6 * (ends + 4 * inner))
 
 
-def steps_to(system: Linearised) -> NDArray[np.float64]:
-    """Time that each sample stands for, (N,): half of the steps on both sides of it."""
-    step = system.steps
+def steps_to(steps: Array | Linearised) -> NDArray[np.float64]:
+    """Time that each sample stands for, (N,): half of the steps (N − 1,) on both sides of it."""
+    step = steps.steps if isinstance(steps, Linearised) else steps
     return np.concatenate([[step[0]], 0.5 * (step[1:] + step[:-1]), [step[-1]]])
