@@ -12,6 +12,7 @@ from casest import DataError, DeclarationError, Run, signal
 from casest.dynamics import Motion, dynamics, measured, state
 from casest.dynamics.filter import filtered
 from casest.dynamics.gramian import gramian, gramian_by_ode, observed, smallest_eigenvalue
+from casest.dynamics.record import least_squares
 from casest.dynamics.riccati import riccati
 from casest.dynamics.transition import linearised, transitions
 from casest_problems.bias_gravity import bias_gravity, bias_gravity_position
@@ -191,7 +192,7 @@ def test_a_stiff_riccati_equation_stays_symmetric_and_positive():
 # -- filter and smoother -----------------------------------------------------------------------
 
 
-def least_squares(model, run):
+def by_normal_equations(model, run):
     """All states of a linear record at once, by dense normal equations."""
     from casest.dynamics.transition import process_noise, steps_to
 
@@ -220,10 +221,32 @@ def least_squares(model, run):
 
 def test_filter_smoother_and_least_squares_are_one_estimate():
     run = cart_run(200)
-    found, (x, P) = filtered(cart, run), least_squares(cart, run)
+    found, (x, P) = filtered(cart, run), by_normal_equations(cart, run)
     np.testing.assert_allclose(found.smoothed, x, atol=1e-8)
     np.testing.assert_allclose(found.x[-1], x[-1], atol=1e-8)
     np.testing.assert_allclose(found.P[-1], P, rtol=1e-8)
+
+
+@pytest.mark.parametrize("kind", ["published", "undriven", "matched", "irregular"])
+def test_the_whole_record_at_once_is_the_filters_end(kind):
+    """Sparse augmented equations: no filter, no inverse of what may be singular."""
+    run, _, _ = flight(10)
+    model = bias_gravity
+    if kind != "published":
+        model = model.driven(velocity=0.0, gravity=0.0, bias=0.0)
+    if kind == "matched":
+        model = model.sensing(a=1.7e-8, omega=7.6e-9, v=1e-6)
+    if kind == "irregular":
+        kept = np.sort(np.random.default_rng(0).choice(len(run), 600, replace=False))
+        run = run.take(kept)
+        run.signals["v"][100:150] = np.nan
+    at_once, found = least_squares(model, run), filtered(model, run)
+    np.testing.assert_allclose(at_once.x[-1], found.x[-1], atol=1e-8)
+    np.testing.assert_allclose(at_once.x, found.smoothed, atol=1e-8)
+    size = np.abs(found.P[-1]).max()
+    np.testing.assert_allclose(at_once.P_end, found.P[-1], atol=1e-8 * size)
+    size = np.abs(found.smoothed_P[0]).max()
+    np.testing.assert_allclose(at_once.P_start, found.smoothed_P[0], atol=1e-8 * size)
 
 
 def test_missing_readings_say_nothing_and_do_no_harm():

@@ -14,6 +14,7 @@ from casest import DataError, Run, atan2, log, norm_2, signal, sin, vertcat
 from casest.cli import run as cli
 from casest.dynamics import Motion, constraint, dynamics, measured, state
 from casest.dynamics.filter import filtered
+from casest.dynamics.record import least_squares as at_once_of
 from casest.observing import observe_motion
 from casest_problems.bias_gravity import bias_gravity, bias_gravity_magnitude
 
@@ -134,6 +135,14 @@ def test_without_driving_noise_the_smoother_is_a_fit_of_the_start():
     std = np.sqrt(np.diag(np.linalg.inv(expected.jac.T @ expected.jac)))
     assert np.abs(found.smoothed[0] - expected.x).max() < 1e-3 * std.min()
     np.testing.assert_allclose(np.sqrt(np.diag(found.smoothed_P[0])), std, rtol=1e-3)
+
+
+def test_the_smoother_is_the_least_squares_of_the_whole_record():
+    model = pendulum_of()
+    run, _ = swing()
+    found, at_once = filtered(model, run), at_once_of(model, run)
+    np.testing.assert_allclose(found.smoothed, at_once.x, atol=1e-8)
+    np.testing.assert_allclose(found.smoothed_P[-1], at_once.P_end, rtol=1e-6)
 
 
 def test_range_and_bearing_find_a_moving_body():

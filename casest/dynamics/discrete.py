@@ -85,41 +85,33 @@ def kalman(steps: Steps, start: Array, covariance: Array) -> Estimates:
 
 def _innovations(steps: Steps, x: Array, P: Array) -> tuple[Array, Array]:
     present = steps.present
-    ours = np.where(present, steps.y - steps.d - np.einsum("kij,kj->ki", steps.seen, x), np.nan)
-    return ours, np.where(present[:, :, None] & present[:, None, :], _spread(steps, P), np.nan)
-
-
-def _spread(steps: Steps, P: Array) -> Array:
-    """Covariance of the innovations; of a missing reading, of its noise alone."""
+    said = np.einsum("kij,kj->ki", steps.C, x) + steps.d
     m = steps.C.shape[1]
-    S = steps.seen @ P @ steps.seen.transpose(0, 2, 1)
+    S = steps.C @ P @ steps.C.transpose(0, 2, 1)
     S[:, np.arange(m), np.arange(m)] += steps.R
-    return np.asarray(S)
+    whole = present[:, :, None] & present[:, None, :]
+    return np.where(present, steps.y - said, np.nan), np.where(whole, S, np.nan)
 
 
 def smoothed(steps: Steps, found: Estimates) -> tuple[Array, Array]:
-    """Fixed-interval smoother: states (N, n) and covariances (N, n, n) from the whole record.
+    """Fixed-interval smoother (Rauch, Tung & Striebel 1965): states (N, n), covariances (N, n, n).
 
-    Bryson & Frazier's form (Bierman 1977): x + Pλ and P − PΛP, with λ and Λ what later readings
-    say. No covariance is inverted, so that one may be singular.
+    The covariance left of a step is in Joseph's form, so that it stays positive however much later
+    readings add.
     """
-    C, before = steps.seen, found.predicted_P
-    weight = np.linalg.inv(_spread(steps, before))
-    H = C[1:] @ steps.Phi
-    K = before[1:] @ (C[1:].transpose(0, 2, 1) @ weight[1:])
-    seen = H.transpose(0, 2, 1) @ weight[1:]
-    nu = np.nan_to_num(found.innovations[1:])[:, :, None]
-    lam, Lam = gathered(steps.Phi - K @ H, seen @ H, (seen @ nu)[:, :, 0])
-    x, P = found.x.copy(), found.P.copy()
-    x[:-1] += (P[:-1] @ lam[:, :, None])[:, :, 0]
-    P[:-1] -= P[:-1] @ Lam @ P[:-1]
-    return x, 0.5 * (P + P.transpose(0, 2, 1))
+    x, P = found.x, found.P
+    G = np.linalg.solve(found.predicted_P[1:], steps.Phi @ P[:-1]).transpose(0, 2, 1)
+    left = np.eye(x.shape[1]) - G @ steps.Phi
+    own_x = x[:-1] - (G @ found.predicted_x[1:, :, None])[:, :, 0]
+    own_P = left @ P[:-1] @ left.transpose(0, 2, 1) + G @ steps.Q @ G.transpose(0, 2, 1)
+    earlier = gathered(np.asarray(G, float), own_x, np.asarray(own_P, float), x[-1], P[-1])
+    return np.concatenate([earlier[0], x[-1:]]), np.concatenate([earlier[1], P[-1:]])
 
 
-def gathered(M: Array, W: Array, w: Array) -> tuple[Array, Array]:
-    """Backwards λ(k) = M(k)ᵀλ(k+1) + w(k), Λ(k) = M(k)ᵀΛ(k+1)M(k) + W(k), from zero at the end.
+def gathered(G: Array, w: Array, W: Array, x: Array, P: Array) -> tuple[Array, Array]:
+    """Backwards x(k) = G(k)x(k+1) + w(k), P(k) = G(k)P(k+1)G(k)ᵀ + W(k), from x and P at the end.
 
-    M, W (K, n, n) and w (K, n); λ (K, n) and Λ (K, n, n). About √K stretches of √K steps go side by
+    G, W (K, n, n) and w (K, n); x (K, n) and P (K, n, n). About √K stretches of √K steps go side by
     side: first what each does to any end, then, the ends known, every step.
     """
     count, n = w.shape
@@ -131,23 +123,24 @@ def gathered(M: Array, W: Array, w: Array) -> tuple[Array, Array]:
         padded = np.concatenate([np.zeros((lead, *parts.shape[1:])), parts])
         return padded.reshape(stretches, length, *parts.shape[1:])
 
-    M, both = cut(M), cut(np.concatenate([W, w[:, :, None]], axis=2))
-    # λ rides along as one more column of Λ, which M does not multiply from the right.
+    # x rides along as one more column of P, which Gᵀ does not multiply from the right.
+    G, both = cut(G), cut(np.concatenate([W, w[:, :, None]], axis=2))
     whole, ends = np.broadcast_to(np.eye(n), (stretches, n, n)), np.zeros((stretches, n, n + 1))
     for k in range(length - 1, -1, -1):
-        whole, ends = whole @ M[:, k], _earlier(M[:, k], ends, both[:, k])
-    after = np.zeros((stretches, n, n + 1))
+        whole, ends = G[:, k] @ whole, _earlier(G[:, k], ends, both[:, k])
+    after = np.empty((stretches, n, n + 1))
+    after[-1] = np.concatenate([P, x[:, None]], axis=1)
     for j in range(stretches - 1, 0, -1):
         after[j - 1] = _earlier(whole[j], after[j], ends[j])
     found = np.empty((stretches, length, n, n + 1))
     for k in range(length - 1, -1, -1):
-        found[:, k] = after = _earlier(M[:, k], after, both[:, k])
+        found[:, k] = after = _earlier(G[:, k], after, both[:, k])
     found = found.reshape(-1, n, n + 1)[lead:]
     return found[:, :, n], found[:, :, :n]
 
 
-def _earlier(M: Array, after: Array, added: Array) -> Array:
-    n = M.shape[-1]
-    moved = np.swapaxes(M, -1, -2) @ after
-    moved[..., :n] = moved[..., :n] @ M
+def _earlier(G: Array, after: Array, added: Array) -> Array:
+    n = G.shape[-1]
+    moved = G @ after
+    moved[..., :n] = moved[..., :n] @ np.swapaxes(G, -1, -2)
     return np.asarray(moved + added)

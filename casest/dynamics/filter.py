@@ -85,11 +85,15 @@ def filtered(model: Dynamics, run: Run, *, smooth: bool = True) -> Filtered:
     check_covariance(model.start_covariance, "the covariance at the beginning")
     if not model.linear:
         return _extended(model, run, smooth)
+    return _once(model, run, coefficients(model, run), smooth)
+
+
+def coefficients(model: Dynamics, run: Run) -> Linearised:
+    """A linear model along a record; noise that depends on the states, along a first estimate."""
     system = linearised(model, run)
-    if model.input_noise is not None:
-        first = _once(model, run, system, smooth=False)
-        system = linearised(model, run, along=first.x)
-    return _once(model, run, system, smooth)
+    if model.input_noise is None:
+        return system
+    return linearised(model, run, along=_once(model, run, system, smooth=False).x)
 
 
 def _extended(model: Dynamics, run: Run, smooth: bool) -> Filtered:
