@@ -137,7 +137,7 @@ def candidates(model: Dynamics, run: Run) -> list[Candidate]:
                 continue
             if (effect.vector and s.size != 3) or s.kind == "rotation":
                 continue
-            if effect.turning and turn is None:
+            if (effect.turning and turn is None) or (effect is BIAS and _estimated(model, s.name)):
                 continue
             typical = effect.typical(_rms(run.signals[s.name]))
             unit = effect.unit(s.unit or "1", turn.unit or "1" if turn else "1")
@@ -145,6 +145,24 @@ def candidates(model: Dynamics, run: Run) -> list[Candidate]:
             size = effect.size(s.size)
             found.append(Candidate(effect, s.name, size, _tidy(unit), typical, turning))
     return found
+
+
+def _estimated(model: Dynamics, name: str) -> bool:
+    """Is a bias of that input a state already: a constant that acts as the input does?"""
+    t, where = model.traced, model.slices()
+    slope = ca.jacobian(t.f, t.symbols[name])
+    point = np.random.default_rng(0).standard_normal(200)
+    for s in model.states:
+        own = where[s.name]
+        if s.size != slope.size2() or not t.f[own].is_zero():
+            continue
+        pair = ca.vertcat(ca.vec(ca.densify(slope)), ca.vec(ca.densify(t.A[:, own])))
+        free = ca.symvar(pair)
+        numbers = [point[k] for k in range(len(free))]
+        found = np.array(ca.Function("pair", free, [pair])(*numbers)).reshape(2, -1)
+        if np.allclose(found[0], -found[1]):
+            return True
+    return False
 
 
 def _is_turn(unit: str | None) -> bool:

@@ -56,7 +56,7 @@ class Fit:
         if self.answers is None:
             return np.zeros(0)
         H = self.answers.H
-        return np.sqrt(np.diag(np.linalg.inv(np.einsum("kij,kil->jl", H, H))))
+        return np.asarray(np.sqrt(np.diag(np.linalg.inv(np.einsum("kij,kil->jl", H, H)))))
 
 
 def fitted(

@@ -32,7 +32,7 @@ CONTENDERS, ROUNDS, BLOCKS, FOLDS = 3, 6, 40, 4
 #: Whiteness below which noise with a colour is tried; gain of likelihood that asks for it too.
 SUSPECT, ASKS = 0.05, 10.0
 #: Significance of what is left.
-UNEXPLAINED = 1e-3
+UNEXPLAINED = 1e-4
 #: Samples below which nothing can be held out.
 SHORTEST = 400
 
@@ -118,7 +118,7 @@ class _Loop:
                              tuple(first), left, held)  # fmt: skip
 
     def _judged(self, fit: Fit) -> tuple[list[Score], Whiteness]:
-        """Scores of every candidate that is not there yet, and whether the innovations are white."""
+        """Scores of every candidate that is not there yet; are the innovations white?"""
         there = [c for c, _ in fit.added]
         rest = [c for c in self.tried if c not in there]
         found = sensitivity(fit.base, fit.added, rest, self.run, fit.found)
@@ -180,7 +180,7 @@ class _Loop:
     def _confirmed(self, current: Fit, better: Fit) -> float | None:
         """Held-out gain of log-likelihood per reading, if it exceeds its own error."""
         before, after = (_densities(f, held_out(f, self.folds)) for f in (current, better))
-        part = stretches(len(before), BLOCKS).astype(np.int_)
+        part = stretches(len(before), BLOCKS)
         gains = np.bincount(part, after - before)
         error = float(np.sqrt(len(gains)) * np.std(gains, ddof=1))
         total = float(gains.sum())

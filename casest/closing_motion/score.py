@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from casest.closing_motion.effects import Candidate
 from casest.closing_motion.sensitivity import Sensitivity
@@ -34,7 +35,7 @@ class Score:
     moves: Array
 
 
-def stretches(count: int, parts: int = STRETCHES) -> Array:
+def stretches(count: int, parts: int = STRETCHES) -> NDArray[np.int_]:
     """The stretch of each of `count` samples, from 0."""
     return np.arange(count) * parts // count
 
@@ -49,7 +50,7 @@ def scores(found: Sensitivity, tried: list[Candidate]) -> list[Score]:
     return sorted(judged, key=lambda s: (s.p_value, -s.gain))
 
 
-def _score(candidate: Candidate, z: Array, H: Array, X: Array, part: Array) -> Score:
+def _score(candidate: Candidate, z: Array, H: Array, X: Array, part: NDArray[np.int_]) -> Score:
     M, b = by_stretch(z, H, part)
     total, whole = b.sum(axis=0), M.sum(axis=0)
     kept = _worth(whole, candidate.typical)
@@ -63,7 +64,7 @@ def _score(candidate: Candidate, z: Array, H: Array, X: Array, part: Array) -> S
     return Score(candidate, step, std, float(total @ step), p_value, whole, moves)
 
 
-def by_stretch(z: Array, H: Array, part: Array) -> tuple[Array, Array]:
+def by_stretch(z: Array, H: Array, part: NDArray[np.int_]) -> tuple[Array, Array]:
     """Information (J, p, p) and gradient (J, p) of every stretch."""
     first = np.flatnonzero(np.diff(part, prepend=-1))
     M = np.add.reduceat(H.transpose(0, 2, 1) @ H, first)

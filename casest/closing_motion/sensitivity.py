@@ -19,7 +19,7 @@ from casest.data.run import Run
 from casest.declaring.shapes import Array
 from casest.dynamics.declare import Dynamics
 from casest.dynamics.filter import Filtered
-from casest.dynamics.transition import steps_to, transitions
+from casest.dynamics.transition import Linearised, steps_to, transitions
 from casest.engine import Columns, Replay
 from casest.modelling.tracing import flat
 
@@ -58,12 +58,12 @@ def sensitivity(
     PC = found.predicted_P @ C.transpose(0, 2, 1)
     S = C @ PC
     S[:, np.arange(m), np.arange(m)] += R
-    K = np.linalg.solve(S, PC.transpose(0, 2, 1)).transpose(0, 2, 1)
+    K: Array = np.linalg.solve(S, PC.transpose(0, 2, 1)).transpose(0, 2, 1).astype(float)
     X, H = _answers(transitions(system)[0], _over_steps(system, F), C, G, K)
-    L = np.linalg.cholesky(S)
+    L: Array = np.asarray(np.linalg.cholesky(S), float)
     nu = np.where(present, found.innovations, 0.0)
-    z = np.linalg.solve(L, nu[:, :, None])[:, :, 0]
-    return Sensitivity(z, np.linalg.solve(L, H), L, X, columns)
+    z: Array = np.asarray(np.linalg.solve(L, nu[:, :, None])[:, :, 0], float)
+    return Sensitivity(z, np.asarray(np.linalg.solve(L, H), float), L, X, columns)
 
 
 def _slopes(
@@ -100,11 +100,8 @@ def _slopes(
     return np.pad(joined, ((0, 0), (0, wide), (0, 0))), np.concatenate(G, axis=2), tuple(columns)
 
 
-def _over_steps(system: object, F: Array) -> Array:
+def _over_steps(system: Linearised, F: Array) -> Array:
     """∫Φ(t₁, s)F(s) ds of every step, (N − 1, n, p): Simpson's rule."""
-    from casest.dynamics.transition import Linearised
-
-    assert isinstance(system, Linearised)
     h = system.steps[:, None, None]
     Phi, half = transitions(system)[0], transitions(system, (0.5, 1.0))[0]
     return np.asarray(h / 6 * (Phi @ F[:-1] + 2 * half @ (F[:-1] + F[1:]) + F[1:]))

@@ -14,6 +14,7 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from casest.data.run import Run
 from casest.declaring.shapes import Array
@@ -21,6 +22,8 @@ from casest.dynamics.declare import Dynamics
 from casest.dynamics.stepping import CHUNK, reach
 from casest.dynamics.transition import linearised, process_noise, steps_to, transitions
 from casest.modelling.tracing import flat
+
+Mask = NDArray[np.bool_]
 
 #: Sum of the squared coefficients of a fourth difference.
 _FOURTH = 70.0
@@ -43,7 +46,7 @@ class Prepared:
     forced: Array
     C: Array
     y: Array
-    present: Array
+    present: Mask
     period: Array
     units: Mapping[str, Array]
     readings: Mapping[str, slice]
@@ -103,18 +106,18 @@ def whitened(ready: Prepared, intensities: Mapping[str, float]) -> tuple[Array, 
 
 
 def likelihood(
-    ready: Prepared, intensities: Mapping[str, float], used: Array | None = None
+    ready: Prepared, intensities: Mapping[str, float], used: Mask | None = None
 ) -> float:
     """Log-likelihood of the readings (those of instants `used`, (N,))."""
     return _log_density(ready, *whitened(ready, intensities), used)
 
 
-def _log_density(ready: Prepared, e: Array, s: Array, used: Array | None) -> float:
+def _log_density(ready: Prepared, e: Array, s: Array, used: Mask | None) -> float:
     counted = _counted(ready, used)
     return float(-0.5 * np.sum((np.log(2 * np.pi * s) + e**2 / s)[counted]))
 
 
-def _counted(ready: Prepared, used: Array | None) -> Array:
+def _counted(ready: Prepared, used: Mask | None) -> Mask:
     return ready.present if used is None else ready.present & used[:, None]
 
 
@@ -122,7 +125,7 @@ def matched(
     ready: Prepared,
     run: Run,
     start: Mapping[str, float] | None = None,
-    used: Array | None = None,
+    used: Mask | None = None,
 ) -> tuple[dict[str, float], float]:
     """The most likely intensities, and their log-likelihood: Fisher scoring of their logarithms.
 
@@ -162,7 +165,7 @@ def matched(
 
 
 def _slope(
-    moved: tuple[Array, Array, float], e: Array, s: Array, counted: Array
+    moved: tuple[Array, Array, float], e: Array, s: Array, counted: Mask
 ) -> tuple[Array, Array]:
     """∂e/√s and ∂s/s by a difference."""
     e0, s0 = e[counted], s[counted]
@@ -237,10 +240,10 @@ def _run(steps: Any, x: Array, P: Array, parts: list[Array]) -> tuple[Array, Arr
     buffer, run = steps.buffer()
     for k in range(0, padded, CHUNK):
         span = slice(k, k + CHUNK)
-        buffer.set_arg(0, memoryview(state))
-        buffer.set_arg(1, memoryview(numbers[span]))
-        buffer.set_res(0, memoryview(after))
-        buffer.set_res(1, memoryview(found[span]))
+        arrays: Any = (state, numbers[span]), (after, found[span])
+        for i in range(2):
+            buffer.set_arg(i, memoryview(arrays[0][i]))
+            buffer.set_res(i, memoryview(arrays[1][i]))
         run()
         state = after[-1].copy()
     return found[:N, :m], found[:N, m:]
