@@ -151,15 +151,14 @@ def _estimated(model: Dynamics, name: str) -> bool:
     """Is a bias of that input a state already: a constant that acts as the input does?"""
     t, where = model.traced, model.slices()
     slope = ca.jacobian(t.f, t.symbols[name])
-    point = np.random.default_rng(0).standard_normal(200)
     for s in model.states:
         own = where[s.name]
         if s.size != slope.size2() or not t.f[own].is_zero():
             continue
-        pair = ca.vertcat(ca.vec(ca.densify(slope)), ca.vec(ca.densify(t.A[:, own])))
-        free = ca.symvar(pair)
-        numbers = [point[k] for k in range(len(free))]
-        found = np.array(ca.Function("pair", free, [pair])(*numbers)).reshape(2, -1)
+        pair = ca.horzcat(ca.vec(slope), ca.vec(t.A[:, own]))
+        sample = ca.vertcat(t.x, *[ca.vec(symbol) for symbol in t.symbols.values()])
+        point = np.random.default_rng(0).standard_normal(sample.numel())
+        found = ca.Function("pair", [sample], [ca.densify(pair)])(point).full().T
         if np.allclose(found[0], -found[1]):
             return True
     return False

@@ -123,7 +123,7 @@ def _best_colour(fit: Fit, run: Run, name: str, where: slice) -> Fit:
     """From the middle of the correlation times towards where the likelihood rises."""
     step = float(np.median(np.diff(fit.found.time)))
     signal = next(s for s in fit.base.signals if s.name == name)
-    std = float(np.median(np.abs(fit.found.innovations[:, where]))) / 2
+    std = float(np.nanmedian(np.abs(fit.found.innovations[:, where]))) / 2
     done: dict[int, Fit] = {}
 
     def at(k: int) -> float:

@@ -122,7 +122,8 @@ class _Loop:
         there = [c for c, _ in fit.added]
         rest = [c for c in self.tried if c not in there]
         found = sensitivity(fit.base, fit.added, rest, self.run, fit.found)
-        return scores(found, rest), whiteness(found.z)
+        whole = np.isfinite(fit.found.innovations).all(axis=1)
+        return scores(found, rest), whiteness(found.z[whole])
 
     def _with_effect(self, current: Fit, ranked: list[Score]) -> Fit | None:
         """The fit with the best effect that held-out time confirms; None if none does."""

@@ -30,7 +30,7 @@ _FOURTH = 70.0
 #: An intensity is looked for within so many powers of e around where it begins.
 RANGE = 14.0
 #: Scoring: rounds, difference and largest step of a logarithm, gain in log-likelihood that ends it.
-ROUNDS, STEP, LARGEST, ENOUGH = 30, 1e-3, 3.0, 0.02
+ROUNDS, STEP, LARGEST, ENOUGH = 30, 1e-3, 5.0, 0.1
 
 
 @dataclass(frozen=True)
@@ -131,16 +131,16 @@ def matched(
 
     Information of two of them is Σ(∂e·∂e/s + ½·∂s·∂s/s²) over innovations e of variance s.
     """
-    begin = {**first_guess(ready, run), **(start or {})}
-    names = ready.names
-    logs = middle = np.log([begin[name] for name in names])
-    counted, damping = _counted(ready, used), 1e-3
+    names, counted, damping = ready.names, _counted(ready, used), 1e-3
+    guess = first_guess(ready, run)
+    middle = np.log([guess[name] for name in names])
+    starts = [middle] + ([np.log([{**guess, **start}[n] for n in names])] if start else [])
 
     def at(where: Array) -> tuple[Array, Array, float]:
         e, s = whitened(ready, dict(zip(names, np.exp(where).tolist(), strict=True)))
         return e, s, _log_density(ready, e, s, used)
 
-    e, s, best = at(logs)
+    logs, (e, s, best) = max(((x, at(x)) for x in starts), key=lambda pair: pair[1][2])
     for _ in range(ROUNDS):
         slopes = [_slope(at(logs + STEP * unit), e, s, counted) for unit in np.eye(len(names))]
         of_e, of_s = (np.array([pair[k] for pair in slopes]) for k in range(2))

@@ -39,6 +39,8 @@ def motion_result(
     left = closing.left
     misfit = left.p_value < UNEXPLAINED
     period = float(np.median(np.diff(after.found.time)))
+    complete = np.isfinite(after.found.innovations).all(axis=1)
+    between = float(np.median(np.diff(after.found.time[complete])))
     return {
         "casest": __version__,
         "model": model_name,
@@ -60,7 +62,7 @@ def motion_result(
         "invisible": [i for s in closing.first for i in _invisible(s, closing)],
         "unexplained": {
             "fraction": plain(left.share if misfit else 0.0),
-            "where": f"innovations foretell those within {left.lag * period:.3g} s after them"
+            "where": f"innovations foretell those within {left.lag * between:.3g} s after them"
             if misfit else "",
         },
         "moved": _moved(closing),
@@ -245,9 +247,8 @@ def _moved(closing: MotionClosing) -> dict[str, Any]:
 def _innovations(fit: Fit) -> dict[str, Any]:
     nu, counted = fit.found.innovations, settled(fit)
     normalised = fit.found.normalised_innovations
-    pairs = [(nu[:-1, k], nu[1:, k]) for k in range(nu.shape[1])]
-    both = [np.isfinite(a) & np.isfinite(b) for a, b in pairs]
-    lag1 = [np.corrcoef(a[g], b[g])[0, 1] for (a, b), g in zip(pairs, both, strict=True)]
+    whole = nu[np.isfinite(normalised)]
+    lag1 = [np.corrcoef(own[:-1], own[1:])[0, 1] for own in whole.T]
     return {
         "rms": plain(np.sqrt(np.nanmean(nu[counted] ** 2, axis=0))),
         "normalised_mean": plain(np.nanmean(normalised[counted])),
