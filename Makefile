@@ -49,6 +49,7 @@ study-loop: $(READY)
 
 study-motion: $(READY)
 	$(BIN)/python studies/flight.py
+	$(BIN)/python studies/flight_loop.py
 
 figures: $(READY)
 	$(BIN)/python studies/figures.py

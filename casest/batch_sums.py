@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 
 from casest.declaring.shapes import Array
 from casest.engine import Plan, Replay
-from casest.engine.replay import _KERNELS, Entry, Kernel
+from casest.engine.replay import KERNELS, Entry, Kernel
 
 #: Numbers per call: enough to hide the cost of the call, few enough to stay in the cache.
-NUMBERS = 12288
+NUMBERS = 16384
 #: Fewest sensors side by side: NumPy adds in another order along rows that are shorter.
 NARROWEST = 32
 
@@ -63,12 +63,12 @@ def chunk(samples: int) -> int:
     It must not depend on the number of sensors: sums of chunks are added, and each sensor's digits
     would depend on how many others there are.
     """
-    return min(samples, 12 if samples <= 64 else 48 if samples <= 1024 else NUMBERS // NARROWEST)
+    return min(samples, 8 if samples <= 64 else 48 if samples <= 1024 else NUMBERS // NARROWEST)
 
 
 def widest(samples: int) -> int:
     """Sensors side by side for records of so many samples."""
-    return NUMBERS // max(chunk(samples), 12)
+    return NUMBERS // max(chunk(samples), 8)
 
 
 class SideBySide:
@@ -153,7 +153,7 @@ def _computed(plan: Plan, i: int) -> bool:
 
 def _call(plan: Plan, i: int, place: dict[int, Array]) -> tuple[Kernel, tuple[Array, ...]]:
     value = plan.graph.values[i]
-    return _KERNELS[value.code], (*(place[j] for j in value.operands), place[i])
+    return KERNELS[value.code], (*(place[j] for j in value.operands), place[i])
 
 
 def _copied(value: Array, out: Array) -> None:

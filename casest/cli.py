@@ -232,7 +232,13 @@ def close(model_name: str, data: tuple[str, ...], **options: Any) -> int:
 
     Verdict `adequate`: nothing that these data can show is missing; `extended`: effects were added
     and what is left is noise; `unexplained`: a misfit remains. Exit code 0 whatever the verdict.
+    Of an estimator in motion the one-step innovations are diagnosed.
     """
+    from casest.dynamics import Dynamics
+    from casest.problem import find_any
+
+    if isinstance(find_any(model_name), Dynamics):
+        return closing_in_motion(model_name, data, options, typed())
     return closing(model_name, data, options, typed())
 
 
@@ -275,6 +281,40 @@ def closing(model_name: str, data: Sequence[str], options: Options, command: str
         click.echo(result.as_json(content), nl=False)
     else:
         click.echo(text.closing_text(found, content, options["output"]))
+    return 0
+
+
+#: Options of `close` that only calibrations have.
+FITTED = ("effects", "per_run", "shared", "fix", "free", "starts", "holdout")
+
+
+def closing_in_motion(model_name: str, data: Sequence[str], options: Options, command: str) -> int:
+    """Filter, diagnose the innovations, add what is missing, save, print."""
+    from casest import result
+    from casest.closing_motion import loop, text, written
+    from casest.report import closing_motion_page
+
+    for name in FITTED:
+        if options[name]:
+            flag = {"starts": "start"}.get(name, name.replace("_", "-"))
+            raise UsageError(
+                f"--{flag} is for calibrations; {model_name} is an estimator in motion: its "
+                "effects and noise are found from the record alone"
+            )
+    moving, run = moving_record(model_name, data, {**options, "intensities": (), "stds": ()})
+    found = loop.close_motion(moving, run, say=progress)
+    content = written.motion_result(found, model_name=model_name, data=data, command=command)
+    if options["output"]:
+        result.save(options["output"], content, written.residual_rows(found))
+        reported(options["output"], closing_motion_page(found, content))
+    if options["as_json"]:
+        click.echo(result.as_json(content), nl=False)
+    else:
+        click.echo(text.motion_text(content, options["output"]))
+    if not content["trusted"]:
+        reason = content["after"]["certificate"]["reasons"][-1]
+        click.echo(f"casest: no trustworthy estimate: {reason}", err=True)
+        return NotTrusted.exit_code
     return 0
 
 

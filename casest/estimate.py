@@ -175,7 +175,10 @@ def _attempt(problem: Problem, start: Mapping[str, Any] | None, solver: str, see
     if solver not in SOLVERS and solver not in own:
         known = ", ".join([*SOLVERS, *own])
         raise UsageError(f"unknown solver {solver!r} for {model.name}; it has {known}")
-    first = problem.start() if start is None else problem.point(_merged(problem, start))
+    try:
+        first = problem.start() if start is None else problem.point(_merged(problem, start))
+    except NotTrusted as error:
+        return _refused(problem, problem.point({}), str(error), began)
     nowhere = _not_finite(problem, first)
     if nowhere:
         return _refused(problem, first, nowhere, began)
@@ -212,7 +215,8 @@ def _enough(problem: Problem) -> None:
 
 def _not_finite(problem: Problem, start: Point) -> str:
     """Where the residual or its derivative is not finite at the start, in words; else empty."""
-    if np.isfinite(problem.cost(start)) and np.all(np.isfinite(problem.normal(start).gradient)):
+    normal = problem.normal(start)
+    if np.isfinite(normal.cost) and np.all(np.isfinite(normal.gradient)):
         return ""
     for run, residual in zip(problem.runs, problem.residuals(start), strict=True):
         bad = np.flatnonzero(~np.isfinite(residual).all(axis=1))
@@ -253,8 +257,10 @@ def _merged(problem: Problem, start: Mapping[str, Any]) -> dict[str, Any]:
 def _estimate(
     problem: Problem, best: Outcome, outcomes: Sequence[Outcome], began: float
 ) -> Estimate:
-    best = _canonical(problem, best)
-    outcomes = [_canonical(problem, outcome) for outcome in outcomes]
+    found, best = best, _canonical(problem, best)
+    outcomes = [
+        best if o is found else o if _beside(o, best) else _canonical(problem, o) for o in outcomes
+    ]
     point = best.point
     factor = problem.factor(point)
     R, _, rest = factor
@@ -309,10 +315,17 @@ def _canonical(problem: Problem, best: Outcome) -> Outcome:
         return best
     values = problem.values(best.point)
     chosen = {k: v for k, v in convention(problem.model, values).items() if k in values}
+    if all(np.allclose(v, values[k], rtol=1e-12, atol=1e-14) for k, v in chosen.items()):
+        return best
     point = problem.point({**values, **chosen})
     cost = problem.cost(point)
     same = abs(cost - best.cost) <= 1e-6 * best.cost + 1e-20
     return replace(best, point=point, cost=min(cost, best.cost)) if same else best
+
+
+def _beside(other: Outcome, best: Outcome) -> bool:
+    """Is an outcome so near to the best that it is in the same convention already?"""
+    return np.allclose(other.point.x, best.point.x, rtol=1e-3, atol=1e-9)
 
 
 def _by_estimator(optimum: Estimate, function: Callable[..., Any], name: str) -> Estimate:

@@ -6,6 +6,7 @@ parameters that each run has for itself, run after run. Every run sees its own s
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
@@ -29,7 +30,7 @@ from casest.engine import (
     summed,
     triangular_factor,
 )
-from casest.errors import DataError, UsageError
+from casest.errors import DataError, NotTrusted, UsageError
 from casest.modelling.model import Model
 from casest.modelling.tracing import function_of, sample_symbol
 from casest.persample import residual_and_jacobian
@@ -68,6 +69,8 @@ class Block(NamedTuple):
     weights: Array | None
 
 
+#: Points whose normal equations are kept: a solution is asked for again by who judges it.
+LATEST = 16
 #: Samples that are evaluated at once where every residual is looked at on its own.
 BLOCK = 32_768
 #: Records smaller than this (numbers) are copied once into columns, which are quicker to read.
@@ -124,6 +127,13 @@ class Problem:
             order = [own[p.name] for p in self.model.parameters]
             selections.append((_indices(s.x for s in order), _indices(s.ref for s in order)))
         return tuple(selections)
+
+    @cached_property
+    def _alone(self) -> bool:
+        """Is there one run, with the unknowns in the same order?"""
+        return len(self.runs) == 1 and np.array_equal(
+            self._selections[0][0], np.arange(self.unknowns)
+        )
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -210,7 +220,13 @@ class Problem:
 
     @cached_property
     def _start(self) -> Point:
-        values = self.model.starter(self.model, self.runs) if self.model.starter else {}
+        try:
+            values = self.model.starter(self.model, self.runs) if self.model.starter else {}
+        except np.linalg.LinAlgError as error:
+            raise NotTrusted(
+                f"{self.model.name}: no start values follow from these readings ({error}); are "
+                "they all alike?"
+            ) from error
         known = {p.name for p in self.model.parameters}
         return self.point({k: v for k, v in values.items() if k in known})
 
@@ -296,16 +312,22 @@ class Problem:
 
     def thinned(self, every: int) -> Problem:
         """The same problem on one sample in `every`: for a start, never for a result."""
-        runs = tuple(run.take(slice(None, None, every)) for run in self.runs)
-        weights = None if self.weights is None else tuple(w[::every] for w in self.weights)
-        return Problem(self.model, runs, weights)
+        if every not in self._thinned:
+            runs = tuple(run.take(slice(None, None, every)) for run in self.runs)
+            weights = None if self.weights is None else tuple(w[::every] for w in self.weights)
+            self._thinned[every] = Problem(self.model, runs, weights)
+        return self._thinned[every]
+
+    @cached_property
+    def _thinned(self) -> dict[int, Problem]:
+        return {}
 
     @property
     def sequential(self) -> bool:
         """Does a sample's residual depend on the samples before?"""
         return self._recursion is not None
 
-    @property
+    @cached_property
     def _with_jacobian(self) -> Replay:
         return residual_and_jacobian(self.model)
 
@@ -377,19 +399,21 @@ class Problem:
         return sum(self._run_cost(point, r) for r in range(len(self.runs)))
 
     def normal(self, point: Point) -> Normal:
-        """Cost, gradient (n,) and Gauss-Newton matrix (n, n); those of the last point are kept."""
+        """Cost, gradient (n,) and Gauss-Newton matrix (n, n); those of the last points are kept."""
         for known, normal in self._latest:
             if known is point:
                 return normal
         normal = self._normal(point)
-        self._latest[:] = [(point, normal)]
+        self._latest.append((point, normal))
         return normal
 
     @cached_property
-    def _latest(self) -> list[tuple[Point, Normal]]:
-        return []
+    def _latest(self) -> deque[tuple[Point, Normal]]:
+        return deque(maxlen=LATEST)
 
     def _normal(self, point: Point) -> Normal:
+        if self._alone:
+            return self._run_normal(point, 0)
         total, gradient = 0.0, np.zeros(self.unknowns)
         matrix = np.zeros((self.unknowns, self.unknowns))
         for r in range(len(self.runs)):

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +42,8 @@ Array = NDArray[np.float64]
 #: Readings are averaged over this time, in s, before the motion is sought: at 20 rad/s that takes
 #: 0.7 % off what goes round, and the slip of a turn begins at 150 rad/s.
 BIN = 0.02
+#: Slow phase below which a motion is found, rad: the readings' noise hides less.
+SETTLED = 1e-3
 #: Degree up to which the angle is looked at for what a cubic speed law lacks (speed_polynomial's).
 HIGHER = 8
 #: Windows of whole turns: as many where there are that many turns, and what is too few for a test.
@@ -104,6 +106,12 @@ class Motion:
         coefficients[0] += angle
         return Motion(coefficients)
 
+    def plus(self, other: Motion) -> Motion:
+        """The sum of two phases."""
+        size = max(len(self.coefficients), len(other.coefficients))
+        parts = (np.pad(c, (0, size - len(c))) for c in (self.coefficients, other.coefficients))
+        return Motion(np.add(*parts))
+
 
 def find_motion(t: Array, v: Array) -> Motion:
     """Phase of the turning, up to a constant and its sign, from readings (N, 3).
@@ -124,7 +132,10 @@ def find_motion(t: Array, v: Array) -> Motion:
     cubic = _robust_fit(centres / counts, rates, order)
     motion = Motion(np.polynomial.polynomial.polyint(np.pad(cubic, (0, 3 - order))))
     for _ in range(3):
-        motion = _corrected(motion, t, z, step)
+        left = _slow_phase(motion, t, z, step)
+        motion = motion.plus(left)
+        if np.abs(left.phase(t[:: max(1, len(t) // 100)])).max() < SETTLED:
+            break
     return motion
 
 
@@ -141,11 +152,16 @@ def _averaged(t: Array, v: Array) -> tuple[Array, Array]:
 def _phasor(t: Array, v: Array) -> Any:
     """Complex numbers going round the unit circle once per turn."""
     slow = _slow_columns(t)
-    rest = v - slow @ np.linalg.lstsq(slow, v, rcond=None)[0]
-    u, s, _ = np.linalg.svd(rest, full_matrices=False)
-    if not s[1] > 1e-3 * s[0]:
+    rest = v - slow @ _fitted(slow, v)
+    squares, axes = np.linalg.eigh(rest.T @ rest)
+    if not squares[1] > 1e-6 * squares[2]:
         raise NotTrusted("wheel: the readings do not go round: no turning seen in them")
-    return np.sqrt(len(t) / 2) * (u[:, 0] + 1j * u[:, 1])
+    return rest @ (np.sqrt(len(t) / 2 / squares[:0:-1]) * axes[:, :0:-1] @ [1, 1j])
+
+
+def _fitted(columns: Array, v: Array) -> Array:
+    """Coefficients of least squares, from the normal equations: a start value may be rough."""
+    return np.asarray(np.linalg.lstsq(columns.T @ columns, columns.T @ v, rcond=None)[0])
 
 
 def _slow_columns(t: Array) -> Array:
@@ -178,17 +194,15 @@ def _robust_fit(x: Array, y: Array, degree: int) -> Array:
     return np.asarray(fit)
 
 
-def _corrected(motion: Motion, t: Array, z: Any, step: float, degree: int = 4) -> Motion:
-    """The motion with the slow phase added that is left after turning back by it."""
-    left = z * np.exp(-1j * motion.phase(t))
+def _slow_phase(motion: Motion, t: Array, z: Any, step: float, degree: int = 4) -> Motion:
+    """The slow phase that is left after turning back by a motion."""
+    phase = motion.phase(t)
+    left = z * (np.cos(phase) - 1j * np.sin(phase))
     first = _windows(len(t), step, 1.0)
     counts = np.diff(np.append(first, len(t)))
     slow = np.unwrap(np.angle(_window_sums(left, first)))
     centres = np.add.reduceat(t, first) / counts
-    more = np.polynomial.polynomial.polyfit(centres, slow, min(degree, len(first) - 1))
-    size = max(len(motion.coefficients), len(more))
-    parts = [np.pad(c, (0, size - len(c))) for c in (motion.coefficients, more)]
-    return Motion(parts[0] + parts[1])
+    return Motion(np.polynomial.polynomial.polyfit(centres, slow, min(degree, len(first) - 1)))
 
 
 # -- everything else, linear once the motion is known ----------------------------------------------
@@ -216,17 +230,36 @@ def _number(declared: Model, name: str) -> float | None:
 def _one_run(declared: Model, run: Run) -> dict[str, Array]:
     t, v = _averaged(run.signals["t"][:, 0], run.signals["v"])
     motion = find_motion(t, v)
-    both = [_from_motion(declared, t, v, motion.shifted(0.0, sign)) for sign in (1, -1)]
+    turning = _turning(motion, t, v)
+    mirrored = turning._replace(sine=-turning.sine)  # the same, gone round the other way
+    both = [
+        _from_motion(declared, motion.shifted(0.0, sign), seen)
+        for sign, seen in ((1, turning), (-1, mirrored))
+    ]
     return min(both, key=lambda values: float(np.linalg.norm(values["offset"])))
 
 
-def _from_motion(declared: Model, t: Array, v: Array, motion: Motion) -> dict[str, Array]:
+class _Turning(NamedTuple):
+    """Readings as level + radial·ϑ̇² + cosine·cos ϑ + sine·sin ϑ, (3,) each."""
+
+    level: Array
+    radial: Array
+    cosine: Array
+    sine: Array
+
+
+def _turning(motion: Motion, t: Array, v: Array) -> _Turning:
     """v = o + ΓR a(t) is linear in ΓR's first two columns once ϑ(t) is known (1, 6)."""
     phase, rate = motion.phase(t), motion.rate(t)
     size = np.mean(rate**2)
     columns = np.column_stack([np.ones_like(t), rate**2 / size, np.cos(phase), np.sin(phase)])
-    level, radial, c, s = np.linalg.lstsq(columns, v, rcond=None)[0]
-    radial = radial / size  # ΓR₁·r
+    level, radial, cosine, sine = _fitted(columns, v)
+    return _Turning(level, radial / size, cosine, sine)
+
+
+def _from_motion(declared: Model, motion: Motion, turning: _Turning) -> dict[str, Array]:
+    """Every parameter, from what the readings do as the wheel turns."""
+    level, radial, c, s = turning  # radial = ΓR₁·r
     # The phase counts from where gravity pulls along the radial axis: c·cos δ + s·sin δ ∥ radial.
     shift = float(np.arctan2(s @ radial, c @ radial))
     along, across = c * np.cos(shift) + s * np.sin(shift), s * np.cos(shift) - c * np.sin(shift)
@@ -479,7 +512,8 @@ def law_misfit(t: Array, v: Array) -> LawMisfit | None:
     width = float(np.sqrt(max(step**2 - short**2, 0.0)))
     motion = find_motion(t, v)
     for _ in range(3):
-        motion = _corrected(motion, t, _circular(t, v, motion, width), step, HIGHER)
+        left = _slow_phase(motion, t, _circular(t, v, motion, width), step, HIGHER)
+        motion = motion.plus(left)
     found = _by_turns(motion, t, _circular(t, v, motion, width))
     if found is None:
         return None

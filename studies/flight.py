@@ -1,6 +1,6 @@
 """Batista et al., section V-B, repeated: bias and gravity of a moving body, 300 s at 100 Hz.
 
-    make study-motion                     # python studies/flight.py: about ten minutes
+    make study-motion                     # python studies/flight.py: about twenty minutes
     python studies/flight.py --quick      # few runs; flight.md left as it is
 
 His sensor noises, start, Ξ and Θ; Fig. 3's trajectory is not published, so two of ours are stated
@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import os
 import sys
+import textwrap
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -331,9 +332,9 @@ independent ones and scatters.
 CLAIM = """The claim "well below the noise of the accelerometer" (0.0013 m/s²): for the bias it can
 be true, the bound is {bias:.5f} m/s². For gravity it cannot: the bound is {gravity:.5f} m/s² on
 one axis ({least:.5f} to {most:.5f} on the three), {share:.2f} of that noise, and the published
-tuning ends at {published}. Its own covariance says {says} times as much as its errors are: it is tuned for
-readings worse than the stated ones, and its innovations and normalised errors are far outside their
-χ² distributions."""
+tuning ends at {published}. Its own covariance says {says} times as much as its errors are: it is
+tuned for readings worse than the stated ones, and its innovations and normalised errors are far
+outside their χ² distributions."""
 
 
 def claim(drawn: dict[str, Any], lines: list[str], t: Array) -> str:
@@ -345,7 +346,7 @@ def claim(drawn: dict[str, Any], lines: list[str], t: Array) -> str:
     ]
     gravity = rms(limit, PARTS["gravity"])
     axes = [rms(limit, slice(k, k + 1)) for k in range(3, 6)]
-    return CLAIM.format(
+    said = CLAIM.format(
         least=min(axes),
         most=max(axes),
         bias=rms(limit, PARTS["bias"]),
@@ -354,6 +355,7 @@ def claim(drawn: dict[str, Any], lines: list[str], t: Array) -> str:
         published=" and ".join(ends) + " m/s² on the two trajectories",
         says=" to ".join(f"{s:.0f}" for s in sorted(says)),
     )
+    return textwrap.fill(said, 98)
 
 
 def main() -> None:

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from casest.cli import run
+from casest.solve import strategy
+from casest.solve.trust_region import trust_region
 
 HEAD = """
 import os, signal as signals
@@ -97,6 +99,38 @@ def test_a_point_that_is_not_finite_on_the_way_is_stepped_back_from(line, capsys
     assert code == 0
     assert abs(result["estimate"]["parameters"]["b"]["value"] - 25) < 0.5
     assert "WARNING" not in capsys.readouterr().err
+
+
+def test_a_start_that_cannot_be_computed_is_no_traceback(line, capsys):
+    more = """
+import numpy
+def begin(model, runs):
+    return {"a": numpy.linalg.inv(numpy.zeros((2, 2)))}
+bad = bad.starting(begin)
+"""
+    path = declared(line, "a=param(start=1.0), b=param(start=1.0)", "a + b * x", more)
+    code, result = fitted(line, path)
+    shown = capsys.readouterr().err
+    assert code == 2
+    assert (result["trusted"], result["verdict"]) == (False, None)
+    assert "no start values follow from these readings (Singular matrix)" in shown
+
+
+def test_a_solver_that_runs_out_of_iterations_is_not_trusted(line, monkeypatch, capsys):
+    """Twenty iterations would do from this start; none of the ways is given more than one."""
+
+    def hasty(problem, start, **options):
+        return trust_region(problem, start, **{**options, "max_iterations": 1})
+
+    monkeypatch.setattr(strategy, "trust_region", hasty)
+    path = declared(line, "a=param(start=40.0), b=param(start=-6.0)", "a * exp(b * x / 10)")
+    model = [path, str(line / "d.csv"), "--solver", "trust-region", "-o", str(line / "out")]
+    code = run(["calibrate", *model])
+    result = json.loads((line / "out" / "result.json").read_text())
+    assert code == 2
+    assert result["trusted"] is False
+    assert "not a stationary point" in result["estimate"]["certificate"]["reasons"][0]
+    assert "standard deviations long" in capsys.readouterr().err
 
 
 def test_ctrl_c_keeps_the_best_point_so_far_and_trusts_nothing(line, capsys):

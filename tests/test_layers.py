@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 ROOT = Path(__file__).parents[1]
@@ -36,13 +37,13 @@ FLOORS = [
         "casest.batch_verdicts",
     ],
     ["casest.result", "casest.problem", "casest.earth", "casest.effects"],
-    ["casest.closing", "casest.observing"],
+    ["casest.closing", "casest.closing_motion", "casest.observing"],
     ["casest.values", "casest.applying", "casest.demonstration", "casest.export"],
     ["casest.exporting", "casest.simulating"],
     ["casest.compare"],
     ["casest.terminal"],
     ["casest.comparing_text", "casest.comparing_plot"],
-    ["casest.closing.text"],
+    ["casest.closing.text", "casest.closing_motion.text"],
     ["casest.report"],
     ["casest.cli"],
 ]
@@ -163,3 +164,20 @@ def test_help_of_every_command_needs_neither_numpy_nor_casadi():
         "print('heavy:', sorted({'numpy', 'casadi'} & set(sys.modules)))\n"
     )
     assert python(code).endswith("heavy: []\n")
+
+
+def test_a_small_calibration_loads_nothing_it_does_not_need(tmp_path):
+    rng = np.random.default_rng(0)
+    v = rng.standard_normal((60, 3))
+    v *= 9.8 / np.linalg.norm(v, axis=1)[:, None]
+    names = "vx [m/s^2],vy [m/s^2],vz [m/s^2]"
+    noisy = v * [1.01, 0.99, 1.02] + 0.01 * rng.standard_normal(v.shape)
+    np.savetxt(tmp_path / "n.csv", noisy, delimiter=",", header=names, comments="")
+    code = (
+        "import sys\n"
+        "from casest.cli import run\n"
+        f"assert run(['calibrate', 'norm-diagonal', {str(tmp_path / 'n.csv')!r}]) == 0\n"
+        "slow = {'scipy.stats', 'scipy.optimize', 'matplotlib', 'pandas', 'pint', 'pyarrow'}\n"
+        "print('slow:', sorted(slow & set(sys.modules)))\n"
+    )
+    assert python(code).endswith("slow: []\n")

@@ -312,6 +312,19 @@ def test_matlab_v73_is_refused_with_the_command_that_helps(tmp_path: Path) -> No
     assert "'-v7')" in error_of(tmp_path, head + b"\x00" * 512, "a.mat")
 
 
+def test_a_parquet_file_read_in_pieces_is_the_one_read_whole(tmp_path: Path, monkeypatch) -> None:
+    rng, file = np.random.default_rng(0), tmp_path / "a.parquet"
+    content = {"v": rng.standard_normal(100), "n": rng.integers(0, 9, 100)}
+    labels = [f"r{k // 30}" for k in range(100)]
+    table = pyarrow.table({**content, "run": labels})
+    pyarrow.parquet.write_table(table, file, row_group_size=33)
+    monkeypatch.setattr("casest.data.arrays.PIECE", 7)
+    found = read_table(file)
+    for name, values in content.items():
+        np.testing.assert_array_equal(found.columns[name].values, values)
+    assert found.columns["run"].values.tolist() == labels
+
+
 def test_parquet_keeps_units_labels_nulls_and_times(tmp_path: Path) -> None:
     vx = pyarrow.field("vx", pyarrow.float32(), metadata={"unit": "g"})
     schema = pyarrow.schema(

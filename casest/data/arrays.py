@@ -14,6 +14,11 @@ from casest.data.column import Column, numeric_column, text_column
 from casest.data.delimited import Contents
 from casest.errors import DataError
 
+#: Rows of a Parquet file that are read at once.
+PIECE = 65_536
+_TEXT = ("bool", "string", "large_string", "dictionary")
+_NUMBER = ("timestamp", "int", "uint", "float", "double", "halffloat", "decimal")
+
 
 def read_npy(file: Path) -> Contents:
     """Read one array: (N, k) gives columns "0".."k-1"; a structured (N,) its fields."""
@@ -60,35 +65,60 @@ def read_matlab(file: Path) -> Contents:
 
 
 def read_parquet(file: Path) -> Contents:
-    """Read a Parquet table; a field's metadata may hold its `unit`; times become seconds."""
+    """Read a Parquet table; a field's metadata may hold its `unit`; times become seconds.
+
+    In pieces, so that no more than one of them is held beside the columns.
+    """
     import pyarrow
     import pyarrow.parquet
 
     try:
-        table = pyarrow.parquet.read_table(str(file))
+        table = pyarrow.parquet.ParquetFile(str(file), pre_buffer=False)
+        columns, notes = _parquet_columns(table)
     except (pyarrow.ArrowException, OSError) as error:
         text = str(error).splitlines()[0]
         raise DataError(f"{file}: cannot be read as Parquet ({text})") from error
-    columns, notes = [], []
-    for entry in table.schema:
-        kind, values = str(entry.type), table.column(table.schema.get_field_index(entry.name))
-        unit = (entry.metadata or {}).get(b"unit", b"").decode()
-        header = f"{entry.name} [{unit}]" if unit else entry.name
-        if kind.startswith("timestamp"):
-            values = values.cast(pyarrow.timestamp("ns")).cast(pyarrow.int64())
-            columns.append(numeric_column(f"{entry.name} [ns]", _floats(values), None))
-        elif kind in ("bool", "string", "large_string") or kind.startswith("dictionary"):
-            texts = ["" if v is None else str(v) for v in values.to_pylist()]
-            columns.append(text_column(header, texts))
-        elif kind.startswith(("int", "uint", "float", "double", "halffloat", "decimal")):
-            columns.append(numeric_column(header, _floats(values), None))
-        else:
-            notes.append(f"column {entry.name} of type {kind} left out")
     return Contents(columns, notes)
 
 
-def _floats(values: Any) -> NDArray[np.float64]:
-    return np.array(values.to_numpy(), dtype=np.float64)
+def _parquet_columns(table: Any) -> tuple[list[Column], list[str]]:
+    kinds = {entry.name: str(entry.type) for entry in table.schema_arrow}
+    texts: dict[str, list[str]] = {n: [] for n, kind in kinds.items() if kind.startswith(_TEXT)}
+    numbers = {
+        name: np.empty(table.metadata.num_rows)
+        for name, kind in kinds.items()
+        if kind.startswith(_NUMBER)
+    }
+    first, wanted = 0, [*texts, *numbers]
+    for piece in table.iter_batches(batch_size=PIECE, columns=wanted) if wanted else ():
+        for name, values in zip(piece.schema.names, piece.columns, strict=True):
+            if name in numbers:
+                numbers[name][first : first + len(values)] = _floats(values, kinds[name])
+            else:
+                texts[name] += ["" if v is None else str(v) for v in values.to_pylist()]
+        first += len(piece)
+    columns, notes = [], []
+    for entry in table.schema_arrow:
+        unit = (entry.metadata or {}).get(b"unit", b"").decode()
+        if kinds[entry.name].startswith("timestamp"):
+            unit = "ns"
+        header = f"{entry.name} [{unit}]" if unit else entry.name
+        if entry.name in numbers:
+            columns.append(numeric_column(header, numbers[entry.name], None))
+        elif entry.name in texts:
+            columns.append(text_column(header, texts[entry.name]))
+        else:
+            notes.append(f"column {entry.name} of type {kinds[entry.name]} left out")
+    return columns, notes
+
+
+def _floats(values: Any, kind: str) -> NDArray[np.float64]:
+    """Numbers of one piece; times in ns."""
+    import pyarrow
+
+    if kind.startswith("timestamp"):
+        values = values.cast(pyarrow.timestamp("ns")).cast(pyarrow.int64())
+    return np.asarray(values.to_numpy(zero_copy_only=False), dtype=np.float64)
 
 
 def _loaded(file: Path) -> Any:

@@ -38,7 +38,7 @@ class Run:
     columns: Mapping[str, Array | Labels]
     column_units: Mapping[str, str | None]
     time: Array | None
-    rows: Index
+    rows: Index | range
     block: Index
     count: Index
     spread: Mapping[str, Array]
@@ -72,10 +72,9 @@ class Run:
     ) -> Run:
         """Make a run of one block from arrays alone, as a simulation does."""
         n = len(next(iter(signals.values())))
-        # One number seen n times: a long record needs no arrays of zeros and ones.
+        # One number seen n times: a long record needs no arrays of zeros, ones and counts.
         zeros, ones = (np.broadcast_to(np.array([k]), (n,)) for k in (0, 1))
-        rows = np.arange(n)
-        return cls(name, file, signals, units, {}, {}, time, rows, zeros, ones, {}, notes)
+        return cls(name, file, signals, units, {}, {}, time, range(n), zeros, ones, {}, notes)
 
     def __len__(self) -> int:
         """Return the number of samples N."""
@@ -83,12 +82,13 @@ class Run:
 
     def take(self, chosen: NDArray[np.int_] | NDArray[np.bool_] | slice) -> Run:
         """Return the samples given by an index, a mask or a slice, as a run of the same name."""
+        rows = self.rows[chosen] if isinstance(chosen, slice) else np.asarray(self.rows)[chosen]
         return replace(
             self,
             signals={name: values[chosen] for name, values in self.signals.items()},
             columns={name: values[chosen] for name, values in self.columns.items()},
             time=None if self.time is None else self.time[chosen],
-            rows=self.rows[chosen],
+            rows=rows,
             block=self.block[chosen],
             count=self.count[chosen],
             spread={name: values[chosen] for name, values in self.spread.items()},

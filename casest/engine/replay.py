@@ -84,7 +84,7 @@ def _erf(a: Floats, out: Floats) -> None:
     erf(a, out)
 
 
-_KERNELS: dict[int, Kernel] = {
+KERNELS: dict[int, Kernel] = {
     ca.OP_ADD: np.add,
     ca.OP_SUB: np.subtract,
     ca.OP_MUL: np.multiply,
@@ -174,7 +174,7 @@ class _Graph:
                 register[target[0]] = self._add(_Value("constant", constant=constant))
             elif code == ca.OP_INPUT:
                 register[target[0]] = self._add(_input(source[0], source[1]))
-            elif code in _KERNELS:
+            elif code in KERNELS:
                 operands = tuple(register[i] for i in source)
                 register[target[0]] = self._add(self._operation(code, operands))
             else:
@@ -390,7 +390,7 @@ class _Workspace:
 
     def _call(self, i: int, place: dict[int, Floats]) -> tuple[Kernel, tuple[Floats, ...]]:
         value = self.plan.graph.values[i]
-        return _KERNELS[value.code], (*(place[j] for j in value.operands), place[i])
+        return KERNELS[value.code], (*(place[j] for j in value.operands), place[i])
 
 
 def _run(calls: list[tuple[Kernel, tuple[Floats, ...]]]) -> None:

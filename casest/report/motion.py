@@ -139,10 +139,10 @@ def filter_page(found: Filtered, content: Mapping[str, Any]) -> str:
     """`report.html` of `casest filter`."""
     figures = Figures()
     body = [
-        section("states", "States", *_states(found, figures)),
+        section("states", "States", *state_figures(found, figures)),
         _final(content),
-        section("innovations", "Innovations", *_innovations(found, content, figures)),
-        _conventions(found.model),
+        section("innovations", "Innovations", *innovation_figures(found, content, figures)),
+        conventions(found.model),
         reproduction(content),
     ]
     said = filter_verdict(content)
@@ -155,7 +155,7 @@ def filter_page(found: Filtered, content: Mapping[str, Any]) -> str:
     return whole(content["model"], verdict, under, body, content, figures)
 
 
-def _states(found: Filtered, figures: Figures) -> Iterator[str]:
+def state_figures(found: Filtered, figures: Figures) -> Iterator[str]:
     """Each state with its band, filtered beside smoothed."""
     t, every = _thin(found.time)
     smooth = np.sqrt(np.diagonal(found.smoothed_P, axis1=1, axis2=2))
@@ -207,7 +207,9 @@ def _final(content: Mapping[str, Any]) -> str:
     return section("parameters", "At the end of the record", table(head, rows, [1, 2, 3]))
 
 
-def _innovations(found: Filtered, content: Mapping[str, Any], figures: Figures) -> Iterator[str]:
+def innovation_figures(
+    found: Filtered, content: Mapping[str, Any], figures: Figures
+) -> Iterator[str]:
     """Each reading's surprise with the band that the filter expects, and its autocorrelation."""
     said = content["innovations"]
     names, units = _outputs(found)
@@ -274,7 +276,8 @@ def _outputs(found: Filtered) -> tuple[list[str], list[str]]:
     return names, units
 
 
-def _conventions(model: Dynamics) -> str:
+def conventions(model: Dynamics) -> str:
+    """What the declaration says of itself, and the noise that drives its states."""
     words = inspect.getdoc(model.function) or ""
     said = [paragraph(part.replace("\n", " ")) for part in words.split("\n\n") if part]
     rows = [

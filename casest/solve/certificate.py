@@ -8,7 +8,7 @@ the intervals that will be printed describe the cost around it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,8 +20,8 @@ from casest.solve.outcome import Outcome
 from casest.solve.profile import Profile, half_width, profiled
 from casest.solve.trust_region import LITTLE, trust_region
 from casest.stack import Point, Problem
+from casest.sums import few_of, second_order
 from casest.sums import rounding as rounding_error
-from casest.sums import second_order
 
 #: Share of the residual that the Jacobian can still reach (Bates & Watts' relative offset).
 SLOPE = 1e-5
@@ -222,11 +222,13 @@ def _shape(
     """
     norms = np.linalg.norm(R, axis=0)
     _, singular, Vt = np.linalg.svd(R / norms)
-    ratios, words = [1.0], []
+    ratios, words, few = [1.0], [], _few_around(problem, best.point, sigma)
     for k in range(len(norms) - 1, -1, -1):
         for sign in (1, -1):
             step = sign * 2 * sigma / singular[k] * Vt[k] / norms
-            ratio = _rise(problem, best, best.point, step, sigma)
+            ratio = few(step) if few else None
+            if ratio is None or not LINEAR[0] <= ratio <= LINEAR[1]:
+                ratio = _rise(problem, best, best.point, step, sigma)
             if SHAPE[1] < ratio <= BENT:
                 row = Vt[k] * norms * singular[k]
                 there = profiled(problem, best.point, step, row)
@@ -235,6 +237,31 @@ def _shape(
                 words.append(_misshapen(problem, step, norms, ratio))
             ratios.append(ratio)
     return (float(min(ratios)), float(max(ratios))), words[:1]
+
+
+def _few_around(
+    problem: Problem, point: Point, sigma: float
+) -> Callable[[Array], float | None] | None:
+    """The same ratio as a few of the samples see it, for long records; None where they cannot.
+
+    They cannot where the direction is told by others: their own parabola must be as steep as that
+    of all, to a factor of two. Only what they find harmless is believed.
+    """
+    few = few_of(problem)
+    if few is None:
+        return None
+    here, share = few.normal(point), few.residual_count / problem.residual_count
+    lower, upper = problem.bounds
+
+    def ratio(step: Array) -> float | None:
+        x, assumed = point.x + step, 0.5 * float(step @ here.matrix @ step)
+        inside = bool(np.all((x >= lower) & (x <= upper)))
+        if not (inside and 0.5 <= assumed / (2 * sigma**2 * share) <= 2.0):
+            return None
+        rise = few.cost(few.moved(point, step)) - here.cost - float(here.gradient @ step)
+        return rise / assumed
+
+    return ratio
 
 
 def _ambiguous(

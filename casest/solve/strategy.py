@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -21,6 +21,7 @@ from casest.solve.ipopt import ipopt
 from casest.solve.outcome import Outcome
 from casest.solve.trust_region import LITTLE, trust_region
 from casest.stack import Point, Problem
+from casest.sums import few_of
 
 #: Iterations after which a second opinion has nothing to say.
 OPINION = 50
@@ -31,8 +32,6 @@ PATIENCE = 1000
 STARTS, SPREAD = 8, 0.3
 #: Still more of them, where these did not all end alike.
 FURTHER = 24
-#: Samples that are enough to come near a solution of a longer record.
-NEARBY = 2000
 #: Ratio of the costs of a few samples from which on there is no need to look at all of them.
 CLEARLY = 1.1
 #: Rise of the cost over that of a parabola within which there is no second valley.
@@ -89,10 +88,8 @@ def _ways(
         main = trust_region(problem, first)
     else:
         main = _polished(problem, ipopt(problem, first, exact=solver == "ipopt-exact"))
-    outcomes = [main, _opinion(problem, first)]
-    if not automatic:
-        # A start of the user's may lie in a wrong valley: the automatic one must agree.
-        outcomes.append(_opinion(problem, problem.start()))
+    # A start of the user's may lie in a wrong valley: the automatic one must agree.
+    outcomes = [main, *_opinions(problem, (first,) if automatic else (first, problem.start()))]
     costs = [_cost(o) for o in outcomes]
     disagree = max(costs) - min(costs) > 1e-6 * max(min(costs), 1e-300)
     # From a start that was declared, not computed, two ways may end in one valley, and the wrong.
@@ -134,12 +131,10 @@ def _nearby(
     And whether it is clear from the few that the rival is better.
     """
     began = time.perf_counter()
-    every = problem.residual_count // (NEARBY * len(problem.model.axes) * len(problem.runs))
-    here = problem.cost(start)
+    thinned, here = few_of(problem), problem.cost(start)
     stay = Outcome("trust-region", start, here, 0, 1, False, "start", 0.0)
-    if every < 2 or problem.sequential:
+    if thinned is None:
         return stay, False
-    thinned = problem.thinned(every)
     # A tenth of the deviations of so few samples is as near as they can say.
     few = trust_region(
         thinned,
@@ -154,14 +149,41 @@ def _nearby(
     return replace(near, cost=min(here, there), seconds=time.perf_counter() - began), worse
 
 
+def _opinions(problem: Problem, starts: Sequence[Point]) -> list[Outcome]:
+    """Opinions from several starts.
+
+    Where a few of the samples lead two starts to one place, the rest of the way is one as well.
+    """
+    found: list[tuple[Outcome, Outcome]] = []
+    for start in starts:
+        near, _ = _nearby(problem, start)
+        same = (o for place, o in found if _one_place(problem, place, near))
+        opinion = next(same, None) or _followed(problem, near)
+        found.append((near, opinion))
+    return [opinion for _, opinion in found]
+
+
+def _one_place(problem: Problem, a: Outcome, b: Outcome) -> bool:
+    """Are the solutions for a few of the samples a tenth of those' deviations apart, or less?"""
+    few = few_of(problem)
+    if few is None or not (a.iterations and b.iterations):
+        return False
+    normal, away = few.normal(a.point), problem.difference(a.point, b.point)
+    freedom = max(few.residual_count - few.unknowns, 1)
+    return bool(away @ normal.matrix @ away <= 1e-2 * 2 * normal.cost / freedom)
+
+
 def _opinion(problem: Problem, start: Point, rival: Outcome | None = None) -> Outcome:
     """Where a trust region ends from a start: near a solution to a fraction of its deviations.
 
     All samples are only looked at where a few of them leave it open which is better, it or a rival.
     """
     near, worse = _nearby(problem, start, rival)
-    if worse:
-        return near
+    return near if worse else _followed(problem, near)
+
+
+def _followed(problem: Problem, near: Outcome) -> Outcome:
+    """Where all samples lead from there."""
     found = trust_region(
         problem,
         near.point,

@@ -23,6 +23,8 @@ ROUGH = 1e-5
 LITTLE = 1e-7
 #: Residuals from which on a QR factor is too dear for a step far away.
 LONG = 5000
+#: Share of the residual in the Jacobian's reach that is left to rounding.
+SETTLED = 1e-12
 #: Range of dampings in which a wary run looks for that of its radius.
 DAMPINGS = (1e-24, 1e24)
 
@@ -201,24 +203,24 @@ def _bounded_step(
 
 
 def _damped(here: _Local, scale: Array, damping: float, free: Array, step: Array) -> Array:
-    fixed = np.logical_not(free)
-    right = -(here.t + here.R[:, fixed] @ step[fixed])
-    A = np.vstack([here.R[:, free], np.diag(np.sqrt(damping) * scale[free])])
-    b = np.concatenate([right, np.zeros(int(free.sum()))])
-    if not (np.all(np.isfinite(A)) and np.all(np.isfinite(b))):
-        return np.full(int(free.sum()), np.nan)
+    count, fixed = int(free.sum()), np.logical_not(free)
     # Unit columns: scales that differ by orders of magnitude must not reach the rank decision.
-    return np.asarray(_least_squares(A / scale[free], b) / scale[free])
+    system = np.zeros((len(here.R) + count, count + 1))
+    system[:-count, :-1] = here.R[:, free] / scale[free]
+    system[:-count, -1] = -(here.t + here.R[:, fixed] @ step[fixed])
+    np.fill_diagonal(system[-count:], np.sqrt(damping))
+    if not np.isfinite(system).all():
+        return np.full(count, np.nan)
+    return np.asarray(_least_squares(system) / scale[free])
 
 
-def _least_squares(A: Array, b: Array) -> Array:
-    """Shortest z of least ‖Az − b‖, (n,)."""
-    n = A.shape[1]
-    factor = cast(Array, np.linalg.qr(np.column_stack([A, b]), mode="r"))
-    pivots = np.abs(np.diag(factor))[:n]
+def _least_squares(system: Array) -> Array:
+    """Shortest z of least ‖Az − b‖, (n,), from [A b]."""
+    factor, n = cast(Array, np.linalg.qr(system, mode="r")), system.shape[1] - 1
+    pivots = np.abs(factor.diagonal())[:n]
     if len(pivots) == n and pivots.min(initial=1.0) > 1e-8 * pivots.max(initial=1.0):
         return np.asarray(np.linalg.solve(factor[:n, :n], factor[:n, n]))
-    return np.asarray(np.linalg.lstsq(A, b, rcond=None)[0])
+    return np.asarray(np.linalg.lstsq(system[:, :n], system[:, n], rcond=None)[0])
 
 
 def _negligible(step: Array, point: Point, scale: Array, here: _Local, gain: float) -> bool:
@@ -232,6 +234,8 @@ def _refine(
 ) -> tuple[Point, _Local]:
     """A few undamped steps: cost differences drown in rounding before the gradient does."""
     for _ in range(3):
+        if _slope(here) <= SETTLED * np.sqrt(2 * here.cost):
+            break
         step = _bounded_step(problem, point, here, scale, 0.0)
         if not np.all(np.isfinite(step)):
             break
