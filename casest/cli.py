@@ -505,7 +505,8 @@ def moving_record(name: str, data: Sequence[str], options: Options) -> tuple[Dyn
     moving = moving_model(name, options)
     if len(data) != 1:
         raise UsageError(f"{name}: a trajectory is one file, not {len(data)}")
-    runs = load_runs(list(data), moving.signals, **reading_arguments(options))
+    gaps = moving.may_be_missing
+    runs = load_runs(list(data), moving.signals, gaps=gaps, **reading_arguments(options))
     if len(runs) != 1:
         raise UsageError(f"{data[0]} holds {len(runs)} runs; a trajectory is one")
     return moving, runs[0]

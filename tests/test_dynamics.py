@@ -106,6 +106,23 @@ def test_the_hidden_direction_is_gravity_and_bias_along_the_axis():
     assert abs(abs(expected @ seen.directions[:, 0]) - 1) < 1e-9
 
 
+def test_a_reading_that_is_missing_tells_nothing():
+    """Half of the velocities: half of the information, but for the stretches' edges."""
+    t = np.arange(0, 20, 0.02)
+    run = motionless(turning("all round", t), t)
+    v = np.zeros((len(t), 3))
+    v[: len(t) // 2] = np.nan
+    part = Run.raw("r", {**run.signals, "v": v}, units={}, time=t)
+    late = run.take(slice(len(t) // 2, None))
+    W = gramian(bias_gravity, linearised(bias_gravity, part))
+    expected = gramian(bias_gravity, linearised(bias_gravity, late))
+    Phi = np.eye(9)
+    for step in transitions(linearised(bias_gravity, run))[0][: len(t) // 2]:
+        Phi = step @ Phi
+    expected = Phi.T @ expected @ Phi
+    np.testing.assert_allclose(W, expected, atol=3e-3 * np.abs(expected).max())
+
+
 def test_with_positions_the_rank_is_full_too():
     t = np.arange(0, 60, 0.02)
     zero, omega = np.zeros((len(t), 3)), turning("all round", t)

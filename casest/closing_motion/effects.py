@@ -235,7 +235,7 @@ def _reading(motion: Motion, given: Mapping[str, SX], candidate: Candidate, k: S
         if o.signal is given[candidate.on] else o
         for o in motion.outputs
     )  # fmt: skip
-    return Motion(rates=motion.rates, outputs=outputs)
+    return replace(motion, outputs=outputs)
 
 
 def _rate(output: Measured, motion: Motion, given: Mapping[str, SX]) -> SX:
@@ -256,7 +256,7 @@ def _coloured(model: Dynamics, colour: Colour) -> Dynamics:
             replace(o, predicted=o.predicted + own) if o.signal is given[colour.on] else o
             for o in motion.outputs
         )
-        return Motion(rates={**motion.rates, name: -own / colour.tau}, outputs=outputs)
+        return replace(motion, rates={**motion.rates, name: -own / colour.tau}, outputs=outputs)
 
     own = state(colour.size, colour.unit, std=colour.std,
                 intensity=2 * colour.std**2 / colour.tau)  # fmt: skip

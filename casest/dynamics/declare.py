@@ -275,6 +275,13 @@ class Dynamics:
         return self.traced.measured
 
     @cached_property
+    def may_be_missing(self) -> tuple[str, ...]:
+        """Signals whose readings may be missing: those that nothing is computed from."""
+        t = self.traced
+        used = ca.vertcat(t.f, t.h, t.g)
+        return tuple(n for n in t.measured if not ca.depends_on(used, flat(t.symbols[n])))
+
+    @cached_property
     def linear(self) -> bool:
         """Are rates and outputs linear in the state?"""
         t = self.traced

@@ -36,7 +36,8 @@ _BLOCK = 256
 class Linearised:
     """ẋ = A x + c, y = C x + d along a record, at every sample.
 
-    time (N,); A (N, n, n), c (N, n), C (N, m, n), d (N, m); y (N, m) with NaN where it is missing;
+    time (N,); A (N, n, n), c (N, n), C (N, m, n), d (N, m); y (N, m) with NaN where it is missing
+    and no row in C;
     process noise intensity Ξ (n, n), or (N, n, n) where inputs have noise of their own.
     """
 
@@ -106,13 +107,15 @@ def linearised(model: Dynamics, run: Run, along: Array | None = None) -> Lineari
     columns = Columns([np.ascontiguousarray(along), *(run.signals[s.name] for s in model.signals)])
     A, c_, C, d_, y, *more = Replay(function)(np.zeros(0), columns)
     process = model.process + more[0] if more else model.process
-    return Linearised(time, A, c_[:, :, 0], C, d_[:, :, 0], y[:, :, 0], process)
+    readings = y[:, :, 0]
+    if not np.isfinite(readings).all():
+        C = np.where(np.isfinite(readings)[:, :, None], C, 0.0)
+    return Linearised(time, A, c_[:, :, 0], C, d_[:, :, 0], readings, process)
 
 
 def _refuse_missing_inputs(model: Dynamics, run: Run) -> None:
-    t = model.traced
     for s in model.signals:
-        used = ca.depends_on(t.f, flat(t.symbols[s.name]))
+        used = s.name not in model.may_be_missing
         bad = np.flatnonzero(~np.isfinite(run.signals[s.name]).all(axis=1))
         if used and bad.size:
             raise DataError(
