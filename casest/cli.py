@@ -444,12 +444,33 @@ def observe(model_name: str, data: tuple[str, ...], **options: Any) -> int:
 )
 @reading_options
 @motion_options
+@click.option(
+    "--noise",
+    type=click.Choice(["declared", "ml"]),
+    default="declared",
+    help="Noise intensities: as declared, or the most likely ones for this record.",
+)
+@click.option(
+    "--sensor-noise",
+    "stated",
+    multiple=True,
+    metavar="SIGNAL=STD",
+    help="Standard deviation of one reading, in the model's unit; its rate is the record's.",
+)
+@click.option(
+    "--rest",
+    type=click.Path(),
+    metavar="FILE",
+    help="A record at rest: noise of the inputs by its Allan deviation.",
+)
 def filter_command(model_name: str, data: tuple[str, ...], **options: Any) -> int:
     """States over time by the Kalman filter and smoother, with innovations diagnosed."""
     from casest import observing, result
 
     moving, run = moving_record(model_name, data, options)
-    content, found = observing.follow(moving, run)
+    tuned, told = tuned_noise(moving, run, options)
+    content, found = observing.follow(moving, run, tuned)
+    content |= told
     content |= {"data": list(data), "reproduce": result.reproduce(typed(), data)}
     if options["output"]:
         from casest.report import filter_page
@@ -461,6 +482,33 @@ def filter_command(model_name: str, data: tuple[str, ...], **options: Any) -> in
         result.as_json(content).rstrip() if options["as_json"] else observing.filter_text(content)
     )
     return 0
+
+
+def tuned_noise(moving: Dynamics, run: Run, options: Options) -> tuple[Any, Options]:
+    """Noise intensities as --noise, --sensor-noise or --rest ask for them, and what a rest said."""
+    from casest import intensities
+    from casest.data import load_runs
+
+    if options["noise"] == "ml":
+        if options["stated"] or options["rest"]:
+            raise UsageError("--noise ml finds every intensity: leave --sensor-noise, --rest out")
+        progress("looking for the most likely noise intensities")
+        return intensities.most_likely(moving, run), {}
+    stds = dict(number_pair(text, "--sensor-noise") for text in options["stated"])
+    stated = intensities.from_stated(moving, run, stds) if stds else None
+    if options["rest"] is None:
+        return stated, {}
+    inputs = [s for s in moving.signals if s.name not in (*moving.measured_signals, "t")]
+    arguments = reading_arguments(options)
+    names = {s.name for s in inputs}
+    for key in ("columns", "units", "scales"):
+        arguments[key] = {n: v for n, v in arguments[key].items() if n in (*names, "t")}
+    (rest,) = load_runs([options["rest"]], inputs, **arguments)[:1]
+    tuned, found = intensities.from_rest(moving, rest)
+    if stated:
+        both = intensities.from_stated(tuned.model, run, stds).model
+        tuned = intensities.Tuned(both, f"{tuned.how} and {stated.how}")
+    return tuned, {"allan": intensities.told(found)}
 
 
 def reported(folder: Path, page: str) -> None:

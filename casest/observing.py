@@ -19,6 +19,7 @@ from casest.dynamics.structural import Structure, structure
 from casest.dynamics.transition import linearised
 from casest.errors import DeclarationError, UsageError
 from casest.estimate import Estimate, attempt
+from casest.intensities import Tuned, intensities, units
 from casest.modelling.model import Model
 from casest.result import plain
 
@@ -152,14 +153,19 @@ def _too_short(seen: Observed, samples: int, duration: float) -> list[str]:
     ]
 
 
-def follow(model: Dynamics, run: Run) -> tuple[dict[str, Any], Filtered]:
-    """States over time by the Kalman filter, and whether the innovations are as expected."""
-    found = filtered(model, run)
-    normalised = found.normalised_innovations
-    whole = normalised[np.isfinite(normalised)]
+def follow(
+    model: Dynamics, run: Run, tuned: Tuned | None = None
+) -> tuple[dict[str, Any], Filtered]:
+    """States over time by the Kalman filter, and whether the innovations are as expected.
+
+    `tuned`: the same model with other noise intensities, used in place of the declared ones, which
+    are shown beside them.
+    """
+    declared = filtered(model, run, smooth=tuned is None)
+    found = filtered(tuned.model, run) if tuned else declared
+    model, before = found.model, model
+    mean, normalised = _normalised_mean(found), found.normalised_innovations
     m = found.innovations.shape[1]
-    half = slice(len(whole) // 10, None)  # the beginning belongs to the start values
-    mean = float(np.mean(whole[half])) if len(whole[half]) else float("nan")
     final = {
         name: {
             "value": plain(found.x[-1][where]),
@@ -175,6 +181,14 @@ def follow(model: Dynamics, run: Run) -> tuple[dict[str, Any], Filtered]:
         "notes": assumed(run),
         "samples": len(found.time),
         "states": final,
+        "intensities": {
+            "how": tuned.how if tuned else "as declared",
+            "declared": _plain_values(intensities(before)),
+            "used": _plain_values(intensities(model)),
+            "spread": _plain_values(tuned.spread) if tuned else {},
+            "units": units(model),
+            "declared_normalised_mean": plain(_normalised_mean(declared)),
+        },
         "innovations": {
             "rms": plain(np.sqrt(np.nanmean(found.innovations**2, axis=0))),
             "normalised_mean": plain(mean),
@@ -183,6 +197,18 @@ def follow(model: Dynamics, run: Run) -> tuple[dict[str, Any], Filtered]:
             "lag1_correlation": plain(_lag1(found.innovations)),
         },
     }, found
+
+
+def _plain_values(values: Mapping[str, float]) -> dict[str, Any]:
+    return {name: plain(value) for name, value in values.items()}
+
+
+def _normalised_mean(found: Filtered) -> float:
+    """Mean of νᵀS⁻¹ν after the first tenth, which belongs to the start values."""
+    normalised = found.normalised_innovations
+    whole = normalised[np.isfinite(normalised)]
+    later = whole[len(whole) // 10 :]
+    return float(np.mean(later)) if len(later) else float("nan")
 
 
 def _median_std(found: Filtered, where: slice) -> Any:
@@ -200,10 +226,10 @@ def states_csv(found: Filtered) -> str:
     """Filtered and smoothed states with standard deviations, a row per sample."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    names, units = found.model.names, found.model.state_units
+    names, own_units = found.model.names, found.model.state_units
     head = ["t [s]"]
     for kind in ("", "std_", "smoothed_", "smoothed_std_"):
-        head += [f"{kind}{n} [{u}]" for n, u in zip(names, units, strict=True)]
+        head += [f"{kind}{n} [{u}]" for n, u in zip(names, own_units, strict=True)]
     writer.writerow(head)
     smooth_std = np.sqrt(np.diagonal(found.smoothed_P, axis1=1, axis2=2))
     table = np.hstack([found.time[:, None], found.x, found.std, found.smoothed, smooth_std])
@@ -221,13 +247,13 @@ def observe_text(content: Mapping[str, Any]) -> str:
     if not content["unobservable"]:
         lines.append("  every unknown is determined by these data")
     lines += ["", "  standard deviation that these data allow:"]
-    units = content.get("units", {})
+    shown_units = content.get("units", {})
     for name, std in content["std"].items():
         rows = std if isinstance(std, list) else [std]
         rows = rows if rows and isinstance(rows[0], list) else [rows]
         for k, row in enumerate(rows):
             shown = ", ".join(map(_number, row))
-            unit = units.get(name, "") if k == 0 else ""
+            unit = shown_units.get(name, "") if k == 0 else ""
             lines.append(f"    {name if k == 0 else '':<16} {shown} {unit}".rstrip())
     if "windows" in content:
         w = content["windows"]
@@ -290,11 +316,41 @@ def filter_text(content: Mapping[str, Any]) -> str:
         for k, (value, std) in enumerate(zip(s["value"], s["std"], strict=True)):
             label = name if len(s["value"]) == 1 else f"{name}[{k}]"
             lines.append(f"    {label:<14} {value:>12.5g} ± {std:<10.2g} {s['unit']}")
+    lines += ["", *intensity_lines(content)]
     i = content["innovations"]
     lines += ["", f"  innovations are {filter_verdict(content)}"]
     if i["missing_readings"]:
         lines.append(f"  {i['missing_readings']} samples without a complete reading")
     return "\n".join([*lines, *_note_lines(content)])
+
+
+def intensity_lines(content: Mapping[str, Any]) -> list[str]:
+    """Noise intensities, declared ones beside those that were used."""
+    said, expected = content["intensities"], content["innovations"]["expected"]
+    declared, used, spread = said["declared"], said["used"], said["spread"]
+    same = declared == used
+    lines = ["  noise intensities " + ("as declared:" if same else f"{said['how']}:")]
+    if not same:
+        lines.append(f"    {'':<14} {'declared':>12} {'used':>12}")
+    for name in dict.fromkeys([*declared, *used]):
+        columns = [declared.get(name)] if same else [declared.get(name), used.get(name)]
+        shown = " ".join(f"{'-' if not v else format(v, '.3g'):>12}" for v in columns)
+        share = "" if same else intensity_spread(spread, name)
+        lines.append(f"    {name:<14} {shown} {said['units'][name]}{share and ' ' + share}")
+    means = [said["declared_normalised_mean"]]
+    means += [] if same else [content["innovations"]["normalised_mean"]]
+    shown = " ".join(f"{_number(v):>12}" for v in means)
+    return [*lines, f"    {'innovations²':<14} {shown} ({expected} expected)"]
+
+
+def intensity_spread(spread: Mapping[str, Any], name: str) -> str:
+    """How sure an intensity is, where the data gave it."""
+    if name not in spread:
+        return ""
+    share = spread[name]
+    if share is None:
+        return "(not determined)"
+    return f"± {100 * share:.2g} %" if share < 0.5 else f"(within a factor of {np.exp(share):.2g})"
 
 
 def filter_verdict(content: Mapping[str, Any]) -> str:
@@ -303,4 +359,7 @@ def filter_verdict(content: Mapping[str, Any]) -> str:
     ratio = (said["normalised_mean"] or float("nan")) / said["expected"]
     if 0.8 < ratio < 1.25:
         return "as large as the noise intensities say"
-    return f"{ratio:.2g} times as large (squared) as the noise intensities say: match them"
+    return (
+        f"{ratio:.2g} times as large (squared) as the noise intensities say: match them "
+        "(--sensor-noise, --rest or --noise ml)"
+    )

@@ -13,7 +13,7 @@ from casest.data.run import Run
 from casest.declaring.shapes import Array
 from casest.dynamics import Dynamics
 from casest.dynamics.filter import Filtered
-from casest.observing import could_reach, filter_verdict
+from casest.observing import could_reach, filter_verdict, intensity_spread
 from casest.report.figures import Figures, axis, panel
 from casest.report.fitted import reproduction
 from casest.report.frame import whole
@@ -142,6 +142,7 @@ def filter_page(found: Filtered, content: Mapping[str, Any]) -> str:
         section("states", "States", *state_figures(found, figures)),
         _final(content),
         section("innovations", "Innovations", *innovation_figures(found, content, figures)),
+        _intensities(content),
         conventions(found.model),
         reproduction(content),
     ]
@@ -274,6 +275,22 @@ def _outputs(found: Filtered) -> tuple[list[str], list[str]]:
         names += [f"{name}[{k}]" for k in range(signal.size)] if several else [name]
         units += [signal.unit or "1"] * signal.size
     return names, units
+
+
+def _intensities(content: Mapping[str, Any]) -> str:
+    """Declared noise intensities beside those that were used."""
+    said, expected = content["intensities"], content["innovations"]["expected"]
+    declared, used, spread = said["declared"], said["used"], said["spread"]
+    rows = []
+    for name in dict.fromkeys([*declared, *used]):
+        values = ["—" if not v else number(v) for v in (declared.get(name), used.get(name))]
+        sure = intensity_spread(spread, name).strip("()")
+        rows.append([f"`{name}`", *values, sure, printed_unit(said["units"][name])])
+    means = [said["declared_normalised_mean"], content["innovations"]["normalised_mean"]]
+    rows.append(["innovations²", *map(number, means), f"{expected} expected", ""])
+    head = ["noise intensity of", "declared", "used", "", "unit"]
+    shown = table(head, rows, [1, 2])
+    return section("intensities", "Noise intensities", paragraph(_sentence(said["how"])), shown)
 
 
 def conventions(model: Dynamics) -> str:
