@@ -40,7 +40,8 @@ class Tuned:
 def from_stated(model: Dynamics, run: Run, stds: Mapping[str, float]) -> Tuned:
     """From standard deviations of single readings, in the signals' units: σ²/rate.
 
-    The rate is that of the readings that are there. Raises UsageError for a name that is no signal.
+    The rate is the record's, also of a signal that is read less often: the filter takes a reading's
+    variance to be intensity × rate. Raises UsageError for a name that is no signal.
     """
     known = {s.name for s in model.signals}
     for name, std in stds.items():
@@ -50,16 +51,15 @@ def from_stated(model: Dynamics, run: Run, stds: Mapping[str, float]) -> Tuned:
             )
         if not 0 < std < np.inf:
             raise UsageError(f"{name}: the noise {std:g} must be positive: one standard deviation")
-    said = {name: std**2 * period(run, name) for name, std in stds.items()}
+    said = {name: std**2 * period(run) for name, std in stds.items()}
     return Tuned(_driven_by(model, said), "from the sensors' stated noise")
 
 
-def period(run: Run, name: str) -> float:
-    """Median time between two readings of a signal, s."""
-    there = np.isfinite(run.signals[name]).all(axis=1)
-    if run.time is None or there.sum() < 2:
-        raise DataError(f"{run.file or run.name}: {name} has no two readings with a time")
-    return float(np.median(np.diff(run.time[there])))
+def period(run: Run) -> float:
+    """Median time between two samples, s."""
+    if run.time is None or len(run) < 2:
+        raise DataError(f"{run.file or run.name}: no rate: it needs a time column, or --rate")
+    return float(np.median(np.diff(run.time)))
 
 
 def from_rest(model: Dynamics, rest: Run) -> tuple[Tuned, dict[str, Allan]]:
@@ -67,7 +67,7 @@ def from_rest(model: Dynamics, rest: Run) -> tuple[Tuned, dict[str, Allan]]:
     found: dict[str, Allan] = {}
     for s in model.signals:
         if s.name in rest.signals and s.kind != "rotation" and s.name != "t":
-            found[s.name] = allan(rest.signals[s.name], 1 / period(rest, s.name))
+            found[s.name] = allan(rest.signals[s.name], 1 / period(rest))
     white = {name: float(np.mean(a.white**2)) for name, a in found.items()}
     tuned = _driven_by(model, {name: value for name, value in white.items() if value > 0})
     drifts = {}

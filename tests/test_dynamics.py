@@ -123,6 +123,16 @@ def test_a_reading_that_is_missing_tells_nothing():
     np.testing.assert_allclose(W, expected, atol=3e-3 * np.abs(expected).max())
 
 
+def test_readings_at_a_third_of_the_rate_tell_a_third():
+    t = np.arange(0, 20, 0.02)
+    run = motionless(turning("all round", t), t)
+    v = np.zeros((len(t), 3))
+    v[np.arange(len(t)) % 3 > 0] = np.nan
+    thin = Run.raw("r", {**run.signals, "v": v}, units={}, time=t)
+    whole, third = (gramian(bias_gravity, linearised(bias_gravity, r)) for r in (run, thin))
+    np.testing.assert_allclose(3 * third, whole, atol=3e-3 * np.abs(whole).max())
+
+
 def test_with_positions_the_rank_is_full_too():
     t = np.arange(0, 60, 0.02)
     zero, omega = np.zeros((len(t), 3)), turning("all round", t)

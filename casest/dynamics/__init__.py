@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from casest.dynamics.declare import Dynamics, Motion, State, constraint, dynamics, measured, state
+from casest.dynamics.discrete import Estimates, Steps, kalman, smoothed
 from casest.dynamics.filter import Filtered, filtered
 from casest.dynamics.record import Record, least_squares
 from casest.dynamics.statespace import to_statespace
@@ -10,16 +11,20 @@ from casest.dynamics.structural import Structure, structure
 
 __all__ = [
     "Dynamics",
+    "Estimates",
     "Filtered",
     "Motion",
     "Record",
     "State",
+    "Steps",
     "Structure",
     "constraint",
     "dynamics",
     "filtered",
+    "kalman",
     "least_squares",
     "measured",
+    "smoothed",
     "state",
     "structure",
     "to_statespace",
