@@ -20,7 +20,7 @@ from casest.closing_motion.tuning import first_guess, likelihood, matched, prepa
 from casest.closing_motion.whiteness import whiteness
 from casest.closing_motion.written import motion_result, rms_settled
 from casest.dynamics.filter import filtered
-from casest_problems.bias_gravity import bias_gravity
+from casest_problems.bias_gravity import bias_gravity, bias_gravity_position
 
 RATE = 25.0
 #: Noises at the rate of the tests.
@@ -153,6 +153,15 @@ def test_units_of_effects_are_those_of_the_quantities():
     assert units["lever_arm of v"] == "m"
     assert units["time_delay of v"] == "s"
     assert units["gain of a"] == "1"
+
+
+def test_a_lever_arm_is_one_of_a_speed_not_of_a_position():
+    run = flight(seconds=2)
+    signals = {"a": run.signals["a"], "omega": run.signals["omega"], "p": run.signals["v"]}
+    there = Run.raw("p", signals, units={}, time=run.time)
+    labels = [c.label for c in candidates(bias_gravity_position, there)]
+    assert "bias of p" in labels
+    assert not any("lever" in label for label in labels)
 
 
 # -- the command -------------------------------------------------------------------------------

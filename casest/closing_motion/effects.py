@@ -27,14 +27,15 @@ class MotionEffect:
 
     `changed(value, k, body)`: on an input the reading and on an output the prediction, with the
     effect's numbers k; `body` gives the derivative of a prediction and the turn rate. `size` and
-    `unit` depend on the signal's; `typical` is of the size found in practice.
+    `unit` depend on the signal's; `typical` is of the size found in practice. `vector`: for three
+    components; `turning`: for a speed of a body whose rate of turn is measured.
     """
 
     name: str
     on: Literal["input", "output"]
     formula: str
     size: Callable[[int], int]
-    unit: Callable[[str, str], str]
+    unit: Callable[[str], str]
     typical: Callable[[float], float]
     changed: Callable[[SX, SX, Body], SX]
     shown_by: str
@@ -59,36 +60,36 @@ def _cross(a: SX, b: SX) -> SX:
 
 
 BIAS = MotionEffect(
-    "bias", "input", "reading − k", _same, lambda u, _: u, lambda rms: 0.02 * rms,
+    "bias", "input", "reading − k", _same, lambda u: u, lambda rms: 0.02 * rms,
     lambda y, k, _: y - k, "the sensor at rest, turned to several sides",
 )  # fmt: skip
 GAIN = MotionEffect(
-    "gain", "input", "reading / (1 + k)", _same, lambda u, _: "1", lambda _: 0.01,
+    "gain", "input", "reading / (1 + k)", _same, lambda u: "1", lambda _: 0.01,
     lambda y, k, _: y / (1 + k), "a known input of another size",
 )  # fmt: skip
 MISALIGNMENT = MotionEffect(
-    "misalignment", "input", "reading − k × reading", _same, lambda u, _: "rad", lambda _: 0.01,
+    "misalignment", "input", "reading − k × reading", _same, lambda u: "rad", lambda _: 0.01,
     lambda y, k, _: y - _cross(k, y), "the angles between the sensors' axes", vector=True,
 )  # fmt: skip
 OUTPUT_BIAS = MotionEffect(
-    "bias", "output", "prediction + k", _same, lambda u, _: u, lambda rms: 0.02 * rms,
+    "bias", "output", "prediction + k", _same, lambda u: u, lambda rms: 0.02 * rms,
     lambda y, k, _: y + k, "the sensor at rest",
 )  # fmt: skip
 OUTPUT_GAIN = MotionEffect(
-    "gain", "output", "(1 + k)·prediction", _same, lambda u, _: "1", lambda _: 0.01,
+    "gain", "output", "(1 + k)·prediction", _same, lambda u: "1", lambda _: 0.01,
     lambda y, k, _: (1 + k) * y, "a known length or speed",
 )  # fmt: skip
 OUTPUT_MISALIGNMENT = MotionEffect(
-    "misalignment", "output", "prediction + k × prediction", _same, lambda u, _: "rad",
+    "misalignment", "output", "prediction + k × prediction", _same, lambda u: "rad",
     lambda _: 0.01, lambda y, k, _: y + _cross(k, y), "the angles between the sensors' axes",
     vector=True,
 )  # fmt: skip
 TIME_DELAY = MotionEffect(
-    "time_delay", "output", "prediction − k·d(prediction)/dt", lambda _: 1, lambda u, _: "s",
+    "time_delay", "output", "prediction − k·d(prediction)/dt", lambda _: 1, lambda u: "s",
     lambda _: 0.01, lambda y, k, body: y - k * body.rate, "an event that all sensors see",
 )  # fmt: skip
 LEVER_ARM = MotionEffect(
-    "lever_arm", "output", "prediction + omega × k", _same, lambda u, turn: f"{u}/({turn})*rad",
+    "lever_arm", "output", "prediction + omega × k", _same, lambda _: "m",
     lambda _: 0.05, lambda y, k, body: y + _cross(body.turn, k),
     "the place of the sensor in the body, by a ruler", vector=True, turning=True,
 )  # fmt: skip
@@ -127,7 +128,7 @@ class Candidate:
 def candidates(model: Dynamics, run: Run) -> list[Candidate]:
     """Every effect of the catalogue on every signal that it can act on."""
     t = model.traced
-    turn = next((s for s in model.signals if _is_turn(s.unit) and s.size == 3), None)
+    turn = next((s.name for s in model.signals if s.unit == "rad/s" and s.size == 3), "")
     found = []
     for effect in CATALOGUE:
         for s in model.signals:
@@ -137,13 +138,15 @@ def candidates(model: Dynamics, run: Run) -> list[Candidate]:
                 continue
             if (effect.vector and s.size != 3) or s.kind == "rotation":
                 continue
-            if (effect.turning and turn is None) or (effect is BIAS and _estimated(model, s.name)):
+            if effect.turning and not (turn and s.unit == "m/s"):
                 continue
+            if effect is BIAS and _estimated(model, s.name):
+                continue
+            unit, size = effect.unit(s.unit or "1"), effect.size(s.size)
             typical = effect.typical(_rms(run.signals[s.name]))
-            unit = effect.unit(s.unit or "1", turn.unit or "1" if turn else "1")
-            turning = turn.name if effect.turning and turn else ""
-            size = effect.size(s.size)
-            found.append(Candidate(effect, s.name, size, _tidy(unit), typical, turning))
+            found.append(
+                Candidate(effect, s.name, size, unit, typical, turn if effect.turning else "")
+            )
     return found
 
 
@@ -162,14 +165,6 @@ def _estimated(model: Dynamics, name: str) -> bool:
         if np.allclose(found[0], -found[1]):
             return True
     return False
-
-
-def _is_turn(unit: str | None) -> bool:
-    return unit in ("rad/s", "deg/s")
-
-
-def _tidy(unit: str) -> str:
-    return {"m/s/(rad/s)*rad": "m", "m/(rad/s)*rad": "m*s"}.get(unit, unit)
 
 
 def _rms(values: Array) -> float:

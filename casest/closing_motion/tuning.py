@@ -37,24 +37,36 @@ ROUNDS, STEP, LARGEST, ENOUGH = 30, 1e-3, 5.0, 0.1
 class Prepared:
     """A record made ready for many likelihoods: all that does not depend on the intensities.
 
-    `units`: per intensity of a state or an input, what 1 of it adds to each step, (N − 1, n, n);
-    `readings`: per output signal, its rows.
+    `units`: per intensity of a state or an input, what 1 of it adds before each sample, (N, n²);
+    `readings`: per output signal, its rows; `numbers` (padded N, …): what each step is given, in
+    which Q and R are filled in by every likelihood.
     """
 
     model: Dynamics
-    Phi: Array
-    forced: Array
-    C: Array
-    y: Array
     present: Mask
     period: Array
     units: Mapping[str, Array]
     readings: Mapping[str, slice]
+    numbers: Array
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the intensities: inputs and states, then outputs."""
         return (*self.units, *self.readings)
+
+    def steps(self, intensities: Mapping[str, float]) -> Array:
+        """What each step is given, with these intensities."""
+        count, n, m = len(self.present), self.model.size, self.present.shape[1]
+        Q = self.numbers[:count, n * n + n : n * n + n + n * n]
+        Q[:] = 0.0
+        for name, unit in self.units.items():
+            Q += intensities[name] * unit
+        last = self.numbers.shape[1] - 2 * m
+        for name, rows in self.readings.items():
+            R = self.numbers[:count, last + rows.start : last + rows.stop]
+            R[:] = (intensities[name] / self.period)[:, None]
+        self.numbers[count:] = self.numbers[count - 1]
+        return self.numbers
 
 
 def reached(model: Dynamics) -> tuple[list[str], list[str]]:
@@ -80,7 +92,8 @@ def prepared(model: Dynamics, run: Run, along: Array) -> Prepared:
     units = {}
     for name in (*inputs, *own):
         alone = silent.sensing(**{name: 1.0}) if name in inputs else silent.driven(**{name: 1.0})
-        units[name] = process_noise(system, linearised(alone, run, along).process, Phi)
+        Q = process_noise(system, linearised(alone, run, along).process, Phi)
+        units[name] = np.concatenate([0 * Q[:1], Q]).reshape(len(Q) + 1, -1)
     present = np.isfinite(system.y)
     C = np.where(present[:, :, None], system.C, 0.0)
     y = np.where(present, system.y - system.d, 0.0)
@@ -88,88 +101,87 @@ def prepared(model: Dynamics, run: Run, along: Array) -> Prepared:
     for name, o in zip(model.traced.measured, model.traced.outputs, strict=True):
         readings[name] = slice(place, place + o.predicted.numel())
         place += o.predicted.numel()
-    return Prepared(model, Phi, forced, C, y, present, steps_to(system), units, readings)
+    numbers = _assembled(Phi, forced, C, y)
+    return Prepared(model, present, steps_to(system), units, readings, numbers)
+
+
+def _assembled(Phi: Array, forced: Array, C: Array, y: Array) -> Array:
+    """Φ, u, room for Q, C, room for R, y of every sample in a row, column by column; padded."""
+    count, (m, n) = len(y), C.shape[1:]
+    numbers = np.zeros((-(-count // CHUNK) * CHUNK, 2 * n * n + n + m * n + 2 * m))
+    first = np.concatenate([np.eye(n)[None], Phi])
+    numbers[:count, : n * n] = first.transpose(0, 2, 1).reshape(count, -1)
+    numbers[1:count, n * n : n * n + n] = forced
+    place = 2 * n * n + n
+    numbers[:count, place : place + m * n] = C.transpose(0, 2, 1).reshape(count, -1)
+    numbers[:count, -m:] = y
+    return numbers
 
 
 def whitened(ready: Prepared, intensities: Mapping[str, float]) -> tuple[Array, Array]:
     """Innovations component by component (N, m), each given those before it, and variances."""
-    n, m = ready.model.size, ready.C.shape[1]
-    Q = sum(intensities[name] * unit for name, unit in ready.units.items())
-    R = np.empty((len(ready.y), m))
-    for name, rows in ready.readings.items():
-        R[:, rows] = (intensities[name] / ready.period)[:, None]
-    first = np.eye(n)[None]
-    columns = [np.concatenate([first, ready.Phi]), np.concatenate([np.zeros((1, n)), ready.forced]),
-               np.concatenate([0 * first, Q]), ready.C, R, ready.y]  # fmt: skip
-    step = _likelihood_step(n, m, reach(ready.model.traced.A))
-    return _run(step, ready.model.start, ready.model.start_covariance, columns)
+    count, m = ready.present.shape
+    model = ready.model
+    step = _likelihood_step(model.size, m, reach(model.traced.A))
+    found = _run(step, model.start, model.start_covariance, ready.steps(intensities), 2 * m)
+    return found[:count, :m], found[:count, m:]
 
 
-def likelihood(
-    ready: Prepared, intensities: Mapping[str, float], used: Mask | None = None
-) -> float:
-    """Log-likelihood of the readings (those of instants `used`, (N,))."""
-    return _log_density(ready, *whitened(ready, intensities), used)
+def likelihood(ready: Prepared, intensities: Mapping[str, float]) -> float:
+    """Log-likelihood of the readings."""
+    return _log_density(ready, *whitened(ready, intensities))
 
 
-def _log_density(ready: Prepared, e: Array, s: Array, used: Mask | None) -> float:
-    counted = _counted(ready, used)
-    return float(-0.5 * np.sum((np.log(2 * np.pi * s) + e**2 / s)[counted]))
-
-
-def _counted(ready: Prepared, used: Mask | None) -> Mask:
-    return ready.present if used is None else ready.present & used[:, None]
+def _log_density(ready: Prepared, e: Array, s: Array) -> float:
+    return float(-0.5 * np.sum((np.log(2 * np.pi * s) + e**2 / s)[ready.present]))
 
 
 def matched(
-    ready: Prepared,
-    run: Run,
-    start: Mapping[str, float] | None = None,
-    used: Mask | None = None,
+    ready: Prepared, run: Run, start: Mapping[str, float] | None = None
 ) -> tuple[dict[str, float], float]:
-    """The most likely intensities, and their log-likelihood: Fisher scoring of their logarithms.
-
-    Information of two of them is Σ(∂e·∂e/s + ½·∂s·∂s/s²) over innovations e of variance s.
-    """
-    names, counted, damping = ready.names, _counted(ready, used), 1e-3
-    guess = first_guess(ready, run)
+    """The most likely intensities, and their log-likelihood: Fisher scoring of their logarithms."""
+    names, guess = ready.names, first_guess(ready, run)
     middle = np.log([guess[name] for name in names])
     starts = [middle] + ([np.log([{**guess, **start}[n] for n in names])] if start else [])
 
     def at(where: Array) -> tuple[Array, Array, float]:
         e, s = whitened(ready, dict(zip(names, np.exp(where).tolist(), strict=True)))
-        return e, s, _log_density(ready, e, s, used)
+        return e, s, _log_density(ready, e, s)
 
-    logs, (e, s, best) = max(((x, at(x)) for x in starts), key=lambda pair: pair[1][2])
+    logs, found = max(((x, at(x)) for x in starts), key=lambda pair: pair[1][2])
+    damping = 1e-3
     for _ in range(ROUNDS):
-        slopes = [_slope(at(logs + STEP * unit), e, s, counted) for unit in np.eye(len(names))]
-        of_e, of_s = (np.array([pair[k] for pair in slopes]) for k in range(2))
-        e0, s0 = e[counted], s[counted]
-        gradient = of_s @ (e0**2 / s0 - 1) / 2 - of_e @ (e0 / np.sqrt(s0))
-        information = of_e @ of_e.T + 0.5 * of_s @ of_s.T
+        moved = [at(logs + STEP * unit) for unit in np.eye(len(names))]
+        gradient, information = _scoring(ready.present, found, moved)
         while damping < 1e9:
             curved = information + damping * np.diag(np.diag(information) + 1.0)
             step = np.clip(np.linalg.solve(curved, gradient), -LARGEST, LARGEST)
             tried = np.clip(logs + step, middle - RANGE, middle + RANGE)
-            e_new, s_new, value = at(tried)
-            if value > best:
+            promised = gradient @ (tried - logs)
+            better = at(tried) if promised > ENOUGH else found
+            if better[2] > found[2] or promised <= ENOUGH:
                 break
             damping = max(10 * damping, 0.1)
-        gained, damping = value - best, damping / 10
-        if not gained > 0:
-            break
-        logs, e, s, best = tried, e_new, s_new, value
+        gained, damping = better[2] - found[2], damping / 10
+        if gained > 0:
+            logs, found = tried, better
         if gained < ENOUGH:
             break
-    return dict(zip(names, np.exp(logs).tolist(), strict=True)), best
+    return dict(zip(names, np.exp(logs).tolist(), strict=True)), found[2]
 
 
-def _slope(
-    moved: tuple[Array, Array, float], e: Array, s: Array, counted: Mask
+def _scoring(
+    present: Mask, found: tuple[Array, Array, float], moved: list[tuple[Array, Array, float]]
 ) -> tuple[Array, Array]:
-    """∂e/√s and ∂s/s by a difference."""
-    e0, s0 = e[counted], s[counted]
-    return (moved[0][counted] - e0) / STEP / np.sqrt(s0), (moved[1][counted] - s0) / STEP / s0
+    """Gradient and information, by differences of innovations e and their variances s.
+
+    Of two logarithms: Σ(∂e·∂e/s + ½·∂s·∂s/s²).
+    """
+    e, s = found[0][present], found[1][present]
+    of_e = np.array([(m[0][present] - e) / STEP / np.sqrt(s) for m in moved])
+    of_s = np.array([(m[1][present] - s) / STEP / s for m in moved])
+    gradient = of_s @ (e**2 / s - 1) / 2 - of_e @ (e / np.sqrt(s))
+    return gradient, of_e @ of_e.T + 0.5 * of_s @ of_s.T
 
 
 def first_guess(ready: Prepared, run: Run) -> dict[str, float]:
@@ -227,18 +239,12 @@ def _symmetric(matrix: Any) -> Any:
     return ca.densify(ca.triu(matrix) + ca.triu(matrix, False).T)
 
 
-def _run(steps: Any, x: Array, P: Array, parts: list[Array]) -> tuple[Array, Array]:
-    """Over a record, CHUNK steps at a time."""
-    N, m = len(parts[0]), parts[-1].shape[1]
-    flats = [p.transpose(0, 2, 1).reshape(N, -1) if p.ndim == 3 else p for p in parts]
-    padded = -(-N // CHUNK) * CHUNK
-    numbers = np.zeros((padded, sum(f.shape[1] for f in flats)))
-    np.concatenate(flats, axis=1, out=numbers[:N])
-    numbers[N:] = numbers[N - 1]
+def _run(steps: Any, x: Array, P: Array, numbers: Array, wide: int) -> Array:
+    """Over a record, CHUNK steps at a time: (padded N, wide)."""
     state = np.concatenate([x, P.T.ravel()])
-    after, found = np.empty((CHUNK, len(state))), np.empty((padded, 2 * m))
+    after, found = np.empty((CHUNK, len(state))), np.empty((len(numbers), wide))
     buffer, run = steps.buffer()
-    for k in range(0, padded, CHUNK):
+    for k in range(0, len(numbers), CHUNK):
         span = slice(k, k + CHUNK)
         arrays: Any = (state, numbers[span]), (after, found[span])
         for i in range(2):
@@ -246,4 +252,4 @@ def _run(steps: Any, x: Array, P: Array, parts: list[Array]) -> tuple[Array, Arr
             buffer.set_res(i, memoryview(arrays[1][i]))
         run()
         state = after[-1].copy()
-    return found[:N, :m], found[:N, m:]
+    return found
