@@ -104,6 +104,7 @@ def observe_motion(model: Dynamics, run: Run, window: float | None = None) -> di
         )
     length = min(window or WINDOW * duration, duration)
     ends, eigenvalues = window_eigenvalues(model, system, length)
+    telling = np.flatnonzero(eigenvalues[:, 0] > 1)
     std = {name: plain(seen.std[where]) for name, where in model.slices().items()}
     return {
         "casest": __version__,
@@ -122,6 +123,7 @@ def observe_motion(model: Dynamics, run: Run, window: float | None = None) -> di
             "length_s": plain(length),
             "end_s": plain(ends),
             "smallest_eigenvalue": plain(eigenvalues[:, 0]),
+            "informative_from_s": plain(ends[telling[0]]) if telling.size else None,
             "eigenvalues": plain(eigenvalues),
         },
     }
@@ -261,9 +263,18 @@ def observe_text(content: Mapping[str, Any]) -> str:
         lines += [
             "",
             f"  over windows of {w['length_s']:.3g} s the smallest eigenvalue (information over "
-            f"prior) goes from {low:.3g} to {high:.3g}",
+            f"prior) goes from {low:.3g} to {high:.3g};",
+            f"  {window_words(w)}",
         ]
     return "\n".join([*lines, *_note_lines(content)])
+
+
+def window_words(windows: Mapping[str, Any]) -> str:
+    """Since when a window alone tells every state more than was known beforehand."""
+    since = windows["informative_from_s"]
+    if since is None:
+        return "no window alone tells every state more than was known beforehand"
+    return f"the first window that tells every state more than was known ends at {since:.4g} s"
 
 
 def could_reach(content: Mapping[str, Any]) -> str:

@@ -15,6 +15,7 @@ from casest.dynamics.gramian import gramian, gramian_by_ode, observed, smallest_
 from casest.dynamics.record import least_squares
 from casest.dynamics.riccati import riccati
 from casest.dynamics.transition import linearised, transitions
+from casest.observing import observe_motion
 from casest_problems.bias_gravity import bias_gravity, bias_gravity_position
 
 BIAS = np.array([0.1, -0.05, 0.025])
@@ -146,6 +147,16 @@ def test_both_forms_of_the_gramian_agree():
     system = linearised(bias_gravity, motionless(turning("all round", t), t))
     product, ode = gramian(bias_gravity, system), gramian_by_ode(bias_gravity, system)
     assert np.abs(product - ode).max() < 1e-8 * np.abs(product).max()
+
+
+def test_it_is_said_since_when_a_trajectory_tells_everything():
+    """Straight on for 30 s, then it turns about changing axes."""
+    t = np.arange(0, 60, 0.02)
+    run = motionless(np.where((t > 30)[:, None], 2 * turning("all round", t), 0.0), t)
+    windows = observe_motion(bias_gravity.known_to(bias=0.5), run, window=10.0)["windows"]
+    assert 30 < windows["informative_from_s"] < 45
+    still = observe_motion(bias_gravity, motionless(turning("not at all", t), t))["windows"]
+    assert still["informative_from_s"] is None
 
 
 def test_a_slow_precession_shows_more_in_longer_windows():

@@ -13,7 +13,7 @@ from casest.data.run import Run
 from casest.declaring.shapes import Array
 from casest.dynamics import Dynamics
 from casest.dynamics.filter import Filtered
-from casest.observing import could_reach, filter_verdict, intensity_spread
+from casest.observing import could_reach, filter_verdict, intensity_spread, window_words
 from casest.report.figures import Figures, axis, panel
 from casest.report.fitted import reproduction
 from casest.report.frame import whole
@@ -109,8 +109,10 @@ def _windows(content: Mapping[str, Any], figures: Figures) -> str:
     least = max(float(positive.min(initial=np.inf)), float(positive.max(initial=1.0)) * 1e-16)
     most = float(positive.max(initial=1.0))
     lines = [
-        figures.series("line", "after", end, exact=True, y=np.maximum(column, least))
-        for column in values.T
+        figures.series(
+            "line", "before" if k else "after", end, exact=True, y=np.maximum(column, least)
+        )
+        for k, column in reversed(list(enumerate(values.T)))
     ]
     drawn = panel(
         "eigenvalues" if values.shape[1] > 1 else "smallest eigenvalue",
@@ -122,8 +124,9 @@ def _windows(content: Mapping[str, Any], figures: Figures) -> str:
     )
     caption = (
         "Observability along the record:",
-        f"eigenvalues of the Gramian over windows of {number(windows['length_s'])} s, in units of "
-        "what was known beforehand. Above 1 (dashed) one window alone teaches more than that.",
+        f"eigenvalues of the Gramian over windows of {number(windows['length_s'])} s, the smallest "
+        "in its own colour, in units of what was known beforehand. Above 1 (dashed) one window "
+        f"alone teaches more than that. {_sentence(window_words(windows))}",
     )
     picture = figures.add("windows", caption, [drawn])
     scaled = content.get("eigenvalues") or []
