@@ -7,6 +7,7 @@ that is discrete from the beginning.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,14 +35,16 @@ class Steps:
     of_Phi: Pattern | None = None  # noqa: N815
     of_C: Pattern | None = None  # noqa: N815
 
-    @property
+    @cached_property
     def present(self) -> NDArray[np.bool_]:
         """Which readings there are, (N, m)."""
         return np.asarray(np.isfinite(self.y))
 
-    @property
+    @cached_property
     def seen(self) -> Array:
         """C without what is missing: a reading that the state does not reach says nothing."""
+        if self.present.all():
+            return self.C
         return np.where(self.present[:, :, None], self.C, 0.0)
 
     @property
@@ -73,12 +76,15 @@ def kalman(steps: Steps, start: Array, covariance: Array) -> Estimates:
     m, n = steps.C.shape[1:]
     C, R = steps.seen, steps.R
     y = np.where(steps.present, steps.y - steps.d, 0.0)
-    Phi = np.concatenate([np.eye(n)[None], steps.Phi])
-    forced = np.concatenate([np.zeros((1, n)), steps.forced])
-    Q = np.concatenate([np.zeros((1, n, n)), steps.Q])
-    state = np.concatenate([start, covariance.T.ravel()])
+    # No step leads to the first sample: Φ = 0 from an empty state, and what is known beforehand.
+    Phi, forced, Q = (
+        steps.Phi,
+        np.concatenate([start[None], steps.forced]),
+        np.empty((len(y), n, n)),
+    )
+    Q[0], Q[1:] = covariance, steps.Q
     step = kalman_step(n, m, *steps.patterns)
-    after, before = run_steps(step, state, [Phi, forced, Q, C, R, y])
+    after, before = run_steps(step, np.zeros(n + n * n), [Phi, forced, Q, C, R, y])
     (x, P), (before_x, before_P) = unpacked(after, n), unpacked(before, n)
     return Estimates(x, P, before_x, before_P, *_innovations(steps, before_x, before_P))
 

@@ -92,13 +92,19 @@ def run_steps(steps: Any, state: Array, parts: Sequence[Array]) -> list[Array]:
     """Every output of the accumulated steps, (N, …) each.
 
     `state`: what the first step begins from; `parts`: arrays (N, …) of what each step is given,
-    matrices included, in the order of its numbers.
+    matrices included, in the order of its numbers; (N − 1, …) where the first is given zeros.
     """
-    N = len(parts[0])
-    flat = [p.transpose(0, 2, 1).reshape(N, -1) if p.ndim == 3 else p for p in parts]
+    N = max(map(len, parts))
     padded = -(-N // CHUNK) * CHUNK
-    numbers = np.empty((padded, sum(f.shape[1] for f in flat)))
-    np.concatenate(flat, axis=1, out=numbers[:N])
+    numbers = np.empty((padded, sum(p[0].size for p in parts)))
+    place = 0
+    for p in parts:
+        own = numbers[:, place : place + p[0].size]
+        place += p[0].size
+        if p.ndim == 3:
+            own, p = own.reshape(padded, *p.shape[:0:-1]), p.transpose(0, 2, 1)
+        own[N - len(p) : N] = p
+        own[: N - len(p)] = 0.0
     numbers[N:] = numbers[N - 1]
     found = [np.empty((padded, steps.size1_out(i))) for i in range(steps.n_out())]
     # CasADi's matrices are column by column: a row of these arrays is one of its columns.
@@ -118,5 +124,5 @@ def run_steps(steps: Any, state: Array, parts: Sequence[Array]) -> list[Array]:
 
 
 def unpacked(both: Array, n: int) -> tuple[Array, Array]:
-    """x (N, n) and P (N, n, n) of what `packed` put together."""
-    return both[:, :n], both[:, n:].reshape(len(both), n, n).transpose(0, 2, 1)
+    """x (N, n) and P (N, n, n), symmetric, of what `packed` put together."""
+    return both[:, :n], both[:, n:].reshape(len(both), n, n)
