@@ -2,13 +2,25 @@
 
 from __future__ import annotations
 
+import control
 import flights
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from casest import Run
-from casest.dynamics import Steps, filtered, kalman, least_squares, smoothed
+from casest import Run, UsageError, signal, sin
+from casest.dynamics import (
+    Motion,
+    Steps,
+    dynamics,
+    filtered,
+    kalman,
+    kalman_bucy,
+    least_squares,
+    measured,
+    smoothed,
+    state,
+)
 from casest.dynamics.gramian import gramian, observed
 from casest.dynamics.transition import linearised, transitions
 from casest_problems.bias_gravity import bias_gravity
@@ -138,3 +150,70 @@ def test_repeated_and_thinned_readings_are_taken_as_they_come():
     std = [filtered(bias_gravity, run).std[-1, :3].mean() for run in (full, thin)]
     assert std[1] > std[0]
     assert np.isfinite(filtered(bias_gravity, thin).smoothed).all()
+
+
+# -- Kalman and Bucy's -----------------------------------------------------------------------------
+
+
+@dynamics
+def cart(
+    u=signal("m/s^2"),
+    y=signal("m"),
+    *,
+    position=state("m", intensity=1e-3, std=0.3),
+    velocity=state("m/s", intensity=0.02, std=0.2),
+):
+    rates = {"position": velocity, "velocity": u - 0.8 * velocity - 1.5 * position}
+    return Motion(rates=rates, outputs=(measured(y, position, intensity=0.01),))
+
+
+def readings(seconds, step):
+    t = np.arange(0, seconds, step)
+    signals = {"u": np.sin(t)[:, None], "y": 0.3 * np.sin(0.9 * t)[:, None] + 0.1}
+    return Run.raw("cart", signals, units={}, time=t)
+
+
+def test_the_kalman_bucy_filter_follows_its_differential_equations():
+    run = readings(5, 0.01)
+    A, C, Xi = np.array([[0, 1], [-1.5, -0.8]]), np.array([[1.0, 0]]), np.diag([1e-3, 0.02])
+
+    def rate(t, z):
+        x, P = z[:2], z[2:].reshape(2, 2)
+        K = P @ C.T / 0.01
+        u, y = (np.interp(t, run.time, run.signals[n][:, 0]) for n in "uy")
+        slope = A @ x + [0, u] + K[:, 0] * (y - x[0])
+        return np.r_[slope, (A @ P + P @ A.T + Xi - K @ C @ P).ravel()]
+
+    start = np.r_[0, 0, np.diag([0.09, 0.04]).ravel()]
+    end = solve_ivp(rate, (0, run.time[-1]), start, max_step=0.01, rtol=1e-9, atol=1e-11).y[:, -1]
+    found = kalman_bucy(cart, run)
+    np.testing.assert_allclose(found.x[-1], end[:2], atol=1e-6)
+    np.testing.assert_allclose(found.P[-1].ravel(), end[2:], atol=1e-8)
+
+
+def test_its_gain_settles_where_python_control_says():
+    L, _, _ = control.lqe(
+        [[0, 1], [-1.5, -0.8]], np.eye(2), [[1, 0]], np.diag([1e-3, 0.02]), [[0.01]]
+    )
+    found = kalman_bucy(cart, readings(40, 0.05))
+    np.testing.assert_allclose(found.K[-1], L, rtol=1e-8)
+
+
+def test_the_faster_the_samples_the_nearer_the_discrete_filter_comes():
+    apart = []
+    for step in (0.04, 0.02, 0.01):
+        run = readings(4, step)
+        apart.append(np.abs(kalman_bucy(cart, run).x[-1] - filtered(cart, run).x[-1]).max())
+    assert apart[2] < 0.6 * apart[1] < 0.36 * apart[0]
+
+
+def test_it_bridges_what_is_missing_and_refuses_what_is_not_linear():
+    run = readings(4, 0.02)
+    run.signals["y"][60:90] = np.nan
+    found = kalman_bucy(cart, run)
+    assert np.isfinite(found.x).all()
+    assert np.all(found.K[65] == 0)
+    pendulum = dynamics(lambda y=signal("rad"), *, angle=state("rad"): Motion(
+        rates={"angle": -sin(angle)}, outputs=(measured(y, angle, intensity=1.0),)))  # fmt: skip
+    with pytest.raises(UsageError, match="is nonlinear: the Kalman-Bucy filter is for linear"):
+        kalman_bucy(pendulum, run)

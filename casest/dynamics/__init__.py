@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from casest.dynamics.continuous import Continuous, kalman_bucy
 from casest.dynamics.declare import Dynamics, Motion, State, constraint, dynamics, measured, state
 from casest.dynamics.discrete import Estimates, Steps, kalman, smoothed
 from casest.dynamics.filter import Filtered, filtered
@@ -10,6 +11,7 @@ from casest.dynamics.statespace import to_statespace
 from casest.dynamics.structural import Structure, structure
 
 __all__ = [
+    "Continuous",
     "Dynamics",
     "Estimates",
     "Filtered",
@@ -22,6 +24,7 @@ __all__ = [
     "dynamics",
     "filtered",
     "kalman",
+    "kalman_bucy",
     "least_squares",
     "measured",
     "smoothed",
