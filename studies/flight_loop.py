@@ -50,6 +50,13 @@ WORLDS: dict[str, tuple[Sensors, str, str]] = {
     ),
 }
 SHARES = (1.0, 0.2)
+#: Nothing missing, but noise of another kind.
+KINDS = {
+    "null, Student's t noise (4)": Sensors(tails=True),
+    "null, readings in steps of one σ": Sensors(quantised=True),
+    "null, bias that wanders (1e-5 m²/s⁵)": Sensors(wander=1e-5),
+}
+OTHERS = 15
 #: Two at once.
 PAIR = Sensors(gyro_bias=(0.002, -0.001, 0.0015), lever=(0.1, -0.05, 0.07))
 
@@ -74,6 +81,9 @@ def tasks() -> Iterator[tuple[str, int, Sensors, float]]:
             for share in SHARES:
                 yield f"{name} x{share:g}", 1000 + seed, smaller(sensors, share), 100.0
         yield "gyro bias and lever arm", 1000 + seed, PAIR, 100.0
+    for seed in range(OTHERS):
+        for name, sensors in KINDS.items():
+            yield name, 2000 + seed, sensors, 50.0
 
 
 def world(name: str, seed: int, sensors: Sensors, rate: float) -> dict[str, Any]:
@@ -116,6 +126,10 @@ with the published intensities as its start.
 the loop is not told: an effect was reported in {false} ({share:.1%}, at most {upper:.1%} with 95 %
 confidence), a misfit without a name in {unexplained}. Median time {seconds:.1f} s.
 
+| other noise | flights | with an effect | with a misfit without a name |
+| --- | --- | --- | --- |
+{kinds}
+
 ## One effect planted
 
 {seeds} flights each. Named: first, or among at most two that it cannot be told apart from. Errors
@@ -147,6 +161,7 @@ def table(kept: dict[tuple[str, int], dict[str, Any]]) -> str:
         for name in WORLDS
         for share in SHARES
     ]
+    kinds = [_kind(name, [k for k in kept.values() if k["name"] == name]) for name in KINDS]
     both = [k for k in kept.values() if k["name"] == "gyro bias and lever arm"]
     named = sum({"bias of omega", "lever_arm of v"} == set(k["found"]) for k in both)
     return PAGE.format(
@@ -156,11 +171,19 @@ def table(kept: dict[tuple[str, int], dict[str, Any]]) -> str:
         upper=float(beta.ppf(0.95, false + 1, max(len(nulls) - false, 1))),
         unexplained=sum(k["unexplained"] for k in nulls),
         seconds=float(np.median([k["seconds"] for k in nulls])) if nulls else np.nan,
+        kinds="\n".join(kinds),
         seeds=SEEDS,
         rows="\n".join(r for r in rows if r),
         pair=f"Gyro bias and lever arm of the table's sizes: exactly both named in {named} of "
         f"{len(both)} flights.",
     )
+
+
+def _kind(name: str, kept: list[dict[str, Any]]) -> str:
+    found = sorted({label for k in kept for label in k["found"]})
+    said = f" ({', '.join(found)})" if found else ""
+    some, none = sum(bool(k["found"]) for k in kept), sum(k["unexplained"] for k in kept)
+    return f"| {name.removeprefix('null, ')} | {len(kept)} | {some}{said} | {none} |"
 
 
 def _row(name: str, share: float, kept: list[dict[str, Any]]) -> str:

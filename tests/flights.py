@@ -83,6 +83,9 @@ class Sensors:
     lever: tuple = (0.0, 0.0, 0.0)  # place of the velocity sensor in the body, m
     colour: float = 0.0  # correlation time of a part of the velocity noise, s
     coloured: float = 0.0  # its standard deviation, m/s
+    tails: bool = False  # noise by Student's t with four degrees of freedom
+    quantised: bool = False  # readings in steps of their noise
+    wander: float = 0.0  # intensity of a random walk of the accelerometer's bias, (m/s²)²/s
 
     def but(self, **changes):
         return replace(self, **changes)
@@ -95,10 +98,28 @@ def record(flight, t, rng=None, sensors=Sensors(), sigma=SIGMA):
     a = (1 + sensors.gain) * flight.force(t) + np.asarray(sensors.bias)
     signals = {"a": a, "omega": flight.omega(t) + np.asarray(sensors.gyro_bias), "v": v}
     if rng is not None:
-        signals = {k: x + sigma[k] * rng.standard_normal(x.shape) for k, x in signals.items()}
+        signals["a"] = signals["a"] + walk(t, sensors.wander, rng)
+        signals = {k: x + sigma[k] * noise(x.shape, sensors, rng) for k, x in signals.items()}
         if sensors.coloured:
             signals["v"] = signals["v"] + coloured(t, sensors.colour, sensors.coloured, rng)
+        if sensors.quantised:
+            signals = {k: sigma[k] * np.round(x / sigma[k]) for k, x in signals.items()}
     return Run.raw("flight", signals, units=UNITS, time=t)
+
+
+def noise(shape, sensors, rng):
+    """White, of unit variance."""
+    if sensors.tails:
+        return rng.standard_t(4, shape) / np.sqrt(2)
+    return rng.standard_normal(shape)
+
+
+def walk(t, intensity, rng):
+    """A random walk (N, 3)."""
+    if not intensity:
+        return 0.0
+    step = np.sqrt(intensity * np.diff(t, prepend=t[0]))
+    return np.cumsum(step[:, None] * rng.standard_normal((len(t), 3)), axis=0)
 
 
 def coloured(t, correlation, std, rng):
