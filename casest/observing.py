@@ -180,7 +180,7 @@ def follow(
     return {
         "casest": __version__,
         "model": model.name,
-        "notes": assumed(run),
+        "notes": [*assumed(run), *_unsettled(found)],
         "samples": len(found.time),
         "states": final,
         "intensities": {
@@ -203,6 +203,15 @@ def follow(
 
 def _plain_values(values: Mapping[str, float]) -> dict[str, Any]:
     return {name: plain(value) for name, value in values.items()}
+
+
+def _unsettled(found: Filtered) -> list[str]:
+    if found.settled:
+        return []
+    return [
+        "the smoother's rounds did not settle: its states are those of one pass; nearer start "
+        "values or a smaller std at the beginning may help"
+    ]
 
 
 def _normalised_mean(found: Filtered) -> float:

@@ -15,7 +15,7 @@ from casest.cli import run as cli
 from casest.dynamics import Motion, constraint, dynamics, measured, state
 from casest.dynamics.filter import filtered
 from casest.dynamics.record import least_squares as at_once_of
-from casest.observing import observe_motion
+from casest.observing import follow, observe_motion
 from casest_problems.bias_gravity import bias_gravity, bias_gravity_magnitude
 
 G_OVER_L, DAMPING = 9.81 / 0.8, 0.15
@@ -260,6 +260,36 @@ def test_a_known_length_is_kept_and_helps():
         errors[known] = np.sqrt(np.mean(np.sum(np.square(ends), axis=1)))
     assert errors[True] < 0.5 * errors[False]
     assert 0.5 < np.mean(squares) < 2.0  # one direction is left, and a little of the other
+
+
+def test_a_nonlinear_model_keeps_to_what_is_known_too():
+    """A swing in the plane by its two coordinates, on a thread of known length."""
+
+    @dynamics
+    def thread(torque=signal("1/s^2"), y=signal("rad"), *,
+               n=state(2, start=(np.sin(0.6), np.cos(0.6)), std=0.3, intensity=1e-5),
+               rate=state("rad/s", intensity=4e-3, std=0.5)):  # fmt: skip
+        turning = vertcat(rate * n[1], -rate * n[0])
+        slope = torque - G_OVER_L * n[0] - DAMPING * rate
+        seen = (measured(y, atan2(n[0], n[1]), intensity=THETA),)
+        known = (constraint(norm_2(n), 1.0),)
+        return Motion(rates={"n": turning, "rate": slope}, outputs=seen, constraints=known)
+
+    run, truth = swing()
+    found = filtered(thread, run)
+    for states in (found.x, found.smoothed):
+        np.testing.assert_allclose(np.linalg.norm(states[:, :2], axis=1), 1, atol=1e-9)
+    assert found.settled
+    angle = np.arctan2(*found.smoothed[:, :2].T)
+    plain = filtered(pendulum_of(), run)
+    assert np.std(angle - truth[:, 0]) < 1.2 * np.std(plain.smoothed[:, 0] - truth[:, 0])
+
+
+def test_a_smoother_that_does_not_settle_says_so(monkeypatch):
+    monkeypatch.setattr("casest.dynamics.filter.ROUNDS", 1)
+    content, found = follow(pendulum_of(), swing()[0])
+    assert not found.settled
+    assert "the smoother's rounds did not settle" in " ".join(content["notes"])
 
 
 def test_a_known_gravity_brings_its_error_and_the_biass_down():

@@ -52,6 +52,8 @@ class Filtered:
     S: Array
     smoothed: Array
     smoothed_P: Array  # noqa: N815
+    #: Did the rounds of a nonlinear model's smoother settle? If not, its states are approximate.
+    settled: bool = True
 
     @property
     def time(self) -> Array:
@@ -104,36 +106,35 @@ def _extended(model: Dynamics, run: Run, smooth: bool) -> Filtered:
             f"{run.file or run.name}: the extended filter of {model.name} diverges at row {row}: "
             "start= and std= must lie where the model holds"
         )
-    along, smooth_P = trajectory(model, run, x) if smooth else (x, P)
-    return Filtered(
-        model,
-        linearised(model, run, along),
-        x,
-        P,
-        before_x,
-        before_P,
-        innovations,
-        S,
-        along,
-        smooth_P,
-    )
+    before = before_x, before_P, innovations, S
+    after = known(model, run, x, P)
+    if not smooth:
+        return Filtered(model, linearised(model, run, x), *after, *before, *after)
+    along, smooth_P, settled = trajectory(model, run, x)
+    both = known(model, run, along, smooth_P)
+    return Filtered(model, linearised(model, run, along), *after, *before, *both, settled)
 
 
-def trajectory(model: Dynamics, run: Run, along: Array) -> tuple[Array, Array]:
-    """The most probable states (N, n) and their covariances, by smoothing again and again.
+def trajectory(model: Dynamics, run: Run, along: Array) -> tuple[Array, Array, bool]:
+    """The most probable states (N, n), their covariances, and whether they settled.
 
-    Gauss-Newton on all states of the record, from states `along`.
+    Gauss-Newton on all states of the record, from states `along`, by smoothing again and again.
+    Where the rounds do not settle, the first one's states.
     """
+    first: tuple[Array, Array] | None = None
     for _ in range(ROUNDS):
         steps = relinearised(model, run, along)
-        before, (along, P) = (
-            along,
-            smoothed(steps, kalman(steps, model.start, model.start_covariance)),
-        )
+        before = along
+        along, P = smoothed(steps, kalman(steps, model.start, model.start_covariance))
+        first = first or (along, P)
         std = np.sqrt(np.maximum(np.diagonal(P, axis1=1, axis2=2), 1e-300))
-        if np.max(np.abs(along - before) / std) < SETTLED:
+        change = np.max(np.abs(along - before) / std)
+        if change < SETTLED:
+            return along, P, True
+        if not np.isfinite(change):
             break
-    return along, P
+    assert first is not None
+    return *first, False
 
 
 def discretised(model: Dynamics, system: Linearised) -> Steps:
