@@ -109,7 +109,7 @@ def observe_motion(model: Dynamics, run: Run, window: float | None = None) -> di
     return {
         "casest": __version__,
         "model": model.name,
-        "notes": [*assumed(run), *_too_short(seen, len(run), duration)],
+        "notes": [*assumed(run), *_readings_alone(model), *_too_short(seen, len(run), duration)],
         "rank": seen.rank,
         "unknowns": seen.unknowns,
         "structural_rank": _structural_rank(model),
@@ -144,6 +144,14 @@ def assumed(run: Run) -> list[str]:
             "happened there"
         )
     return notes
+
+
+def _readings_alone(model: Dynamics) -> list[str]:
+    if not model.traced.g.numel():
+        return []
+    return [
+        "what the model knows exactly (constraint) is not counted: this the readings alone show"
+    ]
 
 
 def _too_short(seen: Observed, samples: int, duration: float) -> list[str]:

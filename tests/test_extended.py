@@ -366,6 +366,12 @@ def test_a_magnitude_can_be_set(in_the_air, capsys):
         assert np.linalg.norm(found) == pytest.approx(magnitude, rel=1e-12)
 
 
+def test_what_is_known_is_not_counted_as_a_reading_and_that_is_said(in_the_air, capsys):
+    assert cli(["observe", "bias-gravity-magnitude", in_the_air, "--json"]) == 0
+    notes = " ".join(json.loads(capsys.readouterr().out)["notes"])
+    assert "(constraint) is not counted: this the readings alone show" in notes
+
+
 def test_a_nonlinear_model_is_observed_along_its_own_trajectory(tmp_path, capsys):
     """A pendulum's length from its swing."""
     model = """
