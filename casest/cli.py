@@ -465,21 +465,21 @@ def observe(model_name: str, data: tuple[str, ...], **options: Any) -> int:
 )
 def filter_command(model_name: str, data: tuple[str, ...], **options: Any) -> int:
     """States over time by the Kalman filter and smoother, with innovations diagnosed."""
-    from casest import observing, result
+    from casest import following, result
 
     moving, run = moving_record(model_name, data, options)
     tuned, told = tuned_noise(moving, run, options)
-    content, found = observing.follow(moving, run, tuned)
+    content, found = following.follow(moving, run, tuned)
     content |= told
     content |= {"data": list(data), "reproduce": result.reproduce(typed(), data)}
     if options["output"]:
         from casest.report import filter_page
 
-        write(options["output"] / "states.csv", observing.states_csv(found))
+        write(options["output"] / "states.csv", following.states_csv(found))
         write(options["output"] / "filter.json", result.as_json(content))
         reported(options["output"], filter_page(found, content))
     click.echo(
-        result.as_json(content).rstrip() if options["as_json"] else observing.filter_text(content)
+        result.as_json(content).rstrip() if options["as_json"] else following.filter_text(content)
     )
     return 0
 

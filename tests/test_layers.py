@@ -38,6 +38,7 @@ FLOORS = [
     ],
     ["casest.result", "casest.problem", "casest.earth", "casest.effects"],
     ["casest.closing", "casest.closing_motion", "casest.intensities", "casest.observing"],
+    ["casest.following"],
     ["casest.values", "casest.applying", "casest.demonstration", "casest.export"],
     ["casest.exporting", "casest.simulating"],
     ["casest.compare"],

@@ -13,7 +13,8 @@ from casest.data.run import Run
 from casest.declaring.shapes import Array
 from casest.dynamics import Dynamics
 from casest.dynamics.filter import Filtered
-from casest.observing import could_reach, filter_verdict, intensity_spread, window_words
+from casest.following import filter_verdict, intensity_spread
+from casest.observing import could_reach, window_words
 from casest.report.figures import Figures, axis, panel
 from casest.report.fitted import reproduction
 from casest.report.frame import whole
