@@ -52,11 +52,13 @@ def test_a_flight_that_lacks_nothing_is_adequate():
     ("sensors", "label", "planted", "alike"),
     [
         (Sensors(gyro_bias=(0.01, -0.005, 0.004)), "bias of omega", [0.01, -0.005, 0.004], ()),
+        # So large that the matched intensities swallow it at first.
+        (Sensors(gyro_bias=(0.1, -0.05, 0.04)), "bias of omega", [0.1, -0.05, 0.04], ()),
         (Sensors(delay=0.04), "time_delay of v", [0.04], ()),
         # A scale of the velocity does the same: the unknown gravity follows either.
         (Sensors(gain=0.03), "gain of a", [0.03, 0.03, 0.03], ("gain of v",)),
     ],
-    ids=["gyro bias", "delay", "scale"],
+    ids=["gyro bias", "large gyro bias", "delay", "scale"],
 )
 def test_a_planted_effect_is_found_and_named_with_its_size(sensors, label, planted, alike):
     closing = close_motion(bias_gravity, flight(sensors, seed=3))
