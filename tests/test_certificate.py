@@ -424,3 +424,30 @@ def test_a_scale_of_any_size_is_not_taken_for_one_on_its_bound_at_zero(norm):
     found = attempt(find_model("norm-triangular").having(norm=norm), [run])
     assert found.certificate.trusted, found.certificate.reasons
     assert found.values["scale"][0, 0] == pytest.approx(norm / 1000, rel=0.01)
+
+
+@model
+def peak(
+    x=signal("1"),
+    y=signal("1"),
+    *,
+    level=param(start=0.0),
+    height=param(start=5.0),
+    place=param("1", start=7.0),
+    width=param("1", start=1.0, bounds=(0.1, 10.0)),
+):
+    return Residual(measured=y, predicted=level + height * exp(-(((x - place) / width) ** 2)))
+
+
+def test_one_of_several_valleys_that_leaves_a_course_is_refused_until_a_start_says_which():
+    """Two peaks where the model has one: either is a minimum."""
+    x = np.arange(200) * 0.1
+    y = 10 * np.exp(-((x - 5) ** 2)) + 8 * np.exp(-((x - 13) ** 2))
+    y = y + 0.1 * np.random.default_rng(0).standard_normal(200)
+    run = Run.raw("peak", {"x": x[:, None], "y": y[:, None]}, units={})
+    refused = attempt(peak, [run]).certificate
+    assert not refused.trusted
+    assert "there may be a better one, or the model lacks something" in refused.reasons[0]
+    stated = attempt(peak, [run], start={"place": 5.2})
+    assert stated.certificate.trusted
+    assert abs(float(stated.values["place"]) - 5) < 0.2

@@ -97,7 +97,7 @@ def _ways(
         rival = best_of((*outcomes,))
         starts = list(_perturbations(problem, first, seed))
         outcomes += [_opinion(problem, start, rival) for start in starts[:STARTS]]
-    if problem.model.starter is None and _valleys(outcomes) > 1:
+    if problem.model.starter is None and valleys(outcomes) > 1:
         # One valley more is a reason to look for others.
         outcomes += [_opinion(problem, start, best_of((*outcomes,))) for start in starts[STARTS:]]
     if problem.model.starter is None and best_of((*outcomes,)) is not outcomes[0]:
@@ -105,7 +105,7 @@ def _ways(
     return (*outcomes,)
 
 
-def _valleys(outcomes: list[Outcome]) -> int:
+def valleys(outcomes: Sequence[Outcome]) -> int:
     """In how many different costs did they end, to a thousandth?"""
     costs = sorted(_cost(o) for o in outcomes)
     apart = [b > a * (1 + 1e-3) + 1e-300 for a, b in itertools.pairwise(costs) if np.isfinite(b)]
