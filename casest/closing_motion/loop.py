@@ -12,7 +12,7 @@ from casest.closing_motion.effects import Candidate, Colour, candidates
 from casest.closing_motion.fitting import Fit, coloured, fitted
 from casest.closing_motion.score import Score, scores, stretches
 from casest.closing_motion.sensitivity import sensitivity
-from casest.closing_motion.tuning import first_guess, likelihood, prepared
+from casest.closing_motion.tuning import Prepared, applied, first_guess, likelihood, prepared
 from casest.closing_motion.whiteness import Whiteness, whiteness
 from casest.data.run import Run
 from casest.data.splits import interleaved_blocks
@@ -127,15 +127,9 @@ class _Loop:
 
     def _with_effect(self, current: Fit, ranked: list[Score]) -> Fit | None:
         """The fit with the best effect that held-out time confirms; None if none does."""
-        significant = [s for s in ranked if s.p_value <= self.limit]
-        promising = [s for s in significant if s.gain > 0.5 * significant[0].gain]
-        trials = [
-            (s, fitted(current.base, self.run, current.found.smoothed,
-                       added=(*current.added, (s.candidate, s.step)), colour=current.colour,
-                       start=current.intensities))
-            for s in promising[:CONTENDERS]
-        ]  # fmt: skip
-        trials = [t for t in trials if np.isfinite(t[1].evidence)]
+        promising = self._promising(ranked) or self._promising(self._strictly(current))
+        trials = [(s, self._refitted(current, s)) for s in promising[:CONTENDERS]]
+        trials = [(s, fit) for s, fit in trials if self._likelier(fit, current, s.candidate.size)]
         if not trials:
             return None
         best = max(fit.evidence for _, fit in trials)
@@ -150,6 +144,34 @@ class _Loop:
         self.added.append(Added(score.candidate, score.p_value, gained, others[:2]))
         self.say(f"{score.candidate.label}: held-out innovations become smaller")
         return chosen
+
+    def _promising(self, ranked: list[Score]) -> list[Score]:
+        """Significant ones, those left out that would gain less than half of the best."""
+        significant = [s for s in ranked if s.p_value <= self.limit]
+        most = max((s.gain for s in significant), default=0.0)
+        return sorted((s for s in significant if s.gain > 0.5 * most), key=lambda s: -s.gain)
+
+    def _strictly(self, current: Fit) -> list[Score]:
+        """Scores with no more noise than the sensors' own: a large effect that the matched
+        intensities have swallowed stands out again. Empty where these say the same."""
+        if not self._noise_is_odd(current):
+            return []
+        model = applied(current.model, self._of_sensors(current)[1])
+        found = filtered(model, self.run)
+        rest = [c for c in self.tried if all(c is not a for a, _ in current.added)]
+        return scores(sensitivity(current.base, current.added, rest, self.run, found), rest)
+
+    def _refitted(self, current: Fit, score: Score) -> Fit:
+        return fitted(current.base, self.run, current.found.smoothed,
+                      added=(*current.added, (score.candidate, score.step)),
+                      colour=current.colour, start=current.intensities)  # fmt: skip
+
+    def _likelier(self, fit: Fit, current: Fit, size: int) -> bool:
+        """Is the rise of likelihood more than so many more numbers gain from noise?"""
+        from scipy.special import chdtrc
+
+        rise = 2 * (fit.likelihood - current.likelihood)
+        return bool(np.isfinite(rise) and rise > 0 and chdtrc(size, rise) <= self.limit)
 
     def _with_colour(self, current: Fit, white: Whiteness) -> Fit | None:
         """The fit with correlated noise on an output, if the innovations ask for it."""
@@ -172,11 +194,19 @@ class _Loop:
 
     def _noise_is_odd(self, fit: Fit) -> bool:
         """Are the intensities far from what the signals themselves show from sample to sample?"""
+        ready, sensors = self._of_sensors(fit)
+        return fit.likelihood - likelihood(ready, sensors) > ASKS
+
+    def _of_sensors(self, fit: Fit) -> tuple[Prepared, dict[str, float]]:
+        """Intensities of inputs and states no larger than the signals' noise from sample to sample
+        says; those of readings as they are."""
         ready = prepared(fit.model, self.run, fit.found.smoothed)
-        inputs = [name for name in ready.units if name in self.run.signals]
         guess = first_guess(ready, self.run)
-        seen = {**fit.intensities, **{name: guess[name] for name in inputs}}
-        return fit.likelihood - likelihood(ready, seen) > ASKS
+        kept = {*ready.readings, *({fit.colour.state} if fit.colour else ())}
+        return ready, {
+            name: value if name in kept else min(guess[name], value)
+            for name, value in fit.intensities.items()
+        }
 
     def _confirmed(self, current: Fit, better: Fit) -> float | None:
         """Held-out gain of log-likelihood per reading, if it exceeds its own error."""
