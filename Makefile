@@ -4,7 +4,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: demo test lint types format wheel bench study study-starts study-nist study-loop figures docs clean
+.PHONY: demo test lint types format wheel bench study study-starts study-nist study-loop \
+	study-motion figures docs clean
 
 demo: $(READY)
 	$(BIN)/casest demo
@@ -45,6 +46,10 @@ study-nist: $(READY)
 
 study-loop: $(READY)
 	$(BIN)/python studies/loop.py
+
+study-motion: $(READY)
+	$(BIN)/python studies/flight.py
+	$(BIN)/python studies/flight_loop.py
 
 figures: $(READY)
 	$(BIN)/python studies/figures.py

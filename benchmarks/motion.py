@@ -26,6 +26,7 @@ from casest import Run
 from casest.declaring.shapes import Array
 from casest.dynamics.filter import filtered
 from casest.dynamics.gramian import gramian
+from casest.dynamics.record import least_squares
 from casest.dynamics.riccati import riccati
 from casest.dynamics.transition import Linearised, linearised, process_noise, transitions
 from casest_problems.bias_gravity import bias_gravity
@@ -110,9 +111,18 @@ def main() -> None:
             False,
         ),
     }
-    print(f"{len(run)} samples, {bias_gravity.size} states")
+    half = run.take(slice(len(run) // 2))
+    part = linearised(bias_gravity, half)
+    halves = {
+        "Gramian": timed(lambda: gramian(bias_gravity, part)),
+        "Riccati": timed(lambda: riccati(bias_gravity, part)),
+        "filter": timed(lambda: filtered(bias_gravity, half, smooth=False)),
+        "filter and smoother": timed(lambda: filtered(bias_gravity, half)),
+    }
+    print(f"{len(run)} samples, {bias_gravity.size} states; of half the record in brackets")
     for name, seconds in times.items():
-        print(f"{name:<22}{seconds:8.3f} s")
+        print(f"{name:<22}{seconds:8.3f} s ({halves[name]:.3f} s)")
+    print(f"least squares         {timed(lambda: least_squares(bias_gravity, run), 1):8.3f} s")
     for (name, way), job in others.items():
         print(f"{way}, {name:<11}{SHARE * timed(job, 1) / times[name]:8.1f} times as long")
     slow = timed(lambda: by_loop(system), 1)

@@ -26,6 +26,7 @@ _HOME = {
     "casest.estimate": "Estimate attempt calibrate",
     "casest.batch": "Batch calibrate_many",
     "casest.closing.loop": "Closing close",
+    "casest.closing_motion.loop": "MotionClosing close_motion",
     "casest.apply": "Correction",
 }
 _WHERE = {name: module for module, names in _HOME.items() for name in names.split()}

@@ -18,6 +18,7 @@ from casest.waiting import Waiting
 
 if TYPE_CHECKING:
     from casest.data.run import Run
+    from casest.dynamics import Dynamics
     from casest.modelling.model import Model
 
 Options = dict[str, Any]
@@ -254,7 +255,13 @@ def close(model_name: str, data: tuple[str, ...], **options: Any) -> int:
 
     Verdict `adequate`: nothing that these data can show is missing; `extended`: effects were added
     and what is left is noise; `unexplained`: a misfit remains. Exit code 0 whatever the verdict.
+    Of an estimator in motion the one-step innovations are diagnosed.
     """
+    from casest.dynamics import Dynamics
+    from casest.problem import find_any
+
+    if isinstance(find_any(model_name), Dynamics):
+        return closing_in_motion(model_name, data, options, typed())
     return closing(model_name, data, options, typed())
 
 
@@ -300,6 +307,40 @@ def closing(model_name: str, data: Sequence[str], options: Options, command: str
         echo(result.as_json(content), nl=False)
     else:
         echo(coloured(text.closing_text(found, content, options["output"]), sys.stdout))
+    return 0
+
+
+#: Options of `close` that only calibrations have.
+FITTED = ("effects", "per_run", "shared", "fix", "free", "starts", "holdout")
+
+
+def closing_in_motion(model_name: str, data: Sequence[str], options: Options, command: str) -> int:
+    """Filter, diagnose the innovations, add what is missing, save, print."""
+    from casest import result
+    from casest.closing_motion import loop, text, written
+    from casest.report import closing_motion_page
+
+    for name in FITTED:
+        if options[name]:
+            flag = {"starts": "start"}.get(name, name.replace("_", "-"))
+            raise UsageError(
+                f"--{flag} is for calibrations; {model_name} is an estimator in motion: its "
+                "effects and noise are found from the record alone"
+            )
+    moving, run = moving_record(model_name, data, {**options, "intensities": (), "stds": ()})
+    found = loop.close_motion(moving, run, say=progress)
+    content = written.motion_result(found, model_name=model_name, data=data, command=command)
+    if options["output"]:
+        result.save(options["output"], content, written.residual_rows(found))
+        reported(options["output"], closing_motion_page(found, content))
+    if options["as_json"]:
+        echo(result.as_json(content), nl=False)
+    else:
+        echo(text.motion_text(content, options["output"]))
+    if not content["trusted"]:
+        reason = content["after"]["certificate"]["reasons"][-1]
+        click.echo(f"casest: no trustworthy estimate: {reason}", err=True)
+        return NotTrusted.exit_code
     return 0
 
 
@@ -363,7 +404,12 @@ def motion_options(command: Callable[..., Any]) -> Callable[..., Any]:
         click.option("--json", "as_json", is_flag=True, help="Print JSON instead of text."),
         click.option("-o", "--output", type=FOLDER, metavar="DIR", help="Folder."),
         click.option("--std", "stds", help="What is known of a state at the beginning.", **many),
-        click.option("--intensity", "intensities", help="Of its driving noise, unit^2/s.", **many),
+        click.option(
+            "--intensity",
+            "intensities",
+            help="Of a state's driving noise, unit^2/s, or of a signal's noise, unit^2 s.",
+            **{**many, "metavar": "NAME=NUMBER"},
+        ),
     ):
         command = option(command)
     return command
@@ -371,7 +417,7 @@ def motion_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 @commands.command()
 @click.argument("model_name", metavar="MODEL", type=ModelName())
-@click.argument("data", nargs=-1, required=True, type=click.Path())
+@click.argument("data", nargs=-1, type=click.Path())
 @model_options
 @reading_options
 @motion_options
@@ -379,7 +425,8 @@ def motion_options(command: Callable[..., Any]) -> Callable[..., Any]:
 def observe(model_name: str, data: tuple[str, ...], **options: Any) -> int:
     """What these data, or this trajectory, can see: rank, and what is hidden, in words.
 
-    Exit code 0 even where something is not observable.
+    Without DATA: what any record of an estimator in motion could show (structural rank). Exit
+    code 0 even where something is not observable.
     """
     from casest import observing, result
     from casest.modelling.model import Model
@@ -388,9 +435,13 @@ def observe(model_name: str, data: tuple[str, ...], **options: Any) -> int:
     fits = isinstance(find_any(model_name), Model)
     if fits:
         model = declared_model(model_name, options)
+        if not data:
+            raise UsageError(f"{model_name}: what can be seen depends on the record: give DATA")
         runs = records(model, data, options)
         progress(f"fitting {model_name}")
         content, _ = observing.observe_parameters(model, runs)
+    elif not data:
+        content = observing.observe_structure(moving_model(model_name, options))
     else:
         moving, run = moving_record(model_name, data, options)
         progress("what the trajectory shows")
@@ -413,26 +464,50 @@ def observe(model_name: str, data: tuple[str, ...], **options: Any) -> int:
 @commands.command("filter")
 @click.argument("model_name", metavar="MODEL", type=ModelName())
 @click.argument("data", nargs=-1, required=True, type=click.Path())
+@click.option(
+    "--set", "constants", metavar="NAME=VALUE", multiple=True, help="Set a constant of the model."
+)
 @reading_options
 @motion_options
+@click.option(
+    "--noise",
+    type=click.Choice(["declared", "ml"]),
+    default="declared",
+    help="Noise intensities: as declared, or the most likely ones for this record.",
+)
+@click.option(
+    "--sensor-noise",
+    "stated",
+    multiple=True,
+    metavar="SIGNAL=STD",
+    help="Standard deviation of one reading, in the model's unit; its rate is the record's.",
+)
+@click.option(
+    "--rest",
+    type=click.Path(),
+    metavar="FILE",
+    help="A record at rest: noise of the inputs by its Allan deviation.",
+)
 def filter_command(model_name: str, data: tuple[str, ...], **options: Any) -> int:
     """States over time by the Kalman filter and smoother, with innovations diagnosed."""
-    from casest import observing, result
+    from casest import filtering, result
 
-    moving, run = moving_record(model_name, data, {**options, "constants": ()})
+    moving, run = moving_record(model_name, data, options)
+    tuned, told = tuned_noise(moving, run, options)
     progress("filter and smoother")
-    content, found = observing.follow(moving, run)
+    content, found = filtering.follow(moving, run, tuned)
+    content |= told
     content |= {"data": list(data), "reproduce": result.reproduce(typed(), data)}
     if options["output"]:
         from casest.report import filter_page
 
-        write(options["output"] / "states.csv", observing.states_csv(found))
+        write(options["output"] / "states.csv", filtering.states_csv(found))
         write(options["output"] / "filter.json", result.as_json(content))
         reported(options["output"], filter_page(found, content))
     if options["as_json"]:
         echo(result.as_json(content), nl=False)
         return 0
-    echo(observing.filter_text(content))
+    echo(filtering.filter_text(content))
     last_words(options["output"], "report.html, filter.json, states.csv")
     return 0
 
@@ -445,6 +520,33 @@ def last_words(output: Path | None, files: str, **known: Any) -> None:
         echo(f"\nWritten: {output}/{files}")
     if words := following(typed(), output, **known):
         echo(f"\n{words}")
+
+
+def tuned_noise(moving: Dynamics, run: Run, options: Options) -> tuple[Any, Options]:
+    """Noise intensities as --noise, --sensor-noise or --rest ask for them, and what a rest said."""
+    from casest import intensities
+    from casest.data import load_runs
+
+    if options["noise"] == "ml":
+        if options["stated"] or options["rest"]:
+            raise UsageError("--noise ml finds every intensity: leave --sensor-noise, --rest out")
+        progress("looking for the most likely noise intensities")
+        return intensities.most_likely(moving, run), {}
+    stds = dict(number_pair(text, "--sensor-noise") for text in options["stated"])
+    stated = intensities.from_stated(moving, run, stds) if stds else None
+    if options["rest"] is None:
+        return stated, {}
+    inputs = [s for s in moving.signals if s.name not in (*moving.measured_signals, "t")]
+    arguments = reading_arguments(options)
+    names = {s.name for s in inputs}
+    for key in ("columns", "units", "scales"):
+        arguments[key] = {n: v for n, v in arguments[key].items() if n in (*names, "t")}
+    (rest,) = load_runs([options["rest"]], inputs, **arguments)[:1]
+    tuned, found = intensities.from_rest(moving, rest)
+    if stated:
+        both = intensities.from_stated(tuned.model, run, stds).model
+        tuned = intensities.Tuned(both, f"{tuned.how} and {stated.how}")
+    return tuned, {"allan": intensities.told(found)}
 
 
 def reported(folder: Path, page: str) -> None:
@@ -466,23 +568,32 @@ def write(path: Path, text: str) -> None:
     write_atomically(path, text)
 
 
-def moving_record(name: str, data: Sequence[str], options: Options) -> tuple[Any, Run]:
-    """The estimator with its options applied, and its one record."""
-    from casest.data import load_runs
+def moving_model(name: str, options: Options) -> Dynamics:
+    """The estimator with its options applied."""
     from casest.dynamics import Dynamics
     from casest.problem import find_any
 
     moving = find_any(name)
     if not isinstance(moving, Dynamics):
         raise UsageError(f"{name} is no estimator in motion: casest calibrate, close or observe it")
-    if len(data) != 1:
-        raise UsageError(f"{name}: a trajectory is one file, not {len(data)}")
     constants = dict(number_pair(text, "--set") for text in options["constants"])
     moving = moving.having(**constants)
-    moving = moving.driven(**dict(number_pair(t, "--intensity") for t in options["intensities"]))
-    moving = moving.known_to(**dict(number_pair(t, "--std") for t in options["stds"]))
+    intensities = dict(number_pair(text, "--intensity") for text in options["intensities"])
+    sensed = {s.name: intensities.pop(s.name) for s in moving.signals if s.name in intensities}
+    moving = moving.driven(**intensities).sensing(**sensed)
+    return moving.known_to(**dict(number_pair(t, "--std") for t in options["stds"]))
+
+
+def moving_record(name: str, data: Sequence[str], options: Options) -> tuple[Dynamics, Run]:
+    """The estimator with its options applied, and its one record."""
+    from casest.data import load_runs
+
+    moving = moving_model(name, options)
+    if len(data) != 1:
+        raise UsageError(f"{name}: a trajectory is one file, not {len(data)}")
     progress(f"reading {data[0]}")
-    runs = load_runs(list(data), moving.signals, **reading_arguments(options))
+    gaps = moving.may_be_missing
+    runs = load_runs(list(data), moving.signals, gaps=gaps, **reading_arguments(options))
     if len(runs) != 1:
         raise UsageError(f"{data[0]} holds {len(runs)} runs; a trajectory is one")
     return moving, runs[0]

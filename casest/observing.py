@@ -1,9 +1,7 @@
-"""`casest observe` and `casest filter`: what a trajectory shows, and the states along it."""
+"""`casest observe`: what data, a trajectory, or any record of a model can show."""
 
 from __future__ import annotations
 
-import csv
-import io
 import textwrap
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -14,10 +12,11 @@ from casest import __version__
 from casest.data.run import Run
 from casest.data.timing import GAP
 from casest.dynamics import Dynamics
-from casest.dynamics.filter import Filtered, filtered
+from casest.dynamics.filter import filtered
 from casest.dynamics.gramian import Observed, gramian, observed, window_eigenvalues
+from casest.dynamics.structural import Structure, structure
 from casest.dynamics.transition import linearised
-from casest.errors import UsageError
+from casest.errors import DeclarationError, UsageError
 from casest.estimate import Estimate, attempt
 from casest.modelling.model import Model
 from casest.result import plain
@@ -45,12 +44,55 @@ def observe_parameters(model: Model, runs: Sequence[Run]) -> tuple[dict[str, Any
     }, found
 
 
+def observe_structure(model: Dynamics) -> dict[str, Any]:
+    """What any record could show: structural rank with inputs that vary freely, and held constant.
+
+    `std` is empty: how well needs a record.
+    """
+    free = structure(model)
+    held = structure(model, varying=False) if free.inputs else free
+    return {
+        "casest": __version__,
+        "model": model.name,
+        "notes": [],
+        "rank": free.rank,
+        "unknowns": free.unknowns,
+        "unobservable": list(free.unobservable),
+        "std": {},
+        "structural": _structural(free),
+        "constant_inputs": _structural(held),
+        "tolerance": "singular values below 1e-10 of the largest count as zero; the smallest that "
+        f"counts is {min(free.gap, held.gap):.1g} times the largest that does not",
+    }
+
+
+def _structural(found: Structure) -> dict[str, Any]:
+    return {
+        "rank": found.rank,
+        "undetermined": list(found.undetermined),
+        "unobservable": list(found.unobservable),
+        "order": found.order,
+        "inputs": list(found.inputs),
+        "gap": plain(found.gap),
+    }
+
+
+def _structural_rank(model: Dynamics) -> int | None:
+    """What a better record could reach; None where it cannot be said."""
+    try:
+        return structure(model).rank
+    except DeclarationError:
+        return None
+
+
 def observe_motion(model: Dynamics, run: Run, window: float | None = None) -> dict[str, Any]:
     """What a trajectory makes observable, by the Gramian over the whole record and over windows.
 
-    `std` is what the readings alone allow at the beginning of the record, per state.
+    `std` is what the readings alone allow at the beginning of the record, per state. A nonlinear
+    model is linearised along its smoothed states.
     """
-    system = linearised(model, run)
+    along = None if model.linear else filtered(model, run).smoothed
+    system = linearised(model, run, along)
     seen = observed(model, gramian(model, system))
     duration = float(system.time[-1] - system.time[0])
     if window is not None and not 2 * float(np.median(system.steps)) <= window < np.inf:
@@ -60,13 +102,15 @@ def observe_motion(model: Dynamics, run: Run, window: float | None = None) -> di
         )
     length = min(window or WINDOW * duration, duration)
     ends, eigenvalues = window_eigenvalues(model, system, length)
+    telling = np.flatnonzero(eigenvalues[:, 0] > 1)
     std = {name: plain(seen.std[where]) for name, where in model.slices().items()}
     return {
         "casest": __version__,
         "model": model.name,
-        "notes": [*assumed(run), *_too_short(seen, len(run), duration)],
+        "notes": [*assumed(run), *_readings_alone(model), *_too_short(seen, len(run), duration)],
         "rank": seen.rank,
         "unknowns": seen.unknowns,
+        "structural_rank": _structural_rank(model),
         "unobservable": list(seen.unobservable),
         "std": std,
         "units": {s.name: s.unit for s in model.states},
@@ -77,6 +121,7 @@ def observe_motion(model: Dynamics, run: Run, window: float | None = None) -> di
             "length_s": plain(length),
             "end_s": plain(ends),
             "smallest_eigenvalue": plain(eigenvalues[:, 0]),
+            "informative_from_s": plain(ends[telling[0]]) if telling.size else None,
             "eigenvalues": plain(eigenvalues),
         },
     }
@@ -99,6 +144,14 @@ def assumed(run: Run) -> list[str]:
     return notes
 
 
+def _readings_alone(model: Dynamics) -> list[str]:
+    if not model.traced.g.numel():
+        return []
+    return [
+        "what the model knows exactly (constraint) is not counted: this the readings alone show"
+    ]
+
+
 def _too_short(seen: Observed, samples: int, duration: float) -> list[str]:
     if seen.rank == seen.unknowns or samples > seen.unknowns:
         return []
@@ -108,79 +161,23 @@ def _too_short(seen: Observed, samples: int, duration: float) -> list[str]:
     ]
 
 
-def follow(model: Dynamics, run: Run) -> tuple[dict[str, Any], Filtered]:
-    """States over time by the Kalman filter, and whether the innovations are as expected."""
-    found = filtered(model, run)
-    normalised = found.normalised_innovations
-    whole = normalised[np.isfinite(normalised)]
-    m = found.innovations.shape[1]
-    half = slice(len(whole) // 10, None)  # the beginning belongs to the start values
-    mean = float(np.mean(whole[half])) if len(whole[half]) else float("nan")
-    final = {
-        name: {
-            "value": plain(found.x[-1][where]),
-            "std": plain(found.std[-1][where]),
-            "smoothed_std_median": plain(_median_std(found, where)),
-            "unit": model[name].unit,
-        }
-        for name, where in model.slices().items()
-    }
-    return {
-        "casest": __version__,
-        "model": model.name,
-        "notes": assumed(run),
-        "samples": len(found.time),
-        "states": final,
-        "innovations": {
-            "rms": plain(np.sqrt(np.nanmean(found.innovations**2, axis=0))),
-            "normalised_mean": plain(mean),
-            "expected": m,
-            "missing_readings": int(np.sum(~np.isfinite(normalised))),
-            "lag1_correlation": plain(_lag1(found.innovations)),
-        },
-    }, found
-
-
-def _median_std(found: Filtered, where: slice) -> Any:
-    std = np.sqrt(np.diagonal(found.smoothed_P, axis1=1, axis2=2))[:, where]
-    return np.median(std, axis=0)
-
-
-def _lag1(innovations: Any) -> Any:
-    """Correlation of neighbouring innovations, each component: zero for the right filter."""
-    r = np.where(np.isfinite(innovations), innovations, 0.0)
-    return np.sum(r[1:] * r[:-1], axis=0) / np.maximum(np.sum(r**2, axis=0), 1e-300)
-
-
-def states_csv(found: Filtered) -> str:
-    """Filtered and smoothed states with standard deviations, a row per sample."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    names, units = found.model.names, found.model.state_units
-    head = ["t [s]"]
-    for kind in ("", "std_", "smoothed_", "smoothed_std_"):
-        head += [f"{kind}{n} [{u}]" for n, u in zip(names, units, strict=True)]
-    writer.writerow(head)
-    smooth_std = np.sqrt(np.diagonal(found.smoothed_P, axis1=1, axis2=2))
-    table = np.hstack([found.time[:, None], found.x, found.std, found.smoothed, smooth_std])
-    writer.writerows([[repr(float(v)) for v in row] for row in table])
-    return text.getvalue()
-
-
 def observe_text(content: Mapping[str, Any]) -> str:
     """Rank, what is hidden in words, and the standard deviations that the data allow."""
+    if "structural" in content:
+        return structure_text(content)
     lines = [f"{content['model']}: rank {content['rank']} of {content['unknowns']}"]
     lines += [f"  - {words}" for words in content["unobservable"]]
+    lines += [f"  {could}" for could in [could_reach(content)] if could]
     if not content["unobservable"]:
         lines.append("  every unknown is determined by these data")
     lines += ["", "  standard deviation that these data allow:"]
-    units = content.get("units", {})
+    shown_units = content.get("units", {})
     for name, std in content["std"].items():
         rows = std if isinstance(std, list) else [std]
         rows = rows if rows and isinstance(rows[0], list) else [rows]
         for k, row in enumerate(rows):
-            shown = ", ".join(map(_number, row))
-            unit = units.get(name, "") if k == 0 else ""
+            shown = ", ".join(map(number_or_not, row))
+            unit = shown_units.get(name, "") if k == 0 else ""
             lines.append(f"    {name if k == 0 else '':<16} {shown} {unit}".rstrip())
     if "windows" in content:
         w = content["windows"]
@@ -188,45 +185,67 @@ def observe_text(content: Mapping[str, Any]) -> str:
         lines += [
             "",
             f"  over windows of {w['length_s']:.3g} s the smallest eigenvalue (information over "
-            f"prior) goes from {low:.3g} to {high:.3g}",
+            f"prior) goes from {low:.3g} to {high:.3g};",
+            f"  {window_words(w)}",
         ]
-    return "\n".join(_wrapped([*lines, *_note_lines(content)]))
+    return "\n".join(wrapped([*lines, *note_lines(content)]))
 
 
-def _wrapped(lines: list[str]) -> list[str]:
+def wrapped(lines: Sequence[str]) -> list[str]:
     """Lines that fit 80 columns."""
     return [
         textwrap.fill(line, 80, subsequent_indent=" " * 4, break_on_hyphens=False) for line in lines
     ]
 
 
-def _note_lines(content: Mapping[str, Any]) -> list[str]:
+def window_words(windows: Mapping[str, Any]) -> str:
+    """Since when a window alone tells every state more than was known beforehand."""
+    since = windows["informative_from_s"]
+    if since is None:
+        return "no window alone tells every state more than was known beforehand"
+    return f"the first window that tells every state more than was known ends at {since:.4g} s"
+
+
+def could_reach(content: Mapping[str, Any]) -> str:
+    """Whether another record could show what this one hides; empty where it hides nothing."""
+    could = content.get("structural_rank")
+    if could is None or content["rank"] == content["unknowns"]:
+        return ""
+    if could > content["rank"]:
+        return f"another motion could show more: the structural rank is {could}"
+    return f"no motion shows more: the structural rank is {could} too"
+
+
+def structure_text(content: Mapping[str, Any]) -> str:
+    """Structural rank and what no record can determine, in words."""
+    free, held, n = content["structural"], content["constant_inputs"], content["unknowns"]
+    order = f"{free['order']} {'derivative' if free['order'] == 1 else 'derivatives'}"
+    lines = [
+        f"{content['model']}: structural rank {free['rank']} of {n} "
+        f"(readings and {order} of them, at random points)"
+    ]
+    inputs = " and ".join(free["inputs"])
+    if free["rank"] == n:
+        how = ""
+        if inputs:
+            how = f" where {inputs} vary" if held["rank"] < n else f" even with {inputs} constant"
+        lines.append(f"  suitable data determine every state and parameter{how}")
+    else:
+        lines += [f"  - {words}" for words in free["unobservable"]]
+        lines.append(f"  not determined by any record: {', '.join(free['undetermined'])}")
+    if held["rank"] < free["rank"]:
+        lines += ["", f"  with {inputs} held constant: rank {held['rank']} of {n}"]
+        lines += [f"  - {words}" for words in held["unobservable"]]
+        lines.append(f"  then not determined: {', '.join(held['undetermined'])}")
+    return "\n".join(wrapped(lines))
+
+
+def note_lines(content: Mapping[str, Any]) -> list[str]:
+    """What was assumed, a line each."""
     notes = content.get("notes", [])
     return ["", *(f"  note: {note}" for note in notes)] if notes else []
 
 
-def _number(value: Any) -> str:
+def number_or_not(value: Any) -> str:
+    """A number, or that there is none."""
     return "not determined" if value is None else f"{value:.3g}"
-
-
-def filter_text(content: Mapping[str, Any]) -> str:
-    """Final states and the innovations' verdict."""
-    lines = [f"{content['model']}: {content['samples']} samples", "", "  at the end of the record:"]
-    for name, s in content["states"].items():
-        for k, (value, std) in enumerate(zip(s["value"], s["std"], strict=True)):
-            label = name if len(s["value"]) == 1 else f"{name}[{k}]"
-            lines.append(f"    {label:<14} {value:>12.5g} ± {std:<10.2g} {s['unit']}")
-    i = content["innovations"]
-    lines += ["", f"  innovations are {filter_verdict(content)}"]
-    if i["missing_readings"]:
-        lines.append(f"  {i['missing_readings']} samples without a complete reading")
-    return "\n".join(_wrapped([*lines, *_note_lines(content)]))
-
-
-def filter_verdict(content: Mapping[str, Any]) -> str:
-    """How large the innovations are beside what the noise intensities say."""
-    said = content["innovations"]
-    ratio = (said["normalised_mean"] or float("nan")) / said["expected"]
-    if 0.8 < ratio < 1.25:
-        return "as large as the noise intensities say"
-    return f"{ratio:.2g} times as large (squared) as the noise intensities say: match them"

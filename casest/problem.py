@@ -32,6 +32,7 @@ SHIPPED = {
 #: Shipped estimators in motion.
 MOVING = {
     "bias-gravity": ("bias_gravity", "bias_gravity"),
+    "bias-gravity-magnitude": ("bias_gravity", "bias_gravity_magnitude"),
     "bias-gravity-position": ("bias_gravity", "bias_gravity_position"),
 }
 
@@ -67,7 +68,7 @@ def find_model(name: str) -> Model:
         check_units(own)
         return own
     if name in MOVING:
-        raise UsageError(f"{name} is an estimator in motion: casest observe {name}, casest filter")
+        raise UsageError(f"{name} is an estimator in motion: casest observe, filter or close it")
     near = difflib.get_close_matches(name, [*SHIPPED, *MOVING], 1)
     hint = f"; did you mean {near[0]!r}?" if near else ""
     raise UsageError(

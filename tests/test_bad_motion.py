@@ -14,8 +14,9 @@ HEAD = ["t [s]", *(f"a{c} [m/s^2]" for c in "xyz"), *(f"omega_{c}" for c in "xyz
         *(f"v{c} [m/s]" for c in "xyz")]  # fmt: skip
 
 
-def record(path, count=500, unit="rad/s", times=None, hole=None, factor=1.0):
-    """A turning body, written as a user's file; hole: rows without an angular rate."""
+def record(path, count=500, unit="rad/s", times=None, hole=None, factor=1.0, unread=()):
+    """A turning body, written as a user's file; hole: rows without an angular rate, `unread`:
+    (row, axis) without a velocity."""
     t = np.arange(count) * STEP if times is None else times
     omega = factor * np.c_[0.5 * np.sin(0.6 * t), 0.4 * np.cos(0.42 * t), 0.3 * np.sin(0.2 * t + 1)]
     rng = np.random.default_rng(1)
@@ -25,7 +26,8 @@ def record(path, count=500, unit="rad/s", times=None, hole=None, factor=1.0):
     lines = [",".join(head)]
     for k in range(len(t)):
         rates = ["" if hole and k in hole else f"{w:.12g}" for w in omega[k]]
-        lines.append(",".join([f"{t[k]:.6f}", *map(str, a[k]), *rates, *map(str, v[k])]))
+        speeds = ["" if (k, i) in unread else str(v[k, i]) for i in range(3)]
+        lines.append(",".join([f"{t[k]:.6f}", *map(str, a[k]), *rates, *speeds]))
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
     return str(path)
 
@@ -87,6 +89,32 @@ def test_rates_without_a_unit_are_said(told, tmp_path):
 def test_a_rate_that_is_missing_for_a_while(refused, tmp_path):
     said = refused("filter", record(tmp_path / "r.csv", hole=range(100, 150)))
     assert "omega_x row 100 is empty (and 49 more such rows)" in said
+
+
+def test_empty_velocity_cells_are_readings_that_are_missing(told, tmp_path):
+    """A whole stretch without, and one axis alone: what is there is used, and it is said."""
+    unread = {(k, i) for k in range(100, 150) for i in range(3)} | {(200, 1)}
+    for command in ("filter", "observe"):
+        content = told(command, record(tmp_path / "r.csv", unread=unread))
+        notes = " ".join(content["notes"])
+        assert "v: 51 of 500 readings are missing, whole or in part, the first in row 100" in notes
+    content = told("filter", record(tmp_path / "r.csv", unread=unread))
+    assert content["innovations"]["missing_readings"] == 51
+    assert all(np.isfinite(s["value"]).all() for s in content["states"].values())
+
+
+def test_a_velocity_that_is_never_read(refused, tmp_path):
+    unread = {(k, i) for k in range(500) for i in range(3)}
+    said = refused("filter", record(tmp_path / "r.csv", unread=unread))
+    assert "signal v has no reading in 500 rows" in said
+
+
+def test_a_velocity_cell_that_holds_something_else(refused, tmp_path):
+    file = record(tmp_path / "r.csv")
+    text = (tmp_path / "r.csv").read_text("utf-8").splitlines()
+    text[31] = text[31].rpartition(",")[0] + ",overflow"
+    (tmp_path / "r.csv").write_text("\n".join(text) + "\n", encoding="utf-8")
+    assert "column vz row 30 holds 'overflow'" in refused("filter", file)
 
 
 @pytest.mark.parametrize("std", ["-1", "0", "nan", "inf"])

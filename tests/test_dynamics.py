@@ -12,8 +12,10 @@ from casest import DataError, DeclarationError, Run, signal
 from casest.dynamics import Motion, dynamics, measured, state
 from casest.dynamics.filter import filtered
 from casest.dynamics.gramian import gramian, gramian_by_ode, observed, smallest_eigenvalue
+from casest.dynamics.record import least_squares
 from casest.dynamics.riccati import riccati
 from casest.dynamics.transition import linearised, transitions
+from casest.observing import observe_motion
 from casest_problems.bias_gravity import bias_gravity, bias_gravity_position
 
 BIAS = np.array([0.1, -0.05, 0.025])
@@ -105,6 +107,33 @@ def test_the_hidden_direction_is_gravity_and_bias_along_the_axis():
     assert abs(abs(expected @ seen.directions[:, 0]) - 1) < 1e-9
 
 
+def test_a_reading_that_is_missing_tells_nothing():
+    """Half of the velocities: half of the information, but for the stretches' edges."""
+    t = np.arange(0, 20, 0.02)
+    run = motionless(turning("all round", t), t)
+    v = np.zeros((len(t), 3))
+    v[: len(t) // 2] = np.nan
+    part = Run.raw("r", {**run.signals, "v": v}, units={}, time=t)
+    late = run.take(slice(len(t) // 2, None))
+    W = gramian(bias_gravity, linearised(bias_gravity, part))
+    expected = gramian(bias_gravity, linearised(bias_gravity, late))
+    Phi = np.eye(9)
+    for step in transitions(linearised(bias_gravity, run))[0][: len(t) // 2]:
+        Phi = step @ Phi
+    expected = Phi.T @ expected @ Phi
+    np.testing.assert_allclose(W, expected, atol=3e-3 * np.abs(expected).max())
+
+
+def test_readings_at_a_third_of_the_rate_tell_a_third():
+    t = np.arange(0, 20, 0.02)
+    run = motionless(turning("all round", t), t)
+    v = np.zeros((len(t), 3))
+    v[np.arange(len(t)) % 3 > 0] = np.nan
+    thin = Run.raw("r", {**run.signals, "v": v}, units={}, time=t)
+    whole, third = (gramian(bias_gravity, linearised(bias_gravity, r)) for r in (run, thin))
+    np.testing.assert_allclose(3 * third, whole, atol=3e-3 * np.abs(whole).max())
+
+
 def test_with_positions_the_rank_is_full_too():
     t = np.arange(0, 60, 0.02)
     zero, omega = np.zeros((len(t), 3)), turning("all round", t)
@@ -118,6 +147,16 @@ def test_both_forms_of_the_gramian_agree():
     system = linearised(bias_gravity, motionless(turning("all round", t), t))
     product, ode = gramian(bias_gravity, system), gramian_by_ode(bias_gravity, system)
     assert np.abs(product - ode).max() < 1e-8 * np.abs(product).max()
+
+
+def test_it_is_said_since_when_a_trajectory_tells_everything():
+    """Straight on for 30 s, then it turns about changing axes."""
+    t = np.arange(0, 60, 0.02)
+    run = motionless(np.where((t > 30)[:, None], 2 * turning("all round", t), 0.0), t)
+    windows = observe_motion(bias_gravity.known_to(bias=0.5), run, window=10.0)["windows"]
+    assert 30 < windows["informative_from_s"] < 45
+    still = observe_motion(bias_gravity, motionless(turning("not at all", t), t))["windows"]
+    assert still["informative_from_s"] is None
 
 
 def test_a_slow_precession_shows_more_in_longer_windows():
@@ -191,7 +230,7 @@ def test_a_stiff_riccati_equation_stays_symmetric_and_positive():
 # -- filter and smoother -----------------------------------------------------------------------
 
 
-def least_squares(model, run):
+def by_normal_equations(model, run):
     """All states of a linear record at once, by dense normal equations."""
     from casest.dynamics.transition import process_noise, steps_to
 
@@ -220,10 +259,32 @@ def least_squares(model, run):
 
 def test_filter_smoother_and_least_squares_are_one_estimate():
     run = cart_run(200)
-    found, (x, P) = filtered(cart, run), least_squares(cart, run)
+    found, (x, P) = filtered(cart, run), by_normal_equations(cart, run)
     np.testing.assert_allclose(found.smoothed, x, atol=1e-8)
     np.testing.assert_allclose(found.x[-1], x[-1], atol=1e-8)
     np.testing.assert_allclose(found.P[-1], P, rtol=1e-8)
+
+
+@pytest.mark.parametrize("kind", ["published", "undriven", "matched", "irregular"])
+def test_the_whole_record_at_once_is_the_filters_end(kind):
+    """Sparse augmented equations: no filter, no inverse of what may be singular."""
+    run, _, _ = flight(10)
+    model = bias_gravity
+    if kind != "published":
+        model = model.driven(velocity=0.0, gravity=0.0, bias=0.0)
+    if kind == "matched":
+        model = model.sensing(a=1.7e-8, omega=7.6e-9, v=1e-6)
+    if kind == "irregular":
+        kept = np.sort(np.random.default_rng(0).choice(len(run), 600, replace=False))
+        run = run.take(kept)
+        run.signals["v"][100:150] = np.nan
+    at_once, found = least_squares(model, run), filtered(model, run)
+    np.testing.assert_allclose(at_once.x[-1], found.x[-1], atol=1e-8)
+    np.testing.assert_allclose(at_once.x, found.smoothed, atol=1e-8)
+    size = np.abs(found.P[-1]).max()
+    np.testing.assert_allclose(at_once.P_end, found.P[-1], atol=1e-8 * size)
+    size = np.abs(found.smoothed_P[0]).max()
+    np.testing.assert_allclose(at_once.P_start, found.smoothed_P[0], atol=1e-8 * size)
 
 
 def test_missing_readings_say_nothing_and_do_no_harm():

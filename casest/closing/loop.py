@@ -342,7 +342,7 @@ class _Loop:
             self._refuse(score.candidate, f"its fit is refused: {why}")
             return None
         crossed = replace(crossed, values=estimate.values)
-        pruned, candidate = self._pruned(crossed, estimate, score)
+        pruned, candidate = self._plainer(*self._pruned(crossed, estimate, score))
         return pruned, candidate, self._gain(current, pruned)[0]
 
     def _keep(
@@ -416,6 +416,30 @@ class _Loop:
         if again is None or self._confirmed(again, fitted):
             return fitted, candidate
         return again, smaller
+
+    def _plainer(self, fitted: Fitted, candidate: Candidate) -> tuple[Fitted, Candidate]:
+        """In the effect's plain form, where held-out data do not want more.
+
+        What was held at a value of its grid is an unknown then.
+        """
+        effect = self.original[candidate.label].effect
+        if effect is None or not effect.plain:
+            return fitted, candidate
+        held, label = _held_value(candidate), candidate.label + "."
+        begun = effect.starting(**{held[0]: held[2]}) if held else effect
+        smaller = replace(candidate, effect=begun.holding(**dict(effect.plain)), traced=None)
+        values = {n: v for n, v in fitted.values.items() if not n.startswith(label)}
+        try:
+            base = replace(fitted.model, effects=fitted.model.effects[:-1])
+            again = self._crossed(self._fitted(smaller.added_to(base), values))
+        except CasestError:
+            return fitted, candidate
+        if again is None or self._confirmed(again, fitted):
+            return fitted, candidate
+        estimate = self._certified(again)
+        if not estimate.certificate.trusted:
+            return fitted, candidate
+        return replace(again, values=estimate.values), smaller
 
     def _weeded(self, current: Fitted) -> Fitted:
         """Each kept effect must still earn its place."""

@@ -50,6 +50,7 @@ def load_runs(
     at_rest: bool | Sequence[str] = False,
     extra: Sequence[str] = (),
     time_zero: Literal["first", "column"] = "first",
+    gaps: Sequence[str] = (),
 ) -> tuple[Run, ...]:
     """Read files and bind their columns to `signals`: one run per file and `run` label.
 
@@ -60,6 +61,7 @@ def load_runs(
     * rate: samples per second, instead of a time column or a rate stated above the table.
     * at_rest: average the rest intervals; names of further columns that must be at rest too.
     * extra: columns that must be there and hold numbers throughout.
+    * gaps: signals whose cells may be empty; a reading that is missing is NaN in the run.
     * time_zero: "first" makes each run's first sample t = 0, "column" keeps the column's own zero.
 
     Raises DataError, UnitError or UsageError naming file, column, row, value and the way out.
@@ -75,6 +77,7 @@ def load_runs(
         None if rate is None else timing.checked_rate(rate),
         time_zero,
         tuple(extra),
+        frozenset(gaps),
     )
     tables = [read_table(path) for path in listed]
     refuse_unknown_names(tables, wanted, options)
@@ -292,6 +295,7 @@ def _checked(run: Run, signals: Sequence[Signal], sources: Mapping[str, tuple[st
         if _is_time(signal) or signal.kind == "rotation":
             continue
         values, columns = run.signals[signal.name], sources[signal.name]
+        values = values[np.isfinite(values).all(axis=1)]
         checks.refuse_constant(run.file, signal.name, values, columns)
         notes += checks.constant_columns(values, columns) + checks.clipped(values, columns)
     return replace(run, notes=(*run.notes, *notes))

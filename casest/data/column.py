@@ -13,6 +13,10 @@ from casest import units
 Values = NDArray[np.float64] | NDArray[np.str_]
 
 
+#: What a cell holds where a reading is missing.
+_BLANK = frozenset({"", "nan", "na", "n/a", "null", "none", "-"})
+
+
 @dataclass(frozen=True)
 class BadCell:
     """The first cell of a column that is no finite number: its data row, its text, how many."""
@@ -20,6 +24,8 @@ class BadCell:
     row: int
     text: str
     count: int
+    #: No cell holds anything but nothing (or `nan`): readings that are missing.
+    blank: bool = False
 
     def __str__(self) -> str:
         """Say what is wrong, as it goes into an error or a note."""
@@ -55,7 +61,11 @@ def numeric_column(header: str, values: NDArray[np.float64], texts: list[str] | 
     if wrong.size:
         row = int(wrong[0])
         text = texts[row] if texts is not None else str(values[row])
-        bad = BadCell(row, text.strip(), int(wrong.size))
+        if texts is None:
+            blank = bool(np.isnan(values[wrong]).all())
+        else:
+            blank = all(texts[k].strip().lower() in _BLANK for k in wrong)
+        bad = BadCell(row, text.strip(), int(wrong.size), blank)
         values = np.where(np.isfinite(values), values, np.nan)
     return Column(name, unit, np.ascontiguousarray(values, dtype=np.float64), bad)
 

@@ -29,15 +29,33 @@ def vector(
             values = _converted(table, name, signal, values, unit, target, stated)
         parts.append(values)
     values = np.stack(parts, axis=1)
-    notes = _overruled(table, signal, names, options)
+    notes = [*_overruled(table, signal, names, options), *_missing(table, signal, values)]
     if target is not None and None in stated:
         silent = " ".join(n for n, u in zip(names, stated, strict=True) if u is None)
-        size = f"median length {np.median(np.linalg.norm(values, axis=1)):.4g}"
+        size = f"median length {np.nanmedian(np.linalg.norm(values, axis=1)):.4g}"
         notes.append(
             f"{signal.name}: no unit stated for {silent}, taken as {target} ({size}); "
             f"if that is wrong say --unit {signal.name}=…"
         )
     return values, target, notes
+
+
+def _missing(table: Table, signal: Signal, values: Array) -> list[str]:
+    """How many readings are missing, where they may be."""
+    absent = ~np.isfinite(values)
+    count = int(absent.any(axis=1).sum())
+    if not count:
+        return []
+    if absent.all(axis=1).all():
+        raise DataError(
+            f"{table.file}: signal {signal.name} has no reading in {len(values)} rows; choose its "
+            f"columns: --columns {signal.name}=…"
+        )
+    first = int(np.flatnonzero(absent.any(axis=1))[0])
+    return [
+        f"{signal.name}: {count} of {len(values)} readings are missing, whole or in part, the "
+        f"first in row {first}; what is there is used"
+    ]
 
 
 def _overruled(table: Table, signal: Signal, names: tuple[str, ...], options: Options) -> list[str]:
@@ -93,14 +111,19 @@ def _scale_of(column: str, signal: str | None, options: Options) -> Scale | None
     return options.scales.get(column) or (options.scales.get(signal) if signal else None)
 
 
-def numbers(table: Table, column: Column, purpose: str, way_out: str) -> Array:
-    """Return a column's numbers; raise DataError where one of them is none."""
+def numbers(
+    table: Table, column: Column, purpose: str, way_out: str, *, gaps: bool = False
+) -> Array:
+    """Return a column's numbers; raise DataError where one of them is none.
+
+    `gaps`: cells may be empty, and are NaN then.
+    """
     if column.is_text:
         raise DataError(
             f"{table.file}: column {column.name} row 0 holds '{column.values[0]}', and {purpose} "
             f"needs numbers; choose another column: {way_out}"
         )
-    if column.bad is not None:
+    if column.bad is not None and not (gaps and column.bad.blank):
         raise DataError(
             f"{table.file}: column {column.name} {column.bad}, and {purpose} needs finite numbers; "
             f"repair or delete that row, or choose another column: {way_out}"
@@ -109,7 +132,8 @@ def numbers(table: Table, column: Column, purpose: str, way_out: str) -> Array:
 
 
 def _scaled(table: Table, column: Column, signal: str, options: Options) -> Array:
-    values = numbers(table, column, f"signal {signal}", f"--columns {signal}=…")
+    gaps = signal in options.gaps
+    values = numbers(table, column, f"signal {signal}", f"--columns {signal}=…", gaps=gaps)
     scale = _scale_of(column.name, signal, options)
     return values if scale is None else scale.apply(values, table.file, column.name)
 

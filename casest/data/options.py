@@ -25,6 +25,8 @@ class Options:
     rate: float | None
     time_zero: Literal["first", "column"]
     extra: tuple[str, ...]
+    #: Signals of which readings may be missing (empty cells).
+    gaps: frozenset[str] = frozenset()
 
 
 def stated_unit(name: str, unit: str) -> str:

@@ -2,6 +2,33 @@
 
 from __future__ import annotations
 
-from casest.dynamics.declare import Dynamics, Motion, State, dynamics, measured, state
+from casest.dynamics.continuous import Continuous, kalman_bucy
+from casest.dynamics.declare import Dynamics, Motion, State, constraint, dynamics, measured, state
+from casest.dynamics.discrete import Estimates, Steps, kalman, smoothed
+from casest.dynamics.filter import Filtered, filtered
+from casest.dynamics.record import Record, least_squares
+from casest.dynamics.statespace import to_statespace
+from casest.dynamics.structural import Structure, structure
 
-__all__ = ["Dynamics", "Motion", "State", "dynamics", "measured", "state"]
+__all__ = [
+    "Continuous",
+    "Dynamics",
+    "Estimates",
+    "Filtered",
+    "Motion",
+    "Record",
+    "State",
+    "Steps",
+    "Structure",
+    "constraint",
+    "dynamics",
+    "filtered",
+    "kalman",
+    "kalman_bucy",
+    "least_squares",
+    "measured",
+    "smoothed",
+    "state",
+    "structure",
+    "to_statespace",
+]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -52,8 +52,8 @@ def state(
     else:
         size = shape
     values = np.broadcast_to(np.asarray(start, float), (size,))
-    for field, number in (("intensity", intensity), ("std", std)):
-        wrong = _wrong(field, number)
+    for what, number in (("intensity", intensity), ("std", std)):
+        wrong = _wrong(what, number)
         if wrong:
             raise DeclarationError(f"state: {wrong}")
     return State("", size, unit, float(intensity), tuple(values.tolist()), float(std))
@@ -83,11 +83,23 @@ class Measured:
     intensity: float
 
 
-class Motion:
-    """What a @dynamics function returns: the rate of every state, in their order, and outputs."""
+@dataclass(frozen=True)
+class Constraint:
+    """What is known of the state without noise: `expression` is zero at every instant."""
 
-    def __init__(self, *, rates: Mapping[str, SX], outputs: tuple[Measured, ...]) -> None:
-        self.rates, self.outputs = dict(rates), outputs
+    expression: SX
+
+
+@dataclass(frozen=True, kw_only=True)
+class Motion:
+    """What a @dynamics function returns: rates of the states, outputs, and what is known exactly.
+
+    A state without a rate is constant but for its driving noise.
+    """
+
+    rates: Mapping[str, SX]
+    outputs: tuple[Measured, ...]
+    constraints: tuple[Constraint, ...] = ()
 
 
 def measured(signal: SX, predicted: SX, *, intensity: float) -> Measured:
@@ -100,6 +112,11 @@ def measured(signal: SX, predicted: SX, *, intensity: float) -> Measured:
     return Measured(signal, predicted, float(intensity))
 
 
+def constraint(expression: SX, value: float | SX) -> Constraint:
+    """Known without noise: `constraint(norm_2(gravity), 9.80665)`; every estimate keeps to it."""
+    return Constraint(ca.densify(ca.SX(expression) - value))
+
+
 @dataclass(frozen=True)
 class Dynamics:
     """ẋ = f(x, signals) + noise, y = h(x, signals) + noise, declared once; a value."""
@@ -109,6 +126,8 @@ class Dynamics:
     signals: tuple[Signal, ...]
     states: tuple[State, ...]
     constants: tuple[Constant, ...]
+    #: Intensity of the white noise of signals, unit²·s, where `sensing` has said it.
+    sensors: Mapping[str, float] = field(default_factory=dict, hash=False)
 
     # -- new ones from this one ----------------------------------------------------------------
 
@@ -128,6 +147,27 @@ class Dynamics:
     def driven(self, **intensities: float) -> Dynamics:
         """The same with other noise intensities of its states, unit²/s."""
         return self._with_states("intensity", intensities)
+
+    def sensing(self, **intensities: float) -> Dynamics:
+        """The same with other noise intensities of its signals, unit²·s: variance of one reading
+        times the time between two.
+
+        Noise of an output is the measurement noise Θ. Noise of an input, none where nothing is
+        said, drives the states: it adds G·q·Gᵀ to Ξ with G = ∂f/∂input, which may depend on them.
+        """
+        for name, value in intensities.items():
+            if name not in {s.name for s in self.signals}:
+                known = ", ".join(s.name for s in self.signals)
+                raise UsageError(f"{self.name} has no signal {name!r}; it has {known}")
+            wrong = _wrong("intensity", value) or (
+                "a reading without noise makes the Riccati equation singular; give the sensor's "
+                "variance times its period"
+                if value == 0 and name in self.measured_signals
+                else None
+            )
+            if wrong:
+                raise UsageError(f"{self.name}: {name}: {wrong}")
+        return replace(self, sensors={**self.sensors, **intensities})
 
     def known_to(self, **stds: float) -> Dynamics:
         """The same with other standard deviations of the states at the beginning."""
@@ -205,8 +245,22 @@ class Dynamics:
     @cached_property
     def noise(self) -> Array:
         """Intensity Θ of the measurement noise, (m, m)."""
-        parts = [np.full(o.predicted.numel(), o.intensity) for o in self.traced.outputs]
+        t = self.traced
+        parts = [
+            np.full(o.predicted.numel(), self.sensors.get(name, o.intensity))
+            for name, o in zip(t.measured, t.outputs, strict=True)
+        ]
         return np.diag(np.concatenate(parts))
+
+    @cached_property
+    def input_noise(self) -> SX | None:
+        """What the noise of the inputs adds to Ξ, ΣG·q·Gᵀ, as an expression; None: nothing."""
+        t = self.traced
+        slopes = [
+            (ca.jacobian(t.f, flat(t.symbols[name])), q) for name, q in self.sensors.items() if q
+        ]
+        found = [q * (G @ G.T) for G, q in slopes if G.nnz()]
+        return sum(found[1:], found[0]) if found else None
 
     # -- symbols -------------------------------------------------------------------------------
 
@@ -221,6 +275,13 @@ class Dynamics:
         return self.traced.measured
 
     @cached_property
+    def may_be_missing(self) -> tuple[str, ...]:
+        """Signals whose readings may be missing: those that nothing is computed from."""
+        t = self.traced
+        used = ca.vertcat(t.f, t.h, t.g)
+        return tuple(n for n in t.measured if not ca.depends_on(used, flat(t.symbols[n])))
+
+    @cached_property
     def linear(self) -> bool:
         """Are rates and outputs linear in the state?"""
         t = self.traced
@@ -230,7 +291,8 @@ class Dynamics:
 
 @dataclass(frozen=True)
 class Traced:
-    """Symbols and expressions: x, signals, f(x, u), h(x, u), A = ∂f/∂x, C = ∂h/∂x, readings."""
+    """Symbols and expressions: x, signals, f(x, u), h(x, u), A = ∂f/∂x, C = ∂h/∂x, readings;
+    constraints g(x, u) = 0 and G = ∂g/∂x."""
 
     x: SX
     symbols: Mapping[str, SX]
@@ -239,6 +301,8 @@ class Traced:
     A: SX
     C: SX
     reading: SX
+    g: SX
+    G: SX
     outputs: tuple[Measured, ...]
     measured: tuple[str, ...]
 
@@ -308,5 +372,6 @@ def _trace(declared: Dynamics) -> Traced:
     reading = ca.vertcat(*[flat(o.signal) for o in motion.outputs])
     if reading.numel() != h.numel():
         raise DeclarationError(f"dynamics {declared.name}: outputs and signals differ in shape")
-    A, C = ca.jacobian(f, x), ca.jacobian(h, x)
-    return Traced(x, symbols, f, h, A, C, reading, motion.outputs, tuple(names))
+    g = ca.vertcat(*[ca.vec(c.expression) for c in motion.constraints])
+    A, C, G = ca.jacobian(f, x), ca.jacobian(h, x), ca.jacobian(g, x)
+    return Traced(x, symbols, f, h, A, C, reading, g, G, motion.outputs, tuple(names))

@@ -14,8 +14,11 @@ import numpy as np
 from casest.data.run import Run
 from casest.declaring.shapes import Array
 from casest.dynamics.declare import Dynamics
+from casest.dynamics.discrete import Steps, kalman, smoothed
+from casest.dynamics.extended import extended, relinearised
+from casest.dynamics.known import known
 from casest.dynamics.riccati import check_covariance
-from casest.dynamics.stepping import kalman_step, reach, run_steps
+from casest.dynamics.stepping import entries, reach
 from casest.dynamics.transition import (
     Linearised,
     linearised,
@@ -23,9 +26,11 @@ from casest.dynamics.transition import (
     steps_to,
     transitions,
 )
+from casest.errors import DataError
 
-#: Rounds of an extended filter: linearised along its own smoothed states.
-ROUNDS = 20
+#: Rounds of an extended smoother, linearised along its own states; a change of this share of a
+#: standard deviation ends them.
+ROUNDS, SETTLED = 30, 1e-5
 
 
 @dataclass(frozen=True)
@@ -47,6 +52,8 @@ class Filtered:
     S: Array
     smoothed: Array
     smoothed_P: Array  # noqa: N815
+    #: Did the rounds of a nonlinear model's smoother settle? If not, its states are approximate.
+    settled: bool = True
 
     @property
     def time(self) -> Array:
@@ -69,63 +76,80 @@ class Filtered:
 
 
 def filtered(model: Dynamics, run: Run, *, smooth: bool = True) -> Filtered:
-    """Kalman filter over a record; an extended one, iterated, for a nonlinear model.
+    """Kalman filter over a record, and smoother; for a nonlinear model the extended ones.
 
+    The extended filter linearises at each prediction; its smoother is iterated: the record is
+    linearised along the smoothed states until they stay (the most probable trajectory). Where the
+    noise of inputs reaches a linear model through its states, it is taken along the estimates of a
+    first pass. What is known exactly (`constraint`) is put into every estimate and not fed back.
     Raises DataError where time or inputs are not usable, or a covariance is none.
     """
     check_covariance(model.start_covariance, "the covariance at the beginning")
+    if not model.linear:
+        return _extended(model, run, smooth)
+    return _once(model, run, coefficients(model, run), smooth)
+
+
+def coefficients(model: Dynamics, run: Run) -> Linearised:
+    """A linear model along a record; noise that depends on the states, along a first estimate."""
     system = linearised(model, run)
-    found = _once(model, system, smooth or not model.linear)
-    if model.linear:
-        return found
+    if model.input_noise is None:
+        return system
+    return linearised(model, run, along=_once(model, run, system, smooth=False).x)
+
+
+def _extended(model: Dynamics, run: Run, smooth: bool) -> Filtered:
+    x, P, before_x, before_P, innovations, S = extended(model, run)
+    if not np.all(np.isfinite(x)):
+        row = int(run.rows[np.flatnonzero(~np.isfinite(x).all(axis=1))[0]])
+        raise DataError(
+            f"{run.file or run.name}: the extended filter of {model.name} diverges at row {row}: "
+            "start= and std= must lie where the model holds"
+        )
+    before = before_x, before_P, innovations, S
+    after = known(model, run, x, P)
+    if not smooth:
+        return Filtered(model, linearised(model, run, x), *after, *before, *after)
+    along, smooth_P, settled = trajectory(model, run, x)
+    both = known(model, run, along, smooth_P)
+    return Filtered(model, linearised(model, run, along), *after, *before, *both, settled)
+
+
+def trajectory(model: Dynamics, run: Run, along: Array) -> tuple[Array, Array, bool]:
+    """The most probable states (N, n), their covariances, and whether they settled.
+
+    Gauss-Newton on all states of the record, from states `along`, by smoothing again and again.
+    Where the rounds do not settle, the first one's states.
+    """
+    first: tuple[Array, Array] | None = None
     for _ in range(ROUNDS):
-        system = linearised(model, run, along=found.smoothed)
-        again = _once(model, system, True)
-        change = np.max(np.abs(again.smoothed - found.smoothed) / np.maximum(again.std, 1e-300))
-        found = again
-        if change < 1e-6:
+        steps = relinearised(model, run, along)
+        before = along
+        along, P = smoothed(steps, kalman(steps, model.start, model.start_covariance))
+        first = first or (along, P)
+        std = np.sqrt(np.maximum(np.diagonal(P, axis1=1, axis2=2), 1e-300))
+        change = np.max(np.abs(along - before) / std)
+        if change < SETTLED:
+            return along, P, True
+        if not np.isfinite(change):
             break
-    return found
+    assert first is not None
+    return *first, False
 
 
-def _once(model: Dynamics, system: Linearised, smooth: bool) -> Filtered:
+def discretised(model: Dynamics, system: Linearised) -> Steps:
+    """The record in discrete time: exact transitions, readings as averages over their period."""
     Phi, forced = transitions(system)
-    Q = process_noise(system, model.process, Phi)
+    Q = process_noise(system, system.process, Phi)
     R = np.diag(model.noise)[None] / steps_to(system)[:, None]
-    n, m = model.size, system.C.shape[1]
-    present = np.isfinite(system.y)
-    # A reading that is missing is one that the state does not reach: no row, no innovation.
-    C = np.where(present[:, :, None], system.C, 0.0)
-    y = np.where(present, system.y - system.d, 0.0)
-    eye = np.eye(n)[None]
-    Phi_first = np.concatenate([eye, Phi])
-    moved = np.concatenate([np.zeros((1, n)), forced])
-    added = np.concatenate([np.zeros((1, n, n)), Q])
-    columns = [Phi_first, moved, added, C, R, y]
-    found = run_steps(
-        kalman_step(n, m, reach(model.traced.A)), model.start, model.start_covariance, columns
-    )
-    x, P, before_x, before_P = found
-    innovations = np.where(present, y - np.einsum("kij,kj->ki", C, before_x), np.nan)
-    S = C @ before_P @ C.transpose(0, 2, 1)
-    S[:, np.arange(m), np.arange(m)] += R
-    S = np.where(present[:, :, None] & present[:, None, :], S, np.nan)
-    smoothed, smoothed_P = _smoothed(Phi, x, P, before_x, before_P) if smooth else (x, P)
-    return Filtered(model, system, x, P, before_x, before_P, innovations, S, smoothed, smoothed_P)
+    t = model.traced
+    return Steps(Phi, forced, Q, system.C, system.d, R, system.y, reach(t.A), entries(t.C))
 
 
-def _smoothed(
-    Phi: Array, x: Array, P: Array, before_x: Array, before_P: Array
-) -> tuple[Array, Array]:
-    """Rauch, Tung & Striebel (1965), backwards over the record."""
-    smooth_x, smooth_P = x.copy(), P.copy()
-    gains = np.linalg.solve(before_P[1:], Phi @ P[:-1]).transpose(0, 2, 1)
-    # What does not depend on later samples, all at once.
-    own_x = x[:-1] - np.einsum("kij,kj->ki", gains, before_x[1:])
-    own_P = P[:-1] - gains @ before_P[1:] @ gains.transpose(0, 2, 1)
-    later_x, later_P = x[-1], P[-1]
-    for k in range(len(x) - 2, -1, -1):
-        G = gains[k]
-        smooth_x[k] = later_x = own_x[k] + G.dot(later_x)
-        smooth_P[k] = later_P = own_P[k] + G.dot(later_P).dot(G.T)
-    return smooth_x, smooth_P
+def _once(model: Dynamics, run: Run, system: Linearised, smooth: bool) -> Filtered:
+    steps = discretised(model, system)
+    found = kalman(steps, model.start, model.start_covariance)
+    before = found.predicted_x, found.predicted_P, found.innovations, found.S
+    after = known(model, run, found.x, found.P)
+    both = known(model, run, *smoothed(steps, found)) if smooth else after
+    return Filtered(model, system, *after, *before, *both)

@@ -15,7 +15,7 @@ import numpy as np
 
 from casest.declaring.shapes import Array
 from casest.dynamics.declare import Dynamics
-from casest.dynamics.transition import Linearised, transitions
+from casest.dynamics.transition import Linearised, half_transitions, transitions
 
 #: A direction counts as observable from this share of the largest scaled eigenvalue on. Rounding
 #: and the error of a fourth-order step stay below 1e-13.
@@ -49,10 +49,12 @@ def gramian(model: Dynamics, system: Linearised) -> Array:
 def _of_steps(model: Dynamics, system: Linearised, Phi: Array) -> Array:
     """W of every single step at its own beginning, (N − 1, n, n): Simpson's rule."""
     weight = np.linalg.inv(model.noise)
-    half, _ = transitions(system, (0.0, 0.5))
+    half = half_transitions(system, (0.0, 0.5))
     middle = 0.5 * (system.C[1:] + system.C[:-1]) @ half
     first, last = system.C[:-1], system.C[1:] @ Phi
     h = system.steps[:, None, None]
+    if not np.isfinite(system.y).all():  # single readings are no curve: each for its own time
+        return np.asarray(0.5 * h * sum(M.transpose(0, 2, 1) @ weight @ M for M in (first, last)))
     return np.asarray(
         h
         / 6
@@ -124,7 +126,7 @@ def observed(model: Dynamics, W: Array) -> Observed:
 def _words(model: Dynamics, null: Array) -> Sequence[str]:
     """Each unobservable direction as a sentence."""
     basis = _sparse(null)
-    return [_sentence(model, basis[:, k]) for k in range(basis.shape[1])]
+    return [sentence(model, basis[:, k]) for k in range(basis.shape[1])]
 
 
 def _sparse(null: Array) -> Array:
@@ -144,7 +146,7 @@ def _sparse(null: Array) -> Array:
     return np.asarray(matrix / np.linalg.norm(matrix, axis=0))
 
 
-def _sentence(model: Dynamics, direction: Array) -> str:
+def sentence(model: Dynamics, direction: Array) -> str:
     """ "gravity and bias along (0.27, 0.53, 0.80) move together" """
     largest = np.abs(direction).max()
     parts: list[tuple[str, Array]] = []
@@ -164,12 +166,15 @@ def _sentence(model: Dynamics, direction: Array) -> str:
             same = all(abs(a - along[0]) < 1e-4 * abs(along[0]) for a in along)
             how = "move together" if same else "move in proportion"
             return f"{names} along the body axis ({axis}) {how}: no reading changes"
-    words = []
+    words: list[str] = []
+    label = ""
     for name, own in parts:
         for i, value in enumerate(own):
             if abs(value) > 1e-6 * largest:
                 label = name if len(own) == 1 else f"{name}[{i}]"
                 words.append(f"{label} {value / largest:+.3g}")
+    if len(words) == 1:
+        return f"{label} changes no reading"
     return f"{', '.join(words)} together change no reading"
 
 

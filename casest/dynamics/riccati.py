@@ -48,7 +48,8 @@ def _hamiltonian(model: Dynamics, system: Linearised, where: slice, weight: Arra
     A, C = system.A[where], system.C[where]
     n = model.size
     both = np.zeros((len(A), 2 * n, 2 * n))
-    both[:, :n, :n], both[:, :n, n:] = A, model.process
+    Xi = system.process[where] if system.process.ndim == 3 else system.process
+    both[:, :n, :n], both[:, :n, n:] = A, Xi
     both[:, n:, :n] = C.transpose(0, 2, 1) @ weight @ C
     both[:, n:, n:] = -A.transpose(0, 2, 1)
     return both

@@ -17,14 +17,16 @@ from casest.declaring.shapes import Array
 #: Steps in one accumulated map.
 CHUNK = 500
 
+Pattern = tuple[tuple[int, int], ...]
 
-def _symmetric(matrix: Any) -> Any:
+
+def symmetric(matrix: Any) -> Any:
     """The matrix of its upper half: half the operations, and no drift."""
     upper = ca.triu(matrix)
     return ca.densify(upper + ca.triu(matrix, False).T)
 
 
-def reach(A: Any) -> tuple[tuple[int, int], ...]:
+def reach(A: Any) -> Pattern:
     """Which entries of Φ can differ from zero, given the pattern of A: (row, column)."""
     n = A.size1()
     rows, columns = A.sparsity().get_triplet()
@@ -35,63 +37,92 @@ def reach(A: Any) -> tuple[tuple[int, int], ...]:
     return tuple((int(i), int(j)) for i, j in np.argwhere(found))
 
 
+def entries(matrix: Any) -> Pattern:
+    """Which entries of a matrix of expressions are not zero for good: (row, column)."""
+    rows, columns = matrix.sparsity().get_triplet()
+    return tuple(zip(map(int, rows), map(int, columns), strict=True))
+
+
+def _matrix(name: str, shape: tuple[int, int], pattern: Pattern) -> tuple[Any, Any]:
+    """A full matrix of symbols, as it is handed over, and what can differ from zero of it."""
+    full, used = ca.SX.sym(name, *shape), ca.SX(*shape)
+    for i, j in pattern:
+        used[i, j] = full[i, j]
+    return full, used
+
+
+def taken(x: Any, P: Any, c: Any, innovation: Any, s: Any) -> tuple[Any, Any]:
+    """State and covariance after one scalar reading with gradient c and variance s."""
+    PC = P @ c
+    # One component at a time this form is as safe as Joseph's: s is a sum of positive terms.
+    return x + PC * (innovation / s), symmetric(P - PC @ (PC / s).T)
+
+
 @lru_cache(maxsize=16)
-def kalman_step(n: int, m: int, pattern: tuple[tuple[int, int], ...]) -> Any:
+def kalman_step(n: int, m: int, of_Phi: Pattern, of_C: Pattern) -> Any:
     """(state, numbers of one sample) -> (state, also before the reading), CHUNK steps at a time.
 
     state: x and P column by column; numbers: Φ, forced step, Q, C, diagonal of R, y. Readings are
     taken one component after the other, which needs no inverse (their noise is independent).
     """
     x, P = ca.SX.sym("x", n), ca.SX.sym("P", n, n)
-    full, u, Q = ca.SX.sym("Phi", n, n), ca.SX.sym("u", n), ca.SX.sym("Q", n, n)
-    Phi = ca.SX(n, n)
-    for i, j in pattern:
-        Phi[i, j] = full[i, j]
-    C, R, y = ca.SX.sym("C", m, n), ca.SX.sym("R", m), ca.SX.sym("y", m)
+    full, Phi = _matrix("Phi", (n, n), of_Phi)
+    whole, C = _matrix("C", (m, n), of_C)
+    u, Q = ca.SX.sym("u", n), ca.SX.sym("Q", n, n)
+    R, y = ca.SX.sym("R", m), ca.SX.sym("y", m)
     before_x = Phi @ x + u
-    before_P = Phi @ P @ Phi.T + Q
-    before_P = _symmetric(before_P)
+    before_P = symmetric(Phi @ P @ Phi.T + Q)
     after_x, after_P = before_x, before_P
     for i in range(m):
         c = C[i, :].T
-        PC = after_P @ c
-        s = ca.dot(c, PC) + R[i]
-        after_x = after_x + PC * ((y[i] - ca.dot(c, after_x)) / s)
-        # One component at a time this form is as safe as Joseph's: s is a sum of positive terms.
-        after_P = _symmetric(after_P - PC @ (PC / s).T)
-    numbers = ca.vertcat(*[ca.vec(e) for e in (full, u, Q, C, R, y)])
-    state = ca.vertcat(x, ca.vec(P))
-    after = ca.vertcat(after_x, ca.vec(after_P))
-    before = ca.vertcat(before_x, ca.vec(before_P))
-    step = ca.Function("step", [state, numbers], [after, before], {"cse": True})
+        s = ca.dot(c, after_P @ c) + R[i]
+        after_x, after_P = taken(after_x, after_P, c, y[i] - ca.dot(c, after_x), s)
+    numbers = ca.vertcat(*[ca.vec(e) for e in (full, u, Q, whole, R, y)])
+    outputs = [packed(after_x, after_P), packed(before_x, before_P)]
+    step = ca.Function("step", [packed(x, P), numbers], outputs, {"cse": True})
     return step.mapaccum("steps", CHUNK)
 
 
-def run_steps(
-    steps: Any, x: Array, P: Array, parts: Sequence[Array]
-) -> tuple[Array, Array, Array, Array]:
-    """x (N, n), P (N, n, n) after every reading, and both before it.
+def packed(x: Any, P: Any) -> Any:
+    """x and P column by column."""
+    return ca.vertcat(ca.densify(x), ca.vec(ca.densify(P)))
 
-    `parts`: arrays (N, …) of what each step is given, matrices included.
+
+def run_steps(steps: Any, state: Array, parts: Sequence[Array]) -> list[Array]:
+    """Every output of the accumulated steps, (N, …) each.
+
+    `state`: what the first step begins from; `parts`: arrays (N, …) of what each step is given,
+    matrices included, in the order of its numbers; (N − 1, …) where the first is given zeros.
     """
-    N, n = len(parts[0]), len(x)
-    flat = [p.transpose(0, 2, 1).reshape(N, -1) if p.ndim == 3 else p for p in parts]
+    N = max(map(len, parts))
     padded = -(-N // CHUNK) * CHUNK
-    numbers = np.zeros((padded, sum(f.shape[1] for f in flat)))
-    np.concatenate(flat, axis=1, out=numbers[:N])
+    numbers = np.empty((padded, sum(p[0].size for p in parts)))
+    place = 0
+    for p in parts:
+        own = numbers[:, place : place + p[0].size]
+        place += p[0].size
+        if p.ndim == 3:
+            own, p = own.reshape(padded, *p.shape[:0:-1]), p.transpose(0, 2, 1)
+        own[N - len(p) : N] = p
+        own[: N - len(p)] = 0.0
     numbers[N:] = numbers[N - 1]
-    state = np.concatenate([x, P.T.ravel()])
-    after, before = (np.empty((padded, len(state))) for _ in range(2))
+    found = [np.empty((padded, steps.size1_out(i))) for i in range(steps.n_out())]
     # CasADi's matrices are column by column: a row of these arrays is one of its columns.
     buffer, run = steps.buffer()
+    state = np.ascontiguousarray(state, float)
     for k in range(0, padded, CHUNK):
         span = slice(k, k + CHUNK)
-        arrays: Any = (state, numbers[span]), (after[span], before[span])
-        for i in range(2):
-            buffer.set_arg(i, memoryview(arrays[0][i]))
-            buffer.set_res(i, memoryview(arrays[1][i]))
+        given: list[Any] = [state, numbers[span]]
+        results: list[Any] = [f[span] for f in found]
+        for i, array in enumerate(given):
+            buffer.set_arg(i, memoryview(array))
+        for i, array in enumerate(results):
+            buffer.set_res(i, memoryview(array))
         run()
-        state = after[k + CHUNK - 1].copy()
-    both = [a[:N] for a in (after, before)]
-    matrices = [b[:, n:].reshape(N, n, n).transpose(0, 2, 1) for b in both]
-    return both[0][:, :n], matrices[0], both[1][:, :n], matrices[1]
+        state = found[0][k + CHUNK - 1].copy()
+    return [f[:N] for f in found]
+
+
+def unpacked(both: Array, n: int) -> tuple[Array, Array]:
+    """x (N, n) and P (N, n, n), symmetric, of what `packed` put together."""
+    return both[:, :n], both[:, n:].reshape(len(both), n, n)

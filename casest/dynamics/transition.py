@@ -23,10 +23,10 @@ from casest.engine import Columns, Replay
 from casest.errors import DataError
 from casest.modelling.tracing import flat
 
-#: Coefficients of the exponential's series to degree 11, four at a time: below this norm the rest
-#: is under 1e-17.
-_SERIES = np.array([1 / factorial(k) for k in range(12)]).reshape(3, 4)
-_NORM = 0.2
+#: Coefficients of the exponential's series to degree 11, three at a time; and the norms below which
+#: six, nine or all twelve of them leave less than 1e-17.
+_SERIES = np.array([1 / factorial(k) for k in range(12)]).reshape(4, 3)
+_NORMS = np.array([0.004, 0.05, 0.2])
 
 #: Matrices that are worked on together: they stay in the processor's cache.
 _BLOCK = 256
@@ -36,7 +36,9 @@ _BLOCK = 256
 class Linearised:
     """ẋ = A x + c, y = C x + d along a record, at every sample.
 
-    time (N,); A (N, n, n), c (N, n), C (N, m, n), d (N, m); y (N, m) with NaN where it is missing.
+    time (N,); A (N, n, n), c (N, n), C (N, m, n), d (N, m); y (N, m) with NaN where it is missing
+    and no row in C;
+    process noise intensity Ξ (n, n), or (N, n, n) where inputs have noise of their own.
     """
 
     time: Array
@@ -45,6 +47,7 @@ class Linearised:
     C: Array
     d: Array
     y: Array
+    process: Array
 
     @property
     def steps(self) -> Array:
@@ -74,34 +77,45 @@ def checked_time(run: Run) -> Array:
     return time
 
 
+def checked_record(model: Dynamics, run: Run) -> Array:
+    """The run's time; DataError where it, a signal or an input is not usable."""
+    time = checked_time(run)
+    for s in model.signals:
+        if s.name not in run.signals:
+            raise DataError(f"{run.file or run.name}: no data for signal {s.name!r}; add --columns")
+    _refuse_missing_inputs(model, run)
+    return time
+
+
 def linearised(model: Dynamics, run: Run, along: Array | None = None) -> Linearised:
     """The model along a record; a nonlinear one along states `along` (N, n).
 
     Signals that only outputs use may be missing (NaN); inputs may not.
     """
-    time, t = checked_time(run), model.traced
-    for s in model.signals:
-        if s.name not in run.signals:
-            raise DataError(f"{run.file or run.name}: no data for signal {s.name!r}; add --columns")
-    _refuse_missing_inputs(model, run)
+    time, t = checked_record(model, run), model.traced
     if along is None:
         along = np.broadcast_to(model.start, (len(time), model.size))
     sample = ca.vertcat(t.x, *[flat(t.symbols[s.name]) for s in model.signals])
     c, d = t.f - t.A @ t.x, t.h - t.C @ t.x
-    outputs = [ca.densify(e) for e in (t.A, c, t.C, d, t.reading)]
+    added = model.input_noise
+    expressions = [t.A, c, t.C, d, t.reading] + ([] if added is None else [added])
+    outputs = [ca.densify(e) for e in expressions]
     none = ca.SX.sym("none", 0)
     function = ca.Function(
-        "along", [none, sample], outputs, ["parameters", "sample"], list("AcCdy")
+        "along", [none, sample], outputs, ["parameters", "sample"], list("AcCdyQ")[: len(outputs)]
     )
     columns = Columns([np.ascontiguousarray(along), *(run.signals[s.name] for s in model.signals)])
-    A, c_, C, d_, y = Replay(function)(np.zeros(0), columns)
-    return Linearised(time, A, c_[:, :, 0], C, d_[:, :, 0], y[:, :, 0])
+    A, c_, C, d_, y, *more = Replay(function)(np.zeros(0), columns)
+    process = model.process + more[0] if more else model.process
+    readings = y[:, :, 0]
+    if not np.isfinite(readings).all():
+        C = np.where(np.isfinite(readings)[:, :, None], C, 0.0)
+    return Linearised(time, A, c_[:, :, 0], C, d_[:, :, 0], readings, process)
 
 
 def _refuse_missing_inputs(model: Dynamics, run: Run) -> None:
-    t = model.traced
     for s in model.signals:
-        used = ca.depends_on(t.f, flat(t.symbols[s.name]))
+        used = s.name not in model.may_be_missing
         bad = np.flatnonzero(~np.isfinite(run.signals[s.name]).all(axis=1))
         if used and bad.size:
             raise DataError(
@@ -119,6 +133,11 @@ def transitions(system: Linearised, part: tuple[float, float] = (0.0, 1.0)) -> t
     n = system.A.shape[1]
     both = magnus_steps(lambda where: _augmented(system.A[where], system.c[where]), system, part)
     return both[:, :n, :n], both[:, :n, n]
+
+
+def half_transitions(system: Linearised, part: tuple[float, float]) -> Array:
+    """Φ alone over a part of every step, for rules that need the middle."""
+    return magnus_steps(lambda where: system.A[where], system, part)
 
 
 def magnus_steps(
@@ -152,36 +171,51 @@ def _augmented(A: Array, c: Array) -> Array:
 def exponential(matrices: Array) -> Array:
     """exp of every matrix, (N, n, n): scaling, Taylor series, squaring.
 
-    The series of degree 11 takes five products (Paterson & Stockmeyer 1973).
+    Degree 5 takes three products, 8 four, 11 five (Paterson & Stockmeyer 1973): as many as needed.
     """
     norm = float(np.max(np.sum(np.abs(matrices), axis=2), initial=0.0))
-    squarings = max(0, int(np.ceil(np.log2(max(norm / _NORM, 1e-300)))))
-    powers = np.empty((4, *matrices.shape))
-    X, square, cube, fourth = powers
-    np.divide(matrices, 2.0**squarings, out=X)
+    squarings = max(0, int(np.ceil(np.log2(max(norm / _NORMS[-1], 1e-300)))))
+    rows = 2 + int(np.searchsorted(_NORMS, norm / 2.0**squarings))
+    powers = np.empty((3, *matrices.shape))
+    X, square, cube = powers
+    np.multiply(matrices, 0.5**squarings, out=X)
     np.matmul(X, X, out=square)
     np.matmul(square, X, out=cube)
-    np.matmul(square, square, out=fourth)
-    sums = (_SERIES[:, 1:] @ powers[:3].reshape(3, -1)).reshape(3, *matrices.shape)
+    series = _SERIES[:rows]
+    # In three terms each: (1, X, X²) times powers of X³.
+    sums = (series[:, 1:] @ powers[:2].reshape(2, -1)).reshape(rows, *matrices.shape)
     diagonal = np.arange(matrices.shape[1])
-    sums[:, :, diagonal, diagonal] += _SERIES[:, :1, None]
-    result = sums[0] + fourth @ (sums[1] + fourth @ sums[2])
+    sums[:, :, diagonal, diagonal] += series[:, :1, None]
+    result = sums[-1]
+    for k in range(rows - 2, -1, -1):
+        result = sums[k] + cube @ result
     for _ in range(squarings):
         result = result @ result
     return np.asarray(result)
 
 
 def process_noise(system: Linearised, intensity: Array, Phi: Array) -> Array:
-    """∫Φ(t₁, s)ΞΦ(t₁, s)ᵀ ds of every step, (N − 1, n, n): Simpson's rule."""
+    """∫Φ(t₁, s)ΞΦ(t₁, s)ᵀ ds of every step, (N − 1, n, n): Simpson's rule.
+
+    Ξ constant and diagonal (n, n), or any at every sample (N, n, n).
+    """
     h = system.steps[:, None, None]
-    # The process noise is diagonal: a product with its roots, half the work.
-    root = np.sqrt(np.diag(intensity))
-    first, middle = Phi * root, transitions(system, (0.5, 1.0))[0] * root
-    ends = first @ first.transpose(0, 2, 1) + intensity
-    return np.asarray(h / 6 * (ends + 4 * (middle @ middle.transpose(0, 2, 1))))
+    middle = half_transitions(system, (0.5, 1.0))
+    if intensity.ndim == 3:
+        last = intensity[1:]
+        between = 0.5 * (intensity[:-1] + last)
+        ends = Phi @ intensity[:-1] @ Phi.transpose(0, 2, 1) + last
+        inner = middle @ between @ middle.transpose(0, 2, 1)
+    else:
+        # A diagonal one: a product with its roots, half the work.
+        root = np.sqrt(np.diag(intensity))
+        first, middle = Phi * root, middle * root
+        ends = first @ first.transpose(0, 2, 1) + intensity
+        inner = middle @ middle.transpose(0, 2, 1)
+    return np.asarray(h / 6 * (ends + 4 * inner))
 
 
-def steps_to(system: Linearised) -> NDArray[np.float64]:
-    """Time that each sample stands for, (N,): half of the steps on both sides of it."""
-    step = system.steps
+def steps_to(steps: Array | Linearised) -> NDArray[np.float64]:
+    """Time that each sample stands for, (N,): half of the steps (N − 1,) on both sides of it."""
+    step = steps.steps if isinstance(steps, Linearised) else steps
     return np.concatenate([[step[0]], 0.5 * (step[1:] + step[:-1]), [step[-1]]])

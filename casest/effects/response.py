@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from casest.declaring.physics import SX, fabs, fmax, sign, vertcat
+from casest.declaring.physics import SX, fabs, fmax, inf, sign, vertcat
 from casest.declaring.shapes import each
 from casest.declaring.symbols import param
 from casest.errors import UsageError
@@ -89,6 +89,8 @@ def cross_quadratic(u: SX, *, k: SX = param(3, "1/[u]")) -> SX:
     on="output",
     typical={"share": 1.0},
     profile={"level": "level"},
+    plain={"share": 1.0},
+    null={"level": inf},
     shown_by="readings that reach the end of the range",
     formula="y − share·sign(y)·max(|y| − level, 0)",
 )

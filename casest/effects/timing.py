@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from casest.declaring.physics import SX, der, tanh
+from casest.declaring.physics import SX, der, sqrt
 from casest.declaring.shapes import each
 from casest.declaring.symbols import param, signal
 from casest.modelling.effect import effect
+
+#: Time (s) in which a reading with hysteresis turns round, far below a sample's.
+TURN = 1e-3
 
 
 @effect(
@@ -50,5 +53,9 @@ def low_pass(y: SX, t: SX = signal("s"), *, tau: SX = param("s")) -> SX:
     formula="y − k·sign(dy/dt)",
 )
 def hysteresis(y: SX, t: SX = signal("s"), *, k: SX = param(each, "[y]")) -> SX:
-    """A reading that lags behind by k, whichever way it moves."""
-    return y - k * tanh(1e3 * der(y, t))
+    """A reading that lags behind by k, whichever way it moves.
+
+    It turns round within TURN: a jump has no derivative, and when it turns depends on parameters.
+    """
+    rate = der(y, t)
+    return y - k * rate / sqrt(rate**2 + (TURN * der(rate, t)) ** 2 + 1e-12)

@@ -29,7 +29,8 @@ class Effect:
     `null` maps each parameter to the value at which the effect vanishes (0 unless told).
     For tracing a residual: `typical` sizes of the parameters, each in its unit; `profile` the
     parameters that are searched over a grid (name -> "frequency", "time" or "level"), because the
-    effect is not smooth in them or has many valleys; `shown_by` the measurement that shows it.
+    effect is not smooth in them or has many valleys; `shown_by` the measurement that shows it;
+    `plain` the form that it is tried in once it was found.
     """
 
     name: str
@@ -45,6 +46,8 @@ class Effect:
     shown_by: str = ""
     #: What it does as a formula, where the source is not what a reader should see.
     formula: str = ""
+    #: Values of parameters at which it is what it mostly is in practice, with fewer unknowns.
+    plain: tuple[tuple[str, float], ...] = ()
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         """Evaluate the effect's own function."""
@@ -80,6 +83,7 @@ def effect(
     profile: Mapping[str, str] | None = None,
     shown_by: str = "",
     formula: str = "",
+    plain: Mapping[str, float] | None = None,
 ) -> Callable[[Callable[..., Any]], Effect]:
     """Declare an effect: first argument the value acted on, further ones signals or columns.
 
@@ -113,6 +117,7 @@ def effect(
             tuple((profile or {}).items()),
             shown_by,
             formula,
+            tuple((plain or {}).items()),
         )
 
     return declare

@@ -13,7 +13,8 @@ from casest.data.run import Run
 from casest.declaring.shapes import Array
 from casest.dynamics import Dynamics
 from casest.dynamics.filter import Filtered
-from casest.observing import filter_verdict
+from casest.filtering import filter_verdict, intensity_spread
+from casest.observing import could_reach, window_words
 from casest.report.figures import Figures, axis, panel
 from casest.report.fitted import reproduction
 from casest.report.frame import whole
@@ -31,6 +32,7 @@ def observe_page(content: Mapping[str, Any]) -> str:
     figures = Figures()
     body = [
         _directions(content),
+        _constant_inputs(content),
         _deviations(content),
         _windows(content, figures),
         reproduction(content),
@@ -41,6 +43,10 @@ def observe_page(content: Mapping[str, Any]) -> str:
 def observe_sentence(content: Mapping[str, Any]) -> str:
     """The verdict: how many unknowns these data determine."""
     rank, unknowns = content["rank"], content["unknowns"]
+    if "structural" in content:
+        if rank == unknowns:
+            return f"Observable: suitable data determine all {unknowns} unknowns."
+        return f"Not observable: no data determine more than {rank} of {unknowns} unknowns."
     if rank == unknowns:
         return f"Observable: these data determine all {unknowns} unknowns."
     return f"Not observable: these data determine {rank} of {unknowns} unknowns."
@@ -58,16 +64,29 @@ def _directions(content: Mapping[str, Any]) -> str:
         "What is hidden",
         points(content["unobservable"]),
         tag("h3", "Weak combinations") + points(weak) if weak else "",
-        paragraph(_tolerance(content), "soft") if content.get("tolerance") else "",
+        paragraph(_sentence(could_reach(content))) if could_reach(content) else "",
+        paragraph(_sentence(content["tolerance"]), "soft") if content.get("tolerance") else "",
     )
 
 
-def _tolerance(content: Mapping[str, Any]) -> str:
-    said = str(content["tolerance"])
-    return said[0].upper() + said[1:] + "."
+def _sentence(words: str) -> str:
+    return words[0].upper() + words[1:] + "."
+
+
+def _constant_inputs(content: Mapping[str, Any]) -> str:
+    """What the motion must change to show everything."""
+    held = content.get("constant_inputs")
+    if not held or held["rank"] == content["rank"]:
+        return ""
+    inputs = " and ".join(f"`{name}`" for name in held["inputs"])
+    said = f"Rank {held['rank']} of {content['unknowns']} while {inputs} stay as they are."
+    hidden = points(held["unobservable"])
+    return section("constant", "With constant inputs", paragraph(said), hidden)
 
 
 def _deviations(content: Mapping[str, Any]) -> str:
+    if not content["std"]:
+        return ""
     units, rows = content.get("units", {}), []
     for name, std in content["std"].items():
         values = np.array(std, dtype=object)
@@ -91,8 +110,10 @@ def _windows(content: Mapping[str, Any], figures: Figures) -> str:
     least = max(float(positive.min(initial=np.inf)), float(positive.max(initial=1.0)) * 1e-16)
     most = float(positive.max(initial=1.0))
     lines = [
-        figures.series("line", "after", end, exact=True, y=np.maximum(column, least))
-        for column in values.T
+        figures.series(
+            "line", "before" if k else "after", end, exact=True, y=np.maximum(column, least)
+        )
+        for k, column in reversed(list(enumerate(values.T)))
     ]
     drawn = panel(
         "eigenvalues" if values.shape[1] > 1 else "smallest eigenvalue",
@@ -104,8 +125,9 @@ def _windows(content: Mapping[str, Any], figures: Figures) -> str:
     )
     caption = (
         "Observability along the record:",
-        f"eigenvalues of the Gramian over windows of {number(windows['length_s'])} s, in units of "
-        "what was known beforehand. Above 1 (dashed) one window alone teaches more than that.",
+        f"eigenvalues of the Gramian over windows of {number(windows['length_s'])} s, the smallest "
+        "in its own colour, in units of what was known beforehand. Above 1 (dashed) one window "
+        f"alone teaches more than that. {_sentence(window_words(windows))}",
     )
     picture = figures.add("windows", caption, [drawn])
     scaled = content.get("eigenvalues") or []
@@ -121,10 +143,11 @@ def filter_page(found: Filtered, content: Mapping[str, Any]) -> str:
     """`report.html` of `casest filter`."""
     figures = Figures()
     body = [
-        section("states", "States", *_states(found, figures)),
+        section("states", "States", *state_figures(found, figures)),
         _final(content),
-        section("innovations", "Innovations", *_innovations(found, content, figures)),
-        _conventions(found.model),
+        section("innovations", "Innovations", *innovation_figures(found, content, figures)),
+        _intensities(content),
+        conventions(found.model),
         reproduction(content),
     ]
     said = filter_verdict(content)
@@ -137,7 +160,7 @@ def filter_page(found: Filtered, content: Mapping[str, Any]) -> str:
     return whole(content["model"], verdict, under, body, content, figures)
 
 
-def _states(found: Filtered, figures: Figures) -> Iterator[str]:
+def state_figures(found: Filtered, figures: Figures) -> Iterator[str]:
     """Each state with its band, filtered beside smoothed."""
     t, every = _thin(found.time)
     smooth = np.sqrt(np.diagonal(found.smoothed_P, axis1=1, axis2=2))
@@ -189,7 +212,9 @@ def _final(content: Mapping[str, Any]) -> str:
     return section("parameters", "At the end of the record", table(head, rows, [1, 2, 3]))
 
 
-def _innovations(found: Filtered, content: Mapping[str, Any], figures: Figures) -> Iterator[str]:
+def innovation_figures(
+    found: Filtered, content: Mapping[str, Any], figures: Figures
+) -> Iterator[str]:
     """Each reading's surprise with the band that the filter expects, and its autocorrelation."""
     said = content["innovations"]
     names, units = _outputs(found)
@@ -256,7 +281,24 @@ def _outputs(found: Filtered) -> tuple[list[str], list[str]]:
     return names, units
 
 
-def _conventions(model: Dynamics) -> str:
+def _intensities(content: Mapping[str, Any]) -> str:
+    """Declared noise intensities beside those that were used."""
+    said, expected = content["intensities"], content["innovations"]["expected"]
+    declared, used, spread = said["declared"], said["used"], said["spread"]
+    rows = []
+    for name in dict.fromkeys([*declared, *used]):
+        values = ["—" if not v else number(v) for v in (declared.get(name), used.get(name))]
+        sure = intensity_spread(spread, name).strip("()")
+        rows.append([f"`{name}`", *values, sure, printed_unit(said["units"][name])])
+    means = [said["declared_normalised_mean"], content["innovations"]["normalised_mean"]]
+    rows.append(["innovations²", *map(number, means), f"{expected} expected", ""])
+    head = ["noise intensity of", "declared", "used", "", "unit"]
+    shown = table(head, rows, [1, 2])
+    return section("intensities", "Noise intensities", paragraph(_sentence(said["how"])), shown)
+
+
+def conventions(model: Dynamics) -> str:
+    """What the declaration says of itself, and the noise that drives its states."""
     words = inspect.getdoc(model.function) or ""
     said = [paragraph(part.replace("\n", " ")) for part in words.split("\n\n") if part]
     rows = [

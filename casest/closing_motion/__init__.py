@@ -1,0 +1,1 @@
+"""Closing the loop for estimators in motion: innovations are diagnosed like residuals."""

@@ -1,0 +1,171 @@
+"""Nonlinear models step by step: the motion between two samples, and the extended Kalman filter.
+
+Between samples the state follows two fourth-order Runge-Kutta steps, inputs being straight lines;
+Φ is the Jacobian of that very map, so that filter, smoother and least squares speak of one problem.
+Readings are linearised at the prediction (Jazwinski 1970, 8.3).
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from casest.data.run import Run
+from casest.declaring.physics import SX
+from casest.declaring.shapes import Array
+from casest.dynamics.declare import Dynamics
+from casest.dynamics.discrete import Steps
+from casest.dynamics.stepping import CHUNK, entries, packed, run_steps, symmetric, taken, unpacked
+from casest.dynamics.transition import checked_record, steps_to
+from casest.engine import Columns, Replay
+from casest.modelling.tracing import flat
+
+
+def relinearised(model: Dynamics, run: Run, along: Array) -> Steps:
+    """The record in discrete time, linearised along states (N, n)."""
+    time = checked_record(model, run)
+    inputs = _input_names(model)
+    columns = [
+        np.ascontiguousarray(along[:-1]),
+        *(run.signals[n][:-1] for n in inputs),
+        *(run.signals[n][1:] for n in inputs),
+        np.diff(time)[:, None],
+    ]
+    Phi, forced, Q = over_samples(_step(model), columns)
+    C, d, y = _rows(model, run, along)
+    R = np.diag(model.noise)[None] / steps_to(np.diff(time))[:, None]
+    return Steps(Phi, forced[:, :, 0], Q, C, d, R, y, of_C=entries(model.traced.C))
+
+
+def _rows(model: Dynamics, run: Run, along: Array) -> tuple[Array, Array, Array]:
+    """Readings as rows: C, d and y."""
+    columns = [np.ascontiguousarray(along), *(run.signals[s.name] for s in model.signals)]
+    C, d, y = over_samples(_outputs(model), columns)
+    return C, d[:, :, 0], y[:, :, 0]
+
+
+@lru_cache(maxsize=8)
+def _step(model: Dynamics) -> Replay:
+    x, u, v, h = model.traced.x, *_two_samples(model), ca.SX.sym("h")
+    end, Phi, Q = _motion(model)(x, u, v, h)
+    return replay(ca.vertcat(x, u, v, h), [Phi, end - Phi @ x, Q])
+
+
+@lru_cache(maxsize=8)
+def _outputs(model: Dynamics) -> Replay:
+    t = model.traced
+    sample = ca.vertcat(t.x, *[flat(t.symbols[s.name]) for s in model.signals])
+    return replay(sample, [t.C, t.h - t.C @ t.x, t.reading])
+
+
+def replay(sample: SX, outputs: list[SX]) -> Replay:
+    """Expressions of one sample, to be evaluated over many."""
+    none = ca.SX.sym("none", 0)
+    names = ["parameters", "sample"], [f"o{k}" for k in range(len(outputs))]
+    dense = [ca.densify(e) for e in outputs]
+    return Replay(ca.Function("replayed", [none, sample], dense, *names))
+
+
+def over_samples(expressions: Replay, columns: list[Array]) -> list[Array]:
+    """Each expression at every sample, (N, …)."""
+    return list(expressions(np.zeros(0), Columns(columns)))
+
+
+def extended(model: Dynamics, run: Run) -> tuple[Array, Array, Array, Array, Array, Array]:
+    """Extended Kalman filter: x, P after each reading and before it, innovations, their S."""
+    time = checked_record(model, run)
+    t, inputs = model.traced, _input_names(model)
+    n, m = model.size, t.h.numel()
+    step = np.diff(time)
+    u = np.concatenate([run.signals[name] for name in inputs] or [np.zeros((len(time), 0))], axis=1)
+    at = np.concatenate([run.signals[s.name] for s in model.signals], axis=1)
+    y = _rows(model, run, np.broadcast_to(model.start, (len(time), n)))[2][:, :m]
+    present = np.isfinite(y)
+    parts = [
+        np.concatenate([u[:1], u[:-1]]),
+        u,
+        np.concatenate([[0.0], step])[:, None],
+        np.nan_to_num(at),
+        np.diag(model.noise)[None] / steps_to(step)[:, None],
+        np.nan_to_num(y),
+        present.astype(float),
+    ]
+    state = np.concatenate([model.start, model.start_covariance.T.ravel()])
+    after, before, told = run_steps(_extended_step(model), state, parts)
+    ours = np.where(present, told[:, :m], np.nan)
+    S = told[:, m:].reshape(-1, m, m).transpose(0, 2, 1)
+    S = np.where(present[:, :, None] & present[:, None, :], S, np.nan)
+    return *unpacked(after, n), *unpacked(before, n), ours, S
+
+
+@lru_cache(maxsize=8)
+def _extended_step(model: Dynamics) -> Any:
+    """(x and P, numbers of one sample) -> (x and P, also before the reading, innovation and S)."""
+    t, n = model.traced, model.size
+    u, v, h = *_two_samples(model), ca.SX.sym("h")
+    x, P = ca.SX.sym("x", n), ca.SX.sym("P", n, n)
+    end, Phi, Q = _motion(model)(x, u, v, h)
+    before_x, before_P = end, symmetric(Phi @ P @ Phi.T + Q)
+    signals = ca.vertcat(*[flat(t.symbols[s.name]) for s in model.signals])
+    R, y, there = (ca.SX.sym(name, t.h.numel()) for name in ("R", "y", "there"))
+    predict = ca.Function("predict", [t.x, signals], [t.h, t.C])
+    said, C = predict(before_x, signals)
+    after_x, after_P = before_x, before_P
+    for i in range(t.h.numel()):
+        c = C[i, :].T * there[i]
+        left = (y[i] - said[i]) * there[i] - ca.dot(c, after_x - before_x)
+        after_x, after_P = taken(after_x, after_P, c, left, ca.dot(c, after_P @ c) + R[i])
+    numbers = ca.vertcat(u, v, h, signals, R, y, there)
+    told = ca.vertcat(y - said, ca.vec(ca.densify(C @ before_P @ C.T + ca.diag(R))))
+    outputs = [packed(after_x, after_P), packed(before_x, before_P), told]
+    made = ca.Function("extended", [packed(x, P), numbers], outputs, {"cse": True})
+    return made.mapaccum("extended_steps", CHUNK)
+
+
+@lru_cache(maxsize=8)
+def _motion(model: Dynamics) -> Any:
+    """(x, inputs at both ends, h) -> (x after it, Φ, Q), as a function of symbols."""
+    t, inputs = model.traced, _input_names(model)
+    x, h = ca.SX.sym("x", model.size), ca.SX.sym("h")
+    u, v = _two_samples(model)
+    own = ca.vertcat(*[flat(t.symbols[n]) for n in inputs])
+    rate = ca.Function("rate", [t.x, own], [t.f])
+    noise = ca.SX(ca.DM(model.process))
+    noise = noise if model.input_noise is None else noise + model.input_noise
+    intensity = ca.Function("intensity", [t.x, own], [noise])
+    half = ca.Function("half", [x, u, v, h], _with_jacobian(_runge_kutta(rate, x, u, v, h), x))
+    middle_u = 0.5 * (u + v)
+    middle, first = half(x, u, middle_u, 0.5 * h)
+    end, second = half(middle, middle_u, v, 0.5 * h)
+    Phi = second @ first
+    ends = Phi @ intensity(x, u) @ Phi.T + intensity(end, v)
+    between = second @ intensity(middle, middle_u) @ second.T
+    Q = h / 6 * (ends + 4 * between)
+    return ca.Function("motion", [x, u, v, h], [end, Phi, Q], {"cse": True})
+
+
+def _with_jacobian(expression: SX, x: SX) -> list[SX]:
+    return [expression, ca.jacobian(expression, x)]
+
+
+def _runge_kutta(rate: Any, x: SX, u: SX, v: SX, h: SX) -> SX:
+    middle = 0.5 * (u + v)
+    a = rate(x, u)
+    b = rate(x + 0.5 * h * a, middle)
+    c = rate(x + 0.5 * h * b, middle)
+    d = rate(x + h * c, v)
+    return x + h / 6 * (a + 2 * b + 2 * c + d)
+
+
+def _input_names(model: Dynamics) -> list[str]:
+    """Signals that drive the rates."""
+    t = model.traced
+    return [s.name for s in model.signals if ca.depends_on(t.f, flat(t.symbols[s.name]))]
+
+
+def _two_samples(model: Dynamics) -> tuple[SX, SX]:
+    size = sum(int(model.traced.symbols[n].numel()) for n in _input_names(model))
+    return ca.SX.sym("u", size), ca.SX.sym("v", size)

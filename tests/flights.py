@@ -1,0 +1,170 @@
+"""Flights by closed forms: attitude and position are sums of sines, everything else their
+derivatives. Inertial frame, z down, ZYX Euler angles; no code of the model, nothing integrated.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from casest import Run
+
+GRAVITY = np.array([0.0, 0.0, 9.80665])
+#: Batista's sensors (V-B): standard deviations at 100 Hz of a (m/s²), omega (rad/s), v (m/s).
+SIGMA = {"a": 0.0013, "omega": np.radians(0.05), "v": 0.01}
+BIAS = np.array([0.1, -0.05, 0.025])
+UNITS = {"a": "m/s^2", "omega": "rad/s", "v": "m/s"}
+
+
+@dataclass(frozen=True)
+class Sines:
+    """Three sums of K sines over time: amplitude, frequency (rad/s) and phase, (3, K)."""
+
+    amplitude: np.ndarray
+    frequency: np.ndarray
+    phase: np.ndarray
+
+    def __call__(self, t, order=0):
+        """The derivative of that order at t (N,), (N, 3)."""
+        angle = t[:, None, None] * self.frequency + self.phase + order * np.pi / 2
+        return np.sum(self.amplitude * self.frequency**order * np.sin(angle), axis=2)
+
+
+def sines(rng, size, slow, fast, terms=3):
+    """Random ones: about `size` large, between two frequencies (rad/s)."""
+    amplitude = size * rng.uniform(0.5, 1.0, (3, terms)) / np.sqrt(terms)
+    frequency = np.exp(rng.uniform(np.log(slow), np.log(fast), (3, terms)))
+    return Sines(amplitude, frequency, rng.uniform(0, 2 * np.pi, (3, terms)))
+
+
+@dataclass(frozen=True)
+class Flight:
+    """A rigid motion: Euler angles (roll, pitch, yaw; rad) and position (m) over time."""
+
+    angles: Sines
+    position: Sines
+
+    def body(self, t):
+        """Inertial to body axes at every time."""
+        return Rotation.from_euler("ZYX", self.angles(t)[:, ::-1]).inv()
+
+    def gravity(self, t):
+        """In body axes, (N, 3)."""
+        return self.body(t).apply(GRAVITY)
+
+    def omega(self, t):
+        """Angular velocity in body axes, from the Euler rates."""
+        (roll, pitch, _), (p, q, r) = self.angles(t).T, self.angles(t, 1).T
+        return np.c_[
+            p - r * np.sin(pitch),
+            q * np.cos(roll) + r * np.cos(pitch) * np.sin(roll),
+            -q * np.sin(roll) + r * np.cos(pitch) * np.cos(roll),
+        ]
+
+    def velocity(self, t):
+        """In body axes, (N, 3)."""
+        return self.body(t).apply(self.position(t, 1))
+
+    def force(self, t):
+        """What an ideal accelerometer reads, in body axes."""
+        return self.body(t).apply(self.position(t, 2) - GRAVITY)
+
+
+@dataclass(frozen=True)
+class Sensors:
+    """Errors beyond white noise, each null by default."""
+
+    bias: np.ndarray | tuple = tuple(BIAS)
+    gyro_bias: tuple = (0.0, 0.0, 0.0)
+    gain: float = 0.0  # accelerometer reads (1 + gain) times the force
+    delay: float = 0.0  # velocity is read late, s
+    lever: tuple = (0.0, 0.0, 0.0)  # place of the velocity sensor in the body, m
+    colour: float = 0.0  # correlation time of a part of the velocity noise, s
+    coloured: float = 0.0  # its standard deviation, m/s
+    tails: bool = False  # noise by Student's t with four degrees of freedom
+    quantised: bool = False  # readings in steps of their noise
+    wander: float = 0.0  # intensity of a random walk of the accelerometer's bias, (m/s²)²/s
+
+    def but(self, **changes):
+        return replace(self, **changes)
+
+
+def record(flight, t, rng=None, sensors=Sensors(), sigma=SIGMA):
+    """A run with signals a, omega, v; without rng no noise."""
+    late = t - sensors.delay
+    v = flight.velocity(late) + np.cross(flight.omega(late), sensors.lever)
+    a = (1 + sensors.gain) * flight.force(t) + np.asarray(sensors.bias)
+    signals = {"a": a, "omega": flight.omega(t) + np.asarray(sensors.gyro_bias), "v": v}
+    if rng is not None:
+        signals["a"] = signals["a"] + walk(t, sensors.wander, rng)
+        signals = {k: x + sigma[k] * noise(x.shape, sensors, rng) for k, x in signals.items()}
+        if sensors.coloured:
+            signals["v"] = signals["v"] + coloured(t, sensors.colour, sensors.coloured, rng)
+        if sensors.quantised:
+            signals = {k: sigma[k] * np.round(x / sigma[k]) for k, x in signals.items()}
+    return Run.raw("flight", signals, units=UNITS, time=t)
+
+
+def noise(shape, sensors, rng):
+    """White, of unit variance."""
+    if sensors.tails:
+        return rng.standard_t(4, shape) / np.sqrt(2)
+    return rng.standard_normal(shape)
+
+
+def walk(t, intensity, rng):
+    """A random walk (N, 3)."""
+    if not intensity:
+        return 0.0
+    step = np.sqrt(intensity * np.diff(t, prepend=t[0]))
+    return np.cumsum(step[:, None] * rng.standard_normal((len(t), 3)), axis=0)
+
+
+def coloured(t, correlation, std, rng):
+    """Exponentially correlated noise (N, 3)."""
+    keep = np.exp(-np.diff(t, prepend=t[0]) / correlation)
+    x = std * rng.standard_normal(3)
+    found = np.empty((len(t), 3))
+    for k in range(len(t)):
+        x = keep[k] * x + std * np.sqrt(1 - keep[k] ** 2) * rng.standard_normal(3)
+        found[k] = x
+    return found
+
+
+def on_the_table():
+    """Of the kind of Batista's Fig. 3: a rate table swings about all axes, 0.3 m off its centre."""
+    angles = Sines(
+        np.array([[0.45, 0.25], [0.40, 0.20], [0.80, 0.30]]),
+        2 * np.pi / np.array([[37.0, 11.0], [29.0, 13.0], [53.0, 17.0]]),
+        np.array([[0.0, 1.0], [0.5, 2.0], [1.0, 0.0]]),
+    )
+    still = Sines(np.full((3, 1), 1e-12), np.ones((3, 1)), np.zeros((3, 1)))
+    return Turning(angles, still, np.array([0.3, 0.0, 0.1]))
+
+
+@dataclass(frozen=True)
+class Turning(Flight):
+    """A body on a rate table: fixed to it at `arm` (m, body axes) from the point that rests."""
+
+    arm: np.ndarray = (0.0, 0.0, 0.0)
+
+    def velocity(self, t):
+        return np.cross(self.omega(t), self.arm)
+
+    def force(self, t):
+        omega, h = self.omega(t), 1e-4
+        change = (self.omega(t + h) - self.omega(t - h)) / (2 * h)
+        turning = np.cross(change, self.arm) + np.cross(omega, np.cross(omega, self.arm))
+        return turning - self.gravity(t)
+
+
+def in_the_air():
+    """A small vehicle that turns and accelerates by about 1 m/s²."""
+    return somewhere(np.random.default_rng(3))
+
+
+def somewhere(rng):
+    """A small vehicle on a random way."""
+    return Flight(sines(rng, 0.6, 0.2, 1.0), sines(rng, 4.0, 0.2, 0.9))

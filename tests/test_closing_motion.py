@@ -1,0 +1,208 @@
+"""The loop in motion: effects planted in closed-form flights are found and named; nulls are not."""
+
+from __future__ import annotations
+
+import csv
+import json
+
+import flights
+import numpy as np
+import pytest
+from flights import Sensors
+
+from casest import DataError, Run, cli
+from casest.closing_motion.effects import candidates, extended
+from casest.closing_motion.fitting import fitted
+from casest.closing_motion.loop import close_motion
+from casest.closing_motion.score import scores
+from casest.closing_motion.sensitivity import sensitivity
+from casest.closing_motion.tuning import first_guess, likelihood, matched, prepared
+from casest.closing_motion.whiteness import whiteness
+from casest.closing_motion.written import motion_result, rms_settled
+from casest.dynamics.filter import filtered
+from casest_problems.bias_gravity import bias_gravity, bias_gravity_position
+
+RATE = 25.0
+#: Noises at the rate of the tests.
+SIGMA = {"a": 0.005, "omega": np.radians(0.1), "v": 0.01}
+
+
+def flight(sensors=Sensors(), seed=0, seconds=30.0):
+    rng = np.random.default_rng(seed)
+    motion = flights.somewhere(rng)
+    return flights.record(motion, np.arange(0, seconds, 1 / RATE), rng, sensors, SIGMA)
+
+
+def names(closing):
+    return [a.candidate.label for a in closing.effects]
+
+
+# -- the loop ----------------------------------------------------------------------------------
+
+
+def test_a_flight_that_lacks_nothing_is_adequate():
+    closing = close_motion(bias_gravity, flight(seed=1))
+    assert names(closing) == []
+    content = motion_result(closing, model_name="bias-gravity", data=[])
+    assert content["verdict"] == "adequate"
+    assert content["before"]["rmse_holdout"] == content["after"]["rmse_holdout"]
+
+
+@pytest.mark.parametrize(
+    ("sensors", "label", "planted", "alike"),
+    [
+        (Sensors(gyro_bias=(0.01, -0.005, 0.004)), "bias of omega", [0.01, -0.005, 0.004], ()),
+        # So large that the matched intensities swallow it at first.
+        (Sensors(gyro_bias=(0.1, -0.05, 0.04)), "bias of omega", [0.1, -0.05, 0.04], ()),
+        (Sensors(delay=0.04), "time_delay of v", [0.04], ()),
+        # A scale of the velocity does the same: the unknown gravity follows either.
+        (Sensors(gain=0.03), "gain of a", [0.03, 0.03, 0.03], ("gain of v",)),
+    ],
+    ids=["gyro bias", "large gyro bias", "delay", "scale"],
+)
+def test_a_planted_effect_is_found_and_named_with_its_size(sensors, label, planted, alike):
+    closing = close_motion(bias_gravity, flight(sensors, seed=3))
+    assert names(closing) == [label]
+    assert closing.effects[0].indistinguishable_from == alike
+    ((_, value),) = closing.after.added
+    # First order in the delay: it is small against a period of the motion.
+    np.testing.assert_allclose(value, planted, atol=4 * closing.after.std.max())
+    before, after = rms_settled(closing)
+    assert after < before
+    assert closing.after.likelihood > closing.before.likelihood + 50
+
+
+def test_coloured_noise_becomes_a_state_and_nothing_else_is_named():
+    closing = close_motion(bias_gravity, flight(Sensors(colour=0.5, coloured=0.03), seed=4))
+    assert names(closing) == ["coloured_noise of v"]
+    (effect,) = motion_result(closing, model_name="bias-gravity", data=[])["effects"]
+    assert 0.2 < effect["parameters"]["correlation_time"]["value"] < 1.2
+    assert 0.015 < effect["parameters"]["std"]["value"] < 0.06
+
+
+# -- its parts ---------------------------------------------------------------------------------
+
+
+def test_readings_slower_than_the_inputs_are_enough():
+    """Five readings a second, 25 of the inputs: one candidate, scored and then fitted."""
+    run = flight(Sensors(lever=(0.3, -0.1, 0.2)), seed=5)
+    v = run.signals["v"].copy()
+    v[np.arange(len(v)) % 5 != 0] = np.nan
+    run = Run.raw("slow", {**run.signals, "v": v}, units=flights.UNITS, time=run.time)
+    fit = fitted(bias_gravity, run, filtered(bias_gravity, run).smoothed)
+    tried = [c for c in candidates(bias_gravity, run) if c.label == "lever_arm of v"]
+    (score,) = scores(sensitivity(bias_gravity, [], tried, run, fit.found), tried)
+    assert score.p_value < 1e-4
+    better = fitted(bias_gravity, run, fit.found.smoothed, added=[(tried[0], score.step)])
+    ((_, arm),) = better.added
+    assert np.all(np.abs(arm - [0.3, -0.1, 0.2]) < 4 * better.std)
+
+
+def test_sensitivities_are_the_differences_of_two_filters():
+    """Of every effect, at a small size; the filter's gains are the same on both sides.
+
+    To 1 %, after the start: they are taken along the smoothed states, not those of the filter.
+    """
+    run = flight(seed=6, seconds=20)
+    # Constant intensities: the noise of the inputs would be taken along other states.
+    model = bias_gravity.driven(velocity=1e-5, gravity=1e-5, bias=1e-8).sensing(v=1e-5)
+    found = filtered(model, run)
+    tried = candidates(bias_gravity, run)
+    answers = sensitivity(model, [], tried, run, found)
+    for candidate, where in zip(tried, answers.columns, strict=True):
+        k = 1e-5 * np.arange(1, candidate.size + 1)
+        there = filtered(extended(model, [(candidate, k)]), run)
+        expected = found.innovations - there.innovations
+        linear = np.einsum("kij,kjl,l->ki", answers.L, answers.H[:, :, where], k)
+        off, size = np.abs(linear - expected)[100:], np.abs(expected)[100:]
+        assert off.max() < 0.01 * size.max(), candidate.label
+
+
+def test_matched_intensities_are_those_of_the_sensors():
+    run = flight(seed=7, seconds=120)
+    ready = prepared(bias_gravity, run, filtered(bias_gravity, run).smoothed)
+    found, best = matched(ready, run)
+    truth = {name: sigma**2 / RATE for name, sigma in SIGMA.items()}
+    assert abs(np.log(found["v"] / truth["v"])) < 0.1
+    assert abs(np.log(found["omega"] / truth["omega"])) < 0.7
+    assert best > likelihood(ready, {**truth, "bias": 1e-14}) - 0.5
+    guess = first_guess(ready, run)
+    for name, value in truth.items():
+        assert abs(np.log(guess[name] / value)) < 0.25, name
+
+
+def test_whiteness_rejects_as_often_as_it_says():
+    rng = np.random.default_rng(0)
+    p = np.array([whiteness(rng.standard_normal((1500, 3))).p_value for _ in range(400)])
+    assert abs(np.mean(p < 0.05) - 0.05) < 3 * np.sqrt(0.05 * 0.95 / len(p))
+
+
+def test_correlated_innovations_are_not_white():
+    rng = np.random.default_rng(1)
+    noise = rng.standard_normal((2001, 3))
+    assert whiteness(noise[1:] + 0.2 * noise[:-1]).p_value < 1e-6
+
+
+def test_a_bias_that_is_a_state_already_is_no_candidate():
+    labels = [c.label for c in candidates(bias_gravity, flight(seconds=2))]
+    assert "bias of a" not in labels
+    assert {"bias of omega", "gain of a", "lever_arm of v", "time_delay of v"} <= set(labels)
+
+
+def test_units_of_effects_are_those_of_the_quantities():
+    units = {c.label: c.unit for c in candidates(bias_gravity, flight(seconds=2))}
+    assert units["bias of omega"] == "rad/s"
+    assert units["lever_arm of v"] == "m"
+    assert units["time_delay of v"] == "s"
+    assert units["gain of a"] == "1"
+
+
+def test_a_lever_arm_is_one_of_a_speed_not_of_a_position():
+    run = flight(seconds=2)
+    signals = {"a": run.signals["a"], "omega": run.signals["omega"], "p": run.signals["v"]}
+    there = Run.raw("p", signals, units={}, time=run.time)
+    labels = [c.label for c in candidates(bias_gravity_position, there)]
+    assert "bias of p" in labels
+    assert not any("lever" in label for label in labels)
+
+
+# -- the command -------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def record(tmp_path):
+    run = flight(Sensors(lever=(0.3, -0.1, 0.2)), seed=3)
+    path = tmp_path / "flight.csv"
+    head = ",".join(f"{s}{x} [{u}]" for s, u in flights.UNITS.items() for x in "xyz")
+    columns = [run.time, *(run.signals[s] for s in flights.UNITS)]
+    np.savetxt(path, np.column_stack(columns), delimiter=",", header=f"t [s],{head}", comments="")
+    return path
+
+
+def test_close_writes_what_the_design_says(record, tmp_path, capsys):
+    assert cli.run(["close", "bias-gravity", str(record), "-o", str(tmp_path / "out")]) == 0
+    assert "extended: lever_arm of v was missing" in " ".join(capsys.readouterr().out.split())
+    content = json.loads((tmp_path / "out" / "result.json").read_text())
+    assert content["verdict"] == "extended"
+    assert [(e["name"], e["on"]) for e in content["effects"]] == [("lever_arm", "v")]
+    arm = content["effects"][0]["parameters"]["k"]
+    assert np.all(np.abs(np.subtract(arm["value"], [0.3, -0.1, 0.2])) < 4 * np.array(arm["std"]))
+    assert arm["unit"] == "m"
+    assert content["after"]["rmse_holdout"] < content["before"]["rmse_holdout"]
+    assert set(content["before"]["rmse_holdout_by_axis"]) == {"v[0]", "v[1]", "v[2]"}
+    assert content["before"]["certificate"]["trusted"]
+    with (tmp_path / "out" / "residuals.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert list(rows[0]) == ["file", "run", "row", "t", "axis", "split", "before", "after"]
+    assert len(rows) == 2 * 3 * 750
+    assert "lever_arm of v was missing" in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_options_of_calibrations_are_refused(record, capsys):
+    assert cli.run(["close", "bias-gravity", str(record), "--fix", "bias=0"]) == 1
+    assert "--fix is for calibrations; bias-gravity is an estimator" in capsys.readouterr().err
+
+
+def test_a_record_too_short_to_hold_any_of_it_out_is_refused():
+    with pytest.raises(DataError, match="100 samples are too few to hold some of them out"):
+        close_motion(bias_gravity, flight(seconds=4))

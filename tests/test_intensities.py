@@ -1,0 +1,170 @@
+"""Noise intensities from stated noise, from a record at rest, and from the flight itself."""
+
+from __future__ import annotations
+
+import json
+import sys
+
+import flights
+import numpy as np
+import pytest
+
+from casest import DataError, UsageError
+from casest.allan import allan
+from casest.cli import run
+from casest.dynamics.filter import filtered
+from casest.intensities import from_rest, from_stated, intensities, most_likely
+from casest_problems.bias_gravity import bias_gravity
+
+DT = 0.02
+T = np.arange(0, 30, DT)
+TRUE = {name: sigma**2 * DT for name, sigma in flights.SIGMA.items()}
+NAMES = ["t [s]", *(f"a{c} [m/s^2]" for c in "xyz"), *(f"omega_{c} [rad/s]" for c in "xyz"),
+         *(f"v{c} [m/s]" for c in "xyz")]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def flight():
+    return flights.record(flights.in_the_air(), T, np.random.default_rng(0))
+
+
+def drifting(count, sigma, walk, seed=0):
+    """White noise and a random walk of three axes, (count, 3), at 1/DT per second."""
+    rng = np.random.default_rng(seed)
+    white = sigma * rng.standard_normal((count, 3))
+    return white + np.cumsum(walk * np.sqrt(DT) * rng.standard_normal((count, 3)), axis=0)
+
+
+# -- stated noise ----------------------------------------------------------------------------------
+
+
+def test_stated_noise_over_its_rate_is_the_intensity(flight):
+    found = from_stated(bias_gravity, flight, flights.SIGMA)
+    used = intensities(found.model)
+    for name, value in TRUE.items():
+        assert used[name] == pytest.approx(value, rel=1e-9)
+    assert "velocity" not in used  # driven through the sensors alone
+    assert used["bias"] == intensities(bias_gravity)["bias"]
+
+
+def test_a_sensor_that_is_read_less_often_keeps_its_noise(flight):
+    v = flight.signals["v"].copy()
+    v[np.arange(len(v)) % 5 > 0] = np.nan
+    slow = type(flight).raw("slow", {**flight.signals, "v": v}, units={}, time=flight.time)
+    found = filtered(from_stated(bias_gravity, slow, flights.SIGMA).model, slow)
+    late = found.normalised_innovations[150:]
+    assert abs(late[np.isfinite(late)].mean() - 3) < 0.6  # χ² of 810 over 270, 99.9 %: ±0.5
+
+
+def test_matched_innovations_are_as_large_as_expected(flight):
+    matched = from_stated(bias_gravity, flight, flights.SIGMA).model
+    assert filtered(bias_gravity, flight).normalised_innovations[150:].mean() < 0.01
+    assert abs(filtered(matched, flight).normalised_innovations[150:].mean() - 3) < 0.3
+
+
+@pytest.mark.parametrize(("stds", "words"), [
+    ({"w": 1.0}, "has no signal 'w'; it has a, omega, v"),
+    ({"v": 0.0}, "v: the noise 0 must be positive"),
+])  # fmt: skip
+def test_what_is_no_noise_is_refused(flight, stds, words):
+    with pytest.raises(UsageError, match=words):
+        from_stated(bias_gravity, flight, stds)
+
+
+# -- maximum likelihood ----------------------------------------------------------------------------
+
+
+def test_the_most_likely_intensities_are_the_true_ones(flight):
+    """Each within three of its own standard deviations."""
+    found = most_likely(bias_gravity, flight)
+    used = intensities(found.model)
+    for name, true in TRUE.items():
+        assert abs(np.log(used[name] / true)) < 3 * found.spread[name], name
+    assert found.spread["v"] < 0.05
+    assert found.spread["omega"] < 1.0
+    assert not found.spread["bias"] < 1.0  # it does not drift at all
+
+
+# -- at rest ---------------------------------------------------------------------------------------
+
+
+def test_allan_deviation_finds_white_noise_and_random_walk():
+    found = allan(drifting(60_000, 0.01, 3e-4), 1 / DT)
+    np.testing.assert_allclose(found.white, 0.01 * np.sqrt(DT), rtol=0.02)
+    np.testing.assert_allclose(found.walk, 3e-4, rtol=0.35)
+    assert found.deviations.shape == (len(found.taus), 3)
+    # White noise averages out with the root of time.
+    np.testing.assert_allclose(found.deviations[2], found.white / np.sqrt(found.taus[2]), rtol=0.03)
+
+
+def test_a_record_at_rest_gives_the_inputs_noise_and_the_biass_drift(flight):
+    signals = {"a": drifting(40_000, 0.0013, 2e-5), "omega": drifting(40_000, 8.7e-4, 0.0, 1)}
+    rest = type(flight).raw("rest", signals, units={}, time=DT * np.arange(40_000))
+    tuned, found = from_rest(bias_gravity, rest)
+    used = intensities(tuned.model)
+    assert used["a"] == pytest.approx(0.0013**2 * DT, rel=0.05)
+    assert used["omega"] == pytest.approx(8.7e-4**2 * DT, rel=0.05)
+    assert used["bias"] == pytest.approx(2e-5**2, rel=0.7)
+    assert set(found) == {"a", "omega"}
+
+
+@pytest.mark.parametrize(("readings", "words"), [
+    (np.zeros((20, 3)), "20 readings at 50 Hz are too few for an Allan deviation"),
+    (np.full((2000, 3), np.nan), "needs every reading"),
+])  # fmt: skip
+def test_a_rest_that_is_too_little(readings, words):
+    with pytest.raises(DataError, match=words):
+        allan(readings, 50.0)
+
+
+def test_without_allantools_it_says_how_to_get_it(monkeypatch):
+    monkeypatch.setitem(sys.modules, "allantools", None)
+    with pytest.raises(UsageError, match=r"pip install 'casest\[allan\]'"):
+        allan(np.zeros((2000, 3)), 50.0)
+
+
+# -- through the command line ----------------------------------------------------------------------
+
+
+@pytest.fixture
+def files(tmp_path, flight):
+    s = flight.signals
+    table = np.c_[T, s["a"], s["omega"], s["v"]]
+    still = (
+        np.array([0, 0, -9.8]) + drifting(10_000, 0.0013, 2e-5),
+        drifting(10_000, 8.7e-4, 0.0, 1),
+    )
+    for name, values, head in (
+        ("flight.csv", table, NAMES),
+        ("rest.csv", np.c_[DT * np.arange(10_000), still[0], still[1]], NAMES[:7]),
+    ):
+        np.savetxt(tmp_path / name, values, delimiter=",", header=",".join(head), comments="")
+    return tmp_path
+
+
+STATED = ["--sensor-noise", "a=0.0013", "--sensor-noise", "omega=8.727e-4"]
+VELOCITY = ["--sensor-noise", "v=0.01"]
+
+
+@pytest.mark.parametrize("options", [
+    [*STATED, *VELOCITY], ["--noise", "ml"], ["--rest", "rest.csv", *VELOCITY],
+])  # fmt: skip
+def test_declared_and_matched_stand_side_by_side(files, capsys, monkeypatch, options):
+    monkeypatch.chdir(files)
+    assert run(["filter", "bias-gravity", "flight.csv", *options, "-o", "out"]) == 0
+    said = capsys.readouterr().out
+    assert "declared         used" in said
+    assert "innovations are as large as the noise intensities say" in said
+    content = json.loads((files / "out" / "filter.json").read_text("utf-8"))
+    both = content["intensities"]
+    assert both["declared"]["v"] == 0.1
+    assert both["used"]["v"] == pytest.approx(TRUE["v"], rel=0.1)
+    assert both["declared_normalised_mean"] < 0.01
+    assert abs(content["innovations"]["normalised_mean"] - 3) < 0.3
+    assert "Noise intensities" in (files / "out" / "report.html").read_text("utf-8")
+
+
+def test_two_ways_at_once_are_refused(files, capsys):
+    words = ["filter", "bias-gravity", str(files / "flight.csv"), "--noise", "ml", *VELOCITY]
+    assert run(words) == 1
+    assert "--noise ml finds every intensity: leave" in capsys.readouterr().err
