@@ -319,6 +319,7 @@ def closing_in_motion(model_name: str, data: Sequence[str], options: Options, co
     from casest import result
     from casest.closing_motion import loop, text, written
     from casest.report import closing_motion_page
+    from casest.terminal import coloured
 
     for name in FITTED:
         if options[name]:
@@ -328,6 +329,7 @@ def closing_in_motion(model_name: str, data: Sequence[str], options: Options, co
                 "effects and noise are found from the record alone"
             )
     moving, run = moving_record(model_name, data, {**options, "intensities": (), "stds": ()})
+    progress(f"filtering {model_name}, looking for effects")
     found = loop.close_motion(moving, run, say=progress)
     content = written.motion_result(found, model_name=model_name, data=data, command=command)
     if options["output"]:
@@ -336,7 +338,7 @@ def closing_in_motion(model_name: str, data: Sequence[str], options: Options, co
     if options["as_json"]:
         echo(result.as_json(content), nl=False)
     else:
-        echo(text.motion_text(content, options["output"]))
+        echo(coloured(text.motion_text(content, options["output"]), sys.stdout))
     if not content["trusted"]:
         reason = content["after"]["certificate"]["reasons"][-1]
         click.echo(f"casest: no trustworthy estimate: {reason}", err=True)

@@ -45,10 +45,12 @@ class ModelName(_Name):
     """A shipped model or estimator in motion, as far as the command takes it, or a file."""
 
     def names(self, command: str) -> list[str]:
-        """Shipped models; for `filter` estimators in motion, for `observe` both."""
+        """Shipped models; for `filter` estimators in motion, for `observe` and `close` both."""
         still = declared_names("problem.py", "SHIPPED")
         moving = declared_names("problem.py", "MOVING")
-        return moving if command == "filter" else [*still, *moving * (command == "observe")]
+        if command == "filter":
+            return moving
+        return [*still, *moving] if command in ("observe", "close") else still
 
 
 class EffectName(_Name):

@@ -122,11 +122,15 @@ def _after_fit(typed: Typed, output: str | Path | None, trusted: bool, applies: 
 
 def _after_look(typed: Typed, output: str | Path | None, trusted: bool, applies: bool) -> _Steps:
     """After observe, filter and compare; only estimators in motion have nothing to apply."""
-    motion = (*_READING, "--std", "--intensity")
+    motion = (*_READING, "--set", "--std", "--intensity")
     if typed.name == "filter":
         if output is None:
-            yield "keep the states", typed.keeping("filter", motion).into("out").lines()
+            noise = ("--noise", "--sensor-noise", "--rest")
+            yield "keep the states", typed.keeping("filter", (*motion, *noise)).into("out").lines()
         yield "what can this trajectory see?", typed.keeping("observe", motion).lines()
+        yield "is something missing?", typed.keeping("close", motion[:-2]).into("out").lines()
+    elif len(typed.arguments) < 2:
+        return
     elif not applies:
         yield "estimate the states", typed.keeping("filter", motion).into("out").lines()
     elif trusted:

@@ -127,6 +127,12 @@ def test_the_only_column_of_a_signals_unit_is_suggested(tmp_path: Path) -> None:
     assert "try --columns mass=weight" in message
 
 
+def test_a_suggestion_with_blanks_is_quoted_for_the_shell(tmp_path: Path) -> None:
+    text = "Acc. X,Acc. Y,Acc. Z\n1,2,3\n2,3,5\n"
+    message = refusal(DataError, tmp_path, text)
+    assert "try --columns 'v=Acc. X,Acc. Y,Acc. Z'" in message
+
+
 def test_columns_may_be_named_by_what_they_have_in_common(tmp_path: Path) -> None:
     text = "AccX,AccY,AccZ,w\n1,2,3,0\n4,5,6,0\n"
     run = run_of(tmp_path, text, columns={"v": ("Acc",)})

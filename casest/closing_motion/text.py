@@ -7,6 +7,8 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from casest.data.logs import file_name
+from casest.following import following
 from casest.terminal import WIDTH, item, rounded
 
 #: Lists longer than this are left to result.json.
@@ -15,7 +17,7 @@ SHOWN = 4
 
 def motion_text(content: Mapping[str, Any], output: Path | None) -> str:
     """Verdict, error before and after, effects, states at the end, what stays invisible."""
-    files = ", ".join(Path(name).name for name in content["data"])
+    files = ", ".join(file_name(name) for name in content["data"])
     head = f"{content['model']} on {files}: {sentence(content)}"
     blocks = [
         textwrap.fill(head, WIDTH),
@@ -25,8 +27,9 @@ def motion_text(content: Mapping[str, Any], output: Path | None) -> str:
         "\n".join(_intensities(content)),
         "\n".join(_left(content)),
     ]
-    where = f"{output}/report.html, result.json, residuals.csv"
-    blocks.append(f"Written: {where}." if output else "Next: add -o out to keep the result.")
+    if output is not None:
+        blocks.append(f"Written: {output}/report.html, result.json, residuals.csv")
+    blocks.append(following(content["reproduce"]["command"], output, applies=False))
     return "\n\n".join(b for b in blocks if b)
 
 

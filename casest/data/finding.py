@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import re
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -122,10 +123,11 @@ def _missing(table: Table, signal: Signal) -> DataError:
     if signal.kind == "rotation":
         wanted = "roll pitch yaw or qw qx qy qz"
     near = _near_group(table, signal)
-    some = ",".join(near) if near else ",".join("…" * min(signal.size, 3))
+    some = shlex.quote(f"{signal.name}={','.join(near)}") if near else ""
+    some = some or f"{signal.name}={','.join('…' * min(signal.size, 3))}"
     return DataError(
         f"{table.file}: no columns {wanted} for signal {signal.name}; "
-        f"the file has {_listed(names)}; try --columns {signal.name}={some}"
+        f"the file has {_listed(names)}; try --columns {some}"
     )
 
 
