@@ -44,8 +44,14 @@ def bash(folder: Path, *words: str) -> list[str]:
     [
         (["casest", "cal"], ["calibrate"]),
         (["casest", "close", "norm-t"], ["norm-triangular"]),
-        (["casest", "filter", ""], ["bias-gravity", "bias-gravity-position"]),
-        (["casest", "observe", "b"], ["bias-gravity", "bias-gravity-position"]),
+        (
+            ["casest", "filter", ""],
+            ["bias-gravity", "bias-gravity-magnitude", "bias-gravity-position"],
+        ),
+        (
+            ["casest", "observe", "b"],
+            ["bias-gravity", "bias-gravity-magnitude", "bias-gravity-position"],
+        ),
         (["casest", "calibrate", "b"], ["files"]),
         (["casest", "calibrate", "mine"], ["files"]),
         (["casest", "calibrate", "wheel", "rec"], ["files"]),
