@@ -73,11 +73,11 @@ def test_a_planted_effect_is_found_and_named_with_its_size(sensors, label, plant
 
 
 def test_coloured_noise_becomes_a_state_and_nothing_else_is_named():
-    closing = close_motion(bias_gravity, flight(Sensors(colour=1.0, coloured=0.05), seed=4))
+    closing = close_motion(bias_gravity, flight(Sensors(colour=0.5, coloured=0.03), seed=4))
     assert names(closing) == ["coloured_noise of v"]
     (effect,) = motion_result(closing, model_name="bias-gravity", data=[])["effects"]
-    assert 0.3 < effect["parameters"]["correlation_time"]["value"] < 3
-    assert 0.025 < effect["parameters"]["std"]["value"] < 0.1
+    assert 0.2 < effect["parameters"]["correlation_time"]["value"] < 1.2
+    assert 0.015 < effect["parameters"]["std"]["value"] < 0.06
 
 
 # -- its parts ---------------------------------------------------------------------------------
