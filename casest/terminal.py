@@ -195,7 +195,8 @@ def _held(found: Estimate, content: Mapping[str, Any]) -> Iterator[str]:
         unit = content["units"].get(c.name, "")
         value = in_digits(c.array, 9)
         fixed = fixed or c.frozen is not None
-        yield f"  {c.name} = {value} {'' if unit == '1' else unit}".rstrip() + " (held)"
+        line = f"  {c.name} = {value} {'' if unit == '1' else unit}".rstrip() + " (held)"
+        yield textwrap.fill(line, WIDTH, subsequent_indent="      ", break_on_hyphens=False)
     if fixed:
         yield "  (the uncertainty of held values is not in the standard deviations above)"
 

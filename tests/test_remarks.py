@@ -125,7 +125,7 @@ def test_held_values_are_printed_with_what_they_leave_out(sphere, capsys):
     command = ["calibrate", "norm-triangular", sphere, "--set", "norm=9.80665", "--fix", "scale=1"]
     run(command)
     printed = capsys.readouterr().out
-    assert "scale = [[1., 0., 0.]" in printed
+    assert "scale = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]" in printed
     assert "norm = 9.80665 m/s^2 (held)" in printed
     assert "uncertainty of held values" in printed
 

@@ -22,6 +22,8 @@ WORDS = {
     "calibrate": "calibrate norm-diagonal poses.csv --columns v=Acc --unit v=g -o fit",
     "calibrate without -o": "calibrate norm-diagonal poses.csv --columns v=Acc --unit v=g",
     "calibrate the wheel": "calibrate wheel wheel.csv --set 'radius=28 cm' -o w",
+    "calibrate a matrix": "calibrate norm-triangular poses.csv --columns v=Acc --unit v=g -o tri",
+    "held": "calibrate norm-triangular poses.csv --columns v=Acc --unit v=g --fix scale=@tri",
     "refused": "calibrate norm-full poses.csv --columns v=Acc --unit v=g -o refused",
     "close": "close norm-diagonal poses.csv --columns v=Acc --unit v=g -o closed",
     "observe": "observe norm-diagonal poses.csv --columns v=Acc --unit v=g -o seen",
