@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from flights import Sensors
 
-from casest import DataError, Run, cli
-from casest.closing_motion.effects import candidates, extended
+from casest import DataError, Run, cli, cross, norm_2, signal
+from casest.closing_motion.effects import Colour, candidates, extended
 from casest.closing_motion.fitting import fitted
 from casest.closing_motion.loop import close_motion
 from casest.closing_motion.score import scores
@@ -19,6 +19,7 @@ from casest.closing_motion.sensitivity import sensitivity
 from casest.closing_motion.tuning import first_guess, likelihood, matched, prepared
 from casest.closing_motion.whiteness import whiteness
 from casest.closing_motion.written import motion_result, rms_settled
+from casest.dynamics import Motion, constraint, dynamics, measured, state
 from casest.dynamics.filter import filtered
 from casest_problems.bias_gravity import bias_gravity, bias_gravity_position
 
@@ -164,6 +165,39 @@ def test_a_lever_arm_is_one_of_a_speed_not_of_a_position():
     labels = [c.label for c in candidates(bias_gravity_position, there)]
     assert "bias of p" in labels
     assert not any("lever" in label for label in labels)
+
+
+def test_an_effect_leaves_what_is_known_exactly_as_it_was():
+    """A constraint of the declaration holds in the extended one too."""
+
+    @dynamics
+    def heavy(
+        a=signal(3, "m/s^2"),
+        omega=signal(3, "rad/s"),
+        v=signal(3, "m/s"),
+        *,
+        velocity=state(3, "m/s"),
+        gravity=state(3, "m/s^2", start=(0.0, 0.0, 9.8), std=1.0),
+    ):
+        rates = {
+            "velocity": a - cross(omega, velocity) + gravity,
+            "gravity": -cross(omega, gravity),
+        }
+        return Motion(
+            rates=rates,
+            outputs=(measured(v, velocity, intensity=0.1),),
+            constraints=(constraint(norm_2(gravity), 9.8),),
+        )
+
+    tried = [c for c in candidates(heavy, flight(seconds=2)) if c.on == "v"]
+    grown = extended(heavy, [(c, np.ones(c.size)) for c in tried], Colour("v", 3, "m/s", 1.0, 0.1))
+    assert len(grown.function(**symbols(grown)).constraints) == 1
+
+
+def symbols(model):
+    import casadi as ca
+
+    return {s.name: ca.SX.sym(s.name, s.size) for s in (*model.signals, *model.states)}
 
 
 # -- the command -------------------------------------------------------------------------------
