@@ -1,0 +1,115 @@
+"""`compare`: solvers side by side."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from casest.cli.options import model_options, reading_options
+from casest.cli.shared import (
+    FOLDER,
+    Options,
+    commands,
+    echo,
+    progress,
+    typed,
+)
+from casest.cli.words import (
+    declared_model,
+    records,
+    start_value,
+)
+from casest.completing import ModelName
+from casest.errors import NotTrusted, UsageError
+
+
+@commands.command()
+@click.argument("model_name", metavar="MODEL", type=ModelName())
+@click.argument("data", nargs=-1, required=True, type=click.Path())
+@model_options
+@reading_options
+@click.option(
+    "--solver", "solvers", multiple=True, metavar="NAME", help="Only this one (repeatable)."
+)
+@click.option(
+    "--start", multiple=True, metavar="NAME=VALUE", help="Start value in place of the automatic."
+)
+@click.option(
+    "--starts", type=int, default=8, show_default=True, help="More starts, spread around the first."
+)
+@click.option(
+    "--spread",
+    type=float,
+    multiple=True,
+    metavar="SHARE",
+    help="How far, as a share of each unknown's size (repeatable; 0.001, 0.01, 0.1 and 0.3).",
+)
+@click.option("--seed", type=int, default=0, show_default=True, help="For the spread of starts.")
+@click.option(
+    "--limit",
+    type=float,
+    default=10,
+    show_default=True,
+    metavar="SECONDS",
+    help="Stop a solver's run after this time.",
+)
+@click.option(
+    "-o",
+    "--output",
+    type=FOLDER,
+    metavar="DIR",
+    help="Folder for compare.json, compare.png and compare.svg.",
+)
+@click.option("--json", "as_json", is_flag=True, help="Print compare.json instead of tables.")
+def compare(model_name: str, data: tuple[str, ...], **options: Any) -> int:
+    """Run every solver on MODEL and DATA, from one start and from a spread of starts.
+
+    Each is judged by the certified optimum: where it ended, what it claims, what it took. Exit
+    code 0: done; 1: bad input; 2: no certified optimum to judge by, or interrupted (what is done
+    is shown and written all the same).
+    """
+    from casest import comparing_text, result
+    from casest.compare import SIZES
+    from casest.compare import compare as compared
+
+    model = declared_model(model_name, options)
+    runs = records(model, data, options)
+    found = compared(
+        model,
+        runs,
+        starts=options["starts"],
+        seed=options["seed"],
+        start=dict(start_value(text, model) for text in options["start"]) or None,
+        sizes=options["spread"] or SIZES,
+        solvers=options["solvers"],
+        limit=options["limit"],
+        say=progress,
+    )
+    command = typed()
+    content = comparing_text.comparison_result(
+        found, model_name=model_name, data=data, command=command
+    )
+    written = written_comparison(found, content, options["output"]) if options["output"] else []
+    if options["as_json"]:
+        echo(result.as_json(content), nl=False)
+    else:
+        echo(comparing_text.comparison_text(found, data, written, command))
+    if found.interrupted:
+        echo(f"casest: interrupted after {found.done} of {found.planned} runs", err=True)
+    elif not found.certified:
+        echo("casest: no certified optimum to judge by", err=True)
+    return 0 if found.certified and not found.interrupted else NotTrusted.exit_code
+
+
+def written_comparison(found: Any, content: Options, folder: Path) -> list[Path]:
+    """compare.json, and the plot where matplotlib is there; says so where it is not."""
+    from casest import comparing_plot, comparing_text
+
+    paths = [comparing_text.save(folder, content)]
+    try:
+        paths += comparing_plot.draw(found, folder)
+    except UsageError as error:
+        echo(f"casest: {error}", err=True)
+    return paths

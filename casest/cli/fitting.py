@@ -1,0 +1,248 @@
+"""`list`, `calibrate`, `close` and `demo`: fits, and what the models lack."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import click
+
+from casest.cli.options import model_options, output_options, reading_options
+from casest.cli.shared import (
+    FOLDER,
+    Options,
+    commands,
+    echo,
+    progress,
+    reported,
+    typed,
+    write,
+)
+from casest.cli.words import (
+    declared_model,
+    held_out,
+    moving_record,
+    records,
+    start_value,
+)
+from casest.completing import ModelName
+from casest.errors import NotTrusted, UsageError
+
+
+@commands.command("list")
+@click.option("--json", "as_json", is_flag=True, help="For programs.")
+def list_command(as_json: bool) -> None:
+    """Shipped problems with their symbols and estimators, and the catalogue of effects."""
+    from casest.effects import CATALOGUE
+    from casest.problem import MOVING, SHIPPED, find_any, find_model
+    from casest.terminal import listing
+
+    models = [(name, find_model(name)) for name in SHIPPED]
+    moving: list[Any] = [(name, find_any(name)) for name in MOVING]
+    echo(listing(models, CATALOGUE, moving, as_json=as_json))
+
+
+@commands.command()
+@click.argument("model_name", metavar="MODEL", type=ModelName())
+@click.argument("data", nargs=-1, required=True, type=click.Path())
+@model_options
+@reading_options
+@output_options
+def calibrate(model_name: str, data: tuple[str, ...], **options: Any) -> int:
+    """Fit MODEL to DATA: values with uncertainty, certificate, what was not determined.
+
+    Exit code 0: trusted; 1: bad input; 2: no trustworthy estimate (result.json says why).
+    """
+    return calibration(model_name, data, options, typed())
+
+
+def calibration(model_name: str, data: Sequence[str], options: Options, command: str) -> int:
+    """Read, fit, save, print; the exit code says whether the estimate is trusted."""
+    from casest import estimate, result, terminal, unseen
+    from casest.report import calibration_page
+    from casest.solve.interrupt import interruptible
+
+    model = declared_model(model_name, options)
+    runs = records(model, data, options)
+    hidden = held_out(model, data, options)
+    start = dict(start_value(text, model) for text in options["starts"]) or None
+    progress(f"fitting {model_name}")
+    with interruptible():
+        found = estimate.attempt(
+            model, runs, start=start, solver=options["solver"], seed=options["seed"]
+        )
+    holdout = unseen.score(found, hidden) if hidden else None
+    content = result.calibration_result(
+        found, model_name=model_name, data=data, command=command, holdout=holdout
+    )
+    if options["output"]:
+        progress(f"writing {options['output']}")
+        result.save(options["output"], content, result.residual_rows(found))
+        reported(options["output"], calibration_page(found, content, str(options["output"])))
+    if options["as_json"]:
+        echo(result.as_json(content), nl=False)
+    else:
+        words = terminal.calibration_text(found, content, options["output"])
+        echo(terminal.coloured(words, sys.stdout))
+    if not found.certificate.trusted:
+        reason = found.certificate.reasons[0]
+        echo(f"casest: no trustworthy estimate: {reason}", err=True)
+        return NotTrusted.exit_code
+    return 0
+
+
+@commands.command()
+@click.argument("model_name", metavar="MODEL", type=ModelName())
+@click.argument("data", nargs=-1, required=True, type=click.Path())
+@model_options
+@reading_options
+@output_options
+def close(model_name: str, data: tuple[str, ...], **options: Any) -> int:
+    """Fit, trace the residual to missing effects, add them, judge by held-out data.
+
+    Verdict `adequate`: nothing that these data can show is missing; `extended`: effects were added
+    and what is left is noise; `unexplained`: a misfit remains. Exit code 0 whatever the verdict.
+    Of an estimator in motion the one-step innovations are diagnosed.
+    """
+    from casest.dynamics import Dynamics
+    from casest.problem import find_any
+
+    if isinstance(find_any(model_name), Dynamics):
+        return closing_in_motion(model_name, data, options, typed())
+    return closing(model_name, data, options, typed())
+
+
+def closing(model_name: str, data: Sequence[str], options: Options, command: str) -> int:
+    """Read, close the loop, save, print."""
+    from casest import result
+    from casest.closing import loop, text, unseen, written
+    from casest.effects import CATALOGUE
+    from casest.problem import find_effects
+    from casest.report import closing_page
+    from casest.terminal import coloured
+
+    own = tuple(e for path in options["effects"] for e in find_effects(path))
+    model = declared_model(model_name, {**options, "effects": ()})
+    runs = records(model, data, options)
+    apart = held_out(model, data, options)
+    start = dict(start_value(words, model) for words in options["starts"]) or None
+    progress(f"fitting {model_name}, looking for effects")
+    try:
+        found = loop.close(
+            model,
+            runs,
+            catalogue=(*CATALOGUE, *own),
+            start=start,
+            seed=options["seed"],
+            say=progress,
+        )
+    except NotTrusted as error:
+        return refused(error, model_name, data, options, command)
+    hidden = unseen.scored(found, apart) if apart else None
+    content = written.closing_result(
+        found, model_name=model_name, data=data, command=command, held_out=hidden and hidden[1:]
+    )
+    if options["output"]:
+        progress(f"writing {options['output']}")
+        formula = written.formula_source(found)
+        if formula:
+            write(options["output"] / "formula.py", formula)
+            written.name_file(content, options["output"] / "formula.py")
+        result.save(options["output"], content, written.residual_rows(found, hidden))
+        reported(options["output"], closing_page(found, content, str(options["output"])))
+    if options["as_json"]:
+        echo(result.as_json(content), nl=False)
+    else:
+        echo(coloured(text.closing_text(found, content, options["output"]), sys.stdout))
+    return 0
+
+
+#: Options of `close` that only calibrations have.
+FITTED = ("effects", "per_run", "shared", "fix", "free", "starts", "holdout")
+
+
+def closing_in_motion(model_name: str, data: Sequence[str], options: Options, command: str) -> int:
+    """Filter, diagnose the innovations, add what is missing, save, print."""
+    from casest import result
+    from casest.closing_motion import loop, text, written
+    from casest.report import closing_motion_page
+    from casest.terminal import coloured
+
+    for name in FITTED:
+        if options[name]:
+            flag = {"starts": "start"}.get(name, name.replace("_", "-"))
+            raise UsageError(
+                f"--{flag} is for calibrations; {model_name} is an estimator in motion: its "
+                "effects and noise are found from the record alone"
+            )
+    moving, run = moving_record(model_name, data, {**options, "intensities": (), "stds": ()})
+    progress(f"filtering {model_name}, looking for effects")
+    found = loop.close_motion(moving, run, say=progress)
+    content = written.motion_result(found, model_name=model_name, data=data, command=command)
+    if options["output"]:
+        result.save(options["output"], content, written.residual_rows(found))
+        reported(options["output"], closing_motion_page(found, content))
+    if options["as_json"]:
+        echo(result.as_json(content), nl=False)
+    else:
+        echo(coloured(text.motion_text(content, options["output"]), sys.stdout))
+    if not content["trusted"]:
+        reason = content["after"]["certificate"]["reasons"][-1]
+        click.echo(f"casest: no trustworthy estimate: {reason}", err=True)
+        return NotTrusted.exit_code
+    return 0
+
+
+def refused(
+    error: NotTrusted, model_name: str, data: Sequence[str], options: Options, command: str
+) -> int:
+    """Write and say what there is where the declared model itself has no trustworthy fit."""
+    from casest import result
+    from casest.report import calibration_page
+
+    if error.estimate is not None and options["output"]:
+        content = result.calibration_result(
+            error.estimate, model_name=model_name, data=data, command=command
+        )
+        result.save(options["output"], content, result.residual_rows(error.estimate))
+        page = calibration_page(error.estimate, content, str(options["output"]))
+        reported(options["output"], page)
+        if options["as_json"]:
+            echo(result.as_json(content), nl=False)
+    echo(f"casest: {error}", err=True)
+    return NotTrusted.exit_code
+
+
+@commands.command()
+@click.option(
+    "-o",
+    "--output",
+    type=FOLDER,
+    metavar="DIR",
+    help="Folder for result.json, residuals.csv and report.html.",
+)
+def demo(output: Path | None) -> int:
+    """Close the loop on a shipped record with an effect that its model lacks."""
+    from casest import demonstration
+
+    record = demonstration.WHEEL
+    options: Options = {
+        **dict.fromkeys(
+            ("effects", "constants", "free", "fix", "shared", "per_run", "columns", "units"), ()
+        ),
+        **dict.fromkeys(("scales", "holdout", "starts"), ()),
+        "rate": None,
+        "at_rest": False,
+        "time_zero": "first",
+        "solver": "ipopt",
+        "seed": 0,
+        "output": output or Path("out"),
+        "as_json": False,
+    }
+    words = f"casest close wheel {record} -o {options['output']}"
+    echo(f"$ {words}\n")
+    code = closing("wheel", (str(record),), options, words)
+    echo("\n" + demonstration.comparison(options["output"]))
+    return code

@@ -1,0 +1,124 @@
+"""`observe` and `filter`: what data can see, and states over time."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import click
+
+from casest.cli.options import model_options, motion_options, reading_options
+from casest.cli.shared import (
+    commands,
+    echo,
+    last_words,
+    progress,
+    reported,
+    typed,
+    write,
+)
+from casest.cli.words import (
+    declared_model,
+    moving_model,
+    moving_record,
+    records,
+    tuned_noise,
+)
+from casest.completing import ModelName
+from casest.errors import UsageError
+
+
+@commands.command()
+@click.argument("model_name", metavar="MODEL", type=ModelName())
+@click.argument("data", nargs=-1, type=click.Path())
+@model_options
+@reading_options
+@motion_options
+@click.option("--window", type=float, metavar="SECONDS", help="Of the sliding eigenvalue.")
+def observe(model_name: str, data: tuple[str, ...], **options: Any) -> int:
+    """What these data, or this trajectory, can see: rank, and what is hidden, in words.
+
+    Without DATA: what any record of an estimator in motion could show (structural rank). Exit
+    code 0 even where something is not observable.
+    """
+    from casest import observing, result
+    from casest.modelling.model import Model
+    from casest.problem import find_any
+
+    fits = isinstance(find_any(model_name), Model)
+    if fits:
+        model = declared_model(model_name, options)
+        if not data:
+            raise UsageError(f"{model_name}: what can be seen depends on the record: give DATA")
+        runs = records(model, data, options)
+        progress(f"fitting {model_name}")
+        content, _ = observing.observe_parameters(model, runs)
+    elif not data:
+        content = observing.observe_structure(moving_model(model_name, options))
+    else:
+        moving, run = moving_record(model_name, data, options)
+        progress("what the trajectory shows")
+        content = observing.observe_motion(moving, run, options["window"])
+    content |= {"data": list(data), "reproduce": result.reproduce(typed(), data)}
+    if options["output"]:
+        from casest.report import observe_page
+
+        write(options["output"] / "observe.json", result.as_json(content))
+        reported(options["output"], observe_page(content))
+    if options["as_json"]:
+        echo(result.as_json(content), nl=False)
+        return 0
+    echo(observing.observe_text(content))
+    seen = content["rank"] == content["unknowns"]
+    last_words(options["output"], "report.html, observe.json", trusted=seen, applies=fits)
+    return 0
+
+
+@commands.command("filter")
+@click.argument("model_name", metavar="MODEL", type=ModelName())
+@click.argument("data", nargs=-1, required=True, type=click.Path())
+@click.option(
+    "--set", "constants", metavar="NAME=VALUE", multiple=True, help="Set a constant of the model."
+)
+@reading_options
+@motion_options
+@click.option(
+    "--noise",
+    type=click.Choice(["declared", "ml"]),
+    default="declared",
+    help="Noise intensities: as declared, or the most likely ones for this record.",
+)
+@click.option(
+    "--sensor-noise",
+    "stated",
+    multiple=True,
+    metavar="SIGNAL=STD",
+    help="Standard deviation of one reading, in the model's unit; its rate is the record's.",
+)
+@click.option(
+    "--rest",
+    type=click.Path(),
+    metavar="FILE",
+    help="A record at rest: noise of the inputs by its Allan deviation.",
+)
+def filter_command(model_name: str, data: tuple[str, ...], **options: Any) -> int:
+    """States over time by the Kalman filter and smoother, with innovations diagnosed."""
+    from casest import filtering, result
+
+    moving, run = moving_record(model_name, data, options)
+    tuned, told = tuned_noise(moving, run, options)
+    progress("filter and smoother")
+    content, found = filtering.follow(moving, run, tuned)
+    content |= told
+    content |= {"data": list(data), "reproduce": result.reproduce(typed(), data)}
+    if options["output"]:
+        from casest.report import filter_page
+
+        write(options["output"] / "states.csv", filtering.states_csv(found))
+        write(options["output"] / "filter.json", result.as_json(content))
+        reported(options["output"], filter_page(found, content))
+    if options["as_json"]:
+        echo(result.as_json(content), nl=False)
+        return 0
+    echo(filtering.filter_text(content))
+    last_words(options["output"], "report.html, filter.json, states.csv")
+    return 0
