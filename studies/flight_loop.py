@@ -125,7 +125,8 @@ with the published intensities as its start.
 
 {nulls} flights, half at 25 Hz, half at 50 Hz, with noises of one to three times Batista's, which
 the loop is not told: an effect was reported in {false} ({share:.1%}, at most {upper:.1%} with 95 %
-confidence), a misfit without a name in {unexplained}. Median time {seconds:.1f} s (on a machine busy with other work).
+confidence), a misfit without a name in {unexplained}. Median time {seconds:.1f} s
+(on a machine busy with other work).
 
 | other noise | flights | with an effect | with a misfit without a name |
 | --- | --- | --- | --- |
