@@ -125,7 +125,8 @@ with the published intensities as its start.
 
 {nulls} flights, half at 25 Hz, half at 50 Hz, with noises of one to three times Batista's, which
 the loop is not told: an effect was reported in {false} ({share:.1%}, at most {upper:.1%} with 95 %
-confidence), a misfit without a name in {unexplained}. Median time {seconds:.1f} s.
+confidence), a misfit without a name in {unexplained}. Median time {seconds:.1f} s
+(on a machine busy with other work).
 
 | other noise | flights | with an effect | with a misfit without a name |
 | --- | --- | --- | --- |
@@ -133,7 +134,7 @@ confidence), a misfit without a name in {unexplained}. Median time {seconds:.1f}
 
 ## One effect planted
 
-Up to {seeds} flights each, at 50 Hz. Named: first, or among at most two that it cannot be told
+{seeds} flights each, at 50 Hz. Named: first, or among at most two that it cannot be told
 apart from. Errors are one-step innovations of the velocity (m/s, rms, held-out time; noise of
 0.01 m/s stays in any case), and what a flight's log-likelihood gained. `error` is the median
 distance of the found number from the planted one, in its own standard deviations.
