@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from casest.declaring.shapes import Array
+from casest.null_space import sparsest
 from casest.stack import Point, Problem
 
 #: Below this singular value (relative to the largest, unit columns) a direction is null. Rounding
@@ -85,7 +86,7 @@ def _null_words(problem: Problem, point: Point, null: Array, scale: Array) -> It
             yield words
             left = _without(left, new / np.linalg.norm(new))
     for k in range(left.shape[1]):
-        yield _combination(problem, _sparsest(left)[:, k], scale)
+        yield _combination(problem, sparsest(left)[:, k], scale)
 
 
 def _rotations(problem: Problem, point: Point) -> Iterator[tuple[str, Array]]:
@@ -111,24 +112,6 @@ def _without(basis: Array, direction: Array) -> Array:
     rest = basis - np.outer(direction, direction @ basis)
     u, _, _ = np.linalg.svd(rest, full_matrices=False)
     return u[:, : basis.shape[1] - 1] if basis.shape[1] > 1 else u[:, :0]
-
-
-def _sparsest(basis: Array) -> Array:
-    """The same space with few unknowns per direction: reduced column echelon form."""
-    matrix = basis.copy()
-    done: list[int] = []
-    for k in range(matrix.shape[1]):
-        size = np.abs(matrix[:, k:]).max(axis=1)
-        size[done] = 0
-        row = int(np.argmax(size))
-        pivot = k + int(np.argmax(np.abs(matrix[row, k:])))
-        matrix[:, [k, pivot]] = matrix[:, [pivot, k]]
-        matrix[:, k] /= matrix[row, k]
-        for j in range(matrix.shape[1]):
-            if j != k:
-                matrix[:, j] -= matrix[row, j] * matrix[:, k]
-        done.append(row)
-    return np.asarray(matrix / np.linalg.norm(matrix, axis=0))
 
 
 def _combination(problem: Problem, scaled: Array, scale: Array) -> str:

@@ -27,18 +27,11 @@ from scipy.spatial.transform import Rotation  # noqa: E402
 
 from casest import CasestError, Run, attempt  # noqa: E402
 from casest.problem import find_model  # noqa: E402
-from casest.result import half_width  # noqa: E402
+from casest.solve.profile import half_width  # noqa: E402
 
 KEPT, TABLE = ROOT / "out" / "study.jsonl", ROOT / "studies" / "bound.md"
 
-WHEEL = {
-    "offset": np.array([1.0, -1.0, 1.0]),
-    "gain": np.array([0.9, 1.0, 1.1]),
-    "misalignment": np.radians([30.0, 20.0, 25.0]),
-    "tilt": np.radians(45.0),
-    "phase": np.radians(30.0),
-    "speed": np.array([9.0, -0.09, 5e-4, 2e-6]),
-}
+WHEEL = sim.TABLE_1
 TABLE_SENSOR = {
     "inverse_scale": np.array(
         [[0.990, 0.001, -0.002], [0.020, 1.005, 0.003], [-0.010, -0.004, 1.010]]

@@ -67,14 +67,7 @@ BLUE, RED, PURPLE = "#0072B2", "#D55E00", "#CC79A7"
 
 # -- what is known of the papers ------------------------------------------------------------------
 
-WHEEL = {
-    "offset": np.array([1.0, -1.0, 1.0]),
-    "gain": np.array([0.9, 1.0, 1.1]),
-    "misalignment": np.radians([30.0, 20.0, 25.0]),
-    "tilt": np.radians(45.0),
-    "phase": np.radians(30.0),
-    "speed": np.array([9.0, -0.09, 5e-4, 2e-6]),
-}
+WHEEL = sim.TABLE_1
 #: The groups that Figs. 7 and 8 average over: label, parameters, colour.
 GROUPS = {
     "offset": ("offset", ("offset",), RED),

@@ -52,14 +52,7 @@ LEVELS = (0.01, 0.02, 0.05, 0.08, 0.2, 0.5, 1.0)  # m/s²
 CHUNK, PAPERS = 20, 60  # fits kept at a time; realisations of the paper
 SECONDS, RATE = 90.0, 200.0
 
-TRUTH = {
-    "offset": np.array([1.0, -1.0, 1.0]),
-    "gain": np.array([0.9, 1.0, 1.1]),
-    "misalignment": np.radians([30.0, 20.0, 25.0]),
-    "tilt": np.radians(45.0),
-    "phase": np.radians(30.0),
-    "speed": np.array([9.0, -0.09, 5e-4, 2e-6]),
-}
+TRUTH = sim.TABLE_1
 NAMES = (
     *("offset[0]", "offset[1]", "offset[2]", "gain[0]", "gain[1]", "gain[2]"),
     *("misalignment[0]", "misalignment[1]", "misalignment[2]", "tilt", "phase"),

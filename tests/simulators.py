@@ -13,6 +13,15 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 GRAVITY = 9.80665
+#: The wheel of Pedersini, Table I: m/s², rad and s.
+TABLE_1 = {
+    "offset": np.array([1.0, -1.0, 1.0]),
+    "gain": np.array([0.9, 1.0, 1.1]),
+    "misalignment": np.radians([30.0, 20.0, 25.0]),
+    "tilt": np.radians(45.0),
+    "phase": np.radians(30.0),
+    "speed": np.array([9.0, -0.09, 5e-4, 2e-6]),
+}
 
 
 # -- directions of the true vector in the sensor's frame, (n, 3) unit vectors ----------------------

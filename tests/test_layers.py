@@ -20,7 +20,7 @@ FLOORS = [
     ["casest.data"],
     ["casest.modelling"],
     ["casest.engine"],
-    ["casest.sequence", "casest.persample"],
+    ["casest.sequence", "casest.persample", "casest.null_space"],
     ["casest.stack", "casest.dynamics"],
     ["casest.sums"],
     ["casest.noise", "casest.identify", "casest.scatter", "casest.allan"],

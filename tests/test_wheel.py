@@ -24,14 +24,7 @@ from casest_problems.wheel import (
     wheel,
 )
 
-TABLE_1 = {
-    "offset": np.array([1.0, -1.0, 1.0]),
-    "gain": np.array([0.9, 1.0, 1.1]),
-    "misalignment": np.radians([30.0, 20.0, 25.0]),
-    "tilt": np.radians(45.0),
-    "phase": np.radians(30.0),
-    "speed": np.array([9.0, -0.09, 5e-4, 2e-6]),
-}
+TABLE_1 = sim.TABLE_1
 
 
 def turn(angles):

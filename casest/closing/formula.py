@@ -25,7 +25,7 @@ from casest.closing.noise_model import (
     power,
     slice_means,
 )
-from casest.closing.score import CLIPPED, PIECE, Score, _slope, scores, widened
+from casest.closing.score import CLIPPED, PIECE, Score, scores, slope_of, widened
 from casest.closing.search import Chosen, Rows, search
 from casest.closing.terms import Shape, Term, Variable, formula_effect, library
 from casest.data.run import Run
@@ -289,7 +289,7 @@ def _library(state: State, probe: Candidate) -> _Library | None:
     assert probe.effect is not None
     on, signals = probe.effect.on, list(model.signals)
     symbols: dict[str, Any] = {s.name: model.traced.symbols[s.name] for s in signals}
-    slope, _, _ = _slope(probe, model, symbols)
+    slope, _, _ = slope_of(probe, model, symbols)
     size = int(slope.size2())
     rows = list(_readable(model, problem.runs, on, symbols, signals, size))
     if not rows:

@@ -117,7 +117,7 @@ def widened(
     symbols = {s.name: base.symbols[s.name] for s in signals}
     slopes, columns, places, count, width = [], [], [], 0, problem.unknowns
     for candidate in found:
-        slope, scopes, more = _slope(candidate, model, symbols)
+        slope, scopes, more = slope_of(candidate, model, symbols)
         signals += more
         slopes.append(slope)
         own = np.arange(count, count + slope.size2())
@@ -149,7 +149,7 @@ def widened(
     )
 
 
-def _slope(
+def slope_of(
     candidate: Candidate, model: Model, symbols: dict[str, Any]
 ) -> tuple[Any, list[bool], list[Signal]]:
     """∂r/∂(its unknowns) at null in the model's symbols; which are per run; signals it adds."""
@@ -180,7 +180,7 @@ def _slope(
 
 
 @dataclass(frozen=True)
-class _Sums:
+class ScoreSums:
     """Of every batch [J G]ᵀ[J G] (batches, n, n) and [J G]ᵀr (batches, n), scaled by `scale`.
 
     `squares`: rᵀr of all. Far residuals are clipped, except in `unclipped`, its rᵀr coming second.
@@ -194,6 +194,7 @@ class _Sums:
 
     @cached_property
     def whole(self) -> Array:
+        """[J G]ᵀ[J G] of all batches, (n, n)."""
         return np.asarray(self.matrices.sum(axis=0))
 
 
@@ -211,18 +212,18 @@ def scores(
     sums = _sums(wide, sigma, [first[:: _together(batches)] for first in batches])
     A, d = sums.whole, np.arange(wide.problem.unknowns)
     inverse = np.asarray(np.linalg.pinv(A[np.ix_(d, d)], rcond=1e-10, hermitian=True), float)
-    test = _Test(sums, d, inverse, sigma, known, _least_survival(wide.problem, sigma))
+    test = ScoreTest(sums, d, inverse, sigma, known, _least_survival(wide.problem, sigma))
     return [
-        _score(candidate, np.unique(np.concatenate(own)), test, wide.problem.residual_count)
+        scored(candidate, np.unique(np.concatenate(own)), test, wide.problem.residual_count)
         for candidate, own in zip(found, wide.places, strict=True)
     ]
 
 
 @dataclass(frozen=True)
-class _Test:
+class ScoreTest:
     """What the scores of all candidates share: sums, the declared unknowns, the noise."""
 
-    sums: _Sums
+    sums: ScoreSums
     declared: NDArray[np.int_]
     inverse: Array
     residual: float
@@ -253,7 +254,7 @@ def _together(batches: Sequence[NDArray[np.int_]]) -> int:
     return -(-sum(map(len, batches)) // MOST_BATCHES)
 
 
-def _sums(wide: Wide, sigma: float, batches: Sequence[NDArray[np.int_]]) -> _Sums:
+def _sums(wide: Wide, sigma: float, batches: Sequence[NDArray[np.int_]]) -> ScoreSums:
     """Sums over every batch, far residuals clipped."""
     problem, n = wide.problem, wide.width
     offsets = np.cumsum([0, *map(len, batches)])
@@ -277,7 +278,7 @@ def _sums(wide: Wide, sigma: float, batches: Sequence[NDArray[np.int_]]) -> _Sum
             gradients[1, b][index] += part.T @ residual[start:stop].ravel()
     scale = np.sqrt(np.maximum(np.einsum("bii->i", matrices), 1e-300))
     clipped, unclipped = gradients / scale
-    return _Sums(matrices / np.outer(scale, scale), clipped, unclipped, scale, (squares, far))
+    return ScoreSums(matrices / np.outer(scale, scale), clipped, unclipped, scale, (squares, far))
 
 
 def _rows(wide: Wide) -> Iterator[tuple[int, slice, NDArray[np.int_], Array, Array]]:
@@ -296,7 +297,8 @@ def _rows(wide: Wide) -> Iterator[tuple[int, slice, NDArray[np.int_], Array, Arr
             yield block.run, span, index, block.residual[local], np.where(np.isfinite(J), J, 0.0)
 
 
-def _score(candidate: Candidate, own: NDArray[np.int_], test: _Test, count: int) -> Score:
+def scored(candidate: Candidate, own: NDArray[np.int_], test: ScoreTest, count: int) -> Score:
+    """The score of a candidate whose columns are `own`, of `count` residuals."""
     sums, d, inverse, sigma = test.sums, test.declared, test.inverse, test.sigma
     A, scale = sums.whole, sums.scale
     absorbed = inverse @ A[np.ix_(d, own)]

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casest.closing.candidates import Candidate
-from casest.closing.score import SURVIVES, Score, _score, _Sums, _Test
+from casest.closing.score import SURVIVES, Score, ScoreSums, ScoreTest, scored
 from casest.declaring.shapes import Array
 
 #: Chance, under a model that lacks nothing, that any formula is called significant.
@@ -90,7 +90,7 @@ def _gains(left: Array, whole: Array, score: Array) -> Array:
     return np.asarray(gains.sum(axis=1))
 
 
-def summed(rows: Iterator[Rows], unknowns: int, shapes: int, axes: int, batches: int) -> _Sums:
+def summed(rows: Iterator[Rows], unknowns: int, shapes: int, axes: int, batches: int) -> ScoreSums:
     """Sums over every batch of the declared columns and those of all shapes."""
     n = unknowns + shapes * axes
     matrices, gradients, squares = np.zeros((batches, n, n)), np.zeros((batches, n)), 0.0
@@ -106,7 +106,7 @@ def summed(rows: Iterator[Rows], unknowns: int, shapes: int, axes: int, batches:
     scale = np.sqrt(np.maximum(np.einsum("bii->i", matrices), 1e-300))
     gradients /= scale
     whole = matrices / np.outer(scale, scale)
-    return _Sums(whole, gradients, gradients, scale, (squares, squares))
+    return ScoreSums(whole, gradients, gradients, scale, (squares, squares))
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,7 @@ class Search:
     `reads` says what each shape reads, `trials` how many there were, `count` the residuals.
     """
 
-    sums: _Sums
+    sums: ScoreSums
     declared: int
     axes: int
     sigma: float
@@ -187,10 +187,10 @@ class Search:
         d, A = self._declared(beside), self.sums.whole
         inverse = np.asarray(np.linalg.pinv(A[np.ix_(d, d)], rcond=1e-10, hermitian=True))
         sums = self._left(d, inverse) if len(beside) else self.sums
-        test = _Test(sums, d, inverse, self.sigma, None, SURVIVES)
-        return _score(Candidate(None), self._columns(shapes), test, self.count)
+        test = ScoreTest(sums, d, inverse, self.sigma, None, SURVIVES)
+        return scored(Candidate(None), self._columns(shapes), test, self.count)
 
-    def _left(self, d: NDArray[np.int_], inverse: Array) -> _Sums:
+    def _left(self, d: NDArray[np.int_], inverse: Array) -> ScoreSums:
         """Sums with the residual that a fit of the columns d leaves."""
         sums, total = self.sums, self.sums.gradients[:, d].sum(axis=0)
         sizes = inverse @ total

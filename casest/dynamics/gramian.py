@@ -16,6 +16,7 @@ import numpy as np
 from casest.declaring.shapes import Array
 from casest.dynamics.declare import Dynamics
 from casest.dynamics.transition import Linearised, half_transitions, transitions
+from casest.null_space import sparsest
 
 #: A direction counts as observable from this share of the largest scaled eigenvalue on. Rounding
 #: and the error of a fourth-order step stay below 1e-13.
@@ -125,25 +126,8 @@ def observed(model: Dynamics, W: Array) -> Observed:
 
 def _words(model: Dynamics, null: Array) -> Sequence[str]:
     """Each unobservable direction as a sentence."""
-    basis = _sparse(null)
+    basis = sparsest(null)
     return [sentence(model, basis[:, k]) for k in range(basis.shape[1])]
-
-
-def _sparse(null: Array) -> Array:
-    """The same space with as few states per direction as echelon form gives."""
-    matrix, done = null.copy(), list[int]()
-    for k in range(matrix.shape[1]):
-        size = np.abs(matrix[:, k:]).max(axis=1)
-        size[done] = 0
-        row = int(np.argmax(size))
-        pivot = k + int(np.argmax(np.abs(matrix[row, k:])))
-        matrix[:, [k, pivot]] = matrix[:, [pivot, k]]
-        matrix[:, k] /= matrix[row, k]
-        for j in range(matrix.shape[1]):
-            if j != k:
-                matrix[:, j] -= matrix[row, j] * matrix[:, k]
-        done.append(row)
-    return np.asarray(matrix / np.linalg.norm(matrix, axis=0))
 
 
 def sentence(model: Dynamics, direction: Array) -> str:

@@ -1,0 +1,24 @@
+"""Studies and benchmarks run for hours, so nobody runs them daily: they must at least still load."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PROGRAMS = sorted([*ROOT.glob("studies/*.py"), *ROOT.glob("benchmarks/*.py")])
+HELPERS = {"loop_table", "by_hand", "fused"}
+
+
+@pytest.mark.parametrize("path", PROGRAMS, ids=lambda p: f"{p.parent.name}/{p.stem}")
+def test_every_name_that_a_study_needs_is_there(path, monkeypatch):
+    monkeypatch.setattr(sys, "path", [str(path.parent), str(ROOT), *sys.path])
+    name = f"loaded_{path.parent.name}_{path.stem}"
+    spec = importlib.util.spec_from_file_location(name, path)
+    module = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, name, module)
+    spec.loader.exec_module(module)
+    assert path.stem in HELPERS or callable(module.main)
