@@ -11,10 +11,8 @@ with the models.
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import time
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +20,7 @@ import numpy as np
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT / "tests"))
 
+import resumed  # noqa: E402
 import simulators as sim  # noqa: E402
 from scipy.spatial.transform import Rotation  # noqa: E402
 
@@ -106,18 +105,12 @@ def one_fit(case: str, sigma: float, seed: int) -> dict:
     return record
 
 
-def kept_records() -> list[dict]:
-    if not KEPT.exists():
-        return []
-    return [json.loads(line) for line in KEPT.read_text(encoding="utf-8").splitlines()]
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="a tenth of the fits")
     parser.add_argument("--workers", type=int, default=2)
     options = parser.parse_args()
-    records = kept_records()
+    records = resumed.kept(KEPT)
     done = {(r["case"], r["sigma"], r["seed"]) for r in records}
     tasks = [
         (case, sigma, seed)
@@ -127,21 +120,7 @@ def main() -> None:
     ]
     left = [task for task in tasks if task not in done]
     print(f"{len(tasks)} fits, {len(left)} to do")
-    KEPT.parent.mkdir(exist_ok=True)
-    began = time.time()
-    with (
-        ProcessPoolExecutor(options.workers) as pool,
-        KEPT.open("a", encoding="utf-8") as kept,
-    ):
-        waiting = [pool.submit(one_fit, *task) for task in left]
-        for k, ready in enumerate(as_completed(waiting), 1):
-            record = ready.result()
-            records.append(record)
-            kept.write(json.dumps(record) + "\n")
-            if k % 20 == 0 or k == len(left):
-                kept.flush()
-                print(f"\r{k}/{len(left)}, {time.time() - began:.0f} s", end="", flush=True)
-    print()
+    records += resumed.done(one_fit, left, KEPT, options.workers)
     TABLE.write_text(table(records), encoding="utf-8")
     print(f"written: {TABLE}")
 

@@ -14,15 +14,14 @@ rate table (warm_sine and warm_force, seed 30 003) that it had missed.
 from __future__ import annotations
 
 import argparse
-import json
 import re
-import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import loop as study
 import numpy as np
+import resumed
 from loop_table import says, share_removed, upper, visible
 
 from casest import effect, param
@@ -165,23 +164,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--seeds", type=int, default=4)
     parser.add_argument("--nothing", type=int, default=4)
     parser.add_argument("--first", type=int, default=FIRST, help="first seed: others for tuning")
+    parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--kept", type=Path, default=KEPT)
     parser.add_argument("--table", type=Path, default=TABLE)
     options = parser.parse_args(arguments)
     seeds, nothing = (1, 1) if options.quick else (options.seeds, options.nothing)
     every = [t for t in tasks(seeds, nothing, options.first) if re.search(options.only, t.name)]
-    done = {r["name"]: r for r in study.kept_records(options.kept)}
+    done = {r["name"]: r for r in resumed.kept(options.kept)}
     left = [t for t in every if t.name not in done]
-    options.kept.parent.mkdir(exist_ok=True)
-    began = time.time()
-    with options.kept.open("a", encoding="utf-8") as kept:
-        for k, task in enumerate(left, 1):
-            record = study.one_world(task)
-            done[record["name"]] = record
-            kept.write(json.dumps(record) + "\n")
-            kept.flush()
-            if k % 20 == 0:
-                print(f"{k}/{len(left)}, {time.time() - began:.0f} s", flush=True)
+    made = resumed.done(study.one_world, [(t,) for t in left], options.kept, options.workers)
+    done |= {r["name"]: r for r in made}
     records = [done[t.name] for t in every if t.name in done]
     options.table.write_text(table(records), encoding="utf-8")
     print(f"written: {options.table}")

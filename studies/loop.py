@@ -13,12 +13,10 @@ readings without noise. Seeds below 10 000 are the study's; the loop was tuned o
 from __future__ import annotations
 
 import argparse
-import json
 import re
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -29,6 +27,7 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT / "tests"))
 
 import loop_table  # noqa: E402
+import resumed  # noqa: E402
 import simulators as sim  # noqa: E402
 import worlds  # noqa: E402
 
@@ -402,12 +401,6 @@ def _error(truth: Mapping[str, Any], values: Mapping[str, Any], std: Mapping[str
 # -- all of them -----------------------------------------------------------------------------------
 
 
-def kept_records(path: Path) -> list[dict[str, Any]]:
-    if not path.exists():
-        return []
-    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
-
-
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="one seed of each, few without effect")
@@ -423,28 +416,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     every = [
         task for task in tasks(seeds, nothing, options.first) if re.search(options.only, task.name)
     ]
-    done = {r["name"]: r for r in kept_records(options.kept)}
+    done = {r["name"]: r for r in resumed.kept(options.kept)}
     left = [task for task in every if task.name not in done]
     print(f"{len(every)} worlds, {len(left)} to do")
-    done |= _run(left, options.workers, options.kept)
+    made = resumed.done(one_world, [(task,) for task in left], options.kept, options.workers)
+    done |= {r["name"]: r for r in made}
     records = [done[task.name] for task in every]
     options.table.write_text(loop_table.table(records, WORDS), encoding="utf-8")
     print(f"written: {options.table}")
-
-
-def _run(left: Sequence[Task], workers: int, path: Path) -> dict[str, dict[str, Any]]:
-    path.parent.mkdir(exist_ok=True)
-    found, began = {}, time.time()
-    with ProcessPoolExecutor(workers) as pool, path.open("a", encoding="utf-8") as kept:
-        waiting = [pool.submit(one_world, task) for task in left]
-        for k, ready in enumerate(as_completed(waiting), 1):
-            record = ready.result()
-            found[record["name"]] = record
-            kept.write(json.dumps(record) + "\n")
-            kept.flush()
-            print(f"\r{k}/{len(left)}, {time.time() - began:.0f} s", end="", flush=True)
-    print()
-    return found
 
 
 if __name__ == "__main__":

@@ -25,6 +25,7 @@ from scipy.optimize import least_squares
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT / "tests"))
 
+import resumed  # noqa: E402
 from nist import MODELS, Certified, fewest_digits, read  # noqa: E402
 
 from casest import Model, attempt  # noqa: E402
@@ -142,7 +143,7 @@ def by_itself(solver: str, certified: Certified, model: Model) -> dict[str, Any]
 
 
 def main() -> None:
-    records = kept_records()
+    records = resumed.kept(KEPT)
     done = {(r["solver"], r["problem"], r["start"]) for r in records}
     tasks = [(s, n, k) for s in (DEFAULT, *ALONE) for n in MODELS for k in (1, 2)]
     tasks += [(DEFAULT, n, k) for n in MODELS for k in range(3, MORE + 3)]
@@ -162,12 +163,6 @@ def main() -> None:
     print()
     TABLE.write_text(page(records), encoding="utf-8")
     print(f"written: {TABLE}")
-
-
-def kept_records() -> list[dict[str, Any]]:
-    if not KEPT.exists():
-        return []
-    return [json.loads(line) for line in KEPT.read_text(encoding="utf-8").splitlines()]
 
 
 # -- the page --------------------------------------------------------------------------------------

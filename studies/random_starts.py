@@ -15,11 +15,9 @@ come from the tests' simulators, which share no code with the models.
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import time
 from collections import Counter
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +26,7 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT / "tests"))
 
 import bodies  # noqa: E402
+import resumed  # noqa: E402
 import simulators as sim  # noqa: E402
 from scipy.spatial.transform import Rotation  # noqa: E402
 
@@ -254,39 +253,19 @@ def one_record(name: str, seed: int) -> dict:
 # -- all of them -----------------------------------------------------------------------------------
 
 
-def kept_records() -> list[dict]:
-    if not KEPT.exists():
-        return []
-    return [json.loads(line) for line in KEPT.read_text(encoding="utf-8").splitlines()]
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help=f"{QUICK} records of each model")
     parser.add_argument("--only", choices=MODELS, metavar="MODEL", help="one model alone")
     parser.add_argument("--workers", type=int, default=2)
     options = parser.parse_args()
-    records = kept_records()
+    records = resumed.kept(KEPT)
     done = {(r["model"], r["seed"]) for r in records}
     models = [options.only] if options.only else MODELS
     tasks = [(m, seed) for seed in range(QUICK if options.quick else COUNT) for m in models]
     left = [task for task in tasks if task not in done]
     print(f"{len(tasks)} records, {len(left)} to do")
-    KEPT.parent.mkdir(exist_ok=True)
-    began = time.time()
-    with (
-        ProcessPoolExecutor(options.workers) as pool,
-        KEPT.open("a", encoding="utf-8") as kept,
-    ):
-        waiting = [pool.submit(one_record, *task) for task in left]
-        for k, ready in enumerate(as_completed(waiting), 1):
-            record = ready.result()
-            records.append(record)
-            kept.write(json.dumps(record) + "\n")
-            kept.flush()
-            if k % 10 == 0 or k == len(left):
-                print(f"\r{k}/{len(left)}, {time.time() - began:.0f} s", end="", flush=True)
-    print()
+    records += resumed.done(one_record, left, KEPT, options.workers)
     TABLE.write_text(table(records), encoding="utf-8")
     print(f"written: {TABLE}")
 

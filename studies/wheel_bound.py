@@ -15,12 +15,10 @@ code with the model.
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import sys
 import time
 from collections.abc import Callable, Iterable
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from functools import cache, partial
 from itertools import permutations, product
 from pathlib import Path
@@ -33,6 +31,7 @@ import numpy as np
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT / "tests"))
 
+import resumed  # noqa: E402
 import simulators as sim  # noqa: E402
 from numpy.typing import NDArray  # noqa: E402
 from scipy import stats  # noqa: E402
@@ -250,28 +249,14 @@ def one_chunk(kind: str, sigma: float, first: int, count: int) -> dict:
     return {"kind": kind, "sigma": sigma, "first": first, **found}
 
 
-def kept_chunks() -> list[dict]:
-    if not KEPT.exists():
-        return []
-    return [json.loads(line) for line in KEPT.read_text(encoding="utf-8").splitlines()]
-
-
 def run_study(fits: int, workers: int) -> None:
     """Do what is not yet kept."""
     wanted = [("joint", s, k) for k in range(0, fits, CHUNK) for s in LEVELS]
     wanted += [(r, s, k) for r in READINGS for s in PUBLISHED for k in range(0, PAPERS, CHUNK)]
-    done = {(c["kind"], c["sigma"], c["first"]) for c in kept_chunks()}
+    done = {(c["kind"], c["sigma"], c["first"]) for c in resumed.kept(KEPT)}
     left = [task for task in wanted if task not in done]
     print(f"{len(wanted)} chunks of {CHUNK} fits, {len(left)} to do")
-    KEPT.parent.mkdir(exist_ok=True)
-    began = time.time()
-    with ProcessPoolExecutor(workers) as pool, KEPT.open("a", encoding="utf-8") as kept:
-        waiting = [pool.submit(one_chunk, *task, CHUNK) for task in left]
-        for k, ready in enumerate(as_completed(waiting), 1):
-            kept.write(json.dumps(ready.result()) + "\n")
-            kept.flush()
-            print(f"\r{k}/{len(left)}, {time.time() - began:.0f} s", end="", flush=True)
-    print()
+    resumed.done(one_chunk, [(*task, CHUNK) for task in left], KEPT, workers)
 
 
 def main() -> None:
@@ -283,7 +268,7 @@ def main() -> None:
     options = parser.parse_args()
     if not options.only_table:
         run_study(PAPERS if options.quick else options.fits, options.workers)
-    TABLE.write_text(report(kept_chunks()), encoding="utf-8")
+    TABLE.write_text(report(resumed.kept(KEPT)), encoding="utf-8")
     print(f"written: {TABLE}")
 
 

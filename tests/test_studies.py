@@ -1,4 +1,4 @@
-"""Studies and benchmarks run for hours, so nobody runs them daily: they must at least still load."""
+"""Studies and benchmarks run for hours, so nobody runs them daily: they must at least load."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 PROGRAMS = sorted([*ROOT.glob("studies/*.py"), *ROOT.glob("benchmarks/*.py")])
-HELPERS = {"loop_table", "by_hand", "fused"}
+HELPERS = {"loop_table", "resumed", "by_hand", "fused"}
 
 
 @pytest.mark.parametrize("path", PROGRAMS, ids=lambda p: f"{p.parent.name}/{p.stem}")
