@@ -254,8 +254,8 @@ class Problem:
         return away
 
     def _charted(self, slot: Slot, x: Array, reference: Array) -> Array:
-        value = ca.evalf(chart(slot.parameter.shape.kind, ca.SX(ca.DM(x)), ca.SX(ca.DM(reference))))
-        return np.array(value).reshape(slot.parameter.shape.dims)
+        value, _ = _chart(slot.parameter.shape.kind, len(x), len(reference))
+        return np.array(value(x, reference)).reshape(slot.parameter.shape.dims)
 
     def values(self, point: Point) -> dict[str, Array]:
         """Parameter values by name; per-run ones with a leading run axis if there are several."""
@@ -287,11 +287,9 @@ class Problem:
         return {n: np.stack(v) if several and n in per_run else v[0] for n, v in found.items()}
 
     def _chart_jacobian(self, slot: Slot, point: Point) -> Array:
-        c = ca.SX.sym("c", slot.parameter.shape.coordinates)
-        value = chart(slot.parameter.shape.kind, c, ca.SX(ca.DM(point.references[slot.ref])))
-        flat = ca.vec(value.T) if value.shape == (3, 3) else value
-        f = ca.Function("chart", [c], [ca.jacobian(flat, c)])
-        return np.array(f(point.x[slot.x]))
+        x, reference = point.x[slot.x], point.references[slot.ref]
+        _, slope = _chart(slot.parameter.shape.kind, len(x), len(reference))
+        return np.array(slope(x, reference))
 
     # -- evaluation ----------------------------------------------------------------------------
 
@@ -502,6 +500,17 @@ class Problem:
     def with_weights(self, weights: Sequence[Array] | None) -> Problem:
         """The same problem with other weights on the squares."""
         return replace(self, weights=None if weights is None else tuple(weights))
+
+
+@lru_cache(maxsize=8)
+def _chart(kind: str, coordinates: int, references: int) -> tuple[Any, Any]:
+    """A chart's value, and the slope of its entries row by row, of coordinates and reference."""
+    c, reference = ca.SX.sym("c", coordinates), ca.SX.sym("reference", references)
+    value = chart(kind, c, reference)
+    flat = ca.vec(value.T) if value.shape == (3, 3) else value
+    slope = ca.jacobian(flat, c)
+    arguments = [c, reference]
+    return ca.Function("chart", arguments, [value]), ca.Function("slope", arguments, [slope])
 
 
 @lru_cache(maxsize=64)
