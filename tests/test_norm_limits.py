@@ -22,7 +22,7 @@ POOR = {
     "half sphere": lambda n, rng: sim.cap(24, rng, np.pi / 2),
     "one more pose than unknowns": lambda n, rng: sim.spread_poses(n + 1, rng),
 }
-COUNTS = {"ring": 24, "cap of ten degrees": 12}
+COUNTS = {"ring": 12, "cap of ten degrees": 8}
 
 
 def recorded(v, unit="m/s^2"):
@@ -131,7 +131,7 @@ def poor(kind):
     """All calibrations on one kind of poor data, both models, three noise levels."""
     tasks = [
         (name, kind, seed, (1e-3, 2e-2, 1e-1)[seed % 3])
-        for seed in range(COUNTS.get(kind, 60))
+        for seed in range(COUNTS.get(kind, 36))
         for name in ("norm-diagonal", "norm-triangular")
     ]
     return [poor_case(task) for task in tasks]
