@@ -237,7 +237,7 @@ def test_the_offset_of_the_full_scale_is_that_of_the_triangular_one():
 @pytest.mark.parametrize("name", ["norm-diagonal", "norm-triangular"])
 def test_with_the_scale_from_the_laboratory_six_poses_determine_the_offset(name):
     rng, z = np.random.default_rng(40), []
-    for _ in range(200):
+    for _ in range(120):
         sensor = sim.accelerometer(rng, skew=name == "norm-triangular")
         scale = np.diag(sensor.scale) if name == "norm-diagonal" else sensor.scale
         v = sensor.read(sim.six_faces(rng, tilt=0.1), 3e-3, rng)
@@ -245,7 +245,7 @@ def test_with_the_scale_from_the_laboratory_six_poses_determine_the_offset(name)
         assert set(found.values) == {"offset"}
         z.append((found.values["offset"] - sensor.b) / found.std["offset"])
     # Six poses, three unknowns: z is Student's t with 3 degrees of freedom, 95 % within 3.18;
-    # the share of 600 has a spread of 0.9 % (more, as three share one noise).
+    # the share of 360 has a spread of 1.1 % (more, as three share one noise).
     inside = np.mean(np.abs(z) < stats.t.ppf(0.975, 3))
     print(f"\n{name}: offset alone from six poses, coverage {100 * inside:.1f} %")
     assert 0.92 < inside < 0.98
