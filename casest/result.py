@@ -9,6 +9,7 @@ import io
 import json
 import platform
 from collections.abc import Mapping, Sequence
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -197,9 +198,15 @@ def reproduce(command: str, data: Sequence[str]) -> dict[str, Any]:
     return {
         "command": command,
         "python": platform.python_version(),
-        **{name: version(name) for name in ("casadi", "numpy", "scipy")},
+        **_versions(),
         "sha256": {name: _digest(name) for name in data},
     }
+
+
+@cache
+def _versions() -> dict[str, str]:
+    """Versions of what computes; looked up once, for it takes as long as a small fit."""
+    return {name: version(name) for name in ("casadi", "numpy", "scipy")}
 
 
 def _digest(name: str) -> str:
