@@ -291,6 +291,11 @@ def load_result(path: Path) -> dict[str, Any]:
     return result
 
 
+def made_by(path: Path) -> str:
+    """The command that made a saved result; empty where Python did."""
+    return str(load_result(path).get("reproduce", {}).get("command", ""))
+
+
 #: What other commands leave in their folders.
 _WRITERS = {
     "observe.json": "observe",

@@ -42,6 +42,7 @@ from casest.errors import UsageError
 def apply(result_path: Path, data: str, **options: Any) -> None:
     """Correct the readings in DATA with a saved RESULT (result.json, or its folder)."""
     from casest import applying, exporting
+    from casest.following import following
 
     arguments = reading_arguments(options)
     progress(f"correcting {data}")
@@ -52,6 +53,7 @@ def apply(result_path: Path, data: str, **options: Any) -> None:
     waiting.done()
     if path := applying.write_or_print(text, options["output"]):
         echo(f"Written: {path}")
+        echo(f"\n{following(typed(), file=path)}")
 
 
 @commands.command()
@@ -151,6 +153,7 @@ def export(result_path: Path, to: Any, output: Path | None, **options: Any) -> N
     """The correction of a saved RESULT, ready to run on the device."""
     from casest import exporting
     from casest.following import following
+    from casest.result import made_by
 
     if options["single"] and to != "c":
         raise UsageError("--float is for --to c")
@@ -161,5 +164,4 @@ def export(result_path: Path, to: Any, output: Path | None, **options: Any) -> N
         return
     write(output, text)
     echo(f"Written: {output}")
-    if words := following(typed(), file=output):
-        echo(f"\n{words}")
+    echo(f"\n{following(typed(), file=output, fitted=made_by(result_path))}")
