@@ -75,6 +75,7 @@ def following(
     output: str | Path | None = None,
     *,
     trusted: bool = True,
+    doubtful: bool = False,
     applies: bool = True,
     moving: bool = False,
     file: str | Path = "",
@@ -82,9 +83,10 @@ def following(
 ) -> str:
     """What to type after `command`, a line of words and the command each; empty where unknown.
 
-    output: folder of its results; trusted: whether there is an estimate to go on with; applies:
-    whether the model says what readings correct to; moving: whether it is an estimator in motion;
-    file: what simulate, apply or export has written; fitted: the command that made the result.
+    output: folder of its results; trusted: whether there is an estimate to go on with; doubtful:
+    whether its residual speaks against the model; applies: whether the model says what readings
+    correct to; moving: whether it is an estimator in motion; file: what simulate, apply or export
+    has written; fitted: the command that made the result.
     """
     typed = typed_words(command)
     if typed is None or not typed.arguments:
@@ -92,7 +94,7 @@ def following(
     if typed.name == "close" and moving:
         steps = _after_motion(typed, output, trusted)
     elif typed.name in ("calibrate", "close"):
-        steps = _after_fit(typed, output, trusted, applies)
+        steps = _after_fit(typed, output, trusted, applies and not doubtful)
     elif typed.name == "simulate":
         steps = _after_simulate(typed, file)
     elif typed.name == "export":
