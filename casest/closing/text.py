@@ -115,7 +115,8 @@ def _invisible(content: Mapping[str, Any]) -> Iterator[str]:
         yield "Could be wrong without showing (shift by a typical size):"
     for i in hidden[:SHOWN]:
         moves = ", ".join(f"{n} by {v:.2g}" for n, v in i["would_move"].items())
-        size = ", ".join(f"{n} = {v:g}" for n, v in i["typical"].items())
+        units = {n: "" if u == "1" else f" {u}" for n, u in i["units"].items()}
+        size = ", ".join(f"{n} = {v:.3g}{units[n]}" for n, v in i["typical"].items())
         yield item(f"{i['name']} ({size}): {moves}; shown by {i['shown_by']}")
     if len(hidden) > SHOWN:
         yield f"  - and {len(hidden) - SHOWN} more, in result.json"

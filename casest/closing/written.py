@@ -20,7 +20,7 @@ from casest.declaring.shapes import Array
 from casest.declaring.symbols import Constant
 from casest.estimate import Estimate
 from casest.modelling.effect import Attached
-from casest.naming import unit_table
+from casest.naming import resolved, unit_table
 from casest.result import attachment, calibration_result, parameter_table, plain
 from casest.stack import Problem
 
@@ -59,6 +59,7 @@ def closing_result(
             "name": i.name,
             "column": i.column,
             "typical": {k: plain(v) for k, v in i.typical.items()},
+            "units": {k: resolved(u, common["units"]) for k, u in i.units.items()},
             "would_move": {k: plain(v) for k, v in i.would_move.items()},
             "share_left": plain(i.share),
             "shown_by": i.shown_by,
