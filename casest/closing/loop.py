@@ -19,7 +19,7 @@ from casest.closing.crossfit import (
     gain,
     rms,
 )
-from casest.closing.formula import try_formula
+from casest.closing.formula import formula_instead, try_formula
 from casest.closing.profile import freed_again, profiled
 from casest.closing.restrict import restricted
 from casest.closing.score import SURVIVES, Score, scores, second_freedom, steadied, widened
@@ -46,12 +46,13 @@ FALSE_ALARM = 0.004
 HELD_OUT = 1.64
 #: What is refused where nothing can be held out.
 HELD_OUT_DATA = "held-out data"
-#: Candidates whose errors differ by fewer standard errors are not told apart; so many are named.
-ALIKE, NAMED = 2.0, 2
+#: Candidates whose errors differ by fewer standard errors are not told apart.
+ALIKE = 2.0
 #: Candidates that are refitted in a round, those that score as well as the best of them, rounds.
 CONTENDERS, MORE, ROUNDS = 6, 4, 8
-#: Steps of one size that a level or moment may take from where the grid found it.
-STRIDES = 6
+#: Steps of one size that a level or moment may take from where the grid found it; rivals of the
+#: best take them too, where they leave at most this share of what it explains.
+STRIDES, NEAR = 6, 0.3
 #: A parameter within so many standard deviations of null is nothing.
 NOTHING = 3.0
 #: Columns of the widest model that is evaluated at once.
@@ -158,6 +159,8 @@ class _Loop:
         self.refused: list[Skipped] = []
         self.skipped: list[Skipped] = []
         self.found: list[Found] = []
+        #: Candidates as they are declared, by label: their profiles unknown, on all axes.
+        self.original: dict[str, Candidate] = {}
 
     def closed(self) -> Closing:
         """Run the loop."""
@@ -165,20 +168,23 @@ class _Loop:
         if current is None:
             raise NotTrusted("no part of the record can be predicted from the rest of it")
         first, first_scores = current, None
+        declared: Fitted | None = None
         ranked: list[Score] = []
         for _ in range(ROUNDS):
             current = self._without_outliers(current)
             ranked = self._ranked(current)
-            first_scores = first_scores or ranked
+            first_scores, declared = first_scores or ranked, declared or current
             better = self._better(current, ranked)
             if better is None:
                 better = try_formula(self, current)
+            if better is None:
+                better = formula_instead(self, declared, current)
             if better is None:
                 break
             current = better
         else:
             ranked = self._ranked(current)
-        current = self._weeded(current)
+        current = self._weeded(self._filled(current))
         after = self._certified(current) if self.found else self.before
         return Closing(
             self.before,
@@ -255,7 +261,7 @@ class _Loop:
             self.skipped = skipped
         problem = Problem(current.model, self.runs)
         readings = _readings(problem, problem.point(current.values))
-        self.original = {c.label: c for c in found}
+        self.original |= {c.label: c for c in found}
         expanded = profiled(found, self.runs, current.residuals, readings, current.noise)
         ranked: list[Score] = []
         known = self.before.noise.repeats
@@ -277,7 +283,15 @@ class _Loop:
             self._refuse(
                 significant[0].candidate, "no more than noise that is not alike everywhere"
             )
-        tried = self._contenders(current, _best_of_each(confirmed, current))
+        if not confirmed:
+            return None
+        tried = self._contenders(current, _best_of_each(_rivals(confirmed, ranked), current))
+        return self._first_accepted(current, tried) or self._two_at_once(current, tried)
+
+    def _first_accepted(
+        self, current: Fitted, tried: list[tuple[Score, Fitted]]
+    ) -> Fitted | None:
+        """The model with the best of those that were tried and that held-out data confirm."""
         for k, (score, fitted) in enumerate(tried):
             if k and not _alike(tried[0][1], fitted, tried[0][0], self.folds):
                 break  # What explains the data clearly less well is not the cause.
@@ -289,6 +303,34 @@ class _Loop:
             self._keep(*accepted, score, alike)
             return accepted[0]
         return None
+
+    def _two_at_once(self, current: Fitted, tried: list[tuple[Score, Fitted]]) -> Fitted | None:
+        """The best of those that were tried with the best beside it, if both together are confirmed.
+
+        In few poses, what a second cause leaves can hide the gain of the first.
+        """
+        if not tried:
+            return None
+        score, first = tried[0]
+        if _undetermined(Problem(first.model, self.runs), first.values):
+            return None
+        refused = list(self.refused)
+        ranked = self._ranked(first)
+        limit = FALSE_ALARM / max(len({s.candidate.label for s in ranked}), 1)
+        beside = [s for s in ranked if s.p_value <= limit]
+        best = self._contenders(first, _best_of_each(beside, first)) if beside else []
+        both = self._first_accepted(current, best)
+        if both is None:
+            self.refused = refused
+            return None
+        others = [pair for pair in tried if pair[1] is not first]
+        alike = [s.candidate.label for s, f in others if _alike(first, f, score, self.folds)]
+        candidate, second = self._whole(score, current.model), self.found.pop()
+        self._keep(both, candidate, second.gain, score, alike)
+        self.found.append(second)
+        label = candidate.label
+        self.refused = [r for r in self.refused if r.name not in (label, second.candidate.label)]
+        return both
 
     def _contenders(self, current: Fitted, best: list[Score]) -> list[tuple[Score, Fitted]]:
         """The most promising candidates refitted, the best explanation first."""
@@ -303,9 +345,14 @@ class _Loop:
     def _refitted(self, current: Fitted, chosen: Sequence[Score]) -> list[tuple[Score, Fitted]]:
         tried = [(score, self._with(current, score)) for score in chosen]
         found = _by_evidence([(score, fitted) for score, fitted in tried if fitted is not None])
-        if found:
-            found[0] = self._sharpened(current, *found[0])
-        return found
+        if not found:
+            return []
+        best = found[0] = self._sharpened(current, *found[0])
+        far = NEAR * (_cost(current) - _cost(best[1]))
+        return [best] + [
+            self._sharpened(current, *pair) if _cost(pair[1]) - _cost(best[1]) < far else pair
+            for pair in found[1:]
+        ]
 
     def _sharpened(self, current: Fitted, score: Score, fitted: Fitted) -> tuple[Score, Fitted]:
         """With the best level or moment near the one that was found: the grid is coarse."""
@@ -350,7 +397,6 @@ class _Loop:
     ) -> None:
         self.say(f"{candidate.label}: held-out error falls")
         names = tuple(p.name for p in candidate.parameters(fitted.model))
-        alike = alike[:NAMED]
         found = Found(candidate, score, score.p_value, gained, tuple(alike), names)
         self.found.append(found)
 
@@ -440,6 +486,47 @@ class _Loop:
         if not estimate.certificate.trusted:
             return fitted, candidate
         return replace(again, values=estimate.values), smaller
+
+    def _filled(self, current: Fitted) -> Fitted:
+        """Axes that were nothing beside what was still missing may be something now."""
+        for k, found in enumerate(self.found[:-1]):
+            fuller = self._on_all_axes(current, found)
+            if fuller is None:
+                continue
+            current, candidate = fuller
+            names = tuple(p.name for p in candidate.parameters(current.model))
+            self.found[k] = replace(found, candidate=candidate, names=names)
+        return current
+
+    def _on_all_axes(self, current: Fitted, found: Found) -> tuple[Fitted, Candidate] | None:
+        """The model with an effect on all the axes where it is something, if that is better."""
+        if found.score is None or found.candidate.effect is None or not found.names:
+            return None
+        label = found.candidate.label
+        if self.original[label].effect is None or self.original[label].effect.plain:
+            return None
+        base = replace(
+            current.model, effects=tuple(a for a in current.model.effects if a.label != label)
+        )
+        values = {k: v for k, v in current.values.items() if not k.startswith(label + ".")}
+        try:
+            whole = self._whole(found.score, base)
+            model = whole.added_to(base)
+            if Problem(model, self.runs).unknowns <= current.unknowns:
+                return None
+            fuller = self._crossed(self._fitted(model, values))
+        except CasestError:
+            return None
+        if fuller is None or self._gain(current, fuller)[0] <= 0:
+            return None
+        estimate = self._certified(fuller)
+        if not estimate.certificate.trusted:
+            return None
+        fuller = replace(fuller, values=estimate.values)
+        pruned, candidate = self._pruned(fuller, estimate, found.score)
+        if self._gain(current, pruned)[0] <= 0 or pruned.unknowns <= current.unknowns:
+            return None
+        return pruned, candidate
 
     def _weeded(self, current: Fitted) -> Fitted:
         """Each kept effect must still earn its place."""
@@ -549,9 +636,24 @@ def _by_evidence(tried: Sequence[tuple[Score, Fitted]]) -> list[tuple[Score, Fit
     price = float(np.log(sum(r.size for r in tried[0][1].residuals)))
 
     def criterion(pair: tuple[Score, Fitted]) -> float:
-        return _squares(pair[1], sigma) / inflation + price * pair[1].unknowns
+        return _squares(pair[1], sigma) / inflation + price * _unknowns(*pair)
 
     return sorted(tried, key=criterion)
+
+
+def _unknowns(score: Score, fitted: Fitted) -> int:
+    """Of the fit; a level or moment that was looked for is one more."""
+    return fitted.unknowns + (_held_value(score.candidate) is not None)
+
+
+def _rivals(confirmed: Sequence[Score], ranked: Sequence[Score]) -> list[Score]:
+    """Those that are significant, and what explains more than they do.
+
+    That something is missing is known then. A limit that two poses reach is never significant by
+    itself, and may be the cause of all that others explain in part.
+    """
+    most = max(s.gain for s in confirmed)
+    return [s for s in ranked if s in confirmed or s.gain > most]
 
 
 def _alike(one: Fitted, other: Fitted, score: Score, folds: Folds) -> bool:

@@ -18,6 +18,8 @@ from casest.declaring.shapes import Array
 
 #: Lines of the periodogram, moments and levels that are tried.
 LINES, MOMENTS, LEVELS = 4, 3, 3
+#: Moments that are tried where the residual does not say: an implicit one has no axes of its own.
+EVEN = 15
 #: Share of the readings that the lowest level lets through, and fewest beyond the highest.
 LOWEST, FEWEST = 0.7, 6
 #: Samples of the longest periodogram.
@@ -71,7 +73,7 @@ def _values(
     if kind == "frequency":
         return _lines(runs, residuals)
     if kind == "time":
-        return _moments(runs, residuals)
+        return _moments(runs, residuals) if readings is not None else _even(runs)
     if readings is None:
         return [], 1
     return _levels(np.concatenate(residuals), np.concatenate(readings))
@@ -90,8 +92,11 @@ def _levels(r: Array, y: Array) -> tuple[list[float], int]:
     level = size[beyond]
     n, first, second, plain, product = sums[beyond - 1].T
     spread = second - 2 * level * first + n * level**2
-    gain = (product - level * plain) ** 2 / np.maximum(spread, 1e-300)
-    best = np.argsort(-gain)[:LEVELS]
+    # Rows of one pose are predicted alike: what nothing exceeds, by more than rounding, is no level.
+    exceeded = spread > 1e-9 * second
+    gain = np.where(exceeded, (product - level * plain) ** 2 / np.maximum(spread, 1e-300), 0.0)
+    _, once = np.unique(level, return_index=True)
+    best = sorted((k for k in once if gain[k] > 0), key=lambda k: -gain[k])[:LEVELS]
     return [float(level[k]) for k in best], len(beyond)
 
 
@@ -145,6 +150,16 @@ def _moments(runs: Sequence[Run], residuals: Sequence[Array]) -> tuple[list[floa
     found.sort(reverse=True)
     count = max((len(run) for run in runs), default=2)
     return [when for _, when in found[:MOMENTS]], max(int(8 * np.log(max(count, 2))), 1)
+
+
+def _even(runs: Sequence[Run]) -> tuple[list[float], int]:
+    """Moments (s) that cut the longest run into parts of as many samples."""
+    run = max(runs, key=len)
+    if "t" not in run.signals or len(run) < 8:
+        return [], 1
+    t = run.signals["t"][:, 0]
+    at = np.unique(np.linspace(0, len(t) - 1, EVEN + 2).astype(int)[1:-1])
+    return [float(0.5 * (t[k] + t[k + 1])) for k in at], max(int(8 * np.log(len(t))), 1)
 
 
 def _bends(t: Array, r: Array) -> Iterator[tuple[float, float]]:
