@@ -41,7 +41,8 @@ from casest.noise import robust_scale
 from casest.stack import Problem
 
 if TYPE_CHECKING:
-    from casest.closing.loop import Fitted, Found, _Loop
+    from casest.closing.evidence import Fitted
+    from casest.closing.loop import Found, _Loop
 
 #: Searches: with other batches, or beside a wander.
 ATTEMPTS = 4

@@ -92,7 +92,7 @@ def _levels(r: Array, y: Array) -> tuple[list[float], int]:
     level = size[beyond]
     n, first, second, plain, product = sums[beyond - 1].T
     spread = second - 2 * level * first + n * level**2
-    # Rows of one pose are predicted alike: what nothing exceeds, by more than rounding, is no level.
+    # Rows of one pose are predicted alike: what nothing exceeds but by rounding is no level.
     exceeded = spread > 1e-9 * second
     gain = np.where(exceeded, (product - level * plain) ** 2 / np.maximum(spread, 1e-300), 0.0)
     _, once = np.unique(level, return_index=True)
