@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -76,11 +76,12 @@ def best_of_each(ranked: Sequence[Score], current: Fitted) -> list[Score]:
 def with_rivals(confirmed: Sequence[Score], ranked: Sequence[Score]) -> list[Score]:
     """Those that are significant, and what explains more than they do.
 
-    That something is missing is known then. A limit that two poses reach is never significant by
-    itself, and may be the cause of all that others explain in part.
+    That something is missing is known then, at their p-value. A limit that two poses reach is never
+    significant by itself, and may be the cause of all that others explain in part.
     """
-    most = max(s.gain for s in confirmed)
-    return [s for s in ranked if s in confirmed or s.gain > most]
+    most, proof = max(s.gain for s in confirmed), min(s.p_value for s in confirmed)
+    more = [s for s in ranked if s not in confirmed and s.gain > most]
+    return [*confirmed, *(replace(s, p_value=min(s.p_value, proof)) for s in more)]
 
 
 def as_promising(score: Score, winner: Score) -> bool:

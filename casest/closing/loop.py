@@ -293,7 +293,7 @@ class _Loop:
 
     def _better(self, current: Fitted, ranked: list[Score]) -> Fitted | None:
         """The model with the best candidate that held-out data confirm; None if none does."""
-        limit = FALSE_ALARM / max(len({s.candidate.label for s in ranked}), 1)
+        limit = _limit(ranked)
         significant = [s for s in ranked if s.p_value <= limit]
         confirmed = confirmed_by_flips(significant, ranked)
         if significant and not confirmed:
@@ -302,12 +302,18 @@ class _Loop:
             )
         if not confirmed:
             return None
-        tried = self._contenders(current, best_of_each(with_rivals(confirmed, ranked), current))
-        return self._first_accepted(current, tried) or self._two_at_once(current, tried)
+        tried = self._contenders(current, with_rivals(confirmed, ranked), ranked)
+        return self._first_accepted(current, tried, limit) or self._two_at_once(
+            current, [pair for pair in tried if pair[0].p_value <= limit]
+        )
 
-    def _first_accepted(self, current: Fitted, tried: list[tuple[Score, Fitted]]) -> Fitted | None:
-        """The model with the best of those that were tried and that held-out data confirm."""
+    def _first_accepted(
+        self, current: Fitted, tried: list[tuple[Score, Fitted]], limit: float
+    ) -> Fitted | None:
+        """The model with the best of those that are significant and that held-out data confirm."""
         for k, (score, fitted) in enumerate(tried):
+            if score.p_value > limit:
+                continue  # It may be the cause as well, but speaks for itself too softly.
             if k and not not_told_apart(tried[0][1], fitted, tried[0][0], self.folds):
                 break  # What explains the data clearly less well is not the cause.
             accepted = self._accepted(current, score, fitted)
@@ -333,10 +339,10 @@ class _Loop:
             return None
         refused = list(self.refused)
         ranked = self._ranked(first)
-        limit = FALSE_ALARM / max(len({s.candidate.label for s in ranked}), 1)
+        limit = _limit(ranked)
         beside = [s for s in ranked if s.p_value <= limit]
-        best = self._contenders(first, best_of_each(beside, first)) if beside else []
-        both = self._first_accepted(current, best)
+        best = self._contenders(first, beside, ranked) if beside else []
+        both = self._first_accepted(current, best, limit)
         if both is None:
             self.refused = refused
             return None
@@ -351,13 +357,21 @@ class _Loop:
         self.refused = [r for r in self.refused if r.name not in (label, second.candidate.label)]
         return both
 
-    def _contenders(self, current: Fitted, best: list[Score]) -> list[tuple[Score, Fitted]]:
-        """The most promising candidates refitted, the best explanation first."""
+    def _contenders(
+        self, current: Fitted, significant: Sequence[Score], ranked: Sequence[Score]
+    ) -> list[tuple[Score, Fitted]]:
+        """The most promising candidates refitted, the best explanation first.
+
+        With them those that may explain as much without being significant: they are not told apart.
+        """
+        best = best_of_each(significant, current)
         tried = self._refitted(current, best[:CONTENDERS])
         if not tried:
             return []
-        winner = tried[0][0]
-        near = [s for s in best[CONTENDERS:] if as_promising(s, winner)]
+        winner, labels = tried[0][0], {s.candidate.label for s in best}
+        rest = [s for s in ranked if s.candidate.label not in labels]
+        near = best[CONTENDERS:] + best_of_each(rest, current)
+        near = [s for s in near if s.freedom and as_promising(s, winner)]
         tried += self._refitted(current, near[:MORE])
         return by_evidence(tried)
 
@@ -593,6 +607,11 @@ def _readings(problem: Problem, point: Point) -> list[Array] | None:
 
 def _parts(found: Sequence[Candidate], size: int) -> list[list[Candidate]]:
     return [list(found[k : k + size]) for k in range(0, len(found), size)]
+
+
+def _limit(ranked: Sequence[Score]) -> float:
+    """The p-value up to which a candidate is significant, beside all others."""
+    return FALSE_ALARM / max(len({s.candidate.label for s in ranked}), 1)
 
 
 def _undetermined(problem: Problem, values: Mapping[str, Array]) -> str:
