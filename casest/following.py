@@ -89,7 +89,8 @@ def following(
     if typed.name in ("calibrate", "close"):
         steps = _after_fit(typed, output, trusted, applies)
     elif typed.name in ("simulate", "export"):
-        steps = _after_simulate(typed, file) if typed.name == "simulate" else _device(typed, file)
+        simulated = _after_simulate if applies else _after_motion
+        steps = simulated(typed, file) if typed.name == "simulate" else _device(typed, file)
     else:
         steps = _after_look(typed, output, trusted, applies)
     return "\n".join(f"Next: {words}\n{step}" for words, step in steps)
@@ -146,6 +147,15 @@ def _after_simulate(typed: Typed, file: str | Path) -> _Steps:
     if any(flag == "--effect" for flag, _ in typed.options):
         closed = replace(fit, name="close").into(folder / "closed")
         yield "is the effect found?", closed.lines()
+
+
+def _after_motion(typed: Typed, file: str | Path) -> _Steps:
+    folder, model = Path(file).parent, typed.arguments[0]
+    noise = ("--set", "--std", "--intensity", "--sensor-noise")
+    followed = typed.keeping("filter", noise, model, str(file)).into(folder / "states")
+    yield "how well are the states found?", followed.lines()
+    closed = typed.keeping("close", ("--set",), model, str(file)).into(folder / "closed")
+    yield "is something missing?", closed.lines()
 
 
 def _device(typed: Typed, file: str | Path) -> _Steps:
