@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from casest.closing.candidates import Candidate
+from casest.closing.profile import least_beside
 from casest.closing.score import Score
 from casest.data.run import Run
 
@@ -30,6 +31,19 @@ def strides(kind: str, value: float, runs: Sequence[Run]) -> list[float]:
     times = [run.signals["t"][:, 0] for run in runs if "t" in run.signals]
     gap = min((float(np.median(np.diff(t))) for t in times if len(t) > 1), default=1.0)
     return [gap * n for n in (8, 2, 1)]
+
+
+def within(kind: str, value: float, runs: Sequence[Run], axes: int) -> bool:
+    """Does a run have enough samples before and after the moment?"""
+    if kind != "time":
+        return True
+    times = [run.signals["t"][:, 0] for run in runs if "t" in run.signals]
+    return any(
+        least_beside(len(t), axes)
+        <= np.count_nonzero(t <= value)
+        <= len(t) - least_beside(len(t), axes)
+        for t in times
+    )
 
 
 def holding(score: Score, name: str, value: float) -> Score:

@@ -33,7 +33,7 @@ from casest.closing.evidence import (
     with_rivals,
 )
 from casest.closing.formula import formula_instead, try_formula
-from casest.closing.held import held_value, holding, strides
+from casest.closing.held import held_value, holding, strides, within
 from casest.closing.profile import freed_again, profiled
 from casest.closing.restrict import restricted
 from casest.closing.score import Score, scores, steadied, widened
@@ -397,6 +397,8 @@ class _Loop:
         for step in steps:
             for way in (-1, 1):
                 for _ in range(STRIDES):
+                    if not within(kind, value + way * step, self.runs, len(current.model.axes)):
+                        break
                     moved = holding(score, name, value + way * step)
                     found = self._with(current, moved)
                     if found is None or cost_of(found) >= cost_of(best[1]):

@@ -20,6 +20,8 @@ from casest.declaring.shapes import Array
 LINES, MOMENTS, LEVELS = 4, 3, 3
 #: Moments that are tried where the residual does not say: an implicit one has no axes of its own.
 EVEN = 15
+#: Residuals before and after a moment, at least: three poses at the end are fitted by any step.
+BESIDE = 8
 #: Share of the readings that the lowest level lets through, and fewest beyond the highest.
 LOWEST, FEWEST = 0.7, 6
 #: Samples of the longest periodogram.
@@ -73,7 +75,7 @@ def _values(
     if kind == "frequency":
         return _lines(runs, residuals)
     if kind == "time":
-        return _moments(runs, residuals) if readings is not None else _even(runs)
+        return _moments(runs, residuals) if readings is not None else _even(runs, residuals)
     if readings is None:
         return [], 1
     return _levels(np.concatenate(residuals), np.concatenate(readings))
@@ -152,14 +154,20 @@ def _moments(runs: Sequence[Run], residuals: Sequence[Array]) -> tuple[list[floa
     return [when for _, when in found[:MOMENTS]], max(int(8 * np.log(max(count, 2))), 1)
 
 
-def _even(runs: Sequence[Run]) -> tuple[list[float], int]:
+def _even(runs: Sequence[Run], residuals: Sequence[Array]) -> tuple[list[float], int]:
     """Moments (s) that cut the longest run into parts of as many samples."""
-    run = max(runs, key=len)
-    if "t" not in run.signals or len(run) < 8:
+    run, r = max(zip(runs, residuals, strict=True), key=lambda pair: len(pair[0]))
+    edge = least_beside(*r.shape)
+    if "t" not in run.signals or len(run) <= 2 * edge:
         return [], 1
     t = run.signals["t"][:, 0]
-    at = np.unique(np.linspace(0, len(t) - 1, EVEN + 2).astype(int)[1:-1])
+    at = np.unique(np.linspace(edge - 1, len(t) - edge - 1, EVEN).round().astype(int))
     return [float(0.5 * (t[k] + t[k + 1])) for k in at], max(int(8 * np.log(len(t))), 1)
+
+
+def least_beside(samples: int, axes: int) -> int:
+    """Samples before and after a moment, at least."""
+    return max(2, samples // 50, -(-BESIDE // axes))
 
 
 def _bends(t: Array, r: Array) -> Iterator[tuple[float, float]]:
@@ -167,8 +175,8 @@ def _bends(t: Array, r: Array) -> Iterator[tuple[float, float]]:
     k = np.arange(1, n)
     total = np.cumsum(r - r.mean(axis=0), axis=0)[:-1]
     size = np.sum(total**2, axis=1) / (k * (n - k) / n)
-    edge = max(2, n // 50)
-    size[:edge] = size[-edge:] = 0
+    edge = least_beside(*r.shape)
+    size[: edge - 1] = size[n - edge :] = 0
     for _ in range(MOMENTS):
         at = int(np.argmax(size))
         if not size[at] > 0:
