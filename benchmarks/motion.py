@@ -25,7 +25,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from casest import Run
 from casest.declaring.shapes import Array
 from casest.dynamics.filter import filtered
-from casest.dynamics.gramian import gramian
+from casest.dynamics.gramian import gramian, gramian_by_ode
 from casest.dynamics.record import least_squares
 from casest.dynamics.riccati import riccati
 from casest.dynamics.transition import Linearised, linearised, process_noise, transitions
@@ -123,6 +123,11 @@ def main() -> None:
     for name, seconds in times.items():
         print(f"{name:<22}{seconds:8.3f} s ({halves[name]:.3f} s)")
     print(f"least squares         {timed(lambda: least_squares(bias_gravity, run), 1):8.3f} s")
+    begin = perf_counter()
+    ode, product = gramian_by_ode(bias_gravity, system, 1e-13), gramian(bias_gravity, system)
+    spent, scale = perf_counter() - begin, np.sqrt(np.diag(product))
+    apart = np.abs((ode - product) / np.outer(scale, scale)).max()
+    print(f"Gramian by CVODES     {spent:8.3f} s; both forms differ by {apart:.1g} (relative)")
     for (name, way), job in others.items():
         print(f"{way}, {name:<11}{SHARE * timed(job, 1) / times[name]:8.1f} times as long")
     slow = timed(lambda: by_loop(system), 1)

@@ -45,20 +45,22 @@ class ModelName(_Name):
     """A shipped model or estimator in motion, as far as the command takes it, or a file."""
 
     def names(self, command: str) -> list[str]:
-        """Shipped models; for `filter` estimators in motion, for `observe` and `close` both."""
+        """Shipped models; for `filter` estimators in motion, for some both."""
         still = declared_names("problem.py", "SHIPPED")
         moving = declared_names("problem.py", "MOVING")
         if command == "filter":
             return moving
-        return [*still, *moving] if command in ("observe", "close") else still
+        return [*still, *moving] if command in ("observe", "close", "simulate") else still
 
 
 class EffectName(_Name):
     """An effect of the catalogue."""
 
     def names(self, command: str) -> list[str]:
-        """The catalogue's names."""
-        return declared_names("effects/__init__.py", "CATALOGUE")
+        """Names of the catalogue, and of the one of motion."""
+        moving = declared_names("closing_motion/effects.py", "CATALOGUE")
+        own = [name.lower().removeprefix("output_") for name in moving]
+        return list(dict.fromkeys([*declared_names("effects/__init__.py", "CATALOGUE"), *own]))
 
 
 class SolverName(_Name):

@@ -96,7 +96,7 @@ def following(
     elif typed.name in ("calibrate", "close"):
         steps = _after_fit(typed, output, trusted, applies and not doubtful)
     elif typed.name == "simulate":
-        steps = _after_simulate(typed, file)
+        steps = (_after_flight if moving else _after_simulate)(typed, file)
     elif typed.name == "export":
         steps = _device(typed, file, fitted)
     elif typed.name == "apply":
@@ -177,6 +177,16 @@ def _after_simulate(typed: Typed, file: str | Path) -> _Steps:
     if any(flag == "--effect" for flag, _ in typed.options):
         closed = replace(fit, name="close").into(folder / "closed")
         yield "is the effect found?", closed.lines()
+
+
+def _after_flight(typed: Typed, file: str | Path) -> _Steps:
+    """After a record of an estimator in motion was simulated."""
+    folder, model = Path(file).parent, typed.arguments[0]
+    noise = ("--set", "--std", "--intensity", "--sensor-noise")
+    followed = typed.keeping("filter", noise, model, str(file)).into(folder / "states")
+    yield "how well are the states found?", followed.lines()
+    closed = typed.keeping("close", ("--set",), model, str(file)).into(folder / "closed")
+    yield "is something missing?", closed.lines()
 
 
 def _after_apply(typed: Typed, file: str | Path) -> _Steps:

@@ -13,6 +13,7 @@ import io
 import json
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ from casest.data import load_runs
 from casest.data.run import Run
 from casest.data.write import write_atomically
 from casest.declaring.shapes import Array
+from casest.declaring.symbols import Signal
 from casest.errors import UsageError
 from casest.modelling.effect import NOISE, Effect
 from casest.modelling.model import Model
@@ -227,26 +229,7 @@ def written(
 ) -> tuple[Path, Path]:
     """`record.csv` and `truth.json` in the folder."""
     name, readings = reading
-    signals = {**run.signals, name: readings}
-    head, columns = [], []
-    if run.time is not None and "t" not in signals:
-        head.append("t [s]")
-        columns.append(run.time)
-    for s in model.signals:
-        unit = f" [{s.unit}]" if s.unit else ""
-        if s.name in run.columns:
-            continue
-        for k, label in enumerate(_labels(s.name, s.size, s.kind)):
-            head.append(label + ("" if s.kind == "rotation" else unit))
-            columns.append(_numbers(signals[s.name], s.kind)[:, k])
-    for column, found in run.columns.items():
-        head.append(column)
-        columns.append(np.asarray(found))
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(head)
-    for row in zip(*columns, strict=True):
-        writer.writerow([f"{x:.12g}" if isinstance(x, float) else x for x in row])
+    text = record_text(model.signals, replace(run, signals={**run.signals, name: readings}))
     content = {
         "casest": __version__,
         "model": model.name,
@@ -259,9 +242,33 @@ def written(
     }
     record, truth_file = folder / "record.csv", folder / "truth.json"
     folder.mkdir(parents=True, exist_ok=True)
-    write_atomically(record, text.getvalue())
+    write_atomically(record, text)
     write_atomically(truth_file, json.dumps(content, indent=1) + "\n")
     return record, truth_file
+
+
+def record_text(declared: Sequence[Signal], run: Run) -> str:
+    """The table of a run: time, declared signals with their units, every other column."""
+    head, columns = [], []
+    if run.time is not None and "t" not in run.signals:
+        head.append("t [s]")
+        columns.append(run.time)
+    for s in declared:
+        unit = f" [{s.unit}]" if s.unit else ""
+        if s.name in run.columns:
+            continue
+        for k, label in enumerate(_labels(s.name, s.size, s.kind)):
+            head.append(label + ("" if s.kind == "rotation" else unit))
+            columns.append(_numbers(run.signals[s.name], s.kind)[:, k])
+    for column, found in run.columns.items():
+        head.append(column)
+        columns.append(np.asarray(found))
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(head)
+    for row in zip(*columns, strict=True):
+        writer.writerow([f"{x:.12g}" if isinstance(x, float) else x for x in row])
+    return text.getvalue()
 
 
 def _labels(name: str, size: int, kind: str) -> list[str]:

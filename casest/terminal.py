@@ -49,10 +49,14 @@ def listing(
     models: Sequence[tuple[str, Model]],
     effects: Sequence[Effect] = (),
     moving: Sequence[tuple[str, Dynamics]] = (),
+    motion_effects: Sequence[tuple[str, str, str]] = (),
     *,
     as_json: bool = False,
 ) -> str:
-    """Shipped problems and estimators in motion, a paragraph each; a line for each effect."""
+    """Shipped problems and estimators in motion, a paragraph each; a line for each effect.
+
+    `motion_effects`: name of each effect in motion, what it is on, and what it does.
+    """
     if as_json:
         problems = {name: _summary(m) for name, m in models}
         catalogue = [
@@ -67,7 +71,9 @@ def listing(
             }
             for name, d in moving
         }
-        return json.dumps({"problems": problems, "motion": motion, "effects": catalogue}, indent=2)
+        of_motion = [dict(zip(("name", "on", "formula"), e, strict=True)) for e in motion_effects]
+        content = {"problems": problems, "motion": motion, "effects": catalogue}
+        return json.dumps({**content, "motion_effects": of_motion}, indent=2)
     lines = ["Problems (casest calibrate NAME DATA):"]
     for name, m in models:
         lines += ["", f"  {name}", _under(_about(m), "")]
@@ -92,6 +98,11 @@ def listing(
         lines.append(
             textwrap.fill(f"  {e.name}: {_first_line(e.doc)}", WIDTH, subsequent_indent=" " * 6)
         )
+    if motion_effects:
+        lines += ["", "Effects that it looks for in motion, on every signal that they fit:"]
+    for name, on, formula in motion_effects:
+        words = f"  {name} of {on}: {formula}"
+        lines.append(textwrap.fill(words, WIDTH, subsequent_indent=" " * 6))
     return "\n".join(lines)
 
 

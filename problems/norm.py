@@ -270,7 +270,7 @@ def closed_form(declared: Model, runs: Sequence[Run]) -> dict[str, Array]:
 
 
 def closed_form_many(declared: Model, signals: Mapping[str, Array]) -> dict[str, Any]:
-    """Burkhard's closed form for many sensors at once, for `calibrate_many(…, start=…)`.
+    """Burkhard's closed form for many sensors at once: where `calibrate_many` starts.
 
     v is (S, N, 3); returns scale (S, …) and offset as (value, lower, upper), bounded as by
     `inside_the_ball`. As (4) and (5), but in readings from which their mean is taken, and with the
@@ -426,7 +426,11 @@ def remarks(declared: Model, runs: Sequence[Run], values: dict[str, Array]) -> l
 
 
 def _complete(declared: Model) -> Model:
-    declared = declared.starting(automatic_start).bounded(inside_the_ball).remarking(remarks)
+    declared = (
+        declared.starting(automatic_start, many=closed_form_many)
+        .bounded(inside_the_ball)
+        .remarking(remarks)
+    )
     named = {
         "closed-form": closed_form,
         "bias-only": bias_only,

@@ -192,7 +192,9 @@ def test_list_names_the_shipped_problems(capsys):
 
 def test_list_for_programs(capsys):
     assert run(["list", "--json"]) == 0
-    problems = json.loads(capsys.readouterr().out)["problems"]
+    listed = json.loads(capsys.readouterr().out)
+    problems, motion = listed["problems"], [(e["name"], e["on"]) for e in listed["motion_effects"]]
+    assert ("time_delay", "an output") in motion
     assert problems["norm-full"]["signals"] == ["v"]
     assert problems["norm-full"]["parameters"] == ["scale", "offset"]
     assert problems["norm-full"]["constants"] == {"norm": 1.0}

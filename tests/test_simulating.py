@@ -91,7 +91,7 @@ def test_other_signals_and_columns_come_from_a_file(tmp_path, capsys):
         (["wheel", *WHEEL, "--effect", "outliers"], "it weighs samples and makes none"),
         (["wheel", *WHEEL, "--noise", "-1"], "a standard deviation, not negative"),
         (["wheel", *WHEEL, "--value", "radius=1"], "unknowns are gain"),
-        (["bias-gravity"], "estimator in motion"),
+        (["bias-gravity"], "say --duration and --rate"),
         (["norm-pair", "--directions", "5"], "cannot be simulated"),
     ],
 )

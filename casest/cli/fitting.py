@@ -35,13 +35,14 @@ from casest.errors import NotTrusted, UsageError
 @click.option("--json", "as_json", is_flag=True, help="For programs.")
 def list_command(as_json: bool) -> None:
     """Shipped problems with their symbols and estimators, and the catalogue of effects."""
+    from casest.closing_motion.effects import listed
     from casest.effects import CATALOGUE
     from casest.problem import MOVING, SHIPPED, find_any, find_model
     from casest.terminal import listing
 
     models = [(name, find_model(name)) for name in SHIPPED]
     moving: list[Any] = [(name, find_any(name)) for name in MOVING]
-    echo(listing(models, CATALOGUE, moving, as_json=as_json))
+    echo(listing(models, CATALOGUE, moving, listed(), as_json=as_json))
 
 
 @commands.command()

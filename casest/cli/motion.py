@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from casest.cli.options import model_options, motion_options, reading_options
+from casest.cli.options import model_options, motion_options, reading_options, sensor_noise
 from casest.cli.shared import (
     commands,
     echo,
@@ -87,13 +87,7 @@ def observe(model_name: str, data: tuple[str, ...], **options: Any) -> int:
     default="declared",
     help="Noise intensities: as declared, or the most likely ones for this record.",
 )
-@click.option(
-    "--sensor-noise",
-    "stated",
-    multiple=True,
-    metavar="SIGNAL=STD",
-    help="Standard deviation of one reading, in the model's unit; its rate is the record's.",
-)
+@sensor_noise
 @click.option(
     "--rest",
     type=click.Path(),

@@ -105,10 +105,34 @@ def output_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 def motion_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Options of estimators in motion."""
-    many: Options = {"multiple": True, "metavar": "STATE=NUMBER"}
     for option in (
         click.option("--json", "as_json", is_flag=True, help="Print JSON instead of text."),
         click.option("-o", "--output", type=FOLDER, metavar="DIR", help="Folder."),
+        _known_and_driving,
+    ):
+        command = option(command)
+    return command
+
+
+def driving_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Options of a record in motion that is simulated."""
+    return _known_and_driving(sensor_noise(command))
+
+
+def sensor_noise(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Noise of the sensors as their data sheets say it."""
+    return click.option(
+        "--sensor-noise",
+        "stated",
+        multiple=True,
+        metavar="SIGNAL=STD",
+        help="In motion: std of one reading, in the model's unit; its rate is the record's.",
+    )(command)
+
+
+def _known_and_driving(command: Callable[..., Any]) -> Callable[..., Any]:
+    many: Options = {"multiple": True, "metavar": "STATE=NUMBER"}
+    for option in (
         click.option("--std", "stds", help="What is known of a state at the beginning.", **many),
         click.option(
             "--intensity",

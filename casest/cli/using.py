@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from casest.cli.options import model_options, reading_options
+from casest.cli.options import driving_options, model_options, reading_options
 from casest.cli.shared import (
     FOLDER,
     Options,
@@ -20,7 +20,10 @@ from casest.cli.shared import (
 )
 from casest.cli.words import (
     declared_model,
+    moving_model,
     named_value,
+    number_list,
+    number_pair,
     reading_arguments,
 )
 from casest.completing import EffectName, ModelName
@@ -71,7 +74,12 @@ def apply(result_path: Path, data: str, **options: Any) -> None:
     metavar="NAME[(COLUMN)]",
     help="An effect to add.",
 )
-@click.option("--noise", type=float, default=0.0, help="Standard deviation of each reading.")
+@click.option(
+    "--noise",
+    type=float,
+    help="Standard deviation of each reading; in motion of each output, else as declared.",
+)
+@driving_options
 @click.option("--duration", type=float, help="Seconds, with --rate, where time is all it needs.")
 @click.option("--directions", type=int, metavar="N", help="N random directions or attitudes.")
 @click.option("--input", "given", type=click.Path(), help="Record with the signals it needs.")
@@ -81,8 +89,62 @@ def simulate(model_name: str, **options: Any) -> None:
     """A record with known truth: DIR/record.csv and DIR/truth.json.
 
     Unknowns are at their declared start unless --value says otherwise, effects at a typical size.
+    Of an estimator in motion the states over time are in DIR/truth.csv; the motion is a smooth
+    random one, or follows the inputs of --input.
     """
-    simulation(model_name, options, typed())
+    from casest.dynamics import Dynamics
+    from casest.problem import find_any
+
+    if isinstance(find_any(model_name), Dynamics):
+        simulation_in_motion(model_name, options, typed())
+    else:
+        simulation(model_name, options, typed())
+
+
+#: Options of `simulate` that only static models have, and that only estimators in motion have.
+STILL = ("effects", "per_run", "shared", "fix", "free", "directions")
+MOVING = ("stds", "intensities", "stated")
+
+
+def simulation_in_motion(model_name: str, options: Options, command: str) -> None:
+    """A trajectory, states along it, readings, files."""
+    import numpy as np
+
+    from casest import intensities, simulating, simulating_motion
+    from casest.data.run import Run
+    from casest.dynamics.transition import checked_time
+    from casest.following import following
+
+    for name in STILL:
+        if options[name]:
+            raise UsageError(f"--{name.replace('_', '-')} is no option of an estimator in motion")
+    moving = moving_model(model_name, options)
+    stds = dict(number_pair(text, "--sensor-noise") for text in options["stated"])
+    values = dict(number_list(text, "--value") for text in options["values"])
+    inputs = None
+    if options["given"]:
+        along = simulating_motion.inputs_of(moving, options["given"], reading_arguments(options))
+        time, inputs = np.asarray(along.time, float), along.signals
+    else:
+        time = simulating.times(options["duration"], options["rate"])
+    blank = Run.raw("simulated", {"t": time[:, None]}, units={"t": "s"}, time=time)
+    checked_time(blank)
+    if stds:
+        moving = intensities.from_stated(moving, blank, stds).model
+    progress(f"simulating {model_name}")
+    made = simulating_motion.simulated_motion(
+        moving,
+        time,
+        np.random.default_rng(options["seed"]),
+        inputs=inputs,
+        noise=options["noise"],
+        effects=options["effect"],
+        values=values,
+    )
+    paths = simulating_motion.written_motion(options["output"], made, options["seed"], command)
+    for path in paths:
+        echo(f"Written: {path}")
+    echo(f"\n{following(command, file=paths[0], moving=True)}")
 
 
 def simulation(model_name: str, options: Options, command: str) -> None:
@@ -90,13 +152,14 @@ def simulation(model_name: str, options: Options, command: str) -> None:
     import numpy as np
 
     from casest import simulating
-    from casest.dynamics import Dynamics
     from casest.effects import CATALOGUE
     from casest.following import following
-    from casest.problem import find_any, find_effects
+    from casest.problem import find_effects
 
-    if isinstance(find_any(model_name), Dynamics):
-        raise UsageError(f"{model_name} is an estimator in motion: it needs a trajectory of yours")
+    for name in MOVING:
+        if options[name]:
+            flag = {"stds": "std", "intensities": "intensity", "stated": "sensor-noise"}[name]
+            raise UsageError(f"--{flag} is for estimators in motion; {model_name} has --noise")
     own = tuple(e for path in options["effects"] for e in find_effects(path))
     model = declared_model(model_name, {**options, "effects": ()})
     rng = np.random.default_rng(options["seed"])
@@ -114,9 +177,10 @@ def simulation(model_name: str, options: Options, command: str) -> None:
     given = dict(named_value(text, "--value", model) for text in options["values"])
     values = simulating.truth(model, {name: value.array for name, value in given.items()})
     progress(f"simulating {model_name}")
-    reading = simulating.simulated(model, run, values, options["noise"], rng)
+    noise = options["noise"] or 0.0
+    reading = simulating.simulated(model, run, values, noise, rng)
     paths = simulating.written(
-        options["output"], model, run, reading, values, options["noise"], options["seed"], command
+        options["output"], model, run, reading, values, noise, options["seed"], command
     )
     for path in paths:
         echo(f"Written: {path}")

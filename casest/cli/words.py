@@ -82,6 +82,15 @@ def number_pair(text: str, option: str) -> tuple[str, float]:
         raise UsageError(f"{option} {text}: {value!r} is no number") from None
 
 
+def number_list(text: str, option: str) -> tuple[str, list[float]]:
+    """`name=1,2,3`."""
+    key, value = _pair(text, option)
+    try:
+        return key, [float(part) for part in value.split(",")]
+    except ValueError:
+        raise UsageError(f"{option} {text}: {value!r} are no numbers") from None
+
+
 def declared_model(name: str, options: Options) -> Model:
     """The model with --set, --free, --fix, --shared, --per-run and --effects applied."""
     from casest.declaring.symbols import Constant, Parameter, constant

@@ -103,6 +103,12 @@ CATALOGUE = (
 COLOURED = "coloured_noise"
 
 
+def listed() -> list[tuple[str, str, str]]:
+    """Name, what it is on and formula of everything that may be missing in motion."""
+    found = [(e.name, f"an {e.on}", e.formula) for e in CATALOGUE]
+    return [*found, (COLOURED, "an output", "noise that is correlated in time, as a state")]
+
+
 @dataclass(frozen=True)
 class Candidate:
     """An effect on one signal of one estimator: its numbers' count, unit and typical size."""

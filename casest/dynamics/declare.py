@@ -175,10 +175,13 @@ class Dynamics:
 
     def beginning(self, **starts: Any) -> Dynamics:
         """The same with other states at the beginning."""
-        found = {
-            n: tuple(np.broadcast_to(np.asarray(v, float), (self[n].size,)).tolist())
-            for n, v in starts.items()
-        }
+        found = {}
+        for name, value in starts.items():
+            own, size = np.asarray(value, float).ravel(), self[name].size
+            if own.size not in (1, size) or not np.all(np.isfinite(own)):
+                what = f"{own.size} numbers" if own.size not in (1, size) else "what is not finite"
+                raise UsageError(f"{self.name}: {name} begins with {size} numbers, not {what}")
+            found[name] = tuple(np.broadcast_to(own, (size,)).tolist())
         return self._with_states("start", found)
 
     def _with_states(self, field: str, values: Mapping[str, Any]) -> Dynamics:

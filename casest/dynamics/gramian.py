@@ -78,31 +78,47 @@ def _reduced(Phi: Array, W: Array) -> tuple[Array, Array]:
     return Phi[0], 0.5 * (W[0] + W[0].T)
 
 
-def gramian_by_ode(model: Dynamics, system: Linearised, tolerance: float = 1e-11) -> Array:
-    """The same by integrating −Ẇ = AᵀW + WA + CᵀΘ⁻¹C backwards with CVODES (SUNDIALS).
+def gramian_by_ode(model: Dynamics, system: Linearised, tolerance: float = 1e-12) -> Array:
+    """The same by integrating −Ẇ = AᵀW + WA + CᵀΘ⁻¹C backwards with CVODES (SUNDIALS, Adams).
 
-    Signals are straight lines between samples, as in the other form; each step is an interval of
-    its own, so that the integrator never steps over a corner.
+    Signals are straight lines between samples, as in the other form; the integrator stops at every
+    sample, so that it never steps over a corner.
     """
-    n, m = model.size, system.C.shape[1]
+    t, n = model.traced, model.size
     W, weight = ca.SX.sym("W", n, n), ca.SX(ca.DM(np.linalg.inv(model.noise)))
-    ends = [ca.SX.sym(name, *shape) for name, shape in
-            (("A0", (n, n)), ("A1", (n, n)), ("C0", (m, n)), ("C1", (m, n)))]  # fmt: skip
-    h, s = ca.SX.sym("h"), ca.SX.sym("s")  # s runs from the end of the step (0) to its start (1)
-    A = ends[1] + s * (ends[0] - ends[1])
-    C = ends[3] + s * (ends[2] - ends[3])
-    rate = h * (A.T @ W + W @ A + C.T @ weight @ C)
-    p = ca.vertcat(*[ca.vec(e) for e in ends], h)
-    ode = {"x": ca.vec(W), "t": s, "p": p, "ode": ca.vec(rate)}
-    options = {"abstol": tolerance, "reltol": tolerance, "max_num_steps": 100_000}
-    step = ca.integrator("gramian", "cvodes", ode, 0, 1, options)
-    value = np.zeros(n * n)
-    for k in range(len(system.steps) - 1, -1, -1):
-        parts = [system.A[k], system.A[k + 1], system.C[k], system.C[k + 1]]
-        numbers = np.concatenate([*(M.T.ravel() for M in parts), [system.steps[k]]])
-        value = np.array(step(x0=value, p=numbers)["xf"]).ravel()
-    found = value.reshape(n, n)
+    # Time runs backwards from the end; `since` is when the step began, at its later sample.
+    s, since, h = (ca.SX.sym(name) for name in ("s", "since", "h"))
+    share, ends = (s - since) / h, list[ca.SX]()
+
+    def between(name: str, like: ca.SX) -> ca.SX:
+        later, earlier = (ca.SX.sym(name + end, like.sparsity()) for end in "10")
+        ends.extend((later, earlier))
+        return later + share * (earlier - later)
+
+    A, C = between("A", t.A), between("C", t.C)
+    rate = A.T @ W + W @ A + C.T @ weight @ C
+    u = ca.vertcat(*[ca.vcat(e.nonzeros()) for e in ends], since, h)
+    back = system.time[-1] - system.time[::-1]
+    columns = [_entries(M[::-1], e)[part] for M, e in ((system.A, t.A), (system.C, t.C))
+               for part in (slice(None, -1), slice(1, None))]  # fmt: skip
+    numbers = np.column_stack([*columns, back[:-1], np.diff(back)])
+    options = {
+        "abstol": tolerance,
+        "reltol": tolerance,
+        "max_num_steps": 1_000_000,
+        "linear_multistep_method": "adams",
+        "nonlinear_solver_iteration": "functional",
+    }
+    ode = {"x": ca.vec(W), "t": s, "u": u, "ode": ca.vec(rate)}
+    whole = ca.integrator("gramian", "cvodes", ode, 0, back[1:], options)
+    found = np.asarray(whole(x0=np.zeros(n * n), u=numbers.T)["xf"][:, -1]).reshape(n, n)
     return np.asarray(0.5 * (found + found.T))
+
+
+def _entries(matrices: Array, like: ca.SX) -> Array:
+    """What can differ from zero of every matrix, (N, k), in CasADi's order."""
+    rows, columns = like.sparsity().get_triplet()
+    return matrices[:, rows, columns]
 
 
 def observed(model: Dynamics, W: Array) -> Observed:
