@@ -13,6 +13,7 @@ from casest import Residual, attempt, close, load_runs, model, param, quantity, 
 from casest.cli import run
 from casest.closing import doubt
 from casest.closing.doubt import doubts
+from casest.closing.written import closing_result
 from casest.data.run import Run
 from casest.demonstration import WHEEL
 from casest_problems.norm import norm_full, norm_triangular
@@ -67,6 +68,11 @@ def test_two_effects_of_one_column_on_a_prediction_without_a_name_are_both_found
         away = closing.after.values[name] - truth
         assert abs(away) < 4 * closing.after.std[name]
     assert closing.after.rmse == pytest.approx(1e-3, rel=0.15)
+    content = closing_result(closing, model_name="cell.py", data=())
+    for e in content["effects"]:  # what is added as well is no rival
+        assert not {"temperature_bias(temp)", "temperature_gain(temp)"} & {
+            *e["indistinguishable_from"], *e["less_likely"],
+        }  # fmt: skip
 
 
 def test_noise_alone_is_no_doubt():

@@ -109,10 +109,16 @@ def _effect(found: Found, closing: Closing) -> dict[str, Any]:
         "p_value": plain(found.p_value),
         "holdout_gain": plain(found.gain),
         "formula": _formula(found, attached),
-        "indistinguishable_from": list(found.indistinguishable_from[:NEAREST]),
-        "less_likely": list(found.indistinguishable_from[NEAREST:]),
+        "indistinguishable_from": _alike(found, closing)[:NEAREST],
+        "less_likely": _alike(found, closing)[NEAREST:],
         "would_separate": _separating(found, closing),
     } | ({} if attached is None else attachment(attached))
+
+
+def _alike(found: Found, closing: Closing) -> list[str]:
+    """What explains the data as well, but for what has been added beside it since."""
+    added = {f.candidate.label for f in closing.effects}
+    return [label for label in found.indistinguishable_from if label not in added]
 
 
 def formula_source(closing: Closing) -> str:
@@ -149,7 +155,7 @@ def _separating(found: Found, closing: Closing) -> list[str]:
     """Measurements that would separate the effect from those that explain the data as well."""
     by_label = {s.candidate.label: s.candidate for s in closing.first}
     said = []
-    for label in found.indistinguishable_from[:NEAREST]:
+    for label in _alike(found, closing)[:NEAREST]:
         other = by_label.get(label)
         if other is not None and other.effect is not None and other.effect.shown_by:
             said.append(f"{label}: {other.effect.shown_by}")
