@@ -231,6 +231,20 @@ def test_the_json_follows_its_published_schema(results, tmp_path):
         jsonschema.validate(json.loads(path.read_text(encoding="utf-8")), schema)
 
 
+def test_every_result_follows_its_published_schema(results, tmp_path):
+    """Of fits, of loops closed, and of a fit that is refused."""
+    jsonschema = pytest.importorskip("jsonschema")
+    schema = json.loads(files("casest").joinpath("result.schema.json").read_text("utf-8"))
+    jsonschema.Draft202012Validator.check_schema(schema)
+    assert command(["calibrate", "norm-full", *HANDHELD, *G, "-o", str(tmp_path)]) == 2
+    assert command(["close", "wheel", str(WHEEL), "-o", str(tmp_path / "wheel")]) == 0
+    for folder in (*(results / name for name in NAMES), tmp_path, tmp_path / "wheel"):
+        found = json.loads((folder / "result.json").read_text(encoding="utf-8"))
+        jsonschema.validate(found, schema)
+        with pytest.raises(jsonschema.ValidationError):
+            jsonschema.validate(found | {"verdict": "fine"}, schema)
+
+
 def test_a_refused_result_is_not_exported(tmp_path, capsys):
     assert command(["calibrate", "norm-full", *HANDHELD, *G, "-o", str(tmp_path)]) == 2
     capsys.readouterr()
