@@ -9,6 +9,7 @@ prove that a fit works, and nothing about a sensor.
 from __future__ import annotations
 
 import csv
+import difflib
 import io
 import json
 import re
@@ -43,18 +44,39 @@ def with_effects(
     for text in wanted:
         found = re.fullmatch(r"(\w+)(?:\((\w+)\))?", text)
         if found is None or found[1] not in known:
+            near = difflib.get_close_matches(text, known, n=1)
+            hint = f"did you mean {near[0]}? " if near else ""
             raise UsageError(
-                f"--effect {text}: no such effect; `casest list` names them, --effects adds yours"
+                f"--effect {text}: no such effect; {hint}`casest list` names them, --effects adds "
+                "yours"
             )
         effect = known[found[1]]
         if effect.on == NOISE:
             raise UsageError(
                 f"--effect {text}: it weighs samples and makes none; add far samples yourself"
             )
-        columns = tuple((s.name, found[2]) for s in effect.extras) if found[2] else ()
+        columns = _columns_of(effect, found[2], model, run)
         effect = with_numbers(placed_in(effect, model), columns, prepared(model, (run,)))
         model = model.with_effect(effect, columns=dict(columns))
     return model
+
+
+def _columns_of(
+    effect: Effect, named: str | None, model: Model, run: Run
+) -> tuple[tuple[str, str], ...]:
+    """The column that the effect reads: as named, else the only one that there is."""
+    inner = {*model.quantities, *(s.name for s in model.signals), *run.columns}
+    wanted = [s.name for s in effect.extras if s.name not in inner]
+    if not wanted:
+        return ()
+    there = sorted(set(run.columns) - {s.name for s in model.signals})
+    if named is None and len(there) != 1:
+        which = f"the record has {', '.join(there)}" if there else "give --input FILE with one"
+        raise UsageError(
+            f"--effect {effect.name}: it follows a column; say which, {effect.name}(COLUMN); "
+            f"{which}"
+        )
+    return tuple((name, named or there[0]) for name in wanted)
 
 
 def truth(model: Model, given: Mapping[str, Any]) -> dict[str, Array]:
@@ -94,6 +116,9 @@ def without_data(
 ) -> Run:
     """A run of signals that need no record: time, random attitudes; readings still zero."""
     needed = [s for s in model.signals if s.name != model.traced.measured]
+    given = [s.name for s in needed if s.kind != "rotation" and (s.unit != "s" or s.size > 1)]
+    if given and not model.implicit:
+        raise UsageError(f"{model.name} needs {', '.join(given)}: give --input FILE with them")
     if model.implicit or any(s.kind == "rotation" for s in needed):
         if directions is None:
             raise UsageError(
@@ -112,10 +137,8 @@ def without_data(
             signals[s.name] = _rotations(count, rng)
         elif time is not None and s.unit == "s" and s.size == 1:
             signals[s.name] = time[:, None]
-        elif s.name == model.traced.measured or model.implicit:
-            signals[s.name] = np.zeros((count, s.size))
         else:
-            raise UsageError(f"signal {s.name} of {model.name} must be given: --input FILE")
+            signals[s.name] = np.zeros((count, s.size))
     units = {s.name: s.unit for s in model.signals}
     return Run.raw("simulated", signals, units=units, time=time)
 

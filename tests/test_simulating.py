@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from casest.cli import run as command
 
+LOAD_CELL = str(Path(__file__).parent / "models" / "load_cell.py:load_cell")
 WHEEL = [
     "--duration", "60", "--rate", "100", "--noise", "0.05",
     "--value", "speed=10,-0.05,1e-4,1e-7", "--value", "misalignment=0.5,0.4,0.3",
@@ -81,6 +83,15 @@ def test_other_signals_and_columns_come_from_a_file(tmp_path, capsys):
     assert truth["effects"] == ["temperature_bias(temp)"]
 
 
+def test_the_only_column_is_the_one_that_an_effect_follows(tmp_path):
+    loads = tmp_path / "loads.csv"
+    loads.write_text("mass [kg],volt [V]\n1,5.0\n2,5.1\n3,5.2\n")
+    _, truth = made(
+        tmp_path / "out", LOAD_CELL, "--input", str(loads), "--effect", "channel_bias",
+    )  # fmt: skip
+    assert truth["effects"] == ["channel_bias(volt)"]
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -88,6 +99,9 @@ def test_other_signals_and_columns_come_from_a_file(tmp_path, capsys):
         (["wheel"], "say --duration and --rate"),
         (["wheel", "--duration", "-1", "--rate", "10"], "both must be positive"),
         (["wheel", *WHEEL, "--effect", "nothing"], "no such effect"),
+        (["wheel", *WHEEL, "--effect", "imbalace"], "did you mean imbalance?"),
+        (["wheel", *WHEEL, "--effect", "temperature_bias"], "say which, temperature_bias(COLUMN)"),
+        ([LOAD_CELL], "load-cell needs mass: give --input FILE with them"),
         (["wheel", *WHEEL, "--effect", "outliers"], "it weighs samples and makes none"),
         (["wheel", *WHEEL, "--noise", "-1"], "a standard deviation, not negative"),
         (["wheel", *WHEEL, "--value", "radius=1"], "unknowns are gain"),
