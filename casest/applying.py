@@ -29,6 +29,11 @@ from casest.result import load_result, saved_parameters
 
 def saved_model(result: Mapping[str, Any]) -> tuple[Model, dict[str, Any]]:
     """Model and parameter values of a saved result: effects, constants and scopes as they were."""
+    if "innovations" in result:
+        raise UsageError(
+            f"the result is of {result['model']}, an estimator in motion: it has states over time "
+            f"(casest filter {result['model']} DATA) and no correction"
+        )
     model, units = _found_model(result), result.get("units", {})
     parameters = saved_parameters(result)
     for saved in result.get("effects", []):

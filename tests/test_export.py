@@ -9,6 +9,7 @@ import sys
 from dataclasses import replace
 from importlib.resources import files
 
+import bodies
 import numpy as np
 import pytest
 import simulators as sim
@@ -35,6 +36,16 @@ def ntc(T=signal("K"), r=signal("ohm"), *, a=param("ohm", start=9e3), b=param("K
     reading = quantity("reading", a * exp(b * (1 / temperature - 1 / 298.15)), "ohm")
     return Residual(measured=r, predicted=reading, corrected=temperature)
 '''
+
+
+def pair_record(path):
+    """Both sensors of one body in 40 poses; no code of the model."""
+    rng = np.random.default_rng(11)
+    run = bodies.Body(rng).record(bodies.attitudes(40, rng), rng)
+    header = ",".join([f"a{x} [m/s^2]" for x in "xyz"] + [f"m{x} [uT]" for x in "xyz"])
+    columns = np.hstack([run.signals["a"], run.signals["m"]])
+    np.savetxt(path, columns, delimiter=",", header=header, comments="")
+    return path
 
 
 def table_record(path):
@@ -73,6 +84,7 @@ def results(tmp_path_factory):
         "closed": ["close", "norm-diagonal", *HANDHELD, *G],
         "wheel": ["calibrate", "wheel", str(WHEEL)],
         "rate-table": ["calibrate", "rate-table", str(table_record(folder / "table.csv"))],
+        "norm-pair": ["calibrate", "norm-pair", str(pair_record(folder / "pair.csv"))],
         "thermistor": ["calibrate", str(folder / "thermistor.py"), str(folder / "bath.csv")],
     }
     for name, arguments in made.items():
@@ -80,7 +92,15 @@ def results(tmp_path_factory):
     return folder
 
 
-NAMES = ["norm-diagonal", "norm-triangular", "closed", "wheel", "rate-table", "thermistor"]
+NAMES = [
+    "norm-diagonal",
+    "norm-triangular",
+    "closed",
+    "wheel",
+    "rate-table",
+    "thermistor",
+    "norm-pair",
+]
 
 
 def by_apply(folder, inputs):
@@ -160,7 +180,7 @@ def test_c_python_and_json_give_what_apply_gives(results, tmp_path, name):
 
 
 @pytest.mark.parametrize("flag", [(), ("--float",)])
-@pytest.mark.parametrize("name", ["closed", "wheel", "rate-table", "thermistor"])
+@pytest.mark.parametrize("name", ["closed", "wheel", "rate-table", "thermistor", "norm-pair"])
 def test_the_self_test_of_the_source_passes(results, tmp_path, name, flag):
     source = exported(results / name, "c", tmp_path / "c.c", *flag)
     program = compiled(source, tmp_path, "-DCASEST_SELF_TEST")
@@ -250,6 +270,20 @@ def test_a_refused_result_is_not_exported(tmp_path, capsys):
     capsys.readouterr()
     assert command(["export", str(tmp_path), "--to", "c"]) == 1
     assert "this estimate was refused; --force" in capsys.readouterr().err
+
+
+def test_an_estimator_in_motion_has_no_correction(tmp_path, capsys):
+    found = {
+        "model": "bias-gravity",
+        "trusted": True,
+        "after": {"parameters": {}},
+        "innovations": {},
+    }
+    (tmp_path / "result.json").write_text(json.dumps(found), encoding="utf-8")
+    for words in (["export", str(tmp_path), "--to", "c"], ["apply", str(tmp_path), "flight.csv"]):
+        assert command(words) == 1
+        said = capsys.readouterr().err
+        assert "it has states over time (casest filter bias-gravity DATA) and no correction" in said
 
 
 def test_float_is_for_c_alone(results, capsys):
