@@ -9,11 +9,12 @@ import numpy as np
 
 from casest.closing_motion.effects import Candidate, Colour, extended
 from casest.closing_motion.sensitivity import Sensitivity, sensitivity
-from casest.closing_motion.tuning import applied, matched, prepared
+from casest.closing_motion.tuning import Prepared, applied, matched, prepared
 from casest.data.run import Run
 from casest.declaring.shapes import Array
 from casest.dynamics.declare import Dynamics
 from casest.dynamics.filter import Filtered, filtered
+from casest.dynamics.transition import process_along
 
 #: Rounds of scoring of an effect's numbers, and the step in standard deviations that ends it.
 ROUNDS, ENOUGH = 4, 0.1
@@ -25,7 +26,8 @@ COLOURS = (3, 9, 30, 90, 300)
 class Fit:
     """An estimator with effects at their most likely numbers, and its filter over the record.
 
-    `answers`: how the innovations answer to the numbers of `added`; None where there are none.
+    `ready`: the record made ready for its likelihoods; `answers`: how the innovations answer to the
+    numbers of `added`; None where there are none.
     `last_step`: of the scoring, in standard deviations.
     """
 
@@ -35,6 +37,7 @@ class Fit:
     colour: Colour | None
     intensities: Mapping[str, float]
     likelihood: float
+    ready: Prepared
     found: Filtered
     answers: Sensitivity | None
     last_step: float = 0.0
@@ -49,6 +52,14 @@ class Fit:
         """Log-likelihood less what as many numbers gain from noise alone (Schwarz 1978)."""
         readings = np.isfinite(self.found.innovations).sum()
         return self.likelihood - 0.5 * self.unknowns * float(np.log(readings))
+
+    def lighter(self) -> Fit:
+        """The same without the transitions and the noise along the record: to be looked at, and
+        judged, but no longer filtered."""
+        ready = replace(self.ready, system=replace(self.ready.system))
+        system = replace(self.found.system, process=self.model.process)
+        found = replace(self.found, system=system)
+        return replace(self, ready=ready, found=found)
 
     @property
     def std(self) -> Array:
@@ -107,10 +118,13 @@ def _tuned(
     known = {name: value for name, value in (start or {}).items() if name in ready.names}
     intensities, likelihood = matched(ready, run, known)
     model = applied(grown, intensities)
-    found = filtered(model, run)
+    system = None
+    if model.linear:
+        system = ready.system.driven(process_along(model, run, along))
+    found = filtered(model, run, system=system, spread=False)
     tried = [c for c, _ in added]
     answers = sensitivity(base, added, tried, run, found) if added else None
-    return Fit(base, model, added, colour, intensities, likelihood, found, answers)
+    return Fit(base, model, added, colour, intensities, likelihood, ready, found, answers)
 
 
 def coloured(fit: Fit, run: Run) -> Fit:

@@ -12,7 +12,7 @@ from casest.closing_motion.effects import Candidate, Colour, candidates
 from casest.closing_motion.fitting import Fit, coloured, fitted
 from casest.closing_motion.score import Score, scores, stretches
 from casest.closing_motion.sensitivity import sensitivity
-from casest.closing_motion.tuning import Prepared, applied, first_guess, likelihood, prepared
+from casest.closing_motion.tuning import applied, first_guess, likelihood
 from casest.closing_motion.whiteness import Whiteness, whiteness
 from casest.data.run import Run
 from casest.data.splits import interleaved_blocks
@@ -98,15 +98,15 @@ class _Loop:
         """Run the loop."""
         along = filtered(self.model, self.run).smoothed
         before = current = fitted(self.model, self.run, along)
-        first: list[Score] = []
+        ranked, left = self._judged(current)
+        first = ranked
         for _ in range(ROUNDS):
-            ranked, white = self._judged(current)
-            first = first or ranked
-            better = self._with_effect(current, ranked) or self._with_colour(current, white)
+            better = self._with_effect(current, ranked) or self._with_colour(current, left)
             if better is None:
                 break
+            before = before.lighter()
             current = self._weeded(better)
-        left = self._judged(current)[1]
+            ranked, left = self._judged(current)
         held = held_out(before, self.folds), held_out(current, self.folds)
         there = {a.candidate.label for a in self.added}
         added = tuple(
@@ -128,7 +128,7 @@ class _Loop:
     def _with_effect(self, current: Fit, ranked: list[Score]) -> Fit | None:
         """The fit with the best effect that held-out time confirms; None if none does."""
         promising = self._promising(ranked) or self._promising(self._strictly(current))
-        trials = [(s, self._refitted(current, s)) for s in promising[:CONTENDERS]]
+        trials = [(s, self._refitted(current, s).lighter()) for s in promising[:CONTENDERS]]
         trials = [(s, fit) for s, fit in trials if self._likelier(fit, current, s.candidate.size)]
         if not trials:
             return None
@@ -156,8 +156,8 @@ class _Loop:
         intensities have swallowed stands out again. Empty where these say the same."""
         if not self._noise_is_odd(current):
             return []
-        model = applied(current.model, self._of_sensors(current)[1])
-        found = filtered(model, self.run)
+        model = applied(current.model, self._of_sensors(current))
+        found = filtered(model, self.run, spread=False)
         rest = [c for c in self.tried if all(c is not a for a, _ in current.added)]
         return scores(sensitivity(current.base, current.added, rest, self.run, found), rest)
 
@@ -194,16 +194,14 @@ class _Loop:
 
     def _noise_is_odd(self, fit: Fit) -> bool:
         """Are the intensities far from what the signals themselves show from sample to sample?"""
-        ready, sensors = self._of_sensors(fit)
-        return fit.likelihood - likelihood(ready, sensors) > ASKS
+        return fit.likelihood - likelihood(fit.ready, self._of_sensors(fit)) > ASKS
 
-    def _of_sensors(self, fit: Fit) -> tuple[Prepared, dict[str, float]]:
+    def _of_sensors(self, fit: Fit) -> dict[str, float]:
         """Intensities of inputs and states no larger than the signals' noise from sample to sample
         says; those of readings as they are."""
-        ready = prepared(fit.model, self.run, fit.found.smoothed)
-        guess = first_guess(ready, self.run)
-        kept = {*ready.readings, *({fit.colour.state} if fit.colour else ())}
-        return ready, {
+        guess = first_guess(fit.ready, self.run)
+        kept = {*fit.ready.readings, *({fit.colour.state} if fit.colour else ())}
+        return {
             name: value if name in kept else min(guess[name], value)
             for name, value in fit.intensities.items()
         }

@@ -18,9 +18,9 @@ from casest.declaring.physics import SX
 from casest.declaring.shapes import Array
 from casest.dynamics.declare import Dynamics
 from casest.dynamics.discrete import Steps
-from casest.dynamics.stepping import CHUNK, entries, packed, run_steps, symmetric, taken, unpacked
+from casest.dynamics.stepping import entries, packed, run_steps, symmetric, taken, unpacked
 from casest.dynamics.transition import checked_record, steps_to
-from casest.engine import Columns, Replay
+from casest.engine import Columns, Recursion, Replay
 from casest.modelling.tracing import flat
 
 
@@ -102,7 +102,7 @@ def extended(model: Dynamics, run: Run) -> tuple[Array, Array, Array, Array, Arr
 
 
 @lru_cache(maxsize=8)
-def _extended_step(model: Dynamics) -> Any:
+def _extended_step(model: Dynamics) -> Recursion:
     """(x and P, numbers of one sample) -> (x and P, also before the reading, innovation and S)."""
     t, n = model.traced, model.size
     u, v, h = *_two_samples(model), ca.SX.sym("h")
@@ -121,8 +121,7 @@ def _extended_step(model: Dynamics) -> Any:
     numbers = ca.vertcat(u, v, h, signals, R, y, there)
     told = ca.vertcat(y - said, ca.vec(ca.densify(C @ before_P @ C.T + ca.diag(R))))
     outputs = [packed(after_x, after_P), packed(before_x, before_P), told]
-    made = ca.Function("extended", [packed(x, P), numbers], outputs, {"cse": True})
-    return made.mapaccum("extended_steps", CHUNK)
+    return Recursion(ca.Function("step", [packed(x, P), numbers], outputs, {"cse": True}))
 
 
 @lru_cache(maxsize=8)

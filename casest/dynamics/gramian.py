@@ -15,7 +15,7 @@ import numpy as np
 
 from casest.declaring.shapes import Array
 from casest.dynamics.declare import Dynamics
-from casest.dynamics.transition import Linearised, half_transitions, transitions
+from casest.dynamics.transition import Linearised, half_transitions
 from casest.null_space import sparsest
 
 #: A direction counts as observable from this share of the largest scaled eigenvalue on. Rounding
@@ -43,7 +43,7 @@ class Observed:
 
 def gramian(model: Dynamics, system: Linearised) -> Array:
     """W of the whole record at its first sample, (n, n), from transition matrices."""
-    Phi, _ = transitions(system)
+    Phi, _ = system.moved
     return _reduced(Phi, _of_steps(model, system, Phi))[1]
 
 
@@ -195,7 +195,7 @@ def window_eigenvalues(
     model: Dynamics, system: Linearised, window: float, count: int = 60
 ) -> tuple[Array, Array]:
     """All of them, ascending: the windows' ends (K,) and eigenvalues (K, n), scaled alike."""
-    Phi, _ = transitions(system)
+    Phi, _ = system.moved
     W = _of_steps(model, system, Phi)
     prior = np.sqrt(np.diag(model.start_covariance))
     time = system.time

@@ -8,7 +8,8 @@ where holding A is right to second order only. A known input is one more, consta
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from math import factorial
 
 import casadi as ca
@@ -53,6 +54,25 @@ class Linearised:
     def steps(self) -> Array:
         """Time between samples, (N − 1,), s."""
         return np.diff(self.time)
+
+    @cached_property
+    def moved(self) -> tuple[Array, Array]:
+        """Φ (N − 1, n, n) and forced step u (N − 1, n) of every step."""
+        return transitions(self)
+
+    @cached_property
+    def later_half(self) -> Array:
+        """Φ over the second half of every step, (N − 1, n, n)."""
+        return half_transitions(self, (0.5, 1.0))
+
+    def driven(self, process: Array) -> Linearised:
+        """The same motion with other process noise; what is known of its steps is kept."""
+        other = replace(self, process=process)
+        other.__dict__.update({k: v for k, v in self.__dict__.items() if k in _KEPT})
+        return other
+
+
+_KEPT = ("moved", "later_half")
 
 
 def checked_time(run: Run) -> Array:
@@ -111,6 +131,19 @@ def linearised(model: Dynamics, run: Run, along: Array | None = None) -> Lineari
     if not np.isfinite(readings).all():
         C = np.where(np.isfinite(readings)[:, :, None], C, 0.0)
     return Linearised(time, A, c_[:, :, 0], C, d_[:, :, 0], readings, process)
+
+
+def process_along(model: Dynamics, run: Run, along: Array) -> Array:
+    """Process noise Ξ alone, (n, n), or along states (N, n) where inputs have noise: (N, n, n)."""
+    added = model.input_noise
+    if added is None:
+        return model.process
+    t = model.traced
+    sample = ca.vertcat(t.x, *[flat(t.symbols[s.name]) for s in model.signals])
+    function = ca.Function("noise", [ca.SX.sym("none", 0), sample], [ca.densify(added)],
+                           ["parameters", "sample"], ["Q"])  # fmt: skip
+    columns = Columns([np.ascontiguousarray(along), *(run.signals[s.name] for s in model.signals)])
+    return np.asarray(model.process + Replay(function)(np.zeros(0), columns)[0])
 
 
 def _refuse_missing_inputs(model: Dynamics, run: Run) -> None:
@@ -194,13 +227,13 @@ def exponential(matrices: Array) -> Array:
     return np.asarray(result)
 
 
-def process_noise(system: Linearised, intensity: Array, Phi: Array) -> Array:
+def process_noise(system: Linearised, intensity: Array) -> Array:
     """∫Φ(t₁, s)ΞΦ(t₁, s)ᵀ ds of every step, (N − 1, n, n): Simpson's rule.
 
     Ξ constant and diagonal (n, n), or any at every sample (N, n, n).
     """
     h = system.steps[:, None, None]
-    middle = half_transitions(system, (0.5, 1.0))
+    Phi, middle = system.moved[0], system.later_half
     if intensity.ndim == 3:
         last = intensity[1:]
         between = 0.5 * (intensity[:-1] + last)
