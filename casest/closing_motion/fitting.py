@@ -145,8 +145,9 @@ def _best_colour(fit: Fit, run: Run, name: str, where: slice) -> Fit:
             return -np.inf
         if k not in done:
             colour = Colour(name, signal.size, signal.unit or "1", COLOURS[k] * step, std)
-            done[k] = fitted(fit.base, run, fit.found.smoothed, added=fit.added, colour=colour,
-                             start=fit.intensities)  # fmt: skip
+            found = fitted(fit.base, run, fit.found.smoothed, added=fit.added, colour=colour,
+                           start=fit.intensities)  # fmt: skip
+            done[k] = found.lighter()
         return done[k].likelihood
 
     best = 1 if at(1) > at(2) else 2

@@ -128,12 +128,15 @@ class _Loop:
     def _with_effect(self, current: Fit, ranked: list[Score]) -> Fit | None:
         """The fit with the best effect that held-out time confirms; None if none does."""
         promising = self._promising(ranked) or self._promising(self._strictly(current))
-        trials = [(s, self._refitted(current, s).lighter()) for s in promising[:CONTENDERS]]
-        trials = [(s, fit) for s, fit in trials if self._likelier(fit, current, s.candidate.size)]
-        if not trials:
+        alike: list[tuple[Score, Fit]] = []
+        for score in promising[:CONTENDERS]:
+            fit = self._refitted(current, score).lighter()
+            if self._likelier(fit, current, score.candidate.size):
+                alike.append((score, fit))
+            best = max((f.evidence for _, f in alike), default=0.0)
+            alike = [(s, f) for s, f in alike if best - f.evidence < ALIKE]
+        if not alike:
             return None
-        best = max(fit.evidence for _, fit in trials)
-        alike = [(s, fit) for s, fit in trials if best - fit.evidence < ALIKE]
         # Of those that explain it alike, the one that is met more often.
         score, chosen = min(alike, key=lambda pair: self.tried.index(pair[0].candidate))
         gained = self._confirmed(current, chosen)

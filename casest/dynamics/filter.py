@@ -91,7 +91,7 @@ def filtered(
     first pass. What is known exactly (`constraint`) is put into every estimate and not fed back.
 
     Of a linear model: `system`, the model along the record, where it is known already; `spread`
-    False: smoothed states without their covariances (the filter's in their place), in half the time.
+    False: smoothed states without their covariances (the filter's in their place): half the time.
     Raises DataError where time or inputs are not usable, or a covariance is none.
     """
     check_covariance(model.start_covariance, "the covariance at the beginning")
