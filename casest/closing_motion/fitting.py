@@ -6,10 +6,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
+from casest.closing_motion.delays import by_reading, shifted, shifts_of
 from casest.closing_motion.effects import Candidate, Colour, extended
 from casest.closing_motion.sensitivity import Sensitivity, sensitivity
-from casest.closing_motion.tuning import Prepared, applied, matched, prepared
+from casest.closing_motion.tuning import Prepared, applied, matched, prepared, whitened
 from casest.data.run import Run
 from casest.declaring.shapes import Array
 from casest.dynamics.declare import Dynamics
@@ -20,14 +22,17 @@ from casest.dynamics.transition import process_along
 ROUNDS, ENOUGH = 4, 0.1
 #: Correlation times of noise that are tried, in samples.
 COLOURS = (3, 9, 30, 90, 300)
+#: A start is forgotten where a reading's variance is below so many times its usual one.
+FORGOTTEN = 2.0
 
 
 @dataclass(frozen=True)
 class Fit:
     """An estimator with effects at their most likely numbers, and its filter over the record.
 
-    `ready`: the record made ready for its likelihoods; `answers`: how the innovations answer to the
-    numbers of `added`; None where there are none.
+    `run`: the record, readings that come late moved by `shifts` samples; `ready`: it made ready
+    for its likelihoods; `answers`: how the innovations answer to the numbers of `added`; None where
+    there are none.
     `last_step`: of the scoring, in standard deviations.
     """
 
@@ -37,6 +42,8 @@ class Fit:
     colour: Colour | None
     intensities: Mapping[str, float]
     likelihood: float
+    run: Run
+    shifts: Mapping[str, int]
     ready: Prepared
     found: Filtered
     answers: Sensitivity | None
@@ -47,11 +54,14 @@ class Fit:
         """Numbers that were estimated beside the states and intensities."""
         return sum(c.size for c, _ in self.added) + (2 if self.colour else 0)
 
-    @property
-    def evidence(self) -> float:
-        """Log-likelihood less what as many numbers gain from noise alone (Schwarz 1978)."""
+    def evidence(self, other: Fit) -> float:
+        """Rise of log-likelihood less what as many numbers gain from noise alone (Schwarz 1978)."""
         readings = np.isfinite(self.found.innovations).sum()
-        return self.likelihood - 0.5 * self.unknowns * float(np.log(readings))
+        return rise(self, other) - 0.5 * self.unknowns * float(np.log(readings))
+
+    def by_reading(self, values: Array) -> Array:
+        """Values of readings (N, m) in the rows that these have in the file."""
+        return by_reading(self.base, self.shifts, values)
 
     def lighter(self) -> Fit:
         """The same without the transitions and the noise along the record: to be looked at, and
@@ -68,6 +78,32 @@ class Fit:
             return np.zeros(0)
         H = self.answers.H
         return np.asarray(np.sqrt(np.diag(np.linalg.inv(np.einsum("kij,kil->jl", H, H)))))
+
+
+def rise(fit: Fit, other: Fit) -> float:
+    """By how much the log-likelihood of a fit is above another's, on the readings of both.
+
+    Where readings were moved in time the first ones are lost: then only those count that come once
+    both filters have forgotten the start.
+    """
+    if fit.shifts == other.shifts:
+        return fit.likelihood - other.likelihood
+    (one, first), (two, second) = (_log_densities(f) for f in (fit, other))
+    return float(np.sum((one - two)[np.isfinite(one - two) & first & second]))
+
+
+def _log_densities(fit: Fit) -> tuple[Array, NDArray[np.bool_]]:
+    """Of every reading given those before it (N, m), and whether the start is forgotten there."""
+    e, s = whitened(fit.ready, fit.intensities)
+    density = np.where(fit.ready.present, -0.5 * (np.log(2 * np.pi * s) + e**2 / s), np.nan)
+    return fit.by_reading(density), forgotten(fit)[:, None]
+
+
+def forgotten(fit: Fit) -> NDArray[np.bool_]:
+    """Which readings count, (N,): what the filter expects there is not the start's doing."""
+    expected = fit.by_reading(np.diagonal(fit.found.S, axis1=1, axis2=2))
+    usual = np.nanmedian(expected, axis=0)
+    return np.asarray(~(expected > FORGOTTEN * usual).any(axis=1))
 
 
 def fitted(
@@ -112,6 +148,8 @@ def _tuned(
     colour: Colour | None,
     start: Mapping[str, float] | None,
 ) -> Fit:
+    shifts = shifts_of(base, run, added)
+    run = shifted(base, run, shifts)
     grown = extended(base, added, colour)
     along = np.pad(along[:, : grown.size], ((0, 0), (0, max(0, grown.size - along.shape[1]))))
     ready = prepared(grown, run, along)
@@ -124,7 +162,9 @@ def _tuned(
     found = filtered(model, run, system=system, spread=False)
     tried = [c for c, _ in added]
     answers = sensitivity(base, added, tried, run, found) if added else None
-    return Fit(base, model, added, colour, intensities, likelihood, ready, found, answers)
+    return Fit(
+        base, model, added, colour, intensities, likelihood, run, shifts, ready, found, answers
+    )
 
 
 def coloured(fit: Fit, run: Run) -> Fit:
