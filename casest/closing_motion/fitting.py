@@ -20,8 +20,9 @@ from casest.dynamics.transition import process_along
 
 #: Rounds of scoring of an effect's numbers, and the step in standard deviations that ends it.
 ROUNDS, ENOUGH = 4, 0.1
-#: Correlation times of noise that are tried, in samples.
-COLOURS = (3, 9, 30, 90, 300)
+#: Correlation times of noise that are tried, logarithms of samples: the shortest, where the search
+#: begins, the longest, and the steps.
+FIRST, MIDDLE, LAST, WIDE = np.log([2.5, 9.0, 350.0, 3.2]).tolist()
 #: A start is forgotten where a reading's variance is below so many times its usual one.
 FORGOTTEN = 2.0
 
@@ -174,27 +175,33 @@ def coloured(fit: Fit, run: Run) -> Fit:
 
 
 def _best_colour(fit: Fit, run: Run, name: str, where: slice) -> Fit:
-    """From the middle of the correlation times towards where the likelihood rises."""
+    """From the middle of the correlation times towards where the likelihood rises; between those
+    that enclose the best by a parabola over their logarithms."""
     step = float(np.median(np.diff(fit.found.time)))
     signal = next(s for s in fit.base.signals if s.name == name)
     std = float(np.nanmedian(np.abs(fit.found.innovations[:, where]))) / 2
-    done: dict[int, Fit] = {}
+    done: dict[float, Fit] = {}
 
-    def at(k: int) -> float:
-        if not 0 <= k < len(COLOURS):
+    def at(logarithm: float) -> float:
+        if not FIRST <= logarithm <= LAST:
             return -np.inf
-        if k not in done:
-            colour = Colour(name, signal.size, signal.unit or "1", COLOURS[k] * step, std)
+        if logarithm not in done:
+            tau = float(np.exp(logarithm)) * step
+            colour = Colour(name, signal.size, signal.unit or "1", tau, std)
             found = fitted(fit.base, run, fit.found.smoothed, added=fit.added, colour=colour,
                            start=fit.intensities)  # fmt: skip
-            done[k] = found.lighter()
-        return done[k].likelihood
+            done[logarithm] = found.lighter()
+        return done[logarithm].likelihood
 
-    best = 1 if at(1) > at(2) else 2
-    way = -1 if best == 1 else 1
+    best = MIDDLE if at(MIDDLE) > at(MIDDLE + WIDE) else MIDDLE + WIDE
+    way = -WIDE if best == MIDDLE else WIDE
     while at(best + way) > at(best):
         best += way
-    return done[best]
+    low, middle, high = at(best - WIDE), at(best), at(best + WIDE)
+    bend = low - 2 * middle + high
+    if np.isfinite(bend) and bend < 0:
+        at(best + 0.5 * WIDE * (low - high) / bend)
+    return max(done.values(), key=lambda f: f.likelihood)
 
 
 def _outputs(model: Dynamics) -> dict[str, slice]:
