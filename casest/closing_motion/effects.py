@@ -88,7 +88,7 @@ OUTPUT_MISALIGNMENT = MotionEffect(
     vector=True,
 )  # fmt: skip
 TIME_DELAY = MotionEffect(
-    "time_delay", "output", "prediction of k earlier", lambda _: 1, lambda u: "s",
+    "time_delay", "output", "prediction, k earlier", lambda _: 1, lambda u: "s",
     # Whole samples are moved (delays.py); over the rest of less than one the rate is constant.
     lambda _: 0.01, lambda y, k, body: y - (k - body.moved) * body.rate,
     "an event that all sensors see",

@@ -72,6 +72,14 @@ class Fit:
         found = replace(self.found, system=system)
         return replace(self, ready=ready, found=found)
 
+    def with_spread(self) -> Fit:
+        """The same with the covariances of the smoothed states, which the loop has no use for."""
+        if not self.model.linear:
+            return self
+        process = process_along(self.model, self.run, self.found.smoothed)
+        found = filtered(self.model, self.run, system=self.ready.system.driven(process))
+        return replace(self, found=replace(self.found, smoothed_P=found.smoothed_P))
+
     @property
     def std(self) -> Array:
         """Standard deviation of all numbers of the effects, in order."""

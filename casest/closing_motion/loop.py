@@ -114,8 +114,17 @@ class _Loop:
                 x for x in a.indistinguishable_from if x not in there))
             for a in self.added
         )  # fmt: skip
-        return MotionClosing(self.model, self.run, before, current, added, tuple(self.refused),
-                             tuple(first), left, (one, two))  # fmt: skip
+        return MotionClosing(
+            self.model,
+            self.run,
+            before,
+            current.with_spread(),
+            added,
+            tuple(self.refused),
+            tuple(first),
+            left,
+            (one, two),
+        )
 
     def _judged(self, fit: Fit) -> tuple[list[Score], Whiteness]:
         """Scores of every candidate that is not there yet; are the innovations white?"""
