@@ -86,6 +86,21 @@ def test_coloured_noise_becomes_a_state_and_nothing_else_is_named():
     assert 0.015 < effect["parameters"]["std"]["value"] < 0.06
 
 
+@pytest.mark.parametrize(
+    ("sensors", "found"),
+    [(Sensors(), []), (Sensors(lever=(0.3, -0.1, 0.2)), ["lever_arm of v"])],
+    ids=["nothing missing", "lever arm"],
+)
+def test_a_gap_in_time_is_no_effect_and_hides_none(sensors, found):
+    rng = np.random.default_rng(1)
+    t = np.arange(0, 40, 1 / RATE)
+    t = t[(t < 20) | (t > 24)]
+    run = flights.record(flights.somewhere(rng), t, rng, sensors, SIGMA)
+    closing = close_motion(bias_gravity, run)
+    assert names(closing) == found
+    assert closing.left.p_value > 1e-3
+
+
 def test_a_delay_is_found_where_samples_come_at_uneven_times():
     rng = np.random.default_rng(7)
     t = np.cumsum(rng.uniform(0.02, 0.06, 750))

@@ -2,7 +2,8 @@
 
 A delay of many samples is no matter of the prediction's rate at one of them: the reading itself
 is moved by whole samples, and the rest, half a sample at most, is first order. Nothing is
-interpolated, so that white noise stays white; a reading from before the first sample is lost.
+interpolated, so that white noise stays white; a reading from before the first sample, or from a
+gap, is lost.
 """
 
 from __future__ import annotations
@@ -35,11 +36,13 @@ def shifted(model: Dynamics, run: Run, shifts: Mapping[str, int]) -> Run:
     time, signals = np.asarray(run.time, float), dict(run.signals)
     for name in model.measured_signals:
         shift = shifts.get(name, 0)
-        moved = _rolled(time, shift) - time
-        usual = shift * float(np.median(np.diff(time)))
-        signals[f"{name}_moved"] = np.where(np.isfinite(moved), moved, usual)[:, None]
+        step = float(np.median(np.diff(time)))
+        moved, usual = _rolled(time, shift) - time, shift * step
+        # Not across a gap in time: such a reading belongs to no sample.
+        near = np.abs(moved - usual) < 0.5 * abs(usual) + 2 * step
+        signals[f"{name}_moved"] = np.where(near, moved, usual)[:, None]
         if shift:
-            signals[name] = _rolled(signals[name], shift)
+            signals[name] = np.where(near[:, None], _rolled(signals[name], shift), np.nan)
     return replace(run, signals=signals)
 
 

@@ -23,6 +23,7 @@ from casest.dynamics.stepping import Pattern, entries, packed, reach, symmetric,
 from casest.dynamics.transition import (
     Linearised,
     linearised,
+    lost,
     process_along,
     process_noise,
     steps_to,
@@ -93,6 +94,7 @@ def prepared(model: Dynamics, run: Run, along: Array) -> Prepared:
     for one, pattern in zip(alone, units.values(), strict=True):
         Q = process_noise(system, process_along(one, run, along))
         parts.append(_after(_picked(Q, pattern), count))
+    parts.append(_after(lost(model, system.steps), count))
     parts.append(_picked(np.where(present[:, :, None], system.C, 0.0), entries(t.C)))
     parts.append(np.where(present, system.y - system.d, 0.0))
     period = steps_to(system)
@@ -239,19 +241,20 @@ def _likelihood_step(
     u, y, period = ca.SX.sym("u", n), ca.SX.sym("y", m), ca.SX.sym("period")
     own = [_sparse(f"Q{k}", (n, n), pattern) for k, pattern in enumerate(units)]
     seen, C = _sparse("C", (m, n), of_C)
-    Q = ca.SX(n, n)
+    gap = ca.SX.sym("gap", n)
+    Q = ca.diag(gap)
     for k, (_, unit) in enumerate(own):
         Q += q[k] * unit
     R = ca.vertcat(*[ca.repmat(q[len(units) + k] / period, last - first)
                      for k, (first, last) in enumerate(rows)])  # fmt: skip
-    later_x, later_P = Phi @ x + u, symmetric(ca.triu(Phi @ P @ Phi.T) + Q)
+    later_x, later_P = Phi @ x + u, symmetric(ca.triu(Phi @ (P + ca.diag(gap)) @ Phi.T) + Q)
     e, s = [], []
     for i in range(m):
         c = C[i, :].T
         e.append(y[i] - ca.dot(c, later_x))
         s.append(ca.dot(c, later_P @ c) + R[i])
         later_x, later_P = taken(later_x, later_P, c, e[-1], s[-1])
-    numbers = ca.vertcat(moved, u, *[k for k, _ in own], seen, y, period)
+    numbers = ca.vertcat(moved, u, *[k for k, _ in own], gap, seen, y, period)
     outputs = [ca.vertcat(packed(later_x, later_P), q), ca.vertcat(*e), ca.vertcat(*s)]
     state = ca.vertcat(packed(x, P), q)
     return Recursion(ca.Function("step", [state, numbers], outputs, {"cse": True}))

@@ -25,6 +25,7 @@ from casest.dynamics.transition import (
     process_along,
     process_noise,
     steps_to,
+    with_lost,
 )
 from casest.errors import DataError
 
@@ -151,7 +152,7 @@ def trajectory(model: Dynamics, run: Run, along: Array) -> tuple[Array, Array, b
 def discretised(model: Dynamics, system: Linearised) -> Steps:
     """The record in discrete time: exact transitions, readings as averages over their period."""
     Phi, forced = system.moved
-    Q = process_noise(system, system.process)
+    Q = with_lost(model, system.steps, Phi, process_noise(system, system.process))
     R = np.diag(model.noise)[None] / steps_to(system)[:, None]
     t = model.traced
     return Steps(Phi, forced, Q, system.C, system.d, R, system.y, reach(t.A), entries(t.C))

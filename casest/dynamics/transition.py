@@ -17,9 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casest.data.run import Run
-from casest.data.timing import UNUSED
+from casest.data.timing import GAP, UNUSED
 from casest.declaring.shapes import Array
 from casest.dynamics.declare import Dynamics
+from casest.dynamics.stepping import reach
 from casest.engine import Columns, Replay
 from casest.errors import DataError
 from casest.modelling.tracing import flat
@@ -248,7 +249,43 @@ def process_noise(system: Linearised, intensity: Array) -> Array:
     return np.asarray(h / 6 * (ends + 4 * inner))
 
 
+def lost(model: Dynamics, steps: Array) -> Array:
+    """Variances (N − 1, n) that are added before and after each step: nothing but in gaps.
+
+    What inputs did in a gap is unknown: states that they drive, through others too, are known in it
+    and afterwards no better than at the beginning.
+    """
+    t, n = model.traced, model.size
+    found = np.zeros((len(steps), n))
+    gaps = steps > GAP * np.median(steps)
+    if gaps.any():
+        u = [flat(t.symbols[s.name]) for s in model.signals if s.name not in t.measured]
+        driven = np.zeros(n, dtype=bool)
+        if u:
+            driven[list(set(ca.jacobian(t.f, ca.vertcat(*u)).sparsity().get_triplet()[0]))] = True
+        moved = np.zeros((n, n), dtype=bool)
+        moved[tuple(np.array(reach(t.A)).T)] = True
+        found[gaps] = np.where(moved @ driven, np.diag(model.start_covariance), 0.0)
+    return found
+
+
+def with_lost(model: Dynamics, steps: Array, Phi: Array, Q: Array) -> Array:
+    """The noise Q (N − 1, n, n) of steps, gaps included."""
+    added, i = lost(model, steps), np.arange(model.size)
+    gaps = np.flatnonzero(added.any(axis=1))
+    own = np.zeros((len(gaps), model.size, model.size))
+    own[:, i, i] = added[gaps]
+    Q[gaps] += Phi[gaps] @ own @ Phi[gaps].transpose(0, 2, 1) + own
+    return Q
+
+
+def counted(steps: Array) -> Array:
+    """Steps (N − 1,) as far as readings stand for them: in a gap nothing was read."""
+    usual = float(np.median(steps))
+    return np.where(steps > GAP * usual, usual, steps)
+
+
 def steps_to(steps: Array | Linearised) -> NDArray[np.float64]:
     """Time that each sample stands for, (N,): half of the steps (N − 1,) on both sides of it."""
-    step = steps.steps if isinstance(steps, Linearised) else steps
+    step = counted(steps.steps if isinstance(steps, Linearised) else steps)
     return np.concatenate([[step[0]], 0.5 * (step[1:] + step[:-1]), [step[-1]]])

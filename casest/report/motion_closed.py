@@ -65,7 +65,7 @@ def _effects(content: Mapping[str, Any]) -> str:
         return section("effects", "Effects", said)
     texts = []
     for e in content["effects"]:
-        text = f"{e['name']} of {e['on']}: {e['formula']}{found(e)} (p = {e['p_value']:.1g})"
+        text = f"{e['name']} of {e['on']}: {e['formula']}{found(e)} (p = {number(e['p_value'], 1)})"
         if e["indistinguishable_from"]:
             text += f"; not told apart from {', '.join(e['indistinguishable_from'])}"
         texts.append(text + ".")
