@@ -29,7 +29,7 @@ from casest.batch import calibrate_many
 from casest.estimate import attempt
 from casest.solve.ipopt import ipopt
 from casest.stack import Problem
-from casest_problems.norm import closed_form, closed_form_many, norm_triangular
+from casest_problems.norm import closed_form, norm_triangular
 
 SENSORS, POSES, GRAVITY, SIGMA = 100_000, 24, 9.80665, 0.01
 ONE_BY_ONE, SLOW, TURNS = 200, 20, 5
@@ -89,7 +89,7 @@ def ways(v: Any) -> dict[str, tuple[int, Callable[[], Any]]]:
     line = {"v": v}
     return {
         "calibrate_many, closed form": (
-            len(v), lambda: calibrate_many(MODEL, line, start=closed_form_many)
+            len(v), lambda: calibrate_many(MODEL, line)
         ),
         "nlpsol, declared start": (len(many), lambda: [plain(own, neutral) for own in many]),
         "nlpsol, closed form": (
@@ -116,7 +116,7 @@ def main() -> None:
     print(f"{len(v)} sensors, {POSES} poses, 9 unknowns; per second and core, ratio")
     for name, median in medians.items():
         print(f"  {name:32}{median:10.0f}{first / median:8.1f}")
-    print(calibrate_many(MODEL, {"v": v}, start=closed_form_many))
+    print(calibrate_many(MODEL, {"v": v}))
 
 
 if __name__ == "__main__":

@@ -6,7 +6,7 @@ import csv
 import hashlib
 import io
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -108,27 +108,22 @@ def corrected_csv(
     needed = {
         n: _of_one_run(model[n], v, which) for n, v in values.items() if n in correction.parameters
     }
-    runs = load_runs([data], correction.signals, **_needed(arguments, model, correction))
-    _same_units(result, runs, data)
-    found = result.get("corrected") or {}
-    around = (found["low"], found["high"]) if "low" in found else None
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    for k, run in enumerate(runs):
-        value = correction(run, needed, around)
-        _write(writer, correction, run, value, result, header=k == 0, several=len(runs) > 1)
-    return text.getvalue()
-
-
-def _needed(
-    arguments: Mapping[str, Any], model: Model, correction: Correction
-) -> Mapping[str, Any]:
-    """Options of the fit may be typed again: those of signals that are not needed fall away."""
     spare = {s.name for s in model.signals} - {s.name for s in correction.signals}
-    kept = dict(arguments)
+    runs = load_runs([data], correction.signals, **without(spare, arguments))
+    _same_units(result, runs, data)
+    known = result.get("corrected") or {}
+    around = (known["low"], known["high"]) if "low" in known else None
+    given, unit = correction.signals, result.get("units", {}).get(correction.name)
+    found = [correction(run, needed, around) for run in runs]
+    return table_of(runs, [s.name for s in given], found, correction.name, unit)
+
+
+def without(spare: Iterable[str], arguments: Mapping[str, Any]) -> dict[str, Any]:
+    """Options of the fit may be typed again: those of signals that are not needed fall away."""
+    kept, away = dict(arguments), set(spare)
     for option in ("columns", "units", "scales"):
         given = arguments.get(option) or {}
-        kept[option] = {name: value for name, value in given.items() if name not in spare}
+        kept[option] = {name: value for name, value in given.items() if name not in away}
     return kept
 
 
@@ -162,29 +157,28 @@ def _same_units(result: Mapping[str, Any], runs: tuple[Run, ...], data: str) -> 
             )
 
 
-def _write(
-    writer: Any,
-    correction: Correction,
-    run: Run,
-    value: Array,
-    result: Mapping[str, Any],
-    header: bool,
-    several: bool,
-) -> None:
-    """Rows of one run: run, row, time, the reading, the corrected quantity."""
-    reading = correction.model.traced.measured or correction.signals[-1].name
-    readings, own = run.signals[reading], run.units.get(reading)
-    if header:
-        names = ["run"] * several + ["row"] + ["t [s]"] * (run.time is not None)
-        names += [f"{reading}{a}" + _bracket(own) for a in _axes(readings)]
-        unit = _bracket(result.get("units", {}).get(correction.name))
-        names += [f"{correction.name}{'_' * bool(a)}{a}{unit}" for a in _axes(value)]
-        writer.writerow(names)
-    for i in range(len(run)):
-        row: list[Any] = [run.name] * several + [int(run.rows[i])]
-        if run.time is not None:
-            row.append(f"{float(run.time[i]):.9g}")
-        writer.writerow([*row, *(f"{x:.9g}" for x in readings[i]), *(f"{x:.9g}" for x in value[i])])
+def table_of(
+    runs: Sequence[Run], given: Sequence[str], found: Sequence[Array], name: str, unit: str | None
+) -> str:
+    """CSV of row, time, the `given` signals and what was `found`, called `name`, in each run."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    first, several = runs[0], len(runs) > 1
+    given = [signal for signal in given if signal != "t" or first.time is None]
+    header = ["run"] * several + ["row"] + ["t [s]"] * (first.time is not None)
+    for signal in given:
+        own = _bracket(first.units.get(signal))
+        header += [f"{signal}{a}{own}" for a in _axes(first.signals[signal])]
+    header += [f"{name}{'_' * bool(a)}{a}{_bracket(unit)}" for a in _axes(found[0])]
+    writer.writerow(header)
+    for run, value in zip(runs, found, strict=True):
+        numbers = np.column_stack([*(run.signals[signal] for signal in given), value])
+        for i in range(len(run)):
+            row: list[Any] = [run.name] * several + [int(run.rows[i])]
+            if run.time is not None:
+                row.append(f"{float(run.time[i]):.9g}")
+            writer.writerow([*row, *(f"{x:.9g}" for x in numbers[i])])
+    return text.getvalue()
 
 
 def _axes(values: Array) -> list[str]:

@@ -84,7 +84,8 @@ def calibrate_many(
     `start` gives start values by parameter, one for all or (S, …); or it is a function
     `(model, signals) -> {name: value}` that is called for some hundreds of sensors at a time, such
     as `casest_problems.norm.closed_form_many`. In place of a value it may give a triple (value,
-    lower, upper) where bounds depend on the data. Without it every sensor starts from the declared
+    lower, upper) where bounds depend on the data. Without it sensors start where the model says
+    that many do (`model.starting(…, many=…)`: the shipped norm models), else from the declared
     values; bounds that the model computes from data are then asked for sensor by sensor, in Python.
 
     `noise` is the standard deviation of one residual that a sound sensor has: one with
@@ -99,7 +100,7 @@ def calibrate_many(
     _check_model(model)
     readings, lengths = _checked(model, signals, counts)
     size, samples = readings[0].shape[:2]
-    job = _Job(model, readings, lengths, start, noise)
+    job = _Job(model, readings, lengths, start or model.starter_of_many, noise)
     result = _Result.empty(model, size)
     width = widest(samples)
     with np.errstate(all="ignore"), one_thread():

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import re
 from collections.abc import Mapping
@@ -14,7 +12,7 @@ import numpy as np
 
 from casest import __version__
 from casest.apply import Correction
-from casest.applying import saved_model
+from casest.applying import saved_model, table_of, without
 from casest.data import load_runs
 from casest.declaring.shapes import Array
 from casest.declaring.symbols import Signal
@@ -23,6 +21,7 @@ from casest.export import runtime
 from casest.export.c import c_source
 from casest.export.numpy_module import as_data, python_source
 from casest.export.program import Program, program
+from casest.modelling.model import Model
 from casest.result import load_result, plain
 
 #: What the JSON form calls itself; its schema is `casest/export/correction.schema.json`.
@@ -56,9 +55,9 @@ def exported(
     built = program(correction, known, result.get("units", {}), around, largest)
     expected = runtime.corrected(as_data(built), samples)
     if to == "json":
-        return _as_json(built, result, known)
+        return _as_json(built, model, result, known)
     if to == "python":
-        return python_source(built)
+        return python_source(built, (samples, expected))
     name = "correct_" + re.sub(r"\W", "_", model.name)
     return c_source(built, name, single, (samples, expected))
 
@@ -90,11 +89,14 @@ def _samples(
     return samples, float(np.abs(readings).max())
 
 
-def _as_json(built: Program, result: Mapping[str, Any], values: Mapping[str, Any]) -> str:
+def _as_json(
+    built: Program, model: Model, result: Mapping[str, Any], values: Mapping[str, Any]
+) -> str:
     content = {
         "format": FORMAT,
         "casest": __version__,
         "model": result["model"],
+        "signals": [s.name for s in model.signals],
         "convention": result.get("convention", ""),
         "data": result["data"],
         "parameters": {
@@ -129,31 +131,15 @@ def applied(path: Path, data: str, arguments: Mapping[str, Any]) -> str:
     content = json.loads(path.read_text(encoding="utf-8"))
     if content["format"] != FORMAT:
         raise UsageError(f"{path}: format {content['format']!r}; this casest reads {FORMAT}")
-    steps = content["program"]
+    steps, out = content["program"], content["program"]["output"]
     signals = [Signal(i["name"], i["size"], i["unit"] or None) for i in steps["inputs"]]
-    runs = load_runs([data], signals, **arguments)
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    out = steps["output"]
-    names = [f"{s.name}{_axis(k, s.size)}" for s in signals for k in range(s.size)]
-    wanted = [
-        f"{out['name']}{_axis(k, out['size'], '_')} [{out['unit'] or '1'}]"
-        for k in range(out["size"])
-    ]
-    writer.writerow(["run", "row", *names, *wanted])
+    spare = set(content.get("signals", [])) - {s.name for s in signals}
+    runs = load_runs([data], signals, **without(spare, arguments))
+    found = []
     for run in runs:
         x = np.hstack([np.asarray(run.signals[s.name]) for s in signals])
         try:
-            found = runtime.corrected(steps, x)
+            found.append(runtime.corrected(steps, x))
         except ValueError as error:
             raise DataError(f"{run.file}: {error}") from None
-        for k in range(len(run)):
-            row = [f"{v:.9g}" for v in (*x[k], *found[k])]
-            writer.writerow([run.name, int(run.rows[k]), *row])
-    return text.getvalue()
-
-
-def _axis(k: int, size: int, before: str = "") -> str:
-    if size == 1:
-        return ""
-    return before + ("xyz"[k] if size == 3 else f"[{k}]")
+    return table_of(runs, [s.name for s in signals], found, out["name"], out["unit"])

@@ -75,22 +75,32 @@ def following(
     output: str | Path | None = None,
     *,
     trusted: bool = True,
+    doubtful: bool = False,
     applies: bool = True,
+    moving: bool = False,
     file: str | Path = "",
+    fitted: str = "",
 ) -> str:
     """What to type after `command`, a line of words and the command each; empty where unknown.
 
-    output: folder of its results; trusted: whether there is an estimate to go on with; applies:
-    whether the model says what readings correct to; file: what simulate or export has written.
+    output: folder of its results; trusted: whether there is an estimate to go on with; doubtful:
+    whether its residual speaks against the model; applies: whether the model says what readings
+    correct to; moving: whether it is an estimator in motion; file: what simulate, apply or export
+    has written; fitted: the command that made the result.
     """
     typed = typed_words(command)
     if typed is None or not typed.arguments:
         return ""
-    if typed.name in ("calibrate", "close"):
-        steps = _after_fit(typed, output, trusted, applies)
-    elif typed.name in ("simulate", "export"):
-        simulated = _after_simulate if applies else _after_motion
-        steps = simulated(typed, file) if typed.name == "simulate" else _device(typed, file)
+    if typed.name == "close" and moving:
+        steps = _after_motion(typed, output, trusted)
+    elif typed.name in ("calibrate", "close"):
+        steps = _after_fit(typed, output, trusted, applies and not doubtful)
+    elif typed.name == "simulate":
+        steps = (_after_flight if moving else _after_simulate)(typed, file)
+    elif typed.name == "export":
+        steps = _device(typed, file, fitted)
+    elif typed.name == "apply":
+        steps = _after_apply(typed, file)
     else:
         steps = _after_look(typed, output, trusted, applies)
     return "\n".join(f"Next: {words}\n{step}" for words, step in steps)
@@ -117,8 +127,28 @@ def _after_fit(typed: Typed, output: str | Path | None, trusted: bool, applies: 
         yield "keep the result", typed.keeping(typed.name, flags).into("out").lines()
     elif applies:
         yield "correct readings", applying(typed, output).lines()
-        made = Typed("export", (str(output),), (("--to", "c"),)).into(Path(output) / "correction.c")
-        yield "the correction for a device", made.lines()
+        yield "the correction for a device", exporting(output).lines()
+
+
+def exporting(result: str | Path) -> Typed:
+    """`casest export` of a result, in its folder."""
+    folder = Path(result).parent if Path(result).suffix == ".json" else Path(result)
+    return Typed("export", (str(result),), (("--to", "c"),)).into(folder / "correction.c")
+
+
+def _after_motion(typed: Typed, output: str | Path | None, trusted: bool) -> _Steps:
+    """After the loop of an estimator in motion: there is nothing to apply, but states."""
+    reading = (*_READING, "--set")
+    if output is None:
+        yield "keep the result", typed.keeping("close", reading).into("out").lines()
+        return
+    if trusted:
+        states = typed.keeping("filter", reading)
+        states = replace(states, options=(*states.options, ("--noise", "ml")))
+        into = Path(output) / "states"
+        yield "the states, noise matched to the record", states.into(into).lines()
+    seen = typed.keeping("observe", reading).into(Path(output) / "seen")
+    yield "what can this trajectory see?", seen.lines()
 
 
 def _after_look(typed: Typed, output: str | Path | None, trusted: bool, applies: bool) -> _Steps:
@@ -149,7 +179,8 @@ def _after_simulate(typed: Typed, file: str | Path) -> _Steps:
         yield "is the effect found?", closed.lines()
 
 
-def _after_motion(typed: Typed, file: str | Path) -> _Steps:
+def _after_flight(typed: Typed, file: str | Path) -> _Steps:
+    """After a record of an estimator in motion was simulated."""
     folder, model = Path(file).parent, typed.arguments[0]
     noise = ("--set", "--std", "--intensity", "--sensor-noise")
     followed = typed.keeping("filter", noise, model, str(file)).into(folder / "states")
@@ -158,10 +189,25 @@ def _after_motion(typed: Typed, file: str | Path) -> _Steps:
     yield "is something missing?", closed.lines()
 
 
-def _device(typed: Typed, file: str | Path) -> _Steps:
+def _after_apply(typed: Typed, file: str | Path) -> _Steps:
+    """After readings were corrected by a result, or by an exported correction."""
+    result = Path(typed.arguments[0])
+    if result.suffix != ".json" or result.name == "result.json":
+        yield "the correction for a device", exporting(result).lines()
+    else:
+        name = shlex.quote(str(result))
+        yield "correct another record", f"  casest apply {name} DATA -o FILE.csv"
+
+
+def _device(typed: Typed, file: str | Path, fitted: str) -> _Steps:
+    """After an export: its own check, or a record corrected by it alone."""
     to, name = dict(typed.options).get("--to"), shlex.quote(str(file))
     if to == "c":
         compiled = f"  cc -DCASEST_SELF_TEST {name} -lm -o self-test && ./self-test"
         yield "compile it and run its self-test", compiled
+    elif to == "python":
+        yield "run its self-test", f"  python {name}"
     elif to == "json":
-        yield "correct readings", f"  casest apply {name} DATA"
+        words = applying(typed_words(fitted) or Typed("", (), ()), file)
+        into = Path(file).with_name(f"{Path(file).stem}-applied.csv")
+        yield "correct readings", words.into(into).lines()

@@ -61,7 +61,8 @@ def resolved(unit: str, known: Mapping[str, str]) -> str:
         value = _difference(known.get(match[1], match[0]))
         return f"({value})" if "/" in value or "*" in value else value
 
-    return _PLACEHOLDER.sub(replacement, unit) or "1"
+    found = _PLACEHOLDER.sub(replacement, unit) or "1"
+    return re.sub(r"\((\w+)\)", r"\1", found)
 
 
 def _difference(unit: str) -> str:

@@ -40,8 +40,12 @@ def calibration_result(
     data: Sequence[str],
     command: str = "",
     holdout: float | None = None,
+    misfit: list[dict[str, Any]] | None = None,
 ) -> dict[str, Any]:
-    """The content of `result.json` for `calibrate`. `verdict` is null: nothing was diagnosed."""
+    """The content of `result.json` for `calibrate`. `verdict` is null: no effect was looked for.
+
+    `misfit` is what speaks against the model, null where nobody asked.
+    """
     problem, certificate = estimate.problem, estimate.certificate
     table = unit_table(problem.model, problem.runs)
     return {
@@ -91,6 +95,7 @@ def calibration_result(
         "scatter_between_runs": _scatter(estimate),
         "invisible": None,
         "unexplained": None,
+        "misfit": misfit,
         "corrected": _corrected_range(estimate),
         "units": {name: unit for name, unit in table.items() if "[" not in name},
         "solver": _solver(estimate),
@@ -289,6 +294,11 @@ def load_result(path: Path) -> dict[str, Any]:
         by = f", but what `casest {writer}` writes" if writer else ": it holds no estimate"
         raise DataError(f"{path}: not a result of calibrate or close{by}")
     return result
+
+
+def made_by(path: Path) -> str:
+    """The command that made a saved result; empty where Python did."""
+    return str(load_result(path).get("reproduce", {}).get("command", ""))
 
 
 #: What other commands leave in their folders.

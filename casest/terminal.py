@@ -28,8 +28,8 @@ WIDTH = 80
 #: Verdicts and their colours (SGR codes): red, green, yellow.
 _COLOURS = {
     r"NOT\s+TRUSTED|unexplained(?=:)|no\s+trustworthy\s+estimate": 31,
+    r"trusted,\s+but\s+the\s+residual\s+is\s+not\s+noise|extended(?=:)": 33,
     r"trusted$|adequate(?=:)": 32,
-    r"extended(?=:)": 33,
 }
 
 
@@ -138,7 +138,11 @@ def _summary(m: Model) -> dict[str, Any]:
 
 def calibration_text(found: Estimate, content: Mapping[str, Any], output: Path | None) -> str:
     """Verdict, values with uncertainty, what was not determined, why it is believed."""
-    blocks = [_head(found, content), *_wrapped_notes(content["notes"])]
+    from casest.closing.doubt import sentence
+
+    doubt = content["misfit"]
+    notes = [*([sentence(doubt)] if doubt else []), *content["notes"]]
+    blocks = [_head(found, content), *_wrapped_notes(notes)]
     blocks.append("\n".join(value_table(found)))
     blocks.append("\n".join(_held(found, content)))
     blocks.append("\n".join(_fit_lines(found, content)))
@@ -153,6 +157,8 @@ def _head(found: Estimate, content: Mapping[str, Any]) -> str:
     samples = sum(len(run) for run in found.problem.runs)
     what = "rest intervals" if found.problem.runs[0].spread else "samples"
     verdict = "trusted" if found.certificate.trusted else "NOT TRUSTED"
+    if content["misfit"]:
+        verdict += ", but the residual is not noise"
     files = ", ".join(file_name(name) for name in content["data"])
     line = (
         f"{found.model.name} on {files}: {samples} {what}, "
@@ -235,7 +241,7 @@ def _fit_lines(found: Estimate, content: Mapping[str, Any]) -> Iterator[str]:
     if content["estimate"]["rmse_holdout"] is not None:
         yield f"  held-out residual rms {content['estimate']['rmse_holdout']:.3g}{unit}"
     repeats, residual = found.noise.repeats, found.noise.residual
-    if repeats and np.isfinite(residual) and residual > 2 * repeats:
+    if repeats and np.isfinite(residual) and residual > 2 * repeats and not content["misfit"]:
         yield item(
             f"the residual is {residual / repeats:.1f} times what the scatter within the rest "
             f"intervals explains ({repeats:.2g}{unit}): the model lacks something; the standard "
@@ -272,5 +278,6 @@ def _written(found: Estimate, content: Mapping[str, Any], output: Path | None) -
         content["reproduce"]["command"],
         output,
         trusted=found.certificate.trusted,
+        doubtful=bool(content["misfit"]),
         applies=found.model.traced.corrected is not None,
     )

@@ -38,6 +38,9 @@ from casest import (
 
 Array = NDArray[np.float64]
 
+#: Orientations closer than this (degrees) count as one, and no more than ENOUGH are counted.
+APART, ENOUGH = 15.0, 13
+
 
 def _norm_residual(corrected: Any, scale: Any, norm: float) -> Residual:
     """How far the corrected reading is from its known length, in the unit of the reading."""
@@ -263,7 +266,7 @@ def closed_form(declared: Model, runs: Sequence[Run]) -> dict[str, Array]:
 
 
 def closed_form_many(declared: Model, signals: Mapping[str, Array]) -> dict[str, Any]:
-    """Burkhard's closed form for many sensors at once, for `calibrate_many(…, start=…)`.
+    """Burkhard's closed form for many sensors at once: where `calibrate_many` starts.
 
     v is (S, N, 3); returns scale (S, …) and offset as (value, lower, upper), bounded as by
     `inside_the_ball`. As (4) and (5), but in readings from which their mean is taken, and with the
@@ -368,6 +371,18 @@ def inside_the_ball(declared: Model, runs: Sequence[Run]) -> dict[str, tuple[Any
     return {"offset": (-radius, radius)}
 
 
+def _orientations(v: Array) -> int:
+    """Orientations further than APART from each other, counted up to ENOUGH."""
+    extent = float(np.ptp(v, axis=0).max())
+    if extent < np.radians(APART) * float(np.median(np.linalg.norm(v, axis=1))):
+        return 1
+    left, count = v[:: max(1, len(v) // 2000)], 0
+    while len(left) and count < ENOUGH:
+        away = np.linalg.norm(left - left[0], axis=1)
+        left, count = left[away > np.radians(APART) * extent / 2], count + 1
+    return count
+
+
 def remarks(declared: Model, runs: Sequence[Run], values: dict[str, Array]) -> list[str]:
     """What an engineer would notice: a unit mixed up, poses in a plane, a record in motion."""
     v, norm = readings(runs), _length(declared)
@@ -379,10 +394,24 @@ def remarks(declared: Model, runs: Sequence[Run], values: dict[str, Array]) -> l
     if same and not 1 / 3 < length / norm < 3:
         found.append(
             f"readings are {length / norm:.3g} times the norm ({norm:g}), both in {unit}: is "
-            "one of the two in another unit? (--unit v=…, --set 'norm=… m/s^2')"
+            f"one of the two in another unit? (--unit v=…, --set 'norm=… {unit}')"
+        )
+    elif unit is None and norm == 1 and 9 < length < 11:
+        found.append(
+            f"readings are {length:.3g} long, and norm is 1: if they are in m/s^2, say --unit "
+            "v=m/s^2 --set 'norm=9.80665 m/s^2'"
         )
     spread = np.linalg.svd(v - v.mean(axis=0), compute_uv=False) / np.sqrt(len(v))
-    if spread[2] < 0.15 * spread[0]:
+    poses, unknowns = _orientations(v), sum(p.shape.size for p in declared.parameters)
+    if poses == 1:
+        found.append("the readings never leave one orientation: turn the sensor")
+    elif poses < unknowns:
+        found.append(
+            f"these are {poses} different orientations (more than {APART:g} degrees apart) for "
+            f"{unknowns} unknowns: hold the sensor in more, or declare fewer unknowns"
+            + (" (norm-diagonal has 6)" if declared.name == "norm-triangular" else "")
+        )
+    elif spread[2] < 0.15 * spread[0]:
         found.append(
             f"the readings lie close to a plane (thickness {spread[2] / spread[0]:.1%} of their "
             "extent): tilt the sensor about another axis too"
@@ -393,7 +422,11 @@ def remarks(declared: Model, runs: Sequence[Run], values: dict[str, Array]) -> l
 
 
 def _complete(declared: Model) -> Model:
-    declared = declared.starting(automatic_start).bounded(inside_the_ball).remarking(remarks)
+    declared = (
+        declared.starting(automatic_start, many=closed_form_many)
+        .bounded(inside_the_ball)
+        .remarking(remarks)
+    )
     named = {
         "closed-form": closed_form,
         "bias-only": bias_only,

@@ -35,7 +35,7 @@ from casest import Model, Run, effect, param, signal  # noqa: E402
 from casest.closing import loop, summary  # noqa: E402
 from casest.closing.candidates import prepared  # noqa: E402
 from casest.closing.crossfit import cross_fitted, rms  # noqa: E402
-from casest.declaring.physics import cos, exp, fabs, fmax, sign, tanh  # noqa: E402
+from casest.declaring.physics import cos, exp, tanh  # noqa: E402
 from casest.declaring.shapes import each  # noqa: E402
 from casest.effects import CATALOGUE  # noqa: E402
 from casest.problem import find_model  # noqa: E402
@@ -64,6 +64,7 @@ SIZES: dict[str, dict[str, float]] = {
         "axis_delay": 0.003,
         "low_pass": 0.002,
         "saturation": 0.06,
+        "dead_zone": 0.03,
         "vibration": 0.018,
         "lever_arm": 0.002,
         "axis_wobble": 0.018,
@@ -82,6 +83,7 @@ SIZES: dict[str, dict[str, float]] = {
         "channel_bias": 3.0,
         "channel_gain": 0.15,
         "saturation": 0.06,
+        "dead_zone": 0.03,
         "table_angle": 0.002,
         "reference_drift": 5e-06,
     },
@@ -92,6 +94,7 @@ SIZES: dict[str, dict[str, float]] = {
         "signed_cubic": 1e-4,
         "cross_quadratic": 1e-3,
         "cross_axis": 4e-3,
+        "dead_zone": 0.03,
         "bias_drift": 2e-4,
         "bias_step": 0.03,
         "temperature_bias": 0.015,
@@ -123,10 +126,9 @@ ELSEWHERE = {
         "warm_tanh": 0.03,
         "product": 0.02,
         "sixth": 0.03,
-        "dead_zone": 0.1,
     },
-    "table": {"warm_exp": 0.03, "warm_tanh": 0.05, "product": 0.04, "dead_zone": 0.3},
-    "norm": {"warm_exp": 0.03, "warm_tanh": 0.05, "product": 0.04, "dead_zone": 0.3},
+    "table": {"warm_exp": 0.03, "warm_tanh": 0.05, "product": 0.04},
+    "norm": {"warm_exp": 0.03, "warm_tanh": 0.05, "product": 0.04},
 }
 #: What a formula for each must name.
 WORDS = {name: words for name, (_, words) in worlds.ELSEWHERE.items()}
@@ -259,14 +261,8 @@ def sixth(y, angle=signal(), *, k=param(each)):
     return y + k * cos(6 * angle + 0.4)
 
 
-@effect(on="output")
-def dead_zone(y, *, share=param(), width=0.1):
-    left = fmax(fabs(y) - width * (1 - exp(-(y**2) / width**2)), 0)
-    return y + share * (sign(y) * left - y)
-
-
 #: What the oracle knows of effects of no catalogue.
-KNOWN = {e.name: e for e in (warm_exp, warm_tanh, product, sixth, dead_zone)}
+KNOWN = {e.name: e for e in (warm_exp, warm_tanh, product, sixth)}
 
 
 def oracle_of(model: Model, world: worlds.World, effects: Mapping[str, float]) -> Model:
@@ -295,8 +291,6 @@ def _knowing(chosen: Any, world: worlds.World, size: float) -> Any:
         told["at"] = float(world.columns[column].mean())
     if "other" in names:
         told["other"] = float(world.columns["supply"].mean())
-    if "width" in names:
-        told["width"] = size
     if "duration" in names:
         told["duration"] = float(np.ptp(t))
     if "when" in names:

@@ -32,6 +32,8 @@ def done(
     with ProcessPoolExecutor(workers) as pool, path.open("a", encoding="utf-8") as file:
         waiting = [pool.submit(function, *arguments) for arguments in left]
         for k, ready in enumerate(as_completed(waiting), 1):
+            if ready.exception() is not None:  # what has not begun would be waited for
+                pool.shutdown(wait=False, cancel_futures=True)
             found.append(ready.result())
             file.write(json.dumps(found[-1]) + "\n")
             file.flush()

@@ -24,7 +24,7 @@ from casest import (
     unit_vector,
 )
 from casest.problem import find_model
-from casest_problems.norm import closed_form_many, norm_diagonal, norm_triangular
+from casest_problems.norm import automatic_start, closed_form_many, norm_diagonal, norm_triangular
 
 NORM = norm_triangular.having(norm=sim.GRAVITY)
 MODELS = Path(__file__).parent / "models"
@@ -82,6 +82,17 @@ def test_values_and_spread_are_those_of_one_calibration(start):
         np.testing.assert_allclose(found.std["offset"][i], one.std["offset"], rtol=1e-4)
         assert found.sigma[i] == pytest.approx(one.noise.sigma, rel=1e-9)
         assert found.rmse[i] == pytest.approx(one.rmse, rel=1e-9)
+
+
+def test_a_shipped_model_knows_where_many_sensors_start():
+    v, _ = line(40, 3)
+    found = calibrate_many(NORM, {"v": v})
+    told = calibrate_many(NORM.starting(automatic_start), {"v": v}, start=closed_form_many)
+    np.testing.assert_array_equal(found.values["scale"], told.values["scale"])
+    plain = calibrate_many(NORM.starting(automatic_start), {"v": v})
+    away = (found.values["offset"] - plain.values["offset"]) / found.std["offset"]
+    assert np.abs(away).max() < 1e-5
+    assert found.trusted.all()
 
 
 def test_the_verdict_is_that_of_one_calibration():

@@ -359,6 +359,13 @@ def test_a_value_that_is_no_such_count_is_named(tmp_path: Path, cell: str) -> No
     assert f"column temp row 1 holds {float(cell):g}, which is no int16" in message
 
 
+@pytest.mark.parametrize("written", ["/16384", "1/16384", "0.00006103515625"])
+def test_a_factor_may_be_written_as_a_number(tmp_path: Path, written: str) -> None:
+    text = "vx,vy,vz\n16384,-16384,8192\n0,1,2\n"
+    run = run_of(tmp_path, text, scales={"v": written})
+    np.testing.assert_array_equal(run.signals["v"][0], [1, -1, 0.5])
+
+
 def test_columns_that_no_signal_takes_are_scaled_too(tmp_path: Path) -> None:
     text = "vx,vy,vz,temp [raw]\n1,2,3,65236\n4,5,6,65233\n"
     run = run_of(tmp_path, text, scales={"temp": "int16/256+25"}, units={"temp": "°C"})

@@ -138,6 +138,13 @@ def test_saturation_is_clipping():
     np.testing.assert_allclose(cut, np.clip(y, -4, 4), atol=1e-14)
 
 
+def test_dead_zone_is_what_friction_takes_from_either_side():
+    y = np.array(moving(T[::20])).T
+    width = np.array([0.5, 1.0, 0.0])
+    found = applied(effects.dead_zone, y, width=width)
+    np.testing.assert_allclose(found, y - np.clip(y, -width, width), atol=1e-14)
+
+
 def test_lever_arm_adds_the_acceleration_of_a_place_further_out():
     """Centripetal, of a point on a circle: positions differentiated twice."""
     arm, step = np.array([0.3, -0.1, 0.2]), 1e-4

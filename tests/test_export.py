@@ -172,9 +172,34 @@ def test_the_json_is_applied_without_the_model(results, tmp_path, capsys):
     capsys.readouterr()
     assert command(["apply", str(path), str(results / "bath.csv")]) == 0
     rows = capsys.readouterr().out.splitlines()
-    assert rows[0] == "run,row,r,temperature [K]"
-    table = np.array([row.split(",")[1:] for row in rows[1:]], dtype=float)
+    assert rows[0] == "row,r [ohm],temperature [K]"
+    table = np.array([row.split(",") for row in rows[1:]], dtype=float)
     np.testing.assert_allclose(table[:, 2], np.linspace(270.0, 345.0, 30), atol=0.05)
+
+
+def test_the_json_takes_the_options_of_the_fit_and_prints_what_apply_prints(results, capsys):
+    """T is a signal of the fit that the correction does not need."""
+    path = exported(results / "thermistor", "json", results / "options.json")
+    told = ["--columns", "T=T", "--unit", "T=K", "--columns", "r=r"]
+    printed = []
+    for result in (path, results / "thermistor"):
+        capsys.readouterr()
+        assert command(["apply", str(result), str(results / "bath.csv"), *told]) == 0
+        printed.append(capsys.readouterr().out)
+    assert printed[0] == printed[1]
+    assert command(["apply", str(path), str(results / "bath.csv"), "--columns", "S=r"]) == 1
+    assert "no signal or column S" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["closed", "thermistor"])
+def test_the_self_test_of_the_module_passes_and_can_fail(results, tmp_path, name):
+    module = exported(results / name, "python", tmp_path / "correction.py")
+    done = subprocess.run([sys.executable, module], capture_output=True, text=True, check=True)
+    assert done.stdout.startswith("largest error ")
+    text = module.read_text(encoding="utf-8")
+    module.write_text(text.replace('"add": np.add', '"add": np.subtract'), encoding="utf-8")
+    done = subprocess.run([sys.executable, module], capture_output=True, text=True, check=False)
+    assert done.returncode == 1
 
 
 def test_outside_the_domain_every_form_says_so(results, tmp_path, capsys):

@@ -280,3 +280,31 @@ def test_the_command_line_ends_with_2_on_a_ring_and_1_on_too_few_rows(tmp_path, 
         arguments = ["calibrate", "norm-triangular", str(path), "--set", "norm=9.80665"]
         assert run(arguments) == code
         assert "casest:" in capsys.readouterr().err
+
+
+# -- what is remarked ------------------------------------------------------------------------------
+
+
+def remarked(name, directions, noise=5e-3, unit="m/s^2", norm=sim.GRAVITY):
+    rng = np.random.default_rng(2)
+    v = sim.accelerometer(rng).read(directions(rng), noise, rng)
+    runs = (Run.raw("simulated", {"v": v}, units={"v": unit} if unit else {}),)
+    return " ".join(attempt(model_of(name, norm), runs).notes)
+
+
+def test_six_faces_repeated_are_six_orientations():
+    """A Ferraris session: many rest intervals, but no more than six of them differ."""
+    said = remarked("norm-triangular", lambda rng: np.vstack([sim.six_faces(rng)] * 3))
+    assert "these are 6 different orientations" in said
+    assert "norm-diagonal has 6" in said
+    assert "orientations" not in remarked("norm-triangular", lambda rng: sim.spread_poses(24, rng))
+
+
+def test_a_sensor_that_is_never_turned_is_told_so():
+    still = np.tile([0.0, 0.6, 0.8], (50, 1))
+    assert "never leave one orientation" in remarked("norm-diagonal", lambda rng: still)
+
+
+def test_readings_ten_times_a_norm_that_nobody_set_are_metres_per_second_squared():
+    said = remarked("norm-diagonal", lambda rng: sim.spread_poses(24, rng), unit=None, norm=1.0)
+    assert "if they are in m/s^2, say --unit v=m/s^2 --set 'norm=9.80665 m/s^2'" in said

@@ -78,7 +78,16 @@ def test_the_verdict_of_a_closed_loop_is_one_sentence_on_top(browser, closed):
 def test_the_verdict_of_a_calibration_says_what_was_determined(browser, calibrated):
     browser.open(calibrated / "report.html")
     assert text(browser, "h1").startswith("Trusted: 9 unknowns determined from 24 rest intervals")
-    assert "whether the model is right is what casest close asks" in text(browser, "h1 + p")
+    assert "nothing in the residual speaks against the model" in text(browser, "h1 + p")
+    assert browser.ask("document.querySelectorAll('.doubt').length") == 0
+
+
+def test_a_residual_that_is_no_noise_is_said_at_the_top(browser, tmp_path):
+    """The shipped wheel is out of balance: its offset is far off, its fit is proved."""
+    assert run(["calibrate", "wheel", str(WHEEL), "-o", str(tmp_path)]) == 0
+    browser.open(tmp_path / "report.html")
+    assert text(browser, "h1").startswith("Trusted, but the residual is not noise")
+    assert "varies twice per turn of angle" in text(browser, "header + .doubt")
 
 
 def test_every_section_is_there_and_the_contents_lead_to_it(browser, closed):

@@ -325,6 +325,23 @@ def test_a_parquet_file_read_in_pieces_is_the_one_read_whole(tmp_path: Path, mon
     assert found.columns["run"].values.tolist() == labels
 
 
+def test_a_parquet_column_of_vectors_becomes_a_column_for_each_component(tmp_path: Path) -> None:
+    rows = np.random.default_rng(0).normal(size=(70, 3))
+    for kind in (pyarrow.list_(pyarrow.float64()), pyarrow.list_(pyarrow.float64(), 3)):
+        table = pyarrow.table({"acc": pyarrow.array(rows.tolist(), kind)})
+        pyarrow.parquet.write_table(table, tmp_path / "a.parquet")
+        found = read_table(tmp_path / "a.parquet")
+        assert list(found.columns) == ["acc[0]", "acc[1]", "acc[2]"]
+        assert np.array_equal(np.column_stack([c.values for c in found.columns.values()]), rows)
+
+
+def test_a_parquet_column_of_lists_of_several_lengths_is_named(tmp_path: Path) -> None:
+    table = pyarrow.table({"acc": [[1.0, 2.0], [3.0]]})
+    pyarrow.parquet.write_table(table, tmp_path / "a.parquet")
+    with pytest.raises(DataError, match=r"a.parquet: column acc holds lists of 1 to 2 numbers"):
+        read_table(tmp_path / "a.parquet")
+
+
 def test_parquet_keeps_units_labels_nulls_and_times(tmp_path: Path) -> None:
     vx = pyarrow.field("vx", pyarrow.float32(), metadata={"unit": "g"})
     schema = pyarrow.schema(

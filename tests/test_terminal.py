@@ -33,8 +33,12 @@ WORDS = {
     "filter": "filter bias-gravity flight.csv",
     "compare": "compare norm-diagonal poses.csv --columns v=Acc --unit v=g --starts 1 -o side",
     "simulate": "simulate norm-diagonal --directions 30 --noise 0.01 --set norm=9.81 -o made",
+    "close in motion, kept": "close bias-gravity flight.csv -o moved",
     "apply": "apply fit poses.csv --columns v=Acc --unit v=g -o fit/corrected.csv",
     "export": "export fit --to c -o fit/correction.c",
+    "export to python": "export fit --to python -o fit/correction.py",
+    "export to json": "export fit --to json -o fit/correction.json",
+    "apply json": "apply fit/correction.json poses.csv --columns v=Acc --unit v=g -o again.csv",
     "list": "list",
 }
 
@@ -101,6 +105,9 @@ def nexts(text: str) -> list[str]:
         ("filter", ["filter", "observe", "close"]),
         ("compare", ["calibrate"]),
         ("simulate", ["calibrate"]),
+        ("close in motion, kept", ["filter", "observe"]),
+        ("apply", ["export"]),
+        ("export to json", ["apply"]),
     ],
 )
 def test_the_next_command_can_be_typed_as_it_stands(said, name, expected):
@@ -117,6 +124,12 @@ def test_after_an_export_comes_its_self_test(said):
     assert nexts(said["export"]) == [
         "cc -DCASEST_SELF_TEST fit/correction.c -lm -o self-test && ./self-test"
     ]
+    assert nexts(said["export to python"]) == ["python fit/correction.py"]
+
+
+def test_every_command_that_left_files_says_what_to_type_next(said):
+    for name, text in said.items():
+        assert ("Written: " in text) <= ("Next: " in text), name
 
 
 def test_a_long_command_continues_as_a_shell_reads_it():

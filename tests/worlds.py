@@ -166,6 +166,7 @@ ON_READING: dict[str, Bend] = {
     "vibration": lambda y, s, w: y + s * SHARES * np.sin(2 * np.pi * 17.3 * w.t + 0.7)[:, None],
     "saturation": _limited,
     "hysteresis": _lagging,
+    "dead_zone": lambda y, s, _: y - np.clip(y, -s * np.abs(SHARES), s * np.abs(SHARES)),
 }
 #: Effects that no catalogue has: (what happens, the column or quantity that a formula must name).
 ELSEWHERE: dict[str, tuple[Bend, tuple[str, ...]]] = {
@@ -187,10 +188,6 @@ ELSEWHERE: dict[str, tuple[Bend, tuple[str, ...]]] = {
         ("temperature", "supply"),
     ),
     "sixth": (lambda y, s, w: y + s * SHARES * np.cos(6 * w.angle + 0.4)[:, None], ("angle",)),
-    "dead_zone": (
-        lambda y, s, _: np.sign(y) * np.maximum(np.abs(y) - s * (1 - np.exp(-(y**2) / s**2)), 0),
-        ("reading", "specific_force", "corrected"),
-    ),
     "warm_sine": (
         lambda y, s, w: (
             y + s * SHARES * np.sin(2 * np.pi * w.columns["temperature"] / 2.5)[:, None]

@@ -62,6 +62,7 @@ def calibrate(model_name: str, data: tuple[str, ...], **options: Any) -> int:
 def calibration(model_name: str, data: Sequence[str], options: Options, command: str) -> int:
     """Read, fit, save, print; the exit code says whether the estimate is trusted."""
     from casest import estimate, result, terminal, unseen
+    from casest.closing import doubt
     from casest.report import calibration_page
     from casest.solve.interrupt import interruptible
 
@@ -75,8 +76,14 @@ def calibration(model_name: str, data: Sequence[str], options: Options, command:
             model, runs, start=start, solver=options["solver"], seed=options["seed"]
         )
     holdout = unseen.score(found, hidden) if hidden else None
+    progress("asking whether the residual is noise")
     content = result.calibration_result(
-        found, model_name=model_name, data=data, command=command, holdout=holdout
+        found,
+        model_name=model_name,
+        data=data,
+        command=command,
+        holdout=holdout,
+        misfit=doubt.asked(found),
     )
     if options["output"]:
         progress(f"writing {options['output']}")

@@ -45,6 +45,7 @@ from casest.errors import UsageError
 def apply(result_path: Path, data: str, **options: Any) -> None:
     """Correct the readings in DATA with a saved RESULT (result.json, or its folder)."""
     from casest import applying, exporting
+    from casest.following import following
 
     arguments = reading_arguments(options)
     progress(f"correcting {data}")
@@ -55,6 +56,7 @@ def apply(result_path: Path, data: str, **options: Any) -> None:
     waiting.done()
     if path := applying.write_or_print(text, options["output"]):
         echo(f"Written: {path}")
+        echo(f"\n{following(typed(), file=path)}")
 
 
 @commands.command()
@@ -139,7 +141,7 @@ def simulation_in_motion(model_name: str, options: Options, command: str) -> Non
     paths = simulating_motion.written_motion(options["output"], made, options["seed"], command)
     for path in paths:
         echo(f"Written: {path}")
-    echo(f"\n{following(command, file=paths[0], applies=False)}")
+    echo(f"\n{following(command, file=paths[0], moving=True)}")
 
 
 def simulation(model_name: str, options: Options, command: str) -> None:
@@ -215,6 +217,7 @@ def export(result_path: Path, to: Any, output: Path | None, **options: Any) -> N
     """The correction of a saved RESULT, ready to run on the device."""
     from casest import exporting
     from casest.following import following
+    from casest.result import made_by
 
     if options["single"] and to != "c":
         raise UsageError("--float is for --to c")
@@ -225,5 +228,4 @@ def export(result_path: Path, to: Any, output: Path | None, **options: Any) -> N
         return
     write(output, text)
     echo(f"Written: {output}")
-    if words := following(typed(), file=output):
-        echo(f"\n{words}")
+    echo(f"\n{following(typed(), file=output, fitted=made_by(result_path))}")

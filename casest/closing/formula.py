@@ -41,7 +41,8 @@ from casest.noise import robust_scale
 from casest.stack import Problem
 
 if TYPE_CHECKING:
-    from casest.closing.loop import Fitted, Found, _Loop
+    from casest.closing.evidence import Fitted
+    from casest.closing.loop import Found, _Loop
 
 #: Searches: with other batches, or beside a wander.
 ATTEMPTS = 4
@@ -64,6 +65,47 @@ def try_formula(loop: _Loop, current: Fitted) -> Fitted | None:
 
     A formula that is there already gets more terms.
     """
+    sought = _sought(loop, current)
+    if sought is None:
+        return None
+    score, fitted = sought
+    fitted, replaced = _alone(loop, fitted)
+    return _kept(loop, current, score, fitted, replaced)
+
+
+def formula_instead(loop: _Loop, declared: Fitted, current: Fitted) -> Fitted | None:
+    """The declared model with one formula, if that is clearly better than what was added to it.
+
+    A course over temperature that no effect has can look like a slope and then a step in time.
+    """
+    replaced = [f for f in loop.found if f.score is not None and f.names]
+    if not any(f.candidate.column for f in replaced) or _terms(current.model):
+        return None
+    sought = _sought(loop, declared)
+    crossed = sought and loop._crossed(sought[1])
+    if not sought or not crossed or not loop._confirmed(current, crossed):
+        return None
+    return _kept(loop, declared, sought[0], crossed, replaced)
+
+
+def _kept(
+    loop: _Loop, before: Fitted, score: Score, fitted: Fitted, replaced: Sequence[Found]
+) -> Fitted | None:
+    """The fit with the formula in the place of these effects, if it passes the loop's gate."""
+    accepted = loop._accepted(before, score, fitted)
+    if accepted is None:
+        return None
+    loop.found = [f for f in loop.found if f not in replaced and f.candidate.label != NAME]
+    for found in replaced:
+        loop._refuse(found.candidate, "no longer needed beside the formula")
+    better, candidate, gained = accepted
+    better, candidate = _with_sizes(better, candidate)
+    loop._keep(better, candidate, gained, score, [])
+    return better
+
+
+def _sought(loop: _Loop, current: Fitted) -> tuple[Score, Fitted] | None:
+    """The formula that the residual asks for, fitted; its score."""
     library, known = _Library.of(loop, current), _terms(current.model)
     if library is None or len(known) >= TERMS:
         return None
@@ -84,17 +126,7 @@ def try_formula(loop: _Loop, current: Fitted) -> Fitted | None:
             break
     else:
         return None
-    fitted, replaced = _alone(loop, fitted)
-    accepted = loop._accepted(current, score, fitted)
-    if accepted is None:
-        return None
-    loop.found = [f for f in loop.found if f not in replaced and f.candidate.label != NAME]
-    for found in replaced:
-        loop._refuse(found.candidate, "no longer needed beside the formula")
-    better, candidate, gained = accepted
-    better, candidate = _with_sizes(better, candidate)
-    loop._keep(better, candidate, gained, score, [])
-    return better
+    return score, fitted
 
 
 def _terms(model: Model) -> tuple[Term, ...]:
@@ -391,4 +423,4 @@ def _unit(unit: str, runs: Sequence[Run]) -> str:
     return "" if "[" in unit or unit == "1" else unit
 
 
-__all__ = ["try_formula"]
+__all__ = ["formula_instead", "try_formula"]

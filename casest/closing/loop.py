@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
+from casest.closing.adequacy import Misfit, misfit
+from casest.closing.axes import living_axes, narrowed, significant_axes
 from casest.closing.candidates import Candidate, Skipped, candidates, prepared
 from casest.closing.crossfit import (
     ENOUGH,
-    FAR,
     ITERATIONS,
     Folds,
     cross_fitted,
@@ -19,14 +21,25 @@ from casest.closing.crossfit import (
     gain,
     rms,
 )
-from casest.closing.formula import try_formula
+from casest.closing.evidence import (
+    FALSE_ALARM,
+    Fitted,
+    as_promising,
+    best_of_each,
+    by_evidence,
+    confirmed_by_flips,
+    cost_of,
+    not_told_apart,
+    with_rivals,
+)
+from casest.closing.formula import formula_instead, try_formula
+from casest.closing.held import held_value, holding, strides, within
 from casest.closing.profile import freed_again, profiled
 from casest.closing.restrict import restricted
-from casest.closing.score import SURVIVES, Score, scores, second_freedom, steadied, widened
+from casest.closing.score import Score, scores, steadied, widened
 from casest.closing.tails import outliers_p_value
 from casest.data.run import Run
 from casest.declaring.shapes import Array
-from casest.declaring.symbols import Parameter
 from casest.effects import CATALOGUE
 from casest.engine.kernel import patient
 from casest.engine.threads import one_thread
@@ -40,37 +53,19 @@ from casest.solve.certificate import PRACTICALLY_NULL
 from casest.solve.trust_region import trust_region
 from casest.stack import Point, Problem
 
-#: Chance, under a model that lacks nothing, that any candidate is called significant.
-FALSE_ALARM = 0.004
 #: The held-out gain must exceed this many of its own standard errors.
 HELD_OUT = 1.64
 #: What is refused where nothing can be held out.
 HELD_OUT_DATA = "held-out data"
-#: Candidates whose errors differ by fewer standard errors are not told apart; so many are named.
-ALIKE, NAMED = 2.0, 2
 #: Candidates that are refitted in a round, those that score as well as the best of them, rounds.
 CONTENDERS, MORE, ROUNDS = 6, 4, 8
-#: Steps of one size that a level or moment may take from where the grid found it.
-STRIDES = 6
-#: A parameter within so many standard deviations of null is nothing.
-NOTHING = 3.0
+#: Steps of one size that a level or moment may take from where the grid found it; rivals of the
+#: best take them too, where they leave at most this share of what it explains.
+STRIDES, NEAR = 6, 0.3
+#: Effects that are a property of the noise, and leave a model adequate.
+OF_NOISE = frozenset({"outliers", "bias_wander"})
 #: Columns of the widest model that is evaluated at once.
 WIDEST = 120
-
-
-@dataclass(frozen=True)
-class Fitted:
-    """A model fitted to all data, with its residuals and, once they are asked for, held-out ones.
-
-    `noise` is σ of one residual, from the middle of their distribution.
-    """
-
-    model: Model
-    values: Mapping[str, Array]
-    unknowns: int
-    residuals: tuple[Array, ...]
-    noise: float
-    held_out: tuple[Array, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -101,7 +96,24 @@ class Closing:
     first: tuple[Score, ...]
     runs: tuple[Run, ...]
     noise: float = 0.0
-    extra: Mapping[str, Any] = field(default_factory=dict)
+
+    @cached_property
+    def misfit(self) -> Misfit:
+        """What is left after the loop, tested beside the noise as it is."""
+        return misfit(self)
+
+    @property
+    def verdict(self) -> str | None:
+        """adequate, extended or unexplained; None where nothing can be told.
+
+        That is without a trusted estimate, and where nothing could be held out.
+        """
+        if not self.after.certificate.trusted or not self.folds.count:
+            return None
+        if self.misfit.significant:
+            return "unexplained"
+        named = {f.candidate.name for f in self.effects}
+        return "extended" if named - OF_NOISE else "adequate"
 
 
 def close(
@@ -158,6 +170,10 @@ class _Loop:
         self.refused: list[Skipped] = []
         self.skipped: list[Skipped] = []
         self.found: list[Found] = []
+        #: The last estimate that was asked for.
+        self.proved = before
+        #: Candidates as they are declared, by label: their profiles unknown, on all axes.
+        self.original: dict[str, Candidate] = {}
 
     def closed(self) -> Closing:
         """Run the loop."""
@@ -165,20 +181,23 @@ class _Loop:
         if current is None:
             raise NotTrusted("no part of the record can be predicted from the rest of it")
         first, first_scores = current, None
+        declared: Fitted | None = None
         ranked: list[Score] = []
         for _ in range(ROUNDS):
             current = self._without_outliers(current)
             ranked = self._ranked(current)
-            first_scores = first_scores or ranked
+            first_scores, declared = first_scores or ranked, declared or current
             better = self._better(current, ranked)
             if better is None:
                 better = try_formula(self, current)
+            if better is None:
+                better = formula_instead(self, declared, current)
             if better is None:
                 break
             current = better
         else:
             ranked = self._ranked(current)
-        current = self._weeded(current)
+        current = self._weeded(self._filled(current))
         after = self._certified(current) if self.found else self.before
         return Closing(
             self.before,
@@ -226,7 +245,11 @@ class _Loop:
         return replace(fitted, held_out=held_out)
 
     def _certified(self, current: Fitted) -> Estimate:
-        return attempt(current.model, self.runs, start=current.values, seed=self.seed)
+        known = self.proved
+        if current.model is not known.model or current.values is not known.values:
+            known = attempt(current.model, self.runs, start=current.values, seed=self.seed)
+        self.proved = known
+        return known
 
     def _without_outliers(self, current: Fitted) -> Fitted:
         """With the effect `outliers` where there are some: they would pull what follows."""
@@ -255,7 +278,7 @@ class _Loop:
             self.skipped = skipped
         problem = Problem(current.model, self.runs)
         readings = _readings(problem, problem.point(current.values))
-        self.original = {c.label: c for c in found}
+        self.original |= {c.label: c for c in found}
         expanded = profiled(found, self.runs, current.residuals, readings, current.noise)
         ranked: list[Score] = []
         known = self.before.noise.repeats
@@ -270,56 +293,115 @@ class _Loop:
 
     def _better(self, current: Fitted, ranked: list[Score]) -> Fitted | None:
         """The model with the best candidate that held-out data confirm; None if none does."""
-        limit = FALSE_ALARM / max(len({s.candidate.label for s in ranked}), 1)
+        limit = _limit(ranked)
         significant = [s for s in ranked if s.p_value <= limit]
-        confirmed = _confirmed_by_flips(significant, ranked)
+        confirmed = confirmed_by_flips(significant, ranked)
         if significant and not confirmed:
             self._refuse(
                 significant[0].candidate, "no more than noise that is not alike everywhere"
             )
-        tried = self._contenders(current, _best_of_each(confirmed, current))
+        if not confirmed:
+            return None
+        tried = self._contenders(current, with_rivals(confirmed, ranked), ranked)
+        return self._first_accepted(current, tried, limit) or self._two_at_once(
+            current, [pair for pair in tried if pair[0].p_value <= limit]
+        )
+
+    def _first_accepted(
+        self, current: Fitted, tried: list[tuple[Score, Fitted]], limit: float
+    ) -> Fitted | None:
+        """The model with the best of those that are significant and that held-out data confirm."""
         for k, (score, fitted) in enumerate(tried):
-            if k and not _alike(tried[0][1], fitted, tried[0][0], self.folds):
+            if score.p_value > limit:
+                continue  # It may be the cause as well, but speaks for itself too softly.
+            if k and not not_told_apart(tried[0][1], fitted, tried[0][0], self.folds):
                 break  # What explains the data clearly less well is not the cause.
             accepted = self._accepted(current, score, fitted)
             if accepted is None:
                 continue
             others = [pair for pair in tried if pair[1] is not fitted]
-            alike = [s.candidate.label for s, f in others if _alike(fitted, f, score, self.folds)]
+            alike = [
+                s.candidate.label for s, f in others if not_told_apart(fitted, f, score, self.folds)
+            ]
             self._keep(*accepted, score, alike)
             return accepted[0]
         return None
 
-    def _contenders(self, current: Fitted, best: list[Score]) -> list[tuple[Score, Fitted]]:
-        """The most promising candidates refitted, the best explanation first."""
+    def _two_at_once(self, current: Fitted, tried: list[tuple[Score, Fitted]]) -> Fitted | None:
+        """The best that was tried with the best beside it, if both together are confirmed.
+
+        In few poses, what a second cause leaves can hide the gain of the first.
+        """
+        if not tried:
+            return None
+        score, first = tried[0]
+        if _undetermined(Problem(first.model, self.runs), first.values):
+            return None
+        refused = list(self.refused)
+        ranked = self._ranked(first)
+        limit = _limit(ranked)
+        beside = [s for s in ranked if s.p_value <= limit]
+        best = self._contenders(first, beside, ranked) if beside else []
+        both = self._first_accepted(current, best, limit)
+        if both is None:
+            self.refused = refused
+            return None
+        others = [pair for pair in tried if pair[1] is not first]
+        alike = [
+            s.candidate.label for s, f in others if not_told_apart(first, f, score, self.folds)
+        ]
+        candidate, second = self._whole(score, current.model), self.found.pop()
+        self._keep(both, candidate, second.gain, score, alike)
+        self.found.append(second)
+        label = candidate.label
+        self.refused = [r for r in self.refused if r.name not in (label, second.candidate.label)]
+        return both
+
+    def _contenders(
+        self, current: Fitted, significant: Sequence[Score], ranked: Sequence[Score]
+    ) -> list[tuple[Score, Fitted]]:
+        """The most promising candidates refitted, the best explanation first.
+
+        With them those that may explain as much without being significant: they are not told apart.
+        """
+        best = best_of_each(significant, current)
         tried = self._refitted(current, best[:CONTENDERS])
         if not tried:
             return []
-        winner = tried[0][0]
-        near = [s for s in best[CONTENDERS:] if _as_promising(s, winner)]
+        winner, labels = tried[0][0], {s.candidate.label for s in best}
+        rest = [s for s in ranked if s.candidate.label not in labels]
+        near = best[CONTENDERS:] + best_of_each(rest, current)
+        near = [s for s in near if s.freedom and as_promising(s, winner)]
         tried += self._refitted(current, near[:MORE])
-        return _by_evidence(tried)
+        return by_evidence(tried)
 
     def _refitted(self, current: Fitted, chosen: Sequence[Score]) -> list[tuple[Score, Fitted]]:
         tried = [(score, self._with(current, score)) for score in chosen]
-        found = _by_evidence([(score, fitted) for score, fitted in tried if fitted is not None])
-        if found:
-            found[0] = self._sharpened(current, *found[0])
-        return found
+        found = by_evidence([(score, fitted) for score, fitted in tried if fitted is not None])
+        if not found:
+            return []
+        best = found[0] = self._sharpened(current, *found[0])
+        far = NEAR * (cost_of(current) - cost_of(best[1]))
+        return [best] + [
+            self._sharpened(current, *pair) if cost_of(pair[1]) - cost_of(best[1]) < far else pair
+            for pair in found[1:]
+        ]
 
     def _sharpened(self, current: Fitted, score: Score, fitted: Fitted) -> tuple[Score, Fitted]:
         """With the best level or moment near the one that was found: the grid is coarse."""
-        held = _held_value(score.candidate)
+        held = held_value(score.candidate)
         if held is None:
             return score, fitted
         name, kind, value = held
-        best, steps = (score, fitted), _steps(kind, value, self.runs)
+        best, steps = (score, fitted), strides(kind, value, self.runs)
         for step in steps:
             for way in (-1, 1):
                 for _ in range(STRIDES):
-                    moved = _holding(score, name, value + way * step)
+                    if not within(kind, value + way * step, self.runs, len(current.model.axes)):
+                        break
+                    moved = holding(score, name, value + way * step)
                     found = self._with(current, moved)
-                    if found is None or _cost(found) >= _cost(best[1]):
+                    if found is None or cost_of(found) >= cost_of(best[1]):
                         break
                     best, value = (moved, found), value + way * step
         return best
@@ -350,7 +432,6 @@ class _Loop:
     ) -> None:
         self.say(f"{candidate.label}: held-out error falls")
         names = tuple(p.name for p in candidate.parameters(fitted.model))
-        alike = alike[:NAMED]
         found = Found(candidate, score, score.p_value, gained, tuple(alike), names)
         self.found.append(found)
 
@@ -392,7 +473,7 @@ class _Loop:
         candidate = freed_again(score.candidate, self.original[score.candidate.label])
         if candidate.effect is None:
             return candidate
-        kept = _living_axes(score, model)
+        kept = living_axes(score, model)
         if kept is None:
             return candidate
         effect = restricted(candidate.effect, kept, model)
@@ -402,14 +483,14 @@ class _Loop:
         """Without the axes on which the effect is nothing: an axis with nothing in it stays."""
         base = replace(fitted.model, effects=fitted.model.effects[:-1])
         candidate = self._whole(score, base)
-        kept = _significant_axes(candidate, estimate)
+        kept = significant_axes(candidate, estimate)
         if kept is None or candidate.effect is None:
             return fitted, candidate
         effect = restricted(candidate.effect, kept, fitted.model)
         smaller = replace(candidate, effect=effect, traced=None)
         try:
             again = self._crossed(
-                self._fitted(smaller.added_to(base), _narrowed(fitted.values, candidate, kept))
+                self._fitted(smaller.added_to(base), narrowed(fitted.values, candidate, kept))
             )
         except CasestError:
             return fitted, candidate
@@ -425,7 +506,7 @@ class _Loop:
         effect = self.original[candidate.label].effect
         if effect is None or not effect.plain:
             return fitted, candidate
-        held, label = _held_value(candidate), candidate.label + "."
+        held, label = held_value(candidate), candidate.label + "."
         begun = effect.starting(**{held[0]: held[2]}) if held else effect
         smaller = replace(candidate, effect=begun.holding(**dict(effect.plain)), traced=None)
         values = {n: v for n, v in fitted.values.items() if not n.startswith(label)}
@@ -440,6 +521,48 @@ class _Loop:
         if not estimate.certificate.trusted:
             return fitted, candidate
         return replace(again, values=estimate.values), smaller
+
+    def _filled(self, current: Fitted) -> Fitted:
+        """Axes that were nothing beside what was still missing may be something now."""
+        for k, found in enumerate(self.found[:-1]):
+            fuller = self._on_all_axes(current, found)
+            if fuller is None:
+                continue
+            current, candidate = fuller
+            names = tuple(p.name for p in candidate.parameters(current.model))
+            self.found[k] = replace(found, candidate=candidate, names=names)
+        return current
+
+    def _on_all_axes(self, current: Fitted, found: Found) -> tuple[Fitted, Candidate] | None:
+        """The model with an effect on all the axes where it is something, if that is better."""
+        if found.score is None or found.candidate.effect is None or not found.names:
+            return None
+        label = found.candidate.label
+        declared = self.original[label].effect
+        if declared is None or declared.plain:
+            return None
+        base = replace(
+            current.model, effects=tuple(a for a in current.model.effects if a.label != label)
+        )
+        values = {k: v for k, v in current.values.items() if not k.startswith(label + ".")}
+        try:
+            whole = self._whole(found.score, base)
+            model = whole.added_to(base)
+            if Problem(model, self.runs).unknowns <= current.unknowns:
+                return None
+            fuller = self._crossed(self._fitted(model, values))
+        except CasestError:
+            return None
+        if fuller is None or self._gain(current, fuller)[0] <= 0:
+            return None
+        estimate = self._certified(fuller)
+        if not estimate.certificate.trusted:
+            return None
+        fuller = replace(fuller, values=estimate.values)
+        pruned, candidate = self._pruned(fuller, estimate, found.score)
+        if self._gain(current, pruned)[0] <= 0 or pruned.unknowns <= current.unknowns:
+            return None
+        return pruned, candidate
 
     def _weeded(self, current: Fitted) -> Fitted:
         """Each kept effect must still earn its place."""
@@ -456,37 +579,6 @@ class _Loop:
                 self._refuse(found.candidate, "no longer needed beside what came later")
                 current = without
         return current
-
-
-def _held_value(candidate: Candidate) -> tuple[str, str, float] | None:
-    """Name, kind and value of what a profile holds: a level or a moment."""
-    profile = dict(candidate.effect.profile) if candidate.effect else {}
-    for name, kind in profile.items():
-        assert candidate.effect is not None
-        for n, d in candidate.effect.declarations:
-            if n == name and kind in ("level", "time"):
-                return name, kind, float(d.array)
-    return None
-
-
-def _steps(kind: str, value: float, runs: Sequence[Run]) -> list[float]:
-    """From coarse to fine: shares of a level; samples around a moment."""
-    if kind == "level":
-        return [abs(value) * 0.02 / 4**k for k in range(4)]
-    times = [run.signals["t"][:, 0] for run in runs if "t" in run.signals]
-    gap = min((float(np.median(np.diff(t))) for t in times if len(t) > 1), default=1.0)
-    return [gap * n for n in (8, 2, 1)]
-
-
-def _holding(score: Score, name: str, value: float) -> Score:
-    """The score's candidate with another value held."""
-    assert score.candidate.effect is not None
-    effect = score.candidate.effect.holding(**{name: float(f"{value:.9g}")})
-    return replace(score, candidate=replace(score.candidate, effect=effect, traced=None))
-
-
-def _cost(fitted: Fitted) -> float:
-    return sum(float(np.sum(r**2)) for r in fitted.residuals)
 
 
 def _finite(cost: float) -> float:
@@ -519,46 +611,9 @@ def _parts(found: Sequence[Candidate], size: int) -> list[list[Candidate]]:
     return [list(found[k : k + size]) for k in range(0, len(found), size)]
 
 
-def _best_of_each(ranked: Sequence[Score], current: Fitted) -> list[Score]:
-    """The best of several trials of one effect, those that promise most first."""
-    seen: dict[str, Score] = {}
-    for score in sorted(ranked, key=lambda s: -s.gain / s.inflation):
-        seen.setdefault(score.candidate.label, score)
-    price = np.log(sum(r.size for r in current.residuals))
-    return sorted(seen.values(), key=lambda s: price * s.freedom - s.gain / s.inflation)
-
-
-def _as_promising(score: Score, winner: Score) -> bool:
-    """Could it explain as much as the winner? By the first-order gains, generously."""
-    lost = (winner.gain - score.gain) / winner.inflation
-    return lost <= 0.2 * winner.gain / winner.inflation + 4 * ALIKE**2
-
-
-def _squares(fitted: Fitted, sigma: float) -> float:
-    """Sum of squared residuals in σ², far ones counted as FAR."""
-    return sum(float(np.sum(np.minimum((r / sigma) ** 2, FAR**2))) for r in fitted.residuals)
-
-
-def _by_evidence(tried: Sequence[tuple[Score, Fitted]]) -> list[tuple[Score, Fitted]]:
-    """Best first: the sum of squares, and a price for every unknown (Schwarz 1978)."""
-    if not tried:
-        return []
-    sigma = min(fitted.noise for _, fitted in tried)
-    # What the noise's colour makes of the squares: beside the cause nothing else varies.
-    inflation = min(score.inflation for score, _ in tried)
-    price = float(np.log(sum(r.size for r in tried[0][1].residuals)))
-
-    def criterion(pair: tuple[Score, Fitted]) -> float:
-        return _squares(pair[1], sigma) / inflation + price * pair[1].unknowns
-
-    return sorted(tried, key=criterion)
-
-
-def _alike(one: Fitted, other: Fitted, score: Score, folds: Folds) -> bool:
-    """Do the data not tell two models apart? (Vuong 1989, with 2 for every unknown)."""
-    gained, error = gain(other.residuals, one.residuals, folds, one.noise)
-    lead = gained + 2 * (other.unknowns - one.unknowns) * score.inflation
-    return lead <= ALIKE * error + 1e-6 * sum(r.size for r in one.residuals)
+def _limit(ranked: Sequence[Score]) -> float:
+    """The p-value up to which a candidate is significant, beside all others."""
+    return FALSE_ALARM / max(len({s.candidate.label for s in ranked}), 1)
 
 
 def _undetermined(problem: Problem, values: Mapping[str, Array]) -> str:
@@ -570,99 +625,6 @@ def _undetermined(problem: Problem, values: Mapping[str, Array]) -> str:
     if found.singular_values[-1] < PRACTICALLY_NULL * found.singular_values[0]:
         return f"practically not determined: {found.weakest}"
     return ""
-
-
-def _confirmed_by_flips(significant: list[Score], ranked: list[Score]) -> list[Score]:
-    """The smallest p-value must be rare when the signs of the batches' noise are random.
-
-    Flipping the sign of all that a batch contributes keeps unequal noise as it is, and the
-    dependence between candidates (Westfall & Young 1993, with wild bootstrap weights).
-    """
-    if not significant:
-        return []
-    rng = np.random.default_rng(0)
-    alive = [s for s in ranked if s.freedom]
-    flips = rng.choice([-1.0, 1.0], (999, len(alive[0].batches)))
-    smallest = np.ones(len(flips))
-    from scipy.special import fdtrc
-
-    for s in alive:
-        total = flips @ s.batches
-        F = np.sum(total**2, axis=1) / s.freedom / s.inflation
-        second = second_freedom(s.freedom, s.inflation, s.effective)
-        p = np.minimum(1.0, fdtrc(s.freedom, second, F) * s.candidate.trials)
-        smallest = np.minimum(smallest, p)
-    limit = float(np.quantile(smallest, FALSE_ALARM))
-    return [s for s in significant if s.p_value <= limit]
-
-
-def _living_axes(score: Score, model: Model) -> list[int] | None:
-    """Axes on which the effect changes anything of its own; None for all, or if it has no axes.
-
-    Where the declared parameters imitate it on all axes together (a delay: a phase), as many axes
-    as are left to be determined, the plainest ones.
-    """
-    own = score.candidate.parameters(score.candidate.added_to(model))
-    size = _axes_of(own)
-    if not size or len(score.survives) != size * len(own):
-        return None
-    alive = score.survives.reshape(len(own), size).max(axis=0) > SURVIVES
-    if len(own) == 1 and score.freedom < alive.sum():
-        alive = np.isin(np.arange(size), _pivots(score.information, score.freedom))
-    return _some(alive)
-
-
-def _pivots(information: Array, count: int) -> list[int]:
-    """Unknowns that are determined beside each other: the largest pivots of Cholesky's factor."""
-    left, chosen = information.copy(), []
-    for _ in range(count):
-        k = int(np.argmax(np.diag(left)))
-        chosen.append(k)
-        left -= np.outer(left[:, k], left[k]) / left[k, k]
-    return chosen
-
-
-def _significant_axes(candidate: Candidate, estimate: Estimate) -> list[int] | None:
-    """Axes on which any parameter of the effect is beyond NOTHING standard deviations.
-
-    None where all are, or where the effect is no matter of axes.
-    """
-    own = [p for p in candidate.parameters(estimate.model) if p.shape.dims]
-    size = _axes_of(own)
-    if not size:
-        return None
-    z = np.zeros(size)
-    for p in own:
-        with np.errstate(all="ignore"):
-            z = np.maximum(z, np.abs(estimate.values[p.name] / estimate.std[p.name]))
-    return _some(z > NOTHING)
-
-
-def _axes_of(own: Sequence[Parameter]) -> int:
-    """How many axes the parameters have, one number each; 0 where that is no matter of axes."""
-    vectors = all(p.shape.kind == "array" and len(p.shape.dims) == 1 for p in own)
-    sizes = {p.shape.size for p in own}
-    per_run = any(p.scope == "run" for p in own)
-    return 0 if not vectors or per_run or len(sizes) != 1 else next(iter(sizes))
-
-
-def _some(kept: Any) -> list[int] | None:
-    """Where it is true, unless that is everywhere or nowhere."""
-    return [int(i) for i in np.flatnonzero(kept)] if 0 < np.sum(kept) < len(kept) else None
-
-
-def _narrowed(
-    values: Mapping[str, Array], candidate: Candidate, kept: list[int]
-) -> dict[str, Array]:
-    """Values of the restricted effect's unknowns, from those of the whole one."""
-    found: dict[str, Array] = {}
-    for name, value in values.items():
-        if not name.startswith(candidate.label + ".") or np.ndim(value) != 1:
-            found[name] = value
-            continue
-        for i in kept:
-            found[f"{name}_{'xyz'[i] if len(value) == 3 else i}"] = np.asarray(value[i])
-    return found
 
 
 __all__ = ["Closing", "Found", "close", "rms"]

@@ -18,6 +18,10 @@ from casest.declaring.shapes import Array
 
 #: Lines of the periodogram, moments and levels that are tried.
 LINES, MOMENTS, LEVELS = 4, 3, 3
+#: Moments that are tried where the residual does not say: an implicit one has no axes of its own.
+EVEN = 15
+#: Residuals before and after a moment, at least: three poses at the end are fitted by any step.
+BESIDE = 8
 #: Share of the readings that the lowest level lets through, and fewest beyond the highest.
 LOWEST, FEWEST = 0.7, 6
 #: Samples of the longest periodogram.
@@ -71,7 +75,7 @@ def _values(
     if kind == "frequency":
         return _lines(runs, residuals)
     if kind == "time":
-        return _moments(runs, residuals)
+        return _moments(runs, residuals) if readings is not None else _even(runs, residuals)
     if readings is None:
         return [], 1
     return _levels(np.concatenate(residuals), np.concatenate(readings))
@@ -90,8 +94,11 @@ def _levels(r: Array, y: Array) -> tuple[list[float], int]:
     level = size[beyond]
     n, first, second, plain, product = sums[beyond - 1].T
     spread = second - 2 * level * first + n * level**2
-    gain = (product - level * plain) ** 2 / np.maximum(spread, 1e-300)
-    best = np.argsort(-gain)[:LEVELS]
+    # Rows of one pose are predicted alike: what nothing exceeds but by rounding is no level.
+    exceeded = spread > 1e-9 * second
+    gain = np.where(exceeded, (product - level * plain) ** 2 / np.maximum(spread, 1e-300), 0.0)
+    _, once = np.unique(level, return_index=True)
+    best = sorted((k for k in once if gain[k] > 0), key=lambda k: -gain[k])[:LEVELS]
     return [float(level[k]) for k in best], len(beyond)
 
 
@@ -147,13 +154,29 @@ def _moments(runs: Sequence[Run], residuals: Sequence[Array]) -> tuple[list[floa
     return [when for _, when in found[:MOMENTS]], max(int(8 * np.log(max(count, 2))), 1)
 
 
+def _even(runs: Sequence[Run], residuals: Sequence[Array]) -> tuple[list[float], int]:
+    """Moments (s) that cut the longest run into parts of as many samples."""
+    run, r = max(zip(runs, residuals, strict=True), key=lambda pair: len(pair[0]))
+    edge = least_beside(*r.shape)
+    if "t" not in run.signals or len(run) <= 2 * edge:
+        return [], 1
+    t = run.signals["t"][:, 0]
+    at = np.unique(np.linspace(edge - 1, len(t) - edge - 1, EVEN).round().astype(int))
+    return [float(0.5 * (t[k] + t[k + 1])) for k in at], max(int(8 * np.log(len(t))), 1)
+
+
+def least_beside(samples: int, axes: int) -> int:
+    """Samples before and after a moment, at least."""
+    return max(2, samples // 50, -(-BESIDE // axes))
+
+
 def _bends(t: Array, r: Array) -> Iterator[tuple[float, float]]:
     n = len(t)
     k = np.arange(1, n)
     total = np.cumsum(r - r.mean(axis=0), axis=0)[:-1]
     size = np.sum(total**2, axis=1) / (k * (n - k) / n)
-    edge = max(2, n // 50)
-    size[:edge] = size[-edge:] = 0
+    edge = least_beside(*r.shape)
+    size[: edge - 1] = size[n - edge :] = 0
     for _ in range(MOMENTS):
         at = int(np.argmax(size))
         if not size[at] > 0:

@@ -87,7 +87,8 @@ def _effects(content: Mapping[str, Any]) -> Iterator[str]:
         column = f" of column {e['column']}" if e["column"] else ""
         yield item(f"{e['name']} on {e['on']}{column} (p = {e['p_value']:.1g}): {e['formula']}")
         if e["indistinguishable_from"]:
-            yield item(f"not told apart from {', '.join(e['indistinguishable_from'])}")
+            also = f" (less likely: {', '.join(e['less_likely'])})" if e["less_likely"] else ""
+            yield item(f"not told apart from {', '.join(e['indistinguishable_from'])}{also}")
             yield from (item(words) for words in e["would_separate"][:SHOWN])
 
 

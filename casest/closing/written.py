@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from casest.closing.adequacy import Misfit, misfit
 from casest.closing.crossfit import rms
 from casest.closing.loop import Closing, Found
 from casest.closing.summary import detectable, invisible
@@ -23,6 +22,9 @@ from casest.modelling.effect import Attached
 from casest.naming import unit_table
 from casest.result import attachment, calibration_result, parameter_table, plain
 from casest.stack import Problem
+
+#: How many of those that are not told apart from an effect are named beside it; others come after.
+NEAREST = 2
 
 
 def closing_result(
@@ -37,7 +39,7 @@ def closing_result(
 
     `held_out` are residuals before and after on a record of its own; else the cross-fitted ones.
     """
-    left = misfit(closing)
+    left = closing.misfit
     common = calibration_result(closing.after, model_name=model_name, data=data, command=command)
     estimate = common.pop("estimate")
     before, after = held_out or (closing.before_held_out, closing.after_held_out)
@@ -50,8 +52,7 @@ def closing_result(
     ordered = {k: common[k] for k in first[:place]} | sections
     ordered |= {k: common[k] for k in first[place:]}
     ordered["trusted"] = closing.after.certificate.trusted
-    judged = ordered["trusted"] and closing.folds.count > 0
-    ordered["verdict"] = verdict(closing, left) if judged else None
+    ordered["verdict"] = closing.verdict
     ordered["noise"] |= left.noise
     ordered["effects"] = [_effect(f, closing) for f in closing.effects]
     ordered["invisible"] = [
@@ -65,7 +66,7 @@ def closing_result(
         }
         for i in invisible(closing)
     ]
-    fraction = left.fraction if judged else np.nan
+    fraction = np.nan if closing.verdict is None else left.fraction
     ordered["unexplained"] = {"fraction": plain(fraction), "where": left.where}
     ordered["moved"] = _moved(closing)
     ordered["smallest_detectable"] = [
@@ -75,15 +76,6 @@ def closing_result(
     ordered["refused"] = [{"name": s.name, "reason": s.reason} for s in closing.refused]
     ordered["not_tried"] = [{"name": s.name, "reason": s.reason} for s in closing.skipped]
     return ordered
-
-
-def verdict(closing: Closing, left: Misfit) -> str:
-    """adequate, extended or unexplained."""
-    if left.significant:
-        return "unexplained"
-    of_noise = {"outliers", "bias_wander"}
-    named = {f.candidate.name for f in closing.effects}
-    return "extended" if named - of_noise else "adequate"
 
 
 def _section(estimate: Estimate, closing: Closing, held_out: Sequence[Array]) -> dict[str, Any]:
@@ -116,7 +108,8 @@ def _effect(found: Found, closing: Closing) -> dict[str, Any]:
         "p_value": plain(found.p_value),
         "holdout_gain": plain(found.gain),
         "formula": _formula(found, attached),
-        "indistinguishable_from": list(found.indistinguishable_from),
+        "indistinguishable_from": list(found.indistinguishable_from[:NEAREST]),
+        "less_likely": list(found.indistinguishable_from[NEAREST:]),
         "would_separate": _separating(found, closing),
     } | ({} if attached is None else attachment(attached))
 
@@ -155,7 +148,7 @@ def _separating(found: Found, closing: Closing) -> list[str]:
     """Measurements that would separate the effect from those that explain the data as well."""
     by_label = {s.candidate.label: s.candidate for s in closing.first}
     said = []
-    for label in found.indistinguishable_from:
+    for label in found.indistinguishable_from[:NEAREST]:
         other = by_label.get(label)
         if other is not None and other.effect is not None and other.effect.shown_by:
             said.append(f"{label}: {other.effect.shown_by}")

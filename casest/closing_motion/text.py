@@ -31,7 +31,8 @@ def motion_text(content: Mapping[str, Any], output: Path | None) -> str:
     ]
     if output is not None:
         blocks.append(f"Written: {output}/report.html, result.json, residuals.csv")
-    blocks.append(following(content["reproduce"]["command"], output, applies=False))
+    typed, trusted = content["reproduce"]["command"], content["trusted"]
+    blocks.append(following(typed, output, trusted=trusted, moving=True))
     return "\n\n".join(b for b in blocks if b)
 
 

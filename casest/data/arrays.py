@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -18,6 +19,7 @@ from casest.errors import DataError
 PIECE = 65_536
 _TEXT = ("bool", "string", "large_string", "dictionary")
 _NUMBER = ("timestamp", "int", "uint", "float", "double", "halffloat", "decimal")
+_VECTOR = re.compile(r"(large_|fixed_size_)?list<\w+: (u?int\d+|float|double|halffloat)\b")
 
 
 def read_npy(file: Path) -> Contents:
@@ -75,6 +77,8 @@ def read_parquet(file: Path) -> Contents:
     try:
         table = pyarrow.parquet.ParquetFile(str(file), pre_buffer=False)
         columns, notes = _parquet_columns(table)
+    except DataError as error:
+        raise DataError(f"{file}: {error}") from error
     except (pyarrow.ArrowException, OSError) as error:
         text = str(error).splitlines()[0]
         raise DataError(f"{file}: cannot be read as Parquet ({text})") from error
@@ -89,11 +93,16 @@ def _parquet_columns(table: Any) -> tuple[list[Column], list[str]]:
         for name, kind in kinds.items()
         if kind.startswith(_NUMBER)
     }
-    first, wanted = 0, [*texts, *numbers]
+    lists: dict[str, list[NDArray[np.float64]]] = {
+        name: [] for name, kind in kinds.items() if _VECTOR.match(kind)
+    }
+    first, wanted = 0, [*texts, *numbers, *lists]
     for piece in table.iter_batches(batch_size=PIECE, columns=wanted) if wanted else ():
         for name, values in zip(piece.schema.names, piece.columns, strict=True):
             if name in numbers:
                 numbers[name][first : first + len(values)] = _floats(values, kinds[name])
+            elif name in lists:
+                lists[name].append(_vectors(values, name))
             else:
                 texts[name] += ["" if v is None else str(v) for v in values.to_pylist()]
         first += len(piece)
@@ -107,9 +116,27 @@ def _parquet_columns(table: Any) -> tuple[list[Column], list[str]]:
             columns.append(numeric_column(header, numbers[entry.name], None))
         elif entry.name in texts:
             columns.append(text_column(header, texts[entry.name]))
+        elif lists.get(entry.name):
+            whole = np.vstack(lists[entry.name])
+            columns += [
+                numeric_column(header.replace(entry.name, f"{entry.name}[{k}]", 1), x, None)
+                for k, x in enumerate(whole.T)
+            ]
         else:
             notes.append(f"column {entry.name} of type {kinds[entry.name]} left out")
     return columns, notes
+
+
+def _vectors(values: Any, name: str) -> NDArray[np.float64]:
+    """Rows (N, size) of a column of lists that all have one length."""
+    flat = np.asarray(values.flatten().to_numpy(zero_copy_only=False), dtype=np.float64)
+    sizes = {len(row) if row is not None else 0 for row in values.to_pylist()}
+    if len(sizes) != 1:
+        raise DataError(
+            f"column {name} holds lists of {min(sizes)} to {max(sizes)} numbers: a vector has "
+            "as many in each row"
+        )
+    return flat.reshape(len(values), -1)
 
 
 def _floats(values: Any, kind: str) -> NDArray[np.float64]:

@@ -56,7 +56,7 @@ class Scale:
 
 
 def parse_scale(text: str) -> Scale:
-    """Read `int16/256+25`, `/131`, `*0.001-2`; steps apply from left to right.
+    """Read `int16/256+25`, `/131`, `0.001-2`; steps apply from left to right.
 
     Raises UsageError that says how a scale is written.
     """
@@ -64,6 +64,8 @@ def parse_scale(text: str) -> Scale:
     found = re.match(r"u?int\d+", rest)
     kind = found[0] if found else None
     rest = rest[len(kind) :] if kind else rest
+    if kind is None and re.match(_NUMBER, rest):  # 1/16384 is a factor and a divisor
+        rest = f"*{rest}"
     steps = []
     while rest:
         step = _STEP.match(rest)
@@ -78,6 +80,6 @@ def parse_scale(text: str) -> Scale:
 
 def _misread(text: str, at: str) -> UsageError:
     return UsageError(
-        f"scale '{text}' is not understood at '{at}': write a type ({', '.join(_BITS)}) "
-        f"and then /number *number +number -number, for example int16/256+25"
+        f"scale '{text}' is not understood at '{at}': write /number *number +number "
+        f"-number, behind a type ({', '.join(_BITS)}) if need be: /16384, int16/256+25"
     )

@@ -97,3 +97,17 @@ def cross_quadratic(u: SX, *, k: SX = param(3, "1/[u]")) -> SX:
 def saturation(y: SX, *, share: SX = param(each), level: SX = param("[y]")) -> SX:
     """Readings beyond ±level are cut off (share 1), or compressed (share below 1)."""
     return y - share * sign(y) * fmax(fabs(y) - level, 0)
+
+
+@effect(
+    on="output",
+    typical={"width": 0.02},
+    shown_by="readings close to zero, of both signs",
+    formula="sign(y)·max(|y| − width, 0)",
+)
+def dead_zone(y: SX, *, width: SX = param(each, "[y]")) -> SX:
+    """Readings stay at zero up to ±width, and lack it beyond: friction, a comparator's threshold.
+
+    A negative width is a jump at zero instead (crossover distortion).
+    """
+    return sign(y) * fmax(fabs(y) - width, 0)

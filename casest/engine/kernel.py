@@ -28,7 +28,8 @@ from pathlib import Path
 import numpy as np
 
 from casest.engine.emit import source, source_of_sum
-from casest.engine.replay import Columns, Entry, Floats, Replay
+from casest.engine.operations import Floats
+from casest.engine.replay import Columns, Entry, Replay
 
 #: A kernel is built for at least this many samples: below, compiling costs more than it saves.
 WORTHWHILE = 5_000

@@ -4,18 +4,40 @@ from __future__ import annotations
 
 import inspect
 import json
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from casest import __version__
+from casest.declaring.shapes import Array
 from casest.export import runtime
 from casest.export.program import Program
 
+_TEST = '''
 
-def python_source(program: Program) -> str:
-    """Source of a module with `correct(x)`: the runtime's text and the program as data."""
+def largest_error() -> float:
+    """Of the values that casest computed when this was exported, relative to their size."""
+    given = np.array(INPUTS, dtype=float)
+    expected = np.array(EXPECTED, dtype=float)
+    size = np.abs(expected).max(axis=1, keepdims=True)
+    return float(np.max(np.abs(correct(given) - expected) / np.where(size > 0, size, 1.0)))
+
+
+INPUTS = {inputs}
+EXPECTED = {outputs}
+
+if __name__ == "__main__":
+    worst = largest_error()
+    print(f"largest error {{worst:.2g}} of the value")
+    raise SystemExit(0 if worst <= 1e-9 else 1)
+'''
+
+
+def python_source(program: Program, test: tuple[Array, Array]) -> str:
+    """Source of a module with `correct(x)`: the runtime's text and the program as data.
+
+    Run as a script it checks itself on `test` (inputs, corrected), as the C source does.
+    """
     text = inspect.getsource(runtime)
     _, _, body = text.partition("from __future__ import annotations\n")
     signals = ", ".join(f"{i.name} ({i.size}, {i.unit or '1'})" for i in program.inputs)
@@ -26,13 +48,12 @@ def python_source(program: Program) -> str:
         'naming the row whose reading lies outside what the model can produce.\n"""\n\n'
         "from __future__ import annotations\n"
     )
-    data = json.dumps(as_data(program))
-    lines = "\n".join(_wrapped(data))
     tail = (
-        "\n\nPROGRAM = json.loads(\n" + lines + "\n)\n\n\n"
+        f"\n\nPROGRAM = {_loaded(as_data(program))}\n\n\n"
         "def correct(x: Any) -> Any:\n"
         '    """Corrected values of every row of x."""\n'
         "    return corrected(PROGRAM, x)\n"
+        + _TEST.format(inputs=_loaded(test[0].tolist()), outputs=_loaded(test[1].tolist()))
     )
     return (
         head
@@ -44,9 +65,11 @@ def python_source(program: Program) -> str:
     )
 
 
-def _wrapped(text: str, width: int = 88) -> Sequence[str]:
+def _loaded(data: Any, width: int = 88) -> str:
+    """An expression for plain data, in lines of bounded length."""
+    text = json.dumps(data)
     pieces = [text[k : k + width] for k in range(0, len(text), width)]
-    return [f"    {piece!r}" for piece in pieces]
+    return "json.loads(\n" + "\n".join(f"    {piece!r}" for piece in pieces) + "\n)"
 
 
 def as_data(program: Program) -> dict[str, Any]:

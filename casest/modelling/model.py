@@ -38,6 +38,7 @@ class Model:
     declared: tuple[Symbol, ...]
     effects: tuple[Attached, ...] = ()
     starter: Callable[..., Any] | None = None
+    starter_of_many: Callable[..., Any] | None = None
     limiter: Callable[..., Any] | None = None
     remarker: Callable[..., Any] | None = None
     inverter: Callable[..., Any] | None = None
@@ -271,9 +272,14 @@ class Model:
             )
         return self.starting(function)
 
-    def starting(self, function: Callable[..., Any]) -> Model:
-        """A model with start values from the data: `function(model, runs) -> {name: value}`."""
-        return replace(self, starter=function)
+    def starting(
+        self, function: Callable[..., Any], *, many: Callable[..., Any] | None = None
+    ) -> Model:
+        """A model with start values from the data: `function(model, runs) -> {name: value}`.
+
+        `many` gives those of many sensors at once, for `calibrate_many`, which says what it takes.
+        """
+        return replace(self, starter=function, starter_of_many=many)
 
     def bounded(self, function: Callable[..., Any]) -> Model:
         """A model with bounds from the data: `function(model, runs) -> {name: (lower, upper)}`."""

@@ -23,9 +23,6 @@ from casest.report.story import Story
 #: Longer formulas are left to the declaration.
 READABLE = 240
 
-#: Longer formulas are left to the declaration.
-READABLE = 240
-
 
 def application(story: Story, content: Mapping[str, Any], folder: str) -> str:
     """What goes in, what is done to it in which order, what comes out, with units."""

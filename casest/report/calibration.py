@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from casest.closing.doubt import sentence as doubts
 from casest.declaring.shapes import Array
 from casest.estimate import Estimate
 from casest.report.applied import application
@@ -27,21 +28,24 @@ from casest.report.story import Story, of_calibration
 def calibration_page(estimate: Estimate, content: Mapping[str, Any], folder: str = "out") -> str:
     """`report.html` of a calibration, trusted or refused."""
     story, figures = of_calibration(estimate, content), Figures()
+    doubt, trusted = content.get("misfit"), estimate.certificate.trusted
     body = [
+        paragraph(f"Before you use these values: {doubts(doubt)}.", "doubt") if doubt else "",
         error_section(story, content, figures),
         section("residual", "Residual", residual_figures(story, figures)) if _finite(story) else "",
         parameters(story),
         uncertain(story, content),
-        section("invisible", "What stayed invisible", paragraph(
-            "A calibration proves the optimum; it does not ask whether the model is right. "
-            "`casest close` with the same arguments does, and names what these data could not show."
+        section("invisible", "What stayed invisible", paragraph(_asked(content)), paragraph(
+            "A calibration looks for no effect. `casest close` with the same arguments does, and "
+            "names what these data could not show."
         )),
         certified(story, content),
         application(story, content, folder),
         reproduction(content, content["notes"]),
     ]  # fmt: skip
-    proved = "The optimum is proved; whether the model is right is what `casest close` asks."
-    under = proved if estimate.certificate.trusted else ""
+    asked = "" if doubt is None else ", and nothing in the residual speaks against the model"
+    proved = f"The optimum is proved{asked}; what the model may lack is what `casest close` asks."
+    under = proved if trusted and not doubt else ""
     return whole(story.last.model.name, sentence(estimate, content), under, body, content, figures)
 
 
@@ -52,9 +56,24 @@ def sentence(estimate: Estimate, content: Mapping[str, Any]) -> str:
     count = sum(len(run) for run in estimate.problem.runs)
     what = "rest intervals" if estimate.problem.runs[0].spread else "samples"
     rms = with_unit(estimate.rmse, content["noise"]["unit"])
+    but = ", but the residual is not noise" if content.get("misfit") else ""
     return (
-        f"Trusted: {estimate.identifiability.unknowns} unknowns determined from {count} {what}, "
-        f"with a residual of {rms} rms."
+        f"Trusted{but}: {estimate.identifiability.unknowns} unknowns determined from {count} "
+        f"{what}, with a residual of {rms} rms."
+    )
+
+
+def _asked(content: Mapping[str, Any]) -> str:
+    """What the residual says of the model."""
+    found = content.get("misfit")
+    if found is None:
+        return "Nobody asked whether the residual is noise."
+    if found:
+        return "Something did not: the residual is no noise, as is said above."
+    return (
+        "Nothing in the residual speaks against the model: it does not depend on any column, "
+        "quantity or time, holds no line, and is as large as repeats say. What the values have "
+        "swallowed would not show there."
     )
 
 

@@ -160,7 +160,9 @@ def _effect(e: Mapping[str, Any], doc: str, story: Story) -> str:
         )
     if e["indistinguishable_from"]:
         names = ", ".join(f"`{n}`" for n in e["indistinguishable_from"])
-        evidence.append(f"These data do not tell it apart from {names}.")
+        more = ", ".join(f"`{n}`" for n in e["less_likely"])
+        more = f", nor, though they are less likely, from {more}" if more else ""
+        evidence.append(f"These data do not tell it apart from {names}{more}.")
         evidence += [f"To tell them apart, {words}." for words in e["would_separate"]]
     else:
         evidence.append("No other candidate explains the held-out data as well.")

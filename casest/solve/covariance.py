@@ -43,5 +43,6 @@ def sandwich(problem: Problem, point: Point, R: Array, correlated_over: float) -
     robust = correction * bread @ squares_of_gradients(problem, point, firsts) @ bread
     if groups >= 20 * problem.unknowns:
         return np.asarray(robust)
-    ratio = np.sqrt(np.diag(robust) / np.diag(bread))
+    with np.errstate(invalid="ignore"):  # nothing is known of an unknown that no residual has
+        ratio = np.sqrt(np.diag(robust) / np.diag(bread))
     return np.asarray(bread * np.outer(ratio, ratio))

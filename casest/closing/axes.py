@@ -1,0 +1,87 @@
+"""On which axes an effect is something: the others stay as declared."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from casest.closing.candidates import Candidate
+from casest.closing.score import SURVIVES, Score
+from casest.declaring.shapes import Array
+from casest.declaring.symbols import Parameter
+from casest.estimate import Estimate
+from casest.modelling.model import Model
+
+#: A parameter within so many standard deviations of null is nothing.
+NOTHING = 3.0
+
+
+def living_axes(score: Score, model: Model) -> list[int] | None:
+    """Axes on which the effect changes anything of its own; None for all, or if it has no axes.
+
+    Where the declared parameters imitate it on all axes together (a delay: a phase), as many axes
+    as are left to be determined, the plainest ones.
+    """
+    own = score.candidate.parameters(score.candidate.added_to(model))
+    size = axes_of(own)
+    if not size or len(score.survives) != size * len(own):
+        return None
+    alive = score.survives.reshape(len(own), size).max(axis=0) > SURVIVES
+    if len(own) == 1 and score.freedom < alive.sum():
+        alive = np.isin(np.arange(size), pivots(score.information, score.freedom))
+    return in_part(alive)
+
+
+def pivots(information: Array, count: int) -> list[int]:
+    """Unknowns that are determined beside each other: the largest pivots of Cholesky's factor."""
+    left, chosen = information.copy(), []
+    for _ in range(count):
+        k = int(np.argmax(np.diag(left)))
+        chosen.append(k)
+        left -= np.outer(left[:, k], left[k]) / left[k, k]
+    return chosen
+
+
+def significant_axes(candidate: Candidate, estimate: Estimate) -> list[int] | None:
+    """Axes on which any parameter of the effect is beyond NOTHING standard deviations.
+
+    None where all are, or where the effect is no matter of axes.
+    """
+    own = [p for p in candidate.parameters(estimate.model) if p.shape.dims]
+    size = axes_of(own)
+    if not size:
+        return None
+    z = np.zeros(size)
+    for p in own:
+        with np.errstate(all="ignore"):
+            z = np.maximum(z, np.abs(estimate.values[p.name] / estimate.std[p.name]))
+    return in_part(z > NOTHING)
+
+
+def axes_of(own: Sequence[Parameter]) -> int:
+    """How many axes the parameters have, one number each; 0 where that is no matter of axes."""
+    vectors = all(p.shape.kind == "array" and len(p.shape.dims) == 1 for p in own)
+    sizes = {p.shape.size for p in own}
+    per_run = any(p.scope == "run" for p in own)
+    return 0 if not vectors or per_run or len(sizes) != 1 else next(iter(sizes))
+
+
+def in_part(kept: Any) -> list[int] | None:
+    """Where it is true, unless that is everywhere or nowhere."""
+    return [int(i) for i in np.flatnonzero(kept)] if 0 < np.sum(kept) < len(kept) else None
+
+
+def narrowed(
+    values: Mapping[str, Array], candidate: Candidate, kept: list[int]
+) -> dict[str, Array]:
+    """Values of the restricted effect's unknowns, from those of the whole one."""
+    found: dict[str, Array] = {}
+    for name, value in values.items():
+        if not name.startswith(candidate.label + ".") or np.ndim(value) != 1:
+            found[name] = value
+            continue
+        for i in kept:
+            found[f"{name}_{'xyz'[i] if len(value) == 3 else i}"] = np.asarray(value[i])
+    return found

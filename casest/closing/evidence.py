@@ -1,0 +1,121 @@
+"""Which candidate explains the data best, and which are not told apart from it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from casest.closing.crossfit import FAR, Folds, gain
+from casest.closing.held import held_value
+from casest.closing.score import Score, second_freedom
+from casest.declaring.shapes import Array
+from casest.modelling.model import Model
+
+#: Chance, under a model that lacks nothing, that any candidate is called significant.
+FALSE_ALARM = 0.004
+#: Candidates whose errors differ by fewer standard errors are not told apart.
+ALIKE = 2.0
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A model fitted to all data, with its residuals and, once they are asked for, held-out ones.
+
+    `noise` is σ of one residual, from the middle of their distribution.
+    """
+
+    model: Model
+    values: Mapping[str, Array]
+    unknowns: int
+    residuals: tuple[Array, ...]
+    noise: float
+    held_out: tuple[Array, ...] = ()
+
+
+def cost_of(fitted: Fitted) -> float:
+    """Sum of squared residuals."""
+    return sum(float(np.sum(r**2)) for r in fitted.residuals)
+
+
+def clipped_squares(fitted: Fitted, sigma: float) -> float:
+    """Sum of squared residuals in σ², far ones counted as FAR."""
+    return sum(float(np.sum(np.minimum((r / sigma) ** 2, FAR**2))) for r in fitted.residuals)
+
+
+def unknowns_of(score: Score, fitted: Fitted) -> int:
+    """Of the fit; a level or moment that was looked for is one more."""
+    return fitted.unknowns + (held_value(score.candidate) is not None)
+
+
+def by_evidence(tried: Sequence[tuple[Score, Fitted]]) -> list[tuple[Score, Fitted]]:
+    """Best first: the sum of squares, and a price for every unknown (Schwarz 1978)."""
+    if not tried:
+        return []
+    sigma = min(fitted.noise for _, fitted in tried)
+    # What the noise's colour makes of the squares: beside the cause nothing else varies.
+    inflation = min(score.inflation for score, _ in tried)
+    price = float(np.log(sum(r.size for r in tried[0][1].residuals)))
+
+    def criterion(pair: tuple[Score, Fitted]) -> float:
+        return clipped_squares(pair[1], sigma) / inflation + price * unknowns_of(*pair)
+
+    return sorted(tried, key=criterion)
+
+
+def best_of_each(ranked: Sequence[Score], current: Fitted) -> list[Score]:
+    """The best of several trials of one effect, those that promise most first."""
+    seen: dict[str, Score] = {}
+    for score in sorted(ranked, key=lambda s: -s.gain / s.inflation):
+        seen.setdefault(score.candidate.label, score)
+    price = np.log(sum(r.size for r in current.residuals))
+    return sorted(seen.values(), key=lambda s: price * s.freedom - s.gain / s.inflation)
+
+
+def with_rivals(confirmed: Sequence[Score], ranked: Sequence[Score]) -> list[Score]:
+    """Those that are significant, and what explains more than they do.
+
+    That something is missing is known then, at their p-value. A limit that two poses reach is never
+    significant by itself, and may be the cause of all that others explain in part.
+    """
+    most, proof = max(s.gain for s in confirmed), min(s.p_value for s in confirmed)
+    more = [s for s in ranked if s not in confirmed and s.gain > most]
+    return [*confirmed, *(replace(s, p_value=min(s.p_value, proof)) for s in more)]
+
+
+def as_promising(score: Score, winner: Score) -> bool:
+    """Could it explain as much as the winner? By the first-order gains, generously."""
+    lost = (winner.gain - score.gain) / winner.inflation
+    return lost <= 0.2 * winner.gain / winner.inflation + 4 * ALIKE**2
+
+
+def not_told_apart(one: Fitted, other: Fitted, score: Score, folds: Folds) -> bool:
+    """Do the data not tell two models apart? (Vuong 1989, with 2 for every unknown)."""
+    gained, error = gain(other.residuals, one.residuals, folds, one.noise)
+    lead = gained + 2 * (other.unknowns - one.unknowns) * score.inflation
+    return lead <= ALIKE * error + 1e-6 * sum(r.size for r in one.residuals)
+
+
+def confirmed_by_flips(significant: list[Score], ranked: list[Score]) -> list[Score]:
+    """The smallest p-value must be rare when the signs of the batches' noise are random.
+
+    Flipping the sign of all that a batch contributes keeps unequal noise as it is, and the
+    dependence between candidates (Westfall & Young 1993, with wild bootstrap weights).
+    """
+    if not significant:
+        return []
+    rng = np.random.default_rng(0)
+    alive = [s for s in ranked if s.freedom]
+    flips = rng.choice([-1.0, 1.0], (999, len(alive[0].batches)))
+    smallest = np.ones(len(flips))
+    from scipy.special import fdtrc
+
+    for s in alive:
+        total = flips @ s.batches
+        F = np.sum(total**2, axis=1) / s.freedom / s.inflation
+        second = second_freedom(s.freedom, s.inflation, s.effective)
+        p = np.minimum(1.0, fdtrc(s.freedom, second, F) * s.candidate.trials)
+        smallest = np.minimum(smallest, p)
+    limit = float(np.quantile(smallest, FALSE_ALARM))
+    return [s for s in significant if s.p_value <= limit]
