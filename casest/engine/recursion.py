@@ -17,7 +17,7 @@ import casadi as ca
 import numpy as np
 
 from casest.engine.kernel import library
-from casest.engine.replay import Floats
+from casest.engine.operations import Floats
 
 #: Steps that CasADi runs in one call.
 CHUNK = 500
