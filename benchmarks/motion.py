@@ -12,6 +12,7 @@ import argparse
 import os
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 
@@ -74,7 +75,7 @@ def by_ivp(
 def by_loop(system: Linearised) -> Array:
     """The filter sample by sample in NumPy, the transitions given; returns the last state."""
     model, (Phi, u) = bias_gravity, transitions(system)
-    Q, R = process_noise(system, model.process, Phi), model.noise * RATE
+    Q, R = process_noise(system, model.process), model.noise * RATE
     x, P, eye = model.start, model.start_covariance, np.eye(model.size)
     for k in range(len(Phi)):
         x, P = Phi[k] @ x + u[k], Phi[k] @ P @ Phi[k].T + Q[k]
@@ -94,7 +95,7 @@ def main() -> None:
     weight = np.linalg.inv(bias_gravity.noise)
     info, noise = system.C[0].T @ weight @ system.C[0], bias_gravity.process
     jobs: dict[str, Callable[[], object]] = {
-        "Gramian": lambda: gramian(bias_gravity, system),
+        "Gramian": lambda: gramian(bias_gravity, replace(system)),
         "Riccati": lambda: riccati(bias_gravity, system),
         "filter": lambda: filtered(bias_gravity, run, smooth=False),
         "filter and smoother": lambda: filtered(bias_gravity, run),
@@ -114,7 +115,7 @@ def main() -> None:
     half = run.take(slice(len(run) // 2))
     part = linearised(bias_gravity, half)
     halves = {
-        "Gramian": timed(lambda: gramian(bias_gravity, part)),
+        "Gramian": timed(lambda: gramian(bias_gravity, replace(part))),
         "Riccati": timed(lambda: riccati(bias_gravity, part)),
         "filter": timed(lambda: filtered(bias_gravity, half, smooth=False)),
         "filter and smoother": timed(lambda: filtered(bias_gravity, half)),

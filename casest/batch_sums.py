@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from casest.declaring.shapes import Array
 from casest.engine import Plan, Replay
-from casest.engine.replay import KERNELS, Entry, Kernel
+from casest.engine.operations import KERNELS, Kernel
+from casest.engine.replay import Entry
 
 #: Numbers per call: enough to hide the cost of the call, few enough to stay in the cache.
 NUMBERS = 16384

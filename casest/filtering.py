@@ -14,7 +14,7 @@ from casest.data.run import Run
 from casest.dynamics import Dynamics
 from casest.dynamics.filter import Filtered, filtered
 from casest.intensities import Tuned, intensities, units
-from casest.observing import assumed, note_lines, number_or_not, wrapped
+from casest.observing import assumed, note_lines, number_or_not, too_short, wrapped
 from casest.result import plain
 
 
@@ -43,7 +43,7 @@ def follow(
     return {
         "casest": __version__,
         "model": model.name,
-        "notes": [*assumed(run), *_unsettled(found)],
+        "notes": [*assumed(run), *_unsettled(found), *_too_short(run, model.size)],
         "samples": len(found.time),
         "states": final,
         "intensities": {
@@ -75,6 +75,11 @@ def _unsettled(found: Filtered) -> list[str]:
         "the smoother's rounds did not settle: its states are those of one pass; nearer start "
         "values or a smaller std at the beginning may help"
     ]
+
+
+def _too_short(run: Run, unknowns: int) -> list[str]:
+    words = too_short(run, unknowns)
+    return [f"{w}; the states are mostly what was declared of the start" for w in words]
 
 
 def _normalised_mean(found: Filtered) -> float:

@@ -107,7 +107,7 @@ def observe_motion(model: Dynamics, run: Run, window: float | None = None) -> di
     return {
         "casest": __version__,
         "model": model.name,
-        "notes": [*assumed(run), *_readings_alone(model), *_too_short(seen, len(run), duration)],
+        "notes": [*assumed(run), *_readings_alone(model), *_too_short(seen, run)],
         "rank": seen.rank,
         "unknowns": seen.unknowns,
         "structural_rank": _structural_rank(model),
@@ -138,8 +138,8 @@ def assumed(run: Run) -> list[str]:
         notes.append(
             f"{gaps.size} {'gap' if gaps.size == 1 else 'gaps'} in time, the longest of "
             f"{step[worst]:.3g} s after row {int(run.rows[worst])} (t = {time[worst]:.6g} s): "
-            "inputs were taken as straight lines across; the driving noise does not cover what "
-            "happened there"
+            "inputs were taken as straight lines across; the states that they drive are known "
+            "after it no better than at the beginning"
         )
     return notes
 
@@ -152,12 +152,21 @@ def _readings_alone(model: Dynamics) -> list[str]:
     ]
 
 
-def _too_short(seen: Observed, samples: int, duration: float) -> list[str]:
-    if seen.rank == seen.unknowns or samples > seen.unknowns:
+def _too_short(seen: Observed, run: Run) -> list[str]:
+    if seen.rank == seen.unknowns:
         return []
+    words = too_short(run, seen.unknowns)
+    return [f"{w}; what is called unobservable may only need a longer one" for w in words]
+
+
+def too_short(run: Run, unknowns: int) -> list[str]:
+    """Whether a record has no more samples than there are states to tell apart."""
+    if len(run) > unknowns:
+        return []
+    duration = float(np.ptp(np.asarray(run.time, float)))
     return [
-        f"the trajectory is too short for the question: {samples} samples over {duration:.3g} s "
-        f"for {seen.unknowns} unknowns; what is called unobservable may only need a longer one"
+        f"the trajectory is too short for the question: {len(run)} samples over {duration:.3g} s "
+        f"for {unknowns} unknowns"
     ]
 
 

@@ -21,9 +21,8 @@ from casest.modelling.tracing import function_of, sample_symbol
 def residual_and_jacobian(model: Model) -> Replay:
     """r and ∂r/∂x of one sample; kept, for many problems may have the same model."""
     t = model.traced
-    return Replay(
-        function_of(model, {"r": t.expression, "J": ca.jacobian(t.expression, t.coordinates)})
-    )
+    J = ca.jacobian(t.expression, t.coordinates)
+    return Replay(function_of(model, {"r": t.expression, "J": J}), grouped=(0, 1))
 
 
 @lru_cache(maxsize=64)

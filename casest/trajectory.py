@@ -18,7 +18,8 @@ from casest.declaring.physics import SX
 from casest.declaring.shapes import Array
 from casest.dynamics.declare import Dynamics
 from casest.dynamics.extended import over_samples, replay
-from casest.dynamics.stepping import CHUNK, run_steps
+from casest.dynamics.stepping import run_steps
+from casest.engine import Recursion
 from casest.errors import CasestError, UsageError
 from casest.modelling.tracing import flat
 
@@ -172,7 +173,7 @@ def _course(model: Dynamics, fine: Array, u: Array, first: int, rng: np.random.G
 
 
 def _followed(
-    step: Any,
+    step: Recursion,
     given: Curve,
     start: Array,
     time: Array,
@@ -189,7 +190,7 @@ def _followed(
     return np.concatenate([parts[0][:0:-1], parts[1]])
 
 
-def _way(step: Any, given: Curve, start: Array, time: Array, noise: Array) -> Array:
+def _way(step: Recursion, given: Curve, start: Array, time: Array, noise: Array) -> Array:
     if len(time) < 2:
         return start[None]
     h = np.diff(time)
@@ -198,8 +199,8 @@ def _way(step: Any, given: Curve, start: Array, time: Array, noise: Array) -> Ar
     return np.concatenate([start[None], after])
 
 
-def _step(model: Dynamics, leads: Mapping[str, str]) -> Any:
-    """(x, [inputs at the beginning, middle and end; h; noise]) -> x after it, many at a time."""
+def _step(model: Dynamics, leads: Mapping[str, str]) -> Recursion:
+    """(x, [inputs at the beginning, middle and end; h; noise]) -> x after it."""
     rate, wide = _rate(model, leads)
     x, h = ca.SX.sym("x", model.size), ca.SX.sym("h")
     u, middle, v = (ca.SX.sym(name, wide) for name in "umv")
@@ -209,8 +210,8 @@ def _step(model: Dynamics, leads: Mapping[str, str]) -> Any:
     c = rate(x + 0.5 * h * b, middle)[0]
     d = rate(x + h * c, v)[0]
     after = x + h / 6 * (a + 2 * b + 2 * c + d) + noise
-    made = ca.Function("step", [x, ca.vertcat(u, middle, v, h, noise)], [after], {"cse": True})
-    return made.mapaccum("motion", CHUNK)
+    numbers = ca.vertcat(u, middle, v, h, noise)
+    return Recursion(ca.Function("step", [x, numbers], [after], {"cse": True}))
 
 
 def _rate(model: Dynamics, leads: Mapping[str, str]) -> tuple[Any, int]:

@@ -42,6 +42,7 @@ NULLS, SEEDS = 120, 5
 WORLDS: dict[str, tuple[Sensors, str, str]] = {
     "gyro bias": (Sensors(gyro_bias=(0.002, -0.001, 0.0015)), "bias of omega", "0.15 °/s"),
     "velocity delay": (Sensors(delay=0.02), "time_delay of v", "20 ms"),
+    "long velocity delay": (Sensors(delay=0.2), "time_delay of v", "200 ms"),
     "lever arm": (Sensors(lever=(0.1, -0.05, 0.07)), "lever_arm of v", "0.13 m"),
     "accelerometer scale": (Sensors(gain=0.01), "gain of a", "1 %"),
     "coloured noise": (

@@ -11,8 +11,9 @@ import pytest
 from flights import Sensors
 
 from casest import DataError, Run, cli, cross, norm_2, signal
+from casest.closing_motion.delays import by_reading, shifted
 from casest.closing_motion.effects import Colour, candidates, extended
-from casest.closing_motion.fitting import fitted
+from casest.closing_motion.fitting import fitted, rise
 from casest.closing_motion.loop import close_motion
 from casest.closing_motion.score import scores
 from casest.closing_motion.sensitivity import sensitivity
@@ -55,7 +56,8 @@ def test_a_flight_that_lacks_nothing_is_adequate():
         (Sensors(gyro_bias=(0.01, -0.005, 0.004)), "bias of omega", [0.01, -0.005, 0.004], ()),
         # So large that the matched intensities swallow it at first.
         (Sensors(gyro_bias=(0.1, -0.05, 0.04)), "bias of omega", [0.1, -0.05, 0.04], ()),
-        (Sensors(delay=0.04), "time_delay of v", [0.04], ()),
+        # Not a whole number of samples, and no longer small against a period of the motion.
+        (Sensors(delay=0.31), "time_delay of v", [0.31], ()),
         # A scale of the velocity does the same: the unknown gravity follows either.
         (Sensors(gain=0.03), "gain of a", [0.03, 0.03, 0.03], ("gain of v",)),
     ],
@@ -66,11 +68,14 @@ def test_a_planted_effect_is_found_and_named_with_its_size(sensors, label, plant
     assert names(closing) == [label]
     assert closing.effects[0].indistinguishable_from == alike
     ((_, value),) = closing.after.added
-    # First order in the delay: it is small against a period of the motion.
     np.testing.assert_allclose(value, planted, atol=4 * closing.after.std.max())
     before, after = rms_settled(closing)
     assert after < before
-    assert closing.after.likelihood > closing.before.likelihood + 50
+    assert rise(closing.after, closing.before) > 50
+    # The report shows the smoother's spread, which is below the filter's at the beginning.
+    fit = closing.after.found
+    first, later = (np.diagonal(P[0]).sum() for P in (fit.P, fit.smoothed_P))
+    assert later < 0.1 * first
 
 
 def test_coloured_noise_becomes_a_state_and_nothing_else_is_named():
@@ -79,6 +84,43 @@ def test_coloured_noise_becomes_a_state_and_nothing_else_is_named():
     (effect,) = motion_result(closing, model_name="bias-gravity", data=[])["effects"]
     assert 0.2 < effect["parameters"]["correlation_time"]["value"] < 1.2
     assert 0.015 < effect["parameters"]["std"]["value"] < 0.06
+
+
+@pytest.mark.parametrize(
+    ("sensors", "found"),
+    [(Sensors(), []), (Sensors(lever=(0.3, -0.1, 0.2)), ["lever_arm of v"])],
+    ids=["nothing missing", "lever arm"],
+)
+def test_a_gap_in_time_is_no_effect_and_hides_none(sensors, found):
+    rng = np.random.default_rng(1)
+    t = np.arange(0, 40, 1 / RATE)
+    t = t[(t < 20) | (t > 24)]
+    run = flights.record(flights.somewhere(rng), t, rng, sensors, SIGMA)
+    closing = close_motion(bias_gravity, run)
+    assert names(closing) == found
+    assert closing.left.p_value > 1e-3
+
+
+def test_a_delay_is_found_where_samples_come_at_uneven_times():
+    rng = np.random.default_rng(7)
+    t = np.cumsum(rng.uniform(0.02, 0.06, 750))
+    run = flights.record(flights.somewhere(rng), t, rng, Sensors(delay=0.25), SIGMA)
+    closing = close_motion(bias_gravity, run)
+    assert names(closing) == ["time_delay of v"]
+    ((_, value),) = closing.after.added
+    assert abs(value[0] - 0.25) < 4 * closing.after.std[0]
+
+
+def test_readings_that_were_moved_are_given_back_in_their_rows():
+    run = flight(seconds=2)
+    for shift in (3, -2):
+        moved = shifted(bias_gravity, run, {"v": shift})
+        off = moved.signals["v_moved"][5:-5, 0]
+        np.testing.assert_allclose(off, shift / RATE)
+        back = by_reading(bias_gravity, {"v": shift}, moved.signals["v"])
+        kept = np.isfinite(back).all(axis=1)
+        assert np.sum(~kept) == abs(shift)
+        np.testing.assert_array_equal(back[kept], run.signals["v"][kept])
 
 
 # -- its parts ---------------------------------------------------------------------------------
@@ -104,7 +146,7 @@ def test_sensitivities_are_the_differences_of_two_filters():
 
     To 1 %, after the start: they are taken along the smoothed states, not those of the filter.
     """
-    run = flight(seed=6, seconds=20)
+    run = shifted(bias_gravity, flight(seed=6, seconds=20), {})  # says that nothing was moved
     # Constant intensities: the noise of the inputs would be taken along other states.
     model = bias_gravity.driven(velocity=1e-5, gravity=1e-5, bias=1e-8).sensing(v=1e-5)
     found = filtered(model, run)

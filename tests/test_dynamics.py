@@ -240,7 +240,7 @@ def by_normal_equations(model, run):
 
     system = linearised(model, run)
     Phi, forced = transitions(system)
-    Q = process_noise(system, model.process, Phi)
+    Q = process_noise(system, model.process)
     N, n = len(system.time), model.size
     H, g = np.zeros((N * n, N * n)), np.zeros(N * n)
     start = np.linalg.inv(model.start_covariance)

@@ -77,6 +77,33 @@ def test_errors_reach_the_bound_and_do_not_pass_it(runs):
     assert chi2.ppf(0.005, late.size) < ratio < chi2.ppf(0.995, late.size)
 
 
+def test_errors_stay_within_what_the_filter_claims_on_both_sides_of_a_gap():
+    """What the inputs did for 4 s is unknown: velocity and gravity are forgotten, the bias not."""
+    t, squares, bias = np.concatenate([T[T < 14], T[T > 18]]), [], []
+    for seed in range(6):
+        rng = np.random.default_rng(100 + seed)
+        flight = flights.somewhere(rng)
+        run = flights.record(flight, t, rng)
+        known = np.tile(flights.BIAS, (len(t), 1))
+        truth = np.hstack([flight.velocity(t), flight.gravity(t), known])
+        start = truth[0] + np.repeat(list(STD.values()), 3) * rng.standard_normal(9)
+        model = MATCHED.beginning(velocity=start[:3], gravity=start[3:6], bias=start[6:])
+        wide = model.known_to(velocity=10.0, gravity=10.0, bias=0.1)
+        found = filtered(wide, run)
+        k = int(np.sum(t < 14))
+        at = [k - 1, k + 25, len(t) - 1]
+        squares.append(nees(found, found.x - truth)[at])
+        smooth = found.smoothed - truth
+        late = np.sum(smooth * np.linalg.solve(found.smoothed_P, smooth[:, :, None])[:, :, 0], 1)
+        squares.append(late[[k - 1, k, k + 25]])
+        bias.append(found.std[k + 1, 6:] / found.std[k - 1, 6:])
+    low, high = chi2.ppf([0.001, 0.999], 9 * 6) / 6
+    for half in (squares[::2], squares[1::2]):
+        mean = np.mean(half, axis=0)
+        assert np.all((low < mean) & (mean < high))
+    assert np.max(bias) < 1.01
+
+
 def test_published_tuning_claims_many_times_its_errors():
     rng = np.random.default_rng(1)
     found, errors = follow(bias_gravity, flights.in_the_air(), rng)

@@ -18,6 +18,7 @@ import numpy as np
 from casest.data.run import Run
 from casest.declaring.physics import SX
 from casest.declaring.shapes import Array
+from casest.declaring.symbols import Signal
 from casest.dynamics.declare import Dynamics, Measured, Motion, state
 
 
@@ -45,10 +46,12 @@ class MotionEffect:
 
 @dataclass(frozen=True)
 class Body:
-    """What an effect may read beside its signal: its rate of change, and the rate of turn."""
+    """What an effect may read beside its signal: its rate of change, the rate of turn, and by how
+    much the reading was moved in time (s) before the model saw it."""
 
     rate: SX | None = None
     turn: SX | None = None
+    moved: SX | float = 0.0
 
 
 def _same(n: int) -> int:
@@ -85,8 +88,10 @@ OUTPUT_MISALIGNMENT = MotionEffect(
     vector=True,
 )  # fmt: skip
 TIME_DELAY = MotionEffect(
-    "time_delay", "output", "prediction − k·d(prediction)/dt", lambda _: 1, lambda u: "s",
-    lambda _: 0.01, lambda y, k, body: y - k * body.rate, "an event that all sensors see",
+    "time_delay", "output", "prediction, k earlier", lambda _: 1, lambda u: "s",
+    # Whole samples are moved (delays.py); over the rest of less than one the rate is constant.
+    lambda _: 0.01, lambda y, k, body: y - (k - body.moved) * body.rate,
+    "an event that all sensors see",
 )  # fmt: skip
 LEVER_ARM = MotionEffect(
     "lever_arm", "output", "prediction + omega × k", _same, lambda _: "m",
@@ -129,6 +134,11 @@ class Candidate:
     def state(self) -> str:
         """Name of its numbers as a state: `omega_bias`."""
         return f"{self.on}_{self.effect.name}"
+
+    @property
+    def moved(self) -> str:
+        """Name of the column that says by how much readings were moved in time: `v_moved`."""
+        return f"{self.on}_moved"
 
 
 def candidates(model: Dynamics, run: Run) -> list[Candidate]:
@@ -214,25 +224,30 @@ def _with(model: Dynamics, candidate: Candidate, value: Array | None) -> Dynamic
     @wraps(inner)
     def function(**given: Any) -> Motion:
         k = given.pop(name) if value is None else ca.SX(ca.DM(value))
+        moved = given.pop(candidate.moved) if effect is TIME_DELAY else 0.0
         if effect.on == "input":
             corrected = effect.changed(given[candidate.on], k, Body())
             return inner(**{**given, candidate.on: corrected})
         motion = inner(**given)
-        return _reading(motion, given, candidate, k)
+        return _reading(motion, given, candidate, k, moved)
 
     grown = replace(model, function=function)
+    if effect is TIME_DELAY:
+        grown = replace(grown, signals=(*model.signals, Signal(candidate.moved, 1, "s")))
     if value is not None:
         return grown
     own = state(candidate.size, candidate.unit, std=candidate.typical)
     return replace(grown, states=(*model.states, replace(own, name=name)))
 
 
-def _reading(motion: Motion, given: Mapping[str, SX], candidate: Candidate, k: SX) -> Motion:
+def _reading(
+    motion: Motion, given: Mapping[str, SX], candidate: Candidate, k: SX, moved: SX | float
+) -> Motion:
     """The motion with another prediction of one output."""
     turn = given.get(candidate.turn)
     outputs = tuple(
         replace(o, predicted=candidate.effect.changed(
-            o.predicted, k, Body(_rate(o, motion, given), turn)))
+            o.predicted, k, Body(_rate(o, motion, given), turn, moved)))
         if o.signal is given[candidate.on] else o
         for o in motion.outputs
     )  # fmt: skip

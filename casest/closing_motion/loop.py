@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casest.closing_motion.effects import Candidate, Colour, candidates
-from casest.closing_motion.fitting import Fit, coloured, fitted
+from casest.closing_motion.fitting import Fit, coloured, fitted, forgotten, rise
 from casest.closing_motion.score import Score, scores, stretches
 from casest.closing_motion.sensitivity import sensitivity
-from casest.closing_motion.tuning import Prepared, applied, first_guess, likelihood, prepared
+from casest.closing_motion.tuning import applied, first_guess, likelihood
 from casest.closing_motion.whiteness import Whiteness, whiteness
 from casest.data.run import Run
 from casest.data.splits import interleaved_blocks
@@ -51,8 +51,8 @@ class Added:
 class MotionClosing:
     """What the loop leaves: fits before and after, evidence, what was refused.
 
-    `held_out`: innovations (N, m) of both, each block of time predicted with numbers from the
-    others.
+    `held_out`: innovations (N, m) of both, in the rows of the readings, each block of time
+    predicted with numbers from the others.
     """
 
     declared: Dynamics
@@ -98,42 +98,54 @@ class _Loop:
         """Run the loop."""
         along = filtered(self.model, self.run).smoothed
         before = current = fitted(self.model, self.run, along)
-        first: list[Score] = []
+        ranked, left = self._judged(current)
+        first = ranked
         for _ in range(ROUNDS):
-            ranked, white = self._judged(current)
-            first = first or ranked
-            better = self._with_effect(current, ranked) or self._with_colour(current, white)
+            better = self._with_effect(current, ranked) or self._with_colour(current, left)
             if better is None:
                 break
+            before = before.lighter()
             current = self._weeded(better)
-        left = self._judged(current)[1]
-        held = held_out(before, self.folds), held_out(current, self.folds)
+            ranked, left = self._judged(current)
+        one, two = (f.by_reading(held_out(f, self.folds)) for f in (before, current))
         there = {a.candidate.label for a in self.added}
         added = tuple(
             replace(a, indistinguishable_from=tuple(
                 x for x in a.indistinguishable_from if x not in there))
             for a in self.added
         )  # fmt: skip
-        return MotionClosing(self.model, self.run, before, current, added, tuple(self.refused),
-                             tuple(first), left, held)  # fmt: skip
+        return MotionClosing(
+            self.model,
+            self.run,
+            before,
+            current.with_spread(),
+            added,
+            tuple(self.refused),
+            tuple(first),
+            left,
+            (one, two),
+        )
 
     def _judged(self, fit: Fit) -> tuple[list[Score], Whiteness]:
         """Scores of every candidate that is not there yet; are the innovations white?"""
         there = [c for c, _ in fit.added]
         rest = [c for c in self.tried if c not in there]
-        found = sensitivity(fit.base, fit.added, rest, self.run, fit.found)
+        found = sensitivity(fit.base, fit.added, rest, fit.run, fit.found)
         whole = np.isfinite(fit.found.innovations).all(axis=1)
         return scores(found, rest), whiteness(found.z[whole])
 
     def _with_effect(self, current: Fit, ranked: list[Score]) -> Fit | None:
         """The fit with the best effect that held-out time confirms; None if none does."""
         promising = self._promising(ranked) or self._promising(self._strictly(current))
-        trials = [(s, self._refitted(current, s)) for s in promising[:CONTENDERS]]
-        trials = [(s, fit) for s, fit in trials if self._likelier(fit, current, s.candidate.size)]
-        if not trials:
+        alike: list[tuple[Score, Fit]] = []
+        for score in promising[:CONTENDERS]:
+            fit = self._refitted(current, score).lighter()
+            if self._likelier(fit, current, score.candidate.size):
+                alike.append((score, fit))
+            best = max((f.evidence(current) for _, f in alike), default=0.0)
+            alike = [(s, f) for s, f in alike if best - f.evidence(current) < ALIKE]
+        if not alike:
             return None
-        best = max(fit.evidence for _, fit in trials)
-        alike = [(s, fit) for s, fit in trials if best - fit.evidence < ALIKE]
         # Of those that explain it alike, the one that is met more often.
         score, chosen = min(alike, key=lambda pair: self.tried.index(pair[0].candidate))
         gained = self._confirmed(current, chosen)
@@ -156,10 +168,10 @@ class _Loop:
         intensities have swallowed stands out again. Empty where these say the same."""
         if not self._noise_is_odd(current):
             return []
-        model = applied(current.model, self._of_sensors(current)[1])
-        found = filtered(model, self.run)
+        model = applied(current.model, self._of_sensors(current))
+        found = filtered(model, current.run, spread=False)
         rest = [c for c in self.tried if all(c is not a for a, _ in current.added)]
-        return scores(sensitivity(current.base, current.added, rest, self.run, found), rest)
+        return scores(sensitivity(current.base, current.added, rest, current.run, found), rest)
 
     def _refitted(self, current: Fit, score: Score) -> Fit:
         return fitted(current.base, self.run, current.found.smoothed,
@@ -170,8 +182,8 @@ class _Loop:
         """Is the rise of likelihood more than so many more numbers gain from noise?"""
         from scipy.special import chdtrc
 
-        rise = 2 * (fit.likelihood - current.likelihood)
-        return bool(np.isfinite(rise) and rise > 0 and chdtrc(size, rise) <= self.limit)
+        risen = 2 * rise(fit, current)
+        return bool(np.isfinite(risen) and risen > 0 and chdtrc(size, risen) <= self.limit)
 
     def _with_colour(self, current: Fit, white: Whiteness) -> Fit | None:
         """The fit with correlated noise on an output, if the innovations ask for it."""
@@ -180,8 +192,8 @@ class _Loop:
         from scipy.special import chdtrc
 
         trial = coloured(current, self.run)
-        rise = max(trial.likelihood - current.likelihood, 0.0)
-        p_value = min(1.0, 4 * float(chdtrc(2, 2 * rise)))
+        risen = max(rise(trial, current), 0.0)
+        p_value = min(1.0, 4 * float(chdtrc(2, 2 * risen)))
         if p_value > self.limit or trial.colour is None:
             return None
         gained = self._confirmed(current, trial)
@@ -194,16 +206,14 @@ class _Loop:
 
     def _noise_is_odd(self, fit: Fit) -> bool:
         """Are the intensities far from what the signals themselves show from sample to sample?"""
-        ready, sensors = self._of_sensors(fit)
-        return fit.likelihood - likelihood(ready, sensors) > ASKS
+        return fit.likelihood - likelihood(fit.ready, self._of_sensors(fit)) > ASKS
 
-    def _of_sensors(self, fit: Fit) -> tuple[Prepared, dict[str, float]]:
+    def _of_sensors(self, fit: Fit) -> dict[str, float]:
         """Intensities of inputs and states no larger than the signals' noise from sample to sample
         says; those of readings as they are."""
-        ready = prepared(fit.model, self.run, fit.found.smoothed)
-        guess = first_guess(ready, self.run)
-        kept = {*ready.readings, *({fit.colour.state} if fit.colour else ())}
-        return ready, {
+        guess = first_guess(fit.ready, self.run)
+        kept = {*fit.ready.readings, *({fit.colour.state} if fit.colour else ())}
+        return {
             name: value if name in kept else min(guess[name], value)
             for name, value in fit.intensities.items()
         }
@@ -211,8 +221,11 @@ class _Loop:
     def _confirmed(self, current: Fit, better: Fit) -> float | None:
         """Held-out gain of log-likelihood per reading, if it exceeds its own error."""
         before, after = (_densities(f, held_out(f, self.folds)) for f in (current, better))
+        if current.shifts != better.shifts:  # the first readings are of one of them alone
+            lost = ~(forgotten(current) & forgotten(better))
+            before[lost] = after[lost] = np.nan
         part = stretches(len(before), BLOCKS)
-        gains = np.bincount(part, after - before)
+        gains = np.bincount(part, np.nan_to_num(after - before))
         error = float(np.sqrt(len(gains)) * np.std(gains, ddof=1))
         total = float(gains.sum())
         count = int(np.isfinite(current.found.innovations).sum())
@@ -266,10 +279,10 @@ def held_out(fit: Fit, folds: NDArray[np.int_]) -> Array:
 
 
 def _densities(fit: Fit, innovations: Array) -> Array:
-    """Log-density of every complete innovation (N,); 0 where something is missing."""
+    """Log-density of every complete reading (N,); NaN where something is missing."""
     whole = np.isfinite(innovations).all(axis=1)
     S, nu = fit.found.S[whole], innovations[whole]
     squares = np.sum(nu * np.linalg.solve(S, nu[:, :, None])[:, :, 0], axis=1)
-    found = np.zeros(len(innovations))
-    found[whole] = -0.5 * (squares + np.linalg.slogdet(S)[1])
-    return found
+    found = np.full((len(innovations), innovations.shape[1]), np.nan)
+    found[whole] = -0.5 * (squares + np.linalg.slogdet(S)[1])[:, None] / innovations.shape[1]
+    return np.asarray(fit.by_reading(found).sum(axis=1))

@@ -44,13 +44,13 @@ def scores(found: Sensitivity, tried: list[Candidate]) -> list[Score]:
     """Every candidate's, the most significant first."""
     part = stretches(len(found.z))
     judged = [
-        _score(candidate, found.z, found.H[:, :, where], found.X[:, :, where], part)
+        _score(candidate, found.z, found.H[:, :, where], found.moves[:, where], part)
         for candidate, where in zip(tried, found.columns, strict=True)
     ]
     return sorted(judged, key=lambda s: (s.p_value, -s.gain))
 
 
-def _score(candidate: Candidate, z: Array, H: Array, X: Array, part: NDArray[np.int_]) -> Score:
+def _score(candidate: Candidate, z: Array, H: Array, moves: Array, part: NDArray[np.int_]) -> Score:
     M, b = by_stretch(z, H, part)
     total, whole = b.sum(axis=0), M.sum(axis=0)
     kept = _worth(whole, candidate.typical)
@@ -59,8 +59,6 @@ def _score(candidate: Candidate, z: Array, H: Array, X: Array, part: NDArray[np.
     p_value = _p_value(kept.T @ total, inner, (b - M @ step) @ kept, kept.shape[1])
     with np.errstate(all="ignore"):
         std = np.sqrt(np.diag(np.linalg.pinv(whole, hermitian=True)))
-    settled = X[len(X) // 5 :]
-    moves = np.sqrt(np.mean(settled**2, axis=0))
     return Score(candidate, step, std, float(total @ step), p_value, whole, moves)
 
 

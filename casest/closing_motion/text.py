@@ -7,6 +7,8 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from casest.data.logs import file_name
 from casest.following import following
 from casest.terminal import WIDTH, item, rounded
@@ -68,10 +70,23 @@ def _effects(content: Mapping[str, Any]) -> Iterator[str]:
     if content["effects"]:
         yield "Added:"
     for e in content["effects"]:
-        yield item(f"{e['name']} of {e['on']} (p = {e['p_value']:.1g}): {e['formula']}")
+        yield item(f"{e['name']} of {e['on']} (p = {e['p_value']:.1g}): {e['formula']}{found(e)}")
         if e["indistinguishable_from"]:
             yield item(f"not told apart from {', '.join(e['indistinguishable_from'])}")
             yield from (item(words) for words in e["would_separate"])
+
+
+def found(effect: Mapping[str, Any]) -> str:
+    """`; k = 0.1996 ± 0.0004 s`: the numbers of an effect."""
+    said = []
+    for name, p in effect["parameters"].items():
+        values, stds = (np.atleast_1d(np.array(p[key], float)) for key in ("value", "std"))
+        pairs = zip(values, np.broadcast_to(stds, values.shape), strict=True)
+        shown = [" ± ".join(rounded(v, s)) if np.isfinite(s) else f"{v:.3g}" for v, s in pairs]
+        text = ", ".join(shown)
+        unit = "" if p["unit"] == "1" else f" {p['unit']}"
+        said.append(f"{name} = {text}{unit}")
+    return f"; {', '.join(said)}"
 
 
 def _parameters(content: Mapping[str, Any]) -> Iterator[str]:

@@ -19,8 +19,16 @@ from numpy.typing import NDArray
 from casest.data.run import Run
 from casest.declaring.shapes import Array
 from casest.dynamics.declare import Dynamics
-from casest.dynamics.stepping import CHUNK, reach
-from casest.dynamics.transition import linearised, process_noise, steps_to, transitions
+from casest.dynamics.stepping import Pattern, entries, packed, reach, symmetric, taken
+from casest.dynamics.transition import (
+    Linearised,
+    linearised,
+    lost,
+    process_along,
+    process_noise,
+    steps_to,
+)
+from casest.engine import Recursion
 from casest.modelling.tracing import flat
 
 Mask = NDArray[np.bool_]
@@ -37,15 +45,16 @@ ROUNDS, STEP, LARGEST, ENOUGH = 30, 1e-3, 5.0, 0.1
 class Prepared:
     """A record made ready for many likelihoods: all that does not depend on the intensities.
 
-    `units`: per intensity of a state or an input, what 1 of it adds before each sample, (N, n²);
-    `readings`: per output signal, its rows; `numbers` (padded N, …): what each step is given, in
-    which Q and R are filled in by every likelihood.
+    `system`: the model along the record, with noise of the intensities that it has; `units`: per
+    intensity of a state or an input, which entries of Q it reaches; `readings`: per output signal,
+    its rows; `numbers` (N, …): what each step is given.
     """
 
     model: Dynamics
+    system: Linearised
     present: Mask
     period: Array
-    units: Mapping[str, Array]
+    units: Mapping[str, Pattern]
     readings: Mapping[str, slice]
     numbers: Array
 
@@ -53,20 +62,6 @@ class Prepared:
     def names(self) -> tuple[str, ...]:
         """Names of the intensities: inputs and states, then outputs."""
         return (*self.units, *self.readings)
-
-    def steps(self, intensities: Mapping[str, float]) -> Array:
-        """What each step is given, with these intensities."""
-        count, n, m = len(self.present), self.model.size, self.present.shape[1]
-        Q = self.numbers[:count, n * n + n : n * n + n + n * n]
-        Q[:] = 0.0
-        for name, unit in self.units.items():
-            Q += intensities[name] * unit
-        last = self.numbers.shape[1] - 2 * m
-        for name, rows in self.readings.items():
-            R = self.numbers[:count, last + rows.start : last + rows.stop]
-            R[:] = (intensities[name] / self.period)[:, None]
-        self.numbers[count:] = self.numbers[count - 1]
-        return self.numbers
 
 
 def reached(model: Dynamics) -> tuple[list[str], list[str]]:
@@ -87,44 +82,64 @@ def prepared(model: Dynamics, run: Run, along: Array) -> Prepared:
     """Along states (N, n), where the model or its noise depends on them."""
     inputs, own = reached(model)
     silent = model.driven(**{s.name: 0.0 for s in model.states})
-    system = linearised(silent, run, along)
-    Phi, forced = transitions(system)
-    units = {}
-    for name in (*inputs, *own):
-        alone = silent.sensing(**{name: 1.0}) if name in inputs else silent.driven(**{name: 1.0})
-        Q = process_noise(system, linearised(alone, run, along).process, Phi)
-        units[name] = np.concatenate([0 * Q[:1], Q]).reshape(len(Q) + 1, -1)
+    system = linearised(model, run, along)
+    Phi, forced = system.moved
     present = np.isfinite(system.y)
-    C = np.where(present[:, :, None], system.C, 0.0)
-    y = np.where(present, system.y - system.d, 0.0)
+    t, count = model.traced, len(present)
+    alone = [silent.sensing(**{name: 1.0}) for name in inputs]
+    alone += [silent.driven(**{name: 1.0}) for name in own]
+    units = {name: _spread(one) for name, one in zip((*inputs, *own), alone, strict=True)}
+    first = np.eye(model.size)[None]
+    parts = [_picked(np.concatenate([first, Phi]), reach(t.A)), _after(forced, count)]
+    for one, pattern in zip(alone, units.values(), strict=True):
+        Q = process_noise(system, process_along(one, run, along))
+        parts.append(_after(_picked(Q, pattern), count))
+    parts.append(_after(lost(model, system.steps), count))
+    parts.append(_picked(np.where(present[:, :, None], system.C, 0.0), entries(t.C)))
+    parts.append(np.where(present, system.y - system.d, 0.0))
+    period = steps_to(system)
     readings, place = {}, 0
-    for name, o in zip(model.traced.measured, model.traced.outputs, strict=True):
+    for name, o in zip(t.measured, t.outputs, strict=True):
         readings[name] = slice(place, place + o.predicted.numel())
         place += o.predicted.numel()
-    numbers = _assembled(Phi, forced, C, y)
-    return Prepared(model, present, steps_to(system), units, readings, numbers)
+    numbers = np.concatenate([*parts, period[:, None]], axis=1)
+    return Prepared(model, system, present, period, units, readings, numbers)
 
 
-def _assembled(Phi: Array, forced: Array, C: Array, y: Array) -> Array:
-    """Φ, u, room for Q, C, room for R, y of every sample in a row, column by column; padded."""
-    count, (m, n) = len(y), C.shape[1:]
-    numbers = np.zeros((-(-count // CHUNK) * CHUNK, 2 * n * n + n + m * n + 2 * m))
-    first = np.concatenate([np.eye(n)[None], Phi])
-    numbers[:count, : n * n] = first.transpose(0, 2, 1).reshape(count, -1)
-    numbers[1:count, n * n : n * n + n] = forced
-    place = 2 * n * n + n
-    numbers[:count, place : place + m * n] = C.transpose(0, 2, 1).reshape(count, -1)
-    numbers[:count, -m:] = y
-    return numbers
+def _picked(matrices: Array, pattern: Pattern) -> Array:
+    """Entries of every matrix, (N, k)."""
+    rows, columns = np.array(pattern, int).reshape(-1, 2).T
+    return matrices[:, rows, columns]
+
+
+def _after(parts: Array, count: int) -> Array:
+    """Of a step (N − 1, k), at the sample that it leads to; the first has none."""
+    found = np.zeros((count, parts.shape[1]))
+    found[1:] = parts
+    return found
+
+
+def _spread(model: Dynamics) -> Pattern:
+    """Which entries of Q, on and above the diagonal, the noise of a model can reach in a step."""
+    there = model.process != 0
+    if model.input_noise is not None:
+        there[tuple(np.array(entries(model.input_noise)).T)] = True
+    moved = np.zeros_like(there)
+    moved[tuple(np.array(reach(model.traced.A)).T)] = True
+    found = np.triu(moved @ there @ moved.T)
+    return tuple((int(i), int(j)) for i, j in np.argwhere(found))
 
 
 def whitened(ready: Prepared, intensities: Mapping[str, float]) -> tuple[Array, Array]:
     """Innovations component by component (N, m), each given those before it, and variances."""
-    count, m = ready.present.shape
-    model = ready.model
-    step = _likelihood_step(model.size, m, reach(model.traced.A))
-    found = _run(step, model.start, model.start_covariance, ready.steps(intensities), 2 * m)
-    return found[:count, :m], found[:count, m:]
+    t = ready.model.traced
+    rows = tuple((r.start, r.stop) for r in ready.readings.values())
+    patterns = reach(t.A), tuple(ready.units.values()), entries(t.C)
+    step = _likelihood_step(ready.model.size, rows, *patterns)
+    given = np.array([intensities[name] for name in ready.names])
+    state = np.concatenate([ready.model.start, ready.model.start_covariance.T.ravel(), given])
+    _, e, s = step(state, ready.numbers, keep=False)
+    return e, s
 
 
 def likelihood(ready: Prepared, intensities: Mapping[str, float]) -> float:
@@ -212,44 +227,42 @@ def applied(model: Dynamics, intensities: Mapping[str, float]) -> Dynamics:
 
 
 @lru_cache(maxsize=16)
-def _likelihood_step(n: int, m: int, pattern: tuple[tuple[int, int], ...]) -> Any:
-    """(state, numbers of one sample) -> (state, innovations and variances), CHUNK at a time."""
-    x, P = ca.SX.sym("x", n), ca.SX.sym("P", n, n)
-    full, u, Q = ca.SX.sym("Phi", n, n), ca.SX.sym("u", n), ca.SX.sym("Q", n, n)
-    Phi = ca.SX(n, n)
-    for i, j in pattern:
-        Phi[i, j] = full[i, j]
-    C, R, y = ca.SX.sym("C", m, n), ca.SX.sym("R", m), ca.SX.sym("y", m)
-    later_x, later_P = Phi @ x + u, _symmetric(Phi @ P @ Phi.T + Q)
+def _likelihood_step(
+    n: int,
+    rows: tuple[tuple[int, int], ...],
+    of_Phi: Pattern,
+    units: tuple[Pattern, ...],
+    of_C: Pattern,
+) -> Recursion:
+    """(x, P and intensities; numbers of one sample) -> (the same later; innovations; variances)."""
+    m = rows[-1][1]
+    x, P, q = ca.SX.sym("x", n), ca.SX.sym("P", n, n), ca.SX.sym("q", len(units) + len(rows))
+    moved, Phi = _sparse("Phi", (n, n), of_Phi)
+    u, y, period = ca.SX.sym("u", n), ca.SX.sym("y", m), ca.SX.sym("period")
+    own = [_sparse(f"Q{k}", (n, n), pattern) for k, pattern in enumerate(units)]
+    seen, C = _sparse("C", (m, n), of_C)
+    gap = ca.SX.sym("gap", n)
+    Q = ca.diag(gap)
+    for k, (_, unit) in enumerate(own):
+        Q += q[k] * unit
+    R = ca.vertcat(*[ca.repmat(q[len(units) + k] / period, last - first)
+                     for k, (first, last) in enumerate(rows)])  # fmt: skip
+    later_x, later_P = Phi @ x + u, symmetric(ca.triu(Phi @ (P + ca.diag(gap)) @ Phi.T) + Q)
     e, s = [], []
     for i in range(m):
         c = C[i, :].T
-        PC = later_P @ c
         e.append(y[i] - ca.dot(c, later_x))
-        s.append(ca.dot(c, PC) + R[i])
-        later_x = later_x + PC * (e[-1] / s[-1])
-        later_P = _symmetric(later_P - PC @ (PC / s[-1]).T)
-    numbers = ca.vertcat(*[ca.vec(part) for part in (full, u, Q, C, R, y)])
-    state, after = ca.vertcat(x, ca.vec(P)), ca.vertcat(later_x, ca.vec(later_P))
-    step = ca.Function("step", [state, numbers], [after, ca.vertcat(*e, *s)], {"cse": True})
-    return step.mapaccum("steps", CHUNK)
+        s.append(ca.dot(c, later_P @ c) + R[i])
+        later_x, later_P = taken(later_x, later_P, c, e[-1], s[-1])
+    numbers = ca.vertcat(moved, u, *[k for k, _ in own], gap, seen, y, period)
+    outputs = [ca.vertcat(packed(later_x, later_P), q), ca.vertcat(*e), ca.vertcat(*s)]
+    state = ca.vertcat(packed(x, P), q)
+    return Recursion(ca.Function("step", [state, numbers], outputs, {"cse": True}))
 
 
-def _symmetric(matrix: Any) -> Any:
-    return ca.densify(ca.triu(matrix) + ca.triu(matrix, False).T)
-
-
-def _run(steps: Any, x: Array, P: Array, numbers: Array, wide: int) -> Array:
-    """Over a record, CHUNK steps at a time: (padded N, wide)."""
-    state = np.concatenate([x, P.T.ravel()])
-    after, found = np.empty((CHUNK, len(state))), np.empty((len(numbers), wide))
-    buffer, run = steps.buffer()
-    for k in range(0, len(numbers), CHUNK):
-        span = slice(k, k + CHUNK)
-        arrays: Any = (state, numbers[span]), (after, found[span])
-        for i in range(2):
-            buffer.set_arg(i, memoryview(arrays[0][i]))
-            buffer.set_res(i, memoryview(arrays[1][i]))
-        run()
-        state = after[-1].copy()
-    return found
+def _sparse(name: str, shape: tuple[int, int], pattern: Pattern) -> tuple[Any, Any]:
+    """Symbols for the entries of a pattern, and the matrix of them."""
+    symbols, matrix = ca.SX.sym(name, len(pattern)), ca.SX(*shape)
+    for k, (i, j) in enumerate(pattern):
+        matrix[i, j] = symbols[k]
+    return symbols, matrix

@@ -9,20 +9,16 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from casest import __version__
 from casest.closing_motion.effects import Candidate
-from casest.closing_motion.fitting import Fit
+from casest.closing_motion.fitting import Fit, forgotten, rise
 from casest.closing_motion.loop import UNEXPLAINED, Added, MotionClosing
 from casest.closing_motion.score import Score
 from casest.declaring.shapes import Array
 from casest.observing import assumed
 from casest.result import plain, reproduce
 
-#: Innovations count once the filter expects them within so many times their usual variance: those
-#: at the beginning tell of the start only.
-SETTLED = 2.0
 #: Noncentrality from which an effect is found nearly always, and below which nobody could find it.
 SEEN, UNSEEN = 45.0, 9.0
 
@@ -81,16 +77,9 @@ def plain_all(values: Mapping[str, float]) -> dict[str, Any]:
     return {name: plain(value) for name, value in values.items()}
 
 
-def settled(fit: Fit) -> NDArray[np.bool_]:
-    """Which samples count, (N,): what the filter expects there is not the start's doing."""
-    expected = np.diagonal(fit.found.S, axis1=1, axis2=2)
-    usual = np.nanmedian(expected, axis=0)
-    return np.asarray(~(expected > SETTLED * usual).any(axis=1))
-
-
 def rms_settled(closing: MotionClosing) -> tuple[float, float]:
     """Held-out error before and after: rms of one-step innovations, one axis."""
-    counted = settled(closing.before) & settled(closing.after)
+    counted = forgotten(closing.before) & forgotten(closing.after)
     before, after = (float(np.sqrt(np.nanmean(nu[counted] ** 2))) for nu in closing.held_out)
     return before, after
 
@@ -128,11 +117,12 @@ def _declared(closing: MotionClosing) -> dict[str, Any]:
 
 
 def _section(fit: Fit, closing: MotionClosing, side: int) -> dict[str, Any]:
-    counted = settled(closing.before) & settled(closing.after)
-    own, hidden = fit.found.innovations[counted], closing.held_out[side][counted]
+    counted = forgotten(closing.before) & forgotten(closing.after)
+    own = fit.by_reading(fit.found.innovations)[counted]
+    hidden = closing.held_out[side][counted]
     names = axes(closing)
     by_axis = np.sqrt(np.nanmean(hidden**2, axis=0))
-    mean = float(np.nanmean(fit.found.normalised_innovations[counted]))
+    mean = float(np.nanmean(fit.found.normalised_innovations[forgotten(fit)]))
     reasons = [f"normalised squared innovations: {mean:.3g} on average, {len(names)} expected"]
     if fit.added:
         reasons.append(f"the last step of the fit is {fit.last_step:.2g} standard deviations long")
@@ -140,7 +130,7 @@ def _section(fit: Fit, closing: MotionClosing, side: int) -> dict[str, Any]:
         "rmse_fit": plain(np.sqrt(np.nanmean(own**2))),
         "rmse_holdout": plain(np.sqrt(np.nanmean(hidden**2))),
         "rmse_holdout_by_axis": dict(zip(names, map(plain, by_axis), strict=True)),
-        "log_likelihood": plain(fit.likelihood),
+        "log_likelihood": plain(closing.before.likelihood + rise(fit, closing.before)),
         "certificate": {"trusted": _trusted(fit), "reasons": reasons},
         "parameters": _states(fit, closing) | _numbers(fit),
     }
@@ -245,7 +235,7 @@ def _moved(closing: MotionClosing) -> dict[str, Any]:
 
 
 def _innovations(fit: Fit) -> dict[str, Any]:
-    nu, counted = fit.found.innovations, settled(fit)
+    nu, counted = fit.found.innovations, forgotten(fit)
     normalised = fit.found.normalised_innovations
     whole = nu[np.isfinite(normalised)]
     lag1 = [np.corrcoef(own[:-1], own[1:])[0, 1] for own in whole.T]
@@ -266,7 +256,10 @@ def residual_rows(closing: MotionClosing) -> str:
     writer.writerow(["file", "run", "row", "t", "axis", "split", "before", "after"])
     run, names = closing.run, axes(closing)
     time = closing.after.found.time
-    fits: tuple[Array, Array] = (closing.before.found.innovations, closing.after.found.innovations)
+    before_all, after_all = (
+        f.by_reading(f.found.innovations) for f in (closing.before, closing.after)
+    )
+    fits: tuple[Array, Array] = (before_all, after_all)
     for split, (before, after) in (("fit", fits), ("holdout", closing.held_out)):
         for k in range(len(run)):
             for j, axis in enumerate(names):

@@ -18,9 +18,9 @@ from casest.declaring.physics import SX
 from casest.declaring.shapes import Array
 from casest.dynamics.declare import Dynamics
 from casest.dynamics.discrete import Steps
-from casest.dynamics.stepping import CHUNK, entries, packed, run_steps, symmetric, taken, unpacked
-from casest.dynamics.transition import checked_record, steps_to
-from casest.engine import Columns, Replay
+from casest.dynamics.stepping import entries, packed, run_steps, symmetric, taken, unpacked
+from casest.dynamics.transition import checked_record, lost, steps_to, with_lost
+from casest.engine import Columns, Recursion, Replay
 from casest.modelling.tracing import flat
 
 
@@ -35,6 +35,7 @@ def relinearised(model: Dynamics, run: Run, along: Array) -> Steps:
         np.diff(time)[:, None],
     ]
     Phi, forced, Q = over_samples(_step(model), columns)
+    Q = with_lost(model, np.diff(time), Phi, Q)
     C, d, y = _rows(model, run, along)
     R = np.diag(model.noise)[None] / steps_to(np.diff(time))[:, None]
     return Steps(Phi, forced[:, :, 0], Q, C, d, R, y, of_C=entries(model.traced.C))
@@ -88,6 +89,7 @@ def extended(model: Dynamics, run: Run) -> tuple[Array, Array, Array, Array, Arr
         np.concatenate([u[:1], u[:-1]]),
         u,
         np.concatenate([[0.0], step])[:, None],
+        np.concatenate([np.zeros((1, n)), lost(model, step)]),
         np.nan_to_num(at),
         np.diag(model.noise)[None] / steps_to(step)[:, None],
         np.nan_to_num(y),
@@ -102,13 +104,14 @@ def extended(model: Dynamics, run: Run) -> tuple[Array, Array, Array, Array, Arr
 
 
 @lru_cache(maxsize=8)
-def _extended_step(model: Dynamics) -> Any:
+def _extended_step(model: Dynamics) -> Recursion:
     """(x and P, numbers of one sample) -> (x and P, also before the reading, innovation and S)."""
     t, n = model.traced, model.size
     u, v, h = *_two_samples(model), ca.SX.sym("h")
     x, P = ca.SX.sym("x", n), ca.SX.sym("P", n, n)
     end, Phi, Q = _motion(model)(x, u, v, h)
-    before_x, before_P = end, symmetric(Phi @ P @ Phi.T + Q)
+    gap = ca.SX.sym("gap", n)
+    before_x, before_P = end, symmetric(Phi @ (P + ca.diag(gap)) @ Phi.T + Q + ca.diag(gap))
     signals = ca.vertcat(*[flat(t.symbols[s.name]) for s in model.signals])
     R, y, there = (ca.SX.sym(name, t.h.numel()) for name in ("R", "y", "there"))
     predict = ca.Function("predict", [t.x, signals], [t.h, t.C])
@@ -118,11 +121,10 @@ def _extended_step(model: Dynamics) -> Any:
         c = C[i, :].T * there[i]
         left = (y[i] - said[i]) * there[i] - ca.dot(c, after_x - before_x)
         after_x, after_P = taken(after_x, after_P, c, left, ca.dot(c, after_P @ c) + R[i])
-    numbers = ca.vertcat(u, v, h, signals, R, y, there)
+    numbers = ca.vertcat(u, v, h, gap, signals, R, y, there)
     told = ca.vertcat(y - said, ca.vec(ca.densify(C @ before_P @ C.T + ca.diag(R))))
     outputs = [packed(after_x, after_P), packed(before_x, before_P), told]
-    made = ca.Function("extended", [packed(x, P), numbers], outputs, {"cse": True})
-    return made.mapaccum("extended_steps", CHUNK)
+    return Recursion(ca.Function("step", [packed(x, P), numbers], outputs, {"cse": True}))
 
 
 @lru_cache(maxsize=8)

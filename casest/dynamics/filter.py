@@ -14,7 +14,7 @@ import numpy as np
 from casest.data.run import Run
 from casest.declaring.shapes import Array
 from casest.dynamics.declare import Dynamics
-from casest.dynamics.discrete import Steps, kalman, smoothed
+from casest.dynamics.discrete import Steps, kalman, smoothed, smoothed_states
 from casest.dynamics.extended import extended, relinearised
 from casest.dynamics.known import known
 from casest.dynamics.riccati import check_covariance
@@ -22,9 +22,10 @@ from casest.dynamics.stepping import entries, reach
 from casest.dynamics.transition import (
     Linearised,
     linearised,
+    process_along,
     process_noise,
     steps_to,
-    transitions,
+    with_lost,
 )
 from casest.errors import DataError
 
@@ -75,19 +76,29 @@ class Filtered:
         return found
 
 
-def filtered(model: Dynamics, run: Run, *, smooth: bool = True) -> Filtered:
+def filtered(
+    model: Dynamics,
+    run: Run,
+    *,
+    smooth: bool = True,
+    spread: bool = True,
+    system: Linearised | None = None,
+) -> Filtered:
     """Kalman filter over a record, and smoother; for a nonlinear model the extended ones.
 
     The extended filter linearises at each prediction; its smoother is iterated: the record is
     linearised along the smoothed states until they stay (the most probable trajectory). Where the
     noise of inputs reaches a linear model through its states, it is taken along the estimates of a
     first pass. What is known exactly (`constraint`) is put into every estimate and not fed back.
+
+    Of a linear model: `system`, the model along the record, where it is known already; `spread`
+    False: smoothed states without their covariances (the filter's in their place): half the time.
     Raises DataError where time or inputs are not usable, or a covariance is none.
     """
     check_covariance(model.start_covariance, "the covariance at the beginning")
     if not model.linear:
         return _extended(model, run, smooth)
-    return _once(model, run, coefficients(model, run), smooth)
+    return _once(model, run, system or coefficients(model, run), smooth, spread)
 
 
 def coefficients(model: Dynamics, run: Run) -> Linearised:
@@ -95,7 +106,8 @@ def coefficients(model: Dynamics, run: Run) -> Linearised:
     system = linearised(model, run)
     if model.input_noise is None:
         return system
-    return linearised(model, run, along=_once(model, run, system, smooth=False).x)
+    first = _once(model, run, system, smooth=False)
+    return system.driven(process_along(model, run, first.x))
 
 
 def _extended(model: Dynamics, run: Run, smooth: bool) -> Filtered:
@@ -139,17 +151,24 @@ def trajectory(model: Dynamics, run: Run, along: Array) -> tuple[Array, Array, b
 
 def discretised(model: Dynamics, system: Linearised) -> Steps:
     """The record in discrete time: exact transitions, readings as averages over their period."""
-    Phi, forced = transitions(system)
-    Q = process_noise(system, system.process, Phi)
+    Phi, forced = system.moved
+    Q = with_lost(model, system.steps, Phi, process_noise(system, system.process))
     R = np.diag(model.noise)[None] / steps_to(system)[:, None]
     t = model.traced
     return Steps(Phi, forced, Q, system.C, system.d, R, system.y, reach(t.A), entries(t.C))
 
 
-def _once(model: Dynamics, run: Run, system: Linearised, smooth: bool) -> Filtered:
+def _once(
+    model: Dynamics, run: Run, system: Linearised, smooth: bool, spread: bool = True
+) -> Filtered:
     steps = discretised(model, system)
     found = kalman(steps, model.start, model.start_covariance)
     before = found.predicted_x, found.predicted_P, found.innovations, found.S
     after = known(model, run, found.x, found.P)
-    both = known(model, run, *smoothed(steps, found)) if smooth else after
+    if not smooth:
+        both = after
+    elif spread or model.traced.g.numel():
+        both = known(model, run, *smoothed(steps, found))
+    else:
+        both = smoothed_states(steps, found), found.P
     return Filtered(model, system, *after, *before, *both)

@@ -15,7 +15,7 @@ import numpy as np
 
 from casest.declaring.shapes import Array
 from casest.dynamics.declare import Dynamics
-from casest.dynamics.transition import Linearised, half_transitions, transitions
+from casest.dynamics.transition import Linearised, counted, half_transitions
 from casest.null_space import sparsest
 
 #: A direction counts as observable from this share of the largest scaled eigenvalue on. Rounding
@@ -43,7 +43,7 @@ class Observed:
 
 def gramian(model: Dynamics, system: Linearised) -> Array:
     """W of the whole record at its first sample, (n, n), from transition matrices."""
-    Phi, _ = transitions(system)
+    Phi, _ = system.moved
     return _reduced(Phi, _of_steps(model, system, Phi))[1]
 
 
@@ -53,7 +53,7 @@ def _of_steps(model: Dynamics, system: Linearised, Phi: Array) -> Array:
     half = half_transitions(system, (0.0, 0.5))
     middle = 0.5 * (system.C[1:] + system.C[:-1]) @ half
     first, last = system.C[:-1], system.C[1:] @ Phi
-    h = system.steps[:, None, None]
+    h = counted(system.steps)[:, None, None]
     if not np.isfinite(system.y).all():  # single readings are no curve: each for its own time
         return np.asarray(0.5 * h * sum(M.transpose(0, 2, 1) @ weight @ M for M in (first, last)))
     return np.asarray(
@@ -96,12 +96,14 @@ def gramian_by_ode(model: Dynamics, system: Linearised, tolerance: float = 1e-12
         return later + share * (earlier - later)
 
     A, C = between("A", t.A), between("C", t.C)
-    rate = A.T @ W + W @ A + C.T @ weight @ C
-    u = ca.vertcat(*[ca.vcat(e.nonzeros()) for e in ends], since, h)
+    read = ca.SX.sym("read")  # what share of the step readings stand for
+    rate = A.T @ W + W @ A + read * (C.T @ weight @ C)
+    u = ca.vertcat(*[ca.vcat(e.nonzeros()) for e in ends], since, h, read)
     back = system.time[-1] - system.time[::-1]
     columns = [_entries(M[::-1], e)[part] for M, e in ((system.A, t.A), (system.C, t.C))
                for part in (slice(None, -1), slice(1, None))]  # fmt: skip
-    numbers = np.column_stack([*columns, back[:-1], np.diff(back)])
+    shares = (counted(system.steps) / system.steps)[::-1]
+    numbers = np.column_stack([*columns, back[:-1], np.diff(back), shares])
     options = {
         "abstol": tolerance,
         "reltol": tolerance,
@@ -195,7 +197,7 @@ def window_eigenvalues(
     model: Dynamics, system: Linearised, window: float, count: int = 60
 ) -> tuple[Array, Array]:
     """All of them, ascending: the windows' ends (K,) and eigenvalues (K, n), scaled alike."""
-    Phi, _ = transitions(system)
+    Phi, _ = system.moved
     W = _of_steps(model, system, Phi)
     prior = np.sqrt(np.diag(model.start_covariance))
     time = system.time

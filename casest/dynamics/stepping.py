@@ -1,4 +1,4 @@
-"""One step of the filter in CasADi's symbols, run over a record by its virtual machine.
+"""One step of the filter in CasADi's symbols, run over a record by the engine.
 
 A step of nine states is a few thousand operations: in NumPy the calls alone take longer.
 """
@@ -13,9 +13,7 @@ import casadi as ca
 import numpy as np
 
 from casest.declaring.shapes import Array
-
-#: Steps in one accumulated map.
-CHUNK = 500
+from casest.engine import Recursion
 
 Pattern = tuple[tuple[int, int], ...]
 
@@ -59,8 +57,8 @@ def taken(x: Any, P: Any, c: Any, innovation: Any, s: Any) -> tuple[Any, Any]:
 
 
 @lru_cache(maxsize=16)
-def kalman_step(n: int, m: int, of_Phi: Pattern, of_C: Pattern) -> Any:
-    """(state, numbers of one sample) -> (state, also before the reading), CHUNK steps at a time.
+def kalman_step(n: int, m: int, of_Phi: Pattern, of_C: Pattern) -> Recursion:
+    """(state, numbers of one sample) -> (state, also before the reading).
 
     state: x and P column by column; numbers: Φ, forced step, Q, C, diagonal of R, y. Readings are
     taken one component after the other, which needs no inverse (their noise is independent).
@@ -79,8 +77,7 @@ def kalman_step(n: int, m: int, of_Phi: Pattern, of_C: Pattern) -> Any:
         after_x, after_P = taken(after_x, after_P, c, y[i] - ca.dot(c, after_x), s)
     numbers = ca.vertcat(*[ca.vec(e) for e in (full, u, Q, whole, R, y)])
     outputs = [packed(after_x, after_P), packed(before_x, before_P)]
-    step = ca.Function("step", [packed(x, P), numbers], outputs, {"cse": True})
-    return step.mapaccum("steps", CHUNK)
+    return Recursion(ca.Function("step", [packed(x, P), numbers], outputs, {"cse": True}))
 
 
 def packed(x: Any, P: Any) -> Any:
@@ -88,39 +85,23 @@ def packed(x: Any, P: Any) -> Any:
     return ca.vertcat(ca.densify(x), ca.vec(ca.densify(P)))
 
 
-def run_steps(steps: Any, state: Array, parts: Sequence[Array]) -> list[Array]:
-    """Every output of the accumulated steps, (N, …) each.
+def run_steps(steps: Recursion, state: Array, parts: Sequence[Array]) -> list[Array]:
+    """Every output of the steps, (N, …) each.
 
     `state`: what the first step begins from; `parts`: arrays (N, …) of what each step is given,
     matrices included, in the order of its numbers; (N − 1, …) where the first is given zeros.
     """
     N = max(map(len, parts))
-    padded = -(-N // CHUNK) * CHUNK
-    numbers = np.empty((padded, sum(p[0].size for p in parts)))
+    numbers = np.empty((N, sum(p[0].size for p in parts)))
     place = 0
     for p in parts:
         own = numbers[:, place : place + p[0].size]
         place += p[0].size
         if p.ndim == 3:
-            own, p = own.reshape(padded, *p.shape[:0:-1]), p.transpose(0, 2, 1)
-        own[N - len(p) : N] = p
+            own, p = own.reshape(N, *p.shape[:0:-1]), p.transpose(0, 2, 1)
+        own[N - len(p) :] = p
         own[: N - len(p)] = 0.0
-    numbers[N:] = numbers[N - 1]
-    found = [np.empty((padded, steps.size1_out(i))) for i in range(steps.n_out())]
-    # CasADi's matrices are column by column: a row of these arrays is one of its columns.
-    buffer, run = steps.buffer()
-    state = np.ascontiguousarray(state, float)
-    for k in range(0, padded, CHUNK):
-        span = slice(k, k + CHUNK)
-        given: list[Any] = [state, numbers[span]]
-        results: list[Any] = [f[span] for f in found]
-        for i, array in enumerate(given):
-            buffer.set_arg(i, memoryview(array))
-        for i, array in enumerate(results):
-            buffer.set_res(i, memoryview(array))
-        run()
-        state = found[0][k + CHUNK - 1].copy()
-    return [f[:N] for f in found]
+    return steps(state, numbers)
 
 
 def unpacked(both: Array, n: int) -> tuple[Array, Array]:

@@ -8,7 +8,8 @@ where holding A is right to second order only. A known input is one more, consta
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from math import factorial
 
 import casadi as ca
@@ -16,9 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casest.data.run import Run
-from casest.data.timing import UNUSED
+from casest.data.timing import GAP, UNUSED
 from casest.declaring.shapes import Array
 from casest.dynamics.declare import Dynamics
+from casest.dynamics.stepping import reach
 from casest.engine import Columns, Replay
 from casest.errors import DataError
 from casest.modelling.tracing import flat
@@ -53,6 +55,25 @@ class Linearised:
     def steps(self) -> Array:
         """Time between samples, (N − 1,), s."""
         return np.diff(self.time)
+
+    @cached_property
+    def moved(self) -> tuple[Array, Array]:
+        """Φ (N − 1, n, n) and forced step u (N − 1, n) of every step."""
+        return transitions(self)
+
+    @cached_property
+    def later_half(self) -> Array:
+        """Φ over the second half of every step, (N − 1, n, n)."""
+        return half_transitions(self, (0.5, 1.0))
+
+    def driven(self, process: Array) -> Linearised:
+        """The same motion with other process noise; what is known of its steps is kept."""
+        other = replace(self, process=process)
+        other.__dict__.update({k: v for k, v in self.__dict__.items() if k in _KEPT})
+        return other
+
+
+_KEPT = ("moved", "later_half")
 
 
 def checked_time(run: Run) -> Array:
@@ -111,6 +132,19 @@ def linearised(model: Dynamics, run: Run, along: Array | None = None) -> Lineari
     if not np.isfinite(readings).all():
         C = np.where(np.isfinite(readings)[:, :, None], C, 0.0)
     return Linearised(time, A, c_[:, :, 0], C, d_[:, :, 0], readings, process)
+
+
+def process_along(model: Dynamics, run: Run, along: Array) -> Array:
+    """Process noise Ξ alone, (n, n), or along states (N, n) where inputs have noise: (N, n, n)."""
+    added = model.input_noise
+    if added is None:
+        return model.process
+    t = model.traced
+    sample = ca.vertcat(t.x, *[flat(t.symbols[s.name]) for s in model.signals])
+    function = ca.Function("noise", [ca.SX.sym("none", 0), sample], [ca.densify(added)],
+                           ["parameters", "sample"], ["Q"])  # fmt: skip
+    columns = Columns([np.ascontiguousarray(along), *(run.signals[s.name] for s in model.signals)])
+    return np.asarray(model.process + Replay(function)(np.zeros(0), columns)[0])
 
 
 def _refuse_missing_inputs(model: Dynamics, run: Run) -> None:
@@ -194,13 +228,13 @@ def exponential(matrices: Array) -> Array:
     return np.asarray(result)
 
 
-def process_noise(system: Linearised, intensity: Array, Phi: Array) -> Array:
+def process_noise(system: Linearised, intensity: Array) -> Array:
     """∫Φ(t₁, s)ΞΦ(t₁, s)ᵀ ds of every step, (N − 1, n, n): Simpson's rule.
 
     Ξ constant and diagonal (n, n), or any at every sample (N, n, n).
     """
     h = system.steps[:, None, None]
-    middle = half_transitions(system, (0.5, 1.0))
+    Phi, middle = system.moved[0], system.later_half
     if intensity.ndim == 3:
         last = intensity[1:]
         between = 0.5 * (intensity[:-1] + last)
@@ -215,7 +249,43 @@ def process_noise(system: Linearised, intensity: Array, Phi: Array) -> Array:
     return np.asarray(h / 6 * (ends + 4 * inner))
 
 
+def lost(model: Dynamics, steps: Array) -> Array:
+    """Variances (N − 1, n) that are added before and after each step: nothing but in gaps.
+
+    What inputs did in a gap is unknown: states that they drive, through others too, are known in it
+    and afterwards no better than at the beginning.
+    """
+    t, n = model.traced, model.size
+    found = np.zeros((len(steps), n))
+    gaps = steps > GAP * np.median(steps)
+    if gaps.any():
+        u = [flat(t.symbols[s.name]) for s in model.signals if s.name not in t.measured]
+        driven = np.zeros(n, dtype=bool)
+        if u:
+            driven[list(set(ca.jacobian(t.f, ca.vertcat(*u)).sparsity().get_triplet()[0]))] = True
+        moved = np.zeros((n, n), dtype=bool)
+        moved[tuple(np.array(reach(t.A)).T)] = True
+        found[gaps] = np.where(moved @ driven, np.diag(model.start_covariance), 0.0)
+    return found
+
+
+def with_lost(model: Dynamics, steps: Array, Phi: Array, Q: Array) -> Array:
+    """The noise Q (N − 1, n, n) of steps, gaps included."""
+    added, i = lost(model, steps), np.arange(model.size)
+    gaps = np.flatnonzero(added.any(axis=1))
+    own = np.zeros((len(gaps), model.size, model.size))
+    own[:, i, i] = added[gaps]
+    Q[gaps] += Phi[gaps] @ own @ Phi[gaps].transpose(0, 2, 1) + own
+    return Q
+
+
+def counted(steps: Array) -> Array:
+    """Steps (N − 1,) as far as readings stand for them: in a gap nothing was read."""
+    usual = float(np.median(steps))
+    return np.where(steps > GAP * usual, usual, steps)
+
+
 def steps_to(steps: Array | Linearised) -> NDArray[np.float64]:
     """Time that each sample stands for, (N,): half of the steps (N − 1,) on both sides of it."""
-    step = steps.steps if isinstance(steps, Linearised) else steps
+    step = counted(steps.steps if isinstance(steps, Linearised) else steps)
     return np.concatenate([[step[0]], 0.5 * (step[1:] + step[:-1]), [step[-1]]])

@@ -11,12 +11,14 @@ from casest.engine.normal import (
     summed,
     triangular_factor,
 )
+from casest.engine.recursion import Recursion
 from casest.engine.replay import Columns, Plan, Replay, Samples
 
 __all__ = [
     "Columns",
     "Normal",
     "Plan",
+    "Recursion",
     "Replay",
     "Samples",
     "cost",

@@ -18,7 +18,7 @@ import platform
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -28,7 +28,8 @@ from pathlib import Path
 import numpy as np
 
 from casest.engine.emit import source, source_of_sum
-from casest.engine.replay import Columns, Entry, Floats, Replay
+from casest.engine.operations import Floats
+from casest.engine.replay import Columns, Entry, Replay
 
 #: A kernel is built for at least this many samples: below, compiling costs more than it saves.
 WORTHWHILE = 5_000
@@ -194,6 +195,13 @@ def _kernel(
 
 
 def _made(text: str) -> Kernel | None:
+    found = library(text, _FLAGS)
+    return None if found is None else Kernel(found)
+
+
+def library(text: str, flag_sets: Sequence[list[str]], *, build: bool = True) -> ctypes.CDLL | None:
+    """C source as a loaded library: from the cache folder, or compiled with the first flags that
+    work (with `build`); None where neither can be."""
     compiler = _compiler()
     if compiler is None:
         return None
@@ -201,13 +209,13 @@ def _made(text: str) -> Kernel | None:
         folder = cache_folder()
         folder.mkdir(parents=True, exist_ok=True)
         machine = [compiler, _version(compiler), _processor()]
-        paths = [folder / f"{_key([text, *machine, *flags])}.so" for flags in _FLAGS]
+        paths = [folder / f"{_key([text, *machine, *flags])}.so" for flags in flag_sets]
         for path in paths:
             if _whole(path):
-                return Kernel(ctypes.CDLL(str(path)))
-        for flags, path in zip(_FLAGS, paths, strict=True):
+                return ctypes.CDLL(str(path))
+        for flags, path in zip(flag_sets if build else [], paths, strict=False):
             if _compiled(compiler, text, flags, path):
-                return Kernel(ctypes.CDLL(str(path)))
+                return ctypes.CDLL(str(path))
     except (OSError, ValueError, subprocess.SubprocessError):
         return None
     return None

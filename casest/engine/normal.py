@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casest.engine.kernel import Kernel, kernel_for, kernel_of_sum
-from casest.engine.replay import BLOCK, Entry, Floats, Replay, Samples
+from casest.engine.operations import Floats
+from casest.engine.replay import BLOCK, Entry, Replay, Samples
 from casest.errors import CasestError
 
 _RESIDUAL = 0  # which output

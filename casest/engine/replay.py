@@ -11,203 +11,20 @@ The way down: `Replay` (what users hold) > `Plan` (which values to compute, and 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterator, Sequence
 from typing import Any
 
-import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from casest.engine.graph import PARAMETER, SAMPLE, Graph
+from casest.engine.grouping import group
+from casest.engine.operations import KERNELS, Floats, Kernel
 from casest.errors import CasestError
 
-Floats = NDArray[np.float64]
-Kernel = Callable[..., object]
 Entry = tuple[int, int]  # (output, index of the nonzero in CasADi's column-major order)
 
 BLOCK = 9216  # samples per block: long enough to hide the cost of NumPy's calls
-
-
-# Kernels: f(operand, ..., out). An operand is a row of samples or a 0-d array. The composite ones
-# finish every read of their operands before they write, since `out` may be one of them.
-
-
-def _twice(a: Floats, out: Floats) -> None:
-    np.add(a, a, out)
-
-
-def _sign(a: Floats, out: Floats) -> None:
-    # Not np.sign, which loses the sign of -0.0.
-    np.copyto(out, np.where(a < 0, -1.0, np.where(a > 0, 1.0, a)))
-
-
-def _if_else_zero(condition: Floats, a: Floats, out: Floats) -> None:
-    # Not a product: 0 * inf is nan.
-    np.copyto(out, np.where(condition != 0, a, 0.0))
-
-
-def _fmin(a: Floats, b: Floats, out: Floats) -> None:
-    # Not np.fmin: of 0.0 and -0.0 it takes either, CasADi the first.
-    np.copyto(out, np.where((a <= b) | (b != b), a, b))
-
-
-def _fmax(a: Floats, b: Floats, out: Floats) -> None:
-    np.copyto(out, np.where((a >= b) | (b != b), a, b))
-
-
-def _remainder(a: Floats, b: Floats, out: Floats) -> None:
-    """IEEE 754 remainder, exact (np.remainder is Python's %): the algorithm of FreeBSD's libm."""
-    y = np.abs(b)
-    # 2y overflows only where |a| < 2y holds anyway, and fmod(x, inf) is x.
-    r = np.fmod(np.abs(a), y + y)
-    # r > y/2, in a form that is exact for both tiny and huge y.
-    tiny = y < 1.0
-    over = np.where(tiny, r + r > y, r > 0.5 * y)
-    r = np.where(over, r - y, r)
-    over &= np.where(tiny, r + r >= y, r >= 0.5 * y)
-    r = np.where(over, r - y, r)
-    np.copyto(out, np.where(np.signbit(a), -r, r))
-
-
-def _pow(a: Floats, b: Floats, out: Floats) -> None:
-    # For a single exponent of 0.5 NumPy takes the square root, which is -0.0 of -0.0 and nan of
-    # -inf, where pow is 0.0 and inf.
-    if b.ndim == 0 and b == 0.5:
-        np.copyto(out, np.where(np.isinf(a), np.abs(a), np.sqrt(a) + 0.0))
-    else:
-        np.power(a, b, out)
-
-
-def _erf(a: Floats, out: Floats) -> None:
-    from scipy.special import erf  # imported late: few models use it, and SciPy loads slowly
-
-    erf(a, out)
-
-
-KERNELS: dict[int, Kernel] = {
-    ca.OP_ADD: np.add,
-    ca.OP_SUB: np.subtract,
-    ca.OP_MUL: np.multiply,
-    ca.OP_DIV: np.divide,
-    ca.OP_NEG: np.negative,
-    ca.OP_EXP: np.exp,
-    ca.OP_LOG: np.log,
-    ca.OP_LOG1P: np.log1p,
-    ca.OP_EXPM1: np.expm1,
-    ca.OP_POW: _pow,
-    ca.OP_CONSTPOW: _pow,
-    ca.OP_SQRT: np.sqrt,
-    ca.OP_SQ: np.square,
-    ca.OP_TWICE: _twice,
-    ca.OP_INV: np.reciprocal,
-    ca.OP_SIN: np.sin,
-    ca.OP_COS: np.cos,
-    ca.OP_TAN: np.tan,
-    ca.OP_ASIN: np.arcsin,
-    ca.OP_ACOS: np.arccos,
-    ca.OP_ATAN: np.arctan,
-    ca.OP_SINH: np.sinh,
-    ca.OP_COSH: np.cosh,
-    ca.OP_TANH: np.tanh,
-    ca.OP_ASINH: np.arcsinh,
-    ca.OP_ACOSH: np.arccosh,
-    ca.OP_ATANH: np.arctanh,
-    ca.OP_ATAN2: np.arctan2,
-    ca.OP_HYPOT: np.hypot,
-    ca.OP_FMIN: _fmin,
-    ca.OP_FMAX: _fmax,
-    ca.OP_FABS: np.fabs,
-    ca.OP_FLOOR: np.floor,
-    ca.OP_CEIL: np.ceil,
-    ca.OP_FMOD: np.fmod,
-    ca.OP_REMAINDER: _remainder,
-    ca.OP_SIGN: _sign,
-    ca.OP_COPYSIGN: np.copysign,
-    ca.OP_ERF: _erf,
-    ca.OP_LT: np.less,
-    ca.OP_LE: np.less_equal,
-    ca.OP_EQ: np.equal,
-    ca.OP_NE: np.not_equal,
-    ca.OP_NOT: np.logical_not,
-    ca.OP_AND: np.logical_and,
-    ca.OP_OR: np.logical_or,
-    ca.OP_IF_ELSE_ZERO: _if_else_zero,
-}
-_COMMUTATIVE = {ca.OP_ADD, ca.OP_MUL}
-_SAME = {ca.OP_ASSIGN, ca.OP_LIFT}  # the value of the (first) operand, unchanged
-_PARAMETER = 0  # which input
-_SAMPLE = 1
-
-
-@dataclass(frozen=True)
-class _Value:
-    """One value of the single-assignment form: a constant, an input entry or an operation."""
-
-    kind: str  # "constant", "parameter", "sample" or "operation"
-    code: int = 0  # index into the input, or CasADi's operation
-    operands: tuple[int, ...] = ()
-    constant: float = 0.0
-    per_sample: bool = False
-
-
-class _Graph:
-    """The instruction list in single-assignment form, with equal values merged.
-
-    `values` are in order of computation; `outputs[i][j]` is the value of nonzero j of output i.
-    """
-
-    def __init__(self, function: Any) -> None:
-        self.values: list[_Value] = []
-        self.outputs = [[-1] * function.nnz_out(i) for i in range(function.n_out())]
-        self._known: dict[object, int] = {}
-        register: dict[int, int] = {}
-        for k in range(function.n_instructions()):
-            code = function.instruction_id(k)
-            source = function.instruction_input(k)
-            target = function.instruction_output(k)
-            if code == ca.OP_OUTPUT:
-                self.outputs[target[0]][target[1]] = register[source[0]]
-            elif code in _SAME:
-                register[target[0]] = register[source[0]]
-            elif code == ca.OP_CONST:
-                constant = float(function.instruction_constant(k))
-                register[target[0]] = self._add(_Value("constant", constant=constant))
-            elif code == ca.OP_INPUT:
-                register[target[0]] = self._add(_input(source[0], source[1]))
-            elif code in KERNELS:
-                operands = tuple(register[i] for i in source)
-                register[target[0]] = self._add(self._operation(code, operands))
-            else:
-                raise CasestError(
-                    f"function {function.name()!r} uses the operation {_name(code)}, which replay"
-                    " does not know: write the expression without it"
-                )
-
-    def _operation(self, code: int, operands: tuple[int, ...]) -> _Value:
-        if code in _COMMUTATIVE:
-            operands = tuple(sorted(operands))
-        per_sample = any(self.values[i].per_sample for i in operands)
-        return _Value("operation", code, operands, per_sample=per_sample)
-
-    def _add(self, value: _Value) -> int:
-        # Constants by their bits, to keep -0.0 from 0.0.
-        bits = np.float64(value.constant).tobytes() if value.kind == "constant" else b""
-        key = (value.kind, value.code, value.operands, bits)
-        if key not in self._known:
-            self._known[key] = len(self.values)
-            self.values.append(value)
-        return self._known[key]
-
-
-def _input(which: int, index: int) -> _Value:
-    if which == _PARAMETER:
-        return _Value("parameter", index)
-    return _Value("sample", index, per_sample=True)
-
-
-def _name(code: int) -> str:
-    names = [name for name in dir(ca) if name.startswith("OP_") and getattr(ca, name) == code]
-    return names[0] if names else f"number {code}"
 
 
 class Columns:
@@ -257,10 +74,10 @@ class Plan:
     over as soon as its last reader has run. The other values live in `scalars`.
     """
 
-    def __init__(self, graph: _Graph, wanted: Sequence[Entry]) -> None:
+    def __init__(self, graph: Graph, wanted: Sequence[Entry]) -> None:
         self.graph = graph
         self.wanted = [graph.outputs[output][nonzero] for output, nonzero in wanted]
-        needed = self._needed()
+        needed = graph.needed(self.wanted)
         values = graph.values
         self.scalars = [i for i in needed if not values[i].per_sample]
         self.inputs = [i for i in needed if values[i].kind == "sample"]
@@ -273,16 +90,6 @@ class Plan:
                 self.home.setdefault(i, row)
         self.register, self.n_registers = self._assign_registers()
         self._idle: list[_Workspace] = []
-
-    def _needed(self) -> list[int]:
-        needed: set[int] = set()
-        stack = list(self.wanted)
-        while stack:
-            i = stack.pop()
-            if i not in needed:
-                needed.add(i)
-                stack.extend(self.graph.values[i].operands)
-        return sorted(needed)
 
     def _assign_registers(self) -> tuple[dict[int, int], int]:
         values = self.graph.values
@@ -419,12 +226,18 @@ class Replay:
     standard fixes but copysign can see, may differ.
     """
 
-    def __init__(self, function: Any) -> None:
+    def __init__(self, function: Any, grouped: Collection[int] = ()) -> None:
+        """From a function; outputs that are `grouped` may be computed in another order.
+
+        That takes fewer operations (see `grouping`), and changes the last digits.
+        """
         _check_function(function)
         self.name = str(function.name())
-        self.n_parameters = int(function.numel_in(_PARAMETER))
-        self.n_sample = int(function.numel_in(_SAMPLE))
-        self._graph = _Graph(function)
+        self.n_parameters = int(function.numel_in(PARAMETER))
+        self.n_sample = int(function.numel_in(SAMPLE))
+        self._graph = Graph(function)
+        if grouped:
+            group(self._graph, grouped)
         self.shapes: list[tuple[int, int]] = [
             (int(function.size1_out(i)), int(function.size2_out(i)))
             for i in range(function.n_out())

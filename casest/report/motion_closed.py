@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from casest.closing_motion.loop import MotionClosing
-from casest.closing_motion.text import sentence
+from casest.closing_motion.text import found, sentence
 from casest.report.calibration import error_picture
 from casest.report.figures import Figures
 from casest.report.fitted import reproduction
@@ -68,7 +68,7 @@ def _effects(content: Mapping[str, Any]) -> str:
         return section("effects", "Effects", said)
     texts = []
     for e in content["effects"]:
-        text = f"{e['name']} of {e['on']}: {e['formula']} (p = {e['p_value']:.1g})"
+        text = f"{e['name']} of {e['on']}: {e['formula']}{found(e)} (p = {number(e['p_value'], 1)})"
         if e["indistinguishable_from"]:
             text += f"; not told apart from {', '.join(e['indistinguishable_from'])}"
         texts.append(text + ".")

@@ -1,0 +1,102 @@
+"""The instruction list of a CasADi SX function as a graph of values."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from casest.engine.operations import KERNELS
+from casest.errors import CasestError
+
+_COMMUTATIVE = {ca.OP_ADD, ca.OP_MUL}
+_SAME = {ca.OP_ASSIGN, ca.OP_LIFT}  # the value of the (first) operand, unchanged
+PARAMETER = 0  # which input
+SAMPLE = 1
+
+
+@dataclass(frozen=True)
+class Value:
+    """One value of the single-assignment form: a constant, an input entry or an operation."""
+
+    kind: str  # "constant", "parameter", "sample" or "operation"
+    code: int = 0  # index into the input, or CasADi's operation
+    operands: tuple[int, ...] = ()
+    constant: float = 0.0
+    per_sample: bool = False
+
+
+class Graph:
+    """The instruction list in single-assignment form, with equal values merged.
+
+    `values` are in order of computation; `outputs[i][j]` is the value of nonzero j of output i.
+    """
+
+    def __init__(self, function: Any) -> None:
+        self.values: list[Value] = []
+        self.outputs = [[-1] * function.nnz_out(i) for i in range(function.n_out())]
+        self._known: dict[object, int] = {}
+        register: dict[int, int] = {}
+        for k in range(function.n_instructions()):
+            code = function.instruction_id(k)
+            source = function.instruction_input(k)
+            target = function.instruction_output(k)
+            if code == ca.OP_OUTPUT:
+                self.outputs[target[0]][target[1]] = register[source[0]]
+            elif code in _SAME:
+                register[target[0]] = register[source[0]]
+            elif code == ca.OP_CONST:
+                constant = float(function.instruction_constant(k))
+                register[target[0]] = self.add(Value("constant", constant=constant))
+            elif code == ca.OP_INPUT:
+                register[target[0]] = self.add(_input(source[0], source[1]))
+            elif code in KERNELS:
+                operands = tuple(register[i] for i in source)
+                register[target[0]] = self.add(self.operation(code, operands))
+            else:
+                raise CasestError(
+                    f"function {function.name()!r} uses the operation {_name(code)}, which replay"
+                    " does not know: write the expression without it"
+                )
+
+    def needed(self, wanted: Iterable[int]) -> list[int]:
+        """Values that these take, in order of computation."""
+        found: set[int] = set()
+        stack = list(wanted)
+        while stack:
+            i = stack.pop()
+            if i not in found:
+                found.add(i)
+                stack.extend(self.values[i].operands)
+        return sorted(found)
+
+    def operation(self, code: int, operands: tuple[int, ...]) -> Value:
+        """An operation on values of the graph, not yet one of them."""
+        if code in _COMMUTATIVE:
+            operands = tuple(sorted(operands))
+        per_sample = any(self.values[i].per_sample for i in operands)
+        return Value("operation", code, operands, per_sample=per_sample)
+
+    def add(self, value: Value) -> int:
+        """The number of a value, which is added where there is no equal one."""
+        # Constants by their bits, to keep -0.0 from 0.0.
+        bits = np.float64(value.constant).tobytes() if value.kind == "constant" else b""
+        key = (value.kind, value.code, value.operands, bits)
+        if key not in self._known:
+            self._known[key] = len(self.values)
+            self.values.append(value)
+        return self._known[key]
+
+
+def _input(which: int, index: int) -> Value:
+    if which == PARAMETER:
+        return Value("parameter", index)
+    return Value("sample", index, per_sample=True)
+
+
+def _name(code: int) -> str:
+    names = [name for name in dir(ca) if name.startswith("OP_") and getattr(ca, name) == code]
+    return names[0] if names else f"number {code}"

@@ -1,0 +1,124 @@
+"""A step that begins where the one before ended, over a whole record: a filter's, a simulation's.
+
+CasADi's virtual machine runs the step's instructions; compiled by the machine's C compiler they run
+ten times as fast and give the same digits. Compiling takes half a second: it is done once so much
+has been spent on replaying, and what is in the cache folder already is used at once.
+
+Environment: as for the kernels.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from casest.engine.kernel import library
+from casest.engine.operations import Floats
+
+#: Steps that CasADi runs in one call.
+CHUNK = 500
+#: Steps of one call from which on the cache is looked at, and replayed ones that make a compiler
+#: worthwhile.
+LOOK, WORTHWHILE = 5_000, 60_000
+#: No contraction: the digits are those of the virtual machine.
+_FLAGS = [["-O1", "-ffp-contract=off", "-fno-math-errno"]]
+
+_LOOP = """
+void casest_run(const double *state, const double *numbers, long n, double **out, int keep) {
+  const double *from = state;
+  const double *arg[2];
+  double *res[%(outputs)d];
+  static const long size[] = {%(sizes)s};
+  for (long k = 0; k < n; ++k) {
+    arg[0] = from;
+    arg[1] = numbers + k * %(wide)d;
+    res[0] = out[0] + (keep ? k : k %% 2) * size[0];
+    for (int i = 1; i < %(outputs)d; ++i) res[i] = out[i] + k * size[i];
+    casest_step(arg, res, 0, 0, 0);
+    from = res[0];
+  }
+}
+"""
+
+
+class Recursion:
+    """`step`: (state, numbers of one sample) -> (state, …), both vectors, of SX."""
+
+    def __init__(self, step: ca.Function) -> None:
+        arguments = step.sx_in()
+        self._step = ca.Function("casest_step", arguments, step.call(arguments), {"cse": True})
+        self.sizes = [int(step.numel_out(i)) for i in range(step.n_out())]
+        self._wide = int(step.numel_in(1))
+        self._replayed = 0
+        self._library: ctypes.CDLL | None = None
+        self._looked = self._built = False
+        self._chunk: Any = None
+
+    def __call__(self, state: Floats, numbers: Floats, *, keep: bool = True) -> list[Floats]:
+        """Every output of every step, (N, …) each; without `keep` of the states nothing of use.
+
+        `state`: what the first step begins from; `numbers` (N, …): what each step is given.
+        """
+        count = len(numbers)
+        state = np.ascontiguousarray(state, float).ravel()
+        numbers = np.ascontiguousarray(numbers, float)
+        rows = [count if keep or i else 2 for i in range(len(self.sizes))]
+        found = [np.empty((r, size)) for r, size in zip(rows, self.sizes, strict=True)]
+        compiled = self._compiled(count)
+        if compiled is None:
+            self._replay(state, numbers, found, keep)
+            self._replayed += count
+            return found
+        places = (ctypes.c_void_p * len(found))(*[f.ctypes.data for f in found])
+        compiled.casest_run(
+            ctypes.c_void_p(state.ctypes.data),
+            ctypes.c_void_p(numbers.ctypes.data),
+            ctypes.c_long(count),
+            places,
+            ctypes.c_int(keep),
+        )
+        return found
+
+    def _compiled(self, count: int) -> ctypes.CDLL | None:
+        wish = os.environ.get("CASEST_KERNEL", "auto")
+        if wish == "off":
+            return None
+        due = wish == "always" or self._replayed + count > WORTHWHILE
+        if self._library is None and due and not self._built:
+            self._built = self._looked = True
+            self._library = library(self._source(), _FLAGS)
+        elif self._library is None and count >= LOOK and not self._looked:
+            self._looked = True
+            self._library = library(self._source(), _FLAGS, build=False)
+        return self._library
+
+    def _source(self) -> str:
+        generator = ca.CodeGenerator("step.c")
+        generator.add(self._step)
+        sizes = {"outputs": len(self.sizes), "sizes": ", ".join(map(str, self.sizes))}
+        return str(generator.dump()) + _LOOP % {**sizes, "wide": self._wide}
+
+    def _replay(self, state: Floats, numbers: Floats, found: list[Floats], keep: bool) -> None:
+        if self._chunk is None:
+            self._chunk = self._step.mapaccum("steps", CHUNK)
+        # CasADi's matrices are column by column: a row of these arrays is one of its columns.
+        buffer, run = self._chunk.buffer()
+        parts = [np.empty((CHUNK, size)) for size in self.sizes]
+        for i, part in enumerate(parts):
+            buffer.set_res(i, memoryview(part))  # type: ignore[arg-type]
+        for k in range(0, len(numbers), CHUNK):
+            given = numbers[k : k + CHUNK]
+            size = len(given)
+            if size < CHUNK:
+                given = np.concatenate([given, np.repeat(given[-1:], CHUNK - size, axis=0)])
+            for i, array in enumerate((state, given)):
+                buffer.set_arg(i, memoryview(array))  # type: ignore[arg-type]
+            run()
+            for i, part in enumerate(parts):
+                if keep or i:
+                    found[i][k : k + size] = part[:size]
+            state = parts[0][-1].copy()
