@@ -74,6 +74,10 @@ _ATOMS: dict[str, _Size] = {
     "V": _si(1.0, kg=1, m=2, s=-3, A=-1),
     "mV": _si(1e-3, kg=1, m=2, s=-3, A=-1),
     "uV": _si(1e-6, kg=1, m=2, s=-3, A=-1),
+    "ohm": _si(1.0, kg=1, m=2, s=-3, A=-2),
+    "kohm": _si(1e3, kg=1, m=2, s=-3, A=-2),
+    "Mohm": _si(1e6, kg=1, m=2, s=-3, A=-2),
+    "mohm": _si(1e-3, kg=1, m=2, s=-3, A=-2),
     "g": _si(STANDARD_GRAVITY, m=1, s=-2),
     "mg": _si(STANDARD_GRAVITY * 1e-3, m=1, s=-2),
     "ug": _si(STANDARD_GRAVITY * 1e-6, m=1, s=-2),
@@ -119,12 +123,13 @@ _SPELLINGS: dict[str, str] = {
     "m/s": "mps ms-1 ms^-1 m*s^-1",
     "rad": "rads radian radians",
     "deg": "degs degree degrees",
+    "mdeg/s": "mdps",
     "deg/s": "dps DPS degps deg*s^-1",
     "rad/s": "rps rads/s radps rad*s^-1",
     "arcsec": "as arcsecond arcseconds",
     "arcmin": "arcminute arcminutes",
     "rev": "revolution revolutions turn turns",
-    "rpm": "RPM rev/min",
+    "rpm": "RPM rev/min U/min",
     "T": "tesla teslas",
     "uT": "microtesla",
     "mT": "millitesla",
@@ -135,6 +140,10 @@ _SPELLINGS: dict[str, str] = {
     "degF": "F fahrenheit Fahrenheit deg_F",
     "K": "kelvin Kelvin",
     "V": "volt volts",
+    "ohm": "Ohm ohms Ohms",
+    "kohm": "kOhm KOhm kohms kOhms",
+    "Mohm": "MOhm Mohms MOhms",
+    "mohm": "mOhm mohms mOhms",
     "A": "amp ampere",
 }
 _CANONICAL = {name: name for name in _ATOMS} | {
@@ -142,11 +151,25 @@ _CANONICAL = {name: name for name in _ATOMS} | {
     for name, spellings in _SPELLINGS.items()
     for spelling in [name, *spellings.split()]
 }
-# Case tells g from G and ms from Ms, so it is forgiven only in names of three letters or more.
-_ANY_CASE = {name.lower(): unit for name, unit in _CANONICAL.items() if len(name) >= 3}
+# Case tells g from G, ms from Ms and mohm from Mohm, so it is forgiven only in names of three
+# letters or more that mean one unit in any case.
+_IN_LOWER_CASE = [(name.lower(), unit) for name, unit in _CANONICAL.items() if len(name) >= 3]
+_ANY_CASE = {
+    name: unit
+    for name, unit in _IN_LOWER_CASE
+    if {u for n, u in _IN_LOWER_CASE if n == name} == {unit}
+}
 
 _SUPERSCRIPT = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻", "0123456789-")
-_SIGNS = (("µ", "u"), ("μ", "u"), ("°", "deg"), ("º", "deg"), ("−", "-"))
+_SIGNS = (
+    ("µ", "u"),
+    ("μ", "u"),
+    ("°", "deg"),
+    ("º", "deg"),
+    ("−", "-"),
+    ("Ω", "ohm"),
+    ("\u2126", "ohm"),
+)
 _PRODUCT_SIGNS = ("·", "⋅", "×")  # a middle dot, a dot operator, a times sign
 _TOKEN = re.compile(
     r"\s*(?:(?P<name>[A-Za-z_%][A-Za-z_0-9%]*)|(?P<number>[-+]?\d+(?:\.\d+)?)|(?P<sign>[*/^()]))"

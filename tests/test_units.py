@@ -19,6 +19,7 @@ from casest.units import (
     parse_quantity,
     product,
     quotient,
+    size,
 )
 
 SPELLINGS = [
@@ -249,3 +250,17 @@ def test_g_is_a_gram_where_a_mass_is_wanted():
     assert conversion("g", "kg") == pytest.approx((1e-3, 0.0))
     assert conversion("mg", "kg") == pytest.approx((1e-6, 0.0))
     assert conversion("g", "m/s^2") == pytest.approx((9.80665, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("written", "factor"),
+    [("Ohm", 1.0), ("kOhm", 1e3), ("kΩ", 1e3), ("\u2126", 1.0), ("MΩ", 1e6), ("mOhm", 1e-3)],
+)
+def test_ohms_are_read_as_they_are_written(written, factor):
+    assert size(written)[0] == factor
+    assert size(written)[1] == size("V/A")[1]
+
+
+def test_case_that_would_tell_two_units_apart_is_not_forgiven():
+    with pytest.raises(UnitError, match="MOHM"):
+        canonical("MOHM")
