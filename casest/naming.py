@@ -61,9 +61,13 @@ def resolved(unit: str, known: Mapping[str, str]) -> str:
         value = _difference(known.get(match[1], match[0]))
         return f"({value})" if "/" in value or "*" in value else value
 
-    found = _PLACEHOLDER.sub(replacement, unit) or "1"
-    found = re.sub(r"\(\(([^()]*)\)\)", r"(\1)", found)
-    return re.sub(r"\((\w+)\)", r"\1", found)
+    return _plainer(_PLACEHOLDER.sub(replacement, unit) or "1")
+
+
+def _plainer(unit: str) -> str:
+    """Without parentheses that nobody needs: 1/((m/s^2))^2, 1/(g), (rad/s)."""
+    unit = re.sub(r"\(\(([^()]*)\)\)", r"(\1)", unit)
+    return re.sub(r"(?<!\w)\((\w+)\)|^\(([^()]*)\)$", lambda m: m[1] or m[2], unit)
 
 
 def _difference(unit: str) -> str:

@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from casest.errors import UnitError, UsageError
+from casest.naming import resolved
 from casest.units import (
     canonical,
     conversion,
@@ -264,3 +265,12 @@ def test_ohms_are_read_as_they_are_written(written, factor):
 def test_case_that_would_tell_two_units_apart_is_not_forgiven():
     with pytest.raises(UnitError, match="MOHM"):
         canonical("MOHM")
+
+
+@pytest.mark.parametrize(
+    ("declared", "printed"),
+    [("1/([u])^2", "1/(m/s^2)^2"), ("[u]/s", "(m/s^2)/s"), ("([u])", "m/s^2"),
+     ("1/([c])^2", "1/count^2"), ("[u]/sqrt(Hz)", "(m/s^2)/sqrt(Hz)")],
+)  # fmt: skip
+def test_a_unit_is_printed_without_parentheses_that_nobody_needs(declared, printed):
+    assert resolved(declared, {"u": "m/s^2", "c": "count"}) == printed
