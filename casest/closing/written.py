@@ -140,8 +140,11 @@ def _attached(found: Found, closing: Closing) -> Attached | None:
 
 def _formula(found: Found, attached: Attached | None) -> str:
     """What the effect does, with the name of its column."""
-    if attached is None:
-        return f"{found.candidate.freed} is an unknown"
+    return f"{found.candidate.freed} is an unknown" if attached is None else formula_of(attached)
+
+
+def formula_of(attached: Attached) -> str:
+    """What the effect does where it is attached, its columns and numbers put in."""
     formula = attached.effect.formula or attached.effect.doc.partition("\n")[0]
     for name, column in attached.columns:
         formula = formula.replace(name, column)

@@ -11,9 +11,9 @@ from typing import Any
 import casadi as ca
 
 from casest.apply import LEFT, Correction, invertible
+from casest.closing.written import formula_of
 from casest.errors import CasestError
 from casest.following import applying, typed_words
-from casest.modelling.effect import Attached
 from casest.modelling.model import Model
 from casest.modelling.tracing import trace
 from casest.report.numbers import printed_unit
@@ -82,7 +82,9 @@ def _steps(model: Model, units: Mapping[str, str], typed: str, folder: str) -> l
         )
         inside = [a for a in model.effects if a.on in chain]
         if inside:
-            effects = "; ".join(f"`{a.label}` makes `{a.on}` {_said(a)}" for a in inside)
+            effects = "; ".join(
+                f"`{a.label}` makes `{a.on}` {formula_of(a).rstrip('.')}" for a in inside
+            )
             steps.append(f"On the way each added effect is undone where it acts: {effects}.")
     if left:
         steps.append(f"{LEFT.capitalize()}{', '.join(f'`{label}`' for label in left)}.")
@@ -98,10 +100,6 @@ def _command(typed: str, folder: str) -> str:
     words = typed_words(typed)
     line = applying(words, folder).lines() if words else f"casest apply {folder} DATA"
     return textwrap.dedent(line)
-
-
-def _said(attached: Attached) -> str:
-    return attached.effect.formula or attached.effect.doc.partition("\n")[0].rstrip(".")
 
 
 def _elsewhere(model: Model, chain: list[str]) -> Iterator[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -153,7 +154,9 @@ def _effect(e: Mapping[str, Any], doc: str, story: Story) -> str:
     ]
     evidence = [f"Chance of as much by noise alone: p = {number(e['p_value'], 2)}."]
     if gain:
-        unit = "" if story.unit == "1" else f" ({printed_unit(story.unit)})²"
+        alone = re.fullmatch(r"\w+", story.unit)
+        squared = f"{story.unit}^2" if alone else f"({story.unit})^2"
+        unit = "" if story.unit == "1" else f" {printed_unit(squared)}"
         evidence.append(
             f"The mean square error on held-out data falls by {number(gain)}{unit}, residuals "
             f"beyond {FAR:g} standard deviations of the noise counted as {FAR:g}."
