@@ -141,7 +141,8 @@ def _attached(found: Found, closing: Closing) -> Attached | None:
 def _formula(found: Found, attached: Attached | None) -> str:
     """What the effect does, with the name of its column."""
     if attached is None:
-        return f"{found.candidate.freed} is an unknown"
+        effect = found.candidate.effect
+        return effect.formula if effect else f"{found.candidate.freed} is an unknown"
     formula = attached.effect.formula or attached.effect.doc.partition("\n")[0]
     for name, column in attached.columns:
         formula = formula.replace(name, column)
