@@ -73,7 +73,15 @@ def invisible(closing: Closing) -> list[Invisible]:
                 _shown_by(candidate),
                 {n: p.units[0] for n, p in zip(names, parameters, strict=True)},
             )
-    return sorted(found.values(), key=lambda i: i.share)
+    # What would do most harm comes first; shares that are rounding say nothing of order.
+    return sorted(found.values(), key=lambda i: -_harm(closing, i))
+
+
+def _harm(closing: Closing, hidden: Invisible) -> float:
+    """Largest unseen shift in standard deviations of the parameter, two digits."""
+    std = {n: s[s > 0] for n, s in closing.before.std.items()}  # the rest is zero by its shape
+    shifts = [v / float(np.min(std[n], initial=np.inf)) for n, v in hidden.would_move.items()]
+    return float(f"{max(shifts, default=0.0):.2g}")
 
 
 def _own(candidate: Candidate, model: Model) -> list[Parameter]:

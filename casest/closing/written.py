@@ -140,7 +140,10 @@ def _attached(found: Found, closing: Closing) -> Attached | None:
 
 def _formula(found: Found, attached: Attached | None) -> str:
     """What the effect does, with the name of its column."""
-    return f"{found.candidate.freed} is an unknown" if attached is None else formula_of(attached)
+    if attached is None:
+        effect = found.candidate.effect
+        return effect.formula if effect else f"{found.candidate.freed} is an unknown"
+    return formula_of(attached)
 
 
 def formula_of(attached: Attached) -> str:
