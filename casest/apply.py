@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal
 
@@ -16,6 +16,7 @@ from casest.declaring.shapes import Array
 from casest.declaring.symbols import Signal
 from casest.engine import Replay
 from casest.errors import DataError, UsageError
+from casest.modelling.effect import Attached
 from casest.modelling.model import Model
 from casest.modelling.tracing import (
     Traced,
@@ -26,8 +27,37 @@ from casest.modelling.tracing import (
     trace,
 )
 
+#: What is said of effects that a correction leaves in the readings.
+LEFT = "not undone, which would amplify the noise without bound: "
+
 #: Newton steps, each halved up to HALVINGS times until it gains.
 STEPS, HALVINGS = 60, 30
+
+
+def invertible(model: Model) -> tuple[Model, tuple[str, ...]]:
+    """The model without the effects that a correction of single samples cannot undo; their labels.
+
+    Those are effects on the sequence of samples, and those that act on rates of the reading.
+    """
+    if model.traced.corrected is None:
+        return model, ()
+    left = [a for a in model.effects if a.kind == "sequence" or _acts_on_a_rate(model, a)]
+    kept = tuple(a for a in model.effects if a not in left)
+    return replace(model, effects=kept), tuple(a.label for a in left)
+
+
+def _acts_on_a_rate(model: Model, attached: Attached) -> bool:
+    """Does the effect vanish where the corrected quantity is one free number, without a rate?"""
+    name = model.traced.corrected
+    if attached.kind != "quantity" or model.implicit or not attached.parameters or name is None:
+        return False
+    cut = trace(model, cut=name)
+    wanted = cut.quantities[name].declared
+    declared = cut.quantities[attached.on].declared
+    if attached.on != name and not ca.depends_on(ca.vec(declared), ca.vec(wanted)):
+        return False  # it lies before the correction
+    own = {p.name for p in attached.parameters}
+    return not own & reached_parameters(model, cut, cut.expression)
 
 
 @dataclass(frozen=True)
@@ -44,10 +74,12 @@ class Correction:
         """Refuse what has no inverse, sample by sample."""
         if self.model.traced.corrected is None:
             raise UsageError(f"model {self.model.name} names no corrected quantity: Residual(…)")
-        if any(a.kind == "sequence" for a in self.model.effects):
+        left = invertible(self.model)[1]
+        if left:
             raise UsageError(
-                f"model {self.model.name} has an effect on the sequence of samples: undoing it "
-                "would amplify the noise without bound; calibrate without it to apply the rest"
+                f"model {self.model.name} has an effect on the sequence of samples or on rates "
+                f"({', '.join(left)}): undoing it would amplify the noise without bound; "
+                "`invertible` gives the model without it"
             )
 
     @property

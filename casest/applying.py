@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from casest.apply import Correction
+from casest.apply import Correction, invertible
 from casest.closing.restrict import axis_name, restricted
 from casest.data import load_runs
 from casest.data.run import Run
@@ -97,16 +97,20 @@ def _as_it_was(effect: Effect, saved: Mapping[str, Any], own: set[str], model: M
 
 def corrected_csv(
     path: Path, data: str, arguments: Mapping[str, Any], *, force: bool = False
-) -> str:
-    """CSV with time, the readings and the corrected readings, units in the header."""
+) -> tuple[str, tuple[str, ...]]:
+    """CSV with time, the readings and the corrected readings, units in the header.
+
+    Beside it the effects that are left in the readings (see `invertible`).
+    """
     result = load_result(path)
     if not result.get("trusted", True) and not force:
         raise UsageError(f"{path}: this estimate was refused; --force applies it all the same")
-    model, values = saved_model(result)
+    saved, values = saved_model(result)
+    model, left = invertible(saved)
     correction = Correction(model)
     which = _run_number(model, correction, result, data)
     needed = {
-        n: _of_one_run(model[n], v, which) for n, v in values.items() if n in correction.parameters
+        n: _of_one_run(saved[n], v, which) for n, v in values.items() if n in correction.parameters
     }
     spare = {s.name for s in model.signals} - {s.name for s in correction.signals}
     runs = load_runs([data], correction.signals, **without(spare, arguments))
@@ -115,7 +119,7 @@ def corrected_csv(
     around = (known["low"], known["high"]) if "low" in known else None
     given, unit = correction.signals, result.get("units", {}).get(correction.name)
     found = [correction(run, needed, around) for run in runs]
-    return table_of(runs, [s.name for s in given], found, correction.name, unit)
+    return table_of(runs, [s.name for s in given], found, correction.name, unit), left
 
 
 def without(spare: Iterable[str], arguments: Mapping[str, Any]) -> dict[str, Any]:

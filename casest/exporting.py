@@ -5,13 +5,14 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
 from casest import __version__
-from casest.apply import Correction
+from casest.apply import Correction, invertible
 from casest.applying import saved_model, table_of, without
 from casest.data import load_runs
 from casest.declaring.shapes import Array
@@ -42,20 +43,24 @@ def exported(
     result = load_result(path)
     if not result.get("trusted", True) and not force:
         raise UsageError(f"{path}: this estimate was refused; --force exports it all the same")
-    model, values = saved_model(result)
+    saved, values = saved_model(result)
+    model, left = invertible(saved)
     correction = Correction(model)
     several = len(result["runs"]) > 1
     own = {p.name for p in model.parameters if p.scope == "run"} & correction.parameters
     if several and own and not 0 <= run < len(result["runs"]):
         raise UsageError(f"--run {run}: there are runs 0 to {len(result['runs']) - 1}")
-    known = {n: _of_run(model[n], np.asarray(v), run) for n, v in values.items()}
+    known = {n: _of_run(saved[n], np.asarray(v), run) for n, v in values.items()}
+    own_names = {p.name for p in model.parameters}
+    known = {n: v for n, v in known.items() if n in own_names}
     found = result.get("corrected") or {}
     around = (found["low"], found["high"]) if "low" in found else None
     samples, largest = _samples(correction, known, around)
     built = program(correction, known, result.get("units", {}), around, largest)
+    built = replace(built, left=left)
     expected = runtime.corrected(as_data(built), samples)
     if to == "json":
-        return _as_json(built, model, result, known)
+        return _as_json(built, saved, result, known)
     if to == "python":
         return python_source(built, (samples, expected))
     name = "correct_" + re.sub(r"\W", "_", model.name)
@@ -97,6 +102,7 @@ def _as_json(
         "casest": __version__,
         "model": result["model"],
         "signals": [s.name for s in model.signals],
+        "not_undone": list(built.left),
         "convention": result.get("convention", ""),
         "data": result["data"],
         "parameters": {
@@ -126,8 +132,11 @@ def is_exported(path: Path) -> bool:
     return isinstance(content, dict) and str(content.get("format", "")).startswith("casest-corr")
 
 
-def applied(path: Path, data: str, arguments: Mapping[str, Any]) -> str:
-    """CSV of readings and corrected values by an exported JSON correction alone."""
+def applied(path: Path, data: str, arguments: Mapping[str, Any]) -> tuple[str, tuple[str, ...]]:
+    """CSV of readings and corrected values by an exported JSON correction alone.
+
+    Beside it the effects that are left in the readings.
+    """
     content = json.loads(path.read_text(encoding="utf-8"))
     if content["format"] != FORMAT:
         raise UsageError(f"{path}: format {content['format']!r}; this casest reads {FORMAT}")
@@ -142,4 +151,5 @@ def applied(path: Path, data: str, arguments: Mapping[str, Any]) -> str:
             found.append(runtime.corrected(steps, x))
         except ValueError as error:
             raise DataError(f"{run.file}: {error}") from None
-    return table_of(runs, [s.name for s in signals], found, out["name"], out["unit"])
+    text = table_of(runs, [s.name for s in signals], found, out["name"], out["unit"])
+    return text, tuple(content.get("not_undone", []))

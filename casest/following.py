@@ -85,14 +85,14 @@ def following(
 
     output: folder of its results; trusted: whether there is an estimate to go on with; doubtful:
     whether its residual speaks against the model; applies: whether the model says what readings
-    correct to; moving: whether it is an estimator in motion; file: what simulate, apply or export
-    has written; fitted: the command that made the result.
+    correct to, or that an estimator in motion lacks nothing; moving: whether it is one; file: what
+    simulate, apply or export has written; fitted: the command that made the result.
     """
     typed = typed_words(command)
     if typed is None or not typed.arguments:
         return ""
     if typed.name == "close" and moving:
-        steps = _after_motion(typed, output, trusted)
+        steps = _after_motion(typed, output, trusted and applies)
     elif typed.name in ("calibrate", "close"):
         steps = _after_fit(typed, output, trusted, applies and not doubtful)
     elif typed.name == "simulate":
@@ -136,13 +136,13 @@ def exporting(result: str | Path) -> Typed:
     return Typed("export", (str(result),), (("--to", "c"),)).into(folder / "correction.c")
 
 
-def _after_motion(typed: Typed, output: str | Path | None, trusted: bool) -> _Steps:
+def _after_motion(typed: Typed, output: str | Path | None, complete: bool) -> _Steps:
     """After the loop of an estimator in motion: there is nothing to apply, but states."""
     reading = (*_READING, "--set")
     if output is None:
         yield "keep the result", typed.keeping("close", reading).into("out").lines()
         return
-    if trusted:
+    if complete:  # a filter whose model lacks something has no states to keep
         states = typed.keeping("filter", reading)
         states = replace(states, options=(*states.options, ("--noise", "ml")))
         into = Path(output) / "states"

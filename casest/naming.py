@@ -62,6 +62,7 @@ def resolved(unit: str, known: Mapping[str, str]) -> str:
         return f"({value})" if "/" in value or "*" in value else value
 
     found = _PLACEHOLDER.sub(replacement, unit) or "1"
+    found = re.sub(r"\(\(([^()]*)\)\)", r"(\1)", found)
     return re.sub(r"\((\w+)\)", r"\1", found)
 
 

@@ -144,7 +144,7 @@ def calibration_text(found: Estimate, content: Mapping[str, Any], output: Path |
     notes = [*([sentence(doubt)] if doubt else []), *content["notes"]]
     blocks = [_head(found, content), *_wrapped_notes(notes)]
     blocks.append("\n".join(value_table(found)))
-    blocks.append("\n".join(_held(found, content)))
+    blocks.append("\n".join(held(found, content)))
     blocks.append("\n".join(_fit_lines(found, content)))
     blocks += _determined(found)
     title = "Believed because" if found.certificate.trusted else "Refused because"
@@ -205,7 +205,7 @@ def value_table(found: Estimate) -> Iterator[str]:
         yield f"  {name:<{width}}  {value_text:>{left}} ± {std_text:<{middle}}  {unit}".rstrip()
 
 
-def _held(found: Estimate, content: Mapping[str, Any]) -> Iterator[str]:
+def held(found: Estimate, content: Mapping[str, Any]) -> Iterator[str]:
     """Constants, and parameters held at a value: as much a part of the answer as the unknowns."""
     fixed = False
     for c in found.model.constants:

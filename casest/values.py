@@ -14,6 +14,9 @@ from casest.errors import CasestError, UsageError
 from casest.modelling.model import Model
 from casest.result import load_result, saved_parameters
 
+#: What stands behind the last number; an exponent is part of the number.
+_UNIT_BEHIND = re.compile(r"(?![eE][-+]?\d)[A-Za-z°µ%][^,;]*$")
+
 
 def parse_value(name: str, text: str, option: str, model: Model) -> Constant:
     """`0.28`, `28 cm`, `1,2,3`, `1,0;0.1,1`, `@result.json`, `gravity(45.5, 120)`: a constant."""
@@ -29,14 +32,20 @@ def parse_value(name: str, text: str, option: str, model: Model) -> Constant:
         except CasestError as error:
             raise type(error)(f"{option} {name}={text}: {error}") from None
         return _constant(number, unit or _declared_unit(old))
+    behind = _UNIT_BEHIND.search(text)
+    numbers = text[: behind.start()] if behind else text
     try:
-        rows = [[float(cell) for cell in row.split(",")] for row in text.split(";")]
+        rows = [[float(cell) for cell in row.split(",")] for row in numbers.split(";")]
         array = np.array(rows if len(rows) > 1 else rows[0])
+        stated = units.canonical(behind[0]) if behind else _declared_unit(old)
     except ValueError:
         raise UsageError(
-            f"{option} {name}={text}: not a number, a list 1,2,3 or rows 1,0;0,1"
+            f"{option} {name}={text}: not a number, a list 1,2,3 or rows 1,0;0,1, with a unit "
+            "behind it or none"
         ) from None
-    return _constant(array, _declared_unit(old))
+    except CasestError as error:
+        raise type(error)(f"{option} {name}={text}: {error}") from None
+    return _constant(array, stated)
 
 
 def _of_place(what: str, arguments: str, where: str) -> Constant:

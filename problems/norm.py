@@ -64,7 +64,8 @@ def norm_diagonal(
 ):
     """Scale of each axis and offset (Ren & Liu, eqs. 5-6): 6 unknowns.
 
-    corrected = scale·(v − offset), and the length of corrected is `norm`.
+    corrected = scale·(v − offset), each axis alone, and the length of corrected is `norm`. First
+    the offset is taken away, in the unit of the reading. Scales are positive.
     """
     return _norm_residual(diag(scale) @ (v - offset), diag(scale), norm)
 
@@ -79,7 +80,10 @@ def norm_triangular(
 ):
     """Scale, non-orthogonality and offset (Burkhard et al., eq. 1, A = M⁻¹): 9 unknowns.
 
-    corrected = scale·(v − offset), and the length of corrected is `norm`.
+    corrected = scale·(v − offset), and the length of corrected is `norm`. First the offset is
+    taken away, in the unit of the reading; then the matrix acts, lower triangular with positive
+    diagonal: the corrected x axis is the sensor's own, and the sensor's y axis lies in the
+    corrected x-y plane.
     """
     return _norm_residual(scale @ (v - offset), scale, norm)
 

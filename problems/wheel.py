@@ -69,7 +69,16 @@ def wheel(
     radius=constant(0.28, "m"),
     gravity=constant(9.80665, "m/s^2"),
 ):
-    """Accelerometer on a tilted, freely rotating wheel (Pedersini, eqs. 1-7)."""
+    """Accelerometer on a tilted, freely rotating wheel (Pedersini, eqs. 1-7).
+
+    reading = offset + gain·specific_force, each axis alone; specific_force is in the sensor's
+    own axes: R·a of the force a in the wheel's axes (towards the axle, along the turn, up the
+    axle; +g upwards at rest), R = Rx(misalignment[0])·Ry(misalignment[1])·Rz(misalignment[2]).
+
+    angle is counted from the lowest point in the direction of the turn, phase is its value at
+    t = 0, in (−π, π]; the rate of turn is speed[0] + speed[1]·t + …; tilt is the angle between
+    axle and vertical. Gains are positive.
+    """
     angle = quantity("angle", phase + integral(polynomial(speed, t), t), "rad")
     rate, acceleration = der(angle, t), der(der(angle, t), t)
     a = vertcat(

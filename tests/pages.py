@@ -2,7 +2,8 @@
 
 In order: python and csv blocks that begin with `# name` are files; each line of a sh block is a
 command, whose exit code is 0 or what `# exit code N` at its end says; a text block shows what
-the commands above it have printed, with `...` where lines are left out.
+the commands above it have printed, with `...` where lines are left out; lines of a c block stand
+in a C file that the commands have written.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
-BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+BLOCK = re.compile(r"^```\{?([\w-]*)\}?\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 EXIT = re.compile(r"\s+# exit code (\d)$")
 
 
@@ -68,6 +69,10 @@ def follow(page: Path, folder: Path) -> int:
                 assert code or done.stderr == "", f"{line}\n{done.stderr}"
                 printed += done.stdout.splitlines()
                 count += 1
+        elif language == "c":
+            written_c = "".join(p.read_text(encoding="utf-8") for p in folder.rglob("*.c"))
+            for line in text.splitlines():
+                assert line in written_c, f"{page.name}: no exported source has {line!r}"
         elif language == "text":
             for line in text.splitlines():
                 digits = "stationary" not in line  # rounding differs from machine to machine

@@ -274,6 +274,7 @@ def test_an_effect_that_fails_is_named_by_effect_file_and_line(refused):
         (["--free", "mass"], "mass is a signal of model load-cell"),
         (["--fix", "zero=1,2"], "zero of model load-cell: a value of shape (2,) does not fit"),
         (["--fix", "zero=1,x"], "--fix zero=1,x: not a number, a list 1,2,3 or rows 1,0;0,1"),
+        (["--fix", "zero=1,2 volt-ish"], "--fix zero=1,2 volt-ish: "),
         (["--fix", "zero=@nowhere.json"], "nowhere.json: no such result"),
         (["--fix", "zero=@good.csv"], "good.csv: not a result.json"),
         (["--fix", "zero=5 K"], "zero is declared in 'mV': 'K' does not fit"),

@@ -3,19 +3,40 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import simulators as sim
 
-from casest import attempt, load_runs
+from casest import Residual, attempt, close, load_runs, model, param, quantity, signal
 from casest.cli import run
 from casest.closing import doubt
 from casest.closing.doubt import doubts
+from casest.closing.written import closing_result
 from casest.data.run import Run
 from casest.demonstration import WHEEL
 from casest_problems.norm import norm_full, norm_triangular
 from casest_problems.wheel import wheel
+
+
+@model
+def cell(p=signal("bar"), u=signal("V"), *, zero=param("V"), gain=param("V/bar", start=0.4)):
+    """A pressure transmitter against a dead-weight tester; the prediction has no name."""
+    pressure = quantity("pressure", p, "bar")
+    return Residual(measured=u, predicted=zero + gain * pressure, corrected=pressure)
+
+
+def transmitter(shuffled=None):
+    """Eleven pressures at each of eight temperatures, one after the other, or shuffled."""
+    rng = np.random.default_rng(4)
+    p, temp = np.tile(np.linspace(0, 10, 11), 8), np.repeat(np.linspace(5, 45, 8), 11)
+    u = 0.5 + 0.4 * p + (1.5e-3 + 4e-4 * p) * (temp - 25) + 1e-3 * rng.standard_normal(88)
+    if shuffled is not None:
+        order = shuffled.permutation(88)
+        p, temp, u = p[order], temp[order], u[order]
+    run = Run.raw("bench", {"p": p[:, None], "u": u[:, None]}, units={"p": "bar", "u": "V"})
+    return replace(run, columns={"temp": temp}, column_units={"temp": "degC"})
 
 
 def poses(count=60, noise=5e-3, seed=0):
@@ -29,6 +50,29 @@ def test_an_undeclared_effect_is_seen_and_where():
     assert found is not None
     assert "turn of angle" in found[0].where
     assert found[0].p_value < 0.0025
+
+
+def test_a_temperature_that_rises_all_the_time_is_named_beside_a_wander():
+    found = doubts(attempt(cell, [transmitter()]))
+    assert found is not None
+    assert found[0].where == "wanders, or varies with temp"
+
+
+def test_two_effects_of_one_column_on_a_prediction_without_a_name_are_both_found():
+    """Zero and gain of a pressure transmitter depend on its temperature: 1.5 mV/K, 1e-3/K."""
+    closing = close(cell, [transmitter(np.random.default_rng(5))])
+    assert sorted(e.candidate.effect.name for e in closing.effects) == [
+        "temperature_bias", "temperature_gain",
+    ]  # fmt: skip
+    for name, truth in (("temperature_bias(temp).k", 1.5e-3), ("temperature_gain(temp).k", 1e-3)):
+        away = closing.after.values[name] - truth
+        assert abs(away) < 4 * closing.after.std[name]
+    assert closing.after.rmse == pytest.approx(1e-3, rel=0.15)
+    content = closing_result(closing, model_name="cell.py", data=())
+    for e in content["effects"]:  # what is added as well is no rival
+        assert not {"temperature_bias(temp)", "temperature_gain(temp)"} & {
+            *e["indistinguishable_from"], *e["less_likely"],
+        }  # fmt: skip
 
 
 def test_noise_alone_is_no_doubt():

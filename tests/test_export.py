@@ -14,10 +14,13 @@ import pytest
 import simulators as sim
 
 from casest import Correction, Run
+from casest.apply import invertible
 from casest.applying import saved_model
 from casest.cli import run as command
 from casest.demonstration import RECORD, WHEEL
+from casest.effects import CATALOGUE
 from casest.exporting import is_exported
+from casest.problem import find_model
 
 HANDHELD = [str(RECORD), "--columns", "v=ax,ay,az", "--rate", "50", "--at-rest"]
 G = ["--set", "norm=9.80665 m/s^2"]
@@ -116,7 +119,7 @@ def compiled(source, folder, *flags):
     if compiler is None:
         pytest.skip("no C compiler on this machine: the exported source is not compiled")
     program = folder / "a.out"
-    strict = ["-std=c99", "-Wall", "-Wextra", "-Werror", "-O2"]
+    strict = ["-std=c99", "-Wall", "-Wextra", "-pedantic", "-Werror", "-O2"]
     subprocess.run([compiler, *strict, *flags, str(source), "-o", str(program), "-lm"], check=True)
     return program
 
@@ -228,6 +231,20 @@ def test_the_json_follows_its_published_schema(results, tmp_path):
         jsonschema.validate(json.loads(path.read_text(encoding="utf-8")), schema)
 
 
+def test_every_result_follows_its_published_schema(results, tmp_path):
+    """Of fits, of loops closed, and of a fit that is refused."""
+    jsonschema = pytest.importorskip("jsonschema")
+    schema = json.loads(files("casest").joinpath("result.schema.json").read_text("utf-8"))
+    jsonschema.Draft202012Validator.check_schema(schema)
+    assert command(["calibrate", "norm-full", *HANDHELD, *G, "-o", str(tmp_path)]) == 2
+    assert command(["close", "wheel", str(WHEEL), "-o", str(tmp_path / "wheel")]) == 0
+    for folder in (*(results / name for name in NAMES), tmp_path, tmp_path / "wheel"):
+        found = json.loads((folder / "result.json").read_text(encoding="utf-8"))
+        jsonschema.validate(found, schema)
+        with pytest.raises(jsonschema.ValidationError):
+            jsonschema.validate(found | {"verdict": "fine"}, schema)
+
+
 def test_a_refused_result_is_not_exported(tmp_path, capsys):
     assert command(["calibrate", "norm-full", *HANDHELD, *G, "-o", str(tmp_path)]) == 2
     capsys.readouterr()
@@ -238,3 +255,60 @@ def test_a_refused_result_is_not_exported(tmp_path, capsys):
 def test_float_is_for_c_alone(results, capsys):
     assert command(["export", str(results / "wheel"), "--to", "json", "--float"]) == 1
     assert "--float is for --to c" in capsys.readouterr().err
+
+
+LAG = """
+from casest import der, effect, param, signal, vertcat
+
+
+@effect(on="reading")
+def lag(y, t=signal("s"), *, tau=param("s")):
+    return y - vertcat(tau, 0, 0) * der(y, t)
+"""
+
+
+def test_a_lag_stays_in_and_every_form_says_so(tmp_path, capsys):
+    """Solved for one sample, the force has no rate: the lag cannot be undone, only named."""
+    (tmp_path / "lag.py").write_text(LAG, encoding="utf-8")
+    fit = ["calibrate", "wheel", str(WHEEL), "--effects", str(tmp_path / "lag.py")]
+    assert command([*fit, "-o", str(tmp_path / "out")]) == 0
+    said = "not undone, which would amplify the noise without bound"
+    page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert f"{said.capitalize()}: <code>lag</code>" in page
+    capsys.readouterr()
+    assert command(["apply", str(tmp_path / "out"), str(WHEEL)]) == 0
+    printed = capsys.readouterr()
+    assert f"{said}: lag" in printed.err
+    path = exported(tmp_path / "out", "json", tmp_path / "c.json")
+    assert json.loads(path.read_text(encoding="utf-8"))["not_undone"] == ["lag"]
+    capsys.readouterr()
+    assert command(["apply", str(path), str(WHEEL)]) == 0
+    again = capsys.readouterr()
+    assert f"{said}: lag" in again.err
+    found, expected = (
+        np.array([r.split(",")[-3:] for r in text.splitlines()[1:]], dtype=float)
+        for text in (again.out, printed.out)
+    )
+    np.testing.assert_allclose(found, expected, rtol=1e-8)
+    values = json.loads((tmp_path / "out" / "result.json").read_text(encoding="utf-8"))
+    p = {n: np.array(v["value"]) for n, v in values["estimate"]["parameters"].items()}
+    v = np.loadtxt(WHEEL, delimiter=",", skiprows=1)[:, 1:4]
+    np.testing.assert_allclose(expected, (v - p["offset"]) / p["gain"], rtol=1e-7, atol=1e-7)
+    for to in ("c", "python"):
+        source = exported(tmp_path / "out", to, tmp_path / f"c.{to}").read_text(encoding="utf-8")
+        assert said in source
+        assert "lag." in source
+
+
+@pytest.mark.parametrize(
+    ("name", "left"),
+    [("axis_delay", True), ("low_pass", True), ("hysteresis", True), ("imbalance", False),
+     ("temperature_bias", False), ("bias_drift", False), ("quadratic", False),
+     ("saturation", False)],
+)  # fmt: skip
+def test_what_acts_on_a_rate_is_left_and_nothing_else(name, left):
+    found = next(e for e in CATALOGUE if e.name == name)
+    place = {"input": "specific_force", "output": "reading"}.get(found.on, found.on)
+    columns = {"channel": "temp"} if name == "temperature_bias" else {}
+    model = find_model("wheel").with_effect(found, on=place, columns=columns)
+    assert bool(invertible(model)[1]) is left

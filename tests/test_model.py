@@ -212,7 +212,8 @@ def test_a_model_without_source_is_printed_from_its_expressions():
     space: dict = {}
     exec(body, space)
     assert "r = (a*x)" in str(space["line"])
-    assert "residual = (y-(r+1))" in str(space["line"])
+    assert "predicted = (r+1)" in str(space["line"])
+    assert "residual = (y-predicted)" in str(space["line"])
 
 
 # -- changing what is known and unknown -----------------------------------------------------------
@@ -409,7 +410,26 @@ def test_what_is_corrected_must_be_a_quantity():
     def loose(y=signal("V"), *, a=param("V")):
         return Residual(measured=y, predicted=a, corrected=2 * a)
 
-    assert "corrected= must be a quantity of the model" in refused_body(loose)
+    assert "corrected= must be a quantity of the model: wrap the expression" in refused_body(loose)
+
+
+def test_a_signal_cannot_be_what_is_corrected_and_the_way_out_works():
+    @model
+    def bare(T=signal("degC"), y=signal("V"), *, a=param("V/K")):
+        return Residual(measured=y, predicted=a * T, corrected=T)
+
+    with pytest.raises(DeclarationError) as refused:
+        bare(T=20.0, y=0.0)
+    text = str(refused.value)
+    assert "corrected= is the signal T" in text
+    assert 'wanted = quantity("wanted", T, "degC")' in text
+
+    @model
+    def named(T=signal("degC"), y=signal("V"), *, a=param("V/K")):
+        wanted = quantity("wanted", T, "degC")
+        return Residual(measured=y, predicted=a * wanted, corrected=wanted)
+
+    assert named.traced.corrected == "wanted"
 
 
 def test_a_prediction_in_another_dimension_than_the_reading_is_refused():

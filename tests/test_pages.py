@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import re
+import shlex
 
 import pytest
-from pages import ROOT, blocks, folder_of_a_reader, follow
+from pages import BLOCK, ROOT, blocks, folder_of_a_reader, follow
+
+from casest.cli import commands
 
 PAGES = sorted((ROOT / "docs").glob("*.md"))
 PHYSICS = "casest.declaring.physics"
@@ -17,11 +20,78 @@ def test_a_reader_who_does_what_a_page_says_sees_what_it_shows(page, tmp_path):
     assert follow(page, folder_of_a_reader(page, tmp_path)) >= 1
 
 
+EVERY = [*PAGES, ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
+
+
+@pytest.mark.parametrize("page", EVERY, ids=lambda p: p.stem)
+def test_no_block_of_a_page_slips_through(page):
+    """Languages that `follow` knows; files that a command uses; else make targets and extras."""
+    known = blocks(page)
+    assert {language for language, _ in known} <= RUN | {"", "toctree", "eval-rst", "include"}
+    typed = "".join(text for language, text in known if language == "sh")
+    for language, text in known:
+        if language in ("python", "csv"):
+            name = text.partition("\n")[0].removeprefix("# ")
+            apart = page.name == "README.md" and name == "fit.py"  # run by test_readme
+            used = name in typed or f"from {name.removesuffix('.py')} import" in text
+            assert used or apart, f"{page.name}: nothing uses {name}"
+        elif language == "":
+            for line in filter(None, map(str.strip, text.splitlines())):
+                assert understood(line.partition("#")[0].strip()), f"{page.name}: {line}"
+
+
+#: Languages of blocks that are run, written or compared.
+RUN = {"sh", "text", "python", "csv", "c"}
+
+
+def understood(line):
+    """A make target, an extra, or the script that runs everything."""
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    project = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    words = line.split()
+    if words[0] == "make":
+        return all(re.search(rf"^{t}:", makefile, re.MULTILINE) for t in words[1:])
+    extra = re.fullmatch(r"pip install 'casest\[(\w+)\]'", line)
+    return bool(extra and re.search(rf"^{extra[1]} =", project, re.MULTILINE)) or line == ".ci/run"
+
+
+@pytest.mark.parametrize("page", EVERY, ids=lambda p: p.stem)
+def test_every_command_within_a_sentence_exists_with_its_options(page):
+    prose = BLOCK.sub("", page.read_text(encoding="utf-8"))
+    for span in re.findall(r"`(casest [^`]*)`", " ".join(prose.split())):
+        name, *words = shlex.split(span.replace("…", ""))[1:]
+        if name.startswith("-"):
+            continue
+        assert name in commands.commands, span
+        options = {o for p in commands.commands[name].params for o in p.opts}
+        for word in words:
+            if word.startswith("-"):
+                assert word in options, span
+
+
 def test_every_question_has_a_page_with_commands():
     index = (ROOT / "docs" / "index.md").read_text(encoding="utf-8")
     questions = set(re.findall(r"\[\]\((\w+)\.md\)", index))
     assert questions == {"calibrate", "motion_enough", "close", "invisible", "export", "in_motion"}
     assert questions <= {page.stem for page in WITH_COMMANDS}
+
+
+def test_figures_of_a_study_are_quoted_as_they_stand_there():
+    """The README quotes NIST's; the method includes the loop's table."""
+    nist = (ROOT / "studies" / "nist.md").read_text(encoding="utf-8")
+    readme = " ".join((ROOT / "README.md").read_text(encoding="utf-8").split())
+    right, refused, wrong, no = (
+        int(n) for n in re.search(r"\| \*\*all\*\* (.*)", nist)[1].replace("*", "").split("|")[1:5]
+    )
+    assert wrong == 0
+    said = (
+        f"of {right + refused + no} perturbed starts {right} end right, {refused + no} are refused"
+    )
+    assert said in readme
+    method = (ROOT / "docs" / "method.md").read_text(encoding="utf-8")
+    loop = (ROOT / "studies" / "loop.md").read_text(encoding="utf-8")
+    first, last = re.search(r'start-after: "(.*)"\n:end-before: "(.*)"', method).groups()
+    assert "without effect, one reported" in loop.partition(first)[2].partition(last)[0]
 
 
 def test_every_page_is_reached_from_the_front():

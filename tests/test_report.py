@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shlex
 import time
 from pathlib import Path
 
@@ -115,7 +116,8 @@ def test_the_page_shows_the_numbers_of_the_result(browser, closed):
         assert shown == pytest.approx(result["after"]["rmse_holdout_by_axis"][axis], rel=1e-3)
     digest = next(iter(result["reproduce"]["sha256"].values()))
     assert digest in text(browser, "#reproduce")
-    assert result["reproduce"]["command"] in text(browser, "#reproduce")
+    shown = text(browser, "#reproduce pre")
+    assert shlex.split(shown.replace("\\\n", " ")) == shlex.split(result["reproduce"]["command"])
     invisible = text(browser, "#invisible")
     assert all(i["name"] in invisible and i["shown_by"] in invisible for i in result["invisible"])
 

@@ -45,15 +45,18 @@ from casest.errors import UsageError
 def apply(result_path: Path, data: str, **options: Any) -> None:
     """Correct the readings in DATA with a saved RESULT (result.json, or its folder)."""
     from casest import applying, exporting
+    from casest.apply import LEFT
     from casest.following import following
 
     arguments = reading_arguments(options)
     progress(f"correcting {data}")
     if exporting.is_exported(result_path):
-        text = exporting.applied(result_path, data, arguments)
+        text, left = exporting.applied(result_path, data, arguments)
     else:
-        text = applying.corrected_csv(result_path, data, arguments, force=options["force"])
+        text, left = applying.corrected_csv(result_path, data, arguments, force=options["force"])
     waiting.done()
+    if left:
+        echo(f"casest: {LEFT}{', '.join(left)}", err=True)
     if path := applying.write_or_print(text, options["output"]):
         echo(f"Written: {path}")
         echo(f"\n{following(typed(), file=path)}")

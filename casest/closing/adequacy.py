@@ -158,10 +158,12 @@ def predictions(problem: Problem, point: Point) -> list[Array] | None:
 # -- the tests -------------------------------------------------------------------------------------
 
 
-def findings(state: State, noise: NoiseModel, correlated_over: float = 1.0) -> list[Finding]:
-    """All that is significant, repeats first."""
+def findings(
+    state: State, noise: NoiseModel, correlated_over: float = 1.0, *, wander: bool = False
+) -> list[Finding]:
+    """All that is significant, repeats first; with `wander` also what a random walk explains."""
     found = _repeats(state)
-    found += _shapes(state)
+    found += _shapes(state, wander)
     even = even_scale(state.clipped, state.batches, noise.unequal > 1)
     line = strongest_line(state.problem.runs, even)
     if line is not None and line.p_value < LINES:
@@ -201,14 +203,16 @@ def _runs(state: State, correlated_over: float) -> list[Finding]:
     return [Finding(where, scatter.p_value, _white(state))]
 
 
-def _shapes(state: State) -> list[Finding]:
-    """Dependence on columns, quantities, time and products; a wander is no dependence."""
+def _shapes(state: State, wander: bool = False) -> list[Finding]:
+    """Dependence on columns, quantities, time and products; a wander is none unless it counts."""
     tests, known = _dependences(state, wander=False)
     if any(t.together < SHAPES for t in tests) and _wanders(state, known, tests):
-        jump = _jump(state)
+        jump, slow = _jump(state), tests[0]
         if jump is not None:
             return [jump]
         tests, _ = _dependences(state, wander=True)
+        if wander and not any(t.together < SHAPES for t in tests):
+            return [Finding(f"wanders, or {slow.words}", slow.together, _white(state))]
     significant = [t for t in tests if t.together < SHAPES]
     if not significant:
         return []

@@ -175,7 +175,9 @@ def usable_columns(model: Model, runs: Sequence[Run]) -> list[str]:
 
 def _channels(model: Model, runs: Sequence[Run]) -> tuple[dict[str, bool], list[Skipped]]:
     """Columns that measure something (is it a temperature?), and those that cannot be used."""
-    used = {s.name for s in model.signals} | {"t"}
+    # A column that an effect reads already may be the cause of another one as well.
+    read = {column for attached in model.effects for _, column in dict(attached.columns).items()}
+    used = {s.name for s in model.signals} - read | {"t"}
     found: dict[str, bool] = {}
     skipped: list[Skipped] = []
     values: dict[str, Array] = {}

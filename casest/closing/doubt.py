@@ -22,6 +22,7 @@ LONGEST = 200_000
 def doubts(estimate: Estimate) -> list[Finding] | None:
     """What of the residual is no noise, by the tests with which `close` begins.
 
+    A residual that wanders counts too: where a temperature rises all the time, it looks like that.
     They call a misfit where there is none in at most one of a hundred records. None where nothing
     is asked: a refused estimate, a record too short, or of more than LONGEST samples.
     """
@@ -45,7 +46,7 @@ def doubts(estimate: Estimate) -> list[Finding] | None:
             correlated_over=over,
             levels=predictions(problem, point),
         )
-        return findings(state, noise, over)
+        return findings(state, noise, over, wander=True)
 
 
 def asked(estimate: Estimate) -> list[dict[str, Any]] | None:

@@ -15,19 +15,16 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from casest.closing.adequacy import DOUBT, State, independent, state_of
+from casest.closing.adequacy import State, independent, state_of
 from casest.closing.candidates import Candidate, placed_in, usable_columns
 from casest.closing.dependence import slow_shapes
 from casest.closing.noise_model import (
     MIDDLE,
-    likelihood_of_walk,
-    likelihood_of_white,
-    power,
-    slice_means,
 )
 from casest.closing.score import CLIPPED, PIECE, Score, scores, slope_of, widened
 from casest.closing.search import Chosen, Rows, search
 from casest.closing.terms import Shape, Term, Variable, formula_effect, library
+from casest.closing.wandering import wanders
 from casest.data.run import Run
 from casest.declaring.physics import SX
 from casest.declaring.shapes import Array, each
@@ -82,10 +79,20 @@ def formula_instead(loop: _Loop, declared: Fitted, current: Fitted) -> Fitted | 
     if not any(f.candidate.column for f in replaced) or _terms(current.model):
         return None
     sought = _sought(loop, declared)
-    crossed = sought and loop._crossed(sought[1])
-    if not sought or not crossed or not loop._confirmed(current, crossed):
+    if sought is None or all(_has_a_name(t, declared.model) for t in _terms(sought[1].model)):
+        return None
+    crossed = loop._crossed(sought[1])
+    if crossed is None or not loop._confirmed(current, crossed):
         return None
     return _kept(loop, declared, sought[0], crossed, replaced)
+
+
+def _has_a_name(term: Term, model: Model) -> bool:
+    """Is it an effect of the catalogue: an offset or a gain that follows a column?"""
+    shape = term.shape
+    if shape.kind == "product":
+        return any(v.name in model.quantities for v in shape.variables)
+    return (shape.kind, shape.order) == ("power", 1)
 
 
 def _kept(
@@ -120,7 +127,7 @@ def _sought(loop: _Loop, current: Fitted) -> tuple[Score, Fitted] | None:
         enough = library.independent_after(fitted)
         if sum(map(len, enough)) < sum(map(len, batches)):
             batches = enough
-        elif not wander and _wanders(loop.runs, current, fitted, chosen.score):
+        elif not wander and wanders(loop.runs, current, fitted, chosen.score):
             wander = True
         else:
             break
@@ -183,24 +190,6 @@ def _with_sizes(fitted: Fitted, candidate: Candidate) -> tuple[Fitted, Candidate
     effects = (*fitted.model.effects[:-1], replace(attached, effect=written))
     candidate = replace(candidate, effect=written, traced=None)
     return replace(fitted, model=replace(fitted.model, effects=effects)), candidate
-
-
-def _wanders(runs: Sequence[Run], before: Fitted, after: Fitted, score: Score) -> bool:
-    """Does a random walk explain the slow part of the residual as well as the formula does?
-
-    Log-likelihoods of what is seen at slow rates, less what the fitted sizes cost.
-    """
-    q, gain = score.freedom, score.gain / score.inflation
-    cost = 0.5 * q * (1 + float(np.log1p(gain / q)))
-    walk = plain = shaped = 0.0
-    limit = CLIPPED * before.noise
-    for run, old, new in zip(runs, before.residuals, after.residuals, strict=True):
-        b, a = (slice_means(run, np.clip(r, -limit, limit)) for r in (old, new))
-        if b is not None and a is not None:
-            walk += likelihood_of_walk(power(b)) - old.shape[1]
-            plain += likelihood_of_white(power(b))
-            shaped += likelihood_of_white(power(a))
-    return walk > plain + DOUBT and walk > shaped - cost - DOUBT
 
 
 # -- what terms may read -----------------------------------------------------------------------

@@ -34,10 +34,12 @@ from casest.closing.evidence import (
 )
 from casest.closing.formula import formula_instead, try_formula
 from casest.closing.held import held_value, holding, strides, within
+from casest.closing.noise_model import wander_of
 from casest.closing.profile import freed_again, profiled
 from casest.closing.restrict import restricted
 from casest.closing.score import Score, scores, steadied, widened
 from casest.closing.tails import outliers_p_value
+from casest.closing.wandering import wanders
 from casest.data.run import Run
 from casest.declaring.shapes import Array
 from casest.effects import CATALOGUE
@@ -199,6 +201,7 @@ class _Loop:
             ranked = self._ranked(current)
         current = self._weeded(self._filled(current))
         after = self._certified(current) if self.found else self.before
+        self._note_wander(current)
         return Closing(
             self.before,
             after,
@@ -269,6 +272,13 @@ class _Loop:
         self.say("outliers: they count less from here on")
         return fitted
 
+    def _note_wander(self, current: Fitted) -> None:
+        """Say that the offset wanders: a property of the noise, which changes no fit."""
+        effect = next((e for e in self.catalogue if e.name == "bias_wander"), None)
+        p_value = wander_of(self.runs, current.residuals)
+        if effect is not None and p_value is not None:
+            self.found.append(Found(Candidate(effect), None, p_value, 0.0, (), ()))
+
     # -- candidates ----------------------------------------------------------------------------
 
     def _ranked(self, current: Fitted) -> list[Score]:
@@ -316,6 +326,9 @@ class _Loop:
                 continue  # It may be the cause as well, but speaks for itself too softly.
             if k and not not_told_apart(tried[0][1], fitted, tried[0][0], self.folds):
                 break  # What explains the data clearly less well is not the cause.
+            if wanders(self.runs, current, fitted, score):
+                self._refuse(score.candidate, "an offset that walks at random explains it as well")
+                continue
             accepted = self._accepted(current, score, fitted)
             if accepted is None:
                 continue

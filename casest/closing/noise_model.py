@@ -166,6 +166,14 @@ def _wander(runs: Sequence[Run], clipped: Sequence[Array], sigma: Array) -> tupl
     return size, wander_p_value([power for _, power in known])
 
 
+def wander_of(runs: Sequence[Run], residuals: Sequence[Array]) -> float | None:
+    """The chance of as much slow variation without a random walk; None where it is not small."""
+    sigma = _sigma(residuals)
+    clipped = [np.clip(r / sigma, -CLIPPED, CLIPPED) for r in residuals]
+    _, p = _wander(runs, clipped, sigma)
+    return p if p < ALARM else None
+
+
 def slow_power(run: Run, r: Array) -> Array | None:
     """Power (slices, m) of batch means over cosines of 0, ½, 1, … periods; None if too short.
 

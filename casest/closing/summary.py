@@ -34,6 +34,7 @@ class Invisible:
     would_move: Mapping[str, float]
     share: float
     shown_by: str
+    units: Mapping[str, str]  # of `typical`, with placeholders
 
 
 @dataclass(frozen=True)
@@ -70,6 +71,7 @@ def invisible(closing: Closing) -> list[Invisible]:
                 moves,
                 float(score.survives[: len(typical)][hidden].max()),
                 _shown_by(candidate),
+                {n: p.units[0] for n, p in zip(names, parameters, strict=True)},
             )
     return sorted(found.values(), key=lambda i: i.share)
 

@@ -11,7 +11,7 @@ from casest.closing.loop import HELD_OUT_DATA, Closing
 from casest.data.logs import file_name
 from casest.effects import CATALOGUE
 from casest.following import following
-from casest.terminal import WIDTH, item, value_table
+from casest.terminal import WIDTH, held, item, value_table
 
 #: Lists longer than this are left to result.json.
 SHOWN = 4
@@ -24,6 +24,7 @@ def closing_text(closing: Closing, content: Mapping[str, Any], output: Path | No
         "\n".join(_errors(content)),
         "\n".join(_effects(content)),
         "\n".join(value_table(closing.after)),
+        "\n".join(held(closing.after, content)),
         "\n".join(_moved(content)),
         "\n".join(_invisible(content)),
         "\n".join(_unexplained(content)),
@@ -73,11 +74,11 @@ def _errors(content: Mapping[str, Any]) -> Iterator[str]:
     if len(axes) > 1 and before["rmse_holdout"] is not None:
         for axis, value in axes.items():
             there = after["rmse_holdout_by_axis"][axis]
-            yield f"    held-out, {axis:<12} {value:>12.5g} {there:>12.5g}"
+            yield f"    held-out, {axis:<12} {_figure(value)} {_figure(there)}"
 
 
 def _figure(value: float | None) -> str:
-    return f"{'-' if value is None else format(value, '.5g'):>12}"
+    return f"{'-' if value is None else format(value, '#.5g'):>12}"
 
 
 def _effects(content: Mapping[str, Any]) -> Iterator[str]:
@@ -115,7 +116,8 @@ def _invisible(content: Mapping[str, Any]) -> Iterator[str]:
         yield "Could be wrong without showing (shift by a typical size):"
     for i in hidden[:SHOWN]:
         moves = ", ".join(f"{n} by {v:.2g}" for n, v in i["would_move"].items())
-        size = ", ".join(f"{n} = {v:g}" for n, v in i["typical"].items())
+        units = {n: "" if u == "1" else f" {u}" for n, u in i["units"].items()}
+        size = ", ".join(f"{n} = {v:.3g}{units[n]}" for n, v in i["typical"].items())
         yield item(f"{i['name']} ({size}): {moves}; shown by {i['shown_by']}")
     if len(hidden) > SHOWN:
         yield f"  - and {len(hidden) - SHOWN} more, in result.json"

@@ -19,7 +19,7 @@ from casest.declaring.shapes import Array
 from casest.declaring.symbols import Constant
 from casest.estimate import Estimate
 from casest.modelling.effect import Attached
-from casest.naming import unit_table
+from casest.naming import resolved, unit_table
 from casest.result import attachment, calibration_result, parameter_table, plain
 from casest.stack import Problem
 
@@ -60,6 +60,7 @@ def closing_result(
             "name": i.name,
             "column": i.column,
             "typical": {k: plain(v) for k, v in i.typical.items()},
+            "units": {k: resolved(u, common["units"]) for k, u in i.units.items()},
             "would_move": {k: plain(v) for k, v in i.would_move.items()},
             "share_left": plain(i.share),
             "shown_by": i.shown_by,
@@ -108,10 +109,16 @@ def _effect(found: Found, closing: Closing) -> dict[str, Any]:
         "p_value": plain(found.p_value),
         "holdout_gain": plain(found.gain),
         "formula": _formula(found, attached),
-        "indistinguishable_from": list(found.indistinguishable_from[:NEAREST]),
-        "less_likely": list(found.indistinguishable_from[NEAREST:]),
+        "indistinguishable_from": _alike(found, closing)[:NEAREST],
+        "less_likely": _alike(found, closing)[NEAREST:],
         "would_separate": _separating(found, closing),
     } | ({} if attached is None else attachment(attached))
+
+
+def _alike(found: Found, closing: Closing) -> list[str]:
+    """What explains the data as well, but for what has been added beside it since."""
+    added = {f.candidate.label for f in closing.effects}
+    return [label for label in found.indistinguishable_from if label not in added]
 
 
 def formula_source(closing: Closing) -> str:
@@ -134,7 +141,8 @@ def _attached(found: Found, closing: Closing) -> Attached | None:
 def _formula(found: Found, attached: Attached | None) -> str:
     """What the effect does, with the name of its column."""
     if attached is None:
-        return f"{found.candidate.freed} is an unknown"
+        effect = found.candidate.effect
+        return effect.formula if effect else f"{found.candidate.freed} is an unknown"
     formula = attached.effect.formula or attached.effect.doc.partition("\n")[0]
     for name, column in attached.columns:
         formula = formula.replace(name, column)
@@ -148,7 +156,7 @@ def _separating(found: Found, closing: Closing) -> list[str]:
     """Measurements that would separate the effect from those that explain the data as well."""
     by_label = {s.candidate.label: s.candidate for s in closing.first}
     said = []
-    for label in found.indistinguishable_from[:NEAREST]:
+    for label in _alike(found, closing)[:NEAREST]:
         other = by_label.get(label)
         if other is not None and other.effect is not None and other.effect.shown_by:
             said.append(f"{label}: {other.effect.shown_by}")

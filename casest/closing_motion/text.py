@@ -32,7 +32,9 @@ def motion_text(content: Mapping[str, Any], output: Path | None) -> str:
     if output is not None:
         blocks.append(f"Written: {output}/report.html, result.json, residuals.csv")
     typed, trusted = content["reproduce"]["command"], content["trusted"]
-    blocks.append(following(typed, output, trusted=trusted, moving=True))
+    blocks.append(
+        following(typed, output, trusted=trusted, applies=not content["effects"], moving=True)
+    )
     return "\n\n".join(b for b in blocks if b)
 
 

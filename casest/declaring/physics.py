@@ -23,12 +23,16 @@ pi, inf = ca.pi, float("inf")
 
 @dataclass(frozen=True)
 class Quantity:
-    """A named inner value of a model: `declared` before, `value` after the effects on it."""
+    """A named inner value of a model: `declared` before, `value` after the effects on it.
+
+    `implied`: the body did not name it; it is the prediction.
+    """
 
     name: str
     unit: str
     declared: SX
     value: SX
+    implied: bool = False
 
     @property
     def dims(self) -> tuple[int, ...]:
@@ -47,7 +51,7 @@ class Trace:
     quantities: dict[str, Quantity] = field(default_factory=dict)
     handed: dict[str, SX] = field(default_factory=dict)
 
-    def enter(self, name: str, expression: Any, unit: str) -> SX:
+    def enter(self, name: str, expression: Any, unit: str, *, implied: bool = False) -> SX:
         """Record a quantity and hand back what the rest of the body shall see."""
         if name in self.quantities or name in self.reserved:
             raise DeclarationError(
@@ -59,7 +63,7 @@ class Trace:
         value = declared
         for apply in self.effects.get(name, ()):
             value = apply(value)
-        self.quantities[name] = Quantity(name, unit, declared, value)
+        self.quantities[name] = Quantity(name, unit, declared, value, implied)
         self.handed[name] = ca.SX.sym(name, *declared.shape) if self.naming else value
         return self.handed[name]
 

@@ -23,7 +23,7 @@ from casest.effects.motion import (
     speed_polynomial,
     vibration,
 )
-from casest.effects.noise import outliers
+from casest.effects.noise import bias_wander, outliers
 from casest.effects.reference import table_angle
 from casest.effects.response import (
     cross_axis,
@@ -64,6 +64,7 @@ CATALOGUE: tuple[Effect, ...] = (
     hysteresis,
     table_angle,
     reference_drift,
+    bias_wander,
     outliers,
 )
 

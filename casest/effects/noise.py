@@ -1,4 +1,4 @@
-"""Effects on the noise: samples that count less."""
+"""Effects on the noise: samples that count less, neighbours that are not independent."""
 
 from __future__ import annotations
 
@@ -14,3 +14,16 @@ from casest.modelling.effect import effect
 def outliers(r: SX) -> SX:
     """Samples far out count less: Tukey's biweight, 6 standard deviations wide."""
     return if_else(fabs(r) < 6, (1 - (r / 6) ** 2) ** 2, 0)
+
+
+@effect(
+    on="noise",
+    shown_by="a long record at rest (Allan deviation)",
+    formula="y + a random walk (its size: wander, under noise)",
+)
+def bias_wander(r: SX) -> SX:
+    """The offset walks at random: bias instability (IEEE Std 952).
+
+    No sample counts less for it: the correlation that it leaves makes intervals wider.
+    """
+    return 1 + 0 * r

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from casest import __version__
+from casest.apply import LEFT
 from casest.declaring.shapes import Array
 from casest.export.program import Program
 
@@ -157,6 +158,7 @@ def _head(program: Program, name: str, single: bool) -> str:
         place += i.size
     lines += [
         f" * corrected: {program.output.size} values [{program.output.unit or '1'}].",
+        *([f" * {LEFT}{', '.join(program.left)}."] if program.left else []),
         " * Returns 0, or 1 where the reading lies outside what the model can produce. */",
         "#include <math.h>",
         "#include <tgmath.h>",

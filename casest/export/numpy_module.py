@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from casest import __version__
+from casest.apply import LEFT
 from casest.declaring.shapes import Array
 from casest.export import runtime
 from casest.export.program import Program
@@ -45,7 +46,9 @@ def python_source(program: Program, test: tuple[Array, Array]) -> str:
         f'"""{program.output.name} of {program.model}, exported by casest {__version__}.\n\n'
         f"correct(x): x (N, {program.width}) holds {signals};\n"
         f"returns (N, {program.output.size}) in {program.output.unit or '1'}. Raises ValueError\n"
-        'naming the row whose reading lies outside what the model can produce.\n"""\n\n'
+        "naming the row whose reading lies outside what the model can produce.\n"
+        + (f"\n{LEFT}\n{', '.join(program.left)}.\n" if program.left else "")
+        + '"""\n\n'
         "from __future__ import annotations\n"
     )
     tail = (

@@ -51,7 +51,7 @@ class Program:
     `steps` are [operation, register, operands…]: "input" has the number of the input, "constant"
     a value, "output" (with the register as operand) the number of the output. `starts` are the
     levels where Newton's method begins, the reading itself among them where `from_reading`;
-    `measured` is the place of the reading among the inputs.
+    `measured` is the place of the reading among the inputs. `left` are effects that stay in.
     """
 
     model: str
@@ -64,6 +64,7 @@ class Program:
     middle: float = 0.0
     measured: tuple[int, int] | None = None
     largest: float = 1.0
+    left: tuple[str, ...] = ()
 
     @property
     def width(self) -> int:

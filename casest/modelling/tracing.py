@@ -22,6 +22,9 @@ from casest.modelling.effect import Attached
 if TYPE_CHECKING:
     from casest.modelling.model import Model
 
+#: Name of a prediction that the body does not name.
+PREDICTED = "predicted"
+
 
 @dataclass(frozen=True)
 class Traced:
@@ -60,6 +63,8 @@ def trace(model: Model, cut: str | None = None, naming: bool = False) -> Traced:
     measured = _name_of(residual.measured, symbols)
     if residual.measured is not None and measured is None:
         raise DeclarationError(f"model {model.name}: measured= must be one of the model's signals")
+    if measured is not None:
+        residual = _with_named_prediction(residual, running, model[measured].unit or "")
     traced = Traced(
         symbols,
         ca.vertcat(*coordinates),
@@ -70,7 +75,7 @@ def trace(model: Model, cut: str | None = None, naming: bool = False) -> Traced:
         None if residual.predicted is None else ca.vec(ca.SX(residual.predicted)),
         None if residual.measured is None else ca.vec(residual.measured),
         measured,
-        _corrected(model, residual, running),
+        _corrected(model, residual, running, symbols),
     )
     on_signals = [a for a in model.effects if a.kind == "signal"]
     for attached in on_signals:
@@ -143,6 +148,27 @@ def _run_body(model: Model, running: Trace, symbols: Mapping[str, SX]) -> Residu
     return residual
 
 
+def _with_named_prediction(residual: Residual, running: Trace, unit: str) -> Residual:
+    """A prediction that nobody named is a quantity all the same: effects on the reading act there.
+
+    It is called PREDICTED, or PREDICTED_ where that is something else.
+    """
+    of = residual.predicted
+    for name, found in running.quantities.items():
+        if of is found.value or of is running.handed[name]:
+            return residual
+    name = PREDICTED
+    while name in running.quantities or name in running.reserved:
+        name += "_"
+    return Residual(
+        measured=residual.measured,
+        predicted=running.enter(name, of, unit, implied=True),
+        corrected=residual.corrected,
+        unit=residual.unit,
+        axes=residual.axes,
+    )
+
+
 def _with_changed_reading(traced: Traced, attached: Attached) -> Traced:
     """The prediction stays; what is compared with it does not."""
     changed = ca.vec(ca.SX(attached.apply(traced.reading, traced.symbols)))
@@ -170,7 +196,9 @@ def _with_signal_effect(traced: Traced, attached: Attached) -> Traced:
     )
 
 
-def _corrected(model: Model, residual: Residual, running: Trace) -> str | None:
+def _corrected(
+    model: Model, residual: Residual, running: Trace, symbols: Mapping[str, SX]
+) -> str | None:
     if residual.corrected is None:
         return None
     for name, found in running.quantities.items():
@@ -178,7 +206,21 @@ def _corrected(model: Model, residual: Residual, running: Trace) -> str | None:
             return name
     if isinstance(residual.corrected, str) and residual.corrected in running.quantities:
         return residual.corrected
-    raise DeclarationError(f"model {model.name}: corrected= must be a quantity of the model")
+    signal = next((s for s in model.signals if residual.corrected is symbols[s.name]), None)
+    if signal is not None:
+        unit = f', "{signal.unit}"' if signal.unit else ""
+        raise DeclarationError(
+            f"model {model.name}: corrected= is the signal {signal.name}: write wanted = "
+            f'quantity("wanted", {signal.name}{unit}), use `wanted` instead of {signal.name} in '
+            "the lines below, and say corrected=wanted"
+        )
+    names = [name for name, found in running.quantities.items() if not found.implied]
+    there = f" (there is {', '.join(names)})" if names else ""
+    raise DeclarationError(
+        f"model {model.name}: corrected= must be a quantity of the model{there}: wrap the "
+        'expression where it is computed, wanted = quantity("wanted", …, "unit"), and say '
+        "corrected=wanted"
+    )
 
 
 def function_of(model: Model, outputs: Mapping[str, SX], traced: Traced | None = None) -> Any:

@@ -10,7 +10,7 @@ from typing import Any
 
 import casadi as ca
 
-from casest.apply import Correction
+from casest.apply import LEFT, Correction, invertible
 from casest.errors import CasestError
 from casest.following import applying, typed_words
 from casest.modelling.effect import Attached
@@ -63,6 +63,7 @@ def _has_source(model: Model) -> bool:
 def _steps(model: Model, units: Mapping[str, str], typed: str, folder: str) -> list[str]:
     """The correction's order of operations, and the command."""
     try:
+        model, left = invertible(model)
         correction = Correction(model)
         signals, needed, name = correction.signals, correction.parameters, correction.name
     except CasestError as error:
@@ -83,6 +84,8 @@ def _steps(model: Model, units: Mapping[str, str], typed: str, folder: str) -> l
         if inside:
             effects = "; ".join(f"`{a.label}` makes `{a.on}` {_said(a)}" for a in inside)
             steps.append(f"On the way each added effect is undone where it acts: {effects}.")
+    if left:
+        steps.append(f"{LEFT.capitalize()}{', '.join(f'`{label}`' for label in left)}.")
     steps.append(f"The result is `{name}`, {_size(correction.size)}{_in(units, name)}.")
     command = tag("pre", tag("code", escaped(_command(typed, folder))))
     lines = "\n".join(formulas(model, chain if model.implicit else chain[1:]))

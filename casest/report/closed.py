@@ -201,15 +201,11 @@ def _invisible(story: Story, content: Mapping[str, Any]) -> str:
     if not hidden:
         said = "Every effect of the catalogue that applies here would have shown at a typical size."
         return section("invisible", "What stayed invisible", paragraph(said))
-    units = {d["parameter"]: d["unit"] for d in content["smallest_detectable"]}
     rows = [
         [
             i["name"] + (f" ({i['column']})" if i["column"] else ""),
-            _typical(i, story, units),
-            ", ".join(
-                f"`{n}` by {with_unit(v, story.units.get(n, ''))}"
-                for n, v in i["would_move"].items()
-            ),
+            ", ".join(f"`{n}` = {with_unit(v, i['units'][n])}" for n, v in i["typical"].items()),
+            _moves(i["would_move"], story),
             i["shown_by"],
         ]
         for i in hidden
@@ -225,10 +221,3 @@ def _invisible(story: Story, content: Mapping[str, Any]) -> str:
 def _moves(would_move: Mapping[str, float], story: Story) -> str:
     sizes = {n: with_unit(v, story.unit_of(n)) for n, v in would_move.items()}
     return ", ".join(f"`{n}` by {size}" for n, size in sizes.items())
-
-
-def _typical(i: Mapping[str, Any], story: Story, units: Mapping[str, str]) -> str:
-    """Typical sizes with their units, where those are known."""
-    own = {n: units.get(f"{i['name']}.{n}") or story.unit_of(n) for n in i["typical"]}
-    sizes = {n: with_unit(v, own[n]) for n, v in i["typical"].items()}
-    return ", ".join(f"`{n}` = {size}" for n, size in sizes.items())

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from casest.estimate import Estimate
+from casest.following import typed_words
 from casest.report.numbers import number, printed, printed_unit, with_unit
 from casest.report.page import escaped, paragraph, points, section, table, tag
 from casest.report.story import Story
@@ -207,7 +209,9 @@ def reproduction(content: Mapping[str, Any], notes: Sequence[str] = ()) -> str:
     command, digests = again.pop("command", ""), again.pop("sha256", {})
     said = []
     if command:
-        said.append(tag("pre", tag("code", escaped(command))))
+        words = typed_words(command)
+        shown = textwrap.dedent(words.lines()) if words else command
+        said.append(tag("pre", tag("code", escaped(shown))))
     versions = {"casest": content["casest"], **again}
     said.append(table(["software", "version"], [[k, str(v)] for k, v in versions.items()]))
     rows = [[f"`{name}`", f"`{digest}`"] for name, digest in digests.items()]

@@ -91,6 +91,8 @@ def _deviations(content: Mapping[str, Any]) -> str:
     for name, std in content["std"].items():
         values = np.array(std, dtype=object)
         for index, value in np.ndenumerate(values):
+            if value == 0 and index:  # an entry that the shape holds at zero
+                continue
             label = f"`{name}[{','.join(map(str, index))}]`" if index else f"`{name}`"
             shown = "not determined" if value is None else number(value)
             rows.append([label, shown, printed_unit(units.get(name, ""))])

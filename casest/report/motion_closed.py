@@ -7,6 +7,7 @@ from typing import Any
 
 from casest.closing_motion.loop import MotionClosing
 from casest.closing_motion.text import found, sentence
+from casest.report.calibration import error_picture
 from casest.report.figures import Figures
 from casest.report.fitted import reproduction
 from casest.report.frame import whole
@@ -19,7 +20,7 @@ def closing_motion_page(closing: MotionClosing, content: Mapping[str, Any]) -> s
     """`report.html` of a loop closed in motion."""
     figures, found = Figures(), closing.after.found
     body = [
-        _errors(content),
+        _errors(content, figures),
         _effects(content),
         section("states", "States", *state_figures(found, figures)),
         _parameters(content),
@@ -39,7 +40,7 @@ def closing_motion_page(closing: MotionClosing, content: Mapping[str, Any]) -> s
     return whole(content["model"], f"{said[0].upper()}{said[1:]}.", under, body, content, figures)
 
 
-def _errors(content: Mapping[str, Any]) -> str:
+def _errors(content: Mapping[str, Any], figures: Figures) -> str:
     before, after = content["before"], content["after"]
     rows = [("fit", before["rmse_fit"], after["rmse_fit"]),
             ("held-out", before["rmse_holdout"], after["rmse_holdout"])]  # fmt: skip
@@ -56,7 +57,9 @@ def _errors(content: Mapping[str, Any]) -> str:
     shown = table(["innovation, rms", "before", "after", "unit"], cells, [1, 2])
     rise = after["log_likelihood"] - before["log_likelihood"]
     gained = paragraph(f"Log-likelihood: {rise:+.1f}.") if content["effects"] else ""
-    return section("error", "Error before and after", said, shown, gained)
+    sides = [("before", [b for _, b, _ in rows]), ("after", [a for _, _, a in rows])]
+    picture = error_picture(figures, [row[0] for row in rows], sides, content["noise"]["unit"])
+    return section("error", "Error before and after", said, shown, gained, picture)
 
 
 def _effects(content: Mapping[str, Any]) -> str:

@@ -91,9 +91,9 @@ class Story:
         return [v for v in found if v.name not in ("time", "place in the record")]
 
     def unit_of(self, name: str) -> str:
-        """Unit of a parameter, or of its first entry."""
-        entries = (u for n, u in self.units.items() if n.startswith(f"{name}["))
-        return self.units.get(name) or next(entries, "")
+        """Unit of a parameter; empty where its entries have several."""
+        entries = {u for n, u in self.units.items() if n.startswith(f"{name}[")}
+        return self.units.get(name) or (entries.pop() if len(entries) == 1 else "")
 
     def variable_unit(self, name: str) -> str:
         """Unit of a variable, empty where nobody stated it."""
