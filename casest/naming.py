@@ -63,7 +63,8 @@ def resolved(unit: str, known: Mapping[str, str]) -> str:
 
     found = _PLACEHOLDER.sub(replacement, unit) or "1"
     found = re.sub(r"\(\(([^()]*)\)\)", r"(\1)", found)
-    return re.sub(r"\((\w+)\)", r"\1", found)
+    found = re.sub(r"\((\w+)\)", r"\1", found)
+    return re.sub(r"^\(([^()]*)\)$", r"\1", found)
 
 
 def _difference(unit: str) -> str:
