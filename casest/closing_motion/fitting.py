@@ -140,6 +140,7 @@ def fitted(
         if last < ENOUGH or k == ROUNDS - 1:
             return fit
         added, start, along = _moved(fit, step), fit.intensities, fit.found.smoothed
+        del fit, H, z  # the next one needs the room
     raise AssertionError
 
 

@@ -8,11 +8,14 @@ Shnider 1999).
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from itertools import chain
+
 import numpy as np
 
 from casest.declaring.shapes import Array
 from casest.dynamics.declare import Dynamics
-from casest.dynamics.transition import Linearised, magnus_steps
+from casest.dynamics.transition import Linearised, magnus_blocks
 from casest.errors import DataError
 
 
@@ -25,23 +28,25 @@ def riccati(model: Dynamics, system: Linearised, start: Array | None = None) -> 
 
     P = np.asarray(model.start_covariance if start is None else start, float)
     check_covariance(P, "the covariance at the beginning")
-    steps = hamiltonian_steps(model, system)
     n = model.size
     found = np.empty((len(system.time), n, n))
     found[0] = P
-    for k, (of_P, alone) in enumerate(zip(steps[:, :, :n], steps[:, :, n:], strict=True)):
-        both = of_P.dot(P)
-        both += alone
+    both = np.empty((2 * n, n))
+    top, bottom = both[:n].T, both[n:].T
+    for later, step in zip(found[1:], chain.from_iterable(_blocks(model, system)), strict=True):
+        np.dot(step[:, :n], P, out=both)
+        both += step[:, n:]
         # The rows of [X; Y] are the columns that LAPACK wants: P = XY⁻¹ = (Y⁻ᵀXᵀ)ᵀ.
-        half = dgesv(both[n:].T, both[:n].T)[2]
-        found[k + 1] = P = 0.5 * (half + half.T)
+        half = dgesv(bottom, top, 1, 1)[2]
+        P = np.add(half, half.T, out=later)
+        P *= 0.5
     return found
 
 
-def hamiltonian_steps(model: Dynamics, system: Linearised) -> Array:
-    """Transition of [X; Y] over every step, (N − 1, 2n, 2n), by fourth-order Magnus steps."""
+def _blocks(model: Dynamics, system: Linearised) -> Iterator[Array]:
+    """Transition of [X; Y] over every step, (…, 2n, 2n), by fourth-order Magnus steps."""
     weight: Array = np.asarray(np.linalg.inv(model.noise), float)
-    return magnus_steps(lambda where: _hamiltonian(model, system, where, weight), system)
+    return magnus_blocks(lambda where: _hamiltonian(model, system, where, weight), system)
 
 
 def _hamiltonian(model: Dynamics, system: Linearised, where: slice, weight: Array) -> Array:

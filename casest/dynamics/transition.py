@@ -7,7 +7,7 @@ where holding A is right to second order only. A known input is one more, consta
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import factorial
@@ -183,16 +183,23 @@ def magnus_steps(
 
     `coefficients(where)` gives M at those samples; between samples it is a straight line.
     """
+    return np.concatenate(list(magnus_blocks(coefficients, system, part)))
+
+
+def magnus_blocks(
+    coefficients: Callable[[slice], Array],
+    system: Linearised,
+    part: tuple[float, float] = (0.0, 1.0),
+) -> Iterator[Array]:
+    """The same, some steps at a time: they stay in the processor's cache."""
     steps, (begin, end) = system.steps, part
-    found = []
     for k in range(0, len(steps), _BLOCK):
         M = coefficients(slice(k, k + _BLOCK + 1))
         slope = M[1:] - M[:-1]
         first, last = (M[:-1] + share * slope if share else M[:-1] for share in part)
         h = (end - begin) * steps[k : k + _BLOCK, None, None]
         bend = last @ first - first @ last
-        found.append(exponential(0.5 * h * (first + last) + h**2 / 12 * bend))
-    return np.concatenate(found)
+        yield exponential(0.5 * h * (first + last) + h**2 / 12 * bend)
 
 
 def _augmented(A: Array, c: Array) -> Array:

@@ -21,8 +21,7 @@ from casest.engine.operations import Floats
 
 #: Steps that CasADi runs in one call.
 CHUNK = 500
-#: Steps of one call from which on the cache is looked at, and replayed ones that make a compiler
-#: worthwhile.
+#: Steps from which on the cache is looked at, and from which on a compiler is worthwhile.
 LOOK, WORTHWHILE = 5_000, 60_000
 #: No contraction: the digits are those of the virtual machine.
 _FLAGS = [["-O1", "-ffp-contract=off", "-fno-math-errno"]]
@@ -91,7 +90,7 @@ class Recursion:
         if self._library is None and due and not self._built:
             self._built = self._looked = True
             self._library = library(self._source(), _FLAGS)
-        elif self._library is None and count >= LOOK and not self._looked:
+        elif not self._looked and self._replayed + count >= LOOK:
             self._looked = True
             self._library = library(self._source(), _FLAGS, build=False)
         return self._library

@@ -1,0 +1,117 @@
+"""The loop on worlds whose cause is known: what is named, what is left open, what is no effect."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import simulators as sim
+import worlds
+
+import casest as c
+from casest import Run
+from casest.closing.loop import close, rms
+from casest.problem import find_model
+
+
+def record(world, seed=0):
+    """The world's record as it would be read from a file."""
+    units = {name: world.units.get(name) for name in world.signals}
+    run = Run.raw(world.model, dict(world.signals), units=units, time=world.time)
+    degrees = {name: "degC" if name == "temperature" else None for name in world.columns}
+    n = len(world.block)
+    run = replace(run, columns=dict(world.columns), column_units=degrees, block=world.block)
+    run = replace(run, count=np.full(n, world.count))
+    if world.count > 1:
+        rng, freedom = np.random.default_rng(seed), world.count - 1
+        scatter = world.sigma * np.sqrt(rng.chisquare(freedom, (n, 3)) / freedom)
+        run = replace(run, spread={world.read: scatter})
+    return run
+
+
+def declared(world):
+    model = find_model(world.model)
+    return model.having(norm=sim.GRAVITY) if world.model.startswith("norm") else model
+
+
+def closed(place, seed, effects, **options):
+    seed = seed if isinstance(seed, list) else [seed]
+    world = worlds.made(place, seed, effects, **options)
+    return close(declared(world), [record(world)]), world
+
+
+def labels(closing):
+    return [f.candidate.label for f in closing.effects]
+
+
+def test_a_step_is_found_in_poses_that_show_their_norm_only():
+    """The residual of a norm has no axes: where it jumps, cannot be seen in it directly."""
+    closing, world = closed("norm", 31, {"bias_step": 0.12})
+    assert labels(closing) == ["bias_step"]
+    moment = dict(closing.effects[0].candidate.effect.declarations)["when"]
+    assert abs(float(moment.array) - 0.37 * world.time[-1]) < 0.05 * world.time[-1]
+    assert closing.verdict == "extended"
+
+
+def test_two_causes_in_few_poses_are_found_though_neither_alone_is_confirmed():
+    closing, _ = closed("norm", 7, {"quadratic": 3e-3, "channel_bias": 6.0})
+    assert set(labels(closing)) == {"quadratic", "channel_bias(supply)"}
+
+
+def test_an_axis_that_was_nothing_beside_what_was_missing_is_filled_in_again():
+    """The slope over temperature comes first, while the bent response still looks like noise."""
+    seed = [10001, *b"two", *b"norm", *b"cubic+temperature_bias"]
+    closing, _ = closed("norm", seed, {"cubic": 4.5e-4, "temperature_bias": 0.045})
+    assert labels(closing) == ["temperature_bias(temperature)", "cubic"]
+    assert [name for f in closing.effects for name in f.names] == [
+        "temperature_bias(temperature).k",
+        "cubic.k",
+    ]
+
+
+def test_a_dead_zone_is_named_and_its_width_found():
+    closing, _ = closed("table", 3, {"dead_zone": 0.12})
+    assert labels(closing) == ["dead_zone"]
+    width, std = (getattr(closing.after, k)["dead_zone.width"] for k in ("values", "std"))
+    assert np.all(np.abs(width - 0.12 * np.abs(worlds.SHARES)) < 5 * std)
+
+
+def test_a_bent_course_over_temperature_is_a_formula_and_no_step():
+    closing, world = closed("table", 5, {"warm_exp": 0.03})
+    assert "formula" in labels(closing)
+    assert "bias_step" not in labels(closing)
+    assert "temperature" in closing.effects[-1].candidate.effect.formula
+    assert rms(closing.after_held_out) < 1.1 * world.sigma
+
+
+def test_all_that_small_nonlinearity_may_be_is_named():
+    """On one tilt four shapes of response look alike until they are large."""
+    closing, _ = closed("wheel", 4, {"quadratic": 2e-4})
+    (found,) = closing.effects
+    assert "quadratic" in {found.candidate.label, *found.indistinguishable_from}
+
+
+@c.model
+def constant_bias(v=c.signal(3, "m/s^2"), *, bias=c.param(3, "m/s^2")):
+    return c.Residual(measured=v, predicted=c.quantity("reading", bias, "m/s^2"))
+
+
+def wandering(step, seed, count=3000):
+    rng = np.random.default_rng(seed)
+    walk = np.cumsum(step * rng.standard_normal((count, 3)), axis=0)
+    v = 0.05 * rng.standard_normal((count, 3)) + walk
+    return Run.raw("rest", {"v": v}, units={"v": "m/s^2"}, time=np.arange(count) * 0.01)
+
+
+def test_an_offset_that_walks_at_random_is_noise_and_neither_drift_nor_step():
+    named = []
+    for seed in range(5):
+        closing = close(constant_bias, [wandering(2e-3, seed)])
+        named += [set(labels(closing))]
+        assert "bias_wander" in named[-1]
+    assert sum(bool(found - {"bias_wander"}) for found in named) == 0
+
+
+def test_a_steady_offset_does_not_wander():
+    found = [labels(close(constant_bias, [wandering(0.0, seed)])) for seed in range(6)]
+    assert not any(found)
