@@ -11,7 +11,7 @@ import pytest
 import casest as c
 from casest import load_runs
 from casest.cli import run
-from casest.closing.loop import close
+from casest.closing.loop import OF_NOISE, close
 from casest.problem import find_model
 
 
@@ -70,7 +70,7 @@ def test_a_cooling_gyro_has_an_offset_that_time_explains_as_well_as_temperature(
         scales={"temp": "int16/256+25"},
         units={"temp": "degC"},
     )
-    (moved,) = [e for e in found.effects if e.candidate.label != "outliers"]
+    (moved,) = [e for e in found.effects if e.candidate.label not in OF_NOISE]
     named = {moved.candidate.label, *moved.indistinguishable_from}
     assert {"temperature_bias(temp)", "bias_drift"} <= named
     assert "outliers" in labels(found)  # two spikes in x
@@ -117,7 +117,7 @@ def test_the_example_of_a_gyro_at_rest_traces_a_cold_test(shared_data, tmp_path)
         "--scale", "temp=int16/256+25", "--unit", "temp=degC",
     )  # fmt: skip
     assert result["verdict"] == "extended"
-    (moved,) = [e for e in result["effects"] if e["name"] != "outliers"]
+    (moved,) = [e for e in result["effects"] if e["name"] not in OF_NOISE]
     assert {moved["name"], *(n.partition("(")[0] for n in moved["indistinguishable_from"])} >= {
         "temperature_bias",
         "bias_drift",
