@@ -164,14 +164,20 @@ def attempt(
     start: Mapping[str, Any] | None = None,
     solver: str = "ipopt",
     seed: int = 0,
+    intervals: bool = True,
 ) -> Estimate:
-    """The same as `calibrate`, but a refused estimate is returned instead of raised."""
+    """The same as `calibrate`, but a refused estimate is returned instead of raised.
+
+    Without `intervals`, those that only the likelihood can give are left out: each takes fits.
+    """
     # What is not finite is found and named, not warned about.
     with np.errstate(all="ignore"), one_thread():
-        return _attempt(Problem(model, tuple(runs)), start, solver, seed)
+        return _attempt(Problem(model, tuple(runs)), start, solver, seed, intervals)
 
 
-def _attempt(problem: Problem, start: Mapping[str, Any] | None, solver: str, seed: int) -> Estimate:
+def _attempt(
+    problem: Problem, start: Mapping[str, Any] | None, solver: str, seed: int, intervals: bool
+) -> Estimate:
     began, model = time.perf_counter(), problem.model
     _enough(problem)
     own = dict(model.estimators)
@@ -192,7 +198,7 @@ def _attempt(problem: Problem, start: Mapping[str, Any] | None, solver: str, see
         seed=seed,
         automatic=start is None,
     )
-    found = _estimate(problem, best_of(outcomes), outcomes, began)
+    found = _estimate(problem, best_of(outcomes), outcomes, began, intervals)
     if start is None and model.starter is None and found.certificate.trusted:
         found = _looked_at_for_a_better_one(found)
     if stopped():
@@ -260,7 +266,11 @@ def _merged(problem: Problem, start: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _estimate(
-    problem: Problem, best: Outcome, outcomes: Sequence[Outcome], began: float
+    problem: Problem,
+    best: Outcome,
+    outcomes: Sequence[Outcome],
+    began: float,
+    intervals: bool = True,
 ) -> Estimate:
     found, best = best, _canonical(problem, best)
     outcomes = [
@@ -278,7 +288,10 @@ def _estimate(
     relative = float(np.max(np.abs(bias) / np.sqrt(np.diag(covariance)), initial=0.0))
     shift = np.outer(bias, bias) if relative > NOTABLE_BIAS else 0.0
     covariance = covariance + shift
-    certificate = certify(problem, best, outcomes, identified, (R, factor[1], rest), noise.sigma)
+    factored = (R, factor[1], rest)
+    certificate = certify(
+        problem, best, outcomes, identified, factored, noise.sigma, intervals=intervals
+    )
     unknown = identified.touched
     covariance[unknown, :] = covariance[:, unknown] = np.nan
     return Estimate(

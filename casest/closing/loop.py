@@ -172,8 +172,6 @@ class _Loop:
         self.refused: list[Skipped] = []
         self.skipped: list[Skipped] = []
         self.found: list[Found] = []
-        #: The last estimate that was asked for.
-        self.proved = before
         #: Candidates as they are declared, by label: their profiles unknown, on all axes.
         self.original: dict[str, Candidate] = {}
 
@@ -200,7 +198,7 @@ class _Loop:
         else:
             ranked = self._ranked(current)
         current = self._weeded(self._filled(current))
-        after = self._certified(current) if self.found else self.before
+        current, after = self._proved(current)
         self._note_wander(current)
         return Closing(
             self.before,
@@ -248,11 +246,31 @@ class _Loop:
         return replace(fitted, held_out=held_out)
 
     def _certified(self, current: Fitted) -> Estimate:
-        known = self.proved
-        if current.model is not known.model or current.values is not known.values:
-            known = attempt(current.model, self.runs, start=current.values, seed=self.seed)
-        self.proved = known
-        return known
+        """An estimate whose trust is known; its intervals may be left for the end."""
+        return attempt(
+            current.model, self.runs, start=current.values, seed=self.seed, intervals=False
+        )
+
+    def _proved(self, current: Fitted) -> tuple[Fitted, Estimate]:
+        """The last estimate, with intervals; without effects that leave one without an end."""
+        while self.found:
+            after = attempt(current.model, self.runs, start=current.values, seed=self.seed)
+            if after.certificate.trusted:
+                return current, after
+            last = self.found.pop()
+            self._refuse(last.candidate, f"its fit is refused: {after.certificate.reasons[0]}")
+            left = {f.candidate.label for f in self.found}
+            added = current.model.effects[len(self.before.model.effects) :]
+            kept = self.before.model.effects + tuple(a for a in added if a.label in left)
+            base = self.before.model if last.candidate.freed else current.model
+            model = replace(base, effects=kept)
+            names = {p.name for p in model.parameters}
+            values = {name: v for name, v in current.values.items() if name in names}
+            without = self._crossed(self._fitted(model, values))
+            if without is None:
+                break
+            current = without
+        return current, self.before
 
     def _without_outliers(self, current: Fitted) -> Fitted:
         """With the effect `outliers` where there are some: they would pull what follows."""

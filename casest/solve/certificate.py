@@ -72,10 +72,13 @@ def certify(
     identified: Identifiability,
     factor: tuple[Array, Array, float],
     sigma: float,
+    *,
+    intervals: bool = True,
 ) -> Certificate:
     """Judge the best of several outcomes. Reasons say what speaks against it, or else for it.
 
-    `sigma` is the standard deviation of one residual, NaN where nothing shows it.
+    `sigma` is the standard deviation of one residual, NaN where nothing shows it. Without
+    `intervals`, those that the likelihood would have to give are taken to have ends.
     """
     R = factor[0]
     against: list[str] = []
@@ -122,7 +125,10 @@ def certify(
     if not against:
         shape, words = _shape(problem, best, R, max(sigma, rounding))
         if not LINEAR[0] <= shape[0] <= shape[1] <= LINEAR[1]:
-            profile = _profile(problem, best, R, sigma)
+            if not intervals and _has_likelihood(problem):
+                words = []
+            else:
+                profile = _profile(problem, best, R, sigma)
         if profile is not None:
             words = []
         against += words or _ambiguous(problem, best, others, R, sigma)
@@ -142,14 +148,19 @@ def certify(
     )
 
 
+def _has_likelihood(problem: Problem) -> bool:
+    """Is there one that can be profiled?"""
+    curved = any(slot.parameter.shape.curved for slot in problem.slots)
+    return not (problem.model.implicit or curved or problem.sequential)
+
+
 def _profile(problem: Problem, best: Outcome, R: Array, sigma: float) -> Array | None:
     """95 % intervals of the likelihood, (n, 2), or None where one has no end.
 
     For models that predict readings: of an implicit residual the likelihood is known to first
     order only, and unknowns on curved sets have no interval.
     """
-    curved = any(slot.parameter.shape.curved for slot in problem.slots)
-    if problem.model.implicit or curved or problem.sequential:
+    if not _has_likelihood(problem):
         return None
     around = Profile(problem, best.point, best.cost, sigma**2 * inverse_normal(R), sigma)
     rise = half_width(problem.residual_count - problem.unknowns) ** 2
