@@ -140,3 +140,15 @@ def test_of_the_mpu6050_at_rest_the_accelerometer_is_adequate_and_nothing_is_a_f
     gyro = from_the_command_line(tmp_path, model, record, "--columns", "v=gx,gy,gz", *options)
     assert "formula" not in [e["name"] for e in gyro["effects"]]
     assert gyro["after"]["rmse_holdout"] > 0.99 * gyro["before"]["rmse_holdout"]
+
+
+def test_six_orientations_have_none_to_spare(shared_data, tmp_path):
+    """A Ferraris session: without one of its six positions the rest foretells nothing of it."""
+    record = shared_data / "imucal" / "example_ferraris_session.csv"
+    result = from_the_command_line(
+        tmp_path, "norm-diagonal", record, "--columns", "v=acc_x,acc_y,acc_z", "--unit",
+        "v=m/s^2", "--rate", "102.4", "--at-rest", "--set", "norm=9.80665",
+    )  # fmt: skip
+    assert result["verdict"] is None
+    assert result["trusted"]
+    assert any("record more orientations" in r["reason"] for r in result["refused"])

@@ -64,6 +64,8 @@ CONTENDERS, MORE, ROUNDS = 6, 4, 8
 #: Steps of one size that a level or moment may take from where the grid found it; rivals of the
 #: best take them too, where they leave at most this share of what it explains.
 STRIDES, NEAR = 6, 0.3
+#: Variance of what a fit to the rest foretells of a part, in those of the noise, at most.
+UNCERTAIN = 10.0
 #: Effects that are a property of the noise, and leave a model adequate.
 OF_NOISE = frozenset({"outliers", "bias_wander"})
 #: Columns of the widest model that is evaluated at once.
@@ -169,6 +171,7 @@ class _Loop:
             before, runs, catalogue, seed, say,
         )  # fmt: skip
         self.folds = folded(runs, before.correlated_over, seed)
+        _check_folds(before, runs, self.folds)
         self.refused: list[Skipped] = []
         self.skipped: list[Skipped] = []
         self.found: list[Found] = []
@@ -645,6 +648,37 @@ def _parts(found: Sequence[Candidate], size: int) -> list[list[Candidate]]:
 def _limit(ranked: Sequence[Score]) -> float:
     """The p-value up to which a candidate is significant, beside all others."""
     return FALSE_ALARM / max(len({s.candidate.label for s in ranked}), 1)
+
+
+def _check_folds(before: Estimate, runs: Sequence[Run], folds: Folds) -> None:
+    """Raise DataError where the rest of a record does not determine what a part is held out for.
+
+    What a fit to the rest leaves uncertain of the part, in variances of the noise, is the trace
+    of JᵀJ of the part times the inverse of that of the rest.
+    """
+    for k in range(folds.count):
+        parts = [
+            tuple(run.take((fold == k) == held) for run, fold in zip(runs, folds.of, strict=True))
+            for held in (False, True)
+        ]
+        if any(len(run) == 0 for run in parts[0]) or not sum(map(len, parts[1])):
+            continue  # the fits themselves say so
+        rest, part = (Problem(before.model, p) for p in parts)
+        words = "there are too few equations"
+        if rest.residual_count >= rest.unknowns:
+            words = _undetermined(rest, before.values)
+        if not words:
+            point = rest.point(before.values)
+            own = part.normal(part.point(before.values)).matrix
+            spread = float(np.trace(np.linalg.solve(rest.normal(point).matrix, own)))
+            if spread < UNCERTAIN * part.residual_count:
+                continue
+            deviations = np.sqrt(spread / part.residual_count)
+            words = f"the part is foretold to {deviations:.2g} standard deviations of the noise"
+        raise DataError(
+            f"without one part in {folds.count} of the record {words}; record more orientations, "
+            "or each of them twice"
+        )
 
 
 def _undetermined(problem: Problem, values: Mapping[str, Array]) -> str:
