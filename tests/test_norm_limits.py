@@ -22,7 +22,7 @@ POOR = {
     "half sphere": lambda n, rng: sim.cap(24, rng, np.pi / 2),
     "one more pose than unknowns": lambda n, rng: sim.spread_poses(n + 1, rng),
 }
-COUNTS = {"ring": 12, "cap of ten degrees": 8}
+COUNTS = {"ring": 6, "cap of ten degrees": 6}
 
 
 def recorded(v, unit="m/s^2"):
