@@ -53,7 +53,8 @@ def with_effects(
         effect = known[found[1]]
         if effect.on == NOISE:
             raise UsageError(
-                f"--effect {text}: it describes noise and makes none; add it to the readings yourself"
+                f"--effect {text}: it describes noise and makes none; add the noise to the "
+                "readings yourself"
             )
         columns = _columns_of(effect, found[2], model, run)
         effect = with_numbers(placed_in(effect, model), columns, prepared(model, (run,)))

@@ -102,7 +102,7 @@ def test_the_only_column_is_the_one_that_an_effect_follows(tmp_path):
         (["wheel", *WHEEL, "--effect", "imbalace"], "did you mean imbalance?"),
         (["wheel", *WHEEL, "--effect", "temperature_bias"], "say which, temperature_bias(COLUMN)"),
         ([LOAD_CELL], "load-cell needs mass: give --input FILE with them"),
-        (["wheel", *WHEEL, "--effect", "outliers"], "it weighs samples and makes none"),
+        (["wheel", *WHEEL, "--effect", "outliers"], "it describes noise and makes none"),
         (["wheel", *WHEEL, "--noise", "-1"], "a standard deviation, not negative"),
         (["wheel", *WHEEL, "--value", "radius=1"], "unknowns are gain"),
         (["bias-gravity"], "say --duration and --rate"),
