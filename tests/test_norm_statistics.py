@@ -1,4 +1,4 @@
-"""Are the printed uncertainties true? Two thousand simulated calibrations, and the closed form.
+"""Are the printed uncertainties true? A thousand simulated calibrations, and the closed form.
 
 Truth: a simulator that shares no code with casest, and the laws of Student and Fisher.
 """
@@ -29,7 +29,7 @@ from casest_problems.norm import (
 
 POSES = 24
 SIGMAS = (1e-3, 3e-3, 1e-2, 2e-2)
-CALIBRATIONS = 1000  # of each model
+CALIBRATIONS = 500  # of each model
 BATCHES = 8
 
 
@@ -87,7 +87,7 @@ def simulated(task):
 
 @pytest.fixture(scope="module")
 def calibrations():
-    """{model: outcomes} of 2000 calibrations, on two processes."""
+    """{model: outcomes} of 1000 calibrations, on two processes."""
     tasks = [
         (name, 1000 * m + batch, CALIBRATIONS // BATCHES)
         for batch in range(BATCHES)
