@@ -15,6 +15,7 @@ from typing import NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from casest.engine.factored import factored_sums
 from casest.engine.kernel import Kernel, kernel_for, kernel_of_sum
 from casest.engine.operations import Floats
 from casest.engine.replay import BLOCK, Entry, Replay, Samples
@@ -82,6 +83,10 @@ def _replayed_sums(
 ) -> Floats:
     """[J r]ᵀ W [J r], (n+1, n+1)."""
     components = _components(replay)
+    if weights is None:
+        found = factored_sums(replay, parameters, samples)
+        if found is not None:
+            return found
     sums = [np.zeros((len(c.columns),) * 2) for c in components]
     with np.errstate(all="ignore"):
         for block, w in _weighted_blocks(replay, components, parameters, samples, weights):
