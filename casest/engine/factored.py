@@ -1,115 +1,141 @@
-"""Least-squares sums where every entry of J is a sum of few factors × atoms.
+"""Least-squares sums from atoms that all entries of J share.
 
-J = C(parameters) · Φ(sample), with atoms Φ that all entries share: JᵀJ = Σ Cᵢ (ΦΦᵀ) Cᵢᵀ and
-Jᵀr = Σ Cᵢ (Φ rᵢ) over the residuals i. Then only atoms and residuals are computed on every sample,
-and one product of them in place of one for each residual.
+Every entry of J is a sum of factor × atom, J = C(parameters) · Φ(sample). For the residuals i
+JᵀJ = Σ Cᵢ (ΦΦᵀ) Cᵢᵀ and Jᵀr = Σ Cᵢ (Φ rᵢ): only atoms and residuals are computed on every sample,
+and one product of them takes the place of one for each residual.
 
-Where the terms of an entry cancel, digits are lost that the entry itself has. The loss is measured
-on every call, and what has lost too much is refused.
+Where the terms of an entry cancel, digits are lost that the entry itself has. How far they do is
+seen in the sums, on every call: what would lose too many is refused, and so is what is not finite,
+for an atom may be infinite where an entry is not.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
+from math import sqrt
 
 import numpy as np
 
 from casest.engine.graph import Graph
 from casest.engine.operations import Floats
-from casest.engine.replay import BLOCK, Plan, Replay, Samples
-from casest.engine.spreading import _SUMS, Spreading
+from casest.engine.replay import Columns, Plan, Replay, Samples
+from casest.engine.spreading import SUMS, Spreading
 
-#: Samples from which on this way is tried.
-ENOUGH = 4_000
-#: Length of an entry's terms over that of the entry: the error of JᵀJ grows with its square.
-_LOSS = 16.0
-#: After this many refusals in a row nothing is tried any more.
-_PATIENCE = 3
-#: Multiplications of BLAS that take as long as one operation on a sample; what must be saved.
-_RATE, _GAIN = 8.0, 0.8
-#: OpenBLAS is quicker with pieces of up to a million multiplications.
-_PIECE, _SMALL = 1024, 1_000_000
+#: Samples from which on this way is looked for: finding it takes as long as it then saves in a few
+#: evaluations.
+ENOUGH = 10_000
+#: Norm of a column's terms over that of the column: errors of JᵀJ grow with its square.
+LOSS = 16.0
+#: Squares below this have lost digits, or all, and large factors would show it.
+_UNDERFLOW = 1e-290
+#: Refusals in a row after which a function is evaluated entry by entry for good.
+PATIENCE = 3
+#: Terms up to which values are spread out: few make for few atoms, many for few operations.
+_FEW, _MANY = 12, 24
+#: Multiplications of a product that take as long as one operation on a sample.
+_RATE = 5.0
+#: The share of the work that must be left over for it to be worthwhile.
+_WORTHWHILE = 0.8
+#: Multiplications and samples of a piece of a product; see `normal`.
+_SMALL, _PIECE = 1_000_000, 1024
 
 
 def factored_sums(replay: Replay, parameters: Floats, samples: Samples) -> Floats | None:
-    """[J r]ᵀ[J r] (n+1, n+1), or None where it does not pay, is not finite or loses digits."""
+    """[J r]ᵀ[J r], (n+1, n+1), of a replay with the outputs r and J; None where it is refused."""
     if len(samples) < ENOUGH:
         return None
-    way = _factored(replay)
-    return None if way is None else way.sums(parameters, samples)
+    found = factored(replay)
+    return None if found is None else found.sums(*replay.check(parameters, samples))
 
 
 @lru_cache(maxsize=256)
-def _factored(replay: Replay) -> _Factored | None:
-    graph, (m, _) = replay.graph, replay.shapes[1]
-    residual, jacobian = graph.outputs[0], graph.outputs[1]
-    sums = [i for i in graph.needed(residual) if graph.values[i].code in _SUMS]
-    ways = [_Factored(replay, Spreading(graph, jacobian, closed)) for closed in ((), sums)]
-    best = min(ways, key=lambda way: way.work)
-    counts = np.bincount(replay.sparsity[1][0], minlength=m) + 1
-    now = _operations(graph, [*jacobian, *residual]) + float(counts @ counts) / _RATE
-    return best.prepared() if best.work < _GAIN * now else None
+def factored(replay: Replay) -> Factored | None:
+    """The way that takes least work; None if that is no less than entry by entry."""
+    graph, (residual, jacobian) = replay.graph, replay.graph.outputs[:2]
+    lengths = np.bincount(replay.sparsity[1][0]) + 1
+    now = _operations(graph, [*jacobian, *residual]) + float(lengths @ lengths) / _RATE
+    best, least, fixed = None, _WORTHWHILE * now, _operations(graph, residual)
+    # What the residuals take anyway costs nothing as an atom.
+    sums = {i for i in graph.needed(residual) if graph.values[i].code in SUMS}
+    for most, closed in ((_FEW, set[int]()), (_FEW, sums), (_MANY, sums)):
+        limit = sqrt(_RATE * max(least - fixed, 0.0))
+        spreading = Spreading(graph, jacobian, most, closed, limit)
+        if spreading.done:
+            found = Factored(replay, spreading)
+            if found.work < least:
+                best, least = found, found.work
+    if best is not None:
+        best.prepare()
+    return best
 
 
 def _operations(graph: Graph, wanted: Sequence[int]) -> int:
+    """How many there are on every sample."""
     values = [graph.values[i] for i in graph.needed(wanted)]
     return sum(value.per_sample and value.kind == "operation" for value in values)
 
 
-class _Factored:
-    def __init__(self, replay: Replay, spreading: Spreading) -> None:
-        self.replay, self.spreading = replay, spreading
-        self.atoms = sorted({atom for own in spreading.sums for atom in own})
-        self.m, self.n = replay.shapes[1]
-        self.count = len(self.atoms)
-        values = [spreading.value(atom) for atom in self.atoms]
-        self.wanted = [*values, *replay.graph.outputs[0]]
-        products = self.count * (self.count + self.m)
-        self.work = _operations(replay.graph, self.wanted) + products / _RATE
-        self.piece = max(1, min(_PIECE, _SMALL // max(products, 1)))
-        self.refused = 0
+class Factored:
+    """One way to write J as factors × atoms. `work`: operations on every sample, products' too."""
 
-    def prepared(self) -> _Factored:
-        place = {atom: k for k, atom in enumerate(self.atoms)}
-        row, column = self.replay.sparsity[1]
-        entries = [
-            (j, i, place[atom], factor)
-            for own, i, j in zip(self.spreading.sums, row, column, strict=True)
+    def __init__(self, replay: Replay, spreading: Spreading) -> None:
+        self._spreading, self._graph = spreading, replay.graph
+        self._row, self._column = replay.sparsity[1]
+        self.m, self.n = replay.shapes[1]
+        self._atoms = sorted(spreading.atoms)
+        self._wanted = [*map(spreading.value, self._atoms), *replay.graph.outputs[0]]
+        products = len(self._atoms) * len(self._wanted)
+        self.work = _operations(self._graph, self._wanted) + products / _RATE
+        self._piece = max(1, min(_PIECE, _SMALL // max(products, 1)))
+        self._refused = 0
+
+    def prepare(self) -> None:
+        """What calls need, once the way is chosen."""
+        place = {atom: k for k, atom in enumerate(self._atoms)}
+        entries = zip(self._spreading.sums, self._column, self._row, strict=True)
+        terms = [
+            (int(j), int(i), place[atom], factor)
+            for own, j, i in entries
             for atom, factor in own.items()
         ]
-        where = self.spreading.factors.keep([factor for *_, factor in entries])
-        self.entries = tuple(np.array([e[k] for e in entries], dtype=np.intp) for k in range(3))
-        self.source = np.array([where[e[3]] for e in entries], dtype=np.intp)
-        self.plan = Plan(self.replay.graph, self.wanted)
-        return self
+        self._factors = self._spreading.factors
+        where = self._factors.keep([factor for *_, factor in terms])
+        self._source = np.array([where[factor] for *_, factor in terms], dtype=np.intp)
+        self._target = tuple(np.array([t[:3] for t in terms], dtype=np.intp).reshape(-1, 3).T)
+        self._plan = Plan(self._graph, self._wanted)
 
-    def sums(self, parameters: Floats, samples: Samples) -> Floats | None:
-        if self.refused >= _PATIENCE:
+    def sums(self, parameters: Floats, samples: Columns) -> Floats | None:
+        """[J r]ᵀ[J r], or None where digits would be lost or something is not finite."""
+        if self._refused >= PATIENCE:
             return None
         with np.errstate(all="ignore"):
-            found = self._sums(parameters, samples)
-        self.refused = self.refused + 1 if found is None else 0
+            C = np.zeros((self.n, self.m, len(self._atoms)))
+            C[self._target] = self._factors.values(parameters)[self._source]
+            found = self._whole(C, *self._products(parameters, samples))
+        self._refused = 0 if found is not None else self._refused + 1
         return found
 
-    def _sums(self, parameters: Floats, samples: Samples) -> Floats | None:
-        parameters, columns = self.replay.check(parameters, samples)
-        K, n = self.count, self.n
-        products, squares = np.zeros((K, K + self.m)), 0.0
-        for _, values in self.plan.blocks(parameters, columns, BLOCK):
-            for start in range(0, values.shape[1], self.piece):
-                piece = values[:, start : start + self.piece]
-                products += piece[:K] @ piece.T
+    def _products(self, parameters: Floats, samples: Columns) -> tuple[Floats, float]:
+        """Φ [Φ r]ᵀ (K, K + m) and Σ r²."""
+        K = len(self._atoms)
+        total, squares = np.zeros((K, K + self.m)), 0.0
+        for _, values in self._plan.blocks(parameters, samples):
+            for start in range(0, values.shape[1], self._piece):
+                piece = values[:, start : start + self._piece]
+                total += piece[:K] @ piece.T
             squares += sum(float(r @ r) for r in values[K:])
-        gram = products[:, :K]
-        C = np.zeros((n, self.m, K))
-        C[self.entries] = self.spreading.factors.values(parameters)[self.source]
-        flat = C.reshape(n, -1)
+        return total, squares
+
+    def _whole(self, C: Floats, total: Floats, squares: float) -> Floats | None:
+        """The factors C (n, m, K) put to the products of the atoms."""
+        n, K = self.n, len(self._atoms)
+        gram, flat = total[:, :K], C.reshape(n, -1)
+        matrix = (C @ gram).reshape(n, -1) @ flat.T
         whole = np.empty((n + 1, n + 1))
-        matrix = (C @ (0.5 * (gram + gram.T))).reshape(n, -1) @ flat.T
         whole[:n, :n] = 0.5 * (matrix + matrix.T)
-        whole[:n, n] = whole[n, :n] = flat @ products[:, K:].T.ravel()
+        whole[n, :n] = whole[:n, n] = flat @ total[:, K:].T.ravel()
         whole[n, n] = squares
-        terms = np.abs(C) @ np.sqrt(np.diag(gram))
-        kept = np.einsum("ji,ji->j", terms, terms) <= _LOSS**2 * np.diag(matrix)
+        lengths = np.sum((np.abs(C) @ np.sqrt(np.diag(gram) + _UNDERFLOW)) ** 2, axis=1)
+        kept = lengths <= LOSS**2 * np.diag(matrix)
         return whole if np.isfinite(whole).all() and kept.all() else None

@@ -24,9 +24,8 @@ Spread = dict[Atom, int]
 
 #: Terms that two sums may have together for their product to be spread out.
 _PRODUCT = 6
-#: Terms up to which a value is spread out.
-_MOST = 24
-_SUMS = (ca.OP_ADD, ca.OP_SUB)
+#: Operations that make sums.
+SUMS = (ca.OP_ADD, ca.OP_SUB)
 
 
 class Factors:
@@ -86,18 +85,37 @@ class Factors:
 
 
 class Spreading:
-    """The values of a graph as sums of factor × atom; those that are `closed` stay atoms."""
+    """Wanted values of a graph as `sums` of factor × atom.
 
-    def __init__(self, graph: Graph, wanted: Sequence[int], closed: Collection[int] = ()) -> None:
-        self.graph, self.factors, self._closed = graph, Factors(graph), closed
+    Values that are `closed`, and those that would have more than `most` terms, stay atoms. It ends
+    before it is `done` where there are more than `limit` atoms.
+    """
+
+    def __init__(
+        self,
+        graph: Graph,
+        wanted: Sequence[int],
+        most: int,
+        closed: Collection[int],
+        limit: float,
+    ) -> None:
+        self.graph, self.factors = graph, Factors(graph)
+        self._most, self._closed = most, closed
         self._minus, self._two = (
             self.factors.of(graph.add(Value("constant", constant=c))) for c in (-1.0, 2.0)
         )
         self._fixed: set[int] = set()  # values that no parameter enters
         self._spreads: dict[int, Spread] = {}
+        self.atoms: set[Atom] = set()
+        self.done, ends = False, set(wanted)
         for i in graph.needed(wanted):
             self._spreads[i] = self._spread(i, graph.values[i])
+            if i in ends:
+                self.atoms.update(self._spreads[i])
+            if len(self.atoms) > limit:
+                return
         self.sums = [self._spreads[i] for i in wanted]
+        self.done = True
 
     def value(self, atom: Atom) -> int:
         """The number of the graph's value that is this atom."""
@@ -118,10 +136,10 @@ class Spreading:
             return {(): self.factors.of(i)}
         whole: Spread = {(i,): self.factors.one}
         # A sum that no parameter enters has nothing to be taken out.
-        if not kind[0] or i in self._closed or (i in self._fixed and value.code in _SUMS):
+        if not kind[0] or i in self._closed or (i in self._fixed and value.code in SUMS):
             return whole
         found = self._operation(value)
-        return whole if found is None or len(found) > _MOST else found
+        return whole if found is None or len(found) > self._most else found
 
     def _operation(self, value: Value) -> Spread | None:
         code, j = value.code, value.operands[-1]
@@ -130,7 +148,7 @@ class Spreading:
             return self._scaled(a, self._minus)
         if code == ca.OP_TWICE:
             return self._scaled(a, self._two)
-        if code in _SUMS:
+        if code in SUMS:
             return self._added(a, b if code == ca.OP_ADD else self._scaled(b, self._minus))
         if code in (ca.OP_MUL, ca.OP_SQ):
             return self._product(a, b)
