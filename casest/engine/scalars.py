@@ -17,6 +17,12 @@ from casest.engine.operations import KERNELS, Floats
 #: What is done with two earlier numbers, the second of which may be the first again.
 Step = tuple[Callable[[float, float], float], int, int]
 
+
+
+def _divided(a: float, b: float) -> float:
+    return a / b if b else float(np.divide(a, b))
+
+
 #: Operations that Python's numbers do as IEEE 754 has it, without an exception.
 _PLAIN: dict[int, Callable[[float, float], float]] = {
     ca.OP_ADD: operator.add,
@@ -25,6 +31,8 @@ _PLAIN: dict[int, Callable[[float, float], float]] = {
     ca.OP_MUL: operator.mul,
     ca.OP_SQ: operator.mul,
     ca.OP_NEG: lambda a, _: -a,
+    ca.OP_DIV: _divided,
+    ca.OP_INV: lambda a, _: _divided(1.0, a),
 }
 
 
@@ -67,9 +75,11 @@ def follow(steps: list[Step], found: list[float]) -> list[float]:
 def _by_numpy(code: int, count: int) -> Callable[[float, float], float]:
     kernel = KERNELS[code]
 
-    def compute(a: float, b: float) -> float:
+    def compute(*numbers: float) -> float:
+        if isinstance(kernel, np.ufunc):
+            return float(kernel(*numbers[:count]))
         out = np.empty(())
-        kernel(*(np.float64(x) for x in (a, b)[:count]), out)
+        kernel(*map(np.float64, numbers[:count]), out)
         return float(out)
 
     return compute
