@@ -26,7 +26,7 @@ from casest.engine.spreading import SUMS, Spreading
 #: evaluations.
 ENOUGH = 10_000
 #: Norm of a column's terms over that of the column: errors of JᵀJ grow with its square.
-LOSS = 16.0
+LOSS = 30.0
 #: Squares below this have lost digits, or all, and large factors would show it.
 _UNDERFLOW = 1e-290
 #: Refusals in a row after which a function is evaluated entry by entry for good.
@@ -110,10 +110,12 @@ class Factored:
         if self._refused >= PATIENCE:
             return None
         with np.errstate(all="ignore"):
-            C = np.zeros((self.n, self.m, len(self._atoms)))
-            C[self._target] = self._factors.values(parameters)[self._source]
-            found = self._whole(C, *self._products(parameters, samples))
-        self._refused = 0 if found is not None else self._refused + 1
+            total, squares = self._products(parameters, samples)
+            found = self._whole(parameters, total, squares)
+        if found is not None:
+            self._refused = 0
+        elif np.isfinite(squares):  # else it is the point that is bad
+            self._refused += 1
         return found
 
     def _products(self, parameters: Floats, samples: Columns) -> tuple[Floats, float]:
@@ -127,15 +129,18 @@ class Factored:
             squares += sum(float(r @ r) for r in values[K:])
         return total, squares
 
-    def _whole(self, C: Floats, total: Floats, squares: float) -> Floats | None:
+    def _whole(self, parameters: Floats, total: Floats, squares: float) -> Floats | None:
         """The factors C (n, m, K) put to the products of the atoms."""
         n, K = self.n, len(self._atoms)
+        C, size = np.zeros((2, n, self.m, K))
+        for filled, values in zip((C, size), self._factors.values(parameters), strict=True):
+            filled[self._target] = values[self._source]
         gram, flat = total[:, :K], C.reshape(n, -1)
         matrix = (C @ gram).reshape(n, -1) @ flat.T
         whole = np.empty((n + 1, n + 1))
         whole[:n, :n] = 0.5 * (matrix + matrix.T)
         whole[n, :n] = whole[:n, n] = flat @ total[:, K:].T.ravel()
         whole[n, n] = squares
-        lengths = np.sum((np.abs(C) @ np.sqrt(np.diag(gram) + _UNDERFLOW)) ** 2, axis=1)
+        lengths = np.sum((size @ np.sqrt(np.diag(gram) + _UNDERFLOW)) ** 2, axis=1)
         kept = lengths <= LOSS**2 * np.diag(matrix)
         return whole if np.isfinite(whole).all() and kept.all() else None

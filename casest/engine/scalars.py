@@ -18,7 +18,6 @@ from casest.engine.operations import KERNELS, Floats
 Step = tuple[Callable[[float, float], float], int, int]
 
 
-
 def _divided(a: float, b: float) -> float:
     return a / b if b else float(np.divide(a, b))
 

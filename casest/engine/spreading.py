@@ -79,9 +79,14 @@ class Factors:
                 self._rest.append((step[0], place[step[1]], place[step[2]]))
         return {i: place[i] for i in wanted}
 
-    def values(self, parameters: Floats) -> Floats:
-        """All that was kept, at some parameters (n,)."""
-        return np.array(follow(self._rest, self._scalars(parameters)))
+    def values(self, parameters: Floats) -> tuple[Floats, Floats]:
+        """All that was kept, at some parameters (n,), and the same with all signs positive.
+
+        Where the second is much larger, digits have been lost.
+        """
+        first = self._scalars(parameters)
+        size = follow(self._rest, [abs(x) for x in first])
+        return np.array(follow(self._rest, first)), np.array(size)
 
 
 class Spreading:
