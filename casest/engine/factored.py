@@ -55,7 +55,8 @@ def factored(replay: Replay) -> Factored | None:
     graph, (residual, jacobian) = replay.graph, replay.graph.outputs[:2]
     lengths = np.bincount(replay.sparsity[1][0]) + 1
     now = _operations(graph, [*jacobian, *residual]) + float(lengths @ lengths) / _RATE
-    best, least, fixed = None, _WORTHWHILE * now, _operations(graph, residual)
+    least, fixed = _WORTHWHILE * now, _operations(graph, residual)
+    best: tuple[Factored, Spreading] | None = None
     # What the residuals take anyway costs nothing as an atom.
     sums = {i for i in graph.needed(residual) if graph.values[i].code in SUMS}
     for most, closed in ((_FEW, set[int]()), (_FEW, sums), (_MANY, sums)):
@@ -64,10 +65,8 @@ def factored(replay: Replay) -> Factored | None:
         if spreading.done:
             found = Factored(replay, spreading)
             if found.work < least:
-                best, least = found, found.work
-    if best is not None:
-        best.prepare()
-    return best
+                best, least = (found, spreading), found.work
+    return None if best is None else best[0].prepared(best[1])
 
 
 def _operations(graph: Graph, wanted: Sequence[int]) -> int:
@@ -80,7 +79,7 @@ class Factored:
     """One way to write J as factors × atoms. `work`: operations on every sample, products' too."""
 
     def __init__(self, replay: Replay, spreading: Spreading) -> None:
-        self._spreading, self._graph = spreading, replay.graph
+        self._graph = replay.graph
         self._row, self._column = replay.sparsity[1]
         self.m, self.n = replay.shapes[1]
         self._atoms = sorted(spreading.atoms)
@@ -90,20 +89,21 @@ class Factored:
         self._piece = max(1, min(_PIECE, _SMALL // max(products, 1)))
         self._refused = 0
 
-    def prepare(self) -> None:
-        """What calls need, once the way is chosen."""
+    def prepared(self, spreading: Spreading) -> Factored:
+        """Itself, with what calls need: made once this is the way."""
         place = {atom: k for k, atom in enumerate(self._atoms)}
-        entries = zip(self._spreading.sums, self._column, self._row, strict=True)
+        entries = zip(spreading.sums, self._column, self._row, strict=True)
         terms = [
             (int(j), int(i), place[atom], factor)
             for own, j, i in entries
             for atom, factor in own.items()
         ]
-        self._factors = self._spreading.factors
+        self._factors = spreading.factors
         where = self._factors.keep([factor for *_, factor in terms])
         self._source = np.array([where[factor] for *_, factor in terms], dtype=np.intp)
         self._target = tuple(np.array([t[:3] for t in terms], dtype=np.intp).reshape(-1, 3).T)
         self._plan = Plan(self._graph, self._wanted)
+        return self
 
     def sums(self, parameters: Floats, samples: Columns) -> Floats | None:
         """[J r]ᵀ[J r], or None where digits would be lost or something is not finite."""

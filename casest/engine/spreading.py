@@ -44,9 +44,9 @@ class Factors:
 
     def times(self, a: int, b: int) -> int:
         """The number of a product."""
-        if self.one in (a, b):
-            return a + b - self.one
-        return self._add((operator.mul, a, b))
+        if a == self.one:
+            return b
+        return a if b == self.one else self._add((operator.mul, a, b))
 
     def plus(self, a: int, b: int) -> int:
         """The number of a sum."""
@@ -77,6 +77,8 @@ class Factors:
             else:
                 place[i] = len(self._scalars) + len(self._rest)
                 self._rest.append((step[0], place[step[1]], place[step[2]]))
+        self._steps.clear()
+        self._known.clear()
         return {i: place[i] for i in wanted}
 
     def values(self, parameters: Floats) -> tuple[Floats, Floats]:
@@ -134,14 +136,14 @@ class Spreading:
         return graph.add(graph.operation(ca.OP_MUL, (atom[0], self.value(atom[1:]))))
 
     def _spread(self, i: int, value: Value) -> Spread:
-        kind = (value.kind == "operation", value.kind == "parameter")
-        if not kind[1] and all(j in self._fixed for j in value.operands):
+        if value.kind != "parameter" and all(j in self._fixed for j in value.operands):
             self._fixed.add(i)
         if not value.per_sample:
             return {(): self.factors.of(i)}
         whole: Spread = {(i,): self.factors.one}
         # A sum that no parameter enters has nothing to be taken out.
-        if not kind[0] or i in self._closed or (i in self._fixed and value.code in SUMS):
+        plain = i in self._fixed and value.code in SUMS
+        if value.kind != "operation" or i in self._closed or plain:
             return whole
         found = self._operation(value)
         return whole if found is None or len(found) > self._most else found
