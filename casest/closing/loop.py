@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from casest.closing.adequacy import Misfit, misfit
-from casest.closing.axes import living_axes, narrowed, significant_axes
+from casest.closing.axes import lighter, living_axes, narrowed, significant_axes
 from casest.closing.candidates import Candidate, Skipped, candidates, prepared
 from casest.closing.crossfit import (
     ENOUGH,
@@ -29,6 +29,7 @@ from casest.closing.evidence import (
     by_evidence,
     confirmed_by_flips,
     cost_of,
+    gentlest_first,
     not_told_apart,
     with_rivals,
 )
@@ -342,10 +343,11 @@ class _Loop:
         self, current: Fitted, tried: list[tuple[Score, Fitted]], limit: float
     ) -> Fitted | None:
         """The model with the best of those that are significant and that held-out data confirm."""
-        for k, (score, fitted) in enumerate(tried):
+        for score, fitted in gentlest_first(tried, self.folds):
             if score.p_value > limit:
                 continue  # It may be the cause as well, but speaks for itself too softly.
-            if k and not not_told_apart(tried[0][1], fitted, tried[0][0], self.folds):
+            best = tried[0]
+            if fitted is not best[1] and not not_told_apart(best[1], fitted, best[0], self.folds):
                 break  # What explains the data clearly less well is not the cause.
             if wanders(self.runs, current, fitted, score):
                 self._refuse(score.candidate, "an offset that walks at random explains it as well")
@@ -500,7 +502,20 @@ class _Loop:
             return None
         if fitted is None:
             self._refuse(score.candidate, "its refit fails: the residual is not finite")
-        return fitted
+            return None
+        return self._weighed(current, fitted, candidate)
+
+    def _weighed(self, current: Fitted, fitted: Fitted, candidate: Candidate) -> Fitted:
+        """With what could be left away of the candidate, and what it does to the others."""
+        problem = weighted(Problem(fitted.model, self.runs), fitted.values)
+        own = candidate.parameters(fitted.model)
+        less = lighter(problem, problem.point(fitted.values), own, fitted.noise)
+        names = [p.name for p in current.model.parameters if p.name in fitted.values]
+        before = weighted(Problem(current.model, self.runs), current.values)
+        there = before.point({**current.values, **{n: fitted.values[n] for n in names}})
+        pairs = zip(before.residuals(there), current.residuals, strict=True)
+        moved = sum(float(np.sum((a - b) ** 2)) for a, b in pairs) / fitted.noise**2
+        return replace(fitted, lighter=less, moved=moved)
 
     def _whole(self, score: Score, model: Model) -> Candidate:
         """The candidate with its profile unknown again, on the axes where it does anything."""
