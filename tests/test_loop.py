@@ -110,6 +110,23 @@ def wandering(step, seed, count=3000):
     return Run.raw("rest", {"v": v}, units={"v": "m/s^2"}, time=np.arange(count) * 0.01)
 
 
+def test_what_hangs_on_which_of_two_causes_it_is_said():
+    """Against a fit of each, made by itself."""
+    closing, world = closed("wheel", 4, {"quadratic": 2e-4})
+    (found,) = closing.effects
+    fits = {}
+    for name in (found.candidate.label, *found.rivals):
+        if name in ("quadratic", "signed_quadratic", "cubic", "signed_cubic"):
+            bent = replace(next(e for e in CATALOGUE if e.name == name), on="specific_force")
+            fits[name] = c.calibrate(declared(world).with_effect(bent), closing.runs)
+    assert len(fits) == 4
+    chosen = fits.pop(found.candidate.label)
+    for name, fit in fits.items():
+        for parameter, shift in found.rivals[name].items():
+            off = fit.values[parameter] - chosen.values[parameter] - shift
+            assert np.all(np.abs(off) < 0.1 * chosen.std[parameter] + 1e-12)
+
+
 def test_an_offset_that_walks_at_random_is_noise_and_neither_drift_nor_step():
     named = []
     for seed in range(5):

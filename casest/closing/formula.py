@@ -107,7 +107,7 @@ def _kept(
         loop._refuse(found.candidate, "no longer needed beside the formula")
     better, candidate, gained = accepted
     better, candidate = _with_sizes(better, candidate)
-    loop._keep(better, candidate, gained, score, [])
+    loop._keep(better, candidate, gained, score, {})
     return better
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -75,14 +75,23 @@ WIDEST = 120
 
 @dataclass(frozen=True)
 class Found:
-    """An effect that was added, with the evidence: a score, but for one on the noise."""
+    """An effect that was added, with the evidence: a score, but for one on the noise.
+
+    `rivals`: what the data do not tell apart from it, nearest first, each with how far the declared
+    parameters would move were it the cause instead.
+    """
 
     candidate: Candidate
     score: Score | None
     p_value: float
     gain: float
-    indistinguishable_from: tuple[str, ...]
-    names: tuple[str, ...]
+    names: tuple[str, ...] = ()
+    rivals: Mapping[str, Mapping[str, Array]] = field(default_factory=dict)
+
+    @property
+    def indistinguishable_from(self) -> tuple[str, ...]:
+        """Names of the rivals."""
+        return tuple(self.rivals)
 
 
 @dataclass(frozen=True)
@@ -290,7 +299,7 @@ class _Loop:
         if fitted is None or not self._certified(fitted).certificate.trusted:
             return current
         gained = self._gain(current, fitted)[0]
-        self.found.append(Found(Candidate(effect), None, p_value, gained, (), ()))
+        self.found.append(Found(Candidate(effect), None, p_value, gained))
         self.say("outliers: they count less from here on")
         return fitted
 
@@ -299,7 +308,7 @@ class _Loop:
         effect = next((e for e in self.catalogue if e.name == "bias_wander"), None)
         p_value = wander_of(self.runs, current.residuals)
         if effect is not None and p_value is not None:
-            self.found.append(Found(Candidate(effect), None, p_value, 0.0, (), ()))
+            self.found.append(Found(Candidate(effect), None, p_value, 0.0))
 
     # -- candidates ----------------------------------------------------------------------------
 
@@ -355,13 +364,24 @@ class _Loop:
             accepted = self._accepted(current, score, fitted)
             if accepted is None:
                 continue
-            others = [pair for pair in tried if pair[1] is not fitted]
-            alike = [
-                s.candidate.label for s, f in others if not_told_apart(fitted, f, score, self.folds)
-            ]
-            self._keep(*accepted, score, alike)
+            self._keep(*accepted, score, self._rivals(fitted, score, tried))
             return accepted[0]
         return None
+
+    def _rivals(
+        self, fitted: Fitted, score: Score, tried: Sequence[tuple[Score, Fitted]]
+    ) -> dict[str, dict[str, Array]]:
+        """What is not told apart from a fit, and where it would have the declared parameters."""
+        names = [p.name for p in self.before.model.parameters]
+        return {
+            s.candidate.label: {
+                n: f.values[n] - fitted.values[n]
+                for n in names
+                if n in f.values and n in fitted.values
+            }
+            for s, f in tried
+            if f is not fitted and not_told_apart(fitted, f, score, self.folds)
+        }
 
     def _two_at_once(self, current: Fitted, tried: list[tuple[Score, Fitted]]) -> Fitted | None:
         """The best that was tried with the best beside it, if both together are confirmed.
@@ -382,12 +402,9 @@ class _Loop:
         if both is None:
             self.refused = refused
             return None
-        others = [pair for pair in tried if pair[1] is not first]
-        alike = [
-            s.candidate.label for s, f in others if not_told_apart(first, f, score, self.folds)
-        ]
+        rivals = self._rivals(first, score, tried)
         candidate, second = self._whole(score, current.model), self.found.pop()
-        self._keep(both, candidate, second.gain, score, alike)
+        self._keep(both, candidate, second.gain, score, rivals)
         self.found.append(second)
         label = candidate.label
         self.refused = [r for r in self.refused if r.name not in (label, second.candidate.label)]
@@ -464,12 +481,16 @@ class _Loop:
         return pruned, candidate, self._gain(current, pruned)[0]
 
     def _keep(
-        self, fitted: Fitted, candidate: Candidate, gained: float, score: Score, alike: list[str]
+        self,
+        fitted: Fitted,
+        candidate: Candidate,
+        gained: float,
+        score: Score,
+        rivals: Mapping[str, Mapping[str, Array]],
     ) -> None:
         self.say(f"{candidate.label}: held-out error falls")
         names = tuple(p.name for p in candidate.parameters(fitted.model))
-        found = Found(candidate, score, score.p_value, gained, tuple(alike), names)
-        self.found.append(found)
+        self.found.append(Found(candidate, score, score.p_value, gained, names, rivals))
 
     def _refuse(self, candidate: Candidate, why: str) -> None:
         said = Skipped(candidate.label, why)
