@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from casest.closing.loop import HELD_OUT_DATA, Closing
+from casest.closing.closed import HELD_OUT_DATA, Closing
 from casest.data.logs import file_name
 from casest.effects import CATALOGUE
 from casest.following import following

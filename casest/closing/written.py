@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from casest.closing.closed import Closing, Found
 from casest.closing.crossfit import rms
-from casest.closing.loop import Closing, Found
 from casest.closing.summary import detectable, invisible
 from casest.closing.terms import source
 from casest.declaring.shapes import Array

@@ -6,8 +6,8 @@ import re
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from casest.closing.closed import Closing
 from casest.closing.crossfit import FAR
-from casest.closing.loop import Closing
 from casest.closing.text import instead, sentence
 from casest.report.applied import application
 from casest.report.calibration import by_axis, error_picture
