@@ -380,3 +380,19 @@ def test_without_a_folder_to_write_to_numpy_takes_over(tmp_path, is_compiled):
     assert not is_compiled(file)
     assert not is_compiled(file / "below")
     assert not is_compiled(Path("/proc/casest"))
+
+
+def test_a_model_that_is_only_tried_is_not_compiled_unless_its_record_is_very_long(monkeypatch):
+    """Closing the loop evaluates dozens of models a few times: compilers would take longer."""
+    monkeypatch.setenv("CASEST_KERNEL", "auto")
+    p, s = ca.SX.sym("p"), ca.SX.sym("s")
+    r = ca.sin(p * s)
+    for count, expected in ((10_000, False), (kernel.TRIED, True)):
+        replay = Replay(function(p, s, r, ca.jacobian(r, p)))
+        samples = np.linspace(0, 1, count)[:, None]
+        with kernel.patient():
+            cost(replay, [2.0], samples)
+        assert compiled(replay) == expected
+    replay = Replay(function(p, s, r, ca.jacobian(r, p)))
+    cost(replay, [2.0], np.linspace(0, 1, 10_000)[:, None])
+    assert compiled(replay)
