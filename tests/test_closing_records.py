@@ -14,7 +14,6 @@ from casest.cli import run
 from casest.closing.loop import OF_NOISE, close
 from casest.problem import find_model
 
-
 EXAMPLE = Path(__file__).parents[1] / "examples" / "at_rest.py"
 COOLING = (
     "psim-thermal/TVCtest3_7_20.csv", "--columns", "v=gyrox,gyroy,gyroz", "--unit", "v=rad/s",
