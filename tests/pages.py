@@ -3,8 +3,8 @@
 In order: python and csv blocks that begin with `# name` are files; each line of a sh block is a
 command, whose exit code is 0 or what `# exit code N` at its end says; a text block shows what
 the commands above it have printed, with `...` where lines are left out; lines of a c block stand
-in a C file that the commands have written. Commands of casest may be run within this process, by
-the function that the installed script calls: it starts up once instead of once for each line.
+in a C file that the commands have written. Commands may be run within this process, those of
+casest by the function that the installed script calls: it starts up once, not for each line.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from __future__ import annotations
 import io
 import os
 import re
+import runpy
 import shlex
 import shutil
 import subprocess
@@ -58,14 +59,39 @@ def run(line: str, folder: Path) -> subprocess.CompletedProcess[str]:
 
 
 def run_within(line: str, folder: Path) -> subprocess.CompletedProcess[str]:
-    """The same of a command of casest without a process of its own."""
+    """The same of a command of casest, or of a Python file, without a process of its own."""
     name, *words = shlex.split(line)
-    if name != "casest":
+    if name not in ("casest", "python"):
         return run(line, folder)
     out, err = io.StringIO(), io.StringIO()
     with chdir(folder), redirect_stdout(out), redirect_stderr(err):
-        code = cli.run(words)
+        code = cli.run(words) if name == "casest" else _run_file(words)
     return subprocess.CompletedProcess(line, code, out.getvalue(), err.getvalue())
+
+
+def _run_file(words: list[str]) -> int:
+    """What `python FILE` does; an exception is not caught."""
+    before, sys.argv = sys.argv, words
+    try:
+        runpy.run_path(words[0], run_name="__main__")
+    except SystemExit as end:
+        return end.code if isinstance(end.code, int) else int(end.code is not None)
+    finally:
+        sys.argv = before
+    return 0
+
+
+def first_apart() -> Runner:
+    """Each command is a process of its own the first time, and within this one afterwards."""
+    seen: set[str] = set()
+
+    def run_either(line: str, folder: Path) -> subprocess.CompletedProcess[str]:
+        command = " ".join(shlex.split(line)[:2])
+        known = command in seen
+        seen.add(command)
+        return run_within(line, folder) if known else run(line, folder)
+
+    return run_either
 
 
 def follow(page: Path, folder: Path, run: Runner = run) -> int:
