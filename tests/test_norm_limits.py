@@ -23,7 +23,9 @@ POOR = {
     "half sphere": lambda n, rng: sim.cap(24, rng, np.pi / 2),
     "one more pose than unknowns": lambda n, rng: sim.spread_poses(n + 1, rng),
 }
-COUNTS = {"ring": 6, "cap of ten degrees": 6}
+#: Seeds where every fit is refused after a long search: each noise level once. (Of many at once,
+#: test_batch judges 800 rings and caps, and that its verdicts are those of one.)
+COUNTS = {"ring": 3, "cap of ten degrees": 3}
 
 
 def recorded(v, unit="m/s^2"):
