@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from casest.closing.loop import HELD_OUT_DATA, Closing
+from casest.closing.closed import HELD_OUT_DATA, Closing
 from casest.data.logs import file_name
 from casest.effects import CATALOGUE
 from casest.following import following
@@ -54,6 +54,8 @@ def sentence(content: Mapping[str, Any]) -> str:
         verb = "was" if len(names) == 1 else "were"
         return f"extended: {', '.join(names)} {verb} missing; what is left is noise"
     found = f" beside {', '.join(names)}" if names else ""
+    if content["unexplained"]["one_of"]:
+        return f"unexplained: a small misfit{found} that several causes explain alike"
     return f"unexplained: a misfit remains{found} that no candidate explains"
 
 
@@ -91,6 +93,15 @@ def _effects(content: Mapping[str, Any]) -> Iterator[str]:
             also = f" (less likely: {', '.join(e['less_likely'])})" if e["less_likely"] else ""
             yield item(f"not told apart from {', '.join(e['indistinguishable_from'])}{also}")
             yield from (item(words) for words in e["would_separate"][:SHOWN])
+            yield from (item(words) for words in instead(e["instead_would_move"]))
+
+
+def instead(moves: Mapping[str, Mapping[str, float]]) -> Iterator[str]:
+    """What hangs on which of the causes it is."""
+    for label, shifts in moves.items():
+        if shifts:
+            words = ", ".join(f"{name} by {size:.2g}" for name, size in shifts.items())
+            yield f"were it {label} instead, the parameters would move: {words}"
 
 
 def _moved(content: Mapping[str, Any]) -> Iterator[str]:
@@ -126,7 +137,9 @@ def _invisible(content: Mapping[str, Any]) -> Iterator[str]:
 def _unexplained(content: Mapping[str, Any]) -> Iterator[str]:
     left = content["unexplained"]
     if content["verdict"] == "unexplained":
-        yield item(f"Unexplained: {left['fraction']:.0%} of the held-out variance, {left['where']}")
+        yield item(
+            f"Unexplained: {100 * left['fraction']:.2g} % of the held-out variance, {left['where']}"
+        )
 
 
 def _notes(content: Mapping[str, Any]) -> Iterator[str]:

@@ -6,9 +6,9 @@ import re
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from casest.closing.closed import Closing
 from casest.closing.crossfit import FAR
-from casest.closing.loop import Closing
-from casest.closing.text import sentence
+from casest.closing.text import instead, sentence
 from casest.report.applied import application
 from casest.report.calibration import by_axis, error_picture
 from casest.report.figures import Figures
@@ -121,13 +121,15 @@ def _effects(closing: Closing, story: Story, content: Mapping[str, Any]) -> str:
     said = [_effect(e, docs.get(e["name"], ""), story) for e in content["effects"]]
     if not said and content["verdict"] is None:
         said = [paragraph("None was tried: there is nothing to judge it by.")]
+    elif not said and content["unexplained"]["one_of"]:
+        said = [paragraph("None was added: too little shows to tell which of several it is.")]
     elif not said:
         said = [paragraph("None was needed: no candidate makes held-out data better predicted.")]
     left = content["unexplained"]
     if content["verdict"] == "unexplained":
         said += [
             tag("h3", "What is left unexplained"),
-            paragraph(f"{left['fraction']:.0%} of the held-out variance: {left['where']}."),
+            paragraph(f"{100 * left['fraction']:.2g} % of the held-out variance: {left['where']}."),
         ]
     rows = [
         [d["name"], f"`{d['parameter']}`", number(d["size"]), printed_unit(d["unit"])]
@@ -167,6 +169,9 @@ def _effect(e: Mapping[str, Any], doc: str, story: Story) -> str:
         more = f", nor, though they are less likely, from {more}" if more else ""
         evidence.append(f"These data do not tell it apart from {names}{more}.")
         evidence += [f"To tell them apart, {words}." for words in e["would_separate"]]
+        evidence += [
+            f"{words[0].upper()}{words[1:]}." for words in instead(e["instead_would_move"])
+        ]
     else:
         evidence.append("No other candidate explains the held-out data as well.")
     return "".join(
