@@ -10,8 +10,9 @@ READY := $(VENV)/.ready
 demo: $(READY)
 	$(BIN)/casest demo
 
+# Compiled modules and tests are kept whatever the environment says: a hundred processes start here.
 test: $(READY)
-	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist loadfile -rs
+	PYTHONDONTWRITEBYTECODE= OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist loadfile -rs
 
 lint: $(READY)
 	$(BIN)/ruff check .

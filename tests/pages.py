@@ -3,30 +3,33 @@
 In order: python and csv blocks that begin with `# name` are files; each line of a sh block is a
 command, whose exit code is 0 or what `# exit code N` at its end says; a text block shows what
 the commands above it have printed, with `...` where lines are left out; lines of a c block stand
-in a C file that the commands have written.
+in a C file that the commands have written. Commands may be run within this process, those of
+casest by the function that the installed script calls: it starts up once, not for each line.
 """
 
 from __future__ import annotations
 
+import io
 import os
 import re
+import runpy
+import shlex
 import shutil
 import subprocess
 import sys
-from dataclasses import dataclass
+from collections.abc import Callable
+from contextlib import chdir, redirect_stderr, redirect_stdout
 from pathlib import Path
+
+from casest import cli
 
 ROOT = Path(__file__).parent.parent
 BLOCK = re.compile(r"^```\{?([\w-]*)\}?\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 EXIT = re.compile(r"\s+# exit code (\d)$")
 
 
-@dataclass(frozen=True)
-class Command:
-    """A command line, the exit code it should have, and the folder it runs in."""
-
-    line: str
-    expected: int
+#: Runs a command line in a folder.
+Runner = Callable[[str, Path], subprocess.CompletedProcess[str]]
 
 
 def blocks(page: Path) -> list[tuple[str, str]]:
@@ -55,7 +58,43 @@ def run(line: str, folder: Path) -> subprocess.CompletedProcess[str]:
     )
 
 
-def follow(page: Path, folder: Path) -> int:
+def run_within(line: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    """The same of a command of casest, or of a Python file, without a process of its own."""
+    name, *words = shlex.split(line)
+    if name not in ("casest", "python"):
+        return run(line, folder)
+    out, err = io.StringIO(), io.StringIO()
+    with chdir(folder), redirect_stdout(out), redirect_stderr(err):
+        code = cli.run(words) if name == "casest" else _run_file(words)
+    return subprocess.CompletedProcess(line, code, out.getvalue(), err.getvalue())
+
+
+def _run_file(words: list[str]) -> int:
+    """What `python FILE` does; an exception is not caught."""
+    before, sys.argv = sys.argv, words
+    try:
+        runpy.run_path(words[0], run_name="__main__")
+    except SystemExit as end:
+        return end.code if isinstance(end.code, int) else int(end.code is not None)
+    finally:
+        sys.argv = before
+    return 0
+
+
+def first_apart() -> Runner:
+    """Each command is a process of its own the first time, and within this one afterwards."""
+    seen: set[str] = set()
+
+    def run_either(line: str, folder: Path) -> subprocess.CompletedProcess[str]:
+        command = " ".join(shlex.split(line)[:2])
+        known = command in seen
+        seen.add(command)
+        return run_within(line, folder) if known else run(line, folder)
+
+    return run_either
+
+
+def follow(page: Path, folder: Path, run: Runner = run) -> int:
     """Do what the page says; the number of its commands."""
     printed: list[str] = []
     count = 0

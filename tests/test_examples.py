@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -12,10 +13,19 @@ EXAMPLES = sorted((Path(__file__).parent.parent / "examples").glob("[0-9]*.py"))
 
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda p: p.stem)
-def test_example_runs_and_its_own_assertions_hold(path, tmp_path):
+def test_example_runs_and_its_own_assertions_hold(path, tmp_path, monkeypatch, capsys):
+    """As `python PATH` runs it, in a folder of its own."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", [str(path)])
+    runpy.run_path(str(path), run_name="__main__")
+    assert capsys.readouterr().out
+    assert "assert " in path.read_text(encoding="utf-8")
+
+
+def test_an_example_is_a_program_of_its_own(tmp_path):
     done = subprocess.run(
-        [sys.executable, str(path)], cwd=tmp_path, capture_output=True, text=True, check=False
-    )
+        [sys.executable, str(EXAMPLES[0])],
+        cwd=tmp_path, capture_output=True, text=True, check=False,
+    )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert done.stdout
-    assert "assert " in path.read_text(encoding="utf-8")

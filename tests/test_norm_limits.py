@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -22,7 +23,9 @@ POOR = {
     "half sphere": lambda n, rng: sim.cap(24, rng, np.pi / 2),
     "one more pose than unknowns": lambda n, rng: sim.spread_poses(n + 1, rng),
 }
-COUNTS = {"ring": 6, "cap of ten degrees": 6}
+#: Seeds where every fit is refused after a long search: each noise level once. (Of many at once,
+#: test_batch judges 800 rings and caps, and that its verdicts are those of one.)
+COUNTS = {"ring": 3, "cap of ten degrees": 3}
 
 
 def recorded(v, unit="m/s^2"):
@@ -191,7 +194,7 @@ def test_eight_poses_for_nine_unknowns_are_bad_input_that_says_so():
 def test_as_many_poses_as_unknowns_are_refused_for_want_of_redundancy(name, poses):
     """Burkhard: q unknowns need q + 1 measurements; only the last one shows the noise."""
     rng = np.random.default_rng(37)
-    for _ in range(6):
+    for _ in range(3):
         sensor = sim.accelerometer(rng, skew=poses == 9)
         v = sensor.read(sim.spread_poses(poses, rng), 1e-3, rng)
         with pytest.raises(NotTrusted, match="no redundancy"):
@@ -236,14 +239,18 @@ def test_the_offset_of_the_full_scale_is_that_of_the_triangular_one():
 
 @pytest.mark.parametrize("name", ["norm-diagonal", "norm-triangular"])
 def test_with_the_scale_from_the_laboratory_six_poses_determine_the_offset(name):
+    """Twelve sensors as the laboratory left them, each with ten offsets in the field."""
     rng, z = np.random.default_rng(40), []
-    for _ in range(120):
+    for _ in range(12):
         sensor = sim.accelerometer(rng, skew=name == "norm-triangular")
         scale = np.diag(sensor.scale) if name == "norm-diagonal" else sensor.scale
-        v = sensor.read(sim.six_faces(rng, tilt=0.1), 3e-3, rng)
-        found = calibrate(model_of(name).having(scale=scale), recorded(v), solver="trust-region")
-        assert set(found.values) == {"offset"}
-        z.append((found.values["offset"] - sensor.b) / found.std["offset"])
+        model = model_of(name).having(scale=scale)
+        for _ in range(10):
+            sensor = replace(sensor, b=sim.accelerometer(rng).b)
+            v = sensor.read(sim.six_faces(rng, tilt=0.1), 3e-3, rng)
+            found = calibrate(model, recorded(v), solver="trust-region")
+            assert set(found.values) == {"offset"}
+            z.append((found.values["offset"] - sensor.b) / found.std["offset"])
     # Six poses, three unknowns: z is Student's t with 3 degrees of freedom, 95 % within 3.18;
     # the share of 360 has a spread of 1.1 % (more, as three share one noise).
     inside = np.mean(np.abs(z) < stats.t.ppf(0.975, 3))

@@ -6,7 +6,7 @@ import re
 import shlex
 
 import pytest
-from pages import BLOCK, ROOT, blocks, folder_of_a_reader, follow
+from pages import BLOCK, ROOT, blocks, folder_of_a_reader, follow, run_within
 
 from casest.cli import commands
 
@@ -17,7 +17,7 @@ WITH_COMMANDS = [p for p in PAGES if any(language == "sh" for language, _ in blo
 
 @pytest.mark.parametrize("page", WITH_COMMANDS, ids=lambda p: p.stem)
 def test_a_reader_who_does_what_a_page_says_sees_what_it_shows(page, tmp_path):
-    assert follow(page, folder_of_a_reader(page, tmp_path)) >= 1
+    assert follow(page, folder_of_a_reader(page, tmp_path), run_within) >= 1
 
 
 EVERY = [*PAGES, ROOT / "README.md", ROOT / "CONTRIBUTING.md"]

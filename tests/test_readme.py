@@ -6,7 +6,7 @@ import re
 import sys
 
 import pytest
-from pages import ROOT, folder_of_a_reader, follow, run
+from pages import ROOT, first_apart, folder_of_a_reader, follow, run
 
 README = ROOT / "README.md"
 
@@ -17,7 +17,7 @@ def folder(tmp_path_factory):
 
 
 def test_every_command_of_the_readme_does_what_it_shows(folder):
-    assert follow(README, folder) >= 7
+    assert follow(README, folder, first_apart()) >= 7
 
 
 def test_the_python_of_the_readme_prints_an_offset_with_its_uncertainty(folder):

@@ -7,6 +7,7 @@ import os
 import re
 import shlex
 import time
+from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
@@ -64,6 +65,16 @@ def text(browser, selector):
 def texts(browser, selector):
     found = f"document.querySelectorAll({json.dumps(selector)})"
     return browser.ask(f"[...{found}].map(e => e.textContent)")
+
+
+def test_the_result_of_a_loop_that_grew_follows_the_published_schema(closed):
+    jsonschema = pytest.importorskip("jsonschema")
+    schema = json.loads(files("casest").joinpath("result.schema.json").read_text("utf-8"))
+    found = json.loads((closed / "result.json").read_text(encoding="utf-8"))
+    assert found["effects"]
+    jsonschema.validate(found, schema)
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate(found | {"verdict": "fine"}, schema)
 
 
 # -- what it says ----------------------------------------------------------------------------------

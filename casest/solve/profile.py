@@ -8,7 +8,7 @@ import numpy as np
 
 from casest.declaring.shapes import Array
 from casest.engine import Normal
-from casest.solve.trust_region import trust_region
+from casest.solve.trust_region import LITTLE, trust_region
 from casest.stack import Point, Problem
 
 #: Weight of the held combination against one residual: error of the hold is its square root's
@@ -16,6 +16,8 @@ from casest.stack import Point, Problem
 HOLD = 1e4
 #: An end of an interval is found to this share, in so many tries of so many iterations each.
 CLOSE, TRIES, LONGEST = 0.01, 25, 300
+#: Gain over the cost of one residual from which on a point of the profile is good enough.
+NEAR = 1e-6
 #: First step outwards and where to stop, in linear intervals: beyond, standard deviations mean
 #: nothing.
 FIRST, REACH = 0.25, 4.0
@@ -78,7 +80,11 @@ def profiled(
     held = Held(problem, row, point.x + step)
     lower, upper = problem.bounds
     start = Point(np.clip(point.x + step, lower, upper), point.references)
-    return trust_region(held, start, max_iterations=max_iterations).point
+    # To rounding the other unknowns need not be known: it is the cost that is looked at.
+    near = NEAR / held.residual_count
+    return trust_region(
+        held, start, max_iterations=max_iterations, tolerance=near, damping=LITTLE
+    ).point
 
 
 @dataclass(frozen=True)
