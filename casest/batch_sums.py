@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from casest.declaring.shapes import Array
 from casest.engine import Plan, Replay
 from casest.engine.operations import KERNELS, Kernel
-from casest.engine.replay import Entry
+from casest.engine.replay import Entry, aligned
 
 #: Numbers per call: enough to hide the cost of the call, few enough to stay in the cache.
 NUMBERS = 16384
@@ -109,17 +109,17 @@ class _Registers:
 
     def __init__(self, plan: Plan, length: int, width: int) -> None:
         values = plan.graph.values
-        rows = np.empty((len(plan.scalars), width))
+        rows = aligned(len(plan.scalars), width)
         place = {i: rows[k] for k, i in enumerate(plan.scalars)}
         for i in plan.scalars:
             if values[i].kind == "constant":
                 place[i] = np.array(values[i].constant)
         self._parameters = [(place[i], values[i].code) for i in plan.scalars if _given(plan, i)]
         self._once = [_call(plan, i, place) for i in plan.scalars if _computed(plan, i)]
-        self._inputs = np.empty((len(plan.inputs), length, width))
+        self._inputs = _side_by_side(len(plan.inputs), length, width)
         self._codes = [values[i].code for i in plan.inputs]
-        self._results = np.empty((len(plan.wanted), length, width))
-        registers = np.empty((plan.n_registers, length, width))
+        self._results = _side_by_side(len(plan.wanted), length, width)
+        registers = _side_by_side(plan.n_registers, length, width)
         place.update((i, self._inputs[k]) for k, i in enumerate(plan.inputs))
         place.update((i, registers[k]) for i, k in plan.register.items())
         place.update((i, self._results[k]) for i, k in plan.home.items())
@@ -142,6 +142,10 @@ class _Registers:
         for kernel, arguments in self._each:
             kernel(*arguments)
         return self._results
+
+
+def _side_by_side(count: int, length: int, width: int) -> Array:
+    return aligned(count, length * width).reshape(count, length, width)
 
 
 def _given(plan: Plan, i: int) -> bool:

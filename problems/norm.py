@@ -46,8 +46,9 @@ def _norm_residual(corrected: Any, scale: Any, norm: float) -> Residual:
     """How far the corrected reading is from its known length, in the unit of the reading."""
     corrected = quantity("corrected", corrected, "[norm]")
     length = norm_2(corrected)
+    # ‖c‖/‖Sᵀc‖ is 1/‖Sᵀn‖ in one division for the three of n = c/‖c‖.
     return Residual(
-        implicit=(length - norm) / norm_2(scale.T @ (corrected / length)),
+        implicit=(length - norm) * (length / norm_2(scale.T @ corrected)),
         unit="[v]",
         corrected=corrected,
         axes=("norm",),
