@@ -161,6 +161,12 @@ def _call(plan: Plan, i: int, place: dict[int, Array]) -> tuple[Kernel, tuple[Ar
     return KERNELS[value.code], (*(place[j] for j in value.operands), place[i])
 
 
+def _run(places: list[int]) -> slice | list[int]:
+    """The same places, as a slice where they follow each other: that makes views."""
+    first, last = places[0], places[-1]
+    return slice(first, last + 1) if last - first == len(places) - 1 else places
+
+
 def _copied(value: Array, out: Array) -> None:
     np.copyto(out, value)
 
@@ -174,6 +180,7 @@ class Squares:
         row, column = replay.sparsity[1]
         self.residual_count = m
         self._columns = [[*map(int, column[row == i]), self.n] for i in range(m)]
+        self._places = [[_run(own[i:]) for i in range(len(own))] for own in self._columns]
         entries: list[Entry] = []
         for i in range(m):
             entries += [*((1, int(j)) for j in np.flatnonzero(row == i)), (0, i)]
@@ -182,24 +189,16 @@ class Squares:
 
     def normals(self, x: Array, sensors: Sensors) -> Normals:
         """Normal equations of every sensor at its own x, (n, W)."""
-        n, width = self.n, x.shape[1]
-        sums = [np.zeros((len(c) * (len(c) + 1) // 2, width)) for c in self._columns]
+        n = self.n
+        whole = np.zeros((n + 1, n + 1, x.shape[1]))
         for _, values in self._all.chunks(x, sensors):
             first = 0
-            for columns, total in zip(self._columns, sums, strict=True):
-                own, row = values[first : first + len(columns)], 0
+            for columns, places in zip(self._columns, self._places, strict=True):
+                own = values[first : first + len(columns)]
                 first += len(columns)
-                for i in range(len(own)):
-                    part = total[row : row + len(own) - i]
-                    part += np.einsum("ps,jps->js", own[i], own[i:])
-                    row += len(part)
-        whole = np.zeros((n + 1, n + 1, width))
-        for columns, total in zip(self._columns, sums, strict=True):
-            row = 0
-            for i, column in enumerate(columns):
-                # [J r] by columns: the first index is never below the second.
-                whole[columns[i:], column] += total[row : row + len(columns) - i]
-                row += len(columns) - i
+                for i, column in enumerate(columns):
+                    # [J r] by columns: the first index is never below the second.
+                    whole[places[i], column] += np.einsum("ps,jps->js", own[i], own[i:])
         if sensors.hold is not None:
             held, target = sensors.hold
             miss = np.einsum("is,is->s", held, x - target)
