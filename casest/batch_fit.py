@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from casest.batch_linear import backward, cholesky, dot, forward, times
+from casest.batch_linear import backward, cholesky, dot, forward, times, whole
 from casest.batch_sums import NARROWEST, Normals, Sensors, Squares
 from casest.declaring.shapes import Array
 from casest.solve.trust_region import LITTLE
@@ -174,12 +174,12 @@ def _kept(
 
 def _steps(state: _State) -> tuple[Array, Array]:
     """Damped step (n, W) within the bounds, and its squared length in residuals (W,)."""
-    matrix = state.here.matrix.copy()
-    diagonal = np.einsum("iis->is", matrix)
-    diagonal += state.damping * np.where(diagonal > 0, diagonal, 1.0)  # a nil column stays out
-    factor = cholesky(matrix)
-    half = forward(factor, -state.here.gradient)
-    step = backward(factor, half)
+    n = len(state.x)
+    diagonal = np.einsum("iis->is", state.here.matrix)
+    ridge = state.damping * np.where(diagonal > 0, diagonal, 1.0)  # a nil column stays out
+    factor = cholesky(state.here.rows, ridge)
+    half = factor[n]
+    step = -backward(factor[:n], half)
     left = dot(half, half)
     target = state.x + step
     out = (target < state.bounds.lower) | (target > state.bounds.upper)
@@ -187,16 +187,17 @@ def _steps(state: _State) -> tuple[Array, Array]:
     if over.size:
         k = padded(over)
         part = _held_back(
-            matrix[:, :, k], state.here.gradient[:, k], state.x[:, k], state.bounds.some(k)
+            state.here.rows[:, :, k], ridge[:, k], state.x[:, k], state.bounds.some(k)
         )
         step[:, over], left[over] = (p[..., : over.size] for p in part)
     return step, left
 
 
-def _held_back(matrix: Array, slope: Array, x: Array, bounds: Bounds) -> tuple[Array, Array]:
+def _held_back(rows: Array, ridge: Array, x: Array, bounds: Bounds) -> tuple[Array, Array]:
     """The same where unknowns that would leave their bounds stop there."""
     n = len(x)
-    matrix = np.where(np.tri(n, dtype=bool)[:, :, None], matrix, matrix.transpose(1, 0, 2))
+    matrix, slope = whole(rows[:n]), rows[n]
+    matrix[range(n), range(n)] += ridge
     fixed, held = np.zeros(x.shape, bool), np.zeros(x.shape)
     for _ in range(n):
         free = ~fixed

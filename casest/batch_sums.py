@@ -51,11 +51,20 @@ class Sensors(NamedTuple):
 
 
 class Normals(NamedTuple):
-    """½Σr² (W,), Jᵀr (n, W) and JᵀJ (n, n, W), of which the lower triangle is filled."""
+    """½Σr² (W,), and JᵀJ with (Jᵀr)ᵀ as one more row, (n + 1, n, W); zeros above the diagonal."""
 
     cost: Array
-    gradient: Array
-    matrix: Array
+    rows: Array
+
+    @property
+    def matrix(self) -> Array:
+        """JᵀJ (n, n, W), lower triangle."""
+        return self.rows[:-1]
+
+    @property
+    def gradient(self) -> Array:
+        """Jᵀr, (n, W)."""
+        return np.asarray(self.rows[-1])
 
 
 def chunk(samples: int) -> int:
@@ -203,8 +212,9 @@ class Squares:
             held, target = sensors.hold
             miss = np.einsum("is,is->s", held, x - target)
             entries = np.concatenate([held, miss[None]])
-            whole += entries[:, None] * entries
-        return Normals(0.5 * whole[n, n], whole[n, :n], whole[:n, :n])
+            for i in range(n + 1):
+                whole[i:, i] += entries[i:] * entries[i]
+        return Normals(0.5 * whole[n, n], whole[:, :n])
 
     def cost(self, x: Array, sensors: Sensors) -> Array:
         """½Σr² of every sensor, (W,)."""
