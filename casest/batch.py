@@ -82,7 +82,7 @@ def calibrate_many(
     count; what follows them is not looked at.
 
     `start` gives start values by parameter, one for all or (S, …); or it is a function
-    `(model, signals) -> {name: value}` that is called for some hundreds of sensors at a time, such
+    `(model, signals) -> {name: value}` that is called for some of the sensors at a time, such
     as `casest_problems.norm.closed_form_many`. In place of a value it may give a triple (value,
     lower, upper) where bounds depend on the data. Without it sensors start where the model says
     that many do (`model.starting(…, many=…)`: the shipped norm models), else from the declared

@@ -360,8 +360,8 @@ def _bend(model: Model, x: Array, sensors: Sensors) -> Array:
     replay, beside = _bends(model)
     row, column = replay.sparsity[0]
     total = np.zeros((len(x), *x.shape))
-    for _, values in beside.chunks(x, sensors):
-        total[row, column] += np.add.reduce(values, axis=1)
+    for _, s, values in beside.chunks(x, sensors):
+        total[row, column, s] += np.add.reduce(values, axis=1)
     return whole(total)
 
 
@@ -374,6 +374,6 @@ def _dense(replay: Replay, x: Array, sensors: Sensors) -> Array:
     """The first output of every sample, (rows, columns, N, W)."""
     row, column = replay.sparsity[0]
     found = np.zeros((*replay.shapes[0], *sensors.samples.shape[1:]))
-    for span, values in _beside(replay).chunks(x, sensors):
-        found[row, column, span] = values
+    for span, s, values in _beside(replay).chunks(x, sensors):
+        found[row, column, span, s] = values
     return found

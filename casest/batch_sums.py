@@ -2,7 +2,7 @@
 
 `engine` replays a model's instructions over the samples of one sensor, with its parameters as
 plain numbers. Here the sensors lie side by side: what depends on parameters only is a row (W,) of W
-sensors, computed once per call; what depends on samples is (P, W), a chunk of P samples of each.
+sensors, computed once per call; what depends on samples is (P, w), P samples of a panel of them.
 No value of a sensor depends on its neighbours or on its place among them: the same instructions
 act on every column, and the sums run over samples in their order.
 """
@@ -21,7 +21,9 @@ from casest.engine.operations import KERNELS, Kernel
 from casest.engine.replay import Entry, aligned
 
 #: Numbers per call: enough to hide the cost of the call, few enough to stay in the cache.
-NUMBERS = 16384
+NUMBERS = 12288
+#: Samples of all sensors whose small matrices are factored side by side.
+SAMPLES = 98304
 #: Fewest sensors side by side: NumPy adds in another order along rows that are shorter.
 NARROWEST = 32
 
@@ -73,12 +75,17 @@ def chunk(samples: int) -> int:
     It must not depend on the number of sensors: sums of chunks are added, and each sensor's digits
     would depend on how many others there are.
     """
-    return min(samples, 8 if samples <= 64 else 48 if samples <= 1024 else NUMBERS // NARROWEST)
+    return min(samples, 24 if samples <= 64 else 48 if samples <= 1024 else NUMBERS // NARROWEST)
+
+
+def panel(samples: int) -> int:
+    """Sensors that are evaluated at once, for records of so many samples."""
+    return NUMBERS // max(chunk(samples), 8) // NARROWEST * NARROWEST
 
 
 def widest(samples: int) -> int:
-    """Sensors side by side for records of so many samples."""
-    return NUMBERS // max(chunk(samples), 8)
+    """Sensors side by side for records of so many samples: some panels."""
+    return panel(samples) * max(1, SAMPLES // (panel(samples) * max(samples, 24)))
 
 
 class SideBySide:
@@ -88,22 +95,24 @@ class SideBySide:
         self.plan = replay.plan(entries)
         self._places: dict[tuple[int, int], _Registers] = {}
 
-    def chunks(self, parameters: Array, sensors: Sensors) -> Iterator[tuple[slice, Array]]:
-        """Samples and their entries (entries, P, W), which the next chunk overwrites.
+    def chunks(self, parameters: Array, sensors: Sensors) -> Iterator[tuple[slice, slice, Array]]:
+        """Samples, sensors and their entries (entries, P, w), which the next chunk overwrites.
 
         parameters: (n, W). Samples that do not count have entries of zero.
         """
         total, width = sensors.samples.shape[1:]
-        length = chunk(total)
-        for start in range(0, total, length):
-            span = slice(start, min(start + length, total))
-            registers = self._registers(span.stop - start, width)
-            if start == 0 or span.stop - start < length:
-                registers.set(parameters)
-            values = registers.run(sensors.samples[:, span])
-            if sensors.mask is not None:
-                values *= sensors.mask[span]
-            yield span, values
+        length, broad = chunk(total), panel(total)
+        for first in range(0, width, broad):
+            own = slice(first, min(first + broad, width))
+            for start in range(0, total, length):
+                span = slice(start, min(start + length, total))
+                registers = self._registers(span.stop - start, own.stop - first)
+                if start == 0 or span.stop - start < length:
+                    registers.set(parameters[:, own])
+                values = registers.run(sensors.samples[:, span, own])
+                if sensors.mask is not None:
+                    values *= sensors.mask[span, own]
+                yield span, own, values
 
     def _registers(self, length: int, width: int) -> _Registers:
         if (length, width) not in self._places:
@@ -200,14 +209,18 @@ class Squares:
         """Normal equations of every sensor at its own x, (n, W)."""
         n = self.n
         whole = np.zeros((n + 1, n + 1, x.shape[1]))
-        for _, values in self._all.chunks(x, sensors):
+        for span, s, values in self._all.chunks(x, sensors):
             first = 0
             for columns, places in zip(self._columns, self._places, strict=True):
                 own = values[first : first + len(columns)]
+                fresh = span.start == first == 0
                 first += len(columns)
-                for i, column in enumerate(columns):
-                    # [J r] by columns: the first index is never below the second.
-                    whole[places[i], column] += np.einsum("ps,jps->js", own[i], own[i:])
+                # [J r] by columns: the first index is never below the second.
+                for i, (rows, column) in enumerate(zip(places, columns, strict=True)):
+                    if fresh and isinstance(rows, slice):
+                        np.einsum("ps,jps->js", own[i], own[i:], out=whole[rows, column, s])
+                    else:
+                        whole[rows, column, s] += np.einsum("ps,jps->js", own[i], own[i:])
         if sensors.hold is not None:
             held, target = sensors.hold
             miss = np.einsum("is,is->s", held, x - target)
@@ -219,25 +232,25 @@ class Squares:
     def cost(self, x: Array, sensors: Sensors) -> Array:
         """½Σr² of every sensor, (W,)."""
         total = np.zeros(x.shape[1])
-        for _, values in self._residual.chunks(x, sensors):
+        for _, s, values in self._residual.chunks(x, sensors):
             for own in values:
-                total += np.einsum("ps,ps->s", own, own)
+                total[s] += np.einsum("ps,ps->s", own, own)
         return 0.5 * total
 
     def pulled(self, x: Array, sensors: Sensors, values: Array) -> Array:
         """Jᵀ·values (n, W) for values (m, N, W), one for every residual."""
         total = np.zeros((self.n + 1, x.shape[1]))
-        for span, entries in self._all.chunks(x, sensors):
+        for span, s, entries in self._all.chunks(x, sensors):
             first = 0
-            for columns, own in zip(self._columns, values[:, span], strict=True):
+            for columns, own in zip(self._columns, values[:, span, s], strict=True):
                 part = entries[first : first + len(columns)]
                 first += len(columns)
-                total[columns] += np.einsum("ps,jps->js", own, part)
+                total[columns, s] += np.einsum("ps,jps->js", own, part)
         return total[: self.n]
 
     def residuals(self, x: Array, sensors: Sensors) -> Array:
         """Every residual, (m, N, W)."""
         found = np.empty((self.residual_count, *sensors.samples.shape[1:]))
-        for span, values in self._residual.chunks(x, sensors):
-            found[:, span] = values
+        for span, s, values in self._residual.chunks(x, sensors):
+            found[:, span, s] = values
         return found
