@@ -270,11 +270,13 @@ class _Job:
 
     def _sensors(self, span: slice) -> Sensors:
         """Readings by column, the last sensor repeated up to a width that NumPy handles alike."""
-        own = np.concatenate([r[span] for r in self.readings], axis=2)
-        total, samples, columns = own.shape
+        total, samples = span.stop - span.start, self.readings[0].shape[1]
         width = -(-total // NARROWEST) * NARROWEST
-        found = np.empty((columns, samples, width))
-        found[:, :, :total] = own.transpose(2, 1, 0)
+        found = np.empty((sum(r.shape[2] for r in self.readings), samples, width))
+        first = 0
+        for r in self.readings:
+            found[first : first + r.shape[2], :, :total] = r[span].transpose(2, 1, 0)
+            first += r.shape[2]
         mask = None
         if self.counts is not None:
             place = np.arange(samples)[:, None]

@@ -32,6 +32,8 @@ class Bounds(NamedTuple):
 
     def inside(self, x: Array) -> Array:
         """The unknowns, moved strictly inside where they are not (as in `stack.Problem`)."""
+        if ((x > self.lower) & (x < self.upper)).all():
+            return x
         both = np.isfinite(self.lower) & np.isfinite(self.upper)
         width = np.where(both, self.upper - self.lower, np.inf)
         margin = np.minimum(1e-8 * np.maximum(1.0, np.abs(x)), 0.1 * width)

@@ -271,7 +271,8 @@ class Judge:
         for s in self.model.signals:
             own = slice(first, first + s.size)
             first += s.size
-            size = np.sqrt(np.mean(some.samples[own] ** 2, axis=(0, 1)))
+            part = some.samples[own]
+            size = np.sqrt(np.einsum("kps,kps->s", part, part) / (len(part) * len(number)))
             move = 1e-4 * np.where(size > 0, size, 1.0)
             signs = np.where((number >> np.arange(s.size)[:, None]) & 1, -1.0, 1.0)
             up, down = (
