@@ -63,11 +63,6 @@ class Normals(NamedTuple):
         """JᵀJ (n, n, W), lower triangle."""
         return self.rows[:-1]
 
-    @property
-    def gradient(self) -> Array:
-        """Jᵀr, (n, W)."""
-        return np.asarray(self.rows[-1])
-
 
 def chunk(samples: int) -> int:
     """Samples of each sensor that are evaluated at once.
@@ -179,7 +174,7 @@ def _call(plan: Plan, i: int, place: dict[int, Array]) -> tuple[Kernel, tuple[Ar
     return KERNELS[value.code], (*(place[j] for j in value.operands), place[i])
 
 
-def _run(places: list[int]) -> slice | list[int]:
+def _adjacent(places: list[int]) -> slice | list[int]:
     """The same places, as a slice where they follow each other: that makes views."""
     first, last = places[0], places[-1]
     return slice(first, last + 1) if last - first == len(places) - 1 else places
@@ -198,7 +193,7 @@ class Squares:
         row, column = replay.sparsity[1]
         self.residual_count = m
         self._columns = [[*map(int, column[row == i]), self.n] for i in range(m)]
-        self._places = [[_run(own[i:]) for i in range(len(own))] for own in self._columns]
+        self._places = [[_adjacent(own[i:]) for i in range(len(own))] for own in self._columns]
         entries: list[Entry] = []
         for i in range(m):
             entries += [*((1, int(j)) for j in np.flatnonzero(row == i)), (0, i)]
@@ -215,7 +210,7 @@ class Squares:
                 own = values[first : first + len(columns)]
                 fresh = span.start == first == 0
                 first += len(columns)
-                # [J r] by columns: the first index is never below the second.
+                # [J r] by columns: only the lower triangle is filled.
                 for i, (rows, column) in enumerate(zip(places, columns, strict=True)):
                     if fresh and isinstance(rows, slice):
                         np.einsum("ps,jps->js", own[i], own[i:], out=whole[rows, column, s])
