@@ -132,6 +132,8 @@ ELSEWHERE = {
 }
 #: What a formula for each must name.
 WORDS = {name: words for name, (_, words) in worlds.ELSEWHERE.items()}
+#: Share of a column's square below which the data do not determine what is left of it.
+NULL = 1e-9
 #: Effects that one mounting of the wheel hides.
 HIDDEN = {"cross_axis": 0.02, "radius": 0.02, "time_delay": 0.01}
 #: Worlds with nothing in them: place -> (weight, options); with every noise, 20 seeds a weight.
@@ -357,7 +359,8 @@ def _against_oracle(
 ) -> dict[str, Any]:
     """Noncentrality; the oracle's held-out error; errors of the declared parameters.
 
-    These are root mean squares in units of the oracle's standard deviations.
+    These are root mean squares of the independent combinations of them that the oracle's data
+    determine, in the oracle's standard deviations.
     """
     runs = closing.runs
     clean = replace(runs[0], signals={**runs[0].signals, world.read: world.clean})
@@ -371,25 +374,41 @@ def _against_oracle(
     )
     values = problem.values(fit.point)
     told["oracle"] = rms(cross_fitted(oracle, problem.runs, values, closing.folds))
-    covariance = world.sigma**2 * np.linalg.pinv(problem.normal(fit.point).matrix)
-    std = problem.spread(fit.point, covariance)
+    seen = _seen(problem, fit.point, tuple(world.truth)) / world.sigma
+    told["truths"] = len(seen)
     for name, found in (
         ("error_before", closing.before.values),
         ("error_after", closing.after.values),
         ("error_oracle", values),
     ):
-        told[name] = _error(world.truth, found, std)
-    told["truths"] = sum(np.size(v) for v in world.truth.values())
+        off = problem.point({**values, **_only(found, world)}).x
+        off -= problem.point({**values, **world.truth}).x
+        told[name] = float(np.sqrt(np.mean((seen @ off) ** 2)))
     return told
 
 
-def _error(truth: Mapping[str, Any], values: Mapping[str, Any], std: Mapping[str, Any]) -> float:
-    parts = []
-    for name, true in truth.items():
-        known = std[name] > 0
-        z = (values[name] - true)[known] / std[name][known]
-        parts.append(np.ravel(z))
-    return float(np.sqrt(np.mean(np.concatenate(parts) ** 2)))
+def _only(values: Mapping[str, Any], world: worlds.World) -> dict[str, Any]:
+    return {name: values[name] for name in world.truth}
+
+
+def _seen(problem: Problem, point: Any, names: tuple[str, ...]) -> Any:
+    """Combinations of the named parameters that the data determine, of unit variance for σ = 1.
+
+    Whatever the other unknowns are: the root of the Schur complement of JᵀJ. What the oracle's
+    data cannot determine either (a lever arm along the radius is a change of gain) has no row.
+    """
+    matrix = problem.normal(point).matrix
+    scale = np.sqrt(np.where(np.diag(matrix) > 0, np.diag(matrix), 1.0))
+    matrix = matrix / np.outer(scale, scale)
+    own = np.zeros(len(matrix), dtype=bool)
+    for slot in problem.slots:
+        own[slot.x] = slot.parameter.name in names
+    across = matrix[np.ix_(own, ~own)]
+    others = np.linalg.pinv(matrix[np.ix_(~own, ~own)], rcond=NULL, hermitian=True)
+    size, way = np.linalg.eigh(matrix[np.ix_(own, own)] - across @ others @ across.T)
+    rows = np.zeros((int(np.sum(size > NULL)), len(matrix)))
+    rows[:, own] = (np.sqrt(size) * way).T[size > NULL] * scale[own]
+    return rows
 
 
 # -- all of them -----------------------------------------------------------------------------------

@@ -11,7 +11,8 @@ import pytest
 import casest as c
 from casest import load_runs
 from casest.cli import run
-from casest.closing.loop import OF_NOISE, close
+from casest.closing.closed import OF_NOISE
+from casest.closing.loop import close
 from casest.problem import find_model
 
 

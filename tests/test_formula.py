@@ -219,16 +219,16 @@ def test_effects_of_the_users_own_that_cannot_be_used_are_named(bench, tmp_path,
 
 def test_a_candidate_whose_refit_fails_is_named_and_the_loop_goes_on(bench, tmp_path, monkeypatch):
     """The refit of one candidate meets a matrix that cannot be solved."""
-    from casest.closing import loop
+    from casest.closing.work import Work
 
-    fitted = loop._Loop._fitted
+    fitted = Work.fitted
 
     def failing(self, model, values):
         if any(a.label == "temperature_bias(temperature)" for a in model.effects):
             raise np.linalg.LinAlgError("singular matrix")
         return fitted(self, model, values)
 
-    monkeypatch.setattr(loop._Loop, "_fitted", failing)
+    monkeypatch.setattr(Work, "fitted", failing)
     code, result = closed()
     assert code == 0
     reasons = {s["name"]: s["reason"] for s in result["refused"]}

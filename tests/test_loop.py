@@ -5,13 +5,20 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import simulators as sim
 import worlds
 
 import casest as c
 from casest import Run
+from casest.closing.axes import lighter
+from casest.closing.candidates import prepared
 from casest.closing.loop import close, rms
+from casest.closing.restrict import restricted
+from casest.effects import CATALOGUE
 from casest.problem import find_model
+from casest.solve.trust_region import trust_region
+from casest.stack import Problem
 
 
 def record(world, seed=0):
@@ -103,6 +110,23 @@ def wandering(step, seed, count=3000):
     return Run.raw("rest", {"v": v}, units={"v": "m/s^2"}, time=np.arange(count) * 0.01)
 
 
+def test_what_hangs_on_which_of_two_causes_it_is_said():
+    """Against a fit of each, made by itself."""
+    closing, world = closed("wheel", 4, {"quadratic": 2e-4})
+    (found,) = closing.effects
+    fits = {}
+    for name in (found.candidate.label, *found.rivals):
+        if name in ("quadratic", "signed_quadratic", "cubic", "signed_cubic"):
+            bent = replace(next(e for e in CATALOGUE if e.name == name), on="specific_force")
+            fits[name] = c.calibrate(declared(world).with_effect(bent), closing.runs)
+    assert len(fits) == 4
+    chosen = fits.pop(found.candidate.label)
+    for name, fit in fits.items():
+        for parameter, shift in found.rivals[name].items():
+            off = fit.values[parameter] - chosen.values[parameter] - shift
+            assert np.all(np.abs(off) < 0.1 * chosen.std[parameter] + 1e-12)
+
+
 def test_an_offset_that_walks_at_random_is_noise_and_neither_drift_nor_step():
     named = []
     for seed in range(5):
@@ -115,3 +139,20 @@ def test_an_offset_that_walks_at_random_is_noise_and_neither_drift_nor_step():
 def test_a_steady_offset_does_not_wander():
     found = [labels(close(constant_bias, [wandering(0.0, seed)])) for seed in range(6)]
     assert not any(found)
+
+
+def test_what_an_axis_less_would_cost_is_what_a_fit_without_it_costs():
+    world = worlds.made("table", [8], {"bias_drift": 8e-5})
+    drift = replace(next(e for e in CATALOGUE if e.name == "bias_drift"), on="reading")
+    whole = declared(world).with_effect(drift)
+    runs = prepared(whole, (record(world),))
+    problem = Problem(whole, runs)
+    fit = trust_region(problem, problem.point({}), tolerance=1e-12)
+    own = [p for p in whole.parameters if p.name.startswith("bias_drift")]
+    ways = dict(zip(["x", "y", "z"], lighter(problem, fit.point, own, world.sigma), strict=False))
+    for axis, others in (("x", [1, 2]), ("y", [0, 2]), ("z", [0, 1])):
+        less = declared(world).with_effect(restricted(drift, others, whole))
+        without = Problem(less, runs)
+        cost = trust_region(without, without.point({}), tolerance=1e-12).cost - fit.cost
+        assert ways[axis][0] == 1
+        assert ways[axis][1] == pytest.approx(2 * cost / world.sigma**2, rel=0.02)

@@ -44,7 +44,7 @@ from casest.scatter import between_runs
 from casest.stack import Point, Problem
 
 if TYPE_CHECKING:
-    from casest.closing.loop import Closing
+    from casest.closing.closed import Closing
 
 #: Chance of each kind of test to call a misfit where there is none: together half of one percent.
 REPEATS, SHAPES, LINES, RUNS = 0.001, 0.0025, 0.001, 0.001

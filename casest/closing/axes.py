@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import combinations
 from typing import Any
 
 import numpy as np
 
 from casest.closing.candidates import Candidate
+from casest.closing.restrict import axis_name
 from casest.closing.score import SURVIVES, Score
 from casest.declaring.shapes import Array
 from casest.declaring.symbols import Parameter
 from casest.estimate import Estimate
 from casest.modelling.model import Model
+from casest.stack import Point, Problem
 
 #: A parameter within so many standard deviations of null is nothing.
 NOTHING = 3.0
+Ways = tuple[tuple[int, float], ...]
 
 
 def living_axes(score: Score, model: Model) -> list[int] | None:
@@ -85,3 +89,33 @@ def narrowed(
         for i in kept:
             found[f"{name}_{'xyz'[i] if len(value) == 3 else i}"] = np.asarray(value[i])
     return found
+
+
+def lighter(problem: Problem, point: Point, own: Sequence[Parameter], noise: float) -> Ways:
+    """What some axes of an effect less would save and cost: unknowns, and squares in σ² (Wald)."""
+    axes: dict[str, list[int]] = {}
+    for slot in problem.slots:
+        p = slot.parameter
+        if p.name not in {q.name for q in own}:
+            continue
+        if axes_of([p]):
+            for i in range(p.shape.size):
+                axes.setdefault(axis_name(i, p.shape.size), []).append(slot.x.start + i)
+        elif "_" in p.name.rpartition(".")[2] and not p.shape.dims:  # on one axis already
+            axes.setdefault(p.name.rpartition("_")[2], []).append(slot.x.start)
+    if len(axes) < 2:
+        return ()
+    matrix = problem.normal(point).matrix
+    scale = np.sqrt(np.where(np.diag(matrix) > 0, np.diag(matrix), 1.0))
+    covariance = np.linalg.pinv(matrix / np.outer(scale, scale), hermitian=True)
+    covariance *= noise**2 / np.outer(scale, scale)
+    ways = []
+    for count in range(1, len(axes)):
+        for left in combinations(axes.values(), count):
+            k = [i for axis in left for i in axis]
+            own_part, x = (
+                covariance[np.ix_(k, k)] * np.outer(scale[k], scale[k]),
+                point.x[k] * scale[k],
+            )
+            ways.append((len(k), float(x @ np.linalg.pinv(own_part, hermitian=True) @ x)))
+    return tuple(ways)

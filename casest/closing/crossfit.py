@@ -12,8 +12,11 @@ from casest.data.run import Run
 from casest.data.splits import interleaved_blocks
 from casest.declaring.shapes import Array
 from casest.errors import DataError
+from casest.estimate import Estimate
+from casest.identify import identify
 from casest.modelling.model import Model
 from casest.noise import weighted
+from casest.solve.certificate import PRACTICALLY_NULL
 from casest.solve.trust_region import trust_region
 from casest.stack import Problem
 
@@ -21,6 +24,8 @@ from casest.stack import Problem
 FOLDS = 4
 #: Stretches that a continuous record is cut into.
 STRETCHES = 40
+#: Variance of what a fit to the rest foretells of a part, in those of the noise, at most.
+UNCERTAIN = 10.0
 #: A residual counts as at most this many robust standard deviations.
 FAR = 4.0
 #: Iterations of a fit that begins at the fit to everything, and gain (in σ²) that ends it.
@@ -116,3 +121,45 @@ def rms(residuals: Sequence[Array]) -> float:
     """Root mean square of all residuals."""
     count = sum(r.size for r in residuals)
     return float(np.sqrt(sum(float(np.sum(r**2)) for r in residuals) / count))
+
+
+def check_folds(before: Estimate, runs: Sequence[Run], folds: Folds) -> None:
+    """Raise DataError where the rest of a record does not determine what a part is held out for.
+
+    What a fit to the rest leaves uncertain of the part, in variances of the noise, is the trace
+    of JᵀJ of the part times the inverse of that of the rest.
+    """
+    for k in range(folds.count):
+        parts = [
+            tuple(run.take((fold == k) == held) for run, fold in zip(runs, folds.of, strict=True))
+            for held in (False, True)
+        ]
+        if any(len(run) == 0 for run in parts[0]) or not sum(map(len, parts[1])):
+            continue  # the fits themselves say so
+        rest, part = (Problem(before.model, p) for p in parts)
+        words = "there are too few equations"
+        if rest.residual_count >= rest.unknowns:
+            words = undetermined(rest, before.values)
+        if not words:
+            point = rest.point(before.values)
+            own = part.normal(part.point(before.values)).matrix
+            spread = float(np.trace(np.linalg.solve(rest.normal(point).matrix, own)))
+            if spread < UNCERTAIN * part.residual_count:
+                continue
+            deviations = np.sqrt(spread / part.residual_count)
+            words = f"the part is foretold to {deviations:.2g} standard deviations of the noise"
+        raise DataError(
+            f"without one part in {folds.count} of the record {words}; record more orientations, "
+            "or each of them twice"
+        )
+
+
+def undetermined(problem: Problem, values: Mapping[str, Array]) -> str:
+    """What the data do not determine, in words: cheaper than to ask for a certificate."""
+    point = problem.point(values)
+    found = identify(problem, point, problem.factor(point)[0])
+    if found.rank < found.unknowns:
+        return f"not determined: {found.unobservable[0]}" if found.unobservable else "rank"
+    if found.singular_values[-1] < PRACTICALLY_NULL * found.singular_values[0]:
+        return f"practically not determined: {found.weakest}"
+    return ""

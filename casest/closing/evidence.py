@@ -17,13 +17,17 @@ from casest.modelling.model import Model
 FALSE_ALARM = 0.004
 #: Candidates whose errors differ by fewer standard errors are not told apart.
 ALIKE = 2.0
+#: Difference of evidence that is not worth more than a bare mention (Kass & Raftery 1995).
+BARE_MENTION = 2.0
 
 
 @dataclass(frozen=True)
 class Fitted:
     """A model fitted to all data, with its residuals and, once they are asked for, held-out ones.
 
-    `noise` is σ of one residual, from the middle of their distribution.
+    `noise` is σ of one residual, from the middle of their distribution. `lighter` says what could
+    be left away of the effect added last: unknowns fewer, and squares more, in σ². `moved` is what
+    its coming changed of the other parameters, by what they predict: squares, in σ².
     """
 
     model: Model
@@ -32,6 +36,8 @@ class Fitted:
     residuals: tuple[Array, ...]
     noise: float
     held_out: tuple[Array, ...] = ()
+    lighter: tuple[tuple[int, float], ...] = ()
+    moved: float = 0.0
 
 
 def cost_of(fitted: Fitted) -> float:
@@ -49,19 +55,52 @@ def unknowns_of(score: Score, fitted: Fitted) -> int:
     return fitted.unknowns + (held_value(score.candidate) is not None)
 
 
+def price_of(score: Score, fitted: Fitted, price: float) -> float:
+    """Of the unknowns, without those of axes that cost more than they explain."""
+    count = unknowns_of(score, fitted)
+    ways = [(0, 0.0), *fitted.lighter]
+    return min(price * (count - fewer) + more / score.inflation for fewer, more in ways)
+
+
 def by_evidence(tried: Sequence[tuple[Score, Fitted]]) -> list[tuple[Score, Fitted]]:
-    """Best first: the sum of squares, and a price for every unknown (Schwarz 1978)."""
+    """Best first: the sum of squares, and a price for every unknown (Hannan & Quinn 1979).
+
+    Schwarz's price, ln N, makes little of how well a cause with several unknowns fits a long
+    record, and one unknown that wrenches all parameters wins.
+    """
+    criteria = evidence(tried)
+    return [tried[k] for k in np.argsort(criteria, kind="stable")]
+
+
+def evidence(tried: Sequence[tuple[Score, Fitted]]) -> list[float]:
+    """Squares in σ² and what the unknowns cost, of each candidate: the least is the best."""
     if not tried:
         return []
     sigma = min(fitted.noise for _, fitted in tried)
     # What the noise's colour makes of the squares: beside the cause nothing else varies.
     inflation = min(score.inflation for score, _ in tried)
-    price = float(np.log(sum(r.size for r in tried[0][1].residuals)))
+    price = 2 * float(np.log(np.log(max(sum(r.size for r in tried[0][1].residuals), 16))))
+    return [clipped_squares(f, sigma) / inflation + price_of(s, f, price) for s, f in tried]
 
-    def criterion(pair: tuple[Score, Fitted]) -> float:
-        return clipped_squares(pair[1], sigma) / inflation + price * unknowns_of(*pair)
 
-    return sorted(tried, key=criterion)
+def gentlest_first(
+    tried: Sequence[tuple[Score, Fitted]], folds: Folds
+) -> list[tuple[Score, Fitted]]:
+    """Of those that are as good as the best, first the one that moves the parameters least.
+
+    Where two causes explain the same, the smaller correction does the smaller harm if it is the
+    wrong one.
+    """
+    if not tried:
+        return []
+    criteria, (score, best) = evidence(tried), tried[0]
+    close = min(criteria) + BARE_MENTION
+    alike = [
+        c <= close and not_told_apart(best, fitted, score, folds)
+        for c, (_, fitted) in zip(criteria, tried, strict=True)
+    ]
+    leaders = sorted((p for p, a in zip(tried, alike, strict=True) if a), key=lambda p: p[1].moved)
+    return leaders + [p for p, a in zip(tried, alike, strict=True) if not a]
 
 
 def best_of_each(ranked: Sequence[Score], current: Fitted) -> list[Score]:
@@ -93,8 +132,14 @@ def as_promising(score: Score, winner: Score) -> bool:
 def not_told_apart(one: Fitted, other: Fitted, score: Score, folds: Folds) -> bool:
     """Do the data not tell two models apart? (Vuong 1989, with 2 for every unknown)."""
     gained, error = gain(other.residuals, one.residuals, folds, one.noise)
-    lead = gained + 2 * (other.unknowns - one.unknowns) * score.inflation
+    lead = gained + _price_of_two(other, score) - _price_of_two(one, score)
     return lead <= ALIKE * error + 1e-6 * sum(r.size for r in one.residuals)
+
+
+def _price_of_two(fitted: Fitted, score: Score) -> float:
+    """2 for every unknown, where leaving it away does not cost less; in σ²."""
+    ways = [(0, 0.0), *fitted.lighter]
+    return min(2 * (fitted.unknowns - few) * score.inflation + more for few, more in ways)
 
 
 def confirmed_by_flips(significant: list[Score], ranked: list[Score]) -> list[Score]:

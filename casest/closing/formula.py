@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -17,7 +17,11 @@ from numpy.typing import NDArray
 
 from casest.closing.adequacy import State, independent, state_of
 from casest.closing.candidates import Candidate, placed_in, usable_columns
+from casest.closing.closed import Found
+from casest.closing.contest import joined
 from casest.closing.dependence import slow_shapes
+from casest.closing.evidence import Fitted
+from casest.closing.gate import accepted
 from casest.closing.noise_model import (
     MIDDLE,
 )
@@ -25,6 +29,7 @@ from casest.closing.score import CLIPPED, PIECE, Score, scores, slope_of, widene
 from casest.closing.search import Chosen, Rows, search
 from casest.closing.terms import Shape, Term, Variable, formula_effect, library
 from casest.closing.wandering import wanders
+from casest.closing.work import Work
 from casest.data.run import Run
 from casest.declaring.physics import SX
 from casest.declaring.shapes import Array, each
@@ -36,10 +41,6 @@ from casest.modelling.model import Model
 from casest.modelling.tracing import flat
 from casest.noise import robust_scale
 from casest.stack import Problem
-
-if TYPE_CHECKING:
-    from casest.closing.evidence import Fitted
-    from casest.closing.loop import Found, _Loop
 
 #: Searches: with other batches, or beside a wander.
 ATTEMPTS = 4
@@ -57,34 +58,34 @@ def _probe(y: SX, *, k: SX = param(each, "[y]")) -> SX:
     return y + k
 
 
-def try_formula(loop: _Loop, current: Fitted) -> Fitted | None:
+def try_formula(work: Work, current: Fitted) -> Fitted | None:
     """The model with a formula, if the residual asks for one and held-out data confirm it.
 
     A formula that is there already gets more terms.
     """
-    sought = _sought(loop, current)
+    sought = _sought(work, current)
     if sought is None:
         return None
     score, fitted = sought
-    fitted, replaced = _alone(loop, fitted)
-    return _kept(loop, current, score, fitted, replaced)
+    fitted, replaced = _alone(work, fitted)
+    return _kept(work, current, score, fitted, replaced)
 
 
-def formula_instead(loop: _Loop, declared: Fitted, current: Fitted) -> Fitted | None:
+def formula_instead(work: Work, declared: Fitted, current: Fitted) -> Fitted | None:
     """The declared model with one formula, if that is clearly better than what was added to it.
 
     A course over temperature that no effect has can look like a slope and then a step in time.
     """
-    replaced = [f for f in loop.found if f.score is not None and f.names]
+    replaced = [f for f in work.found if f.score is not None and f.names]
     if not any(f.candidate.column for f in replaced) or _terms(current.model):
         return None
-    sought = _sought(loop, declared)
+    sought = _sought(work, declared)
     if sought is None or all(_has_a_name(t, declared.model) for t in _terms(sought[1].model)):
         return None
-    crossed = loop._crossed(sought[1])
-    if crossed is None or not loop._confirmed(current, crossed):
+    crossed = work.crossed(sought[1])
+    if crossed is None or not work.confirmed(current, crossed):
         return None
-    return _kept(loop, declared, sought[0], crossed, replaced)
+    return _kept(work, declared, sought[0], crossed, replaced)
 
 
 def _has_a_name(term: Term, model: Model) -> bool:
@@ -96,38 +97,38 @@ def _has_a_name(term: Term, model: Model) -> bool:
 
 
 def _kept(
-    loop: _Loop, before: Fitted, score: Score, fitted: Fitted, replaced: Sequence[Found]
+    work: Work, before: Fitted, score: Score, fitted: Fitted, replaced: Sequence[Found]
 ) -> Fitted | None:
-    """The fit with the formula in the place of these effects, if it passes the loop's gate."""
-    accepted = loop._accepted(before, score, fitted)
-    if accepted is None:
+    """The fit with the formula in the place of these effects, if it passes the gate."""
+    passed = accepted(work, before, score, fitted)
+    if passed is None:
         return None
-    loop.found = [f for f in loop.found if f not in replaced and f.candidate.label != NAME]
+    work.found = [f for f in work.found if f not in replaced and f.candidate.label != NAME]
     for found in replaced:
-        loop._refuse(found.candidate, "no longer needed beside the formula")
-    better, candidate, gained = accepted
+        work.refuse(found.candidate, "no longer needed beside the formula")
+    better, candidate, gained = passed
     better, candidate = _with_sizes(better, candidate)
-    loop._keep(better, candidate, gained, score, [])
+    work.keep(better, candidate, gained, score, {})
     return better
 
 
-def _sought(loop: _Loop, current: Fitted) -> tuple[Score, Fitted] | None:
+def _sought(work: Work, current: Fitted) -> tuple[Score, Fitted] | None:
     """The formula that the residual asks for, fitted; its score."""
-    library, known = _Library.of(loop, current), _terms(current.model)
+    library, known = _Library.of(work, current), _terms(current.model)
     if library is None or len(known) >= TERMS:
         return None
     # What is missing makes neighbours alike: how alike noise makes them, is seen without it.
     batches, wander = independent(library.state, 0.0), False
     for _ in range(ATTEMPTS):
         chosen = library.search(batches, wander)
-        tried = chosen and _tried(loop, current, library.candidate(chosen, known), chosen)
+        tried = chosen and _tried(work, current, library.candidate(chosen, known), chosen)
         if not tried or chosen is None:
             return None
         score, fitted = tried
         enough = library.independent_after(fitted)
         if sum(map(len, enough)) < sum(map(len, batches)):
             batches = enough
-        elif not wander and wanders(loop.runs, current, fitted, chosen.score):
+        elif not wander and wanders(work.runs, current, fitted, chosen.score):
             wander = True
         else:
             break
@@ -149,31 +150,31 @@ def _without(fitted: Fitted, label: str) -> tuple[Model, dict[str, Array]]:
     return replace(fitted.model, effects=effects), values
 
 
-def _alone(loop: _Loop, fitted: Fitted) -> tuple[Fitted, list[Found]]:
+def _alone(work: Work, fitted: Fitted) -> tuple[Fitted, list[Found]]:
     """Without the effects that only stood for what the formula says; and those."""
     replaced = []
-    for found in loop.found:
+    for found in work.found:
         label = found.candidate.label
         if found.score is None or not found.names or found.candidate.freed or label == NAME:
             continue
-        without = loop._crossed(loop._fitted(*_without(fitted, label)))
-        whole = loop._crossed(fitted)
-        if without is not None and (whole is None or not loop._confirmed(without, whole)):
+        without = work.crossed(work.fitted(*_without(fitted, label)))
+        whole = work.crossed(fitted)
+        if without is not None and (whole is None or not work.confirmed(without, whole)):
             fitted = without
             replaced.append(found)
     return fitted, replaced
 
 
 def _tried(
-    loop: _Loop, current: Fitted, candidate: Candidate, chosen: Chosen
+    work: Work, current: Fitted, candidate: Candidate, chosen: Chosen
 ) -> tuple[Score, Fitted] | None:
     """The model refitted with the formula, in place of one that it has; the score."""
-    loop.original[candidate.label] = candidate
+    work.original[candidate.label] = candidate
     model, values = _without(current, NAME)
-    wide = widened(model, loop.runs, values, [candidate])
-    (score,) = scores(wide, [candidate], current.noise, loop.folds.batches)
+    wide = widened(model, work.runs, values, [candidate])
+    (score,) = scores(wide, [candidate], current.noise, work.folds.batches)
     score = replace(score, p_value=min(1.0, chosen.score.p_value * candidate.trials))
-    fitted = loop._with(replace(current, model=model, values=values), score)
+    fitted = joined(work, replace(current, model=model, values=values), score)
     return None if fitted is None else (score, fitted)
 
 
@@ -213,12 +214,12 @@ class _Library:
     size: int
 
     @classmethod
-    def of(cls, loop: _Loop, current: Fitted) -> _Library | None:
+    def of(cls, work: Work, current: Fitted) -> _Library | None:
         """None where there is no output that anything could be added to, or nothing to read."""
-        problem = Problem(current.model, loop.runs)
+        problem = Problem(current.model, work.runs)
         if problem.sequential:
             return None
-        state = state_of(problem, problem.point(current.values), loop.folds.batches)
+        state = state_of(problem, problem.point(current.values), work.folds.batches)
         try:
             probe = Candidate(placed_in(_probe, current.model))
             return _library(state, probe)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from casest.closing.candidates import Candidate, typical_sizes
-from casest.closing.loop import Closing
+from casest.closing.closed import Closing
 from casest.closing.score import SURVIVES, Score
 from casest.declaring.symbols import Parameter
 from casest.modelling.model import Model

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from casest.closing.loop import HELD_OUT_DATA, Closing
+from casest.closing.closed import HELD_OUT_DATA, Closing
 from casest.data.logs import file_name
 from casest.effects import CATALOGUE
 from casest.following import following
@@ -91,6 +91,15 @@ def _effects(content: Mapping[str, Any]) -> Iterator[str]:
             also = f" (less likely: {', '.join(e['less_likely'])})" if e["less_likely"] else ""
             yield item(f"not told apart from {', '.join(e['indistinguishable_from'])}{also}")
             yield from (item(words) for words in e["would_separate"][:SHOWN])
+            yield from (item(words) for words in instead(e["instead_would_move"]))
+
+
+def instead(moves: Mapping[str, Mapping[str, float]]) -> Iterator[str]:
+    """What hangs on which of the causes it is."""
+    for label, shifts in moves.items():
+        if shifts:
+            words = ", ".join(f"{name} by {size:.2g}" for name, size in shifts.items())
+            yield f"were it {label} instead, the parameters would move: {words}"
 
 
 def _moved(content: Mapping[str, Any]) -> Iterator[str]:

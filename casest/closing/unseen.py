@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from casest import unseen
 from casest.closing.candidates import prepared
-from casest.closing.loop import Closing
+from casest.closing.closed import Closing
 from casest.data.run import Run
 from casest.declaring.shapes import Array
 

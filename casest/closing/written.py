@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from casest.closing.closed import Closing, Found
 from casest.closing.crossfit import rms
-from casest.closing.loop import Closing, Found
 from casest.closing.summary import detectable, invisible
 from casest.closing.terms import source
 from casest.declaring.shapes import Array
@@ -112,6 +112,10 @@ def _effect(found: Found, closing: Closing) -> dict[str, Any]:
         "indistinguishable_from": _alike(found, closing)[:NEAREST],
         "less_likely": _alike(found, closing)[NEAREST:],
         "would_separate": _separating(found, closing),
+        "instead_would_move": {
+            label: _shifts(found.rivals[label], closing)
+            for label in _alike(found, closing)[:NEAREST]
+        },
     } | ({} if attached is None else attachment(attached))
 
 
@@ -119,6 +123,15 @@ def _alike(found: Found, closing: Closing) -> list[str]:
     """What explains the data as well, but for what has been added beside it since."""
     added = {f.candidate.label for f in closing.effects}
     return [label for label in found.indistinguishable_from if label not in added]
+
+
+def _shifts(rival: Mapping[str, Array], closing: Closing) -> dict[str, Any]:
+    """Largest shift of each declared parameter that is more than its standard deviation."""
+    found = {}
+    for name, shift in rival.items():
+        if name in closing.after.std and np.any(np.abs(shift) > closing.after.std[name]):
+            found[name] = plain(np.max(np.abs(shift)))
+    return found
 
 
 def formula_source(closing: Closing) -> str:

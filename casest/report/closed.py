@@ -6,9 +6,9 @@ import re
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from casest.closing.closed import Closing
 from casest.closing.crossfit import FAR
-from casest.closing.loop import Closing
-from casest.closing.text import sentence
+from casest.closing.text import instead, sentence
 from casest.report.applied import application
 from casest.report.calibration import by_axis, error_picture
 from casest.report.figures import Figures
@@ -167,6 +167,9 @@ def _effect(e: Mapping[str, Any], doc: str, story: Story) -> str:
         more = f", nor, though they are less likely, from {more}" if more else ""
         evidence.append(f"These data do not tell it apart from {names}{more}.")
         evidence += [f"To tell them apart, {words}." for words in e["would_separate"]]
+        evidence += [
+            f"{words[0].upper()}{words[1:]}." for words in instead(e["instead_would_move"])
+        ]
     else:
         evidence.append("No other candidate explains the held-out data as well.")
     return "".join(

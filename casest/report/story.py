@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from casest.closing.candidates import prepared, usable_columns
+from casest.closing.closed import Closing
 from casest.closing.dependence import Variable, variables
-from casest.closing.loop import Closing
 from casest.data.run import Run
 from casest.declaring.shapes import Array
 from casest.estimate import Estimate

@@ -1,0 +1,85 @@
+"""The gate: what an effect must pass to stay, and the plainest form in which it does."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from casest.closing.axes import narrowed, significant_axes
+from casest.closing.candidates import Candidate
+from casest.closing.contest import whole
+from casest.closing.crossfit import undetermined
+from casest.closing.evidence import Fitted
+from casest.closing.held import held_value
+from casest.closing.restrict import restricted
+from casest.closing.score import Score
+from casest.closing.work import Work
+from casest.errors import CasestError
+from casest.estimate import Estimate
+from casest.stack import Problem
+
+
+def accepted(
+    work: Work, current: Fitted, score: Score, fitted: Fitted
+) -> tuple[Fitted, Candidate, float] | None:
+    """The fit without needless axes, its candidate and held-out gain; None if refused."""
+    crossed = work.crossed(fitted)
+    if crossed is None or not work.confirmed(current, crossed):
+        work.refuse(score.candidate, "too small to matter here: held-out data do not confirm it")
+        return None
+    why = undetermined(Problem(crossed.model, work.runs), crossed.values)
+    estimate = None if why else work.certified(crossed)
+    if estimate is not None and not estimate.certificate.trusted:
+        why = estimate.certificate.reasons[0]
+    if estimate is None or why:
+        work.refuse(score.candidate, f"its fit is refused: {why}")
+        return None
+    crossed = replace(crossed, values=estimate.values)
+    plain, candidate = _plainer(work, *pruned(work, crossed, estimate, score))
+    return plain, candidate, work.gain(current, plain)[0]
+
+
+def pruned(
+    work: Work, fitted: Fitted, estimate: Estimate, score: Score
+) -> tuple[Fitted, Candidate]:
+    """Without the axes on which the effect is nothing: an axis with nothing in it stays."""
+    base = replace(fitted.model, effects=fitted.model.effects[:-1])
+    candidate = whole(work, score, base)
+    kept = significant_axes(candidate, estimate)
+    if kept is None or candidate.effect is None:
+        return fitted, candidate
+    effect = restricted(candidate.effect, kept, fitted.model)
+    smaller = replace(candidate, effect=effect, traced=None)
+    try:
+        again = work.crossed(
+            work.fitted(smaller.added_to(base), narrowed(fitted.values, candidate, kept))
+        )
+    except CasestError:
+        return fitted, candidate
+    if again is None or work.confirmed(again, fitted):
+        return fitted, candidate
+    return again, smaller
+
+
+def _plainer(work: Work, fitted: Fitted, candidate: Candidate) -> tuple[Fitted, Candidate]:
+    """In the effect's plain form, where held-out data do not want more.
+
+    What was held at a value of its grid is an unknown then.
+    """
+    effect = work.original[candidate.label].effect
+    if effect is None or not effect.plain:
+        return fitted, candidate
+    held, label = held_value(candidate), candidate.label + "."
+    begun = effect.starting(**{held[0]: held[2]}) if held else effect
+    smaller = replace(candidate, effect=begun.holding(**dict(effect.plain)), traced=None)
+    values = {n: v for n, v in fitted.values.items() if not n.startswith(label)}
+    try:
+        base = replace(fitted.model, effects=fitted.model.effects[:-1])
+        again = work.crossed(work.fitted(smaller.added_to(base), values))
+    except CasestError:
+        return fitted, candidate
+    if again is None or work.confirmed(again, fitted):
+        return fitted, candidate
+    estimate = work.certified(again)
+    if not estimate.certificate.trusted:
+        return fitted, candidate
+    return replace(again, values=estimate.values), smaller
