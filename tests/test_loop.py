@@ -15,6 +15,8 @@ from casest.closing.axes import lighter
 from casest.closing.candidates import prepared
 from casest.closing.loop import close, rms
 from casest.closing.restrict import restricted
+from casest.closing.text import sentence
+from casest.closing.written import closing_result
 from casest.effects import CATALOGUE
 from casest.problem import find_model
 from casest.solve.trust_region import trust_region
@@ -156,3 +158,17 @@ def test_what_an_axis_less_would_cost_is_what_a_fit_without_it_costs():
         cost = trust_region(without, without.point({}), tolerance=1e-12).cost - fit.cost
         assert ways[axis][0] == 1
         assert ways[axis][1] == pytest.approx(2 * cost / world.sigma**2, rel=0.02)
+
+
+def test_a_cause_too_small_to_be_told_from_others_is_not_added():
+    """Four shapes of response explain the same half of a percent, and put offset and gain apart."""
+    seed = [10000, *b"one", *b"wheel", *b"cubic", *b"small"]
+    closing, _ = closed("wheel", seed, {"cubic": 2.4e-6})
+    assert labels(closing) == []
+    assert "cubic" in closing.undecided.names
+    assert 0 < closing.undecided.share < 0.01
+    assert closing.verdict == "unexplained"
+    assert closing.after is closing.before
+    content = closing_result(closing, model_name="wheel", data=["wheel.csv"])
+    assert content["unexplained"]["one_of"] == list(closing.undecided.names)
+    assert sentence(content) == "unexplained: a small misfit that several causes explain alike"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 from casest.closing.adequacy import Misfit, misfit
@@ -42,6 +42,17 @@ class Found:
 
 
 @dataclass(frozen=True)
+class Undecided:
+    """Something is missing, and too little of it shows to tell which of these causes it is.
+
+    `share` of the held-out mean square that any of them would take away.
+    """
+
+    names: tuple[str, ...]
+    share: float
+
+
+@dataclass(frozen=True)
 class Closing:
     """What the loop leaves: the estimate before and after, what was added, what was refused."""
 
@@ -57,11 +68,17 @@ class Closing:
     first: tuple[Score, ...]
     runs: tuple[Run, ...]
     noise: float = 0.0
+    undecided: Undecided | None = None
 
     @cached_property
     def misfit(self) -> Misfit:
         """What is left after the loop, tested beside the noise as it is."""
-        return misfit(self)
+        left = misfit(self)
+        if self.undecided is None:
+            return left
+        where = f"which {' or '.join(self.undecided.names)} explain alike"
+        fraction = max(left.fraction, self.undecided.share)
+        return replace(left, significant=True, fraction=fraction, where=where)
 
     @property
     def verdict(self) -> str | None:

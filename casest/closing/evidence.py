@@ -17,8 +17,9 @@ from casest.modelling.model import Model
 FALSE_ALARM = 0.004
 #: Candidates whose errors differ by fewer standard errors are not told apart.
 ALIKE = 2.0
-#: Difference of evidence that is not worth more than a bare mention (Kass & Raftery 1995).
-BARE_MENTION = 2.0
+#: Differences of evidence that are not worth more than a bare mention, and not strong (Kass &
+#: Raftery 1995).
+BARE_MENTION, STRONG = 2.0, 6.0
 
 
 @dataclass(frozen=True)
@@ -83,6 +84,21 @@ def evidence(tried: Sequence[tuple[Score, Fitted]]) -> list[float]:
     return [clipped_squares(f, sigma) / inflation + price_of(s, f, price) for s, f in tried]
 
 
+def as_good(
+    tried: Sequence[tuple[Score, Fitted]], folds: Folds, within: float
+) -> list[tuple[Score, Fitted]]:
+    """The best, and what is not told apart from it and has as much evidence but for `within`."""
+    if not tried:
+        return []
+    criteria, (score, best) = evidence(tried), tried[0]
+    return [
+        pair
+        for c, pair in zip(criteria, tried, strict=True)
+        if pair[1] is best
+        or (c <= min(criteria) + within and not_told_apart(best, pair[1], score, folds))
+    ]
+
+
 def gentlest_first(
     tried: Sequence[tuple[Score, Fitted]], folds: Folds
 ) -> list[tuple[Score, Fitted]]:
@@ -91,16 +107,9 @@ def gentlest_first(
     Where two causes explain the same, the smaller correction does the smaller harm if it is the
     wrong one.
     """
-    if not tried:
-        return []
-    criteria, (score, best) = evidence(tried), tried[0]
-    close = min(criteria) + BARE_MENTION
-    alike = [
-        c <= close and not_told_apart(best, fitted, score, folds)
-        for c, (_, fitted) in zip(criteria, tried, strict=True)
-    ]
-    leaders = sorted((p for p, a in zip(tried, alike, strict=True) if a), key=lambda p: p[1].moved)
-    return leaders + [p for p, a in zip(tried, alike, strict=True) if not a]
+    leaders = sorted(as_good(tried, folds, BARE_MENTION), key=lambda pair: pair[1].moved)
+    led = {id(fitted) for _, fitted in leaders}
+    return leaders + [pair for pair in tried if id(pair[1]) not in led]
 
 
 def best_of_each(ranked: Sequence[Score], current: Fitted) -> list[Score]:

@@ -8,12 +8,14 @@ from typing import Any
 import numpy as np
 
 from casest.closing.candidates import Candidate, Skipped, candidates, prepared
-from casest.closing.closed import HELD_OUT_DATA, Closing, Found
+from casest.closing.closed import HELD_OUT_DATA, Closing, Found, Undecided
 from casest.closing.contest import contenders, whole
 from casest.closing.crossfit import Folds, rms, undetermined
 from casest.closing.evidence import (
     FALSE_ALARM,
+    STRONG,
     Fitted,
+    as_good,
     confirmed_by_flips,
     gentlest_first,
     not_told_apart,
@@ -41,6 +43,9 @@ from casest.stack import Point, Problem
 
 #: Columns of the widest model that is evaluated at once.
 WIDEST = 120
+#: Share of the held-out mean square below which a cause must be the only one that it can be, if
+#: another would move the declared parameters by so many standard deviations.
+SMALL, ELSEWHERE = 0.01, 2.0
 #: Rounds at most.
 ROUNDS = 8
 
@@ -94,7 +99,7 @@ def _closed(work: Work) -> Closing:
         ranked = _ranked(work, current)
         first_scores, declared = first_scores or ranked, declared or current
         better = _better(work, current, ranked)
-        if better is None:
+        if better is None and work.undecided is None:
             better = try_formula(work, current)
         if better is None:
             better = formula_instead(work, declared, current)
@@ -119,6 +124,7 @@ def _closed(work: Work) -> Closing:
         tuple(first_scores or ()),
         work.runs,
         current.noise,
+        work.undecided,
     )
 
 
@@ -153,9 +159,10 @@ def _better(work: Work, current: Fitted, ranked: list[Score]) -> Fitted | None:
     if not confirmed:
         return None
     tried = contenders(work, current, with_rivals(confirmed, ranked), ranked)
-    return _first_accepted(work, current, tried, limit) or _two_at_once(
-        work, current, [pair for pair in tried if pair[0].p_value <= limit]
-    )
+    found = _first_accepted(work, current, tried, limit)
+    if found is not None or work.undecided is not None:
+        return found
+    return _two_at_once(work, current, [pair for pair in tried if pair[0].p_value <= limit])
 
 
 def _first_accepted(
@@ -174,9 +181,27 @@ def _first_accepted(
         passed = accepted(work, current, score, fitted)
         if passed is None:
             continue
+        equals = [pair for pair in as_good(tried, work.folds, STRONG) if pair[1] is not fitted]
+        share = passed[2] / passed[0].noise ** 2
+        if share < SMALL and _hangs_on_which(work, fitted, equals):
+            names = [s.candidate.label for s, _ in equals]
+            why = f"it may as well be {', '.join(names)}, and the parameters hang on which it is"
+            work.refuse(score.candidate, why)
+            work.undecided = Undecided((score.candidate.label, *names), share)
+            return None
         work.keep(*passed, score, _rivals(work, fitted, score, tried))
         return passed[0]
     return None
+
+
+def _hangs_on_which(work: Work, fitted: Fitted, equals: Sequence[tuple[Score, Fitted]]) -> bool:
+    """Would one of the other causes have the declared parameters elsewhere?"""
+    return any(
+        np.any(np.abs(other.values[n] - fitted.values[n]) > ELSEWHERE * std)
+        for _, other in equals
+        for n, std in work.before.std.items()
+        if n in other.values and n in fitted.values
+    )
 
 
 def _rivals(
@@ -210,7 +235,7 @@ def _two_at_once(work: Work, current: Fitted, tried: list[tuple[Score, Fitted]])
     best = contenders(work, first, beside, ranked) if beside else []
     both = _first_accepted(work, current, best, limit)
     if both is None:
-        work.refused = refused
+        work.refused, work.undecided = refused, None
         return None
     rivals = _rivals(work, first, score, tried)
     candidate, second = whole(work, score, current.model), work.found.pop()

@@ -54,6 +54,8 @@ def sentence(content: Mapping[str, Any]) -> str:
         verb = "was" if len(names) == 1 else "were"
         return f"extended: {', '.join(names)} {verb} missing; what is left is noise"
     found = f" beside {', '.join(names)}" if names else ""
+    if content["unexplained"]["one_of"]:
+        return f"unexplained: a small misfit{found} that several causes explain alike"
     return f"unexplained: a misfit remains{found} that no candidate explains"
 
 
@@ -135,7 +137,9 @@ def _invisible(content: Mapping[str, Any]) -> Iterator[str]:
 def _unexplained(content: Mapping[str, Any]) -> Iterator[str]:
     left = content["unexplained"]
     if content["verdict"] == "unexplained":
-        yield item(f"Unexplained: {left['fraction']:.0%} of the held-out variance, {left['where']}")
+        yield item(
+            f"Unexplained: {100 * left['fraction']:.2g} % of the held-out variance, {left['where']}"
+        )
 
 
 def _notes(content: Mapping[str, Any]) -> Iterator[str]:

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from casest.closing.candidates import Candidate, Skipped
-from casest.closing.closed import Found
+from casest.closing.closed import Found, Undecided
 from casest.closing.crossfit import ENOUGH, ITERATIONS, check_folds, cross_fitted, folded, gain
 from casest.closing.evidence import Fitted
 from casest.closing.score import Score
@@ -44,6 +44,7 @@ class Work:
         self.refused: list[Skipped] = []
         self.skipped: list[Skipped] = []
         self.found: list[Found] = []
+        self.undecided: Undecided | None = None
         #: Candidates as they are declared, by label: their profiles unknown, on all axes.
         self.original: dict[str, Candidate] = {}
 

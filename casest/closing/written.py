@@ -68,7 +68,12 @@ def closing_result(
         for i in invisible(closing)
     ]
     fraction = np.nan if closing.verdict is None else left.fraction
-    ordered["unexplained"] = {"fraction": plain(fraction), "where": left.where}
+    names = closing.undecided.names if closing.undecided else ()
+    ordered["unexplained"] = {
+        "fraction": plain(fraction),
+        "where": left.where,
+        "one_of": list(names),
+    }
     ordered["moved"] = _moved(closing)
     ordered["smallest_detectable"] = [
         {"name": d.name, "parameter": d.parameter, "size": plain(d.size), "unit": d.unit}

@@ -15,6 +15,7 @@ from typing import NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from casest.engine.factored import factored_sums
 from casest.engine.kernel import Kernel, kernel_for, kernel_of_sum
 from casest.engine.operations import Floats
 from casest.engine.replay import BLOCK, Entry, Replay, Samples
@@ -81,12 +82,22 @@ def _replayed_sums(
     replay: Replay, parameters: Floats, samples: Samples, weights: Floats | None
 ) -> Floats:
     """[J r]ᵀ W [J r], (n+1, n+1)."""
+    found = factored_sums(replay, parameters, samples) if weights is None else None
+    if found is not None:
+        return found
+    with np.errstate(all="ignore"):
+        return _sums_by_entry(replay, parameters, samples, weights)
+
+
+def _sums_by_entry(
+    replay: Replay, parameters: Floats, samples: Samples, weights: Floats | None
+) -> Floats:
+    """The same from every entry of J on every sample."""
     components = _components(replay)
     sums = [np.zeros((len(c.columns),) * 2) for c in components]
-    with np.errstate(all="ignore"):
-        for block, w in _weighted_blocks(replay, components, parameters, samples, weights):
-            for i, (component, total) in enumerate(zip(components, sums, strict=True)):
-                _add_products(total, block[component.rows], None if w is None else w[:, i])
+    for block, w in _weighted_blocks(replay, components, parameters, samples, weights):
+        for i, (component, total) in enumerate(zip(components, sums, strict=True)):
+            _add_products(total, block[component.rows], None if w is None else w[:, i])
     n = replay.shapes[_JACOBIAN][1]
     whole = np.zeros((n + 1, n + 1))
     for component, total in zip(components, sums, strict=True):

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from casest.engine.graph import PARAMETER, SAMPLE, Graph
 from casest.engine.grouping import group
 from casest.engine.operations import KERNELS, Floats, Kernel
+from casest.engine.scalars import Scalars
 from casest.errors import CasestError
 
 Entry = tuple[int, int]  # (output, index of the nonzero in CasADi's column-major order)
@@ -68,18 +69,19 @@ Samples = Floats | Columns
 
 
 class Plan:
-    """What to compute for some entries of the outputs, and where each value lives.
+    """What to compute for some wanted values of a graph, and where each value lives.
 
     A per-sample value lives in a row: one of the result's if it is wanted, else one that is taken
     over as soon as its last reader has run. The other values live in `scalars`.
     """
 
-    def __init__(self, graph: Graph, wanted: Sequence[Entry]) -> None:
+    def __init__(self, graph: Graph, wanted: Sequence[int]) -> None:
         self.graph = graph
-        self.wanted = [graph.outputs[output][nonzero] for output, nonzero in wanted]
+        self.wanted = list(wanted)
         needed = graph.needed(self.wanted)
         values = graph.values
         self.scalars = [i for i in needed if not values[i].per_sample]
+        self.once = Scalars(graph, self.scalars)
         self.inputs = [i for i in needed if values[i].kind == "sample"]
         self.steps = [i for i in needed if values[i].per_sample and values[i].kind == "operation"]
         # The first place a computed value is wanted in is its home; the others get copies.
@@ -149,26 +151,17 @@ class _Workspace:
     def __init__(self, plan: Plan, length: int) -> None:
         self.plan = plan
         self.length = length
-        self._scalars = np.empty(len(plan.scalars))
-        self._scalar = {i: self._scalars[k, ...] for k, i in enumerate(plan.scalars)}
+        self._scalars = np.empty(len(plan.once))
+        self._scalar = {i: self._scalars[k, ...] for i, k in plan.once.place.items()}
         self._results = aligned(len(plan.wanted), length)
         self._inputs = aligned(len(plan.inputs), length)
         self._registers = aligned(plan.n_registers, length)
-        values = plan.graph.values
-        self._scalar_calls = [
-            self._call(i, self._scalar) for i in plan.scalars if values[i].kind == "operation"
-        ]
         self._bound: dict[int, list[tuple[Kernel, tuple[Floats, ...]]]] = {}
 
     def set_parameters(self, parameters: Floats) -> None:
         """Evaluate once what does not depend on the sample."""
-        for i in self.plan.scalars:
-            value = self.plan.graph.values[i]
-            if value.kind == "constant":
-                self._scalar[i][...] = value.constant
-            elif value.kind == "parameter":
-                self._scalar[i][...] = parameters[value.code]
-        _run(self._scalar_calls)
+        with np.errstate(all="ignore"):
+            self._scalars[:] = self.plan.once(parameters)
         for row, i in enumerate(self.plan.wanted):
             if i in self._scalar:
                 self._results[row] = self._scalar[i]
@@ -235,9 +228,9 @@ class Replay:
         self.name = str(function.name())
         self.n_parameters = int(function.numel_in(PARAMETER))
         self.n_sample = int(function.numel_in(SAMPLE))
-        self._graph = Graph(function)
+        self.graph = Graph(function)
         if grouped:
-            group(self._graph, grouped)
+            group(self.graph, grouped)
         self.shapes: list[tuple[int, int]] = [
             (int(function.size1_out(i)), int(function.size2_out(i)))
             for i in range(function.n_out())
@@ -254,7 +247,8 @@ class Replay:
         """How to compute the (output, nonzero) entries `wanted`, in that order; made once."""
         key = tuple(wanted)
         if key not in self._plans:
-            self._plans[key] = Plan(self._graph, key)
+            values = [self.graph.outputs[output][nonzero] for output, nonzero in key]
+            self._plans[key] = Plan(self.graph, values)
         return self._plans[key]
 
     def entries(self, output: int) -> list[Entry]:

@@ -121,13 +121,15 @@ def _effects(closing: Closing, story: Story, content: Mapping[str, Any]) -> str:
     said = [_effect(e, docs.get(e["name"], ""), story) for e in content["effects"]]
     if not said and content["verdict"] is None:
         said = [paragraph("None was tried: there is nothing to judge it by.")]
+    elif not said and content["unexplained"]["one_of"]:
+        said = [paragraph("None was added: too little shows to tell which of several it is.")]
     elif not said:
         said = [paragraph("None was needed: no candidate makes held-out data better predicted.")]
     left = content["unexplained"]
     if content["verdict"] == "unexplained":
         said += [
             tag("h3", "What is left unexplained"),
-            paragraph(f"{left['fraction']:.0%} of the held-out variance: {left['where']}."),
+            paragraph(f"{100 * left['fraction']:.2g} % of the held-out variance: {left['where']}."),
         ]
     rows = [
         [d["name"], f"`{d['parameter']}`", number(d["size"]), printed_unit(d["unit"])]
