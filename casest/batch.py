@@ -82,7 +82,7 @@ def calibrate_many(
     count; what follows them is not looked at.
 
     `start` gives start values by parameter, one for all or (S, …); or it is a function
-    `(model, signals) -> {name: value}` that is called for some hundreds of sensors at a time, such
+    `(model, signals) -> {name: value}` that is called for some of the sensors at a time, such
     as `casest_problems.norm.closed_form_many`. In place of a value it may give a triple (value,
     lower, upper) where bounds depend on the data. Without it sensors start where the model says
     that many do (`model.starting(…, many=…)`: the shipped norm models), else from the declared
@@ -270,11 +270,13 @@ class _Job:
 
     def _sensors(self, span: slice) -> Sensors:
         """Readings by column, the last sensor repeated up to a width that NumPy handles alike."""
-        own = np.concatenate([r[span] for r in self.readings], axis=2)
-        total, samples, columns = own.shape
+        total, samples = span.stop - span.start, self.readings[0].shape[1]
         width = -(-total // NARROWEST) * NARROWEST
-        found = np.empty((columns, samples, width))
-        found[:, :, :total] = own.transpose(2, 1, 0)
+        found = np.empty((sum(r.shape[2] for r in self.readings), samples, width))
+        first = 0
+        for r in self.readings:
+            found[first : first + r.shape[2], :, :total] = r[span].transpose(2, 1, 0)
+            first += r.shape[2]
         mask = None
         if self.counts is not None:
             place = np.arange(samples)[:, None]

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from casest.batch_linear import backward, cholesky, dot, forward, lengths, times
+from casest.batch_linear import backward, cholesky, dot, forward, times, whole
 from casest.batch_sums import NARROWEST, Normals, Sensors, Squares
 from casest.declaring.shapes import Array
 from casest.solve.trust_region import LITTLE
@@ -32,6 +32,8 @@ class Bounds(NamedTuple):
 
     def inside(self, x: Array) -> Array:
         """The unknowns, moved strictly inside where they are not (as in `stack.Problem`)."""
+        if ((x > self.lower) & (x < self.upper)).all():
+            return x
         both = np.isfinite(self.lower) & np.isfinite(self.upper)
         width = np.where(both, self.upper - self.lower, np.inf)
         margin = np.minimum(1e-8 * np.maximum(1.0, np.abs(x)), 0.1 * width)
@@ -100,13 +102,6 @@ def minimise(
 ) -> Fits:
     """Minimise every sensor's cost from its start (n, W). `near`: starts are near the solutions."""
     n, width = start.shape
-    found = Fits(
-        start.copy(),
-        np.full(width, np.nan),
-        np.full((n, n, width), np.nan),
-        np.full(width, np.inf),
-        np.ones(width),
-    )
     state = _State(
         np.arange(width),
         sensors,
@@ -118,20 +113,21 @@ def minimise(
         np.full(width, 2.0),
         np.full(width, np.inf),
     )
+    found: Fits | None = None
     for _ in range(LIMIT):
         step, left = _steps(state)
         settled = _settled(state, left)
         ended = settled | ~np.isfinite(left) | (state.damping > 1e12)
-        _keep(found, state, step, left, settled, ended)
+        if ended.any():
+            found = _kept(found, state, step, left, settled, ended)
         going = np.flatnonzero(~ended)
-        if not going.size:
+        if not going.size and found is not None:
             return found
         if going.size < len(ended):
             going = padded(going)
             state, step, left = state.some(going), step[:, going], left[going]
         _move(squares, state, step, left)
-    _keep(found, state, step, left, np.zeros(len(left), bool), np.ones(len(left), bool))
-    return found
+    return _kept(found, state, step, left, np.zeros(len(left), bool), np.ones(len(left), bool))
 
 
 def residual_counts(squares: Squares, sensors: Sensors) -> Array:
@@ -155,33 +151,37 @@ def _settled(state: _State, left: Array) -> Array:
     return np.asarray(fine | (left <= ROUNDING * reach))
 
 
-def _keep(
-    found: Fits, state: _State, step: Array, left: Array, settled: Array, ended: Array
-) -> None:
-    """Write down the sensors that ended, after their last step if they settled."""
-    if not ended.any():
-        return
-    k = slice(None) if ended.all() else np.flatnonzero(ended)
-    place = state.place[k]
-    found.x[:, place] = np.where(settled, state.x + step, state.x)[:, k]
-    found.cost[place] = np.where(settled, state.here.cost - 0.5 * left, state.here.cost)[k]
-    found.matrix[:, :, place] = state.here.matrix[:, :, k]
-    found.left[place] = left[k]
-    ratio = np.sqrt(left / state.before)
-    found.shrink[place] = np.where(np.isfinite(state.before), ratio, 1.0)[k]
+def _kept(
+    found: Fits | None, state: _State, step: Array, left: Array, settled: Array, ended: Array
+) -> Fits:
+    """What was found, with the sensors that ended, after their last step if they settled.
+
+    The first to end come with all others, whose places are written over when they end.
+    """
+    ratio = np.where(np.isfinite(state.before), np.sqrt(left / state.before), 1.0)
+    now = Fits(
+        np.where(settled, state.x + step, state.x),
+        np.where(settled, state.here.cost - 0.5 * left, state.here.cost),
+        state.here.matrix,
+        left,
+        ratio,
+    )
+    if found is None:
+        return now
+    k = np.flatnonzero(ended)
+    for part, own in zip(found, now.some(k), strict=True):
+        part[..., state.place[k]] = own
+    return found
 
 
 def _steps(state: _State) -> tuple[Array, Array]:
     """Damped step (n, W) within the bounds, and its squared length in residuals (W,)."""
-    scale = lengths(state.here.matrix)
-    matrix = state.here.matrix / scale
-    matrix /= scale[:, None]
-    for i in range(len(scale)):
-        matrix[i, i] = (matrix[i, i] > 0) + state.damping  # a column that is nil stays out
-    slope = state.here.gradient / scale
-    factor = cholesky(matrix)
-    half = forward(factor, -slope)
-    step = backward(factor, half) / scale
+    n = len(state.x)
+    diagonal = np.einsum("iis->is", state.here.matrix)
+    ridge = state.damping * np.where(diagonal > 0, diagonal, 1.0)  # a nil column stays out
+    factor = cholesky(state.here.rows, ridge)
+    half = factor[n]
+    step = -backward(factor[:n], half)
     left = dot(half, half)
     target = state.x + step
     out = (target < state.bounds.lower) | (target > state.bounds.upper)
@@ -189,37 +189,33 @@ def _steps(state: _State) -> tuple[Array, Array]:
     if over.size:
         k = padded(over)
         part = _held_back(
-            matrix[:, :, k], slope[:, k], scale[:, k], state.x[:, k], state.bounds.some(k)
+            state.here.rows[:, :, k], ridge[:, k], state.x[:, k], state.bounds.some(k)
         )
         step[:, over], left[over] = (p[..., : over.size] for p in part)
     return step, left
 
 
-def _held_back(
-    matrix: Array, slope: Array, scale: Array, x: Array, bounds: Bounds
-) -> tuple[Array, Array]:
+def _held_back(rows: Array, ridge: Array, x: Array, bounds: Bounds) -> tuple[Array, Array]:
     """The same where unknowns that would leave their bounds stop there."""
     n = len(x)
-    matrix = np.where(np.tri(n, dtype=bool)[:, :, None], matrix, matrix.transpose(1, 0, 2))
+    matrix, slope = whole(rows[:n]), rows[n]
+    matrix[range(n), range(n)] += ridge
     fixed, held = np.zeros(x.shape, bool), np.zeros(x.shape)
     for _ in range(n):
         free = ~fixed
         own = matrix * (free[:, None] & free[None])
         for i in range(n):
             own[i, i] += fixed[i]
-        pull = np.where(free, -slope - times(matrix, held), held)
         factor = cholesky(own)
-        half = forward(factor, pull)
-        scaled = backward(factor, half)
-        target = x + scaled / scale
-        out = free & ((target < bounds.lower) | (target > bounds.upper))
+        half = forward(factor, np.where(free, -slope - times(matrix, held), held))
+        step = backward(factor, half)
+        out = free & ((x + step < bounds.lower) | (x + step > bounds.upper))
         if not out.any():
             break
-        held = np.where(out, (np.clip(target, bounds.lower, bounds.upper) - x) * scale, held)
+        held = np.where(out, np.clip(x + step, bounds.lower, bounds.upper) - x, held)
         fixed |= out
     left = dot(np.where(fixed, 0.0, half), np.where(fixed, 0.0, half))
-    inside = np.clip(x + scaled / scale, bounds.lower, bounds.upper)
-    return inside - x, left
+    return np.clip(x + step, bounds.lower, bounds.upper) - x, left
 
 
 def _move(squares: Squares, state: _State, step: Array, left: Array) -> None:

@@ -15,7 +15,7 @@ import casadi as ca
 import numpy as np
 
 from casest.batch_fit import Bounds, Fits, Places, minimise, padded, residual_counts
-from casest.batch_linear import cholesky, dot, inverse, lengths, times
+from casest.batch_linear import cholesky, dot, form, inverse, lengths, times, whole
 from casest.batch_sums import Hold, Sensors, SideBySide, Squares
 from casest.batch_verdicts import Code, Flags, Judged
 from casest.declaring.shapes import Array
@@ -83,7 +83,9 @@ class Judge:
         self._independent(found, here, sensors)
         self._shape(found, here, sensors, bounds)
         shift = self._second_order(found, here, sensors, count)
-        found.covariance[:] = here.inverse * (here.sigma**2 / (here.scale * here.scale[:, None]))
+        unit = here.sigma / here.scale
+        np.multiply(here.inverse, unit[:, None], out=found.covariance)
+        found.covariance *= unit
         if shift is not None:
             found.covariance[:] += shift
         found.std[:] = np.sqrt(np.einsum("iis->is", found.covariance))
@@ -91,7 +93,8 @@ class Judge:
 
     def _local(self, fits: Fits, count: Array) -> tuple[Local, Array]:
         scale = lengths(fits.matrix)
-        factor = cholesky(fits.matrix / (scale * scale[:, None]))
+        factor = cholesky(fits.matrix)
+        factor /= scale[:, None]
         freedom = count - len(scale)
         sigma = np.sqrt(2 * fits.cost / np.where(freedom > 0, freedom, np.nan))
         noise = np.maximum(np.where(np.isfinite(sigma), sigma, 0.0), _rounding(fits, count))
@@ -119,15 +122,16 @@ class Judge:
         found.smallest[:] = 1 / np.sqrt(largest)
         # The normal equations square the condition: what is close is looked at on its own.
         close = ~(found.smallest > 10 * PRACTICALLY_NULL)
-        usable = np.isfinite(here.fits.matrix).all(axis=(0, 1))
+        diagonal = np.einsum("iis->is", here.fits.matrix)
+        usable = np.isfinite(diagonal).all(axis=0)  # the other entries are no larger
         k = np.flatnonzero(close & usable)
         if k.size:
-            part = _whole(here.fits.matrix[:, :, k] / (here.scale * here.scale[:, None])[:, :, k])
+            part = whole(here.fits.matrix[:, :, k] / (here.scale * here.scale[:, None])[:, :, k])
             values, vectors = np.linalg.eigh(part.transpose(2, 0, 1))
             found.weakest[:, k] = vectors[:, :, 0].T
             found.smallest[k] = np.sqrt(np.maximum(values[:, 0], 0.0) / values[:, -1])
         # Columns of no length are null whatever the rest is.
-        nil = ~(np.einsum("iis->is", here.fits.matrix) > 0)
+        nil = ~(diagonal > 0)
         for i in np.flatnonzero((nil & usable).any(axis=1)):
             found.weakest[:, nil[i] & usable] = np.eye(len(nil))[:, [i]]
         null = ~(found.smallest >= PRACTICALLY_NULL) | nil.any(axis=0)
@@ -187,7 +191,7 @@ class Judge:
         self, found: Judged, here: Local, sensors: Sensors, bounds: Bounds, k: Places
     ) -> None:
         """Second derivatives, and the cost along every principal direction."""
-        matrix = _whole(here.fits.matrix)
+        matrix = whole(here.fits.matrix)
         bent = matrix + _bend(self.model, here.fits.x, sensors)
         scale = here.scale * here.scale[:, None]
         # Positive definite, and so beyond rounding: curvature of 1e-9 of the Gauss-Newton one.
@@ -212,7 +216,7 @@ class Judge:
     def _profiled(self, here: Local, sensors: Sensors, bounds: Bounds, step: Array) -> Array:
         """Rise of the cost over a parabola's where all but the combination along a step is fitted
         again."""
-        row = times(_whole(here.fits.matrix), step) / (2 * here.noise)
+        row = times(whole(here.fits.matrix), step) / (2 * here.noise)
         target = here.fits.x + step
         tied = sensors._replace(hold=Hold(HOLD * row, target))
         start = np.clip(target, bounds.lower, bounds.upper)
@@ -267,7 +271,8 @@ class Judge:
         for s in self.model.signals:
             own = slice(first, first + s.size)
             first += s.size
-            size = np.sqrt(np.mean(some.samples[own] ** 2, axis=(0, 1)))
+            part = some.samples[own]
+            size = np.sqrt(np.einsum("kps,kps->s", part, part) / (len(part) * len(number)))
             move = 1e-4 * np.where(size > 0, size, 1.0)
             signs = np.where((number >> np.arange(s.size)[:, None]) & 1, -1.0, 1.0)
             up, down = (
@@ -306,8 +311,7 @@ def _walk(here: Local, direction: Array, deviations: float) -> Array:
     """Step (n, W) along a scaled direction after which a parabola has risen by ½(kσ)²."""
     # In scaled unknowns JᵀJ is that of unit columns; its form in the direction gives the length.
     unit = direction / here.scale
-    form = dot(unit, times(_whole(here.fits.matrix), unit))
-    return np.asarray(unit * (deviations * here.noise / np.sqrt(form)))
+    return np.asarray(unit * (deviations * here.noise / np.sqrt(form(here.fits.matrix, unit))))
 
 
 def _parabolic(ratios: Array) -> Flags:
@@ -317,16 +321,10 @@ def _parabolic(ratios: Array) -> Flags:
 def _another(here: Local, other: Fits) -> Flags:
     """Is the other fit a solution elsewhere that the data hardly tell from this one, or better?"""
     step = other.x - here.fits.x
-    away = np.sqrt(dot(step, times(_whole(here.fits.matrix), step))) / here.noise
+    away = np.sqrt(form(here.fits.matrix, step)) / here.noise
     near = other.cost - here.fits.cost < 1.92 * here.noise**2
     lower = other.cost < here.fits.cost - 0.5 * (1e-2 * here.noise) ** 2
     return np.asarray((near & (away > 10)) | lower)
-
-
-def _whole(matrix: Array) -> Array:
-    """Both triangles of matrices of which the lower one is filled."""
-    below = np.tri(len(matrix), dtype=bool)[:, :, None]
-    return np.where(below, matrix, matrix.transpose(1, 0, 2))
 
 
 def _groups(chosen: Flags) -> list[Places]:
@@ -363,9 +361,9 @@ def _bend(model: Model, x: Array, sensors: Sensors) -> Array:
     replay, beside = _bends(model)
     row, column = replay.sparsity[0]
     total = np.zeros((len(x), *x.shape))
-    for _, values in beside.chunks(x, sensors):
-        total[row, column] += np.add.reduce(values, axis=1)
-    return _whole(total)
+    for _, s, values in beside.chunks(x, sensors):
+        total[row, column, s] += np.add.reduce(values, axis=1)
+    return whole(total)
 
 
 @lru_cache(maxsize=64)
@@ -377,6 +375,6 @@ def _dense(replay: Replay, x: Array, sensors: Sensors) -> Array:
     """The first output of every sample, (rows, columns, N, W)."""
     row, column = replay.sparsity[0]
     found = np.zeros((*replay.shapes[0], *sensors.samples.shape[1:]))
-    for span, values in _beside(replay).chunks(x, sensors):
-        found[row, column, span] = values
+    for span, s, values in _beside(replay).chunks(x, sensors):
+        found[row, column, span, s] = values
     return found

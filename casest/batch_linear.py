@@ -12,16 +12,20 @@ import numpy as np
 from casest.declaring.shapes import Array
 
 
-def cholesky(matrix: Array) -> Array:
+def cholesky(matrix: Array, ridge: Array | None = None) -> Array:
     """Lower triangular L with LLᵀ = matrix, of which the lower triangle is read.
 
-    Above its diagonal L holds nothing meant to be read.
+    `ridge` (n, W) is added to the diagonal. A row bᵀ below the matrix becomes (L⁻¹b)ᵀ. Above its
+    diagonal L holds nothing meant to be read.
     """
-    L = matrix.copy()
-    for j in range(len(L)):
-        if j:
-            L[j:, j] -= np.einsum("iks,ks->is", L[j:, :j], L[j, :j])
-        L[j:, j] /= np.sqrt(L[j, j])
+    L = np.empty_like(matrix)
+    for j in range(L.shape[1]):
+        column = L[j:, j]
+        np.einsum("iks,ks->is", L[j:, :j], L[j, :j], out=column)
+        np.subtract(matrix[j:, j], column, out=column)
+        if ridge is not None:
+            column[0] += ridge[j]
+        column /= np.sqrt(column[0])
     return L
 
 
@@ -61,9 +65,21 @@ def inverse(L: Array) -> Array:
     return found
 
 
+def whole(matrix: Array) -> Array:
+    """Both triangles of symmetric matrices of which the lower one is given."""
+    below = np.tri(len(matrix), dtype=bool)[:, :, None]
+    return np.where(below, matrix, matrix.transpose(1, 0, 2))
+
+
 def times(matrix: Array, vector: Array) -> Array:
     """matrix·vector, (n, W)."""
     return np.asarray(np.einsum("ijs,js->is", matrix, vector))
+
+
+def form(matrix: Array, vector: Array) -> Array:
+    """vectorᵀ·matrix·vector, (W,), of a symmetric matrix given by its lower triangle alone."""
+    diagonal = np.einsum("iis->is", matrix)
+    return dot(vector, 2 * times(matrix, vector) - diagonal * vector)
 
 
 def dot(a: Array, b: Array) -> Array:

@@ -46,8 +46,9 @@ def _norm_residual(corrected: Any, scale: Any, norm: float) -> Residual:
     """How far the corrected reading is from its known length, in the unit of the reading."""
     corrected = quantity("corrected", corrected, "[norm]")
     length = norm_2(corrected)
+    # ‖c‖/‖Sᵀc‖ is 1/‖Sᵀn‖ in one division for the three of n = c/‖c‖.
     return Residual(
-        implicit=(length - norm) / norm_2(scale.T @ (corrected / length)),
+        implicit=(length - norm) * (length / norm_2(scale.T @ corrected)),
         unit="[v]",
         corrected=corrected,
         axes=("norm",),
@@ -269,6 +270,26 @@ def closed_form(declared: Model, runs: Sequence[Run]) -> dict[str, Array]:
     return _values(declared, *burkhard_full(z, g))
 
 
+def _columns(z: Array, middle: Array, k: int) -> Array:
+    """Columns of the closed form's equations, k of squares, and their right side, (k + 5, N, S).
+
+    θ = (s11, s22, 2·s12, 2·s13, 2·s23, −2r, d); on the right stays −3w², on a sphere −‖z‖².
+    """
+    X = np.empty((k + 5, *z.shape[1:]))
+    x, y, w = np.subtract(z, middle[:, None], out=X[k : k + 3])
+    X[k + 3] = 1.0
+    if not k:
+        np.einsum("ips,ips->ps", X[:3], X[:3], out=X[-1])
+        return X
+    np.square(w, out=X[-1])
+    for row, own in ((0, x), (1, y)):
+        np.subtract(np.square(own, out=X[row]), X[-1], out=X[row])
+    X[-1] *= 3.0
+    for row, own, other in ((2, x, y), (3, x, w), (4, y, w))[: k - 2]:
+        np.multiply(own, other, out=X[row])
+    return X
+
+
 def closed_form_many(declared: Model, signals: Mapping[str, Array]) -> dict[str, Any]:
     """Burkhard's closed form for many sensors at once: where `calibrate_many` starts.
 
@@ -278,23 +299,17 @@ def closed_form_many(declared: Model, signals: Mapping[str, Array]) -> dict[str,
     mean where that gives no ellipsoid.
     """
     v, g = np.ascontiguousarray(np.transpose(signals["v"], (2, 1, 0))), _length(declared)
-    ball = np.sqrt(np.max(np.sum(v**2, axis=0), axis=0))[:, None]
+    ball = np.sqrt(np.max(np.einsum("ips,ips->ps", v, v), axis=0))[:, None]
     known = _known_scale(declared)
     z = v if known is None else np.einsum("ij,jns->ins", known, v)
     middle = np.mean(z, axis=1)
-    z = z - middle[:, None]
-    size = np.sqrt(np.mean(np.sum(z**2, axis=0), axis=0) / 3)
-    x, y, w = z = z / size
-    squares = [] if known is not None else [x * x - w * w, y * y - w * w]
-    if squares and declared.function.__name__ != "norm_diagonal":
-        squares += [x * y, x * w, y * w]
-    # θ = (s11, s22, 2·s12, 2·s13, 2·s23, −2r, d); on the right stays −3w², on a sphere −‖z‖².
-    right = 3 * w * w if squares else np.sum(z**2, axis=0)
-    X = np.stack([*squares, *z, np.ones_like(x), right])
-    n, k = len(X) - 1, len(squares)
+    k = 0 if known is not None else 2 if declared.function.__name__ == "norm_diagonal" else 5
+    X = _columns(z, middle, k)
+    n = len(X) - 1
     A = np.empty((n, n + 1, v.shape[2]))
     for i in range(n):
-        A[i, i:] = np.einsum("ps,jps->js", X[i], X[i:])
+        np.einsum("ps,jps->js", X[i], X[i:], out=A[i, i:])
+    spread = (A[k, k] + A[k + 1, k + 1] + A[k + 2, k + 2]) / v.shape[1]
     for i in range(n):  # Cholesky, on the upper triangle and the right side
         if i:
             A[i, i:] -= np.einsum("ks,kjs->js", A[:i, i], A[:i, i:])
@@ -320,9 +335,8 @@ def closed_form_many(declared: Model, signals: Mapping[str, Array]) -> dict[str,
     for i in range(3):
         b[i] = (b[i] - np.sum(L[i, :i] * b[:i], axis=0)) / L[i, i]
     good = np.isfinite(b).all(axis=0) & (square > 0)
-    # Readings of unit size in each component lie √3 from their mean.
-    L = np.where(good, L, np.eye(3)[:, :, None]) * (g / np.sqrt(np.where(good, square, 3.0)) / size)
-    offset = (np.where(good, b, 0.0) * size + middle).T
+    L = np.where(good, L, np.eye(3)[:, :, None]) * (g / np.sqrt(np.where(good, square, spread)))
+    offset = (np.where(good, b, 0.0) + middle).T
     if known is not None:
         return {"offset": (offset @ np.linalg.inv(known).T, -ball, ball)}
     scale = np.einsum("iis->si", L) if k == 2 else L.transpose(2, 0, 1)

@@ -186,7 +186,7 @@ def test_a_bad_sensor_is_refused_alone_and_moves_no_digit_of_the_others(start):
 
 
 def test_the_order_of_the_sensors_moves_no_digit():
-    v, _ = line(1200, 9)  # more than are calibrated side by side
+    v, _ = line(5000, 9)  # more than are calibrated side by side
     order = np.random.default_rng(0).permutation(len(v))
     found = calibrate_many(NORM, {"v": v}, start=closed_form_many)
     turned = calibrate_many(NORM, {"v": v[order]}, start=closed_form_many)

@@ -153,9 +153,9 @@ class _Workspace:
         self.length = length
         self._scalars = np.empty(len(plan.once))
         self._scalar = {i: self._scalars[k, ...] for i, k in plan.once.place.items()}
-        self._results = _aligned(len(plan.wanted), length)
-        self._inputs = _aligned(len(plan.inputs), length)
-        self._registers = _aligned(plan.n_registers, length)
+        self._results = aligned(len(plan.wanted), length)
+        self._inputs = aligned(len(plan.inputs), length)
+        self._registers = aligned(plan.n_registers, length)
         self._bound: dict[int, list[tuple[Kernel, tuple[Floats, ...]]]] = {}
 
     def set_parameters(self, parameters: Floats) -> None:
@@ -199,15 +199,15 @@ def _run(calls: list[tuple[Kernel, tuple[Floats, ...]]]) -> None:
             kernel(*arguments)
 
 
-def _aligned(rows: int, length: int) -> Floats:
-    """An uninitialised (rows, >= length) array whose rows start on cache lines.
+def aligned(rows: int, length: int) -> Floats:
+    """An uninitialised (rows, length) array whose rows start on cache lines.
 
     An odd number of cache lines per row: rows a power of two apart would fight for the same sets.
     """
     stride = 8 * ((length + 7) // 8 | 1)
     raw = np.empty(rows * stride + 7)
     start = -(raw.ctypes.data // 8) % 8
-    return raw[start : start + rows * stride].reshape(rows, stride)
+    return raw[start : start + rows * stride].reshape(rows, stride)[:, :length]
 
 
 class Replay:
