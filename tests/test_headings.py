@@ -38,6 +38,12 @@ def deviation(y, table=signal("deg"), *, sine=param("deg"), cosine=param("deg"))
 '''
 
 
+def table_of(which):
+    """One of the two columns as a file."""
+    rows = [f"{k},{a},{h}" for k, (a, h) in enumerate(zip(TABLE, HEADINGS[which], strict=True))]
+    return "\n".join(["pose,table [deg],heading [deg]", *rows, ""])
+
+
 @pytest.fixture
 def headings(tmp_path, monkeypatch):
     """Run a command on one of the two columns; its result."""
@@ -45,9 +51,7 @@ def headings(tmp_path, monkeypatch):
     (tmp_path / "compass.py").write_text(COMPASS, encoding="utf-8")
 
     def call(command, which, *more):
-        rows = [f"{k},{a},{h}" for k, (a, h) in enumerate(zip(TABLE, HEADINGS[which], strict=True))]
-        text = "\n".join(["pose,table [deg],heading [deg]", *rows, ""])
-        (tmp_path / "headings.csv").write_text(text, encoding="utf-8")
+        (tmp_path / "headings.csv").write_text(table_of(which), encoding="utf-8")
         assert run([command, "compass.py", "headings.csv", *more, "-o", "out"]) == 0
         return json.loads((tmp_path / "out" / "result.json").read_text(encoding="utf-8"))
 
