@@ -117,7 +117,7 @@ RECORDS = (
         COUNTS,
         "mpu6050-tomisuarez/imu_static_test.csv",
         ("--columns", "v=gx,gy,gz", "--unit", "v=count", "--rate", "100"),
-        "A narrow line and a drift, 0.2 % of the rms: real, and of no "
+        "A narrow line and a slow change, 0.2 % of the rms: real, and of no "
         "use to anybody who corrects readings.",
     ),
     Record(
