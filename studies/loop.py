@@ -369,12 +369,10 @@ def _against_oracle(
     told: dict[str, Any] = {"noncentrality": 2 * least.cost / world.sigma**2}
     oracle = oracle_of(model, world, task.effects)
     problem = Problem(oracle, prepared(oracle, runs))
-    fit = trust_region(
-        problem, problem.point({**closing.before.values, **world.truth}), tolerance=1e-9
-    )
-    values = problem.values(fit.point)
+    point = _nearest(problem, problem.point({**closing.before.values, **world.truth}))
+    values = problem.values(point)
     told["oracle"] = rms(cross_fitted(oracle, problem.runs, values, closing.folds))
-    seen = _seen(problem, fit.point, tuple(world.truth)) / world.sigma
+    seen = _seen(problem, point, tuple(world.truth)) / world.sigma
     told["truths"] = len(seen)
     for name, found in (
         ("error_before", closing.before.values),
@@ -387,6 +385,27 @@ def _against_oracle(
     return told
 
 
+def _nearest(problem: Problem, start: Any) -> Any:
+    """The optimum; where it is a valley, the place in it that is next to the start, the truth."""
+    point = trust_region(problem, start, tolerance=1e-9).point
+    matrix, scale = _scaled(problem.normal(point).matrix)
+    if np.linalg.eigvalsh(matrix)[0] > NULL:
+        return point
+    point = start
+    for _ in range(20):
+        normal = problem.normal(point)
+        matrix, scale = _scaled(normal.matrix)
+        step = np.linalg.pinv(matrix, rcond=NULL, hermitian=True) @ (normal.gradient / scale)
+        point = problem.moved(point, -step / scale)
+    return point
+
+
+def _scaled(matrix: Any) -> tuple[Any, Any]:
+    """With ones on the diagonal; by what it was divided."""
+    scale = np.sqrt(np.where(np.diag(matrix) > 0, np.diag(matrix), 1.0))
+    return matrix / np.outer(scale, scale), scale
+
+
 def _only(values: Mapping[str, Any], world: worlds.World) -> dict[str, Any]:
     return {name: values[name] for name in world.truth}
 
@@ -397,9 +416,7 @@ def _seen(problem: Problem, point: Any, names: tuple[str, ...]) -> Any:
     Whatever the other unknowns are: the root of the Schur complement of JᵀJ. What the oracle's
     data cannot determine either (a lever arm along the radius is a change of gain) has no row.
     """
-    matrix = problem.normal(point).matrix
-    scale = np.sqrt(np.where(np.diag(matrix) > 0, np.diag(matrix), 1.0))
-    matrix = matrix / np.outer(scale, scale)
+    matrix, scale = _scaled(problem.normal(point).matrix)
     own = np.zeros(len(matrix), dtype=bool)
     for slot in problem.slots:
         own[slot.x] = slot.parameter.name in names
@@ -407,7 +424,7 @@ def _seen(problem: Problem, point: Any, names: tuple[str, ...]) -> Any:
     others = np.linalg.pinv(matrix[np.ix_(~own, ~own)], rcond=NULL, hermitian=True)
     size, way = np.linalg.eigh(matrix[np.ix_(own, own)] - across @ others @ across.T)
     rows = np.zeros((int(np.sum(size > NULL)), len(matrix)))
-    rows[:, own] = (np.sqrt(size) * way).T[size > NULL] * scale[own]
+    rows[:, own] = (np.sqrt(np.maximum(size, 0)) * way).T[size > NULL] * scale[own]
     return rows
 
 
