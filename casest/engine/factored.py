@@ -12,14 +12,13 @@ for an atom may be infinite where an entry is not.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
 from math import sqrt
 
 import numpy as np
 
 from casest.engine.graph import Graph
 from casest.engine.operations import Floats
-from casest.engine.replay import Columns, Plan, Replay, Samples
+from casest.engine.replay import Columns, Plan, Replay, Samples, once
 from casest.engine.spreading import SUMS, Spreading
 
 #: Samples from which on this way is looked for: finding it takes as long as it then saves in a few
@@ -49,7 +48,7 @@ def factored_sums(replay: Replay, parameters: Floats, samples: Samples) -> Float
     return None if found is None else found.sums(*replay.check(parameters, samples))
 
 
-@lru_cache(maxsize=256)
+@once
 def factored(replay: Replay) -> Factored | None:
     """The way that takes least work; None if that is no less than entry by entry."""
     graph, (residual, jacobian) = replay.graph, replay.graph.outputs[:2]

@@ -9,7 +9,6 @@ are not an error: they appear in the results. A weight of zero does not hide the
 from __future__ import annotations
 
 from collections.abc import Iterator
-from functools import lru_cache
 from typing import NamedTuple, cast
 
 import numpy as np
@@ -18,7 +17,7 @@ from numpy.typing import NDArray
 from casest.engine.factored import factored_sums
 from casest.engine.kernel import Kernel, kernel_for, kernel_of_sum
 from casest.engine.operations import Floats
-from casest.engine.replay import BLOCK, Entry, Replay, Samples
+from casest.engine.replay import BLOCK, Entry, Replay, Samples, once
 from casest.errors import CasestError
 
 _RESIDUAL = 0  # which output
@@ -146,7 +145,7 @@ def _compiled_sums(
     return cast(Floats, whole)
 
 
-@lru_cache(maxsize=256)
+@once
 def _places(replay: Replay) -> NDArray[np.intp]:
     """Where in [J r]ᵀ[J r], row by row, each product of the compiled kernel belongs."""
     n, places = replay.shapes[_JACOBIAN][1], []
@@ -244,7 +243,7 @@ def _weighted_blocks(
         yield values, None if weights is None else weights[span]
 
 
-@lru_cache(maxsize=256)
+@once
 def _entries(replay: Replay) -> list[tuple[int, int]]:
     """All entries of J and r, those of one component side by side: BLAS then needs no copy."""
     row, _ = replay.sparsity[_JACOBIAN]
@@ -255,7 +254,7 @@ def _entries(replay: Replay) -> list[tuple[int, int]]:
     return entries
 
 
-@lru_cache(maxsize=256)
+@once
 def _components(replay: Replay) -> list[_Component]:
     m = _count_residuals(replay)
     if len(replay.shapes) < 2 or replay.shapes[_JACOBIAN][0] != m:

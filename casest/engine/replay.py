@@ -11,8 +11,9 @@ The way down: `Replay` (what users hold) > `Plan` (which values to compute, and 
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
-from typing import Any
+from collections.abc import Callable, Collection, Iterator, Sequence
+from functools import wraps
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,7 @@ from casest.engine.operations import KERNELS, Floats, Kernel
 from casest.engine.scalars import Scalars
 from casest.errors import CasestError
 
+T = TypeVar("T")
 Entry = tuple[int, int]  # (output, index of the nonzero in CasADi's column-major order)
 
 BLOCK = 9216  # samples per block: long enough to hide the cost of NumPy's calls
@@ -210,6 +212,22 @@ def aligned(rows: int, length: int) -> Floats:
     return raw[start : start + rows * stride].reshape(rows, stride)[:, :length]
 
 
+def once(make: Callable[[Replay], T]) -> Callable[[Replay], T]:
+    """Make something of a replay once and keep it there: it goes when the replay goes.
+
+    A cache beside it would keep replays alive, and their blocks of samples with them.
+    """
+
+    @wraps(make)
+    def kept(replay: Replay) -> T:
+        if make not in replay.made:
+            replay.made[make] = make(replay)
+        found: T = replay.made[make]
+        return found
+
+    return kept
+
+
 class Replay:
     """A CasADi SX function of (parameters, sample), evaluated over all samples of a record.
 
@@ -242,6 +260,8 @@ class Replay:
         self._plans: dict[tuple[Entry, ...], Plan] = {}
         #: Compiled forms, by output (−1: least-squares sums); None where compiling failed.
         self.kernels: dict[int, Any] = {}
+        #: What else was made of it once; see `once`.
+        self.made: dict[Any, Any] = {}
 
     def plan(self, wanted: Sequence[Entry]) -> Plan:
         """How to compute the (output, nonzero) entries `wanted`, in that order; made once."""
