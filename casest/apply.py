@@ -30,6 +30,9 @@ from casest.modelling.tracing import (
 #: What is said of effects that a correction leaves in the readings.
 LEFT = "not undone, which would amplify the noise without bound: "
 
+#: What is said of effects that follow the time of the record they were found in.
+TIMED = "found at the times of the fitted record, and a guess for any other: "
+
 #: Newton steps, each halved up to HALVINGS times until it gains.
 STEPS, HALVINGS = 60, 30
 
@@ -44,6 +47,16 @@ def invertible(model: Model) -> tuple[Model, tuple[str, ...]]:
     left = [a for a in model.effects if a.kind == "sequence" or _acts_on_a_rate(model, a)]
     kept = tuple(a for a in model.effects if a not in left)
     return replace(model, effects=kept), tuple(a.label for a in left)
+
+
+def of_their_time(model: Model) -> tuple[str, ...]:
+    """Effects of an invertible model that follow the time of the record they were found in.
+
+    A drift, a step, a line in the spectrum: they say nothing of another record.
+    """
+    if model.traced.corrected is None or "t" not in {s.name for s in Correction(model).signals}:
+        return ()
+    return tuple(a.label for a in model.effects if "t" in {s.name for s in a.effect.extras})
 
 
 def _acts_on_a_rate(model: Model, attached: Attached) -> bool:

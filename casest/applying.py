@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from casest.apply import Correction, invertible
+from casest.apply import Correction, invertible, of_their_time
 from casest.closing.restrict import axis_name, restricted
 from casest.data import load_runs
 from casest.data.run import Run
@@ -125,6 +125,14 @@ def corrected_csv(
     given, unit = correction.signals, result.get("units", {}).get(correction.name)
     found = [correction(run, needed, around) for run in runs]
     return table_of(runs, [s.name for s in given], found, correction.name, unit), left
+
+
+def of_another_time(path: Path, data: str | None = None) -> tuple[str, ...]:
+    """Effects that follow the time of the fitted record, unless it is that record again."""
+    result = load_result(path)
+    if data is not None and Path(data).resolve() in {Path(d).resolve() for d in result["data"]}:
+        return ()
+    return of_their_time(invertible(saved_model(result)[0])[0])
 
 
 def without(spare: Iterable[str], arguments: Mapping[str, Any]) -> dict[str, Any]:

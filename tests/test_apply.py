@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import simulators as sim
@@ -22,6 +24,7 @@ from casest import (
     signal,
 )
 from casest.apply import Correction
+from casest.cli import run
 from casest.effects import CATALOGUE
 from casest.problem import find_model
 
@@ -154,6 +157,29 @@ def test_an_effect_on_the_sequence_is_not_undone_in_silence():
 
     with pytest.raises(UsageError, match="effect on the sequence of samples"):
         Correction(load_cell.with_effect(low_pass))
+
+
+def test_what_follows_the_time_of_the_fitted_record_is_said_for_another_one(tmp_path, capsys):
+    """A drift belongs to its record; the same file again is corrected without a word."""
+    rng = np.random.default_rng(3)
+    for name in ("first", "other"):
+        t, mass = np.arange(200) / 10, rng.uniform(0, 5, 200)
+        reading = 0.5 + 0.1 * 9.81 * mass + 0.02 * t + 0.003 * rng.standard_normal(200)
+        table = np.column_stack([t, mass, np.full(200, 20.0), reading])
+        head = "t [s],mass [kg],temperature [degC],output [mV]"
+        np.savetxt(tmp_path / f"{name}.csv", table, delimiter=",", header=head, comments="")
+    cell, out = str(Path(__file__).parent / "models" / "load_cell.py:load_cell"), tmp_path / "out"
+    first, other = (str(tmp_path / f"{name}.csv") for name in ("first", "other"))
+    assert run(["close", cell, first, "-o", str(out)]) == 0
+    said = {}
+    for name in (first, other):
+        capsys.readouterr()
+        assert run(["apply", str(out), name, "-o", str(tmp_path / "c.csv")]) == 0
+        said[name] = capsys.readouterr().err
+    assert "a guess for any other: bias_drift" in said[other]
+    assert "a guess" not in said[first]
+    assert run(["export", str(out), "--to", "c", "-o", str(tmp_path / "c.c")]) == 0
+    assert "a guess for any other: bias_drift" in capsys.readouterr().err
 
 
 def test_an_effect_on_an_implicit_models_corrected_quantity_is_in_the_correction():

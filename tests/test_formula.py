@@ -206,12 +206,16 @@ def test_effects_of_the_users_own_that_cannot_be_used_are_named(bench, tmp_path,
     for name, (arguments, value, _) in BAD.items():
         text += f"\n\n@effect(on='reading')\ndef {name}({arguments}):\n"
         text += f"    '''Bad.'''\n    return {value}\n"
+    text += "\n\n@effect(on='reading', kind='sequence')\n"
+    text += "def lag(value, previous, dt, *, tau=param('s')):\n    '''Late.'''\n"
+    text += "    return previous + (value - previous) * dt / (dt + tau)\n"
     (tmp_path / "bad.py").write_text(text, encoding="utf-8")
     code, result = closed("--effects", "bad.py")
     assert code == 0
     reasons = {s["name"]: s["reason"] for s in result["not_tried"]}
     for name, (_, _, words) in BAD.items():
         assert words in reasons[name]
+    assert "it acts on the sequence of samples" in reasons["lag"]
     printed = capsys.readouterr().out
     assert all(f"{name} was not tried" in printed for name in BAD)
     assert [e["name"] for e in result["effects"]] == ["formula"]

@@ -171,4 +171,6 @@ def test_a_cause_too_small_to_be_told_from_others_is_not_added():
     assert closing.after is closing.before
     content = closing_result(closing, model_name="wheel", data=["wheel.csv"])
     assert content["unexplained"]["one_of"] == list(closing.undecided.names)
-    assert sentence(content) == "unexplained: a small misfit that several causes explain alike"
+    assert sentence(content) == (
+        "unexplained: a small misfit remains that several causes explain alike"
+    )

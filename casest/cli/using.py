@@ -45,18 +45,22 @@ from casest.errors import UsageError
 def apply(result_path: Path, data: str, **options: Any) -> None:
     """Correct the readings in DATA with a saved RESULT (result.json, or its folder)."""
     from casest import applying, exporting
-    from casest.apply import LEFT
+    from casest.apply import LEFT, TIMED
     from casest.following import following
 
     arguments = reading_arguments(options)
     progress(f"correcting {data}")
+    timed: tuple[str, ...] = ()
     if exporting.is_exported(result_path):
         text, left = exporting.applied(result_path, data, arguments)
     else:
         text, left = applying.corrected_csv(result_path, data, arguments, force=options["force"])
+        timed = applying.of_another_time(result_path, data)
     waiting.done()
     if left:
         echo(f"casest: {LEFT}{', '.join(left)}", err=True)
+    if timed:
+        echo(f"casest: {TIMED}{', '.join(timed)}", err=True)
     if path := applying.write_or_print(text, options["output"]):
         echo(f"Written: {path}")
         echo(f"\n{following(typed(), file=path)}")
@@ -218,7 +222,8 @@ def completion(shell: str) -> None:
 @click.option("--force", is_flag=True, help="Export a result that was refused.")
 def export(result_path: Path, to: Any, output: Path | None, **options: Any) -> None:
     """The correction of a saved RESULT, ready to run on the device."""
-    from casest import exporting
+    from casest import applying, exporting
+    from casest.apply import TIMED
     from casest.following import following
     from casest.result import made_by
 
@@ -226,6 +231,8 @@ def export(result_path: Path, to: Any, output: Path | None, **options: Any) -> N
         raise UsageError("--float is for --to c")
     progress(f"exporting {result_path}")
     text = exporting.exported(result_path, to, **options)
+    if timed := applying.of_another_time(result_path):
+        echo(f"casest: {TIMED}{', '.join(timed)}", err=True)
     if output is None:
         echo(text, nl=False)
         return

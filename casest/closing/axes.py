@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from itertools import combinations
 from typing import Any
 
@@ -93,16 +94,7 @@ def narrowed(
 
 def lighter(problem: Problem, point: Point, own: Sequence[Parameter], noise: float) -> Ways:
     """What some axes of an effect less would save and cost: unknowns, and squares in σ² (Wald)."""
-    axes: dict[str, list[int]] = {}
-    for slot in problem.slots:
-        p = slot.parameter
-        if p.name not in {q.name for q in own}:
-            continue
-        if axes_of([p]):
-            for i in range(p.shape.size):
-                axes.setdefault(axis_name(i, p.shape.size), []).append(slot.x.start + i)
-        elif "_" in p.name.rpartition(".")[2] and not p.shape.dims:  # on one axis already
-            axes.setdefault(p.name.rpartition("_")[2], []).append(slot.x.start)
+    axes = _unknowns_by_axis(problem, own)
     if len(axes) < 2:
         return ()
     matrix = problem.normal(point).matrix
@@ -119,3 +111,38 @@ def lighter(problem: Problem, point: Point, own: Sequence[Parameter], noise: flo
             )
             ways.append((len(k), float(x @ np.linalg.pinv(own_part, hermitian=True) @ x)))
     return tuple(ways)
+
+
+def without_dead(score: Score, problem: Problem, point: Point, own: Sequence[Parameter]) -> Score:
+    """The score without the axes on which the fitted effect changes nothing.
+
+    A limit that was looked for on all axes may end where only some of them reach it.
+    """
+    axes = _unknowns_by_axis(problem, own)
+    slopes = np.diag(problem.normal(point).matrix)
+    dead = [name for name, unknowns in axes.items() if not np.any(slopes[unknowns])]
+    size = axes_of(score.candidate.parameters(score.candidate.added_to(_bare(problem.model))))
+    if not dead or len(dead) == len(axes) or not size:
+        return score
+    survives = score.survives.reshape(-1, size).copy()
+    survives[:, [k for k in range(size) if axis_name(k, size) in dead]] = 0.0
+    return replace(score, survives=survives.ravel())
+
+
+def _bare(model: Model) -> Model:
+    return replace(model, effects=model.effects[:-1])
+
+
+def _unknowns_by_axis(problem: Problem, own: Sequence[Parameter]) -> dict[str, list[int]]:
+    """Which unknowns of an effect belong to each axis, by its name."""
+    axes: dict[str, list[int]] = {}
+    for slot in problem.slots:
+        p = slot.parameter
+        if p.name not in {q.name for q in own}:
+            continue
+        if axes_of([p]):
+            for i in range(p.shape.size):
+                axes.setdefault(axis_name(i, p.shape.size), []).append(slot.x.start + i)
+        elif "_" in p.name.rpartition(".")[2] and not p.shape.dims:  # on one axis already
+            axes.setdefault(p.name.rpartition("_")[2], []).append(slot.x.start)
+    return axes

@@ -229,6 +229,11 @@ def _tried(candidate: Candidate, model: Model, runs: Sequence[Run]) -> Candidate
     """The candidate on the model. Raises where it does not apply here."""
     if any(a.label == candidate.label for a in model.effects):
         raise UsageError("already in the model")
+    if candidate.effect is not None and candidate.effect.kind == "sequence":
+        raise UsageError(
+            "it acts on the sequence of samples, and has no slope for each of them to be found by; "
+            "`calibrate --effects` fits it"
+        )
     candidate = candidate.on_model(model)
     effect, extended = candidate.effect, candidate.added_to(model)
     for s in extended.signals:

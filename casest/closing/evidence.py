@@ -20,6 +20,8 @@ ALIKE = 2.0
 #: Differences of evidence that are not worth more than a bare mention, and not strong (Kass &
 #: Raftery 1995).
 BARE_MENTION, STRONG = 2.0, 6.0
+#: Share of the mean square that is no matter.
+NEXT_TO_NOTHING = 0.005
 
 
 @dataclass(frozen=True)
@@ -105,9 +107,13 @@ def gentlest_first(
     """Of those that are as good as the best, first the one that moves the parameters least.
 
     Where two causes explain the same, the smaller correction does the smaller harm if it is the
-    wrong one.
+    wrong one. As good: in evidence and in error.
     """
-    leaders = sorted(as_good(tried, folds, BARE_MENTION), key=lambda pair: pair[1].moved)
+    if not tried:
+        return []
+    matter = NEXT_TO_NOTHING * sum(r.size for r in tried[0][1].residuals)
+    near = as_good(tried, folds, min(BARE_MENTION, matter))
+    leaders = sorted(near, key=lambda pair: pair[1].moved)
     led = {id(fitted) for _, fitted in leaders}
     return leaders + [pair for pair in tried if id(pair[1]) not in led]
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from casest.closing.axes import narrowed, significant_axes
+from casest.closing.axes import narrowed, significant_axes, without_dead
 from casest.closing.candidates import Candidate
-from casest.closing.contest import whole
+from casest.closing.contest import joined, whole
 from casest.closing.crossfit import undetermined
 from casest.closing.evidence import Fitted
 from casest.closing.held import held_value
@@ -26,7 +26,14 @@ def accepted(
     if crossed is None or not work.confirmed(current, crossed):
         work.refuse(score.candidate, "too small to matter here: held-out data do not confirm it")
         return None
-    why = undetermined(Problem(crossed.model, work.runs), crossed.values)
+    problem = Problem(crossed.model, work.runs)
+    why = undetermined(problem, crossed.values)
+    if why:
+        own = whole(work, score, current.model).parameters(crossed.model)
+        less = without_dead(score, problem, problem.point(crossed.values), own)
+        again = None if less is score else joined(work, current, less)
+        if again is not None:
+            return accepted(work, current, less, again)
     estimate = None if why else work.certified(crossed)
     if estimate is not None and not estimate.certificate.trusted:
         why = estimate.certificate.reasons[0]

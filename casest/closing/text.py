@@ -53,10 +53,10 @@ def sentence(content: Mapping[str, Any]) -> str:
     if content["verdict"] == "extended":
         verb = "was" if len(names) == 1 else "were"
         return f"extended: {', '.join(names)} {verb} missing; what is left is noise"
-    found = f" beside {', '.join(names)}" if names else ""
+    found = f"beside {', '.join(names)} " if names else ""
     if content["unexplained"]["one_of"]:
-        return f"unexplained: a small misfit{found} that several causes explain alike"
-    return f"unexplained: a misfit remains{found} that no candidate explains"
+        return f"unexplained: {found}a small misfit remains that several causes explain alike"
+    return f"unexplained: {found}a misfit remains that no candidate explains"
 
 
 def _head(closing: Closing, content: Mapping[str, Any]) -> str:
@@ -92,16 +92,24 @@ def _effects(content: Mapping[str, Any]) -> Iterator[str]:
         if e["indistinguishable_from"]:
             also = f" (less likely: {', '.join(e['less_likely'])})" if e["less_likely"] else ""
             yield item(f"not told apart from {', '.join(e['indistinguishable_from'])}{also}")
-            yield from (item(words) for words in e["would_separate"][:SHOWN])
-            yield from (item(words) for words in instead(e["instead_would_move"]))
+            yield from (item(f"to tell it from {w}") for w in e["would_separate"][:SHOWN])
+            yield from (item(words) for words in instead(e, content))
 
 
-def instead(moves: Mapping[str, Mapping[str, float]]) -> Iterator[str]:
+def instead(effect: Mapping[str, Any], content: Mapping[str, Any]) -> Iterator[str]:
     """What hangs on which of the causes it is."""
-    for label, shifts in moves.items():
-        if shifts:
-            words = ", ".join(f"{name} by {size:.2g}" for name, size in shifts.items())
-            yield f"were it {label} instead, the parameters would move: {words}"
+    parameters = content["after"]["parameters"]
+    for label, shifts in effect["instead_would_move"].items():
+        words = [
+            f"{name} by {size:.2g} {_first(parameters[name]['unit'])}".removesuffix(" 1").rstrip()
+            for name, size in shifts.items()
+        ]
+        if words:
+            yield f"were it {label} instead, the parameters would move: {', '.join(words)}"
+
+
+def _first(unit: Any) -> str:
+    return _first(unit[0]) if isinstance(unit, list) else str(unit)
 
 
 def _moved(content: Mapping[str, Any]) -> Iterator[str]:

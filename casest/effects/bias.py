@@ -11,7 +11,7 @@ from casest.modelling.effect import effect
 @effect(
     on="output",
     typical={"k": 1e-4},
-    shown_by="the first pose repeated at the end of the record",
+    shown_by="the first pose repeated at the end of the record, at the temperature of its start",
     formula="y + k·t",
 )
 def bias_drift(y: SX, t: SX = signal("s"), *, k: SX = param(each, "[y]/s")) -> SX:

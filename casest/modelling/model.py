@@ -209,10 +209,10 @@ class Model:
         check_null(attached, self._target_shape(target), shapes)
         made = replace(self, effects=(*self.effects, attached))
         if attached.kind in ("quantity", "signal") and not _reaches_residual(made, attached):
-            raise UsageError(
-                f"effect {label} is not applicable to model {self.name}: "
-                f"its residual does not depend on {target}"
-            )
+            why = f"its residual does not depend on {target}"
+            if target in self.quantities and "t" in {s.name for s in added.extras}:
+                why = f"how fast {target} changes is unknown: it is not declared as a function of t"
+            raise UsageError(f"effect {label} is not applicable to model {self.name}: {why}")
         return made
 
     def _attached(

@@ -118,7 +118,7 @@ def _error_rows(story: Story, content: Mapping[str, Any]) -> Iterator[tuple[str,
 
 def _effects(closing: Closing, story: Story, content: Mapping[str, Any]) -> str:
     docs = {f.candidate.name: getattr(f.candidate.effect, "doc", "") for f in closing.effects}
-    said = [_effect(e, docs.get(e["name"], ""), story) for e in content["effects"]]
+    said = [_effect(e, docs.get(e["name"], ""), story, content) for e in content["effects"]]
     if not said and content["verdict"] is None:
         said = [paragraph("None was tried: there is nothing to judge it by.")]
     elif not said and content["unexplained"]["one_of"]:
@@ -147,7 +147,7 @@ def _effects(closing: Closing, story: Story, content: Mapping[str, Any]) -> str:
     return section("effects", "Effects found", *said)
 
 
-def _effect(e: Mapping[str, Any], doc: str, story: Story) -> str:
+def _effect(e: Mapping[str, Any], doc: str, story: Story, content: Mapping[str, Any]) -> str:
     column = f", of column {e['column']}" if e["column"] else ""
     gain = e["holdout_gain"]
     rows = [
@@ -169,9 +169,7 @@ def _effect(e: Mapping[str, Any], doc: str, story: Story) -> str:
         more = f", nor, though they are less likely, from {more}" if more else ""
         evidence.append(f"These data do not tell it apart from {names}{more}.")
         evidence += [f"To tell them apart, {words}." for words in e["would_separate"]]
-        evidence += [
-            f"{words[0].upper()}{words[1:]}." for words in instead(e["instead_would_move"])
-        ]
+        evidence += [f"{words[0].upper()}{words[1:]}." for words in instead(e, content)]
     else:
         evidence.append("No other candidate explains the held-out data as well.")
     return "".join(
