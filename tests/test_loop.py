@@ -171,6 +171,42 @@ def test_a_cause_too_small_to_be_told_from_others_is_not_added():
     assert closing.after is closing.before
     content = closing_result(closing, model_name="wheel", data=["wheel.csv"])
     assert content["unexplained"]["one_of"] == list(closing.undecided.names)
-    assert sentence(content) == (
-        "unexplained: a small misfit remains that several causes explain alike"
-    )
+    assert sentence(content) == ("unexplained: a misfit remains that several causes explain alike")
+
+
+def test_a_slow_course_that_a_random_walk_explains_too_is_not_called_nothing():
+    rng = np.random.default_rng(0)
+    t = np.arange(6000) / 10
+    v = 0.3 + 0.02 * rng.standard_normal((6000, 3))
+    v[:, 0] += 0.007 * (t / t[-1] - 0.5)
+    closing = close(constant_bias, [Run.raw("r", {"v": v}, units={"v": "m/s^2"}, time=t)])
+    assert labels(closing) == []
+    assert {"bias_drift", "bias_wander"} <= set(closing.undecided.names)
+    assert closing.verdict == "unexplained"
+
+
+@c.model
+def pressure_cell(
+    p=c.signal("kPa"),
+    out=c.signal("mV"),
+    *,
+    zero=c.param("mV"),
+    gain=c.param("mV/kPa", start=1.0),
+):
+    inside = c.quantity("pressure", p, "kPa")
+    reading = c.quantity("reading", zero + gain * inside, "mV")
+    return c.Residual(measured=out, predicted=reading, corrected=inside)
+
+
+def test_a_course_too_small_to_have_a_shape_is_no_formula():
+    """Half of a percent of the variance: cubes, sines and exponentials fit alike."""
+    rng = np.random.default_rng(0)
+    p = rng.uniform(5, 95, (6000, 1))
+    x = (p - 50) / 45
+    out = 1 + 0.85 * p + 0.02 * rng.standard_normal((6000, 1)) + 0.0093 * (x**3 - 0.6 * x)
+    units = {"p": "kPa", "out": "mV"}
+    closing = close(pressure_cell, [Run.raw("r", {"p": p, "out": out}, units=units)])
+    assert labels(closing) == []
+    assert closing.undecided.names == ("formula",)
+    assert closing.verdict == "unexplained"
+    assert 0.001 < closing.misfit.fraction < 0.01

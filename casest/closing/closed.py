@@ -76,7 +76,9 @@ class Closing:
         left = misfit(self)
         if self.undecided is None:
             return left
-        where = f"which {' or '.join(self.undecided.names)} explain alike"
+        names = self.undecided.names
+        several = " and other shapes" if len(names) == 1 else ""
+        where = f"which {' or '.join(names)}{several} explain alike"
         fraction = max(left.fraction, self.undecided.share)
         return replace(left, significant=True, fraction=fraction, where=where)
 

@@ -20,6 +20,8 @@ ALIKE = 2.0
 #: Differences of evidence that are not worth more than a bare mention, and not strong (Kass &
 #: Raftery 1995).
 BARE_MENTION, STRONG = 2.0, 6.0
+#: Share of the held-out mean square below which a cause must be the only one that it can be.
+SMALL = 0.01
 #: Share of the mean square that is no matter.
 NEXT_TO_NOTHING = 0.005
 

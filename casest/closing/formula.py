@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 
 from casest.closing.adequacy import State, independent, state_of
 from casest.closing.candidates import Candidate, placed_in, usable_columns
-from casest.closing.closed import Found
+from casest.closing.closed import Found, Undecided
 from casest.closing.contest import joined
 from casest.closing.dependence import slow_shapes
-from casest.closing.evidence import Fitted
+from casest.closing.evidence import SMALL, Fitted
 from casest.closing.gate import accepted
 from casest.closing.noise_model import (
     MIDDLE,
@@ -102,6 +102,11 @@ def _kept(
     """The fit with the formula in the place of these effects, if it passes the gate."""
     passed = accepted(work, before, score, fitted)
     if passed is None:
+        return None
+    share = passed[2] / passed[0].noise ** 2
+    if share < SMALL and not replaced and not _terms(before.model):
+        work.refuse(score.candidate, "so small a course may as well have another shape")
+        work.undecided = Undecided((score.candidate.label,), share)
         return None
     work.found = [f for f in work.found if f not in replaced and f.candidate.label != NAME]
     for found in replaced:

@@ -13,6 +13,7 @@ from casest.closing.contest import contenders, whole
 from casest.closing.crossfit import Folds, rms, undetermined
 from casest.closing.evidence import (
     FALSE_ALARM,
+    SMALL,
     STRONG,
     Fitted,
     as_good,
@@ -43,9 +44,8 @@ from casest.stack import Point, Problem
 
 #: Columns of the widest model that is evaluated at once.
 WIDEST = 120
-#: Share of the held-out mean square below which a cause must be the only one that it can be, if
-#: another would move the declared parameters by so many standard deviations.
-SMALL, ELSEWHERE = 0.01, 2.0
+#: Standard deviations by which another cause must move a declared parameter to have it elsewhere.
+ELSEWHERE = 2.0
 #: Rounds at most.
 ROUNDS = 8
 
@@ -96,6 +96,7 @@ def _closed(work: Work) -> Closing:
     ranked: list[Score] = []
     for _ in range(ROUNDS):
         current = _without_outliers(work, current)
+        work.walks.clear()
         ranked = _ranked(work, current)
         first_scores, declared = first_scores or ranked, declared or current
         better = _better(work, current, ranked)
@@ -177,6 +178,7 @@ def _first_accepted(
             break  # What explains the data clearly less well is not the cause.
         if wanders(work.runs, current, fitted, score):
             work.refuse(score.candidate, "an offset that walks at random explains it as well")
+            _note_walk(work, current, score, fitted)
             continue
         passed = accepted(work, current, score, fitted)
         if passed is None:
@@ -192,6 +194,14 @@ def _first_accepted(
         work.keep(*passed, score, _rivals(work, fitted, score, tried))
         return passed[0]
     return None
+
+
+def _note_walk(work: Work, current: Fitted, score: Score, fitted: Fitted) -> None:
+    """Keep in mind what held-out data confirm, though a random walk may be the cause as well."""
+    crossed = work.crossed(fitted)
+    if crossed is not None and work.confirmed(current, crossed):
+        share = work.gain(current, crossed)[0] / crossed.noise**2
+        work.walks.append(Undecided((score.candidate.label,), share))
 
 
 def _hangs_on_which(work: Work, fitted: Fitted, equals: Sequence[tuple[Score, Fitted]]) -> bool:
@@ -269,6 +279,11 @@ def _note_wander(work: Work, current: Fitted) -> None:
     """Say that the offset wanders: a property of the noise, which changes no fit."""
     effect = next((e for e in work.catalogue if e.name == "bias_wander"), None)
     p_value = wander_of(work.runs, current.residuals)
+    if p_value is None and work.walks and work.undecided is None:
+        # It is no noise either, by which the offset would be known to wander.
+        names = [name for walk in work.walks for name in walk.names]
+        share = max(walk.share for walk in work.walks)
+        work.undecided = Undecided((*dict.fromkeys(names), "bias_wander"), share)
     if effect is not None and p_value is not None:
         work.found.append(Found(Candidate(effect), None, p_value, 0.0))
 

@@ -55,7 +55,7 @@ def sentence(content: Mapping[str, Any]) -> str:
         return f"extended: {', '.join(names)} {verb} missing; what is left is noise"
     found = f"beside {', '.join(names)} " if names else ""
     if content["unexplained"]["one_of"]:
-        return f"unexplained: {found}a small misfit remains that several causes explain alike"
+        return f"unexplained: {found}a misfit remains that several causes explain alike"
     return f"unexplained: {found}a misfit remains that no candidate explains"
 
 

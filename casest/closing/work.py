@@ -45,6 +45,8 @@ class Work:
         self.skipped: list[Skipped] = []
         self.found: list[Found] = []
         self.undecided: Undecided | None = None
+        #: What would have been added, were a random walk of the offset not as good a cause.
+        self.walks: list[Undecided] = []
         #: Candidates as they are declared, by label: their profiles unknown, on all axes.
         self.original: dict[str, Candidate] = {}
 
