@@ -38,8 +38,8 @@ from casest import (
 
 Array = NDArray[np.float64]
 
-#: Orientations closer than this (degrees) count as one, and no more than ENOUGH are counted.
-APART, ENOUGH = 15.0, 13
+#: Orientations closer than this (degrees) count as one.
+APART = 15.0
 
 
 def _norm_residual(corrected: Any, scale: Any, norm: float) -> Residual:
@@ -389,13 +389,13 @@ def inside_the_ball(declared: Model, runs: Sequence[Run]) -> dict[str, tuple[Any
     return {"offset": (-radius, radius)}
 
 
-def _orientations(v: Array) -> int:
-    """Orientations further than APART from each other, counted up to ENOUGH."""
+def _orientations(v: Array, enough: int) -> int:
+    """Orientations further than APART from each other, counted up to enough."""
     extent = float(np.ptp(v, axis=0).max())
     if extent < np.radians(APART) * float(np.median(np.linalg.norm(v, axis=1))):
         return 1
     left, count = v[:: max(1, len(v) // 2000)], 0
-    while len(left) and count < ENOUGH:
+    while len(left) and count < enough:
         away = np.linalg.norm(left - left[0], axis=1)
         left, count = left[away > np.radians(APART) * extent / 2], count + 1
     return count
@@ -420,7 +420,8 @@ def remarks(declared: Model, runs: Sequence[Run], values: dict[str, Array]) -> l
             "v=m/s^2 --set 'norm=9.80665 m/s^2'"
         )
     spread = np.linalg.svd(v - v.mean(axis=0), compute_uv=False) / np.sqrt(len(v))
-    poses, unknowns = _orientations(v), sum(p.shape.size for p in declared.parameters)
+    unknowns = sum(p.shape.size for p in declared.parameters)
+    poses = _orientations(v, max(unknowns, 2))
     if poses == 1:
         found.append("the readings never leave one orientation: turn the sensor")
     elif poses < unknowns:

@@ -11,8 +11,10 @@ import simulators as sim
 from scipy import stats
 
 from casest import DataError, NotTrusted, Run, calibrate
+from casest.effects import CATALOGUE
 from casest.estimate import attempt
 from casest.problem import find_model
+from casest_problems.norm import remarks
 
 ESTIMATORS = ("ipopt", "trust-region", "closed-form", "ren-liu", "plain-norm", "bias-only")
 
@@ -305,6 +307,18 @@ def test_six_faces_repeated_are_six_orientations():
     assert "these are 6 different orientations" in said
     assert "norm-diagonal has 6" in said
     assert "orientations" not in remarked("norm-triangular", lambda rng: sim.spread_poses(24, rng))
+
+
+def test_orientations_are_counted_as_far_as_there_are_unknowns():
+    """Effects add unknowns: 45 spread poses are enough for fifteen."""
+    rng = np.random.default_rng(2)
+    v = sim.accelerometer(rng).read(sim.spread_poses(45, rng), 5e-3, rng)
+    bent = model_of("norm-triangular", sim.GRAVITY)
+    for name in ("quadratic", "cubic"):
+        bent = bent.with_effect(next(e for e in CATALOGUE if e.name == name), on="corrected")
+    runs = (Run.raw("simulated", {"v": v}, units={"v": "m/s^2"}),)
+    assert sum(p.shape.coordinates for p in bent.parameters) == 15
+    assert "orientations" not in " ".join(remarks(bent, runs, {}))
 
 
 def test_a_sensor_that_is_never_turned_is_told_so():

@@ -117,7 +117,8 @@ def _moves(
 
 def detectable(closing: Closing) -> list[Detectable]:
     """For every visible candidate parameter the smallest size that would have been found."""
-    model, seen, found = closing.before.model, set(), []
+    model, found = closing.before.model, []
+    seen = {f.candidate.label for f in closing.effects}  # found, at the sizes that they have
     for score in closing.first:
         candidate = score.candidate
         if candidate.label in seen or candidate.trials > 1:

@@ -15,6 +15,8 @@ from casest.terminal import WIDTH, held, item, value_table
 
 #: Lists longer than this are left to result.json.
 SHOWN = 4
+#: Samples that resemble each other from which on noise may as well be a lag or a hysteresis.
+COLOURED = 20
 
 
 def closing_text(closing: Closing, content: Mapping[str, Any], output: Path | None) -> str:
@@ -52,7 +54,9 @@ def sentence(content: Mapping[str, Any]) -> str:
         )
     if content["verdict"] == "extended":
         verb = "was" if len(names) == 1 else "were"
-        return f"extended: {', '.join(names)} {verb} missing; what is left is noise"
+        over = content["noise"].get("correlated_over_samples") or 1
+        left = "noise" if over < COLOURED else f"noise of {over:.0f} samples' memory, or a lag"
+        return f"extended: {', '.join(names)} {verb} missing; what is left is {left}"
     found = f"beside {', '.join(names)} " if names else ""
     if content["unexplained"]["one_of"]:
         return f"unexplained: {found}a misfit remains that several causes explain alike"

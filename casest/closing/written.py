@@ -76,7 +76,12 @@ def closing_result(
     }
     ordered["moved"] = _moved(closing)
     ordered["smallest_detectable"] = [
-        {"name": d.name, "parameter": d.parameter, "size": plain(d.size), "unit": d.unit}
+        {
+            "name": d.name,
+            "parameter": d.parameter,
+            "size": plain(d.size),
+            "unit": resolved(d.unit, common["units"]),
+        }
         for d in detectable(closing)
     ]
     ordered["refused"] = [{"name": s.name, "reason": s.reason} for s in closing.refused]
