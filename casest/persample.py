@@ -26,6 +26,17 @@ def residual_and_jacobian(model: Model) -> Replay:
 
 
 @lru_cache(maxsize=64)
+def linear(model: Model) -> bool:
+    """Is the residual linear in all unknowns, none of them a direction or rotation?"""
+    t = model.traced
+    if any(p.shape.curved for p in model.parameters):
+        return False
+    if any(a.kind == "sequence" for a in model.effects):
+        return False
+    return not ca.depends_on(ca.jacobian(t.expression, t.coordinates), t.coordinates)
+
+
+@lru_cache(maxsize=64)
 def laplacian(model: Model) -> Replay:
     """Σ ∂²r/∂s² over the numbers of each signal, (m, signals): for each residual and signal."""
     sample, expression = sample_symbol(model), model.traced.expression

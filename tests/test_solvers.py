@@ -9,6 +9,7 @@ from casest import (
     Residual,
     Run,
     attitude,
+    calibrate,
     exp,
     model,
     param,
@@ -19,6 +20,7 @@ from casest import (
     vertcat,
 )
 from casest.estimate import attempt
+from casest.persample import linear
 from casest.solve.ipopt import ipopt
 from casest.solve.trust_region import trust_region
 from casest.stack import Problem
@@ -314,3 +316,31 @@ def test_the_std_of_a_rotations_entries_is_that_of_its_chart():
     slopes = np.array([found.values["M"] @ E[k] for k in range(3)])  # ∂(M·C(δ))/∂δ_k
     variance = np.einsum("kij,kl,lij->ij", slopes, found.covariance, slopes)
     np.testing.assert_allclose(found.std["M"], np.sqrt(variance), rtol=1e-6)
+
+
+@model
+def straight(x=signal("m"), y=signal("V"), *, zero=param("V"), slope=param("V/m")):
+    return Residual(measured=y, predicted=zero + slope * x)
+
+
+@model
+def scaled(x=signal("m"), y=signal("V"), *, at=param("m"), slope=param("V/m", start=1.0)):
+    return Residual(measured=y, predicted=slope * (x - at))
+
+
+@model
+def upright(v=signal(3, "g"), *, down=param(unit_vector)):
+    return Residual(measured=v, predicted=down)
+
+
+def test_what_is_linear_has_one_valley_and_no_other_is_looked_for():
+    assert [linear(m) for m in (straight, scaled, upright)] == [True, False, False]
+    rng = np.random.default_rng(0)
+    x = rng.uniform(0, 1, (40, 1))
+    y = 2 + 3 * x + 0.01 * rng.standard_normal((40, 1))
+    run = Run.raw("r", {"x": x, "y": y}, units={"x": "m", "y": "V"})
+    plain, curved = (calibrate(m, [run]) for m in (straight, scaled))
+    assert len(plain.outcomes) < len(curved.outcomes)
+    expected = np.polynomial.polynomial.polyfit(x[:, 0], y[:, 0], 1)
+    found = [float(plain.values[n]) for n in ("zero", "slope")]
+    np.testing.assert_allclose(found, expected, rtol=1e-9)

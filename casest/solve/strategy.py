@@ -17,6 +17,7 @@ import numpy as np
 from casest.errors import UsageError
 from casest.identify import identify
 from casest.noise import has_noise_effects, weights
+from casest.persample import linear
 from casest.solve.ipopt import ipopt
 from casest.solve.outcome import Outcome
 from casest.solve.trust_region import LITTLE, trust_region
@@ -93,7 +94,8 @@ def _ways(
     costs = [_cost(o) for o in outcomes]
     disagree = max(costs) - min(costs) > 1e-6 * max(min(costs), 1e-300)
     # From a start that was declared, not computed, two ways may end in one valley, and the wrong.
-    if disagree or problem.model.starter is None:
+    # Where the residual is linear in all unknowns there is no other.
+    if disagree or (problem.model.starter is None and not linear(problem.model)):
         rival = best_of((*outcomes,))
         starts = list(_perturbations(problem, first, seed))
         outcomes += [_opinion(problem, start, rival) for start in starts[:STARTS]]
