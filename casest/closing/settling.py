@@ -10,6 +10,7 @@ from casest.closing.contest import whole
 from casest.closing.evidence import Fitted
 from casest.closing.gate import pruned
 from casest.closing.work import Work
+from casest.engine.kernel import patient
 from casest.errors import CasestError
 from casest.estimate import Estimate, attempt
 from casest.stack import Problem
@@ -79,7 +80,8 @@ def weeded(work: Work, current: Fitted) -> Fitted:
 def proved(work: Work, current: Fitted) -> tuple[Fitted, Estimate]:
     """The last estimate, with intervals; without effects that leave one without an end."""
     while work.found:
-        after = attempt(current.model, work.runs, start=current.values, seed=work.seed)
+        with patient(tried=False):
+            after = attempt(current.model, work.runs, start=current.values, seed=work.seed)
         if after.certificate.trusted:
             return current, after
         last = work.found.pop()

@@ -14,6 +14,7 @@ from casest.closing.evidence import Fitted
 from casest.closing.score import Score
 from casest.data.run import Run
 from casest.declaring.shapes import Array
+from casest.engine.kernel import patient
 from casest.estimate import Estimate, attempt
 from casest.modelling.effect import Effect
 from casest.modelling.model import Model
@@ -80,9 +81,10 @@ class Work:
 
     def certified(self, current: Fitted) -> Estimate:
         """An estimate whose trust is known; its intervals may be left for the end."""
-        return attempt(
-            current.model, self.runs, start=current.values, seed=self.seed, intervals=False
-        )
+        with patient(tried=False):
+            return attempt(
+                current.model, self.runs, start=current.values, seed=self.seed, intervals=False
+            )
 
     def gain(self, current: Fitted, better: Fitted) -> tuple[float, float]:
         """Held-out gain in mean squared error, and its standard error."""

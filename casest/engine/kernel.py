@@ -52,18 +52,21 @@ _FLAGS = (
 
 
 #: Samples from which on a kernel is built for a model that is only tried.
-TRIED = 400_000
-_impatient: ContextVar[bool] = ContextVar("impatient", default=False)
+TRIED = 100_000
+_tried: ContextVar[bool] = ContextVar("tried", default=False)
 
 
 @contextmanager
-def patient() -> Iterator[None]:
-    """While many models are tried, none is compiled unless the record is very long."""
-    token = _impatient.set(True)
+def patient(tried: bool = True) -> Iterator[None]:
+    """While many models are tried, none is compiled unless the record is very long.
+
+    Within it, what is not `tried` but proved is evaluated often, and compiled.
+    """
+    token = _tried.set(tried)
     try:
         yield
     finally:
-        _impatient.reset(token)
+        _tried.reset(token)
 
 
 class Kernel:
@@ -184,7 +187,7 @@ def _kernel(
     replay: Replay, which: int, samples: int, enough: int, text: Callable[[], str]
 ) -> Kernel | None:
     wish = os.environ.get("CASEST_KERNEL", "auto")
-    if _impatient.get():
+    if _tried.get():
         enough = max(enough, TRIED)
     if wish == "off":
         return None
