@@ -390,7 +390,7 @@ def test_a_model_that_is_only_tried_is_not_compiled_unless_its_record_is_very_lo
     for count, expected in ((10_000, False), (kernel.TRIED, True)):
         replay = Replay(function(p, s, r, ca.jacobian(r, p)))
         samples = np.linspace(0, 1, count)[:, None]
-        with kernel.patient():
+        with kernel.only_tried():
             cost(replay, [2.0], samples)
         assert compiled(replay) == expected
     replay = Replay(function(p, s, r, ca.jacobian(r, p)))

@@ -210,3 +210,12 @@ def test_a_course_too_small_to_have_a_shape_is_no_formula():
     assert closing.undecided.names == ("formula",)
     assert closing.verdict == "unexplained"
     assert 0.001 < closing.misfit.fraction < 0.01
+
+
+def test_a_residual_that_resembles_itself_over_many_samples_is_not_called_noise_alone():
+    content = {"effects": [{"name": "vibration", "column": None}], "verdict": "extended"}
+    said = [
+        sentence(content | {"noise": {"correlated_over_samples": over}}) for over in (1.0, 33.2)
+    ]
+    assert said[0] == "extended: vibration was missing; what is left is noise"
+    assert said[1].endswith("what is left is coloured noise (alike over 33 samples), or a lag")

@@ -20,6 +20,7 @@ from casest.stack import Point, Problem
 
 #: A parameter within so many standard deviations of null is nothing.
 NOTHING = 3.0
+#: For each way to leave axes away: unknowns fewer, squares more.
 Ways = tuple[tuple[int, float], ...]
 
 
@@ -88,7 +89,7 @@ def narrowed(
             found[name] = value
             continue
         for i in kept:
-            found[f"{name}_{'xyz'[i] if len(value) == 3 else i}"] = np.asarray(value[i])
+            found[f"{name}_{axis_name(i, len(value))}"] = np.asarray(value[i])
     return found
 
 
@@ -99,17 +100,13 @@ def lighter(problem: Problem, point: Point, own: Sequence[Parameter], noise: flo
         return ()
     matrix = problem.normal(point).matrix
     scale = np.sqrt(np.where(np.diag(matrix) > 0, np.diag(matrix), 1.0))
-    covariance = np.linalg.pinv(matrix / np.outer(scale, scale), hermitian=True)
-    covariance *= noise**2 / np.outer(scale, scale)
-    ways = []
+    covariance = noise**2 * np.linalg.pinv(matrix / np.outer(scale, scale), hermitian=True)
+    x, ways = point.x * scale, []
     for count in range(1, len(axes)):
         for left in combinations(axes.values(), count):
             k = [i for axis in left for i in axis]
-            own_part, x = (
-                covariance[np.ix_(k, k)] * np.outer(scale[k], scale[k]),
-                point.x[k] * scale[k],
-            )
-            ways.append((len(k), float(x @ np.linalg.pinv(own_part, hermitian=True) @ x)))
+            weight = np.linalg.pinv(covariance[np.ix_(k, k)], hermitian=True)
+            ways.append((len(k), float(x[k] @ weight @ x[k])))
     return tuple(ways)
 
 

@@ -34,7 +34,7 @@ from casest.closing.work import Work
 from casest.data.run import Run
 from casest.declaring.shapes import Array
 from casest.effects import CATALOGUE
-from casest.engine.kernel import patient
+from casest.engine.kernel import only_tried
 from casest.engine.threads import one_thread
 from casest.errors import CasestError, DataError, NotTrusted
 from casest.estimate import Estimate, attempt
@@ -69,7 +69,7 @@ def close(
         error = NotTrusted("no trustworthy estimate: " + "; ".join(before.certificate.reasons))
         error.estimate = before
         raise error
-    with np.errstate(all="ignore"), one_thread(), patient():
+    with np.errstate(all="ignore"), one_thread(), only_tried():
         try:
             work = Work(before, prepared(model, runs), catalogue, seed, say)
         except DataError as error:
@@ -96,7 +96,7 @@ def _closed(work: Work) -> Closing:
     ranked: list[Score] = []
     for _ in range(ROUNDS):
         current = _without_outliers(work, current)
-        work.walks.clear()
+        work.walks, work.undecided = [], None  # of this round
         ranked = _ranked(work, current)
         first_scores, declared = first_scores or ranked, declared or current
         better = _better(work, current, ranked)

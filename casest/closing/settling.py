@@ -10,7 +10,7 @@ from casest.closing.contest import whole
 from casest.closing.evidence import Fitted
 from casest.closing.gate import pruned
 from casest.closing.work import Work
-from casest.engine.kernel import patient
+from casest.engine.kernel import only_tried
 from casest.errors import CasestError
 from casest.estimate import Estimate, attempt
 from casest.stack import Problem
@@ -80,7 +80,7 @@ def weeded(work: Work, current: Fitted) -> Fitted:
 def proved(work: Work, current: Fitted) -> tuple[Fitted, Estimate]:
     """The last estimate, with intervals; without effects that leave one without an end."""
     while work.found:
-        with patient(tried=False):
+        with only_tried(False):
             after = attempt(current.model, work.runs, start=current.values, seed=work.seed)
         if after.certificate.trusted:
             return current, after

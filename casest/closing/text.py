@@ -55,7 +55,8 @@ def sentence(content: Mapping[str, Any]) -> str:
     if content["verdict"] == "extended":
         verb = "was" if len(names) == 1 else "were"
         over = content["noise"].get("correlated_over_samples") or 1
-        left = "noise" if over < COLOURED else f"noise of {over:.0f} samples' memory, or a lag"
+        coloured = f"coloured noise (alike over {over:.0f} samples), or a lag"
+        left = "noise" if over < COLOURED else coloured
         return f"extended: {', '.join(names)} {verb} missing; what is left is {left}"
     found = f"beside {', '.join(names)} " if names else ""
     if content["unexplained"]["one_of"]:

@@ -14,7 +14,7 @@ from casest.closing.evidence import Fitted
 from casest.closing.score import Score
 from casest.data.run import Run
 from casest.declaring.shapes import Array
-from casest.engine.kernel import patient
+from casest.engine.kernel import only_tried
 from casest.estimate import Estimate, attempt
 from casest.modelling.effect import Effect
 from casest.modelling.model import Model
@@ -81,7 +81,7 @@ class Work:
 
     def certified(self, current: Fitted) -> Estimate:
         """An estimate whose trust is known; its intervals may be left for the end."""
-        with patient(tried=False):
+        with only_tried(False):
             return attempt(
                 current.model, self.runs, start=current.values, seed=self.seed, intervals=False
             )

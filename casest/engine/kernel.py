@@ -57,12 +57,12 @@ _tried: ContextVar[bool] = ContextVar("tried", default=False)
 
 
 @contextmanager
-def patient(tried: bool = True) -> Iterator[None]:
+def only_tried(yes: bool = True) -> Iterator[None]:
     """While many models are tried, none is compiled unless the record is very long.
 
-    Within it, what is not `tried` but proved is evaluated often, and compiled.
+    Within it, `only_tried(False)`: what is to be proved is evaluated often, and compiled.
     """
-    token = _tried.set(tried)
+    token = _tried.set(yes)
     try:
         yield
     finally:
