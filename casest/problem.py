@@ -13,9 +13,10 @@ from types import ModuleType
 from typing import Any
 
 from casest.dynamics import Dynamics
+from casest.effects import CATALOGUE
 from casest.errors import CasestError, DeclarationError, UsageError
 from casest.modelling.dimensions import check_units
-from casest.modelling.effect import Effect
+from casest.modelling.effect import NOISE, Effect
 from casest.modelling.model import Model
 
 #: Shipped models: name on the command line -> module and attribute in `casest_problems`.
@@ -78,7 +79,10 @@ def find_model(name: str) -> Model:
 
 
 def find_effects(name: str) -> tuple[Effect, ...]:
-    """All effects declared in `file.py`, or the one of `file.py:name`."""
+    """All effects declared in `file.py`, the one of `file.py:name`, or a shipped one's name."""
+    shipped = {e.name: e for e in CATALOGUE}
+    if name in shipped:
+        return (_whole(shipped[name]),)
     path, _, wanted = name.partition(":")
     module = load_file(Path(path))
     if wanted:
@@ -87,6 +91,21 @@ def find_effects(name: str) -> tuple[Effect, ...]:
     if not found:
         raise UsageError(f"{path} declares no @effect")
     return found
+
+
+def _whole(effect: Effect) -> Effect:
+    """A shipped effect that needs neither a column nor a value that must be looked for."""
+    missing = "the column it follows" if any(s.name == "channel" for s in effect.extras) else ""
+    if effect.profile or effect.on == NOISE:
+        missing = "what only `casest close` finds: " + (
+            ", ".join(n for n, _ in effect.profile) or "the noise"
+        )
+    if missing:
+        raise UsageError(
+            f"--effects {effect.name}: this effect needs {missing}. Declare it in a file of your "
+            "own, with the value or column in it"
+        )
+    return effect
 
 
 def _one(module: ModuleType, kind: type, word: str, path: str, wanted: str) -> Any:

@@ -347,6 +347,7 @@ def one_world(task: Task) -> dict[str, Any]:
     record["wanted"] = labels_of(world, task.effects)
     record["refused"] = sorted({s.name for s in closing.refused})
     record["invisible"] = [i.name for i in summary.invisible(closing)]
+    record["one_of"] = list(closing.undecided.names) if closing.undecided else []
     record["before"], record["after"] = rms(closing.before_held_out), rms(closing.after_held_out)
     record["trusted"] = closing.after.certificate.trusted
     if task.effects:

@@ -131,7 +131,8 @@ def closing(model_name: str, data: Sequence[str], options: Options, command: str
     from casest.report import closing_page
     from casest.terminal import coloured
 
-    own = tuple(e for path in options["effects"] for e in find_effects(path))
+    known = {e.name for e in CATALOGUE} & {*options["effects"]}
+    own = tuple(e for path in options["effects"] if path not in known for e in find_effects(path))
     model = declared_model(model_name, {**options, "effects": ()})
     runs = records(model, data, options)
     apart = held_out(model, data, options)
@@ -143,6 +144,7 @@ def closing(model_name: str, data: Sequence[str], options: Options, command: str
             runs,
             catalogue=(*CATALOGUE, *own),
             start=start,
+            known=known,
             seed=options["seed"],
             say=progress,
         )

@@ -38,8 +38,8 @@ def model_options(command: Callable[..., Any]) -> Callable[..., Any]:
         click.option(
             "--effects",
             "effects",
-            metavar="FILE",
-            help="Your own effects, added to the model.",
+            metavar="FILE|NAME",
+            help="Your own effects; or a shipped one that you know to be there.",
             **many,
         ),
         click.option("--per-run", metavar="NAME", help="One value for each run.", **many),

@@ -93,6 +93,7 @@ def number_list(text: str, option: str) -> tuple[str, list[float]]:
 
 def declared_model(name: str, options: Options) -> Model:
     """The model with --set, --free, --fix, --shared, --per-run and --effects applied."""
+    from casest.closing.candidates import placed_in
     from casest.declaring.symbols import Constant, Parameter, constant
     from casest.modelling.dimensions import check_units
     from casest.problem import find_effects, find_model
@@ -100,7 +101,7 @@ def declared_model(name: str, options: Options) -> Model:
     model = find_model(name)
     for path in options["effects"]:
         for effect in find_effects(path):
-            model = model.with_effect(effect)
+            model = model.with_effect(placed_in(effect, model))
             check_units(model)
     for text in options["constants"]:
         key, value = named_value(text, "--set", model)

@@ -19,7 +19,7 @@ from casest.modelling.model import Model
 from casest.stack import Point, Problem
 
 #: A parameter within so many standard deviations of null is nothing.
-NOTHING = 3.0
+NOTHING = 2.0
 #: For each way to leave axes away: unknowns fewer, squares more.
 Ways = tuple[tuple[int, float], ...]
 

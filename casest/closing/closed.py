@@ -43,13 +43,15 @@ class Found:
 
 @dataclass(frozen=True)
 class Undecided:
-    """Something is missing, and too little of it shows to tell which of these causes it is.
+    """Something is missing, and these causes explain it alike; what is added hangs on which it is.
 
-    `share` of the held-out mean square that any of them would take away.
+    `share` of the held-out mean square that any of them would take away; `moves`: how far each
+    would move the declared parameters, where that is known.
     """
 
     names: tuple[str, ...]
     share: float
+    moves: Mapping[str, Mapping[str, Array]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

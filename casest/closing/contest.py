@@ -14,6 +14,7 @@ from casest.closing.held import held_value, holding, strides, within
 from casest.closing.profile import freed_again
 from casest.closing.restrict import restricted
 from casest.closing.score import Score
+from casest.closing.stakes import apart
 from casest.closing.work import Work
 from casest.errors import CasestError
 from casest.modelling.model import Model
@@ -25,6 +26,8 @@ CONTENDERS, MORE = 6, 4
 #: Steps of one size that a level or moment may take from where the grid found it; rivals of the
 #: best take them too, where they leave at most this share of what it explains.
 STRIDES, NEAR = 6, 0.3
+#: Steps in a row that explain less, and end the search: between few poses the noise makes valleys.
+WORSE = 2
 
 
 def contenders(
@@ -68,14 +71,19 @@ def _sharpened(work: Work, current: Fitted, score: Score, fitted: Fitted) -> tup
     best, steps = (score, fitted), strides(kind, value, work.runs)
     for step in steps:
         for way in (-1, 1):
+            at, worse = value, 0
             for _ in range(STRIDES):
-                if not within(kind, value + way * step, work.runs, len(current.model.axes)):
+                at += way * step
+                if not within(kind, at, work.runs, len(current.model.axes)):
                     break
-                moved = holding(score, name, value + way * step)
+                moved = holding(score, name, at)
                 found = joined(work, current, moved)
-                if found is None or cost_of(found) >= cost_of(best[1]):
+                if found is not None and cost_of(found) < cost_of(best[1]):
+                    best, value, worse = (moved, found), at, 0
+                    continue
+                worse += 1
+                if worse == WORSE:
                     break
-                best, value = (moved, found), value + way * step
     return best
 
 
@@ -103,11 +111,7 @@ def _weighed(work: Work, current: Fitted, fitted: Fitted, candidate: Candidate) 
     problem = weighted(Problem(fitted.model, work.runs), fitted.values)
     own = candidate.parameters(fitted.model)
     less = lighter(problem, problem.point(fitted.values), own, fitted.noise)
-    names = [p.name for p in current.model.parameters if p.name in fitted.values]
-    before = weighted(Problem(current.model, work.runs), current.values)
-    there = before.point({**current.values, **{n: fitted.values[n] for n in names}})
-    pairs = zip(before.residuals(there), current.residuals, strict=True)
-    moved = sum(float(np.sum((a - b) ** 2)) for a, b in pairs) / fitted.noise**2
+    moved = apart(work, current, fitted.values, current.values) / fitted.noise**2
     return replace(fitted, lighter=less, moved=moved)
 
 

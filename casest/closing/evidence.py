@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -104,18 +104,21 @@ def as_good(
 
 
 def gentlest_first(
-    tried: Sequence[tuple[Score, Fitted]], folds: Folds
+    tried: Sequence[tuple[Score, Fitted]], folds: Folds, known: Collection[str] = ()
 ) -> list[tuple[Score, Fitted]]:
     """Of those that are as good as the best, first the one that moves the parameters least.
 
     Where two causes explain the same, the smaller correction does the smaller harm if it is the
-    wrong one. As good: in evidence and in error.
+    wrong one. As good: in evidence and in error. Before them come effects that are known to be
+    there, if the data do not speak against them.
     """
     if not tried:
         return []
     matter = NEXT_TO_NOTHING * sum(r.size for r in tried[0][1].residuals)
     near = as_good(tried, folds, min(BARE_MENTION, matter))
-    leaders = sorted(near, key=lambda pair: pair[1].moved)
+    near.sort(key=lambda pair: pair[1].moved)
+    said = [p for p in as_good(tried, folds, STRONG) if p[0].candidate.name in known]
+    leaders = said + [p for p in near if p[0].candidate.name not in known]
     led = {id(fitted) for _, fitted in leaders}
     return leaders + [pair for pair in tried if id(pair[1]) not in led]
 

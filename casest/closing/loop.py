@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -28,9 +28,10 @@ from casest.closing.noise_model import wander_of
 from casest.closing.profile import profiled
 from casest.closing.score import Score, scores, steadied, widened
 from casest.closing.settling import filled, proved, weeded
+from casest.closing.stakes import hangs_on_which, opposed, rivals, shifts
 from casest.closing.tails import outliers_p_value
 from casest.closing.wandering import wanders
-from casest.closing.work import Work
+from casest.closing.work import Step, Work
 from casest.data.run import Run
 from casest.declaring.shapes import Array
 from casest.effects import CATALOGUE
@@ -44,8 +45,6 @@ from casest.stack import Point, Problem
 
 #: Columns of the widest model that is evaluated at once.
 WIDEST = 120
-#: Standard deviations by which another cause must move a declared parameter to have it elsewhere.
-ELSEWHERE = 2.0
 #: Rounds at most.
 ROUNDS = 8
 
@@ -56,11 +55,13 @@ def close(
     *,
     catalogue: Sequence[Effect] = CATALOGUE,
     start: Mapping[str, Any] | None = None,
+    known: Collection[str] = (),
     seed: int = 0,
     say: Callable[[str], None] = lambda _: None,
 ) -> Closing:
     """Fit, trace the residual to effects of the catalogue, add those that held-out data confirm.
 
+    Where several causes explain the data alike, those that are `known` to be there come first.
     Where nothing can be held out, nothing is added, and `refused` says so. Raises NotTrusted, with
     the refused estimate, where the declared model itself has no trustworthy fit.
     """
@@ -71,7 +72,7 @@ def close(
         raise error
     with np.errstate(all="ignore"), one_thread(), only_tried():
         try:
-            work = Work(before, prepared(model, runs), catalogue, seed, say)
+            work = Work(before, prepared(model, runs), catalogue, seed, say, known)
         except DataError as error:
             return _as_it_is(before, prepared(model, runs), str(error))
         return _closed(work)
@@ -109,7 +110,12 @@ def _closed(work: Work) -> Closing:
         current = better
     else:
         ranked = _ranked(work, current)
+    last = current
     current = weeded(work, filled(work, current))
+    if current is last:
+        current = _without_opposed(work, current)
+    if current is not last:
+        ranked = _ranked(work, current)
     current, after = proved(work, current)
     _note_wander(work, current)
     return Closing(
@@ -170,7 +176,7 @@ def _first_accepted(
     work: Work, current: Fitted, tried: list[tuple[Score, Fitted]], limit: float
 ) -> Fitted | None:
     """The model with the best of those that are significant and that held-out data confirm."""
-    for score, fitted in gentlest_first(tried, work.folds):
+    for score, fitted in gentlest_first(tried, work.folds, work.known):
         if score.p_value > limit:
             continue  # It may be the cause as well, but speaks for itself too softly.
         best = tried[0]
@@ -183,17 +189,48 @@ def _first_accepted(
         passed = accepted(work, current, score, fitted)
         if passed is None:
             continue
-        equals = [pair for pair in as_good(tried, work.folds, STRONG) if pair[1] is not fitted]
-        share = passed[2] / passed[0].noise ** 2
-        if share < SMALL and _hangs_on_which(work, fitted, equals):
-            names = [s.candidate.label for s, _ in equals]
-            why = f"it may as well be {', '.join(names)}, and the parameters hang on which it is"
-            work.refuse(score.candidate, why)
-            work.undecided = Undecided((score.candidate.label, *names), share)
+        step = Step(current, score, fitted, tried, passed[2] / passed[0].noise ** 2)
+        near = as_good(tried, work.folds, STRONG)
+        known = score.candidate.name in work.known
+        if step.share < SMALL and not known and hangs_on_which(work, fitted, near):
+            _leave_open(work, step, near)
             return None
-        work.keep(*passed, score, _rivals(work, fitted, score, tried))
+        work.last = None if known else step
+        work.keep(*passed, score, rivals(work, fitted, score, tried))
         return passed[0]
     return None
+
+
+def _without_opposed(work: Work, current: Fitted) -> Fitted:
+    """Without the effect added last, if another explains as much and the parameters hang on it.
+
+    That is: if it explains little, or if the other one pulls the opposite way. Beside causes that
+    are still missing nothing is known of that: it is asked at the end.
+    """
+    step = work.last
+    if step is None or not work.found or work.found[-1].score is not step.score:
+        return current
+    near = as_good(step.tried, work.folds, STRONG)
+    if step.share < SMALL:
+        near = [p for p in step.tried if not_told_apart(step.fitted, p[1], step.score, work.folds)]
+    elif not opposed(work, step.before, step.fitted, near):
+        return current
+    if not hangs_on_which(work, step.fitted, near):
+        return current
+    work.found.pop()
+    _leave_open(work, step, near)
+    return step.before
+
+
+def _leave_open(work: Work, step: Step, near: Sequence[tuple[Score, Fitted]]) -> None:
+    """Say that several causes explain alike, and that none is added."""
+    own = step.score.candidate
+    names = [s.candidate.label for s, fitted in near if fitted is not step.fitted]
+    why = f"it may as well be {', '.join(names)}, and the parameters hang on which it is"
+    work.refuse(own, why)
+    moves = {own.label: shifts(work, step.before, step.fitted)}
+    moves |= {s.candidate.label: shifts(work, step.before, fitted) for s, fitted in near}
+    work.undecided = Undecided((own.label, *names), step.share, moves)
 
 
 def _note_walk(work: Work, current: Fitted, score: Score, fitted: Fitted) -> None:
@@ -202,30 +239,6 @@ def _note_walk(work: Work, current: Fitted, score: Score, fitted: Fitted) -> Non
     if crossed is not None and work.confirmed(current, crossed):
         share = work.gain(current, crossed)[0] / crossed.noise**2
         work.walks.append(Undecided((score.candidate.label,), share))
-
-
-def _hangs_on_which(work: Work, fitted: Fitted, equals: Sequence[tuple[Score, Fitted]]) -> bool:
-    """Would one of the other causes have the declared parameters elsewhere?"""
-    return any(
-        np.any(np.abs(other.values[n] - fitted.values[n]) > ELSEWHERE * std)
-        for _, other in equals
-        for n, std in work.before.std.items()
-        if n in other.values and n in fitted.values
-    )
-
-
-def _rivals(
-    work: Work, fitted: Fitted, score: Score, tried: Sequence[tuple[Score, Fitted]]
-) -> dict[str, dict[str, Array]]:
-    """What is not told apart from a fit, and where it would have the declared parameters."""
-    names = [p.name for p in work.before.model.parameters]
-    return {
-        s.candidate.label: {
-            n: f.values[n] - fitted.values[n] for n in names if n in f.values and n in fitted.values
-        }
-        for s, f in tried
-        if f is not fitted and not_told_apart(fitted, f, score, work.folds)
-    }
 
 
 def _two_at_once(work: Work, current: Fitted, tried: list[tuple[Score, Fitted]]) -> Fitted | None:
@@ -247,9 +260,10 @@ def _two_at_once(work: Work, current: Fitted, tried: list[tuple[Score, Fitted]])
     if both is None:
         work.refused, work.undecided = refused, None
         return None
-    rivals = _rivals(work, first, score, tried)
+    alike = rivals(work, first, score, tried)
     candidate, second = whole(work, score, current.model), work.found.pop()
-    work.keep(both, candidate, second.gain, score, rivals)
+    work.last = None
+    work.keep(both, candidate, second.gain, score, alike)
     work.found.append(second)
     label = candidate.label
     work.refused = [r for r in work.refused if r.name not in (label, second.candidate.label)]
@@ -271,6 +285,7 @@ def _without_outliers(work: Work, current: Fitted) -> Fitted:
         return current
     gained = work.gain(current, fitted)[0]
     work.found.append(Found(Candidate(effect), None, p_value, gained))
+    work.last = None
     work.say("outliers: they count less from here on")
     return fitted
 

@@ -103,14 +103,28 @@ def _effects(content: Mapping[str, Any]) -> Iterator[str]:
 
 def instead(effect: Mapping[str, Any], content: Mapping[str, Any]) -> Iterator[str]:
     """What hangs on which of the causes it is."""
-    parameters = content["after"]["parameters"]
     for label, shifts in effect["instead_would_move"].items():
-        words = [
-            f"{name} by {size:.2g} {_first(parameters[name]['unit'])}".removesuffix(" 1").rstrip()
-            for name, size in shifts.items()
-        ]
-        if words:
-            yield f"were it {label} instead, the parameters would move: {', '.join(words)}"
+        if shifts:
+            words = moved_by(shifts, content)
+            yield f"were it {label} instead, the parameters would move: {words}"
+
+
+def moved_by(shifts: Mapping[str, float], content: Mapping[str, Any]) -> str:
+    """`offset by 0.05 m/s^2, …`."""
+    parameters = content["after"]["parameters"]
+    return ", ".join(
+        f"{name} by {size:.2g} {_first(parameters[name]['unit'])}".removesuffix(" 1").rstrip()
+        for name, size in shifts.items()
+    )
+
+
+def undecided(content: Mapping[str, Any]) -> Iterator[str]:
+    """Causes of which none was added: what each would do, what would tell them apart."""
+    left = content["unexplained"]
+    for label, shifts in left["would_move"].items():
+        if shifts:
+            yield f"{label} would move the parameters: {moved_by(shifts, content)}"
+    yield from (f"to tell {words}" for words in left["would_separate"][:SHOWN])
 
 
 def _first(unit: Any) -> str:
@@ -153,6 +167,7 @@ def _unexplained(content: Mapping[str, Any]) -> Iterator[str]:
         yield item(
             f"Unexplained: {100 * left['fraction']:.2g} % of the held-out variance, {left['where']}"
         )
+        yield from (item(words) for words in undecided(content))
 
 
 def _notes(content: Mapping[str, Any]) -> Iterator[str]:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,6 +27,19 @@ from casest.stack import Problem
 HELD_OUT = 1.64
 
 
+class Step(NamedTuple):
+    """How an effect was added: the fit before it, its own, what else was tried, its share.
+
+    The share is of the held-out mean square: what it takes away.
+    """
+
+    before: Fitted
+    score: Score
+    fitted: Fitted
+    tried: Sequence[tuple[Score, Fitted]]
+    share: float
+
+
 class Work:
     """What the steps of the loop share: fits, their judgement on held-out data, the findings."""
 
@@ -36,16 +50,21 @@ class Work:
         catalogue: Sequence[Effect],
         seed: int,
         say: Callable[[str], None],
+        known: Collection[str] = (),
     ) -> None:
         self.before, self.runs, self.catalogue, self.seed, self.say = (
             before, runs, catalogue, seed, say,
         )  # fmt: skip
+        #: Names of effects that the user knows to be there.
+        self.known = frozenset(known)
         self.folds = folded(runs, before.correlated_over, seed)
         check_folds(before, runs, self.folds)
         self.refused: list[Skipped] = []
         self.skipped: list[Skipped] = []
         self.found: list[Found] = []
         self.undecided: Undecided | None = None
+        #: The step that added the effect found last, where it can be taken back.
+        self.last: Step | None = None
         #: What would have been added, were a random walk of the offset not as good a cause.
         self.walks: list[Undecided] = []
         #: Candidates as they are declared, by label: their profiles unknown, on all axes.

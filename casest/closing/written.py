@@ -68,11 +68,10 @@ def closing_result(
         for i in invisible(closing)
     ]
     fraction = np.nan if closing.verdict is None else left.fraction
-    names = closing.undecided.names if closing.undecided else ()
     ordered["unexplained"] = {
         "fraction": plain(fraction),
         "where": left.where,
-        "one_of": list(names),
+        **_open(closing),
     }
     ordered["moved"] = _moved(closing)
     ordered["smallest_detectable"] = [
@@ -129,6 +128,18 @@ def _effect(found: Found, closing: Closing) -> dict[str, Any]:
     } | ({} if attached is None else attachment(attached))
 
 
+def _open(closing: Closing) -> dict[str, Any]:
+    """Causes of which none was added, since the parameters hang on which of them it is."""
+    left = closing.undecided
+    names = left.names if left else ()
+    moves = left.moves if left else {}
+    return {
+        "one_of": list(names),
+        "would_move": {label: _shifts(moves[label], closing) for label in names if label in moves},
+        "would_separate": _measurements(names, closing) if len(names) > 1 else [],
+    }
+
+
 def _alike(found: Found, closing: Closing) -> list[str]:
     """What explains the data as well, but for what has been added beside it since."""
     added = {f.candidate.label for f in closing.effects}
@@ -182,9 +193,14 @@ def formula_of(attached: Attached) -> str:
 
 def _separating(found: Found, closing: Closing) -> list[str]:
     """Measurements that would separate the effect from those that explain the data as well."""
+    return _measurements(_alike(found, closing)[:NEAREST], closing)
+
+
+def _measurements(labels: Sequence[str], closing: Closing) -> list[str]:
+    """What would show each of these effects."""
     by_label = {s.candidate.label: s.candidate for s in closing.first}
     said = []
-    for label in _alike(found, closing)[:NEAREST]:
+    for label in labels:
         other = by_label.get(label)
         if other is not None and other.effect is not None and other.effect.shown_by:
             said.append(f"{label}: {other.effect.shown_by}")

@@ -8,7 +8,7 @@ from typing import Any
 
 from casest.closing.closed import Closing
 from casest.closing.crossfit import FAR
-from casest.closing.text import instead, sentence
+from casest.closing.text import instead, sentence, undecided
 from casest.report.applied import application
 from casest.report.calibration import by_axis, error_picture
 from casest.report.figures import Figures
@@ -122,7 +122,8 @@ def _effects(closing: Closing, story: Story, content: Mapping[str, Any]) -> str:
     if not said and content["verdict"] is None:
         said = [paragraph("None was tried: there is nothing to judge it by.")]
     elif not said and content["unexplained"]["one_of"]:
-        said = [paragraph("None was added: too little shows to tell which of several it is.")]
+        alike = "several explain the data alike, and the parameters hang on which it is"
+        said = [paragraph(f"None was added: {alike}.")]
     elif not said:
         said = [paragraph("None was needed: no candidate makes held-out data better predicted.")]
     left = content["unexplained"]
@@ -130,6 +131,7 @@ def _effects(closing: Closing, story: Story, content: Mapping[str, Any]) -> str:
         said += [
             tag("h3", "What is left unexplained"),
             paragraph(f"{100 * left['fraction']:.2g} % of the held-out variance: {left['where']}."),
+            *(paragraph(f"{words[0].upper()}{words[1:]}.") for words in undecided(content)),
         ]
     rows = [
         [d["name"], f"`{d['parameter']}`", number(d["size"]), printed_unit(d["unit"])]

@@ -1,0 +1,75 @@
+"""What hangs on which of several causes it is: where each would have the declared parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from casest.closing.evidence import Fitted, not_told_apart
+from casest.closing.score import Score
+from casest.closing.work import Work
+from casest.declaring.shapes import Array
+from casest.noise import weighted
+from casest.stack import Problem
+
+#: Standard deviations by which another cause must move a declared parameter to have it elsewhere.
+ELSEWHERE = 2.0
+
+
+def hangs_on_which(work: Work, fitted: Fitted, near: Sequence[tuple[Score, Fitted]]) -> bool:
+    """Would one of the other causes have the declared parameters elsewhere?"""
+    return any(
+        np.any(np.abs(other.values[n] - fitted.values[n]) > ELSEWHERE * std)
+        for _, other in near
+        for n, std in work.before.std.items()
+        if n in other.values and n in fitted.values
+    )
+
+
+def rivals(
+    work: Work, fitted: Fitted, score: Score, tried: Sequence[tuple[Score, Fitted]]
+) -> dict[str, dict[str, Array]]:
+    """What is not told apart from a fit, and where it would have the declared parameters."""
+    return {
+        s.candidate.label: shifts(work, fitted, f)
+        for s, f in tried
+        if f is not fitted and not_told_apart(fitted, f, score, work.folds)
+    }
+
+
+def shifts(work: Work, one: Fitted, other: Fitted) -> dict[str, Array]:
+    """From the one to the other: how far each declared parameter goes."""
+    names = [p.name for p in work.before.model.parameters]
+    both = [n for n in names if n in one.values and n in other.values]
+    return {n: other.values[n] - one.values[n] for n in both}
+
+
+def opposed(
+    work: Work, current: Fitted, fitted: Fitted, near: Sequence[tuple[Score, Fitted]]
+) -> bool:
+    """If it were one of the others, would the parameters be nearer to the truth as they are?
+
+    Two causes may explain alike and move the parameters in opposite ways: each, where it is the
+    wrong one, does more harm than none.
+    """
+    return any(
+        apart(work, current, fitted.values, other.values)
+        > apart(work, current, current.values, other.values)
+        for _, other in near
+    )
+
+
+def apart(
+    work: Work, current: Fitted, one: Mapping[str, Array], other: Mapping[str, Array]
+) -> float:
+    """Between two places of a model's own parameters: squares of what they predict differently."""
+    names = [p.name for p in current.model.parameters]
+    problem = weighted(Problem(current.model, work.runs), current.values)
+
+    def predicted(values: Mapping[str, Array]) -> Sequence[Array]:
+        own = {n: values[n] for n in names if n in values}
+        return problem.residuals(problem.point({**current.values, **own}))
+
+    pairs = zip(predicted(one), predicted(other), strict=True)
+    return sum(float(np.sum((a - b) ** 2)) for a, b in pairs)
