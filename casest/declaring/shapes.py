@@ -8,6 +8,7 @@ sphere and a rotation a point of SO(3): a solver moves those in a chart around a
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -27,7 +28,7 @@ class Shape:
     dims: tuple[int, ...]
     positive_diagonal: bool = False
 
-    @property
+    @cached_property
     def entries(self) -> tuple[tuple[int, ...], ...]:
         """Index of every stored entry, in order (a triangular matrix stores no zeros)."""
         indices = [tuple(int(k) for k in i) for i in np.ndindex(*self.dims)]

@@ -69,11 +69,11 @@ def run_nlpsol(
         stats = solver.nlpsol.stats()
     z = np.array(found["x"]).ravel()
     # After Invalid_Option and the like IPOPT returns the start without a word: read its status.
-    point = problem.moved(start, scaled.scale * z - start.x)
+    point = scaled.reached(z)
     return Outcome(
         plugin,
         point,
-        problem.cost(point),
+        problem.normal(point).cost,  # kept for the polish that follows
         int(stats.get("iter_count", 0)),
         scaled.evaluations,
         bool(stats["success"]),
@@ -94,18 +94,26 @@ class _Scaled:
         self.scale = np.where(usable, np.sqrt(2 * self.unit) / np.where(usable, columns, 1.0), 1.0)
         self.evaluations = 0
         self._z: Array | None = None
-        self._normal = first
+        self._point, self._normal = start, first
 
     def normal(self, z: Array) -> Any:
         """Normal equations at z (cached: IPOPT asks for cost, gradient, Hessian in turn)."""
         if self._z is None or not np.array_equal(z, self._z):
-            self._z, self._normal = z.copy(), self.problem.normal(self.point(z))
+            self._z, self._point = z.copy(), self.point(z)
+            self._normal = self.problem.normal(self._point)
             self.evaluations += 1
         return self._normal
 
     def point(self, z: Array) -> Point:
         """The point in the chart of the start (charts stay fixed while IPOPT runs)."""
         return Point(self.scale * z, self.start.references)
+
+    def reached(self, z: Array) -> Point:
+        """The point in charts around itself; the one evaluated last where that is the same."""
+        flat = not any(slot.parameter.shape.curved for slot in self.problem.slots)
+        if flat and self._z is not None and np.array_equal(z, self._z):
+            return self._point
+        return self.problem.moved(self.start, self.scale * z - self.start.x)
 
     def cost(self, z: Array) -> float:
         """Scaled cost; with its slope, for nearly every point that IPOPT tries is accepted."""

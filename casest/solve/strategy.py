@@ -89,8 +89,7 @@ def _ways(
         main = trust_region(problem, first)
     else:
         main = _polished(problem, ipopt(problem, first, exact=solver == "ipopt-exact"))
-    # A start of the user's may lie in a wrong valley: the automatic one must agree.
-    outcomes = [main, *_opinions(problem, (first,) if automatic else (first, problem.start()))]
+    outcomes = [main, *_opinions(problem, _other_starts(problem, first, automatic))]
     costs = [_cost(o) for o in outcomes]
     disagree = max(costs) - min(costs) > 1e-6 * max(min(costs), 1e-300)
     # From a start that was declared, not computed, two ways may end in one valley, and the wrong.
@@ -105,6 +104,17 @@ def _ways(
     if problem.model.starter is None and best_of((*outcomes,)) is not outcomes[0]:
         outcomes.append(_wary(problem, first))
     return (*outcomes,)
+
+
+def _other_starts(problem: Problem, first: Point, automatic: bool) -> Sequence[Point]:
+    """Where a second opinion begins.
+
+    A start of the user's may lie in a wrong valley: the automatic one must agree. Where that is
+    computed from the data, it is second opinion enough.
+    """
+    if automatic:
+        return (first,)
+    return (problem.start(),) if problem.model.starter else (first, problem.start())
 
 
 def valleys(outcomes: Sequence[Outcome]) -> int:

@@ -29,12 +29,72 @@ SETTLED = 1e-12
 DAMPINGS = (1e-24, 1e24)
 
 
-class _Local(NamedTuple):
-    """Linearisation at a point: J = QR, t = Qᵀr, cost."""
+class _Fine(NamedTuple):
+    """Linearisation at a point for the last digits: J = QR, t = Qᵀr, cost."""
 
     R: Array
     t: Array
     cost: float
+
+    def finite(self) -> bool:
+        """Is there nothing in it that is not finite?"""
+        return bool(np.isfinite(self.cost) and np.isfinite(self.R).all())
+
+    def norms(self) -> Array:
+        """Length of each column of J; 1 where there is none."""
+        return _lengths(np.linalg.norm(self.R, axis=0))
+
+    def gain(self, step: Array) -> float:
+        """What a step is promised to take off the cost."""
+        return 0.5 * float(self.t @ self.t - np.sum((self.t + self.R @ step) ** 2))
+
+    def damped(self, scale: Array, damping: float, free: Array, step: Array) -> Array:
+        """Levenberg-Marquardt step of the free unknowns, the others' given."""
+        count, fixed = int(free.sum()), np.logical_not(free)
+        # Unit columns: scales that differ by orders of magnitude must not reach the rank decision.
+        system = np.zeros((len(self.R) + count, count + 1))
+        system[:-count, :-1] = self.R[:, free] / scale[free]
+        system[:-count, -1] = -(self.t + self.R[:, fixed] @ step[fixed])
+        np.fill_diagonal(system[-count:], np.sqrt(damping))
+        if not np.isfinite(system).all():
+            return np.full(count, np.nan)
+        return np.asarray(_least_squares(system) / scale[free])
+
+
+class _Rough(NamedTuple):
+    """Linearisation far away: JᵀJ, which is well conditioned, Jᵀr, cost."""
+
+    matrix: Array
+    gradient: Array
+    cost: float
+
+    def finite(self) -> bool:
+        """It is, or it would not be used."""
+        return bool(np.isfinite(self.cost))
+
+    def norms(self) -> Array:
+        """Length of each column of J; 1 where there is none."""
+        return _lengths(np.sqrt(self.matrix.diagonal()))
+
+    def gain(self, step: Array) -> float:
+        """What a step is promised to take off the cost."""
+        return -float(step @ (self.gradient + 0.5 * (self.matrix @ step)))
+
+    def damped(self, scale: Array, damping: float, free: Array, step: Array) -> Array:
+        """Levenberg-Marquardt step of the free unknowns, the others' given."""
+        slope, matrix = self.gradient, self.matrix
+        if not free.all():
+            slope = (slope + matrix @ np.where(free, 0.0, step))[free]
+            matrix, scale = matrix[np.ix_(free, free)], scale[free]
+        system = matrix / np.outer(scale, scale)
+        system.flat[:: len(scale) + 1] += damping
+        try:
+            return np.asarray(np.linalg.solve(system, -slope / scale) / scale)
+        except np.linalg.LinAlgError:
+            return np.full(len(slope), np.nan)
+
+
+_Local = _Fine | _Rough
 
 
 def trust_region(
@@ -54,8 +114,8 @@ def trust_region(
     damping alone leaves, and does not jump across one.
     """
     began = time.perf_counter()
-    point, here, precise = start, _linearise(problem, start, precise=False), False
-    scale = _column_norms(here.R)
+    point, here, precise = start, _rough(problem, start), False
+    scale = here.norms()
     size = float(np.linalg.norm(scale * start.x)) or float(np.sqrt(2 * here.cost))
     radius = size if wary else np.inf
     growth, evaluations, status = 2.0, 1, "iteration limit"
@@ -65,19 +125,19 @@ def trust_region(
             status = "interrupted"
             break
         iterations += 1
-        if not (np.isfinite(here.cost) and np.all(np.isfinite(here.R))):
+        if not here.finite():
             status = "cost or slope is not finite"
             break
-        scale = np.maximum(scale, _column_norms(here.R))
+        scale = np.maximum(scale, here.norms())
         if wary:
             damping = _damping_within(problem, point, here, scale, radius)
         step = _bounded_step(problem, point, here, scale, damping)
         if not np.all(np.isfinite(step)):
             status = "step is not finite"
             break
-        gain = 0.5 * float(here.t @ here.t - np.sum((here.t + here.R @ step) ** 2))
+        gain = here.gain(step)
         if not precise and gain <= ROUGH * here.cost:
-            precise, here = True, _linearise(problem, point, precise=True)
+            precise, here = True, _fine(problem, point)
             continue
         if _negligible(step, point, scale, here, gain) or (
             damping < 1 and gain <= tolerance * here.cost
@@ -95,7 +155,8 @@ def trust_region(
         elif ratio > 0.75:
             radius = max(radius, 2 * float(np.linalg.norm(scale * step)))
         if ratio > 0:
-            point, here = trial, _linearise(problem, trial, precise, normal)
+            point = trial
+            here = _fine(problem, trial) if precise else _rough(problem, trial, normal)
             damping = _relieved(damping, ratio)
             growth = 2.0
         else:
@@ -103,10 +164,9 @@ def trust_region(
             if damping > 1e20:
                 status = "no descent"
                 break
-    if not precise and not tolerance:
-        here = _linearise(problem, point, precise=True)
-    if np.all(np.isfinite(here.R)) and not tolerance:
-        point, here = _refine(problem, point, here, scale)
+    if not tolerance:
+        exact = here if precise and isinstance(here, _Fine) else _fine(problem, point)
+        point, here = _refine(problem, point, exact, scale) if exact.finite() else (point, exact)
     claims = status in ("converged", "no descent")
     seconds = time.perf_counter() - began
     return Outcome(
@@ -143,28 +203,30 @@ def _relieved(damping: float, ratio: float) -> float:
     return damping * float(max(1 / 5, 1 - (2 * min(ratio, 2.0) - 1) ** 3))
 
 
-def _linearise(
-    problem: LeastSquares, point: Point, precise: bool, normal: Normal | None = None
-) -> _Local:
-    """From JᵀJ, which is quick, while far away; from a QR factor where the last digits count."""
-    if not precise:
-        normal = normal or problem.normal(point)
-        scale = np.sqrt(np.where(np.diag(normal.matrix) > 0, np.diag(normal.matrix), 1.0))
-        try:
-            lower = np.linalg.cholesky(normal.matrix / np.outer(scale, scale))
-        except np.linalg.LinAlgError:
-            lower = np.full_like(normal.matrix, np.nan)
-        if np.all(np.isfinite(lower)) and np.diag(lower).min(initial=1.0) > 1e-6:
-            t = np.asarray(np.linalg.solve(lower, normal.gradient / scale), dtype=float)
-            return _Local(lower.T * scale, t, normal.cost)
-        finite = np.all(np.isfinite(normal.matrix)) and np.all(np.isfinite(normal.gradient))
-        if finite and problem.residual_count > LONG:
-            return _by_eigenvalues(normal, scale)
+def _rough(problem: LeastSquares, point: Point, normal: Normal | None = None) -> _Local:
+    """From JᵀJ, which is quick; from a QR factor where its squared condition number would tell."""
+    normal = normal or problem.normal(point)
+    diagonal = normal.matrix.diagonal()
+    scale = np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
+    try:
+        lower = np.linalg.cholesky(normal.matrix / np.outer(scale, scale))
+    except np.linalg.LinAlgError:
+        lower = np.full_like(normal.matrix, np.nan)
+    slope = bool(np.isfinite(normal.gradient).all())
+    if slope and np.isfinite(lower).all() and lower.diagonal().min(initial=1.0) > 1e-6:
+        return _Rough(normal.matrix, normal.gradient, normal.cost)
+    if slope and np.isfinite(normal.matrix).all() and problem.residual_count > LONG:
+        return _by_eigenvalues(normal, scale)
+    return _fine(problem, point)
+
+
+def _fine(problem: LeastSquares, point: Point) -> _Fine:
+    """From a QR factor."""
     R, t, rest = problem.factor(point)
-    return _Local(R, t, 0.5 * (float(t @ t) + rest * rest))
+    return _Fine(R, t, 0.5 * (float(t @ t) + rest * rest))
 
 
-def _by_eigenvalues(normal: Normal, scale: Array) -> _Local:
+def _by_eigenvalues(normal: Normal, scale: Array) -> _Fine:
     """A factor of a JᵀJ that is singular to rounding: what it cannot tell is left out of the step.
 
     Far away that is common (and a QR factor of all rows dear), and damped steps do not mind.
@@ -174,11 +236,10 @@ def _by_eigenvalues(normal: Normal, scale: Array) -> _Local:
     root = np.sqrt(np.where(told, size, 1.0))
     t = np.where(told, vectors.T @ (normal.gradient / scale) / root, 0.0)
     R = np.where(told, root, 0.0)[:, None] * vectors.T * scale
-    return _Local(np.asarray(R), np.asarray(t), normal.cost)
+    return _Fine(np.asarray(R), np.asarray(t), normal.cost)
 
 
-def _column_norms(R: Array) -> Array:
-    norms = np.linalg.norm(R, axis=0)
+def _lengths(norms: Array) -> Array:
     return np.where(np.isfinite(norms) & (norms > 0), norms, 1.0)
 
 
@@ -190,7 +251,7 @@ def _bounded_step(
     n = len(point.x)
     free, step = np.ones(n, dtype=bool), np.zeros(n)
     for _ in range(n + 1):
-        step[free] = _damped(here, scale, damping, free, step)
+        step[free] = here.damped(scale, damping, free, step)
         target = point.x + step
         out = free & ((target < lower) | (target > upper))
         if not out.any():
@@ -200,18 +261,6 @@ def _bounded_step(
         if not free.any():
             return step
     return step
-
-
-def _damped(here: _Local, scale: Array, damping: float, free: Array, step: Array) -> Array:
-    count, fixed = int(free.sum()), np.logical_not(free)
-    # Unit columns: scales that differ by orders of magnitude must not reach the rank decision.
-    system = np.zeros((len(here.R) + count, count + 1))
-    system[:-count, :-1] = here.R[:, free] / scale[free]
-    system[:-count, -1] = -(here.t + here.R[:, fixed] @ step[fixed])
-    np.fill_diagonal(system[-count:], np.sqrt(damping))
-    if not np.isfinite(system).all():
-        return np.full(count, np.nan)
-    return np.asarray(_least_squares(system) / scale[free])
 
 
 def _least_squares(system: Array) -> Array:
@@ -229,9 +278,7 @@ def _negligible(step: Array, point: Point, scale: Array, here: _Local, gain: flo
     return bool(size <= 1e-15 * reach or gain <= 1e-17 * here.cost)
 
 
-def _refine(
-    problem: LeastSquares, point: Point, here: _Local, scale: Array
-) -> tuple[Point, _Local]:
+def _refine(problem: LeastSquares, point: Point, here: _Fine, scale: Array) -> tuple[Point, _Fine]:
     """A few undamped steps: cost differences drown in rounding before the gradient does."""
     for _ in range(3):
         if _slope(here) <= SETTLED * np.sqrt(2 * here.cost):
@@ -240,7 +287,7 @@ def _refine(
         if not np.all(np.isfinite(step)):
             break
         trial = problem.moved(point, step)
-        there = _linearise(problem, trial, precise=True)
+        there = _fine(problem, trial)
         # Where residuals are small beside the readings, rounding moves the cost by 1e-11 of itself.
         better = _slope(there) < _slope(here) and there.cost <= here.cost * (1 + 1e-10)
         if not (np.isfinite(there.cost) and better):
@@ -249,6 +296,6 @@ def _refine(
     return point, here
 
 
-def _slope(here: _Local) -> float:
+def _slope(here: _Fine) -> float:
     """Length of the residual's part that the Jacobian can still reach."""
     return float(np.linalg.norm(here.t))
