@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import control
 import flights
 import numpy as np
 import pytest
@@ -191,7 +190,7 @@ def test_the_kalman_bucy_filter_follows_its_differential_equations():
     np.testing.assert_allclose(found.P[-1].ravel(), end[2:], atol=1e-8)
 
 
-def test_its_gain_settles_where_python_control_says():
+def test_its_gain_settles_where_python_control_says(control):
     L, _, _ = control.lqe(
         [[0, 1], [-1.5, -0.8]], np.eye(2), [[1, 0]], np.diag([1e-3, 0.02]), [[0.01]]
     )

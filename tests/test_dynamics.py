@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import control
 import numpy as np
 import pytest
 import scipy.linalg
@@ -171,7 +170,7 @@ def test_a_slow_precession_shows_more_in_longer_windows():
     assert smallest[0] < 0.1 * smallest[1] < 0.01 * smallest[2] * 10
 
 
-def test_the_gramian_of_a_stable_system_is_the_lyapunov_solution_and_python_controls():
+def test_the_gramian_of_a_stable_system_is_the_lyapunov_solution_and_python_controls(control):
     t = np.arange(0, 60, 0.02)
     run = Run.raw("cart", {"u": 0 * t[:, None], "y": 0 * t[:, None]}, units={}, time=t)
     W = gramian(cart, linearised(cart, run)) * THETA[0, 0]
@@ -202,7 +201,7 @@ def test_without_process_noise_the_covariance_is_the_information_carried_forward
     assert np.abs(P - expected).max() < 1e-8 * np.abs(expected).max()
 
 
-def test_the_riccati_equation_settles_where_scipy_and_python_control_say():
+def test_the_riccati_equation_settles_where_scipy_and_python_control_say(control):
     t = np.arange(0, 40, 0.05)
     run = Run.raw("cart", {"u": 0 * t[:, None], "y": 0 * t[:, None]}, units={}, time=t)
     P = riccati(cart, linearised(cart, run))[-1]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 
-import control
 import numpy as np
 import pytest
 import scipy.linalg
@@ -66,7 +65,7 @@ def test_a_constant_of_the_model_can_be_another():
     assert to_statespace(cart.having(damping=0.1)).A[1, 1] == -0.1
 
 
-def test_the_steady_filter_is_python_controls():
+def test_the_steady_filter_is_python_controls(control):
     system = to_statespace(cart)
     _, P, _ = control.lqe(system.A, np.eye(2), system.C, cart.process, cart.noise)
     found = riccati(cart, linearised(cart, cart_at_rest(40, 0.05)))[-1]
@@ -75,7 +74,7 @@ def test_the_steady_filter_is_python_controls():
     np.testing.assert_allclose(found, expected, rtol=1e-8)
 
 
-def test_the_gramian_is_python_controls_and_scipys():
+def test_the_gramian_is_python_controls_and_scipys(control):
     """slycot solves python-control's."""
     system = to_statespace(cart)
     W = gramian(cart, linearised(cart, cart_at_rest(60, 0.02))) * cart.noise[0, 0]
@@ -84,7 +83,7 @@ def test_the_gramian_is_python_controls_and_scipys():
     np.testing.assert_allclose(W, expected, rtol=1e-8, atol=1e-9)
 
 
-def test_the_motion_between_samples_is_python_controls():
+def test_the_motion_between_samples_is_python_controls(control):
     """Forced by a sine, which straight lines between samples follow to h²."""
     t = np.arange(0, 10, 0.01)
     u = np.sin(t)
@@ -100,7 +99,7 @@ def test_the_motion_between_samples_is_python_controls():
 @pytest.mark.parametrize(("angle", "poles"), [
     (0.0, [-1j, 1j]), (np.pi, [-1.0, 1.0]),
 ])  # fmt: skip
-def test_a_pendulum_swings_below_and_falls_above(angle, poles):
+def test_a_pendulum_swings_below_and_falls_above(angle, poles, control):
     """At √(g/l) either way."""
     system = to_statespace(pendulum, state=[angle, 0.0])
     expected = np.array(poles) * np.sqrt(9.81 / 0.5)
