@@ -15,7 +15,7 @@ from casest.closing.axes import lighter
 from casest.closing.candidates import prepared
 from casest.closing.loop import close, rms
 from casest.closing.restrict import restricted
-from casest.closing.text import sentence
+from casest.closing.text import sentence, undecided
 from casest.closing.written import closing_result
 from casest.effects import CATALOGUE
 from casest.problem import find_model
@@ -195,6 +195,7 @@ def test_of_two_causes_that_pull_opposite_ways_none_is_added():
     assert set(content["unexplained"]["would_move"]) == {"lever_arm", "bias_drift"}
     ways = content["unexplained"]["would_separate"]
     assert {words.partition(":")[0] for words in ways} == {"lever_arm", "bias_drift"}
+    assert "--effects" in " ".join(undecided(content))
 
 
 def test_a_cause_that_is_known_to_be_there_comes_first():

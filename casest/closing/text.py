@@ -125,6 +125,9 @@ def undecided(content: Mapping[str, Any]) -> Iterator[str]:
         if shifts:
             yield f"{label} would move the parameters: {moved_by(shifts, content)}"
     yield from (f"to tell {words}" for words in left["would_separate"][:SHOWN])
+    if left["would_move"]:
+        name = left["one_of"][0].partition("(")[0]
+        yield f"who knows which of them is there says so, as --effects {name}"
 
 
 def _first(unit: Any) -> str:
