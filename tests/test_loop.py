@@ -196,6 +196,8 @@ def test_of_two_causes_that_pull_opposite_ways_none_is_added():
     ways = content["unexplained"]["would_separate"]
     assert {words.partition(":")[0] for words in ways} == {"lever_arm", "bias_drift"}
     assert "--effects" in " ".join(undecided(content))
+    assert " or " in sentence(content)
+    assert {"lever_arm", "bias_drift"} <= set(sentence(content).split())
 
 
 def test_a_cause_that_is_known_to_be_there_comes_first():

@@ -59,8 +59,10 @@ def sentence(content: Mapping[str, Any]) -> str:
         left = "noise" if over < COLOURED else coloured
         return f"extended: {', '.join(names)} {verb} missing; what is left is {left}"
     found = f"beside {', '.join(names)} " if names else ""
-    if content["unexplained"]["one_of"]:
-        return f"unexplained: {found}a misfit remains that several causes explain alike"
+    causes = content["unexplained"]["one_of"]
+    if causes:
+        several = " or ".join(causes) if 1 < len(causes) < 4 else "several causes"
+        return f"unexplained: {found}a misfit remains that {several} explain alike"
     return f"unexplained: {found}a misfit remains that no candidate explains"
 
 
