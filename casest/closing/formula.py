@@ -75,15 +75,19 @@ def formula_instead(work: Work, declared: Fitted, current: Fitted) -> Fitted | N
     """The declared model with one formula, if that is clearly better than what was added to it.
 
     A course over temperature that no effect has can look like a slope and then a step in time.
+    Beside a formula it is enough that they are not clearly better than another one alone.
     """
     replaced = [f for f in work.found if f.score is not None and f.names]
-    if not any(f.candidate.column for f in replaced) or _terms(current.model):
+    beside = bool(_terms(current.model))
+    if len(replaced) < 2 if beside else not any(f.candidate.column for f in replaced):
         return None
     sought = _sought(work, declared)
     if sought is None or all(_has_a_name(t, declared.model) for t in _terms(sought[1].model)):
         return None
     crossed = work.crossed(sought[1])
-    if crossed is None or not work.confirmed(current, crossed):
+    if crossed is None or (beside and crossed.unknowns > current.unknowns):
+        return None
+    if work.confirmed(crossed, current) if beside else not work.confirmed(current, crossed):
         return None
     return _kept(work, declared, sought[0], crossed, replaced)
 
@@ -110,7 +114,8 @@ def _kept(
         return None
     work.found = [f for f in work.found if f not in replaced and f.candidate.label != NAME]
     for found in replaced:
-        work.refuse(found.candidate, "no longer needed beside the formula")
+        if found.candidate.label != NAME:
+            work.refuse(found.candidate, "no longer needed beside the formula")
     better, candidate, gained = passed
     better, candidate = _with_sizes(better, candidate)
     work.keep(better, candidate, gained, score, {})

@@ -45,6 +45,8 @@ from casest.stack import Point, Problem
 
 #: Columns of the widest model that is evaluated at once.
 WIDEST = 120
+#: Share of the false alarms allowed for a cause beside one that was added before.
+BESIDE = 0.1
 #: Rounds at most.
 ROUNDS = 8
 
@@ -158,7 +160,7 @@ def _ranked(work: Work, current: Fitted) -> list[Score]:
 
 def _better(work: Work, current: Fitted, ranked: list[Score]) -> Fitted | None:
     """The model with the best candidate that held-out data confirm; None if none does."""
-    limit = _limit(ranked)
+    limit = _limit(ranked, beside=any(f.names for f in work.found))
     significant = [s for s in ranked if s.p_value <= limit]
     confirmed = confirmed_by_flips(significant, ranked)
     if significant and not confirmed:
@@ -253,7 +255,7 @@ def _two_at_once(work: Work, current: Fitted, tried: list[tuple[Score, Fitted]])
         return None
     refused = list(work.refused)
     ranked = _ranked(work, first)
-    limit = _limit(ranked)
+    limit = _limit(ranked, beside=True)
     beside = [s for s in ranked if s.p_value <= limit]
     best = contenders(work, first, beside, ranked) if beside else []
     both = _first_accepted(work, current, best, limit)
@@ -315,9 +317,14 @@ def _parts(found: Sequence[Candidate], size: int) -> list[list[Candidate]]:
     return [list(found[k : k + size]) for k in range(0, len(found), size)]
 
 
-def _limit(ranked: Sequence[Score]) -> float:
-    """The p-value up to which a candidate is significant, beside all others."""
-    return FALSE_ALARM / max(len({s.candidate.label for s in ranked}), 1)
+def _limit(ranked: Sequence[Score], beside: bool = False) -> float:
+    """The p-value up to which a candidate is significant, beside all others.
+
+    What was added before was chosen by the same data, and may be only nearly right: a cause beside
+    it must be the clearer.
+    """
+    budget = FALSE_ALARM * (BESIDE if beside else 1.0)
+    return budget / max(len({s.candidate.label for s in ranked}), 1)
 
 
 __all__ = ["Closing", "Found", "close", "rms"]
