@@ -28,7 +28,7 @@ from casest.closing.noise_model import wander_of
 from casest.closing.profile import profiled
 from casest.closing.score import Score, scores, steadied, widened
 from casest.closing.settling import filled, proved, weeded
-from casest.closing.stakes import hangs_on_which, opposed, rivals, shifts
+from casest.closing.stakes import hangs_on_which, leave_open, note_walk, rivals, without_opposed
 from casest.closing.tails import outliers_p_value
 from casest.closing.wandering import wanders
 from casest.closing.work import Step, Work
@@ -115,7 +115,7 @@ def _closed(work: Work) -> Closing:
     last = current
     current = weeded(work, filled(work, current))
     if current is last:
-        current = _without_opposed(work, current)
+        current = without_opposed(work, current)
     if current is not last:
         ranked = _ranked(work, current)
     current, after = proved(work, current)
@@ -186,7 +186,7 @@ def _first_accepted(
             break  # What explains the data clearly less well is not the cause.
         if wanders(work.runs, current, fitted, score):
             work.refuse(score.candidate, "an offset that walks at random explains it as well")
-            _note_walk(work, current, score, fitted)
+            note_walk(work, current, score, fitted)
             continue
         passed = accepted(work, current, score, fitted)
         if passed is None:
@@ -195,52 +195,12 @@ def _first_accepted(
         near = as_good(tried, work.folds, STRONG)
         known = score.candidate.name in work.known
         if step.share < SMALL and not known and hangs_on_which(work, fitted, near):
-            _leave_open(work, step, near)
+            leave_open(work, step, near)
             return None
         work.last = None if known else step
         work.keep(*passed, score, rivals(work, fitted, score, tried))
         return passed[0]
     return None
-
-
-def _without_opposed(work: Work, current: Fitted) -> Fitted:
-    """Without the effect added last, if another explains as much and the parameters hang on it.
-
-    That is: if it explains little, or if the other one pulls the opposite way. Beside causes that
-    are still missing nothing is known of that: it is asked at the end.
-    """
-    step = work.last
-    if step is None or not work.found or work.found[-1].score is not step.score:
-        return current
-    near = as_good(step.tried, work.folds, STRONG)
-    if step.share < SMALL:
-        near = [p for p in step.tried if not_told_apart(step.fitted, p[1], step.score, work.folds)]
-    elif not opposed(work, step.before, step.fitted, near):
-        return current
-    if not hangs_on_which(work, step.fitted, near):
-        return current
-    work.found.pop()
-    _leave_open(work, step, near)
-    return step.before
-
-
-def _leave_open(work: Work, step: Step, near: Sequence[tuple[Score, Fitted]]) -> None:
-    """Say that several causes explain alike, and that none is added."""
-    own = step.score.candidate
-    names = [s.candidate.label for s, fitted in near if fitted is not step.fitted]
-    why = f"it may as well be {', '.join(names)}, and the parameters hang on which it is"
-    work.refuse(own, why)
-    moves = {own.label: shifts(work, step.before, step.fitted)}
-    moves |= {s.candidate.label: shifts(work, step.before, fitted) for s, fitted in near}
-    work.undecided = Undecided((own.label, *names), step.share, moves)
-
-
-def _note_walk(work: Work, current: Fitted, score: Score, fitted: Fitted) -> None:
-    """Keep in mind what held-out data confirm, though a random walk may be the cause as well."""
-    crossed = work.crossed(fitted)
-    if crossed is not None and work.confirmed(current, crossed):
-        share = work.gain(current, crossed)[0] / crossed.noise**2
-        work.walks.append(Undecided((score.candidate.label,), share))
 
 
 def _two_at_once(work: Work, current: Fitted, tried: list[tuple[Score, Fitted]]) -> Fitted | None:

@@ -1,4 +1,4 @@
-"""What hangs on which of several causes it is: where each would have the declared parameters."""
+"""What hangs on which of several causes it is, and what is left open for it."""
 
 from __future__ import annotations
 
@@ -6,9 +6,10 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from casest.closing.evidence import Fitted, not_told_apart
+from casest.closing.closed import Undecided
+from casest.closing.evidence import SMALL, STRONG, Fitted, as_good, not_told_apart
 from casest.closing.score import Score
-from casest.closing.work import Work
+from casest.closing.work import Step, Work
 from casest.declaring.shapes import Array
 from casest.noise import weighted
 from casest.stack import Problem
@@ -73,3 +74,43 @@ def apart(
 
     pairs = zip(predicted(one), predicted(other), strict=True)
     return sum(float(np.sum((a - b) ** 2)) for a, b in pairs)
+
+
+def without_opposed(work: Work, current: Fitted) -> Fitted:
+    """Without the effect added last, if another explains as much and the parameters hang on it.
+
+    That is: if it explains little, or if the other one pulls the opposite way. Beside causes that
+    are still missing nothing is known of that: it is asked at the end.
+    """
+    step = work.last
+    if step is None or not work.found or work.found[-1].score is not step.score:
+        return current
+    near = as_good(step.tried, work.folds, STRONG)
+    if step.share < SMALL:
+        near = [p for p in step.tried if not_told_apart(step.fitted, p[1], step.score, work.folds)]
+    elif not opposed(work, step.before, step.fitted, near):
+        return current
+    if not hangs_on_which(work, step.fitted, near):
+        return current
+    work.found.pop()
+    leave_open(work, step, near)
+    return step.before
+
+
+def leave_open(work: Work, step: Step, near: Sequence[tuple[Score, Fitted]]) -> None:
+    """Say that several causes explain alike, and that none is added."""
+    own = step.score.candidate
+    names = [s.candidate.label for s, fitted in near if fitted is not step.fitted]
+    why = f"it may as well be {', '.join(names)}, and the parameters hang on which it is"
+    work.refuse(own, why)
+    moves = {own.label: shifts(work, step.before, step.fitted)}
+    moves |= {s.candidate.label: shifts(work, step.before, fitted) for s, fitted in near}
+    work.undecided = Undecided((own.label, *names), step.share, moves)
+
+
+def note_walk(work: Work, current: Fitted, score: Score, fitted: Fitted) -> None:
+    """Keep in mind what held-out data confirm, though a random walk may be the cause as well."""
+    crossed = work.crossed(fitted)
+    if crossed is not None and work.confirmed(current, crossed):
+        share = work.gain(current, crossed)[0] / crossed.noise**2
+        work.walks.append(Undecided((score.candidate.label,), share))
