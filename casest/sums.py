@@ -17,7 +17,7 @@ from casest.stack import Block, Point, Problem
 #: Residuals that are looked at where a median or a correlation is wanted of a longer record.
 SAMPLED = 1_000_000
 #: The same where an order of magnitude is wanted.
-FEW = 3_000
+FEW = 600
 #: Samples of each run that are enough to come near a solution of a longer record.
 NEARBY = 2000
 

@@ -153,9 +153,14 @@ def _averaged(t: Array, v: Array) -> tuple[Array, Array]:
     length = int(BIN / float(np.median(np.diff(t[:10_001]))) + 1e-6)
     if length < 2:
         return t, v
-    first = np.arange(0, len(t), length)
-    counts = np.diff(np.append(first, len(t)))
-    return np.add.reduceat(t, first) / counts, np.add.reduceat(v, first) / counts[:, None]
+    return _means(t, length), _means(v, length)
+
+
+def _means(x: Array, length: int) -> Array:
+    """Of every `length` rows, and of what is left at the end."""
+    whole = len(x) - len(x) % length
+    means = np.asarray(sum(x[k:whole:length] for k in range(length)) / length)
+    return means if whole == len(x) else np.append(means, x[whole:].mean(axis=0)[None], axis=0)
 
 
 def _phasor(t: Array, v: Array) -> Any:
@@ -192,15 +197,23 @@ def _window_sums(values: Any, first: Any) -> Any:
 def _robust_fit(x: Array, y: Array, degree: int) -> Array:
     """Polynomial through most points: those far off the last fit are left out, three times."""
     keep = np.ones(len(x), dtype=bool)
-    fit = np.polynomial.polynomial.polyfit(x, y, degree)
+    fit = _polynomial(x, y, degree)
     for _ in range(3):
         away = np.abs(y - np.polynomial.polynomial.polyval(x, fit))
         limit = 4 * np.median(away[keep]) + 1e-12
-        keep = away <= limit
-        if keep.sum() <= degree + 1:
+        kept, keep = keep, away <= limit
+        if keep.sum() <= degree + 1 or np.array_equal(keep, kept):
             break
-        fit = np.polynomial.polynomial.polyfit(x[keep], y[keep], degree)
-    return np.asarray(fit)
+        fit = _polynomial(x[keep], y[keep], degree)
+    return fit
+
+
+def _polynomial(x: Array, y: Array, degree: int) -> Array:
+    """Coefficients of least squares, lowest first."""
+    size = float(np.abs(x).max()) or 1.0
+    columns = np.vander(x / size, degree + 1, increasing=True)
+    fit = np.linalg.lstsq(columns, y, rcond=None)[0]
+    return np.asarray(fit / size ** np.arange(degree + 1))
 
 
 def _slow_phase(motion: Motion, t: Array, z: Any, step: float, degree: int = 4) -> Motion:
@@ -211,7 +224,7 @@ def _slow_phase(motion: Motion, t: Array, z: Any, step: float, degree: int = 4) 
     counts = np.diff(np.append(first, len(t)))
     slow = np.unwrap(np.angle(_window_sums(left, first)))
     centres = np.add.reduceat(t, first) / counts
-    return Motion(np.polynomial.polynomial.polyfit(centres, slow, min(degree, len(first) - 1)))
+    return Motion(_polynomial(centres, slow, min(degree, len(first) - 1)))
 
 
 # -- everything else, linear once the motion is known ----------------------------------------------
