@@ -117,8 +117,8 @@ RECORDS = (
         COUNTS,
         "mpu6050-tomisuarez/imu_static_test.csv",
         ("--columns", "v=gx,gy,gz", "--unit", "v=count", "--rate", "100"),
-        "A narrow line and a slow change, 0.2 % of the rms: real, and of no "
-        "use to anybody who corrects readings.",
+        "A narrow line; a slow change that may be a drift or a step is left open. "
+        "Together 0.2 % of the rms.",
     ),
     Record(
         "MPU-6050 at rest, accelerometer",
