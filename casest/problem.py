@@ -16,7 +16,7 @@ from casest.dynamics import Dynamics
 from casest.effects import CATALOGUE
 from casest.errors import CasestError, DeclarationError, UsageError
 from casest.modelling.dimensions import check_units
-from casest.modelling.effect import NOISE, Effect
+from casest.modelling.effect import Effect
 from casest.modelling.model import Model
 
 #: Shipped models: name on the command line -> module and attribute in `casest_problems`.
@@ -83,6 +83,13 @@ def find_effects(name: str) -> tuple[Effect, ...]:
     shipped = {e.name: e for e in CATALOGUE}
     if name in shipped:
         return (_whole(shipped[name]),)
+    if not Path(name).suffix and ":" not in name:
+        near = difflib.get_close_matches(name, shipped, 1)
+        hint = f"; did you mean {near[0]!r}?" if near else ""
+        raise UsageError(
+            f"--effects {name}: no shipped effect{hint} (`casest list` has them; or give the path "
+            "of a .py file)"
+        )
     path, _, wanted = name.partition(":")
     module = load_file(Path(path))
     if wanted:
@@ -96,10 +103,8 @@ def find_effects(name: str) -> tuple[Effect, ...]:
 def _whole(effect: Effect) -> Effect:
     """A shipped effect that needs neither a column nor a value that must be looked for."""
     missing = "the column it follows" if any(s.name == "channel" for s in effect.extras) else ""
-    if effect.profile or effect.on == NOISE:
-        missing = "what only `casest close` finds: " + (
-            ", ".join(n for n, _ in effect.profile) or "the noise"
-        )
+    if effect.profile:
+        missing = f"its {', '.join(n for n, _ in effect.profile)}, which only `casest close` finds"
     if missing:
         raise UsageError(
             f"--effects {effect.name}: this effect needs {missing}. Declare it in a file of your "

@@ -228,3 +228,13 @@ def test_hysteresis_lags_behind_whichever_way_the_reading_moves():
     assert np.mean(np.abs(away[clear])) < 1e-3
     assert np.median(np.abs(away[clear])) < 1e-5
     assert np.abs(y - found).max() < 0.02 * (1 + 1e-9)
+
+
+def test_a_shipped_effect_goes_by_its_name_where_the_model_has_its_quantity():
+    from casest.cli.words import declared_model
+
+    options = dict.fromkeys(("constants", "free", "fix", "shared", "per_run"), ())
+    model = declared_model("norm-diagonal", {**options, "effects": ["quadratic"]})
+    (added,) = model.effects
+    assert added.effect.on == find_model("norm-diagonal").traced.corrected
+    assert model.parameters[-1].name == "quadratic.k"
