@@ -116,7 +116,8 @@ def _head() -> Iterator[str]:
     yield "of them were tuned on)."
     yield "Share: of the held-out mean squared error that an oracle removes, how much is gone (the"
     yield "goal: at least 80 %). Named: the column, both columns or the quantity is named. Visible:"
-    yield "worlds where the oracle gains 2 % of held-out rmse, noncentrality 45."
+    yield "worlds where the oracle gains 2 % of held-out rmse, noncentrality 45. (`dead_zone` has"
+    yield "come into the catalogue since.)"
     yield ""
 
 
