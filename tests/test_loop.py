@@ -200,6 +200,16 @@ def test_of_two_causes_that_pull_opposite_ways_none_is_added():
     assert {"lever_arm", "bias_drift"} <= set(sentence(content).split())
 
 
+def test_what_is_to_be_said_with_effects_is_a_name_that_it_takes():
+    """A constant that may be wrong is freed with --free, and is no effect."""
+    moves = {"radius": {}, "temperature_bias(temp)": {}}
+    left = {"one_of": list(moves), "would_move": moves, "would_separate": []}
+    (words,) = undecided({"unexplained": left})
+    assert words.endswith("--effects temperature_bias")
+    left["would_move"] = {"radius": {}}
+    assert not list(undecided({"unexplained": left}))
+
+
 def test_a_cause_that_is_known_to_be_there_comes_first():
     world = worlds.made(*LEVER)
     closing = close(declared(world), [record(world)], known=["lever_arm"])

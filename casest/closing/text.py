@@ -127,8 +127,9 @@ def undecided(content: Mapping[str, Any]) -> Iterator[str]:
         if shifts:
             yield f"{label} would move the parameters: {moved_by(shifts, content)}"
     yield from (f"to tell {words}" for words in left["would_separate"][:SHOWN])
-    if left["would_move"]:
-        name = left["one_of"][0].partition("(")[0]
+    shipped = {e.name for e in CATALOGUE}
+    names = [label.partition("(")[0] for label in left["would_move"]]
+    if name := next((n for n in names if n in shipped), ""):
         yield f"who knows which of them is there says so, as --effects {name}"
 
 
