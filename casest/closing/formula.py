@@ -119,7 +119,6 @@ def _kept(
     better, candidate, gained = passed
     better, candidate = _with_sizes(better, candidate)
     work.keep(better, candidate, gained, score, {})
-    work.last = None
     return better
 
 

@@ -247,7 +247,6 @@ def _without_outliers(work: Work, current: Fitted) -> Fitted:
         return current
     gained = work.gain(current, fitted)[0]
     work.found.append(Found(Candidate(effect), None, p_value, gained))
-    work.last = None
     work.say("outliers: they count less from here on")
     return fitted
 

@@ -63,7 +63,7 @@ class Work:
         self.skipped: list[Skipped] = []
         self.found: list[Found] = []
         self.undecided: Undecided | None = None
-        #: The step that added the effect found last, where it can be taken back.
+        #: The last step that added one effect, which can be taken back while nothing follows it.
         self.last: Step | None = None
         #: What would have been added, were a random walk of the offset not as good a cause.
         self.walks: list[Undecided] = []
