@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
 .PHONY: demo test lint types format wheel bench study study-starts study-nist study-loop \
-	study-motion study-records figures docs clean
+	study-motion study-records study-asked figures docs clean
 
 demo: $(READY)
 	$(BIN)/casest demo
@@ -51,6 +51,9 @@ study-loop: $(READY)
 study-motion: $(READY)
 	$(BIN)/python studies/flight.py
 	$(BIN)/python studies/flight_loop.py
+
+study-asked: $(READY)
+	$(BIN)/python studies/asked.py
 
 study-records: $(READY)
 	$(BIN)/python studies/records.py

@@ -10,6 +10,7 @@ import json
 
 import numpy as np
 import pytest
+from scipy.stats import f
 
 from casest.cli import run
 
@@ -72,7 +73,22 @@ def test_before_calibration_a_first_harmonic_explains_half_of_the_headings_error
     swung = headings("calibrate", "before", "--effects", "compass.py")
     assert plain["noise"]["sigma"][0] == pytest.approx(4.09, abs=0.01)
     assert swung["noise"]["sigma"][0] == pytest.approx(2.01, abs=0.02)
-    assert amplitude(swung) > 4.3  # F(2, 6) = 9.2: one in a hundred
+    assert amplitude(swung) > 4.3
+
+
+def test_before_calibration_closing_the_loop_traces_the_first_harmonic(headings):
+    """Asked for, among nothing else: the F test of ordinary least squares, by hand."""
+    result = headings("close", "before", "--effects", "compass.py")
+    off, angle = np.array(HEADINGS["before"]) - TABLE, np.radians(TABLE)
+    swings = np.stack([np.ones(9), np.sin(angle), np.cos(angle)], axis=1)
+    left = off - swings @ np.linalg.lstsq(swings, off, rcond=None)[0]
+    F = ((off - off.mean()) @ (off - off.mean()) - left @ left) / 2 / (left @ left / 6)
+    (found,) = result["effects"]
+    assert found["name"] == "deviation"
+    assert found["p_value"] == pytest.approx(f.sf(F, 2, 6), rel=0.01)
+    assert result["verdict"] == "extended"
+    assert result["after"]["rmse_holdout"] < 0.6 * result["before"]["rmse_holdout"]
+    assert result["before"]["rmse_holdout"] == pytest.approx(4.62, abs=0.01)
 
 
 def test_after_calibration_no_first_harmonic_is_left(headings):
@@ -86,3 +102,4 @@ def test_after_calibration_closing_the_loop_finds_nothing(headings, effects):
     result = headings("close", "after", *effects)
     assert result["verdict"] == "adequate"
     assert result["effects"] == []
+    assert [r["name"] for r in result["refused"]] == ["deviation"] * bool(effects)

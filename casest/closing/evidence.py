@@ -17,9 +17,9 @@ from casest.modelling.model import Model
 FALSE_ALARM = 0.004
 #: Candidates whose errors differ by fewer standard errors are not told apart.
 ALIKE = 2.0
-#: Differences of evidence that are not worth more than a bare mention, and not strong (Kass &
-#: Raftery 1995).
-BARE_MENTION, STRONG = 2.0, 6.0
+#: Differences of evidence that are not worth more than a bare mention, not strong, and not very
+#: strong (Kass & Raftery 1995).
+BARE_MENTION, STRONG, VERY_STRONG = 2.0, 6.0, 10.0
 #: Share of the held-out mean square below which a cause must be the only one that it can be.
 SMALL = 0.01
 #: Share of the mean square that is no matter.
@@ -162,11 +162,14 @@ def _price_of_two(fitted: Fitted, score: Score) -> float:
     return min(2 * (fitted.unknowns - few) * score.inflation + more for few, more in ways)
 
 
-def confirmed_by_flips(significant: list[Score], ranked: list[Score]) -> list[Score]:
+def confirmed_by_flips(
+    significant: list[Score], ranked: list[Score], chance: float = FALSE_ALARM
+) -> list[Score]:
     """The smallest p-value must be rare when the signs of the batches' noise are random.
 
     Flipping the sign of all that a batch contributes keeps unequal noise as it is, and the
-    dependence between candidates (Westfall & Young 1993, with wild bootstrap weights).
+    dependence between candidates (Westfall & Young 1993, with wild bootstrap weights). Rarer than
+    `chance`, among those of all that are ranked.
     """
     if not significant:
         return []
@@ -182,5 +185,5 @@ def confirmed_by_flips(significant: list[Score], ranked: list[Score]) -> list[Sc
         second = second_freedom(s.freedom, s.inflation, s.effective)
         p = np.minimum(1.0, fdtrc(s.freedom, second, F) * s.candidate.trials)
         smallest = np.minimum(smallest, p)
-    limit = float(np.quantile(smallest, FALSE_ALARM))
+    limit = float(np.quantile(smallest, chance))
     return [s for s in significant if s.p_value <= limit]

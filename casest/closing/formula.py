@@ -7,7 +7,7 @@ effect of the catalogue: a certificate, and the error on held-out data.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -71,11 +71,14 @@ def try_formula(work: Work, current: Fitted) -> Fitted | None:
     return _kept(work, current, score, fitted, replaced)
 
 
-def formula_instead(work: Work, declared: Fitted, current: Fitted) -> Fitted | None:
+def formula_instead(
+    work: Work, declared: Fitted, current: Fitted, complete: Callable[[Fitted], bool]
+) -> Fitted | None:
     """The declared model with one formula, if that is clearly better than what was added to it.
 
     A course over temperature that no effect has can look like a slope and then a step in time.
-    Beside a formula it is enough that they are not clearly better than another one alone.
+    Beside a formula it is enough that they are not clearly better than another one alone, or that
+    this one is `complete`: that nothing else would be added to it.
     """
     replaced = [f for f in work.found if f.score is not None and f.names]
     beside = bool(_terms(current.model))
@@ -87,7 +90,9 @@ def formula_instead(work: Work, declared: Fitted, current: Fitted) -> Fitted | N
     crossed = work.crossed(sought[1])
     if crossed is None or (beside and crossed.unknowns > current.unknowns):
         return None
-    if work.confirmed(crossed, current) if beside else not work.confirmed(current, crossed):
+    if beside and work.confirmed(crossed, current) and not complete(crossed):
+        return None
+    if not beside and not work.confirmed(current, crossed):
         return None
     return _kept(work, declared, sought[0], crossed, replaced)
 

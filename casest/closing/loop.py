@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 
+from casest.closing.asked import CHANCE, asked
 from casest.closing.candidates import Candidate, Skipped, candidates, prepared
 from casest.closing.closed import HELD_OUT_DATA, Closing, Found, Undecided
 from casest.closing.contest import contenders, whole
@@ -104,9 +106,9 @@ def _closed(work: Work) -> Closing:
         first_scores, declared = first_scores or ranked, declared or current
         better = _better(work, current, ranked)
         if better is None and work.undecided is None:
-            better = try_formula(work, current)
+            better = _asked(work, current, ranked) or try_formula(work, current)
         if better is None:
-            better = formula_instead(work, declared, current)
+            better = formula_instead(work, declared, current, partial(_complete, work))
         if better is None:
             break
         current = better
@@ -160,7 +162,7 @@ def _ranked(work: Work, current: Fitted) -> list[Score]:
 
 def _better(work: Work, current: Fitted, ranked: list[Score]) -> Fitted | None:
     """The model with the best candidate that held-out data confirm; None if none does."""
-    limit = _limit(ranked, beside=any(f.names for f in work.found))
+    limit = _limit(ranked, _sternness(work))
     significant = [s for s in ranked if s.p_value <= limit]
     confirmed = confirmed_by_flips(significant, ranked)
     if significant and not confirmed:
@@ -172,6 +174,12 @@ def _better(work: Work, current: Fitted, ranked: list[Score]) -> Fitted | None:
     if found is not None or work.undecided is not None:
         return found
     return _two_at_once(work, current, [pair for pair in tried if pair[0].p_value <= limit])
+
+
+def _asked(work: Work, current: Fitted, ranked: list[Score]) -> Fitted | None:
+    """The model with what the user asks for, if the data and held-out data do not deny it."""
+    tried, limit = asked(work, current, ranked, CHANCE * _sternness(work))
+    return _first_accepted(work, current, tried, limit) if tried else None
 
 
 def _first_accepted(
@@ -215,7 +223,7 @@ def _two_at_once(work: Work, current: Fitted, tried: list[tuple[Score, Fitted]])
         return None
     refused = list(work.refused)
     ranked = _ranked(work, first)
-    limit = _limit(ranked, beside=True)
+    limit = _limit(ranked, BESIDE)
     beside = [s for s in ranked if s.p_value <= limit]
     best = contenders(work, first, beside, ranked) if beside else []
     both = _first_accepted(work, current, best, limit)
@@ -276,14 +284,24 @@ def _parts(found: Sequence[Candidate], size: int) -> list[list[Candidate]]:
     return [list(found[k : k + size]) for k in range(0, len(found), size)]
 
 
-def _limit(ranked: Sequence[Score], beside: bool = False) -> float:
-    """The p-value up to which a candidate is significant, beside all others.
+def _complete(work: Work, fitted: Fitted) -> bool:
+    """Would nothing be significant beside it?"""
+    ranked = _ranked(work, fitted)
+    return all(s.p_value > _limit(ranked, BESIDE) for s in ranked)
+
+
+def _sternness(work: Work) -> float:
+    """Share of the usual chance that a cause may have.
 
     What was added before was chosen by the same data, and may be only nearly right: a cause beside
     it must be the clearer.
     """
-    budget = FALSE_ALARM * (BESIDE if beside else 1.0)
-    return budget / max(len({s.candidate.label for s in ranked}), 1)
+    return BESIDE if any(f.names for f in work.found) else 1.0
+
+
+def _limit(ranked: Sequence[Score], share: float = 1.0) -> float:
+    """The p-value up to which a candidate is significant, beside all others."""
+    return share * FALSE_ALARM / max(len({s.candidate.label for s in ranked}), 1)
 
 
 __all__ = ["Closing", "Found", "close", "rms"]
