@@ -17,9 +17,9 @@ from casest.modelling.model import Model
 FALSE_ALARM = 0.004
 #: Candidates whose errors differ by fewer standard errors are not told apart.
 ALIKE = 2.0
-#: Differences of evidence that are not worth more than a bare mention, not strong, and not very
-#: strong (Kass & Raftery 1995).
-BARE_MENTION, STRONG, VERY_STRONG = 2.0, 6.0, 10.0
+#: Differences of evidence that are not worth more than a bare mention, and not strong (Kass &
+#: Raftery 1995).
+BARE_MENTION, STRONG = 2.0, 6.0
 #: Share of the held-out mean square below which a cause must be the only one that it can be.
 SMALL = 0.01
 #: Share of the mean square that is no matter.

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from casest.closing.closed import Undecided
-from casest.closing.evidence import SMALL, VERY_STRONG, Fitted, as_good, not_told_apart
+from casest.closing.evidence import SMALL, STRONG, Fitted, as_good, not_told_apart
 from casest.closing.score import Score
 from casest.closing.work import Step, Work
 from casest.declaring.shapes import Array
@@ -85,7 +85,7 @@ def without_opposed(work: Work, current: Fitted) -> Fitted:
     step = work.last
     if step is None or not work.found or work.found[-1].score is not step.score:
         return current
-    near = as_good(step.tried, work.folds, VERY_STRONG)
+    near = as_good(step.tried, work.folds, STRONG)
     if step.share < SMALL:
         near = [p for p in step.tried if not_told_apart(step.fitted, p[1], step.score, work.folds)]
     elif not opposed(work, step.before, step.fitted, near):
