@@ -20,7 +20,7 @@ from casest.closing.candidates import Candidate, placed_in, usable_columns
 from casest.closing.closed import Found, Undecided
 from casest.closing.contest import joined
 from casest.closing.dependence import slow_shapes
-from casest.closing.evidence import SMALL, Fitted
+from casest.closing.evidence import SMALL, Fitted, by_evidence
 from casest.closing.gate import accepted
 from casest.closing.noise_model import (
     MIDDLE,
@@ -113,6 +113,11 @@ def _kept(
     if passed is None:
         return None
     share = passed[2] / passed[0].noise ** 2
+    rival = _better_untrusted(work, score, passed[0])
+    if rival:
+        work.refuse(score.candidate, f"{rival} explains more, though its fit is refused")
+        work.undecided = Undecided((rival, NAME), share)
+        return None
     if share < SMALL and not replaced and not _terms(before.model):
         work.refuse(score.candidate, "so small a course may as well have another shape")
         work.undecided = Undecided((score.candidate.label,), share)
@@ -125,6 +130,12 @@ def _kept(
     better, candidate = _with_sizes(better, candidate)
     work.keep(better, candidate, gained, score, {})
     return better
+
+
+def _better_untrusted(work: Work, score: Score, fitted: Fitted) -> str:
+    """What has more evidence than a formula, but a fit that is refused: its label, if any."""
+    tried = by_evidence([(score, fitted), *work.untrusted])
+    return "" if tried[0][1] is fitted else tried[0][0].candidate.label
 
 
 def _sought(work: Work, current: Fitted) -> tuple[Score, Fitted] | None:

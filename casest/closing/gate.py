@@ -39,6 +39,7 @@ def accepted(
         why = estimate.certificate.reasons[0]
     if estimate is None or why:
         work.refuse(score.candidate, f"its fit is refused: {why}")
+        work.untrusted.append((score, crossed))
         return None
     crossed = replace(crossed, values=estimate.values)
     plain, candidate = _plainer(work, *pruned(work, crossed, estimate, score))

@@ -101,7 +101,7 @@ def _closed(work: Work) -> Closing:
     ranked: list[Score] = []
     for _ in range(ROUNDS):
         current = _without_outliers(work, current)
-        work.walks, work.undecided = [], None  # of this round
+        work.walks, work.untrusted, work.undecided = [], [], None  # of this round
         ranked = _ranked(work, current)
         first_scores, declared = first_scores or ranked, declared or current
         better = _better(work, current, ranked)

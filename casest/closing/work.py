@@ -67,6 +67,8 @@ class Work:
         self.last: Step | None = None
         #: What would have been added, were a random walk of the offset not as good a cause.
         self.walks: list[Undecided] = []
+        #: What explains the data in this round, but has no fit that can be trusted.
+        self.untrusted: list[tuple[Score, Fitted]] = []
         #: Candidates as they are declared, by label: their profiles unknown, on all axes.
         self.original: dict[str, Candidate] = {}
 
