@@ -214,9 +214,11 @@ class _Result:
     @classmethod
     def empty(cls, model: Model, size: int) -> _Result:
         n = sum(p.shape.size for p in model.parameters)
-        one, each = np.empty(size), np.empty((size, n))
         verdicts = Verdicts.empty(_names(model), size)
-        return cls(each, each.copy(), np.empty((size, n, n)), one, one.copy(), verdicts)
+        # In memory the sensors lie side by side, as in the blocks that come in.
+        x, std = np.empty((2, n, size)).transpose(0, 2, 1)
+        covariance = np.empty((n, n, size)).transpose(2, 0, 1)
+        return cls(x, std, covariance, np.empty(size), np.empty(size), verdicts)
 
     def batch(self, model: Model) -> Batch:
         trusted = self.verdicts.trusted

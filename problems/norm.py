@@ -270,24 +270,55 @@ def closed_form(declared: Model, runs: Sequence[Run]) -> dict[str, Array]:
     return _values(declared, *burkhard_full(z, g))
 
 
-def _columns(z: Array, middle: Array, k: int) -> Array:
-    """Columns of the closed form's equations, k of squares, and their right side, (k + 5, N, S).
+#: Exponents of x, y and w.
+_Monomial = tuple[int, int, int]
+_ONE, _X, _Y, _W = (0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)
+_XX, _YY, _WW, _XY, _XW, _YW = (2, 0, 0), (0, 2, 0), (0, 0, 2), (1, 1, 0), (1, 0, 1), (0, 1, 1)
+#: Columns of the closed form's equations: θ = (s11, s22, 2·s12, 2·s13, 2·s23, −2r, d); what each
+#: is the sum of. On the right stays −3w², on a sphere −‖z‖².
+_SQUARES: tuple[dict[_Monomial, float], ...] = (
+    {_XX: 1.0, _WW: -1.0}, {_YY: 1.0, _WW: -1.0}, {_XY: 1.0}, {_XW: 1.0}, {_YW: 1.0}
+)  # fmt: skip
+_REST: tuple[dict[_Monomial, float], ...] = ({_X: 1.0}, {_Y: 1.0}, {_W: 1.0}, {_ONE: 1.0})
 
-    θ = (s11, s22, 2·s12, 2·s13, 2·s23, −2r, d); on the right stays −3w², on a sphere −‖z‖².
+
+def _moments(z: Array) -> dict[_Monomial, Array]:
+    """Sums over samples (3, N, S) of the products of up to four readings, (S,).
+
+    Each is summed once: the equations' own products would be twice as many.
     """
-    X = np.empty((k + 5, *z.shape[1:]))
-    x, y, w = np.subtract(z, middle[:, None], out=X[k : k + 3])
-    X[k + 3] = 1.0
-    if not k:
-        np.einsum("ips,ips->ps", X[:3], X[:3], out=X[-1])
-        return X
-    np.square(w, out=X[-1])
-    for row, own in ((0, x), (1, y)):
-        np.subtract(np.square(own, out=X[row]), X[-1], out=X[row])
-    X[-1] *= 3.0
-    for row, own, other in ((2, x, y), (3, x, w), (4, y, w))[: k - 2]:
-        np.multiply(own, other, out=X[row])
-    return X
+    _, count, width = z.shape
+    found = {_X: np.zeros(width), _Y: np.zeros(width), _W: np.zeros(width)}  # from their mean
+    found[_ONE] = np.full(width, float(count))
+    x, y, w = z
+    names = (_XX, _YY, _WW, _XY, _XW, _YW)
+    q = np.empty((6, count, width))
+    for row, (one, other) in enumerate(((x, x), (y, y), (w, w), (x, y), (x, w), (y, w))):
+        np.multiply(one, other, out=q[row])
+    found |= dict(zip(names, np.add.reduce(q, axis=1), strict=True))
+    wanted = [(q[k], names[k], slice(k, 6)) for k in range(3)]
+    wanted += [(x, _X, slice(6)), (y, _Y, slice(1, 3)), (y, _Y, slice(5, 6)), (w, _W, slice(2, 3))]
+    for values, name, rows in wanted:
+        sums = np.einsum("ps,jps->js", values, q[rows])
+        for other, total in zip(names[rows], sums, strict=True):
+            found.setdefault((name[0] + other[0], name[1] + other[1], name[2] + other[2]), total)
+    return found
+
+
+def _equations(z: Array, k: int) -> Array:
+    """Normal equations with the right side as a last column, (n, n + 1, S); k of squares."""
+    m = _moments(z)
+    right = {_WW: 3.0} if k else {_XX: 1.0, _YY: 1.0, _WW: 1.0}
+    columns = [*_SQUARES[:k], *_REST, right]
+    n = len(columns) - 1
+    A = np.zeros((n, n + 1, z.shape[2]))
+    for i, one in enumerate(columns[:-1]):
+        for j in range(i, n + 1):
+            for a, p in one.items():
+                for b, q in columns[j].items():
+                    product = m[a[0] + b[0], a[1] + b[1], a[2] + b[2]]
+                    A[i, j] += product if p * q == 1.0 else p * q * product
+    return A
 
 
 def closed_form_many(declared: Model, signals: Mapping[str, Array]) -> dict[str, Any]:
@@ -304,11 +335,8 @@ def closed_form_many(declared: Model, signals: Mapping[str, Array]) -> dict[str,
     z = v if known is None else np.einsum("ij,jns->ins", known, v)
     middle = np.mean(z, axis=1)
     k = 0 if known is not None else 2 if declared.function.__name__ == "norm_diagonal" else 5
-    X = _columns(z, middle, k)
-    n = len(X) - 1
-    A = np.empty((n, n + 1, v.shape[2]))
-    for i in range(n):
-        np.einsum("ps,jps->js", X[i], X[i:], out=A[i, i:])
+    A = _equations(z - middle[:, None], k)
+    n = len(A)
     spread = (A[k, k] + A[k + 1, k + 1] + A[k + 2, k + 2]) / v.shape[1]
     for i in range(n):  # Cholesky, on the upper triangle and the right side
         if i:

@@ -1,6 +1,6 @@
 """What is asked for: an effect of the user's own is a hypothesis that was there before the data.
 
-It is not looked for among all that could be: a chance of 5 % is enough, by the plain F test of its
+It is not looked for among all that could be: a chance of 1 % is enough, by the plain F test of its
 refit, which in a few poses sees more than a score whose noise the same few poses must tell. Signs
 of the noise that are flipped, and held-out data, must confirm it as they do everything else.
 """
@@ -18,7 +18,7 @@ from casest.effects import CATALOGUE
 from casest.stack import Problem
 
 #: Chance that any effect that is asked for is called significant where there is none.
-CHANCE = 0.05
+CHANCE = 0.01
 
 _SHIPPED = {effect.name for effect in CATALOGUE}
 
