@@ -93,6 +93,29 @@ def test_a_bent_course_over_temperature_is_a_formula_and_no_step():
     assert rms(closing.after_held_out) < 1.1 * world.sigma
 
 
+def test_a_formula_that_leaves_nothing_stands_alone():
+    """The step that had been taken for a part of the product pulled the parameters away."""
+    identity = [8, *b"elsewhere", *b"table", *b"product"]
+    world = worlds.made("table", identity, {"product": 0.04})
+    closing = close(declared(world), [record(world, identity)])
+    assert labels(closing) == ["formula"]
+    (refused,) = [r for r in closing.refused if r.name == "bias_step"]
+    assert refused.reason == "no longer needed beside the formula"
+    assert "formula" not in {r.name for r in closing.refused}
+
+
+def test_no_formula_stands_for_an_effect_whose_fit_is_refused():
+    identity = [11, *b"one", *b"table", *b"dead_zone", *b"medium"]
+    world = worlds.made("table", identity, {"dead_zone": 0.03})
+    closing = close(declared(world), [record(world, identity)])
+    assert labels(closing) == []
+    assert closing.verdict == "unexplained"
+    assert closing.undecided.names == ("dead_zone", "formula")
+    reasons = {r.name: r.reason for r in closing.refused}
+    assert reasons["dead_zone"].startswith("its fit is refused")
+    assert reasons["formula"] == "dead_zone explains more, though its fit is refused"
+
+
 def test_all_that_small_nonlinearity_may_be_is_named():
     """On one tilt four shapes of response look alike until they are large."""
     closing, _ = closed("wheel", 4, {"quadratic": 3e-4})

@@ -122,6 +122,7 @@ def _closed(work: Work) -> Closing:
         ranked = _ranked(work, current)
     current, after = proved(work, current)
     _note_wander(work, current)
+    added = {f.candidate.label for f in work.found}
     return Closing(
         work.before,
         after,
@@ -129,7 +130,7 @@ def _closed(work: Work) -> Closing:
         current.held_out,
         tuple(work.found),
         tuple(work.skipped),
-        tuple(work.refused),
+        tuple(r for r in work.refused if r.name not in added),
         work.folds,
         tuple(ranked),
         tuple(first_scores or ()),

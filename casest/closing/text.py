@@ -30,6 +30,7 @@ def closing_text(closing: Closing, content: Mapping[str, Any], output: Path | No
         "\n".join(_moved(content)),
         "\n".join(_invisible(content)),
         "\n".join(_unexplained(content)),
+        "\n".join(_detectable(content)),
         "\n".join(_notes(content)),
     ]
     if output is not None:
@@ -174,6 +175,19 @@ def _unexplained(content: Mapping[str, Any]) -> Iterator[str]:
             f"Unexplained: {100 * left['fraction']:.2g} % of the held-out variance, {left['where']}"
         )
         yield from (item(words) for words in undecided(content))
+
+
+def _detectable(content: Mapping[str, Any]) -> Iterator[str]:
+    """How small an effect would have been seen, where none was."""
+    sizes: dict[str, str] = {}
+    for d in content["smallest_detectable"]:
+        unit = "" if d["unit"] == "1" else f" {d['unit']}"
+        sizes.setdefault(d["name"], f"{d['parameter']} = {d['size']:.2g}{unit}")
+    if content["verdict"] == "adequate" and sizes:
+        yield "Would have been seen, from this size on:"
+        yield from (item(words) for words in list(sizes.values())[:SHOWN])
+        if len(sizes) > SHOWN:
+            yield f"  - and {len(sizes) - SHOWN} more, in result.json"
 
 
 def _notes(content: Mapping[str, Any]) -> Iterator[str]:
