@@ -77,8 +77,8 @@ def formula_instead(
     """The declared model with one formula, if that is clearly better than what was added to it.
 
     A course over temperature that no effect has can look like a slope and then a step in time.
-    Beside a formula it is enough that they are not clearly better than another one alone, or that
-    this one is `complete`: that nothing else would be added to it.
+    Beside a formula it is enough that they are not clearly better than another one alone; or, if
+    one of them follows time, that this one is `complete`: that nothing else would be added to it.
     """
     replaced = [f for f in work.found if f.score is not None and f.names]
     beside = bool(_terms(current.model))
@@ -90,11 +90,19 @@ def formula_instead(
     crossed = work.crossed(sought[1])
     if crossed is None or (beside and crossed.unknowns > current.unknowns):
         return None
-    if beside and work.confirmed(crossed, current) and not complete(crossed):
+    timed = any(_follows_time(f.candidate) for f in replaced)
+    if beside and work.confirmed(crossed, current) and not (timed and complete(crossed)):
         return None
     if not beside and not work.confirmed(current, crossed):
         return None
     return _kept(work, declared, sought[0], crossed, replaced)
+
+
+def _follows_time(candidate: Candidate) -> bool:
+    """Is it an effect of the catalogue that a moment or the time decides?"""
+    if candidate.effect is None or candidate.label == NAME:
+        return False
+    return any(s.name == "t" for s in candidate.effect.extras)
 
 
 def _has_a_name(term: Term, model: Model) -> bool:
