@@ -16,6 +16,9 @@ from casest.stack import Problem
 
 #: Standard deviations by which another cause must move a declared parameter to have it elsewhere.
 ELSEWHERE = 2.0
+#: Harm of a cause, were it another one, over its good, were it this one, from which on to have more
+#: evidence is not enough. In squares: where the other pulls the opposite way as far.
+HARM = 3.0
 
 
 def hangs_on_which(work: Work, fitted: Fitted, near: Sequence[tuple[Score, Fitted]]) -> bool:
@@ -54,11 +57,18 @@ def opposed(
     Two causes may explain alike and move the parameters in opposite ways: each, where it is the
     wrong one, does more harm than none.
     """
-    return any(
-        apart(work, current, fitted.values, other.values)
-        > apart(work, current, current.values, other.values)
-        for _, other in near
-    )
+    return any(_harms(work, current, fitted, other, 0.0) for _, other in near)
+
+
+def _harms(work: Work, current: Fitted, fitted: Fitted, other: Fitted, times: float) -> bool:
+    """Would a cause do more harm, were it the other one, than so many times its good?
+
+    Harm: how much further away the parameters are from where the other has them. Good: how far
+    they are moved. Both in squares.
+    """
+    harm = apart(work, current, fitted.values, other.values)
+    harm -= apart(work, current, current.values, other.values)
+    return harm > times * apart(work, current, current.values, fitted.values)
 
 
 def apart(
@@ -79,17 +89,19 @@ def apart(
 def without_opposed(work: Work, current: Fitted) -> Fitted:
     """Without the effect added last, if another explains as much and the parameters hang on it.
 
-    That is: if it explains little, or if the other one pulls the opposite way. Beside causes that
-    are still missing nothing is known of that: it is asked at the end.
+    That is: if it explains little, or if the other one pulls the opposite way. If that one pulls
+    far, it need not explain as much: it is enough that the data do not tell the two apart. Beside
+    causes that are still missing nothing is known of that: it is asked at the end.
     """
     step = work.last
     if step is None or not work.found or work.found[-1].score is not step.score:
         return current
     near = as_good(step.tried, work.folds, STRONG)
+    alike = [p for p in step.tried if not_told_apart(step.fitted, p[1], step.score, work.folds)]
     if step.share < SMALL:
-        near = [p for p in step.tried if not_told_apart(step.fitted, p[1], step.score, work.folds)]
+        near = alike
     elif not opposed(work, step.before, step.fitted, near):
-        return current
+        near = [p for p in alike if _harms(work, step.before, step.fitted, p[1], HARM)]
     if not hangs_on_which(work, step.fitted, near):
         return current
     work.found.pop()
