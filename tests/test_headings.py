@@ -12,7 +12,11 @@ import numpy as np
 import pytest
 from scipy.stats import f
 
+from casest import Run
 from casest.cli import run
+from casest.closing.loop import close
+from casest.effects import CATALOGUE
+from casest.problem import find_effects, find_model
 
 TABLE = np.arange(0, 361, 45)
 HEADINGS = {
@@ -103,3 +107,17 @@ def test_after_calibration_closing_the_loop_finds_nothing(headings, effects):
     assert result["verdict"] == "adequate"
     assert result["effects"] == []
     assert [r["name"] for r in result["refused"]] == ["deviation"] * bool(effects)
+
+
+def test_noise_alone_is_hardly_ever_the_effect_that_is_asked_for(tmp_path):
+    """At most one in a hundred: five and more of a hundred have a chance of 1 in 300."""
+    path = tmp_path / "compass.py"
+    path.write_text(COMPASS, encoding="utf-8")
+    compass, own = find_model(str(path)), find_effects(str(path))
+    rng, found = np.random.default_rng(0), 0
+    for _ in range(100):
+        heading = 20 + TABLE + rng.standard_normal(9)
+        signals = {"table": TABLE[:, None], "heading": heading[:, None]}
+        run = Run.raw("nine", signals, units={"table": "deg", "heading": "deg"})
+        found += bool(close(compass, [run], catalogue=(*CATALOGUE, *own)).effects)
+    assert found < 5

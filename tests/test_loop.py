@@ -242,6 +242,21 @@ def test_a_cause_that_is_known_to_be_there_comes_first():
     assert rms(closing.after_held_out) < 1.01 * world.sigma
 
 
+def test_of_what_is_asked_for_it_is_said_why_it_is_not_there():
+    """On one tilt a wheel cannot show cross-axis terms; it has no thermometer and no table."""
+    world = worlds.made("wheel", [5], {}, seconds=12.0, rate=50.0)
+    run = replace(record(world), columns={}, column_units={})
+    asked = ["cross_axis", "temperature_bias", "table_angle", "bias_drift", "outliers"]
+    closing = close(declared(world), [run], known=asked)
+    assert labels(closing) == []
+    reasons = {r.name: r.reason for r in closing.refused}
+    assert reasons["cross_axis"] == "these data cannot show it"
+    assert reasons["temperature_bias"] == "the data have no column that it could follow"
+    assert "is not applicable" in reasons["table_angle"]
+    assert "no more of it than noise" in reasons["bias_drift"]
+    assert "outliers" not in reasons
+
+
 def test_a_slow_course_that_a_random_walk_explains_too_is_not_called_nothing():
     rng = np.random.default_rng(0)
     t = np.arange(6000) / 10

@@ -10,11 +10,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+from casest.closing.candidates import Skipped
 from casest.closing.contest import contenders
 from casest.closing.evidence import Fitted, best_of_each, confirmed_by_flips, cost_of
 from casest.closing.score import Score
 from casest.closing.work import Work
 from casest.effects import CATALOGUE
+from casest.modelling.effect import NOISE
 from casest.stack import Problem
 
 #: Chance that any effect that is asked for is called significant where there is none.
@@ -26,7 +28,7 @@ _SHIPPED = {effect.name for effect in CATALOGUE}
 def asked_for(work: Work, ranked: Sequence[Score]) -> list[Score]:
     """The user's own effects, and those that he knows to be there."""
     own = {e.name for e in work.catalogue} - _SHIPPED | work.known
-    return [s for s in ranked if s.candidate.name in own and s.freedom]
+    return [s for s in ranked if s.candidate.name in own]
 
 
 def asked(
@@ -37,7 +39,7 @@ def asked(
     Only what is asked for has one: the others are there to be told apart from it. That there is no
     more of an effect than noise would have is noted.
     """
-    own = asked_for(work, ranked)
+    own = [s for s in asked_for(work, ranked) if s.freedom]
     confirmed = {s.candidate.label for s in confirmed_by_flips(own, own, chance)}
     labels = {s.candidate.label for s in own}
     limit, tried = chance / max(len(labels), 1), []
@@ -50,6 +52,19 @@ def asked(
                 p_value = 1.0
         tried.append((replace(score, p_value=p_value), fitted))
     return (tried if confirmed else []), limit
+
+
+def note_unseen(work: Work, ranked: Sequence[Score]) -> None:
+    """Say what the data cannot show of what is asked for, and what does not apply to them."""
+    for label in {s.candidate.label: None for s in asked_for(work, ranked)}:
+        scores = [s for s in ranked if s.candidate.label == label]
+        if not any(s.freedom for s in scores):
+            work.refuse(scores[0].candidate, "these data cannot show it")
+    of_noise = {e.name for e in work.catalogue if e.on == NOISE}
+    for name in sorted(work.known - of_noise - {s.candidate.name for s in ranked}):
+        reasons = [s.reason for s in work.skipped if s.name.partition("(")[0] == name]
+        reason = reasons[0] if reasons else "the data have no column that it could follow"
+        work.refused.append(Skipped(name, reason))
 
 
 def _no_more_than_noise(work: Work, score: Score, p_value: float) -> None:

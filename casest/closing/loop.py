@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from casest.closing.asked import CHANCE, asked
+from casest.closing.asked import CHANCE, asked, note_unseen
 from casest.closing.candidates import Candidate, Skipped, candidates, prepared
 from casest.closing.closed import HELD_OUT_DATA, Closing, Found, Undecided
 from casest.closing.contest import contenders, whole
@@ -103,6 +103,8 @@ def _closed(work: Work) -> Closing:
         current = _without_outliers(work, current)
         work.walks, work.untrusted, work.undecided = [], [], None  # of this round
         ranked = _ranked(work, current)
+        if first_scores is None:
+            note_unseen(work, ranked)
         first_scores, declared = first_scores or ranked, declared or current
         better = _better(work, current, ranked)
         if better is None and work.undecided is None:
