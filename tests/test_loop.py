@@ -302,3 +302,12 @@ def test_a_residual_that_resembles_itself_over_many_samples_is_not_called_noise_
     ]
     assert said[0] == "extended: vibration was missing; what is left is noise"
     assert said[1].endswith("what is left is coloured noise (alike over 33 samples), or a lag")
+
+
+def test_a_lag_of_the_response_is_no_wandering_offset():
+    """A tenth of it is slow, and that a walk explains as well; the rest it cannot."""
+    identity = [17, *b"one", *b"wheel", *b"hysteresis", *b"medium"]
+    world = worlds.made("wheel", identity, {"hysteresis": 0.03})
+    closing = close(declared(world), [record(world, identity)])
+    assert labels(closing) == ["hysteresis"]
+    assert rms(closing.after_held_out) < 1.01 * world.sigma
