@@ -47,8 +47,13 @@ def asked(
         label, p_value = score.candidate.label, 1.0
         if label in labels:
             p_value = _of_refit(work, current, score, fitted)
-            if p_value > limit or label not in confirmed:
-                _no_more_than_noise(work, score, p_value)
+            if p_value > limit:
+                _refuse_once(
+                    work, score, f"no more of it than noise would have (p = {p_value:.2g})"
+                )
+                p_value = 1.0
+            elif label not in confirmed:
+                _refuse_once(work, score, "no more than noise that is not alike everywhere")
                 p_value = 1.0
         tried.append((replace(score, p_value=p_value), fitted))
     return (tried if confirmed else []), limit
@@ -67,9 +72,10 @@ def note_unseen(work: Work, ranked: Sequence[Score]) -> None:
         work.refused.append(Skipped(name, reason))
 
 
-def _no_more_than_noise(work: Work, score: Score, p_value: float) -> None:
+def _refuse_once(work: Work, score: Score, why: str) -> None:
+    """The reason of the first round in which it is asked about."""
     if score.candidate.label not in {r.name for r in work.refused}:
-        work.refuse(score.candidate, f"no more of it than noise would have (p = {p_value:.2g})")
+        work.refuse(score.candidate, why)
 
 
 def _of_refit(work: Work, current: Fitted, score: Score, fitted: Fitted) -> float:
