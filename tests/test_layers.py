@@ -42,6 +42,7 @@ FLOORS = [
     ["casest.values", "casest.applying", "casest.demonstration", "casest.export"],
     ["casest.exporting", "casest.simulating", "casest.trajectory"],
     ["casest.simulating_motion"],
+    ["casest.comparing_runs"],
     ["casest.compare"],
     ["casest.following", "casest.waiting"],
     ["casest.terminal"],
