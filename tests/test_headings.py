@@ -121,3 +121,34 @@ def test_noise_alone_is_hardly_ever_the_effect_that_is_asked_for(tmp_path):
         run = Run.raw("nine", signals, units={"table": "deg", "heading": "deg"})
         found += bool(close(compass, [run], catalogue=(*CATALOGUE, *own)).effects)
     assert found < 5
+
+
+ASKEW = """
+from casest import effect, param, signal, sin
+
+
+@effect(on="reading")
+def in_degrees(y, table=signal("deg"), *, k=param("deg")):
+    return y + k * sin(table)
+
+
+@effect(on="reading")
+def in_metres(y, table=signal("m"), *, k=param("deg")):
+    return y + k * table
+
+
+@effect(on="reading")
+def unfinished(y, *, k=param("deg")):
+    y + k
+"""
+
+
+def test_what_is_asked_for_and_cannot_be_tried_is_in_the_headline(tmp_path, headings, capsys):
+    (tmp_path / "askew.py").write_text(ASKEW, encoding="utf-8")
+    result = headings("close", "before", "--effects", "askew.py")
+    said = " ".join(capsys.readouterr().out.split())
+    assert "in_degrees, in_metres, unfinished could not be tried" in said
+    reasons = {n["name"]: n["reason"] for n in result["not_tried"]}
+    assert "or multiply degrees by pi / 180" in reasons["in_degrees"]
+    assert reasons["in_metres"].endswith("declare table=signal('deg')")
+    assert "it returns nothing" in reasons["unfinished"]

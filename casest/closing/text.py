@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -49,22 +49,38 @@ def sentence(content: Mapping[str, Any]) -> str:
             if content["trusted"]
             else ("no trustworthy estimate")
         )
+    untried = _untried(content)
     if content["verdict"] == "adequate":
-        return "adequate: nothing that these data can show is missing" + (
-            f"; {', '.join(names)} belong to the noise" if names else ""
-        )
+        said = "nothing that these data can show is missing"
+        if not names and not content["smallest_detectable"]:
+            said = f"nothing is found; {len(content['not_tried'])} effects do not apply here"
+        noise = f"; {', '.join(names)} belong to the noise" if names else ""
+        return f"adequate: {said}{noise}{untried}"
     if content["verdict"] == "extended":
         verb = "was" if len(names) == 1 else "were"
         over = content["noise"].get("correlated_over_samples") or 1
         coloured = f"coloured noise (alike over {over:.0f} samples), or a lag"
         left = "noise" if over < COLOURED else coloured
-        return f"extended: {', '.join(names)} {verb} missing; what is left is {left}"
+        return f"extended: {', '.join(names)} {verb} missing; what is left is {left}{untried}"
     found = f"beside {', '.join(names)} " if names else ""
     causes = content["unexplained"]["one_of"]
     if causes:
         several = " or ".join(causes) if 1 < len(causes) < 4 else "several causes"
         return f"unexplained: {found}a misfit remains that {several} explain alike"
     return f"unexplained: {found}a misfit remains that no candidate explains"
+
+
+def _untried(content: Mapping[str, Any]) -> str:
+    """The user's own effects that could not be tried."""
+    own = _own(content["not_tried"])
+    names = [s["name"] for s in own if not s["reason"].startswith("column ")]
+    return f"; {', '.join(names)} could not be tried" if names else ""
+
+
+def _own(named: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    """Those that are not shipped: what the user gave."""
+    shipped = {e.name for e in CATALOGUE}
+    return [n for n in named if n["name"].partition("(")[0] not in shipped]
 
 
 def _head(closing: Closing, content: Mapping[str, Any]) -> str:
@@ -180,7 +196,8 @@ def _unexplained(content: Mapping[str, Any]) -> Iterator[str]:
 def _detectable(content: Mapping[str, Any]) -> Iterator[str]:
     """How small an effect would have been seen, where none was."""
     sizes: dict[str, str] = {}
-    for d in content["smallest_detectable"]:
+    own = _own(content["smallest_detectable"])
+    for d in [*own, *content["smallest_detectable"]]:
         unit = "" if d["unit"] == "1" else f" {d['unit']}"
         sizes.setdefault(d["name"], f"{d['parameter']} = {d['size']:.2g}{unit}")
     if content["verdict"] == "adequate" and sizes:
@@ -196,7 +213,5 @@ def _notes(content: Mapping[str, Any]) -> Iterator[str]:
         everything = refused["name"] == HELD_OUT_DATA
         what = "nothing was" if everything else f"{refused['name']} was not"
         yield item(f"{what} added: {refused['reason']}")
-    shipped = {e.name for e in CATALOGUE}
-    for skipped in content["not_tried"]:  # what the user gave
-        if skipped["name"].partition("(")[0] not in shipped:
-            yield item(f"{skipped['name']} was not tried: {skipped['reason']}")
+    for skipped in _own(content["not_tried"]):
+        yield item(f"{skipped['name']} was not tried: {skipped['reason']}")

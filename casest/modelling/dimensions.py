@@ -8,6 +8,7 @@ then, but not its dimension.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -237,7 +238,9 @@ def _way_out(a: Size, b: Size) -> str:
     """What to mend: a factor between two units of one kind, or the formula."""
     if a.powers == b.powers and a.factor and b.factor:
         low, high = sorted((a.factor, b.factor))
-        return f"one kind in two units, {high / low:.4g} to 1: declare both in one of them"
+        said = f"one kind in two units, {high / low:.4g} to 1: declare both in one of them"
+        degrees = abs(high / low * math.pi / 180 - 1) < 1e-9
+        return said + (", or multiply degrees by pi / 180" if degrees else "")
     return "declare another unit, or mend the formula"
 
 

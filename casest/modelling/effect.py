@@ -183,10 +183,10 @@ class Attached:
 
 def evaluated(declared: Effect, *args: Any, **kwargs: Any) -> SX:
     """The effect's function, its own errors turned into one line with their place."""
+    code = declared.function.__code__
     try:
-        return declared.function(*args, **kwargs)
+        found = declared.function(*args, **kwargs)
     except Exception as error:
-        code = declared.function.__code__
         line, traceback = code.co_firstlineno, error.__traceback__
         while traceback is not None:
             if traceback.tb_frame.f_code is code:
@@ -195,6 +195,12 @@ def evaluated(declared: Effect, *args: Any, **kwargs: Any) -> SX:
         raise DeclarationError(
             f"effect {declared.name}, {code.co_filename}, line {line}: {last_line(error)}"
         ) from None
+    if found is None:
+        raise DeclarationError(
+            f"effect {declared.name}, {code.co_filename}, line {code.co_firstlineno}: it returns "
+            "nothing; return what it acts on, with the effect in it"
+        )
+    return found
 
 
 def attach(

@@ -14,7 +14,7 @@ import numpy as np
 from casest.declaring.physics import Quantity, Residual
 from casest.declaring.shapes import Array
 from casest.declaring.symbols import Constant, Parameter, Scope, Signal, constant, named
-from casest.errors import DeclarationError, UsageError
+from casest.errors import DeclarationError, UnitError, UsageError
 from casest.modelling.changing import (
     Symbol,
     check_units_known,
@@ -23,6 +23,7 @@ from casest.modelling.changing import (
 )
 from casest.modelling.effect import NOISE, Attached, Effect, Kind, attach, check_null
 from casest.modelling.tracing import Traced, describe, function_of, reached_parameters, trace
+from casest.units import known, size
 
 
 @dataclass(frozen=True)
@@ -219,7 +220,16 @@ class Model:
         self, added: Effect, target: str, columns: Mapping[str, str], label: str
     ) -> Attached:
         kind, dims, unit = self._place(added, target)
-        signals = {s.name for s in self.signals}
+        signals = {s.name: s.unit for s in self.signals}
+        for s in added.extras:
+            own = signals.get(columns.get(s.name, s.name))
+            if not (s.unit and own and known(s.unit) and known(own)):
+                continue
+            if size(s.unit) != size(own):
+                raise UnitError(
+                    f"effect {label} reads {s.name} in {s.unit}, and model {self.name} has it in "
+                    f"{own}: declare {s.name}=signal({own!r})"
+                )
         inner = tuple(name for name in self.quantities if name not in signals)
         return attach(added, target, kind, dims, {target: unit}, columns, label, inner)
 

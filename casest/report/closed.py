@@ -208,6 +208,8 @@ def _invisible(story: Story, content: Mapping[str, Any]) -> str:
     hidden = content["invisible"]
     if not hidden:
         said = "Every effect of the catalogue that applies here would have shown at a typical size."
+        if not content["smallest_detectable"] and not content["effects"]:
+            said = "No effect of the catalogue applies here: nobody knows what stays invisible."
         return section("invisible", "What stayed invisible", paragraph(said))
     rows = [
         [
