@@ -296,7 +296,8 @@ def test_a_course_too_small_to_have_a_shape_is_no_formula():
 
 
 def test_a_residual_that_resembles_itself_over_many_samples_is_not_called_noise_alone():
-    content = {"effects": [{"name": "vibration", "column": None}], "verdict": "extended"}
+    added = [{"name": "vibration", "column": None}]
+    content = {"effects": added, "verdict": "extended", "not_tried": []}
     said = [
         sentence(content | {"noise": {"correlated_over_samples": over}}) for over in (1.0, 33.2)
     ]
