@@ -100,6 +100,19 @@ def test_the_formula_says_what_the_record_was_made_with(bench):
     assert twisted == pytest.approx([SLOPE * 4 * 0.05, 0], rel=0.03)
 
 
+def test_beside_a_formula_parameters_are_what_they_are_at_the_middle_of_a_column(bench, tmp_path):
+    """An exponential stands for no offset: that of the reading at the mean temperature stays."""
+    t, warm = bench[:, 0], bench[:, 3]
+    v = np.array([0.4, -0.2]) + 0.02 * np.random.default_rng(4).standard_normal((len(t), 2))
+    v[:, 0] += 0.1 * np.exp((warm - warm.mean()) / 3)
+    rows = np.column_stack([t, v, warm])
+    write(tmp_path / "grows.csv", "t [s],vx [V],vy [V],temperature [degC]", rows)
+    _, result = closed(data="grows.csv")
+    assert "exp(2·" in result["effects"][0]["formula"]
+    bias = result["after"]["parameters"]["bias"]
+    assert bias["value"][0] == pytest.approx(0.4 + 0.1, abs=4 * 0.002)
+
+
 def test_an_effect_of_the_users_own_takes_part(bench, tmp_path):
     text = (
         "from casest import effect, param, signal, constant\n\n\n"

@@ -70,7 +70,7 @@ class Variable:
 class Shape:
     """One function of one or two variables: `kind` power (of degree `order`), abs, exp, tanh (of
     `order` times z), sin, cos (of `order` quarter cycles over the range, or times the angle), or
-    product."""
+    product. Nil at z = 0, but for the cosine of an angle."""
 
     kind: str
     variables: tuple[Variable, ...]
@@ -91,7 +91,17 @@ class Shape:
             return z[0] * z[1]
         if self.kind == "power":
             return z[0] ** self.order
-        return getattr(m, "fabs" if self.kind == "abs" else self.kind)(self._factor * z[0])
+        found = getattr(m, "fabs" if self.kind == "abs" else self.kind)(self._factor * z[0])
+        return found - 1 if self._raised else found
+
+    @property
+    def _raised(self) -> bool:
+        """Is the function 1 where z is 0?
+
+        It is lowered then: declared parameters are what they are at the centre of a column, as
+        beside every effect of the catalogue, and a term does not stand for an offset.
+        """
+        return self.kind == "exp" or (self.kind == "cos" and not self.variables[0].angle)
 
     @property
     def _factor(self) -> float:
@@ -109,9 +119,10 @@ class Shape:
         inner = words[0][1:-1] if words[0].startswith("(") else words[0]
         if self.kind == "abs":
             return f"fabs({inner})" if python else f"|{inner}|"
+        text = f"{self.kind}({self._factor:g}{' * ' if python else '·'}{words[0]})"
         if self._factor == 1:
-            return f"{self.kind}({inner})"
-        return f"{self.kind}({self._factor:g}{' * ' if python else '·'}{words[0]})"
+            text = f"{self.kind}({inner})"
+        return f"({text} {'-' if python else '−'} 1)" if self._raised else text
 
 
 @dataclass(frozen=True)
