@@ -10,6 +10,7 @@ import numpy as np
 
 from casest.closing.asked import CHANCE, asked, note_unseen
 from casest.closing.candidates import Candidate, Skipped, candidates, prepared
+from casest.closing.cautious import cautious
 from casest.closing.closed import HELD_OUT_DATA, Closing, Found, Undecided
 from casest.closing.contest import contenders, whole
 from casest.closing.crossfit import Folds, rms, undetermined
@@ -30,7 +31,7 @@ from casest.closing.noise_model import wander_of
 from casest.closing.profile import profiled
 from casest.closing.score import Score, scores, steadied, widened
 from casest.closing.settling import filled, proved, weeded
-from casest.closing.stakes import hangs_on_which, leave_open, note_walk, rivals, without_opposed
+from casest.closing.stakes import hangs_on_which, leave_open, note_walk, rivals
 from casest.closing.tails import outliers_p_value
 from casest.closing.wandering import wanders
 from casest.closing.work import Step, Work
@@ -119,7 +120,7 @@ def _closed(work: Work) -> Closing:
     last = current
     current = weeded(work, filled(work, current))
     if current is last:
-        current = without_opposed(work, current)
+        current = cautious(work, current)
     if current is not last:
         ranked = _ranked(work, current)
     current, after = proved(work, current)

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from casest.closing.closed import Undecided
-from casest.closing.evidence import SMALL, STRONG, Fitted, as_good, not_told_apart
+from casest.closing.evidence import Fitted, not_told_apart
 from casest.closing.score import Score
 from casest.closing.work import Step, Work
 from casest.declaring.shapes import Array
@@ -16,9 +16,8 @@ from casest.stack import Problem
 
 #: Standard deviations by which another cause must move a declared parameter to have it elsewhere.
 ELSEWHERE = 2.0
-#: Harm of a cause, were it another one, over its good, were it this one, from which on to have more
-#: evidence is not enough. In squares: where the other pulls the opposite way as far.
-HARM = 3.0
+#: Share of a column's square below which the data do not determine what is left of it.
+NULL = 1e-9
 
 
 def hangs_on_which(work: Work, fitted: Fitted, near: Sequence[tuple[Score, Fitted]]) -> bool:
@@ -49,26 +48,38 @@ def shifts(work: Work, one: Fitted, other: Fitted) -> dict[str, Array]:
     return {n: other.values[n] - one.values[n] for n in both}
 
 
-def opposed(
-    work: Work, current: Fitted, fitted: Fitted, near: Sequence[tuple[Score, Fitted]]
-) -> bool:
-    """If it were one of the others, would the parameters be nearer to the truth as they are?
-
-    Two causes may explain alike and move the parameters in opposite ways: each, where it is the
-    wrong one, does more harm than none.
-    """
-    return any(_harms(work, current, fitted, other, 0.0) for _, other in near)
-
-
-def _harms(work: Work, current: Fitted, fitted: Fitted, other: Fitted, times: float) -> bool:
+def harms(work: Work, current: Fitted, fitted: Fitted, other: Fitted, times: float = 0.0) -> bool:
     """Would a cause do more harm, were it the other one, than so many times its good?
 
-    Harm: how much further away the parameters are from where the other has them. Good: how far
-    they are moved. Both in squares.
+    Two causes may explain alike and move the parameters in opposite ways. Harm: by how much their
+    error grows if it is the other. Good: by how much it falls if it is this one. Both in squares.
     """
-    harm = apart(work, current, fitted.values, other.values)
-    harm -= apart(work, current, current.values, other.values)
-    return harm > times * apart(work, current, current.values, fitted.values)
+    harm = error(work, other, fitted) - error(work, other, current)
+    return harm > times * error(work, fitted, current)
+
+
+def error(work: Work, truth: Fitted, fitted: Fitted) -> float:
+    """If one fit were the truth: squared error of another one's declared parameters, in σ².
+
+    Of the combinations of them that the data determine in the true model, whatever its other
+    unknowns are, each in standard deviations: the Schur complement of JᵀJ is its metric.
+    """
+    problem = weighted(Problem(truth.model, work.runs), truth.values)
+    point = problem.point(truth.values)
+    names = {p.name for p in work.before.model.parameters} & set(fitted.values)
+    place = problem.point({**truth.values, **{n: fitted.values[n] for n in names}})
+    own = np.zeros(problem.unknowns, dtype=bool)
+    for slot in problem.slots:
+        own[slot.x] = slot.parameter.name in names
+    matrix = problem.normal(point).matrix
+    scale = np.sqrt(np.where(np.diag(matrix) > 0, np.diag(matrix), 1.0))
+    matrix = matrix / np.outer(scale, scale)
+    off = ((place.x - point.x) * scale)[own]
+    across = matrix[np.ix_(own, ~own)] @ np.linalg.pinv(
+        matrix[np.ix_(~own, ~own)], rcond=NULL, hermitian=True
+    )
+    left = matrix[np.ix_(own, own)] - across @ matrix[np.ix_(~own, own)]
+    return float(off @ left @ off) / truth.noise**2
 
 
 def apart(
@@ -84,29 +95,6 @@ def apart(
 
     pairs = zip(predicted(one), predicted(other), strict=True)
     return sum(float(np.sum((a - b) ** 2)) for a, b in pairs)
-
-
-def without_opposed(work: Work, current: Fitted) -> Fitted:
-    """Without the effect added last, if another explains as much and the parameters hang on it.
-
-    That is: if it explains little, or if the other one pulls the opposite way. If that one pulls
-    far, it need not explain as much: it is enough that the data do not tell the two apart. Beside
-    causes that are still missing nothing is known of that: it is asked at the end.
-    """
-    step = work.last
-    if step is None or not work.found or work.found[-1].score is not step.score:
-        return current
-    near = as_good(step.tried, work.folds, STRONG)
-    alike = [p for p in step.tried if not_told_apart(step.fitted, p[1], step.score, work.folds)]
-    if step.share < SMALL:
-        near = alike
-    elif not opposed(work, step.before, step.fitted, near):
-        near = [p for p in alike if _harms(work, step.before, step.fitted, p[1], HARM)]
-    if not hangs_on_which(work, step.fitted, near):
-        return current
-    work.found.pop()
-    leave_open(work, step, near)
-    return step.before
 
 
 def leave_open(work: Work, step: Step, near: Sequence[tuple[Score, Fitted]]) -> None:
