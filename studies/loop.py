@@ -38,6 +38,7 @@ from casest.closing.crossfit import cross_fitted, rms  # noqa: E402
 from casest.declaring.physics import cos, exp, tanh  # noqa: E402
 from casest.declaring.shapes import each  # noqa: E402
 from casest.effects import CATALOGUE  # noqa: E402
+from casest.estimate import Estimate  # noqa: E402
 from casest.problem import find_model  # noqa: E402
 from casest.solve.trust_region import trust_region  # noqa: E402
 from casest.stack import Problem  # noqa: E402
@@ -360,14 +361,14 @@ def _against_oracle(
 ) -> dict[str, Any]:
     """Noncentrality; the oracle's held-out error; errors of the declared parameters.
 
-    These are root mean squares of the independent combinations of them that the oracle's data
-    determine, in the oracle's standard deviations.
+    With noise, and of the same models fitted to readings without. These are root mean squares of
+    the independent combinations of the parameters that the oracle's data determine, in the
+    oracle's standard deviations.
     """
     runs = closing.runs
-    clean = replace(runs[0], signals={**runs[0].signals, world.read: world.clean})
-    problem = Problem(model, (clean,))
-    least = trust_region(problem, problem.point(closing.before.values), tolerance=1e-9)
-    told: dict[str, Any] = {"noncentrality": 2 * least.cost / world.sigma**2}
+    clean = (replace(runs[0], signals={**runs[0].signals, world.read: world.clean}),)
+    cost, bare = _without_noise(closing.before, clean)
+    told: dict[str, Any] = {"noncentrality": 2 * cost / world.sigma**2}
     oracle = oracle_of(model, world, task.effects)
     problem = Problem(oracle, prepared(oracle, runs))
     point = _nearest(problem, problem.point({**closing.before.values, **world.truth}))
@@ -379,11 +380,20 @@ def _against_oracle(
         ("error_before", closing.before.values),
         ("error_after", closing.after.values),
         ("error_oracle", values),
+        ("clean_before", bare),
+        ("clean_after", _without_noise(closing.after, clean)[1] if closing.effects else bare),
     ):
         off = problem.point({**values, **_only(found, world)}).x
         off -= problem.point({**values, **world.truth}).x
         told[name] = float(np.sqrt(np.mean((seen @ off) ** 2)))
     return told
+
+
+def _without_noise(estimate: Estimate, clean: tuple[Run, ...]) -> tuple[float, Any]:
+    """Cost and values of the same model fitted to readings that have no noise."""
+    problem = Problem(estimate.model, clean)
+    fit = trust_region(problem, problem.point(estimate.values), tolerance=1e-9)
+    return fit.cost, problem.values(fit.point)
 
 
 def _nearest(problem: Problem, start: Any) -> Any:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,10 +13,8 @@ import casest as c
 from casest import Run
 from casest.closing.axes import lighter
 from casest.closing.candidates import prepared
-from casest.closing.evidence import Fitted
 from casest.closing.loop import close, rms
 from casest.closing.restrict import restricted
-from casest.closing.stakes import error
 from casest.closing.text import sentence, undecided
 from casest.closing.written import closing_result
 from casest.effects import CATALOGUE
@@ -167,30 +164,6 @@ def test_an_offset_that_walks_at_random_is_noise_and_neither_drift_nor_step():
 def test_a_steady_offset_does_not_wander():
     found = [labels(close(constant_bias, [wandering(0.0, seed)])) for seed in range(6)]
     assert not any(found)
-
-
-def test_the_error_that_another_cause_makes_is_counted_in_standard_deviations():
-    """Against the inverse of the covariance that a calibration of the true model has."""
-    world = worlds.made("table", [8], {"bias_drift": 8e-5})
-    drift = replace(next(e for e in CATALOGUE if e.name == "bias_drift"), on="reading")
-    before = c.calibrate(declared(world), [record(world)])
-    whole = prepared(declared(world).with_effect(drift), before.problem.runs)
-    after = c.calibrate(declared(world).with_effect(drift), whole)
-    names = [name for p in before.model.parameters for name in p.entry_names]
-    assert "bias[0]" in names
-
-    def fitted(estimate):
-        residuals = tuple(estimate.problem.residuals(estimate.point))
-        return Fitted(estimate.model, estimate.values, len(estimate.point.x), residuals, 2.0)
-
-    work = SimpleNamespace(runs=whole, before=before)
-    found = error(work, fitted(after), fitted(before))
-    k = len(before.point.x)
-    inverse = np.linalg.inv(after.covariance[:k, :k] * (2.0 / after.noise.sigma) ** 2)
-    start = after.problem.point({**after.values, **before.values}).x
-    off = (start - after.point.x)[:k]
-    assert found == pytest.approx(off @ inverse @ off, rel=1e-6)
-    assert error(work, fitted(after), fitted(after)) == 0
 
 
 def test_what_an_axis_less_would_cost_is_what_a_fit_without_it_costs():

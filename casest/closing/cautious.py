@@ -14,7 +14,7 @@ from casest.closing.evidence import (
 )
 from casest.closing.gate import accepted
 from casest.closing.score import Score
-from casest.closing.stakes import error, hangs_on_which, harms, leave_open, rivals
+from casest.closing.stakes import apart, hangs_on_which, harms, leave_open, rivals
 from casest.closing.work import Step, Work
 
 #: Harm of a cause, were it another one, over its good, were it this one, from which on to have more
@@ -73,8 +73,8 @@ def _gentler(work: Work, step: Step) -> Fitted | None:
 
 def _nearer(work: Work, step: Step, fitted: Fitted, other: Fitted) -> bool:
     """Were it the other one, would the parameters still come nearer to the truth?"""
-    before = error(work, other, step.before)
-    return error(work, other, fitted) <= (1 - NEARER) * before
+    before = apart(work, step.before, step.before.values, other.values)
+    return apart(work, step.before, fitted.values, other.values) <= (1 - NEARER) * before
 
 
 def _opposed(work: Work, step: Step) -> Sequence[tuple[Score, Fitted]]:

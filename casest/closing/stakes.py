@@ -16,8 +16,6 @@ from casest.stack import Problem
 
 #: Standard deviations by which another cause must move a declared parameter to have it elsewhere.
 ELSEWHERE = 2.0
-#: Share of a column's square below which the data do not determine what is left of it.
-NULL = 1e-9
 
 
 def hangs_on_which(work: Work, fitted: Fitted, near: Sequence[tuple[Score, Fitted]]) -> bool:
@@ -51,35 +49,12 @@ def shifts(work: Work, one: Fitted, other: Fitted) -> dict[str, Array]:
 def harms(work: Work, current: Fitted, fitted: Fitted, other: Fitted, times: float = 0.0) -> bool:
     """Would a cause do more harm, were it the other one, than so many times its good?
 
-    Two causes may explain alike and move the parameters in opposite ways. Harm: by how much their
-    error grows if it is the other. Good: by how much it falls if it is this one. Both in squares.
+    Two causes may explain alike and move the parameters in opposite ways. Harm: how much further
+    away they are from where the other has them. Good: how far they are moved. Both in squares.
     """
-    harm = error(work, other, fitted) - error(work, other, current)
-    return harm > times * error(work, fitted, current)
-
-
-def error(work: Work, truth: Fitted, fitted: Fitted) -> float:
-    """If one fit were the truth: squared error of another one's declared parameters, in σ².
-
-    Of the combinations of them that the data determine in the true model, whatever its other
-    unknowns are, each in standard deviations: the Schur complement of JᵀJ is its metric.
-    """
-    problem = weighted(Problem(truth.model, work.runs), truth.values)
-    point = problem.point(truth.values)
-    names = {p.name for p in work.before.model.parameters} & set(fitted.values)
-    place = problem.point({**truth.values, **{n: fitted.values[n] for n in names}})
-    own = np.zeros(problem.unknowns, dtype=bool)
-    for slot in problem.slots:
-        own[slot.x] = slot.parameter.name in names
-    matrix = problem.normal(point).matrix
-    scale = np.sqrt(np.where(np.diag(matrix) > 0, np.diag(matrix), 1.0))
-    matrix = matrix / np.outer(scale, scale)
-    off = ((place.x - point.x) * scale)[own]
-    across = matrix[np.ix_(own, ~own)] @ np.linalg.pinv(
-        matrix[np.ix_(~own, ~own)], rcond=NULL, hermitian=True
-    )
-    left = matrix[np.ix_(own, own)] - across @ matrix[np.ix_(~own, own)]
-    return float(off @ left @ off) / truth.noise**2
+    harm = apart(work, current, fitted.values, other.values)
+    harm -= apart(work, current, current.values, other.values)
+    return harm > times * apart(work, current, current.values, fitted.values)
 
 
 def apart(
