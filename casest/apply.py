@@ -94,6 +94,14 @@ class Correction:
                 f"({', '.join(left)}): undoing it would amplify the noise without bound; "
                 "`invertible` gives the model without it"
             )
+        if not self.model.implicit and not ca.depends_on(
+            ca.vec(self._cut.expression), ca.vec(self._wanted)
+        ):
+            raise UsageError(
+                f"model {self.model.name}: what is predicted does not depend on {self.name}, which "
+                "corrected= names, so that no reading says anything of it: compute the prediction "
+                "from what quantity(…) returned"
+            )
 
     @property
     def name(self) -> str:

@@ -140,6 +140,16 @@ def test_a_model_that_names_no_corrected_quantity_says_so():
         Correction(plain)
 
 
+def test_a_corrected_quantity_that_nothing_is_computed_from_is_named():
+    @model
+    def line(x=signal("1"), y=signal("V"), *, a=param("V"), b=param("V", start=1.0)):
+        true = quantity("true", 2 * x, "1")
+        return Residual(measured=y, predicted=a + b * x, corrected=true)
+
+    with pytest.raises(UsageError, match="predicted does not depend on true, which corrected="):
+        Correction(line)
+
+
 def test_fewer_readings_than_components_are_refused():
     @model
     def projected(y=signal("V"), d=signal(3), *, a=param("V")):

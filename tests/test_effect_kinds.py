@@ -165,6 +165,15 @@ def test_an_effect_starts_at_its_null_value_and_changes_nothing_there():
     np.testing.assert_allclose(bent(t=t, v=v)["reading"], wheel(t=t, v=v)["reading"], atol=1e-14)
 
 
+@pytest.mark.parametrize("word", ["null", "typical", "profile", "plain"])
+def test_a_size_given_for_no_parameter_is_named(word):
+    with pytest.raises(DeclarationError, match=f"{word}= names 'kk', .* it has k"):
+
+        @effect(on="reading", **{word: {"kk": 1.0}})
+        def bent(y, *, k=param("1")):
+            return y + k * y
+
+
 def test_a_null_value_other_than_zero_is_stated_and_used_as_start():
     @effect(on="reading", null={"factor": 1.0})
     def stretch(reading, *, factor=param()):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -102,6 +102,10 @@ def effect(
             extras.append(
                 named(default, name) if isinstance(default, Signal) else Signal(name, 1, None)
             )
+        for word, given in (
+            ("null", null), ("typical", typical), ("profile", profile), ("plain", plain)
+        ):  # fmt: skip
+            _refuse_unknown(function.__name__, word, given or {}, [name for name, _ in keyword])
         declared_kind: Kind = kind or ("noise" if on == NOISE else "quantity")
         declarations = tuple(_declaration(function.__name__, name, d) for name, d in keyword)
         return Effect(
@@ -121,6 +125,15 @@ def effect(
         )
 
     return declare
+
+
+def _refuse_unknown(name: str, word: str, given: Mapping[str, Any], own: Sequence[str]) -> None:
+    unknown = sorted(set(given) - set(own))
+    if unknown:
+        there = f"it has {', '.join(own)}" if own else "it has none; they stand after a *"
+        raise DeclarationError(
+            f"effect {name}: {word}= names {unknown[0]!r}, which is none of its parameters: {there}"
+        )
 
 
 def _signature(function: Callable[..., Any]) -> tuple[list[tuple[str, Any]], list[tuple[str, Any]]]:
