@@ -7,6 +7,7 @@ import difflib
 import importlib
 import linecache
 import sys
+from collections.abc import Sequence
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from types import ModuleType
@@ -70,12 +71,19 @@ def find_model(name: str) -> Model:
         return own
     if name in MOVING:
         raise UsageError(f"{name} is an estimator in motion: casest observe, filter or close it")
-    near = difflib.get_close_matches(name, [*SHIPPED, *MOVING], 1)
-    hint = f"; did you mean {near[0]!r}?" if near else ""
+    hint = _meant(name, [*SHIPPED, *MOVING])
     raise UsageError(
         f"no model {name!r}{hint} (shipped: {', '.join([*SHIPPED, *MOVING])}; or give the path "
         "of a .py file)"
     )
+
+
+def _meant(name: str, shipped: Sequence[str]) -> str:
+    """A file of that name, or a shipped name that is written alike."""
+    near = difflib.get_close_matches(name, shipped, 1)
+    if Path(f"{name}.py").is_file():
+        near = [f"{name}.py"]
+    return f"; did you mean {near[0]!r}?" if near else ""
 
 
 def find_effects(name: str) -> tuple[Effect, ...]:
@@ -84,8 +92,7 @@ def find_effects(name: str) -> tuple[Effect, ...]:
     if name in shipped:
         return (_whole(shipped[name]),)
     if not Path(name).suffix and ":" not in name:
-        near = difflib.get_close_matches(name, shipped, 1)
-        hint = f"; did you mean {near[0]!r}?" if near else ""
+        hint = _meant(name, list(shipped))
         raise UsageError(
             f"--effects {name}: no shipped effect{hint} (`casest list` has them; or give the path "
             "of a .py file)"

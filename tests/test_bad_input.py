@@ -309,6 +309,14 @@ def test_a_shipped_model_is_suggested_for_a_near_name(refused):
     assert "no model 'norm-triangel'; did you mean 'norm-triangular'?" in text
 
 
+def test_a_file_of_that_name_is_suggested(refused):
+    Path("scales.py").write_text("", encoding="utf-8")
+    text = refused("calibrate", "scales", "good.csv")
+    assert "no model 'scales'; did you mean 'scales.py'?" in text
+    text = refused(*calibrate("good.csv", "--effects", "scales"))
+    assert "no shipped effect; did you mean 'scales.py'?" in text
+
+
 def test_several_models_in_a_file_must_be_told_apart(refused):
     text = refused("calibrate", str(MODELS / "load_cell.py"), "good.csv")
     assert "load_cell.py declares load_cell, zero_only: say which, as" in text
