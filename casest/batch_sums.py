@@ -224,6 +224,21 @@ class Squares:
                 whole[i:, i] += entries[i:] * entries[i]
         return Normals(0.5 * whole[n, n], whole[:, :n])
 
+    def slope(self, x: Array, sensors: Sensors) -> tuple[Array, Array]:
+        """½Σr² of every sensor, (W,), and Jᵀr, (n, W)."""
+        total = np.zeros((self.n + 1, x.shape[1]))
+        for _, s, values in self._all.chunks(x, sensors):
+            first = 0
+            for columns in self._columns:
+                own = values[first : first + len(columns)]
+                first += len(columns)
+                total[_adjacent(columns), s] += np.einsum("ps,jps->js", own[-1], own)
+        if sensors.hold is not None:
+            held, target = sensors.hold
+            miss = np.einsum("is,is->s", held, x - target)
+            total += np.concatenate([held, miss[None]]) * miss
+        return 0.5 * total[self.n], total[: self.n]
+
     def cost(self, x: Array, sensors: Sensors) -> Array:
         """½Σr² of every sensor, (W,)."""
         total = np.zeros(x.shape[1])
