@@ -115,6 +115,8 @@ def table(records: Sequence[Record], words: dict[str, tuple[str, ...]]) -> str:
         "them that the oracle's data determine, root mean square, in its standard deviations.",
         "Named: by name, or among the two nearest that are not told apart. A weaker effect's",
         "wrong name is one without the word that it may as well be the one which the world has.",
+        "Further off, beyond noise: by more than 3.1 standard deviations of the difference, and by",
+        "one or more where the same two models are fitted to readings without noise.",
         "",
         f"{len(records)} worlds, {len(records) - len(good)} where the loop stopped with an error.",
         "",
