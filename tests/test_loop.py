@@ -230,7 +230,7 @@ def test_of_two_causes_the_one_that_helps_whichever_it_is_is_added():
     (found,) = closing.effects
     assert found.candidate.label in ("cubic", "signed_cubic")
     assert {"quadratic", "signed_quadratic"} <= set(found.rivals)
-    assert "whichever of the two it is" in {r.name: r.reason for r in closing.refused}["quadratic"]
+    assert "whichever of them it is" in {r.name: r.reason for r in closing.refused}["quadratic"]
     off = {
         name: np.max(np.abs(estimate.values["gain"] - world.truth["gain"]))
         for name, estimate in (("before", closing.before), ("after", closing.after))

@@ -64,7 +64,10 @@ def _gentler(work: Work, step: Step) -> Fitted | None:
         if passed is None:
             continue
         given = work.found.pop().candidate
-        why = f"{score.candidate.label} brings the parameters nearer whichever of the two it is"
+        label = score.candidate.label
+        why = (
+            f"it explains no less, but {label} brings the parameters nearer whichever of them it is"
+        )
         work.refuse(given, why)
         work.keep(*passed, score, rivals(work, fitted, score, step.tried))
         return passed[0]
