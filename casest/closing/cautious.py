@@ -68,7 +68,6 @@ def _gentler(work: Work, step: Step) -> Fitted | None:
         why = (
             f"it explains no less, but {label} brings the parameters nearer whichever of them it is"
         )
-        work.refuse(given, why)
         work.keep(*passed, score, rivals(work, fitted, score, step.tried))
         return passed[0]
     return None
