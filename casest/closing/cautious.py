@@ -64,10 +64,8 @@ def _gentler(work: Work, step: Step) -> Fitted | None:
         if passed is None:
             continue
         given = work.found.pop().candidate
-        label = score.candidate.label
-        why = (
-            f"it explains no less, but {label} brings the parameters nearer whichever of them it is"
-        )
+        nearer = f"{score.candidate.label} brings the parameters nearer whichever of them it is"
+        work.refuse(given, f"it explains no less, but {nearer}")
         work.keep(*passed, score, rivals(work, fitted, score, step.tried))
         return passed[0]
     return None
