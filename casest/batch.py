@@ -88,6 +88,9 @@ def calibrate_many(
     that many do (`model.starting(…, many=…)`: the shipped norm models), else from the declared
     values; bounds that the model computes from data are then asked for sensor by sensor, in Python.
 
+    Standard deviations and covariances are of JᵀJ at the solution or at most a tenth of a standard
+    deviation from it: a fit that is as near takes its last step without summing JᵀJ again.
+
     `noise` is the standard deviation of one residual that a sound sensor has: one with
     significantly more is refused. Up to `retry` refused sensors are calibrated once more one by
     one, with IPOPT and second opinions.

@@ -20,7 +20,8 @@ LIMIT = 100
 LAST, NEXT, SMALL = 1e-6, 2.5e-13, 1e-14
 #: The same below which a step is rounding, as a share of the unknowns themselves.
 ROUNDING = 1e-29
-#: Squared step, in variances of the estimate, after which JᵀJ is as good as it was before.
+#: Squared step, in variances of the estimate, after which JᵀJ may stay what it was: in triads of 24
+#: poses the standard deviations then differ by up to 3.5e-4 of themselves, half of them by 6e-6.
 NEARBY = 0.01
 #: Share of the sensors from which on all are looked at: to pick them out takes longer.
 MOST = 0.9
@@ -140,7 +141,7 @@ def minimise(
 
 
 def _nearby(state: _State, step: Array, left: Array) -> Flags:
-    """Is the next step so short that it changes nothing of JᵀJ?"""
+    """Is the next step so short that it changes next to nothing of JᵀJ?"""
     there = state.x + step
     inside = ((there > state.bounds.lower) & (there < state.bounds.upper)).all(axis=0)
     short = left <= NEARBY * 2 * state.here.cost / state.freedom

@@ -14,10 +14,10 @@ from typing import NamedTuple
 import casadi as ca
 import numpy as np
 
-from casest.batch_fit import Bounds, Fits, Places, minimise, padded, residual_counts
+from casest.batch_fit import Bounds, Fits, Flags, Places, minimise, padded, residual_counts
 from casest.batch_linear import cholesky, dot, form, inverse, lengths, times, whole
 from casest.batch_sums import Hold, Sensors, SideBySide, Squares
-from casest.batch_verdicts import Code, Flags, Judged
+from casest.batch_verdicts import Code, Judged
 from casest.declaring.shapes import Array
 from casest.engine import Replay
 from casest.modelling.model import Model

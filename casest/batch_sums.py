@@ -34,6 +34,11 @@ class Hold(NamedTuple):
     row: Array
     target: Array
 
+    def entries(self, x: Array) -> Array:
+        """Its row of the Jacobian and then the residual itself at x, (n + 1, W)."""
+        miss = np.einsum("is,is->s", self.row, x - self.target)
+        return np.concatenate([self.row, miss[None]])
+
 
 class Sensors(NamedTuple):
     """Readings of W sensors side by side: samples (k, N, W), and which of them count, (N, W).
@@ -217,9 +222,7 @@ class Squares:
                     else:
                         whole[rows, column, s] += np.einsum("ps,jps->js", own[i], own[i:])
         if sensors.hold is not None:
-            held, target = sensors.hold
-            miss = np.einsum("is,is->s", held, x - target)
-            entries = np.concatenate([held, miss[None]])
+            entries = sensors.hold.entries(x)
             for i in range(n + 1):
                 whole[i:, i] += entries[i:] * entries[i]
         return Normals(0.5 * whole[n, n], whole[:, :n])
@@ -234,9 +237,8 @@ class Squares:
                 first += len(columns)
                 total[_adjacent(columns), s] += np.einsum("ps,jps->js", own[-1], own)
         if sensors.hold is not None:
-            held, target = sensors.hold
-            miss = np.einsum("is,is->s", held, x - target)
-            total += np.concatenate([held, miss[None]]) * miss
+            entries = sensors.hold.entries(x)
+            total += entries * entries[-1]
         return 0.5 * total[self.n], total[: self.n]
 
     def cost(self, x: Array, sensors: Sensors) -> Array:

@@ -10,9 +10,8 @@ from typing import overload
 import numpy as np
 from numpy.typing import NDArray
 
+from casest.batch_fit import Flags
 from casest.declaring.shapes import Array
-
-Flags = NDArray[np.bool_]
 
 
 class Code(IntFlag):

@@ -65,7 +65,7 @@ def _gentler(work: Work, step: Step) -> Fitted | None:
             continue
         given = work.found.pop().candidate
         nearer = f"{score.candidate.label} brings the parameters nearer whichever of them it is"
-        work.refuse(given, f"it explains no less, but {nearer}")
+        work.refuse(given, f"it explains alike, but {nearer}")
         work.keep(*passed, score, rivals(work, fitted, score, step.tried))
         return passed[0]
     return None
