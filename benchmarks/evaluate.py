@@ -23,8 +23,8 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks import by_hand, fused
+from casest.declaration.tracing import function_of
 from casest.engine import Replay, kernel, normal_equations
-from casest.modelling.tracing import function_of
 from casest_problems.wheel import wheel
 
 N_SAMPLES, LONG = 18_000, 500_000

@@ -25,10 +25,10 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from casest import Run
-from casest.batch import calibrate_many
-from casest.estimate import attempt
+from casest.estimate.calibrate import attempt
+from casest.fleet.calibrate_many import calibrate_many
+from casest.leastsquares.problem import Problem
 from casest.solve.ipopt import ipopt
-from casest.stack import Problem
 from casest_problems.norm import closed_form, norm_triangular
 
 SENSORS, POSES, GRAVITY, SIGMA = 100_000, 24, 9.80665, 0.01

@@ -24,7 +24,7 @@ from scipy.integrate import solve_ivp
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from casest import Run
-from casest.declaring.shapes import Array
+from casest.declaration.shapes import Array
 from casest.dynamics.filter import filtered
 from casest.dynamics.gramian import gramian, gramian_by_ode
 from casest.dynamics.record import least_squares

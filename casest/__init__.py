@@ -10,24 +10,25 @@ __version__ = "0.1.0"
 #: Where each public name lives. Modules are imported when first used: CasADi and NumPy are slow
 #: to start, and `casest --help` needs neither.
 _HOME = {
-    "casest.declaring.shapes": "diagonal each full lower rotation_matrix unit_vector",
-    "casest.declaring.symbols": "attitude constant param signal",
-    "casest.declaring.physics": (
+    "casest.declaration.shapes": "diagonal each full lower rotation_matrix unit_vector",
+    "casest.declaration.symbols": "attitude constant param signal",
+    "casest.declaration.physics": (
         "Residual acos asin atan atan2 cos cosh cross der diag dot exp fabs fmax fmin horzcat "
         "if_else inf integral inverse log norm_2 pi polynomial quantity rotation sign sin sinh "
         "skew sqrt sum1 tan tanh vertcat"
     ),
-    "casest.modelling.dimensions": "check_units",
-    "casest.modelling.effect": "Effect effect",
-    "casest.modelling.model": "Model model",
+    "casest.declaration.dimensions": "check_units",
+    "casest.declaration.effect": "Effect effect",
+    "casest.declaration.model": "Model model",
     "casest.data.run": "Run",
     "casest.data": "load_runs read_table",
     "casest.errors": ("CasestError DataError DeclarationError NotTrusted UnitError UsageError"),
-    "casest.estimate": "Estimate attempt calibrate",
-    "casest.batch": "Batch calibrate_many",
-    "casest.closing.loop": "Closing close",
-    "casest.closing_motion.loop": "MotionClosing close_motion",
-    "casest.apply": "Correction",
+    "casest.estimate.calibrate": "Estimate attempt calibrate",
+    "casest.fleet.calibrate_many": "Batch calibrate_many",
+    "casest.diagnose.closing": "Closing",
+    "casest.diagnose.loop": "close",
+    "casest.diagnose.motion.loop": "MotionClosing close_motion",
+    "casest.correction.inverse": "Correction",
 }
 _WHERE = {name: module for module, names in _HOME.items() for name in names.split()}
 

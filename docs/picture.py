@@ -16,7 +16,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from casest import close, load_runs
-from casest.stack import Problem
+from casest.leastsquares.problem import Problem
 from casest_problems.wheel import wheel
 
 HERE = Path(__file__).resolve().parent

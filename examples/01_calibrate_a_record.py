@@ -1,7 +1,7 @@
 """Calibrate a raw hand-held record: rest intervals, fit, certificate, corrected readings."""
 
 from casest import Correction, calibrate, load_runs
-from casest.demonstration import RECORD
+from casest.demo import RECORD
 from casest_problems.norm import norm_triangular
 
 runs = load_runs(

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 import casest as c
-from casest.closing.loop import close
+from casest.diagnose.loop import close
 
 
 @c.model

@@ -3,7 +3,7 @@
 import numpy as np
 
 from casest import close, load_runs
-from casest.demonstration import WHEEL
+from casest.demo import WHEEL
 from casest_problems.wheel import wheel
 
 found = close(wheel, load_runs([WHEEL], wheel.signals), say=print)

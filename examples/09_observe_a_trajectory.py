@@ -3,7 +3,7 @@
 import numpy as np
 
 import casest as c
-from casest.observing import observe_motion
+from casest.results.observability import observe_motion
 from casest_problems.bias_gravity import bias_gravity
 
 t = np.arange(0, 60, 0.02)

@@ -3,7 +3,7 @@
 import numpy as np
 
 import casest as c
-from casest.compare import compare
+from casest.comparison.judge import compare
 
 
 @c.model

@@ -5,7 +5,7 @@ import subprocess
 from pathlib import Path
 
 from casest.cli import run
-from casest.demonstration import RECORD
+from casest.demo import RECORD
 
 read = [str(RECORD), "--columns", "v=ax,ay,az", "--rate", "50", "--at-rest"]
 assert run(["calibrate", "norm-triangular", *read, "--set", "norm=9.80665 m/s^2", "-o", "out"]) == 0

@@ -29,7 +29,7 @@ from scipy.signal import lfilter  # noqa: E402
 from scipy.stats import beta  # noqa: E402
 
 from casest import Residual, Run, constant, cos, effect, model, param, quantity, signal, sin  # noqa: E402
-from casest.closing.loop import close  # noqa: E402
+from casest.diagnose.loop import close  # noqa: E402
 from casest.effects import CATALOGUE  # noqa: E402
 
 KEPT, TABLE = ROOT / "out" / "asked.jsonl", ROOT / "studies" / "asked.md"

@@ -25,8 +25,8 @@ import simulators as sim  # noqa: E402
 from scipy.spatial.transform import Rotation  # noqa: E402
 
 from casest import CasestError, Run, attempt  # noqa: E402
-from casest.problem import find_model  # noqa: E402
-from casest.solve.profile import half_width  # noqa: E402
+from casest.estimate.profile_likelihood import half_width  # noqa: E402
+from casest.results.find import find_model  # noqa: E402
 
 KEPT, TABLE = ROOT / "out" / "study.jsonl", ROOT / "studies" / "bound.md"
 

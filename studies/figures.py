@@ -40,8 +40,8 @@ from scipy.spatial.transform import Rotation  # noqa: E402
 from scipy.stats import spearmanr  # noqa: E402
 
 from casest import CasestError, Model, Run, attempt  # noqa: E402
+from casest.leastsquares.problem import Problem  # noqa: E402
 from casest.solve.trust_region import trust_region  # noqa: E402
-from casest.stack import Problem  # noqa: E402
 from casest_problems.norm import (  # noqa: E402
     burkhard_bias,
     burkhard_full,

@@ -31,8 +31,8 @@ import flights  # noqa: E402
 from flights import Sensors  # noqa: E402
 from scipy.stats import beta  # noqa: E402
 
-from casest.closing_motion.loop import UNEXPLAINED, close_motion  # noqa: E402
-from casest.closing_motion.written import rms_settled  # noqa: E402
+from casest.diagnose.motion.loop import UNEXPLAINED, close_motion  # noqa: E402
+from casest.results.motion import rms_settled  # noqa: E402
 from casest_problems.bias_gravity import bias_gravity  # noqa: E402
 
 KEPT, TABLE = ROOT / "out" / "flight_loop.jsonl", ROOT / "studies" / "flight_loop.md"

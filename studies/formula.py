@@ -25,8 +25,8 @@ import resumed
 from loop_table import says, share_removed, upper, visible
 
 from casest import effect, param
-from casest.declaring.physics import fabs, sin, vertcat
-from casest.declaring.shapes import each
+from casest.declaration.physics import fabs, sin, vertcat
+from casest.declaration.shapes import each
 
 KEPT, TABLE = study.ROOT / "out" / "formula.jsonl", study.ROOT / "studies" / "formula.md"
 FIRST = 30_000

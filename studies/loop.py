@@ -32,16 +32,16 @@ import simulators as sim  # noqa: E402
 import worlds  # noqa: E402
 
 from casest import Model, Run, effect, param, signal  # noqa: E402
-from casest.closing import loop, summary  # noqa: E402
-from casest.closing.candidates import prepared  # noqa: E402
-from casest.closing.crossfit import cross_fitted, rms  # noqa: E402
-from casest.declaring.physics import cos, exp, tanh  # noqa: E402
-from casest.declaring.shapes import each  # noqa: E402
+from casest.declaration.physics import cos, exp, tanh  # noqa: E402
+from casest.declaration.shapes import each  # noqa: E402
+from casest.diagnose import detectability, loop  # noqa: E402
+from casest.diagnose.selection.cross_validation import cross_fitted, rms  # noqa: E402
 from casest.effects import CATALOGUE  # noqa: E402
-from casest.estimate import Estimate  # noqa: E402
-from casest.problem import find_model  # noqa: E402
+from casest.effects.placing import prepared  # noqa: E402
+from casest.estimate.calibrate import Estimate  # noqa: E402
+from casest.leastsquares.problem import Problem  # noqa: E402
+from casest.results.find import find_model  # noqa: E402
 from casest.solve.trust_region import trust_region  # noqa: E402
-from casest.stack import Problem  # noqa: E402
 
 KEPT, TABLE = ROOT / "out" / "loop.jsonl", ROOT / "studies" / "loop.md"
 BY_NAME = {e.name: e for e in CATALOGUE}
@@ -347,7 +347,7 @@ def one_world(task: Task) -> dict[str, Any]:
     ]
     record["wanted"] = labels_of(world, task.effects)
     record["refused"] = sorted({s.name for s in closing.refused})
-    record["invisible"] = [i.name for i in summary.invisible(closing)]
+    record["invisible"] = [i.name for i in detectability.invisible(closing)]
     record["one_of"] = list(closing.undecided.names) if closing.undecided else []
     record["before"], record["after"] = rms(closing.before_held_out), rms(closing.after_held_out)
     record["trusted"] = closing.after.certificate.trusted

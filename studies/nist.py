@@ -30,10 +30,10 @@ from nist import MODELS, Certified, fewest_digits, read  # noqa: E402
 
 from casest import Model, attempt  # noqa: E402
 from casest.engine.threads import one_thread  # noqa: E402
+from casest.leastsquares.problem import Point, Problem  # noqa: E402
 from casest.solve.ipopt import ipopt  # noqa: E402
 from casest.solve.others import sqpmethod  # noqa: E402
 from casest.solve.trust_region import trust_region  # noqa: E402
-from casest.stack import Point, Problem  # noqa: E402
 
 KEPT, TABLE = ROOT / "out" / "nist.jsonl", ROOT / "studies" / "nist.md"
 #: Digits in every parameter from which an answer is right.

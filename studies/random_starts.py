@@ -31,7 +31,7 @@ import simulators as sim  # noqa: E402
 from scipy.spatial.transform import Rotation  # noqa: E402
 
 from casest import CasestError, Run, attempt  # noqa: E402
-from casest.problem import find_model  # noqa: E402
+from casest.results.find import find_model  # noqa: E402
 
 KEPT, TABLE = ROOT / "out" / "random_starts.jsonl", ROOT / "studies" / "random_starts.md"
 MODELS = ("wheel", "rate-table", "norm-diagonal", "norm-triangular", "norm-pair")

@@ -40,9 +40,9 @@ from scipy.spatial.transform import Rotation  # noqa: E402
 
 import casest_problems.wheel as paper  # noqa: E402
 from casest import CasestError, Run  # noqa: E402
-from casest.problem import find_model  # noqa: E402
+from casest.leastsquares.problem import Problem  # noqa: E402
+from casest.results.find import find_model  # noqa: E402
 from casest.solve.trust_region import trust_region  # noqa: E402
-from casest.stack import Problem  # noqa: E402
 
 Array = NDArray[np.float64]
 

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from casest import Residual, Run, model, param, quantity, signal
-from casest.closing.adequacy import Misfit, left_over, state_of
-from casest.closing.candidates import prepared
-from casest.closing.crossfit import folded
-from casest.closing.noise_model import equal_noise, lag_one, noise_model
-from casest.closing.tails import outlier_share, outliers_p_value, tails
-from casest.solve.correlation import correlation_time
+from casest.diagnose.misfit.lack_of_fit import Misfit, left_over, state_of
+from casest.diagnose.noise.noise_model import equal_noise, lag_one, noise_model
+from casest.diagnose.noise.tails import outlier_share, outliers_p_value, tails
+from casest.diagnose.selection.cross_validation import folded
+from casest.effects.placing import prepared
+from casest.estimate.correlation import correlation_time
+from casest.leastsquares.problem import Problem
 from casest.solve.trust_region import trust_region
-from casest.stack import Problem
 
 
 @model

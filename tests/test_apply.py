@@ -23,10 +23,10 @@ from casest import (
     quantity,
     signal,
 )
-from casest.apply import Correction
 from casest.cli import run
+from casest.correction.inverse import Correction
 from casest.effects import CATALOGUE
-from casest.problem import find_model
+from casest.results.find import find_model
 
 
 def as_run(**signals):

@@ -8,7 +8,7 @@ from scipy import linalg
 from scipy.spatial.transform import Rotation
 
 from casest.cli import run
-from casest.earth import magnetic_field, normal_gravity
+from casest.cli.earth import magnetic_field, normal_gravity
 from casest.errors import UsageError
 from casest_problems.attitude import scalar_kalman, steady_gain, tilt_compensated
 

@@ -23,7 +23,7 @@ from casest import (
     sin,
     unit_vector,
 )
-from casest.problem import find_model
+from casest.results.find import find_model
 from casest_problems.norm import automatic_start, closed_form_many, norm_diagonal, norm_triangular
 
 NORM = norm_triangular.having(norm=sim.GRAVITY)

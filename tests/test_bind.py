@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from casest.data import Run, load_runs
-from casest.declaring.symbols import Signal
+from casest.declaration.symbols import Signal
 from casest.errors import CasestError, DataError, UnitError, UsageError
 
 V = Signal("v", 3, "m/s^2")

@@ -25,12 +25,12 @@ from casest import (
     unit_vector,
     vertcat,
 )
-from casest.estimate import attempt
-from casest.identify import identify
-from casest.solve.certificate import certify
+from casest.estimate.calibrate import attempt
+from casest.estimate.certificate import certify
+from casest.leastsquares.identifiability import identify
+from casest.leastsquares.problem import Problem
 from casest.solve.outcome import Outcome
 from casest.solve.trust_region import trust_region
-from casest.stack import Problem
 
 
 def as_run(**signals):
@@ -439,7 +439,7 @@ def test_with_little_freedom_the_scatter_within_rest_counts_when_it_is_larger():
 @pytest.mark.parametrize("norm", [5e-5, 1.0, 5e4])
 def test_a_scale_of_any_size_is_not_taken_for_one_on_its_bound_at_zero(norm):
     """Counts calibrated to tesla: a scale of 5e-8 is as far from zero as one of 5."""
-    from casest.problem import find_model
+    from casest.results.find import find_model
 
     rng = np.random.default_rng(1)
     d = rng.standard_normal((30, 3))

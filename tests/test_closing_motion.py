@@ -11,17 +11,17 @@ import pytest
 from flights import Sensors
 
 from casest import DataError, Run, cli, cross, norm_2, signal
-from casest.closing_motion.delays import by_reading, shifted
-from casest.closing_motion.effects import Colour, candidates, extended
-from casest.closing_motion.fitting import fitted, rise
-from casest.closing_motion.loop import close_motion
-from casest.closing_motion.score import scores
-from casest.closing_motion.sensitivity import sensitivity
-from casest.closing_motion.tuning import first_guess, likelihood, matched, prepared
-from casest.closing_motion.whiteness import whiteness
-from casest.closing_motion.written import motion_result, rms_settled
+from casest.diagnose.motion.delays import by_reading, shifted
+from casest.diagnose.motion.fit import fitted, rise
+from casest.diagnose.motion.loop import close_motion
+from casest.diagnose.motion.score_test import scores
+from casest.diagnose.motion.sensitivity import sensitivity
+from casest.diagnose.motion.whiteness import whiteness
 from casest.dynamics import Motion, constraint, dynamics, measured, state
 from casest.dynamics.filter import filtered
+from casest.dynamics.likelihood import first_guess, likelihood, matched, prepared
+from casest.effects.moving import Colour, candidates, extended
+from casest.results.motion import motion_result, rms_settled
 from casest_problems.bias_gravity import bias_gravity, bias_gravity_position
 
 RATE = 25.0

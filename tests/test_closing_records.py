@@ -11,9 +11,9 @@ import pytest
 
 from casest import load_runs
 from casest.cli import run
-from casest.closing.closed import OF_NOISE
-from casest.closing.loop import close
-from casest.problem import find_model
+from casest.diagnose.loop import close
+from casest.diagnose.selection.found import OF_NOISE
+from casest.results.find import find_model
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "at_rest.py"
 COOLING = (

@@ -15,13 +15,13 @@ import simulators as sim
 import casest
 from casest import NotTrusted, Residual, Run, UsageError, attitude, model, param, unit_vector
 from casest.cli import run
-from casest.compare import SOLVERS, compare
-from casest.comparing_plot import draw
-from casest.comparing_text import comparison_result, comparison_text
-from casest.problem import find_model
+from casest.comparison.judge import SOLVERS, compare
+from casest.leastsquares.problem import Problem
+from casest.report.picture import draw
+from casest.report.text.comparison import comparison_result, comparison_text
+from casest.results.find import find_model
 from casest.solve import others
 from casest.solve.trust_region import trust_region
-from casest.stack import Problem
 
 NORM = find_model("norm-triangular").having(norm=sim.GRAVITY)
 
@@ -190,7 +190,7 @@ def test_an_optimum_that_is_reported_as_a_failure_is_a_false_failure(monkeypatch
 
 def test_a_lower_cost_than_the_certified_one_is_told(monkeypatch):
     """The certified fit is held in a wrong valley; a solver that jumps finds the right one."""
-    import casest.compare as module
+    import casest.comparison.judge as module
 
     attempt = module.attempt
 
@@ -355,12 +355,12 @@ def test_the_printed_tables_fit_80_columns(record, capsys):
 def test_without_matplotlib_the_json_is_written_and_the_way_out_said(
     record, tmp_path, capsys, monkeypatch
 ):
-    from casest import comparing_plot
+    from casest.report import picture
 
     def missing(name):
         raise ImportError(name)
 
-    monkeypatch.setattr(comparing_plot, "import_module", missing)
+    monkeypatch.setattr(picture, "import_module", missing)
     out = tmp_path / "out"
     assert run(arguments(record, "--starts", "0", "--solver", "ipopt", "-o", str(out))) == 0
     printed = capsys.readouterr()

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from casest.completing import declared_names
+from casest.cli.completing import declared_names
 
 BIN = Path(sys.executable).parent
 
@@ -103,12 +103,12 @@ def test_other_shells_are_given_the_same_names(shell, lines, tmp_path):
 
 def test_the_names_are_those_of_the_catalogue_and_the_problems():
     from casest.effects import CATALOGUE
-    from casest.problem import MOVING, SHIPPED
+    from casest.results.find import MOVING, SHIPPED
     from casest.solve.strategy import SOLVERS
 
     assert declared_names("effects/__init__.py", "CATALOGUE") == [e.name for e in CATALOGUE]
-    assert declared_names("problem.py", "SHIPPED") == list(SHIPPED)
-    assert declared_names("problem.py", "MOVING") == list(MOVING)
+    assert declared_names("results/find.py", "SHIPPED") == list(SHIPPED)
+    assert declared_names("results/find.py", "MOVING") == list(MOVING)
     assert declared_names("solve/strategy.py", "SOLVERS") == list(SOLVERS)
 
 

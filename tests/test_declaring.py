@@ -29,7 +29,7 @@ from casest import (
     signal,
     unit_vector,
 )
-from casest.declaring.physics import chart
+from casest.declaration.physics import chart
 
 
 def with_parameter(declaration):

@@ -15,7 +15,7 @@ from casest.dynamics.record import least_squares
 from casest.dynamics.riccati import riccati
 from casest.dynamics.transition import linearised, transitions
 from casest.engine import Replay
-from casest.observing import observe_motion
+from casest.results.observability import observe_motion
 from casest_problems.bias_gravity import bias_gravity, bias_gravity_position
 
 BIAS = np.array([0.1, -0.05, 0.025])

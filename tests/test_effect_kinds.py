@@ -21,9 +21,9 @@ from casest import (
     signal,
     sin,
 )
-from casest.apply import Correction
-from casest.estimate import attempt
-from casest.stack import Problem
+from casest.correction.inverse import Correction
+from casest.estimate.calibrate import attempt
+from casest.leastsquares.problem import Problem
 
 N, DT = 400, 0.01
 TIME = np.arange(N) * DT

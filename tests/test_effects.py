@@ -10,11 +10,11 @@ from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
 from casest import effects
-from casest.closing.candidates import placed_in
-from casest.declaring.symbols import Constant
+from casest.declaration.effect import NOISE
+from casest.declaration.symbols import Constant
+from casest.effects.placing import placed_in
 from casest.errors import CasestError
-from casest.modelling.effect import NOISE
-from casest.problem import SHIPPED, find_model
+from casest.results.find import SHIPPED, find_model
 
 T = np.linspace(0, 20, 2001)
 #: A smooth motion as a function of time that NumPy and CasADi both evaluate.

@@ -23,13 +23,13 @@ from casest import (
     signal,
 )
 from casest.cli import run
+from casest.cli.earth import normal_gravity
 from casest.data.rest import at_rest
 from casest.data.write import write_atomically
-from casest.earth import normal_gravity
-from casest.libraries import library
-from casest.problem import find_effects, find_model
+from casest.errors import library
+from casest.leastsquares.problem import Problem
+from casest.results.find import find_effects, find_model
 from casest.solve.strategy import solve
-from casest.stack import Problem
 from casest_problems import norm, rate_table, wheel
 
 G = ["--set", "norm=9.80665"]

@@ -15,13 +15,13 @@ import pytest
 import simulators as sim
 
 from casest import Correction, Run
-from casest.apply import invertible
-from casest.applying import saved_model
 from casest.cli import run as command
-from casest.demonstration import RECORD, WHEEL
+from casest.correction.export import is_exported
+from casest.correction.inverse import invertible
+from casest.demo import RECORD, WHEEL
 from casest.effects import CATALOGUE
-from casest.exporting import is_exported
-from casest.problem import find_model
+from casest.results.find import find_model
+from casest.results.saved_model import saved_model
 
 HANDHELD = [str(RECORD), "--columns", "v=ax,ay,az", "--rate", "50", "--at-rest"]
 G = ["--set", "norm=9.80665 m/s^2"]
@@ -244,7 +244,7 @@ def test_outside_the_domain_every_form_says_so(results, tmp_path, capsys):
 def test_the_json_follows_its_published_schema(results, tmp_path):
     jsonschema = pytest.importorskip("jsonschema")
     schema = json.loads(
-        files("casest.export").joinpath("correction.schema.json").read_text("utf-8")
+        files("casest.correction").joinpath("correction.schema.json").read_text("utf-8")
     )
     for name in NAMES:
         path = exported(results / name, "json", tmp_path / "c.json")
@@ -254,7 +254,7 @@ def test_the_json_follows_its_published_schema(results, tmp_path):
 def test_every_result_follows_its_published_schema(results, tmp_path):
     """Of fits, of a loop closed, and of a fit that is refused; one that grew: in test_report."""
     jsonschema = pytest.importorskip("jsonschema")
-    schema = json.loads(files("casest").joinpath("result.schema.json").read_text("utf-8"))
+    schema = json.loads(files("casest.results").joinpath("result.schema.json").read_text("utf-8"))
     jsonschema.Draft202012Validator.check_schema(schema)
     assert command(["calibrate", "norm-full", *HANDHELD, *G, "-o", str(tmp_path)]) == 2
     for folder in (*(results / name for name in NAMES), tmp_path):

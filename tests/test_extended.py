@@ -15,8 +15,8 @@ from casest.cli import run as cli
 from casest.dynamics import Motion, constraint, dynamics, measured, state
 from casest.dynamics.filter import filtered
 from casest.dynamics.record import least_squares as at_once_of
-from casest.filtering import follow
-from casest.observing import observe_motion
+from casest.results.observability import observe_motion
+from casest.results.states import follow
 from casest_problems.bias_gravity import bias_gravity, bias_gravity_magnitude
 
 G_OVER_L, DAMPING = 9.81 / 0.8, 0.15

@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from casest.declaration.tracing import function_of
 from casest.engine import Replay, factored, normal_equations
-from casest.modelling.tracing import function_of
-from casest.problem import SHIPPED, find_model
+from casest.results.find import SHIPPED, find_model
 
 #: Pedersini's Table I: offset, gain, misalignment, tilt, phase, speed.
 SPINNING = [1, -1, 1, 0.9, 1, 1.1, *np.radians([30, 20, 25, 45, 30]), 9, -0.09, 5e-4, 2e-6]

@@ -10,8 +10,8 @@ import worlds
 
 from casest import Run
 from casest.cli import run
-from casest.closing.loop import close
-from casest.problem import find_model
+from casest.diagnose.loop import close
+from casest.results.find import find_model
 
 RESTING = '''
 from casest import Residual, model, param, quantity, signal
@@ -83,7 +83,7 @@ def test_the_formula_says_what_the_record_was_made_with(bench):
     """Evaluated on its own, at other temperatures and voltages than the record's means."""
     import casadi as ca
 
-    from casest.problem import find_effects
+    from casest.results.find import find_effects
 
     _, result = closed()
     (effect,) = find_effects("out/formula.py")
@@ -236,7 +236,7 @@ def test_effects_of_the_users_own_that_cannot_be_used_are_named(bench, tmp_path,
 
 def test_a_candidate_whose_refit_fails_is_named_and_the_loop_goes_on(bench, tmp_path, monkeypatch):
     """The refit of one candidate meets a matrix that cannot be solved."""
-    from casest.closing.work import Work
+    from casest.diagnose.selection.state import Work
 
     fitted = Work.fitted
 

@@ -14,9 +14,9 @@ from scipy.stats import f
 
 from casest import Run
 from casest.cli import run
-from casest.closing.loop import close
+from casest.diagnose.loop import close
 from casest.effects import CATALOGUE
-from casest.problem import find_effects, find_model
+from casest.results.find import find_effects, find_model
 
 TABLE = np.arange(0, 361, 45)
 HEADINGS = {

@@ -7,10 +7,10 @@ import pytest
 import simulators as sim
 
 from casest import Residual, Run, constant, cos, model, param, quantity, signal, sin, vertcat
-from casest.estimate import attempt
-from casest.identify import identify
-from casest.problem import find_model
-from casest.stack import Problem
+from casest.estimate.calibrate import attempt
+from casest.leastsquares.identifiability import identify
+from casest.leastsquares.problem import Problem
+from casest.results.find import find_model
 
 
 def as_run(**signals):

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from casest import DataError, UsageError
-from casest.allan import allan
 from casest.cli import run
+from casest.dynamics.allan import allan
 from casest.dynamics.filter import filtered
-from casest.intensities import from_rest, from_stated, intensities, most_likely
+from casest.dynamics.intensities import from_rest, from_stated, intensities, most_likely
 from casest_problems.bias_gravity import bias_gravity
 
 DT = 0.02

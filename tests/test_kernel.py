@@ -26,8 +26,8 @@ from test_replay import (
 
 from casest.engine import Replay, cost, kernel, normal_equations, residuals, rows, summed
 from casest.engine.emit import _C as OPERATIONS
-from casest.persample import residual_and_jacobian
-from casest.problem import SHIPPED, find_model
+from casest.leastsquares.per_sample import residual_and_jacobian
+from casest.results.find import SHIPPED, find_model
 
 pytestmark = pytest.mark.skipif(
     not any(map(shutil.which, ("cc", "gcc", "clang"))), reason="no C compiler on this machine"

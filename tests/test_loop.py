@@ -11,16 +11,16 @@ import worlds
 
 import casest as c
 from casest import Run
-from casest.closing.axes import lighter
-from casest.closing.candidates import prepared
-from casest.closing.loop import close, rms
-from casest.closing.restrict import restricted
-from casest.closing.text import sentence, undecided
-from casest.closing.written import closing_result
+from casest.diagnose.candidates.axes import lighter
+from casest.diagnose.loop import close, rms
 from casest.effects import CATALOGUE
-from casest.problem import find_model
+from casest.effects.on_axes import restricted
+from casest.effects.placing import prepared
+from casest.leastsquares.problem import Problem
+from casest.report.text.closing import sentence, undecided
+from casest.results.closing import closing_result
+from casest.results.find import find_model
 from casest.solve.trust_region import trust_region
-from casest.stack import Problem
 
 
 def record(world, seed=0):

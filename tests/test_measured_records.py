@@ -9,8 +9,8 @@ import pytest
 from scipy import stats
 
 from casest import load_runs
-from casest.estimate import attempt
-from casest.problem import find_model
+from casest.estimate.calibrate import attempt
+from casest.results.find import find_model
 
 UNITS = ("imu0", "imu1", "imu2")
 LOWER = np.tril_indices(3)

@@ -27,8 +27,8 @@ from casest import (
     sin,
     unit_vector,
 )
-from casest.estimate import attempt
-from casest.modelling.dimensions import check_units
+from casest.declaration.dimensions import check_units
+from casest.estimate.calibrate import attempt
 
 TRUTH = {
     "offset": np.array([0.1, -0.2, 0.3]),

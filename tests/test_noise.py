@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from casest import Residual, Run, model, param, signal
-from casest.estimate import attempt
-from casest.noise import robust_scale
-from casest.solve.correlation import batches, correlation_time
-from casest.stack import Problem
+from casest.estimate.calibrate import attempt
+from casest.estimate.correlation import batches, correlation_time
+from casest.leastsquares.problem import Problem
+from casest.leastsquares.weights import robust_scale
 
 
 @model

@@ -12,8 +12,8 @@ from scipy import stats
 
 from casest import DataError, NotTrusted, Run, calibrate
 from casest.effects import CATALOGUE
-from casest.estimate import attempt
-from casest.problem import find_model
+from casest.estimate.calibrate import attempt
+from casest.results.find import find_model
 from casest_problems.norm import remarks
 
 ESTIMATORS = ("ipopt", "trust-region", "closed-form", "ren-liu", "plain-norm", "bias-only")

@@ -11,8 +11,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from casest import Run
-from casest.estimate import attempt
-from casest.problem import find_model
+from casest.estimate.calibrate import attempt
+from casest.results.find import find_model
 
 modest = settings(
     max_examples=8,

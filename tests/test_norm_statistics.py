@@ -14,9 +14,9 @@ import simulators as sim
 from scipy import stats
 
 from casest import Run
-from casest.estimate import attempt
-from casest.problem import find_model
-from casest.result import calibration_result
+from casest.estimate.calibrate import attempt
+from casest.results.calibration import calibration_result
+from casest.results.find import find_model
 from casest_problems.norm import (
     burkhard_bias,
     burkhard_diagonal,

@@ -11,7 +11,7 @@ from pages import BLOCK, ROOT, blocks, folder_of_a_reader, follow, run_within
 from casest.cli import commands
 
 PAGES = sorted((ROOT / "docs").glob("*.md"))
-PHYSICS = "casest.declaring.physics"
+PHYSICS = "casest.declaration.physics"
 WITH_COMMANDS = [p for p in PAGES if any(language == "sh" for language, _ in blocks(p))]
 
 

@@ -17,11 +17,11 @@ from scipy.spatial.transform import Rotation
 
 from casest import DataError, NotTrusted, Run, UsageError, attempt, calibrate, load_runs
 from casest.cli import run as command
-from casest.identify import identify
-from casest.problem import find_model
-from casest.solve.covariance import inverse_normal
+from casest.estimate.covariance import inverse_normal
+from casest.leastsquares.identifiability import identify
+from casest.leastsquares.problem import Problem
+from casest.results.find import find_model
 from casest.solve.trust_region import trust_region
-from casest.stack import Problem
 from casest_problems.pair import noise_levels, weighed
 
 PAIR = find_model("norm-pair").having(field=FIELD)

@@ -8,7 +8,7 @@ import simulators as sim
 from scipy import stats
 
 from casest import Correction, DataError, Run, attempt, calibrate
-from casest.problem import find_model
+from casest.results.find import find_model
 from casest_problems.rate_table import rate_table, two_stage
 
 # The sensor of V-A.

@@ -12,7 +12,7 @@ import simulators as sim
 
 from casest import Run, attempt
 from casest.cli import run
-from casest.problem import find_model
+from casest.results.find import find_model
 
 MODELS = Path(__file__).parent / "models"
 

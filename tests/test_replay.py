@@ -11,10 +11,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from casest.declaration.tracing import sample_symbol
 from casest.engine import Replay, cost, grouping, normal_equations, rows, triangular_factor
 from casest.errors import CasestError
-from casest.modelling.tracing import sample_symbol
-from casest.problem import find_model
+from casest.results.find import find_model
 
 INF, NAN = np.inf, np.nan
 MODERATE = [0.0, -0.0, 1.0, -1.0, 0.5, -0.5, 1.5, 2.0, -3.0, 2.5, 0.7, -0.7, 3.0, 11.0, -25.0]

@@ -16,14 +16,14 @@ from browser import Browser, installed
 
 from casest import load_runs
 from casest.cli import run
-from casest.demonstration import RECORD, WHEEL
-from casest.estimate import calibrate
-from casest.problem import find_model
-from casest.report import calibration_page
-from casest.report.page import aligned
-from casest.report.residuals import bins
-from casest.report.spectra import autocorrelation, spectrum, white_band
-from casest.result import calibration_result
+from casest.demo import RECORD, WHEEL
+from casest.estimate.calibrate import calibrate
+from casest.report.html import calibration_page
+from casest.report.html.page import aligned
+from casest.report.html.residuals import bins
+from casest.report.html.spectra import autocorrelation, spectrum, white_band
+from casest.results.calibration import calibration_result
+from casest.results.find import find_model
 
 HANDHELD = (str(RECORD), "--columns", "v=ax,ay,az", "--rate", "50", "--at-rest")
 NORM = ("--set", "norm=9.80665 m/s^2")
@@ -69,7 +69,7 @@ def texts(browser, selector):
 
 def test_the_result_of_a_loop_that_grew_follows_the_published_schema(closed):
     jsonschema = pytest.importorskip("jsonschema")
-    schema = json.loads(files("casest").joinpath("result.schema.json").read_text("utf-8"))
+    schema = json.loads(files("casest.results").joinpath("result.schema.json").read_text("utf-8"))
     found = json.loads((closed / "result.json").read_text(encoding="utf-8"))
     assert found["effects"]
     jsonschema.validate(found, schema)

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from casest.data import Run, at_rest, load_runs
 from casest.data.rest import standard_error
 from casest.data.stillness import find_rests
-from casest.declaring.symbols import Signal
+from casest.declaration.symbols import Signal
 from casest.errors import DataError, UsageError
 
 V = Signal("v", 3, None)

@@ -6,9 +6,9 @@ import numpy as np
 from scipy import stats
 
 from casest import Residual, Run, attempt, model, param, signal
-from casest.scatter import between_runs
+from casest.leastsquares.agreement import between_runs
+from casest.leastsquares.problem import Problem
 from casest.solve.trust_region import trust_region
-from casest.stack import Problem
 
 
 @model

@@ -15,7 +15,7 @@ from scipy.stats import chi2
 from casest import UsageError, load_runs, signal
 from casest.cli import run as command
 from casest.dynamics import Motion, dynamics, filtered, measured, state
-from casest.simulating_motion import simulated_motion
+from casest.simulation.motion import simulated_motion
 from casest_problems.bias_gravity import bias_gravity, bias_gravity_position
 
 QUIET = bias_gravity.driven(velocity=0.0, gravity=0.0, bias=0.0)

@@ -19,11 +19,11 @@ from casest import (
     unit_vector,
     vertcat,
 )
-from casest.estimate import attempt
-from casest.persample import linear
+from casest.estimate.calibrate import attempt
+from casest.leastsquares.per_sample import linear
+from casest.leastsquares.problem import Problem
 from casest.solve.ipopt import ipopt
 from casest.solve.trust_region import trust_region
-from casest.stack import Problem
 
 SOLVERS = ("ipopt", "ipopt-exact", "trust-region")
 

@@ -21,8 +21,8 @@ from casest import (
     sin,
     unit_vector,
 )
-from casest.estimate import attempt
-from casest.stack import Point, Problem
+from casest.estimate.calibrate import attempt
+from casest.leastsquares.problem import Point, Problem
 
 
 @model

@@ -13,9 +13,9 @@ import pytest
 import simulators as sim
 
 from casest.cli import commands, run
-from casest.following import following, typed_words
-from casest.terminal import coloured, rounded
-from casest.waiting import Waiting
+from casest.cli.waiting import Waiting
+from casest.report.next_command import following, typed_words
+from casest.report.text.calibration import coloured, rounded
 
 ROOT = Path(__file__).parents[1]
 WORDS = {
@@ -150,7 +150,7 @@ def test_a_long_command_continues_as_a_shell_reads_it():
 
 def test_the_list_names_every_shipped_problem_and_effect(said):
     from casest.effects import CATALOGUE
-    from casest.problem import MOVING, SHIPPED
+    from casest.results.find import MOVING, SHIPPED
 
     names = {line.strip().partition(":")[0] for line in said["list"].splitlines()}
     assert {*SHIPPED, *MOVING, *(e.name for e in CATALOGUE)} <= names
@@ -181,8 +181,8 @@ def screen(stream: io.StringIO) -> str:
 
 @pytest.fixture
 def impatient(monkeypatch):
-    monkeypatch.setattr("casest.waiting.PATIENCE", 0.0)
-    monkeypatch.setattr("casest.waiting._TICK", 0.002)
+    monkeypatch.setattr("casest.cli.waiting.PATIENCE", 0.0)
+    monkeypatch.setattr("casest.cli.waiting._TICK", 0.002)
 
 
 def waited(stream: io.StringIO, words: str) -> bool:
@@ -240,7 +240,7 @@ def test_nothing_is_said_where_nobody_watches_or_within_a_second(impatient, monk
     time.sleep(0.02)
     waiting.done()
     assert piped.getvalue() == ""
-    monkeypatch.setattr("casest.waiting.PATIENCE", 1.0)
+    monkeypatch.setattr("casest.cli.waiting.PATIENCE", 1.0)
     terminal = Terminal()
     monkeypatch.setattr("sys.stderr", terminal)
     waiting.say("fitting")

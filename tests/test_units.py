@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from casest.errors import UnitError, UsageError
-from casest.naming import resolved
+from casest.results.units import resolved
 from casest.units import (
     canonical,
     conversion,

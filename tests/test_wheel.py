@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from casest import Run, attempt, load_runs, param
 from casest.cli import run as casest_command
 from casest.effects import speed_polynomial
-from casest.problem import find_model
+from casest.results.find import find_model
 from casest_problems.wheel import (
     closed_form,
     euler,

@@ -10,11 +10,13 @@ import simulators as sim
 from scipy.spatial.transform import Rotation
 
 from casest import Run, calibrate
-from casest.closing.candidates import candidates, prepared
-from casest.closing.score import SURVIVES, scores, widened
+from casest.diagnose.candidates.candidates import candidates
+from casest.diagnose.candidates.score_test import scores, widened
+from casest.diagnose.levels import SURVIVES
 from casest.effects import cross_axis
-from casest.identify import identify
-from casest.stack import Problem
+from casest.effects.placing import prepared
+from casest.leastsquares.identifiability import identify
+from casest.leastsquares.problem import Problem
 from casest_problems.wheel import wheel
 
 OFFSET, GAIN = np.array([0.4, -0.3, 0.2]), np.array([0.98, 1.01, 1.03])

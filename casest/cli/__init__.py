@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import click
 
 from casest.cli import comparing, fitting, motion, using
-from casest.cli.shared import commands, echo, waiting
+from casest.cli.shared import commands, echo, shown
 from casest.errors import CasestError
 
 __all__ = ["commands", "main", "run"]
@@ -54,4 +54,4 @@ def run(arguments: Sequence[str] | None = None) -> int:
         )
         return 2
     finally:
-        waiting.done()
+        shown.done()

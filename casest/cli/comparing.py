@@ -7,6 +7,7 @@ from typing import Any
 
 import click
 
+from casest.cli.completing import ModelName
 from casest.cli.options import model_options, reading_options
 from casest.cli.shared import (
     FOLDER,
@@ -21,7 +22,6 @@ from casest.cli.words import (
     records,
     start_value,
 )
-from casest.completing import ModelName
 from casest.errors import NotTrusted, UsageError
 
 
@@ -70,9 +70,10 @@ def compare(model_name: str, data: tuple[str, ...], **options: Any) -> int:
     code 0: done; 1: bad input; 2: no certified optimum to judge by, or interrupted (what is done
     is shown and written all the same).
     """
-    from casest import comparing_text, result
-    from casest.compare import SIZES
-    from casest.compare import compare as compared
+    from casest.comparison.judge import SIZES
+    from casest.comparison.judge import compare as compared
+    from casest.report.text.comparison import comparison_result, comparison_text
+    from casest.results.file import as_json
 
     model = declared_model(model_name, options)
     runs = records(model, data, options)
@@ -88,14 +89,12 @@ def compare(model_name: str, data: tuple[str, ...], **options: Any) -> int:
         say=progress,
     )
     command = typed()
-    content = comparing_text.comparison_result(
-        found, model_name=model_name, data=data, command=command
-    )
+    content = comparison_result(found, model_name=model_name, data=data, command=command)
     written = written_comparison(found, content, options["output"]) if options["output"] else []
     if options["as_json"]:
-        echo(result.as_json(content), nl=False)
+        echo(as_json(content), nl=False)
     else:
-        echo(comparing_text.comparison_text(found, data, written, command))
+        echo(comparison_text(found, data, written, command))
     if found.interrupted:
         echo(f"casest: interrupted after {found.done} of {found.planned} runs", err=True)
     elif not found.certified:
@@ -105,11 +104,12 @@ def compare(model_name: str, data: tuple[str, ...], **options: Any) -> int:
 
 def written_comparison(found: Any, content: Options, folder: Path) -> list[Path]:
     """compare.json, and the plot where matplotlib is there; says so where it is not."""
-    from casest import comparing_plot, comparing_text
+    from casest.report.picture import draw
+    from casest.report.text.comparison import save
 
-    paths = [comparing_text.save(folder, content)]
+    paths = [save(folder, content)]
     try:
-        paths += comparing_plot.draw(found, folder)
+        paths += draw(found, folder)
     except UsageError as error:
         echo(f"casest: {error}", err=True)
     return paths

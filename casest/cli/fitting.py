@@ -9,6 +9,7 @@ from typing import Any
 
 import click
 
+from casest.cli.completing import ModelName
 from casest.cli.options import model_options, output_options, reading_options
 from casest.cli.shared import (
     FOLDER,
@@ -27,7 +28,6 @@ from casest.cli.words import (
     records,
     start_value,
 )
-from casest.completing import ModelName
 from casest.errors import NotTrusted, UsageError
 
 
@@ -35,10 +35,10 @@ from casest.errors import NotTrusted, UsageError
 @click.option("--json", "as_json", is_flag=True, help="For programs.")
 def list_command(as_json: bool) -> None:
     """Shipped problems with their symbols and estimators, and the catalogue of effects."""
-    from casest.closing_motion.effects import listed
     from casest.effects import CATALOGUE
-    from casest.problem import MOVING, SHIPPED, find_any, find_model
-    from casest.terminal import listing
+    from casest.effects.moving import listed
+    from casest.report.text.calibration import listing
+    from casest.results.find import MOVING, SHIPPED, find_any, find_model
 
     models = [(name, find_model(name)) for name in SHIPPED]
     moving: list[Any] = [(name, find_any(name)) for name in MOVING]
@@ -61,9 +61,13 @@ def calibrate(model_name: str, data: tuple[str, ...], **options: Any) -> int:
 
 def calibration(model_name: str, data: Sequence[str], options: Options, command: str) -> int:
     """Read, fit, save, print; the exit code says whether the estimate is trusted."""
-    from casest import estimate, result, terminal, unseen
-    from casest.closing import doubt
-    from casest.report import calibration_page
+    from casest.diagnose.misfit.specification_test import doubts
+    from casest.estimate.calibrate import attempt
+    from casest.estimate.held_out import score
+    from casest.report.html import calibration_page
+    from casest.report.text.calibration import calibration_text, coloured
+    from casest.results.calibration import calibration_result, residual_rows
+    from casest.results.file import as_json, save
     from casest.solve.interrupt import interruptible
 
     model = declared_model(model_name, options)
@@ -72,28 +76,26 @@ def calibration(model_name: str, data: Sequence[str], options: Options, command:
     start = dict(start_value(text, model) for text in options["starts"]) or None
     progress(f"fitting {model_name}")
     with interruptible():
-        found = estimate.attempt(
-            model, runs, start=start, solver=options["solver"], seed=options["seed"]
-        )
-    holdout = unseen.score(found, hidden) if hidden else None
+        found = attempt(model, runs, start=start, solver=options["solver"], seed=options["seed"])
+    holdout = score(found, hidden) if hidden else None
     progress("asking whether the residual is noise")
-    content = result.calibration_result(
+    content = calibration_result(
         found,
         model_name=model_name,
         data=data,
         command=command,
         holdout=holdout,
-        misfit=doubt.asked(found),
+        misfit=doubts(found),
     )
     if options["output"]:
         progress(f"writing {options['output']}")
-        result.save(options["output"], content, result.residual_rows(found))
+        save(options["output"], content, residual_rows(found))
         reported(options["output"], calibration_page(found, content, str(options["output"])))
     if options["as_json"]:
-        echo(result.as_json(content), nl=False)
+        echo(as_json(content), nl=False)
     else:
-        words = terminal.calibration_text(found, content, options["output"])
-        echo(terminal.coloured(words, sys.stdout))
+        words = calibration_text(found, content, options["output"])
+        echo(coloured(words, sys.stdout))
     if not found.certificate.trusted:
         reason = found.certificate.reasons[0]
         echo(f"casest: no trustworthy estimate: {reason}", err=True)
@@ -115,7 +117,7 @@ def close(model_name: str, data: tuple[str, ...], **options: Any) -> int:
     Of an estimator in motion the one-step innovations are diagnosed.
     """
     from casest.dynamics import Dynamics
-    from casest.problem import find_any
+    from casest.results.find import find_any
 
     if isinstance(find_any(model_name), Dynamics):
         return closing_in_motion(model_name, data, options, typed())
@@ -124,12 +126,15 @@ def close(model_name: str, data: tuple[str, ...], **options: Any) -> int:
 
 def closing(model_name: str, data: Sequence[str], options: Options, command: str) -> int:
     """Read, close the loop, save, print."""
-    from casest import result
-    from casest.closing import loop, text, unseen, written
+    from casest.diagnose import loop
+    from casest.diagnose.held_out import scored
     from casest.effects import CATALOGUE
-    from casest.problem import find_effects
-    from casest.report import closing_page
-    from casest.terminal import coloured
+    from casest.report.html import closing_page
+    from casest.report.text.calibration import coloured
+    from casest.report.text.closing import closing_text
+    from casest.results.closing import closing_result, formula_source, name_file, residual_rows
+    from casest.results.file import as_json, save
+    from casest.results.find import find_effects
 
     known = {e.name for e in CATALOGUE} & {*options["effects"]}
     own = tuple(e for path in options["effects"] if path not in known for e in find_effects(path))
@@ -150,22 +155,22 @@ def closing(model_name: str, data: Sequence[str], options: Options, command: str
         )
     except NotTrusted as error:
         return refused(error, model_name, data, options, command)
-    hidden = unseen.scored(found, apart) if apart else None
-    content = written.closing_result(
+    hidden = scored(found, apart) if apart else None
+    content = closing_result(
         found, model_name=model_name, data=data, command=command, held_out=hidden and hidden[1:]
     )
     if options["output"]:
         progress(f"writing {options['output']}")
-        formula = written.formula_source(found)
+        formula = formula_source(found)
         if formula:
             write(options["output"] / "formula.py", formula)
-            written.name_file(content, options["output"] / "formula.py")
-        result.save(options["output"], content, written.residual_rows(found, hidden))
+            name_file(content, options["output"] / "formula.py")
+        save(options["output"], content, residual_rows(found, hidden))
         reported(options["output"], closing_page(found, content, str(options["output"])))
     if options["as_json"]:
-        echo(result.as_json(content), nl=False)
+        echo(as_json(content), nl=False)
     else:
-        echo(coloured(text.closing_text(found, content, options["output"]), sys.stdout))
+        echo(coloured(closing_text(found, content, options["output"]), sys.stdout))
     return 0
 
 
@@ -175,10 +180,12 @@ FITTED = ("effects", "per_run", "shared", "fix", "free", "starts", "holdout")
 
 def closing_in_motion(model_name: str, data: Sequence[str], options: Options, command: str) -> int:
     """Filter, diagnose the innovations, add what is missing, save, print."""
-    from casest import result
-    from casest.closing_motion import loop, text, written
-    from casest.report import closing_motion_page
-    from casest.terminal import coloured
+    from casest.diagnose.motion import loop
+    from casest.report.html import closing_motion_page
+    from casest.report.text.calibration import coloured
+    from casest.report.text.motion import motion_text
+    from casest.results.file import as_json, save
+    from casest.results.motion import motion_result, residual_rows
 
     for name in FITTED:
         if options[name]:
@@ -190,14 +197,14 @@ def closing_in_motion(model_name: str, data: Sequence[str], options: Options, co
     moving, run = moving_record(model_name, data, {**options, "intensities": (), "stds": ()})
     progress(f"filtering {model_name}, looking for effects")
     found = loop.close_motion(moving, run, say=progress)
-    content = written.motion_result(found, model_name=model_name, data=data, command=command)
+    content = motion_result(found, model_name=model_name, data=data, command=command)
     if options["output"]:
-        result.save(options["output"], content, written.residual_rows(found))
+        save(options["output"], content, residual_rows(found))
         reported(options["output"], closing_motion_page(found, content))
     if options["as_json"]:
-        echo(result.as_json(content), nl=False)
+        echo(as_json(content), nl=False)
     else:
-        echo(coloured(text.motion_text(content, options["output"]), sys.stdout))
+        echo(coloured(motion_text(content, options["output"]), sys.stdout))
     if not content["trusted"]:
         reason = content["after"]["certificate"]["reasons"][-1]
         click.echo(f"casest: no trustworthy estimate: {reason}", err=True)
@@ -209,18 +216,19 @@ def refused(
     error: NotTrusted, model_name: str, data: Sequence[str], options: Options, command: str
 ) -> int:
     """Write and say what there is where the declared model itself has no trustworthy fit."""
-    from casest import result
-    from casest.report import calibration_page
+    from casest.report.html import calibration_page
+    from casest.results.calibration import calibration_result, residual_rows
+    from casest.results.file import as_json, save
 
     if error.estimate is not None and options["output"]:
-        content = result.calibration_result(
+        content = calibration_result(
             error.estimate, model_name=model_name, data=data, command=command
         )
-        result.save(options["output"], content, result.residual_rows(error.estimate))
+        save(options["output"], content, residual_rows(error.estimate))
         page = calibration_page(error.estimate, content, str(options["output"]))
         reported(options["output"], page)
         if options["as_json"]:
-            echo(result.as_json(content), nl=False)
+            echo(as_json(content), nl=False)
     echo(f"casest: {error}", err=True)
     return NotTrusted.exit_code
 
@@ -235,9 +243,9 @@ def refused(
 )
 def demo(output: Path | None) -> int:
     """Close the loop on a shipped record with an effect that its model lacks."""
-    from casest import demonstration
+    from casest.demo import WHEEL, comparison
 
-    record = demonstration.WHEEL
+    record = WHEEL
     options: Options = {
         **dict.fromkeys(
             ("effects", "constants", "free", "fix", "shared", "per_run", "columns", "units"), ()
@@ -254,5 +262,5 @@ def demo(output: Path | None) -> int:
     words = f"casest close wheel {record} -o {options['output']}"
     echo(f"$ {words}\n")
     code = closing("wheel", (str(record),), options, words)
-    echo("\n" + demonstration.comparison(options["output"]))
+    echo("\n" + comparison(options["output"]))
     return code

@@ -6,6 +6,7 @@ from typing import Any
 
 import click
 
+from casest.cli.completing import ModelName
 from casest.cli.options import model_options, motion_options, reading_options, sensor_noise
 from casest.cli.shared import (
     commands,
@@ -23,7 +24,6 @@ from casest.cli.words import (
     records,
     tuned_noise,
 )
-from casest.completing import ModelName
 from casest.errors import UsageError
 
 
@@ -40,9 +40,10 @@ def observe(model_name: str, data: tuple[str, ...], **options: Any) -> int:
     Without DATA: what any record of an estimator in motion could show (structural rank). Exit
     code 0 even where something is not observable.
     """
-    from casest import observing, result
-    from casest.modelling.model import Model
-    from casest.problem import find_any
+    from casest.declaration.model import Model
+    from casest.results import observability
+    from casest.results.file import as_json, reproduce
+    from casest.results.find import find_any
 
     fits = isinstance(find_any(model_name), Model)
     if fits:
@@ -51,23 +52,23 @@ def observe(model_name: str, data: tuple[str, ...], **options: Any) -> int:
             raise UsageError(f"{model_name}: what can be seen depends on the record: give DATA")
         runs = records(model, data, options)
         progress(f"fitting {model_name}")
-        content, _ = observing.observe_parameters(model, runs)
+        content, _ = observability.observe_parameters(model, runs)
     elif not data:
-        content = observing.observe_structure(moving_model(model_name, options))
+        content = observability.observe_structure(moving_model(model_name, options))
     else:
         moving, run = moving_record(model_name, data, options)
         progress("what the trajectory shows")
-        content = observing.observe_motion(moving, run, options["window"])
-    content |= {"data": list(data), "reproduce": result.reproduce(typed(), data)}
+        content = observability.observe_motion(moving, run, options["window"])
+    content |= {"data": list(data), "reproduce": reproduce(typed(), data)}
     if options["output"]:
-        from casest.report import observe_page
+        from casest.report.html import observe_page
 
-        write(options["output"] / "observe.json", result.as_json(content))
+        write(options["output"] / "observe.json", as_json(content))
         reported(options["output"], observe_page(content))
     if options["as_json"]:
-        echo(result.as_json(content), nl=False)
+        echo(as_json(content), nl=False)
         return 0
-    echo(observing.observe_text(content))
+    echo(observability.observe_text(content))
     seen = content["rank"] == content["unknowns"]
     last_words(options["output"], "report.html, observe.json", trusted=seen, applies=fits)
     return 0
@@ -96,23 +97,24 @@ def observe(model_name: str, data: tuple[str, ...], **options: Any) -> int:
 )
 def filter_command(model_name: str, data: tuple[str, ...], **options: Any) -> int:
     """States over time by the Kalman filter and smoother, with innovations diagnosed."""
-    from casest import filtering, result
+    from casest.results import states
+    from casest.results.file import as_json, reproduce
 
     moving, run = moving_record(model_name, data, options)
     tuned, told = tuned_noise(moving, run, options)
     progress("filter and smoother")
-    content, found = filtering.follow(moving, run, tuned)
+    content, found = states.follow(moving, run, tuned)
     content |= told
-    content |= {"data": list(data), "reproduce": result.reproduce(typed(), data)}
+    content |= {"data": list(data), "reproduce": reproduce(typed(), data)}
     if options["output"]:
-        from casest.report import filter_page
+        from casest.report.html import filter_page
 
-        write(options["output"] / "states.csv", filtering.states_csv(found))
-        write(options["output"] / "filter.json", result.as_json(content))
+        write(options["output"] / "states.csv", states.states_csv(found))
+        write(options["output"] / "filter.json", as_json(content))
         reported(options["output"], filter_page(found, content))
     if options["as_json"]:
-        echo(result.as_json(content), nl=False)
+        echo(as_json(content), nl=False)
         return 0
-    echo(filtering.filter_text(content))
+    echo(states.filter_text(content))
     last_words(options["output"], "report.html, filter.json, states.csv")
     return 0

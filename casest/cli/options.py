@@ -7,8 +7,8 @@ from typing import Any
 
 import click
 
+from casest.cli.completing import SolverName
 from casest.cli.shared import FOLDER, Options
-from casest.completing import SolverName
 
 
 def reading_options(command: Callable[..., Any]) -> Callable[..., Any]:

@@ -9,22 +9,22 @@ from typing import Any
 import click
 
 from casest import __version__
-from casest.waiting import Waiting
+from casest.cli.waiting import Waiting
 
 Options = dict[str, Any]
 
 #: A file in its place is refused before anything is computed.
 FOLDER = click.Path(path_type=Path, file_okay=False)
 
-waiting = Waiting()
+shown = Waiting()
 
 #: Say what is going on, where somebody watches.
-progress = waiting.say
+progress = shown.say
 
 
 def echo(text: str, **how: Any) -> None:
     """Print, after what was said of the waiting is wiped away."""
-    waiting.done()
+    shown.done()
     click.echo(text, **how)
 
 
@@ -44,7 +44,7 @@ def typed() -> str:
 
 def last_words(output: Path | None, files: str, **known: Any) -> None:
     """What has been written, and what to type next."""
-    from casest.following import following
+    from casest.report.next_command import following
 
     if output is not None:
         echo(f"\nWritten: {output}/{files}")
@@ -54,7 +54,7 @@ def last_words(output: Path | None, files: str, **known: Any) -> None:
 
 def reported(folder: Path, page: str) -> None:
     """`report.html` beside the results."""
-    from casest.report import REPORT
+    from casest.report.html import REPORT
 
     write(folder / REPORT, page)
 

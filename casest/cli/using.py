@@ -7,6 +7,7 @@ from typing import Any
 
 import click
 
+from casest.cli.completing import EffectName, ModelName
 from casest.cli.options import driving_options, model_options, reading_options
 from casest.cli.shared import (
     FOLDER,
@@ -14,8 +15,8 @@ from casest.cli.shared import (
     commands,
     echo,
     progress,
+    shown,
     typed,
-    waiting,
     write,
 )
 from casest.cli.words import (
@@ -26,7 +27,6 @@ from casest.cli.words import (
     number_pair,
     reading_arguments,
 )
-from casest.completing import EffectName, ModelName
 from casest.errors import UsageError
 
 
@@ -44,24 +44,25 @@ from casest.errors import UsageError
 @click.option("--force", is_flag=True, help="Apply a result that was refused.")
 def apply(result_path: Path, data: str, **options: Any) -> None:
     """Correct the readings in DATA with a saved RESULT (result.json, or its folder)."""
-    from casest import applying, exporting
-    from casest.apply import LEFT, TIMED
-    from casest.following import following
+    from casest.correction import apply as correcting
+    from casest.correction.export import applied, is_exported
+    from casest.correction.inverse import LEFT, TIMED
+    from casest.report.next_command import following
 
     arguments = reading_arguments(options)
     progress(f"correcting {data}")
     timed: tuple[str, ...] = ()
-    if exporting.is_exported(result_path):
-        text, left = exporting.applied(result_path, data, arguments)
+    if is_exported(result_path):
+        text, left = applied(result_path, data, arguments)
     else:
-        text, left = applying.corrected_csv(result_path, data, arguments, force=options["force"])
-        timed = applying.of_another_time(result_path, data)
-    waiting.done()
+        text, left = correcting.corrected_csv(result_path, data, arguments, force=options["force"])
+        timed = correcting.of_another_time(result_path, data)
+    shown.done()
     if left:
         echo(f"casest: {LEFT}{', '.join(left)}", err=True)
     if timed:
         echo(f"casest: {TIMED}{', '.join(timed)}", err=True)
-    if path := applying.write_or_print(text, options["output"]):
+    if path := correcting.write_or_print(text, options["output"]):
         echo(f"Written: {path}")
         echo(f"\n{following(typed(), file=path)}")
 
@@ -97,7 +98,7 @@ def simulate(model_name: str, **options: Any) -> None:
     random one, or follows the inputs of --input.
     """
     from casest.dynamics import Dynamics
-    from casest.problem import find_any
+    from casest.results.find import find_any
 
     if isinstance(find_any(model_name), Dynamics):
         simulation_in_motion(model_name, options, typed())
@@ -114,10 +115,11 @@ def simulation_in_motion(model_name: str, options: Options, command: str) -> Non
     """A trajectory, states along it, readings, files."""
     import numpy as np
 
-    from casest import intensities, simulating, simulating_motion
     from casest.data.run import Run
+    from casest.dynamics import intensities
     from casest.dynamics.transition import checked_time
-    from casest.following import following
+    from casest.report.next_command import following
+    from casest.simulation import motion, record
 
     for name in STILL:
         if options[name]:
@@ -127,16 +129,16 @@ def simulation_in_motion(model_name: str, options: Options, command: str) -> Non
     values = dict(number_list(text, "--value") for text in options["values"])
     inputs = None
     if options["given"]:
-        along = simulating_motion.inputs_of(moving, options["given"], reading_arguments(options))
+        along = motion.inputs_of(moving, options["given"], reading_arguments(options))
         time, inputs = np.asarray(along.time, float), along.signals
     else:
-        time = simulating.times(options["duration"], options["rate"])
+        time = record.times(options["duration"], options["rate"])
     blank = Run.raw("simulated", {"t": time[:, None]}, units={"t": "s"}, time=time)
     checked_time(blank)
     if stds:
         moving = intensities.from_stated(moving, blank, stds).model
     progress(f"simulating {model_name}")
-    made = simulating_motion.simulated_motion(
+    made = motion.simulated_motion(
         moving,
         time,
         np.random.default_rng(options["seed"]),
@@ -145,7 +147,7 @@ def simulation_in_motion(model_name: str, options: Options, command: str) -> Non
         effects=options["effect"],
         values=values,
     )
-    paths = simulating_motion.written_motion(options["output"], made, options["seed"], command)
+    paths = motion.written_motion(options["output"], made, options["seed"], command)
     for path in paths:
         echo(f"Written: {path}")
     echo(f"\n{following(command, file=paths[0], moving=True)}")
@@ -155,10 +157,10 @@ def simulation(model_name: str, options: Options, command: str) -> None:
     """Signals, truth, readings, files."""
     import numpy as np
 
-    from casest import simulating
     from casest.effects import CATALOGUE
-    from casest.following import following
-    from casest.problem import find_effects
+    from casest.report.next_command import following
+    from casest.results.find import find_effects
+    from casest.simulation import record
 
     for name in MOVING:
         if options[name]:
@@ -168,22 +170,22 @@ def simulation(model_name: str, options: Options, command: str) -> None:
     model = declared_model(model_name, {**options, "effects": ()})
     rng = np.random.default_rng(options["seed"])
     if options["given"]:
-        run = simulating.with_record(model, options["given"], reading_arguments(options))
+        run = record.with_record(model, options["given"], reading_arguments(options))
     else:
-        run = simulating.without_data(
+        run = record.without_data(
             model,
             duration=options["duration"],
             rate=options["rate"],
             directions=options["directions"],
             rng=rng,
         )
-    model = simulating.with_effects(model, run, options["effect"], (*CATALOGUE, *own))
+    model = record.with_effects(model, run, options["effect"], (*CATALOGUE, *own))
     given = dict(named_value(text, "--value", model) for text in options["values"])
-    values = simulating.truth(model, {name: value.array for name, value in given.items()})
+    values = record.truth(model, {name: value.array for name, value in given.items()})
     progress(f"simulating {model_name}")
     noise = options["noise"] or 0.0
-    reading = simulating.simulated(model, run, values, noise, rng)
-    paths = simulating.written(
+    reading = record.simulated(model, run, values, noise, rng)
+    paths = record.written(
         options["output"], model, run, reading, values, noise, options["seed"], command
     )
     for path in paths:
@@ -222,16 +224,17 @@ def completion(shell: str) -> None:
 @click.option("--force", is_flag=True, help="Export a result that was refused.")
 def export(result_path: Path, to: Any, output: Path | None, **options: Any) -> None:
     """The correction of a saved RESULT, ready to run on the device."""
-    from casest import applying, exporting
-    from casest.apply import TIMED
-    from casest.following import following
-    from casest.result import made_by
+    from casest.correction import apply as correcting
+    from casest.correction.export import exported
+    from casest.correction.inverse import TIMED
+    from casest.report.next_command import following
+    from casest.results.file import made_by
 
     if options["single"] and to != "c":
         raise UsageError("--float is for --to c")
     progress(f"exporting {result_path}")
-    text = exporting.exported(result_path, to, **options)
-    if timed := applying.of_another_time(result_path):
+    text = exported(result_path, to, **options)
+    if timed := correcting.of_another_time(result_path):
         echo(f"casest: {TIMED}{', '.join(timed)}", err=True)
     if output is None:
         echo(text, nl=False)

@@ -11,14 +11,14 @@ from casest.errors import CasestError, UsageError
 
 if TYPE_CHECKING:
     from casest.data.run import Run
+    from casest.declaration.model import Model
     from casest.dynamics import Dynamics
-    from casest.modelling.model import Model
 
 
 def tuned_noise(moving: Dynamics, run: Run, options: Options) -> tuple[Any, Options]:
     """Noise intensities as --noise, --sensor-noise or --rest ask for them, and what a rest said."""
-    from casest import intensities
     from casest.data import load_runs
+    from casest.dynamics import intensities
 
     if options["noise"] == "ml":
         if options["stated"] or options["rest"]:
@@ -45,7 +45,7 @@ def tuned_noise(moving: Dynamics, run: Run, options: Options) -> tuple[Any, Opti
 def moving_model(name: str, options: Options) -> Dynamics:
     """The estimator with its options applied."""
     from casest.dynamics import Dynamics
-    from casest.problem import find_any
+    from casest.results.find import find_any
 
     moving = find_any(name)
     if not isinstance(moving, Dynamics):
@@ -93,10 +93,10 @@ def number_list(text: str, option: str) -> tuple[str, list[float]]:
 
 def declared_model(name: str, options: Options) -> Model:
     """The model with --set, --free, --fix, --shared, --per-run and --effects applied."""
-    from casest.closing.candidates import placed_in
-    from casest.declaring.symbols import Constant, Parameter, constant
-    from casest.modelling.dimensions import check_units
-    from casest.problem import find_effects, find_model
+    from casest.declaration.dimensions import check_units
+    from casest.declaration.symbols import Constant, Parameter, constant
+    from casest.effects.placing import placed_in
+    from casest.results.find import find_effects, find_model
 
     model = find_model(name)
     for path in options["effects"]:
@@ -124,7 +124,7 @@ def declared_model(name: str, options: Options) -> Model:
 
 def named_value(text: str, option: str, model: Model) -> tuple[str, Any]:
     """`name=value` as a name and a number, array, or constant with unit."""
-    from casest.values import parse_value
+    from casest.cli.values import parse_value
 
     key, equals, value = text.partition("=")
     if not equals or not value:
@@ -134,7 +134,7 @@ def named_value(text: str, option: str, model: Model) -> tuple[str, Any]:
 
 def start_value(text: str, model: Model) -> tuple[str, Any]:
     """`name=value` as a start value in the parameter's own unit."""
-    from casest.declaring.symbols import Parameter
+    from casest.declaration.symbols import Parameter
 
     key, value = named_value(text, "--start", model)
     if not isinstance(model[key], Parameter):

@@ -21,7 +21,7 @@ from casest.data.rest import at_rest as averaged_at_rest
 from casest.data.run import Array, Labels, Run
 from casest.data.scaling import parse_scale
 from casest.data.table import Table, read_table
-from casest.declaring.symbols import Signal
+from casest.declaration.symbols import Signal
 from casest.errors import DataError, UnitError, UsageError
 
 Path_ = str | os.PathLike[str]

@@ -12,7 +12,7 @@ from casest.data.options import Options
 from casest.data.run import Array
 from casest.data.scaling import Scale
 from casest.data.table import Column, Table
-from casest.declaring.symbols import Signal
+from casest.declaration.symbols import Signal
 from casest.errors import DataError, UnitError
 
 

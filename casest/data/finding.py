@@ -11,7 +11,7 @@ from dataclasses import replace
 from casest import units
 from casest.data.column import name_and_unit
 from casest.data.table import Table
-from casest.declaring.symbols import Signal
+from casest.declaration.symbols import Signal
 from casest.errors import DataError, UnitError
 
 Choice = Mapping[str, Sequence[str] | str]

@@ -11,7 +11,7 @@ from casest import units as unit_names
 from casest.data.finding import Choice, find_by_name
 from casest.data.scaling import Scale
 from casest.data.table import Table
-from casest.declaring.symbols import Signal
+from casest.declaration.symbols import Signal
 from casest.errors import UnitError, UsageError
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from casest.data.run import Run
-from casest.declaring.shapes import Array
+from casest.declaration.shapes import Array
 from casest.dynamics.declare import Dynamics
 from casest.dynamics.filter import coefficients
 from casest.dynamics.riccati import riccati

@@ -12,11 +12,11 @@ import casadi as ca
 import numpy as np
 
 from casest import units
-from casest.declaring.physics import SX
-from casest.declaring.shapes import Array
-from casest.declaring.symbols import Constant, Signal
+from casest.declaration.physics import SX
+from casest.declaration.shapes import Array
+from casest.declaration.symbols import Constant, Signal
+from casest.declaration.tracing import flat
 from casest.errors import CasestError, DeclarationError, UsageError
-from casest.modelling.tracing import flat
 
 
 @dataclass(frozen=True)

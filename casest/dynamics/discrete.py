@@ -12,7 +12,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from casest.declaring.shapes import Array
+from casest.declaration.shapes import Array
 from casest.dynamics.stepping import Pattern, kalman_step, run_steps, unpacked
 
 

@@ -14,14 +14,14 @@ import casadi as ca
 import numpy as np
 
 from casest.data.run import Run
-from casest.declaring.physics import SX
-from casest.declaring.shapes import Array
+from casest.declaration.physics import SX
+from casest.declaration.shapes import Array
+from casest.declaration.tracing import flat
 from casest.dynamics.declare import Dynamics
 from casest.dynamics.discrete import Steps
 from casest.dynamics.stepping import entries, packed, run_steps, symmetric, taken, unpacked
 from casest.dynamics.transition import checked_record, lost, steps_to, with_lost
 from casest.engine import Columns, Recursion, Replay
-from casest.modelling.tracing import flat
 
 
 def relinearised(model: Dynamics, run: Run, along: Array) -> Steps:

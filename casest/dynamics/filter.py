@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from casest.data.run import Run
-from casest.declaring.shapes import Array
+from casest.declaration.shapes import Array
 from casest.dynamics.declare import Dynamics
 from casest.dynamics.discrete import Steps, kalman, smoothed, smoothed_states
 from casest.dynamics.extended import extended, relinearised

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from casest.declaring.shapes import Array
+from casest.declaration.shapes import Array
 from casest.dynamics.declare import Dynamics
 from casest.dynamics.transition import Linearised, counted, half_transitions
-from casest.null_space import sparsest
+from casest.leastsquares.null_space import sparsest
 
 #: A direction counts as observable from this share of the largest scaled eigenvalue on. Rounding
 #: and the error of a fourth-order step stay below 1e-13.

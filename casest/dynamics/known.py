@@ -14,11 +14,11 @@ import casadi as ca
 import numpy as np
 
 from casest.data.run import Run
-from casest.declaring.shapes import Array
+from casest.declaration.shapes import Array
+from casest.declaration.tracing import flat
 from casest.dynamics.declare import Dynamics
 from casest.dynamics.extended import over_samples, replay
 from casest.engine import Replay
-from casest.modelling.tracing import flat
 
 #: Rounds of Newton's method towards the constraint, and the change in standard deviations that
 #: ends them.

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from casest.data.run import Run
-from casest.declaring.shapes import Array
+from casest.declaration.shapes import Array
 from casest.dynamics.declare import Dynamics
 from casest.dynamics.discrete import Steps
 from casest.dynamics.extended import extended, relinearised

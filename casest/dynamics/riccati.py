@@ -13,7 +13,7 @@ from itertools import chain
 
 import numpy as np
 
-from casest.declaring.shapes import Array
+from casest.declaration.shapes import Array
 from casest.dynamics.declare import Dynamics
 from casest.dynamics.transition import Linearised, magnus_blocks
 from casest.errors import DataError

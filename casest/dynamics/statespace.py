@@ -9,10 +9,10 @@ import casadi as ca
 import numpy as np
 
 from casest.data.run import Run
-from casest.declaring.shapes import Array
+from casest.declaration.shapes import Array
+from casest.declaration.tracing import flat
 from casest.dynamics.declare import Dynamics
 from casest.errors import UsageError
-from casest.modelling.tracing import flat
 
 if TYPE_CHECKING:
     from control import StateSpace

@@ -12,7 +12,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from casest.declaring.shapes import Array
+from casest.declaration.shapes import Array
 from casest.engine import Recursion
 
 Pattern = tuple[tuple[int, int], ...]

@@ -16,12 +16,12 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
-from casest.declaring.physics import SX
-from casest.declaring.shapes import Array
+from casest.declaration.physics import SX
+from casest.declaration.shapes import Array
+from casest.declaration.tracing import flat
 from casest.dynamics.declare import Dynamics
 from casest.dynamics.gramian import sentence
 from casest.errors import DeclarationError
-from casest.modelling.tracing import flat
 
 #: A singular value of the Jacobian, its rows and columns brought to one size, counts as zero below
 #: this share of the largest: rounding leaves about 1e-15, at orders up to ten.

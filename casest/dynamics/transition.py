@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 
 from casest.data.run import Run
 from casest.data.timing import GAP, UNUSED
-from casest.declaring.shapes import Array
+from casest.declaration.shapes import Array
+from casest.declaration.tracing import flat
 from casest.dynamics.declare import Dynamics
 from casest.dynamics.stepping import reach
 from casest.engine import Columns, Replay
 from casest.errors import DataError
-from casest.modelling.tracing import flat
 
 #: Coefficients of the exponential's series to degree 11, three at a time; and the norms below which
 #: six, nine or all twelve of them leave less than 1e-17.

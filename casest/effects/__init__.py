@@ -7,6 +7,7 @@ that name. So a user's own model gets every effect whose quantity it has.
 
 from __future__ import annotations
 
+from casest.declaration.effect import Effect
 from casest.effects.bias import (
     bias_drift,
     bias_step,
@@ -36,7 +37,6 @@ from casest.effects.response import (
     signed_quadratic,
 )
 from casest.effects.timing import axis_delay, hysteresis, low_pass, time_delay
-from casest.modelling.effect import Effect
 
 CATALOGUE: tuple[Effect, ...] = (
     cross_axis,

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from casest.declaring.physics import SX, cos, der, sin
-from casest.declaring.shapes import each
-from casest.declaring.symbols import constant, param, signal
-from casest.modelling.effect import effect
+from casest.declaration.effect import effect
+from casest.declaration.physics import SX, cos, der, sin
+from casest.declaration.shapes import each
+from casest.declaration.symbols import constant, param, signal
 
 
 @effect(

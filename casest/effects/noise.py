@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from casest.declaring.physics import SX, fabs, if_else
-from casest.modelling.effect import effect
+from casest.declaration.effect import effect
+from casest.declaration.physics import SX, fabs, if_else
 
 
 @effect(

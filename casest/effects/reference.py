@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from casest.declaring.physics import SX, atan2, cos, horzcat, sin, vertcat
-from casest.declaring.symbols import param
-from casest.modelling.effect import effect
+from casest.declaration.effect import effect
+from casest.declaration.physics import SX, atan2, cos, horzcat, sin, vertcat
+from casest.declaration.symbols import param
 
 
 @effect(

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from casest.declaring.physics import SX, fabs, fmax, inf, sign, vertcat
-from casest.declaring.shapes import each
-from casest.declaring.symbols import param
+from casest.declaration.effect import effect
+from casest.declaration.physics import SX, fabs, fmax, inf, sign, vertcat
+from casest.declaration.shapes import each
+from casest.declaration.symbols import param
 from casest.errors import UsageError
-from casest.modelling.effect import effect
 
 
 def _three_axes(u: SX) -> None:

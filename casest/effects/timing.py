@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from casest.declaring.physics import SX, der, sqrt
-from casest.declaring.shapes import each
-from casest.declaring.symbols import param, signal
-from casest.modelling.effect import effect
+from casest.declaration.effect import effect
+from casest.declaration.physics import SX, der, sqrt
+from casest.declaration.shapes import each
+from casest.declaration.symbols import param, signal
 
 #: Time (s) in which a reading with hysteresis turns round, far below a sample's.
 TURN = 1e-3

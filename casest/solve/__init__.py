@@ -1,1 +1,1 @@
-"""Floor 6: solvers, certificate, covariance."""
+"""Solvers of one least-squares problem. Imports leastsquares and below."""

@@ -15,10 +15,10 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from casest.declaring.shapes import Array
+from casest.declaration.shapes import Array
+from casest.leastsquares.problem import Point, Problem
 from casest.solve.interrupt import stopped
 from casest.solve.outcome import Outcome
-from casest.stack import Point, Problem
 
 #: Solvers kept for the next problem of as many unknowns.
 KEPT = 32

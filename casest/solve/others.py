@@ -12,11 +12,11 @@ from typing import Any, Literal
 
 import numpy as np
 
-from casest.declaring.shapes import Array
+from casest.declaration.shapes import Array
 from casest.errors import UsageError
+from casest.leastsquares.problem import Point, Problem
 from casest.solve.ipopt import run_nlpsol
 from casest.solve.outcome import Outcome
-from casest.stack import Point, Problem
 
 Method = Literal["lm", "trf", "dogbox"]
 #: Methods of `scipy.optimize.least_squares`; only the last two know bounds.

@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
-from casest.declaring.shapes import Array
+from casest.declaration.shapes import Array
 from casest.engine import Normal
-from casest.stack import Point
+from casest.leastsquares.problem import Point
 
 
 class LeastSquares(Protocol):
-    """What a solver needs to know of a least-squares problem; see casest.stack.Problem."""
+    """What a solver needs to know of a least-squares problem; see `leastsquares.problem`."""
 
     @property
     def bounds(self) -> tuple[Array, Array]:

@@ -15,14 +15,14 @@ from dataclasses import replace
 import numpy as np
 
 from casest.errors import UsageError
-from casest.identify import identify
-from casest.noise import has_noise_effects, weights
-from casest.persample import linear
+from casest.leastsquares.identifiability import identify
+from casest.leastsquares.per_sample import linear
+from casest.leastsquares.problem import Point, Problem
+from casest.leastsquares.sums import few_of
+from casest.leastsquares.weights import has_noise_effects, weights
 from casest.solve.ipopt import ipopt
 from casest.solve.outcome import Outcome
 from casest.solve.trust_region import LITTLE, trust_region
-from casest.stack import Point, Problem
-from casest.sums import few_of
 
 #: Iterations after which a second opinion has nothing to say.
 OPINION = 50

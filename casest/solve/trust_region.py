@@ -11,11 +11,11 @@ from typing import NamedTuple, cast
 
 import numpy as np
 
-from casest.declaring.shapes import Array
+from casest.declaration.shapes import Array
 from casest.engine import Normal
+from casest.leastsquares.problem import Point
 from casest.solve.interrupt import stopped
 from casest.solve.outcome import LeastSquares, Outcome
-from casest.stack import Point
 
 #: Relative gain from which on the normal equations' squared condition number may tell.
 ROUGH = 1e-5

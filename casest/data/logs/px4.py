@@ -14,8 +14,7 @@ import numpy as np
 
 from casest.data.column import Column, numeric_column
 from casest.data.logs.series import Series, Topic, chosen
-from casest.errors import DataError
-from casest.libraries import library
+from casest.errors import DataError, library
 
 #: By topic, unit: fields. Fields whose unit changed between releases (sensor_baro.pressure) are
 #: not in it.

@@ -13,8 +13,7 @@ import numpy as np
 
 from casest.data.column import Column, numeric_column
 from casest.data.logs.series import Series, Topic, chosen
-from casest.errors import CasestError, DataError
-from casest.libraries import library
+from casest.errors import CasestError, DataError, library
 
 #: By message type and field: sources are REP 103 and the comments of the message definitions.
 UNITS: dict[str, dict[str, str]] = {

@@ -1,1 +1,0 @@
-"""Closing the loop for estimators in motion: innovations are diagnosed like residuals."""

@@ -1,0 +1,1 @@
+"""Corrected readings: inverted, applied, exported. Imports results and below."""

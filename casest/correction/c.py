@@ -1,0 +1,204 @@
+"""C99 source of a correction: fixed memory, no dependency but the mathematics library."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from casest import __version__
+from casest.correction.inverse import LEFT
+from casest.correction.program import Program
+from casest.declaration.shapes import Array
+
+#: Operations as C expressions; <tgmath.h> chooses the function of the number's type.
+_C = {
+    "add": "{0} + {1}", "sub": "{0} - {1}", "mul": "{0} * {1}", "div": "{0} / {1}",
+    "neg": "-{0}", "square": "{0} * {0}", "twice": "{0} + {0}", "inverse": "1 / {0}",
+    "assign": "{0}", "sign": "(real)(({0} > 0) - ({0} < 0))", "less": "(real)({0} < {1})",
+    "less_equal": "(real)({0} <= {1})", "equal": "(real)({0} == {1})",
+    "not_equal": "(real)({0} != {1})", "not": "(real)!({0} != 0)",
+    "and": "(real)({0} != 0 && {1} != 0)", "or": "(real)({0} != 0 || {1} != 0)",
+    "if_else_zero": "({0} != 0) ? {1} : (real)0",
+}  # fmt: skip
+_NEWTON = """
+/* Newton's method, every step halved until it gains, as casest does it. */
+static int solve(const real *x, real *value, real start) {{
+  real in[{width} + {n}], out[2 * {n}], next[2 * {n}], trial[{n}];
+  for (int i = 0; i < {width}; ++i) in[i] = x[i];
+  for (int i = 0; i < {n}; ++i) value[i] = start < FROM_READING ? start : x[{at} + i];
+  for (int i = 0; i < {n}; ++i) in[{width} + i] = value[i];
+  run(in, out);
+  for (int k = 0; k < 60; ++k) {{
+    real share = 1, moved = 0, size = 1;
+    int gained = 0;
+    for (int h = 0; h < 30 && !gained; ++h, share /= 2) {{
+      real before = 0, after = 0;
+      for (int i = 0; i < {n}; ++i) in[{width} + i] = trial[i] = value[i] + share * out[i];
+      run(in, next);
+      for (int i = 0; i < {n}; ++i) {{
+        before += out[{n} + i] * out[{n} + i];
+        after += next[{n} + i] * next[{n} + i];
+      }}
+      gained = after <= before;
+    }}
+    if (!gained) break;
+    for (int i = 0; i < {n}; ++i) {{
+      if (fabs(trial[i] - value[i]) > moved) moved = fabs(trial[i] - value[i]);
+      if (1 + fabs(value[i]) > size) size = 1 + fabs(value[i]);
+      value[i] = trial[i];
+    }}
+    for (int i = 0; i < 2 * {n}; ++i) out[i] = next[i];
+    if (moved <= EXACT * size) break;
+  }}
+  for (int i = 0; i < {n}; ++i) {{
+    if (!isfinite(value[i]) || !(fabs(out[{n} + i]) <= CLOSE * {largest})) return 0;
+  }}
+  return 1;
+}}
+
+int {name}(const real *x, real *corrected) {{
+  static const real starts[] = {{{starts}}};
+  real best = INFINITY;
+  for (unsigned k = 0; k < sizeof starts / sizeof *starts; ++k) {{
+    real value[{n}], away = 0;
+    if (!solve(x, value, starts[k])) continue;
+    for (int i = 0; i < {n}; ++i)
+      if (fabs(value[i] - MIDDLE) > away) away = fabs(value[i] - MIDDLE);
+    if (away < best) {{
+      best = away;
+      for (int i = 0; i < {n}; ++i) corrected[i] = value[i];
+    }}
+  }}
+  return best < INFINITY ? 0 : 1;
+}}
+"""
+_DIRECT = """
+int {name}(const real *x, real *corrected) {{
+  run(x, corrected);
+  for (int i = 0; i < {n}; ++i)
+    if (!isfinite(corrected[i])) return 1;
+  return 0;
+}}
+"""
+_TEST = """
+#ifdef CASEST_SELF_TEST
+/* cc -DCASEST_SELF_TEST {name}.c -lm && ./a.out: against the values that casest computed. */
+#include <stdio.h>
+int main(void) {{
+  static const real x[][{width}] = {{
+{inputs}
+  }};
+  static const real expected[][{n}] = {{
+{outputs}
+  }};
+  double worst = 0;
+  for (unsigned k = 0; k < sizeof x / sizeof *x; ++k) {{
+    real found[{n}], size = 0;
+    if ({name}(x[k], found)) {{
+      printf("row %u: no corrected value\\n", k);
+      return 1;
+    }}
+    for (int i = 0; i < {n}; ++i) if (fabs(expected[k][i]) > size) size = fabs(expected[k][i]);
+    for (int i = 0; i < {n}; ++i) {{
+      double away = fabs(found[i] - expected[k][i]) / (size > 0 ? size : 1);
+      if (!(away <= worst)) worst = away;
+    }}
+  }}
+  printf("largest error %.2g of the value\\n", worst);
+  return !(worst <= {tolerance});
+}}
+#endif
+"""
+
+
+def c_source(program: Program, name: str, single: bool, test: tuple[Array, Array]) -> str:
+    """The source file, with a self-test on `test` (inputs, corrected) under a macro.
+
+    `single` computes with `float` instead of `double`.
+    """
+    n, width = program.output.size, program.width
+    lines = [_head(program, name, single)]
+    lines += ["static void run(const real *in, real *out) {", *_body(program), "}"]
+    if program.kind == "direct":
+        lines.append(_DIRECT.format(name=name, n=n))
+    else:
+        assert program.measured is not None
+        starts = [_number(s) for s in program.starts]
+        starts += ["FROM_READING"] * (program.measured[1] == n)
+        lines.append(
+            _NEWTON.format(
+                name=name,
+                n=n,
+                width=width,
+                at=program.measured[0],
+                starts=", ".join(starts),
+                largest=_number(program.largest),
+            )
+        )
+    inputs, outputs = (_rows(part) for part in test)
+    tolerance = "2e-4" if single else "1e-9"
+    lines.append(
+        _TEST.format(
+            name=name, n=n, width=width, inputs=inputs, outputs=outputs, tolerance=tolerance
+        )
+    )
+    return "\n".join(lines)
+
+
+def _head(program: Program, name: str, single: bool) -> str:
+    """What a reader must know to call it."""
+    lines = [
+        f"/* {program.output.name} of {program.model}, exported by casest {__version__}.",
+        " *",
+    ]
+    lines += [" * x: one sample,"]
+    place = 0
+    for i in program.inputs:
+        places = f"x[{place}]" if i.size == 1 else f"x[{place}]..x[{place + i.size - 1}]"
+        lines.append(f" *   {places}  {i.name} [{i.unit or '1'}]")
+        place += i.size
+    lines += [
+        f" * corrected: {program.output.size} values [{program.output.unit or '1'}].",
+        *([f" * {LEFT}{', '.join(program.left)}."] if program.left else []),
+        " * Returns 0, or 1 where the reading lies outside what the model can produce. */",
+        "#include <math.h>",
+        "#include <tgmath.h>",
+        "",
+        f"typedef {'float' if single else 'double'} real;",
+        f"int {name}(const real *x, real *corrected);",
+    ]
+    if program.kind == "newton":
+        close, exact = ("1e-5f", "2e-7f") if single else ("1e-9", "1e-14")
+        lines += [
+            f"#define CLOSE {close}",
+            f"#define EXACT {exact}",
+            f"#define MIDDLE {_number(program.middle)}",
+            "#define FROM_READING (real)1e30",
+        ]
+    return "\n".join([*lines, ""])
+
+
+def _body(program: Program) -> Iterator[str]:
+    yield f"  real w[{max(program.registers, 1)}];"
+    for operation, place, *rest in program.steps:
+        if operation == "input":
+            yield f"  w[{place}] = in[{rest[0]}];"
+        elif operation == "constant":
+            yield f"  w[{place}] = {_number(rest[0])};"
+        elif operation == "output":
+            yield f"  out[{place}] = w[{rest[0]}];"
+        else:
+            operands = [f"w[{r}]" for r in rest]
+            template = _C.get(
+                operation, operation + "(" + ", ".join(["{0}", "{1}"][: len(rest)]) + ")"
+            )
+            yield f"  w[{place}] = {template.format(*operands)};"
+
+
+def _number(value: float) -> str:
+    """A literal of the right type, to the last digit."""
+    return f"(real){float(value)!r}"
+
+
+def _rows(values: Array) -> str:
+    rows: Sequence[str] = ["    {" + ", ".join(_number(x) for x in row) + "}," for row in values]
+    return "\n".join(rows)

@@ -1,0 +1,103 @@
+"""A Python module with NumPy alone that corrects readings, and the interpreter of the JSON form."""
+
+from __future__ import annotations
+
+import inspect
+import json
+from typing import Any
+
+import numpy as np
+
+from casest import __version__
+from casest.correction import runtime
+from casest.correction.inverse import LEFT
+from casest.correction.program import Program
+from casest.declaration.shapes import Array
+
+_TEST = '''
+
+def largest_error() -> float:
+    """Of the values that casest computed when this was exported, relative to their size."""
+    given = np.array(INPUTS, dtype=float)
+    expected = np.array(EXPECTED, dtype=float)
+    size = np.abs(expected).max(axis=1, keepdims=True)
+    return float(np.max(np.abs(correct(given) - expected) / np.where(size > 0, size, 1.0)))
+
+
+INPUTS = {inputs}
+EXPECTED = {outputs}
+
+if __name__ == "__main__":
+    worst = largest_error()
+    print(f"largest error {{worst:.2g}} of the value")
+    raise SystemExit(0 if worst <= 1e-9 else 1)
+'''
+
+
+def python_source(program: Program, test: tuple[Array, Array]) -> str:
+    """Source of a module with `correct(x)`: the runtime's text and the program as data.
+
+    Run as a script it checks itself on `test` (inputs, corrected), as the C source does.
+    """
+    text = inspect.getsource(runtime)
+    _, _, body = text.partition("from __future__ import annotations\n")
+    signals = ", ".join(f"{i.name} ({i.size}, {i.unit or '1'})" for i in program.inputs)
+    head = (
+        f'"""{program.output.name} of {program.model}, exported by casest {__version__}.\n\n'
+        f"correct(x): x (N, {program.width}) holds {signals};\n"
+        f"returns (N, {program.output.size}) in {program.output.unit or '1'}. Raises ValueError\n"
+        "naming the row whose reading lies outside what the model can produce.\n"
+        + (f"\n{LEFT}\n{', '.join(program.left)}.\n" if program.left else "")
+        + '"""\n\n'
+        "from __future__ import annotations\n"
+    )
+    tail = (
+        f"\n\nPROGRAM = {_loaded(as_data(program))}\n\n\n"
+        "def correct(x: Any) -> Any:\n"
+        '    """Corrected values of every row of x."""\n'
+        "    return corrected(PROGRAM, x)\n"
+        + _TEST.format(inputs=_loaded(test[0].tolist()), outputs=_loaded(test[1].tolist()))
+    )
+    return (
+        head
+        + body.replace(
+            "from typing import Any\n", "import json\nfrom typing import Any\n", 1
+        ).rstrip()
+        + "\n"
+        + tail
+    )
+
+
+def _loaded(data: Any, width: int = 88) -> str:
+    """An expression for plain data, in lines of bounded length."""
+    text = json.dumps(data)
+    pieces = [text[k : k + width] for k in range(0, len(text), width)]
+    return "json.loads(\n" + "\n".join(f"    {piece!r}" for piece in pieces) + "\n)"
+
+
+def as_data(program: Program) -> dict[str, Any]:
+    """The program as plain data, for JSON."""
+    found: dict[str, Any] = {
+        "kind": program.kind,
+        "inputs": [{"name": i.name, "size": i.size, "unit": i.unit} for i in program.inputs],
+        "output": {
+            "name": program.output.name,
+            "size": program.output.size,
+            "unit": program.output.unit,
+        },
+        "registers": program.registers,
+        "steps": [list(step) for step in program.steps],
+    }
+    if program.kind == "newton":
+        found["newton"] = {
+            "starts": list(program.starts),
+            "middle": program.middle,
+            "measured": list(program.measured or ()),
+            "largest": program.largest,
+        }
+    return found
+
+
+def corrected(program: Program, x: Any) -> Any:
+    """The program run by the same text that is exported."""
+    return runtime.corrected(as_data(program), np.asarray(x, dtype=float))

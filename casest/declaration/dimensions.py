@@ -1,0 +1,248 @@
+"""Do the declared units fit together? Dimensional analysis of a model's traced expressions.
+
+Every operation of the body is followed with the sizes of its operands. What is added, subtracted
+or compared must have one unit (cm and m differ, and so do deg and rad inside a sine); a plain
+number fits anything. Factors such as 1000 may convert units: the scale of the product is unknown
+then, but not its dimension.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from typing import Any
+
+import casadi as ca
+
+from casest import units
+from casest.declaration.effect import Attached
+from casest.declaration.model import Model
+from casest.declaration.symbols import Constant, param
+from casest.declaration.tracing import function_of
+from casest.errors import UnitError
+
+
+@dataclass(frozen=True)
+class Size:
+    """Powers of base units, the factor to them (None: unknown), and whose symbols are inside.
+
+    `powers` None: a plain number, which fits anything.
+    """
+
+    powers: Mapping[str, Fraction] | None
+    factor: float | None
+    names: frozenset[str]
+
+    def __str__(self) -> str:
+        if not self.powers:
+            one = self.factor in (None, 1.0)
+            return "a pure number" if one else f"a pure number of unit {self.factor:.4g}"
+        factor = "" if self.factor in (None, 1.0) else f"{self.factor:.4g} "
+        return factor + "·".join(b if p == 1 else f"{b}^{p}" for b, p in self.powers.items())
+
+
+PLAIN = Size(None, None, frozenset())
+#: A number such as 2 or 1/3, which belongs to a formula and converts no unit.
+PURE = Size(None, 1.0, frozenset())
+_ONE = Fraction(1)
+_SAME = {ca.OP_ADD, ca.OP_SUB, ca.OP_FMIN, ca.OP_FMAX, ca.OP_LT, ca.OP_LE, ca.OP_EQ, ca.OP_NE,
+         ca.OP_ATAN2, ca.OP_HYPOT, ca.OP_FMOD, ca.OP_COPYSIGN}  # fmt: skip
+_UNCHANGED = {ca.OP_ASSIGN, ca.OP_NEG, ca.OP_FABS, ca.OP_FLOOR, ca.OP_CEIL, ca.OP_TWICE}
+_LOGICAL = {ca.OP_LT, ca.OP_LE, ca.OP_EQ, ca.OP_NE, ca.OP_ATAN2}
+_PERIODIC = {ca.OP_SIN, ca.OP_COS, ca.OP_TAN}
+
+
+def check_units(model: Model) -> None:
+    """Raise UnitError where units contradict each other: names the symbols on both sides.
+
+    Quantities must come out in the unit that they are declared in, and a prediction in that of
+    the reading.
+    """
+    open_model = model
+    for fixed in model.constants:  # plain numbers would lose their units in the expression
+        open_model = open_model.freed(fixed.name)
+    open_model = replace(open_model, effects=tuple(map(_open, open_model.effects)))
+    traced = open_model.traced
+    outputs = {q.name: ca.vec(q.value) for q in traced.quantities.values()}
+    if traced.predicted is None:
+        outputs["residual"] = traced.expression
+    else:
+        outputs["prediction"] = traced.predicted
+    f = function_of(open_model, outputs, traced)
+    sizes = _outputs(f, _input_sizes(open_model), model.name)
+    for k, q in enumerate(traced.quantities.values()):
+        if q.unit and not q.implied:  # an implied one is checked as the prediction below
+            for found in sizes[k]:
+                where = f"model {model.name}: quantity {q.name} is declared in {q.unit}"
+                try:
+                    declared = _size(q.unit, open_model)
+                except UnitError as error:
+                    raise UnitError(f"{where}: {error}") from None
+                _fits(found, declared, where)
+    if traced.measured is not None:
+        unit = model.residual_unit
+        for found in sizes[-1]:
+            where = f"model {model.name}: the prediction of {traced.measured} [{unit}]"
+            _fits(found, _size(unit, open_model), where)
+
+
+def _input_sizes(model: Model) -> dict[tuple[int, int], Size]:
+    sizes: dict[tuple[int, int], Size] = {}
+    k = 0
+    for p in model.parameters:
+        for i in range(p.shape.coordinates):
+            curved = p.shape.curved
+            unit = "" if curved else p.units[i]
+            size = Size({}, 1.0, frozenset()) if curved else _size(unit, model)
+            sizes[0, k] = _named(size, p.name, unit)
+            k += 1
+    k = 0
+    for s in model.signals:
+        for _ in range(s.size):
+            unit = "" if s.kind == "rotation" else f"[{s.name}]"
+            own = _size(s.unit if s.unit is not None else unit, model)
+            sizes[1, k] = _named(own, s.name, s.unit or "")
+            k += 1
+    return sizes
+
+
+def _size(unit: str, model: Model) -> Size:
+    """Size of a declared unit; `[v]` is that of the symbol v, a base of its own if v has none."""
+    text = unit
+    for _ in model.symbols:  # a unit may refer to one that refers to another
+        text = _PLACEHOLDER.sub(lambda m: _replacement(m[1], model), text)
+    own: dict[str, Fraction] = {}
+    for match in _PLACEHOLDER.finditer(text):
+        power = -_ONE if text[: match.start()].rstrip("( ").endswith("/") else _ONE
+        own[match[0]] = own.get(match[0], Fraction(0)) + power
+    factor, dimension = units.size(_PLACEHOLDER.sub("1", text) or "1")
+    # An angle is a ratio of lengths: rad counts as 1, deg as the factor to it.
+    powers = {base: p for base, p in [*dimension, *own.items()] if p and base != "angle"}
+    return Size(powers, factor, frozenset())
+
+
+_PLACEHOLDER = re.compile(r"\[([^\]]+)\]")
+
+
+def _replacement(name: str, model: Model) -> str:
+    """The unit of a symbol in brackets, or the placeholder itself where it has none."""
+    symbol = model.symbols.get(name)
+    unit = symbol.unit if symbol is not None else None
+    if not unit or "," in unit or unit == f"[{name}]":
+        return f"[{name}]"
+    return f"({unit})"
+
+
+def _named(size: Size, name: str, unit: str) -> Size:
+    return Size(size.powers, size.factor, frozenset({f"{name} [{unit}]" if unit else name}))
+
+
+def _open(attached: Attached) -> Attached:
+    """The effect with its numbers that have a unit as unknowns."""
+    found, more = [], []
+    for name, declared in attached.effect.declarations:
+        if isinstance(declared, Constant) and declared.unit and not declared.dims:
+            opened = param(declared.unit, start=float(declared.array))
+            more.append(replace(opened, name=f"{attached.label}.{name}"))
+            declared = more[-1]
+        found.append((name, declared))
+    effect = replace(attached.effect, declarations=tuple(found))
+    return replace(attached, effect=effect, parameters=(*attached.parameters, *more))
+
+
+def _outputs(f: Any, inputs: Mapping[tuple[int, int], Size], name: str) -> list[list[Size]]:
+    """Sizes of every output entry, by walking the instruction list."""
+    work: dict[int, Size] = {}
+    outputs: list[list[Size]] = [[] for _ in range(f.n_out())]
+    for k in range(f.n_instructions()):
+        op, where, to = f.instruction_id(k), f.instruction_input(k), f.instruction_output(k)
+        if op == ca.OP_CONST:
+            mathematical = _is_mathematical(f.instruction_constant(k))
+            work[to[0]] = PURE if mathematical else PLAIN
+        elif op == ca.OP_INPUT:
+            work[to[0]] = inputs.get((where[0], where[1]), PLAIN)
+        elif op == ca.OP_OUTPUT:
+            outputs[to[0]].append(work[where[0]])
+        else:
+            work[to[0]] = _operation(op, [work[i] for i in where], name)
+    return outputs
+
+
+def _is_mathematical(number: float) -> bool:
+    """Small whole numbers and their inverses; others may be conversions, as 0.01745 or 1000."""
+    size = abs(number)
+    candidates = (size, 1 / size if size else 0.0)
+    return any(abs(x - round(x)) < 1e-12 and round(x) <= 12 for x in candidates)
+
+
+def _operation(op: int, operands: list[Size], name: str) -> Size:
+    names = frozenset().union(*(o.names for o in operands))
+    first = operands[0]
+    if op in _SAME:
+        _fits(first, operands[1], f"model {name}")
+        if op in _LOGICAL:
+            return Size({}, 1.0, names)
+        chosen = first if first.powers is not None else operands[1]
+        return Size(chosen.powers, chosen.factor, names)
+    if op in _UNCHANGED:
+        return Size(first.powers, first.factor, names)
+    if op == ca.OP_IF_ELSE_ZERO:
+        return operands[1]
+    if op in (ca.OP_MUL, ca.OP_DIV, ca.OP_SQ, ca.OP_INV, ca.OP_SQRT):
+        return _product(op, operands, names)
+    if op in (ca.OP_POW, ca.OP_CONSTPOW, ca.OP_SIGN):
+        # The exponent's value is not followed: what comes out fits anything.
+        return PLAIN
+    wanted = Size({}, 1.0 if op in _PERIODIC else None, frozenset())
+    for operand in operands:
+        _fits(operand, wanted, f"model {name}: the argument of {_word(op)}")
+    return Size({}, 1.0, names)
+
+
+def _product(op: int, operands: list[Size], names: frozenset[str]) -> Size:
+    exponents: dict[int, tuple[Fraction, ...]] = {
+        ca.OP_MUL: (_ONE, _ONE),
+        ca.OP_DIV: (_ONE, -_ONE),
+        ca.OP_SQ: (2 * _ONE,),
+        ca.OP_INV: (-_ONE,),
+        ca.OP_SQRT: (_ONE / 2,),
+    }
+    if all(o.powers is None for o in operands):
+        return PURE if all(o.factor for o in operands) else PLAIN
+    total: dict[str, Fraction] = {}
+    factor: float | None = 1.0
+    for operand, power in zip(operands, exponents[op], strict=True):
+        for base, p in (operand.powers or {}).items():
+            total[base] = total.get(base, Fraction(0)) + p * power
+        if factor is None or operand.factor is None:
+            factor = None
+        else:
+            factor *= operand.factor ** float(power)
+    return Size({b: p for b, p in total.items() if p}, factor, names)
+
+
+def _fits(a: Size, b: Size, where: str) -> None:
+    if a.powers is None or b.powers is None:
+        return
+    same_factor = a.factor is None or b.factor is None or abs(a.factor / b.factor - 1) < 1e-9
+    if dict(a.powers) == dict(b.powers) and same_factor:
+        return
+    sides = [f"{s}" + (f" (from {', '.join(sorted(s.names))})" if s.names else "") for s in (a, b)]
+    raise UnitError(f"{where}: units do not fit: {sides[0]} against {sides[1]}; {_way_out(a, b)}")
+
+
+def _way_out(a: Size, b: Size) -> str:
+    """What to mend: a factor between two units of one kind, or the formula."""
+    if a.powers == b.powers and a.factor and b.factor:
+        low, high = sorted((a.factor, b.factor))
+        said = f"one kind in two units, {high / low:.4g} to 1: declare both in one of them"
+        degrees = abs(high / low * math.pi / 180 - 1) < 1e-9
+        return said + (", or multiply degrees by pi / 180" if degrees else "")
+    return "declare another unit, or mend the formula"
+
+
+def _word(op: int) -> str:
+    return next(n[3:].lower() for n in dir(ca) if n.startswith("OP_") and getattr(ca, n) == op)

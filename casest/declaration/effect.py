@@ -1,0 +1,309 @@
+"""Effects: something physical that a model lacks, null at zero, attachable wherever it fits."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import casadi as ca
+import numpy as np
+
+from casest.declaration.physics import SX
+from casest.declaration.symbols import Constant, Parameter, Signal, Undecided, named
+from casest.errors import DeclarationError, UnitError, last_line
+from casest.units import known
+
+Kind = Literal["quantity", "signal", "noise", "sequence"]
+
+#: What an effect on the noise acts on, instead of a quantity.
+NOISE = "noise"
+
+
+@dataclass(frozen=True)
+class Effect:
+    """A function of one quantity, signal, the noise, or the sequence of samples.
+
+    `on` names what it acts on; `extras` are further signals, columns or quantities it reads;
+    `null` maps each parameter to the value at which the effect vanishes (0 unless told).
+    For tracing a residual: `typical` sizes of the parameters, each in its unit; `profile` the
+    parameters that are searched over a grid (name -> "frequency", "time" or "level"), because the
+    effect is not smooth in them or has many valleys; `shown_by` the measurement that shows it;
+    `plain` the form that it is tried in once it was found.
+    """
+
+    name: str
+    function: Callable[..., Any]
+    on: str
+    kind: Kind
+    extras: tuple[Signal, ...]
+    declarations: tuple[Any, ...]
+    null: tuple[tuple[str, float], ...]
+    doc: str = ""
+    typical: tuple[tuple[str, float], ...] = ()
+    profile: tuple[tuple[str, str], ...] = ()
+    shown_by: str = ""
+    #: What it does as a formula, where the source is not what a reader should see.
+    formula: str = ""
+    #: Values of parameters at which it is what it mostly is in practice, with fewer unknowns.
+    plain: tuple[tuple[str, float], ...] = ()
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        """Evaluate the effect's own function."""
+        return self.function(*args, **kwargs)
+
+    def null_of(self, parameter: str) -> float:
+        """Value of a parameter at which the effect is absent."""
+        return dict(self.null).get(parameter, 0.0)
+
+    def holding(self, **values: float) -> Effect:
+        """The same effect with parameters or numbers held at values (in their own units)."""
+        held = tuple(
+            (n, Constant(n, (float(values[n]),), getattr(d, "unit", "")) if n in values else d)
+            for n, d in self.declarations
+        )
+        return replace(self, declarations=held)
+
+    def starting(self, **values: float) -> Effect:
+        """The same effect with other start values of scalar parameters."""
+        moved = tuple(
+            (n, replace(d, start=(float(values[n]),)) if n in values else d)
+            for n, d in self.declarations
+        )
+        return replace(self, declarations=moved)
+
+
+def effect(
+    *,
+    on: str,
+    kind: Kind | None = None,
+    null: Mapping[str, float] | None = None,
+    typical: Mapping[str, float] | None = None,
+    profile: Mapping[str, str] | None = None,
+    shown_by: str = "",
+    formula: str = "",
+    plain: Mapping[str, float] | None = None,
+) -> Callable[[Callable[..., Any]], Effect]:
+    """Declare an effect: first argument the value acted on, further ones signals or columns.
+
+    The kind follows from `on`: the name of a quantity or of a signal of the model, or `"noise"`
+    (then the function returns the weight of a sample whose residual is r standard deviations).
+    `kind="sequence"`: the arguments are (value, previous, dt), where `previous` is the result for
+    the sample before and `dt` the time since then in seconds; the function gives the next one.
+    """
+
+    def declare(function: Callable[..., Any]) -> Effect:
+        positional, keyword = _signature(function)
+        extras = []
+        for name, default in positional[1:]:
+            if kind == "sequence" and name in ("previous", "dt"):
+                continue
+            extras.append(
+                named(default, name) if isinstance(default, Signal) else Signal(name, 1, None)
+            )
+        for word, given in (
+            ("null", null), ("typical", typical), ("profile", profile), ("plain", plain)
+        ):  # fmt: skip
+            _refuse_unknown(function.__name__, word, given or {}, [name for name, _ in keyword])
+        declared_kind: Kind = kind or ("noise" if on == NOISE else "quantity")
+        declarations = tuple(_declaration(function.__name__, name, d) for name, d in keyword)
+        return Effect(
+            function.__name__,
+            function,
+            on,
+            declared_kind,
+            tuple(extras),
+            declarations,
+            tuple(sorted((null or {}).items())),
+            inspect.getdoc(function) or "",
+            tuple((typical or {}).items()),
+            tuple((profile or {}).items()),
+            shown_by,
+            formula,
+            tuple((plain or {}).items()),
+        )
+
+    return declare
+
+
+def _refuse_unknown(name: str, word: str, given: Mapping[str, Any], own: Sequence[str]) -> None:
+    unknown = sorted(set(given) - set(own))
+    if unknown:
+        there = f"it has {', '.join(own)}" if own else "it has none; they stand after a *"
+        raise DeclarationError(
+            f"effect {name}: {word}= names {unknown[0]!r}, which is none of its parameters: {there}"
+        )
+
+
+def _signature(function: Callable[..., Any]) -> tuple[list[tuple[str, Any]], list[tuple[str, Any]]]:
+    """Positional and keyword-only arguments with their defaults."""
+    parameters = inspect.signature(function).parameters.values()
+    positional = [(p.name, p.default) for p in parameters if p.kind is p.POSITIONAL_OR_KEYWORD]
+    keyword = [(p.name, p.default) for p in parameters if p.kind is p.KEYWORD_ONLY]
+    if not positional:
+        raise DeclarationError(f"effect {function.__name__}: its first argument is what it acts on")
+    return positional, keyword
+
+
+def _declaration(effect_name: str, name: str, declared: Any) -> tuple[str, Any]:
+    if isinstance(declared, Parameter | Undecided | Constant):
+        return (name, declared)
+    if isinstance(declared, int | float):
+        return (name, Constant(name, (float(declared),), ""))
+    raise DeclarationError(
+        f"effect {effect_name}: {name} must be param(…) or a number, not {declared!r}"
+    )
+
+
+@dataclass(frozen=True)
+class Attached:
+    """An effect at its place in a model: what it acts on, which columns it reads, its unknowns."""
+
+    effect: Effect
+    on: str
+    kind: Kind
+    label: str
+    columns: tuple[tuple[str, str], ...]
+    parameters: tuple[Parameter, ...]
+    inner: tuple[str, ...] = ()
+
+    @property
+    def reads(self) -> tuple[Signal, ...]:
+        """All that the effect reads, under the names of data and model."""
+        renamed = dict(self.columns)
+        return tuple(replace(s, name=renamed.get(s.name, s.name)) for s in self.effect.extras)
+
+    @property
+    def signals(self) -> tuple[Signal, ...]:
+        """Those of them that data give; `inner` are quantities of the model."""
+        return tuple(s for s in self.reads if s.name not in self.inner)
+
+    def apply(self, value: SX, symbols: Mapping[str, SX], **more: SX) -> SX:
+        """The value with the effect in it, from the model's symbols by name."""
+        extras = [symbols[s.name] for s in self.reads]
+        unknowns = {p.name.rpartition(".")[2]: symbols[p.name] for p in self.parameters}
+        numbers: dict[str, Any] = {
+            n: d.array for n, d in self.effect.declarations if isinstance(d, Constant)
+        }
+        if self.kind == "noise":  # the scatter's own parameters are no unknowns of a fit
+            for n, d in self.effect.declarations:
+                if isinstance(d, Parameter):
+                    numbers[n] = d.shape.unpack(d.start_value())
+        numbers = {n: float(a) if a.ndim == 0 else a for n, a in numbers.items()}
+        return evaluated(self.effect, value, *more.values(), *extras, **unknowns, **numbers)
+
+
+def evaluated(declared: Effect, *args: Any, **kwargs: Any) -> SX:
+    """The effect's function, its own errors turned into one line with their place."""
+    code = declared.function.__code__
+    try:
+        found = declared.function(*args, **kwargs)
+    except Exception as error:
+        line, traceback = code.co_firstlineno, error.__traceback__
+        while traceback is not None:
+            if traceback.tb_frame.f_code is code:
+                line = traceback.tb_lineno
+            traceback = traceback.tb_next
+        raise DeclarationError(
+            f"effect {declared.name}, {code.co_filename}, line {line}: {last_line(error)}"
+        ) from None
+    if found is None:
+        raise DeclarationError(
+            f"effect {declared.name}, {code.co_filename}, line {code.co_firstlineno}: it returns "
+            "nothing; return what it acts on, with the effect in it"
+        )
+    return found
+
+
+def attach(
+    declared: Effect,
+    on: str,
+    kind: Kind,
+    dims: tuple[int, ...],
+    units: Mapping[str, str],
+    columns: Mapping[str, str],
+    label: str,
+    inner: tuple[str, ...] = (),
+) -> Attached:
+    """An effect with its unknowns sized and named for the place where it is attached.
+
+    `units` gives the unit of the value acted on under the name of the effect's first argument.
+    """
+    parameters = []
+    for name, declaration in declared.declarations:
+        if isinstance(declaration, Constant) or kind == "noise":
+            continue
+        parameter = declaration.decided(dims) if isinstance(declaration, Undecided) else declaration
+        parameter = replace(parameter, name=f"{label}.{name}")
+        if parameter.start is None:
+            null = tuple(np.full(parameter.shape.size, declared.null_of(name)))
+            if not parameter.shape.curved:
+                parameter = replace(parameter, start=null)
+        first = next(iter(inspect.signature(declared.function).parameters))
+        own = units.get(on) or f"[{on}]"
+        own = f"({own})" if set("/*") & set(own) else own
+        renamed = tuple(_of_columns(u.replace(f"[{first}]", own), columns) for u in parameter.units)
+        for unit in renamed:
+            if "[" not in unit and unit and not known(unit):
+                raise UnitError(f"effect {label}: {name} has unknown unit {unit!r}")
+        parameters.append(replace(parameter, units=renamed))
+    renamed_columns = tuple(sorted(columns.items()))
+    return Attached(declared, on, kind, label, renamed_columns, tuple(parameters), inner)
+
+
+def _of_columns(unit: str, columns: Mapping[str, str]) -> str:
+    """The unit with the names of the columns that an effect reads: [channel] is [tyre temp]."""
+    for name, column in columns.items():
+        if not set("[]") & set(column):
+            unit = unit.replace(f"[{name}]", f"[{column}]")
+    return unit
+
+
+def check_null(
+    attached: Attached, shape: tuple[int, int], inner: Mapping[str, tuple[int, int]]
+) -> None:
+    """An effect must vanish at its null value: tried at random points.
+
+    `inner` gives the shape of every quantity of the model that it may read.
+
+    Raises DeclarationError naming the effect, its null value, and by how much it misses.
+    """
+    symbols = {s.name: ca.SX.sym(s.name, *inner.get(s.name, (s.size, 1))) for s in attached.reads}
+    free = [ca.SX.sym("value", *shape), *symbols.values()]
+    value = free[0]
+    if "t" in symbols:  # so that rates of change are not zero
+        value = value + 3 * symbols["t"]
+        symbols = {n: s + 3 * symbols["t"] if n in inner else s for n, s in symbols.items()}
+    nulls, unknowns = {}, {}
+    for name, declaration in attached.effect.declarations:
+        if isinstance(declaration, Constant):
+            nulls[name] = declaration.array
+        else:
+            dims = next(
+                (p.shape.dims for p in attached.parameters if p.name.endswith(f".{name}")), ()
+            )
+            nulls[name] = np.full(dims or (1,), attached.effect.null_of(name))
+            unknowns[name] = attached.effect.null_of(name)
+    if attached.kind == "noise" and not unknowns:
+        return  # weights without a parameter: there is nothing that could vanish
+    more = [ca.SX.sym("previous", *shape), ca.SX.sym("dt")] if attached.kind == "sequence" else []
+    numbers = {n: float(v.ravel()[0]) if v.size == 1 else ca.SX(ca.DM(v)) for n, v in nulls.items()}
+    changed = ca.SX(evaluated(attached.effect, value, *more, *symbols.values(), **numbers))
+    if changed.shape != shape:
+        raise DeclarationError(
+            f"effect {attached.label} changes the shape of {attached.on} from {shape} to "
+            f"{changed.shape}"
+        )
+    expected = ca.SX.ones(*shape) if attached.kind == "noise" else value
+    f = ca.Function("vanishes", [free[0], *more, *free[1:]], [changed - expected])
+    rng = np.random.default_rng(0)
+    for _ in range(3):
+        point = [rng.uniform(0.5, 2.0, size=f.size_in(i)) for i in range(f.n_in())]
+        change = float(np.max(np.abs(np.array(f(*point)))))
+        if not change <= 1e-12:
+            where = ", ".join(f"{n} = {v:g}" for n, v in unknowns.items())
+            raise DeclarationError(
+                f"effect {attached.label} is not null at {where}: it changes {attached.on} by "
+                f"{change:.3g}; give the value at which it vanishes, @effect(…, null={{…}})"
+            )

@@ -1,0 +1,424 @@
+"""Models: the declared relation between signals and parameters, as an immutable value."""
+
+from __future__ import annotations
+
+import difflib
+import inspect
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from casest.declaration.changing import (
+    check_units_known,
+    converted_constant,
+    converted_parameter,
+)
+from casest.declaration.effect import NOISE, Attached, Effect, Kind, attach, check_null
+from casest.declaration.physics import Quantity, Residual
+from casest.declaration.shapes import Array
+from casest.declaration.symbols import Constant, Parameter, Scope, Signal, Symbol, constant, named
+from casest.declaration.tracing import Traced, describe, function_of, reached_parameters, trace
+from casest.errors import DeclarationError, UnitError, UsageError
+from casest.units import known, size
+
+
+@dataclass(frozen=True)
+class Model:
+    """Signals, parameters, constants, the body that relates them, and the effects added to it.
+
+    A value: `having` and `with_effect` return new models, and two models are equal when they
+    were declared by the same function with the same symbols and effects.
+    """
+
+    name: str
+    function: Callable[..., Residual]
+    declared: tuple[Symbol, ...]
+    effects: tuple[Attached, ...] = ()
+    starter: Callable[..., Any] | None = None
+    starter_of_many: Callable[..., Any] | None = None
+    limiter: Callable[..., Any] | None = None
+    remarker: Callable[..., Any] | None = None
+    inverter: Callable[..., Any] | None = None
+    canonicaliser: Callable[..., Any] | None = None
+    estimators: tuple[tuple[str, Callable[..., Any]], ...] = ()
+
+    # -- the symbol table ----------------------------------------------------------------------
+
+    @cached_property
+    def signals(self) -> tuple[Signal, ...]:
+        """Signals of the body, then those that effects read, each once."""
+        own = [s for s in self.declared if isinstance(s, Signal)]
+        for attached in self.effects:
+            own += [s for s in attached.signals if s.name not in {o.name for o in own}]
+        return tuple(own)
+
+    @cached_property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Declared parameters, then those of the effects (`quadratic.k`)."""
+        own = [p for p in self.declared if isinstance(p, Parameter)]
+        changed = {s.name: s for s in self.declared if "." in s.name}
+        added = [p for attached in self.effects for p in attached.parameters]
+        of_effects: list[Symbol] = [changed.get(p.name, p) for p in added]
+        return tuple(
+            [p for p in own if "." not in p.name]
+            + [p for p in of_effects if isinstance(p, Parameter)]
+        )
+
+    @cached_property
+    def constants(self) -> tuple[Constant, ...]:
+        """Plain numbers of the model."""
+        return tuple(c for c in self.declared if isinstance(c, Constant))
+
+    @property
+    def quantities(self) -> Mapping[str, Quantity]:
+        """Named inner values, in the order in which the body computes them."""
+        return self.traced.quantities
+
+    @property
+    def implicit(self) -> bool:
+        """True where the residual is no signal, so that readings cannot be simulated from it."""
+        return self.traced.residual.implicit is not None
+
+    @property
+    def axes(self) -> tuple[str, ...]:
+        """Name of each component of the residual."""
+        given, size = self.traced.residual.axes, self.traced.expression.numel()
+        if given:
+            return given
+        return (
+            ("x", "y", "z")
+            if size == 3
+            else tuple(map(str, range(size)))
+            if size > 1
+            else ("value",)
+        )
+
+    @property
+    def residual_unit(self) -> str:
+        """Unit of the residual; `[v]` stands for the unit of signal v."""
+        traced = self.traced
+        if traced.measured is not None and not traced.residual.unit:
+            return self[traced.measured].unit or f"[{traced.measured}]"
+        return traced.residual.unit
+
+    def __getitem__(self, name: str) -> Any:
+        """Signal, parameter or constant of that name."""
+        if name in self.symbols:
+            return self.symbols[name]
+        raise UsageError(self._unknown(name))
+
+    @cached_property
+    def symbols(self) -> Mapping[str, Symbol]:
+        """Every signal, parameter and constant by name."""
+        every: list[Symbol] = [*self.signals, *self.parameters, *self.constants]
+        return {symbol.name: symbol for symbol in every}
+
+    def _unknown(self, name: str) -> str:
+        names = list(self.symbols)
+        near = difflib.get_close_matches(name, names, 1)
+        hint = f"; did you mean {near[0]!r}?" if near else f"; it has {', '.join(names)}"
+        return f"model {self.name} has no {name!r}{hint}"
+
+    # -- new models from this one --------------------------------------------------------------
+
+    def having(self, **changes: Any) -> Model:
+        """A model with constants set, parameters redeclared, or either turned into the other.
+
+        A number fixes (`radius=0.3`), a `param(…)` frees (`radius=param("m", start=0.28)`), a
+        `constant(…)` sets value and unit.
+        """
+        model = self
+        for name, change in changes.items():
+            model = model._with(name, model._changed(name, change))
+        return model
+
+    def _changed(self, name: str, change: Any) -> Parameter | Constant:
+        old = self[name]
+        if isinstance(old, Signal):
+            raise UsageError(f"{name} is a signal of model {self.name}: data give it, not having()")
+        if isinstance(change, Parameter):
+            return replace(converted_parameter(name, change, old), name=name)
+        new = change if isinstance(change, Constant) else constant(change, old.unit)
+        new = converted_constant(name, new, old.unit)
+        if isinstance(old, Parameter):
+            try:
+                value = old.shape.unpack(old.shape.pack(new.array))
+            except DeclarationError as error:
+                raise UsageError(f"{name} of model {self.name}: {error}") from None
+            fixed: Constant = constant(value, new.unit)
+            return replace(fixed, name=name, frozen=old)
+        if new.array.shape != old.array.shape:
+            raise UsageError(f"{name} has shape {old.array.shape}, not {new.array.shape}")
+        like = old.like or (old.unit if "[" in old.unit and new.unit != old.unit else "")
+        return replace(new, name=name, frozen=old.frozen, like=like)
+
+    def _with(self, name: str, symbol: Any) -> Model:
+        if name in {s.name for s in self.declared}:
+            declared = tuple(symbol if s.name == name else s for s in self.declared)
+        else:  # a parameter of an effect
+            declared = (*self.declared, symbol)
+        return replace(self, declared=declared)
+
+    def freed(self, name: str) -> Model:
+        """A model in which the constant is an unknown, starting from its value."""
+        old = self[name]
+        if isinstance(old, Parameter):
+            return self
+        if isinstance(old, Signal):
+            raise UsageError(f"{name} is a signal of model {self.name}, not a constant")
+        from casest.declaration.symbols import param
+
+        if old.frozen is not None:
+            return self._with(
+                name, replace(old.frozen, start=tuple(old.frozen.shape.pack(old.array)))
+            )
+        shape: Any = old.array.shape if old.dims else None
+        return self._with(name, named(param(shape, old.unit, start=old.array), name))
+
+    def scoped(self, name: str, scope: Scope) -> Model:
+        """A model in which the parameter is shared by all runs ("all") or one per run ("run")."""
+        old = self[name]
+        if not isinstance(old, Parameter):
+            raise UsageError(f"{name} is not a parameter of model {self.name}: it has no scope")
+        return self._with(name, replace(old, scope=scope))
+
+    def with_effect(
+        self,
+        added: Effect,
+        *,
+        on: str | None = None,
+        columns: Mapping[str, str] | None = None,
+    ) -> Model:
+        """A model with one more effect. `on` and `columns` say where, if not as declared.
+
+        Raises UsageError where the effect is not applicable: its quantity or signal does not
+        exist here.
+        """
+        target = on or added.on
+        columns = dict(columns or {})
+        label = added.name + "".join(f"({c})" for c in columns.values())
+        label = label if on is None or on == added.on else f"{label}@{on}"
+        taken = {a.label for a in self.effects}
+        if label in taken:
+            raise UsageError(f"model {self.name} already has the effect {label}")
+        attached = self._attached(added, target, columns, label)
+        shapes = {n: (q.declared.size1(), q.declared.size2()) for n, q in self.quantities.items()}
+        check_null(attached, self._target_shape(target), shapes)
+        made = replace(self, effects=(*self.effects, attached))
+        if attached.kind in ("quantity", "signal") and not _reaches_residual(made, attached):
+            why = f"its residual does not depend on {target}"
+            if target in self.quantities and "t" in {s.name for s in added.extras}:
+                why = f"how fast {target} changes is unknown: it is not declared as a function of t"
+            raise UsageError(f"effect {label} is not applicable to model {self.name}: {why}")
+        return made
+
+    def _attached(
+        self, added: Effect, target: str, columns: Mapping[str, str], label: str
+    ) -> Attached:
+        kind, dims, unit = self._place(added, target)
+        signals = {s.name: s.unit for s in self.signals}
+        for s in added.extras:
+            own = signals.get(columns.get(s.name, s.name))
+            if not (s.unit and own and known(s.unit) and known(own)):
+                continue
+            if size(s.unit) != size(own):
+                raise UnitError(
+                    f"effect {label} reads {s.name} in {s.unit}, and model {self.name} has it in "
+                    f"{own}: declare {s.name}=signal({own!r})"
+                )
+        inner = tuple(name for name in self.quantities if name not in signals)
+        return attach(added, target, kind, dims, {target: unit}, columns, label, inner)
+
+    def _target_shape(self, target: str) -> tuple[int, int]:
+        if target in self.quantities:
+            shape = self.quantities[target].declared.shape
+            return (int(shape[0]), int(shape[1]))
+        if target == NOISE:
+            return (1, 1)
+        return (3, 3) if self[target].kind == "rotation" else (self[target].size, 1)
+
+    def _place(self, added: Effect, target: str) -> tuple[Kind, tuple[int, ...], str]:
+        if target == NOISE:
+            return "noise", (), "1"
+        if target in self.quantities:
+            found = self.quantities[target]
+            if added.kind != "sequence":
+                return "quantity", found.dims, found.unit
+            self._check_sequence(added, found)
+            return "sequence", found.dims, found.unit
+        signals = {s.name: s for s in self.signals}
+        if target in signals:
+            dims = () if signals[target].size == 1 else (signals[target].size,)
+            return "signal", dims, signals[target].unit or f"[{target}]"
+        raise UsageError(
+            f"effect {added.name} is not applicable to model {self.name}: "
+            f"it acts on {target!r}, and the model has {', '.join([*self.quantities, *signals])}"
+        )
+
+    def _check_sequence(self, added: Effect, found: Quantity) -> None:
+        if any(a.kind == "sequence" for a in self.effects):
+            raise UsageError(f"model {self.name} already has an effect on the sequence of samples")
+        if self.traced.residual.predicted is not found.value:
+            raise UsageError(
+                f"effect {added.name} is not applicable to model {self.name}: it acts on the "
+                f"sequence of predicted readings, and {found.name} is not what the model predicts"
+            )
+
+    def start(self, function: Callable[..., Any]) -> Model:
+        """Decorator: start values from the data, `def NAME(model, runs) -> {parameter: value}`.
+
+        As with a property's setter, the decorated name becomes the model, so it must be the
+        model's own name.
+        """
+        if function.__name__ != self.function.__name__:
+            raise DeclarationError(
+                f"@{self.function.__name__}.start decorates a function of the same name "
+                f"(`def {self.function.__name__}(model, runs)`), not {function.__name__!r}: "
+                "the name becomes the model with its start values"
+            )
+        return self.starting(function)
+
+    def starting(
+        self, function: Callable[..., Any], *, many: Callable[..., Any] | None = None
+    ) -> Model:
+        """A model with start values from the data: `function(model, runs) -> {name: value}`.
+
+        `many` gives those of many sensors at once, for `calibrate_many`, which says what it takes.
+        """
+        return replace(self, starter=function, starter_of_many=many)
+
+    def bounded(self, function: Callable[..., Any]) -> Model:
+        """A model with bounds from the data: `function(model, runs) -> {name: (lower, upper)}`."""
+        return replace(self, limiter=function)
+
+    def remarking(self, function: Callable[..., Any]) -> Model:
+        """A model that comments on its fits: `function(model, runs, values) -> sentences`."""
+        return replace(self, remarker=function)
+
+    def canonical(self, function: Callable[..., Any]) -> Model:
+        """A model that says which of equivalent values it means.
+
+        `function(model, values) -> values`: an angle within a turn, say. Per-run values come with
+        a leading run axis if there are several runs.
+        """
+        return replace(self, canonicaliser=function)
+
+    def with_inverse(self, function: Callable[..., Any]) -> Model:
+        """A model with a closed form of its correction: `function(values, reading) -> corrected`.
+
+        It is used as long as no effect has been added; without one the model is solved for it.
+        """
+        return replace(self, inverter=function)
+
+    def with_estimator(self, name: str, function: Callable[..., Any]) -> Model:
+        """A model that also knows the estimator `name` (model, runs) -> {parameter: value}."""
+        return replace(self, estimators=(*self.estimators, (name, function)))
+
+    # -- the body in symbols -------------------------------------------------------------------
+
+    @cached_property
+    def traced(self) -> Traced:
+        """The body in CasADi symbols, with every effect in place."""
+        return trace(self)
+
+    # -- numbers -------------------------------------------------------------------------------
+
+    def __call__(self, **values: Any) -> dict[str, Array]:
+        """Evaluate on plain numbers: signals (N, size) or (size,), parameters by name.
+
+        Parameters that are not given take their declared start. Returns every quantity, the
+        prediction (explicit models) and the residual, each with the sample axis first.
+        """
+        for name in values:
+            if isinstance(self[name], Constant):
+                raise UsageError(f"{name} is a constant of model {self.name}: having({name}=…)")
+        missing = [s.name for s in self.signals if s.name not in values]
+        if missing:
+            raise UsageError(f"model {self.name} needs the signal {missing[0]!r}")
+        if any(a.kind == "sequence" for a in self.effects):
+            raise UsageError(
+                f"model {self.name} has an effect on the sequence of samples: single samples have "
+                "no prediction of their own; evaluate it on a run (leastsquares.problem)"
+            )
+        traced = self.traced
+        outputs = {q.name: q.value for q in traced.quantities.values()}
+        if traced.predicted is not None:
+            outputs["predicted"] = traced.predicted
+        outputs["residual"] = traced.expression
+        f = function_of(self, outputs)
+        samples = np.hstack([_rows(values[s.name], s) for s in self.signals])
+        given = {p.name: values.get(p.name) for p in self.parameters}
+        point = np.concatenate([np.zeros(0), *self.point(given)])
+        results = [f.call([point, row]) for row in samples]
+        return {
+            name: np.array([np.array(result[k]).ravel() for result in results])
+            for k, name in enumerate(outputs)
+        }
+
+    def point(self, values: Mapping[str, Any]) -> tuple[Array, Array]:
+        """Coordinates and chart references of given parameter values (declared start if None)."""
+        coordinates, references = [np.zeros(0)], [np.zeros(0)]
+        for p in self.parameters:
+            value = values.get(p.name)
+            packed = p.start_value() if value is None else p.shape.pack(value)
+            if p.shape.curved:
+                coordinates.append(np.zeros(p.shape.coordinates))
+                references.append(p.shape.reference(p.shape.unpack(packed)))
+            else:
+                coordinates.append(packed)
+        return np.concatenate(coordinates), np.concatenate(references)
+
+    def __str__(self) -> str:
+        """Table of the model's symbols, and its equations."""
+        return describe(self)
+
+
+def model(function: Callable[..., Residual]) -> Model:
+    """Declare a model: positional arguments are signals, keyword-only ones unknowns or numbers.
+
+    Raises DeclarationError naming the argument whose declaration makes no sense.
+    """
+    name = function.__name__.replace("_", "-")
+    declared: list[Symbol] = []
+    for argument in inspect.signature(function).parameters.values():
+        declared.append(_declared(name, argument))
+    made = Model(name, function, tuple(declared))
+    check_units_known(made.name, made.declared)
+    return made
+
+
+def _declared(model_name: str, argument: inspect.Parameter) -> Symbol:
+    default: object = argument.default
+    where = f"model {model_name}: {argument.name}"
+    if argument.kind is argument.POSITIONAL_OR_KEYWORD:
+        if not isinstance(default, Signal):
+            raise DeclarationError(
+                f"{where} comes before the * and must be signal(…), not {default!r}"
+            )
+        return replace(default, name=argument.name)
+    if argument.kind is not argument.KEYWORD_ONLY:
+        raise DeclarationError(
+            f"{where}: a model takes signals, then *, then parameters and constants"
+        )
+    if isinstance(default, Parameter | Constant):
+        return replace(default, name=argument.name)
+    if isinstance(default, Signal):
+        raise DeclarationError(f"{where} is a signal: signals come before the *")
+    if isinstance(default, int | float) and not isinstance(default, bool):
+        plain: Constant = constant(default)
+        return replace(plain, name=argument.name)
+    raise DeclarationError(f"{where} must be param(…), constant(…) or a number, not {default!r}")
+
+
+def _reaches_residual(made: Model, attached: Attached) -> bool:
+    """Does the residual depend on the effect's parameters at all?"""
+    reached = reached_parameters(made, made.traced, made.traced.expression)
+    own = {p.name for p in attached.parameters}
+    return not own or bool(own & reached)
+
+
+def _rows(value: Any, declared: Signal) -> Array:
+    return np.asarray(value, dtype=float).reshape(-1, declared.size)

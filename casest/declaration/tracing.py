@@ -1,0 +1,388 @@
+"""A model's body written out in CasADi symbols, with every effect in its place."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import math
+import sys
+import textwrap
+import warnings
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import casadi as ca
+
+from casest.declaration.effect import Attached
+from casest.declaration.physics import SX, Quantity, Residual, Trace, chart, current_trace
+from casest.declaration.shapes import in_digits
+from casest.declaration.symbols import Constant, Parameter, Signal, Symbol
+from casest.errors import CasestError, DeclarationError, last_line
+
+#: Name of a prediction that the body does not name.
+PREDICTED = "predicted"
+
+
+class Declared(Protocol):
+    """What is asked of a model here: its symbols, its body, and what has been added to it."""
+
+    @property
+    def name(self) -> str:
+        """As it is called."""
+
+    @property
+    def function(self) -> Callable[..., Residual]:
+        """The body."""
+
+    @property
+    def declared(self) -> tuple[Symbol, ...]:
+        """Symbols of the signature."""
+
+    @property
+    def effects(self) -> tuple[Attached, ...]:
+        """What was added, in order."""
+
+    @property
+    def signals(self) -> tuple[Signal, ...]:
+        """What is measured, also by what the effects read."""
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Unknowns, also of the effects."""
+
+    @property
+    def constants(self) -> tuple[Constant, ...]:
+        """Known numbers."""
+
+    @property
+    def traced(self) -> Traced:
+        """The body in symbols."""
+
+    def __getitem__(self, name: str) -> Any:
+        """A symbol by name."""
+
+
+@dataclass(frozen=True)
+class Traced:
+    """What a model's body computes.
+
+    `coordinates` are the solver's unknowns and `references` the numbers that describe the charts
+    of directions and rotations; `expression` is the residual column, `predicted` the reading of
+    an explicit model and `reading` what it is compared with; `measured` and `corrected` name a
+    signal and a quantity.
+    """
+
+    symbols: Mapping[str, SX]
+    coordinates: SX
+    references: SX
+    quantities: Mapping[str, Quantity]
+    residual: Residual
+    expression: SX
+    predicted: SX
+    reading: SX
+    measured: str | None
+    corrected: str | None
+
+
+def trace(model: Declared, cut: str | None = None, naming: bool = False) -> Traced:
+    """Run the model's body on symbols.
+
+    `cut` replaces a quantity (before its effects) by a free symbol; `naming` replaces every
+    quantity by a symbol of its name after it is computed, for printing.
+    """
+    symbols, coordinates, references = _symbols(model)
+    running = Trace(cut=cut, naming=naming, reserved=frozenset(symbols))
+    for attached in model.effects:
+        if attached.kind == "quantity":
+            running.effects.setdefault(attached.on, []).append(_applied(attached, symbols, running))
+    residual = _run_body(model, running, symbols)
+    measured = _name_of(residual.measured, symbols)
+    if residual.measured is not None and measured is None:
+        raise DeclarationError(f"model {model.name}: measured= must be one of the model's signals")
+    if measured is not None:
+        residual = _with_named_prediction(residual, running, model[measured].unit or "")
+    traced = Traced(
+        symbols,
+        ca.vertcat(*coordinates),
+        ca.vertcat(*references),
+        running.quantities,
+        residual,
+        ca.densify(residual.expression),
+        None if residual.predicted is None else ca.vec(ca.SX(residual.predicted)),
+        None if residual.measured is None else ca.vec(residual.measured),
+        measured,
+        _corrected(model, residual, running, symbols),
+    )
+    on_signals = [a for a in model.effects if a.kind == "signal"]
+    for attached in on_signals:
+        if attached.on == traced.measured:
+            traced = _with_changed_reading(traced, attached)
+    # What is substituted last acts first: so that the first effect added does, go backwards.
+    for attached in reversed(on_signals):
+        if attached.on != traced.measured:
+            traced = _with_signal_effect(traced, attached)
+    return traced
+
+
+def _symbols(model: Declared) -> tuple[dict[str, SX], list[SX], list[SX]]:
+    symbols: dict[str, SX] = {}
+    for s in model.signals:
+        flat = ca.SX.sym(s.name, s.size)
+        symbols[s.name] = ca.reshape(flat, 3, 3).T if s.kind == "rotation" else flat
+    coordinates, references = [], []
+    for p in model.parameters:
+        c = ca.SX.sym(p.name, p.shape.coordinates)
+        coordinates.append(c)
+        if p.shape.curved:
+            r = ca.SX.sym(f"{p.name}_ref", len(p.shape.reference(p.shape.default())))
+            references.append(r)
+            symbols[p.name] = chart(p.shape.kind, c, r)
+        elif len(p.shape.dims) == 2:
+            matrix = ca.SX(*p.shape.dims)
+            for k, index in enumerate(p.shape.entries):
+                matrix[index] = c[k]
+            symbols[p.name] = matrix
+        else:
+            symbols[p.name] = c
+    for fixed in model.constants:
+        symbols[fixed.name] = float(fixed.array) if not fixed.dims else ca.SX(ca.DM(fixed.array))
+    return symbols, coordinates, references
+
+
+def _applied(attached: Attached, symbols: Mapping[str, SX], running: Trace) -> Callable[[SX], SX]:
+    def apply(value: SX) -> SX:
+        return attached.apply(value, {**running.handed, **symbols})
+
+    return apply
+
+
+def _run_body(model: Declared, running: Trace, symbols: Mapping[str, SX]) -> Residual:
+    arguments = {s.name: symbols[s.name] for s in model.declared if "." not in s.name}
+    token = current_trace.set(running)
+    try:
+        with warnings.catch_warnings():
+            # CasADi remarks on NumPy's functions, which give the right expression.
+            warnings.simplefilter("ignore", FutureWarning)
+            residual = model.function(**arguments)
+        if not isinstance(residual, Residual):
+            found = type(residual).__name__
+            raise DeclarationError(f"the body must return Residual(…), not {found}")
+        _refuse_not_a_number(residual.expression)  # also raises where shapes do not match
+    except CasestError as error:
+        raise type(error)(f"model {model.name}, {_where(model.function)}: {error}") from None
+    except NameError as error:
+        raise DeclarationError(
+            f"model {model.name}, {_where(model.function)}: {error}; "
+            "declare it in the model's signature, or import it"
+        ) from None
+    except Exception as error:
+        raise DeclarationError(
+            f"model {model.name}, {_where(model.function)}: {last_line(error)}"
+        ) from error
+    finally:
+        current_trace.reset(token)
+    return residual
+
+
+def _with_named_prediction(residual: Residual, running: Trace, unit: str) -> Residual:
+    """A prediction that nobody named is a quantity all the same: effects on the reading act there.
+
+    It is called PREDICTED, or PREDICTED_ where that is something else.
+    """
+    of = residual.predicted
+    for name, found in running.quantities.items():
+        if of is found.value or of is running.handed[name]:
+            return residual
+    name = PREDICTED
+    while name in running.quantities or name in running.reserved:
+        name += "_"
+    return Residual(
+        measured=residual.measured,
+        predicted=running.enter(name, of, unit, implied=True),
+        corrected=residual.corrected,
+        unit=residual.unit,
+        axes=residual.axes,
+    )
+
+
+def _with_changed_reading(traced: Traced, attached: Attached) -> Traced:
+    """The prediction stays; what is compared with it does not."""
+    changed = ca.vec(ca.SX(attached.apply(traced.reading, traced.symbols)))
+    return replace(traced, reading=changed, expression=changed - traced.predicted)
+
+
+def _with_signal_effect(traced: Traced, attached: Attached) -> Traced:
+    """Effects on a signal act after the body, because der(…, t) needs the bare symbol."""
+    symbol = traced.symbols[attached.on]
+    changed = flat(ca.SX(attached.apply(symbol, traced.symbols)))
+    plain = flat(symbol)
+
+    def late(expression: SX) -> SX:
+        return ca.substitute(expression, plain, changed)
+
+    quantities = {
+        name: replace(q, declared=late(q.declared), value=late(q.value))
+        for name, q in traced.quantities.items()
+    }
+    return replace(
+        traced,
+        quantities=quantities,
+        expression=late(traced.expression),
+        predicted=None if traced.predicted is None else late(traced.predicted),
+    )
+
+
+def _corrected(
+    model: Declared, residual: Residual, running: Trace, symbols: Mapping[str, SX]
+) -> str | None:
+    if residual.corrected is None:
+        return None
+    for name, found in running.quantities.items():
+        if residual.corrected is found.value or residual.corrected is running.handed.get(name):
+            return name
+    if isinstance(residual.corrected, str) and residual.corrected in running.quantities:
+        return residual.corrected
+    signal = next((s for s in model.signals if residual.corrected is symbols[s.name]), None)
+    if signal is not None:
+        unit = f', "{signal.unit}"' if signal.unit else ""
+        raise DeclarationError(
+            f"model {model.name}: corrected= is the signal {signal.name}: write wanted = "
+            f'quantity("wanted", {signal.name}{unit}), use `wanted` instead of {signal.name} in '
+            "the lines below, and say corrected=wanted"
+        )
+    names = [name for name, found in running.quantities.items() if not found.implied]
+    there = f" (there is {', '.join(names)})" if names else ""
+    raise DeclarationError(
+        f"model {model.name}: corrected= must be a quantity of the model{there}: wrap the "
+        'expression where it is computed, wanted = quantity("wanted", …, "unit"), and say '
+        "corrected=wanted"
+    )
+
+
+def function_of(model: Declared, outputs: Mapping[str, SX], traced: Traced | None = None) -> Any:
+    """CasADi function (parameters, sample) -> outputs, one sample at a time.
+
+    `parameters` holds the solver's coordinates and then the chart references; `sample` the
+    signals one after the other.
+    """
+    traced = traced or model.traced
+    inputs = [ca.vertcat(traced.coordinates, traced.references), sample_symbol(model, traced)]
+    values = [ca.SX(v) for v in outputs.values()]
+    # Not the model's own name: CasADi reserves some, and refuses two underscores in a row.
+    return ca.Function("one_sample", inputs, values, ["parameters", "sample"], list(outputs))
+
+
+def sample_symbol(model: Declared, traced: Traced | None = None) -> SX:
+    """All signals of one sample as one column, in the order in which data hold them."""
+    symbols = (traced or model.traced).symbols
+    return ca.vertcat(*[flat(symbols[s.name]) for s in model.signals])
+
+
+def reached_parameters(model: Declared, traced: Traced, expression: SX) -> set[str]:
+    """Names of the parameters that an expression of the trace depends on."""
+    columns = ca.jacobian(ca.vec(expression), traced.coordinates).sparsity().get_triplet()[1]
+    reached, place = set(), 0
+    for p in model.parameters:
+        width = p.shape.coordinates
+        if any(place <= c < place + width for c in columns):
+            reached.add(p.name)
+        place += width
+    return reached
+
+
+def reached_signals(model: Declared, traced: Traced, expression: SX) -> set[str]:
+    """Names of the signals that an expression of the trace depends on."""
+    sample = sample_symbol(model, traced)
+    columns = ca.jacobian(ca.vec(expression), sample).sparsity().get_triplet()[1]
+    reached, place = set(), 0
+    for s in model.signals:
+        if any(place <= c < place + s.size for c in columns):
+            reached.add(s.name)
+        place += s.size
+    return reached
+
+
+def equations(model: Declared) -> list[str]:
+    """The body of the model and of its effects, as declared.
+
+    Where the source is not at hand, the traced expressions in terms of the quantities before.
+    """
+    try:
+        lines = body(model.function)
+        for attached in model.effects:
+            lines += [
+                "",
+                f"# effect {attached.label} on {attached.on}",
+                *body(attached.effect.function),
+            ]
+    except (OSError, TypeError):
+        traced = trace(model, naming=True)
+        lines = [f"{q.name} = {_expression(q.value)}" for q in traced.quantities.values()]
+        lines.append(f"residual = {_expression(traced.expression)}")
+    return lines
+
+
+def body(function: Callable[..., Any]) -> list[str]:
+    """Source lines of a function without its signature and docstring."""
+    source = textwrap.dedent(inspect.getsource(function))
+    declared = next(n for n in ast.parse(source).body if isinstance(n, ast.FunctionDef))
+    statements = declared.body[1:] if ast.get_docstring(declared) else declared.body
+    lines = source.splitlines()[statements[0].lineno - 1 : statements[-1].end_lineno]
+    return textwrap.dedent("\n".join(lines)).splitlines()
+
+
+def describe(model: Declared) -> str:
+    """Table of the model's symbols, and its equations."""
+    summary = (inspect.getdoc(model.function) or "").partition("\n")[0]
+    rows = [("signal", s.name, s.size, s.unit or "any unit", "") for s in model.signals]
+    for p in model.parameters:
+        rows.append(("parameter", p.name, p.shape.size, p.unit, "per run" * (p.scope == "run")))
+    for c in model.constants:
+        value = in_digits(c.array, 6)
+        rows.append(("constant", c.name, c.array.size, c.unit, f"= {value}"))
+    for a in model.effects:
+        rows.append(("effect", a.label, sum(p.shape.size for p in a.parameters), f"on {a.on}", ""))
+    width = max(len(row[1]) for row in rows)
+    table = [f"  {k:<10} {n:<{width}} {s:>3}  {u} {more}".rstrip() for k, n, s, u, more in rows]
+    return "\n".join([f"{model.name}: {summary}", *table, *(f"  {e}" for e in equations(model))])
+
+
+def _name_of(symbol: SX | None, symbols: Mapping[str, SX]) -> str | None:
+    return (
+        next((n for n, s in symbols.items() if s is symbol), None) if symbol is not None else None
+    )
+
+
+def flat(symbol: SX) -> SX:
+    """A signal's numbers in the order in which data hold them (matrices row by row)."""
+    return ca.vec(symbol.T) if symbol.shape == (3, 3) else symbol
+
+
+def _where(function: Callable[..., Any]) -> str:
+    """File and line of the function in the traceback of the current exception."""
+    traceback = sys.exc_info()[2]
+    line = function.__code__.co_firstlineno
+    while traceback is not None:
+        if traceback.tb_frame.f_code is function.__code__:
+            line = traceback.tb_lineno
+        traceback = traceback.tb_next
+    return f"{function.__code__.co_filename}, line {line}"
+
+
+def _refuse_not_a_number(expression: SX) -> None:
+    """Functions of Python's math module turn a symbol into NaN without a word."""
+    f = ca.Function("one_sample", ca.symvar(expression), [expression])
+    for k in range(f.n_instructions()):
+        constant = f.instruction_id(k) == ca.OP_CONST
+        if constant and math.isnan(float(f.instruction_constant(k))):
+            raise DeclarationError(
+                "the body computes what is not a number; functions of `math` take numbers alone: "
+                "use casest's (from casest import sin, sqrt, exp, …)"
+            )
+
+
+def _expression(value: SX) -> str:
+    """A readable expression, component by component."""
+    parts = [str(value[i]) for i in range(value.numel())]
+    return parts[0] if len(parts) == 1 else "[" + ", ".join(parts) + "]"

@@ -1,1 +1,0 @@
-"""Floor 1: symbols, shapes and the vocabulary of physics."""

@@ -1,0 +1,206 @@
+"""Which effects could be missing: the catalogue at every place and column where it applies."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from casest.data.run import Run
+from casest.declaration.dimensions import check_units
+from casest.declaration.effect import NOISE, Effect
+from casest.declaration.model import Model
+from casest.declaration.shapes import Array
+from casest.declaration.symbols import Parameter
+from casest.effects.placing import placed_in, with_numbers
+from casest.errors import CasestError, UsageError
+
+#: Columns whose name or unit says that they are temperatures.
+_TEMPERATURE = re.compile(r"temp|(^|_)t_?(deg)?c$|celsius|kelvin", re.IGNORECASE)
+_DEGREES = {"degC", "K", "kelvin", "degree_Celsius", "°C"}
+#: Columns that number things instead of measuring them.
+_LABELS = re.compile(
+    r"^(run|pose|index|(first_|last_)?row|count|sample|seq|id|nr|no)$", re.IGNORECASE
+)
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One effect at one place: `freed` names a constant instead, for one that is wrong.
+
+    `trials` says at how many grid values of its profile it was tried, for the p-value.
+    """
+
+    effect: Effect | None
+    columns: tuple[tuple[str, str], ...] = ()
+    freed: str = ""
+    trials: int = 1
+    #: The model that it was tried on, and that model with it: tracing takes longer than scoring.
+    traced: tuple[Model, Model] | None = field(default=None, compare=False, repr=False)
+
+    @property
+    def name(self) -> str:
+        """The bare catalogue name, or that of the constant."""
+        return self.freed or (self.effect.name if self.effect else "")
+
+    @property
+    def column(self) -> str | None:
+        """The column that it reads besides time."""
+        return self.columns[0][1] if self.columns else None
+
+    @property
+    def on(self) -> str:
+        """The quantity or signal it acts on."""
+        return self.freed or (self.effect.on if self.effect else "")
+
+    @property
+    def label(self) -> str:
+        """Name and column, as in the parameters' names: `temperature_bias(temp)`."""
+        return self.name + (f"({self.column})" if self.column else "")
+
+    def added_to(self, model: Model) -> Model:
+        """The model with it. Raises where it does not apply."""
+        if self.traced is not None and self.traced[0] is model:
+            return self.traced[1]
+        if self.freed:
+            return model.freed(self.freed)
+        assert self.effect is not None
+        return model.with_effect(self.effect, columns=dict(self.columns))
+
+    def on_model(self, model: Model) -> Candidate:
+        """The candidate that remembers the model with it. Raises where it does not apply."""
+        return replace(self, traced=(model, replace(self, traced=None).added_to(model)))
+
+    def parameters(self, extended: Model) -> list[Parameter]:
+        """Its unknowns in the extended model."""
+        own = self.label + "."
+        return [p for p in extended.parameters if p.name.startswith(own) or p.name == self.freed]
+
+
+@dataclass(frozen=True)
+class Skipped:
+    """An effect that could not be tried, and why."""
+
+    name: str
+    reason: str
+
+
+def candidates(
+    model: Model, runs: Sequence[Run], catalogue: Sequence[Effect]
+) -> tuple[list[Candidate], list[Skipped]]:
+    """All that can be tried on these data, and what cannot with the reason.
+
+    `runs` come from `prepared`.
+    """
+    found: list[Candidate] = []
+    skipped: list[Skipped] = []
+    channels, unusable = _channels(model, runs)
+    skipped += unusable
+    for effect in catalogue:
+        if effect.on == NOISE:
+            continue
+        try:
+            placed = placed_in(effect, model)
+        except CasestError as error:
+            skipped.append(Skipped(effect.name, str(error)))
+            continue
+        for columns in _columns_for(placed, channels, runs):
+            candidate = Candidate(with_numbers(placed, columns, runs), columns)
+            try:
+                found.append(_tried(candidate, model, runs))
+            except CasestError as error:
+                skipped.append(Skipped(candidate.label, str(error)))
+    for constant in model.constants:
+        candidate = Candidate(None, freed=constant.name)
+        if constant.frozen is None and not constant.dims:
+            found.append(candidate)
+    return found, skipped
+
+
+def _columns_for(
+    effect: Effect, channels: Mapping[str, bool], runs: Sequence[Run]
+) -> list[tuple[tuple[str, str], ...]]:
+    """For effects that read a channel: every column that may be it."""
+    if not any(s.name == "channel" for s in effect.extras):
+        return [()]
+    warm = effect.name.startswith("temperature")
+    return [(("channel", name),) for name, is_warm in channels.items() if is_warm == warm]
+
+
+def usable_columns(model: Model, runs: Sequence[Run]) -> list[str]:
+    """Columns that measure something and are no signal of the model's. `runs` are prepared."""
+    return list(_channels(model, runs)[0])
+
+
+def _channels(model: Model, runs: Sequence[Run]) -> tuple[dict[str, bool], list[Skipped]]:
+    """Columns that measure something (is it a temperature?), and those that cannot be used."""
+    # A column that an effect reads already may be the cause of another one as well.
+    read = {column for attached in model.effects for _, column in dict(attached.columns).items()}
+    used = {s.name for s in model.signals} - read | {"t"}
+    found: dict[str, bool] = {}
+    skipped: list[Skipped] = []
+    values: dict[str, Array] = {}
+    for name in runs[0].columns if runs else ():
+        if name in used or _LABELS.match(name):
+            continue
+        if any(name not in run.signals for run in runs):
+            skipped.append(Skipped(name, "column is not numeric in every file"))
+            continue
+        x = np.concatenate([run.signals[name][:, 0] for run in runs])
+        why = _useless(name, x, values)
+        if why:
+            skipped.append(Skipped(name, why))
+            continue
+        values[name] = x
+        unit = runs[0].column_units.get(name) or ""
+        found[name] = bool(_TEMPERATURE.search(name)) or unit in _DEGREES
+    return found, skipped
+
+
+def _useless(name: str, x: Array, others: Mapping[str, Array]) -> str:
+    """Why a column can explain nothing, in words; else empty."""
+    if not np.all(np.isfinite(x)):
+        return f"column has {int(np.sum(~np.isfinite(x)))} values that are not finite"
+    if np.ptp(x) <= 1e-12 * np.abs(x).max(initial=1e-300):
+        return "column is constant"
+    for other, y in others.items():
+        if abs(np.corrcoef(x, y)[0, 1]) > 1 - 1e-10:
+            return f"column is a copy of {other} (up to scale and offset)"
+    return ""
+
+
+def _tried(candidate: Candidate, model: Model, runs: Sequence[Run]) -> Candidate:
+    """The candidate on the model. Raises where it does not apply here."""
+    if any(a.label == candidate.label for a in model.effects):
+        raise UsageError("already in the model")
+    if candidate.effect is not None and candidate.effect.kind == "sequence":
+        raise UsageError(
+            "it acts on the sequence of samples, and has no slope for each of them to be found by; "
+            "`calibrate --effects` fits it"
+        )
+    candidate = candidate.on_model(model)
+    effect, extended = candidate.effect, candidate.added_to(model)
+    for s in extended.signals:
+        if any(s.name not in run.signals for run in runs):
+            raise UsageError(f"the data have no {s.name!r}")
+    if effect is not None and not effect.function.__module__.startswith("casest.effects"):
+        check_units(extended)  # a user's own; those of the catalogue are tested
+    return candidate
+
+
+def typical_sizes(candidate: Candidate, parameters: Sequence[Parameter], model: Model) -> Any:
+    """A typical size of each of its unknowns (packed), or None where nobody knows one."""
+    if candidate.freed:
+        value = float(model[candidate.freed].array)
+        return np.array([0.01 * abs(value) or 1.0])
+    assert candidate.effect is not None
+    typical = dict(candidate.effect.typical)
+    sizes = [typical.get(p.name.rpartition(".")[2]) for p in parameters]
+    if any(size is None for size in sizes):
+        return None
+    return np.concatenate(
+        [np.full(p.shape.coordinates, s) for p, s in zip(parameters, sizes, strict=True)]
+    )

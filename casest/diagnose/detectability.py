@@ -1,0 +1,137 @@
+"""What the loop says beside the numbers: what stays invisible, what would have been seen, what is
+left unexplained."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from casest.declaration.model import Model
+from casest.declaration.symbols import Parameter
+from casest.diagnose.candidates.candidates import Candidate, typical_sizes
+from casest.diagnose.candidates.score_test import Score
+from casest.diagnose.closing import Closing
+from casest.diagnose.levels import SURVIVES
+
+#: Noncentrality of the score from which on an effect is found nearly always.
+SEEN = 45.0
+#: Noncentrality below which nobody could find it: three standard deviations.
+UNSEEN = 9.0
+
+
+@dataclass(frozen=True)
+class Invisible:
+    """An effect that these data cannot show: a typical size of it would move parameters unseen.
+
+    `would_move`: largest shift of each declared parameter, in its own unit; `share` how much of
+    the effect's own trace in the data survives beside the declared parameters.
+    """
+
+    name: str
+    column: str | None
+    typical: Mapping[str, float]
+    would_move: Mapping[str, float]
+    share: float
+    shown_by: str
+    units: Mapping[str, str]  # of `typical`, with placeholders
+
+
+@dataclass(frozen=True)
+class Detectable:
+    """The smallest size of an effect's parameter that would nearly always have been found."""
+
+    name: str
+    parameter: str
+    size: float
+    unit: str
+
+
+def invisible(closing: Closing) -> list[Invisible]:
+    """Candidates whose typical size the data could not have shown."""
+    model, added = closing.before.model, {f.candidate.label for f in closing.effects}
+    found: dict[str, Invisible] = {}
+    for score in closing.first:
+        candidate = score.candidate
+        if candidate.label in added or candidate.label in found:
+            continue
+        parameters = _own(candidate, model)
+        typical = typical_sizes(candidate, parameters, model)
+        if typical is None or len(typical) > len(score.survives):
+            continue
+        seen = np.diag(score.information)[: len(typical)] * typical**2 / score.inflation
+        hidden = (seen < UNSEEN) | (score.survives[: len(typical)] < SURVIVES)
+        moves = _moves(closing, score, typical, hidden)
+        if hidden.any() and moves:
+            names = [p.name.rpartition(".")[2] for p in parameters]
+            found[candidate.label] = Invisible(
+                candidate.name,
+                candidate.column,
+                dict(zip(names, _sizes(parameters, typical), strict=True)),
+                moves,
+                float(score.survives[: len(typical)][hidden].max()),
+                _shown_by(candidate),
+                {n: p.units[0] for n, p in zip(names, parameters, strict=True)},
+            )
+    # What would do most harm comes first; shares that are rounding say nothing of order.
+    return sorted(found.values(), key=lambda i: -_harm(closing, i))
+
+
+def _harm(closing: Closing, hidden: Invisible) -> float:
+    """Largest unseen shift in standard deviations of the parameter, two digits."""
+    std = {n: s[s > 0] for n, s in closing.before.std.items()}  # the rest is zero by its shape
+    shifts = [v / float(np.min(std[n], initial=np.inf)) for n, v in hidden.would_move.items()]
+    return float(f"{max(shifts, default=0.0):.2g}")
+
+
+def _own(candidate: Candidate, model: Model) -> list[Parameter]:
+    return candidate.parameters(candidate.added_to(model))
+
+
+def _sizes(parameters: Sequence[Parameter], typical: np.ndarray) -> Iterator[float]:
+    place = 0
+    for p in parameters:
+        yield float(typical[place])
+        place += p.shape.coordinates
+
+
+def _shown_by(candidate: Candidate) -> str:
+    if candidate.effect is not None:
+        return candidate.effect.shown_by
+    return f"an independent measurement of {candidate.freed}, or a second setting of the motion"
+
+
+def _moves(
+    closing: Closing, score: Score, typical: np.ndarray, hidden: np.ndarray
+) -> dict[str, float]:
+    """Shift of each declared parameter by a typical size of what is hidden, where it matters."""
+    problem, std = closing.before.problem, np.sqrt(np.diag(closing.before.covariance))
+    shift = np.abs(score.bias[:, : len(typical)] * typical)[:, hidden].max(axis=1, initial=0.0)
+    found: dict[str, float] = {}
+    for slot in problem.slots:
+        size = float(shift[slot.x].max(initial=0.0))
+        if np.any(shift[slot.x] > std[slot.x]):
+            found[slot.parameter.name] = max(size, found.get(slot.parameter.name, 0.0))
+    return found
+
+
+def detectable(closing: Closing) -> list[Detectable]:
+    """For every visible candidate parameter the smallest size that would have been found."""
+    model, found = closing.before.model, []
+    seen = {f.candidate.label for f in closing.effects}  # found, at the sizes that they have
+    for score in closing.first:
+        candidate = score.candidate
+        if candidate.label in seen or candidate.trials > 1:
+            continue
+        seen.add(candidate.label)
+        place = 0
+        for p in _own(candidate, model):
+            width = p.shape.coordinates
+            information = np.diag(score.information)[place : place + width] / score.inflation
+            alive = score.survives[place : place + width] > 1e-4
+            place += width
+            if np.any(alive):
+                size = float(np.sqrt(SEEN / information[alive]).max())
+                found.append(Detectable(candidate.label, p.name, size, p.units[0]))
+    return found

@@ -1,0 +1,1 @@
+"""Is what is left noise? Imports selection, candidates, noise, levels."""

@@ -1,0 +1,222 @@
+"""A moving estimator with effects, fitted to a record: noise by likelihood, numbers by scoring."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from casest.data.run import Run
+from casest.declaration.shapes import Array
+from casest.diagnose.motion.delays import by_reading, shifted, shifts_of
+from casest.diagnose.motion.sensitivity import Sensitivity, sensitivity
+from casest.dynamics.declare import Dynamics
+from casest.dynamics.filter import Filtered, filtered
+from casest.dynamics.likelihood import Prepared, applied, matched, prepared, whitened
+from casest.dynamics.transition import process_along
+from casest.effects.moving import Candidate, Colour, extended
+
+#: Rounds of scoring of an effect's numbers, and the step in standard deviations that ends it.
+ROUNDS, ENOUGH = 4, 0.1
+#: Correlation times of noise that are tried, logarithms of samples: the shortest, where the search
+#: begins, the longest, and the steps.
+FIRST, MIDDLE, LAST, WIDE = np.log([2.5, 9.0, 350.0, 3.2]).tolist()
+#: A start is forgotten where a reading's variance is below so many times its usual one.
+FORGOTTEN = 2.0
+
+
+@dataclass(frozen=True)
+class Fit:
+    """An estimator with effects at their most likely numbers, and its filter over the record.
+
+    `run`: the record, readings that come late moved by `shifts` samples; `ready`: it made ready
+    for its likelihoods; `answers`: how the innovations answer to the numbers of `added`; None where
+    there are none.
+    `last_step`: of the scoring, in standard deviations.
+    """
+
+    base: Dynamics
+    model: Dynamics
+    added: tuple[tuple[Candidate, Array], ...]
+    colour: Colour | None
+    intensities: Mapping[str, float]
+    likelihood: float
+    run: Run
+    shifts: Mapping[str, int]
+    ready: Prepared
+    found: Filtered
+    answers: Sensitivity | None
+    last_step: float = 0.0
+
+    @property
+    def unknowns(self) -> int:
+        """Numbers that were estimated beside the states and intensities."""
+        return sum(c.size for c, _ in self.added) + (2 if self.colour else 0)
+
+    def evidence(self, other: Fit) -> float:
+        """Rise of log-likelihood less what as many numbers gain from noise alone (Schwarz 1978)."""
+        readings = np.isfinite(self.found.innovations).sum()
+        return rise(self, other) - 0.5 * self.unknowns * float(np.log(readings))
+
+    def by_reading(self, values: Array) -> Array:
+        """Values of readings (N, m) in the rows that these have in the file."""
+        return by_reading(self.base, self.shifts, values)
+
+    def lighter(self) -> Fit:
+        """The same without the transitions and the noise along the record: to be looked at, and
+        judged, but no longer filtered."""
+        ready = replace(self.ready, system=replace(self.ready.system))
+        system = replace(self.found.system, process=self.model.process)
+        found = replace(self.found, system=system)
+        return replace(self, ready=ready, found=found)
+
+    def with_spread(self) -> Fit:
+        """The same with the covariances of the smoothed states, which the loop has no use for."""
+        if not self.model.linear:
+            return self
+        process = process_along(self.model, self.run, self.found.smoothed)
+        found = filtered(self.model, self.run, system=self.ready.system.driven(process))
+        return replace(self, found=replace(self.found, smoothed_P=found.smoothed_P))
+
+    @property
+    def std(self) -> Array:
+        """Standard deviation of all numbers of the effects, in order."""
+        if self.answers is None:
+            return np.zeros(0)
+        H = self.answers.H
+        return np.asarray(np.sqrt(np.diag(np.linalg.inv(np.einsum("kij,kil->jl", H, H)))))
+
+
+def rise(fit: Fit, other: Fit) -> float:
+    """By how much the log-likelihood of a fit is above another's, on the readings of both.
+
+    Where readings were moved in time the first ones are lost: then only those count that come once
+    both filters have forgotten the start.
+    """
+    if fit.shifts == other.shifts:
+        return fit.likelihood - other.likelihood
+    (one, first), (two, second) = (_log_densities(f) for f in (fit, other))
+    return float(np.sum((one - two)[np.isfinite(one - two) & first & second]))
+
+
+def _log_densities(fit: Fit) -> tuple[Array, NDArray[np.bool_]]:
+    """Of every reading given those before it (N, m), and whether the start is forgotten there."""
+    e, s = whitened(fit.ready, fit.intensities)
+    density = np.where(fit.ready.present, -0.5 * (np.log(2 * np.pi * s) + e**2 / s), np.nan)
+    return fit.by_reading(density), forgotten(fit)[:, None]
+
+
+def forgotten(fit: Fit) -> NDArray[np.bool_]:
+    """Which readings count, (N,): what the filter expects there is not the start's doing."""
+    expected = fit.by_reading(np.diagonal(fit.found.S, axis1=1, axis2=2))
+    usual = np.nanmedian(expected, axis=0)
+    return np.asarray(~(expected > FORGOTTEN * usual).any(axis=1))
+
+
+def fitted(
+    base: Dynamics,
+    run: Run,
+    along: Array,
+    *,
+    added: Sequence[tuple[Candidate, Array]] = (),
+    colour: Colour | None = None,
+    start: Mapping[str, float] | None = None,
+) -> Fit:
+    """Numbers and intensities in turn, from given ones. `along`: states (N, n) to begin with."""
+    added = tuple(added)
+    last = 0.0
+    for k in range(ROUNDS if added else 1):
+        fit = _tuned(base, run, along, added, colour, start)
+        if not added:
+            return fit
+        assert fit.answers is not None
+        H, z = fit.answers.H, fit.answers.z
+        information = np.einsum("kij,kil->jl", H, H)
+        step = np.linalg.solve(information, np.einsum("kij,ki->j", H, z))
+        last = float(np.max(np.abs(step) * np.sqrt(np.diag(information))))
+        fit = replace(fit, last_step=last)
+        if last < ENOUGH or k == ROUNDS - 1:
+            return fit
+        added, start, along = _moved(fit, step), fit.intensities, fit.found.smoothed
+        del fit, H, z  # the next one needs the room
+    raise AssertionError
+
+
+def _moved(fit: Fit, step: Array) -> tuple[tuple[Candidate, Array], ...]:
+    assert fit.answers is not None
+    pairs = zip(fit.added, fit.answers.columns, strict=True)
+    return tuple((c, v + step[where]) for (c, v), where in pairs)
+
+
+def _tuned(
+    base: Dynamics,
+    run: Run,
+    along: Array,
+    added: tuple[tuple[Candidate, Array], ...],
+    colour: Colour | None,
+    start: Mapping[str, float] | None,
+) -> Fit:
+    shifts = shifts_of(base, run, added)
+    run = shifted(base, run, shifts)
+    grown = extended(base, added, colour)
+    along = np.pad(along[:, : grown.size], ((0, 0), (0, max(0, grown.size - along.shape[1]))))
+    ready = prepared(grown, run, along)
+    known = {name: value for name, value in (start or {}).items() if name in ready.names}
+    intensities, likelihood = matched(ready, run, known)
+    model = applied(grown, intensities)
+    system = None
+    if model.linear:
+        system = ready.system.driven(process_along(model, run, along))
+    found = filtered(model, run, system=system, spread=False)
+    tried = [c for c, _ in added]
+    answers = sensitivity(base, added, tried, run, found) if added else None
+    return Fit(
+        base, model, added, colour, intensities, likelihood, run, shifts, ready, found, answers
+    )
+
+
+def coloured(fit: Fit, run: Run) -> Fit:
+    """The same with correlated noise on the output that it helps most, over the best time."""
+    trials = [_best_colour(fit, run, name, where) for name, where in _outputs(fit.base).items()]
+    return max(trials, key=lambda f: f.likelihood)
+
+
+def _best_colour(fit: Fit, run: Run, name: str, where: slice) -> Fit:
+    """From the middle of the correlation times towards where the likelihood rises; between those
+    that enclose the best by a parabola over their logarithms."""
+    step = float(np.median(np.diff(fit.found.time)))
+    signal = next(s for s in fit.base.signals if s.name == name)
+    std = float(np.nanmedian(np.abs(fit.found.innovations[:, where]))) / 2
+    done: dict[float, Fit] = {}
+
+    def at(logarithm: float) -> float:
+        if not FIRST <= logarithm <= LAST:
+            return -np.inf
+        if logarithm not in done:
+            tau = float(np.exp(logarithm)) * step
+            colour = Colour(name, signal.size, signal.unit or "1", tau, std)
+            found = fitted(fit.base, run, fit.found.smoothed, added=fit.added, colour=colour,
+                           start=fit.intensities)  # fmt: skip
+            done[logarithm] = found.lighter()
+        return done[logarithm].likelihood
+
+    best = MIDDLE if at(MIDDLE) > at(MIDDLE + WIDE) else MIDDLE + WIDE
+    way = -WIDE if best == MIDDLE else WIDE
+    while at(best + way) > at(best):
+        best += way
+    low, middle, high = at(best - WIDE), at(best), at(best + WIDE)
+    bend = low - 2 * middle + high
+    if np.isfinite(bend) and bend < 0:
+        at(best + 0.5 * WIDE * (low - high) / bend)
+    return max(done.values(), key=lambda f: f.likelihood)
+
+
+def _outputs(model: Dynamics) -> dict[str, slice]:
+    """Rows of every output signal."""
+    t, rows, place = model.traced, {}, 0
+    for name, o in zip(t.measured, t.outputs, strict=True):
+        rows[name] = slice(place, place + o.predicted.numel())
+        place += o.predicted.numel()
+    return rows

@@ -1,0 +1,1 @@
+"""The noise as it is: size, colour, tails, lines. Imports levels."""

@@ -1,0 +1,79 @@
+"""Lines in the residual's spectrum: one frequency that stands out of its neighbourhood.
+
+The neighbourhood is the noise's own colour, so that only what is narrow counts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from casest.data.run import Run
+from casest.declaration.shapes import Array
+from casest.diagnose.noise.noise_model import MIDDLE
+
+#: Samples of a run from which on it has a spectrum, and of the longest one.
+ENOUGH, LONGEST = 256, 1 << 18
+#: Frequencies on either side that the level is taken from, and those next to a line that are not.
+WIDE, NEXT = 40, 2
+
+
+@dataclass(frozen=True)
+class Line:
+    """The strongest line: frequency (Hz; per sample without time) and p-value over all of them."""
+
+    frequency: float
+    unit: str
+    p_value: float
+
+
+def strongest_line(runs: Sequence[Run], residuals: Sequence[Array]) -> Line | None:
+    """The most significant line of all runs; None where none is a series without gaps."""
+    found = [
+        line for run, r in zip(runs, residuals, strict=True) if (line := _line(run, r)) is not None
+    ]
+    if not found:
+        return None
+    best = min(found, key=lambda line: line.p_value)
+    return Line(best.frequency, best.unit, min(1.0, best.p_value * len(found)))
+
+
+def _line(run: Run, r: Array) -> Line | None:
+    if run.spread or len(r) < ENOUGH or run.time is None:
+        return None
+    step = float(np.median(np.diff(run.time)))
+    if not step > 0:
+        return None
+    place = np.round((run.time - run.time[0]) / step).astype(int)
+    length = int(place[-1]) + 1
+    if np.any(np.diff(place) < 1) or length > 1.1 * len(r) or length > LONGEST:
+        return None
+    even = np.zeros((length, r.shape[1]))
+    even[place] = r
+    power = np.sum(np.abs(np.fft.rfft(even, axis=0)) ** 2, axis=1)[1:-1]
+    p, k = _most_significant(power, r.shape[1])
+    return Line((k + 1) / (length * step), "Hz", p)
+
+
+def _most_significant(power: Array, axes: int) -> tuple[float, int]:
+    """Bonferroni's p-value and the place of the line that stands out most.
+
+    The level is the mean of as many frequencies on the left as on the right: slopes cancel.
+    """
+    from scipy.special import fdtrc
+
+    n = len(power)
+    k = np.arange(MIDDLE, n - MIDDLE)
+    if not len(k):
+        return 1.0, 0
+    width = np.minimum(WIDE, np.minimum(k, n - 1 - k))
+    total = np.concatenate([[0.0], np.cumsum(power)])
+    around = total[k + width + 1] - total[k - width]
+    inner = total[k + NEXT + 1] - total[k - NEXT]
+    count = 2 * (width - NEXT)
+    level = (around - inner) / count
+    p = fdtrc(2 * axes, 2 * axes * count, power[k] / level)
+    best = int(np.argmin(p))
+    return min(1.0, float(p[best]) * len(k)), int(k[best])

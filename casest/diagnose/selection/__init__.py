@@ -1,0 +1,1 @@
+"""Refits judged: which candidate stays. Imports candidates, noise, levels."""

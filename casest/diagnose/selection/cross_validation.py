@@ -1,0 +1,164 @@
+"""Error on data that the fit never saw: every block predicted by a fit to the others."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from casest.data.run import Run
+from casest.data.splits import interleaved_blocks
+from casest.declaration.model import Model
+from casest.declaration.shapes import Array
+from casest.diagnose.levels import STRETCHES
+from casest.errors import DataError
+from casest.estimate.calibrate import Estimate
+from casest.estimate.certificate import PRACTICALLY_NULL
+from casest.leastsquares.identifiability import identify
+from casest.leastsquares.problem import Problem
+from casest.leastsquares.weights import weighted
+from casest.solve.trust_region import trust_region
+
+#: Fits of a cross-fit: each sees all blocks but one in FOLDS.
+FOLDS = 4
+#: Variance of what a fit to the rest foretells of a part, in those of the noise, at most.
+UNCERTAIN = 10.0
+#: A residual counts as at most this many robust standard deviations.
+FAR = 4.0
+#: Iterations of a fit that begins at the fit to everything, and gain (in σ²) that ends it.
+ITERATIONS, ENOUGH = 30, 1e-3
+
+
+@dataclass(frozen=True)
+class Folds:
+    """The fold of every sample of every run, and the first sample of each batch."""
+
+    of: tuple[NDArray[np.int_], ...]
+    batches: tuple[NDArray[np.int_], ...]
+    count: int
+
+
+def folded(runs: Sequence[Run], correlated_over: float = 1.0, seed: int = 0) -> Folds:
+    """Folds of interleaved stretches, poses or bursts; batches are those stretches.
+
+    Stretches are at least ten correlation times long. Raises DataError where there is nothing left
+    to hold out.
+    """
+    of, batches = [], []
+    for run in runs:
+        stretches = STRETCHES
+        if correlated_over > 1:
+            stretches = int(np.clip(len(run) / (10 * correlated_over), 2 * FOLDS, STRETCHES))
+        of.append(interleaved_blocks(run, stretches, FOLDS, seed))
+        change = np.flatnonzero(_changes(run, of[-1]))
+        batches.append(change)
+    return Folds(tuple(of), tuple(batches), FOLDS)
+
+
+def _changes(run: Run, fold: NDArray[np.int_]) -> NDArray[np.bool_]:
+    """Where a new batch begins: another fold, or another block."""
+    changed = np.ones(len(run), dtype=bool)
+    changed[1:] = (fold[1:] != fold[:-1]) | (run.block[1:] != run.block[:-1])
+    if (run.count > 1).any():
+        changed[:] = True
+    return changed
+
+
+def cross_fitted(
+    model: Model, runs: Sequence[Run], values: Mapping[str, Array], folds: Folds
+) -> tuple[Array, ...]:
+    """Residuals (N, m) of each run, each from a fit that did not see its block.
+
+    `values` are those of the fit to everything: where each fit begins. Effects on the noise count
+    through the weights of that fit.
+    """
+    whole = Problem(model, tuple(runs))
+    found = tuple(np.full((len(run), len(model.axes)), np.nan) for run in runs)
+    for k in range(folds.count):
+        seen = tuple(run.take(fold != k) for run, fold in zip(runs, folds.of, strict=True))
+        if any(len(run) == 0 for run in seen):
+            raise DataError("a run is too short to hold any of it out; record a longer one")
+        problem = weighted(Problem(model, seen), values)
+        fit = trust_region(
+            problem,
+            problem.point(values),
+            max_iterations=ITERATIONS,
+            tolerance=ENOUGH / max(problem.residual_count, 1),
+        )
+        point = whole.point(problem.values(fit.point))
+        for r, fold in enumerate(folds.of):
+            hidden = Problem(
+                model, tuple(run.take(f == k) for run, f in zip(runs, folds.of, strict=True))
+            )
+            found[r][fold == k] = hidden.residuals(point)[r]
+    return found
+
+
+def gain(
+    before: Sequence[Array], after: Sequence[Array], folds: Folds, sigma: float
+) -> tuple[float, float]:
+    """How much the squares fall from one model's residuals to another's, in σ²; standard error.
+
+    Were the second model right, with residuals r and predictions that differ by δ, the squares
+    would fall by Σ(δ² + 2rδ): the error is that of 2Σrδ, from batch to batch and not below that
+    of white noise. So what is gained in a few batches only is a gain as well. Far residuals count
+    as FAR standard deviations.
+    """
+    total, wide, white = 0.0, 0.0, 0.0
+    for b, a, first in zip(before, after, folds.batches, strict=True):
+        b, a = (np.clip(r, -FAR * sigma, FAR * sigma) for r in (b, a))
+        moved = b - a
+        total += float(np.sum(b**2 - a**2))
+        wide += float(np.sum(np.add.reduceat(np.sum(2 * a * moved, axis=1), first) ** 2))
+        white += float(np.sum(moved**2))
+    return total / sigma**2, float(np.sqrt(max(wide / sigma**4, 4 * white / sigma**2)))
+
+
+def rms(residuals: Sequence[Array]) -> float:
+    """Root mean square of all residuals."""
+    count = sum(r.size for r in residuals)
+    return float(np.sqrt(sum(float(np.sum(r**2)) for r in residuals) / count))
+
+
+def check_folds(before: Estimate, runs: Sequence[Run], folds: Folds) -> None:
+    """Raise DataError where the rest of a record does not determine what a part is held out for.
+
+    What a fit to the rest leaves uncertain of the part, in variances of the noise, is the trace
+    of JᵀJ of the part times the inverse of that of the rest.
+    """
+    for k in range(folds.count):
+        parts = [
+            tuple(run.take((fold == k) == held) for run, fold in zip(runs, folds.of, strict=True))
+            for held in (False, True)
+        ]
+        if any(len(run) == 0 for run in parts[0]) or not sum(map(len, parts[1])):
+            continue  # the fits themselves say so
+        rest, part = (Problem(before.model, p) for p in parts)
+        words = "there are too few equations"
+        if rest.residual_count >= rest.unknowns:
+            words = undetermined(rest, before.values)
+        if not words:
+            point = rest.point(before.values)
+            own = part.normal(part.point(before.values)).matrix
+            spread = float(np.trace(np.linalg.solve(rest.normal(point).matrix, own)))
+            if spread < UNCERTAIN * part.residual_count:
+                continue
+            deviations = np.sqrt(spread / part.residual_count)
+            words = f"the part is foretold to {deviations:.2g} standard deviations of the noise"
+        raise DataError(
+            f"without one part in {folds.count} of the record {words}; record more orientations, "
+            "or each of them twice"
+        )
+
+
+def undetermined(problem: Problem, values: Mapping[str, Array]) -> str:
+    """What the data do not determine, in words: cheaper than to ask for a certificate."""
+    point = problem.point(values)
+    found = identify(problem, point, problem.factor(point)[0])
+    if found.rank < found.unknowns:
+        return f"not determined: {found.unobservable[0]}" if found.unobservable else "rank"
+    if found.singular_values[-1] < PRACTICALLY_NULL * found.singular_values[0]:
+        return f"practically not determined: {found.weakest}"
+    return ""

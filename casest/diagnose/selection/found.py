@@ -1,0 +1,49 @@
+"""What was found so far: an effect with its evidence, or causes that explain alike."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from casest.declaration.shapes import Array
+from casest.diagnose.candidates.candidates import Candidate
+from casest.diagnose.candidates.score_test import Score
+
+#: What is refused where nothing can be held out.
+HELD_OUT_DATA = "held-out data"
+#: Effects that are a property of the noise, and leave a model adequate.
+OF_NOISE = frozenset({"outliers", "bias_wander"})
+
+
+@dataclass(frozen=True)
+class Found:
+    """An effect that was added, with the evidence: a score, but for one on the noise.
+
+    `rivals`: what the data do not tell apart from it, nearest first, each with how far the declared
+    parameters would move were it the cause instead.
+    """
+
+    candidate: Candidate
+    score: Score | None
+    p_value: float
+    gain: float
+    names: tuple[str, ...] = ()
+    rivals: Mapping[str, Mapping[str, Array]] = field(default_factory=dict)
+
+    @property
+    def indistinguishable_from(self) -> tuple[str, ...]:
+        """Names of the rivals."""
+        return tuple(self.rivals)
+
+
+@dataclass(frozen=True)
+class Undecided:
+    """Something is missing, and these causes explain it alike; what is added hangs on which it is.
+
+    `share` of the held-out mean square that any of them would take away; `moves`: how far each
+    would move the declared parameters, where that is known.
+    """
+
+    names: tuple[str, ...]
+    share: float
+    moves: Mapping[str, Mapping[str, Array]] = field(default_factory=dict)

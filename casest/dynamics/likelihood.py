@@ -1,0 +1,268 @@
+"""Noise intensities that a record itself asks for: maximum likelihood of the innovations.
+
+Noise of inputs drives the states that they reach; other driven states keep an intensity of their
+own. With published intensities that do not match the sensors every innovation would look wrong,
+and nothing could be traced.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from casest.data.run import Run
+from casest.declaration.shapes import Array
+from casest.declaration.tracing import flat
+from casest.dynamics.declare import Dynamics
+from casest.dynamics.stepping import Pattern, entries, packed, reach, symmetric, taken
+from casest.dynamics.transition import (
+    Linearised,
+    linearised,
+    lost,
+    process_along,
+    process_noise,
+    steps_to,
+)
+from casest.engine import Recursion
+
+Mask = NDArray[np.bool_]
+
+#: Sum of the squared coefficients of a fourth difference.
+_FOURTH = 70.0
+#: An intensity is looked for within so many powers of e around where it begins.
+RANGE = 14.0
+#: Scoring: rounds, difference and largest step of a logarithm, gain in log-likelihood that ends it.
+ROUNDS, STEP, LARGEST, ENOUGH = 30, 1e-3, 5.0, 0.1
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A record made ready for many likelihoods: all that does not depend on the intensities.
+
+    `system`: the model along the record, with noise of the intensities that it has; `units`: per
+    intensity of a state or an input, which entries of Q it reaches; `readings`: per output signal,
+    its rows; `numbers` (N, …): what each step is given.
+    """
+
+    model: Dynamics
+    system: Linearised
+    present: Mask
+    period: Array
+    units: Mapping[str, Pattern]
+    readings: Mapping[str, slice]
+    numbers: Array
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the intensities: inputs and states, then outputs."""
+        return (*self.units, *self.readings)
+
+
+def reached(model: Dynamics) -> tuple[list[str], list[str]]:
+    """Inputs whose noise drives states, and driven states that no such noise reaches."""
+    t = model.traced
+    inputs, touched = [], np.zeros(model.size, dtype=bool)
+    for s in model.signals:
+        slope = ca.jacobian(t.f, flat(t.symbols[s.name]))
+        if slope.nnz() and s.name not in t.measured:
+            inputs.append(s.name)
+            touched[list(set(slope.sparsity().get_triplet()[0]))] = True
+    where = model.slices()
+    own = [s.name for s in model.states if s.intensity > 0 and not touched[where[s.name]].any()]
+    return inputs, own
+
+
+def prepared(model: Dynamics, run: Run, along: Array) -> Prepared:
+    """Along states (N, n), where the model or its noise depends on them."""
+    inputs, own = reached(model)
+    silent = model.driven(**{s.name: 0.0 for s in model.states})
+    system = linearised(model, run, along)
+    Phi, forced = system.moved
+    present = np.isfinite(system.y)
+    t, count = model.traced, len(present)
+    alone = [silent.sensing(**{name: 1.0}) for name in inputs]
+    alone += [silent.driven(**{name: 1.0}) for name in own]
+    units = {name: _spread(one) for name, one in zip((*inputs, *own), alone, strict=True)}
+    first = np.eye(model.size)[None]
+    parts = [_picked(np.concatenate([first, Phi]), reach(t.A)), _after(forced, count)]
+    for one, pattern in zip(alone, units.values(), strict=True):
+        Q = process_noise(system, process_along(one, run, along))
+        parts.append(_after(_picked(Q, pattern), count))
+    parts.append(_after(lost(model, system.steps), count))
+    parts.append(_picked(np.where(present[:, :, None], system.C, 0.0), entries(t.C)))
+    parts.append(np.where(present, system.y - system.d, 0.0))
+    period = steps_to(system)
+    readings, place = {}, 0
+    for name, o in zip(t.measured, t.outputs, strict=True):
+        readings[name] = slice(place, place + o.predicted.numel())
+        place += o.predicted.numel()
+    numbers = np.concatenate([*parts, period[:, None]], axis=1)
+    return Prepared(model, system, present, period, units, readings, numbers)
+
+
+def _picked(matrices: Array, pattern: Pattern) -> Array:
+    """Entries of every matrix, (N, k)."""
+    rows, columns = np.array(pattern, int).reshape(-1, 2).T
+    return matrices[:, rows, columns]
+
+
+def _after(parts: Array, count: int) -> Array:
+    """Of a step (N − 1, k), at the sample that it leads to; the first has none."""
+    found = np.zeros((count, parts.shape[1]))
+    found[1:] = parts
+    return found
+
+
+def _spread(model: Dynamics) -> Pattern:
+    """Which entries of Q, on and above the diagonal, the noise of a model can reach in a step."""
+    there = model.process != 0
+    if model.input_noise is not None:
+        there[tuple(np.array(entries(model.input_noise)).T)] = True
+    moved = np.zeros_like(there)
+    moved[tuple(np.array(reach(model.traced.A)).T)] = True
+    found = np.triu(moved @ there @ moved.T)
+    return tuple((int(i), int(j)) for i, j in np.argwhere(found))
+
+
+def whitened(ready: Prepared, intensities: Mapping[str, float]) -> tuple[Array, Array]:
+    """Innovations component by component (N, m), each given those before it, and variances."""
+    t = ready.model.traced
+    rows = tuple((r.start, r.stop) for r in ready.readings.values())
+    patterns = reach(t.A), tuple(ready.units.values()), entries(t.C)
+    step = _likelihood_step(ready.model.size, rows, *patterns)
+    given = np.array([intensities[name] for name in ready.names])
+    state = np.concatenate([ready.model.start, ready.model.start_covariance.T.ravel(), given])
+    _, e, s = step(state, ready.numbers, keep=False)
+    return e, s
+
+
+def likelihood(ready: Prepared, intensities: Mapping[str, float]) -> float:
+    """Log-likelihood of the readings."""
+    return _log_density(ready, *whitened(ready, intensities))
+
+
+def _log_density(ready: Prepared, e: Array, s: Array) -> float:
+    return float(-0.5 * np.sum((np.log(2 * np.pi * s) + e**2 / s)[ready.present]))
+
+
+def matched(
+    ready: Prepared, run: Run, start: Mapping[str, float] | None = None
+) -> tuple[dict[str, float], float]:
+    """The most likely intensities, and their log-likelihood: Fisher scoring of their logarithms."""
+    names, guess = ready.names, first_guess(ready, run)
+    middle = np.log([guess[name] for name in names])
+    starts = [middle] + ([np.log([{**guess, **start}[n] for n in names])] if start else [])
+
+    def at(where: Array) -> tuple[Array, Array, float]:
+        e, s = whitened(ready, dict(zip(names, np.exp(where).tolist(), strict=True)))
+        return e, s, _log_density(ready, e, s)
+
+    logs, found = max(((x, at(x)) for x in starts), key=lambda pair: pair[1][2])
+    damping = 1e-3
+    for _ in range(ROUNDS):
+        moved = [at(logs + STEP * unit) for unit in np.eye(len(names))]
+        gradient, information = _scoring(ready.present, found, moved)
+        while damping < 1e9:
+            curved = information + damping * np.diag(np.diag(information) + 1.0)
+            step = np.clip(np.linalg.solve(curved, gradient), -LARGEST, LARGEST)
+            tried = np.clip(logs + step, middle - RANGE, middle + RANGE)
+            promised = gradient @ (tried - logs)
+            better = at(tried) if promised > ENOUGH else found
+            if better[2] > found[2] or promised <= ENOUGH:
+                break
+            damping = max(10 * damping, 0.1)
+        gained, damping = better[2] - found[2], damping / 10
+        if gained > 0:
+            logs, found = tried, better
+        if gained < ENOUGH:
+            break
+    return dict(zip(names, np.exp(logs).tolist(), strict=True)), found[2]
+
+
+def _scoring(
+    present: Mask, found: tuple[Array, Array, float], moved: list[tuple[Array, Array, float]]
+) -> tuple[Array, Array]:
+    """Gradient and information, by differences of innovations e and their variances s.
+
+    Of two logarithms: Σ(∂e·∂e/s + ½·∂s·∂s/s²).
+    """
+    e, s = found[0][present], found[1][present]
+    of_e = np.array([(m[0][present] - e) / STEP / np.sqrt(s) for m in moved])
+    of_s = np.array([(m[1][present] - s) / STEP / s for m in moved])
+    gradient = of_s @ (e**2 / s - 1) / 2 - of_e @ (e / np.sqrt(s))
+    return gradient, of_e @ of_e.T + 0.5 * of_s @ of_s.T
+
+
+def first_guess(ready: Prepared, run: Run) -> dict[str, float]:
+    """Of a signal: its fourth differences, where little but noise is left. Of a state: little."""
+    model, guess = ready.model, {}
+    stds = {s.name: s.std for s in model.states}
+    intensities = {s.name: s.intensity for s in model.states}
+    duration = float(np.sum(ready.period))
+    for name in ready.names:
+        if name in run.signals:
+            values = run.signals[name]
+            fourth = np.diff(values[np.isfinite(values).all(axis=1)], 4, axis=0)
+            variance = float(np.median(fourth**2)) / 0.4549 / _FOURTH if len(fourth) else 0.0
+            scale = 1e-12 * float(np.nanmean(values**2)) or 1e-12
+            guess[name] = max(variance, scale) * float(np.median(ready.period))
+        elif name.endswith("_colour"):
+            guess[name] = intensities[name]
+        else:
+            guess[name] = 1e-6 * stds[name] ** 2 / duration
+    return guess
+
+
+def applied(model: Dynamics, intensities: Mapping[str, float]) -> Dynamics:
+    """The model with these intensities, its states driven by nothing else."""
+    states = {s.name: intensities.get(s.name, 0.0) for s in model.states}
+    signals = {s.name: intensities[s.name] for s in model.signals if s.name in intensities}
+    return model.driven(**states).sensing(**signals)
+
+
+@lru_cache(maxsize=16)
+def _likelihood_step(
+    n: int,
+    rows: tuple[tuple[int, int], ...],
+    of_Phi: Pattern,
+    units: tuple[Pattern, ...],
+    of_C: Pattern,
+) -> Recursion:
+    """(x, P and intensities; numbers of one sample) -> (the same later; innovations; variances)."""
+    m = rows[-1][1]
+    x, P, q = ca.SX.sym("x", n), ca.SX.sym("P", n, n), ca.SX.sym("q", len(units) + len(rows))
+    moved, Phi = _sparse("Phi", (n, n), of_Phi)
+    u, y, period = ca.SX.sym("u", n), ca.SX.sym("y", m), ca.SX.sym("period")
+    own = [_sparse(f"Q{k}", (n, n), pattern) for k, pattern in enumerate(units)]
+    seen, C = _sparse("C", (m, n), of_C)
+    gap = ca.SX.sym("gap", n)
+    Q = ca.diag(gap)
+    for k, (_, unit) in enumerate(own):
+        Q += q[k] * unit
+    R = ca.vertcat(*[ca.repmat(q[len(units) + k] / period, last - first)
+                     for k, (first, last) in enumerate(rows)])  # fmt: skip
+    later_x, later_P = Phi @ x + u, symmetric(ca.triu(Phi @ (P + ca.diag(gap)) @ Phi.T) + Q)
+    e, s = [], []
+    for i in range(m):
+        c = C[i, :].T
+        e.append(y[i] - ca.dot(c, later_x))
+        s.append(ca.dot(c, later_P @ c) + R[i])
+        later_x, later_P = taken(later_x, later_P, c, e[-1], s[-1])
+    numbers = ca.vertcat(moved, u, *[k for k, _ in own], gap, seen, y, period)
+    outputs = [ca.vertcat(packed(later_x, later_P), q), ca.vertcat(*e), ca.vertcat(*s)]
+    state = ca.vertcat(packed(x, P), q)
+    return Recursion(ca.Function("step", [state, numbers], outputs, {"cse": True}))
+
+
+def _sparse(name: str, shape: tuple[int, int], pattern: Pattern) -> tuple[Any, Any]:
+    """Symbols for the entries of a pattern, and the matrix of them."""
+    symbols, matrix = ca.SX.sym(name, len(pattern)), ca.SX(*shape)
+    for k, (i, j) in enumerate(pattern):
+        matrix[i, j] = symbols[k]
+    return symbols, matrix

@@ -1,0 +1,58 @@
+"""An effect on some of its axes only: the others are held at null and cost nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import casadi as ca
+
+from casest.declaration.effect import Effect
+from casest.declaration.model import Model
+from casest.declaration.shapes import Shape
+from casest.declaration.symbols import Parameter, Undecided, make_parameter
+
+
+def restricted(effect: Effect, kept: Sequence[int], model: Model) -> Effect:
+    """The effect with one scalar unknown per kept axis, `k_x`, in place of every vector `k`."""
+    size = model.quantities[effect.on].declared.numel() if effect.on in model.quantities else 0
+    vectors, declarations = {}, []
+    for name, declared in effect.declarations:
+        parameter = declared.decided((size,)) if isinstance(declared, Undecided) else declared
+        if not isinstance(parameter, Parameter) or len(parameter.shape.dims) != 1:
+            declarations.append((name, declared))
+            continue
+        names = [f"{name}_{axis_name(i, parameter.shape.size)}" for i in kept]
+        vectors[name] = (parameter.shape.size, dict(zip(kept, names, strict=True)))
+        declarations += [
+            (n, make_parameter(Shape("array", ()), parameter.units[i], None, None, parameter.scope))
+            for i, n in zip(kept, names, strict=True)
+        ]
+
+    def function(*args: Any, **unknowns: Any) -> Any:
+        for name, (length, places) in vectors.items():
+            vector = ca.SX.zeros(length)
+            vector[:] = effect.null_of(name)
+            for i, own in places.items():
+                vector[i] = unknowns.pop(own)
+            unknowns[name] = vector
+        return effect.function(*args, **unknowns)
+
+    function.__wrapped__ = effect.function  # type: ignore[attr-defined]
+    null = dict(effect.null)
+    more = {own: null.get(n, 0.0) for n, (_, p) in vectors.items() for own in p.values()}
+    typical = dict(effect.typical)
+    sizes = {own: typical[n] for n, (_, p) in vectors.items() if n in typical for own in p.values()}
+    return replace(
+        effect,
+        function=function,
+        declarations=tuple(declarations),
+        null=tuple(sorted({**null, **more}.items())),
+        typical=tuple({**typical, **sizes}.items()),
+    )
+
+
+def axis_name(i: int, size: int) -> str:
+    """As in the names of the restricted unknowns."""
+    return "xyz"[i] if size == 3 else str(i)

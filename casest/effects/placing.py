@@ -1,0 +1,68 @@
+"""Where an effect acts on these data: its quantity, columns as signals, numbers it is told."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from casest.data.run import Run
+from casest.declaration.effect import Effect
+from casest.declaration.model import Model
+from casest.declaration.shapes import Array
+from casest.errors import CasestError
+
+
+def prepared(model: Model, runs: Sequence[Run]) -> tuple[Run, ...]:
+    """Where an effect acts on these data: its quantity, columns as signals, numbers it is told."""
+    names = set.intersection(*[set(_usable(run)) for run in runs]) if runs else set()
+    found = []
+    for run in runs:
+        more = {name: values for name, values in _usable(run).items() if name in names}
+        units = {name: run.column_units.get(name, "s" if name == "t" else None) for name in more}
+        found.append(replace(run, signals={**more, **run.signals}, units={**units, **run.units}))
+    return tuple(found)
+
+
+def _usable(run: Run) -> dict[str, Array]:
+    """Where an effect acts on these data: its quantity, columns as signals, numbers it is told."""
+    found = {} if run.time is None else {"t": np.asarray(run.time, float)[:, None]}
+    for name, values in run.columns.items():
+        if np.issubdtype(values.dtype, np.number):
+            found[name] = np.asarray(values, float)[:, None]
+    return found
+
+
+def placed_in(effect: Effect, model: Model) -> Effect:
+    """Where an effect acts on these data: its quantity, columns as signals, numbers it is told."""
+    corrected = model.traced.corrected
+    predicted = next(
+        (q.name for q in model.quantities.values() if model.traced.residual.predicted is q.value),
+        None,
+    )
+    if effect.on == "input":
+        place = corrected
+    elif effect.on == "output":
+        place = predicted or (corrected if model.implicit else None)
+    else:
+        place = effect.on
+    if place is None:
+        word = "declares no corrected quantity" if effect.on == "input" else "names no prediction"
+        raise CasestError(f"model {model.name} {word}")
+    return replace(effect, on=place)
+
+
+def with_numbers(
+    effect: Effect, columns: tuple[tuple[str, str], ...], runs: Sequence[Run]
+) -> Effect:
+    """Where an effect acts on these data: its quantity, columns as signals, numbers it is told."""
+    names = {n for n, _ in effect.declarations}
+    values: dict[str, float] = {}
+    if "at" in names and columns:
+        x = np.concatenate([run.signals[columns[0][1]][:, 0] for run in runs])
+        values["at"] = float(f"{np.mean(x):.6g}")
+    if "duration" in names:
+        ends = [float(np.ptp(run.signals["t"])) for run in runs if "t" in run.signals]
+        values["duration"] = float(f"{max(ends, default=1.0) or 1.0:.6g}")
+    return effect.holding(**values) if values else effect

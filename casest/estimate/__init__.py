@@ -1,0 +1,1 @@
+"""Fit, prove, say how sure, and remark. Imports solve, leastsquares and below."""

@@ -1,0 +1,434 @@
+"""Fit a model to runs, prove the answer, and say how sure it is."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from casest.data.run import Run
+from casest.declaration.model import Model
+from casest.declaration.shapes import Array
+from casest.engine.threads import one_thread
+from casest.errors import DataError, NotTrusted, UsageError
+from casest.estimate.certificate import Certificate, certify
+from casest.estimate.correlation import ENOUGH, TABLE, correlation_time
+from casest.estimate.covariance import inverse_normal, sandwich
+from casest.estimate.profile_likelihood import half_width
+from casest.estimate.remarks import NOTABLE_BIAS, notes
+from casest.leastsquares.identifiability import Identifiability, Weak, identify, weak_directions
+from casest.leastsquares.problem import Point, Problem
+from casest.leastsquares.sums import repeat_noise, second_order_bias
+from casest.leastsquares.weights import has_noise_effects, variance_factor
+from casest.solve.interrupt import stopped
+from casest.solve.outcome import Outcome
+from casest.solve.strategy import SOLVERS, best_of, solve, valleys
+
+#: From this many degrees of freedom on the residual alone says how large the noise is.
+ENOUGH_FREEDOM = 10
+#: Neighbouring rows of a table over which residuals are alike, from which on the fit is poor: an
+#: autoregression of 0.8. Of NIST's 27 problems one has more at its solution, and one valley.
+ALIKE = 9.0
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Standard deviation of one residual, with where it comes from.
+
+    `sigma` is what the covariance uses; `residual` the root of RSS over degrees of freedom;
+    `repeats` the scatter that rest intervals show by themselves (None without any).
+    """
+
+    sigma: float
+    residual: float
+    repeats: float | None
+    degrees_of_freedom: int
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Parameters by name with covariance, certificate, residuals.
+
+    `values` and `std` have the parameters' shapes (a leading run axis for per-run ones if there
+    are several runs); `robust` is the standard deviation from the sandwich form, which `std` equals
+    where residuals are correlated over more than one sample. Both are taken at the least-squares
+    `optimum`, where `point` is not it; `shift` (n, n) is what second-order noise adds, a
+    bias of up to `bias` standard deviations.
+    `covariance` (n, n) is of the unknowns `names`. Where the data do not determine a value its std
+    is NaN.
+    """
+
+    problem: Problem
+    point: Point
+    values: Mapping[str, Array]
+    std: Mapping[str, Array]
+    covariance: Array
+    noise: Noise
+    rmse: float
+    certificate: Certificate
+    identifiability: Identifiability
+    weak: tuple[Weak, ...]
+    outcomes: tuple[Outcome, ...]
+    seconds: float
+    correlated_over: float = 1.0
+    bias: float = 0.0
+    shift: Array | float = 0.0
+    optimum: Point | None = None
+    extra: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def model(self) -> Model:
+        """The model that was fitted."""
+        return self.problem.model
+
+    @cached_property
+    def robust(self) -> Mapping[str, Array]:
+        """Standard deviations from the sandwich form, shaped like `std`."""
+        if self.identifiability.rank == 0:
+            return self.std
+        at = self.optimum or self.point
+        R = self.problem.factor(at)[0]
+        covariance = sandwich(self.problem, at, R, self.correlated_over) + self.shift
+        unknown = self.identifiability.touched
+        covariance[unknown, :] = covariance[:, unknown] = np.nan
+        return self.problem.spread(at, covariance)
+
+    @cached_property
+    def notes(self) -> tuple[str, ...]:
+        """What an engineer should know beside the numbers, a sentence each; looked for when asked.
+
+        (The test of a wheel's speed law takes as long as its fit.)
+        """
+        if not self.outcomes:
+            return ()
+        problem, at = self.problem, self.optimum or self.point
+        dof = problem.residual_count - self.identifiability.rank
+        with np.errstate(all="ignore"):
+            found = notes(problem, at, dof, self.correlated_over, self.bias)
+            return (*found, *_of_tables(problem, at))
+
+    @cached_property
+    def interval_reach(self) -> tuple[Mapping[str, Array], Mapping[str, Array]]:
+        """How far the 95 % interval of every value reaches below and above it, shaped like `std`.
+
+        Student's t times `std`, or the profile of the cost where that is no parabola (widened as
+        `std` is, where residuals are correlated).
+        """
+        profile, at = self.certificate.profile, self.optimum or self.point
+        if profile is None:
+            half = half_width(int(self.noise.degrees_of_freedom / self.correlated_over))
+            linear = {name: half * std for name, std in self.std.items()}
+            return linear, linear
+        plain = self.noise.sigma**2 * inverse_normal(self.problem.factor(at)[0])
+        wider = np.sqrt(np.diag(self.covariance) / np.diag(plain))
+        below, above = ((wider * profile[:, k]) ** 2 for k in (0, 1))
+        return self.problem.spread(at, np.diag(below)), self.problem.spread(at, np.diag(above))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the unknowns, in the order of the covariance."""
+        return self.problem.names
+
+
+def calibrate(
+    model: Model,
+    runs: Sequence[Run],
+    *,
+    start: Mapping[str, Any] | None = None,
+    solver: str = "ipopt",
+    seed: int = 0,
+) -> Estimate:
+    """Fit the model; return an estimate whose certificate is trusted.
+
+    `start` overrides the automatic start values; `solver` is one of SOLVERS or an estimator of
+    the model's own (`closed-form`), which is judged against the least-squares optimum. Raises
+    NotTrusted, with the refused estimate as its attribute `estimate`, where no answer deserves
+    belief; DataError where there are fewer residuals than unknowns.
+    """
+    found = attempt(model, runs, start=start, solver=solver, seed=seed)
+    if not found.certificate.trusted:
+        error = NotTrusted("no trustworthy estimate: " + "; ".join(found.certificate.reasons))
+        error.estimate = found
+        raise error
+    return found
+
+
+def attempt(
+    model: Model,
+    runs: Sequence[Run],
+    *,
+    start: Mapping[str, Any] | None = None,
+    solver: str = "ipopt",
+    seed: int = 0,
+    intervals: bool = True,
+) -> Estimate:
+    """The same as `calibrate`, but a refused estimate is returned instead of raised.
+
+    Without `intervals`, those that only the likelihood can give are left out: each takes fits.
+    """
+    # What is not finite is found and named, not warned about.
+    with np.errstate(all="ignore"), one_thread():
+        return _attempt(Problem(model, tuple(runs)), start, solver, seed, intervals)
+
+
+def _attempt(
+    problem: Problem, start: Mapping[str, Any] | None, solver: str, seed: int, intervals: bool
+) -> Estimate:
+    began, model = time.perf_counter(), problem.model
+    _enough(problem)
+    own = dict(model.estimators)
+    if solver not in SOLVERS and solver not in own:
+        known = ", ".join([*SOLVERS, *own])
+        raise UsageError(f"unknown solver {solver!r} for {model.name}; it has {known}")
+    try:
+        first = problem.start() if start is None else problem.point(_merged(problem, start))
+    except NotTrusted as error:
+        return _refused(problem, problem.point({}), str(error), began)
+    nowhere = _not_finite(problem, first)
+    if nowhere:
+        return _refused(problem, first, nowhere, began)
+    problem, outcomes = solve(
+        problem,
+        first,
+        solver="ipopt" if solver in own else solver,
+        seed=seed,
+        automatic=start is None,
+    )
+    found = _estimate(problem, best_of(outcomes), outcomes, began, intervals)
+    if start is None and model.starter is None and found.certificate.trusted:
+        found = _looked_at_for_a_better_one(found)
+    if stopped():
+        reason = "interrupted: this is the best point so far, not an optimum"
+        refused = replace(found.certificate, trusted=False, reasons=(reason,))
+        return replace(found, certificate=refused)
+    return _by_estimator(found, own[solver], solver) if solver in own else found
+
+
+def _enough(problem: Problem) -> None:
+    if not problem.runs:
+        raise DataError("there are no runs to fit; give at least one")
+    if problem.residual_count < problem.unknowns:
+        what = "rest intervals" if problem.runs[0].spread else "rows"
+        raise DataError(
+            f"{problem.runs[0].file}: {sum(map(len, problem.runs))} {what} give "
+            f"{problem.residual_count} equations for the {problem.unknowns} unknowns of "
+            f"{problem.model.name}; record more, or fix some with --fix name=value"
+        )
+    if problem.unknowns == 0:
+        raise UsageError(
+            f"model {problem.model.name} has nothing left to estimate; --free something"
+        )
+
+
+def _not_finite(problem: Problem, start: Point) -> str:
+    """Where the residual or its derivative is not finite at the start, in words; else empty."""
+    normal = problem.normal(start)
+    if np.isfinite(normal.cost) and np.all(np.isfinite(normal.gradient)):
+        return ""
+    for run, residual in zip(problem.runs, problem.residuals(start), strict=True):
+        bad = np.flatnonzero(~np.isfinite(residual).all(axis=1))
+        if bad.size:
+            return (
+                f"the residual is not finite at the start values in {bad.size} of {len(run)} rows, "
+                f"first in {run.file or run.name} row {int(run.rows[bad[0]])}; give --start"
+            )
+    return "a derivative of the residual is not finite at the start values; give --start"
+
+
+def _refused(problem: Problem, point: Point, reason: str, began: float) -> Estimate:
+    """An estimate that says nothing but why there is none."""
+    nothing = np.full((problem.unknowns, problem.unknowns), np.nan)
+    nan = float("nan")
+    everything = np.ones(problem.unknowns, dtype=bool)
+    return Estimate(
+        problem,
+        point,
+        problem.values(point),
+        problem.spread(point, nothing),
+        nothing,
+        Noise(nan, nan, None, problem.residual_count - problem.unknowns),
+        nan,
+        Certificate(False, (reason,), nan, nan, nan, 0, 0, (nan, nan), ()),
+        Identifiability(0, problem.unknowns, nothing[0], nothing, (), everything, ""),
+        (),
+        (),
+        time.perf_counter() - began,
+    )
+
+
+def _merged(problem: Problem, start: Mapping[str, Any]) -> dict[str, Any]:
+    automatic = problem.values(problem.start()) if problem.model.starter else {}
+    return {**automatic, **start}
+
+
+def _estimate(
+    problem: Problem,
+    best: Outcome,
+    outcomes: Sequence[Outcome],
+    began: float,
+    intervals: bool = True,
+) -> Estimate:
+    found, best = best, _canonical(problem, best)
+    outcomes = [
+        best if o is found else o if _beside(o, best) else _canonical(problem, o) for o in outcomes
+    ]
+    point = best.point
+    factor = problem.factor(point)
+    R, _, rest = factor
+    identified = identify(problem, point, R)
+    dof = problem.residual_count - identified.rank
+    noise = _noise(problem, point, float(np.sqrt(2 * best.cost)), dof)
+    correlated = correlation_time(problem, point)
+    covariance = _covariance(problem, point, R, noise.sigma, correlated)
+    bias = second_order_bias(problem, point, noise.sigma, inverse_normal(R))
+    relative = float(np.max(np.abs(bias) / np.sqrt(np.diag(covariance)), initial=0.0))
+    shift = np.outer(bias, bias) if relative > NOTABLE_BIAS else 0.0
+    covariance = covariance + shift
+    factored = (R, factor[1], rest)
+    certificate = certify(
+        problem, best, outcomes, identified, factored, noise.sigma, intervals=intervals
+    )
+    unknown = identified.touched
+    covariance[unknown, :] = covariance[:, unknown] = np.nan
+    return Estimate(
+        problem,
+        point,
+        problem.values(point),
+        problem.spread(point, covariance),
+        covariance,
+        noise,
+        float(np.sqrt(2 * best.cost / problem.residual_count)),
+        certificate,
+        identified,
+        weak_directions(problem, R, noise.sigma, identified.rank),
+        tuple(outcomes),
+        time.perf_counter() - began,
+        correlated,
+        relative,
+        shift,
+    )
+
+
+def _looked_at_for_a_better_one(found: Estimate) -> Estimate:
+    """Refuse the best of several valleys where its residual still has a course of its own.
+
+    Around declared starts the right valley may have been missed; in rows without a time nothing but
+    a poor fit makes neighbours so alike. A start of the user's own says that this is the valley.
+    """
+    places = valleys(found.outcomes)
+    over = correlation_time(found.problem, found.point, tables=True) if places > 1 else 1.0
+    timed = any(run.time is not None for run in found.problem.runs)
+    if timed or over <= ALIKE:
+        return found
+    reason = (
+        f"{len(found.outcomes)} starts ended in {places} places, and even the best leaves "
+        f"residuals that are alike over {over:.2g} rows: there may be a better one, or the model "
+        "lacks something; give --start near the solution"
+    )
+    return replace(found, certificate=replace(found.certificate, trusted=False, reasons=(reason,)))
+
+
+def _of_tables(problem: Problem, point: Point) -> Iterator[str]:
+    """That neighbouring rows of a table are alike, in case they followed each other in time."""
+    if not any(run.time is None and ENOUGH <= len(run) < TABLE for run in problem.runs):
+        return
+    over = correlation_time(problem, point, tables=True)
+    if over > 1:
+        yield (
+            f"residuals of neighbouring rows are alike (over {over:.2g} rows), which counts for "
+            "nothing in rows without a time; if they followed each other, say so with --rate: "
+            f"standard deviations grow by about {np.sqrt(over):.2g}"
+        )
+
+
+def _canonical(problem: Problem, best: Outcome) -> Outcome:
+    """The same solution in the model's own convention, as long as it is the same."""
+    convention = problem.model.canonicaliser
+    if convention is None or not np.isfinite(best.cost):
+        return best
+    values = problem.values(best.point)
+    chosen = {k: v for k, v in convention(problem.model, values).items() if k in values}
+    if all(np.allclose(v, values[k], rtol=1e-12, atol=1e-14) for k, v in chosen.items()):
+        return best
+    point = problem.point({**values, **chosen})
+    cost = problem.cost(point)
+    same = abs(cost - best.cost) <= 1e-6 * best.cost + 1e-20
+    return replace(best, point=point, cost=min(cost, best.cost)) if same else best
+
+
+def _beside(other: Outcome, best: Outcome) -> bool:
+    """Is an outcome so near to the best that it is in the same convention already?"""
+    return np.allclose(other.point.x, best.point.x, rtol=1e-3, atol=1e-9)
+
+
+def _by_estimator(optimum: Estimate, function: Callable[..., Any], name: str) -> Estimate:
+    """The values of an estimator of the model's own, judged by the least-squares optimum."""
+    problem, began = optimum.problem, time.perf_counter()
+    known = {p.name for p in problem.model.parameters}
+    try:
+        values = function(problem.model, problem.runs)
+        values = {name: value for name, value in values.items() if name in known}
+    except NotTrusted as error:
+        refused = replace(optimum.certificate, trusted=False, reasons=(str(error),))
+        return replace(optimum, certificate=refused, extra={"estimator": name})
+    seconds = time.perf_counter() - began
+    point = problem.point(values)
+    return replace(
+        optimum,
+        point=point,
+        optimum=optimum.point,
+        values=problem.values(point),
+        rmse=float(np.sqrt(2 * problem.cost(point) / problem.residual_count)),
+        certificate=_judged(optimum, point, values, name),
+        extra={
+            "estimator": name,
+            "seconds": seconds,
+            "least_squares_seconds": optimum.outcomes[0].seconds,
+        },
+    )
+
+
+def _judged(optimum: Estimate, point: Point, values: Mapping[str, Any], name: str) -> Certificate:
+    """Trust an estimator's values only near a trusted optimum; say how far from it they are."""
+    certificate, problem = optimum.certificate, optimum.problem
+    if not certificate.trusted:
+        return certificate
+    kept = problem.values(point)
+    if not all(np.allclose(kept[name], values[name], rtol=1e-6, atol=1e-9) for name in kept):
+        reason = f"{name}: the solution collapsed; it lies outside the bounds of the model"
+        return replace(certificate, trusted=False, reasons=(reason,))
+    away = problem.difference(point, optimum.point)
+    distance = away / np.sqrt(np.diag(optimum.covariance))
+    worst = int(np.argmax(np.abs(distance)))
+    far = (
+        f"{name}: `{problem.names[worst]}` is {abs(distance[worst]):.2g} standard deviations from "
+        "the certified least-squares optimum"
+    )
+    if not abs(distance[worst]) <= 3:
+        return replace(certificate, trusted=False, reasons=(far,))
+    return replace(certificate, reasons=(far, *certificate.reasons))
+
+
+def _covariance(problem: Problem, point: Point, R: Array, sigma: float, correlated: float) -> Array:
+    """The covariance that is printed: plain, unless the noise is known to be otherwise."""
+    if has_noise_effects(problem.model):
+        plain = problem.with_weights(None)
+        return np.asarray(variance_factor(problem, point) * inverse_normal(plain.factor(point)[0]))
+    if correlated > 1:
+        return sandwich(problem, point, R, correlated)
+    return np.asarray(sigma**2 * inverse_normal(R))
+
+
+def _noise(problem: Problem, point: Point, length: float, dof: int) -> Noise:
+    """Noise of one residual: what is left over; with few degrees of freedom to judge that by,
+    never less than what repeats (rest intervals) show."""
+    residual = length / np.sqrt(dof) if dof > 0 else float("nan")
+    repeats = repeat_noise(problem, point)
+    if dof >= ENOUGH_FREEDOM:
+        return Noise(residual, residual, repeats, dof)
+    candidates = [s for s in (residual, repeats) if s is not None and np.isfinite(s)]
+    return Noise(max(candidates, default=float("nan")), residual, repeats, dof)

@@ -1,0 +1,64 @@
+"""Scores on records of their own that no fit has seen.
+
+Parameters of such a record alone (per run) are refitted on half of its blocks with the shared ones
+kept; the other half is scored.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from casest.data.run import Run
+from casest.data.splits import interleaved_blocks
+from casest.declaration.model import Model
+from casest.declaration.shapes import Array
+from casest.errors import UsageError
+from casest.estimate.calibrate import Estimate
+from casest.leastsquares.problem import Problem
+from casest.solve.trust_region import trust_region
+
+#: Stretches that a held-out record is cut into; every other one is scored.
+STRETCHES = 40
+
+
+def score(found: Estimate, runs: Sequence[Run]) -> float:
+    """Root mean square residual of the estimate on runs that it did not see, residual unit."""
+    halves = [split(run, (found.model,)) for run in runs]
+    rows = [residuals(found.model, found.values, *half) for half in halves]
+    return float(np.sqrt(np.mean(np.concatenate([r.ravel() for r in rows]) ** 2)))
+
+
+def split(run: Run, models: Sequence[Model]) -> tuple[Run | None, Run]:
+    """The half that per-run parameters are fitted to, if any model has them, and what is scored."""
+    if not any(map(per_run, models)):
+        return None, run
+    half = np.asarray(interleaved_blocks(run, STRETCHES, 2) == 1)
+    return run.take(~half), run.take(half)
+
+
+def residuals(model: Model, values: Mapping[str, Array], fitted: Run | None, scored: Run) -> Array:
+    """Residuals (N, m) of the scored samples, the record's own parameters from the fitted ones."""
+    missing = [s.name for s in model.signals if s.name not in scored.signals]
+    if missing:
+        raise UsageError(f"{scored.file}: the held-out record has no {missing[0]!r}")
+    if fitted is not None and per_run(model):
+        values = _with_own(model, values, fitted)
+    problem = Problem(model, (scored,))
+    return problem.residuals(problem.point(values))[0]
+
+
+def per_run(model: Model) -> list[str]:
+    """Names of the parameters that each run has of its own."""
+    return [p.name for p in model.parameters if p.scope == "run"]
+
+
+def _with_own(model: Model, values: Mapping[str, Array], run: Run) -> dict[str, Array]:
+    own = per_run(model)
+    shared = {name: value for name, value in values.items() if name not in own}
+    fit = Problem(model.having(**shared), (run,))
+    alone = Problem(model, (run,))
+    guess = alone.values(alone.start()) if model.starter else {}
+    found = trust_region(fit, fit.point({n: v for n, v in guess.items() if n in own}))
+    return {**shared, **fit.values(found.point)}

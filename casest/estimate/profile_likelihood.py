@@ -1,0 +1,167 @@
+"""Fit all unknowns again while one combination of them is held: points and ends of a profile."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from casest.declaration.shapes import Array
+from casest.engine import Normal
+from casest.leastsquares.problem import Point, Problem
+from casest.solve.trust_region import LITTLE, trust_region
+
+#: Weight of the held combination against one residual: error of the hold is its square root's
+#: inverse, far below what a profile needs.
+HOLD = 1e4
+#: An end of an interval is found to this share, in so many tries of so many iterations each.
+CLOSE, TRIES, LONGEST = 0.01, 25, 300
+#: Gain over the cost of one residual from which on a point of the profile is good enough.
+NEAR = 1e-6
+#: First step outwards and where to stop, in linear intervals: beyond, standard deviations mean
+#: nothing.
+FIRST, REACH = 0.25, 4.0
+
+
+@dataclass(frozen=True)
+class Held:
+    """A problem with one more residual, HOLD·(rowᵀ(x − target)), seen through the same methods.
+
+    Unknowns on curved sets are held in the chart of the start, which moves with them: exact for
+    plain unknowns, to first order for directions.
+    """
+
+    problem: Problem
+    row: Array
+    target: Array
+
+    @property
+    def bounds(self) -> tuple[Array, Array]:
+        """Those of the problem."""
+        return self.problem.bounds
+
+    @property
+    def residual_count(self) -> int:
+        """With the hold's."""
+        return self.problem.residual_count + 1
+
+    def moved(self, point: Point, step: Array) -> Point:
+        """As in the problem."""
+        return self.problem.moved(point, step)
+
+    def cost(self, point: Point) -> float:
+        """Cost with the hold's square."""
+        return self.problem.cost(point) + 0.5 * self._miss(point) ** 2
+
+    def normal(self, point: Point) -> Normal:
+        """Normal equations with the hold's row."""
+        cost, gradient, matrix = self.problem.normal(point)
+        row, miss = HOLD * self.row, self._miss(point)
+        return Normal(cost + 0.5 * miss**2, gradient + row * miss, matrix + np.outer(row, row))
+
+    def factor(self, point: Point) -> tuple[Array, Array, float]:
+        """Triangular factor with one more row."""
+        R, t, rest = self.problem.factor(point)
+        n = len(t)
+        stack = np.zeros((n + 2, n + 1))
+        stack[:n, :n], stack[:n, n], stack[n, n] = R, t, rest
+        stack[n + 1, :n], stack[n + 1, n] = HOLD * self.row, self._miss(point)
+        whole = np.asarray(np.linalg.qr(stack, mode="r"))
+        return whole[:n, :n], whole[:n, n], float(abs(whole[n, n]))
+
+    def _miss(self, point: Point) -> float:
+        return HOLD * float(self.row @ (point.x - self.target))
+
+
+def profiled(
+    problem: Problem, point: Point, step: Array, row: Array, max_iterations: int = 60
+) -> Point:
+    """Best point with the combination rowᵀx at its value after the step, all else fitted again."""
+    held = Held(problem, row, point.x + step)
+    lower, upper = problem.bounds
+    start = Point(np.clip(point.x + step, lower, upper), point.references)
+    # To rounding the other unknowns need not be known: it is the cost that is looked at.
+    near = NEAR / held.residual_count
+    return trust_region(
+        held, start, max_iterations=max_iterations, tolerance=near, damping=LITTLE
+    ).point
+
+
+@dataclass(frozen=True)
+class Profile:
+    """The cost around its minimum as one unknown is held at other values.
+
+    `covariance` (n, n) is the linear one and `sigma` that of one residual: they say how far to
+    look.
+    """
+
+    problem: Problem
+    best: Point
+    cost: float
+    covariance: Array
+    sigma: float
+
+    def interval(self, j: int, rise: float) -> tuple[float, float] | None:
+        """Distances below and above unknown j at which 2·cost has risen by rise·σ².
+
+        That is the interval of its likelihood, of whatever shape the cost is (Bates & Watts 1988,
+        ch. 6). None where an end lies outside the bounds, or beyond REACH times the linear one.
+        """
+        below = self._end(j, -1, rise)
+        above = self._end(j, 1, rise) if below is not None else None
+        return None if below is None or above is None else (below, above)
+
+    def _end(self, j: int, sign: int, rise: float) -> float | None:
+        """One end: outwards in short steps, each from the last point found, then between two."""
+        std, wanted = float(np.sqrt(self.covariance[j, j])), float(np.sqrt(rise))
+        linear = wanted * std
+        size, height, here = 0.0, 0.0, self.best
+        outside: tuple[float, float] | None = None
+        step = FIRST * linear
+        for _ in range(TRIES):
+            if size + step > REACH * linear:
+                return None
+            there = self._held(here, j, sign * (size + step))
+            square = 2 * (self.problem.cost(there) - self.cost) / self.sigma**2 if there else -1.0
+            reached = float(np.sqrt(square)) if square >= height**2 else float("inf")
+            if abs(reached / wanted - 1) < CLOSE:
+                return (size + step) * wanted / reached
+            if reached > wanted:  # too far, or into another valley
+                outside = size + step, reached
+            else:
+                size, height, here = size + step, reached, there or here
+            step = _next(size, height, outside, wanted, step)
+        return None
+
+    def _held(self, point: Point, j: int, distance: float) -> Point | None:
+        """Best point with unknown j at a distance from its best value; None outside the bounds."""
+        lower, upper = self.problem.bounds
+        value = self.best.x[j] + distance
+        if not lower[j] < value < upper[j]:
+            return None
+        row = np.zeros(len(point.x))
+        row[j] = self.sigma / np.sqrt(self.covariance[j, j])
+        along = self.covariance[:, j] / self.covariance[j, j]
+        step = (value - point.x[j]) * along
+        return profiled(self.problem, point, step, row, max_iterations=LONGEST)
+
+
+def _next(
+    size: float, height: float, outside: tuple[float, float] | None, wanted: float, step: float
+) -> float:
+    """The next step outwards: by the slope so far, and within what is known to be too far."""
+    slope = height / size if size else 0.0
+    if outside is None:
+        return min(2 * step, 1.05 * (wanted - height) / slope) if slope else 2 * step
+    room = outside[0] - size
+    if not np.isfinite(outside[1]):
+        return 0.5 * room
+    share = (wanted - height) / (outside[1] - height)
+    return float(np.clip(share, 0.1, 0.9)) * room
+
+
+def half_width(degrees_of_freedom: int) -> float:
+    """Half width of a linear 95 % interval in standard deviations: Student's t."""
+    from scipy.special import stdtrit
+
+    return float(stdtrit(max(degrees_of_freedom, 1), 0.975))

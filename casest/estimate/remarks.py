@@ -1,0 +1,80 @@
+"""What an engineer should know beside the numbers: sentences about data, noise and fit."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from casest.declaration.shapes import Array
+from casest.leastsquares.agreement import between_runs
+from casest.leastsquares.problem import Point, Problem
+from casest.leastsquares.sums import rounding, some_residuals
+from casest.leastsquares.weights import robust_scale
+
+#: Second-order shift, in standard deviations, from which on it is added to them.
+NOTABLE_BIAS = 0.3
+#: Gaussian noise passes six standard deviations once in 10⁹ samples.
+FAR_OUT = 6.0
+#: Probability under agreement below which runs are said to disagree.
+DISAGREE = 1e-3
+
+
+def notes(
+    problem: Problem, point: Point, dof: int, correlated: float, bias: float
+) -> Iterator[str]:
+    """All that there is to say. `bias` is the second-order shift in standard deviations."""
+    if problem.model.remarker is not None:
+        yield from problem.model.remarker(problem.model, problem.runs, problem.values(point))
+    if dof == 0:
+        yield (
+            "as many unknowns as equations: nothing checks the model; the standard deviations rest "
+            "on the scatter within the rest intervals alone"
+        )
+    if correlated > 1:
+        count = sum(len(run) for run in problem.runs)
+        yield (
+            f"residuals are correlated over {correlated:.3g} samples: the {count} samples count as "
+            f"{count / correlated:.0f}, and standard deviations come from batches of samples"
+        )
+    if bias > NOTABLE_BIAS:
+        yield (
+            f"the noise of single readings shifts the values by up to {bias:.1f} standard "
+            "deviations (second order), which the printed ones contain: average readings at rest "
+            "(--at-rest), or filter them"
+        )
+    yield from _runs_that_disagree(problem, point, correlated)
+    yield from _furthest_out(problem, point)
+
+
+def _runs_that_disagree(problem: Problem, point: Point, correlated: float) -> Iterator[str]:
+    """Shared parameters that the runs do not agree on."""
+    found = between_runs(problem, point, correlated)
+    if found is not None and found.p_value < DISAGREE:
+        yield (
+            f"the runs disagree on what they share (scatter {found.F:.3g} times that of the noise, "
+            f"p = {found.p_value:.1g}): {found.worst} is {found.away:.0f} standard deviations off; "
+            "say --per-run for what differs, or find what changed"
+        )
+
+
+def _furthest_out(problem: Problem, point: Point) -> Iterator[str]:
+    """The sample that lies far outside what the others show."""
+    scale = robust_scale(some_residuals(problem, point))
+    size, k, row = max(_largest(block) for block in problem.residual_blocks(point))
+    exact = 10 * rounding(problem, point)  # noise-free data have no outliers
+    if problem.residual_count > 2 * problem.unknowns and size > FAR_OUT * max(scale, exact):
+        run = problem.runs[k]
+        what = "rest interval" if run.spread else "row"
+        away = size / max(scale, exact)
+        yield (
+            f"{what} {int(run.rows[row])} of {run.name} is off by {away:.3g} robust standard "
+            "deviations of the residual: look at it first"
+        )
+
+
+def _largest(block: tuple[int, slice, Array]) -> tuple[float, int, int]:
+    """Size, run and row of the largest residual of a block."""
+    run, span, residual = block
+    worst = int(np.argmax(np.abs(residual)))
+    return float(np.abs(residual).flat[worst]), run, span.start + worst // residual.shape[1]

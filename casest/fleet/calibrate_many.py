@@ -1,0 +1,433 @@
+"""Many small calibrations of one model at once: a production line, every sensor on its own.
+
+The sensors are independent problems that share instructions, so each instruction is evaluated for
+many of them in one NumPy call (`batch_sums`), and small matrices are factored side by side
+(`batch_linear`). Every sensor has its own damping, its own certificate (`batch_judge`) and its own
+verdict; no value of one depends on any other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from casest.data.run import Run
+from casest.declaration.model import Model
+from casest.declaration.shapes import Array
+from casest.declaration.symbols import Parameter
+from casest.engine.threads import one_thread
+from casest.errors import DataError, UsageError
+from casest.estimate.calibrate import attempt
+from casest.fleet.fit import Bounds, minimise
+from casest.fleet.judge import Judge
+from casest.fleet.sums import NARROWEST, Sensors, Squares, widest
+from casest.fleet.verdicts import Verdicts
+from casest.leastsquares.per_sample import residual_and_jacobian
+from casest.leastsquares.weights import has_noise_effects
+
+Values = Mapping[str, Array]
+#: `function(model, signals) -> {name: value (S, …) or (value, lower, upper)}`.
+Start = Mapping[str, Any] | Callable[[Model, Values], Mapping[str, Any]]
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Calibrations of S sensors; every array has the sensor axis first.
+
+    `values` and `std` by parameter, (S, …); `covariance` (S, n, n) of the unknowns `names`;
+    `sigma` (S,) the standard deviation of one residual and `rmse` (S,), in the residual's unit;
+    `trusted` (S,). Of a refused sensor every number is NaN, and `reasons[i]` says why; of a trusted
+    one it says why it is believed.
+    """
+
+    model: Model
+    names: tuple[str, ...]
+    values: Values
+    std: Values
+    covariance: Array
+    sigma: Array
+    rmse: Array
+    trusted: NDArray[np.bool_]
+    reasons: Sequence[tuple[str, ...]]
+
+    def __len__(self) -> int:
+        """Return the number of sensors."""
+        return len(self.trusted)
+
+    def __str__(self) -> str:
+        """Counts, and the first refused sensors with their reasons."""
+        refused = np.flatnonzero(~self.trusted)
+        lines = [f"{self.model.name}: {len(self) - len(refused)} of {len(self)} sensors trusted"]
+        lines += [f"  sensor {i}: {self.reasons[i][0]}" for i in refused[:10]]
+        return "\n".join(lines + (["  …"] if len(refused) > 10 else []))
+
+
+def calibrate_many(
+    model: Model,
+    signals: Mapping[str, Any],
+    *,
+    start: Start | None = None,
+    counts: Any = None,
+    noise: float | None = None,
+    retry: int = 0,
+) -> Batch:
+    """Fit the model to each of S sensors, N samples each; every sensor has its own certificate.
+
+    `signals` has for each signal an array (S, N, size), or (S, N) for one number, in the model's
+    units. Where sensors have unequal numbers of samples, `counts` (S,) says how many of the N
+    count; what follows them is not looked at.
+
+    `start` gives start values by parameter, one for all or (S, …); or it is a function
+    `(model, signals) -> {name: value}` that is called for some of the sensors at a time, such
+    as `casest_problems.norm.closed_form_many`. In place of a value it may give a triple (value,
+    lower, upper) where bounds depend on the data. Without it sensors start where the model says
+    that many do (`model.starting(…, many=…)`: the shipped norm models), else from the declared
+    values; bounds that the model computes from data are then asked for sensor by sensor, in Python.
+
+    Standard deviations and covariances are of JᵀJ at the solution or at most a tenth of a standard
+    deviation from it: a fit that is as near takes its last step without summing JᵀJ again.
+
+    `noise` is the standard deviation of one residual that a sound sensor has: one with
+    significantly more is refused. Up to `retry` refused sensors are calibrated once more one by
+    one, with IPOPT and second opinions.
+
+    The samples of a sensor are taken as independent of each other (poses, not a time series); from
+    a hundred of them on a sensor whose neighbouring residuals are alike is refused.
+    Raises UsageError for models with parameters per run, effects on the noise or on the sequence of
+    samples, and directions or rotations among the unknowns; DataError for arrays of wrong shape.
+    """
+    _check_model(model)
+    readings, lengths = _checked(model, signals, counts)
+    size, samples = readings[0].shape[:2]
+    job = _Job(model, readings, lengths, start or model.starter_of_many, noise)
+    result = _Result.empty(model, size)
+    width = widest(samples)
+    with np.errstate(all="ignore"), one_thread():
+        for first in range(0, size, width):
+            job.run(slice(first, min(first + width, size)), result)
+        for i in np.flatnonzero(~result.verdicts.trusted)[:retry]:
+            job.retry(int(i), result)
+    return result.batch(model)
+
+
+# -- what is asked for ---------------------------------------------------------------------------
+
+
+def _check_model(model: Model) -> None:
+    per_run = [p.name for p in model.parameters if p.scope == "run"]
+    curved = [p.name for p in model.parameters if p.shape.curved]
+    if not model.parameters:
+        raise UsageError(f"model {model.name} has nothing left to estimate; free something")
+    if per_run:
+        raise UsageError(
+            f"model {model.name} has a {per_run[0]} per run: calibrate_many takes one record of "
+            f"each sensor; declare it shared with .scoped({per_run[0]!r}, 'all'), or call calibrate"
+        )
+    if curved:
+        raise UsageError(
+            f"model {model.name} has the direction or rotation {curved[0]} among its unknowns, "
+            "which calibrate_many cannot move; fix it, or call calibrate for each sensor"
+        )
+    if any(a.kind == "sequence" for a in model.effects):
+        raise UsageError(
+            f"model {model.name} has an effect on the sequence of samples, which calibrate_many "
+            "does not follow; call calibrate for each sensor"
+        )
+    if has_noise_effects(model):
+        raise UsageError(
+            f"model {model.name} has an effect on the noise, for which calibrate_many does not "
+            "weigh samples; call calibrate for each sensor"
+        )
+    if model.canonicaliser is not None:
+        raise UsageError(
+            f"model {model.name} chooses among equivalent values by a convention of its own, which "
+            "calibrate_many does not apply; call calibrate for each sensor"
+        )
+
+
+def _checked(
+    model: Model, signals: Mapping[str, Any], counts: Any
+) -> tuple[list[Array], Array | None]:
+    """Readings (S, N, size) in the model's order, and how many of each sensor count, (S,)."""
+    unknown = set(signals) - {s.name for s in model.signals}
+    if unknown:
+        raise UsageError(f"model {model.name} has no signal {sorted(unknown)[0]!r}")
+    found: list[Array] = []
+    for s in model.signals:
+        if s.name not in signals:
+            raise UsageError(f"model {model.name} needs the signal {s.name!r}, (S, N, {s.size})")
+        array = _array(s.name, signals[s.name])
+        if array.ndim == 2 and s.size == 1:
+            array = array[:, :, None]
+        if array.ndim != 3 or array.shape[2] != s.size:
+            raise DataError(
+                f"signal {s.name} has shape {array.shape}: give (sensors, samples, {s.size})"
+            )
+        if found and array.shape[:2] != found[0].shape[:2]:
+            raise DataError(
+                f"signal {s.name} has {array.shape[0]} sensors of {array.shape[1]} samples, "
+                f"{model.signals[0].name} {found[0].shape[0]} of {found[0].shape[1]}"
+            )
+        found.append(array)
+    if not found or 0 in found[0].shape:
+        raise DataError("there are no sensors to calibrate: give arrays (sensors, samples, size)")
+    return found, None if counts is None else _counted(counts, *found[0].shape[:2])
+
+
+def _array(name: str, given: Any) -> Array:
+    try:
+        return np.asarray(given, dtype=np.float64)
+    except ValueError:
+        raise DataError(
+            f"signal {name} is no array of numbers with one length for all sensors: fill the short "
+            "ones up to (sensors, samples, size), and say counts= how many samples each has"
+        ) from None
+
+
+def _counted(counts: Any, size: int, samples: int) -> Array:
+    found = np.asarray(counts, dtype=np.float64)
+    if found.shape != (size,):
+        raise DataError(f"counts has shape {found.shape}: give ({size},), one number per sensor")
+    bad = np.flatnonzero(~((found >= 1) & (found <= samples) & (found == np.floor(found))))
+    if bad.size:
+        raise DataError(
+            f"counts[{bad[0]}] is {found[bad[0]]:g}: give a whole number from 1 to {samples}"
+        )
+    return found
+
+
+# -- a block of sensors ----------------------------------------------------------------------------
+
+
+@dataclass
+class _Result:
+    """Arrays over all sensors, filled block by block."""
+
+    x: Array
+    std: Array
+    covariance: Array
+    sigma: Array
+    rmse: Array
+    verdicts: Verdicts
+
+    @classmethod
+    def empty(cls, model: Model, size: int) -> _Result:
+        n = sum(p.shape.size for p in model.parameters)
+        verdicts = Verdicts.empty(_names(model), size)
+        # In memory the sensors lie side by side, as in the blocks that come in.
+        x, std = np.empty((2, n, size)).transpose(0, 2, 1)
+        covariance = np.empty((n, n, size)).transpose(2, 0, 1)
+        return cls(x, std, covariance, np.empty(size), np.empty(size), verdicts)
+
+    def batch(self, model: Model) -> Batch:
+        trusted = self.verdicts.trusted
+        for array in (self.covariance, self.sigma, self.rmse):
+            array[~trusted] = np.nan
+        values, std = _unpacked(model, self.x), _unpacked(model, self.std)
+        for array in (*values.values(), *std.values()):  # zeros of triangular matrices too
+            array[~trusted] = np.nan
+        return Batch(
+            model,
+            _names(model),
+            values,
+            std,
+            self.covariance,
+            self.sigma,
+            self.rmse,
+            trusted,
+            self.verdicts,
+        )
+
+
+@dataclass
+class _Job:
+    """What all blocks have in common."""
+
+    model: Model
+    readings: list[Array]
+    counts: Array | None
+    start: Start | None
+    noise: float | None
+    squares: Squares = field(init=False)
+    judge: Judge = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.squares = Squares(residual_and_jacobian(self.model))
+        self.judge = Judge(self.model, self.squares, self.noise)
+
+    def run(self, span: slice, result: _Result) -> None:
+        """Fit and judge the sensors of a block."""
+        size = span.stop - span.start
+        sensors = self._sensors(span)
+        x, bounds = self._begin(span, sensors)
+        fits = minimise(self.squares, sensors, x, bounds, near=self.start is not None)
+        judged = self.judge(sensors, fits, bounds)
+        result.x[span] = fits.x[:, :size].T
+        result.std[span] = judged.std[:, :size].T
+        result.covariance[span] = judged.covariance[:, :, :size].transpose(2, 0, 1)
+        result.sigma[span] = judged.sigma[:size]
+        result.rmse[span] = judged.rmse[:size]
+        result.verdicts.put(span, judged)
+
+    def _sensors(self, span: slice) -> Sensors:
+        """Readings by column, the last sensor repeated up to a width that NumPy handles alike."""
+        total, samples = span.stop - span.start, self.readings[0].shape[1]
+        width = -(-total // NARROWEST) * NARROWEST
+        found = np.empty((sum(r.shape[2] for r in self.readings), samples, width))
+        first = 0
+        for r in self.readings:
+            found[first : first + r.shape[2], :, :total] = r[span].transpose(2, 1, 0)
+            first += r.shape[2]
+        mask = None
+        if self.counts is not None:
+            place = np.arange(samples)[:, None]
+            mask = np.empty((samples, width))
+            mask[:, :total] = place < self.counts[span]
+            # The first sample takes the place of those that do not count: finite if it is.
+            found = np.where(mask > 0, found, found[:, :1])
+            mask[:, total:] = mask[:, total - 1 : total]
+        found[:, :, total:] = found[:, :, total - 1 : total]
+        return Sensors(found, mask)
+
+    def _begin(self, span: slice, sensors: Sensors) -> tuple[Array, Bounds]:
+        """Start values (n, W), inside bounds (n, W)."""
+        given = self._given(span, sensors)
+        width = sensors.samples.shape[2]
+        x, lower, upper = [], [], []
+        for p in self.model.parameters:
+            value, low, high = _triple(given.get(p.name))
+            value = p.shape.unpack(p.start_value()) if value is None else value
+            if np.ndim(value) == 0 and p.shape.dims:  # a number for a matrix means its diagonal
+                value = p.shape.unpack(p.shape.pack(value))
+            x.append(_packed(p, value, width))
+            lower.append(np.maximum(_packed(p, low, width), np.array(p.lower)[:, None]))
+            upper.append(np.minimum(_packed(p, high, width), np.array(p.upper)[:, None]))
+        bounds = Bounds(np.concatenate(lower), np.concatenate(upper))
+        return bounds.inside(np.concatenate(x)), bounds
+
+    def _given(self, span: slice, sensors: Sensors) -> dict[str, Any]:
+        """Start values, and bounds from the data, as the user, his function or the model say."""
+        given: dict[str, Any] = {}
+        if callable(self.start):
+            given = dict(self.start(self.model, self._views(sensors)))
+        elif self.start is not None:
+            given = dict(self.start)
+        for name in set(given) - {p.name for p in self.model.parameters}:
+            raise UsageError(f"model {self.model.name} has no parameter {name!r}")
+        if not callable(self.start):
+            given = {n: self._of_block(n, v, span) for n, v in given.items()}
+        if self.model.limiter is None or any(isinstance(v, tuple) for v in given.values()):
+            return given
+        return self._limited(given, span)
+
+    def _views(self, sensors: Sensors) -> dict[str, Array]:
+        """Readings of a block by signal, (W, N, size)."""
+        found, first = {}, 0
+        for s in self.model.signals:
+            found[s.name] = sensors.samples[first : first + s.size].transpose(2, 1, 0)
+            first += s.size
+        return found
+
+    def _of_block(self, name: str, value: Any, span: slice) -> Any:
+        """One value for all sensors as it is, else those of the block."""
+        if isinstance(value, tuple):
+            return tuple(self._of_block(name, v, span) for v in value)
+        array, size = np.asarray(value, dtype=float), len(self.readings[0])
+        dims = self.model[name].shape.dims
+        if array.shape == (size, *dims):
+            return array[span]
+        if array.shape in ((), dims):
+            return array
+        raise UsageError(
+            f"start[{name!r}] has shape {array.shape}: give {dims} for all sensors, or "
+            f"{(size, *dims)}"
+        )
+
+    def _limited(self, given: dict[str, Any], span: slice) -> dict[str, Any]:
+        """The same with the bounds that the model computes from data, sensor by sensor."""
+        assert self.model.limiter is not None
+        each = [self.model.limiter(self.model, (self._as_run(i),)) for i in _numbers(span)]
+        found = dict(given)
+        for name in each[0]:
+            dims = self.model[name].shape.dims
+            low, high = (
+                np.array([np.broadcast_to(own[name][side], dims) for own in each])
+                for side in (0, 1)
+            )
+            found[name] = (given.get(name), low, high)
+        return found
+
+    def _as_run(self, i: int) -> Run:
+        """The record of one sensor."""
+        stop = None if self.counts is None else int(self.counts[i])
+        signals = {
+            s.name: r[i, :stop] for s, r in zip(self.model.signals, self.readings, strict=True)
+        }
+        return Run.raw(f"sensor {i}", signals, units={s.name: s.unit for s in self.model.signals})
+
+    def retry(self, i: int, result: _Result) -> None:
+        """Calibrate one sensor by itself; what that finds takes the place of what was found."""
+        if not all(np.isfinite(r[i]).all() for r in self.readings):
+            return
+        try:
+            found = attempt(self.model, [self._as_run(i)])
+        except DataError:  # too few samples, which the sensor's reasons say already
+            return
+        result.x[i], result.covariance[i] = found.point.x, found.covariance
+        result.std[i] = np.sqrt(np.diag(found.covariance))
+        result.sigma[i], result.rmse[i] = found.noise.sigma, found.rmse
+        certificate = found.certificate
+        result.verdicts.replace(i, certificate.trusted, certificate.reasons)
+
+
+def _numbers(span: slice) -> range:
+    return range(span.start, span.stop)
+
+
+def _triple(value: Any) -> tuple[Any, Any, Any]:
+    """Value, lower and upper bound of what a start says of a parameter."""
+    return value if isinstance(value, tuple) else (value, -np.inf, np.inf)
+
+
+def _packed(parameter: Parameter, value: Any, width: int) -> Array:
+    """Stored entries (size, W) of a value for all sensors or (k, …) for the first k of W."""
+    dims = parameter.shape.dims
+    array = np.asarray(value, dtype=float)
+    if array.ndim == len(dims) + 1:
+        if array.shape[1:] == (1,) * len(dims):
+            array = np.broadcast_to(array, (len(array), *dims))
+        if len(array) < width:
+            array = np.concatenate([array, np.repeat(array[-1:], width - len(array), axis=0)])
+    elif array.shape == () and dims:
+        array = np.broadcast_to(array, dims)
+    if array.shape[array.ndim - len(dims) :] != dims:
+        raise UsageError(
+            f"start of {parameter.name} has shape {array.shape}: give {dims} or (sensors, …)"
+        )
+    rows = np.stack([_entry(array, index) for index in parameter.shape.entries])
+    return np.broadcast_to(rows.reshape(len(rows), -1), (len(rows), width))
+
+
+def _entry(array: Array, index: tuple[int, ...]) -> Array:
+    """One entry of every sensor's value, a view."""
+    place: Any = (..., *index)
+    return np.asarray(array[place])
+
+
+def _names(model: Model) -> tuple[str, ...]:
+    return tuple(name for p in model.parameters for name in p.entry_names)
+
+
+def _unpacked(model: Model, x: Array) -> dict[str, Array]:
+    """Values by parameter, (S, …), from the unknowns (S, n)."""
+    found, first = {}, 0
+    for p in model.parameters:
+        value = np.zeros((len(x), *p.shape.dims))
+        for k, index in enumerate(p.shape.entries):
+            _entry(value, index)[:] = x[:, first + k]
+        found[p.name], first = value, first + p.shape.size
+    return found

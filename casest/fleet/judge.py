@@ -1,0 +1,380 @@
+"""The certificate of many sensors side by side: what `solve.certificate` asks, asked of arrays.
+
+Every sensor goes through the questions that are cheap; those whose answers are not plainly good
+go through the exact ones: curvature from second derivatives, the cost along every principal
+direction, a second valley, the exact second order of the noise. What decides which sensors these
+are is the sensor's own data, never its neighbours.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import NamedTuple
+
+import casadi as ca
+import numpy as np
+
+from casest.declaration.model import Model
+from casest.declaration.shapes import Array
+from casest.declaration.tracing import function_of
+from casest.engine import Replay
+from casest.estimate.certificate import BENT, PRACTICALLY_NULL, SECOND_ORDER, SHAPE, SLOPE, STEP
+from casest.estimate.correlation import ENOUGH
+from casest.estimate.profile_likelihood import HOLD
+from casest.estimate.remarks import NOTABLE_BIAS
+from casest.fleet.fit import Bounds, Fits, Flags, Places, minimise, padded, residual_counts
+from casest.fleet.linear import cholesky, dot, form, inverse, lengths, times, whole
+from casest.fleet.sums import Hold, Sensors, SideBySide, Squares
+from casest.fleet.verdicts import Code, Judged
+from casest.leastsquares.per_sample import laplacian, slope_in_sample
+from casest.solve.strategy import PARABOLA
+
+#: Steps must have shrunk to this share of the ones before, else second derivatives are computed.
+SHRUNK = 0.1
+#: The screen of the noise's second order looks at a few samples along one direction each: it must
+#: find this many times less than what would matter.
+SAFETY = 3.5
+#: Correlation of neighbouring residuals, in standard deviations of that of independent ones, from
+#: which on they are taken for a time series.
+ALIKE = 5.0
+#: Probability with which a sound sensor is refused for the size of its residual.
+LOUD = 1e-6
+
+
+class Local(NamedTuple):
+    """Fits with what follows from them: lengths of J's columns (n, W), (JᵀJ)⁻¹ in units of those
+    (n, n, W), σ (W,), and σ or rounding, whichever is larger (W,)."""
+
+    fits: Fits
+    scale: Array
+    inverse: Array
+    sigma: Array
+    noise: Array
+
+    def some(self, k: Places) -> Local:
+        """Those of the sensors at these places."""
+        fits = self.fits.some(k)
+        return Local(fits, self.scale[:, k], self.inverse[:, :, k], self.sigma[k], self.noise[k])
+
+
+class Judge:
+    """Verdicts on fits of one model."""
+
+    def __init__(self, model: Model, squares: Squares, noise: float | None) -> None:
+        self.model, self.squares, self.expected = model, squares, noise
+
+    def __call__(self, sensors: Sensors, fits: Fits, bounds: Bounds) -> Judged:
+        """Judge W sensors."""
+        count = residual_counts(self.squares, sensors)
+        here, freedom = self._local(fits, count)
+        found = Judged.of(here.fits.x.shape, here.sigma, np.sqrt(2 * fits.cost / count))
+        found.step[:] = np.sqrt(fits.left) * np.minimum(fits.shrink, 1.0) / here.noise
+        self._readings(found, sensors)
+        self._determined(found, here)
+        self._bounded(found, here, bounds)
+        found.add(Code.NO_REDUNDANCY, freedom <= 0)
+        found.add(Code.NOT_FINITE, ~np.isfinite(fits.cost))
+        slope = np.sqrt(fits.left / (2 * fits.cost))
+        exact = np.sqrt(fits.left) <= 10 * _rounding(fits, count) * np.sqrt(count)
+        settled = (found.step <= STEP) | (slope <= SLOPE) | exact
+        found.add(Code.NOT_SETTLED, np.logical_not(settled))
+        if self.expected is not None:
+            found.add(Code.LOUD, self._loud(here.sigma, freedom))
+        self._independent(found, here, sensors)
+        self._shape(found, here, sensors, bounds)
+        shift = self._second_order(found, here, sensors, count)
+        unit = here.sigma / here.scale
+        np.multiply(here.inverse, unit[:, None], out=found.covariance)
+        found.covariance *= unit
+        if shift is not None:
+            found.covariance[:] += shift
+        found.std[:] = np.sqrt(np.einsum("iis->is", found.covariance))
+        return found
+
+    def _local(self, fits: Fits, count: Array) -> tuple[Local, Array]:
+        scale = lengths(fits.matrix)
+        factor = cholesky(fits.matrix)
+        factor /= scale[:, None]
+        freedom = count - len(scale)
+        sigma = np.sqrt(2 * fits.cost / np.where(freedom > 0, freedom, np.nan))
+        noise = np.maximum(np.where(np.isfinite(sigma), sigma, 0.0), _rounding(fits, count))
+        return Local(fits, scale, inverse(factor), sigma, noise), freedom
+
+    # -- questions to every sensor -----------------------------------------------------------------
+
+    def _readings(self, found: Judged, sensors: Sensors) -> None:
+        total = np.add.reduce(np.add.reduce(sensors.samples, axis=0), axis=0)
+        if np.isfinite(total).all():
+            return
+        bad = ~np.isfinite(sensors.samples).all(axis=0)
+        found.where[:] = np.argmax(bad, axis=0)
+        found.add(Code.READING, np.asarray(bad.any(axis=0)))
+
+    def _determined(self, found: Judged, here: Local) -> None:
+        """Rank of the scaled Jacobian, and its weakest direction, of unit length, (n, W)."""
+        worst = np.argmax(np.einsum("iis->is", here.inverse), axis=0)
+        direction = here.inverse[:, worst, np.arange(len(worst))]
+        for _ in range(3):
+            direction = direction / np.sqrt(dot(direction, direction))
+            direction = times(here.inverse, direction)
+        largest = np.sqrt(dot(direction, direction))
+        found.weakest[:] = direction / largest
+        found.smallest[:] = 1 / np.sqrt(largest)
+        # The normal equations square the condition: what is close is looked at on its own.
+        close = ~(found.smallest > 10 * PRACTICALLY_NULL)
+        diagonal = np.einsum("iis->is", here.fits.matrix)
+        usable = np.isfinite(diagonal).all(axis=0)  # the other entries are no larger
+        k = np.flatnonzero(close & usable)
+        if k.size:
+            part = whole(here.fits.matrix[:, :, k] / (here.scale * here.scale[:, None])[:, :, k])
+            values, vectors = np.linalg.eigh(part.transpose(2, 0, 1))
+            found.weakest[:, k] = vectors[:, :, 0].T
+            found.smallest[k] = np.sqrt(np.maximum(values[:, 0], 0.0) / values[:, -1])
+        # Columns of no length are null whatever the rest is.
+        nil = ~(diagonal > 0)
+        for i in np.flatnonzero((nil & usable).any(axis=1)):
+            found.weakest[:, nil[i] & usable] = np.eye(len(nil))[:, [i]]
+        null = ~(found.smallest >= PRACTICALLY_NULL) | nil.any(axis=0)
+        found.add(Code.NOT_DETERMINED, np.asarray(usable & null))
+
+    def _bounded(self, found: Judged, here: Local, bounds: Bounds) -> None:
+        width = 1e-3 * here.noise / here.scale
+        active = (here.fits.x <= bounds.lower + width) | (here.fits.x >= bounds.upper - width)
+        found.bound[:] = np.argmax(active, axis=0)
+        found.add(Code.BOUND, np.asarray(active.any(axis=0)))
+
+    def _loud(self, sigma: Array, freedom: Array) -> Flags:
+        from scipy.stats import chi2  # imported late: SciPy's statistics load slowly
+
+        counts, which = np.unique(np.maximum(freedom, 1), return_inverse=True)
+        limit = np.sqrt(chi2.isf(LOUD, counts) / counts)[which] * self.expected
+        return np.asarray(sigma > limit)
+
+    def _independent(self, found: Judged, here: Local, sensors: Sensors) -> None:
+        """Neighbours alike: a time series, whose samples say less than their number."""
+        if sensors.samples.shape[1] < ENOUGH:
+            return
+        residuals = self.squares.residuals(here.fits.x, sensors)
+        along = np.einsum("mns,mns->s", residuals[:, 1:], residuals[:, :-1])
+        share = along / (2 * here.fits.cost)
+        exact = here.sigma < 10 * _rounding(here.fits, np.ones(len(along)))
+        alike = share * np.sqrt(residuals[..., 0].size) > ALIKE
+        found.add(Code.CORRELATED, np.logical_and(alike, np.logical_not(exact)))
+
+    # -- is it a minimum, and do intervals describe the cost around it? --------------------------
+
+    def _shape(self, found: Judged, here: Local, sensors: Sensors, bounds: Bounds) -> None:
+        ratios = self._both_ways(here, sensors, bounds, found.weakest, 2.0)
+        found.low[:], found.high[:] = ratios.min(axis=0), ratios.max(axis=0)
+        plain = (here.fits.shrink <= SHRUNK) & _parabolic(ratios)
+        for k in _groups(~plain & ~found.refused):
+            self._thorough(found, here.some(k), sensors.some(k), bounds.some(k), k)
+        elongated = found.smallest <= 0.1
+        for k in _groups(elongated & ~found.refused):
+            self._second_valley(found, here.some(k), sensors.some(k), bounds.some(k), k)
+
+    def _both_ways(
+        self, here: Local, sensors: Sensors, bounds: Bounds, direction: Array, deviations: float
+    ) -> Array:
+        """Rise of the cost along a scaled direction, both ways, over that of a parabola, (2, W)."""
+        step = _walk(here, direction, deviations)
+        rises = [self._rise(here, sensors, bounds, way) for way in (step, -step)]
+        return np.array(rises) / (0.5 * deviations**2 * here.noise**2)
+
+    def _rise(self, here: Local, sensors: Sensors, bounds: Bounds, step: Array) -> Array:
+        x = here.fits.x + step
+        inside = ((x >= bounds.lower) & (x <= bounds.upper)).all(axis=0)
+        rise = self.squares.cost(x, sensors) - here.fits.cost
+        return np.where(inside & np.isfinite(rise), rise, np.inf)
+
+    def _thorough(
+        self, found: Judged, here: Local, sensors: Sensors, bounds: Bounds, k: Places
+    ) -> None:
+        """Second derivatives, and the cost along every principal direction."""
+        matrix = whole(here.fits.matrix)
+        bent = matrix + _bend(self.model, here.fits.x, sensors)
+        scale = here.scale * here.scale[:, None]
+        # Positive definite, and so beyond rounding: curvature of 1e-9 of the Gauss-Newton one.
+        factor = cholesky((bent - 1e-9 * matrix) / scale)
+        found.add(Code.NO_MINIMUM, ~np.isfinite(np.einsum("iis->is", factor)).all(axis=0), k)
+        finite = np.where(np.isfinite(matrix / scale), matrix / scale, 0.0)
+        vectors = np.linalg.eigh(finite.transpose(2, 0, 1))[1].transpose(1, 2, 0)
+        low = high = np.ones(len(k))
+        for i in range(len(vectors)):
+            ratios = self._both_ways(here, sensors, bounds, vectors[:, i], 2.0)
+            for sign, ratio in zip((1, -1), ratios, strict=True):
+                # The valley may only be bent: fit the other unknowns with this direction held.
+                step = sign * _walk(here, vectors[:, i], 2.0)
+                for j in _groups((ratio > SHAPE[1]) & (ratio <= BENT)):
+                    ratio[j] = self._profiled(
+                        here.some(j), sensors.some(j), bounds.some(j), step[:, j]
+                    )
+            low, high = np.minimum(low, ratios.min(axis=0)), np.maximum(high, ratios.max(axis=0))
+        found.low[k], found.high[k] = low, high
+        found.add(Code.MISSHAPEN, ~((low >= SHAPE[0]) & (high <= SHAPE[1])), k)
+
+    def _profiled(self, here: Local, sensors: Sensors, bounds: Bounds, step: Array) -> Array:
+        """Rise of the cost over a parabola's where all but the combination along a step is fitted
+        again."""
+        row = times(whole(here.fits.matrix), step) / (2 * here.noise)
+        target = here.fits.x + step
+        tied = sensors._replace(hold=Hold(HOLD * row, target))
+        start = np.clip(target, bounds.lower, bounds.upper)
+        there = minimise(self.squares, tied, start, bounds, near=False)
+        rise = self.squares.cost(there.x, sensors) - here.fits.cost
+        return np.where(np.isfinite(rise), rise / (2 * here.noise**2), np.inf)
+
+    def _second_valley(
+        self, found: Judged, here: Local, sensors: Sensors, bounds: Bounds, k: Places
+    ) -> None:
+        """Far along the weakest direction another solution may lie: fit from there."""
+        ratios = self._both_ways(here, sensors, bounds, found.weakest[:, k], 6.0)
+        suspect = ~_parabolic(ratios)
+        for sign in (1, -1):
+            step = sign * _walk(here, found.weakest[:, k], 6.0)
+            for j in _groups(suspect):
+                near = bounds.some(j)
+                start = near.inside((here.fits.x + step)[:, j])
+                other = minimise(self.squares, sensors.some(j), start, near, near=False)
+                found.add(Code.AMBIGUOUS, _another(here.some(j), other), k[j])
+
+    # -- the noise -------------------------------------------------------------------------------
+
+    def _second_order(
+        self, found: Judged, here: Local, sensors: Sensors, count: Array
+    ) -> Array | None:
+        """What an implicit residual neglects of the noise; its shift's square (n, n, W), if any."""
+        if not self.model.implicit:
+            return None
+        enough = np.minimum(SECOND_ORDER, NOTABLE_BIAS / np.sqrt(count)) / SAFETY
+        found.second[:] = self._screened(here, sensors)
+        suspect = ~(found.second <= enough) & ~found.refused
+        shift = None
+        for k in _groups(suspect):
+            second, bias = self._exact_second_order(here.some(k), sensors.some(k), count[k])
+            found.second[k] = second
+            found.add(Code.NOISE, ~(second <= SECOND_ORDER), k)
+            some = here.some(k)
+            std = some.sigma * np.sqrt(np.einsum("iis->is", some.inverse)) / some.scale
+            notable = (np.abs(bias) / std).max(axis=0) > NOTABLE_BIAS
+            shift = np.zeros_like(here.inverse) if shift is None else shift
+            shift[:, :, k] = np.where(notable, bias * bias[:, None], 0.0)
+        return shift
+
+    def _screened(self, here: Local, sensors: Sensors) -> Array:
+        """Size of ½σ²·∂²r over σ along one direction of the readings' noise per sample, (W,)."""
+        some = _thinned(sensors)
+        number = np.arange(some.samples.shape[1])
+        total = np.zeros(len(here.sigma))
+        middle = self.squares.residuals(here.fits.x, some)
+        first = 0
+        for s in self.model.signals:
+            own = slice(first, first + s.size)
+            first += s.size
+            part = some.samples[own]
+            size = np.sqrt(np.einsum("kps,kps->s", part, part) / (len(part) * len(number)))
+            move = 1e-4 * np.where(size > 0, size, 1.0)
+            signs = np.where((number >> np.arange(s.size)[:, None]) & 1, -1.0, 1.0)
+            up, down = (
+                self.squares.residuals(here.fits.x, _moved(some, own, way * signs, move))
+                for way in (1, -1)
+            )
+            slopes = np.mean((up - down) ** 2, axis=1).max(axis=0) / 4
+            bends = np.mean((up + down - 2 * middle) ** 2, axis=1).max(axis=0)
+            total += np.where(slopes > 0, 0.5 * here.sigma * np.sqrt(bends) / slopes, 0.0)
+        return total
+
+    def _exact_second_order(
+        self, here: Local, sensors: Sensors, count: Array
+    ) -> tuple[Array, Array]:
+        """The same from second derivatives (W,), and the shift of the unknowns (n, W)."""
+        m, x = self.squares.residual_count, here.fits.x
+        slopes = _dense(slope_in_sample(self.model), x, sensors)
+        bends = _dense(laplacian(self.model), x, sensors)
+        ends = np.cumsum([0, *(s.size for s in self.model.signals)])
+        squares = np.add.reduceat((slopes**2).sum(axis=2), ends[:-1], axis=1).max(axis=0)
+        slope2 = squares * m / count
+        noise2 = here.sigma**2 / np.where(slope2 > 0, slope2, np.inf)
+        shift = 0.5 * np.einsum("misw,iw->msw", bends.transpose(0, 1, 2, 3), noise2)
+        second = np.sqrt((shift**2).sum(axis=(0, 1)) / count) / here.sigma
+        pulled = self.squares.pulled(x, sensors, shift) / here.scale
+        return second, -times(here.inverse, pulled) / here.scale
+
+
+def _rounding(fits: Fits, count: Array) -> Array:
+    """Rounding error of one residual, from the sizes of what is added up in it, (W,)."""
+    reach = np.einsum("iis,is->s", fits.matrix, fits.x**2) * len(fits.x) / count
+    return np.asarray(4 * np.finfo(float).eps * np.sqrt(reach) + 1e-300)
+
+
+def _walk(here: Local, direction: Array, deviations: float) -> Array:
+    """Step (n, W) along a scaled direction after which a parabola has risen by ½(kσ)²."""
+    # In scaled unknowns JᵀJ is that of unit columns; its form in the direction gives the length.
+    unit = direction / here.scale
+    return np.asarray(unit * (deviations * here.noise / np.sqrt(form(here.fits.matrix, unit))))
+
+
+def _parabolic(ratios: Array) -> Flags:
+    return np.asarray(((ratios >= PARABOLA[0]) & (ratios <= PARABOLA[1])).all(axis=0))
+
+
+def _another(here: Local, other: Fits) -> Flags:
+    """Is the other fit a solution elsewhere that the data hardly tell from this one, or better?"""
+    step = other.x - here.fits.x
+    away = np.sqrt(form(here.fits.matrix, step)) / here.noise
+    near = other.cost - here.fits.cost < 1.92 * here.noise**2
+    lower = other.cost < here.fits.cost - 0.5 * (1e-2 * here.noise) ** 2
+    return np.asarray((near & (away > 10)) | lower)
+
+
+def _groups(chosen: Flags) -> list[Places]:
+    """The chosen places in one group that NumPy handles alike, if there are any."""
+    k = np.flatnonzero(chosen)
+    return [padded(k)] if k.size else []
+
+
+def _thinned(sensors: Sensors) -> Sensors:
+    """A third of the samples, at least eight of them."""
+    every = max(1, min(3, sensors.samples.shape[1] // 8))
+    mask = None if sensors.mask is None else sensors.mask[::every]
+    return Sensors(np.ascontiguousarray(sensors.samples[:, ::every]), mask)
+
+
+def _moved(sensors: Sensors, own: slice, signs: Array, move: Array) -> Sensors:
+    samples = sensors.samples.copy()
+    samples[own] += signs[:, :, None] * move
+    return Sensors(samples, sensors.mask)
+
+
+@lru_cache(maxsize=64)
+def _bends(model: Model) -> tuple[Replay, SideBySide]:
+    """Σ r ∂²r of one sample, lower triangle: what the Hessian of ½rᵀr has beyond JᵀJ."""
+    t = model.traced
+    force = ca.SX.sym("force", t.expression.numel())
+    second = ca.tril(ca.hessian(ca.dot(force, t.expression), t.coordinates)[0])
+    replay = Replay(function_of(model, {"B": ca.substitute(second, force, t.expression)}))
+    return replay, SideBySide(replay, replay.entries(0))
+
+
+def _bend(model: Model, x: Array, sensors: Sensors) -> Array:
+    """The same summed over samples, both triangles, (n, n, W)."""
+    replay, beside = _bends(model)
+    row, column = replay.sparsity[0]
+    total = np.zeros((len(x), *x.shape))
+    for _, s, values in beside.chunks(x, sensors):
+        total[row, column, s] += np.add.reduce(values, axis=1)
+    return whole(total)
+
+
+@lru_cache(maxsize=64)
+def _beside(replay: Replay) -> SideBySide:
+    return SideBySide(replay, replay.entries(0))
+
+
+def _dense(replay: Replay, x: Array, sensors: Sensors) -> Array:
+    """The first output of every sample, (rows, columns, N, W)."""
+    row, column = replay.sparsity[0]
+    found = np.zeros((*replay.shapes[0], *sensors.samples.shape[1:]))
+    for span, s, values in _beside(replay).chunks(x, sensors):
+        found[row, column, span, s] = values
+    return found

@@ -1,0 +1,4 @@
+"""One least-squares problem from a model and its runs.
+
+Imports data, engine, declaration and below.
+"""

@@ -1,0 +1,552 @@
+"""One least-squares problem from a model and its runs. The only place with index arithmetic.
+
+The unknowns are one vector: parameters shared by all runs first (in the model's order), then the
+parameters that each run has for itself, run after run. Every run sees its own selection of it.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+from typing import Any, NamedTuple
+
+import casadi as ca
+import numpy as np
+
+from casest.data.run import Run
+from casest.declaration.model import Model
+from casest.declaration.physics import chart
+from casest.declaration.shapes import Array
+from casest.declaration.symbols import Parameter
+from casest.declaration.tracing import function_of, sample_symbol
+from casest.engine import (
+    Columns,
+    Normal,
+    Replay,
+    cost,
+    normal_equations,
+    residuals,
+    rows,
+    summed,
+    triangular_factor,
+)
+from casest.errors import DataError, NotTrusted, UsageError
+from casest.leastsquares.per_sample import residual_and_jacobian
+from casest.leastsquares.sequence import Recursion
+
+
+@dataclass(frozen=True)
+class Slot:
+    """One parameter's place: `x` in the unknowns, `ref` in the chart references."""
+
+    parameter: Parameter
+    run: int | None
+    x: slice
+    ref: slice
+
+
+@dataclass(frozen=True)
+class Point:
+    """A place in parameter space: unknowns `x` (n,) and the charts they are measured in."""
+
+    x: Array
+    references: Array
+
+
+class Block(NamedTuple):
+    """Consecutive samples of one run: `run` its number, `x` the unknowns that it sees.
+
+    residual (N, m), jacobian (N, m, len(x)), weights (N, m) or None.
+    """
+
+    run: int
+    x: Any
+    span: slice
+    residual: Array
+    jacobian: Array
+    weights: Array | None
+
+
+#: Points whose normal equations are kept: a solution is asked for again by who judges it.
+LATEST = 16
+#: Samples that are evaluated at once where every residual is looked at on its own.
+BLOCK = 32_768
+#: Records smaller than this (numbers) are copied once into columns, which are quicker to read.
+COPIED = 4_000_000
+#: From this condition of the scaled Jacobian on a triangular factor is computed from the rows.
+ROUGH = 1e4
+
+
+@dataclass(frozen=True)
+class Problem:
+    """The sum of squares of a model's residuals over runs.
+
+    `weights` (one (N, m) array per run, or None) multiply the squares. Residuals are in the
+    model's residual unit. Jacobians are with respect to the unknowns `x`.
+    """
+
+    model: Model
+    runs: tuple[Run, ...]
+    weights: tuple[Array, ...] | None = None
+
+    # -- layout --------------------------------------------------------------------------------
+
+    @cached_property
+    def slots(self) -> tuple[Slot, ...]:
+        """Every parameter's place in the unknowns."""
+        order: list[tuple[Parameter, int | None]] = [
+            (p, None) for p in self.model.parameters if p.scope == "all"
+        ]
+        for k in range(len(self.runs)):
+            order += [(p, k) for p in self.model.parameters if p.scope == "run"]
+        slots, x, ref = [], 0, 0
+        for p, run in order:
+            width, numbers = p.shape.coordinates, len(p.shape.reference(p.shape.default()))
+            slots.append(Slot(p, run, slice(x, x + width), slice(ref, ref + numbers)))
+            x, ref = x + width, ref + numbers
+        return tuple(slots)
+
+    @cached_property
+    def unknowns(self) -> int:
+        """Number n of unknowns."""
+        return sum(s.parameter.shape.coordinates for s in self.slots)
+
+    @property
+    def residual_count(self) -> int:
+        """Number of scalar residuals."""
+        return sum(len(run) for run in self.runs) * len(self.model.axes)
+
+    @cached_property
+    def _selections(self) -> tuple[tuple[Any, Any], ...]:
+        """For each run: which unknowns and which references its samples see, in model order."""
+        selections = []
+        for r in range(len(self.runs)):
+            own = {s.parameter.name: s for s in self.slots if s.run in (None, r)}
+            order = [own[p.name] for p in self.model.parameters]
+            selections.append((_indices(s.x for s in order), _indices(s.ref for s in order)))
+        return tuple(selections)
+
+    @cached_property
+    def _alone(self) -> bool:
+        """Is there one run, with the unknowns in the same order?"""
+        return len(self.runs) == 1 and np.array_equal(
+            self._selections[0][0], np.arange(self.unknowns)
+        )
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """A name for every unknown: `gain[2]`, `tilt (run2)`, `direction (tangent 0)`."""
+        names: list[str] = []
+        for s in self.slots:
+            own = s.parameter.entry_names
+            if s.parameter.shape.curved:
+                own = tuple(
+                    f"{s.parameter.name} (tangent {k})"
+                    for k in range(s.parameter.shape.coordinates)
+                )
+            suffix = (
+                f" ({self.runs[s.run].name})" if s.run is not None and len(self.runs) > 1 else ""
+            )
+            names += [name + suffix for name in own]
+        return tuple(names)
+
+    @cached_property
+    def units(self) -> tuple[str, ...]:
+        """Unit of every unknown, placeholders left in."""
+        units: list[str] = []
+        for s in self.slots:
+            curved = s.parameter.shape.curved
+            units += ["rad"] * s.parameter.shape.coordinates if curved else list(s.parameter.units)
+        return tuple(units)
+
+    @cached_property
+    def bounds(self) -> tuple[Array, Array]:
+        """Lower and upper bound of every unknown; data may tighten the declared ones."""
+        lower, upper = np.full(self.unknowns, -np.inf), np.full(self.unknowns, np.inf)
+        from_data = self.model.limiter(self.model, self.runs) if self.model.limiter else {}
+        for s in self.slots:
+            if s.parameter.shape.curved:
+                continue
+            lower[s.x], upper[s.x] = s.parameter.lower, s.parameter.upper
+            if s.parameter.name in from_data:
+                low, high = from_data[s.parameter.name]
+                lower[s.x] = np.maximum(lower[s.x], s.parameter.shape.spread(low))
+                upper[s.x] = np.minimum(upper[s.x], s.parameter.shape.spread(high))
+        return lower, upper
+
+    # -- points --------------------------------------------------------------------------------
+
+    def point(self, values: Mapping[str, Any]) -> Point:
+        """Point with the given parameter values; per-run ones with a leading run axis if several.
+
+        Missing parameters take their declared start. Values outside the bounds are moved inside.
+        """
+        unknown = set(values) - {p.name for p in self.model.parameters}
+        if unknown:
+            raise UsageError(f"model {self.model.name} has no parameter {sorted(unknown)[0]!r}")
+        x, references = np.zeros(self.unknowns), np.zeros(self._reference_count)
+        for s in self.slots:
+            value = values.get(s.parameter.name)
+            if value is not None and s.run is not None and self._has_run_axis(s.parameter, value):
+                value = np.asarray(value)[s.run]
+            shape = s.parameter.shape
+            packed = s.parameter.start_value() if value is None else shape.pack(value)
+            if shape.curved:
+                references[s.ref] = shape.reference(shape.unpack(packed))
+            else:
+                x[s.x] = packed
+        return Point(self.inside(x), references)
+
+    def _has_run_axis(self, parameter: Parameter, value: Any) -> bool:
+        return np.ndim(value) == len(parameter.shape.dims) + 1
+
+    @property
+    def _reference_count(self) -> int:
+        return self.slots[-1].ref.stop if self.slots else 0
+
+    def inside(self, x: Array) -> Array:
+        """The unknowns, moved strictly inside their bounds where they are not."""
+        lower, upper = self.bounds
+        width = np.where(np.isfinite(lower) & np.isfinite(upper), upper - lower, np.inf)
+        margin = np.minimum(1e-8 * np.maximum(1.0, np.abs(x)), 0.1 * width)
+        inside = np.where(x <= lower, lower + margin, x)
+        return np.where(inside >= upper, upper - margin, inside)
+
+    def start(self) -> Point:
+        """The automatic start: the model's function of the data, else the declared values."""
+        return self._start
+
+    @cached_property
+    def _start(self) -> Point:
+        try:
+            values = self.model.starter(self.model, self.runs) if self.model.starter else {}
+        except np.linalg.LinAlgError as error:
+            raise NotTrusted(
+                f"{self.model.name}: no start values follow from these readings ({error}); are "
+                "they all alike?"
+            ) from error
+        known = {p.name for p in self.model.parameters}
+        return self.point({k: v for k, v in values.items() if k in known})
+
+    def moved(self, point: Point, step: Array) -> Point:
+        """The point after a step, with directions and rotations in a chart around themselves."""
+        x, references = point.x + step, point.references.copy()
+        for s in self.slots:
+            shape = s.parameter.shape
+            if shape.curved:
+                value = self._charted(s, x[s.x], references[s.ref])
+                references[s.ref], x[s.x] = shape.reference(value), 0.0
+        return Point(x, references)
+
+    def difference(self, point: Point, other: Point) -> Array:
+        """Unknowns of `point` minus those of `other`, (n,); on curved sets in the latter's chart,
+        to first order."""
+        away = point.x - other.x
+        for s in self.slots:
+            shape = s.parameter.shape
+            if shape.curved:
+                here, there = (
+                    self._charted(s, p.x[s.x], p.references[s.ref]) for p in (point, other)
+                )
+                away[s.x] = shape.tangent(here, shape.reference(there))
+        return away
+
+    def _charted(self, slot: Slot, x: Array, reference: Array) -> Array:
+        value, _ = _chart(slot.parameter.shape.kind, len(x), len(reference))
+        return np.array(value(x, reference)).reshape(slot.parameter.shape.dims)
+
+    def values(self, point: Point) -> dict[str, Array]:
+        """Parameter values by name; per-run ones with a leading run axis if there are several."""
+        found: dict[str, list[Array]] = {p.name: [] for p in self.model.parameters}
+        for s in self.slots:
+            shape = s.parameter.shape
+            if shape.curved:
+                value = self._charted(s, point.x[s.x], point.references[s.ref])
+            else:
+                value = shape.unpack(point.x[s.x])
+            found[s.parameter.name].append(value)
+        several = len(self.runs) > 1
+        per_run = {p.name for p in self.model.parameters if p.scope == "run"}
+        return {n: np.stack(v) if several and n in per_run else v[0] for n, v in found.items()}
+
+    def spread(self, point: Point, covariance: Array) -> dict[str, Array]:
+        """Standard deviation of every value, of the value's shape, from the covariance of x."""
+        found: dict[str, list[Array]] = {p.name: [] for p in self.model.parameters}
+        for s in self.slots:
+            shape, block = s.parameter.shape, covariance[s.x, s.x]
+            if shape.curved:
+                jacobian = self._chart_jacobian(s, point)
+                std = _root(np.diag(jacobian @ block @ jacobian.T)).reshape(shape.dims)
+            else:
+                std = shape.unpack(_root(np.diag(block)))
+            found[s.parameter.name].append(std)
+        several = len(self.runs) > 1
+        per_run = {p.name for p in self.model.parameters if p.scope == "run"}
+        return {n: np.stack(v) if several and n in per_run else v[0] for n, v in found.items()}
+
+    def _chart_jacobian(self, slot: Slot, point: Point) -> Array:
+        x, reference = point.x[slot.x], point.references[slot.ref]
+        _, slope = _chart(slot.parameter.shape.kind, len(x), len(reference))
+        return np.array(slope(x, reference))
+
+    # -- evaluation ----------------------------------------------------------------------------
+
+    @cached_property
+    def samples(self) -> tuple[Columns, ...]:
+        """Signals of each run side by side, by column."""
+        stacked = []
+        for run in self.runs:
+            missing = [s.name for s in self.model.signals if s.name not in run.signals]
+            if missing:
+                raise DataError(f"{run.file}: no data for signal {missing[0]!r}; add --columns")
+            parts = [np.asanyarray(run.signals[s.name]) for s in self.model.signals]
+            if sum(part.size for part in parts) <= COPIED:
+                # Columns first: the kernel reads them in order.
+                parts = [np.ascontiguousarray(part.T, dtype=float).T for part in parts]
+            stacked.append(Columns(parts))
+        return tuple(stacked)
+
+    def thinned(self, every: int) -> Problem:
+        """The same problem on one sample in `every`: for a start, never for a result."""
+        if every not in self._thinned:
+            runs = tuple(run.take(slice(None, None, every)) for run in self.runs)
+            weights = None if self.weights is None else tuple(w[::every] for w in self.weights)
+            self._thinned[every] = Problem(self.model, runs, weights)
+        return self._thinned[every]
+
+    @cached_property
+    def _thinned(self) -> dict[int, Problem]:
+        return {}
+
+    @property
+    def sequential(self) -> bool:
+        """Does a sample's residual depend on the samples before?"""
+        return self._recursion is not None
+
+    @cached_property
+    def _with_jacobian(self) -> Replay:
+        return residual_and_jacobian(self.model)
+
+    @cached_property
+    def _recursion(self) -> Recursion | None:
+        """Where an effect acts on the sequence of samples, rows come from a recursion."""
+        sequential = any(a.kind == "sequence" for a in self.model.effects)
+        return Recursion(self.model) if sequential else None
+
+    def _rows(self, point: Point, r: int, span: slice = slice(None)) -> tuple[Array, Array]:
+        """Residuals (N, m) and Jacobians (N, m, n of the run) of one run, unweighted."""
+        parameters = self.parameters(point, r)
+        if self._recursion is not None:
+            found = self._recursion.rows(parameters, self.samples[r].dense, self.runs[r])
+            return found[0][span], found[1][span]
+        return rows(self._with_jacobian, parameters, self.samples[r][span])
+
+    def blocks(self, point: Point) -> Iterator[Block]:
+        """Residuals and Jacobians of all samples, piece by piece, unweighted."""
+        for r, samples in enumerate(self.samples):
+            # A recursion has to be run through as a whole anyway.
+            length = max(len(samples), 1) if self.sequential else BLOCK
+            for start in range(0, len(samples), length):
+                span = slice(start, min(start + length, len(samples)))
+                weights = self._weight(r)
+                residual, jacobian = self._rows(point, r, span)
+                own = None if weights is None else weights[span]
+                yield Block(r, self._selections[r][0], span, residual, jacobian, own)
+
+    def _weighted_rows(self, point: Point, r: int) -> Array:
+        """[J r] of one run, weighted, (N·m, n + 1)."""
+        residual, jacobian = self._rows(point, r)
+        both = np.concatenate([jacobian, residual[:, :, None]], axis=2)
+        weights = self._weight(r)
+        if weights is not None:
+            both = both * np.sqrt(weights)[:, :, None]
+        return both.reshape(-1, both.shape[2])
+
+    def _run_cost(self, point: Point, r: int) -> float:
+        if self._recursion is not None:
+            return 0.5 * float(np.sum(self._weighted_rows(point, r)[:, -1] ** 2))
+        parameters = self.parameters(point, r)
+        return cost(self._with_jacobian, parameters, self.samples[r], self._weight(r))
+
+    def _run_normal(self, point: Point, r: int) -> Normal:
+        if self._recursion is not None:
+            both = self._weighted_rows(point, r)
+            product = both.T @ both
+            return Normal(0.5 * float(product[-1, -1]), product[:-1, -1], product[:-1, :-1])
+        parameters = self.parameters(point, r)
+        return normal_equations(self._with_jacobian, parameters, self.samples[r], self._weight(r))
+
+    def _run_factor(self, point: Point, r: int) -> Array:
+        if self._recursion is not None:
+            return np.asarray(np.linalg.qr(self._weighted_rows(point, r), mode="r"))
+        parameters = self.parameters(point, r)
+        return triangular_factor(self._with_jacobian, parameters, self.samples[r], self._weight(r))
+
+    def parameters(self, point: Point, r: int) -> Array:
+        """What the per-sample functions of one run are given: its unknowns and its references."""
+        x, ref = self._selections[r]
+        return np.concatenate([point.x[x], point.references[ref]])
+
+    def _weight(self, r: int) -> Array | None:
+        return None if self.weights is None else self.weights[r]
+
+    def cost(self, point: Point) -> float:
+        """½ Σ w r²."""
+        return sum(self._run_cost(point, r) for r in range(len(self.runs)))
+
+    def normal(self, point: Point) -> Normal:
+        """Cost, gradient (n,) and Gauss-Newton matrix (n, n); those of the last points are kept."""
+        for known, normal in self._latest:
+            if known is point:
+                return normal
+        normal = self._normal(point)
+        self._latest.append((point, normal))
+        return normal
+
+    @cached_property
+    def _latest(self) -> deque[tuple[Point, Normal]]:
+        return deque(maxlen=LATEST)
+
+    def _normal(self, point: Point) -> Normal:
+        if self._alone:
+            return self._run_normal(point, 0)
+        total, gradient = 0.0, np.zeros(self.unknowns)
+        matrix = np.zeros((self.unknowns, self.unknowns))
+        for r in range(len(self.runs)):
+            x = self._selections[r][0]
+            own = self._run_normal(point, r)
+            total += own.cost
+            gradient[x] += own.gradient
+            matrix[np.ix_(x, x)] += own.matrix
+        return Normal(total, gradient, matrix)
+
+    def run_normals(self, point: Point) -> list[tuple[Any, Normal]]:
+        """For each run the unknowns it sees and its own normal equations in them."""
+        return [(self._selections[r][0], self._run_normal(point, r)) for r in range(len(self.runs))]
+
+    def factor(self, point: Point) -> tuple[Array, Array, float]:
+        """Triangular factor of J, Qᵀr (n,), and the norm of the rest of r.
+
+        JᵀJ = RᵀR, Jᵀr = Rᵀ(Qᵀr), ‖r‖² = ‖Qᵀr‖² + rest². From the normal equations where the
+        squared condition number leaves eight digits, else from the rows.
+        """
+        return factored(self.normal(point)) or self._factor_of_rows(point)
+
+    def _factor_of_rows(self, point: Point) -> tuple[Array, Array, float]:
+        n, blocks = self.unknowns, []
+        for r in range(len(self.runs)):
+            x = self._selections[r][0]
+            own = self._run_factor(point, r)
+            block = np.zeros((len(own), n + 1))
+            block[:, [*x, n]] = own
+            blocks.append(block)
+        whole = np.vstack(blocks)
+        if len(self.runs) > 1:
+            whole = np.asarray(np.linalg.qr(whole, mode="r"))
+        full = np.zeros((n + 1, n + 1))
+        full[: len(whole)] = whole[: n + 1]
+        return full[:n, :n], full[:n, n], float(abs(full[n, n]))
+
+    def hessian(self, point: Point) -> Array:
+        """Exact second derivative of the cost, (n, n); Gauss-Newton for sequences of samples."""
+        matrix = self.normal(point).matrix.copy()
+        if self._recursion is not None:
+            return matrix
+        for r, samples in enumerate(self.samples):
+            x = self._selections[r][0]
+            weights = self._weight(r)
+            if weights is None:
+                weights = np.broadcast_to(1.0, (len(samples), len(self.model.axes)))
+            with_weights = samples.with_more(weights)
+            own = summed(_bend(self.model), self.parameters(point, r), with_weights)
+            matrix[np.ix_(x, x)] += own + np.triu(own, 1).T
+        return matrix
+
+    def residuals(self, point: Point) -> tuple[Array, ...]:
+        """Residuals of each run, (N, m)."""
+        return tuple(self._residuals(point, r) for r in range(len(self.runs)))
+
+    def _residuals(self, point: Point, r: int, span: slice = slice(None)) -> Array:
+        if self.sequential:
+            return self._rows(point, r, span)[0]
+        parameters = self.parameters(point, r)
+        return residuals(self._with_jacobian, parameters, self.samples[r][span])
+
+    def residual_blocks(self, point: Point) -> Iterator[tuple[int, slice, Array]]:
+        """Run, span and residuals (N, m) of all samples, piece by piece."""
+        for r, samples in enumerate(self.samples):
+            length = max(len(samples), 1) if self.sequential else BLOCK
+            for start in range(0, len(samples), length):
+                span = slice(start, min(start + length, len(samples)))
+                yield r, span, self._residuals(point, r, span)
+
+    def jacobian(self, point: Point) -> Array:
+        """The whole Jacobian, (residuals, n), unweighted; for small problems and tests."""
+        parts = []
+        for r in range(len(self.runs)):
+            _, own = self._rows(point, r)
+            part = np.zeros((own.shape[0] * own.shape[1], self.unknowns))
+            part[:, self._selections[r][0]] = own.reshape(-1, own.shape[2])
+            parts.append(part)
+        return np.vstack(parts)
+
+    def evaluate(self, point: Point, outputs: Mapping[str, Any]) -> list[list[Array]]:
+        """Expressions of the trace for every sample of every run, each (N, rows, columns)."""
+        replay = Replay(function_of(self.model, outputs))
+        return [replay(self.parameters(point, r), s) for r, s in enumerate(self.samples)]
+
+    def with_weights(self, weights: Sequence[Array] | None) -> Problem:
+        """The same problem with other weights on the squares."""
+        return replace(self, weights=None if weights is None else tuple(weights))
+
+
+@lru_cache(maxsize=8)
+def _chart(kind: str, coordinates: int, references: int) -> tuple[Any, Any]:
+    """A chart's value, and the slope of its entries row by row, of coordinates and reference."""
+    c, reference = ca.SX.sym("c", coordinates), ca.SX.sym("reference", references)
+    value = chart(kind, c, reference)
+    flat = ca.vec(value.T) if value.shape == (3, 3) else value
+    slope = ca.jacobian(flat, c)
+    arguments = [c, reference]
+    return ca.Function("chart", arguments, [value]), ca.Function("slope", arguments, [slope])
+
+
+@lru_cache(maxsize=64)
+def _bend(model: Model) -> Replay:
+    """Σ w r ∂²r of one sample, upper triangle: what the Hessian of ½rᵀWr has beyond JᵀWJ.
+
+    The weights arrive as further signals.
+    """
+    t, count = model.traced, model.traced.expression.numel()
+    w, force = ca.SX.sym("w", count), ca.SX.sym("force", count)
+    second = ca.triu(ca.hessian(ca.dot(force, t.expression), t.coordinates)[0])
+    bend = ca.substitute(second, force, w * t.expression)
+    sample = ca.vertcat(sample_symbol(model), w)
+    parameters = ca.vertcat(t.coordinates, t.references)
+    return Replay(ca.Function("h", [parameters, sample], [bend], ["parameters", "sample"], ["H"]))
+
+
+def factored(normal: Normal) -> tuple[Array, Array, float] | None:
+    """R, Qᵀr and the norm of the rest of r from normal equations; None where they are too rough."""
+    scale = np.sqrt(np.where(np.diag(normal.matrix) > 0, np.diag(normal.matrix), 1.0))
+    try:
+        lower = np.linalg.cholesky(normal.matrix / np.outer(scale, scale))
+        t = np.linalg.solve(lower, normal.gradient / scale)
+    except np.linalg.LinAlgError:
+        return None
+    rest = 2 * normal.cost - float(t @ t)
+    # A residual that the Jacobian nearly explains loses its digits in the difference.
+    rough = not np.diag(lower).min(initial=1.0) > 1 / ROUGH or not rest > 1e-6 * normal.cost
+    return None if rough else (np.asarray(lower.T * scale), np.asarray(t), float(np.sqrt(rest)))
+
+
+def _root(variance: Array) -> Array:
+    """Standard deviation; rounding may leave a vanishing variance below zero, NaN stays NaN."""
+    return np.sqrt(np.where(variance < 0, 0.0, variance))
+
+
+def _indices(slices: Any) -> Any:
+    parts = [np.arange(s.start, s.stop) for s in slices]
+    return np.concatenate(parts) if parts else np.zeros(0, dtype=int)

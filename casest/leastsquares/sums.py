@@ -1,0 +1,180 @@
+"""Sums over all samples of a problem, beyond those that solving needs.
+
+Everything here runs through the record piece by piece: memory does not grow with its length.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from casest.declaration.shapes import Array
+from casest.leastsquares.per_sample import laplacian, slope_in_sample
+from casest.leastsquares.problem import Block, Point, Problem
+
+#: Residuals that are looked at where a median or a correlation is wanted of a longer record.
+SAMPLED = 1_000_000
+#: The same where an order of magnitude is wanted.
+FEW = 600
+#: Samples of each run that are enough to come near a solution of a longer record.
+NEARBY = 2000
+
+
+def squares_of_gradients(
+    problem: Problem,
+    point: Point,
+    batches: Sequence[NDArray[np.int_]] | None = None,
+    bread: Array | None = None,
+) -> Array:
+    """Σ_batch (Σ w r ∂r)(Σ w r ∂r)ᵀ: the middle of the sandwich covariance, (n, n).
+
+    `batches` holds the first sample of every batch of each run (None: each sample alone); those of
+    one batch may be correlated. With `bread` = (JᵀWJ)⁻¹ every residual is first divided by what
+    the fit leaves of it, 1 − h.
+    """
+    middle = np.zeros((problem.unknowns, problem.unknowns))
+    sums = [np.zeros((len(b), problem.unknowns)) for b in batches or ()]
+    for block in problem.blocks(point):
+        residual = block.residual
+        if bread is not None:
+            residual = _without_leverage(block, bread[np.ix_(block.x, block.x)])
+        if block.weights is not None:
+            residual = residual * block.weights
+        scores = np.einsum("nm,nmk->nk", residual, block.jacobian)
+        if batches is None:
+            middle[np.ix_(block.x, block.x)] += scores.T @ scores
+        else:
+            own = np.arange(block.span.start, block.span.stop)
+            number = np.searchsorted(batches[block.run], own, side="right") - 1
+            first = np.flatnonzero(np.diff(number, prepend=-1))
+            sums[block.run][np.ix_(number[first], block.x)] += np.add.reduceat(scores, first)
+    for each in sums:
+        middle += each.T @ each
+    return middle
+
+
+def _without_leverage(block: Block, bread: Array) -> Array:
+    """(I − H)⁻¹r sample by sample: what the residual would be had the fit not seen it."""
+    moved = block.jacobian @ bread
+    leverage = moved @ block.jacobian.transpose(0, 2, 1)
+    if block.weights is not None:
+        leverage = leverage * block.weights[:, None, :]
+    residual = block.residual
+    if np.nanmax(np.trace(leverage, axis1=1, axis2=2), initial=0.0) < 0.01:
+        # The geometric series: what is left out is below 1e-12.
+        term = residual
+        for _ in range(5):
+            term = np.einsum("nmk,nk->nm", leverage, term)
+            residual = residual + term
+        return np.asarray(residual)
+    left = np.eye(residual.shape[1]) - np.where(np.isfinite(leverage), leverage, 0.0)
+    # A residual that the fit follows entirely says nothing: keep the inverse finite.
+    values, vectors = np.linalg.eigh(0.5 * (left + left.transpose(0, 2, 1)))
+    inverse = (vectors / np.maximum(values, 1e-3)[:, None, :]) @ vectors.transpose(0, 2, 1)
+    return np.asarray(np.einsum("nmk,nk->nm", inverse, residual))
+
+
+def rounding(problem: Problem, point: Point) -> float:
+    """Rounding error of one residual: machine precision of all that was added up in it.
+
+    Of a long record every k-th sample is looked at: an order of magnitude is wanted.
+    """
+    problem = _sampled(problem, FEW)
+    squares, count = 0.0, 0
+    for block in problem.blocks(point):
+        parameters = problem.parameters(point, block.run)
+        samples = problem.samples[block.run][block.span]
+        slopes = slope_in_sample(problem.model)(parameters, samples)[0]
+        terms = np.sum(np.abs(slopes * samples.dense[:, None, :]), axis=2)
+        terms += np.abs(block.jacobian) @ np.abs(point.x[block.x])
+        squares, count = squares + float(np.sum(terms**2)), count + terms.size
+    return float(4 * np.finfo(float).eps * np.sqrt(squares / max(count, 1)) + 1e-300)
+
+
+def second_order(problem: Problem, point: Point, sigma: float) -> float:
+    """Root mean square over σ of ½Σσ_s²·∂²r/∂s²: what an implicit residual neglects of the noise.
+
+    Zero for explicit models, whose residual is linear in the noise of the reading.
+    """
+    if not problem.model.implicit:
+        return 0.0
+    squares, count, noise = 0.0, 0, _signal_noise(problem, point, sigma)
+    for r, samples in enumerate(problem.samples):
+        shift = 0.5 * laplacian(problem.model)(problem.parameters(point, r), samples)[0] @ noise**2
+        squares, count = squares + float(np.sum(shift**2)), count + shift.size
+    return float(np.sqrt(squares / max(count, 1)) / sigma)
+
+
+def second_order_bias(problem: Problem, point: Point, sigma: float, bread: Array) -> Array:
+    """Shift of the unknowns (n,) by what an implicit residual neglects of the noise.
+
+    Noise of σ_s in every component of signal s shifts each residual by ½Σσ_s²·∂²r/∂s² on average.
+    """
+    slope = np.zeros(problem.unknowns)
+    if not problem.model.implicit:
+        return slope
+    noise = _signal_noise(problem, point, sigma)
+    for block in problem.blocks(point):
+        parameters = problem.parameters(point, block.run)
+        samples = problem.samples[block.run][block.span]
+        shift = 0.5 * laplacian(problem.model)(parameters, samples)[0] @ noise**2
+        np.add.at(slope, block.x, np.einsum("nm,nmk->k", shift, block.jacobian))
+    return np.asarray(-bread @ slope)
+
+
+def _signal_noise(problem: Problem, point: Point, sigma: float) -> Array:
+    """Noise of each signal that makes up the residual's σ, in the signal's own unit, (signals,).
+
+    At most σ over the slope of the residual that sees the signal best. A signal whose spread is
+    zero in all runs, or that a model takes as exact (a time, an attitude), has the same formula:
+    the residual tells no more. What only effects read (a temperature, the time) is exact.
+    """
+    ends = np.cumsum([0, *(s.size for s in problem.model.signals)])
+    squares = np.zeros((len(problem.model.axes), len(ends) - 1))
+    for r, samples in enumerate(problem.samples):
+        G = slope_in_sample(problem.model)(problem.parameters(point, r), samples)[0]
+        squares += np.add.reduceat(np.sum(G**2, axis=0), ends[:-1], axis=1)
+    count = sum(len(run) for run in problem.runs)
+    slope = np.sqrt(squares.max(axis=0) / max(count, 1))
+    own = [s.name in {d.name for d in problem.model.declared} for s in problem.model.signals]
+    return np.asarray(sigma / np.where((slope > 0) & own, slope, np.inf))
+
+
+def repeat_noise(problem: Problem, point: Point) -> float | None:
+    """Root mean square of the residual's noise that the scatter within rest intervals implies.
+
+    None where no signal carries a spread of its own.
+    """
+    if not any(run.spread for run in problem.runs):
+        return None
+    squares, count = 0.0, 0
+    for r, run in enumerate(problem.runs):
+        G = slope_in_sample(problem.model)(problem.parameters(point, r), problem.samples[r])[0]
+        first = 0
+        for s in problem.model.signals:
+            own, first = G[:, :, first : first + s.size], first + s.size
+            if s.name in run.spread:
+                squares += float(np.einsum("nmi,nij,nmj->", own, run.covariance(s.name), own))
+        count += G.shape[0] * G.shape[1]
+    return float(np.sqrt(squares / count))
+
+
+def some_residuals(problem: Problem, point: Point) -> tuple[Array, ...]:
+    """Residuals of each run, (N, m); of a long record those of every k-th sample."""
+    return _sampled(problem, SAMPLED).residuals(point)
+
+
+def few_of(problem: Problem) -> Problem | None:
+    """The problem on as few of its samples as are enough to come near the solution of all.
+
+    None where it has no more than that, or where its samples need each other.
+    """
+    every = problem.residual_count // (NEARBY * len(problem.model.axes) * len(problem.runs))
+    return None if every < 2 or problem.sequential else problem.thinned(every)
+
+
+def _sampled(problem: Problem, limit: int) -> Problem:
+    every = -(-problem.residual_count // limit)
+    return problem if every <= 1 or problem.sequential else problem.thinned(every)

@@ -1,0 +1,73 @@
+"""Effects on the noise: residuals that count less the further out they lie.
+
+An effect on the noise gives the weight w(r) of a residual r (in standard deviations). Fitting with
+these weights, again and again, is M-estimation with ψ(r) = w(r)·r.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import casadi as ca
+import numpy as np
+
+from casest.declaration.model import Model
+from casest.declaration.shapes import Array
+from casest.engine import Replay
+from casest.leastsquares.problem import Point, Problem
+from casest.leastsquares.sums import some_residuals
+
+
+def has_noise_effects(model: Model) -> bool:
+    """Does any effect of the model act on the noise?"""
+    return any(a.kind == "noise" for a in model.effects)
+
+
+def robust_scale(residuals: Sequence[Array]) -> float:
+    """Standard deviation from the median of absolute residuals, which outliers do not move."""
+    everything = np.abs(np.concatenate([r.ravel() for r in residuals]))
+    return max(float(np.median(everything)) / 0.6745, 1e-300)
+
+
+def weights(problem: Problem, point: Point) -> tuple[Array, ...]:
+    """Weight of every residual at a point, (N, m) per run."""
+    residuals = problem.residuals(point)
+    scale, curve = robust_scale(residuals), _curve(problem.model)
+    return tuple(
+        curve(np.zeros(0), (r / scale).reshape(-1, 1))[0].reshape(r.shape) for r in residuals
+    )
+
+
+def weighted(problem: Problem, values: Mapping[str, Array]) -> Problem:
+    """The problem with the weights of its effects on the noise at these values; else as it is."""
+    if not has_noise_effects(problem.model):
+        return problem
+    return problem.with_weights(weights(problem, problem.point(values)))
+
+
+def _curve(model: Model) -> Replay:
+    """w(r) and ψ′(r) of all effects on the noise together."""
+    r = ca.SX.sym("r")
+    w = ca.SX(1)
+    for attached in model.effects:
+        if attached.kind == "noise":
+            w = w * attached.apply(r, {})
+    slope = ca.jacobian(w * r, r)
+    f = ca.Function(
+        "noise",
+        [ca.SX.sym("none", 0), r],
+        [ca.densify(w), ca.densify(slope)],
+        ["parameters", "sample"],
+        ["w", "slope"],
+    )
+    return Replay(f)
+
+
+def variance_factor(problem: Problem, point: Point) -> float:
+    """σ² that multiplies the unweighted (JᵀJ)⁻¹: Huber's (1973) mean(ψ²)/mean(ψ′)²."""
+    residuals = some_residuals(problem, point)
+    scale = robust_scale(residuals)
+    r = np.concatenate([x.ravel() for x in residuals]) / scale
+    w, slope = (out.ravel() for out in _curve(problem.model)(np.zeros(0), r.reshape(-1, 1)))
+    dof = max(len(r) - problem.unknowns, 1)
+    return float(scale**2 * np.sum((w * r) ** 2) / dof / np.mean(slope) ** 2)

@@ -1,1 +1,0 @@
-"""Floor 2: models and effects as values."""

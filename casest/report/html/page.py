@@ -1,0 +1,135 @@
+"""HTML of a report: everything that a person wrote is escaped, and no request can leave the page.
+
+A content security policy allows the one script and the one style sheet of the page, by their
+digests, and nothing else: what slipped through the escaping would still not run.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import html
+import json
+from collections.abc import Iterable, Sequence
+from importlib.resources import files
+from typing import Any
+
+from casest import __version__
+
+
+def escaped(text: Any) -> str:
+    """The text as HTML shows it."""
+    return html.escape(str(text), quote=True)
+
+
+def tag(name: str, *inside: str, **attributes: str) -> str:
+    """An element around HTML; a trailing underscore of an attribute's name is dropped."""
+    said = "".join(f' {k.rstrip("_")}="{escaped(v)}"' for k, v in attributes.items() if v)
+    return f"<{name}{said}>{''.join(inside)}</{name}>"
+
+
+def paragraph(text: str, look: str = "") -> str:
+    """A paragraph of plain text."""
+    return tag("p", prose(text), class_=look)
+
+
+def prose(text: str) -> str:
+    """Escaped text in which `code` is set as code."""
+    parts = escaped(text).split("`")
+    if len(parts) % 2 == 0:  # an odd backtick is only a backtick
+        return escaped(text)
+    return "".join(f"<code>{p}</code>" if k % 2 else p for k, p in enumerate(parts))
+
+
+def points(texts: Iterable[str], kind: str = "ul") -> str:
+    """A list of sentences; nothing where there is none."""
+    items = "".join(tag("li", prose(t)) for t in texts)
+    return tag(kind, items) if items else ""
+
+
+def section(name: str, title: str, *inside: str) -> str:
+    """A section with a heading; nothing where it would be empty."""
+    body = "".join(inside)
+    return tag("section", tag("h2", escaped(title)), body, id=name) if body else ""
+
+
+def details(summary: str, *inside: str) -> str:
+    """What is there for those who ask."""
+    return tag("details", tag("summary", escaped(summary)), *inside)
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str]], numbers: Sequence[int] = ()) -> str:
+    """A table; the columns `numbers` are aligned on their decimal points."""
+    if not rows:
+        return ""
+    columns = [list(c) for c in zip(*rows, strict=True)]
+    for k in numbers:
+        columns[k] = aligned(columns[k])
+    look = ["number" if k in numbers else "" for k in range(len(head))]
+    top = "".join(tag("th", escaped(h), class_=c) for h, c in zip(head, look, strict=True))
+    body = "".join(
+        tag("tr", *(tag("td", prose(cell), class_=c) for cell, c in zip(row, look, strict=True)))
+        for row in zip(*columns, strict=True)
+    )
+    return tag("div", tag("table", tag("thead", tag("tr", top)), tag("tbody", body)), class_="wide")
+
+
+def aligned(texts: Sequence[str]) -> list[str]:
+    """Numbers padded with blanks as wide as digits, so that their decimal points meet."""
+    tails = [_tail(text) for text in texts]
+    digits = max((len(t.lstrip(".")) for t in tails), default=0)
+    point = any(t.startswith(".") for t in tails)
+    found = []
+    for text, tail in zip(texts, tails, strict=True):
+        blanks = "\u2007" * (digits - len(tail.lstrip(".")))
+        found.append(text + ("\u2008" if point and not tail.startswith(".") else "") + blanks)
+    return found
+
+
+def _tail(text: str) -> str:
+    """What stands from the decimal point on."""
+    _, point, rest = text.partition(".")
+    return point + rest
+
+
+def document(
+    title: str, body: str, figures: Sequence[Any], arrays: Sequence[Any], *, trusted: bool
+) -> str:
+    """The whole page, with its style, its script and the figures' data."""
+    style, script = (_shipped(name) for name in ("style.css", "plot.js"))
+    policy = (
+        f"default-src 'none'; img-src data:; style-src '{_digest(style)}'; "
+        f"script-src '{_digest(script)}'; base-uri 'none'; form-action 'none'"
+    )
+    data = _for_script({"figures": figures, "arrays": arrays})
+    return (
+        "<!DOCTYPE html>\n"
+        '<html lang="en"><head><meta charset="utf-8">'
+        f'<meta http-equiv="Content-Security-Policy" content="{escaped(policy)}">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f'<meta name="generator" content="casest {escaped(__version__)}">'
+        '<link rel="icon" href="data:,">'
+        f"<title>{escaped(title)}</title><style>{style}</style></head>\n"
+        f"<body{'' if trusted else ' class=refused'}><main>{body}"
+        "<noscript><p>The figures are drawn by a script of this page, which is switched off.</p>"
+        "</noscript></main>\n"
+        f'<script type="application/json" id="data">{data}</script>\n'
+        f"<script>{script}</script></body></html>\n"
+    )
+
+
+def _shipped(name: str) -> str:
+    return files("casest.report.html").joinpath(name).read_text(encoding="utf-8")
+
+
+def _digest(text: str) -> str:
+    digest = hashlib.sha256(text.encode()).digest()
+    return "sha256-" + base64.b64encode(digest).decode()
+
+
+def _for_script(data: Any) -> str:
+    """JSON that cannot end the element that holds it."""
+    text = json.dumps(data, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
+    for sign in "<>&\u2028\u2029":
+        text = text.replace(sign, f"\\u{ord(sign):04x}")
+    return text

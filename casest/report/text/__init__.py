@@ -1,0 +1,1 @@
+"""What a prompt prints. Imports results."""

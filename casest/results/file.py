@@ -1,0 +1,132 @@
+"""Files of a result: written whole or not at all, read back, and what a file is instead."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import platform
+from collections.abc import Mapping, Sequence
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from casest.data.logs import file_and_topics
+from casest.data.write import write_atomically
+from casest.errors import DataError
+
+RESULT, RESIDUALS = "result.json", "residuals.csv"
+
+
+def reproduce(command: str, data: Sequence[str]) -> dict[str, Any]:
+    """Files of a result: written whole or not at all, read back, and what a file is instead."""
+    return {
+        "command": command,
+        "python": platform.python_version(),
+        **_versions(),
+        "sha256": {name: _digest(name) for name in data},
+    }
+
+
+@cache
+def _versions() -> dict[str, str]:
+    """Files of a result: written whole or not at all, read back, and what a file is instead."""
+    return {name: version(name) for name in ("casadi", "numpy", "scipy")}
+
+
+def _digest(name: str) -> str:
+    """Files of a result: written whole or not at all, read back, and what a file is instead."""
+    path = file_and_topics(name)[0]
+    whole = hashlib.sha256()
+    for file in sorted(path.iterdir()) if path.is_dir() else [path]:
+        if file.is_file():
+            with file.open("rb") as stream:
+                part = hashlib.file_digest(stream, "sha256")
+            if not path.is_dir():
+                return part.hexdigest()
+            whole.update(part.digest())
+    return whole.hexdigest()
+
+
+def plain(value: Any) -> Any:
+    """Files of a result: written whole or not at all, read back, and what a file is instead."""
+    if value is None or isinstance(value, str | bool | int):
+        return value
+    if isinstance(value, np.ndarray) and value.ndim:
+        return [plain(v) for v in value]
+    number = float(value)
+    return number if np.isfinite(number) else None
+
+
+def save(folder: Path, result: Mapping[str, Any], residuals: str | None) -> None:
+    """Files of a result: written whole or not at all, read back, and what a file is instead."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DataError(f"{folder}: cannot be made ({error.strerror}); give another -o") from None
+    if residuals is not None:
+        write_atomically(folder / RESIDUALS, residuals)
+    write_atomically(folder / RESULT, as_json(result))
+
+
+def as_json(result: Mapping[str, Any]) -> str:
+    """Files of a result: written whole or not at all, read back, and what a file is instead."""
+    return json.dumps(result, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def load_result(path: Path) -> dict[str, Any]:
+    """Files of a result: written whole or not at all, read back, and what a file is instead."""
+    if path.is_dir():
+        path = path / RESULT
+    try:
+        result = json.loads(path.read_text(encoding="utf-8"))
+    except (FileNotFoundError, NotADirectoryError):
+        raise DataError(f"{path}: no such result; {_instead(path.parent)}") from None
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        near = path.with_name(RESULT)
+        hint = f"; did you mean {near}?" if near.exists() and near != path else ""
+        raise DataError(f"{path}: not a result.json ({error}){hint}") from None
+    if not isinstance(result, dict) or "model" not in result:
+        raise DataError(f"{path}: not a casest result: it names no model")
+    if "format" in result:
+        raise DataError(
+            f"{path}: is a correction exported already, which `casest apply` reads; here the "
+            "result.json is needed that it was exported from"
+        )
+    if not result.keys() & {"estimate", "before", "after"}:
+        writer = _WRITERS.get(path.name)
+        by = f", but what `casest {writer}` writes" if writer else ": it holds no estimate"
+        raise DataError(f"{path}: not a result of calibrate or close{by}")
+    return result
+
+
+def made_by(path: Path) -> str:
+    """Files of a result: written whole or not at all, read back, and what a file is instead."""
+    return str(load_result(path).get("reproduce", {}).get("command", ""))
+
+
+#: What other commands leave in their folders.
+_WRITERS = {
+    "observe.json": "observe",
+    "filter.json": "filter",
+    "compare.json": "compare",
+    "truth.json": "simulate",
+}
+
+
+def _instead(folder: Path) -> str:
+    """Files of a result: written whole or not at all, read back, and what a file is instead."""
+    make = f"casest calibrate (or close) MODEL DATA -o {folder} makes one"
+    found = next((name for name in _WRITERS if (folder / name).exists()), None)
+    if found:
+        return f"the folder holds {found} of `casest {_WRITERS[found]}`; {make}"
+    return make
+
+
+def saved_parameters(result: Mapping[str, Any]) -> dict[str, Any]:
+    """Files of a result: written whole or not at all, read back, and what a file is instead."""
+    block = result.get("after") or result.get("estimate") or {}
+    found: dict[str, Any] = block.get("parameters", {})
+    return found

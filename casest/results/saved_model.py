@@ -1,0 +1,92 @@
+"""Model and values of a saved result, as they were when it was made."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from casest.declaration.effect import Effect
+from casest.declaration.model import Model
+from casest.declaration.symbols import constant
+from casest.effects.on_axes import axis_name, restricted
+from casest.errors import DataError, UsageError
+from casest.results.file import saved_parameters
+from casest.results.find import find_effects, find_model
+
+
+def saved_model(result: Mapping[str, Any]) -> tuple[Model, dict[str, Any]]:
+    """Model and parameter values of a saved result: effects, constants and scopes as they were."""
+    if "innovations" in result:
+        raise UsageError(
+            f"the result is of {result['model']}, an estimator in motion: it has states over time "
+            f"(casest filter {result['model']} DATA) and no correction"
+        )
+    model, units = _found_model(result), result.get("units", {})
+    parameters = saved_parameters(result)
+    for saved in result.get("effects", []):
+        if "file" not in saved:  # a constant that was freed
+            continue
+        columns, on = saved.get("columns") or {}, saved["on"]
+        label = saved["name"] + "".join(f"({c})" for c in columns.values())
+        moved = any(n.startswith(f"{label}@{on}.") for n in parameters)
+        label += f"@{on}" if moved else ""
+        own = {n.removeprefix(label + ".") for n in parameters if n.startswith(label + ".")}
+        effect = _as_it_was(_found_effect(saved), saved, own, model)
+        effect = effect if moved else replace(effect, on=on)
+        model = model.with_effect(effect, on=on, columns=columns)
+    for name in parameters:
+        model = model.freed(name)
+    for name, value in result["constants"].items():
+        unit = units.get(name, "")
+        model = model.having(**{name: constant(value, "" if "[" in unit else unit)})
+    for name, scope in result.get("scopes", {}).items():
+        model = model.scoped(name, scope)
+    missing = [p.name for p in model.parameters if p.name not in parameters]
+    if missing:
+        raise DataError(f"the result has no value for {missing[0]!r} of model {model.name}")
+    return model, {name: np.array(p["value"], dtype=float) for name, p in parameters.items()}
+
+
+def _found_model(result: Mapping[str, Any]) -> Model:
+    """The model where it was when the result was made, and as it was."""
+    name, declared = str(result["model"]), result.get("declared_in") or {}
+    path, colon, own = name.partition(":")
+    if path.endswith(".py") and not Path(path).exists() and Path(declared.get("file", "")).exists():
+        name = declared["file"] + colon + own
+    model = find_model(name)
+    source = Path(model.function.__code__.co_filename)
+    shipped = not name.partition(":")[0].endswith(".py")
+    if not shipped and declared and source.exists():
+        now = hashlib.sha256(source.read_bytes()).hexdigest()
+        if now != declared["sha256"]:
+            raise UsageError(
+                f"{source} has changed since the result was made: calibrate again (the parameters "
+                "belong to the old declaration)"
+            )
+    return model
+
+
+def _found_effect(saved: Mapping[str, Any]) -> Effect:
+    """The effect of that name in the file that declared it."""
+    try:
+        return find_effects(f"{saved['file']}:{saved['name']}")[0]
+    except UsageError as error:
+        raise UsageError(
+            f"the result was fitted with the effect {saved['name']}: {error}"
+        ) from None
+
+
+def _as_it_was(effect: Effect, saved: Mapping[str, Any], own: set[str], model: Model) -> Effect:
+    """The effect with the numbers it was told, on the axes where it has unknowns of its `own`."""
+    effect = effect.holding(**saved.get("numbers", {}))
+    if own <= {n for n, _ in effect.declarations} or saved["on"] not in model.quantities:
+        return effect
+    size = model.quantities[saved["on"]].declared.numel()
+    ends = {n.rpartition("_")[2] for n in own}
+    kept = [i for i in range(size) if axis_name(i, size) in ends]
+    return replace(restricted(replace(effect, on=saved["on"]), kept, model), on=effect.on)

@@ -1,0 +1,1 @@
+"""Records with known truth. Imports correction and below."""
