@@ -17,8 +17,9 @@ ROOMS = [
     "casest",
     "casest.errors",
     "casest.units",
-    "casest.declaration",
+    # its table of operations says what becomes of units, which a declaration follows
     "casest.engine",
+    "casest.declaration",
     "casest.data",
     "casest.leastsquares",
     "casest.solve",
