@@ -1,4 +1,4 @@
-"""What a shell may complete: models, effects, solvers; read from source, so that Tab is quick."""
+"""`completion`: what a shell may complete; names are read from source, so that Tab is quick."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from pathlib import Path
 import click
 from click.shell_completion import CompletionItem
 from click.types import StringParamType
+
+from casest.cli.shared import commands, echo
 
 _HERE = Path(__file__).parents[1]
 
@@ -69,3 +71,14 @@ class SolverName(_Name):
     def names(self, command: str) -> list[str]:
         """The general solvers."""
         return declared_names("solve/strategy.py", "SOLVERS")
+
+
+@commands.command()
+@click.argument("shell", type=click.Choice(["bash", "zsh", "fish"]))
+def completion(shell: str) -> None:
+    """A script that completes what is typed: eval "$(casest completion bash)"."""
+    from click.shell_completion import get_completion_class
+
+    made = get_completion_class(shell)
+    assert made is not None
+    echo(made(commands, {}, "casest", "_CASEST_COMPLETE").source())
