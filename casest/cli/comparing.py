@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from casest.cli.assignments import Assignment, Assignments
-from casest.cli.flags import flag, taking
+from casest.cli.flags import Kind, flag, taking
 from casest.cli.loading import declared_model, records
-from casest.cli.options import DATA, FOLDER, MODEL, ModelOptions, ReadingOptions, Words
+from casest.cli.options import DATA, FOLDER, ModelOptions, ReadingOptions, Words, model_argument
 from casest.cli.shared import commands, echo, progress, typed
 from casest.errors import NotTrusted, UsageError
 
@@ -59,7 +59,7 @@ class CompareOptions:
 
 
 @commands.command()
-@MODEL
+@model_argument(Kind.FITTED)
 @DATA
 @taking(CompareOptions)
 def compare(model_name: str, data: tuple[str, ...], options: CompareOptions) -> int:

@@ -12,7 +12,7 @@ import click
 
 from casest.cli.flags import Kind, refuse, taking
 from casest.cli.loading import declared_model, held_out, moving_model, records, trajectory
-from casest.cli.options import DATA, MODEL, RESULTS, FitOptions, MotionOptions
+from casest.cli.options import DATA, RESULTS, FitOptions, MotionOptions, model_argument
 from casest.cli.shared import commands, echo, progress, reported, typed, write
 from casest.errors import NotTrusted
 
@@ -32,7 +32,7 @@ def list_command(as_json: bool) -> None:
 
 
 @commands.command()
-@MODEL
+@model_argument(Kind.FITTED)
 @DATA
 @taking(FitOptions)
 def calibrate(model_name: str, data: tuple[str, ...], options: FitOptions) -> int:
@@ -88,7 +88,7 @@ def calibration(model_name: str, data: Sequence[str], options: FitOptions, comma
 
 
 @commands.command()
-@MODEL
+@model_argument(Kind.FITTED, Kind.MOVING)
 @DATA
 @taking(FitOptions)
 def close(model_name: str, data: tuple[str, ...], options: FitOptions) -> int:

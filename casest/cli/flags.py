@@ -95,7 +95,7 @@ def _value(option: Field[Any], words: dict[str, Any]) -> Any:
 
 
 def _given(group: Any, kind: Kind) -> Iterator[str]:
-    """Long flags of what was given, groups first, the last declared first."""
+    """Long flags of what was given: groups first, in each the last declared first."""
     for option in fields(group):
         if not option.metadata:
             yield from _given(getattr(group, option.name), kind)

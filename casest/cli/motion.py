@@ -9,16 +9,16 @@ from typing import TYPE_CHECKING, Any, Literal
 import click
 
 from casest.cli.assignments import Assignment, Assignments
-from casest.cli.flags import flag, taking
+from casest.cli.flags import Kind, flag, taking
 from casest.cli.loading import declared_model, moving_model, records, trajectory
 from casest.cli.options import (
     DATA,
     FOLDER,
-    MODEL,
     ModelOptions,
     MotionOptions,
     ReadingOptions,
     SensorOptions,
+    model_argument,
 )
 from casest.cli.shared import commands, echo, last_words, progress, reported, typed, write
 from casest.errors import UsageError
@@ -30,21 +30,28 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
+class OutputOptions:
+    """Where a result goes."""
+
+    output: Path | None = flag(None, "-o", "--output", type=FOLDER, metavar="DIR", help="Folder.")
+    as_json: bool = flag(False, "--json", help="Print JSON instead of text.")
+
+
+@dataclass(frozen=True, slots=True)
 class ObserveOptions:
     """Options of `observe`."""
 
     model: ModelOptions = field(default_factory=ModelOptions)
     reading: ReadingOptions = field(default_factory=ReadingOptions)
     motion: MotionOptions = field(default_factory=MotionOptions)
-    output: Path | None = flag(None, "-o", "--output", type=FOLDER, metavar="DIR", help="Folder.")
-    as_json: bool = flag(False, "--json", help="Print JSON instead of text.")
+    result: OutputOptions = field(default_factory=OutputOptions)
     window: float | None = flag(
         None, "--window", type=float, metavar="SECONDS", help="Of the sliding eigenvalue."
     )
 
 
 @commands.command()
-@MODEL
+@model_argument(Kind.FITTED, Kind.MOVING)
 @click.argument("data", nargs=-1, type=click.Path())
 @taking(ObserveOptions)
 def observe(model_name: str, data: tuple[str, ...], options: ObserveOptions) -> int:
@@ -75,17 +82,17 @@ def observe(model_name: str, data: tuple[str, ...], options: ObserveOptions) -> 
         else:
             content = observability.observe_structure(moving)
     content |= {"data": list(data), "reproduce": reproduce(typed(), data)}
-    if options.output:
+    if options.result.output:
         from casest.report.html import observe_page
 
-        write(options.output / "observe.json", as_json(content))
-        reported(options.output, observe_page(content))
-    if options.as_json:
+        write(options.result.output / "observe.json", as_json(content))
+        reported(options.result.output, observe_page(content))
+    if options.result.as_json:
         echo(as_json(content), nl=False)
         return 0
     echo(observability.observe_text(content))
     seen = content["rank"] == content["unknowns"]
-    last_words(options.output, "report.html, observe.json", trusted=seen, applies=fits)
+    last_words(options.result.output, "report.html, observe.json", trusted=seen, applies=fits)
     return 0
 
 
@@ -98,8 +105,7 @@ class FilterOptions:
     )
     reading: ReadingOptions = field(default_factory=ReadingOptions)
     motion: MotionOptions = field(default_factory=MotionOptions)
-    output: Path | None = flag(None, "-o", "--output", type=FOLDER, metavar="DIR", help="Folder.")
-    as_json: bool = flag(False, "--json", help="Print JSON instead of text.")
+    result: OutputOptions = field(default_factory=OutputOptions)
     noise: Literal["declared", "ml"] = flag(
         "declared",
         "--noise",
@@ -117,7 +123,7 @@ class FilterOptions:
 
 
 @commands.command("filter")
-@MODEL
+@model_argument(Kind.MOVING)
 @DATA
 @taking(FilterOptions)
 def filter_command(model_name: str, data: tuple[str, ...], options: FilterOptions) -> int:
@@ -132,17 +138,17 @@ def filter_command(model_name: str, data: tuple[str, ...], options: FilterOption
     content, found = states.follow(moving, run, tuned)
     content |= told
     content |= {"data": list(data), "reproduce": reproduce(typed(), data)}
-    if options.output:
+    if options.result.output:
         from casest.report.html import filter_page
 
-        write(options.output / "states.csv", states.states_csv(found))
-        write(options.output / "filter.json", as_json(content))
-        reported(options.output, filter_page(found, content))
-    if options.as_json:
+        write(options.result.output / "states.csv", states.states_csv(found))
+        write(options.result.output / "filter.json", as_json(content))
+        reported(options.result.output, filter_page(found, content))
+    if options.result.as_json:
         echo(as_json(content), nl=False)
         return 0
     echo(states.filter_text(content))
-    last_words(options.output, "report.html, filter.json, states.csv")
+    last_words(options.result.output, "report.html, filter.json, states.csv")
     return 0
 
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Container
+from collections.abc import Callable, Container
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import click
 
@@ -14,9 +14,10 @@ from casest.cli.completing import ModelName, SolverName
 from casest.cli.flags import Kind, flag
 from casest.errors import CasestError
 
-MODEL = click.argument("model_name", metavar="MODEL", type=ModelName())
 DATA = click.argument("data", nargs=-1, required=True, type=click.Path())
 RESULT = click.argument("result_path", metavar="RESULT", type=click.Path(path_type=Path))
+
+R = TypeVar("R")
 
 #: A file in its place is refused before anything is computed.
 FOLDER = click.Path(path_type=Path, file_okay=False)
@@ -29,6 +30,11 @@ RESULTS: dict[str, Any] = {
 }
 
 Words = tuple[str, ...]
+
+
+def model_argument(*kinds: Kind) -> Callable[[Callable[..., R]], Callable[..., R]]:
+    """MODEL of a command that takes these kinds of model."""
+    return click.argument("model_name", metavar="MODEL", type=ModelName(*kinds))
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,12 +13,12 @@ from casest.cli.flags import Kind, flag, refuse, taking
 from casest.cli.loading import declared_model, moving_model
 from casest.cli.options import (
     FOLDER,
-    MODEL,
     ModelOptions,
     MotionOptions,
     ReadingOptions,
     SensorOptions,
     Words,
+    model_argument,
 )
 from casest.cli.shared import commands, echo, progress, typed
 
@@ -69,7 +69,7 @@ class SimulateOptions:
 
 
 @commands.command()
-@MODEL
+@model_argument(Kind.FITTED, Kind.MOVING)
 @taking(SimulateOptions)
 def simulate(model_name: str, options: SimulateOptions) -> None:
     """A record with known truth: DIR/record.csv and DIR/truth.json.
