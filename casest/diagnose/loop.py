@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from casest.data.run import Run
-from casest.declaration.effect import Effect
+from casest.declaration.effect import RANDOM_WALK, TAILS, Effect
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
 from casest.diagnose.candidates.candidates import Candidate, Skipped, candidates
@@ -41,6 +41,7 @@ from casest.diagnose.selection.refit import contenders, whole
 from casest.diagnose.selection.state import Step, Work
 from casest.diagnose.selection.swap import cautious
 from casest.effects import CATALOGUE
+from casest.effects.noise import bias_wander
 from casest.effects.placing import prepared
 from casest.engine.kernel import only_tried
 from casest.engine.threads import one_thread
@@ -248,7 +249,7 @@ def _two_at_once(work: Work, current: Fitted, tried: list[tuple[Score, Fitted]])
 
 def _without_outliers(work: Work, current: Fitted) -> Fitted:
     """With the effect `outliers` where there are some: they would pull what follows."""
-    effect = next((e for e in work.catalogue if e.name == "outliers"), None)
+    effect = next((e for e in work.catalogue if e.seen_in == TAILS), None)
     if effect is None or any(a.label == effect.name for a in current.model.effects):
         return current
     problem = Problem(current.model, work.runs)
@@ -261,19 +262,19 @@ def _without_outliers(work: Work, current: Fitted) -> Fitted:
         return current
     gained = work.gain(current, fitted)[0]
     work.found.append(Found(Candidate(effect), None, p_value, gained))
-    work.say("outliers: they count less from here on")
+    work.say(f"{effect.name}: they count less from here on")
     return fitted
 
 
 def _note_wander(work: Work, current: Fitted) -> None:
     """Say that the offset wanders: a property of the noise, which changes no fit."""
-    effect = next((e for e in work.catalogue if e.name == "bias_wander"), None)
+    effect = next((e for e in work.catalogue if e.seen_in == RANDOM_WALK), None)
     p_value = wander_of(work.runs, current.residuals)
     if p_value is None and work.walks and work.undecided is None:
         # It is no noise either, by which the offset would be known to wander.
         names = [name for walk in work.walks for name in walk.names]
         share = max(walk.share for walk in work.walks)
-        work.undecided = Undecided((*dict.fromkeys(names), "bias_wander"), share)
+        work.undecided = Undecided((*dict.fromkeys(names), (effect or bias_wander).name), share)
     if effect is not None and p_value is not None:
         work.found.append(Found(Candidate(effect), None, p_value, 0.0))
 

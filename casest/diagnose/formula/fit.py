@@ -177,13 +177,6 @@ def _terms(model: Model) -> tuple[Term, ...]:
     return getattr(own[0], "terms", ()) if own else ()
 
 
-def _without(fitted: Fitted, label: str) -> tuple[Model, dict[str, Array]]:
-    """The model without an effect, and the values of what it has left."""
-    effects = tuple(a for a in fitted.model.effects if a.label != label)
-    values = {k: v for k, v in fitted.values.items() if not k.startswith(label + ".")}
-    return replace(fitted.model, effects=effects), values
-
-
 def _alone(work: Work, fitted: Fitted) -> tuple[Fitted, list[Found]]:
     """Without the effects that only stood for what the formula says; and those."""
     replaced = []
@@ -191,7 +184,7 @@ def _alone(work: Work, fitted: Fitted) -> tuple[Fitted, list[Found]]:
         label = found.candidate.label
         if found.score is None or not found.names or found.candidate.freed or label == NAME:
             continue
-        without = work.crossed(work.fitted(*_without(fitted, label)))
+        without = work.crossed(work.fitted(*fitted.without(label)))
         whole = work.crossed(fitted)
         if without is not None and (whole is None or not work.confirmed(without, whole)):
             fitted = without
@@ -204,7 +197,7 @@ def _tried(
 ) -> tuple[Score, Fitted] | None:
     """The model refitted with the formula, in place of one that it has; the score."""
     work.original[candidate.label] = candidate
-    model, values = _without(current, NAME)
+    model, values = current.without(NAME)
     wide = widened(model, work.runs, values, [candidate])
     (score,) = scores(wide, [candidate], current.noise, work.folds.batches)
     score = replace(score, p_value=min(1.0, chosen.score.p_value * candidate.trials))

@@ -57,10 +57,9 @@ def pruned(
         return fitted, candidate
     effect = restricted(candidate.effect, kept, fitted.model)
     smaller = replace(candidate, effect=effect, traced=None)
+    values = narrowed(fitted.values, candidate, fitted.model, kept)
     try:
-        again = work.crossed(
-            work.fitted(smaller.added_to(base), narrowed(fitted.values, candidate, kept))
-        )
+        again = work.crossed(work.fitted(smaller.added_to(base), values))
     except CasestError:
         return fitted, candidate
     if again is None or work.confirmed(again, fitted):
@@ -76,12 +75,11 @@ def _plainer(work: Work, fitted: Fitted, candidate: Candidate) -> tuple[Fitted, 
     effect = work.original[candidate.label].effect
     if effect is None or not effect.plain:
         return fitted, candidate
-    held, label = held_value(candidate), candidate.label + "."
+    held = held_value(candidate)
     begun = effect.starting(**{held[0]: held[2]}) if held else effect
     smaller = replace(candidate, effect=begun.holding(**dict(effect.plain)), traced=None)
-    values = {n: v for n, v in fitted.values.items() if not n.startswith(label)}
+    base, values = fitted.without(candidate.label)
     try:
-        base = replace(fitted.model, effects=fitted.model.effects[:-1])
         again = work.crossed(work.fitted(smaller.added_to(base), values))
     except CasestError:
         return fitted, candidate

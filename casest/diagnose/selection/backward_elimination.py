@@ -36,10 +36,7 @@ def _on_all_axes(work: Work, current: Fitted, found: Found) -> tuple[Fitted, Can
     declared = work.original[label].effect
     if declared is None or declared.plain:
         return None
-    base = replace(
-        current.model, effects=tuple(a for a in current.model.effects if a.label != label)
-    )
-    values = {k: v for k, v in current.values.items() if not k.startswith(label + ".")}
+    base, values = current.without(label)
     try:
         candidate = whole(work, found.score, base)
         model = candidate.added_to(base)
@@ -66,10 +63,7 @@ def weeded(work: Work, current: Fitted) -> Fitted:
         label = found.candidate.label
         if found.candidate.freed or not found.names:
             continue
-        effects = tuple(a for a in current.model.effects if a.label != label)
-        values = {k: v for k, v in current.values.items() if not k.startswith(label + ".")}
-        model = replace(current.model, effects=effects)
-        without = work.crossed(work.fitted(model, values))
+        without = work.crossed(work.fitted(*current.without(label)))
         if without is not None and not work.confirmed(without, current):
             work.found.remove(found)
             work.refuse(found.candidate, "no longer needed beside what came later")

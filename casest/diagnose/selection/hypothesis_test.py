@@ -21,18 +21,16 @@ from casest.diagnose.selection.model_evidence import (
 )
 from casest.diagnose.selection.refit import contenders
 from casest.diagnose.selection.state import Work
-from casest.effects import CATALOGUE
+from casest.effects import shipped
 from casest.leastsquares.problem import Problem
 
 #: Chance that any effect that is asked for is called significant where there is none.
 CHANCE = 0.01
 
-_SHIPPED = {effect.name for effect in CATALOGUE}
-
 
 def asked_for(work: Work, ranked: Sequence[Score]) -> list[Score]:
     """The user's own effects, and those that he knows to be there."""
-    own = {e.name for e in work.catalogue} - _SHIPPED | work.known
+    own = {e.name for e in work.catalogue if not shipped(e)} | work.known
     return [s for s in ranked if s.candidate.name in own]
 
 

@@ -44,6 +44,13 @@ class Fitted:
     lighter: tuple[tuple[int, float], ...] = ()
     moved: float = 0.0
 
+    def without(self, label: str) -> tuple[Model, dict[str, Array]]:
+        """The model without an effect, and the values of what it has left."""
+        own = self.model.unknowns_of(label)
+        left = tuple(a for a in self.model.effects if a.label != label)
+        values = {n: v for n, v in self.values.items() if n not in own}
+        return replace(self.model, effects=left), values
+
 
 def cost_of(fitted: Fitted) -> float:
     """Sum of squared residuals."""

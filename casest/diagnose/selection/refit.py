@@ -138,13 +138,19 @@ def _finite(cost: float) -> float:
 
 def _stepped(problem: Problem, start: Point, candidate: Candidate, score: Score) -> Point:
     """The start moved by the score's first-order step in the candidate's own unknowns."""
-    own = {p.name for p in candidate.parameters(problem.model)}
+    own = {p.name for p in candidate.parameters(problem.model)} - _frequencies(candidate)
     x, used = start.x.copy(), 0
     for slot in problem.slots:
-        if slot.parameter.name in own and slot.parameter.name.rpartition(".")[2] != "frequency":
+        if slot.parameter.name in own:
             width = slot.x.stop - slot.x.start
             if used + width <= len(score.step):
                 x[slot.x] = x[slot.x] + score.step[used : used + width]
                 used += width
     # What the declared parameters had taken over goes back.
     return Point(problem.inside(x), start.references)
+
+
+def _frequencies(candidate: Candidate) -> set[str]:
+    """Its unknowns that were held when it was scored, and are free again."""
+    profile = candidate.effect.profile if candidate.effect else ()
+    return {f"{candidate.label}.{name}" for name, kind in profile if kind == "frequency"}
