@@ -16,7 +16,7 @@ from casest.estimate.calibrate import Estimate, attempt
 from casest.leastsquares.problem import Problem
 
 
-def filled(work: Work, current: Fitted) -> Fitted:
+def on_all_axes(work: Work, current: Fitted) -> Fitted:
     """Axes that were nothing beside what was still missing may be something now."""
     for k, found in enumerate(work.found[:-1]):
         fuller = _on_all_axes(work, current, found)
@@ -57,7 +57,7 @@ def _on_all_axes(work: Work, current: Fitted, found: Found) -> tuple[Fitted, Can
     return slim, candidate
 
 
-def weeded(work: Work, current: Fitted) -> Fitted:
+def backward_eliminated(work: Work, current: Fitted) -> Fitted:
     """Each kept effect must still earn its place."""
     for found in list(work.found[:-1]):
         label = found.candidate.label
@@ -71,7 +71,7 @@ def weeded(work: Work, current: Fitted) -> Fitted:
     return current
 
 
-def proved(work: Work, current: Fitted) -> tuple[Fitted, Estimate]:
+def certified(work: Work, current: Fitted) -> tuple[Fitted, Estimate]:
     """The last estimate, with intervals; without effects that leave one without an end."""
     while work.found:
         with only_tried(False):

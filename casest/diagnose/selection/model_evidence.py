@@ -9,7 +9,7 @@ import numpy as np
 
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
-from casest.diagnose.candidates.grid import held_value
+from casest.diagnose.candidates.grid import grid_value
 from casest.diagnose.candidates.score_test import Score, second_freedom
 from casest.diagnose.selection.cross_validation import FAR, Folds, gain
 
@@ -64,7 +64,7 @@ def clipped_squares(fitted: Fitted, sigma: float) -> float:
 
 def unknowns_of(score: Score, fitted: Fitted) -> int:
     """Of the fit; a level or moment that was looked for is one more."""
-    return fitted.unknowns + (held_value(score.candidate) is not None)
+    return fitted.unknowns + (grid_value(score.candidate) is not None)
 
 
 def price_of(score: Score, fitted: Fitted, price: float) -> float:
@@ -110,7 +110,7 @@ def as_good(
     ]
 
 
-def gentlest_first(
+def least_loss_first(
     tried: Sequence[tuple[Score, Fitted]], folds: Folds, known: Collection[str] = ()
 ) -> list[tuple[Score, Fitted]]:
     """Of those that are as good as the best, first the one that moves the parameters least.
