@@ -1,8 +1,8 @@
 """Hypothesis tests: an effect of the user's own is a hypothesis that was there before the data.
 
-What is asked for is not looked for among all that could be: a chance of 1 % is enough, by the plain F test of its
-refit, which in a few poses sees more than a score whose noise the same few poses must tell. Signs
-of the noise that are flipped, and held-out data, must confirm it as they do everything else.
+What is asked for is not looked for among all that could be: a chance of 1 % is enough, by the plain
+F test of its refit, which in a few poses sees more than a score whose noise the same few poses must
+tell. Signs of the noise that are flipped, and held-out data, must confirm it as all else.
 """
 
 from __future__ import annotations
