@@ -48,7 +48,7 @@ def imports(path: Path) -> set[str]:
             for alias in node.names:
                 inner = ROOT.joinpath(*module.split("."), f"{alias.name}.py")
                 package = ROOT.joinpath(*module.split("."), alias.name)
-                own = inner.exists() or package.is_dir()
+                own = inner.exists() or package.is_dir() or alias.name == "__version__"
                 found.add(f"{module}.{alias.name}" if own else module)
     return {name for name in found if name.partition(".")[0] in ("casest", "casest_problems")}
 
