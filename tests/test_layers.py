@@ -35,6 +35,7 @@ ROOMS = [
     "casest.diagnose.motion",
     "casest.diagnose",
     "casest.comparison",
+    "casest.correction.inverse",
     "casest.results",
     "casest.correction",
     "casest.simulation",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -11,7 +11,6 @@ from casest.cli.completing import ModelName
 from casest.cli.options import model_options, reading_options
 from casest.cli.shared import (
     FOLDER,
-    Options,
     commands,
     echo,
     progress,
@@ -23,6 +22,9 @@ from casest.cli.words import (
     start_value,
 )
 from casest.errors import NotTrusted, UsageError
+
+if TYPE_CHECKING:
+    from casest.results.comparison import SolversCompared
 
 
 @commands.command()
@@ -72,7 +74,8 @@ def compare(model_name: str, data: tuple[str, ...], **options: Any) -> int:
     """
     from casest.comparison.judge import SIZES
     from casest.comparison.judge import compare as compared
-    from casest.report.text.comparison import comparison_result, comparison_text
+    from casest.report.text.comparison import comparison_text
+    from casest.results.comparison import comparison_result
     from casest.results.file import as_json
 
     model = declared_model(model_name, options)
@@ -88,13 +91,12 @@ def compare(model_name: str, data: tuple[str, ...], **options: Any) -> int:
         limit=options["limit"],
         say=progress,
     )
-    command = typed()
-    content = comparison_result(found, model_name=model_name, data=data, command=command)
-    written = written_comparison(found, content, options["output"]) if options["output"] else []
+    result = comparison_result(found, model_name=model_name, data=data, command=typed())
+    written = written_comparison(result, options["output"]) if options["output"] else []
     if options["as_json"]:
-        echo(as_json(content), nl=False)
+        echo(as_json(result.content()), nl=False)
     else:
-        echo(comparison_text(found, data, written, command))
+        echo(comparison_text(result, written))
     if found.interrupted:
         echo(f"casest: interrupted after {found.done} of {found.planned} runs", err=True)
     elif not found.certified:
@@ -102,14 +104,14 @@ def compare(model_name: str, data: tuple[str, ...], **options: Any) -> int:
     return 0 if found.certified and not found.interrupted else NotTrusted.exit_code
 
 
-def written_comparison(found: Any, content: Options, folder: Path) -> list[Path]:
+def written_comparison(result: SolversCompared, folder: Path) -> list[Path]:
     """compare.json, and the plot where matplotlib is there; says so where it is not."""
     from casest.report.picture import draw
-    from casest.report.text.comparison import save
+    from casest.results.comparison import save
 
-    paths = [save(folder, content)]
+    paths = [save(folder, result)]
     try:
-        paths += draw(found, folder)
+        paths += draw(result, folder)
     except UsageError as error:
         echo(f"casest: {error}", err=True)
     return paths

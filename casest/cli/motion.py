@@ -41,9 +41,15 @@ def observe(model_name: str, data: tuple[str, ...], **options: Any) -> int:
     code 0 even where something is not observable.
     """
     from casest.declaration.model import Model
-    from casest.results import observability
-    from casest.results.file import as_json, reproduce
+    from casest.report.text.observability import observe_text
+    from casest.results.file import as_json
     from casest.results.find import find_any
+    from casest.results.observability import (
+        Observability,
+        observe_motion,
+        observe_parameters,
+        observe_structure,
+    )
 
     fits = isinstance(find_any(model_name), Model)
     if fits:
@@ -52,25 +58,24 @@ def observe(model_name: str, data: tuple[str, ...], **options: Any) -> int:
             raise UsageError(f"{model_name}: what can be seen depends on the record: give DATA")
         runs = records(model, data, options)
         progress(f"fitting {model_name}")
-        content, _ = observability.observe_parameters(model, runs)
+        result: Observability = observe_parameters(model, runs, data=data, command=typed())
     elif not data:
-        content = observability.observe_structure(moving_model(model_name, options))
+        result = observe_structure(moving_model(model_name, options), command=typed())
     else:
         moving, run = moving_record(model_name, data, options)
         progress("what the trajectory shows")
-        content = observability.observe_motion(moving, run, options["window"])
-    content |= {"data": list(data), "reproduce": reproduce(typed(), data)}
+        result = observe_motion(moving, run, options["window"], data=data, command=typed())
     if options["output"]:
         from casest.report.html import observe_page
 
-        write(options["output"] / "observe.json", as_json(content))
-        reported(options["output"], observe_page(content))
+        write(options["output"] / "observe.json", as_json(result.content()))
+        reported(options["output"], observe_page(result))
     if options["as_json"]:
-        echo(as_json(content), nl=False)
+        echo(as_json(result.content()), nl=False)
         return 0
-    echo(observability.observe_text(content))
-    seen = content["rank"] == content["unknowns"]
-    last_words(options["output"], "report.html, observe.json", trusted=seen, applies=fits)
+    echo(observe_text(result))
+    shown = result.observable
+    last_words(options["output"], "report.html, observe.json", trusted=shown, applies=fits)
     return 0
 
 
@@ -97,24 +102,23 @@ def observe(model_name: str, data: tuple[str, ...], **options: Any) -> int:
 )
 def filter_command(model_name: str, data: tuple[str, ...], **options: Any) -> int:
     """States over time by the Kalman filter and smoother, with innovations diagnosed."""
+    from casest.report.text.states import filter_text
     from casest.results import states
-    from casest.results.file import as_json, reproduce
+    from casest.results.file import as_json
 
     moving, run = moving_record(model_name, data, options)
     tuned, told = tuned_noise(moving, run, options)
     progress("filter and smoother")
-    content, found = states.follow(moving, run, tuned)
-    content |= told
-    content |= {"data": list(data), "reproduce": reproduce(typed(), data)}
+    result = states.follow(moving, run, tuned, **told, data=data, command=typed())
     if options["output"]:
         from casest.report.html import filter_page
 
-        write(options["output"] / "states.csv", states.states_csv(found))
-        write(options["output"] / "filter.json", as_json(content))
-        reported(options["output"], filter_page(found, content))
+        write(options["output"] / "states.csv", states.states_csv(result.made_from))
+        write(options["output"] / "filter.json", as_json(result.content()))
+        reported(options["output"], filter_page(result))
     if options["as_json"]:
-        echo(as_json(content), nl=False)
+        echo(as_json(result.content()), nl=False)
         return 0
-    echo(states.filter_text(content))
+    echo(filter_text(result))
     last_words(options["output"], "report.html, filter.json, states.csv")
     return 0

@@ -1,4 +1,4 @@
-"""`result.json` and `residuals.csv`: what a calibration leaves behind, in the fixed form."""
+"""What a calibration leaves: `result.json` and `residuals.csv` in their fixed form."""
 
 from __future__ import annotations
 
@@ -6,24 +6,275 @@ import csv
 import hashlib
 import inspect
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import casadi as ca
 import numpy as np
+from msgspec import UNSET, Struct, UnsetType
 
-from casest import __version__
-from casest.data.run import Run
 from casest.declaration.effect import Attached
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
 from casest.declaration.symbols import Constant
 from casest.diagnose.misfit.lack_of_fit import Finding
+from casest.effects.placing import prepared
 from casest.estimate.calibrate import Estimate
 from casest.leastsquares.agreement import between_runs
-from casest.results.file import plain, reproduce
-from casest.results.units import entry_units, unit_table
+from casest.results.application import Application, application_of
+from casest.results.file import plain
+from casest.results.residuals import Residuals, residuals_of, side_of
+from casest.results.result import (
+    Certificate,
+    Number,
+    Numbers,
+    Parameter,
+    Reproduced,
+    Result,
+    reproduced,
+)
+from casest.results.units import unit_table
+from casest.results.values import Entry, Held, entries, held, parameter_table
+
+
+class Noise(Struct, frozen=True):
+    """Standard deviation of one residual on each axis, and where it comes from."""
+
+    sigma: list[float]
+    unit: str
+    from_residual: Number
+    from_repeats: Number
+    degrees_of_freedom: int
+    correlated_over_samples: Number
+
+
+class NoiseModel(Noise, frozen=True):
+    """The noise after the loop: also its colour, tails and inequality."""
+
+    sigma_by_axis: list[float]
+    colour: str
+    lag1_correlation: Number
+    colour_p_value: Number
+    wander: Number
+    wander_p_value: Number
+    tail_degrees_of_freedom: Number
+    outlier_share: float
+    quantisation_step: Number
+    largest_over_smallest: Number
+    unequal_p_value: Number
+
+
+class Correlation(Struct, frozen=True):
+    """Correlation of the unknowns: null where the data do not determine one."""
+
+    names: list[str]
+    matrix: list[list[Number]]
+
+
+class Section(Struct, frozen=True, kw_only=True):
+    """One fit: errors (held-out ones null where nothing was), certificate, parameters."""
+
+    rmse_fit: Number
+    rmse_holdout: Number
+    rmse_holdout_by_axis: dict[str, Number] | UnsetType = UNSET
+    log_likelihood: Number | UnsetType = UNSET
+    certificate: Certificate
+    parameters: dict[str, Parameter]
+    correlation: Correlation | UnsetType = UNSET
+
+
+class JudgedSection(Section, frozen=True, kw_only=True):
+    """One fit that held-out data have judged, axis by axis."""
+
+    rmse_holdout_by_axis: dict[str, Number]
+
+
+class Attachment(Struct, frozen=True):
+    """What is needed to attach an effect again: where, and the numbers it was told."""
+
+    name: str
+    on: str | None
+    columns: dict[str, str]
+    numbers: dict[str, float]
+    file: str
+
+
+class WeakCombination(Struct, frozen=True):
+    """A combination that is determined `inflation` times worse than its parameters alone."""
+
+    direction: str
+    inflation: float
+    std: Number
+
+
+class Identified(Struct, frozen=True):
+    """What the data determine of the unknowns."""
+
+    rank: int
+    unknowns: int
+    unobservable: list[str]
+    weak: list[WeakCombination]
+
+
+class Scatter(Struct, frozen=True):
+    """Agreement of several runs on what they share."""
+
+    F: Number
+    freedom: list[Number]
+    p_value: Number
+    furthest: str
+
+
+class Doubt(Struct, frozen=True):
+    """What in the residual speaks against the model."""
+
+    where: str
+    p_value: Number
+
+
+class Corrected(Struct, frozen=True):
+    """The corrected quantity, and the range it had in the fit, for inverting it later."""
+
+    name: str
+    low: float | UnsetType = UNSET
+    high: float | UnsetType = UNSET
+
+
+class Solver(Struct, frozen=True):
+    """What found the estimate; nothing is said of it where there was nothing to solve."""
+
+    name: str | None
+    iterations: int | UnsetType | None = UNSET
+    evaluations: int | UnsetType | None = UNSET
+    seconds: Number | UnsetType = UNSET
+    least_squares_seconds: Number | UnsetType = UNSET
+
+
+class Samples(Struct, frozen=True):
+    """How many samples a run has, of how many readings."""
+
+    run: str
+    samples: int
+    readings: int
+
+
+class DeclaredIn(Struct, frozen=True):
+    """File of the model's declaration and its digest, so that an edited model is noticed."""
+
+    file: str | UnsetType = UNSET
+    sha256: str | UnsetType = UNSET
+
+
+class Fitted(Result, frozen=True, kw_only=True, dict=True):
+    """What calibrate and close leave in common.
+
+    Beside the file: `declared`, the model's own name; `kind` of its samples; `entries` of the
+    estimate that a reader takes away, the unit of each unknown, and the constants `held`;
+    `made_from`, of which `residuals`
+    and `application` are made when a page asks for them.
+    """
+
+    unwritten: ClassVar[tuple[str, ...]] = (
+        "declared",
+        "kind",
+        "entries",
+        "unknown_units",
+        "held",
+        "made_from",
+    )
+
+    data: list[str]
+    runs: list[str]
+    constants: dict[str, Numbers]
+    scopes: dict[str, str]
+    verdict: str | None
+    trusted: bool
+    noise: Noise
+    estimate: Section | UnsetType = UNSET
+    before: Section | UnsetType = UNSET
+    after: Section | UnsetType = UNSET
+    effects: Sequence[Any]
+    identifiability: Identified
+    scatter_between_runs: Scatter | None
+    invisible: Sequence[Any] | None
+    unexplained: Any
+    misfit: list[Doubt] | None
+    corrected: Corrected | None
+    units: dict[str, str]
+    solver: Solver
+    samples: list[Samples]
+    notes: list[str]
+    convention: str
+    declared_in: DeclaredIn
+    reproduce: Reproduced
+    declared: str
+    kind: str
+    entries: tuple[Entry, ...]
+    unknown_units: dict[str, str]
+    held: tuple[Held, ...]
+    made_from: Any
+
+    @property
+    def last(self) -> Section:
+        """The fit that a reader takes away."""
+        raise NotImplementedError
+
+    @property
+    def correlation(self) -> Correlation:
+        """Correlation of the unknowns of that fit."""
+        assert self.last.correlation
+        return self.last.correlation
+
+    @cached_property
+    def residuals(self) -> Residuals:
+        """What is drawn of the residuals."""
+        raise NotImplementedError
+
+    @cached_property
+    def application(self) -> Application:
+        """How the result is applied."""
+        raise NotImplementedError
+
+
+class Calibration(Fitted, frozen=True, kw_only=True, dict=True):
+    """The content of `result.json` of `calibrate`; `made_from` the estimate."""
+
+    estimate: Section
+    effects: list[Attachment]
+    made_from: Estimate
+
+    @property
+    def last(self) -> Section:
+        """The fit."""
+        return self.estimate
+
+    @property
+    def doubtful(self) -> bool:
+        """Does the residual speak against the model?"""
+        return bool(self.misfit)
+
+    @property
+    def swollen(self) -> float | None:
+        """Residual over the scatter within rest intervals, where it is more than that explains."""
+        repeats, residual = self.noise.from_repeats, self.noise.from_residual
+        if repeats and residual and residual > 2 * repeats:
+            return residual / repeats
+        return None
+
+    @cached_property
+    def residuals(self) -> Residuals:
+        """What is drawn of the residuals: of one fit."""
+        found = self.made_from
+        side = side_of("residual", "after", found, found.problem)
+        runs = prepared(found.model, found.problem.runs)
+        return residuals_of([side], found, runs, noise_of(self.noise))
+
+    @cached_property
+    def application(self) -> Application:
+        """How the result is applied."""
+        return application_of(self.made_from.model, self.residuals.units, trusted=self.trusted)
 
 
 def calibration_result(
@@ -34,81 +285,80 @@ def calibration_result(
     command: str = "",
     holdout: float | None = None,
     misfit: Sequence[Finding] | None = None,
-) -> dict[str, Any]:
-    """The content of `result.json` for `calibrate`. `verdict` is null: no effect was looked for.
+) -> Calibration:
+    """What `calibrate` leaves. `verdict` is null: no effect was looked for.
 
     `misfit` is what speaks against the model, null where nobody asked.
     """
     problem, certificate = estimate.problem, estimate.certificate
     table = unit_table(problem.model, problem.runs)
+    fit = Section(
+        rmse_fit=float(estimate.rmse),
+        rmse_holdout=plain(holdout),
+        certificate=Certificate(
+            certificate.trusted,
+            list(certificate.reasons),
+            plain(certificate.step),
+            plain(certificate.curvature),
+            [certificate.agreeing, certificate.starts],
+            list(certificate.at_bound),
+        ),
+        parameters=parameter_table(estimate, table),
+        correlation=correlation_of(estimate),
+    )
+    shared = fitted_content(estimate, model_name, data, command)
+    doubts = None if misfit is None else [Doubt(f.where, plain(f.p_value)) for f in misfit]
+    return Calibration(**shared, verdict=None, estimate=fit, invisible=None, unexplained=None,
+                       misfit=doubts, made_from=estimate,
+                       effects=[attachment(a) for a in problem.model.effects])  # fmt: skip
+
+
+def fitted_content(
+    estimate: Estimate, model_name: str, data: Sequence[str], command: str
+) -> dict[str, Any]:
+    """The fields that a calibration and a closed loop have in common."""
+    problem, identified = estimate.problem, estimate.identifiability
+    table = unit_table(problem.model, problem.runs)
+    units = {name: unit for name, unit in table.items() if "[" not in name}
     return {
-        "casest": __version__,
         "model": model_name,
         "data": list(data),
         "runs": [run.name for run in problem.runs],
         "constants": {c.name: plain(c.array) for c in problem.model.constants},
         "scopes": {p.name: p.scope for p in problem.model.parameters},
-        "verdict": None,
-        "trusted": certificate.trusted,
-        "noise": {
-            "sigma": [plain(estimate.noise.sigma)] * len(problem.model.axes),
-            "unit": table["residual"],
-            "from_residual": plain(estimate.noise.residual),
-            "from_repeats": plain(estimate.noise.repeats),
-            "degrees_of_freedom": estimate.noise.degrees_of_freedom,
-            "correlated_over_samples": plain(estimate.correlated_over),
-        },
-        "estimate": {
-            "rmse_fit": plain(estimate.rmse),
-            "rmse_holdout": plain(holdout),
-            "certificate": {
-                "trusted": certificate.trusted,
-                "reasons": list(certificate.reasons),
-                "step_left_in_std": plain(certificate.step),
-                "relative_curvature": plain(certificate.curvature),
-                "agreeing_starts": [certificate.agreeing, certificate.starts],
-                "at_bound": list(certificate.at_bound),
-            },
-            "parameters": parameter_table(estimate, table),
-            "correlation": {
-                "names": list(estimate.names),
-                "matrix": plain(_correlation(estimate.covariance)),
-            },
-        },
-        "effects": [attachment(a) for a in problem.model.effects],
-        "identifiability": {
-            "rank": estimate.identifiability.rank,
-            "unknowns": estimate.identifiability.unknowns,
-            "unobservable": list(estimate.identifiability.unobservable),
-            "weak": [
-                {"direction": w.words, "inflation": plain(w.inflation), "std": plain(w.std)}
-                for w in estimate.weak
-            ],
-        },
+        "trusted": estimate.certificate.trusted,
+        "noise": _noise(estimate, table["residual"]),
+        "identifiability": Identified(
+            identified.rank,
+            identified.unknowns,
+            list(identified.unobservable),
+            weak_of(estimate),
+        ),
         "scatter_between_runs": _scatter(estimate),
-        "invisible": None,
-        "unexplained": None,
-        "misfit": _doubts(misfit),
         "corrected": _corrected_range(estimate),
-        "units": {name: unit for name, unit in table.items() if "[" not in name},
+        "units": units,
         "solver": _solver(estimate),
-        "samples": [_sample_note(run) for run in problem.runs],
+        "samples": [Samples(run.name, len(run), int(np.sum(run.count))) for run in problem.runs],
         "notes": [note for run in problem.runs for note in run.notes] + list(estimate.notes),
         "convention": inspect.getdoc(problem.model.function) or "",
         "declared_in": _declared_in(problem.model),
-        "reproduce": reproduce(command, data),
+        "reproduce": reproduced(command, data),
+        "declared": estimate.model.name,
+        "kind": "rest intervals" if problem.runs[0].spread else "samples",
+        "entries": entries(estimate),
+        "unknown_units": dict(zip(estimate.names, problem.units, strict=True)),
+        "held": held(problem.model, units),
     }
 
 
-def _doubts(misfit: Sequence[Finding] | None) -> list[dict[str, Any]] | None:
-    if misfit is None:
-        return None
-    return [{"where": f.where, "p_value": plain(f.p_value)} for f in misfit]
+def weak_of(estimate: Estimate) -> list[WeakCombination]:
+    """Combinations that are determined, but badly."""
+    return [WeakCombination(w.words, w.inflation, plain(w.std)) for w in estimate.weak]
 
 
-def doubt_sentence(misfit: Sequence[Mapping[str, Any]]) -> str:
+def doubt_sentence(misfit: Sequence[Doubt]) -> str:
     """What a reader must know before using the values."""
-    where = "; ".join(f"{f['where']} (p = {f['p_value']:.1g})" for f in misfit)
+    where = "; ".join(f"{f.where} (p = {f.p_value:.1g})" for f in misfit)
     return (
         f"the residual is not noise: {where}. The model lacks something, which may have moved the "
         "values by many of their standard deviations, however small the residual: `casest close` "
@@ -116,61 +366,60 @@ def doubt_sentence(misfit: Sequence[Mapping[str, Any]]) -> str:
     )
 
 
-def parameter_table(estimate: Estimate, table: Mapping[str, str]) -> dict[str, Any]:
-    """Value, standard deviations, interval and unit of every parameter, for JSON."""
-    reach = estimate.interval_reach
-    known = {n: u for n, u in table.items() if "[" not in n}
-    found = {}
-    for p in estimate.model.parameters:
-        value, std = estimate.values[p.name], estimate.std[p.name]
-        below, above = reach[0][p.name], reach[1][p.name]
-        own = entry_units(p, known)
-        found[p.name] = {
-            "value": plain(value),
-            "std": plain(std),
-            "robust_std": plain(estimate.robust[p.name]),
-            "interval95": [plain(value - below), plain(value + above)],
-            "unit": own[0] if len(set(own)) == 1 else own,
-        }
-    return found
-
-
-def _correlation(covariance: Array) -> Array:
-    std = np.sqrt(np.diag(covariance))
+def correlation_of(estimate: Estimate) -> Correlation:
+    """Correlation of the unknowns."""
+    std = np.sqrt(np.diag(estimate.covariance))
     with np.errstate(invalid="ignore", divide="ignore"):
-        return np.asarray(covariance / np.outer(std, std))
+        matrix = np.asarray(estimate.covariance / np.outer(std, std))
+    return Correlation(list(estimate.names), plain(matrix))
 
 
-def _scatter(estimate: Estimate) -> dict[str, Any] | None:
+def _noise(estimate: Estimate, unit: str) -> Noise:
+    noise = estimate.noise
+    return Noise(
+        [float(noise.sigma)] * len(estimate.model.axes),
+        unit,
+        plain(noise.residual),
+        plain(noise.repeats),
+        noise.degrees_of_freedom,
+        plain(estimate.correlated_over),
+    )
+
+
+def noise_of(noise: Noise) -> tuple[Array, str]:
+    """σ of one residual on each axis (m,), and its unit."""
+    sigma = np.array(noise.sigma)
+    each = noise.sigma_by_axis if isinstance(noise, NoiseModel) else ()
+    if len(each) > 1 and all(each):  # unequal axes, with the mean square of the fit
+        sigma = sigma * np.asarray(each) / np.sqrt(np.mean(np.square(each)))
+    return sigma, noise.unit
+
+
+def _scatter(estimate: Estimate) -> Scatter | None:
     """Agreement of several runs on what they share; null for one run, or a refused estimate."""
     if not estimate.certificate.trusted:
         return None
     found = between_runs(estimate.problem, estimate.point, estimate.correlated_over)
     if found is None:
         return None
-    return {
-        "F": plain(found.F),
-        "freedom": [plain(f) for f in found.freedom],
-        "p_value": plain(found.p_value),
-        "furthest": found.worst,
+    freedom = [plain(f) for f in found.freedom]
+    return Scatter(plain(found.F), freedom, plain(found.p_value), found.worst)
+
+
+def attachment(attached: Attached) -> Attachment:
+    """Where an effect is attached, and the numbers it was told."""
+    numbers = {
+        n: float(d.array)
+        for n, d in attached.effect.declarations
+        if isinstance(d, Constant) and not d.dims
     }
+    file = Path(inspect.unwrap(attached.effect.function).__code__.co_filename).resolve()
+    name, columns = attached.effect.name, dict(attached.columns)
+    return Attachment(name, attached.on, columns, numbers, str(file))
 
 
-def attachment(attached: Attached) -> dict[str, Any]:
-    """What is needed to attach the effect again: where, and the numbers it was told."""
-    declared = attached.effect.declarations
-    return {
-        "name": attached.effect.name,
-        "on": attached.on,
-        "columns": dict(attached.columns),
-        "numbers": {n: float(d.array) for n, d in declared
-                    if isinstance(d, Constant) and not d.dims},
-        "file": str(Path(inspect.unwrap(attached.effect.function).__code__.co_filename).resolve()),
-    }  # fmt: skip
-
-
-def _corrected_range(estimate: Estimate) -> dict[str, Any] | None:
-    """Name of the corrected quantity and the range it had in the fit, for inverting it later."""
+def _corrected_range(estimate: Estimate) -> Corrected | None:
+    """Name of the corrected quantity and the range it had in the fit."""
     name = estimate.model.traced.corrected
     if name is None:
         return None
@@ -178,33 +427,28 @@ def _corrected_range(estimate: Estimate) -> dict[str, Any] | None:
     values = estimate.problem.evaluate(estimate.point, {"c": declared})
     finite = np.concatenate([v[0][np.isfinite(v[0])] for v in values])
     if not finite.size:
-        return {"name": name}
-    return {"name": name, "low": float(finite.min()), "high": float(finite.max())}
+        return Corrected(name)
+    return Corrected(name, float(finite.min()), float(finite.max()))
 
 
-def _solver(estimate: Estimate) -> dict[str, Any]:
+def _solver(estimate: Estimate) -> Solver:
     if not estimate.outcomes:
-        return {"name": None}
-    first = estimate.outcomes[0]
-    return {
-        "name": estimate.extra.get("estimator", first.solver),
-        "iterations": first.iterations,
-        "evaluations": first.evaluations,
-        "seconds": plain(estimate.extra.get("seconds", first.seconds)),
-        **{k: plain(v) for k, v in estimate.extra.items() if k == "least_squares_seconds"},
-    }
+        return Solver(None)
+    first, extra = estimate.outcomes[0], estimate.extra
+    return Solver(
+        extra.get("estimator", first.solver),
+        first.iterations,
+        first.evaluations,
+        plain(extra.get("seconds", first.seconds)),
+        plain(extra["least_squares_seconds"]) if "least_squares_seconds" in extra else UNSET,
+    )
 
 
-def _sample_note(run: Run) -> dict[str, Any]:
-    return {"run": run.name, "samples": len(run), "readings": int(np.sum(run.count))}
-
-
-def _declared_in(model: Model) -> dict[str, str]:
-    """File of the model's declaration and its digest, so that an edited model is noticed."""
+def _declared_in(model: Model) -> DeclaredIn:
     path = Path(model.function.__code__.co_filename).resolve()
     if not path.exists():
-        return {}
-    return {"file": str(path), "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
+        return DeclaredIn()
+    return DeclaredIn(str(path), hashlib.sha256(path.read_bytes()).hexdigest())
 
 
 def residual_rows(estimate: Estimate) -> str:
