@@ -37,12 +37,13 @@ def list_command(as_json: bool) -> None:
     """Shipped problems with their symbols and estimators, and the catalogue of effects."""
     from casest.effects import CATALOGUE
     from casest.effects.moving import listed
-    from casest.report.text.listing import listing
+    from casest.report.text.listing import listing_text
     from casest.results.find import MOVING, SHIPPED, find_any, find_model
+    from casest.results.listing import listing
 
     models = [(name, find_model(name)) for name in SHIPPED]
     moving: list[Any] = [(name, find_any(name)) for name in MOVING]
-    echo(listing(models, CATALOGUE, moving, listed(), as_json=as_json))
+    echo(listing_text(listing(models, CATALOGUE, moving, listed()), as_json=as_json))
 
 
 @commands.command()

@@ -16,9 +16,9 @@ from casest.diagnose.motion.fit import Fit, forgotten, rise
 from casest.diagnose.motion.loop import Added, MotionClosing
 from casest.diagnose.motion.score_test import Score
 from casest.effects.moving import Candidate
-from casest.results.calibration import JudgedSection
 from casest.results.closing import Detectable
 from casest.results.file import plain
+from casest.results.fitted import JudgedSection
 from casest.results.observability import assumed
 from casest.results.result import (
     Certificate,

@@ -5,42 +5,50 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from msgspec import Struct
+from msgspec import UNSET, Struct, UnsetType
 
 from casest.data.run import Run
 from casest.data.timing import GAP
 from casest.declaration.model import Model
 from casest.dynamics import Dynamics
 from casest.dynamics.filter import filtered
-from casest.dynamics.gramian import Observed, gramian, observed, window_eigenvalues
+from casest.dynamics.gramian import Observed as Seen
+from casest.dynamics.gramian import gramian, observed, window_eigenvalues
 from casest.dynamics.structural import Structure, structure
 from casest.dynamics.transition import linearised
 from casest.errors import DeclarationError, UsageError
 from casest.estimate.calibrate import attempt
-from casest.results.calibration import WeakCombination, weak_of
 from casest.results.file import plain
+from casest.results.fitted import WeakCombination, weak_of
 from casest.results.result import Number, Numbers, Reproduced, Result, reproduced
 
 #: Windows over which the smallest eigenvalue is followed: this share of the record unless told.
 WINDOW = 0.1
 
 
-class ObservedParameters(Result, frozen=True, kw_only=True, dict=True):
-    """The content of `observe.json` for a calibration's data."""
+class Observed(Result, frozen=True, kw_only=True, dict=True):
+    """What every `observe.json` begins with."""
 
+    notes: list[str] | UnsetType = UNSET
     rank: int
     unknowns: int
+    structural_rank: int | UnsetType | None = UNSET
     unobservable: list[str]
+
+    @property
+    def observable(self) -> bool:
+        """Is every unknown determined?"""
+        return self.rank == self.unknowns
+
+
+class ObservedParameters(Observed, frozen=True, kw_only=True, dict=True):
+    """The content of `observe.json` for a calibration's data."""
+
     weak: list[WeakCombination]
     std: dict[str, Numbers]
     trusted: bool
     data: list[str]
     reproduce: Reproduced
-
-    @property
-    def observable(self) -> bool:
-        """Do these data determine every unknown?"""
-        return self.rank == self.unknowns
 
 
 class Structural(Struct, frozen=True):
@@ -54,24 +62,15 @@ class Structural(Struct, frozen=True):
     gap: Number
 
 
-class ObservedStructure(Result, frozen=True, kw_only=True, dict=True):
+class ObservedStructure(Observed, frozen=True, kw_only=True, dict=True):
     """The content of `observe.json` without data. `std` is empty: how well needs a record."""
 
-    notes: list[str]
-    rank: int
-    unknowns: int
-    unobservable: list[str]
     std: dict[str, Numbers]
     structural: Structural
     constant_inputs: Structural
     tolerance: str
     data: list[str]
     reproduce: Reproduced
-
-    @property
-    def observable(self) -> bool:
-        """Do suitable data determine every unknown?"""
-        return self.rank == self.unknowns
 
 
 class Windows(Struct, frozen=True):
@@ -84,14 +83,11 @@ class Windows(Struct, frozen=True):
     eigenvalues: list[list[float]]
 
 
-class ObservedMotion(Result, frozen=True, kw_only=True, dict=True):
+class ObservedMotion(Observed, frozen=True, kw_only=True, dict=True):
     """The content of `observe.json` for a trajectory. `std`: what the readings alone allow."""
 
     notes: list[str]
-    rank: int
-    unknowns: int
     structural_rank: int | None
-    unobservable: list[str]
     std: dict[str, Numbers]
     units: dict[str, str]
     eigenvalues: list[Number]
@@ -99,11 +95,6 @@ class ObservedMotion(Result, frozen=True, kw_only=True, dict=True):
     windows: Windows
     data: list[str]
     reproduce: Reproduced
-
-    @property
-    def observable(self) -> bool:
-        """Does the trajectory determine every unknown?"""
-        return self.rank == self.unknowns
 
 
 #: What `casest observe` leaves.
@@ -243,7 +234,7 @@ def _readings_alone(model: Dynamics) -> list[str]:
     ]
 
 
-def _too_short(seen: Observed, run: Run) -> list[str]:
+def _too_short(seen: Seen, run: Run) -> list[str]:
     if seen.rank == seen.unknowns:
         return []
     words = too_short(run, seen.unknowns)

@@ -8,7 +8,7 @@ from casest.report.html.numbers import printed_unit
 from casest.report.html.page import details, escaped, paragraph, points, section, tag
 from casest.report.next_command import applying, typed_words
 from casest.results.application import Steps
-from casest.results.calibration import Fitted
+from casest.results.fitted import Fitted
 
 
 def application(result: Fitted, folder: str) -> str:

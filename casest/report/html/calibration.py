@@ -14,7 +14,8 @@ from casest.report.html.frame import whole
 from casest.report.html.numbers import alike, printed_unit, with_unit
 from casest.report.html.page import paragraph, points, section, table
 from casest.report.html.residuals import residual_figures
-from casest.results.calibration import Calibration, Doubt, doubt_sentence
+from casest.results.calibration import Calibration, doubt_sentence
+from casest.results.fitted import Doubt
 from casest.results.residuals import Residuals
 
 

@@ -14,10 +14,11 @@ from casest.report.html.frame import whole
 from casest.report.html.numbers import alike, number, printed, printed_unit, with_unit
 from casest.report.html.page import details, escaped, paragraph, points, section, table, tag
 from casest.report.html.residuals import residual_figures
-from casest.results.closing import Closed, Effect, instead, judged, sentence, undecided
+from casest.results.closing import Closed, Effect
 from casest.results.residuals import Residuals
 from casest.results.result import Parameter
 from casest.results.rounding import rounded
+from casest.results.verdict import instead, judged, sentence, undecided
 
 
 def closing_page(result: Closed, folder: str = "out") -> str:

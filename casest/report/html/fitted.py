@@ -12,7 +12,7 @@ from casest import __version__
 from casest.report.html.numbers import number, printed, printed_unit, with_unit
 from casest.report.html.page import escaped, paragraph, points, section, table, tag
 from casest.report.next_command import typed_words
-from casest.results.calibration import (
+from casest.results.fitted import (
     Correlation,
     DeclaredIn,
     Fitted,

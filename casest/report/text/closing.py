@@ -10,14 +10,8 @@ from typing import Any
 from casest.data.logs import file_name
 from casest.report.next_command import following
 from casest.report.text.layout import WIDTH, held_lines, item, value_table
-from casest.results.closing import (
-    Closed,
-    instead,
-    of_the_user,
-    refusals,
-    sentence,
-    undecided,
-)
+from casest.results.closing import Closed
+from casest.results.verdict import instead, of_the_user, refusals, sentence, undecided
 
 #: Lists longer than this are left to result.json.
 SHOWN = 4
