@@ -289,7 +289,7 @@ def test_a_nonlinear_model_keeps_to_what_is_known_too():
 def test_a_smoother_that_does_not_settle_says_so(monkeypatch):
     monkeypatch.setattr("casest.dynamics.filter.ROUNDS", 1)
     result = follow(pendulum_of(), swing()[0])
-    assert not result.made_from.settled
+    assert not result.filtered.settled
     assert "the smoother's rounds did not settle" in " ".join(result.notes)
 
 

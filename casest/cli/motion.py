@@ -113,7 +113,7 @@ def filter_command(model_name: str, data: tuple[str, ...], **options: Any) -> in
     if options["output"]:
         from casest.report.html import filter_page
 
-        write(options["output"] / "states.csv", states.states_csv(result.made_from))
+        write(options["output"] / "states.csv", states.states_csv(result.filtered))
         write(options["output"] / "filter.json", as_json(result.content()))
         reported(options["output"], filter_page(result))
     if options["as_json"]:

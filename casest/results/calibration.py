@@ -10,7 +10,6 @@ from functools import cached_property
 from casest.diagnose.misfit.lack_of_fit import Finding
 from casest.effects.placing import prepared
 from casest.estimate.calibrate import Estimate
-from casest.results.application import Application, application_of
 from casest.results.file import plain
 from casest.results.fitted import (
     Attachment,
@@ -23,24 +22,16 @@ from casest.results.fitted import (
     noise_of,
 )
 from casest.results.residuals import Residuals, residuals_of, side_of
-from casest.results.result import (
-    Certificate,
-)
+from casest.results.result import Certificate
 from casest.results.units import unit_table
 from casest.results.values import parameter_table
 
 
 class Calibration(Fitted, frozen=True, kw_only=True, dict=True):
-    """The content of `result.json` of `calibrate`; `made_from` the estimate."""
+    """The content of `result.json` of `calibrate`."""
 
     estimate: Section
     effects: list[Attachment]
-    made_from: Estimate
-
-    @property
-    def last(self) -> Section:
-        """The fit."""
-        return self.estimate
 
     @property
     def doubtful(self) -> bool:
@@ -48,8 +39,8 @@ class Calibration(Fitted, frozen=True, kw_only=True, dict=True):
         return bool(self.misfit)
 
     @property
-    def swollen(self) -> float | None:
-        """Residual over the scatter within rest intervals, where it is more than that explains."""
+    def over_repeats(self) -> float | None:
+        """Residual over the scatter within rest intervals, where that does not explain it."""
         repeats, residual = self.noise.from_repeats, self.noise.from_residual
         if repeats and residual and residual > 2 * repeats:
             return residual / repeats
@@ -58,15 +49,10 @@ class Calibration(Fitted, frozen=True, kw_only=True, dict=True):
     @cached_property
     def residuals(self) -> Residuals:
         """What is drawn of the residuals: of one fit."""
-        found = self.made_from
+        found = self.found
         side = side_of("residual", "after", found, found.problem)
         runs = prepared(found.model, found.problem.runs)
         return residuals_of([side], found, runs, noise_of(self.noise))
-
-    @cached_property
-    def application(self) -> Application:
-        """How the result is applied."""
-        return application_of(self.made_from.model, self.residuals.units, trusted=self.trusted)
 
 
 def calibration_result(
@@ -101,7 +87,7 @@ def calibration_result(
     shared = fitted_content(estimate, model_name, data, command)
     doubts = None if misfit is None else [Doubt(f.where, plain(f.p_value)) for f in misfit]
     return Calibration(**shared, verdict=None, estimate=fit, invisible=None, unexplained=None,
-                       misfit=doubts, made_from=estimate,
+                       misfit=doubts,
                        effects=[attachment(a) for a in problem.model.effects])  # fmt: skip
 
 

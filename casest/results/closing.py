@@ -22,13 +22,12 @@ from casest.diagnose.selection.cross_validation import rms
 from casest.diagnose.selection.found import Found
 from casest.estimate.calibrate import Estimate
 from casest.leastsquares.problem import Problem
-from casest.results.application import Application, application_of, formula_of
+from casest.results.application import formula_of
 from casest.results.file import plain
 from casest.results.fitted import (
     Fitted,
     JudgedSection,
     NoiseModel,
-    Section,
     attachment,
     correlation_of,
     fitted_content,
@@ -100,12 +99,12 @@ class Detectable(Struct, frozen=True):
 
 
 class Closed(Fitted, frozen=True, kw_only=True, dict=True):
-    """The content of `result.json` of `close`; `made_from` what the loop left.
+    """The content of `result.json` of `close`.
 
-    `docs`: what each added effect says of itself.
+    Beside the file: `docs`, what each added effect says of itself; `closing`, what the loop left.
     """
 
-    unwritten = (*Fitted.unwritten, "docs")
+    unwritten = (*Fitted.unwritten, "docs", "closing")
 
     noise: NoiseModel
     before: JudgedSection
@@ -118,28 +117,17 @@ class Closed(Fitted, frozen=True, kw_only=True, dict=True):
     refused: list[Explained]
     not_tried: list[Explained]
     docs: dict[str, str]
-    made_from: Closing
-
-    @property
-    def last(self) -> Section:
-        """The fit with what was added."""
-        return self.after
+    closing: Closing
 
     @cached_property
     def residuals(self) -> Residuals:
         """What is drawn of the residuals: before and after, or of one fit if nothing was added."""
-        closing, runs = self.made_from, self.made_from.runs
+        closing, runs = self.closing, self.closing.runs
         fits = [("before", "before", closing.before), ("after", "after", closing.after)]
         if not closing.effects:
             fits = [("residual", "after", closing.after)]
         sides = [side_of(*fit, Problem(fit[2].model, runs)) for fit in fits]
         return residuals_of(sides, closing.after, runs, noise_of(self.noise))
-
-    @cached_property
-    def application(self) -> Application:
-        """How the result is applied."""
-        units = self.residuals.units
-        return application_of(self.made_from.after.model, units, trusted=self.trusted)
 
 
 def closing_result(
@@ -176,7 +164,7 @@ def closing_result(
         refused=[Explained(s.name, s.reason) for s in closing.refused],
         not_tried=[Explained(s.name, s.reason) for s in closing.skipped],
         docs={f.candidate.name: getattr(f.candidate.effect, "doc", "") for f in closing.effects},
-        made_from=closing,
+        closing=closing,
     )
 
 

@@ -19,7 +19,7 @@ from casest.declaration.shapes import Array
 from casest.declaration.symbols import Constant
 from casest.estimate.calibrate import Estimate
 from casest.leastsquares.agreement import between_runs
-from casest.results.application import Application
+from casest.results.application import Application, application_of
 from casest.results.file import plain
 from casest.results.residuals import Residuals
 from casest.results.result import (
@@ -166,10 +166,9 @@ class DeclaredIn(Struct, frozen=True):
 class Fitted(Result, frozen=True, kw_only=True, dict=True):
     """What calibrate and close leave in common.
 
-    Beside the file: `declared`, the model's own name; `kind` of its samples; `entries` of the
-    estimate that a reader takes away, the unit of each unknown, and the constants `held`;
-    `made_from`, of which `residuals`
-    and `application` are made when a page asks for them.
+    Beside the file: `declared`, the model's own name; `kind`, what its samples are; `entries` of
+    the values, the unit of each unknown, and the constants `held`; the estimate `found` that a
+    reader takes away, of which `residuals` and `application` are made when a page asks for them.
     """
 
     unwritten: ClassVar[tuple[str, ...]] = (
@@ -178,7 +177,7 @@ class Fitted(Result, frozen=True, kw_only=True, dict=True):
         "entries",
         "unknown_units",
         "held",
-        "made_from",
+        "found",
     )
 
     data: list[str]
@@ -210,28 +209,25 @@ class Fitted(Result, frozen=True, kw_only=True, dict=True):
     entries: tuple[Entry, ...]
     unknown_units: dict[str, str]
     held: tuple[Held, ...]
-    made_from: Any
-
-    @property
-    def last(self) -> Section:
-        """The fit that a reader takes away."""
-        raise NotImplementedError
+    found: Estimate
 
     @property
     def correlation(self) -> Correlation:
-        """Correlation of the unknowns of that fit."""
-        assert self.last.correlation
-        return self.last.correlation
+        """Correlation of the unknowns."""
+        last = self.after or self.estimate
+        assert last
+        assert last.correlation
+        return last.correlation
 
     @cached_property
     def residuals(self) -> Residuals:
-        """What is drawn of the residuals."""
+        """What is drawn of the residuals: of one fit, or before and after."""
         raise NotImplementedError
 
     @cached_property
     def application(self) -> Application:
         """How the result is applied."""
-        raise NotImplementedError
+        return application_of(self.found.model, self.residuals.units, trusted=self.trusted)
 
 
 def fitted_content(
@@ -269,6 +265,7 @@ def fitted_content(
         "entries": entries(estimate),
         "unknown_units": dict(zip(estimate.names, problem.units, strict=True)),
         "held": held(problem.model, units),
+        "found": estimate,
     }
 
 

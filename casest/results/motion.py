@@ -98,7 +98,7 @@ class MotionClosed(Result, frozen=True, kw_only=True, dict=True):
     are the states at the end of the record and the numbers of the effects.
     """
 
-    unwritten = ("made_from",)
+    unwritten = ("closing",)
 
     data: list[str]
     runs: list[str]
@@ -119,7 +119,7 @@ class MotionClosed(Result, frozen=True, kw_only=True, dict=True):
     notes: list[str]
     convention: str
     reproduce: Reproduced
-    made_from: MotionClosing
+    closing: MotionClosing
 
     @property
     def risen(self) -> float:
@@ -129,7 +129,7 @@ class MotionClosed(Result, frozen=True, kw_only=True, dict=True):
     @cached_property
     def trajectory(self) -> Trajectory:
         """States and innovations along the record, after the loop."""
-        return trajectory_of(self.made_from.after.found)
+        return trajectory_of(self.closing.after.found)
 
 
 def motion_result(
@@ -167,7 +167,7 @@ def motion_result(
         notes=assumed(closing.run),
         convention=inspect.getdoc(declared.function) or "",
         reproduce=reproduced(command, data),
-        made_from=closing,
+        closing=closing,
     )
 
 

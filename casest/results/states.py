@@ -45,13 +45,13 @@ class UsedIntensities(Struct, frozen=True):
 
 
 class States(Result, frozen=True, kw_only=True, dict=True):
-    """The content of `filter.json`; `made_from` the filter.
+    """The content of `filter.json`; `filtered`: states and covariances.
 
     `allan`: what a record at rest said, per signal. `as_expected`: are the innovations as large as
     the noise intensities say?
     """
 
-    unwritten = ("as_expected", "made_from")
+    unwritten = ("as_expected", "filtered")
 
     notes: list[str]
     samples: int
@@ -62,12 +62,12 @@ class States(Result, frozen=True, kw_only=True, dict=True):
     data: list[str]
     reproduce: Reproduced
     as_expected: bool
-    made_from: Filtered
+    filtered: Filtered
 
     @cached_property
     def trajectory(self) -> Trajectory:
         """States and innovations along the record."""
-        return trajectory_of(self.made_from)
+        return trajectory_of(self.filtered)
 
 
 def follow(
@@ -111,7 +111,7 @@ def follow(
         data=list(data),
         reproduce=reproduced(command, data),
         as_expected=bool(SMALLEST < mean / m < LARGEST),
-        made_from=found,
+        filtered=found,
     )
 
 

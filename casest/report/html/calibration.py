@@ -88,7 +88,7 @@ def error_section(result: Calibration, figures: Figures) -> str:
     sizes = alike([value for _, value in rows])
     cells = [[name, s, printed_unit(unit)] for (name, _), s in zip(rows, sizes, strict=True)]
     shown = table(["residual, rms", "size", "unit"], cells, [1])
-    notes = points([_repeats(result, result.swollen)] if result.swollen else [])
+    notes = points([_repeats(result, result.over_repeats)] if result.over_repeats else [])
     sides = [("after", [value for _, value in rows])]
     several = len(rows) > 1  # one number needs no picture
     picture = error_picture(figures, [name for name, _ in rows], sides, unit) if several else ""

@@ -50,9 +50,9 @@ def _fit_lines(result: Calibration) -> Iterator[str]:
     yield f"  residual rms {errors.rmse_fit:.3g}{unit}; {sigma}"
     if errors.rmse_holdout is not None:
         yield f"  held-out residual rms {errors.rmse_holdout:.3g}{unit}"
-    if result.swollen and not result.doubtful:
+    if result.over_repeats and not result.doubtful:
         yield item(
-            f"the residual is {result.swollen:.1f} times what the scatter within the rest "
+            f"the residual is {result.over_repeats:.1f} times what the scatter within the rest "
             f"intervals explains ({noise.from_repeats:.2g}{unit}): the model lacks something; the "
             "standard deviations above include that misfit as if it were noise"
         )
