@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from casest.cli.assignments import Assignment, Assignments
 from casest.cli.flags import Kind, flag, taking
@@ -12,6 +12,9 @@ from casest.cli.loading import declared_model, records
 from casest.cli.options import DATA, FOLDER, ModelOptions, ReadingOptions, Words, model_argument
 from casest.cli.shared import commands, echo, progress, typed
 from casest.errors import NotTrusted, UsageError
+
+if TYPE_CHECKING:
+    from casest.results.comparison import SolversCompared
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +74,8 @@ def compare(model_name: str, data: tuple[str, ...], options: CompareOptions) -> 
     """
     from casest.comparison.judge import SIZES
     from casest.comparison.judge import compare as compared
-    from casest.report.text.comparison import comparison_result, comparison_text
+    from casest.report.text.comparison import comparison_text
+    from casest.results.comparison import comparison_result
     from casest.results.file import as_json
 
     model = declared_model(model_name, options.model)
@@ -87,13 +91,12 @@ def compare(model_name: str, data: tuple[str, ...], options: CompareOptions) -> 
         limit=options.limit,
         say=progress,
     )
-    command = typed()
-    content = comparison_result(found, model_name=model_name, data=data, command=command)
-    written = written_comparison(found, content, options.output) if options.output else []
+    result = comparison_result(found, model_name=model_name, data=data, command=typed())
+    written = written_comparison(result, options.output) if options.output else []
     if options.as_json:
-        echo(as_json(content), nl=False)
+        echo(as_json(result.content()), nl=False)
     else:
-        echo(comparison_text(found, data, written, command))
+        echo(comparison_text(result, written))
     if found.interrupted:
         echo(f"casest: interrupted after {found.done} of {found.planned} runs", err=True)
     elif not found.certified:
@@ -101,14 +104,14 @@ def compare(model_name: str, data: tuple[str, ...], options: CompareOptions) -> 
     return 0 if found.certified and not found.interrupted else NotTrusted.exit_code
 
 
-def written_comparison(found: Any, content: dict[str, Any], folder: Path) -> list[Path]:
+def written_comparison(result: SolversCompared, folder: Path) -> list[Path]:
     """compare.json, and the plot where matplotlib is there; says so where it is not."""
     from casest.report.picture import draw
-    from casest.report.text.comparison import save
+    from casest.results.comparison import save
 
-    paths = [save(folder, content)]
+    paths = [save(folder, result)]
     try:
-        paths += draw(found, folder)
+        paths += draw(result, folder)
     except UsageError as error:
         echo(f"casest: {error}", err=True)
     return paths

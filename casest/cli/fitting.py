@@ -23,12 +23,13 @@ def list_command(as_json: bool) -> None:
     """Shipped problems with their symbols and estimators, and the catalogue of effects."""
     from casest.effects import CATALOGUE
     from casest.effects.moving import listed
-    from casest.report.text.calibration import listing
+    from casest.report.text.listing import listing_text
     from casest.results.find import MOVING, SHIPPED, find_any, find_model
+    from casest.results.listing import listing
 
     models = [(name, find_model(name)) for name in SHIPPED]
     moving: list[Any] = [(name, find_any(name)) for name in MOVING]
-    echo(listing(models, CATALOGUE, moving, listed(), as_json=as_json))
+    echo(listing_text(listing(models, CATALOGUE, moving, listed()), as_json=as_json))
 
 
 @commands.command()
@@ -49,7 +50,8 @@ def calibration(model_name: str, data: Sequence[str], options: FitOptions, comma
     from casest.estimate.calibrate import attempt
     from casest.estimate.held_out import score
     from casest.report.html import calibration_page
-    from casest.report.text.calibration import calibration_text, coloured
+    from casest.report.text.calibration import calibration_text
+    from casest.report.text.layout import coloured
     from casest.results.calibration import calibration_result, residual_rows
     from casest.results.file import as_json, save
     from casest.solve.interrupt import interruptible
@@ -63,7 +65,7 @@ def calibration(model_name: str, data: Sequence[str], options: FitOptions, comma
         found = attempt(model, runs, start=start, solver=options.solver, seed=options.seed)
     holdout = score(found, hidden) if hidden else None
     progress("asking whether the residual is noise")
-    content = calibration_result(
+    result = calibration_result(
         found,
         model_name=model_name,
         data=data,
@@ -73,13 +75,12 @@ def calibration(model_name: str, data: Sequence[str], options: FitOptions, comma
     )
     if options.output:
         progress(f"writing {options.output}")
-        save(options.output, content, residual_rows(found))
-        reported(options.output, calibration_page(found, content, str(options.output)))
+        save(options.output, result.content(), residual_rows(found))
+        reported(options.output, calibration_page(result, str(options.output)))
     if options.as_json:
-        echo(as_json(content), nl=False)
+        echo(as_json(result.content()), nl=False)
     else:
-        words = calibration_text(found, content, options.output)
-        echo(coloured(words, sys.stdout))
+        echo(coloured(calibration_text(result, options.output), sys.stdout))
     if not found.certificate.trusted:
         reason = found.certificate.reasons[0]
         echo(f"casest: no trustworthy estimate: {reason}", err=True)
@@ -112,9 +113,14 @@ def closing(model_name: str, data: Sequence[str], options: FitOptions, command: 
     from casest.diagnose.held_out import scored
     from casest.effects import CATALOGUE
     from casest.report.html import closing_page
-    from casest.report.text.calibration import coloured
     from casest.report.text.closing import closing_text
-    from casest.results.closing import closing_result, formula_source, name_file, residual_rows
+    from casest.report.text.layout import coloured
+    from casest.results.closing import (
+        closing_result,
+        formula_source,
+        residual_rows,
+        with_formula_in,
+    )
     from casest.results.file import as_json, save
     from casest.results.find import find_effects
 
@@ -139,7 +145,7 @@ def closing(model_name: str, data: Sequence[str], options: FitOptions, command: 
     except NotTrusted as error:
         return refused(error, model_name, data, options, command)
     hidden = scored(found, apart) if apart else None
-    content = closing_result(
+    result = closing_result(
         found, model_name=model_name, data=data, command=command, held_out=hidden and hidden[1:]
     )
     if options.output:
@@ -147,13 +153,13 @@ def closing(model_name: str, data: Sequence[str], options: FitOptions, command: 
         formula = formula_source(found)
         if formula:
             write(options.output / "formula.py", formula)
-            name_file(content, options.output / "formula.py")
-        save(options.output, content, residual_rows(found, hidden))
-        reported(options.output, closing_page(found, content, str(options.output)))
+            result = with_formula_in(result, options.output / "formula.py")
+        save(options.output, result.content(), residual_rows(found, hidden))
+        reported(options.output, closing_page(result, str(options.output)))
     if options.as_json:
-        echo(as_json(content), nl=False)
+        echo(as_json(result.content()), nl=False)
     else:
-        echo(coloured(closing_text(found, content, options.output), sys.stdout))
+        echo(coloured(closing_text(result, options.output), sys.stdout))
     return 0
 
 
@@ -163,7 +169,7 @@ def closing_in_motion(
     """Filter, diagnose the innovations, add what is missing, save, print."""
     from casest.diagnose.motion import loop
     from casest.report.html import closing_motion_page
-    from casest.report.text.calibration import coloured
+    from casest.report.text.layout import coloured
     from casest.report.text.motion import motion_text
     from casest.results.file import as_json, save
     from casest.results.motion import motion_result, residual_rows
@@ -177,16 +183,16 @@ def closing_in_motion(
     run = trajectory(moving, model_name, data, options.reading)
     progress(f"filtering {model_name}, looking for effects")
     found = loop.close_motion(moving, run, say=progress)
-    content = motion_result(found, model_name=model_name, data=data, command=command)
+    result = motion_result(found, model_name=model_name, data=data, command=command)
     if options.output:
-        save(options.output, content, residual_rows(found))
-        reported(options.output, closing_motion_page(found, content))
+        save(options.output, result.content(), residual_rows(found))
+        reported(options.output, closing_motion_page(result))
     if options.as_json:
-        echo(as_json(content), nl=False)
+        echo(as_json(result.content()), nl=False)
     else:
-        echo(coloured(motion_text(content, options.output), sys.stdout))
-    if not content["trusted"]:
-        reason = content["after"]["certificate"]["reasons"][-1]
+        echo(coloured(motion_text(result, options.output), sys.stdout))
+    if not result.trusted:
+        reason = result.after.certificate.reasons[-1]
         click.echo(f"casest: no trustworthy estimate: {reason}", err=True)
         return NotTrusted.exit_code
     return 0
@@ -201,14 +207,14 @@ def refused(
     from casest.results.file import as_json, save
 
     if error.estimate is not None and options.output:
-        content = calibration_result(
+        result = calibration_result(
             error.estimate, model_name=model_name, data=data, command=command
         )
-        save(options.output, content, residual_rows(error.estimate))
-        page = calibration_page(error.estimate, content, str(options.output))
+        save(options.output, result.content(), residual_rows(error.estimate))
+        page = calibration_page(result, str(options.output))
         reported(options.output, page)
         if options.as_json:
-            echo(as_json(content), nl=False)
+            echo(as_json(result.content()), nl=False)
     echo(f"casest: {error}", err=True)
     return NotTrusted.exit_code
 

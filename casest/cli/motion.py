@@ -61,9 +61,15 @@ def observe(model_name: str, data: tuple[str, ...], options: ObserveOptions) -> 
     code 0 even where something is not observable.
     """
     from casest.declaration.model import Model
-    from casest.results import observability
-    from casest.results.file import as_json, reproduce
+    from casest.report.text.observability import observe_text
+    from casest.results.file import as_json
     from casest.results.find import find_any
+    from casest.results.observability import (
+        Observability,
+        observe_motion,
+        observe_parameters,
+        observe_structure,
+    )
 
     fits = isinstance(find_any(model_name), Model)
     if fits:
@@ -72,27 +78,26 @@ def observe(model_name: str, data: tuple[str, ...], options: ObserveOptions) -> 
             raise UsageError(f"{model_name}: what can be seen depends on the record: give DATA")
         runs = records(model, data, options.reading)
         progress(f"fitting {model_name}")
-        content, _ = observability.observe_parameters(model, runs)
+        result: Observability = observe_parameters(model, runs, data=data, command=typed())
     else:
         moving = moving_model(model_name, options.model.constants, options.motion)
         if data:
             run = trajectory(moving, model_name, data, options.reading)
             progress("what the trajectory shows")
-            content = observability.observe_motion(moving, run, options.window)
+            result = observe_motion(moving, run, options.window, data=data, command=typed())
         else:
-            content = observability.observe_structure(moving)
-    content |= {"data": list(data), "reproduce": reproduce(typed(), data)}
+            result = observe_structure(moving, command=typed())
     if options.result.output:
         from casest.report.html import observe_page
 
-        write(options.result.output / "observe.json", as_json(content))
-        reported(options.result.output, observe_page(content))
+        write(options.result.output / "observe.json", as_json(result.content()))
+        reported(options.result.output, observe_page(result))
     if options.result.as_json:
-        echo(as_json(content), nl=False)
+        echo(as_json(result.content()), nl=False)
         return 0
-    echo(observability.observe_text(content))
-    seen = content["rank"] == content["unknowns"]
-    last_words(options.result.output, "report.html, observe.json", trusted=seen, applies=fits)
+    echo(observe_text(result))
+    shown = result.observable
+    last_words(options.result.output, "report.html, observe.json", trusted=shown, applies=fits)
     return 0
 
 
@@ -128,26 +133,25 @@ class FilterOptions:
 @taking(FilterOptions)
 def filter_command(model_name: str, data: tuple[str, ...], options: FilterOptions) -> int:
     """States over time by the Kalman filter and smoother, with innovations diagnosed."""
+    from casest.report.text.states import filter_text
     from casest.results import states
-    from casest.results.file import as_json, reproduce
+    from casest.results.file import as_json
 
     moving = moving_model(model_name, options.constants, options.motion)
     run = trajectory(moving, model_name, data, options.reading)
     tuned, told = tuned_noise(moving, run, options)
     progress("filter and smoother")
-    content, found = states.follow(moving, run, tuned)
-    content |= told
-    content |= {"data": list(data), "reproduce": reproduce(typed(), data)}
+    result = states.follow(moving, run, tuned, **told, data=data, command=typed())
     if options.result.output:
         from casest.report.html import filter_page
 
-        write(options.result.output / "states.csv", states.states_csv(found))
-        write(options.result.output / "filter.json", as_json(content))
-        reported(options.result.output, filter_page(found, content))
+        write(options.result.output / "states.csv", states.states_csv(result.filtered))
+        write(options.result.output / "filter.json", as_json(result.content()))
+        reported(options.result.output, filter_page(result))
     if options.result.as_json:
-        echo(as_json(content), nl=False)
+        echo(as_json(result.content()), nl=False)
         return 0
-    echo(states.filter_text(content))
+    echo(filter_text(result))
     last_words(options.result.output, "report.html, filter.json, states.csv")
     return 0
 
