@@ -70,7 +70,7 @@ READ = {
     "html": ["casest.report.html", "casest.report.next_command"],
 }
 BESIDE = ["casest.results", "casest.errors", "casest.units"]
-EXACTLY = {"casest", "casest.data.logs", "casest.data.run", "casest.declaration.shapes"}
+EXACTLY = {"casest.__version__", "casest.data.logs", "casest.data.run", "casest.declaration.shapes"}
 
 
 @pytest.mark.parametrize("path", [p for p in MODULES if p.parent.name in READ], ids=module_name)

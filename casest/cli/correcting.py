@@ -36,10 +36,10 @@ class ApplyOptions:
 @taking(ApplyOptions)
 def apply(result_path: Path, data: str, options: ApplyOptions) -> None:
     """Correct the readings in DATA with a saved RESULT (result.json, or its folder)."""
-    from casest.correction import apply as correcting
-    from casest.correction.export import applied, is_exported
     from casest.correction.inverse import LEFT, TIMED
     from casest.report.next_command import following
+    from casest.saved import apply as correcting
+    from casest.saved.export import applied, is_exported
 
     arguments = options.reading.keywords()
     progress(f"correcting {data}")
@@ -86,11 +86,11 @@ def export(
     force: bool,
 ) -> None:
     """The correction of a saved RESULT, ready to run on the device."""
-    from casest.correction import apply as correcting
-    from casest.correction.export import exported
     from casest.correction.inverse import TIMED
     from casest.report.next_command import following
     from casest.results.file import made_by
+    from casest.saved import apply as correcting
+    from casest.saved.export import exported
 
     if single and to != "c":
         raise UsageError("--float is for --to c")
