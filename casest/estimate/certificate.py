@@ -130,7 +130,7 @@ def certify(
         words.stationary(step),
         words.minimum(curvature),
         words.agreement(agreeing, len(others)),
-        words.intervals(shape, profile is not None),
+        _intervals(shape, profile is not None),
     )
     return Certificate(
         not against,
@@ -145,6 +145,13 @@ def certify(
         None if against else profile,
         reduce(or_, (code for code, _ in against), NOTHING),
     )
+
+
+def _intervals(shape: tuple[float, float], profiled: bool) -> str:
+    if profiled:
+        return words.PROFILED
+    wide = shape[1] > LINEAR[1]
+    return words.cautious_intervals(shape[1]) if wide else words.intervals(*shape)
 
 
 def _undetermined(identified: Identifiability) -> list[tuple[Code, str]]:

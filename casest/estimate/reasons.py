@@ -8,7 +8,6 @@ both ask, but not with the same means, the code's line says so.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from enum import IntFlag, auto
 
 #: Share of the residual that the Jacobian can still reach (Bates & Watts' relative offset).
@@ -246,19 +245,20 @@ def agreement(agreeing: int, others: int) -> str:
     return f"{found}: {agreeing} of {others}" + "; the others end higher" * (agreeing < others)
 
 
-def intervals(shape: Sequence[float], profiled: bool = False) -> str:
+def intervals(low: float, high: float) -> str:
     """Least and largest rise of the cost over what the intervals assume."""
-    if profiled:
-        return (
-            "the 95 % intervals are those of the likelihood, each unknown profiled: the cost is no "
-            "parabola, and standard deviations describe it only roughly"
-        )
-    if shape[1] > LINEAR[1]:
-        return (
-            "intervals are cautious: two standard deviations away the cost rises up to "
-            f"{shape[1]:.2g} times as much as they assume"
-        )
+    return f"intervals describe the cost two standard deviations away within {low:.2f}-{high:.2f}"
+
+
+def cautious_intervals(high: float) -> str:
+    """The same above LINEAR. (Many say `intervals` there too.)"""
     return (
-        "intervals describe the cost two standard deviations away within "
-        f"{shape[0]:.2f}-{shape[1]:.2f}"
+        "intervals are cautious: two standard deviations away the cost rises up to "
+        f"{high:.2g} times as much as they assume"
     )
+
+
+PROFILED = (
+    "the 95 % intervals are those of the likelihood, each unknown profiled: the cost is no "
+    "parabola, and standard deviations describe it only roughly"
+)

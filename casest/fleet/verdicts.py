@@ -173,5 +173,5 @@ class Verdicts(Sequence[tuple[str, ...]]):
         return (
             words.stationary(f.step[i], at_most=True),
             words.minimum(),
-            words.intervals((f.low[i], f.high[i])),
+            words.intervals(f.low[i], f.high[i]),
         )
