@@ -74,8 +74,8 @@ def observe(model_name: str, data: tuple[str, ...], **options: Any) -> int:
         echo(as_json(result.content()), nl=False)
         return 0
     echo(observe_text(result))
-    shown = result.observable
-    last_words(options["output"], "report.html, observe.json", trusted=shown, applies=fits)
+    seen = result.observable
+    last_words(options["output"], "report.html, observe.json", trusted=seen, applies=fits)
     return 0
 
 
