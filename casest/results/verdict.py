@@ -32,7 +32,7 @@ def sentence(result: Closed) -> str:
         return f"adequate: {said}{noise}{untried}"
     if result.verdict == "extended":
         verb = "was" if len(names) == 1 else "were"
-        left = remaining_noise(result.noise.correlated_over_samples)
+        left = _remaining_noise(result.noise.correlated_over_samples)
         return f"extended: {', '.join(names)} {verb} missing; what is left is {left}{untried}"
     found = f"beside {', '.join(names)} " if names else ""
     causes = result.unexplained.one_of
@@ -42,7 +42,7 @@ def sentence(result: Closed) -> str:
     return f"unexplained: {found}a misfit remains that no candidate explains"
 
 
-def remaining_noise(correlated_over: Number) -> str:
+def _remaining_noise(correlated_over: Number) -> str:
     """What noise is called that resembles itself over so many samples."""
     over = correlated_over or 1
     return (
