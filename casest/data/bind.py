@@ -35,7 +35,7 @@ class _Bound:
     units: dict[str, str | None]
     sources: dict[str, tuple[str, ...]]
     time: Array | None
-    time_source: str | None
+    time_source: tuple[str, ...]
     notes: list[str]
 
 
@@ -94,7 +94,8 @@ def _runs(table: Table, signals: Sequence[Signal], options: Options) -> list[Run
     bound = _bind(table, signals, options)
     groups = {kind: _group(table, kind, options) for kind in ("run", "pose")}
     sources = {name for names in bound.sources.values() for name in names}
-    sources |= {name for name in (bound.time_source, *groups.values()) if name}
+    dates = {name for name in bound.time_source if table.columns[name].is_text}
+    sources |= {name for name in (*bound.time_source, *groups.values()) if name} - dates
     others, other_units, notes = _others(table, sources, options)
     labels = _labels(table, groups["run"])
     pose = _labels(table, groups["pose"])
@@ -104,12 +105,13 @@ def _runs(table: Table, signals: Sequence[Signal], options: Options) -> list[Run
         rows = np.arange(table.n_rows) if labels is None else np.flatnonzero(labels == label)
         part = {name: values[rows] for name, values in bound.signals.items()}
         time, time_notes = _run_time(table, bound, rows, signals, options)
+        used = time is not None and options.rate is None  # dates that are no time are labels
         run = Run(
             name=stem if label is None else f"{stem}:{label}",
             file=table.file,
             signals=_with_time(part, time, signals),
             units=bound.units | _time_unit(signals),
-            columns={name: values[rows] for name, values in others.items()},
+            columns={n: values[rows] for n, values in others.items() if not (n in dates and used)},
             column_units=other_units,
             time=time,
             rows=rows,
@@ -124,7 +126,7 @@ def _runs(table: Table, signals: Sequence[Signal], options: Options) -> list[Run
 
 def _bind(table: Table, signals: Sequence[Signal], options: Options) -> _Bound:
     """Find, scale and convert the columns of every signal but time."""
-    found = _Bound({}, {}, {}, None, None, [])
+    found = _Bound({}, {}, {}, None, (), [])
     for signal in signals:
         if _is_time(signal):
             continue
@@ -153,35 +155,55 @@ def _with_time_column(
 ) -> _Bound:
     """Add the time column in s, where there is one and no rate is given."""
     needed = any(_is_time(signal) for signal in signals)
-    chosen = None
-    if "t" in options.columns:
-        names = as_names(options.columns["t"])
-        if len(names) != 1:
-            raise DataError(f"{table.file}: --columns t={','.join(names)} must name one column")
-        chosen = find_column(table, names[0], "time")
-    name = timing.find_time(table, chosen)
-    if name is None or name in {n for names in found.sources.values() for n in names}:
+    chosen = _chosen_time(table, options)
+    names = chosen or timing.find_time(table)
+    if not names or set(names) & {n for used in found.sources.values() for n in used}:
+        note = timing.kept_as_text(table) if not names else None
+        found.notes.extend([note] if note else [])
         return found
     if options.rate is not None:
-        found.notes.append(f"time column {name} not used: rate {options.rate:g} Hz is given")
-        return replace(found, time_source=name)
-    column = table.columns[name]
+        listed = " and ".join(names)
+        found.notes.append(f"time column {listed} not used: rate {options.rate:g} Hz is given")
+        return replace(found, time_source=names)
     try:
-        if not column.is_text:
-            numbers(table, column, "time", "--columns t=… or --rate HZ")
-        time, note = timing.seconds(table, column, timing.time_units_declared(options.units, name))
+        time, notes = _seconds(table, names, options)
     except (UnitError, DataError) as error:
         if needed or chosen:
             if isinstance(error, DataError):
                 raise
             raise UnitError(
-                f"{table.file}: column {name} as time: {error}; "
+                f"{table.file}: column {names[0]} as time: {error}; "
                 f"name another column with --columns t=… or say its unit with --unit t=…"
             ) from error
         found.notes.append(f"{timing.UNUSED}{error}")
-        return replace(found, time_source=name)
-    found.notes.extend([note] if note else [])
-    return replace(found, time=time, time_source=name)
+        return replace(found, time_source=names)
+    found.notes.extend(notes)
+    return replace(found, time=time, time_source=names)
+
+
+def _chosen_time(table: Table, options: Options) -> tuple[str, ...]:
+    """The columns that the user names as the time: one, or a date and a time of day."""
+    if "t" not in options.columns:
+        return ()
+    given = as_names(options.columns["t"])
+    names = tuple(find_column(table, name, "time") for name in given[:2])
+    if len(given) > 2 or (len(names) == 2 and not all(table.columns[n].is_text for n in names)):
+        raise DataError(
+            f"{table.file}: --columns t={','.join(given)} must name one column, or one of dates "
+            f"and one of times of day"
+        )
+    return names
+
+
+def _seconds(table: Table, names: tuple[str, ...], options: Options) -> tuple[Array, list[str]]:
+    """The time in s, (n_rows,), and what was assumed."""
+    columns = tuple(table.columns[name] for name in names)
+    if any(column.is_text for column in columns):
+        return timing.from_text(table, columns), [f"time from {' and '.join(names)}"]
+    numbers(table, columns[0], "time", "--columns t=… or --rate HZ")
+    stated = timing.time_units_declared(options.units, names[0])
+    time, note = timing.seconds(table, columns[0], stated)
+    return time, [note] if note else []
 
 
 def _run_time(
@@ -215,7 +237,7 @@ def _from_column(
     assert bound.time is not None
     time = bound.time[rows]
     try:
-        timing.refuse_unordered(table.file, str(bound.time_source), time, rows)
+        timing.refuse_unordered(table.file, " and ".join(bound.time_source), time, rows)
     except DataError as error:
         if needed:
             raise

@@ -17,6 +17,15 @@ Values = NDArray[np.float64] | NDArray[np.str_]
 _BLANK = frozenset({"", "nan", "na", "n/a", "null", "none", "-"})
 
 
+_GROUPS = re.compile(r"[-+]?[1-9]\d{0,2}([.,' ]\d{3})+([.,]\d+)?")
+_THOUSANDS = ", where thousands and decimals cannot be told apart: export without separators"
+
+
+def _grouped(text: str) -> bool:
+    """Whether a cell looks like 1.234,5 or 1'234: digits in groups of three."""
+    return bool(_GROUPS.fullmatch(text))
+
+
 @dataclass(frozen=True)
 class BadCell:
     """The first cell of a column that is no finite number: its data row, its text, how many."""
@@ -31,7 +40,7 @@ class BadCell:
         """Say what is wrong, as it goes into an error or a note."""
         what = f"holds '{self.text}'" if self.text else "is empty"
         more = f" (and {self.count - 1} more such rows)" if self.count > 1 else ""
-        return f"row {self.row} {what}{more}"
+        return f"row {self.row} {what}{more}{_THOUSANDS if _grouped(self.text) else ''}"
 
 
 @dataclass(frozen=True)

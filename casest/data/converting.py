@@ -8,6 +8,7 @@ import numpy as np
 
 from casest import units as unit_names
 from casest.data import attitude
+from casest.data.column import BadCell
 from casest.data.options import Options
 from casest.data.run import Array
 from casest.data.scaling import Scale
@@ -119,9 +120,10 @@ def numbers(
     `gaps`: cells may be empty, and are NaN then.
     """
     if column.is_text:
+        text = BadCell(0, str(column.values[0]), 1)
         raise DataError(
-            f"{table.file}: column {column.name} row 0 holds '{column.values[0]}', and {purpose} "
-            f"needs numbers; choose another column: {way_out}"
+            f"{table.file}: column {column.name} {text}, and {purpose} needs numbers; "
+            f"choose another column: {way_out}"
         )
     if column.bad is not None and not (gaps and column.bad.blank):
         raise DataError(
