@@ -17,6 +17,7 @@ Values = NDArray[np.float64] | NDArray[np.str_]
 _BLANK = frozenset({"", "nan", "na", "n/a", "null", "none", "-"})
 
 
+_NO_UNITS = ("-", "as", "turn", "code", "none")  # words that name things more often than units
 _GROUPS = re.compile(r"[-+]?[1-9]\d{0,2}([.,' ]\d{3})+([.,]\d+)?")
 _THOUSANDS = ", where thousands and decimals cannot be told apart: export without separators"
 
@@ -86,7 +87,7 @@ def text_column(header: str, cells: list[str]) -> Column:
 
 
 def name_and_unit(header: str) -> tuple[str, str | None]:
-    """Split `vx [m/s^2]`, `time (ms)` or `gyrox rad/s` into name and unit.
+    """Split `vx [m/s^2]`, `time (ms)`, `Kraft in N`, `F/kN` or `gyrox rad/s` into name and unit.
 
     Square brackets hold a unit unless they hold an index (`v[0]`, `v[x]`); round brackets and a
     last word hold one only where it is a familiar unit (`value (left)` is a name).
@@ -95,17 +96,36 @@ def name_and_unit(header: str) -> tuple[str, str | None]:
     if found := re.fullmatch(r"(.+?)\s*\[([^\[\]]*)\]", text):
         name, inside = found[1], found[2].strip()
         if not re.fullmatch(r"\d*|[xyzXYZ]", inside):
-            return name.strip(), inside
+            return _bare(name), inside
     if (found := re.fullmatch(r"(.+?)\s*\((.*)\)", text)) and units.familiar(found[2]):
-        return found[1].strip(), found[2].strip()
+        return _bare(found[1]), found[2].strip()
     name, _, word = text.rpartition(" ")
-    if name.strip() and _is_unit_word(word):
-        return name.strip(), word
+    if name.strip() and (_is_unit_word(word) or (name.endswith(" in") and units.familiar(word))):
+        return _bare(name), word
+    found = re.fullmatch(r"([^/]*[^/\s])\s*/\s*([^/]+)", text)
+    if found and _is_divisor(text, found[2]):
+        return found[1].strip(), found[2]
     return text, None
+
+
+def _bare(name: str) -> str:
+    """The name without what leads to its unit: "Kraft in", "Kraft /"."""
+    return re.sub(r"(\s+in|\s*/)$", "", name.strip()) or name.strip()
+
+
+def _is_divisor(whole: str, word: str) -> bool:
+    """Whether Kraft/N is a quantity over its unit (DIN 1313), not a unit itself, as m/s is.
+
+    T/K and T/°C are temperatures: nobody measures tesla per kelvin.
+    """
+    named = any(sign.isalpha() for sign in word) and word not in _NO_UNITS
+    if not named or not units.familiar(word):
+        return False
+    return not units.familiar(whole) or units.canonical(word) in ("K", "degC", "degF")
 
 
 def _is_unit_word(word: str) -> bool:
     """Whether a header's last word is a unit: "temp 1", "phase A" and "channel C" name things."""
     if len(word) == 1 and word not in "gsmTG":
         return False
-    return word not in ("-", "as", "turn", "code", "none") and units.familiar(word)
+    return word not in _NO_UNITS and units.familiar(word)

@@ -9,14 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casest import units
-from casest.data.finding import find_by_name
+from casest.data.matching import find_by_name
 from casest.data.moments import Moments, parse_moments
+from casest.data.scaling import Scale
 from casest.data.table import Column, Table
 from casest.errors import DataError, UnitError, UsageError
 
 Array = NDArray[np.float64]
 
 GAP = 5.0  # times the median step
+_EVEN = 20  # steps that show whether a record is evenly sampled
 
 #: How the note begins that tells why a time column was left aside.
 UNUSED = "time not used: "
@@ -96,14 +98,17 @@ def _is_temperature(column: Column) -> bool:
         return True
 
 
-def increasing(table: Table) -> str | None:
+def first_increasing(table: Table) -> str | None:
     """Return the first column of numbers that always grows: it may be the time."""
-    for name, column in table.columns.items():
-        if not column.is_text and column.bad is None and table.n_rows > 1:
-            values = np.asarray(column.values, dtype=np.float64)
-            if (np.diff(values) > 0).all():
-                return name
-    return None
+    return next((name for name in table.columns if increasing(table, name)), None)
+
+
+def increasing(table: Table, name: str) -> bool:
+    """Whether a column of numbers always grows: it counts samples, or is their time."""
+    column = table.columns[name]
+    if column.is_text or column.bad is not None or table.n_rows < 2:
+        return False
+    return bool((np.diff(np.asarray(column.values, dtype=np.float64)) > 0).all())
 
 
 def from_text(table: Table, columns: tuple[Column, ...]) -> Array:
@@ -132,19 +137,74 @@ def from_text(table: Table, columns: tuple[Column, ...]) -> Array:
     return np.where(missing, np.nan, (time - time[first]) * 1e-9)
 
 
-def seconds(table: Table, column: Column, stated: str | None) -> tuple[Array, str | None]:
-    """Return a time column of numbers in s and a note on what was assumed.
+def seconds(
+    table: Table, column: Column, stated: str | None, scale: Scale | None = None
+) -> tuple[Array, list[str]]:
+    """Return a time column of numbers in s, scaled first, and notes on what was assumed.
 
-    Raises UnitError where its unit is no time.
+    Raises UnitError where its unit is no time, UsageError where the header states one that may be
+    that before or after scaling.
     """
     unit = stated or column.unit or _unit_in_name(column.name)
     values = np.asarray(column.values, dtype=np.float64)
+    if scale is not None:
+        values = scale.apply(values, table.file, column.name)
+        unit = _after_scaling(table, column, stated, unit)
     if unit is None:
-        step = f"{np.median(np.diff(values)):g}" if len(values) > 1 else "unknown"
+        there = values[np.isfinite(values)]
+        step = f"{np.median(np.diff(there)):g}" if len(there) > 1 else "unknown"
         note = f"{column.name}: no unit stated, taken as s (median step {step} s); "
-        return values, note + "if that is wrong say --unit t=ms"
+        return values, [note + "if that is wrong say --unit t=ms"]
     factor, _ = units.conversion(unit, "s")
-    return values * factor, None
+    return values * factor, []
+
+
+def _after_scaling(
+    table: Table, column: Column, stated: str | None, unit: str | None
+) -> str | None:
+    """The unit of scaled time stamps: as the user states it; counts are counts no more."""
+    if stated or unit is None:
+        return stated
+    spelled = units.canonical(unit)
+    if spelled == "count":
+        return None
+    if spelled != "s":
+        raise UsageError(
+            f"{table.file}: column {column.name} is in {unit} by its header, and --scale changes "
+            f"its numbers: say what they are then, --unit t=s, or leave --scale out"
+        )
+    return spelled
+
+
+def interruptions(name: str, time: Array, rows: NDArray[np.int_]) -> list[str]:
+    """A note on samples that an evenly sampled record lacks, and on gaps: how many, and where."""
+    steps = np.diff(time)
+    if len(steps) < _EVEN:
+        return []
+    median = float(np.median(steps))
+    even = float(np.mean(np.abs(steps - median) < 0.1 * median)) >= 0.5
+    said = []
+    lost = np.flatnonzero((steps > 1.5 * median) & (steps <= GAP * median))
+    if even and lost.size:
+        count = int((np.rint(steps[lost] / median) - 1).sum())
+        coarse = ", or the time stamps are coarse" if lost.size > 0.1 * len(steps) else ""
+        said.append(
+            f"{_counted(count, 'sample')} missing in {_counted(lost.size, 'place')}, the first "
+            f"behind row {rows[lost[0]]} (t = {time[lost[0]]:.6g} s){coarse}"
+        )
+    gaps = np.flatnonzero(steps > GAP * median)
+    if gaps.size:
+        longest = gaps[np.argmax(steps[gaps])]
+        samples = f" ({round(steps[longest] / median) - 1} samples)" if even else ""
+        said.append(
+            f"{_counted(gaps.size, 'gap')}, the longest {steps[longest]:.4g} s{samples} behind row "
+            f"{rows[longest]} (t = {time[longest]:.6g} s)"
+        )
+    return [f"{name}: {'; '.join(said)}; the median step is {median:.3g} s"] if said else []
+
+
+def _counted(n: int, thing: str) -> str:
+    return f"{n} {thing}" if n == 1 else f"{n} {thing}s"
 
 
 def rate_in_preamble(table: Table) -> tuple[str, float] | None:
@@ -178,11 +238,16 @@ def refuse_unordered(file: str, column: str, time: Array, rows: NDArray[np.int_]
         )
 
 
-def blocks(time: Array | None, pose: NDArray[np.generic] | None, n: int) -> NDArray[np.int_]:
-    """Number the stretches between gaps in time and changes of pose, from 0."""
-    starts = np.zeros(n, dtype=np.bool_)
-    if time is not None and n > 2:
-        steps = np.diff(time)
+def blocks(
+    time: Array | None, pose: NDArray[np.generic] | None, rows: NDArray[np.int_]
+) -> NDArray[np.int_]:
+    """Number the stretches between gaps in time and changes of pose, from 0.
+
+    Without a time the rows are one: where more than a few were dropped there is a gap.
+    """
+    starts = np.zeros(len(rows), dtype=np.bool_)
+    if len(rows) > 2:
+        steps = np.diff(rows if time is None else time)
         starts[1:] |= steps > GAP * np.median(steps)
     if pose is not None:
         starts[1:] |= pose[1:] != pose[:-1]
