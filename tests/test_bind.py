@@ -334,6 +334,33 @@ def test_a_signal_that_never_changes_is_refused(tmp_path: Path, signal: Signal) 
     assert "signal v (columns vx vy vz) is 1, 2, 3 in all 3 rows; a dead channel" in message
 
 
+@pytest.mark.parametrize(
+    ("size", "words"),
+    [
+        (
+            "1e-310",
+            "signal v (columns vx vy vz) is nowhere larger than 3e-310, too small to compute with",
+        ),
+        (
+            "1e-200",
+            "signal v (columns vx vy vz) is nowhere larger than 3e-200, too small to compute with",
+        ),
+        ("1e200", "column vx reaches 2e+200, too large to compute with"),
+    ],
+)
+def test_readings_beyond_what_can_be_squared_are_refused(
+    tmp_path: Path, size: str, words: str
+) -> None:
+    power = size[1:]
+    text = f"vx,vy,vz\n1{power},2{power},3{power}\n2{power},1{power},1{power}\n"
+    said = refusal(DataError, tmp_path, text)
+    assert words in said
+    assert "--scale v" in said
+    one = run_of(tmp_path, "vx,vy,vz,w\n1,1e-310,3,1e300\n2,1,1,2e300\n")
+    assert one.signals["v"][0, 1] == 1e-310
+    assert "column w left out: it holds numbers too large to compute with" in one.notes
+
+
 def test_one_dead_axis_is_noted(tmp_path: Path) -> None:
     run = run_of(tmp_path, "vx,vy,vz\n1,2,3\n1,3,3.5\n1,4,2\n")
     assert "vx: 1 in all 3 rows; a dead channel?" in run.notes

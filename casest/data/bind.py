@@ -249,7 +249,9 @@ def _seconds(
     numbers(table, columns[0], "time", "--columns t=… or --rate HZ", gaps=needed)
     stated = timing.time_units_declared(options.units, names[0])
     scale = options.scales.get(names[0]) or options.scales.get("t")
-    return timing.seconds(table, columns[0], stated, scale)
+    time, notes = timing.seconds(table, columns[0], stated, scale)
+    checks.refuse_too_large(table.file, "the time", names[0], time)
+    return time, notes
 
 
 def _run_time(
@@ -360,6 +362,9 @@ def _others(
             notes.append(f"column {name} left out: {column.bad}")
             continue
         values, unit = column.values, options.units.get(name, column.unit)
+        if not column.is_text and np.abs(np.asarray(values, float)[complete]).max() > checks.MOST:
+            notes.append(f"column {name} left out: it holds numbers too large to compute with")
+            continue
         if name in options.scales:
             values = options.scales[name].apply(np.asarray(values, float), table.file, name)
             unit = None if unit == column.unit and unit in ("count", "raw", "LSB") else unit

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from casest import units as unit_names
-from casest.data import attitude
+from casest.data import attitude, checks
 from casest.data.column import BadCell
 from casest.data.options import Options
 from casest.data.run import Array
@@ -30,6 +30,7 @@ def vector(
             values = _converted(table, name, signal, values, unit, target, stated)
         parts.append(values)
     values = np.stack(parts, axis=1)
+    checks.refuse_too_small(table.file, signal.name, values, names)
     notes = [*_overruled(table, signal, names, options), *_missing(table, signal, values, options)]
     if target is not None and None in stated:
         silent = " ".join(n for n, u in zip(names, stated, strict=True) if u is None)
@@ -139,7 +140,10 @@ def numbers(
 def _scaled(table: Table, column: Column, signal: str, options: Options) -> Array:
     values = numbers(table, column, f"signal {signal}", f"--columns {signal}=…", gaps=True)
     scale = _scale_of(column.name, signal, options)
-    return values if scale is None else scale.apply(values, table.file, column.name)
+    if scale is not None:
+        values = scale.apply(values, table.file, column.name)
+    checks.refuse_too_large(table.file, f"signal {signal}", column.name, values)
+    return values
 
 
 def rotation(
