@@ -244,6 +244,11 @@ def size(unit: str) -> tuple[float, Dimension]:
     return found.factor, found.dimension
 
 
+def zero_point(unit: str) -> float:
+    """Return where the zero of a unit lies in SI: 273.15 for degC, 0 for all but temperatures."""
+    return _size(canonical(unit), unit).offset
+
+
 def quotient(a: str, b: str) -> str:
     """Return the unit of a / b in readable form: "1/count", "1", "(m/s^2)/count"."""
     if b == "1":
