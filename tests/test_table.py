@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+import zlib
 from pathlib import Path
 
 import h5py
@@ -422,6 +423,43 @@ def test_matlab_v73_that_is_damaged_or_lacks_its_library_says_what_helps(
     monkeypatch.setitem(sys.modules, "h5py", None)
     with pytest.raises(UsageError, match=r"needs the library h5py: pip install 'casest\[matlab\]'"):
         read_table(tmp_path / "a.mat")
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_a_matlab_file_with_a_damaged_tag_is_named(
+    tmp_path: Path, compressed: bool, order: str
+) -> None:
+    """A type of numbers that there is none of ends the process in SciPy."""
+    values = np.arange(60.0).reshape(20, 3)
+    scipy.io.savemat(tmp_path / "a.mat", {"v": values}, do_compression=False)
+    raw = bytearray((tmp_path / "a.mat").read_bytes())
+    at = raw.index(np.array([9, values.nbytes], dtype="<u4").tobytes())  # miDOUBLE, its bytes
+    raw[at] = 44
+    if compressed:
+        packed = zlib.compress(bytes(raw[128:]))
+        raw[128:] = np.array([15, len(packed)], dtype="<u4").tobytes() + packed
+    assert "are of the unknown type 44" in error_of(tmp_path, bytes(raw), "a.mat")
+    if order == ">":
+        raw[126:128] = b"MI"
+        assert "cannot be read as MATLAB" in error_of(tmp_path, bytes(raw), "a.mat")
+
+
+def test_matlab_structs_in_structs_cells_and_text_pass_the_check_of_tags(tmp_path: Path) -> None:
+    content = {
+        "t": ROWS[:, 0],
+        "deep": {"inner": {"x": 1.0}},
+        "cells": np.array([1, "a"], object),
+        "text": "XS-3",
+        "empty": np.zeros((0, 0)),
+        "flag": np.array([True, False, True]),
+    }
+    for compressed in (False, True):
+        scipy.io.savemat(tmp_path / "a.mat", content, do_compression=compressed)
+        table = read_table(tmp_path / "a.mat")
+        assert table.columns["t"].values.tolist() == ROWS[:, 0].tolist()
+        assert table.columns["flag"].values.tolist() == [1, 0, 1]
+        assert table.preamble["text"] == "XS-3"
 
 
 def test_text_that_is_called_mat_is_read_as_text(tmp_path: Path) -> None:

@@ -27,8 +27,7 @@ _VECTOR = re.compile(r"(large_|fixed_size_)?list<\w+: (u?int\d+|float|double|hal
 def read_npy(file: Path) -> Contents:
     """Read one array: (N, k) gives columns "0".."k-1"; a structured (N,) its fields."""
     array = _loaded(file)
-    if not isinstance(array, np.ndarray):
-        array.close()
+    if isinstance(array, dict):
         raise DataError(f"{file}: is an archive of arrays; call it .npz")
     if array.dtype.names:
         return from_arrays(file, {name: array[name] for name in array.dtype.names})
@@ -37,14 +36,9 @@ def read_npy(file: Path) -> Contents:
 
 def read_npz(file: Path) -> Contents:
     """Read named arrays: (N,) each a column, (N, 3) `v` gives v[0] v[1] v[2], scalars are kept."""
-    archive = _loaded(file)
-    if isinstance(archive, np.ndarray):
+    arrays = _loaded(file)
+    if not isinstance(arrays, dict):
         raise DataError(f"{file}: is one array, not an archive of them; call it .npy")
-    with archive:
-        try:
-            arrays = {name: archive[name] for name in archive.files}
-        except Exception as error:
-            raise _unreadable(file, error) from error
     if len(arrays) == 1 and next(iter(arrays)).startswith("arr_"):
         arrays = {"": next(iter(arrays.values()))}
     return from_arrays(file, arrays)
@@ -134,7 +128,8 @@ def _floats(values: Any, kind: str) -> NDArray[np.float64]:
     return np.asarray(values.to_numpy(zero_copy_only=False), dtype=np.float64)
 
 
-def _loaded(file: Path) -> Any:
+def _loaded(file: Path) -> NDArray[Any] | dict[str, NDArray[Any]]:
+    """The array in a file, or those of an archive by name."""
     with file.open("rb") as stream:
         start = stream.read(6)
         if start.startswith(_PICKLE):
@@ -143,12 +138,16 @@ def _loaded(file: Path) -> Any:
             raise DataError(f"{file}: cannot be read as NumPy: it does not begin like one")
         if start.startswith(b"PK") and not zipfile.is_zipfile(stream):
             raise DataError(f"{file}: cannot be read as NumPy: the archive is damaged")
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            return np.load(file, allow_pickle=False)
-    except Exception as error:  # a damaged file can fail anywhere in the library
-        raise _unreadable(file, error) from error
+        stream.seek(0)
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                found = np.load(stream, allow_pickle=False)
+                if isinstance(found, np.ndarray):
+                    return found
+                return {name: found[name] for name in found.files}
+        except Exception as error:  # a damaged file can fail anywhere in the library
+            raise _unreadable(file, error) from error
 
 
 def _unreadable(file: Path, error: Exception) -> DataError:

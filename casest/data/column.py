@@ -18,6 +18,8 @@ _BLANK = frozenset({"", "nan", "na", "n/a", "null", "none", "-"})
 
 
 _NO_UNITS = ("-", "as", "turn", "code", "none")  # words that name things more often than units
+#: Characters of a name or label that are kept: an array of labels is as wide as its longest.
+LONGEST = 200
 _GROUPS = re.compile(r"[-+]?[1-9]\d{0,2}([.,' ]\d{3})+([.,]\d+)?")
 _THOUSANDS = ", where thousands and decimals cannot be told apart: export without separators"
 
@@ -75,7 +77,7 @@ def numeric_column(header: str, values: NDArray[np.float64], texts: list[str] | 
             blank = bool(np.isnan(values[wrong]).all())
         else:
             blank = all(texts[k].strip().lower() in _BLANK for k in wrong)
-        bad = BadCell(row, text.strip(), int(wrong.size), blank)
+        bad = BadCell(row, _cut(text, 60), int(wrong.size), blank)
         values = np.where(np.isfinite(values), values, np.nan)
     return Column(name, unit, np.ascontiguousarray(values, dtype=np.float64), bad)
 
@@ -83,7 +85,13 @@ def numeric_column(header: str, values: NDArray[np.float64], texts: list[str] | 
 def text_column(header: str, cells: list[str]) -> Column:
     """Make a column of labels."""
     name, unit = name_and_unit(header)
-    return Column(name, unit, np.array([cell.strip() for cell in cells], dtype=np.str_))
+    return Column(name, unit, np.array([_cut(cell, LONGEST) for cell in cells], dtype=np.str_))
+
+
+def _cut(text: str, longest: int) -> str:
+    """Text on one line, with what is too long cut off."""
+    line = " ".join(text.split())
+    return line if len(line) <= longest else line[: longest - 1] + "…"
 
 
 def name_and_unit(header: str) -> tuple[str, str | None]:
@@ -92,7 +100,7 @@ def name_and_unit(header: str) -> tuple[str, str | None]:
     Square brackets hold a unit unless they hold an index (`v[0]`, `v[x]`); round brackets and a
     last word hold one only where it is a familiar unit (`value (left)` is a name).
     """
-    text = header.strip()
+    text = _cut(header, LONGEST)
     if found := re.fullmatch(r"(.+?)\s*\[([^\[\]]*)\]", text):
         name, inside = found[1], found[2].strip()
         if not re.fullmatch(r"\d*|[xyzXYZ]", inside):

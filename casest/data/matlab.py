@@ -11,6 +11,7 @@ import numpy as np
 
 from casest.data.arrays import from_arrays, pickled
 from casest.data.delimited import Contents, read_delimited
+from casest.data.matlab_tags import check_tags
 from casest.data.text import decoded, is_text
 from casest.errors import DataError, last_line, library
 
@@ -32,14 +33,16 @@ def read_matlab(file: Path) -> Contents:
         return from_arrays(file, dict(_flat(_version_73(file))))
     if not start.startswith(b"MATLAB") and is_text(start):
         return read_delimited(str(file), decoded(file, file.read_bytes()))
-    return from_arrays(file, dict(_flat(_version_7(file))))
+    return from_arrays(file, dict(_flat(_version_7(file, version_5=b"\x00" not in start[:4]))))
 
 
-def _version_7(file: Path) -> dict[str, Any]:
+def _version_7(file: Path, version_5: bool) -> dict[str, Any]:
     from scipy.io import loadmat
 
     try:
         with warnings.catch_warnings():
+            if version_5:
+                check_tags(file)
             warnings.simplefilter("ignore")  # such as two variables of one name: the last counts
             found = loadmat(str(file), squeeze_me=True, struct_as_record=False)
     except Exception as error:  # a damaged file can fail anywhere in the library

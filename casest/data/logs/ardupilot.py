@@ -91,6 +91,19 @@ def _index(reader: Any, file: Path) -> Any:
     """Where each message lies. The library's clock of GPS time is left out: no topic needs it."""
 
     class Index(reader.DFReader_binary):  # type: ignore[misc]
+        def __init__(self, name: str) -> None:
+            try:
+                super().__init__(name)
+            except BaseException:
+                self.close()  # what it has opened until then
+                raise
+
+        def close(self) -> None:
+            for opened in ("filehandle", "data_map"):
+                if (found := getattr(self, opened, None)) is not None:
+                    with contextlib.suppress(BufferError):  # still looked at by what failed
+                        found.close()
+
         def init_clock(self) -> None:
             pass
 
