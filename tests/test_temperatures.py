@@ -80,6 +80,7 @@ FINE = {
     "a cube": lambda s: s["one"] * s["T"] ** 3 / s["zero"] ** 3,
     "an if": lambda s: s["one"] + s["slope"] * if_else(s["T"] > 30, s["T"], 30.0),
     "a limit in degC": lambda s: s["slope"] * fmax(s["T"], s["near"]),
+    "a difference over a span": lambda s: s["one"] * ((s["T"] - s["near"]) / s["near"]),
     "a rise": lambda s: s["slope"] * quantity("r", s["T"] + s["rise"] * s["i"] ** 2, "degC"),
     "a gain in degC": lambda s: s["slope"] * quantity("g", s["gain"] * s["T"], "degC"),
 }  # fmt: skip

@@ -66,7 +66,8 @@ def load_runs(
     * time_zero: "first" makes each run's first sample t = 0, "column" keeps the column's own zero.
 
     A row in which a signal, the time of a model that needs it or an extra column has no number
-    (empty, nan) is dropped; the run's notes count them. What is not empty and no number is refused.
+    (empty, nan) is dropped; the run's notes count them. Where `gaps` are allowed none is: the other
+    signals need all their numbers. What is neither empty nor a number is refused.
 
     Raises DataError, UnitError or UsageError naming file, column, row, value and the way out.
     """

@@ -138,7 +138,9 @@ def numbers(
 
 
 def _scaled(table: Table, column: Column, signal: str, options: Options) -> Array:
-    values = numbers(table, column, f"signal {signal}", f"--columns {signal}=…", gaps=True)
+    # A filter's reading may be missing; what drives it may not, and no row of it is dropped.
+    gaps = signal in options.gaps or not options.gaps
+    values = numbers(table, column, f"signal {signal}", f"--columns {signal}=…", gaps=gaps)
     scale = _scale_of(column.name, signal, options)
     if scale is not None:
         values = scale.apply(values, table.file, column.name)

@@ -11,9 +11,13 @@ import zlib
 from pathlib import Path
 
 _HEADER = 128
+_COMPLEX = 0x800
 _NUMBERS = (1, 2, 3, 4, 5, 6, 7, 9, 12, 13, 16, 17, 18)  # and text, which is numbers too
 _MATRIX, _COMPRESSED = 14, 15
-_CLASSES = range(1, 18)
+_FLAGS, _DIMENSIONS, _NAME = 6, 5, (1, 2)  # types of the first three elements of a matrix
+#: How many elements of numbers a class has: text, sparse (row, column, value), dense.
+_PARTS = {4: 1, 5: 3} | dict.fromkeys(range(6, 16), 1)
+_CLASSES, _OPAQUE = range(1, 18), 17
 _DEEPEST = 30
 
 Bytes = bytes | mmap.mmap | memoryview
@@ -76,14 +80,29 @@ class _Elements:
             return  # an empty one
         if depth > _DEEPEST:
             raise ValueError("its matrices lie too deep in each other")
-        _, start, size, at = self.tag(at, end)
-        content = self.number(start) & 0xFF
-        if size != 8 or content not in _CLASSES:
+        kind, start, size, at = self.tag(at, end)
+        first, content = start, self.number(start) & 0xFF
+        if kind != _FLAGS or size != 8 or content not in _CLASSES:
             raise ValueError(f"the matrix before byte {at} is of no known class")
+        if content != _OPAQUE:
+            kind, _, size, at = self.tag(at, end)
+            if kind != _DIMENSIONS or size < 8 or size % 4:
+                raise ValueError(f"the dimensions before byte {at} are damaged")
+            kind, _, _, at = self.tag(at, end)
+            if kind not in _NAME:
+                raise ValueError(f"the name before byte {at} is damaged")
+        parts = _PARTS.get(content, 0) + bool(content in _PARTS and self.is_complex(first))
         while at < end:
             kind, start, size, after = self.tag(at, end)
-            if kind == _MATRIX:
+            parts -= 1
+            if kind == _MATRIX and content not in _PARTS:
                 self.check_matrix(start, start + size, depth + 1)
             elif kind not in _NUMBERS:
                 raise ValueError(f"the numbers at byte {at} are of the unknown type {kind}")
             at = after
+        if content in _PARTS and parts:
+            raise ValueError(f"the matrix before byte {at} has not the numbers that it announces")
+
+    def is_complex(self, flags: int) -> bool:
+        """Whether a matrix has an imaginary part."""
+        return bool(self.number(flags) & _COMPLEX)
