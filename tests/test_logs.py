@@ -428,6 +428,7 @@ def test_units_multipliers_and_instances_are_as_the_log_states_them(tmp_path):
     assert battery.columns["Where"].values[0] == 47.1234567
     assert (battery.columns["Where"].unit, battery.columns["Volt"].unit) == ("deg", "V")
     assert list(battery.columns) == ["t", "Volt", "Where"]
+    assert "no topic BAT[1]; did you mean" in error_of(f"{path}:BAT[1]")
 
 
 def test_an_ardupilot_log_is_calibrated(sensor, readings, tmp_path):

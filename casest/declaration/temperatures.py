@@ -169,6 +169,7 @@ def _shifted(one: Zero, by: float, plain: bool, where: str) -> Zero:
 
 def _product(op: int, operands: Sequence[Zero], where: str) -> Zero:
     a, b = operands[0], operands[-1]
+    # A difference over a number of degC that is no reading is one over a span.
     if op == ca.OP_DIV and b.affine and not (a.of == OWN and not b.varies):
         raise _asks_for_absolute(where, "a division by", b.of)
     if op in (ca.OP_POW, ca.OP_CONSTPOW):
@@ -181,7 +182,6 @@ def _product(op: int, operands: Sequence[Zero], where: str) -> Zero:
         return _power(a.of, 2 * a.degree, where) if a.affine else Zero()
     if op == ca.OP_MUL and a.affine and b.affine:
         return _power(a.of, a.degree + b.degree, where)
-    # A difference over a known number of degC is one over a span.
     one, other = (b, a) if op == ca.OP_MUL and not a.of else (a, b)
     if not one.of or one.of == OWN:
         return one

@@ -154,9 +154,13 @@ def _instances(kind: Any, records: Records) -> Iterator[tuple[str, Records]]:
 
 
 def _alias(found: dict[str, Any], name: str) -> str:
-    """`MAG[0]` is the only MAG too."""
-    bare = re.sub(r"\[\d+\]$", "", name.strip("/"))
-    return bare if name.strip("/") not in found and bare in found else name
+    """`MAG[0]` is the only MAG too, if that is its number."""
+    split = re.fullmatch(r"(.+)\[(\d+)\]", name.strip("/"))
+    if split is None or name.strip("/") in found or split[1] not in found:
+        return name
+    kind, records = found[split[1]]
+    number = int(records[kind.instance_field][0]) if kind.instance_field and len(records) else 0
+    return split[1] if int(split[2]) == number else name
 
 
 def _told(log: Any, raw: NDArray[np.uint8]) -> dict[int, list[tuple[float, str]]]:
