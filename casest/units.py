@@ -64,9 +64,11 @@ _ATOMS: dict[str, _Size] = {
     "um": _si(1e-6, m=1),
     "kg": _si(1.0, kg=1),
     "N": _si(1.0, kg=1, m=1, s=-2),
+    "kN": _si(1e3, kg=1, m=1, s=-2),
     "Pa": _si(1.0, kg=1, m=-1, s=-2),
     "hPa": _si(1e2, kg=1, m=-1, s=-2),
     "kPa": _si(1e3, kg=1, m=-1, s=-2),
+    "MPa": _si(1e6, kg=1, m=-1, s=-2),
     "bar": _si(1e5, kg=1, m=-1, s=-2),
     "mbar": _si(1e2, kg=1, m=-1, s=-2),
     "A": _si(1.0, A=1),
@@ -240,6 +242,11 @@ def size(unit: str) -> tuple[float, Dimension]:
     """
     found = _size(canonical(unit), unit)
     return found.factor, found.dimension
+
+
+def zero_point(unit: str) -> float:
+    """Return where the zero of a unit lies in SI: 273.15 for degC, 0 for all but temperatures."""
+    return _size(canonical(unit), unit).offset
 
 
 def quotient(a: str, b: str) -> str:

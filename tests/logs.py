@@ -1,4 +1,4 @@
-"""Logs of several topics: ROS bags by the writers of rosbags, PX4 logs by the published format."""
+"""Logs of several topics: ROS bags by rosbags; PX4 and ArduPilot logs by the published formats."""
 
 from __future__ import annotations
 
@@ -131,3 +131,48 @@ def records(time, **columns) -> tuple[str, np.ndarray]:
     for name, values in columns.items():
         made[name] = values
     return ";".join(fields), made
+
+
+_DATAFLASH = {"B": "B", "h": "h", "f": "f", "Q": "Q", "c": "h", "N": "16s", "Z": "64s", "n": "4s",
+              "b": "b", "d": "d", "L": "i"}  # fmt: skip
+
+
+def dataflash(
+    path: Path,
+    kinds: dict[str, tuple[str, str, str, str, list[tuple]]],
+    units: dict[str, str] | None = None,
+    multipliers: dict[str, float] | None = None,
+) -> Path:
+    """An ArduPilot log of {type: (format, "TimeUS,I,MagX", units, multipliers, rows)}.
+
+    Rows hold the stored numbers. `units` and `multipliers` say what the letters mean; without them
+    the log is one from before 2018. Source: "DataFlash logs", libraries/AP_Logger/README.md.
+    """
+
+    def message(number: int, form: str, *values) -> bytes:
+        body = struct.pack("<" + "".join(_DATAFLASH[c] for c in form), *values)
+        return b"\xa3\x95" + bytes([number]) + body
+
+    def described(number: int, name: str, form: str, columns: str) -> bytes:
+        size = 3 + struct.calcsize("<" + "".join(_DATAFLASH[c] for c in form))
+        words = (name.encode(), form.encode(), columns.encode())
+        return message(0x80, "BBnNZ", number, size, *words)
+
+    parts = [described(0x80, "FMT", "BBnNZ", "Type,Length,Name,Format,Columns")]
+    numbers = {name: 0x90 + k for k, name in enumerate(kinds)}
+    for name, (form, columns, *_) in kinds.items():
+        parts.append(described(numbers[name], name, form, columns))
+    if units is not None:
+        parts.append(described(0xF0, "UNIT", "QbZ", "TimeUS,Id,Label"))
+        parts.append(described(0xF1, "MULT", "Qbd", "TimeUS,Id,Mult"))
+        parts.append(described(0xF2, "FMTU", "QBNN", "TimeUS,FmtType,UnitIds,MultIds"))
+        parts += [message(0xF0, "QbZ", 1, ord(k), v.encode()) for k, v in units.items()]
+        parts += [message(0xF1, "Qbd", 1, ord(k), v) for k, v in (multipliers or {}).items()]
+        for name, (_, _, of_units, of_multipliers, _) in kinds.items():
+            letters = (of_units.encode(), of_multipliers.encode())
+            parts.append(message(0xF2, "QBNN", 1, numbers[name], *letters))
+    rows = [(row, name) for name, kind in kinds.items() for row in kind[4]]
+    for row, name in sorted(rows, key=lambda pair: pair[0][0]):
+        parts.append(message(numbers[name], kinds[name][0], *row))
+    path.write_bytes(b"".join(parts))
+    return path

@@ -85,7 +85,7 @@ def test_a_misnamed_column_suggests_the_near_one(refused):
     assert "good.csv: no column mas for signal mass; did you mean mass?" in text
 
 
-@pytest.mark.parametrize("cell", ["oops", "nan", "inf", "-inf", ""])
+@pytest.mark.parametrize("cell", ["oops", "inf", "-inf", "1e400"])
 def test_a_cell_that_is_no_finite_number_is_named_by_column_row_and_value(refused, cell):
     lines = GOOD.splitlines()
     lines[4] = f"{lines[4].split(',')[0]},{cell}"

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import scipy.io
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -159,6 +160,70 @@ def test_options_that_fit_nothing_are_refused(
     assert words in refusal(UsageError, tmp_path, f"vx,vy,vz\n{THREE}", **options)
 
 
+@pytest.mark.parametrize(
+    ("header", "chosen", "found"),
+    [
+        ("acc_x_raw,acc_y_raw,acc_z_raw", "acc", None),
+        ("imu acc X raw,imu acc Y raw,imu acc Z raw", "imu", None),
+        ("AccRawX,AccRawY,AccRawZ", "acc", None),
+        ("acc1 (g),acc2 (g),acc3 (g)", "acc", None),
+        ("acc_0_raw,acc_1_raw,acc_2_raw", "acc", None),
+        ("acc_x_raw,acc_y_raw,acc_z_raw", "acc_", None),
+    ],
+)
+def test_a_vector_is_found_by_what_its_columns_have_in_common(
+    tmp_path: Path, header: str, chosen: str, found: None
+) -> None:
+    text = f"n,{header},gyr_x_raw,gyr_y_raw,gyr_z_raw\n7,1,2,3,4,5,6\n9,3,2,2,5,5,5\n"
+    run = run_of(tmp_path, text, [ANY], columns={"v": chosen})
+    assert run.signals["v"].tolist() == [[1, 2, 3], [3, 2, 2]]
+
+
+def test_a_vector_that_can_be_read_in_two_ways_is_refused_with_both(tmp_path: Path) -> None:
+    header = ",".join(f"acc_{axis}_{kind}" for kind in ("raw", "cal") for axis in "xyz")
+    text = f"{header}\n1,2,3,4,5,6\n3,2,2,5,5,5\n"
+    said = refusal(DataError, tmp_path, text, [ANY], columns={"v": "acc"})
+    assert (
+        "acc for signal v can be read in 2 ways, acc_x_raw,acc_y_raw,acc_z_raw or acc_x_cal" in said
+    )
+    assert "--columns v=acc_x_raw,acc_y_raw,acc_z_raw" in said
+    run = run_of(tmp_path, text, [ANY], columns={"v": "acc_x_cal,acc_y_cal,acc_z_cal"})
+    assert run.signals["v"][0].tolist() == [4, 5, 6]
+
+
+FORCE = Signal("kraft", 1, "N")
+
+
+@pytest.mark.parametrize(
+    "header",
+    ["Kraft in N", "Kraft (N)", "Kraft [N]", "Kraft/N", "Kraft / N", "Kraft in [N]"],
+)
+def test_a_quantity_is_found_however_its_unit_is_written(tmp_path: Path, header: str) -> None:
+    text = f"{header},Weg in mm\n1,2\n2,5\n"
+    for options in ({"columns": {"kraft": "Kraft"}}, {}):
+        run = run_of(tmp_path, text, [FORCE], **options)
+        assert run.signals["kraft"][:, 0].tolist() == [1, 2]
+    thousand = run_of(tmp_path, text.replace(header, header.replace("N", "kN")), [FORCE])
+    assert thousand.signals["kraft"][:, 0].tolist() == [1000, 2000]
+
+
+def test_a_column_is_found_by_its_first_words_where_one_begins_so(tmp_path: Path) -> None:
+    text = "Kraft gemessen,Kraftwerk,Weg\n1,2,3\n2,5,4\n"
+    run = run_of(tmp_path, text, [FORCE], columns={"kraft": "Kraft"})
+    assert run.signals["kraft"][:, 0].tolist() == [1, 2]
+    both = "Kraft gemessen,Kraft gerechnet\n1,2\n2,5\n"
+    said = refusal(DataError, tmp_path, both, [FORCE], columns={"kraft": "Kraft"})
+    assert "can be read in 2 ways, Kraft gemessen or Kraft gerechnet; name the column" in said
+
+
+@pytest.mark.parametrize("header", ["timestamp,gx,gz,foo", "", "sample,a,b,c"])
+def test_the_time_stamp_is_not_offered_as_an_axis(tmp_path: Path, header: str) -> None:
+    rows = "\n".join(f"{1583 + k},{k % 3},{k % 4},{k % 5}" for k in range(9))
+    said = refusal(DataError, tmp_path, f"{header}\n{rows}\n".lstrip(), [ANY])
+    names = header.split(",") if header else list("0123")
+    assert said.endswith(f"try --columns v={','.join(names[1:])}")
+
+
 def test_no_file_at_all_is_refused() -> None:
     with pytest.raises(UsageError, match="no data file given"):
         load_runs([], [V])
@@ -168,7 +233,7 @@ def test_no_file_at_all_is_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    ("cell", "words"), [("nan", "'nan'"), ("inf", "'inf'"), ("oops", "'oops'"), ("", "is empty")]
+    ("cell", "words"), [("inf", "'inf'"), ("oops", "'oops'"), ("1e400", "'1e400'"), ("?", "'?'")]
 )
 def test_a_bad_cell_in_a_used_column_is_named(tmp_path: Path, cell: str, words: str) -> None:
     text = f"vx,vy,vz\n1,2,3\n4,{cell},6\n7,8,9\n"
@@ -184,9 +249,76 @@ def test_a_bad_cell_elsewhere_costs_only_its_column_and_is_noted(tmp_path: Path)
     assert "column temp left out: row 1 is empty" in run.notes
 
 
-def test_extra_columns_must_be_there_and_whole(tmp_path: Path) -> None:
+@pytest.mark.parametrize("cell", ["", "nan", "NaN", "n/a", "null"])
+def test_a_row_without_a_reading_is_dropped_counted_and_said(tmp_path: Path, cell: str) -> None:
+    text = (
+        f"t [s],vx,vy,vz,n\n0,1,2,3,1\n1,4,{cell},6,2\n2,7,8,9,4\n3,{cell},1,{cell},8\n4,5,1,2,16\n"
+    )
+    run = run_of(tmp_path, text, [T, V])
+    assert run.signals["v"].tolist() == [[1, 2, 3], [7, 8, 9], [5, 1, 2]]
+    assert run.rows.tolist() == [0, 2, 4]
+    assert run.signals["t"][:, 0].tolist() == [0, 2, 4]
+    assert run.columns["n"].tolist() == [1, 4, 16]
+    assert "2 of 5 rows dropped: 2 without vx vy vz, the first row 1" in run.notes
+
+
+def test_dropped_rows_keep_their_place_in_time_where_a_rate_gives_it(tmp_path: Path) -> None:
+    text = "vx,vy,vz\n,2,3\n4,5,6\n,8,9\n3,1,2\n"
+    run = run_of(tmp_path, text, [T, V], rate=10)
+    np.testing.assert_allclose(run.signals["t"][:, 0], [0, 0.2])
+
+
+def test_many_dropped_rows_in_a_row_are_a_gap_without_a_time_too(tmp_path: Path) -> None:
+    rows = ["1,2,3" if k % 2 else "2,1,4" for k in range(20)]
+    rows[8:15] = [",,"] * 7
+    run = run_of(tmp_path, "vx,vy,vz\n" + "\n".join(rows) + "\n")
+    assert run.block.tolist() == [0] * 8 + [1] * 5
+
+
+def test_a_record_without_one_whole_row_is_refused(tmp_path: Path) -> None:
+    said = refusal(DataError, tmp_path, "vx,vy,vz\n,2,3\n4,,6\n7,8,\n")
+    assert "no row has every number that is needed (3 of 3 rows dropped: 3 without vx vy vz" in said
+    text = "run,vx,vy,vz\na,1,2,3\na,2,1,4\nb,,1,1\nb,,2,2\n"
+    run = run_of(tmp_path, text)
+    assert run.name == "imu:a"
+    assert "run b left out: none of its rows is complete" in run.notes
+
+
+def test_rows_without_the_time_that_a_model_needs_are_dropped(tmp_path: Path) -> None:
+    run = run_of(tmp_path, "t,vx,vy,vz\n0,1,2,3\n,2,3,4\n2,4,5,6\n", [T, V])
+    assert run.signals["t"][:, 0].tolist() == [0, 2]
+    assert "1 of 3 rows dropped: 1 without t, the first row 1" in run.notes
+
+
+def test_an_optical_attitude_with_gaps_of_nan_is_used_where_it_is_there(shared_data: Path) -> None:
+    """3944 of 57 141 rows of the quaternion are NaN: known from the file by SciPy alone."""
+    file = shared_data / "broad" / "26_disturbed_phone_vibration_A.mat"
+    quaternion = scipy.io.loadmat(str(file))["opt_quat"]
+    there = np.isfinite(quaternion).all(axis=1)
+    (run,) = load_runs(
+        [file],
+        [Signal("m", 3, None), ATTITUDE],
+        columns={"m": "imu_mag", "attitude": [f"opt_quat[{k}]" for k in range(4)]},
+    )
+    assert len(run) == there.sum() == 57141 - 3944
+    expected = Rotation.from_quat(quaternion[there][:, [1, 2, 3, 0]]).as_matrix().reshape(-1, 9)
+    np.testing.assert_allclose(run.signals["attitude"], expected, atol=1e-9)
+    words = (
+        "3944 of 57141 rows dropped: 3944 without opt_quat[0] opt_quat[1] opt_quat[2] opt_quat[3]"
+    )
+    assert any(words in note for note in run.notes)
+
+
+def test_a_column_that_is_whole_where_the_signals_are_is_kept(tmp_path: Path) -> None:
+    run = run_of(tmp_path, "vx,vy,vz,temp\n1,2,3,20\n4,,6,\n7,8,9,21\n")
+    assert run.columns["temp"].tolist() == [20, 21]
+
+
+def test_extra_columns_must_be_there_and_cost_the_rows_that_they_lack(tmp_path: Path) -> None:
     text = "vx,vy,vz,temp\n1,2,3,20\n4,5,6,\n7,8,9,21\n"
-    assert "column temp row 1 is empty" in refusal(DataError, tmp_path, text, extra=["temp"])
+    run = run_of(tmp_path, text, extra=["temp"])
+    assert run.columns["temp"].tolist() == [20, 21]
+    assert "1 of 3 rows dropped: 1 without temp, the first row 1" in run.notes
     assert "did you mean temp?" in refusal(DataError, tmp_path, text, extra=["tmep"])
 
 
@@ -200,6 +332,33 @@ def test_labels_where_numbers_are_needed_are_refused(tmp_path: Path) -> None:
 def test_a_signal_that_never_changes_is_refused(tmp_path: Path, signal: Signal) -> None:
     message = refusal(DataError, tmp_path, "vx,vy,vz\n1,2,3\n1,2,3\n1,2,3\n", [signal])
     assert "signal v (columns vx vy vz) is 1, 2, 3 in all 3 rows; a dead channel" in message
+
+
+@pytest.mark.parametrize(
+    ("size", "words"),
+    [
+        (
+            "1e-310",
+            "signal v (columns vx vy vz) is nowhere larger than 3e-310, too small to compute with",
+        ),
+        (
+            "1e-200",
+            "signal v (columns vx vy vz) is nowhere larger than 3e-200, too small to compute with",
+        ),
+        ("1e200", "column vx reaches 2e+200, too large to compute with"),
+    ],
+)
+def test_readings_beyond_what_can_be_squared_are_refused(
+    tmp_path: Path, size: str, words: str
+) -> None:
+    power = size[1:]
+    text = f"vx,vy,vz\n1{power},2{power},3{power}\n2{power},1{power},1{power}\n"
+    said = refusal(DataError, tmp_path, text)
+    assert words in said
+    assert "--scale v" in said
+    one = run_of(tmp_path, "vx,vy,vz,w\n1,1e-310,3,1e300\n2,1,1,2e300\n")
+    assert one.signals["v"][0, 1] == 1e-310
+    assert "column w left out: it holds numbers too large to compute with" in one.notes
 
 
 def test_one_dead_axis_is_noted(tmp_path: Path) -> None:
@@ -493,7 +652,7 @@ def test_a_bad_time_that_no_signal_needs_is_only_noted(tmp_path: Path) -> None:
         (f"vx,vy,vz\n{THREE}", DataError, "no time column (t, time, timestamp) for signal t"),
         ("t [m],vx,vy,vz\n0,1,2,3\n1,2,3,4\n", UnitError, "column t as time: m does not convert"),
         ("t,vx,vy,vz\na,1,2,3\nb,2,3,4\n", DataError, "column t row 0 holds 'a', which is no time"),
-        ("t,vx,vy,vz\n0,1,2,3\n,2,3,4\n2,4,5,6\n", DataError, "column t row 1 is empty"),
+        ("t,vx,vy,vz\n0,1,2,3\n?,2,3,4\n2,4,5,6\n", DataError, "column t row 1 holds '?'"),
     ],
 )
 def test_a_time_that_is_none_is_refused(
@@ -514,6 +673,69 @@ def test_a_capital_t_without_a_unit_of_time_is_a_temperature(tmp_path: Path) -> 
         assert run.time is None
         assert "T" in run.columns
     assert run_of(tmp_path, "T [s],vx,vy,vz\n0,1,2,3\n1,2,3,4\n", [V]).time is not None
+
+
+@pytest.mark.parametrize(
+    ("name", "scale"), [("t", "/1000000"), ("t", "/1e6"), ("t", "*1e-6"), ("Zeit", "/1000000")]
+)
+def test_time_stamps_are_scaled_like_any_count(tmp_path: Path, name: str, scale: str) -> None:
+    text = timed([20_000, 20_000], "Zeit", start=5e6)
+    run = run_of(tmp_path, text, [T, V], columns={"t": "Zeit"}, scales={name: scale})
+    np.testing.assert_allclose(run.signals["t"][:, 0], [0, 0.02, 0.04])
+    assert any("Zeit: no unit stated, taken as s (median step 0.02 s)" in n for n in run.notes)
+
+
+def test_scaled_time_stamps_have_the_unit_that_is_stated(tmp_path: Path) -> None:
+    text = timed([20, 20], "ticks")
+    said = {"columns": {"t": "ticks"}, "scales": {"t": "/2"}}
+    run = run_of(tmp_path, text, [T, V], units={"t": "us"}, **said)
+    np.testing.assert_allclose(run.time, [0, 10e-6, 20e-6])
+    counts = run_of(tmp_path, timed([20, 20], "ticks [count]"), [T, V], **said)
+    np.testing.assert_allclose(counts.time, [0, 10, 20])
+    stated = run_of(tmp_path, timed([20_000, 20_000]), [T, V], units={"t": "us"})
+    np.testing.assert_allclose(stated.time, [0, 0.02, 0.04])
+
+
+def test_a_time_in_microseconds_that_is_scaled_too_is_asked_about(tmp_path: Path) -> None:
+    text = timed([20_000, 20_000], "time_us")
+    message = refusal(UsageError, tmp_path, text, [T, V], scales={"t": "/1000000"})
+    assert "column time_us is in us by its header, and --scale changes its numbers" in message
+    told = run_of(tmp_path, text, [T, V], scales={"t": "/1000000"}, units={"t": "s"})
+    np.testing.assert_allclose(told.time, [0, 0.02, 0.04])
+
+
+def test_lost_packets_and_a_gap_are_said_with_count_and_place(tmp_path: Path) -> None:
+    """1000 samples at 100 Hz with jitter; 20 lost one at a time, then 40 in a row."""
+    rng = np.random.default_rng(1)
+    lost = np.arange(25, 425, 20)
+    kept = np.setdiff1d(np.arange(1000), [*lost, *range(700, 740)])
+    time = 0.01 * kept + rng.normal(0, 2e-4, len(kept))
+    rows = "\n".join(f"{t:.5f},{k % 7},{k % 5},{k % 3}" for k, t in enumerate(time))
+    run = run_of(tmp_path, f"t [s],vx,vy,vz\n{rows}\n", [T, V])
+    (note,) = [note for note in run.notes if "missing" in note]
+    assert note.startswith("t: 20 samples missing in 20 places, the first behind row 24 (t = 0.239")
+    assert "1 gap, the longest 0.4" in note
+    assert f"(40 samples) behind row {700 - 20 - 1} (t = 6.99" in note
+    assert note.endswith("the median step is 0.01 s")
+
+
+@pytest.mark.parametrize("form", ["even", "jitter", "poses"])
+def test_a_whole_record_and_one_at_uneven_times_lack_nothing(tmp_path: Path, form: str) -> None:
+    rng = np.random.default_rng(2)
+    steps = {
+        "even": np.full(200, 0.01),
+        "jitter": 0.01 + rng.uniform(-3e-3, 3e-3, 200),
+        "poses": rng.uniform(1, 3, 200),
+    }[form]
+    run = run_of(tmp_path, timed(steps.tolist(), "t [s]"), [T, V])
+    assert not [note for note in run.notes if "missing" in note or "gap" in note]
+
+
+def test_many_long_steps_may_be_coarse_time_stamps(tmp_path: Path) -> None:
+    """800 Hz with stamps in whole milliseconds: each fourth step is two of them."""
+    stamps = np.floor(np.arange(200) * 1.25)
+    run = run_of(tmp_path, timed(np.diff(stamps).tolist(), "t [ms]"), [T, V])
+    assert any("or the time stamps are coarse" in note for note in run.notes)
 
 
 def test_a_gap_in_time_starts_a_block(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ import logs
 import numpy as np
 import pytest
 import simulators as sim
+from pymavlink import DFReader
 
 from casest.cli import run
 from casest.data import read_table
@@ -318,17 +319,171 @@ def test_void_and_late_accelerometer_samples_are_known(tmp_path):
     assert "accelerometer samples lie +1.33 ms from t on average" in table.notes
 
 
+# -- ArduPilot logs --------------------------------------------------------------------------------
+
+
+LOG171 = "ardupilot-log171"
+
+
+@pytest.mark.parametrize("name", ["MAG", "MAG2", "MAG3"])
+def test_a_measured_ardupilot_log_is_what_another_reader_decoded(shared_data, name):
+    """The table beside it is of another decoder: offsets subtracted, t since the start."""
+    beside = read_table(shared_data / LOG171 / f"{name}_all.csv")
+    table = read_table(f"{shared_data / LOG171 / 'log171.bin'}:{name}")
+    assert table.n_rows >= beside.n_rows > 2300
+    time = beside.columns["t"].values - beside.columns["t"].values[0]
+    rows = np.searchsorted(table.columns["t"].values, time - 5e-4)
+    np.testing.assert_allclose(table.columns["t"].values[rows], time, atol=1e-9)
+    for axis in "xyz":
+        raw = (
+            table.columns[f"Mag{axis.upper()}"].values - table.columns[f"Ofs{axis.upper()}"].values
+        )
+        np.testing.assert_array_equal(raw[rows], beside.columns[f"m_{axis}"].values)
+        assert table.columns[f"Mag{axis.upper()}"].unit == "mgauss"
+    assert table.notes == (f"time of {name}: TimeMS",)
+
+
+@pytest.mark.parametrize("name", ["ATT", "GPS", "CURR", "BARO", "IMU2"])
+def test_every_number_of_a_measured_log_is_that_of_the_librarys_own_messages(shared_data, name):
+    """Message by message, which takes the library 40 times as long."""
+    file = shared_data / LOG171 / "log171.bin"
+    table = read_table(f"{file}:/{name}")
+    log = DFReader.DFReader_binary(str(file))
+    messages = []
+    while (message := log.recv_match(type=name)) is not None and len(messages) < 1500:
+        messages.append(message.to_dict())
+    log.filehandle.close()
+    assert len(messages) > 1000
+    stamps = np.array([message["TimeMS"] for message in messages])
+    time = table.columns["t"].values[: len(messages)]
+    np.testing.assert_allclose(time, (stamps - stamps[0]) * 1e-3, atol=1e-9)
+    for column in set(table.columns) - {"t"}:
+        expected = [message[column] for message in messages]
+        np.testing.assert_array_equal(table.columns[column].values[: len(messages)], expected)
+
+
+def test_the_attitude_of_a_measured_log_is_in_degrees(shared_data):
+    log = shared_data / LOG171 / "log171.bin"
+    alone, beside = read_table(f"{log}:ATT"), read_table(shared_data / LOG171 / "MAG_all.csv")
+    assert [alone.columns[name].unit for name in ("Roll", "Pitch", "Yaw")] == ["deg"] * 3
+    assert alone.columns["Roll"].values[0] == beside.columns["roll"].values[0]
+    shared = read_table(f"{log}:MAG,ATT")
+    assert "MAG (9.901 Hz) interpolated linearly at the times of ATT (9.901 Hz)" in shared.notes
+
+
+@pytest.mark.parametrize("low", [0, -180])
+def test_angles_are_interpolated_the_short_way_round(tmp_path, low):
+    """Yaw at 10 Hz turns through north at 20 degrees a second; the flux lies halfway between."""
+    turning = 300 + 2.0 * np.arange(100)
+    written = (turning - low) % 360 + low
+    path = logs.dataflash(
+        tmp_path / "a.bin",
+        {
+            "ATT": ("Qcf", "TimeUS,Roll,Yaw", "", "",
+                    [(k * 100_000, 100, yaw) for k, yaw in enumerate(written)]),
+            "MAG": ("Qh", "TimeUS,MagX", "", "",
+                    [(k * 300_000 + 50_000, k) for k in range(33)]),
+        },
+    )  # fmt: skip
+    yaw = read_table(f"{path}:MAG,ATT").columns["ATT.Yaw"].values
+    off = (yaw - (300 + 2.0 * (0.5 + 3 * np.arange(33))) + 180) % 360 - 180
+    np.testing.assert_allclose(off, 0, atol=1e-4)
+    assert yaw.min() >= low - 2
+    assert yaw.max() <= low + 362
+
+
+KINDS = {
+    "MAG": (
+        "QBhhhc", "TimeUS,I,MagX,MagY,MagZ,Temp", "s#GGGO", "F-CCC0",
+        [(k * 100_000 + 7, i, 100 * i + k, -k, 3, 2050) for k in range(20) for i in range(2)],
+    ),
+    "BAT": (
+        "QBfLN", "TimeUS,Inst,Volt,Where,Name", "s#vD-", "F-0G-",
+        [(k * 50_000, 0, 12.5, 471234567, b"main") for k in range(40)],
+    ),
+}  # fmt: skip
+UNITS = {
+    "s": "s",
+    "G": "Gauss",
+    "O": "degC",
+    "v": "V",
+    "D": "deglatitude",
+    "-": "",
+    "#": "instance",
+}
+MULTIPLIERS = {"F": 1e-6, "C": 1e-3, "0": 1.0, "-": 0.0, "G": 1e-7}
+
+
+def test_units_multipliers_and_instances_are_as_the_log_states_them(tmp_path):
+    path = logs.dataflash(tmp_path / "a.bin", KINDS, UNITS, MULTIPLIERS)
+    assert "MAG[0] (MAG, 20), MAG[1] (MAG, 20), BAT (BAT, 40)" in error_of(path)
+    assert "no topic MAG; did you mean" in error_of(f"{path}:MAG")
+    table = read_table(f"{path}:MAG[1]")
+    np.testing.assert_allclose(table.columns["MagX"].values, (100 + np.arange(20)) * 1e-3)
+    np.testing.assert_allclose(table.columns["t"].values, np.arange(20) * 0.1, atol=1e-12)
+    units = {name: column.unit for name, column in table.columns.items()}
+    assert units == {"t": "s", **dict.fromkeys(("MagX", "MagY", "MagZ"), "Gauss"), "Temp": "degC"}
+    assert table.columns["Temp"].values[0] == 20.5
+    battery = read_table(f"{path}:/BAT[0]")
+    assert battery.columns["Where"].values[0] == 47.1234567
+    assert (battery.columns["Where"].unit, battery.columns["Volt"].unit) == ("deg", "V")
+    assert list(battery.columns) == ["t", "Volt", "Where"]
+    assert "no topic BAT[1]; did you mean" in error_of(f"{path}:BAT[1]")
+
+
+def test_an_ardupilot_log_is_calibrated(sensor, readings, tmp_path):
+    rows = [(20_000 * k, 0, *row) for k, row in enumerate(readings)]
+    path = logs.dataflash(
+        tmp_path / "log.bin",
+        {"IMU": ("QBfff", "TimeUS,I,AccX,AccY,AccZ", "s#ooo", "F-000", rows)},
+        {"s": "s", "o": "m/s/s", "#": "instance"},
+        {"F": 1e-6, "0": 1.0, "-": 0.0},
+    )
+    out = tmp_path / "out"
+    words = ["calibrate", "norm-triangular", f"{path}:IMU", "--columns", "v=Acc", *G]
+    assert run([*words, "-o", str(out)]) == 0
+    assert_found(json.loads((out / "result.json").read_text(encoding="utf-8")), sensor)
+
+
+def test_a_cut_ardupilot_log_is_read_as_far_as_it_goes_and_garbage_is_skipped(tmp_path, capfd):
+    path = logs.dataflash(tmp_path / "a.bin", KINDS, UNITS, MULTIPLIERS)
+    content = path.read_bytes()
+    path.write_bytes(content[:-200])
+    table = read_table(f"{path}:BAT")
+    assert 20 < table.n_rows < 40
+    assert any("bytes are cut or damaged, not read" in note for note in table.notes)
+    middle = len(content) - 700
+    path.write_bytes(content[:middle] + bytes(33) + content[middle:])
+    assert any("bytes are cut or damaged, not read" in n for n in read_table(f"{path}:BAT").notes)
+    path.write_bytes(b"\xa3\x95" + bytes(range(256)) * 4)
+    assert "cannot be read as an ArduPilot log" in error_of(path)
+    path.write_bytes(content[:4])
+    assert "ArduPilot log" in error_of(path)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_bin_file_that_is_no_log_is_read_as_what_it_is(tmp_path):
+    (tmp_path / "a.bin").write_text("vx,vy,vz\n1,2,3\n4,5,6\n")
+    assert list(read_table(tmp_path / "a.bin").columns) == ["vx", "vy", "vz"]
+    (tmp_path / "b.bin").write_bytes(bytes(range(256)))
+    assert "is no text but binary" in error_of(tmp_path / "b.bin")
+
+
 # -- what can be wrong -----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     ("name", "module", "extra"),
-    [("a.bag", "rosbags.highlevel", "ros"), ("a.ulg", "pyulog", "px4")],
+    [
+        ("a.bag", "rosbags.highlevel", "ros"),
+        ("a.ulg", "pyulog", "px4"),
+        ("a.bin", "pymavlink.DFReader", "ardupilot"),
+    ],
 )
 def test_the_library_that_is_missing_is_named_with_its_command(
     name, module, extra, tmp_path, monkeypatch, capsys
 ):
-    (tmp_path / name).write_bytes(b"anything")
+    (tmp_path / name).write_bytes(b"\xa3\x95 anything")
     monkeypatch.setitem(sys.modules, module, None)
     assert run(["calibrate", "norm-triangular", str(tmp_path / name)]) == 1
     said = capsys.readouterr().err
@@ -386,7 +541,7 @@ def test_other_files_need_neither_library(tmp_path):
     code = (
         "import sys; from casest.data import read_table; "
         f"read_table({str(tmp_path / 'a.csv')!r}); "
-        "print({'rosbags', 'pyulog'} & set(sys.modules))"
+        "print({'rosbags', 'pyulog', 'pymavlink', 'h5py'} & set(sys.modules))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"

@@ -17,6 +17,7 @@ from casest import (
     UsageError,
     attitude,
     constant,
+    full,
     inf,
     lower,
     model,
@@ -538,3 +539,22 @@ def test_a_wheel_at_three_tilts_is_calibrated_from_pedersinis_equations():
     )
     assert np.all(np.abs(z) < 4.5)
     assert found.noise.sigma == pytest.approx(0.02, rel=0.1)
+
+
+def test_the_sign_that_a_matrix_is_given_is_shown_where_it_is_declared():
+    @model
+    def matrices(
+        v=signal(3, "m"),
+        *,
+        signed=param(full(3)),
+        free=param((3, 3)),
+        wide=param(full(3), bounds=(-5, 5)),
+    ):
+        """Three matrices on one vector."""
+        return Residual(implicit=(signed + free + wide) @ v, unit="m")
+
+    lines = {line.split()[1]: line for line in str(matrices).splitlines()[1:5]}
+    assert lines["signed"].endswith("diagonal > 0")
+    assert "diagonal" not in lines["free"] + lines["wide"]
+    assert matrices["signed"].lower[0] == 0
+    assert matrices["wide"].lower[0] == -5

@@ -4,22 +4,27 @@ from __future__ import annotations
 
 import gzip
 import os
+import pickle
 import subprocess
 import sys
 import threading
 import time
+import zlib
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pyarrow
 import pyarrow.parquet
 import pytest
 import scipy.io
+import scipy.sparse
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from casest.data import Table, read_table, write_atomically
-from casest.errors import DataError
+from casest.data import Table, load_runs, read_table, write_atomically
+from casest.declaration.symbols import Signal
+from casest.errors import DataError, UsageError
 
 
 def table_of(folder: Path, text: str | bytes, name: str = "data.csv") -> Table:
@@ -287,8 +292,61 @@ def test_pickled_objects_are_refused_unread(tmp_path: Path) -> None:
 
 
 def test_damaged_archives_are_named(tmp_path: Path) -> None:
-    for name in ("a.npy", "a.npz", "a.mat", "a.parquet"):
-        assert "cannot be read" in error_of(tmp_path, b"not what the name says" * 9, name)
+    for name in ("a.npy", "a.npz", "a.mat", "a.parquet", "a.csv.gz"):
+        assert "cannot be read" in error_of(tmp_path, b"\x00not what the name says" * 9, name)
+
+
+def test_an_array_that_is_cut_off_says_so(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", ROWS)
+    np.savez(tmp_path / "b.npz", v=ROWS)
+    whole = (tmp_path / "a.npy").read_bytes()
+    for length in (len(whole) - 1, len(whole) - 60):
+        assert "less than its header announces" in error_of(tmp_path, whole[:length], "a.npy")
+    archive = (tmp_path / "b.npz").read_bytes()
+    assert "the archive is damaged" in error_of(tmp_path, archive[:-10], "b.npz")
+
+
+@pytest.mark.parametrize("name", ["a.npy", "a.npz", "a.mat"])
+@pytest.mark.parametrize("protocol", [2, 4, 5])
+def test_a_pickle_is_refused_unread_whatever_it_is_called(
+    tmp_path: Path, name: str, protocol: int
+) -> None:
+    class Trap:
+        def __reduce__(self):
+            return (os.mkdir, (str(tmp_path / "sprung"),))
+
+    said = error_of(tmp_path, pickle.dumps([Trap()], protocol), name)
+    assert "holds Python objects, which are not read (they could run code)" in said
+    assert not (tmp_path / "sprung").exists()
+
+
+def test_an_array_under_the_name_of_an_archive_is_told_its_own(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", ROWS)
+    np.savez(tmp_path / "b.npz", v=ROWS)
+    assert "call it .npy" in error_of(tmp_path, (tmp_path / "a.npy").read_bytes(), "c.npz")
+    assert "call it .npz" in error_of(tmp_path, (tmp_path / "b.npz").read_bytes(), "c.npy")
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_binary_rubbish_called_csv_is_no_text(tmp_path: Path, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    rubbish = rng.integers(seed % 2, 256, 5000, dtype=np.uint8).tobytes()
+    assert "is no text but binary; export it as CSV" in error_of(tmp_path, rubbish)
+
+
+def test_a_recording_that_ends_in_zero_bytes_is_named_by_line(tmp_path: Path) -> None:
+    text = b"t,v\n" + b"".join(b"%d,1\n" % k for k in range(900)) + bytes(4000)
+    assert "line 902 holds a zero byte: the recording is damaged" in error_of(tmp_path, text)
+
+
+def test_utf_16_that_is_cut_in_the_middle_of_a_sign_is_named(tmp_path: Path) -> None:
+    text = "t,v\n0,1\n1,2\n".encode("utf-16")
+    assert "its UTF-16 text is damaged at byte" in error_of(tmp_path, text[:-1])
+
+
+def test_a_name_too_long_for_the_system_is_an_error_of_the_file(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="cannot be read"):
+        read_table(tmp_path / ("x" * 3000))
 
 
 @pytest.mark.parametrize("by_rows", [True, False])
@@ -307,9 +365,120 @@ def test_matlab_structs_are_opened(tmp_path: Path) -> None:
     assert list(read_table(tmp_path / "a.mat").columns) == ["t", "vx"]
 
 
-def test_matlab_v73_is_refused_with_the_command_that_helps(tmp_path: Path) -> None:
+def test_a_matrix_alone_is_found_by_its_name_and_by_position(tmp_path: Path) -> None:
+    scipy.io.savemat(tmp_path / "a.mat", {"acc": ROWS})
+    assert list(read_table(tmp_path / "a.mat").columns) == ["acc[0]", "acc[1]", "acc[2]"]
+    for columns in ({"v": "acc"}, {"v": "0,1,2"}, {"v": "acc[0],acc[1],acc[2]"}):
+        (run,) = load_runs(tmp_path / "a.mat", [Signal("v", 3, None)], columns=columns)
+        np.testing.assert_array_equal(run.signals["v"], ROWS)
+    (run,) = load_runs(tmp_path / "a.mat", [Signal("acc", 3, None)])
+    np.testing.assert_array_equal(run.signals["acc"], ROWS)
+
+
+def version_73(file: Path, content: dict[str, object]) -> None:
+    """A file as MATLAB 7.3 lays it out: a text header, then HDF5 with every array transposed."""
+    with h5py.File(file, "w", userblock_size=512) as store:
+
+        def put(place: h5py.Group, name: str, value: object) -> None:
+            if isinstance(value, dict):
+                group = place.create_group(name)
+                group.attrs["MATLAB_class"] = np.bytes_("struct")
+                for field, one in value.items():
+                    put(group, field, one)
+                return
+            if isinstance(value, str):
+                data = np.array([[ord(sign)] for sign in value], dtype=np.uint16)
+            else:
+                data = np.atleast_2d(np.asarray(value)).T
+            made = place.create_dataset(name, data=data)
+            kind = "char" if isinstance(value, str) else "double"
+            made.attrs["MATLAB_class"] = np.bytes_(kind)
+
+        for name, value in content.items():
+            put(store, name, value)
+        reference = store.create_dataset("cells", (1, 2), dtype=h5py.ref_dtype)
+        reference.attrs["MATLAB_class"] = np.bytes_("cell")
+        store.create_group("#refs#")
+    head = b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124) + b"\x00\x02IM"
+    with file.open("r+b") as stream:
+        stream.write(head)
+
+
+@pytest.mark.parametrize("by_rows", [True, False])
+def test_matlab_v73_is_read_like_the_versions_before(tmp_path: Path, by_rows: bool) -> None:
+    t, v = np.arange(20.0), np.random.default_rng(0).normal(size=(20, 3))
+    content = {"t": t[:, None] if by_rows else t, "log": {"v": v if by_rows else v.T}, "Fs": 100.0}
+    version_73(tmp_path / "a.mat", {**content, "device": "XS-3"})
+    table = read_table(tmp_path / "a.mat")
+    assert sorted(table.columns) == ["t", "v[0]", "v[1]", "v[2]"]
+    np.testing.assert_array_equal(table.columns["v[2]"].values, v[:, 2])
+    assert table.preamble == {"Fs": "100.0", "device": "XS-3"}
+    assert any("cells" in note and "left out" in note for note in table.notes)
+
+
+def test_matlab_v73_that_is_damaged_or_lacks_its_library_says_what_helps(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     head = b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM"
     assert "'-v7')" in error_of(tmp_path, head + b"\x00" * 512, "a.mat")
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    with pytest.raises(UsageError, match=r"needs the library h5py: pip install 'casest\[matlab\]'"):
+        read_table(tmp_path / "a.mat")
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+def test_a_matlab_file_with_a_damaged_tag_is_named(tmp_path: Path, compressed: bool) -> None:
+    """A type of numbers that there is none of ends the process in SciPy."""
+    values = np.arange(60.0).reshape(20, 3)
+    scipy.io.savemat(tmp_path / "a.mat", {"v": values}, do_compression=False)
+    raw = bytearray((tmp_path / "a.mat").read_bytes())
+    at = raw.index(np.array([9, values.nbytes], dtype="<u4").tobytes())  # miDOUBLE, its bytes
+    raw[at] = 44
+    if compressed:
+        packed = zlib.compress(bytes(raw[128:]))
+        raw[128:] = np.array([15, len(packed)], dtype="<u4").tobytes() + packed
+    assert "are of the unknown type 44" in error_of(tmp_path, bytes(raw), "a.mat")
+    raw[126:128] = b"MI"  # the other order of bytes
+    assert "cannot be read as MATLAB" in error_of(tmp_path, bytes(raw), "a.mat")
+
+
+def test_a_matlab_matrix_without_the_imaginary_part_it_announces_is_named(tmp_path: Path) -> None:
+    scipy.io.savemat(tmp_path / "a.mat", {"v": ROWS, "w": ROWS})
+    raw = bytearray((tmp_path / "a.mat").read_bytes())
+    raw[128 + 8 + 8 + 1] |= 8  # header, tag of the matrix, tag of its flags, class
+    assert "has not the numbers that it announces" in error_of(tmp_path, bytes(raw), "a.mat")
+
+
+def test_matlab_structs_in_structs_cells_and_text_pass_the_check_of_tags(tmp_path: Path) -> None:
+    content = {
+        "t": ROWS[:, 0],
+        "deep": {"inner": {"x": 1.0}},
+        "cells": np.array([1, "a"], object),
+        "text": "XS-3",
+        "empty": np.zeros((0, 0)),
+        "flag": np.array([True, False, True]),
+        "complex": np.array([1.0, 2.0, 1j]),
+        "sparse": scipy.sparse.csc_array(np.eye(3)),
+    }
+    for compressed in (False, True):
+        scipy.io.savemat(tmp_path / "a.mat", content, do_compression=compressed)
+        table = read_table(tmp_path / "a.mat")
+        assert table.columns["t"].values.tolist() == ROWS[:, 0].tolist()
+        assert table.columns["flag"].values.tolist() == [1, 0, 1]
+        assert table.preamble["text"] == "XS-3"
+
+
+def test_text_that_is_called_mat_is_read_as_text(tmp_path: Path) -> None:
+    table = table_of(tmp_path, "t,v\n0,1\n1,2\n", "a.mat")
+    assert table.columns["v"].values.tolist() == [1.0, 2.0]
+
+
+def test_the_measured_text_that_is_called_mat_is_read(shared_data: Path) -> None:
+    """51 175 rows of time and three counts, says the source."""
+    file = shared_data / "xsens-imutk" / "xsens_acc.mat"
+    table = read_table(file)
+    assert (table.n_rows, len(table.columns)) == (51175, 4)
+    np.testing.assert_array_equal(table.columns["2"].values, np.loadtxt(file)[:, 2])
 
 
 def test_a_parquet_file_read_in_pieces_is_the_one_read_whole(tmp_path: Path, monkeypatch) -> None:

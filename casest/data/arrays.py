@@ -1,8 +1,9 @@
-"""Records that are arrays already: NumPy, MATLAB, Parquet."""
+"""Records that are arrays already: NumPy and Parquet, and what MATLAB's have in common."""
 
 from __future__ import annotations
 
 import re
+import warnings
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,10 +14,11 @@ from numpy.typing import NDArray
 
 from casest.data.column import Column, numeric_column, text_column
 from casest.data.delimited import Contents
-from casest.errors import DataError
+from casest.errors import DataError, last_line
 
 #: Rows of a Parquet file that are read at once.
 PIECE = 65_536
+_PICKLE = b"\x80"  # protocol 2 and later; no array begins so
 _TEXT = ("bool", "string", "large_string", "dictionary")
 _NUMBER = ("timestamp", "int", "uint", "float", "double", "halffloat", "decimal")
 _VECTOR = re.compile(r"(large_|fixed_size_)?list<\w+: (u?int\d+|float|double|halffloat)\b")
@@ -25,45 +27,21 @@ _VECTOR = re.compile(r"(large_|fixed_size_)?list<\w+: (u?int\d+|float|double|hal
 def read_npy(file: Path) -> Contents:
     """Read one array: (N, k) gives columns "0".."k-1"; a structured (N,) its fields."""
     array = _loaded(file)
+    if isinstance(array, dict):
+        raise DataError(f"{file}: is an archive of arrays; call it .npz")
     if array.dtype.names:
-        return _from_arrays(file, {name: array[name] for name in array.dtype.names})
-    return _from_arrays(file, {"": array})
+        return from_arrays(file, {name: array[name] for name in array.dtype.names})
+    return from_arrays(file, {"": array})
 
 
 def read_npz(file: Path) -> Contents:
     """Read named arrays: (N,) each a column, (N, 3) `v` gives v[0] v[1] v[2], scalars are kept."""
-    with _loaded(file) as archive:
-        try:
-            arrays = {name: archive[name] for name in archive.files}
-        except ValueError as error:
-            raise _pickled(file) from error
+    arrays = _loaded(file)
+    if not isinstance(arrays, dict):
+        raise DataError(f"{file}: is one array, not an archive of them; call it .npy")
     if len(arrays) == 1 and next(iter(arrays)).startswith("arr_"):
         arrays = {"": next(iter(arrays.values()))}
-    return _from_arrays(file, arrays)
-
-
-def read_matlab(file: Path) -> Contents:
-    """Read the vectors and matrices of a .mat file, and those one level down in structs."""
-    from scipy.io import loadmat
-
-    try:
-        found = loadmat(str(file), squeeze_me=True, struct_as_record=False)
-    except NotImplementedError as error:
-        raise DataError(
-            f"{file}: is MATLAB v7.3 (HDF5), which is not read; "
-            f"save it again with save('{file.name}', ..., '-v7')"
-        ) from error
-    except (ValueError, TypeError, OSError) as error:
-        raise DataError(f"{file}: cannot be read as MATLAB ({error})") from error
-    arrays: dict[str, Any] = {}
-    for name, value in found.items():
-        if name.startswith("__"):
-            continue
-        fields = getattr(value, "_fieldnames", None)
-        arrays |= {f: getattr(value, f) for f in fields} if fields else {name: value}
-    if len(arrays) == 1 and np.ndim(next(iter(arrays.values()))) == 2:
-        arrays = {"": next(iter(arrays.values()))}
-    return _from_arrays(file, arrays)
+    return from_arrays(file, arrays)
 
 
 def read_parquet(file: Path) -> Contents:
@@ -79,9 +57,9 @@ def read_parquet(file: Path) -> Contents:
         columns, notes = _parquet_columns(table)
     except DataError as error:
         raise DataError(f"{file}: {error}") from error
-    except (pyarrow.ArrowException, OSError) as error:
-        text = str(error).splitlines()[0]
-        raise DataError(f"{file}: cannot be read as Parquet ({text})") from error
+    except Exception as error:  # a damaged file can fail anywhere in the library
+        text = (str(error) or type(error).__name__).splitlines()[0]
+        raise DataError(f"{file}: cannot be read as Parquet ({text}); export it again") from error
     return Contents(columns, notes)
 
 
@@ -106,6 +84,8 @@ def _parquet_columns(table: Any) -> tuple[list[Column], list[str]]:
             else:
                 texts[name] += ["" if v is None else str(v) for v in values.to_pylist()]
         first += len(piece)
+    if numbers and first != table.metadata.num_rows:
+        raise DataError(f"announces {table.metadata.num_rows} rows, holds {first}; copy it again")
     columns, notes = [], []
     for entry in table.schema_arrow:
         unit = (entry.metadata or {}).get(b"unit", b"").decode()
@@ -148,42 +128,67 @@ def _floats(values: Any, kind: str) -> NDArray[np.float64]:
     return np.asarray(values.to_numpy(zero_copy_only=False), dtype=np.float64)
 
 
-def _loaded(file: Path) -> Any:
-    with file.open("rb") as start:
-        if not start.read(6).startswith((b"\x93NUMPY", b"PK")):
+def _loaded(file: Path) -> NDArray[Any] | dict[str, NDArray[Any]]:
+    """The array in a file, or those of an archive by name."""
+    with file.open("rb") as stream:
+        start = stream.read(6)
+        if start.startswith(_PICKLE):
+            raise pickled(file)
+        if not start.startswith((b"\x93NUMPY", b"PK")):
             raise DataError(f"{file}: cannot be read as NumPy: it does not begin like one")
-        start.seek(0)
-        if start.read(2) == b"PK" and not zipfile.is_zipfile(start):
+        if start.startswith(b"PK") and not zipfile.is_zipfile(stream):
             raise DataError(f"{file}: cannot be read as NumPy: the archive is damaged")
-    try:
-        return np.load(file, allow_pickle=False)
-    except ValueError as error:
-        if "pickle" in str(error).lower():
-            raise _pickled(file) from error
-        raise DataError(f"{file}: cannot be read as NumPy ({error})") from error
-    except (OSError, EOFError, zipfile.BadZipFile) as error:
-        raise DataError(f"{file}: cannot be read as NumPy ({error})") from error
+        stream.seek(0)
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                found = np.load(stream, allow_pickle=False)
+                if isinstance(found, np.ndarray):
+                    return found
+                return {name: found[name] for name in found.files}
+        except Exception as error:  # a damaged file can fail anywhere in the library
+            raise _unreadable(file, error) from error
 
 
-def _pickled(file: Path) -> DataError:
+def _unreadable(file: Path, error: Exception) -> DataError:
+    """What NumPy's error says of the file."""
+    text = last_line(error)
+    if "pickle" in text.lower() or "allow_pickle" in str(error):
+        return pickled(file)
+    if "reshape" in text or "EOF" in text or "Failed to read all data" in text:
+        return DataError(
+            f"{file}: cannot be read as NumPy: it holds less than its header announces, so it was "
+            f"cut off; copy it again"
+        )
+    return DataError(f"{file}: cannot be read as NumPy ({text}); save it again")
+
+
+def pickled(file: Path) -> DataError:
+    """The refusal of a file of Python objects."""
     return DataError(
         f"{file}: holds Python objects, which are not read (they could run code); "
         f"save plain arrays of numbers"
     )
 
 
-def _from_arrays(file: Path, arrays: Mapping[str, Any]) -> Contents:
+def from_arrays(file: Path, arrays: Mapping[str, Any]) -> Contents:
     """Make columns from vectors and matrices of one common length; keep scalars as preamble."""
     found = {name: np.asarray(value) for name, value in arrays.items()}
-    preamble = {name: str(value) for name, value in found.items() if value.size <= 1}
+    odd = {
+        name: value
+        for name, value in found.items()
+        if value.size and (value.ndim > 2 or value.dtype.kind not in "fiubU")
+    }
+    notes = [
+        f"{name or 'array'} of shape {v.shape} ({v.dtype}) left out" for name, v in odd.items()
+    ]
+    found = {name: value for name, value in found.items() if name not in odd}
+    preamble = {name: str(value) for name, value in found.items() if value.size == 1}
     series = {name: value for name, value in found.items() if value.size > 1}
     n_rows = _common_length(file, series)
     columns: list[Column] = []
-    notes: list[str] = []
     for name, value in series.items():
-        if value.ndim > 2 or value.dtype.kind not in "fiubU":
-            notes.append(f"{name or 'array'} of shape {value.shape} ({value.dtype}) left out")
-        elif value.ndim == 1:
+        if value.ndim == 1:
             columns.append(_column(name or "0", value))
         else:
             rows = value if value.shape[0] == n_rows else value.T

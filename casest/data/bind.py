@@ -6,7 +6,7 @@ import os
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from casest import units as unit_names
 from casest.data import checks, timing
 from casest.data.converting import numbers, rotation, vector
-from casest.data.finding import Choice, as_names, find_by_name, find_column, find_columns
+from casest.data.finding import Choice, as_names, find_column, find_columns
 from casest.data.logs import file_and_topics
+from casest.data.matching import find_by_name
 from casest.data.options import Options, refuse_unknown_names, stated_unit
 from casest.data.rest import at_rest as averaged_at_rest
 from casest.data.run import Array, Labels, Run
@@ -35,7 +36,7 @@ class _Bound:
     units: dict[str, str | None]
     sources: dict[str, tuple[str, ...]]
     time: Array | None
-    time_source: str | None
+    time_source: tuple[str, ...]
     notes: list[str]
 
 
@@ -60,9 +61,13 @@ def load_runs(
     * scales: per signal or column how raw counts become values, {"temp": "int16/256+25"}.
     * rate: samples per second, instead of a time column or a rate stated above the table.
     * at_rest: average the rest intervals; names of further columns that must be at rest too.
-    * extra: columns that must be there and hold numbers throughout.
+    * extra: columns that must be there; like a signal's, their empty cells cost the row.
     * gaps: signals whose cells may be empty; a reading that is missing is NaN in the run.
     * time_zero: "first" makes each run's first sample t = 0, "column" keeps the column's own zero.
+
+    A row in which a signal, the time of a model that needs it or an extra column has no number
+    (empty, nan) is dropped; the run's notes count them. Where `gaps` are allowed none is: the other
+    signals need all their numbers. What is neither empty nor a number is refused.
 
     Raises DataError, UnitError or UsageError naming file, column, row, value and the way out.
     """
@@ -94,29 +99,41 @@ def _runs(table: Table, signals: Sequence[Signal], options: Options) -> list[Run
     bound = _bind(table, signals, options)
     groups = {kind: _group(table, kind, options) for kind in ("run", "pose")}
     sources = {name for names in bound.sources.values() for name in names}
-    sources |= {name for name in (bound.time_source, *groups.values()) if name}
-    others, other_units, notes = _others(table, sources, options)
+    dates = {name for name in bound.time_source if table.columns[name].is_text}
+    sources |= {name for name in (*bound.time_source, *groups.values()) if name} - dates
+    complete, dropped = _complete(table, bound, options)
+    others, other_units, notes = _others(table, sources, options, complete)
     labels = _labels(table, groups["run"])
     pose = _labels(table, groups["pose"])
     stem = file_and_topics(table.file)[0].stem
     runs = []
-    for label in [None] if labels is None else _in_order(labels):
-        rows = np.arange(table.n_rows) if labels is None else np.flatnonzero(labels == label)
+    in_order: list[Any] = [None] if labels is None else _in_order(labels)
+    if labels is not None:
+        empty = [label for label in in_order if not complete[labels == label].any()]
+        in_order = [label for label in in_order if label not in empty]
+        notes += [f"run {label} left out: none of its rows is complete" for label in empty]
+    for label in in_order:
+        every = np.arange(table.n_rows) if labels is None else np.flatnonzero(labels == label)
+        rows = every[complete[every]]
         part = {name: values[rows] for name, values in bound.signals.items()}
-        time, time_notes = _run_time(table, bound, rows, signals, options)
+        time, time_notes = _run_time(table, bound, every, signals, options)
+        if time is not None and bound.time is not None:
+            time_notes = [*_start_said(time[complete[every]], options), *time_notes]
+        time = None if time is None else _from_zero(time[complete[every]], bound, options)
+        used = time is not None and options.rate is None  # dates that are no time are labels
         run = Run(
             name=stem if label is None else f"{stem}:{label}",
             file=table.file,
             signals=_with_time(part, time, signals),
             units=bound.units | _time_unit(signals),
-            columns={name: values[rows] for name, values in others.items()},
+            columns={n: values[rows] for n, values in others.items() if not (n in dates and used)},
             column_units=other_units,
             time=time,
             rows=rows,
-            block=timing.blocks(time, None if pose is None else pose[rows], len(rows)),
+            block=timing.blocks(time, None if pose is None else pose[rows], rows - every[0]),
             count=np.ones(len(rows), dtype=np.int_),
             spread={},
-            notes=(*table.notes, *bound.notes, *notes, *time_notes),
+            notes=(*table.notes, *bound.notes, *dropped, *notes, *time_notes),
         )
         runs.append(_checked(run, signals, bound.sources))
     return runs
@@ -124,7 +141,7 @@ def _runs(table: Table, signals: Sequence[Signal], options: Options) -> list[Run
 
 def _bind(table: Table, signals: Sequence[Signal], options: Options) -> _Bound:
     """Find, scale and convert the columns of every signal but time."""
-    found = _Bound({}, {}, {}, None, None, [])
+    found = _Bound({}, {}, {}, None, (), [])
     for signal in signals:
         if _is_time(signal):
             continue
@@ -140,8 +157,37 @@ def _bind(table: Table, signals: Sequence[Signal], options: Options) -> _Bound:
         found.notes.extend(notes)
     for name in options.extra:
         column = table.columns[find_column(table, name, "the model")]
-        numbers(table, column, f"column {name}", f"--columns {name}=…")
+        numbers(table, column, f"column {name}", f"--columns {name}=…", gaps=True)
     return _with_time_column(table, signals, options, found)
+
+
+def _complete(table: Table, bound: _Bound, options: Options) -> tuple[NDArray[np.bool_], list[str]]:
+    """Which rows have every number that matters, and a note on those that have not."""
+    needed = {name: bound.sources[name] for name in bound.signals if name not in options.gaps}
+    parts = {names: bound.signals[name] for name, names in needed.items()}
+    if bound.time is not None and bound.time_source:
+        parts[bound.time_source] = bound.time[:, None]
+    for name in options.extra:
+        found = find_column(table, name, "the model")
+        parts[(found,)] = np.asarray(table.columns[found].values, dtype=np.float64)[:, None]
+    complete = np.ones(table.n_rows, dtype=np.bool_)
+    said = []
+    for names, values in parts.items():
+        absent = np.isnan(values).any(axis=1)
+        if absent.any():
+            first = int(np.flatnonzero(absent)[0])
+            said.append(f"{int(absent.sum())} without {' '.join(names)}, the first row {first}")
+        complete &= ~absent
+    if not said:
+        return complete, []
+    left = table.n_rows - int(complete.sum())
+    note = f"{left} of {table.n_rows} rows dropped: {'; '.join(said)}"
+    if left == table.n_rows:
+        raise DataError(
+            f"{table.file}: no row has every number that is needed ({note}); choose other columns "
+            f"with --columns, or repair the export"
+        )
+    return complete, [note]
 
 
 def _is_time(signal: Signal) -> bool:
@@ -153,35 +199,60 @@ def _with_time_column(
 ) -> _Bound:
     """Add the time column in s, where there is one and no rate is given."""
     needed = any(_is_time(signal) for signal in signals)
-    chosen = None
-    if "t" in options.columns:
-        names = as_names(options.columns["t"])
-        if len(names) != 1:
-            raise DataError(f"{table.file}: --columns t={','.join(names)} must name one column")
-        chosen = find_column(table, names[0], "time")
-    name = timing.find_time(table, chosen)
-    if name is None or name in {n for names in found.sources.values() for n in names}:
+    chosen = _chosen_time(table, options)
+    names = chosen or timing.find_time(table)
+    if not names or set(names) & {n for used in found.sources.values() for n in used}:
+        note = timing.kept_as_text(table) if not names else None
+        found.notes.extend([note] if note else [])
         return found
     if options.rate is not None:
-        found.notes.append(f"time column {name} not used: rate {options.rate:g} Hz is given")
-        return replace(found, time_source=name)
-    column = table.columns[name]
+        listed = " and ".join(names)
+        found.notes.append(f"time column {listed} not used: rate {options.rate:g} Hz is given")
+        return replace(found, time_source=names)
     try:
-        if not column.is_text:
-            numbers(table, column, "time", "--columns t=… or --rate HZ")
-        time, note = timing.seconds(table, column, timing.time_units_declared(options.units, name))
+        time, notes = _seconds(table, names, signals, options)
     except (UnitError, DataError) as error:
         if needed or chosen:
             if isinstance(error, DataError):
                 raise
             raise UnitError(
-                f"{table.file}: column {name} as time: {error}; "
+                f"{table.file}: column {names[0]} as time: {error}; "
                 f"name another column with --columns t=… or say its unit with --unit t=…"
             ) from error
         found.notes.append(f"{timing.UNUSED}{error}")
-        return replace(found, time_source=name)
-    found.notes.extend([note] if note else [])
-    return replace(found, time=time, time_source=name)
+        return replace(found, time_source=names)
+    found.notes.extend(notes)
+    return replace(found, time=time, time_source=names)
+
+
+def _chosen_time(table: Table, options: Options) -> tuple[str, ...]:
+    """The columns that the user names as the time: one, or a date and a time of day."""
+    if "t" not in options.columns:
+        return ()
+    given = as_names(options.columns["t"])
+    names = tuple(find_column(table, name, "time") for name in given[:2])
+    if len(given) > 2 or (len(names) == 2 and not all(table.columns[n].is_text for n in names)):
+        raise DataError(
+            f"{table.file}: --columns t={','.join(given)} must name one column, or one of dates "
+            f"and one of times of day"
+        )
+    return names
+
+
+def _seconds(
+    table: Table, names: tuple[str, ...], signals: Sequence[Signal], options: Options
+) -> tuple[Array, list[str]]:
+    """The time in s, (n_rows,), and what was assumed."""
+    columns = tuple(table.columns[name] for name in names)
+    if any(column.is_text for column in columns):
+        return timing.from_text(table, columns), [f"time from {' and '.join(names)}"]
+    needed = any(_is_time(signal) for signal in signals) or "t" in options.columns
+    numbers(table, columns[0], "time", "--columns t=… or --rate HZ", gaps=needed)
+    stated = timing.time_units_declared(options.units, names[0])
+    scale = options.scales.get(names[0]) or options.scales.get("t")
+    time, notes = timing.seconds(table, columns[0], stated, scale)
+    checks.refuse_too_large(table.file, "the time", names[0], time)
+    return time, notes
 
 
 def _run_time(
@@ -204,7 +275,7 @@ def _run_time(
         listed = ", ".join(list(table.columns)[:12])
         raise DataError(
             f"{table.file}: no time column (t, time, timestamp) for signal t; the file has "
-            f"{listed}; give --rate HZ or --columns t={timing.increasing(table) or 'NAME'}"
+            f"{listed}; give --rate HZ or --columns t={timing.first_increasing(table) or 'NAME'}"
         )
     return None, []
 
@@ -213,16 +284,28 @@ def _from_column(
     table: Table, bound: _Bound, rows: NDArray[np.int_], needed: bool, options: Options
 ) -> tuple[Array | None, list[str]]:
     assert bound.time is not None
-    time = bound.time[rows]
+    time, name = bound.time[rows], " and ".join(bound.time_source)
+    there = np.isfinite(time)
     try:
-        timing.refuse_unordered(table.file, str(bound.time_source), time, rows)
+        timing.refuse_unordered(table.file, name, time[there], rows[there])
     except DataError as error:
         if needed:
             raise
         return None, [f"{timing.UNUSED}{error}"]
+    return time, timing.interruptions(name, time[there], rows[there])
+
+
+def _start_said(time: Array, options: Options) -> list[str]:
     if options.time_zero == "column" or time[0] == 0.0:
-        return time, []
-    return time - time[0], [f"time starts at {time[0]:.9g} s; that sample is t = 0"]
+        return []
+    return [f"time starts at {time[0]:.9g} s; that sample is t = 0"]
+
+
+def _from_zero(time: Array, bound: _Bound, options: Options) -> Array:
+    """The first sample of a run is t = 0, unless the column's own zero is wanted."""
+    if bound.time is not None and options.time_zero == "column":
+        return time
+    return time if time[0] == 0.0 else time - time[0]
 
 
 def _with_time(
@@ -267,7 +350,7 @@ def _in_order(labels: Array | Labels) -> list[float | int | str]:
 
 
 def _others(
-    table: Table, used: set[str], options: Options
+    table: Table, used: set[str], options: Options, complete: NDArray[np.bool_]
 ) -> tuple[dict[str, Array | Labels], dict[str, str | None], list[str]]:
     """Return the columns that no signal takes: each may be the cause of a residual."""
     columns: dict[str, Array | Labels] = {}
@@ -276,10 +359,13 @@ def _others(
     for name, column in table.columns.items():
         if name in used:
             continue
-        if column.bad is not None:
+        if column.bad is not None and np.isnan(np.asarray(column.values, float)[complete]).any():
             notes.append(f"column {name} left out: {column.bad}")
             continue
         values, unit = column.values, options.units.get(name, column.unit)
+        if not column.is_text and np.abs(np.asarray(values, float)[complete]).max() > checks.MOST:
+            notes.append(f"column {name} left out: it holds numbers too large to compute with")
+            continue
         if name in options.scales:
             values = options.scales[name].apply(np.asarray(values, float), table.file, name)
             unit = None if unit == column.unit and unit in ("count", "raw", "LSB") else unit

@@ -9,6 +9,7 @@ from casest.errors import DataError
 
 Array = NDArray[np.float64]
 
+LEAST, MOST = 1e-140, 1e140  # sums of squares beyond are 0 or infinite
 _FEWEST = 8  # readings at an extreme before it is called clipping
 _CROWDING = 5.0  # times as many as on the levels next to it (a smooth crest gives 2.4)
 _STEEP = 3.0  # resolutions jumped on the way in (rest toggles by one)
@@ -21,6 +22,27 @@ def refuse_constant(file: str, name: str, values: Array, columns: tuple[str, ...
         raise DataError(
             f"{file}: signal {name} (columns {' '.join(columns)}) is {shown} in all "
             f"{len(values)} rows; a dead channel or the wrong column: see --columns {name}=…"
+        )
+
+
+def refuse_too_large(file: str, purpose: str, column: str, values: Array) -> None:
+    """Raise DataError where the squares of a column leave the range of numbers; NaN is none."""
+    largest = float(np.nanmax(np.abs(values), initial=0.0))
+    if largest > MOST:
+        raise DataError(
+            f"{file}: column {column} reaches {largest:.3g}, too large to compute with for "
+            f"{purpose}; choose another column, or scale it: --scale {column}=*1e-100"
+        )
+
+
+def refuse_too_small(file: str, name: str, values: Array, columns: tuple[str, ...]) -> None:
+    """Raise DataError where the squares of a whole signal (N, size) are zero to the computer."""
+    largest = float(np.nanmax(np.abs(values), initial=0.0))
+    if 0.0 < largest < LEAST:
+        raise DataError(
+            f"{file}: signal {name} (columns {' '.join(columns)}) is nowhere larger than "
+            f"{largest:.3g}, too small to compute with; choose other columns with --columns "
+            f"{name}=…, or scale them: --scale {name}=*1e200"
         )
 
 

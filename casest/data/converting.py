@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from casest import units as unit_names
-from casest.data import attitude
+from casest.data import attitude, checks
+from casest.data.column import BadCell
 from casest.data.options import Options
 from casest.data.run import Array
 from casest.data.scaling import Scale
@@ -29,10 +30,12 @@ def vector(
             values = _converted(table, name, signal, values, unit, target, stated)
         parts.append(values)
     values = np.stack(parts, axis=1)
-    notes = [*_overruled(table, signal, names, options), *_missing(table, signal, values)]
+    checks.refuse_too_small(table.file, signal.name, values, names)
+    notes = [*_overruled(table, signal, names, options), *_missing(table, signal, values, options)]
     if target is not None and None in stated:
         silent = " ".join(n for n, u in zip(names, stated, strict=True) if u is None)
-        size = f"median length {np.nanmedian(np.linalg.norm(values, axis=1)):.4g}"
+        whole = values[np.isfinite(values).all(axis=1)]
+        size = f"median length {np.median(np.linalg.norm(whole, axis=1)) if len(whole) else 0:.4g}"
         notes.append(
             f"{signal.name}: no unit stated for {silent}, taken as {target} ({size}); "
             f"if that is wrong say --unit {signal.name}=…"
@@ -40,7 +43,7 @@ def vector(
     return values, target, notes
 
 
-def _missing(table: Table, signal: Signal, values: Array) -> list[str]:
+def _missing(table: Table, signal: Signal, values: Array, options: Options) -> list[str]:
     """How many readings are missing, where they may be."""
     absent = ~np.isfinite(values)
     count = int(absent.any(axis=1).sum())
@@ -51,6 +54,8 @@ def _missing(table: Table, signal: Signal, values: Array) -> list[str]:
             f"{table.file}: signal {signal.name} has no reading in {len(values)} rows; choose its "
             f"columns: --columns {signal.name}=…"
         )
+    if signal.name not in options.gaps:
+        return []  # those rows are dropped, and said to be
     first = int(np.flatnonzero(absent.any(axis=1))[0])
     return [
         f"{signal.name}: {count} of {len(values)} readings are missing, whole or in part, the "
@@ -119,9 +124,10 @@ def numbers(
     `gaps`: cells may be empty, and are NaN then.
     """
     if column.is_text:
+        text = BadCell(0, str(column.values[0]), 1)
         raise DataError(
-            f"{table.file}: column {column.name} row 0 holds '{column.values[0]}', and {purpose} "
-            f"needs numbers; choose another column: {way_out}"
+            f"{table.file}: column {column.name} {text}, and {purpose} needs numbers; "
+            f"choose another column: {way_out}"
         )
     if column.bad is not None and not (gaps and column.bad.blank):
         raise DataError(
@@ -132,10 +138,14 @@ def numbers(
 
 
 def _scaled(table: Table, column: Column, signal: str, options: Options) -> Array:
-    gaps = signal in options.gaps
+    # A filter's reading may be missing; what drives it may not, and no row of it is dropped.
+    gaps = signal in options.gaps or not options.gaps
     values = numbers(table, column, f"signal {signal}", f"--columns {signal}=…", gaps=gaps)
     scale = _scale_of(column.name, signal, options)
-    return values if scale is None else scale.apply(values, table.file, column.name)
+    if scale is not None:
+        values = scale.apply(values, table.file, column.name)
+    checks.refuse_too_large(table.file, f"signal {signal}", column.name, values)
+    return values
 
 
 def rotation(
@@ -160,7 +170,7 @@ def rotation(
 
 
 def _refuse_degrees(table: Table, signal: Signal, name: str, values: Array) -> None:
-    largest = int(np.argmax(np.abs(values)))
+    largest = int(np.argmax(np.nan_to_num(np.abs(values))))
     if abs(values[largest]) > 2 * np.pi * 1.01:
         raise DataError(
             f"{table.file}: column {name} row {largest} holds {values[largest]:g} without a unit, "

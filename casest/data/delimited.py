@@ -14,11 +14,15 @@ from numpy.typing import NDArray
 
 from casest import units
 from casest.data.column import Column, numeric_column, text_column
+from casest.data.moments import looks_like_a_moment
 from casest.errors import DataError
 
 _DELIMITERS = (",", ";", "\t", "|", None)  # None: any white space
 _NAMES = {",": "comma", ";": "semicolon", "\t": "tab", "|": "bar", None: "white space"}
 _DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?")
+_DECIMAL_POINT = re.compile(r"[-+]?\d*\.\d+([eE][-+]?\d+)?")
+_GROUP = re.compile(r"[-+]?[1-9]\d{0,2}[.,]\d{3}")  # 1,234: a decimal, or thousands
+_NO_GROUP = re.compile(r",\d{1,2}(?!\d)|,\d{4}|\d{4},\d|(?<!\d)0,\d|(?<!\d),\d")
 _HEAD = 500  # lines within which a table must start
 _SAMPLE = 60  # lines that decide on the delimiter
 
@@ -33,15 +37,20 @@ class Layout:
 
     def cells(self, line: str) -> list[str]:
         """Cut one line into stripped cells, quotes removed, decimal commas made points."""
+        return [self.with_point(cell) for cell in self.cut(line)]
+
+    def cut(self, line: str) -> list[str]:
+        """Cut one line into stripped cells as they are written, quotes removed."""
         if self.delimiter is None:
             found = line.split()
         elif '"' in line:
             found = next(csv.reader([line], delimiter=self.delimiter, skipinitialspace=True))
         else:
             found = line.split(self.delimiter)
-        return [self._cell(cell.strip()) for cell in found]
+        return [cell.strip() for cell in found]
 
-    def _cell(self, cell: str) -> str:
+    def with_point(self, cell: str) -> str:
+        """A number with a decimal comma made one with a point."""
         if self.decimal_comma and _DECIMAL_COMMA.fullmatch(cell):
             return cell.replace(",", ".")
         return cell
@@ -61,6 +70,15 @@ def read_delimited(file: str, text: str) -> Contents:
 
     Raises DataError where the file is empty, has a header only, or has a row of another width.
     """
+    try:
+        return _read(file, text)
+    except csv.Error as error:
+        raise DataError(
+            f"{file}: a quoted cell cannot be read ({error}); is a quotation mark missing?"
+        ) from error
+
+
+def _read(file: str, text: str) -> Contents:
     all_lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
     lines = [line for line in all_lines if line and not line.isspace()]
     comments: list[str] = []
@@ -77,6 +95,7 @@ def read_delimited(file: str, text: str) -> Contents:
     columns, dropped = _columns(_Body(file, body, layout, all_lines), names)
     before = lines[: start - (1 if names and not _is_comment_header(comments, names) else 0)]
     preamble, notes = _preamble(before, comments, layout)
+    notes += _commas_said(body, layout)
     if dropped:
         notes.append(f"{_counted(dropped, 'column')} without name and content left out")
     return Contents(columns, notes, preamble)
@@ -100,7 +119,7 @@ def _layout(lines: list[str]) -> Layout:
     sample = lines[middle : middle + _SAMPLE]
     best, best_score = Layout(",", False, 1), 0.0
     for delimiter in _DELIMITERS:
-        decimal = delimiter != "," and not any("." in line for line in sample)
+        decimal = _has_decimal_commas(sample, delimiter)
         cut = Layout(delimiter, decimal, 0).cells
         rows = [cut(line) for line in sample]
         widths = Counter(len(row) for row in rows)
@@ -108,11 +127,41 @@ def _layout(lines: list[str]) -> Layout:
         width = max(widths, key=lambda w: (widths[w], overall[w]))
         agree = widths[width]
         cells = [cell for row in rows for cell in row]
-        right = sum(not cell or _is_number(cell) for cell in cells) / len(cells)
+        right = sum(_rightness(cell) for cell in cells) / len(cells)
         score = right * agree / len(rows) * (1.0 if width > 1 else 0.5)
         if score > best_score + 1e-9:
             best, best_score = Layout(delimiter, decimal, width), score
     return best if best_score > 0 else _layout_of_labels(lines)
+
+
+def _rightness(cell: str) -> int:
+    """What a cell says for the delimiter that cut it; one that was not cut speaks against it."""
+    if not cell or _is_number(cell) or looks_like_a_moment(cell):
+        return 1
+    return -1 if any(sign in cell for sign in ";\t|") else 0
+
+
+def _has_decimal_commas(sample: list[str], delimiter: str | None) -> bool:
+    """Whether some number has a comma; where none has a point either, one may come later."""
+    cut = Layout(delimiter, False, 0).cut
+    cells = [cell for line in sample for cell in cut(line)]
+    if any(_DECIMAL_COMMA.fullmatch(cell) for cell in cells):
+        return True
+    return delimiter != "," and not any(_DECIMAL_POINT.fullmatch(cell) for cell in cells)
+
+
+def _commas_said(body: list[str], layout: Layout) -> list[str]:
+    """A note where each comma has three digits behind it: thousands would look the same."""
+    if not layout.decimal_comma or layout.delimiter == ",":
+        return []
+    text = "\n".join(body)
+    first = next((c for c in layout.cut(body[0]) if _GROUP.fullmatch(c) and "," in c), None)
+    if first is None or "." in text or _NO_GROUP.search(text):
+        return []
+    return [
+        f"commas are read as decimal points, {first} as {first.replace(',', '.')}; if they "
+        f"separate thousands, export the file without them"
+    ]
 
 
 def _layout_of_labels(lines: list[str]) -> Layout:
@@ -269,10 +318,18 @@ def _columns(body: _Body, names: list[str] | None) -> tuple[list[Column], int]:
         ], 0
     rows = _slow(body)
     headers = _headers(names, body.layout.width)
+    decimals = body.layout.decimal_comma
+    points = decimals and any(_plain_point(cell) for row in rows for cell in row)
     texts = [list(column) for column in zip(*rows, strict=True)]
     kept = [i for i, t in enumerate(texts) if any(t) or (names and i < len(names) and names[i])]
     _refuse_duplicates(body.file, [headers[i] for i in kept])
-    return [_typed(headers[i], texts[i]) for i in kept], len(texts) - len(kept)
+    typed = [_typed(headers[i], texts[i], body.layout, points) for i in kept]
+    return typed, len(texts) - len(kept)
+
+
+def _plain_point(cell: str) -> bool:
+    """Whether a cell is a number whose point separates no thousands."""
+    return bool(_DECIMAL_POINT.fullmatch(cell)) and not _GROUP.fullmatch(cell)
 
 
 def _headers(names: list[str] | None, width: int) -> list[str]:
@@ -292,6 +349,8 @@ def _fast(body: _Body) -> NDArray[np.float64] | None:
     """Read the whole body with NumPy's C reader; None where a cell or row resists."""
     lines, layout = body.lines, body.layout
     if layout.decimal_comma:
+        if layout.delimiter == "," or any("." in line for line in lines):
+            return None  # what comma and point mean is looked at cell by cell
         lines = "\n".join(lines).replace(",", ".").split("\n")
     try:
         values = np.loadtxt(lines, delimiter=layout.delimiter, comments=None, ndmin=2)
@@ -307,7 +366,7 @@ def _texts_if_needed(body: _Body, values: NDArray[np.float64], at: int) -> list[
 
 
 def _slow(body: _Body) -> list[list[str]]:
-    rows = [body.layout.cells(line) for line in body.lines]
+    rows = [body.layout.cut(line) for line in body.lines]
     width = body.layout.width
     for row, cells in enumerate(rows):
         if len(cells) == width + 1 and not cells[-1]:
@@ -322,13 +381,29 @@ def _slow(body: _Body) -> list[list[str]]:
     return rows
 
 
-def _typed(header: str, cells: list[str]) -> Column:
-    """Numbers where at least half of the filled cells are numbers, else labels."""
-    values = np.array([number(cell) for cell in cells])
+def _typed(header: str, cells: list[str], layout: Layout, points: bool) -> Column:
+    """Numbers where at least half of the filled cells are numbers, else labels.
+
+    `points`: the file has numbers with a decimal point, so that its commas may be something else.
+    A number that may be two (1.234 beside 0,5) is none: it is left to those who use the column.
+    """
+    values = np.array([number(layout.with_point(cell)) for cell in cells])
     right = np.count_nonzero(~np.isnan(values)) + sum(_is_nan_word(cell) for cell in cells)
-    if 2 * right >= sum(bool(cell) for cell in cells):
-        return numeric_column(header, values, cells)
-    return text_column(header, cells)
+    if 2 * right < sum(bool(cell) for cell in cells):
+        return text_column(header, cells)
+    if layout.decimal_comma:
+        values[_open_to_doubt(cells, points or layout.delimiter == ",")] = np.nan
+    return numeric_column(header, values, cells)
+
+
+def _open_to_doubt(cells: list[str], points: bool) -> list[int]:
+    """Rows of 1.234 or 1,234 where nothing in the column says what the sign means."""
+    doubtful: list[int] = []
+    for sign, form in ((".", _DECIMAL_POINT), (",", _DECIMAL_COMMA)):
+        written = [k for k, cell in enumerate(cells) if sign in cell and form.fullmatch(cell)]
+        if (sign == "." or points) and all(_GROUP.fullmatch(cells[k]) for k in written):
+            doubtful += written
+    return doubtful
 
 
 def _is_nan_word(cell: str) -> bool:

@@ -9,8 +9,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from casest import units
-from casest.data.column import name_and_unit
+from casest.data.matching import (
+    beginning_with,
+    find_by_name,
+    listed,
+    plain,
+    vectors_beginning_with,
+)
 from casest.data.table import Table
+from casest.data.timing import find_time, increasing
 from casest.declaration.symbols import Signal
 from casest.errors import DataError, UnitError
 
@@ -31,13 +38,30 @@ def find_columns(table: Table, signal: Signal, chosen: Choice) -> tuple[str, ...
     """
     if signal.name in chosen:
         names = as_names(chosen[signal.name])
-        if len(names) == 1 and (found := _by_stem(table, signal, names[0])):
+        if len(names) == 1 and (found := _by_choice(table, signal, names[0])):
             return found
         _check_number(table, signal, names)
         return tuple(find_column(table, name, f"signal {signal.name}") for name in names)
     if found := _by_stem(table, signal, signal.name):
         return found
     raise _missing(table, signal)
+
+
+def _by_choice(table: Table, signal: Signal, stem: str) -> tuple[str, ...] | None:
+    """Return the columns that a user means by one name, where there is one way to read it."""
+    if found := _by_stem(table, signal, stem):
+        return found
+    if signal.size == 1 or signal.kind == "rotation":
+        return None
+    ways = vectors_beginning_with(table, stem, signal.size)
+    if len(ways) > 1:
+        said = " or ".join(",".join(way) for way in ways[:6])
+        first = shlex.quote(f"{signal.name}={','.join(ways[0])}")
+        raise DataError(
+            f"{table.file}: {stem} for signal {signal.name} can be read in {len(ways)} ways, "
+            f"{said}; name the columns: --columns {first}"
+        )
+    return ways[0] if ways else None
 
 
 def _by_stem(table: Table, signal: Signal, stem: str) -> tuple[str, ...] | None:
@@ -66,26 +90,20 @@ def find_column(table: Table, name: str, purpose: str) -> str:
             return names[int(name)]
         raise DataError(
             f"{table.file}: {purpose} asks for column {name}, and the columns are 0 to "
-            f"{len(names) - 1} ({_listed(names)})"
+            f"{len(names) - 1} ({listed(names)})"
+        )
+    ways = beginning_with(table, name)
+    if len(ways) == 1:
+        return ways[0]
+    if ways:
+        said = " or ".join(ways[:6])
+        raise DataError(
+            f"{table.file}: {name} for {purpose} can be read in {len(ways)} ways, {said}; "
+            f"name the column in full"
         )
     near = _nearest(name, names)
     hint = f"did you mean {near}? " if near else ""
-    raise DataError(f"{table.file}: no column {name} for {purpose}; {hint}it has {_listed(names)}")
-
-
-def find_by_name(table: Table, name: str) -> str | None:
-    """Return the column called so: exactly, else without regard to case and punctuation."""
-    if name in table.columns:
-        return name
-    bare = name_and_unit(name)[0]  # as the header is written, unit and all
-    if bare in table.columns:
-        return bare
-    return next((have for have in table.columns if _plain(have) == _plain(name)), None)
-
-
-def _plain(name: str) -> str:
-    """v_x, v.x, V[x] and "v x" are one name."""
-    return re.sub(r"[\s_.\[\]()\-]", "", name).casefold() or name
+    raise DataError(f"{table.file}: no column {name} for {purpose}; {hint}it has {listed(names)}")
 
 
 def _candidates(signal: Signal) -> Sequence[Sequence[str]]:
@@ -127,13 +145,14 @@ def _missing(table: Table, signal: Signal) -> DataError:
     some = some or f"{signal.name}={','.join('…' * min(signal.size, 3))}"
     return DataError(
         f"{table.file}: no columns {wanted} for signal {signal.name}; "
-        f"the file has {_listed(names)}; try --columns {some}"
+        f"the file has {listed(names)}; try --columns {some}"
     )
 
 
 def _near_group(table: Table, signal: Signal) -> list[str]:
     """Return columns that could hold the signal: x y z of one stem, else the first numbers."""
-    numbers = [name for name, column in table.columns.items() if not column.is_text]
+    clock = find_time(table)
+    numbers = [n for n, column in table.columns.items() if not column.is_text and n not in clock]
     if signal.kind == "rotation":
         angles = [_nearest(angle, numbers) for angle in _ANGLES]
         return [a for a in angles if a] if all(angles) and len(set(angles)) == 3 else []
@@ -146,6 +165,8 @@ def _near_group(table: Table, signal: Signal) -> list[str]:
         wanted = "".join(_candidates(signal)[0])
         alike = [g for g in groups if signal.unit and _in_unit(table, g, signal.unit)] or groups
         return max(alike, key=lambda g: difflib.SequenceMatcher(None, wanted, "".join(g)).ratio())
+    # What always grows is a time or a counter, unless all columns do.
+    numbers = [name for name in numbers if not increasing(table, name)] or numbers
     return numbers[: signal.size] if len(numbers) >= signal.size else []
 
 
@@ -161,17 +182,13 @@ def _stems(names: list[str]) -> list[list[str]]:
     """Group names that differ in their last letter x y z (or digit) only."""
     groups: dict[str, list[str]] = {}
     for name in names:
-        plain = _plain(name)
-        if len(plain) > 1 and plain[-1] in "xyz0123":
-            groups.setdefault(plain[:-1], []).append(name)
+        word = plain(name)
+        if len(word) > 1 and word[-1] in "xyz0123":
+            groups.setdefault(word[:-1], []).append(name)
     return list(groups.values())
 
 
 def _nearest(name: str, names: list[str]) -> str | None:
-    plain = {_plain(have): have for have in names}
-    near = difflib.get_close_matches(_plain(name), list(plain), n=1, cutoff=0.5)
-    return plain[near[0]] if near else None
-
-
-def _listed(names: list[str]) -> str:
-    return ", ".join(names[:12]) + (f", … ({len(names)} in all)" if len(names) > 12 else "")
+    by_plain = {plain(have): have for have in names}
+    near = difflib.get_close_matches(plain(name), list(by_plain), n=1, cutoff=0.5)
+    return by_plain[near[0]] if near else None

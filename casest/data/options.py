@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 from casest import units as unit_names
-from casest.data.finding import Choice, find_by_name
+from casest.data.finding import Choice
+from casest.data.matching import find_by_name
 from casest.data.scaling import Scale
 from casest.data.table import Table
 from casest.declaration.symbols import Signal
@@ -46,7 +47,7 @@ def refuse_unknown_names(
     for option, given, allowed in (
         ("columns", options.columns, [*names, "t", "run", "pose"]),
         ("unit", options.units, [*names, "t", *headers]),
-        ("scale", options.scales, [*names, *headers]),
+        ("scale", options.scales, [*names, "t", *headers]),
     ):
         for name in given:
             if name in allowed:

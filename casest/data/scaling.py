@@ -27,6 +27,10 @@ class Scale:
     def apply(self, values: Array, file: str, column: str) -> Array:
         """Return the scaled values, (N,); raises DataError naming a row that does not fit."""
         result = self._reinterpreted(values, file, column) if self.kind else values.copy()
+        with np.errstate(over="ignore", under="ignore"):  # what is too large is refused by its user
+            return self._stepped(result)
+
+    def _stepped(self, result: Array) -> Array:
         for sign, number in self.steps:
             if sign == "*":
                 result = result * number

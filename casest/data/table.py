@@ -5,14 +5,17 @@ from __future__ import annotations
 import difflib
 import gzip
 import os
+import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from casest.data.arrays import read_matlab, read_npy, read_npz, read_parquet
+from casest.data.arrays import read_npy, read_npz, read_parquet
 from casest.data.column import BadCell, Column
 from casest.data.delimited import Contents, read_delimited
 from casest.data.logs import file_and_topics, is_log, read_log
+from casest.data.matlab import read_matlab
+from casest.data.text import decoded
 from casest.errors import DataError
 
 __all__ = ["BadCell", "Column", "Table", "read_table"]
@@ -41,14 +44,10 @@ def read_table(path: str | os.PathLike[str]) -> Table:
     Raises DataError where the file is missing, empty, of another format, has rows of unequal
     width or two columns of one name. Bad cells raise nothing here: see `Column.bad`.
     """
-    file, topics = file_and_topics(path)
-    _refuse_unreadable(file)
-    if is_log(file):
-        contents = read_log(file, topics)
-    elif topics:
-        raise DataError(f"{file}: holds no topics; leave ':{','.join(topics)}' out")
-    else:
-        contents = _READERS.get(file.suffix.lower(), _read_text)(file)
+    try:
+        file, contents = _contents(path)
+    except OSError as error:  # no permission, a name too long, a drive that has gone
+        raise DataError(f"{os.fspath(path)}: cannot be read ({error.strerror or error})") from error
     columns = {column.name: column for column in contents.columns}
     if len(columns) < len(contents.columns):
         names = [column.name for column in contents.columns]
@@ -60,6 +59,16 @@ def read_table(path: str | os.PathLike[str]) -> Table:
     if n_rows == 0:
         raise DataError(f"{file}: holds a header but no rows below it; check the export")
     return Table(str(path), columns, tuple(contents.notes), contents.preamble, n_rows)
+
+
+def _contents(path: str | os.PathLike[str]) -> tuple[Path, Contents]:
+    file, topics = file_and_topics(path)
+    _refuse_unreadable(file)
+    if is_log(file):
+        return file, read_log(file, topics)
+    if topics:
+        raise DataError(f"{file}: holds no topics; leave ':{','.join(topics)}' out")
+    return file, _READERS.get(file.suffix.lower(), _read_text)(file)
 
 
 def _refuse_unreadable(file: Path) -> None:
@@ -85,20 +94,9 @@ def _near_names(file: Path) -> str:
 def _read_text(file: Path) -> Contents:
     try:
         raw = gzip.decompress(file.read_bytes()) if file.suffix == ".gz" else file.read_bytes()
-    except (OSError, EOFError) as error:
-        raise DataError(f"{file}: cannot be read ({error})") from error
-    return read_delimited(str(file), _decoded(file, raw))
-
-
-def _decoded(file: Path, raw: bytes) -> str:
-    if raw.startswith((b"\xff\xfe", b"\xfe\xff")):
-        return raw.decode("utf-16")
-    if b"\x00" in raw[:4096]:
-        raise DataError(f"{file}: is no text but binary; export it as CSV, Parquet, .npy or .mat")
-    try:
-        return raw.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        return raw.decode("latin-1")  # headers such as "µT" or "°C" from Windows
+    except (EOFError, zlib.error, gzip.BadGzipFile) as error:
+        raise DataError(f"{file}: cannot be read ({error}); copy it again") from error
+    return read_delimited(str(file), decoded(file, raw))
 
 
 def _refused(reason: str) -> Callable[[Path], Contents]:

@@ -9,31 +9,83 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casest import units
-from casest.data.finding import find_by_name
+from casest.data.matching import find_by_name
+from casest.data.moments import Moments, parse_moments
+from casest.data.scaling import Scale
 from casest.data.table import Column, Table
 from casest.errors import DataError, UnitError, UsageError
 
 Array = NDArray[np.float64]
 
 GAP = 5.0  # times the median step
+_EVEN = 20  # steps that show whether a record is evenly sampled
 
 #: How the note begins that tells why a time column was left aside.
 UNUSED = "time not used: "
 
 _NAMES = ("t", "time", "timestamp", "timestamps")
 _CLOCKS = {"millis": "ms", "milliseconds": "ms", "micros": "us", "microseconds": "us"}
+_PAIR = ["clock", "date"]
+_KINDS = ("both", "date", "clock")
+_LOOK = 100  # rows that tell what a column of text holds
 _RATE_NAMES = ("fs", "rate", "samplerate", "samplingrate", "samplefrequency", "samplingfrequency")
 
 
-def find_time(table: Table, chosen: str | None) -> str | None:
-    """Return the name of the time column: `chosen`, t, time, timestamp, or such with a unit."""
-    if chosen is not None:
-        return chosen
+def find_time(table: Table) -> tuple[str, ...]:
+    """Return the column that holds the time, or a date and a time of day; () where none does.
+
+    It is called t, time or timestamp, or such with a unit; else it is the only column of times of
+    day, with the only column of dates if there is one.
+    """
+    kinds = _kinds(table)
+    named = _by_name(table)
+    if named is None:
+        return _only(kinds)
+    partner = {"clock": "date", "date": "clock"}.get(kinds.get(named, ""))
+    partners = [name for name, kind in kinds.items() if kind == partner]
+    if len(partners) == 1:
+        return (*partners, named) if partner == "date" else (named, *partners)
+    return (named,)
+
+
+def _by_name(table: Table) -> str | None:
     for name in _NAMES:
         found = find_by_name(table, name)
         if found and not _is_temperature(table.columns[found]):
             return found
     return next((name for name in table.columns if _unit_in_name(name)), None)
+
+
+def _kinds(table: Table) -> dict[str, str]:
+    """Which columns of text hold dates, times of day or both, by what they begin with."""
+    found: dict[str, str] = {}
+    for name, column in table.columns.items():
+        moments = parse_moments(list(column.values[:_LOOK])) if column.is_text else None
+        if moments:
+            found[name] = moments.kind
+    return found
+
+
+def _only(kinds: Mapping[str, str]) -> tuple[str, ...]:
+    """The one way to read a time of day from the columns of text, () where there are several."""
+    by_kind = {kind: [n for n, k in kinds.items() if k == kind] for kind in _KINDS}
+    both, dates, clocks = (by_kind[kind] for kind in _KINDS)
+    if len(both) == 1 and not clocks:
+        return (both[0],)
+    if not both and len(clocks) == 1 and len(dates) <= 1:
+        return (*dates, *clocks)
+    return ()
+
+
+def kept_as_text(table: Table) -> str | None:
+    """A note on columns of dates and times that are not the time of the record."""
+    names = [name for name, kind in _kinds(table).items() if kind != "date"]
+    if len(names) < 2:
+        return None
+    return (
+        f"{' and '.join(names)} hold times, kept as text; name the time of the record with "
+        f"--columns t={names[0]}"
+    )
 
 
 def _is_temperature(column: Column) -> bool:
@@ -46,31 +98,113 @@ def _is_temperature(column: Column) -> bool:
         return True
 
 
-def increasing(table: Table) -> str | None:
+def first_increasing(table: Table) -> str | None:
     """Return the first column of numbers that always grows: it may be the time."""
-    for name, column in table.columns.items():
-        if not column.is_text and column.bad is None and table.n_rows > 1:
-            values = np.asarray(column.values, dtype=np.float64)
-            if (np.diff(values) > 0).all():
-                return name
-    return None
+    return next((name for name in table.columns if increasing(table, name)), None)
 
 
-def seconds(table: Table, column: Column, stated: str | None) -> tuple[Array, str | None]:
-    """Return a time column in s and a note on what was assumed.
+def increasing(table: Table, name: str) -> bool:
+    """Whether a column of numbers always grows: it counts samples, or is their time."""
+    column = table.columns[name]
+    if column.is_text or column.bad is not None or table.n_rows < 2:
+        return False
+    return bool((np.diff(np.asarray(column.values, dtype=np.float64)) > 0).all())
 
-    Raises UnitError where its unit is no time, DataError where it is text but no date.
+
+def from_text(table: Table, columns: tuple[Column, ...]) -> Array:
+    """Return dates, times of day, or a column of each, as s since row 0; NaN where one is missing.
+
+    Raises DataError where a cell is neither, or where day and month cannot be told apart.
     """
-    if column.is_text:
-        return _from_dates(table, column), None
+    parts = [_moments(table, column) for column in columns]
+    if sorted(part.kind for part in parts) not in (["date"], ["clock"], ["both"], _PAIR):
+        raise DataError(
+            f"{table.file}: columns {' and '.join(c.name for c in columns)} are not a date and a "
+            f"time of day; name one column with --columns t=… or both with --columns t=DATE,TIME"
+        )
+    time = np.zeros(table.n_rows, dtype=np.int64)
+    missing = np.zeros(table.n_rows, dtype=np.bool_)
+    for column, part in zip(columns, parts, strict=True):
+        if part.ambiguous and not (part.constant_date and any(p.kind != "date" for p in parts)):
+            raise DataError(
+                f"{table.file}: column {column.name} row 0 holds '{column.values[0]}', where day "
+                f"and month cannot be told apart; write dates as 2026-03-12 or 12.03.2026, or give "
+                f"--rate HZ"
+            )
+        time += part.clock + (0 if part.days is None else part.days)
+        missing |= part.missing
+    first = int(np.argmin(missing))
+    return np.where(missing, np.nan, (time - time[first]) * 1e-9)
+
+
+def seconds(
+    table: Table, column: Column, stated: str | None, scale: Scale | None = None
+) -> tuple[Array, list[str]]:
+    """Return a time column of numbers in s, scaled first, and notes on what was assumed.
+
+    Raises UnitError where its unit is no time, UsageError where the header states one that may be
+    that before or after scaling.
+    """
     unit = stated or column.unit or _unit_in_name(column.name)
     values = np.asarray(column.values, dtype=np.float64)
+    if scale is not None:
+        values = scale.apply(values, table.file, column.name)
+        unit = _after_scaling(table, column, stated, unit)
     if unit is None:
-        step = f"{np.median(np.diff(values)):g}" if len(values) > 1 else "unknown"
+        there = values[np.isfinite(values)]
+        step = f"{np.median(np.diff(there)):g}" if len(there) > 1 else "unknown"
         note = f"{column.name}: no unit stated, taken as s (median step {step} s); "
-        return values, note + "if that is wrong say --unit t=ms"
+        return values, [note + "if that is wrong say --unit t=ms"]
     factor, _ = units.conversion(unit, "s")
-    return values * factor, None
+    return values * factor, []
+
+
+def _after_scaling(
+    table: Table, column: Column, stated: str | None, unit: str | None
+) -> str | None:
+    """The unit of scaled time stamps: as the user states it; counts are counts no more."""
+    if stated or unit is None:
+        return stated
+    spelled = units.canonical(unit)
+    if spelled == "count":
+        return None
+    if spelled != "s":
+        raise UsageError(
+            f"{table.file}: column {column.name} is in {unit} by its header, and --scale changes "
+            f"its numbers: say what they are then, --unit t=s, or leave --scale out"
+        )
+    return spelled
+
+
+def interruptions(name: str, time: Array, rows: NDArray[np.int_]) -> list[str]:
+    """A note on samples that an evenly sampled record lacks, and on gaps: how many, and where."""
+    steps = np.diff(time)
+    if len(steps) < _EVEN:
+        return []
+    median = float(np.median(steps))
+    even = float(np.mean(np.abs(steps - median) < 0.1 * median)) >= 0.5
+    said = []
+    lost = np.flatnonzero((steps > 1.5 * median) & (steps <= GAP * median))
+    if even and lost.size:
+        count = int((np.rint(steps[lost] / median) - 1).sum())
+        coarse = ", or the time stamps are coarse" if lost.size > 0.1 * len(steps) else ""
+        said.append(
+            f"{_counted(count, 'sample')} missing in {_counted(lost.size, 'place')}, the first "
+            f"behind row {rows[lost[0]]} (t = {time[lost[0]]:.6g} s){coarse}"
+        )
+    gaps = np.flatnonzero(steps > GAP * median)
+    if gaps.size:
+        longest = gaps[np.argmax(steps[gaps])]
+        samples = f" ({round(steps[longest] / median) - 1} samples)" if even else ""
+        said.append(
+            f"{_counted(gaps.size, 'gap')}, the longest {steps[longest]:.4g} s{samples} behind row "
+            f"{rows[longest]} (t = {time[longest]:.6g} s)"
+        )
+    return [f"{name}: {'; '.join(said)}; the median step is {median:.3g} s"] if said else []
+
+
+def _counted(n: int, thing: str) -> str:
+    return f"{n} {thing}" if n == 1 else f"{n} {thing}s"
 
 
 def rate_in_preamble(table: Table) -> tuple[str, float] | None:
@@ -104,11 +238,16 @@ def refuse_unordered(file: str, column: str, time: Array, rows: NDArray[np.int_]
         )
 
 
-def blocks(time: Array | None, pose: NDArray[np.generic] | None, n: int) -> NDArray[np.int_]:
-    """Number the stretches between gaps in time and changes of pose, from 0."""
-    starts = np.zeros(n, dtype=np.bool_)
-    if time is not None and n > 2:
-        steps = np.diff(time)
+def blocks(
+    time: Array | None, pose: NDArray[np.generic] | None, rows: NDArray[np.int_]
+) -> NDArray[np.int_]:
+    """Number the stretches between gaps in time and changes of pose, from 0.
+
+    Without a time the rows are one: where more than a few were dropped there is a gap.
+    """
+    starts = np.zeros(len(rows), dtype=np.bool_)
+    if len(rows) > 2:
+        steps = np.diff(rows if time is None else time)
         starts[1:] |= steps > GAP * np.median(steps)
     if pose is not None:
         starts[1:] |= pose[1:] != pose[:-1]
@@ -128,18 +267,14 @@ def time_units_declared(mapping: Mapping[str, str], column: str | None) -> str |
     return mapping.get("t") or (mapping.get(column) if column else None)
 
 
-def _from_dates(table: Table, column: Column) -> Array:
-    """Read ISO dates (2020-03-07 15:45:00.123) or clock times (15:45:00.1) as s since row 0."""
-    days = ["" if "-" in str(text)[1:] else "2000-01-01T" for text in column.values]
-    try:
-        texts = [
-            day + str(text).strip().rstrip("Z")
-            for day, text in zip(days, column.values, strict=True)
-        ]
-        dates = np.array(texts, dtype="datetime64[ns]")
-    except ValueError:
-        raise DataError(
-            f"{table.file}: column {column.name} row 0 holds '{column.values[0]}', which is no "
-            f"time; name another column with --columns t=… or give --rate HZ"
-        ) from None
-    return np.asarray((dates - dates[0]).astype(np.int64) * 1e-9, dtype=np.float64)
+def _moments(table: Table, column: Column) -> Moments:
+    """A column of dates (2020-03-07 15:45:00.123, 7.3.2020) or times of day (15:45:00,1)."""
+    cells = [str(cell) for cell in column.values]
+    if column.is_text and (found := parse_moments(cells)):
+        return found
+    wrong = [k for k, cell in enumerate(cells) if cell and parse_moments([cell]) is None]
+    row = wrong[0] if wrong else 0
+    raise DataError(
+        f"{table.file}: column {column.name} row {row} holds '{cells[row]}', which is no "
+        f"time; name another column with --columns t=… or give --rate HZ"
+    )

@@ -3,7 +3,7 @@
 Every operation of the body is followed with the sizes of its operands. What is added, subtracted
 or compared must have one unit (cm and m differ, and so do deg and rad inside a sine); a plain
 number fits anything. Factors such as 1000 may convert units: the scale of the product is unknown
-then, but not its dimension.
+then, but not its dimension. From where a temperature counts is followed too (`temperatures`).
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import Any
 
@@ -21,6 +21,7 @@ from casest import units
 from casest.declaration.effect import Attached
 from casest.declaration.model import Model
 from casest.declaration.symbols import Constant, param
+from casest.declaration.temperatures import Zero, followed, of_symbol, refuse_other_zero
 from casest.declaration.tracing import function_of
 from casest.engine.operations import Operation, Powers, Units, operation_of
 from casest.errors import UnitError
@@ -36,6 +37,7 @@ class Size:
     powers: Mapping[str, Fraction] | None
     factor: float | None
     names: frozenset[str]
+    zero: Zero = field(default_factory=Zero, compare=False)
 
     def __str__(self) -> str:
         if not self.powers:
@@ -49,6 +51,7 @@ PLAIN = Size(None, None, frozenset())
 #: A number such as 2 or 1/3, which belongs to a formula and converts no unit.
 PURE = Size(None, 1.0, frozenset())
 _ONE = Fraction(1)
+_KELVIN = {"K": _ONE}
 
 
 def check_units(model: Model) -> None:
@@ -68,7 +71,11 @@ def check_units(model: Model) -> None:
     else:
         outputs["prediction"] = traced.predicted
     f = function_of(open_model, outputs, traced)
-    sizes = _outputs(f, _input_sizes(open_model), model.name)
+    numbers = {c.name: float(c.array) for c in model.constants if not c.dims}
+    sizes = _outputs(f, _input_sizes(open_model, numbers), model.name)
+    if traced.predicted is None:
+        for found in sizes[-1]:
+            _refuse_counted_residual(found, model.name)
     for k, q in enumerate(traced.quantities.values()):
         if q.unit and not q.implied:  # an implied one is checked as the prediction below
             for found in sizes[k]:
@@ -78,14 +85,31 @@ def check_units(model: Model) -> None:
                 except UnitError as error:
                     raise UnitError(f"{where}: {error}") from None
                 _fits(found, declared, where)
+                _same_zero(found, q.unit, declared, where)
     if traced.measured is not None:
         unit = model.residual_unit
         for found in sizes[-1]:
             where = f"model {model.name}: the prediction of {traced.measured} [{unit}]"
-            _fits(found, _size(unit, open_model), where)
+            declared = _size(unit, open_model)
+            _fits(found, declared, where)
+            _same_zero(found, unit, declared, where)
 
 
-def _input_sizes(model: Model) -> dict[tuple[int, int], Size]:
+def _same_zero(found: Size, unit: str, declared: Size, where: str) -> None:
+    """A temperature declared in a unit counts from that unit's zero."""
+    if found.powers == declared.powers == _KELVIN and "[" not in unit:
+        refuse_other_zero(found.zero, unit, where, ", ".join(sorted(found.names)) or "a number")
+
+
+def _refuse_counted_residual(found: Size, name: str) -> None:
+    """A residual is zero but for noise, from whichever zero temperatures count."""
+    if found.powers == _KELVIN and found.zero.affine:
+        refuse_other_zero(
+            found.zero, "K", f"model {name}: the residual", ", ".join(sorted(found.names))
+        )
+
+
+def _input_sizes(model: Model, numbers: Mapping[str, float]) -> dict[tuple[int, int], Size]:
     sizes: dict[tuple[int, int], Size] = {}
     k = 0
     for p in model.parameters:
@@ -93,14 +117,17 @@ def _input_sizes(model: Model) -> dict[tuple[int, int], Size]:
             curved = p.shape.curved
             unit = "" if curved else p.units[i]
             size = Size({}, 1.0, frozenset()) if curved else _size(unit, model)
-            sizes[0, k] = _named(size, p.name, unit)
+            number = numbers.get(p.name)
+            zero = of_symbol(unit, signal=False, free=p.name not in numbers, number=number)
+            sizes[0, k] = replace(_named(size, p.name, unit), zero=zero)
             k += 1
     k = 0
     for s in model.signals:
         for _ in range(s.size):
             unit = "" if s.kind == "rotation" else f"[{s.name}]"
             own = _size(s.unit if s.unit is not None else unit, model)
-            sizes[1, k] = _named(own, s.name, s.unit or "")
+            zero = of_symbol(s.unit or "", signal=True, free=False, number=None)
+            sizes[1, k] = replace(_named(own, s.name, s.unit or ""), zero=zero)
             k += 1
     return sizes
 
@@ -156,15 +183,16 @@ def _outputs(f: Any, inputs: Mapping[tuple[int, int], Size], name: str) -> list[
     for k in range(f.n_instructions()):
         op, where, to = f.instruction_id(k), f.instruction_input(k), f.instruction_output(k)
         if op == ca.OP_CONST:
-            mathematical = _is_mathematical(f.instruction_constant(k))
-            work[to[0]] = PURE if mathematical else PLAIN
+            number = float(f.instruction_constant(k))
+            plain = PURE if _is_mathematical(number) else PLAIN
+            work[to[0]] = replace(plain, zero=Zero(number=number, plain=True))
         elif op == ca.OP_INPUT:
             work[to[0]] = inputs.get((where[0], where[1]), PLAIN)
         elif op == ca.OP_OUTPUT:
             outputs[to[0]].append(work[where[0]])
         else:
             operation = operation_of(op, f"model {name}")
-            work[to[0]] = _result(operation, [work[i] for i in where], name)
+            work[to[0]] = _operated(operation, [work[i] for i in where], name)
     return outputs
 
 
@@ -173,6 +201,18 @@ def _is_mathematical(number: float) -> bool:
     size = abs(number)
     candidates = (size, 1 / size if size else 0.0)
     return any(abs(x - round(x)) < 1e-12 and round(x) <= 12 for x in candidates)
+
+
+def _operated(operation: Operation, operands: list[Size], name: str) -> Size:
+    """Size of an operation's result, and from where it counts if it is a temperature."""
+    found = _result(operation, operands, name)
+    alike = [o.powers == _KELVIN for o in operands]
+    temperature = found.powers == _KELVIN or not found.powers
+    where = f"model {name}"
+    if marked := sorted(frozenset().union(*(o.names for o in operands if o.zero.affine))):
+        where += f", {', '.join(marked)}"
+    zeros = [replace(o.zero, plain=o.powers is None) for o in operands]
+    return replace(found, zero=followed(operation.code, zeros, alike, temperature, where))
 
 
 def _result(operation: Operation, operands: list[Size], name: str) -> Size:

@@ -168,7 +168,11 @@ def lower(n: int) -> Shape:
 
 
 def full(n: int) -> Shape:
-    """A full n×n matrix with positive diagonal (which fixes its sign)."""
+    """A full n×n matrix with positive diagonal, which fixes its sign.
+
+    The bounds at 0 are those of the entries on the diagonal alone; `bounds=` replaces them, and
+    `param((n, n))` is a matrix without any.
+    """
     return Shape("array", (n, n), positive_diagonal=True)
 
 

@@ -337,7 +337,8 @@ def describe(model: Declared) -> str:
     summary = (inspect.getdoc(model.function) or "").partition("\n")[0]
     rows = [("signal", s.name, s.size, s.unit or "any unit", "") for s in model.signals]
     for p in model.parameters:
-        rows.append(("parameter", p.name, p.shape.size, p.unit, "per run" * (p.scope == "run")))
+        said = ["per run"] * (p.scope == "run") + ["diagonal > 0"] * _diagonal_positive(p)
+        rows.append(("parameter", p.name, p.shape.size, p.unit, ", ".join(said)))
     for c in model.constants:
         value = in_digits(c.array, 6)
         rows.append(("constant", c.name, c.array.size, c.unit, f"= {value}"))
@@ -346,6 +347,12 @@ def describe(model: Declared) -> str:
     width = max(len(row[1]) for row in rows)
     table = [f"  {k:<10} {n:<{width}} {s:>3}  {u} {more}".rstrip() for k, n, s, u, more in rows]
     return "\n".join([f"{model.name}: {summary}", *table, *(f"  {e}" for e in equations(model))])
+
+
+def _diagonal_positive(p: Parameter) -> bool:
+    """Whether the diagonal of a matrix is bounded at 0, which its declaration does not show."""
+    diagonal = [k for k, index in enumerate(p.shape.entries) if len(set(index)) == 1]
+    return p.shape.positive_diagonal and all(p.lower[k] >= 0 for k in diagonal)
 
 
 def _name_of(symbol: SX | None, symbols: Mapping[str, SX]) -> str | None:

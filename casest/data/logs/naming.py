@@ -8,11 +8,18 @@ from pathlib import Path
 
 BAGS = (".bag", ".mcap", ".db3")
 PX4 = (".ulg", ".ulog")
+ARDUPILOT = (".bin",)
+_DATAFLASH = b"\xa3\x95"  # how each message of an ArduPilot log begins; others call files .bin too
 
 
 def is_log(file: Path) -> bool:
-    """Whether a file is a ROS bag (ROS 2: also its folder) or a PX4 log."""
-    return file.suffix.lower() in (*BAGS, *PX4) or (file / "metadata.yaml").is_file()
+    """Whether a file is a ROS bag (ROS 2: also its folder), a PX4 log or an ArduPilot log."""
+    suffix = file.suffix.lower()
+    if suffix in ARDUPILOT and file.is_file():
+        with file.open("rb") as stream:
+            return stream.read(2) == _DATAFLASH
+    known = (*BAGS, *PX4, *ARDUPILOT)
+    return suffix in known or (file / "metadata.yaml").is_file()
 
 
 def file_and_topics(path: str | os.PathLike[str]) -> tuple[Path, tuple[str, ...]]:

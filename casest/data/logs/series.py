@@ -19,6 +19,7 @@ Times = NDArray[np.int64]
 Array = NDArray[np.float64]
 
 _LISTED = 40  # topics that an error names
+_TURN = {"deg": 360.0, "rad": 2 * np.pi}  # units in which an angle may jump by a whole turn
 _GAP = 5.0  # times the median step: across more than that nothing is interpolated
 
 
@@ -159,8 +160,26 @@ def _at(series: Series, time: Times) -> list[Column]:
             columns.append(_checked(column, column.values[before]))
             continue
         values = np.asarray(column.values, dtype=np.float64) * signs.get(column.name, 1.0)
-        columns.append(_checked(column, values[before] * (1 - share) + values[after] * share))
+        first, last = values[before], values[after]
+        if turn := _TURN.get(column.unit or ""):
+            last = _short_way(values, first, last, turn)
+        columns.append(_checked(column, _folded(first * (1 - share) + last * share, values, turn)))
     return _unit_length(columns, signs)
+
+
+def _short_way(values: Array, first: Array, last: Array, turn: float) -> Array:
+    """The second angle, whole turns away from what is written: from 359 to 1 degrees are 2."""
+    if np.nanmax(values) - np.nanmin(values) > turn * 1.001:
+        return last  # it counts its turns itself
+    return last - turn * np.round((last - first) / turn)
+
+
+def _folded(angle: Array, values: Array, turn: float | None) -> Array:
+    """An angle within the turn in which the log writes it: from 0, or from minus a half."""
+    if turn is None or np.nanmax(values) - np.nanmin(values) > turn * 1.001:
+        return angle
+    low, high = float(np.nanmin(values)), float(np.nanmax(values))
+    return np.where(angle > high, angle - turn, np.where(angle < low, angle + turn, angle))
 
 
 def _checked(column: Column, values: Array | NDArray[np.str_]) -> Column:
