@@ -320,3 +320,37 @@ def drone(
     directions = np.einsum("nji,j->ni", soft_turning(n, rate, rng), down)
     v = sensor.read(directions, sigma, rng) + np.outer(current, per_ampere)
     return np.arange(n) / rate, v, current
+
+
+# -- a thermistor that lags behind its reference ---------------------------------------------------
+
+
+def chamber(n: int, step: float, rng: np.random.Generator) -> Array:
+    """Temperature (n,) of a climate chamber in K, one reading every `step` s.
+
+    Its controller holds settings of a few minutes each; the air follows with 40 s, and breathes.
+    """
+    t = np.arange(n) * step
+    changes = np.cumsum(rng.uniform(120, 400, int(n * step / 120) + 2))
+    settings = rng.uniform(278, 333, len(changes) + 1)
+    air, found = settings[0], np.empty(n)
+    for k in range(n):
+        air += (1 - np.exp(-step / 40)) * (settings[np.searchsorted(changes, t[k])] - air)
+        found[k] = air
+    return found + 0.3 * np.sin(2 * np.pi * t / rng.uniform(60, 200) + rng.uniform(0, 2 * np.pi))
+
+
+def thermistor(
+    reference: Array, step: float, lag: float, rng: np.random.Generator, noise: float = 0.05
+) -> Array:
+    """Resistance (n,) of a thermistor whose own temperature follows with `lag` s, by integration.
+
+    Beta equation with 10 kΩ at 25 °C and B = 3435 K; `noise` in K.
+    """
+    own, body = np.empty(len(reference)), reference[0]
+    for k, now in enumerate(reference):
+        for part in np.linspace(reference[max(k - 1, 0)], now, 20):  # explicit Euler
+            body += (part - body) * step / 20 / lag if lag else 0.0
+        own[k] = body if lag else now
+    seen = own + noise * rng.standard_normal(len(own))
+    return 10_000 * np.exp(3435 * (1 / seen - 1 / 298.15))
