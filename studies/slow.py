@@ -1,6 +1,6 @@
 """Does `calibrate` see a slow course in its residual, and only where there is one?
 
-    make study-slow                     # some eight minutes on one core
+    make study-slow                     # some six minutes on one core
     python studies/slow.py --worlds 30  # fewer records of each kind
 
 Two sensors from the independent simulators of the tests: a thermistor that lags behind its

@@ -9,7 +9,19 @@ import numpy as np
 import pytest
 import simulators as sim
 
-from casest import Residual, Run, attempt, close, effect, model, norm_2, param, quantity, signal
+from casest import (
+    Residual,
+    Run,
+    attempt,
+    close,
+    effect,
+    load_runs,
+    model,
+    norm_2,
+    param,
+    quantity,
+    signal,
+)
 from casest.diagnose.misfit.dependence import variables
 from casest.effects import CATALOGUE
 from casest.leastsquares.problem import Problem
@@ -100,6 +112,29 @@ def test_effects_on_reading_and_corrected_value_act_together():
                   "stretched.k": np.full(3, -0.3)}  # fmt: skip
         r = residuals(declared, {"v": v}, values)[:, 0]
         assert np.std(r) == pytest.approx(SIGMA, rel=4 / np.sqrt(2 * n))
+
+
+@model
+def warm(v=signal(3, "uT"), temperature=signal("K"), *, offset=param(3, "uT"), size=param("uT")):
+    """The body does not read the temperature that was recorded beside it."""
+    corrected = quantity("corrected", v - offset, "uT")
+    return Residual(implicit=norm_2(corrected) - size, unit="uT", corrected=corrected)
+
+
+@effect(on="corrected")
+def warming(c, temperature, *, k=param("1/K")):
+    """A gain that follows temperature."""
+    return c * (1 + k * temperature)
+
+
+def test_a_signal_that_only_an_effect_reads_is_as_exact_as_a_column():
+    rng, n = np.random.default_rng(9), 20_000
+    heat = rng.uniform(-20, 20, n)
+    v = 48 * sim.sphere(n, rng) / (1 + 0.02 * heat)[:, None] + SIGMA * rng.standard_normal((n, 3))
+    values = {"offset": np.zeros(3), "size": 48.0, "warming.k": 0.02}
+    r = residuals(warm.with_effect(warming), {"v": v, "temperature": heat}, values)[:, 0]
+    for part in np.array_split(np.argsort(heat), 4):
+        assert np.std(r[part]) == pytest.approx(SIGMA, rel=4 / np.sqrt(2 * len(part)))
 
 
 # -- what cannot be told apart stays so --------------------------------------------------------
@@ -231,3 +266,13 @@ def test_what_a_residual_is_compared_with_does_not_hold_its_noise():
     assert len(found) == 3
     for each in found:
         assert abs(np.corrcoef(each.values[0], r)[0, 1]) < 4 / np.sqrt(n)
+
+
+def test_a_response_that_only_contracts_the_noise_of_a_measured_record_gains_nothing(shared_data):
+    """Undivided, k·u·|u| lowered this magnetometer's residual by 10 %, with slopes of 0.83."""
+    declared = norm_triangular.having(norm=1.0)
+    path = shared_data / "qmc5883l-tomisuarez" / "filtered_raw_data.csv"
+    runs = load_runs([path], declared.signals, columns={"v": ("mx", "my", "mz")}, rate=50)
+    before = attempt(declared, runs)
+    after = attempt(along(declared, "signed_quadratic"), runs)
+    assert 0.99 * before.rmse < after.rmse <= before.rmse

@@ -14,12 +14,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import pairwise
 
 import casadi as ca
 
 from casest.declaration.physics import SX
-from casest.declaration.tracing import Declared, Traced, flat, reading_symbol
+from casest.declaration.tracing import Declared, Traced, flat, reached_signals, reading_symbol
 
 #: The slope is taken to fall to this share of the declared one, at most: a residual that no longer
 #: sees its reading (beyond saturation) stays finite.
@@ -36,21 +35,21 @@ def sampson(model: Declared, traced: Traced, straight: Traced) -> Traced:
     reading = reading_symbol(model, straight)
     if not any(ca.depends_on(ca.vec(change), reading) for _, change in straight.steps):
         return traced
-    sizes = [s.size for s in model.readings]
-    own = _squares(ca.jacobian(straight.expression, reading), sizes)
+    # A signal that the body does not read, and an effect does, is exact like a column.
+    seen = reached_signals(model, straight, straight.expression)
+    names = [s.name for s in model.readings if s.name in seen]
+    own = _squares(straight, names)
     for step, change in reversed(straight.steps):
-        own = ca.substitute(own, ca.vec(step), ca.vec(change))
+        own = ca.substitute(own, ca.vec(step), ca.densify(ca.vec(change)))
     own = ca.substitute(own, _symbols(model, straight), _symbols(model, traced))
-    changed = _squares(ca.jacobian(traced.expression, reading_symbol(model, traced)), sizes)
-    factor = _ratio(own, changed)
+    factor = _ratio(own, _squares(traced, names))
     return replace(traced, expression=ca.densify(traced.expression * factor))
 
 
-def _squares(slope: SX, sizes: Sequence[int]) -> SX:
-    """Squared length of every residual's slope in each signal, (m, signals)."""
-    ends = [sum(sizes[:k]) for k in range(len(sizes) + 1)]
-    parts = [ca.sum2(slope[:, a:b] ** 2) for a, b in pairwise(ends)]
-    return ca.densify(ca.horzcat(*parts))
+def _squares(traced: Traced, names: Sequence[str]) -> SX:
+    """Squared length of every residual's slope in each of these signals, (m, signals)."""
+    slopes = [ca.jacobian(traced.expression, flat(traced.symbols[name])) for name in names]
+    return ca.densify(ca.horzcat(*[ca.sum2(slope**2) for slope in slopes]))
 
 
 def _ratio(own: SX, changed: SX) -> SX:
