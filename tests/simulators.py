@@ -265,3 +265,92 @@ def table_readings(
     bent = force + quadratic * force**2 + bias
     noise = sigma * rng.standard_normal(force.shape)
     return np.linalg.solve(inverse_scale, bent.T).T + noise, force
+
+
+# -- a magnetometer beside a motor -----------------------------------------------------------------
+
+
+def soft_turning(n: int, rate: float, rng: np.random.Generator) -> Array:
+    """Rotations (n, 3, 3) of a body that is turned softly about all axes, by integration.
+
+    Each component of its angular rate is a sum of four slow waves, up to 2 rad/s together.
+    """
+    from scipy.spatial.transform import Rotation
+
+    t = np.arange(n) / rate
+    rates = np.zeros((n, 3))
+    for axis in range(3):
+        for _ in range(4):
+            frequency, phase = rng.uniform(0.02, 0.2), rng.uniform(0, 2 * np.pi)
+            rates[:, axis] += rng.uniform(0.2, 0.5) * np.sin(2 * np.pi * frequency * t + phase)
+    turned = np.empty((n, 3, 3))
+    turned[0] = random_rotation(rng)
+    for k, step in enumerate(Rotation.from_rotvec(rates[:-1] / rate).as_matrix()):
+        turned[k + 1] = turned[k] @ step
+    return turned
+
+
+def motor_current(n: int, rate: float, rng: np.random.Generator) -> Array:
+    """Current (n,) of a drone's motors in A: idle, take-off, hover, bursts, landing, with ripple.
+
+    The battery and the rotors answer with a time constant of 0.3 s.
+    """
+    edges = np.sort(rng.uniform(0.1, 0.9, 6))
+    levels = [1.0, rng.uniform(22, 28), *rng.uniform(12, 20, 4), 1.5]
+    demand = np.asarray(levels)[np.searchsorted(edges, np.arange(n) / n)]
+    found, state, share = np.empty(n), demand[0], 1 - np.exp(-1 / (0.3 * rate))
+    for k in range(n):
+        state += share * (demand[k] * (1 + 0.06 * rng.standard_normal()) - state)
+        found[k] = state
+    wave = np.sin(2 * np.pi * rng.uniform(0.5, 3) * np.arange(n) / rate)
+    return found * (1 + 0.03 * wave) + 0.05 * rng.standard_normal(n)
+
+
+def drone(
+    sensor: Sensor,
+    per_ampere: Array,
+    sigma: float,
+    rng: np.random.Generator,
+    n: int = 4000,
+    rate: float = 50.0,
+) -> tuple[Array, Array, Array]:
+    """(t, readings (n, 3), current): the motor's current moves the offset by per_ampere each A."""
+    current = motor_current(n, rate, rng)
+    down = np.array([0.4, 0.1, np.sqrt(1 - 0.17)])
+    directions = np.einsum("nji,j->ni", soft_turning(n, rate, rng), down)
+    v = sensor.read(directions, sigma, rng) + np.outer(current, per_ampere)
+    return np.arange(n) / rate, v, current
+
+
+# -- a thermistor that lags behind its reference ---------------------------------------------------
+
+
+def chamber(n: int, step: float, rng: np.random.Generator) -> Array:
+    """Temperature (n,) of a climate chamber in K, one reading every `step` s.
+
+    Its controller holds settings of a few minutes each; the air follows with 40 s, and breathes.
+    """
+    t = np.arange(n) * step
+    changes = np.cumsum(rng.uniform(120, 400, int(n * step / 120) + 2))
+    settings = rng.uniform(278, 333, len(changes) + 1)
+    air, found = settings[0], np.empty(n)
+    for k in range(n):
+        air += (1 - np.exp(-step / 40)) * (settings[np.searchsorted(changes, t[k])] - air)
+        found[k] = air
+    return found + 0.3 * np.sin(2 * np.pi * t / rng.uniform(60, 200) + rng.uniform(0, 2 * np.pi))
+
+
+def thermistor(
+    reference: Array, step: float, lag: float, rng: np.random.Generator, noise: float = 0.05
+) -> Array:
+    """Resistance (n,) of a thermistor whose own temperature follows with `lag` s, by integration.
+
+    Beta equation with 10 kΩ at 25 °C and B = 3435 K; `noise` in K.
+    """
+    own, body = np.empty(len(reference)), reference[0]
+    for k, now in enumerate(reference):
+        for part in np.linspace(reference[max(k - 1, 0)], now, 20):  # explicit Euler
+            body += (part - body) * step / 20 / lag if lag else 0.0
+        own[k] = body if lag else now
+    seen = own + noise * rng.standard_normal(len(own))
+    return 10_000 * np.exp(3435 * (1 / seen - 1 / 298.15))

@@ -326,6 +326,45 @@ def test_a_sensor_that_is_never_turned_is_told_so():
     assert "never leave one orientation" in remarked("norm-diagonal", lambda rng: still)
 
 
+@pytest.mark.parametrize("zero", [0.0, 32768.0])
+@pytest.mark.parametrize("rounded", [False, True])
+def test_raw_counts_that_only_scatter_are_of_one_orientation_wherever_their_zero_is(zero, rounded):
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        v = zero + 415 * np.array([0.3, -0.5, 0.8]) + (0.4 if rounded else 8) * (
+            rng.standard_normal((2000, 3))
+        )  # fmt: skip
+        runs = (Run.raw("r", {"v": np.round(v) if rounded else v}, units={"v": "count"}),)
+        said = remarks(model_of("norm-triangular", 1.0), runs, {})
+        assert said[:1] == ["the readings never leave one orientation: turn the sensor"]
+
+
+@pytest.mark.parametrize("zero", [0.0, 32768.0])
+@pytest.mark.parametrize("gains", [(415, 413, 415), (415, 200, 300)])
+def test_raw_counts_of_spread_poses_are_of_many_orientations_wherever_their_zero_is(zero, gains):
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        v = zero + 9.8 * sim.spread_poses(24, rng) * gains + rng.standard_normal((24, 3))
+        runs = (Run.raw("r", {"v": np.round(v)}, units={"v": "count"}),)
+        assert remarks(model_of("norm-triangular", 1.0), runs, {}) == []
+
+
+def test_a_sensor_that_sways_by_three_degrees_is_not_turned_where_its_unit_is_known():
+    said = remarked("norm-triangular", lambda rng: sim.cap(500, rng, np.radians(3)), 0.05)
+    assert "never leave one orientation" in said
+
+
+def test_the_counts_of_a_measured_record_are_of_many_orientations(shared_data):
+    """36 positions by hand of an Xsens MTi; its zero is near 32 768, g is 4070 counts."""
+    v = np.loadtxt(shared_data / "xsens-imutk" / "xsens_acc.mat")[:, 1:]
+    norm_of = model_of("norm-triangular", 1.0)
+    for shift in (0.0, -32768.0):
+        runs = (Run.raw("xsens", {"v": v + shift}, units={"v": "count"}),)
+        assert remarks(norm_of, runs, {}) == []
+        at_rest = (Run.raw("xsens", {"v": v[:4000] + shift}, units={"v": "count"}),)
+        assert "never leave one orientation" in remarks(norm_of, at_rest, {})[0]
+
+
 def test_readings_ten_times_a_norm_that_nobody_set_are_metres_per_second_squared():
     said = remarked("norm-diagonal", lambda rng: sim.spread_poses(24, rng), unit=None, norm=1.0)
     assert "if they are in m/s^2, say --unit v=m/s^2 --set 'norm=9.80665 m/s^2'" in said

@@ -22,7 +22,7 @@ from casest.declaration.effect import Attached
 from casest.declaration.model import Model
 from casest.declaration.symbols import Constant, param
 from casest.declaration.temperatures import Zero, followed, of_symbol, refuse_other_zero
-from casest.declaration.tracing import function_of
+from casest.declaration.tracing import function_of, trace
 from casest.engine.operations import Operation, Powers, Units, operation_of
 from casest.errors import UnitError
 
@@ -64,7 +64,7 @@ def check_units(model: Model) -> None:
     for fixed in model.constants:  # plain numbers would lose their units in the expression
         open_model = open_model.freed(fixed.name)
     open_model = replace(open_model, effects=tuple(map(_open, open_model.effects)))
-    traced = open_model.traced
+    traced = trace(open_model)  # what effects do to the noise is no part of the body
     outputs = {q.name: ca.vec(q.value) for q in traced.quantities.values()}
     if traced.predicted is None:
         outputs["residual"] = traced.expression

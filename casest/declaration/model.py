@@ -18,6 +18,7 @@ from casest.declaration.changing import (
 )
 from casest.declaration.effect import NOISE, Attached, Effect, Kind, attach, check_null
 from casest.declaration.physics import Quantity, Residual
+from casest.declaration.sampson import sampson
 from casest.declaration.shapes import Array
 from casest.declaration.symbols import Constant, Parameter, Scope, Signal, Symbol, constant, named
 from casest.declaration.tracing import Traced, describe, function_of, reached_parameters, trace
@@ -75,6 +76,15 @@ class Model:
     def constants(self) -> tuple[Constant, ...]:
         """Plain numbers of the model."""
         return tuple(c for c in self.declared if isinstance(c, Constant))
+
+    @property
+    def readings(self) -> tuple[Signal, ...]:
+        """Signals of the body that carry noise: all but time and attitude, which are exact.
+
+        All of them where there is nothing else.
+        """
+        own = [s for s in self.declared if isinstance(s, Signal)]
+        return tuple([s for s in own if s.name != "t" and s.kind == "plain"] or own)
 
     @property
     def quantities(self) -> Mapping[str, Quantity]:
@@ -326,7 +336,11 @@ class Model:
     @cached_property
     def traced(self) -> Traced:
         """The body in CasADi symbols, with every effect in place."""
-        return trace(self)
+        found = trace(self)
+        acting = any(a.kind in ("quantity", "signal") for a in self.effects)
+        if found.residual.implicit is None or not acting:
+            return found
+        return sampson(self, found, trace(self, straight=True))
 
     # -- numbers -------------------------------------------------------------------------------
 

@@ -42,14 +42,20 @@ class Quantity:
 
 @dataclass
 class Trace:
-    """One run of a model's body; collects the quantities and lets effects and cuts in."""
+    """One run of a model's body; collects the quantities and lets effects and cuts in.
+
+    `straight`: what an effect does is added as a free symbol, so that slopes pass it as they are;
+    `steps` holds each symbol and what it stands for, which may contain those before it.
+    """
 
     effects: dict[str, list[Any]] = field(default_factory=dict)
     cut: str | None = None
     naming: bool = False
+    straight: bool = False
     reserved: frozenset[str] = frozenset()
     quantities: dict[str, Quantity] = field(default_factory=dict)
     handed: dict[str, SX] = field(default_factory=dict)
+    steps: list[tuple[SX, SX]] = field(default_factory=list)
 
     def enter(self, name: str, expression: Any, unit: str, *, implied: bool = False) -> SX:
         """Record a quantity and hand back what the rest of the body shall see."""
@@ -62,10 +68,18 @@ class Trace:
             declared = ca.SX.sym(name, *declared.shape)
         value = declared
         for apply in self.effects.get(name, ()):
-            value = apply(value)
+            value = self.passed(value, apply(value))
         self.quantities[name] = Quantity(name, unit, declared, value, implied)
         self.handed[name] = ca.SX.sym(name, *declared.shape) if self.naming else value
         return self.handed[name]
+
+    def passed(self, before: SX, after: SX) -> SX:
+        """What an effect hands on."""
+        if not self.straight:
+            return after
+        step = ca.SX.sym("step", *before.shape)
+        self.steps.append((step, after - before))
+        return before + step
 
 
 current_trace: ContextVar[Trace | None] = ContextVar("current_trace", default=None)

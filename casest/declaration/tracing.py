@@ -48,6 +48,10 @@ class Declared(Protocol):
         """What is measured, also by what the effects read."""
 
     @property
+    def readings(self) -> tuple[Signal, ...]:
+        """Those of the body's signals that carry noise."""
+
+    @property
     def parameters(self) -> tuple[Parameter, ...]:
         """Unknowns, also of the effects."""
 
@@ -83,16 +87,20 @@ class Traced:
     reading: SX
     measured: str | None
     corrected: str | None
+    steps: tuple[tuple[SX, SX], ...] = ()
 
 
-def trace(model: Declared, cut: str | None = None, naming: bool = False) -> Traced:
+def trace(
+    model: Declared, cut: str | None = None, naming: bool = False, straight: bool = False
+) -> Traced:
     """Run the model's body on symbols.
 
     `cut` replaces a quantity (before its effects) by a free symbol; `naming` replaces every
-    quantity by a symbol of its name after it is computed, for printing.
+    quantity by a symbol of its name after it is computed, for printing; `straight` puts a free
+    symbol in the place of what each effect adds, listed in `steps` with what it stands for.
     """
     symbols, coordinates, references = _symbols(model)
-    running = Trace(cut=cut, naming=naming, reserved=frozenset(symbols))
+    running = Trace(cut=cut, naming=naming, straight=straight, reserved=frozenset(symbols))
     for attached in model.effects:
         if attached.kind == "quantity":
             running.effects.setdefault(attached.on, []).append(_applied(attached, symbols, running))
@@ -121,8 +129,8 @@ def trace(model: Declared, cut: str | None = None, naming: bool = False) -> Trac
     # What is substituted last acts first: so that the first effect added does, go backwards.
     for attached in reversed(on_signals):
         if attached.on != traced.measured:
-            traced = _with_signal_effect(traced, attached)
-    return traced
+            traced = _with_signal_effect(traced, attached, running)
+    return replace(traced, steps=tuple(running.steps))
 
 
 def _symbols(model: Declared) -> tuple[dict[str, SX], list[SX], list[SX]]:
@@ -212,15 +220,18 @@ def _with_changed_reading(traced: Traced, attached: Attached) -> Traced:
     return replace(traced, reading=changed, expression=changed - traced.predicted)
 
 
-def _with_signal_effect(traced: Traced, attached: Attached) -> Traced:
+def _with_signal_effect(traced: Traced, attached: Attached, running: Trace) -> Traced:
     """Effects on a signal act after the body, because der(…, t) needs the bare symbol."""
     symbol = traced.symbols[attached.on]
-    changed = flat(ca.SX(attached.apply(symbol, traced.symbols)))
     plain = flat(symbol)
+    changed = running.passed(plain, flat(ca.SX(attached.apply(symbol, traced.symbols))))
 
     def late(expression: SX) -> SX:
         return ca.substitute(expression, plain, changed)
 
+    if running.straight:  # what was there before reads the signal as it has become
+        *others, own = running.steps
+        running.steps = [own, *((step, late(change)) for step, change in others)]
     quantities = {
         name: replace(q, declared=late(q.declared), value=late(q.value))
         for name, q in traced.quantities.items()
@@ -277,6 +288,12 @@ def sample_symbol(model: Declared, traced: Traced | None = None) -> SX:
     """All signals of one sample as one column, in the order in which data hold them."""
     symbols = (traced or model.traced).symbols
     return ca.vertcat(*[flat(symbols[s.name]) for s in model.signals])
+
+
+def reading_symbol(model: Declared, traced: Traced | None = None) -> SX:
+    """The signals of one sample that carry noise, as one column: those that effects read do not."""
+    symbols = (traced or model.traced).symbols
+    return ca.vertcat(*[flat(symbols[s.name]) for s in model.readings])
 
 
 def reached_parameters(model: Declared, traced: Traced, expression: SX) -> set[str]:

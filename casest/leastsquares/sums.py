@@ -145,17 +145,18 @@ def _signal_noise(problem: Problem, point: Point, sigma: float) -> Array:
 def repeat_noise(problem: Problem, point: Point) -> float | None:
     """Root mean square of the residual's noise that the scatter within rest intervals implies.
 
-    None where no signal carries a spread of its own.
+    None where no signal carries a spread of its own. What only effects read is exact.
     """
     if not any(run.spread for run in problem.runs):
         return None
     squares, count = 0.0, 0
+    declared = {s.name for s in problem.model.declared}
     for r, run in enumerate(problem.runs):
         G = slope_in_sample(problem.model)(problem.parameters(point, r), problem.samples[r])[0]
         first = 0
         for s in problem.model.signals:
             own, first = G[:, :, first : first + s.size], first + s.size
-            if s.name in run.spread:
+            if s.name in run.spread and s.name in declared:
                 squares += float(np.einsum("nmi,nij,nmj->", own, run.covariance(s.name), own))
         count += G.shape[0] * G.shape[1]
     return float(np.sqrt(squares / count))

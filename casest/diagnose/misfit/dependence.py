@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from casest.data.run import Run
 from casest.declaration.shapes import Array
-from casest.declaration.tracing import function_of, sample_symbol
+from casest.declaration.tracing import function_of, reading_symbol, sample_symbol
 from casest.diagnose.levels import CLIPPED, PIECE
 from casest.engine import Replay
 from casest.leastsquares.problem import Point, Problem
@@ -113,11 +113,14 @@ def _quantities(problem: Problem, point: Point) -> Iterator[Variable]:
 
 
 def _consistent(problem: Problem, value: Any) -> Any:
-    """A quantity with the reading moved the shortest way to a vanishing residual."""
-    sample, residual = sample_symbol(problem.model), problem.model.traced.expression
-    G = ca.jacobian(residual, sample)
+    """A quantity with the reading moved the shortest way to a vanishing residual.
+
+    What effects read stays: a recorded current is not in error by what the reading is.
+    """
+    reading, residual = reading_symbol(problem.model), problem.model.traced.expression
+    G = ca.jacobian(residual, reading)
     step = G.T @ ca.solve(G @ G.T, residual)
-    return value - ca.jacobian(value, sample) @ step
+    return value - ca.jacobian(value, reading) @ step
 
 
 def _distinct(found: Sequence[Variable]) -> list[Variable]:

@@ -70,12 +70,13 @@ def _between_rests(
 
 def _rest_variances(problem: Problem, point: Point) -> Iterator[Array]:
     """Variance (N, m) of each residual that the scatter within its rest interval implies."""
+    declared = {s.name for s in problem.model.declared}  # what only effects read is exact
     for r, run in enumerate(problem.runs):
         G = slope_in_sample(problem.model)(problem.parameters(point, r), problem.samples[r])[0]
         variance, first = np.zeros(G.shape[:2]), 0
         for s in problem.model.signals:
             own, first = G[:, :, first : first + s.size], first + s.size
-            if s.name in run.spread:
+            if s.name in run.spread and s.name in declared:
                 variance += np.einsum("nmi,nij,nmj->nm", own, run.covariance(s.name), own)
         yield variance
 
