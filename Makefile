@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: demo test lint types format wheel bench study study-starts study-nist study-loop \
+.PHONY: demo test lint types format wheel bench study study-starts study-nist study-loop study-coverage \
 	study-motion study-records study-asked figures docs clean
 
 demo: $(READY)
@@ -44,6 +44,9 @@ study-starts: $(READY)
 
 study-nist: $(READY)
 	$(BIN)/python studies/nist.py
+
+study-coverage: $(READY)
+	$(BIN)/python studies/coverage.py
 
 study-loop: $(READY)
 	$(BIN)/python studies/loop.py

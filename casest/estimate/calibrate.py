@@ -17,13 +17,12 @@ from casest.engine.threads import one_thread
 from casest.errors import DataError, NotTrusted, UsageError
 from casest.estimate.certificate import Certificate, certify
 from casest.estimate.correlation import ENOUGH, TABLE, correlation_time
-from casest.estimate.covariance import inverse_normal, sandwich
+from casest.estimate.covariance import covariance_of, inverse_normal, sandwich
 from casest.estimate.profile_likelihood import half_width
 from casest.estimate.remarks import NOTABLE_BIAS, notes
 from casest.leastsquares.identifiability import Identifiability, Weak, identify, weak_directions
 from casest.leastsquares.problem import Point, Problem
 from casest.leastsquares.sums import repeat_noise, second_order_bias
-from casest.leastsquares.weights import has_noise_effects, variance_factor
 from casest.solve.interrupt import stopped
 from casest.solve.outcome import Outcome
 from casest.solve.strategy import SOLVERS, best_of, solve, valleys
@@ -54,8 +53,8 @@ class Estimate:
     """Parameters by name with covariance, certificate, residuals.
 
     `values` and `std` have the parameters' shapes (a leading run axis for per-run ones if there
-    are several runs); `robust` is the standard deviation from the sandwich form, which `std` equals
-    where residuals are correlated over more than one sample. Both are taken at the least-squares
+    are several runs). `std` is `robust`, the sandwich form, where residuals are correlated over more
+    than one sample or are many for each unknown, else `plain`. All are taken at the least-squares
     `optimum`, where `point` is not it; `shift` (n, n) is what second-order noise adds, a
     bias of up to `bias` standard deviations.
     `covariance` (n, n) is of the unknowns `names`. Where the data do not determine a value its std
@@ -86,16 +85,26 @@ class Estimate:
         return self.problem.model
 
     @cached_property
+    def plain(self) -> Mapping[str, Array]:
+        """Standard deviations if the noise were alike everywhere and independent: σ²(JᵀJ)⁻¹."""
+        at = self.optimum or self.point
+        return self._spread(self.noise.sigma**2 * inverse_normal(self.problem.factor(at)[0]))
+
+    @cached_property
     def robust(self) -> Mapping[str, Array]:
         """Standard deviations from the sandwich form, shaped like `std`."""
         if self.identifiability.rank == 0:
             return self.std
         at = self.optimum or self.point
         R = self.problem.factor(at)[0]
-        covariance = sandwich(self.problem, at, R, self.correlated_over) + self.shift
+        return self._spread(sandwich(self.problem, at, R, self.correlated_over))
+
+    def _spread(self, covariance: Array) -> Mapping[str, Array]:
+        """Standard deviations by name; NaN where nothing is determined."""
+        covariance = covariance + self.shift
         unknown = self.identifiability.touched
         covariance[unknown, :] = covariance[:, unknown] = np.nan
-        return self.problem.spread(at, covariance)
+        return self.problem.spread(self.optimum or self.point, covariance)
 
     @cached_property
     def notes(self) -> tuple[str, ...]:
@@ -283,7 +292,7 @@ def _estimate(
     dof = problem.residual_count - identified.rank
     noise = _noise(problem, point, float(np.sqrt(2 * best.cost)), dof)
     correlated = correlation_time(problem, point)
-    covariance = _covariance(problem, point, R, noise.sigma, correlated)
+    covariance = covariance_of(problem, point, R, noise.sigma, correlated)
     bias = second_order_bias(problem, point, noise.sigma, inverse_normal(R))
     relative = float(np.max(np.abs(bias) / np.sqrt(np.diag(covariance)), initial=0.0))
     shift = np.outer(bias, bias) if relative > NOTABLE_BIAS else 0.0
@@ -411,16 +420,6 @@ def _judged(optimum: Estimate, point: Point, values: Mapping[str, Any], name: st
     if not abs(distance[worst]) <= 3:
         return replace(certificate, trusted=False, reasons=(far,))
     return replace(certificate, reasons=(far, *certificate.reasons))
-
-
-def _covariance(problem: Problem, point: Point, R: Array, sigma: float, correlated: float) -> Array:
-    """The covariance that is printed: plain, unless the noise is known to be otherwise."""
-    if has_noise_effects(problem.model):
-        plain = problem.with_weights(None)
-        return np.asarray(variance_factor(problem, point) * inverse_normal(plain.factor(point)[0]))
-    if correlated > 1:
-        return sandwich(problem, point, R, correlated)
-    return np.asarray(sigma**2 * inverse_normal(R))
 
 
 def _noise(problem: Problem, point: Point, length: float, dof: int) -> Noise:
