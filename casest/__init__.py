@@ -3,43 +3,122 @@
 from __future__ import annotations
 
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
 
-#: Where each public name lives. Modules are imported when first used: CasADi and NumPy are slow
-#: to start, and `casest --help` needs neither.
-_HOME = {
-    "casest.declaration.shapes": "diagonal each full lower rotation_matrix unit_vector",
-    "casest.declaration.symbols": "attitude constant param signal",
-    "casest.declaration.physics": (
-        "Residual acos asin atan atan2 cos cosh cross der diag dot exp fabs fmax fmin horzcat "
-        "if_else inf integral inverse log norm_2 pi polynomial quantity rotation sign sin sinh "
-        "skew sqrt sum1 tan tanh vertcat"
-    ),
-    "casest.declaration.dimensions": "check_units",
-    "casest.declaration.effect": "Effect effect",
-    "casest.declaration.model": "Model model",
-    "casest.data.run": "Run",
-    "casest.data": "load_runs read_table",
-    "casest.errors": ("CasestError DataError DeclarationError NotTrusted UnitError UsageError"),
-    "casest.estimate.calibrate": "Estimate attempt calibrate",
-    "casest.fleet.calibrate_many": "Batch calibrate_many",
-    "casest.diagnose.closing": "Closing",
-    "casest.diagnose.loop": "close",
-    "casest.diagnose.motion.loop": "MotionClosing close_motion",
-    "casest.correction.inverse": "Correction",
-}
-_WHERE = {name: module for module, names in _HOME.items() for name in names.split()}
+# The one list of public names. A type checker reads it as it stands; at run time a name's module
+# is imported when the name is first used, and which one that is, is read from these same lines:
+# CasADi and NumPy are slow to start, and `casest --help` needs neither.
+if TYPE_CHECKING:
+    from casest.correction.inverse import Correction as Correction
+    from casest.data import load_runs as load_runs
+    from casest.data import read_table as read_table
+    from casest.data.run import Run as Run
+    from casest.declaration.dimensions import check_units as check_units
+    from casest.declaration.effect import Effect as Effect
+    from casest.declaration.effect import effect as effect
+    from casest.declaration.model import Model as Model
+    from casest.declaration.model import model as model
+    from casest.declaration.physics import Residual as Residual
+    from casest.declaration.physics import acos as acos
+    from casest.declaration.physics import asin as asin
+    from casest.declaration.physics import atan as atan
+    from casest.declaration.physics import atan2 as atan2
+    from casest.declaration.physics import cos as cos
+    from casest.declaration.physics import cosh as cosh
+    from casest.declaration.physics import cross as cross
+    from casest.declaration.physics import der as der
+    from casest.declaration.physics import diag as diag
+    from casest.declaration.physics import dot as dot
+    from casest.declaration.physics import exp as exp
+    from casest.declaration.physics import fabs as fabs
+    from casest.declaration.physics import fmax as fmax
+    from casest.declaration.physics import fmin as fmin
+    from casest.declaration.physics import horzcat as horzcat
+    from casest.declaration.physics import if_else as if_else
+    from casest.declaration.physics import inf as inf
+    from casest.declaration.physics import integral as integral
+    from casest.declaration.physics import inverse as inverse
+    from casest.declaration.physics import log as log
+    from casest.declaration.physics import norm_2 as norm_2
+    from casest.declaration.physics import pi as pi
+    from casest.declaration.physics import polynomial as polynomial
+    from casest.declaration.physics import quantity as quantity
+    from casest.declaration.physics import rotation as rotation
+    from casest.declaration.physics import sign as sign
+    from casest.declaration.physics import sin as sin
+    from casest.declaration.physics import sinh as sinh
+    from casest.declaration.physics import skew as skew
+    from casest.declaration.physics import sqrt as sqrt
+    from casest.declaration.physics import sum1 as sum1
+    from casest.declaration.physics import tan as tan
+    from casest.declaration.physics import tanh as tanh
+    from casest.declaration.physics import vertcat as vertcat
+    from casest.declaration.shapes import diagonal as diagonal
+    from casest.declaration.shapes import each as each
+    from casest.declaration.shapes import full as full
+    from casest.declaration.shapes import lower as lower
+    from casest.declaration.shapes import rotation_matrix as rotation_matrix
+    from casest.declaration.shapes import unit_vector as unit_vector
+    from casest.declaration.symbols import attitude as attitude
+    from casest.declaration.symbols import constant as constant
+    from casest.declaration.symbols import param as param
+    from casest.declaration.symbols import signal as signal
+    from casest.diagnose.closing import Closing as Closing
+    from casest.diagnose.loop import close as close
+    from casest.diagnose.motion.loop import MotionClosing as MotionClosing
+    from casest.diagnose.motion.loop import close_motion as close_motion
+    from casest.errors import CasestError as CasestError
+    from casest.errors import DataError as DataError
+    from casest.errors import DeclarationError as DeclarationError
+    from casest.errors import NotTrusted as NotTrusted
+    from casest.errors import UnitError as UnitError
+    from casest.errors import UsageError as UsageError
+    from casest.estimate.calibrate import Estimate as Estimate
+    from casest.estimate.calibrate import attempt as attempt
+    from casest.estimate.calibrate import calibrate as calibrate
+    from casest.fleet.calibrate_many import Batch as Batch
+    from casest.fleet.calibrate_many import calibrate_many as calibrate_many
 
-__all__ = ["__version__", *sorted(_WHERE)]
+
+def _homes() -> dict[str, str]:
+    """The module of each public name, from the imports above as the loader has their source."""
+    import ast
+
+    source = getattr(__spec__.loader, "get_source", lambda name: None)(__name__)
+    if source is None:
+        raise ImportError(
+            "casest/__init__.py was installed without its source, which says where casest's names "
+            "are: install casest with its .py files"
+        )
+    block = next(node for node in ast.parse(source).body if isinstance(node, ast.If))
+    return {
+        alias.name: node.module
+        for node in block.body
+        if isinstance(node, ast.ImportFrom) and node.module
+        for alias in node.names
+    }
 
 
-def __getattr__(name: str) -> Any:
-    if name not in _WHERE:
+_HOMES: dict[str, str] = {}
+
+
+def _public(name: str) -> Any:
+    """What a public name stands for; its module is imported now."""
+    if not _HOMES:
+        _HOMES.update(_homes())
+    if name == "__all__":
+        return ["__version__", *sorted(_HOMES)]
+    if name not in _HOMES:
         raise AttributeError(f"casest has no {name!r}")
-    return getattr(import_module(_WHERE[name]), name)
+    return getattr(import_module(_HOMES[name]), name)
 
 
-def __dir__() -> list[str]:
-    return __all__
+if not TYPE_CHECKING:  # a type checker would take any name for one that is there
+
+    def __getattr__(name):
+        return _public(name)
+
+    def __dir__():
+        return _public("__all__")

@@ -18,8 +18,8 @@ ranks = {}
 for name, omega in turns.items():
     signals = {"a": np.tile([0.0, 0.0, -9.81], (len(t), 1)), "omega": omega, "v": 0 * omega}
     seen = observe_motion(bias_gravity, c.Run.raw(name, signals, units=units, time=t))
-    ranks[name] = seen["rank"]
-    print(f"{name}: rank {seen['rank']} of {seen['unknowns']}", *seen["unobservable"], sep="\n  ")
+    ranks[name] = seen.rank
+    print(f"{name}: rank {seen.rank} of {seen.unknowns}", *seen.unobservable, sep="\n  ")
 
 # Batista et al., theorems 1 and 2.
 assert ranks == {"straight": 6, "about one axis": 8, "about all axes": 9}

@@ -45,9 +45,9 @@ def names(closing):
 def test_a_flight_that_lacks_nothing_is_adequate():
     closing = close_motion(bias_gravity, flight(seed=1))
     assert names(closing) == []
-    content = motion_result(closing, model_name="bias-gravity", data=[])
-    assert content["verdict"] == "adequate"
-    assert content["before"]["rmse_holdout"] == content["after"]["rmse_holdout"]
+    result = motion_result(closing, model_name="bias-gravity", data=[])
+    assert result.verdict == "adequate"
+    assert result.before.rmse_holdout == result.after.rmse_holdout
 
 
 @pytest.mark.parametrize(
@@ -81,9 +81,9 @@ def test_a_planted_effect_is_found_and_named_with_its_size(sensors, label, plant
 def test_coloured_noise_becomes_a_state_and_nothing_else_is_named():
     closing = close_motion(bias_gravity, flight(Sensors(colour=0.5, coloured=0.03), seed=4))
     assert names(closing) == ["coloured_noise of v"]
-    (effect,) = motion_result(closing, model_name="bias-gravity", data=[])["effects"]
-    assert 0.2 < effect["parameters"]["correlation_time"]["value"] < 1.2
-    assert 0.015 < effect["parameters"]["std"]["value"] < 0.06
+    (effect,) = motion_result(closing, model_name="bias-gravity", data=[]).effects
+    assert 0.2 < effect.parameters["correlation_time"].value < 1.2
+    assert 0.015 < effect.parameters["std"].value < 0.06
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,8 @@ from casest.cli import run
 from casest.comparison.judge import SOLVERS, compare
 from casest.leastsquares.problem import Problem
 from casest.report.picture import draw
-from casest.report.text.comparison import comparison_result, comparison_text
+from casest.report.text.comparison import comparison_text
+from casest.results.comparison import comparison_result
 from casest.results.find import find_model
 from casest.solve import others
 from casest.solve.trust_region import trust_region
@@ -61,6 +62,10 @@ def poses():
 @pytest.fixture(scope="module")
 def waves():
     return compare(wave, [wave_run()], starts=6, sizes=(0.3,))
+
+
+def told(found):
+    return comparison_text(comparison_result(found, model_name="wave", data=["a.csv"]))
 
 
 def row(found, name):
@@ -185,7 +190,7 @@ def test_an_optimum_that_is_reported_as_a_failure_is_a_false_failure(monkeypatch
     found = compare(wave, [wave_run()], starts=3, sizes=(1e-3,), solvers=["modest"])
     own = row(found, "modest")
     assert (own.right, own.claimed, own.false_successes, own.false_failures) == (3, 0, 0, 3)
-    assert "modest: not sure" in comparison_text(found, ["a.csv"])
+    assert "modest: not sure" in told(found)
 
 
 def test_a_lower_cost_than_the_certified_one_is_told(monkeypatch):
@@ -204,7 +209,7 @@ def test_a_lower_cost_than_the_certified_one_is_told(monkeypatch):
     assert not found.certified
     assert found.best_by == "trust-region"
     assert row(found, "trust-region").first.right
-    text = comparison_text(found, ["a.csv"])
+    text = told(found)
     assert "NO CERTIFIED OPTIMUM" in text
     assert "found a lower cost than the certified fit" in text
 
@@ -219,9 +224,7 @@ def test_a_solver_that_leaves_the_bounds_is_not_right():
     assert lm.status.startswith("left the bounds")
     assert trf.inside
     assert not found.certified
-    assert "the fit is refused: `k` ended on its bound" in " ".join(
-        comparison_text(found, ["a.csv"]).split()
-    )
+    assert "the fit is refused: `k` ended on its bound" in " ".join(told(found).split())
 
 
 def test_equal_seeds_give_equal_starts(waves):
@@ -244,8 +247,8 @@ def test_an_exception_becomes_a_row_with_its_first_line(monkeypatch):
     own = row(found, "broken")
     assert own.first.status == "RuntimeError: plugin 'snopt' not found"
     assert (own.right, own.claimed, own.false_successes) == (0, 0, 0)
-    assert "  - broken: RuntimeError: plugin 'snopt' not found" in comparison_text(found, ["a"])
-    json.dumps(comparison_result(found, model_name="wave", data=["a"]), allow_nan=False)
+    assert "  - broken: RuntimeError: plugin 'snopt' not found" in told(found)
+    json.dumps(comparison_result(found, model_name="wave", data=["a"]).content(), allow_nan=False)
 
 
 @pytest.mark.parametrize("name", ["ipopt", "sqpmethod", "trust-region", "scipy-lm"])
@@ -280,7 +283,7 @@ def test_ctrl_c_inside_a_solver_ends_with_what_is_done(name, monkeypatch):
     assert (found.done, found.planned) == (2, 5)
     assert row(found, name).first.right
     assert signal.getsignal(signal.SIGINT) is before
-    assert "interrupted after 2 of 5 runs" in comparison_text(found, ["a.csv"])
+    assert "interrupted after 2 of 5 runs" in told(found)
 
 
 def test_without_a_finite_start_there_is_nothing_to_compare():
@@ -400,4 +403,4 @@ def test_an_interrupted_command_is_exit_code_2(record, capsys, monkeypatch):
 def test_a_plot_without_a_folder_is_named(poses, tmp_path):
     pytest.importorskip("matplotlib")
     with pytest.raises(casest.DataError, match="no plot can be written"):
-        draw(poses, tmp_path / "nowhere")
+        draw(comparison_result(poses, model_name="norm", data=[]), tmp_path / "nowhere")

@@ -68,10 +68,10 @@ def test_two_effects_of_one_column_on_a_prediction_without_a_name_are_both_found
         away = closing.after.values[name] - truth
         assert abs(away) < 4 * closing.after.std[name]
     assert closing.after.rmse == pytest.approx(1e-3, rel=0.15)
-    content = closing_result(closing, model_name="cell.py", data=())
-    for e in content["effects"]:  # what is added as well is no rival
+    # What is added as well is no rival.
+    for e in closing_result(closing, model_name="cell.py", data=()).effects:
         assert not {"temperature_bias(temp)", "temperature_gain(temp)"} & {
-            *e["indistinguishable_from"], *e["less_likely"],
+            *e.indistinguishable_from, *e.less_likely,
         }  # fmt: skip
 
 

@@ -156,10 +156,10 @@ def test_it_is_said_since_when_a_trajectory_tells_everything():
     """Straight on for 30 s, then it turns about changing axes."""
     t = np.arange(0, 60, 0.02)
     run = motionless(np.where((t > 30)[:, None], 2 * turning("all round", t), 0.0), t)
-    windows = observe_motion(bias_gravity.known_to(bias=0.5), run, window=10.0)["windows"]
-    assert 30 < windows["informative_from_s"] < 45
-    still = observe_motion(bias_gravity, motionless(turning("not at all", t), t))["windows"]
-    assert still["informative_from_s"] is None
+    windows = observe_motion(bias_gravity.known_to(bias=0.5), run, window=10.0).windows
+    assert 30 < windows.informative_from_s < 45
+    still = observe_motion(bias_gravity, motionless(turning("not at all", t), t)).windows
+    assert still.informative_from_s is None
 
 
 def test_a_slow_precession_shows_more_in_longer_windows():

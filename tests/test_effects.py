@@ -231,10 +231,10 @@ def test_hysteresis_lags_behind_whichever_way_the_reading_moves():
 
 
 def test_a_shipped_effect_goes_by_its_name_where_the_model_has_its_quantity():
-    from casest.cli.words import declared_model
+    from casest.cli.loading import declared_model
+    from casest.cli.options import ModelOptions
 
-    options = dict.fromkeys(("constants", "free", "fix", "shared", "per_run"), ())
-    model = declared_model("norm-diagonal", {**options, "effects": ["quadratic"]})
+    model = declared_model("norm-diagonal", ModelOptions(effects=("quadratic",)))
     (added,) = model.effects
     assert added.effect.on == find_model("norm-diagonal").traced.corrected
     assert model.parameters[-1].name == "quadratic.k"

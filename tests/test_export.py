@@ -16,12 +16,12 @@ import simulators as sim
 
 from casest import Correction, Run
 from casest.cli import run as command
-from casest.correction.export import is_exported
 from casest.correction.inverse import invertible
 from casest.demo import RECORD, WHEEL
 from casest.effects import CATALOGUE
 from casest.results.find import find_model
-from casest.results.saved_model import saved_model
+from casest.saved.export import is_exported
+from casest.saved.model import saved_model
 
 HANDHELD = [str(RECORD), "--columns", "v=ax,ay,az", "--rate", "50", "--at-rest"]
 G = ["--set", "norm=9.80665 m/s^2"]

@@ -288,9 +288,9 @@ def test_a_nonlinear_model_keeps_to_what_is_known_too():
 
 def test_a_smoother_that_does_not_settle_says_so(monkeypatch):
     monkeypatch.setattr("casest.dynamics.filter.ROUNDS", 1)
-    content, found = follow(pendulum_of(), swing()[0])
-    assert not found.settled
-    assert "the smoother's rounds did not settle" in " ".join(content["notes"])
+    result = follow(pendulum_of(), swing()[0])
+    assert not result.filtered.settled
+    assert "the smoother's rounds did not settle" in " ".join(result.notes)
 
 
 def test_a_known_gravity_brings_its_error_and_the_biass_down():
@@ -408,5 +408,5 @@ def test_at_rest_below_the_length_of_a_pendulum_is_not_seen():
 
     run = Run.raw("r", {"y": np.zeros((100, 1))}, units={}, time=np.arange(100) * 0.05)
     told = observe_motion(pendulum, run)
-    assert (told["rank"], told["structural_rank"]) == (2, 3)
-    assert told["unobservable"] == ["stiffness changes no reading"]
+    assert (told.rank, told.structural_rank) == (2, 3)
+    assert told.unobservable == ["stiffness changes no reading"]

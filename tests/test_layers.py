@@ -48,7 +48,7 @@ def imports(path: Path) -> set[str]:
             for alias in node.names:
                 inner = ROOT.joinpath(*module.split("."), f"{alias.name}.py")
                 package = ROOT.joinpath(*module.split("."), alias.name)
-                own = inner.exists() or package.is_dir()
+                own = inner.exists() or package.is_dir() or alias.name == "__version__"
                 found.add(f"{module}.{alias.name}" if own else module)
     return {name for name in found if name.partition(".")[0] in ("casest", "casest_problems")}
 
@@ -61,6 +61,23 @@ def test_imports_go_only_down(path):
     own = module_name(path)
     climbing = {name for name in imports(path) if floor(name) > floor(own)}
     assert climbing == set(), f"{own} (floor {floor(own)}) imports upwards: {sorted(climbing)}"
+
+
+#: What text and page may read beside results: what is theirs, errors, the name of a data file, and
+#: types of what a result holds (a run with its times and gaps, an array and its digits).
+READ = {
+    "text": ["casest.report.text", "casest.report.next_command"],
+    "html": ["casest.report.html", "casest.report.next_command"],
+}
+BESIDE = ["casest.results", "casest.errors", "casest.units"]
+EXACTLY = {"casest.__version__", "casest.data.logs", "casest.data.run", "casest.declaration.shapes"}
+
+
+@pytest.mark.parametrize("path", [p for p in MODULES if p.parent.name in READ], ids=module_name)
+def test_text_and_page_read_results_and_nothing_else(path):
+    rooms = (*READ[path.parent.name], *BESIDE)
+    inside = {n for n in imports(path) if any(n == r or n.startswith(r + ".") for r in rooms)}
+    assert imports(path) - inside - EXACTLY == set()
 
 
 def test_no_two_modules_import_each_other():

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import simulators as sim
 import worlds
+from msgspec.structs import replace as changed
 
 import casest as c
 from casest import Run
@@ -17,9 +18,9 @@ from casest.effects import CATALOGUE
 from casest.effects.on_axes import restricted
 from casest.effects.placing import prepared
 from casest.leastsquares.problem import Problem
-from casest.report.text.closing import sentence, undecided
-from casest.results.closing import closing_result
+from casest.results.closing import Effect, Unexplained, closing_result
 from casest.results.find import find_model
+from casest.results.verdict import sentence, undecided
 from casest.solve.trust_region import trust_region
 
 
@@ -192,9 +193,9 @@ def test_a_cause_too_small_to_be_told_from_others_is_not_added():
     assert 0 < closing.undecided.share < 0.01
     assert closing.verdict == "unexplained"
     assert closing.after is closing.before
-    content = closing_result(closing, model_name="wheel", data=["wheel.csv"])
-    assert content["unexplained"]["one_of"] == list(closing.undecided.names)
-    assert sentence(content) == ("unexplained: a misfit remains that several causes explain alike")
+    result = closing_result(closing, model_name="wheel", data=["wheel.csv"])
+    assert result.unexplained.one_of == list(closing.undecided.names)
+    assert sentence(result) == ("unexplained: a misfit remains that several causes explain alike")
 
 
 LEVER = ("wheel", [10000, *b"one", *b"wheel", *b"lever_arm", *b"medium"], {"lever_arm": 0.002})
@@ -214,13 +215,13 @@ def test_of_two_causes_that_pull_opposite_ways_none_is_added():
         for estimate in (fit, closing.before)
     )
     assert wrong > 2 * bare
-    content = closing_result(closing, model_name="wheel", data=["wheel.csv"])
-    assert set(content["unexplained"]["would_move"]) == {"lever_arm", "bias_drift"}
-    ways = content["unexplained"]["would_separate"]
+    result = closing_result(closing, model_name="wheel", data=["wheel.csv"])
+    assert set(result.unexplained.would_move) == {"lever_arm", "bias_drift"}
+    ways = result.unexplained.would_separate
     assert {words.partition(":")[0] for words in ways} == {"lever_arm", "bias_drift"}
-    assert "--effects" in " ".join(undecided(content))
-    assert " or " in sentence(content)
-    assert {"lever_arm", "bias_drift"} <= set(sentence(content).split())
+    assert "--effects" in " ".join(undecided(result.unexplained, result.after.parameters))
+    assert " or " in sentence(result)
+    assert {"lever_arm", "bias_drift"} <= set(sentence(result).split())
 
 
 def test_of_two_causes_the_one_that_helps_whichever_it_is_is_added():
@@ -241,11 +242,10 @@ def test_of_two_causes_the_one_that_helps_whichever_it_is_is_added():
 def test_what_is_to_be_said_with_effects_is_a_name_that_it_takes():
     """A constant that may be wrong is freed with --free, and is no effect."""
     moves = {"radius": {}, "temperature_bias(temp)": {}}
-    left = {"one_of": list(moves), "would_move": moves, "would_separate": []}
-    (words,) = undecided({"unexplained": left})
+    left = Unexplained(0.1, "", list(moves), moves, [])
+    (words,) = undecided(left, {})
     assert words.endswith("--effects temperature_bias")
-    left["would_move"] = {"radius": {}}
-    assert not list(undecided({"unexplained": left}))
+    assert not list(undecided(Unexplained(0.1, "", ["radius"], {"radius": {}}, []), {}))
 
 
 def test_a_cause_that_is_known_to_be_there_comes_first():
@@ -311,11 +311,17 @@ def test_a_course_too_small_to_have_a_shape_is_no_formula():
 
 
 def test_a_residual_that_resembles_itself_over_many_samples_is_not_called_noise_alone():
-    added = [{"name": "vibration", "column": None}]
-    content = {"effects": added, "verdict": "extended", "not_tried": []}
+    world = worlds.made("norm", [6], {})
+    closing = close(declared(world), [record(world)])
+    result = closing_result(closing, model_name="norm", data=[])
+    added = Effect(name="vibration", on="reading", column=None, parameters={}, p_value=0.0,
+                   holdout_gain=1.0, formula="", indistinguishable_from=[], less_likely=[],
+                   would_separate=[], instead_would_move={})  # fmt: skip
     said = [
-        sentence(content | {"noise": {"correlated_over_samples": over}}) for over in (1.0, 33.2)
-    ]
+        sentence(changed(result, verdict="extended", effects=[added], not_tried=[],
+                         noise=changed(result.noise, correlated_over_samples=over)))
+        for over in (1.0, 33.2)
+    ]  # fmt: skip
     assert said[0] == "extended: vibration was missing; what is left is noise"
     assert said[1].endswith("what is left is coloured noise (alike over 33 samples), or a lag")
 

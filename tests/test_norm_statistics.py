@@ -58,8 +58,8 @@ class Outcome:
 
 def printed(found, name):
     """The 95 % interval of every value as it stands in result.json."""
-    said = calibration_result(found, model_name=name, data=())["estimate"]["parameters"]
-    ends = [[np.array(said[p]["interval95"][k]) for p in ("scale", "offset")] for k in (0, 1)]
+    said = calibration_result(found, model_name=name, data=()).estimate.parameters
+    ends = [[np.array(said[p].interval95[k]) for p in ("scale", "offset")] for k in (0, 1)]
     return [flat(name, *end) for end in ends]
 
 

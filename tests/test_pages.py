@@ -108,7 +108,7 @@ def test_the_reference_names_every_public_name_that_is_no_word_of_mathematics():
     import casest
 
     text = (ROOT / "docs" / "reference.md").read_text(encoding="utf-8")
-    mathematics = {name for name in casest.__all__ if casest._WHERE.get(name) == PHYSICS}
+    mathematics = {name for name in casest.__all__ if casest._HOMES.get(name) == PHYSICS}
     shown = {"Residual", "der", "integral", "inverse", "polynomial", "quantity", "rotation", "skew"}
     mathematics -= shown
     for name in set(casest.__all__) - mathematics - {"__version__"}:

@@ -336,12 +336,6 @@ def test_an_expression_equal_to_another_output_is_given_in_both():
 # What cannot be replayed is named.
 
 
-def test_an_unknown_operation_is_named():
-    p, s = ca.SX.sym("p"), ca.SX.sym("s")
-    with pytest.raises(CasestError, match="OP_ERFINV"):
-        Replay(function(p, s, ca.erfinv(s) + p))
-
-
 def test_an_mx_function_is_refused():
     p, s = ca.MX.sym("p"), ca.MX.sym("s")
     with pytest.raises(CasestError, match=r"'f' is a MXFunction: build it from SX"):

@@ -308,9 +308,9 @@ def test_a_hundred_thousand_samples_are_a_page_of_less_than_a_megabyte(browser, 
     model = find_model(str(Path(__file__).parent / "models" / "load_cell.py:load_cell"))
     runs = load_runs(tmp_path / "long.csv", model.signals)
     found = calibrate(model, runs)
-    content = calibration_result(found, model_name="load_cell.py", data=[])
+    result = calibration_result(found, model_name="load_cell.py", data=[])
     page = tmp_path / "report.html"
-    page.write_text(calibration_page(found, content), encoding="utf-8")
+    page.write_text(calibration_page(result), encoding="utf-8")
     assert page.stat().st_size < 1_000_000
     browser.open(page)
     assert browser.ask("document.querySelectorAll('svg, canvas').length") > 0
@@ -414,7 +414,7 @@ def test_the_report_costs_little_beside_the_fit(calibrated):
         [RECORD], model.signals, columns={"v": ("ax", "ay", "az")}, rate=50, at_rest=True
     )
     found = calibrate(model, runs)
-    content = calibration_result(found, model_name="norm-triangular", data=[str(RECORD)])
+    result = calibration_result(found, model_name="norm-triangular", data=[str(RECORD)])
     began = time.perf_counter()
-    calibration_page(found, content)
+    calibration_page(result)
     assert time.perf_counter() - began < 0.5

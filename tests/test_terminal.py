@@ -15,7 +15,8 @@ import simulators as sim
 from casest.cli import commands, run
 from casest.cli.waiting import Waiting
 from casest.report.next_command import following, typed_words
-from casest.report.text.calibration import coloured, rounded
+from casest.report.text.layout import coloured
+from casest.results.rounding import rounded
 
 ROOT = Path(__file__).parents[1]
 WORDS = {

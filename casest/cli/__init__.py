@@ -8,14 +8,14 @@ from collections.abc import Sequence
 
 import click
 
-from casest.cli import comparing, fitting, motion, using
+from casest.cli import comparing, completing, correcting, fitting, motion, simulating
 from casest.cli.shared import commands, echo, shown
 from casest.errors import CasestError
 
 __all__ = ["commands", "main", "run"]
 
 #: Every room adds its commands to the group as it is imported.
-ROOMS = (fitting, motion, comparing, using)
+ROOMS = (fitting, motion, comparing, correcting, simulating, completing)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -2,68 +2,70 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
-import click
-
-from casest.cli.completing import ModelName
-from casest.cli.options import model_options, reading_options
-from casest.cli.shared import (
-    FOLDER,
-    Options,
-    commands,
-    echo,
-    progress,
-    typed,
-)
-from casest.cli.words import (
-    declared_model,
-    records,
-    start_value,
-)
+from casest.cli.assignments import Assignment, Assignments
+from casest.cli.flags import Kind, flag, taking
+from casest.cli.loading import declared_model, records
+from casest.cli.options import DATA, FOLDER, ModelOptions, ReadingOptions, Words, model_argument
+from casest.cli.shared import commands, echo, progress, typed
 from casest.errors import NotTrusted, UsageError
+
+if TYPE_CHECKING:
+    from casest.results.comparison import SolversCompared
+
+
+@dataclass(frozen=True, slots=True)
+class CompareOptions:
+    """Options of `compare`."""
+
+    model: ModelOptions = field(default_factory=ModelOptions)
+    reading: ReadingOptions = field(default_factory=ReadingOptions)
+    solvers: Words = flag((), "--solver", metavar="NAME", help="Only this one (repeatable).")
+    start: Assignments = flag(
+        (),
+        "--start",
+        of=Assignment,
+        metavar="NAME=VALUE",
+        help="Start value in place of the automatic.",
+    )
+    starts: int = flag(
+        8, "--starts", show_default=True, help="More starts, spread around the first."
+    )
+    spread: tuple[float, ...] = flag(
+        (),
+        "--spread",
+        type=float,
+        metavar="SHARE",
+        help="How far, as a share of each unknown's size (repeatable; 0.001, 0.01, 0.1 and 0.3).",
+    )
+    seed: int = flag(0, "--seed", show_default=True, help="For the spread of starts.")
+    limit: float = flag(
+        10,
+        "--limit",
+        type=float,
+        show_default=True,
+        metavar="SECONDS",
+        help="Stop a solver's run after this time.",
+    )
+    output: Path | None = flag(
+        None,
+        "-o",
+        "--output",
+        type=FOLDER,
+        metavar="DIR",
+        help="Folder for compare.json, compare.png and compare.svg.",
+    )
+    as_json: bool = flag(False, "--json", help="Print compare.json instead of tables.")
 
 
 @commands.command()
-@click.argument("model_name", metavar="MODEL", type=ModelName())
-@click.argument("data", nargs=-1, required=True, type=click.Path())
-@model_options
-@reading_options
-@click.option(
-    "--solver", "solvers", multiple=True, metavar="NAME", help="Only this one (repeatable)."
-)
-@click.option(
-    "--start", multiple=True, metavar="NAME=VALUE", help="Start value in place of the automatic."
-)
-@click.option(
-    "--starts", type=int, default=8, show_default=True, help="More starts, spread around the first."
-)
-@click.option(
-    "--spread",
-    type=float,
-    multiple=True,
-    metavar="SHARE",
-    help="How far, as a share of each unknown's size (repeatable; 0.001, 0.01, 0.1 and 0.3).",
-)
-@click.option("--seed", type=int, default=0, show_default=True, help="For the spread of starts.")
-@click.option(
-    "--limit",
-    type=float,
-    default=10,
-    show_default=True,
-    metavar="SECONDS",
-    help="Stop a solver's run after this time.",
-)
-@click.option(
-    "-o",
-    "--output",
-    type=FOLDER,
-    metavar="DIR",
-    help="Folder for compare.json, compare.png and compare.svg.",
-)
-@click.option("--json", "as_json", is_flag=True, help="Print compare.json instead of tables.")
-def compare(model_name: str, data: tuple[str, ...], **options: Any) -> int:
+@model_argument(Kind.FITTED)
+@DATA
+@taking(CompareOptions)
+def compare(model_name: str, data: tuple[str, ...], options: CompareOptions) -> int:
     """Run every solver on MODEL and DATA, from one start and from a spread of starts.
 
     Each is judged by the certified optimum: where it ended, what it claims, what it took. Exit
@@ -72,29 +74,29 @@ def compare(model_name: str, data: tuple[str, ...], **options: Any) -> int:
     """
     from casest.comparison.judge import SIZES
     from casest.comparison.judge import compare as compared
-    from casest.report.text.comparison import comparison_result, comparison_text
+    from casest.report.text.comparison import comparison_text
+    from casest.results.comparison import comparison_result
     from casest.results.file import as_json
 
-    model = declared_model(model_name, options)
-    runs = records(model, data, options)
+    model = declared_model(model_name, options.model)
+    runs = records(model, data, options.reading)
     found = compared(
         model,
         runs,
-        starts=options["starts"],
-        seed=options["seed"],
-        start=dict(start_value(text, model) for text in options["start"]) or None,
-        sizes=options["spread"] or SIZES,
-        solvers=options["solvers"],
-        limit=options["limit"],
+        starts=options.starts,
+        seed=options.seed,
+        start=dict(given.start(model) for given in options.start) or None,
+        sizes=options.spread or SIZES,
+        solvers=options.solvers,
+        limit=options.limit,
         say=progress,
     )
-    command = typed()
-    content = comparison_result(found, model_name=model_name, data=data, command=command)
-    written = written_comparison(found, content, options["output"]) if options["output"] else []
-    if options["as_json"]:
-        echo(as_json(content), nl=False)
+    result = comparison_result(found, model_name=model_name, data=data, command=typed())
+    written = written_comparison(result, options.output) if options.output else []
+    if options.as_json:
+        echo(as_json(result.content()), nl=False)
     else:
-        echo(comparison_text(found, data, written, command))
+        echo(comparison_text(result, written))
     if found.interrupted:
         echo(f"casest: interrupted after {found.done} of {found.planned} runs", err=True)
     elif not found.certified:
@@ -102,14 +104,14 @@ def compare(model_name: str, data: tuple[str, ...], **options: Any) -> int:
     return 0 if found.certified and not found.interrupted else NotTrusted.exit_code
 
 
-def written_comparison(found: Any, content: Options, folder: Path) -> list[Path]:
+def written_comparison(result: SolversCompared, folder: Path) -> list[Path]:
     """compare.json, and the plot where matplotlib is there; says so where it is not."""
     from casest.report.picture import draw
-    from casest.report.text.comparison import save
+    from casest.results.comparison import save
 
-    paths = [save(folder, content)]
+    paths = [save(folder, result)]
     try:
-        paths += draw(found, folder)
+        paths += draw(result, folder)
     except UsageError as error:
         echo(f"casest: {error}", err=True)
     return paths

@@ -4,31 +4,17 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import click
 
-from casest.cli.completing import ModelName
-from casest.cli.options import model_options, output_options, reading_options
-from casest.cli.shared import (
-    FOLDER,
-    Options,
-    commands,
-    echo,
-    progress,
-    reported,
-    typed,
-    write,
-)
-from casest.cli.words import (
-    declared_model,
-    held_out,
-    moving_record,
-    records,
-    start_value,
-)
-from casest.errors import NotTrusted, UsageError
+from casest.cli.flags import Kind, refuse, taking
+from casest.cli.loading import declared_model, held_out, moving_model, records, trajectory
+from casest.cli.options import DATA, RESULTS, FitOptions, MotionOptions, model_argument
+from casest.cli.shared import commands, echo, progress, reported, typed, write
+from casest.errors import NotTrusted
 
 
 @commands.command("list")
@@ -37,21 +23,20 @@ def list_command(as_json: bool) -> None:
     """Shipped problems with their symbols and estimators, and the catalogue of effects."""
     from casest.effects import CATALOGUE
     from casest.effects.moving import listed
-    from casest.report.text.calibration import listing
+    from casest.report.text.listing import listing_text
     from casest.results.find import MOVING, SHIPPED, find_any, find_model
+    from casest.results.listing import listing
 
     models = [(name, find_model(name)) for name in SHIPPED]
     moving: list[Any] = [(name, find_any(name)) for name in MOVING]
-    echo(listing(models, CATALOGUE, moving, listed(), as_json=as_json))
+    echo(listing_text(listing(models, CATALOGUE, moving, listed()), as_json=as_json))
 
 
 @commands.command()
-@click.argument("model_name", metavar="MODEL", type=ModelName())
-@click.argument("data", nargs=-1, required=True, type=click.Path())
-@model_options
-@reading_options
-@output_options
-def calibrate(model_name: str, data: tuple[str, ...], **options: Any) -> int:
+@model_argument(Kind.FITTED)
+@DATA
+@taking(FitOptions)
+def calibrate(model_name: str, data: tuple[str, ...], options: FitOptions) -> int:
     """Fit MODEL to DATA: values with uncertainty, certificate, what was not determined.
 
     Exit code 0: trusted; 1: bad input; 2: no trustworthy estimate (result.json says why).
@@ -59,27 +44,28 @@ def calibrate(model_name: str, data: tuple[str, ...], **options: Any) -> int:
     return calibration(model_name, data, options, typed())
 
 
-def calibration(model_name: str, data: Sequence[str], options: Options, command: str) -> int:
+def calibration(model_name: str, data: Sequence[str], options: FitOptions, command: str) -> int:
     """Read, fit, save, print; the exit code says whether the estimate is trusted."""
     from casest.diagnose.misfit.specification_test import doubts
     from casest.estimate.calibrate import attempt
     from casest.estimate.held_out import score
     from casest.report.html import calibration_page
-    from casest.report.text.calibration import calibration_text, coloured
+    from casest.report.text.calibration import calibration_text
+    from casest.report.text.layout import coloured
     from casest.results.calibration import calibration_result, residual_rows
     from casest.results.file import as_json, save
     from casest.solve.interrupt import interruptible
 
-    model = declared_model(model_name, options)
-    runs = records(model, data, options)
-    hidden = held_out(model, data, options)
-    start = dict(start_value(text, model) for text in options["starts"]) or None
+    model = declared_model(model_name, options.model)
+    runs = records(model, data, options.reading)
+    hidden = held_out(model, options.holdout, data, options.reading)
+    start = dict(given.start(model) for given in options.starts) or None
     progress(f"fitting {model_name}")
     with interruptible():
-        found = attempt(model, runs, start=start, solver=options["solver"], seed=options["seed"])
+        found = attempt(model, runs, start=start, solver=options.solver, seed=options.seed)
     holdout = score(found, hidden) if hidden else None
     progress("asking whether the residual is noise")
-    content = calibration_result(
+    result = calibration_result(
         found,
         model_name=model_name,
         data=data,
@@ -87,15 +73,14 @@ def calibration(model_name: str, data: Sequence[str], options: Options, command:
         holdout=holdout,
         misfit=doubts(found),
     )
-    if options["output"]:
-        progress(f"writing {options['output']}")
-        save(options["output"], content, residual_rows(found))
-        reported(options["output"], calibration_page(found, content, str(options["output"])))
-    if options["as_json"]:
-        echo(as_json(content), nl=False)
+    if options.output:
+        progress(f"writing {options.output}")
+        save(options.output, result.content(), residual_rows(found))
+        reported(options.output, calibration_page(result, str(options.output)))
+    if options.as_json:
+        echo(as_json(result.content()), nl=False)
     else:
-        words = calibration_text(found, content, options["output"])
-        echo(coloured(words, sys.stdout))
+        echo(coloured(calibration_text(result, options.output), sys.stdout))
     if not found.certificate.trusted:
         reason = found.certificate.reasons[0]
         echo(f"casest: no trustworthy estimate: {reason}", err=True)
@@ -104,12 +89,10 @@ def calibration(model_name: str, data: Sequence[str], options: Options, command:
 
 
 @commands.command()
-@click.argument("model_name", metavar="MODEL", type=ModelName())
-@click.argument("data", nargs=-1, required=True, type=click.Path())
-@model_options
-@reading_options
-@output_options
-def close(model_name: str, data: tuple[str, ...], **options: Any) -> int:
+@model_argument(Kind.FITTED, Kind.MOVING)
+@DATA
+@taking(FitOptions)
+def close(model_name: str, data: tuple[str, ...], options: FitOptions) -> int:
     """Fit, trace the residual to missing effects, add them, judge by held-out data.
 
     Verdict `adequate`: nothing that these data can show is missing; `extended`: effects were added
@@ -124,24 +107,30 @@ def close(model_name: str, data: tuple[str, ...], **options: Any) -> int:
     return closing(model_name, data, options, typed())
 
 
-def closing(model_name: str, data: Sequence[str], options: Options, command: str) -> int:
+def closing(model_name: str, data: Sequence[str], options: FitOptions, command: str) -> int:
     """Read, close the loop, save, print."""
     from casest.diagnose import loop
     from casest.diagnose.held_out import scored
     from casest.effects import CATALOGUE
     from casest.report.html import closing_page
-    from casest.report.text.calibration import coloured
     from casest.report.text.closing import closing_text
-    from casest.results.closing import closing_result, formula_source, name_file, residual_rows
+    from casest.report.text.layout import coloured
+    from casest.results.closing import (
+        closing_result,
+        formula_source,
+        residual_rows,
+        with_formula_in,
+    )
     from casest.results.file import as_json, save
     from casest.results.find import find_effects
 
-    known = {e.name for e in CATALOGUE} & {*options["effects"]}
-    own = tuple(e for path in options["effects"] if path not in known for e in find_effects(path))
-    model = declared_model(model_name, {**options, "effects": ()})
-    runs = records(model, data, options)
-    apart = held_out(model, data, options)
-    start = dict(start_value(words, model) for words in options["starts"]) or None
+    asked = options.model.effects
+    known = {e.name for e in CATALOGUE} & {*asked}
+    own = tuple(e for path in asked if path not in known for e in find_effects(path))
+    model = declared_model(model_name, replace(options.model, effects=()))
+    runs = records(model, data, options.reading)
+    apart = held_out(model, options.holdout, data, options.reading)
+    start = dict(given.start(model) for given in options.starts) or None
     progress(f"fitting {model_name}, looking for effects")
     try:
         found = loop.close(
@@ -150,117 +139,94 @@ def closing(model_name: str, data: Sequence[str], options: Options, command: str
             catalogue=(*CATALOGUE, *own),
             start=start,
             known=known,
-            seed=options["seed"],
+            seed=options.seed,
             say=progress,
         )
     except NotTrusted as error:
         return refused(error, model_name, data, options, command)
     hidden = scored(found, apart) if apart else None
-    content = closing_result(
+    result = closing_result(
         found, model_name=model_name, data=data, command=command, held_out=hidden and hidden[1:]
     )
-    if options["output"]:
-        progress(f"writing {options['output']}")
+    if options.output:
+        progress(f"writing {options.output}")
         formula = formula_source(found)
         if formula:
-            write(options["output"] / "formula.py", formula)
-            name_file(content, options["output"] / "formula.py")
-        save(options["output"], content, residual_rows(found, hidden))
-        reported(options["output"], closing_page(found, content, str(options["output"])))
-    if options["as_json"]:
-        echo(as_json(content), nl=False)
+            write(options.output / "formula.py", formula)
+            result = with_formula_in(result, options.output / "formula.py")
+        save(options.output, result.content(), residual_rows(found, hidden))
+        reported(options.output, closing_page(result, str(options.output)))
+    if options.as_json:
+        echo(as_json(result.content()), nl=False)
     else:
-        echo(coloured(closing_text(found, content, options["output"]), sys.stdout))
+        echo(coloured(closing_text(result, options.output), sys.stdout))
     return 0
 
 
-#: Options of `close` that only calibrations have.
-FITTED = ("effects", "per_run", "shared", "fix", "free", "starts", "holdout")
-
-
-def closing_in_motion(model_name: str, data: Sequence[str], options: Options, command: str) -> int:
+def closing_in_motion(
+    model_name: str, data: Sequence[str], options: FitOptions, command: str
+) -> int:
     """Filter, diagnose the innovations, add what is missing, save, print."""
     from casest.diagnose.motion import loop
     from casest.report.html import closing_motion_page
-    from casest.report.text.calibration import coloured
+    from casest.report.text.layout import coloured
     from casest.report.text.motion import motion_text
     from casest.results.file import as_json, save
     from casest.results.motion import motion_result, residual_rows
 
-    for name in FITTED:
-        if options[name]:
-            flag = {"starts": "start"}.get(name, name.replace("_", "-"))
-            raise UsageError(
-                f"--{flag} is for calibrations; {model_name} is an estimator in motion: its "
-                "effects and noise are found from the record alone"
-            )
-    moving, run = moving_record(model_name, data, {**options, "intensities": (), "stds": ()})
+    why = (
+        f"is for calibrations; {model_name} is an estimator in motion: its effects and noise are "
+        "found from the record alone"
+    )
+    refuse(options, Kind.FITTED, why)
+    moving = moving_model(model_name, options.model.constants, MotionOptions())
+    run = trajectory(moving, model_name, data, options.reading)
     progress(f"filtering {model_name}, looking for effects")
     found = loop.close_motion(moving, run, say=progress)
-    content = motion_result(found, model_name=model_name, data=data, command=command)
-    if options["output"]:
-        save(options["output"], content, residual_rows(found))
-        reported(options["output"], closing_motion_page(found, content))
-    if options["as_json"]:
-        echo(as_json(content), nl=False)
+    result = motion_result(found, model_name=model_name, data=data, command=command)
+    if options.output:
+        save(options.output, result.content(), residual_rows(found))
+        reported(options.output, closing_motion_page(result))
+    if options.as_json:
+        echo(as_json(result.content()), nl=False)
     else:
-        echo(coloured(motion_text(content, options["output"]), sys.stdout))
-    if not content["trusted"]:
-        reason = content["after"]["certificate"]["reasons"][-1]
+        echo(coloured(motion_text(result, options.output), sys.stdout))
+    if not result.trusted:
+        reason = result.after.certificate.reasons[-1]
         click.echo(f"casest: no trustworthy estimate: {reason}", err=True)
         return NotTrusted.exit_code
     return 0
 
 
 def refused(
-    error: NotTrusted, model_name: str, data: Sequence[str], options: Options, command: str
+    error: NotTrusted, model_name: str, data: Sequence[str], options: FitOptions, command: str
 ) -> int:
     """Write and say what there is where the declared model itself has no trustworthy fit."""
     from casest.report.html import calibration_page
     from casest.results.calibration import calibration_result, residual_rows
     from casest.results.file import as_json, save
 
-    if error.estimate is not None and options["output"]:
-        content = calibration_result(
+    if error.estimate is not None and options.output:
+        result = calibration_result(
             error.estimate, model_name=model_name, data=data, command=command
         )
-        save(options["output"], content, residual_rows(error.estimate))
-        page = calibration_page(error.estimate, content, str(options["output"]))
-        reported(options["output"], page)
-        if options["as_json"]:
-            echo(as_json(content), nl=False)
+        save(options.output, result.content(), residual_rows(error.estimate))
+        page = calibration_page(result, str(options.output))
+        reported(options.output, page)
+        if options.as_json:
+            echo(as_json(result.content()), nl=False)
     echo(f"casest: {error}", err=True)
     return NotTrusted.exit_code
 
 
 @commands.command()
-@click.option(
-    "-o",
-    "--output",
-    type=FOLDER,
-    metavar="DIR",
-    help="Folder for result.json, residuals.csv and report.html.",
-)
-def demo(output: Path | None) -> int:
+@click.option("-o", "--output", default=Path("out"), **RESULTS)
+def demo(output: Path) -> int:
     """Close the loop on a shipped record with an effect that its model lacks."""
     from casest.demo import WHEEL, comparison
 
-    record = WHEEL
-    options: Options = {
-        **dict.fromkeys(
-            ("effects", "constants", "free", "fix", "shared", "per_run", "columns", "units"), ()
-        ),
-        **dict.fromkeys(("scales", "holdout", "starts"), ()),
-        "rate": None,
-        "at_rest": False,
-        "time_zero": "first",
-        "solver": "ipopt",
-        "seed": 0,
-        "output": output or Path("out"),
-        "as_json": False,
-    }
-    words = f"casest close wheel {record} -o {options['output']}"
+    words = f"casest close wheel {WHEEL} -o {output}"
     echo(f"$ {words}\n")
-    code = closing("wheel", (str(record),), options, words)
-    echo("\n" + comparison(options["output"]))
+    code = closing("wheel", (str(WHEEL),), FitOptions(output=output), words)
+    echo("\n" + comparison(output))
     return code

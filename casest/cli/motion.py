@@ -2,119 +2,185 @@
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
-from casest.cli.completing import ModelName
-from casest.cli.options import model_options, motion_options, reading_options, sensor_noise
-from casest.cli.shared import (
-    commands,
-    echo,
-    last_words,
-    progress,
-    reported,
-    typed,
-    write,
+from casest.cli.assignments import Assignment, Assignments
+from casest.cli.flags import Kind, flag, taking
+from casest.cli.loading import declared_model, moving_model, records, trajectory
+from casest.cli.options import (
+    DATA,
+    FOLDER,
+    ModelOptions,
+    MotionOptions,
+    ReadingOptions,
+    SensorOptions,
+    model_argument,
 )
-from casest.cli.words import (
-    declared_model,
-    moving_model,
-    moving_record,
-    records,
-    tuned_noise,
-)
+from casest.cli.shared import commands, echo, last_words, progress, reported, typed, write
 from casest.errors import UsageError
+
+if TYPE_CHECKING:
+    from casest.data.run import Run
+    from casest.dynamics import Dynamics
+    from casest.dynamics.intensities import Tuned
+
+
+@dataclass(frozen=True, slots=True)
+class OutputOptions:
+    """Where a result goes."""
+
+    output: Path | None = flag(None, "-o", "--output", type=FOLDER, metavar="DIR", help="Folder.")
+    as_json: bool = flag(False, "--json", help="Print JSON instead of text.")
+
+
+@dataclass(frozen=True, slots=True)
+class ObserveOptions:
+    """Options of `observe`."""
+
+    model: ModelOptions = field(default_factory=ModelOptions)
+    reading: ReadingOptions = field(default_factory=ReadingOptions)
+    motion: MotionOptions = field(default_factory=MotionOptions)
+    result: OutputOptions = field(default_factory=OutputOptions)
+    window: float | None = flag(
+        None, "--window", type=float, metavar="SECONDS", help="Of the sliding eigenvalue."
+    )
 
 
 @commands.command()
-@click.argument("model_name", metavar="MODEL", type=ModelName())
+@model_argument(Kind.FITTED, Kind.MOVING)
 @click.argument("data", nargs=-1, type=click.Path())
-@model_options
-@reading_options
-@motion_options
-@click.option("--window", type=float, metavar="SECONDS", help="Of the sliding eigenvalue.")
-def observe(model_name: str, data: tuple[str, ...], **options: Any) -> int:
+@taking(ObserveOptions)
+def observe(model_name: str, data: tuple[str, ...], options: ObserveOptions) -> int:
     """What these data, or this trajectory, can see: rank, and what is hidden, in words.
 
     Without DATA: what any record of an estimator in motion could show (structural rank). Exit
     code 0 even where something is not observable.
     """
     from casest.declaration.model import Model
-    from casest.results import observability
-    from casest.results.file import as_json, reproduce
+    from casest.report.text.observability import observe_text
+    from casest.results.file import as_json
     from casest.results.find import find_any
+    from casest.results.observability import (
+        Observability,
+        observe_motion,
+        observe_parameters,
+        observe_structure,
+    )
 
     fits = isinstance(find_any(model_name), Model)
     if fits:
-        model = declared_model(model_name, options)
+        model = declared_model(model_name, options.model)
         if not data:
             raise UsageError(f"{model_name}: what can be seen depends on the record: give DATA")
-        runs = records(model, data, options)
+        runs = records(model, data, options.reading)
         progress(f"fitting {model_name}")
-        content, _ = observability.observe_parameters(model, runs)
-    elif not data:
-        content = observability.observe_structure(moving_model(model_name, options))
+        result: Observability = observe_parameters(model, runs, data=data, command=typed())
     else:
-        moving, run = moving_record(model_name, data, options)
-        progress("what the trajectory shows")
-        content = observability.observe_motion(moving, run, options["window"])
-    content |= {"data": list(data), "reproduce": reproduce(typed(), data)}
-    if options["output"]:
+        moving = moving_model(model_name, options.model.constants, options.motion)
+        if data:
+            run = trajectory(moving, model_name, data, options.reading)
+            progress("what the trajectory shows")
+            result = observe_motion(moving, run, options.window, data=data, command=typed())
+        else:
+            result = observe_structure(moving, command=typed())
+    if options.result.output:
         from casest.report.html import observe_page
 
-        write(options["output"] / "observe.json", as_json(content))
-        reported(options["output"], observe_page(content))
-    if options["as_json"]:
-        echo(as_json(content), nl=False)
+        write(options.result.output / "observe.json", as_json(result.content()))
+        reported(options.result.output, observe_page(result))
+    if options.result.as_json:
+        echo(as_json(result.content()), nl=False)
         return 0
-    echo(observability.observe_text(content))
-    seen = content["rank"] == content["unknowns"]
-    last_words(options["output"], "report.html, observe.json", trusted=seen, applies=fits)
+    echo(observe_text(result))
+    shown = result.observable
+    last_words(options.result.output, "report.html, observe.json", trusted=shown, applies=fits)
     return 0
+
+
+@dataclass(frozen=True, slots=True)
+class FilterOptions:
+    """Options of `filter`."""
+
+    constants: Assignments = flag(
+        (), "--set", of=Assignment, metavar="NAME=VALUE", help="Set a constant of the model."
+    )
+    reading: ReadingOptions = field(default_factory=ReadingOptions)
+    motion: MotionOptions = field(default_factory=MotionOptions)
+    result: OutputOptions = field(default_factory=OutputOptions)
+    noise: Literal["declared", "ml"] = flag(
+        "declared",
+        "--noise",
+        type=click.Choice(["declared", "ml"]),
+        help="Noise intensities: as declared, or the most likely ones for this record.",
+    )
+    sensors: SensorOptions = field(default_factory=SensorOptions)
+    rest: str | None = flag(
+        None,
+        "--rest",
+        type=click.Path(),
+        metavar="FILE",
+        help="A record at rest: noise of the inputs by its Allan deviation.",
+    )
 
 
 @commands.command("filter")
-@click.argument("model_name", metavar="MODEL", type=ModelName())
-@click.argument("data", nargs=-1, required=True, type=click.Path())
-@click.option(
-    "--set", "constants", metavar="NAME=VALUE", multiple=True, help="Set a constant of the model."
-)
-@reading_options
-@motion_options
-@click.option(
-    "--noise",
-    type=click.Choice(["declared", "ml"]),
-    default="declared",
-    help="Noise intensities: as declared, or the most likely ones for this record.",
-)
-@sensor_noise
-@click.option(
-    "--rest",
-    type=click.Path(),
-    metavar="FILE",
-    help="A record at rest: noise of the inputs by its Allan deviation.",
-)
-def filter_command(model_name: str, data: tuple[str, ...], **options: Any) -> int:
+@model_argument(Kind.MOVING)
+@DATA
+@taking(FilterOptions)
+def filter_command(model_name: str, data: tuple[str, ...], options: FilterOptions) -> int:
     """States over time by the Kalman filter and smoother, with innovations diagnosed."""
+    from casest.report.text.states import filter_text
     from casest.results import states
-    from casest.results.file import as_json, reproduce
+    from casest.results.file import as_json
 
-    moving, run = moving_record(model_name, data, options)
+    moving = moving_model(model_name, options.constants, options.motion)
+    run = trajectory(moving, model_name, data, options.reading)
     tuned, told = tuned_noise(moving, run, options)
     progress("filter and smoother")
-    content, found = states.follow(moving, run, tuned)
-    content |= told
-    content |= {"data": list(data), "reproduce": reproduce(typed(), data)}
-    if options["output"]:
+    result = states.follow(moving, run, tuned, **told, data=data, command=typed())
+    if options.result.output:
         from casest.report.html import filter_page
 
-        write(options["output"] / "states.csv", states.states_csv(found))
-        write(options["output"] / "filter.json", as_json(content))
-        reported(options["output"], filter_page(found, content))
-    if options["as_json"]:
-        echo(as_json(content), nl=False)
+        write(options.result.output / "states.csv", states.states_csv(result.filtered))
+        write(options.result.output / "filter.json", as_json(result.content()))
+        reported(options.result.output, filter_page(result))
+    if options.result.as_json:
+        echo(as_json(result.content()), nl=False)
         return 0
-    echo(states.filter_text(content))
-    last_words(options["output"], "report.html, filter.json, states.csv")
+    echo(filter_text(result))
+    last_words(options.result.output, "report.html, filter.json, states.csv")
     return 0
+
+
+def tuned_noise(moving: Dynamics, run: Run, options: FilterOptions) -> tuple[Tuned | None, Any]:
+    """Noise intensities as --noise, --sensor-noise or --rest ask for them, and what a rest said."""
+    from casest.dynamics import intensities
+
+    if options.noise == "ml":
+        if options.sensors.stated or options.rest:
+            raise UsageError("--noise ml finds every intensity: leave --sensor-noise, --rest out")
+        progress("looking for the most likely noise intensities")
+        return intensities.most_likely(moving, run), {}
+    stds = options.sensors.stds()
+    stated = intensities.from_stated(moving, run, stds) if stds else None
+    if options.rest is None:
+        return stated, {}
+    rest = record_at_rest(moving, options.rest, options.reading)
+    tuned, found = intensities.from_rest(moving, rest)
+    if stated:
+        both = intensities.from_stated(tuned.model, run, stds).model
+        tuned = intensities.Tuned(both, f"{tuned.how} and {stated.how}")
+    return tuned, {"allan": intensities.told(found)}
+
+
+def record_at_rest(moving: Dynamics, file: str, options: ReadingOptions) -> Run:
+    """The inputs of an estimator in a record of their own; it need not have what is measured."""
+    from casest.data import load_runs
+
+    inputs = [s for s in moving.signals if s.name not in (*moving.measured_signals, "t")]
+    names = {"t", *(s.name for s in inputs)}
+    return load_runs([file], inputs, **options.of_signals(names).keywords())[0]

@@ -1,145 +1,212 @@
-"""Options that several commands have."""
+"""Options that several commands have: flag, type, default and help of each, once."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Container
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal, TypeVar
 
 import click
 
-from casest.cli.completing import SolverName
-from casest.cli.shared import FOLDER, Options
+from casest.cli.assignments import Assignment, Assignments
+from casest.cli.completing import ModelName, SolverName
+from casest.cli.flags import Kind, flag
+from casest.errors import CasestError
+
+DATA = click.argument("data", nargs=-1, required=True, type=click.Path())
+RESULT = click.argument("result_path", metavar="RESULT", type=click.Path(path_type=Path))
+
+R = TypeVar("R")
+
+#: A file in its place is refused before anything is computed.
+FOLDER = click.Path(path_type=Path, file_okay=False)
+
+#: Where fits are written.
+RESULTS: dict[str, Any] = {
+    "type": FOLDER,
+    "metavar": "DIR",
+    "help": "Folder for result.json, residuals.csv and report.html.",
+}
+
+Words = tuple[str, ...]
 
 
-def reading_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Options that say how columns become signals."""
-    many: Options = {"multiple": True, "metavar": "NAME=…"}
-    for option in (
-        click.option(
-            "--time-zero",
-            type=click.Choice(["first", "column"]),
-            default="first",
-            help="t = 0 at each run's first sample, or where the column has it.",
-        ),
-        click.option("--at-rest", is_flag=True, help="Find and average the rest intervals."),
-        click.option("--rate", type=float, help="Samples per second, where no column is the time."),
-        click.option("--scale", "scales", help="Raw counts: temp=int16/256+25.", **many),
-        click.option("--unit", "units", help="Unit of a signal's columns: v=g.", **many),
-        click.option("--columns", help="Columns of a signal: v=ax,ay,az, v=a or v=0,1,2.", **many),
-    ):
-        command = option(command)
-    return command
+def model_argument(*kinds: Kind) -> Callable[[Callable[..., R]], Callable[..., R]]:
+    """MODEL of a command that takes these kinds of model."""
+    return click.argument("model_name", metavar="MODEL", type=ModelName(*kinds))
 
 
-def model_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Options that change what is unknown."""
-    many: Options = {"multiple": True}
-    for option in (
-        click.option(
-            "--effects",
-            "effects",
-            metavar="FILE|NAME",
-            help="Your own effects; or a shipped one that you know to be there.",
-            **many,
-        ),
-        click.option("--per-run", metavar="NAME", help="One value for each run.", **many),
-        click.option("--shared", metavar="NAME", help="One value for all runs.", **many),
-        click.option(
-            "--fix",
-            metavar="NAME=VALUE|@RESULT",
-            **many,
-            help="Hold a parameter: a number, 1,2,3, rows a,b;c,d, or @result.json.",
-        ),
-        click.option("--free", metavar="NAME", help="Make a constant an unknown.", **many),
-        click.option(
-            "--set",
-            "constants",
-            metavar="NAME=VALUE",
-            **many,
-            help="Set a constant: radius=0.28, 'norm=9.80665 m/s^2', 'gravity=gravity(45.5, 120)'.",
-        ),
-    ):
-        command = option(command)
-    return command
+@dataclass(frozen=True, slots=True)
+class ModelOptions:
+    """What is known, what is unknown, and what else acts."""
+
+    constants: Assignments = flag(
+        (),
+        "--set",
+        of=Assignment,
+        metavar="NAME=VALUE",
+        help="Set a constant: radius=0.28, 'norm=9.80665 m/s^2', 'gravity=gravity(45.5, 120)'.",
+    )
+    free: Words = flag(
+        (), "--free", only=Kind.FITTED, metavar="NAME", help="Make a constant an unknown."
+    )
+    fix: Assignments = flag(
+        (),
+        "--fix",
+        only=Kind.FITTED,
+        of=Assignment,
+        metavar="NAME=VALUE|@RESULT",
+        help="Hold a parameter: a number, 1,2,3, rows a,b;c,d, or @result.json.",
+    )
+    shared: Words = flag(
+        (), "--shared", only=Kind.FITTED, metavar="NAME", help="One value for all runs."
+    )
+    per_run: Words = flag(
+        (), "--per-run", only=Kind.FITTED, metavar="NAME", help="One value for each run."
+    )
+    effects: Words = flag(
+        (),
+        "--effects",
+        only=Kind.FITTED,
+        metavar="FILE|NAME",
+        help="Your own effects; or a shipped one that you know to be there.",
+    )
 
 
-def output_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Options for solving and for where results go."""
-    for option in (
-        click.option(
-            "--json", "as_json", is_flag=True, help="Print result.json instead of a table."
-        ),
-        click.option(
-            "-o",
-            "--output",
-            type=FOLDER,
-            metavar="DIR",
-            help="Folder for result.json, residuals.csv and report.html.",
-        ),
-        click.option("--seed", type=int, default=0, show_default=True, help="For random restarts."),
-        click.option(
-            "--start",
-            "starts",
-            multiple=True,
-            metavar="NAME=VALUE",
-            help="Start value in place of the automatic one.",
-        ),
-        click.option(
-            "--solver",
-            default="ipopt",
-            show_default=True,
-            type=SolverName(),
-            help="ipopt, ipopt-exact, trust-region, or an estimator of the model's own.",
-        ),
-        click.option(
-            "--holdout",
-            multiple=True,
-            type=click.Path(),
-            metavar="FILE",
-            help="Score the estimate on this record, which the fit does not see.",
-        ),
-    ):
-        command = option(command)
-    return command
+@dataclass(frozen=True, slots=True)
+class ReadingOptions:
+    """How columns become signals."""
+
+    columns: Assignments = flag(
+        (),
+        "--columns",
+        of=Assignment,
+        metavar="NAME=…",
+        help="Columns of a signal: v=ax,ay,az, v=a or v=0,1,2.",
+    )
+    units: Assignments = flag(
+        (), "--unit", of=Assignment, metavar="NAME=…", help="Unit of a signal's columns: v=g."
+    )
+    scales: Assignments = flag(
+        (), "--scale", of=Assignment, metavar="NAME=…", help="Raw counts: temp=int16/256+25."
+    )
+    rate: float | None = flag(
+        None, "--rate", type=float, help="Samples per second, where no column is the time."
+    )
+    at_rest: bool = flag(False, "--at-rest", help="Find and average the rest intervals.")
+    time_zero: Literal["first", "column"] = flag(
+        "first",
+        "--time-zero",
+        type=click.Choice(["first", "column"]),
+        help="t = 0 at each run's first sample, or where the column has it.",
+    )
+
+    def keywords(self) -> dict[str, Any]:
+        """Keyword arguments of `load_runs`."""
+        columns = dict(given.pair() for given in self.columns)
+        units = dict(given.pair() for given in self.units)
+        scales = {given.pair()[0]: given for given in self.scales}
+        return {
+            "columns": {name: tuple(value.split(",")) for name, value in columns.items()},
+            "units": units,
+            "scales": {name: _checked_scale(given) for name, given in scales.items()},
+            "rate": self.rate,
+            "at_rest": self.at_rest,
+            "time_zero": self.time_zero,
+        }
+
+    def of_signals(self, names: Container[str]) -> ReadingOptions:
+        """The same, without what is said of other signals."""
+
+        def own(option: Assignments) -> Assignments:
+            return tuple(given for given in option if given.pair()[0] in names)
+
+        return replace(
+            self, columns=own(self.columns), units=own(self.units), scales=own(self.scales)
+        )
 
 
-def motion_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Options of estimators in motion."""
-    for option in (
-        click.option("--json", "as_json", is_flag=True, help="Print JSON instead of text."),
-        click.option("-o", "--output", type=FOLDER, metavar="DIR", help="Folder."),
-        _known_and_driving,
-    ):
-        command = option(command)
-    return command
+def _checked_scale(given: Assignment) -> str:
+    from casest.data.scaling import parse_scale
+
+    _, text = given.pair()
+    try:
+        parse_scale(text)
+    except CasestError as error:
+        raise type(error)(f"{given.flag} {given.text}: {error}") from None
+    return text
 
 
-def driving_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Options of a record in motion that is simulated."""
-    return _known_and_driving(sensor_noise(command))
+@dataclass(frozen=True, slots=True)
+class MotionOptions:
+    """What an estimator in motion is told of its states and its noise."""
+
+    intensities: Assignments = flag(
+        (),
+        "--intensity",
+        only=Kind.MOVING,
+        of=Assignment,
+        metavar="NAME=NUMBER",
+        help="Of a state's driving noise, unit^2/s, or of a signal's noise, unit^2 s.",
+    )
+    stds: Assignments = flag(
+        (),
+        "--std",
+        only=Kind.MOVING,
+        of=Assignment,
+        metavar="STATE=NUMBER",
+        help="What is known of a state at the beginning.",
+    )
 
 
-def sensor_noise(command: Callable[..., Any]) -> Callable[..., Any]:
+@dataclass(frozen=True, slots=True)
+class SensorOptions:
     """Noise of the sensors as their data sheets say it."""
-    return click.option(
+
+    stated: Assignments = flag(
+        (),
         "--sensor-noise",
-        "stated",
-        multiple=True,
+        only=Kind.MOVING,
+        of=Assignment,
         metavar="SIGNAL=STD",
         help="In motion: std of one reading, in the model's unit; its rate is the record's.",
-    )(command)
+    )
+
+    def stds(self) -> dict[str, float]:
+        """Standard deviation of one reading by signal, in the model's unit."""
+        return dict(given.number() for given in self.stated)
 
 
-def _known_and_driving(command: Callable[..., Any]) -> Callable[..., Any]:
-    many: Options = {"multiple": True, "metavar": "STATE=NUMBER"}
-    for option in (
-        click.option("--std", "stds", help="What is known of a state at the beginning.", **many),
-        click.option(
-            "--intensity",
-            "intensities",
-            help="Of a state's driving noise, unit^2/s, or of a signal's noise, unit^2 s.",
-            **{**many, "metavar": "NAME=NUMBER"},
-        ),
-    ):
-        command = option(command)
-    return command
+@dataclass(frozen=True, slots=True)
+class FitOptions:
+    """Options of `calibrate` and `close`."""
+
+    model: ModelOptions = field(default_factory=ModelOptions)
+    reading: ReadingOptions = field(default_factory=ReadingOptions)
+    holdout: Words = flag(
+        (),
+        "--holdout",
+        only=Kind.FITTED,
+        type=click.Path(),
+        metavar="FILE",
+        help="Score the estimate on this record, which the fit does not see.",
+    )
+    solver: str = flag(
+        "ipopt",
+        "--solver",
+        show_default=True,
+        type=SolverName(),
+        help="ipopt, ipopt-exact, trust-region, or an estimator of the model's own.",
+    )
+    starts: Assignments = flag(
+        (),
+        "--start",
+        only=Kind.FITTED,
+        of=Assignment,
+        metavar="NAME=VALUE",
+        help="Start value in place of the automatic one.",
+    )
+    seed: int = flag(0, "--seed", show_default=True, help="For random restarts.")
+    output: Path | None = flag(None, "-o", "--output", **RESULTS)
+    as_json: bool = flag(False, "--json", help="Print result.json instead of a table.")

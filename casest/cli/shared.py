@@ -11,11 +11,6 @@ import click
 from casest import __version__
 from casest.cli.waiting import Waiting
 
-Options = dict[str, Any]
-
-#: A file in its place is refused before anything is computed.
-FOLDER = click.Path(path_type=Path, file_okay=False)
-
 shown = Waiting()
 
 #: Say what is going on, where somebody watches.

@@ -21,7 +21,7 @@ from casest.declaration.shapes import Array
 from casest.engine.threads import one_thread
 from casest.errors import NotTrusted, UsageError
 from casest.estimate.calibrate import Estimate, attempt
-from casest.estimate.certificate import SAME
+from casest.estimate.reasons import SAME
 from casest.leastsquares.problem import Point, Problem
 from casest.leastsquares.sums import rounding as rounding_error
 from casest.solve.outcome import Outcome

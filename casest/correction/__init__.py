@@ -1,1 +1,1 @@
-"""Corrected readings: inverted, applied, exported. Imports results and below."""
+"""Corrected readings: a model inverted, and the inverse as a program. Imports engine and below."""

@@ -8,17 +8,9 @@ from casest import __version__
 from casest.correction.inverse import LEFT
 from casest.correction.program import Program
 from casest.declaration.shapes import Array
+from casest.engine.operations import OPERATIONS
 
-#: Operations as C expressions; <tgmath.h> chooses the function of the number's type.
-_C = {
-    "add": "{0} + {1}", "sub": "{0} - {1}", "mul": "{0} * {1}", "div": "{0} / {1}",
-    "neg": "-{0}", "square": "{0} * {0}", "twice": "{0} + {0}", "inverse": "1 / {0}",
-    "assign": "{0}", "sign": "(real)(({0} > 0) - ({0} < 0))", "less": "(real)({0} < {1})",
-    "less_equal": "(real)({0} <= {1})", "equal": "(real)({0} == {1})",
-    "not_equal": "(real)({0} != {1})", "not": "(real)!({0} != 0)",
-    "and": "(real)({0} != 0 && {1} != 0)", "or": "(real)({0} != 0 || {1} != 0)",
-    "if_else_zero": "({0} != 0) ? {1} : (real)0",
-}  # fmt: skip
+_C = {operation.name: operation.exported_c for operation in OPERATIONS}
 _NEWTON = """
 /* Newton's method, every step halved until it gains, as casest does it. */
 static int solve(const real *x, real *value, real start) {{
@@ -188,10 +180,7 @@ def _body(program: Program) -> Iterator[str]:
             yield f"  out[{place}] = w[{rest[0]}];"
         else:
             operands = [f"w[{r}]" for r in rest]
-            template = _C.get(
-                operation, operation + "(" + ", ".join(["{0}", "{1}"][: len(rest)]) + ")"
-            )
-            yield f"  w[{place}] = {template.format(*operands)};"
+            yield f"  w[{place}] = {_C[operation].format(*operands)};"
 
 
 def _number(value: float) -> str:

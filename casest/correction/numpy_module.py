@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from casest import __version__
-from casest.correction import runtime
+from casest.correction import numpy_table, runtime
 from casest.correction.inverse import LEFT
 from casest.correction.program import Program
 from casest.declaration.shapes import Array
@@ -41,6 +41,7 @@ def python_source(program: Program, test: tuple[Array, Array]) -> str:
     """
     text = inspect.getsource(runtime)
     _, _, body = text.partition("from __future__ import annotations\n")
+    body = body.replace(numpy_table.IMPORT, numpy_table.TEXT, 1)
     signals = ", ".join(f"{i.name} ({i.size}, {i.unit or '1'})" for i in program.inputs)
     head = (
         f'"""{program.output.name} of {program.model}, exported by casest {__version__}.\n\n'

@@ -17,22 +17,8 @@ import numpy as np
 
 from casest.correction.inverse import Correction
 from casest.declaration.shapes import Array
+from casest.engine.operations import operation_of
 from casest.errors import UsageError
-
-#: CasADi's operations by the names that the exported JSON uses.
-NAMES = {
-    ca.OP_ADD: "add", ca.OP_SUB: "sub", ca.OP_MUL: "mul", ca.OP_DIV: "div", ca.OP_NEG: "neg",
-    ca.OP_EXP: "exp", ca.OP_LOG: "log", ca.OP_LOG1P: "log1p", ca.OP_EXPM1: "expm1",
-    ca.OP_POW: "pow", ca.OP_CONSTPOW: "pow", ca.OP_SQRT: "sqrt", ca.OP_SQ: "square",
-    ca.OP_TWICE: "twice", ca.OP_INV: "inverse", ca.OP_SIN: "sin", ca.OP_COS: "cos",
-    ca.OP_TAN: "tan", ca.OP_ASIN: "asin", ca.OP_ACOS: "acos", ca.OP_ATAN: "atan",
-    ca.OP_SINH: "sinh", ca.OP_COSH: "cosh", ca.OP_TANH: "tanh", ca.OP_ASINH: "asinh",
-    ca.OP_ACOSH: "acosh", ca.OP_ATANH: "atanh", ca.OP_ATAN2: "atan2", ca.OP_HYPOT: "hypot",
-    ca.OP_FMIN: "fmin", ca.OP_FMAX: "fmax", ca.OP_FABS: "fabs", ca.OP_FLOOR: "floor",
-    ca.OP_CEIL: "ceil", ca.OP_SIGN: "sign", ca.OP_COPYSIGN: "copysign", ca.OP_LT: "less",
-    ca.OP_LE: "less_equal", ca.OP_EQ: "equal", ca.OP_NE: "not_equal", ca.OP_NOT: "not",
-    ca.OP_AND: "and", ca.OP_OR: "or", ca.OP_IF_ELSE_ZERO: "if_else_zero", ca.OP_ASSIGN: "assign",
-}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -137,15 +123,12 @@ def _steps(function: Any) -> tuple[tuple[tuple[Any, ...], ...], int]:
             found.append(("input", outs[0], ins[1]))
         elif op == ca.OP_OUTPUT:
             found.append(("output", outs[1], ins[0]))
-        elif op in NAMES:
-            found.append((NAMES[op], outs[0], *ins[: 2 if op in _BINARY else 1]))
         else:
-            raise UsageError(f"the model uses an operation (number {op}) that is not exported")
+            operation = operation_of(op, "the correction")
+            if operation.numpy is None:
+                raise UsageError(
+                    f"the correction uses the operation {operation.name}, which is not exported:"
+                    " write the model without it, or correct with casest apply"
+                )
+            found.append((operation.name, outs[0], *ins[: operation.arity]))
     return tuple(found), int(function.sz_w())
-
-
-_BINARY = {
-    ca.OP_ADD, ca.OP_SUB, ca.OP_MUL, ca.OP_DIV, ca.OP_POW, ca.OP_CONSTPOW, ca.OP_ATAN2,
-    ca.OP_HYPOT, ca.OP_FMIN, ca.OP_FMAX, ca.OP_COPYSIGN, ca.OP_LT, ca.OP_LE, ca.OP_EQ, ca.OP_NE,
-    ca.OP_AND, ca.OP_OR, ca.OP_IF_ELSE_ZERO,
-}  # fmt: skip

@@ -1,4 +1,7 @@
-"""Runs an exported correction with NumPy alone: the text of this file is part of every module."""
+"""Runs an exported correction with NumPy alone: the text of this file is part of every module.
+
+There the table of operations stands in place of its import.
+"""
 
 from __future__ import annotations
 
@@ -6,52 +9,7 @@ from typing import Any
 
 import numpy as np
 
-OPERATIONS: dict[str, Any] = {
-    "add": np.add,
-    "sub": np.subtract,
-    "mul": np.multiply,
-    "div": np.divide,
-    "neg": np.negative,
-    "exp": np.exp,
-    "log": np.log,
-    "log1p": np.log1p,
-    "expm1": np.expm1,
-    "pow": np.power,
-    "sqrt": np.sqrt,
-    "square": np.square,
-    "twice": lambda a: 2 * a,
-    "inverse": lambda a: 1 / a,
-    "sin": np.sin,
-    "cos": np.cos,
-    "tan": np.tan,
-    "asin": np.arcsin,
-    "acos": np.arccos,
-    "atan": np.arctan,
-    "sinh": np.sinh,
-    "cosh": np.cosh,
-    "tanh": np.tanh,
-    "asinh": np.arcsinh,
-    "acosh": np.arccosh,
-    "atanh": np.arctanh,
-    "atan2": np.arctan2,
-    "hypot": np.hypot,
-    "fmin": np.fmin,
-    "fmax": np.fmax,
-    "fabs": np.abs,
-    "floor": np.floor,
-    "ceil": np.ceil,
-    "sign": np.sign,
-    "copysign": np.copysign,
-    "assign": lambda a: a,
-    "less": lambda a, b: 1.0 * (a < b),
-    "less_equal": lambda a, b: 1.0 * (a <= b),
-    "equal": lambda a, b: 1.0 * (a == b),
-    "not_equal": lambda a, b: 1.0 * (a != b),
-    "not": lambda a: 1.0 * (a == 0),
-    "and": lambda a, b: 1.0 * ((a != 0) & (b != 0)),
-    "or": lambda a, b: 1.0 * ((a != 0) | (b != 0)),
-    "if_else_zero": lambda a, b: np.where(a != 0, b, 0.0),
-}
+from casest.correction.numpy_table import OPERATIONS
 
 
 def run(program: dict[str, Any], x: Any, outputs: int) -> Any:

@@ -22,6 +22,7 @@ from casest.declaration.effect import Attached
 from casest.declaration.model import Model
 from casest.declaration.symbols import Constant, param
 from casest.declaration.tracing import function_of
+from casest.engine.operations import Operation, Powers, Units, operation_of
 from casest.errors import UnitError
 
 
@@ -48,11 +49,6 @@ PLAIN = Size(None, None, frozenset())
 #: A number such as 2 or 1/3, which belongs to a formula and converts no unit.
 PURE = Size(None, 1.0, frozenset())
 _ONE = Fraction(1)
-_SAME = {ca.OP_ADD, ca.OP_SUB, ca.OP_FMIN, ca.OP_FMAX, ca.OP_LT, ca.OP_LE, ca.OP_EQ, ca.OP_NE,
-         ca.OP_ATAN2, ca.OP_HYPOT, ca.OP_FMOD, ca.OP_COPYSIGN}  # fmt: skip
-_UNCHANGED = {ca.OP_ASSIGN, ca.OP_NEG, ca.OP_FABS, ca.OP_FLOOR, ca.OP_CEIL, ca.OP_TWICE}
-_LOGICAL = {ca.OP_LT, ca.OP_LE, ca.OP_EQ, ca.OP_NE, ca.OP_ATAN2}
-_PERIODIC = {ca.OP_SIN, ca.OP_COS, ca.OP_TAN}
 
 
 def check_units(model: Model) -> None:
@@ -167,7 +163,8 @@ def _outputs(f: Any, inputs: Mapping[tuple[int, int], Size], name: str) -> list[
         elif op == ca.OP_OUTPUT:
             outputs[to[0]].append(work[where[0]])
         else:
-            work[to[0]] = _operation(op, [work[i] for i in where], name)
+            operation = operation_of(op, f"model {name}")
+            work[to[0]] = _result(operation, [work[i] for i in where], name)
     return outputs
 
 
@@ -178,43 +175,39 @@ def _is_mathematical(number: float) -> bool:
     return any(abs(x - round(x)) < 1e-12 and round(x) <= 12 for x in candidates)
 
 
-def _operation(op: int, operands: list[Size], name: str) -> Size:
+def _result(operation: Operation, operands: list[Size], name: str) -> Size:
+    """What comes out of an operation on operands of these sizes."""
     names = frozenset().union(*(o.names for o in operands))
-    first = operands[0]
-    if op in _SAME:
-        _fits(first, operands[1], f"model {name}")
-        if op in _LOGICAL:
-            return Size({}, 1.0, names)
-        chosen = first if first.powers is not None else operands[1]
-        return Size(chosen.powers, chosen.factor, names)
-    if op in _UNCHANGED:
-        return Size(first.powers, first.factor, names)
-    if op == ca.OP_IF_ELSE_ZERO:
-        return operands[1]
-    if op in (ca.OP_MUL, ca.OP_DIV, ca.OP_SQ, ca.OP_INV, ca.OP_SQRT):
-        return _product(op, operands, names)
-    if op in (ca.OP_POW, ca.OP_CONSTPOW, ca.OP_SIGN):
-        # The exponent's value is not followed: what comes out fits anything.
-        return PLAIN
-    wanted = Size({}, 1.0 if op in _PERIODIC else None, frozenset())
-    for operand in operands:
-        _fits(operand, wanted, f"model {name}: the argument of {_word(op)}")
-    return Size({}, 1.0, names)
+    first, pure = operands[0], Size({}, 1.0, names)
+    if isinstance(operation.units, tuple):
+        return _product(operation.units, operands, names)
+    match operation.units:
+        case Units.ANY:
+            return PLAIN
+        case Units.FIRST:
+            return Size(first.powers, first.factor, names)
+        case Units.LAST:
+            return operands[-1]
+        case Units.SAME | Units.COMPARED:
+            _fits(first, operands[1], f"model {name}")
+            if operation.units is Units.COMPARED:
+                return pure
+            chosen = first if first.powers is not None else operands[1]
+            return Size(chosen.powers, chosen.factor, names)
+        case Units.PURE | Units.ANGLE:
+            factor = 1.0 if operation.units is Units.ANGLE else None
+            for operand in operands:
+                where = f"model {name}: the argument of {operation.name}"
+                _fits(operand, Size({}, factor, frozenset()), where)
+            return pure
 
 
-def _product(op: int, operands: list[Size], names: frozenset[str]) -> Size:
-    exponents: dict[int, tuple[Fraction, ...]] = {
-        ca.OP_MUL: (_ONE, _ONE),
-        ca.OP_DIV: (_ONE, -_ONE),
-        ca.OP_SQ: (2 * _ONE,),
-        ca.OP_INV: (-_ONE,),
-        ca.OP_SQRT: (_ONE / 2,),
-    }
+def _product(powers: Powers, operands: list[Size], names: frozenset[str]) -> Size:
     if all(o.powers is None for o in operands):
         return PURE if all(o.factor for o in operands) else PLAIN
     total: dict[str, Fraction] = {}
     factor: float | None = 1.0
-    for operand, power in zip(operands, exponents[op], strict=True):
+    for operand, power in zip(operands, powers, strict=True):
         for base, p in (operand.powers or {}).items():
             total[base] = total.get(base, Fraction(0)) + p * power
         if factor is None or operand.factor is None:
@@ -242,7 +235,3 @@ def _way_out(a: Size, b: Size) -> str:
         degrees = abs(high / low * math.pi / 180 - 1) < 1e-9
         return said + (", or multiply degrees by pi / 180" if degrees else "")
     return "declare another unit, or mend the formula"
-
-
-def _word(op: int) -> str:
-    return next(n[3:].lower() for n in dir(ca) if n.startswith("OP_") and getattr(ca, n) == op)

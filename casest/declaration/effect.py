@@ -19,6 +19,11 @@ Kind = Literal["quantity", "signal", "noise", "sequence"]
 
 #: What an effect on the noise acts on, instead of a quantity.
 NOISE = "noise"
+#: What an effect may say of a column that is looked for among those recorded: a temperature, any
+#: other, or both; of a number that data tell; and of where one on the noise shows itself.
+COLUMNS = ("temperature", "other", "any")
+NUMBERS = ("mean", "duration")
+TAILS, RANDOM_WALK = "tails", "random walk"
 
 
 @dataclass(frozen=True)
@@ -30,7 +35,10 @@ class Effect:
     For tracing a residual: `typical` sizes of the parameters, each in its unit; `profile` the
     parameters that are searched over a grid (name -> "frequency", "time" or "level"), because the
     effect is not smooth in them or has many valleys; `shown_by` the measurement that shows it;
-    `plain` the form that it is tried in once it was found.
+    `plain` the form that it is tried in once it was found; `columns` the argument for which a
+    recorded column is looked for (name -> "temperature", "other" or "any"); `numbers` those that
+    data tell (name -> "mean" of that column, or "duration" of the record); `seen_in` where an
+    effect on the noise shows itself: the "tails" of the residuals, or a "random walk" in them.
     """
 
     name: str
@@ -48,6 +56,9 @@ class Effect:
     formula: str = ""
     #: Values of parameters at which it is what it mostly is in practice, with fewer unknowns.
     plain: tuple[tuple[str, float], ...] = ()
+    columns: tuple[tuple[str, str], ...] = ()
+    numbers: tuple[tuple[str, str], ...] = ()
+    seen_in: str = ""
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         """Evaluate the effect's own function."""
@@ -84,6 +95,9 @@ def effect(
     shown_by: str = "",
     formula: str = "",
     plain: Mapping[str, float] | None = None,
+    columns: Mapping[str, str] | None = None,
+    numbers: Mapping[str, str] | None = None,
+    seen_in: str = "",
 ) -> Callable[[Callable[..., Any]], Effect]:
     """Declare an effect: first argument the value acted on, further ones signals or columns.
 
@@ -103,9 +117,11 @@ def effect(
                 named(default, name) if isinstance(default, Signal) else Signal(name, 1, None)
             )
         for word, given in (
-            ("null", null), ("typical", typical), ("profile", profile), ("plain", plain)
+            ("null", null), ("typical", typical), ("profile", profile), ("plain", plain),
+            ("numbers", numbers),
         ):  # fmt: skip
             _refuse_unknown(function.__name__, word, given or {}, [name for name, _ in keyword])
+        _refuse_other_words(function.__name__, on, extras, columns or {}, numbers or {}, seen_in)
         declared_kind: Kind = kind or ("noise" if on == NOISE else "quantity")
         declarations = tuple(_declaration(function.__name__, name, d) for name, d in keyword)
         return Effect(
@@ -122,6 +138,9 @@ def effect(
             shown_by,
             formula,
             tuple((plain or {}).items()),
+            tuple((columns or {}).items()),
+            tuple((numbers or {}).items()),
+            seen_in,
         )
 
     return declare
@@ -134,6 +153,38 @@ def _refuse_unknown(name: str, word: str, given: Mapping[str, Any], own: Sequenc
         raise DeclarationError(
             f"effect {name}: {word}= names {unknown[0]!r}, which is none of its parameters: {there}"
         )
+
+
+def _refuse_other_words(
+    name: str,
+    on: str,
+    extras: Sequence[Signal],
+    columns: Mapping[str, str],
+    numbers: Mapping[str, str],
+    seen_in: str,
+) -> None:
+    """What is said of columns, numbers and the noise must be what the loop knows."""
+    for argument in set(columns) - {s.name for s in extras}:
+        raise DeclarationError(
+            f"effect {name}: columns= names {argument!r}, which is no argument that it reads"
+        )
+    if len(columns) > 1:
+        raise DeclarationError(
+            f"effect {name}: columns= names {len(columns)} arguments, and one column is looked for"
+        )
+    if seen_in and on != NOISE:
+        raise DeclarationError(
+            f"effect {name}: seen_in= is for effects on the noise, and this one acts on {on!r}"
+        )
+    said: list[tuple[str, str, tuple[str, ...]]]
+    said = [("columns", w, COLUMNS) for w in columns.values()]
+    said += [("numbers", w, NUMBERS) for w in numbers.values()]
+    said += [("seen_in", seen_in, (TAILS, RANDOM_WALK))] if seen_in else []
+    for word, given, known_words in said:
+        if given not in known_words:
+            raise DeclarationError(
+                f"effect {name}: {word}= says {given!r}: give {' or '.join(known_words)}"
+            )
 
 
 def _signature(function: Callable[..., Any]) -> tuple[list[tuple[str, Any]], list[tuple[str, Any]]]:
@@ -281,7 +332,8 @@ def check_null(
             nulls[name] = declaration.array
         else:
             dims = next(
-                (p.shape.dims for p in attached.parameters if p.name.endswith(f".{name}")), ()
+                (p.shape.dims for p in attached.parameters if p.name == f"{attached.label}.{name}"),
+                (),
             )
             nulls[name] = np.full(dims or (1,), attached.effect.null_of(name))
             unknowns[name] = attached.effect.null_of(name)

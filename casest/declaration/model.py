@@ -67,6 +67,10 @@ class Model:
             + [p for p in of_effects if isinstance(p, Parameter)]
         )
 
+    def unknowns_of(self, label: str) -> set[str]:
+        """Names of the parameters that an effect brought, by its label; none without it."""
+        return {p.name for a in self.effects if a.label == label for p in a.parameters}
+
     @cached_property
     def constants(self) -> tuple[Constant, ...]:
         """Plain numbers of the model."""

@@ -13,7 +13,7 @@ from casest.diagnose.candidates.candidates import Skipped
 from casest.diagnose.candidates.score_test import Score
 from casest.diagnose.misfit.lack_of_fit import Misfit, left_over, state_of
 from casest.diagnose.selection.cross_validation import Folds
-from casest.diagnose.selection.found import OF_NOISE, Found, Undecided
+from casest.diagnose.selection.found import Found, Undecided
 from casest.estimate.calibrate import Estimate
 from casest.leastsquares.problem import Problem
 
@@ -62,5 +62,4 @@ class Closing:
             return None
         if self.misfit.significant:
             return "unexplained"
-        named = {f.candidate.name for f in self.effects}
-        return "extended" if named - OF_NOISE else "adequate"
+        return "adequate" if all(f.of_noise for f in self.effects) else "extended"

@@ -12,7 +12,7 @@ CLIPPED = 3.5
 
 
 #: Log-likelihood by which a shape must beat a random walk.
-DOUBT = 5.0
+BEYOND_WALK = 5.0
 
 
 #: Stretches that a continuous record is cut into.

@@ -9,22 +9,26 @@ from typing import Any
 import numpy as np
 
 from casest.data.run import Run
-from casest.declaration.effect import Effect
+from casest.declaration.effect import RANDOM_WALK, TAILS, Effect
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
 from casest.diagnose.candidates.candidates import Candidate, Skipped, candidates
-from casest.diagnose.candidates.grid import profiled
+from casest.diagnose.candidates.grid import on_grid
 from casest.diagnose.candidates.score_test import Score, scores, steadied, widened
 from casest.diagnose.closing import Closing
 from casest.diagnose.formula.fit import formula_instead, try_formula
 from casest.diagnose.noise.noise_model import wander_of
 from casest.diagnose.noise.tails import outliers_p_value
 from casest.diagnose.selection.acceptance import accepted
-from casest.diagnose.selection.backward_elimination import filled, proved, weeded
+from casest.diagnose.selection.backward_elimination import (
+    backward_eliminated,
+    certified,
+    on_all_axes,
+)
 from casest.diagnose.selection.cross_validation import Folds, rms, undetermined
 from casest.diagnose.selection.expected_loss import hangs_on_which, leave_open, note_walk, rivals
 from casest.diagnose.selection.found import HELD_OUT_DATA, Found, Undecided
-from casest.diagnose.selection.hypothesis_test import CHANCE, asked, note_unseen
+from casest.diagnose.selection.hypothesis_test import CHANCE, hypothesis_test, note_unseen
 from casest.diagnose.selection.model_evidence import (
     FALSE_ALARM,
     SMALL,
@@ -32,15 +36,16 @@ from casest.diagnose.selection.model_evidence import (
     Fitted,
     as_good,
     confirmed_by_flips,
-    gentlest_first,
+    least_loss_first,
     not_told_apart,
     with_rivals,
 )
-from casest.diagnose.selection.random_walk import wanders
-from casest.diagnose.selection.refit import contenders, whole
+from casest.diagnose.selection.random_walk import is_random_walk
+from casest.diagnose.selection.refit import refitted, whole
 from casest.diagnose.selection.state import Step, Work
-from casest.diagnose.selection.swap import cautious
+from casest.diagnose.selection.swap import swapped
 from casest.effects import CATALOGUE
+from casest.effects.noise import bias_wander
 from casest.effects.placing import prepared
 from casest.engine.kernel import only_tried
 from casest.engine.threads import one_thread
@@ -111,7 +116,7 @@ def _closed(work: Work) -> Closing:
         first_scores, declared = first_scores or ranked, declared or current
         better = _better(work, current, ranked)
         if better is None and work.undecided is None:
-            better = _asked(work, current, ranked) or try_formula(work, current)
+            better = _hypothesised(work, current, ranked) or try_formula(work, current)
         if better is None:
             better = formula_instead(work, declared, current, partial(_complete, work))
         if better is None:
@@ -120,12 +125,12 @@ def _closed(work: Work) -> Closing:
     else:
         ranked = _ranked(work, current)
     last = current
-    current = weeded(work, filled(work, current))
+    current = backward_eliminated(work, on_all_axes(work, current))
     if current is last:
-        current = cautious(work, current)
+        current = swapped(work, current)
     if current is not last:
         ranked = _ranked(work, current)
-    current, after = proved(work, current)
+    current, after = certified(work, current)
     _note_wander(work, current)
     added = {f.candidate.label for f in work.found}
     return Closing(
@@ -153,7 +158,7 @@ def _ranked(work: Work, current: Fitted) -> list[Score]:
     problem = Problem(current.model, work.runs)
     readings = _readings(problem, problem.point(current.values))
     work.original |= {c.label: c for c in found}
-    expanded = profiled(found, work.runs, current.residuals, readings, current.noise)
+    expanded = on_grid(found, work.runs, current.residuals, readings, current.noise)
     ranked: list[Score] = []
     known = work.before.noise.repeats
     for part in _parts(expanded, WIDEST // max(len(current.model.axes), 1)):
@@ -175,16 +180,16 @@ def _better(work: Work, current: Fitted, ranked: list[Score]) -> Fitted | None:
         work.refuse(significant[0].candidate, "no more than noise that is not alike everywhere")
     if not confirmed:
         return None
-    tried = contenders(work, current, with_rivals(confirmed, ranked), ranked)
+    tried = refitted(work, current, with_rivals(confirmed, ranked), ranked)
     found = _first_accepted(work, current, tried, limit)
     if found is not None or work.undecided is not None:
         return found
     return _two_at_once(work, current, [pair for pair in tried if pair[0].p_value <= limit])
 
 
-def _asked(work: Work, current: Fitted, ranked: list[Score]) -> Fitted | None:
+def _hypothesised(work: Work, current: Fitted, ranked: list[Score]) -> Fitted | None:
     """The model with what the user asks for, if the data and held-out data do not deny it."""
-    tried, limit = asked(work, current, ranked, CHANCE * _sternness(work))
+    tried, limit = hypothesis_test(work, current, ranked, CHANCE * _sternness(work))
     return _first_accepted(work, current, tried, limit) if tried else None
 
 
@@ -192,13 +197,13 @@ def _first_accepted(
     work: Work, current: Fitted, tried: list[tuple[Score, Fitted]], limit: float
 ) -> Fitted | None:
     """The model with the best of those that are significant and that held-out data confirm."""
-    for score, fitted in gentlest_first(tried, work.folds, work.known):
+    for score, fitted in least_loss_first(tried, work.folds, work.known):
         if score.p_value > limit:
             continue  # It may be the cause as well, but speaks for itself too softly.
         best = tried[0]
         if fitted is not best[1] and not not_told_apart(best[1], fitted, best[0], work.folds):
             break  # What explains the data clearly less well is not the cause.
-        if wanders(work.runs, current, fitted, score):
+        if is_random_walk(work.runs, current, fitted, score):
             work.refuse(score.candidate, "an offset that walks at random explains it as well")
             note_walk(work, current, score, fitted)
             continue
@@ -231,7 +236,7 @@ def _two_at_once(work: Work, current: Fitted, tried: list[tuple[Score, Fitted]])
     ranked = _ranked(work, first)
     limit = _limit(ranked, BESIDE)
     beside = [s for s in ranked if s.p_value <= limit]
-    best = contenders(work, first, beside, ranked) if beside else []
+    best = refitted(work, first, beside, ranked) if beside else []
     both = _first_accepted(work, current, best, limit)
     if both is None:
         work.refused, work.undecided = refused, None
@@ -248,7 +253,7 @@ def _two_at_once(work: Work, current: Fitted, tried: list[tuple[Score, Fitted]])
 
 def _without_outliers(work: Work, current: Fitted) -> Fitted:
     """With the effect `outliers` where there are some: they would pull what follows."""
-    effect = next((e for e in work.catalogue if e.name == "outliers"), None)
+    effect = next((e for e in work.catalogue if e.seen_in == TAILS), None)
     if effect is None or any(a.label == effect.name for a in current.model.effects):
         return current
     problem = Problem(current.model, work.runs)
@@ -261,19 +266,19 @@ def _without_outliers(work: Work, current: Fitted) -> Fitted:
         return current
     gained = work.gain(current, fitted)[0]
     work.found.append(Found(Candidate(effect), None, p_value, gained))
-    work.say("outliers: they count less from here on")
+    work.say(f"{effect.name}: they count less from here on")
     return fitted
 
 
 def _note_wander(work: Work, current: Fitted) -> None:
     """Say that the offset wanders: a property of the noise, which changes no fit."""
-    effect = next((e for e in work.catalogue if e.name == "bias_wander"), None)
+    effect = next((e for e in work.catalogue if e.seen_in == RANDOM_WALK), None)
     p_value = wander_of(work.runs, current.residuals)
     if p_value is None and work.walks and work.undecided is None:
         # It is no noise either, by which the offset would be known to wander.
         names = [name for walk in work.walks for name in walk.names]
         share = max(walk.share for walk in work.walks)
-        work.undecided = Undecided((*dict.fromkeys(names), "bias_wander"), share)
+        work.undecided = Undecided((*dict.fromkeys(names), (effect or bias_wander).name), share)
     if effect is not None and p_value is not None:
         work.found.append(Found(Candidate(effect), None, p_value, 0.0))
 

@@ -68,4 +68,15 @@ CATALOGUE: tuple[Effect, ...] = (
     outliers,
 )
 
-__all__ = ["CATALOGUE", *(e.name for e in CATALOGUE)]
+_FUNCTIONS = frozenset(e.function for e in CATALOGUE)
+
+
+def shipped(effect: Effect) -> bool:
+    """Is it one of the catalogue, wherever it acts and whatever it holds? Their units are tested.
+
+    Any other is the user's own.
+    """
+    return effect.function in _FUNCTIONS
+
+
+__all__ = ["CATALOGUE", "shipped", *(e.name for e in CATALOGUE)]

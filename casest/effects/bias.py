@@ -38,6 +38,8 @@ def bias_step(
     typical={"k": 2e-3},
     shown_by="the same pose at two temperatures, not rising with time alone",
     formula="y + k·(channel − at)",
+    columns={"channel": "temperature"},
+    numbers={"at": "mean"},
 )
 def temperature_bias(
     y: SX, channel: SX, *, k: SX = param(each, "[y]/[channel]"), at: SX = constant(0.0)
@@ -51,6 +53,8 @@ def temperature_bias(
     typical={"k": 3e-4},
     shown_by="large inputs at two temperatures, not rising with time alone",
     formula="u·(1 + k·(channel − at))",
+    columns={"channel": "temperature"},
+    numbers={"at": "mean"},
 )
 def temperature_gain(
     u: SX, channel: SX, *, k: SX = param(each, "1/[channel]"), at: SX = constant(0.0)
@@ -63,6 +67,8 @@ def temperature_gain(
     on="output",
     shown_by="the same input at two values of the channel",
     formula="y + k·(channel − at)",
+    columns={"channel": "other"},
+    numbers={"at": "mean"},
 )
 def channel_bias(
     y: SX, channel: SX, *, k: SX = param(each, "[y]/[channel]"), at: SX = constant(0.0)
@@ -75,6 +81,8 @@ def channel_bias(
     on="input",
     shown_by="large inputs at two values of the channel",
     formula="u·(1 + k·(channel − at))",
+    columns={"channel": "other"},
+    numbers={"at": "mean"},
 )
 def channel_gain(
     u: SX, channel: SX, *, k: SX = param(each, "1/[channel]"), at: SX = constant(0.0)

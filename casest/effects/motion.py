@@ -50,6 +50,7 @@ def axis_wobble(
     typical={"c": 0.05},
     shown_by="a record short enough for the declared speed law",
     formula="angle + Σ c[k]·P[k+5](2·t/duration − 1), P Legendre's polynomials",
+    numbers={"duration": "duration"},
 )
 def speed_polynomial(
     angle: SX,

@@ -10,6 +10,7 @@ from casest.declaration.physics import SX, fabs, if_else
     on="noise",
     shown_by="the samples themselves",
     formula="weight (1 − (r/6)²)² within 6 standard deviations, else 0",
+    seen_in="tails",
 )
 def outliers(r: SX) -> SX:
     """Samples far out count less: Tukey's biweight, 6 standard deviations wide."""
@@ -20,6 +21,7 @@ def outliers(r: SX) -> SX:
     on="noise",
     shown_by="a long record at rest (Allan deviation)",
     formula="y + a random walk (its size: wander, under noise)",
+    seen_in="random walk",
 )
 def bias_wander(r: SX) -> SX:
     """The offset walks at random: bias instability (IEEE Std 952).

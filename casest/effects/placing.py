@@ -57,12 +57,12 @@ def with_numbers(
     effect: Effect, columns: tuple[tuple[str, str], ...], runs: Sequence[Run]
 ) -> Effect:
     """Where an effect acts on these data: its quantity, columns as signals, numbers it is told."""
-    names = {n for n, _ in effect.declarations}
     values: dict[str, float] = {}
-    if "at" in names and columns:
-        x = np.concatenate([run.signals[columns[0][1]][:, 0] for run in runs])
-        values["at"] = float(f"{np.mean(x):.6g}")
-    if "duration" in names:
-        ends = [float(np.ptp(run.signals["t"])) for run in runs if "t" in run.signals]
-        values["duration"] = float(f"{max(ends, default=1.0) or 1.0:.6g}")
+    for name, what in effect.numbers:
+        if what == "mean" and columns:
+            x = np.concatenate([run.signals[columns[0][1]][:, 0] for run in runs])
+            values[name] = float(f"{np.mean(x):.6g}")
+        if what == "duration":
+            ends = [float(np.ptp(run.signals["t"])) for run in runs if "t" in run.signals]
+            values[name] = float(f"{max(ends, default=1.0) or 1.0:.6g}")
     return effect.holding(**values) if values else effect

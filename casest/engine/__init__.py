@@ -1,4 +1,8 @@
-"""Evaluating per-sample expressions over all samples of a record, fast and in constant memory."""
+"""Evaluating per-sample expressions over all samples of a record, fast and in constant memory.
+
+It imports `errors` alone, and stands below the declarations, whose units follow its table of
+operations (`operations`): NumPy, C and exported programs read the same rows.
+"""
 
 from __future__ import annotations
 

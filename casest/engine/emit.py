@@ -9,67 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-import casadi as ca
-
+from casest.engine.operations import BY_CODE
 from casest.engine.replay import Entry, Plan, Replay
 
-#: Operations as C expressions of their operands.
-_C = {
-    ca.OP_ADD: "{0} + {1}",
-    ca.OP_SUB: "{0} - {1}",
-    ca.OP_MUL: "{0} * {1}",
-    ca.OP_DIV: "{0} / {1}",
-    ca.OP_NEG: "-{0}",
-    ca.OP_EXP: "exp({0})",
-    ca.OP_LOG: "log({0})",
-    ca.OP_LOG1P: "log1p({0})",
-    ca.OP_EXPM1: "expm1({0})",
-    ca.OP_POW: "pow({0}, {1})",
-    ca.OP_CONSTPOW: "pow({0}, {1})",
-    ca.OP_SQRT: "sqrt({0})",
-    ca.OP_SQ: "{0} * {0}",
-    ca.OP_TWICE: "{0} + {0}",
-    ca.OP_INV: "1.0 / {0}",
-    ca.OP_SIN: "sin({0})",
-    ca.OP_COS: "cos({0})",
-    ca.OP_TAN: "tan({0})",
-    ca.OP_ASIN: "asin({0})",
-    ca.OP_ACOS: "acos({0})",
-    ca.OP_ATAN: "atan({0})",
-    ca.OP_SINH: "sinh({0})",
-    ca.OP_COSH: "cosh({0})",
-    ca.OP_TANH: "tanh({0})",
-    ca.OP_ASINH: "asinh({0})",
-    ca.OP_ACOSH: "acosh({0})",
-    ca.OP_ATANH: "atanh({0})",
-    ca.OP_ATAN2: "atan2({0}, {1})",
-    ca.OP_HYPOT: "hypot({0}, {1})",
-    ca.OP_FMIN: "(({0} <= {1}) | ({1} != {1})) ? {0} : {1}",
-    ca.OP_FMAX: "(({0} >= {1}) | ({1} != {1})) ? {0} : {1}",
-    ca.OP_FABS: "fabs({0})",
-    ca.OP_FLOOR: "floor({0})",
-    ca.OP_CEIL: "ceil({0})",
-    ca.OP_FMOD: "fmod({0}, {1})",
-    ca.OP_REMAINDER: "remainder({0}, {1})",
-    ca.OP_SIGN: "{0} < 0 ? -1.0 : {0} > 0 ? 1.0 : {0}",
-    ca.OP_COPYSIGN: "copysign({0}, {1})",
-    ca.OP_ERF: "erf({0})",
-    ca.OP_LT: "{0} < {1}",
-    ca.OP_LE: "{0} <= {1}",
-    ca.OP_EQ: "{0} == {1}",
-    ca.OP_NE: "{0} != {1}",
-    ca.OP_NOT: "!{0}",
-    ca.OP_AND: "({0} != 0) & ({1} != 0)",
-    ca.OP_OR: "({0} != 0) | ({1} != 0)",
-    ca.OP_IF_ELSE_ZERO: "{0} != 0 ? {1} : 0.0",
-}
-#: Library functions that have no SIMD form everywhere: each gets a loop to itself, so that one of
-#: them does not keep the rest of the chunk from being vectorised.
-_ALONE = {
-    ca.OP_LOG1P, ca.OP_EXPM1, ca.OP_TAN, ca.OP_ASIN, ca.OP_ACOS, ca.OP_ATAN, ca.OP_SINH,
-    ca.OP_COSH, ca.OP_TANH, ca.OP_ASINH, ca.OP_ACOSH, ca.OP_ATANH, ca.OP_ATAN2, ca.OP_HYPOT,
-    ca.OP_FMOD, ca.OP_REMAINDER, ca.OP_ERF,
-}  # fmt: skip
 #: Instructions of one loop: the time that compilers take grows with the square of it.
 _LONGEST = 200
 #: Bytes of a chunk's values: they stay in the first-level cache.
@@ -192,7 +134,7 @@ def _scalar(value: object, place: dict[int, int]) -> str:
     if kind == "parameter":
         return f"p[{value.code}]"  # type: ignore[attr-defined]
     operands = [f"c[{place[j]}]" for j in value.operands]  # type: ignore[attr-defined]
-    return _C[value.code].format(*operands)  # type: ignore[attr-defined]
+    return BY_CODE[value.code].c.format(*operands)  # type: ignore[attr-defined]
 
 
 def _number(constant: float) -> str:
@@ -229,7 +171,8 @@ def _loops(plan: Plan, scalars: dict[int, int]) -> tuple[list[list[str]], int]:
     for k, segment in enumerate(segments):
         lines = []
         for i in segment:
-            expression = _C[values[i].code].format(*(operand(j, k) for j in values[i].operands))
+            operands = (operand(j, k) for j in values[i].operands)
+            expression = BY_CODE[values[i].code].c.format(*operands)
             lines.append(f"    const double v{i} = {expression};")
             if i in plan.home:
                 lines.append(f"    out[{plan.home[i]}][l] = v{i};")
@@ -243,7 +186,7 @@ def _segments(plan: Plan) -> list[list[int]]:
     """The per-sample instructions in order, cut where a loop must end."""
     segments: list[list[int]] = [[]]
     for i in plan.steps:
-        if plan.graph.values[i].code in _ALONE:
+        if BY_CODE[plan.graph.values[i].code].alone:
             segments += [[i], []]
             continue
         if len(segments[-1]) == _LONGEST:

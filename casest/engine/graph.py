@@ -9,11 +9,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from casest.engine.operations import KERNELS
-from casest.errors import CasestError
+from casest.engine.operations import BY_CODE, operation_of
 
-_COMMUTATIVE = {ca.OP_ADD, ca.OP_MUL}
-_SAME = {ca.OP_ASSIGN, ca.OP_LIFT}  # the value of the (first) operand, unchanged
 PARAMETER = 0  # which input
 SAMPLE = 1
 
@@ -40,27 +37,23 @@ class Graph:
         self.outputs = [[-1] * function.nnz_out(i) for i in range(function.n_out())]
         self._known: dict[object, int] = {}
         register: dict[int, int] = {}
+        where = f"function {function.name()!r}"
         for k in range(function.n_instructions()):
             code = function.instruction_id(k)
             source = function.instruction_input(k)
             target = function.instruction_output(k)
             if code == ca.OP_OUTPUT:
                 self.outputs[target[0]][target[1]] = register[source[0]]
-            elif code in _SAME:
-                register[target[0]] = register[source[0]]
             elif code == ca.OP_CONST:
                 constant = float(function.instruction_constant(k))
                 register[target[0]] = self.add(Value("constant", constant=constant))
             elif code == ca.OP_INPUT:
                 register[target[0]] = self.add(_input(source[0], source[1]))
-            elif code in KERNELS:
+            elif operation_of(code, where).same:
+                register[target[0]] = register[source[0]]
+            else:
                 operands = tuple(register[i] for i in source)
                 register[target[0]] = self.add(self.operation(code, operands))
-            else:
-                raise CasestError(
-                    f"function {function.name()!r} uses the operation {_name(code)}, which replay"
-                    " does not know: write the expression without it"
-                )
 
     def needed(self, wanted: Iterable[int]) -> list[int]:
         """Values that these take, in order of computation."""
@@ -75,7 +68,7 @@ class Graph:
 
     def operation(self, code: int, operands: tuple[int, ...]) -> Value:
         """An operation on values of the graph, not yet one of them."""
-        if code in _COMMUTATIVE:
+        if BY_CODE[code].commutative:
             operands = tuple(sorted(operands))
         per_sample = any(self.values[i].per_sample for i in operands)
         return Value("operation", code, operands, per_sample=per_sample)
@@ -95,8 +88,3 @@ def _input(which: int, index: int) -> Value:
     if which == PARAMETER:
         return Value("parameter", index)
     return Value("sample", index, per_sample=True)
-
-
-def _name(code: int) -> str:
-    names = [name for name in dir(ca) if name.startswith("OP_") and getattr(ca, name) == code]
-    return names[0] if names else f"number {code}"

@@ -14,7 +14,6 @@ from typing import NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from casest.engine.factored import factored_sums
 from casest.engine.kernel import Kernel, kernel_for, kernel_of_sum
 from casest.engine.operations import Floats
 from casest.engine.replay import BLOCK, Entry, Replay, Samples, once
@@ -73,25 +72,15 @@ def normal_equations(
     if kernel is not None:
         whole = _compiled_sums(kernel, replay, parameters, samples, weights)
     else:
-        whole = _replayed_sums(replay, parameters, samples, weights)
+        with np.errstate(all="ignore"):
+            whole = _replayed_sums(replay, parameters, samples, weights)
     return Normal(0.5 * float(whole[n, n]), whole[:n, n].copy(), whole[:n, :n].copy())
 
 
 def _replayed_sums(
     replay: Replay, parameters: Floats, samples: Samples, weights: Floats | None
 ) -> Floats:
-    """[J r]ᵀ W [J r], (n+1, n+1)."""
-    found = factored_sums(replay, parameters, samples) if weights is None else None
-    if found is not None:
-        return found
-    with np.errstate(all="ignore"):
-        return _sums_by_entry(replay, parameters, samples, weights)
-
-
-def _sums_by_entry(
-    replay: Replay, parameters: Floats, samples: Samples, weights: Floats | None
-) -> Floats:
-    """The same from every entry of J on every sample."""
+    """[J r]ᵀ W [J r], (n+1, n+1), from every entry of J on every sample."""
     components = _components(replay)
     sums = [np.zeros((len(c.columns),) * 2) for c in components]
     for block, w in _weighted_blocks(replay, components, parameters, samples, weights):

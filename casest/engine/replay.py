@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from casest.engine.graph import PARAMETER, SAMPLE, Graph
 from casest.engine.grouping import group
-from casest.engine.operations import KERNELS, Floats, Kernel
+from casest.engine.operations import BY_CODE, Floats, Kernel
 from casest.engine.scalars import Scalars
 from casest.errors import CasestError
 
@@ -192,7 +192,7 @@ class _Workspace:
 
     def _call(self, i: int, place: dict[int, Floats]) -> tuple[Kernel, tuple[Floats, ...]]:
         value = self.plan.graph.values[i]
-        return KERNELS[value.code], (*(place[j] for j in value.operands), place[i])
+        return BY_CODE[value.code].kernel, (*(place[j] for j in value.operands), place[i])
 
 
 def _run(calls: list[tuple[Kernel, tuple[Floats, ...]]]) -> None:

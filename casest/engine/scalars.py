@@ -5,34 +5,15 @@ As Python's numbers: one addition takes NumPy several times as long as Python.
 
 from __future__ import annotations
 
-import operator
 from collections.abc import Callable, Iterable
 
-import casadi as ca
 import numpy as np
 
 from casest.engine.graph import Graph, Value
-from casest.engine.operations import KERNELS, Floats
+from casest.engine.operations import BY_CODE, Floats
 
 #: What is done with two earlier numbers, the second of which may be the first again.
 Step = tuple[Callable[[float, float], float], int, int]
-
-
-def _divided(a: float, b: float) -> float:
-    return a / b if b else float(np.divide(a, b))
-
-
-#: Operations that Python's numbers do as IEEE 754 has it, without an exception.
-_PLAIN: dict[int, Callable[[float, float], float]] = {
-    ca.OP_ADD: operator.add,
-    ca.OP_TWICE: operator.add,
-    ca.OP_SUB: operator.sub,
-    ca.OP_MUL: operator.mul,
-    ca.OP_SQ: operator.mul,
-    ca.OP_NEG: lambda a, _: -a,
-    ca.OP_DIV: _divided,
-    ca.OP_INV: lambda a, _: _divided(1.0, a),
-}
 
 
 class Scalars:
@@ -56,23 +37,18 @@ class Scalars:
         """All of them at some parameters (n,)."""
         given = parameters.tolist()
         found = [*self._constants, *(given[code] for code in self._codes)]
-        return follow(self._steps, found)
+        for do, a, b in self._steps:
+            found.append(do(found[a], found[b]))
+        return found
 
     def _step(self, value: Value) -> Step:
         first, last = (self.place[value.operands[k]] for k in (0, -1))
-        do = _PLAIN.get(value.code) or _by_numpy(value.code, len(value.operands))
+        do = BY_CODE[value.code].python or _by_numpy(value.code, len(value.operands))
         return do, first, last
 
 
-def follow(steps: list[Step], found: list[float]) -> list[float]:
-    """Add the result of every step to what was found before, and return it."""
-    for do, a, b in steps:
-        found.append(do(found[a], found[b]))
-    return found
-
-
 def _by_numpy(code: int, count: int) -> Callable[[float, float], float]:
-    kernel = KERNELS[code]
+    kernel = BY_CODE[code].kernel
 
     def compute(*numbers: float) -> float:
         if isinstance(kernel, np.ufunc):

@@ -15,10 +15,12 @@ from casest.declaration.model import Model
 from casest.declaration.shapes import Array
 from casest.engine.threads import one_thread
 from casest.errors import DataError, NotTrusted, UsageError
+from casest.estimate import reasons as words
 from casest.estimate.certificate import Certificate, certify
 from casest.estimate.correlation import ENOUGH, TABLE, correlation_time
 from casest.estimate.covariance import covariance_of, inverse_normal, sandwich
 from casest.estimate.profile_likelihood import half_width
+from casest.estimate.reasons import NEAR, POOR, Code
 from casest.estimate.remarks import NOTABLE_BIAS, notes
 from casest.leastsquares.identifiability import Identifiability, Weak, identify, weak_directions
 from casest.leastsquares.problem import Point, Problem
@@ -29,9 +31,6 @@ from casest.solve.strategy import SOLVERS, best_of, solve, valleys
 
 #: From this many degrees of freedom on the residual alone says how large the noise is.
 ENOUGH_FREEDOM = 10
-#: Neighbouring rows of a table over which residuals are alike, from which on the fit is poor: an
-#: autoregression of 0.8. Of NIST's 27 problems one has more at its solution, and one valley.
-ALIKE = 9.0
 
 
 @dataclass(frozen=True)
@@ -196,10 +195,10 @@ def _attempt(
     try:
         first = problem.start() if start is None else problem.point(_merged(problem, start))
     except NotTrusted as error:
-        return _refused(problem, problem.point({}), str(error), began)
+        return _refused(problem, problem.point({}), Code.MODEL, str(error), began)
     nowhere = _not_finite(problem, first)
     if nowhere:
-        return _refused(problem, first, nowhere, began)
+        return _refused(problem, first, Code.NOT_FINITE, nowhere, began)
     problem, outcomes = solve(
         problem,
         first,
@@ -211,8 +210,7 @@ def _attempt(
     if start is None and model.starter is None and found.certificate.trusted:
         found = _looked_at_for_a_better_one(found)
     if stopped():
-        reason = "interrupted: this is the best point so far, not an optimum"
-        refused = replace(found.certificate, trusted=False, reasons=(reason,))
+        refused = found.certificate.refused(Code.INTERRUPTED, words.INTERRUPTED)
         return replace(found, certificate=refused)
     return _by_estimator(found, own[solver], solver) if solver in own else found
 
@@ -248,7 +246,7 @@ def _not_finite(problem: Problem, start: Point) -> str:
     return "a derivative of the residual is not finite at the start values; give --start"
 
 
-def _refused(problem: Problem, point: Point, reason: str, began: float) -> Estimate:
+def _refused(problem: Problem, point: Point, code: Code, reason: str, began: float) -> Estimate:
     """An estimate that says nothing but why there is none."""
     nothing = np.full((problem.unknowns, problem.unknowns), np.nan)
     nan = float("nan")
@@ -261,7 +259,7 @@ def _refused(problem: Problem, point: Point, reason: str, began: float) -> Estim
         nothing,
         Noise(nan, nan, None, problem.residual_count - problem.unknowns),
         nan,
-        Certificate(False, (reason,), nan, nan, nan, 0, 0, (nan, nan), ()),
+        Certificate(False, (reason,), nan, nan, nan, 0, 0, (nan, nan), (), code=code),
         Identifiability(0, problem.unknowns, nothing[0], nothing, (), everything, ""),
         (),
         (),
@@ -331,14 +329,10 @@ def _looked_at_for_a_better_one(found: Estimate) -> Estimate:
     places = valleys(found.outcomes)
     over = correlation_time(found.problem, found.point, tables=True) if places > 1 else 1.0
     timed = any(run.time is not None for run in found.problem.runs)
-    if timed or over <= ALIKE:
+    if timed or over <= POOR:
         return found
-    reason = (
-        f"{len(found.outcomes)} starts ended in {places} places, and even the best leaves "
-        f"residuals that are alike over {over:.2g} rows: there may be a better one, or the model "
-        "lacks something; give --start near the solution"
-    )
-    return replace(found, certificate=replace(found.certificate, trusted=False, reasons=(reason,)))
+    reason = words.poor_valley(len(found.outcomes), places, over)
+    return replace(found, certificate=found.certificate.refused(Code.POOR_VALLEY, reason))
 
 
 def _of_tables(problem: Problem, point: Point) -> Iterator[str]:
@@ -382,7 +376,7 @@ def _by_estimator(optimum: Estimate, function: Callable[..., Any], name: str) ->
         values = function(problem.model, problem.runs)
         values = {name: value for name, value in values.items() if name in known}
     except NotTrusted as error:
-        refused = replace(optimum.certificate, trusted=False, reasons=(str(error),))
+        refused = optimum.certificate.refused(Code.MODEL, str(error))
         return replace(optimum, certificate=refused, extra={"estimator": name})
     seconds = time.perf_counter() - began
     point = problem.point(values)
@@ -408,17 +402,13 @@ def _judged(optimum: Estimate, point: Point, values: Mapping[str, Any], name: st
         return certificate
     kept = problem.values(point)
     if not all(np.allclose(kept[name], values[name], rtol=1e-6, atol=1e-9) for name in kept):
-        reason = f"{name}: the solution collapsed; it lies outside the bounds of the model"
-        return replace(certificate, trusted=False, reasons=(reason,))
+        return certificate.refused(Code.MODEL, words.collapsed(name))
     away = problem.difference(point, optimum.point)
     distance = away / np.sqrt(np.diag(optimum.covariance))
     worst = int(np.argmax(np.abs(distance)))
-    far = (
-        f"{name}: `{problem.names[worst]}` is {abs(distance[worst]):.2g} standard deviations from "
-        "the certified least-squares optimum"
-    )
-    if not abs(distance[worst]) <= 3:
-        return replace(certificate, trusted=False, reasons=(far,))
+    far = words.from_optimum(name, problem.names[worst], abs(distance[worst]))
+    if not abs(distance[worst]) <= NEAR:
+        return certificate.refused(Code.MODEL, far)
     return replace(certificate, reasons=(far, *certificate.reasons))
 
 

@@ -9,13 +9,32 @@ the intervals that will be printed describe the cost around it.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import reduce
+from operator import or_
 
 import numpy as np
 
 from casest.declaration.shapes import Array
+from casest.estimate import reasons as words
 from casest.estimate.covariance import inverse_normal
 from casest.estimate.profile_likelihood import Profile, half_width, profiled
+from casest.estimate.reasons import (
+    ALIKE,
+    APART,
+    BENT,
+    CURVATURE,
+    LINEAR,
+    NOTHING,
+    ON_BOUND,
+    PRACTICALLY_NULL,
+    SECOND_ORDER,
+    SHAPE,
+    SLOPE,
+    STEP,
+    Code,
+)
+from casest.estimate.reasons import SAME as SAME
 from casest.leastsquares.identifiability import Identifiability
 from casest.leastsquares.problem import Point, Problem
 from casest.leastsquares.sums import few_of, second_order
@@ -23,26 +42,8 @@ from casest.leastsquares.sums import rounding as rounding_error
 from casest.solve.outcome import Outcome
 from casest.solve.trust_region import LITTLE, trust_region
 
-#: Share of the residual that the Jacobian can still reach (Bates & Watts' relative offset).
-SLOPE = 1e-5
-#: Last Gauss-Newton step, in standard deviations of the estimate.
-STEP = 1e-4
-#: Two solutions are the same when they differ by less than this many standard deviations.
-SAME = 1e-2
-#: Rise of the cost two standard deviations from the optimum, over what the intervals assume.
-SHAPE = (0.5, 10.0)
-#: Within this the linear intervals are as good as those of the likelihood, which are dearer.
-LINEAR = (0.7, 2.0)
-#: From this ratio on a valley is too bent to be looked along: about 45 standard deviations aside.
-BENT = 1e3
 #: Iterations in which another outcome is followed, to see whether it is a solution of its own.
 FOLLOWED = 1000
-#: An implicit residual is the noise of the reading to first order only; the second-order part must
-#: stay below this share of it. (A flat ellipsoid through poses in a plane "fits" by that part.)
-SECOND_ORDER = 0.07
-#: Singular values of the column-scaled Jacobian below this leave a direction undetermined for all
-#: practical purposes: its standard deviation is 10⁵ times that of each parameter alone.
-PRACTICALLY_NULL = 1e-5
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,8 @@ class Certificate:
     """Evidence for (or against) an estimate: the figures, and in words why it is (not) trusted.
 
     `profile` (n, 2): how far below and above each unknown its 95 % interval reaches, by the profile
-    of the cost, where the cost is no parabola; None where the linear intervals describe it.
+    of the cost, where the cost is no parabola; None where the linear intervals describe it. `code`
+    says which reasons speak against it.
     """
 
     trusted: bool
@@ -63,6 +65,11 @@ class Certificate:
     shape: tuple[float, float]
     at_bound: tuple[str, ...]
     profile: Array | None = None
+    code: Code = NOTHING
+
+    def refused(self, code: Code, reason: str) -> Certificate:
+        """The same figures, refused for a reason that takes the place of all others."""
+        return replace(self, trusted=False, reasons=(reason,), code=code)
 
 
 def certify(
@@ -81,62 +88,53 @@ def certify(
     `intervals`, those that the likelihood would have to give are taken to have ends.
     """
     R = factor[0]
-    against: list[str] = []
+    against: list[tuple[Code, str]] = []
     rounding = rounding_error(problem, best.point)
     slope, step = _slope_and_step(factor, sigma, rounding)
     # What cannot be told from rounding is no slope, however small the residual.
     exact = float(np.linalg.norm(factor[1])) <= 10 * rounding * np.sqrt(problem.residual_count)
     at_bound = _active(problem, best.point, R, max(sigma if np.isfinite(sigma) else 0, rounding))
-    missing = identified.unknowns - identified.rank
-    if missing:
-        against += [f"not determined: {words}" for words in identified.unobservable]
-    elif identified.singular_values[-1] < PRACTICALLY_NULL * identified.singular_values[0]:
-        against.append(
-            f"practically not determined: {identified.weakest}; the motion does not separate them"
-        )
-    against += [] if against else [_bound_words(problem, name) for name in at_bound]
+    against += _undetermined(identified)
+    if not against:
+        against += [(Code.BOUND, _bound_words(problem, name)) for name in at_bound]
     if not against and not np.isfinite(sigma):
-        against.append(
-            f"no redundancy: {problem.residual_count} equations for {problem.unknowns} unknowns "
-            "fit whatever the noise is; record more, or rest intervals whose scatter shows it"
-        )
+        way = "record more, or rest intervals whose scatter shows it"
+        counts = problem.residual_count, problem.unknowns
+        against.append((Code.NO_REDUNDANCY, words.no_redundancy(*counts, way)))
     if not np.isfinite(best.cost):
-        against.append("the residual is not finite at the best point found")
+        against.append((Code.NOT_FINITE, words.not_finite()))
     elif slope > SLOPE and step > STEP and not exact and not against:
-        weak = identified.singular_values[-1] < 1e-3 * identified.singular_values[0]
-        against.append(
-            f"not determined well enough to settle: {identified.weakest}; vary the motion"
-            if weak
-            else "not a stationary point: the last step was still "
-            f"{step:.2g} standard deviations long"
-        )
+        smallest = identified.singular_values[-1] / identified.singular_values[0]
+        against.append((Code.NOT_SETTLED, words.not_settled(step, smallest, identified.weakest)))
     curvature = _curvature(problem, best.point, R) if not against else float("nan")
-    if not against and not curvature > 1e-9:
-        against.append(f"no minimum: the exact curvature is {curvature:.2g} in some direction")
+    if not against and not curvature > CURVATURE:
+        against.append((Code.NO_MINIMUM, words.no_minimum(curvature)))
     agreeing = sum(_same(problem, best, other, sigma, rounding) for other in others)
     shape = (1.0, 1.0)
     second = second_order(problem, best.point, sigma) if not against else 0.0
     if second > SECOND_ORDER:
-        against.append(
-            f"the noise is too large for the curvature of the fitted surface (second-order part "
-            f"{second:.2g} of the noise): the readings cover too little, or average more of them"
-        )
+        against.append((Code.NOISE, words.noise(second)))
     profile = None
     if not against:
-        shape, words = _shape(problem, best, R, max(sigma, rounding))
+        shape, misshapen = _shape(problem, best, R, max(sigma, rounding))
         if not LINEAR[0] <= shape[0] <= shape[1] <= LINEAR[1]:
             if not intervals and _has_likelihood(problem):
-                words = []
+                misshapen = []
             else:
                 profile = _profile(problem, best, R, sigma)
         if profile is not None:
-            words = []
-        against += words or _ambiguous(problem, best, others, R, sigma)
-    seen = profile is not None
-    reasons = tuple(against) or _for(slope, step, curvature, agreeing, len(others), shape, seen)
+            misshapen = []
+        against += misshapen or _ambiguous(problem, best, others, R, sigma)
+    against.sort(key=lambda reason: reason[0])
+    speaking_for = (
+        words.stationary(step),
+        words.minimum(curvature),
+        words.agreement(agreeing, len(others)),
+        _intervals(shape, profile is not None),
+    )
     return Certificate(
         not against,
-        reasons,
+        tuple(said for _, said in against) or speaking_for,
         slope,
         step,
         curvature,
@@ -145,7 +143,25 @@ def certify(
         shape,
         at_bound,
         None if against else profile,
+        reduce(or_, (code for code, _ in against), NOTHING),
     )
+
+
+def _intervals(shape: tuple[float, float], profiled: bool) -> str:
+    if profiled:
+        return words.PROFILED
+    wide = shape[1] > LINEAR[1]
+    return words.cautious_intervals(shape[1]) if wide else words.intervals(*shape)
+
+
+def _undetermined(identified: Identifiability) -> list[tuple[Code, str]]:
+    """Null directions, or else one that is so for all practical purposes."""
+    singular = identified.singular_values
+    if identified.unknowns - identified.rank:
+        return [(Code.NOT_DETERMINED, words.not_determined(w)) for w in identified.unobservable]
+    if singular[-1] < PRACTICALLY_NULL * singular[0]:
+        return [(Code.NOT_DETERMINED, words.practically_not_determined(identified.weakest))]
+    return []
 
 
 def _has_likelihood(problem: Problem) -> bool:
@@ -188,18 +204,14 @@ def _active(problem: Problem, point: Point, R: Array, noise: float) -> tuple[str
     """Unknowns on a bound: nearer to it than a thousandth of their standard deviation alone."""
     lower, upper = problem.bounds
     norms = np.linalg.norm(R, axis=0)
-    width = 1e-3 * noise / np.where(norms > 0, norms, np.inf)
+    width = ON_BOUND * noise / np.where(norms > 0, norms, np.inf)
     active = (point.x <= lower + width) | (point.x >= upper - width)
     return tuple(problem.names[i] for i in np.flatnonzero(active))
 
 
 def _bound_words(problem: Problem, name: str) -> str:
     i = problem.names.index(name)
-    lower, upper = problem.bounds[0][i], problem.bounds[1][i]
-    return (
-        f"`{name}` ended on its bound ({lower:.4g}, {upper:.4g}): the data ask for a value "
-        "outside, or do not determine it"
-    )
+    return words.bound(name, problem.bounds[0][i], problem.bounds[1][i])
 
 
 def _curvature(problem: Problem, point: Point, R: Array) -> float:
@@ -223,7 +235,7 @@ def _same(problem: Problem, best: Outcome, other: Outcome, sigma: float, roundin
 
 def _shape(
     problem: Problem, best: Outcome, R: Array, sigma: float
-) -> tuple[tuple[float, float], list[str]]:
+) -> tuple[tuple[float, float], list[tuple[Code, str]]]:
     """Walk two standard deviations along every principal direction: is the cost what intervals say?
 
     The ratio of the cost's rise to the quadratic one is 1 for a linear problem. Below SHAPE the
@@ -233,7 +245,7 @@ def _shape(
     """
     norms = np.linalg.norm(R, axis=0)
     _, singular, Vt = np.linalg.svd(R / norms)
-    ratios, words, few = [1.0], [], _few_around(problem, best.point, sigma)
+    ratios, against, few = [1.0], [], _few_around(problem, best.point, sigma)
     for k in range(len(norms) - 1, -1, -1):
         for sign in (1, -1):
             step = sign * 2 * sigma / singular[k] * Vt[k] / norms
@@ -245,9 +257,10 @@ def _shape(
                 there = profiled(problem, best.point, step, row)
                 ratio = _rise(problem, best, there, np.zeros_like(step), sigma)
             if not SHAPE[0] <= ratio <= SHAPE[1]:
-                words.append(_misshapen(problem, step, norms, ratio))
+                said = words.misshapen(ratio, ratio, _largest(problem, step, norms))
+                against.append((Code.MISSHAPEN, said))
             ratios.append(ratio)
-    return (float(min(ratios)), float(max(ratios))), words[:1]
+    return (float(min(ratios)), float(max(ratios))), against[:1]
 
 
 def _few_around(
@@ -277,7 +290,7 @@ def _few_around(
 
 def _ambiguous(
     problem: Problem, best: Outcome, others: Sequence[Outcome], R: Array, sigma: float
-) -> list[str]:
+) -> list[tuple[Code, str]]:
     """Another solution that the data hardly distinguish from the best one, by a 95 % test."""
     for other in others:
         i = _apart(problem, best, other, R, sigma)
@@ -287,20 +300,18 @@ def _ambiguous(
         other = trust_region(problem, other.point, max_iterations=FOLLOWED, damping=LITTLE)
         i = _apart(problem, best, other, R, sigma)
         if i is not None:
-            return [
-                f"two solutions fit alike: `{problem.names[i]}` = {best.point.x[i]:.6g} and "
-                f"{other.point.x[i]:.6g}; give --start, or vary the motion"
-            ]
+            here, there = best.point.x[i], other.point.x[i]
+            return [(Code.AMBIGUOUS, words.ambiguous(problem.names[i], here, there))]
     return []
 
 
 def _apart(problem: Problem, best: Outcome, other: Outcome, R: Array, sigma: float) -> int | None:
     """The unknown in which an outcome that fits alike is far away; None where there is none."""
-    if not other.cost - best.cost < 1.92 * sigma**2:
+    if not other.cost - best.cost < ALIKE * sigma**2:
         return None
     # Rough where the problem is curved, but a different valley is many deviations away.
     difference = _unturned(problem, other.point.x - best.point.x)
-    if not np.linalg.norm(R @ difference) > 10 * sigma:
+    if not np.linalg.norm(R @ difference) > APART * sigma:
         return None
     return int(np.argmax(np.abs(difference) * np.linalg.norm(R, axis=0)))
 
@@ -322,53 +333,6 @@ def _rise(problem: Problem, best: Outcome, point: Point, step: Array, sigma: flo
     return float(ratio) if np.isfinite(ratio) else float("inf")
 
 
-def _misshapen(problem: Problem, step: Array, norms: Array, ratio: float) -> str:
-    where = _largest(problem, step, norms)
-    if not np.isfinite(ratio):
-        return (
-            f"not determined well enough: two standard deviations ({where}) reach beyond the "
-            "bounds; vary the motion"
-        )
-    flat = ": the data hardly determine it" if ratio < SHAPE[0] else ""
-    return (
-        f"too uncertain for its intervals: two standard deviations away ({where}) the cost rises "
-        f"{ratio:.2g} times as much as they assume{flat}; vary the motion"
-    )
-
-
 def _largest(problem: Problem, step: Array, norms: Array) -> str:
     order = np.argsort(-np.abs(step * norms))[:3]
     return ", ".join(f"`{problem.names[i]}` {step[i]:+.2g}" for i in order)
-
-
-def _for(
-    slope: float,
-    step: float,
-    curvature: float,
-    agreeing: int,
-    others: int,
-    shape: tuple[float, float],
-    profiled: bool,
-) -> tuple[str, ...]:
-    """The case for the estimate."""
-    found = "the same optimum from another start or algorithm"
-    intervals = (
-        "intervals describe the cost two standard deviations away within "
-        f"{shape[0]:.2f}-{shape[1]:.2f}"
-    )
-    if profiled:
-        intervals = (
-            "the 95 % intervals are those of the likelihood, each unknown profiled: the cost is no "
-            "parabola, and standard deviations describe it only roughly"
-        )
-    elif shape[1] > 2.0:
-        intervals = (
-            "intervals are cautious: two standard deviations away the cost rises up to "
-            f"{shape[1]:.2g} times as much as they assume"
-        )
-    return (
-        f"stationary: the step left is {step:.1g} standard deviations",
-        f"a minimum: exact curvature at least {curvature:.3g} of the Gauss-Newton one",
-        f"{found}: {agreeing} of {others}" + "; the others end higher" * (agreeing < others),
-        intervals,
-    )

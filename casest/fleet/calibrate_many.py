@@ -381,7 +381,7 @@ class _Job:
         result.std[i] = np.sqrt(np.diag(found.covariance))
         result.sigma[i], result.rmse[i] = found.noise.sigma, found.rmse
         certificate = found.certificate
-        result.verdicts.replace(i, certificate.trusted, certificate.reasons)
+        result.verdicts.replace(i, certificate.code, certificate.reasons)
 
 
 def _numbers(span: slice) -> range:

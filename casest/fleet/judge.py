@@ -1,4 +1,4 @@
-"""The certificate of many sensors side by side: what `solve.certificate` asks, asked of arrays.
+"""The certificate of many sensors side by side: what `estimate.certificate` asks, asked of arrays.
 
 Every sensor goes through the questions that are cheap; those whose answers are not plainly good
 go through the exact ones: curvature from second derivatives, the cost along every principal
@@ -18,14 +18,29 @@ from casest.declaration.model import Model
 from casest.declaration.shapes import Array
 from casest.declaration.tracing import function_of
 from casest.engine import Replay
-from casest.estimate.certificate import BENT, PRACTICALLY_NULL, SECOND_ORDER, SHAPE, SLOPE, STEP
 from casest.estimate.correlation import ENOUGH
 from casest.estimate.profile_likelihood import HOLD
+from casest.estimate.reasons import (
+    ALIKE,
+    APART,
+    BENT,
+    CURVATURE,
+    ON_BOUND,
+    PRACTICALLY_NULL,
+    SAME,
+    SECOND_ORDER,
+    SHAPE,
+    SLOPE,
+    STEP,
+    TIME_SERIES,
+    TOO_LARGE,
+    Code,
+)
 from casest.estimate.remarks import NOTABLE_BIAS
 from casest.fleet.fit import Bounds, Fits, Flags, Places, minimise, padded, residual_counts
 from casest.fleet.linear import cholesky, dot, form, inverse, lengths, times, whole
 from casest.fleet.sums import Hold, Sensors, SideBySide, Squares
-from casest.fleet.verdicts import Code, Judged
+from casest.fleet.verdicts import Judged
 from casest.leastsquares.per_sample import laplacian, slope_in_sample
 from casest.solve.strategy import PARABOLA
 
@@ -34,11 +49,6 @@ SHRUNK = 0.1
 #: The screen of the noise's second order looks at a few samples along one direction each: it must
 #: find this many times less than what would matter.
 SAFETY = 3.5
-#: Correlation of neighbouring residuals, in standard deviations of that of independent ones, from
-#: which on they are taken for a time series.
-ALIKE = 5.0
-#: Probability with which a sound sensor is refused for the size of its residual.
-LOUD = 1e-6
 
 
 class Local(NamedTuple):
@@ -72,6 +82,7 @@ class Judge:
         self._readings(found, sensors)
         self._determined(found, here)
         self._bounded(found, here, bounds)
+        found.equations[:] = count
         found.add(Code.NO_REDUNDANCY, freedom <= 0)
         found.add(Code.NOT_FINITE, ~np.isfinite(fits.cost))
         slope = np.sqrt(fits.left / (2 * fits.cost))
@@ -138,16 +149,19 @@ class Judge:
         found.add(Code.NOT_DETERMINED, np.asarray(usable & null))
 
     def _bounded(self, found: Judged, here: Local, bounds: Bounds) -> None:
-        width = 1e-3 * here.noise / here.scale
+        width = ON_BOUND * here.noise / here.scale
         active = (here.fits.x <= bounds.lower + width) | (here.fits.x >= bounds.upper - width)
         found.bound[:] = np.argmax(active, axis=0)
+        found.lower[:], found.upper[:] = (
+            np.take_along_axis(side, found.bound[None], axis=0)[0] for side in bounds
+        )
         found.add(Code.BOUND, np.asarray(active.any(axis=0)))
 
     def _loud(self, sigma: Array, freedom: Array) -> Flags:
         from scipy.stats import chi2  # imported late: SciPy's statistics load slowly
 
         counts, which = np.unique(np.maximum(freedom, 1), return_inverse=True)
-        limit = np.sqrt(chi2.isf(LOUD, counts) / counts)[which] * self.expected
+        limit = np.sqrt(chi2.isf(TOO_LARGE, counts) / counts)[which] * self.expected
         return np.asarray(sigma > limit)
 
     def _independent(self, found: Judged, here: Local, sensors: Sensors) -> None:
@@ -158,7 +172,7 @@ class Judge:
         along = np.einsum("mns,mns->s", residuals[:, 1:], residuals[:, :-1])
         share = along / (2 * here.fits.cost)
         exact = here.sigma < 10 * _rounding(here.fits, np.ones(len(along)))
-        alike = share * np.sqrt(residuals[..., 0].size) > ALIKE
+        alike = share * np.sqrt(residuals[..., 0].size) > TIME_SERIES
         found.add(Code.CORRELATED, np.logical_and(alike, np.logical_not(exact)))
 
     # -- is it a minimum, and do intervals describe the cost around it? --------------------------
@@ -194,8 +208,8 @@ class Judge:
         matrix = whole(here.fits.matrix)
         bent = matrix + _bend(self.model, here.fits.x, sensors)
         scale = here.scale * here.scale[:, None]
-        # Positive definite, and so beyond rounding: curvature of 1e-9 of the Gauss-Newton one.
-        factor = cholesky((bent - 1e-9 * matrix) / scale)
+        # Positive definite, and so beyond rounding.
+        factor = cholesky((bent - CURVATURE * matrix) / scale)
         found.add(Code.NO_MINIMUM, ~np.isfinite(np.einsum("iis->is", factor)).all(axis=0), k)
         finite = np.where(np.isfinite(matrix / scale), matrix / scale, 0.0)
         vectors = np.linalg.eigh(finite.transpose(2, 0, 1))[1].transpose(1, 2, 0)
@@ -322,9 +336,9 @@ def _another(here: Local, other: Fits) -> Flags:
     """Is the other fit a solution elsewhere that the data hardly tell from this one, or better?"""
     step = other.x - here.fits.x
     away = np.sqrt(form(here.fits.matrix, step)) / here.noise
-    near = other.cost - here.fits.cost < 1.92 * here.noise**2
-    lower = other.cost < here.fits.cost - 0.5 * (1e-2 * here.noise) ** 2
-    return np.asarray((near & (away > 10)) | lower)
+    near = other.cost - here.fits.cost < ALIKE * here.noise**2
+    lower = other.cost < here.fits.cost - 0.5 * (SAME * here.noise) ** 2
+    return np.asarray((near & (away > APART)) | lower)
 
 
 def _groups(chosen: Flags) -> list[Places]:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from casest.declaration.shapes import Array
 from casest.engine import Plan, Replay
-from casest.engine.operations import KERNELS, Kernel
+from casest.engine.operations import BY_CODE, Kernel
 from casest.engine.replay import Entry, aligned
 
 #: Numbers per call: enough to hide the cost of the call, few enough to stay in the cache.
@@ -176,7 +176,7 @@ def _computed(plan: Plan, i: int) -> bool:
 
 def _call(plan: Plan, i: int, place: dict[int, Array]) -> tuple[Kernel, tuple[Array, ...]]:
     value = plan.graph.values[i]
-    return KERNELS[value.code], (*(place[j] for j in value.operands), place[i])
+    return BY_CODE[value.code].kernel, (*(place[j] for j in value.operands), place[i])
 
 
 def _adjacent(places: list[int]) -> slice | list[int]:

@@ -2,47 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields
-from enum import IntFlag
 from typing import overload
 
 import numpy as np
 from numpy.typing import NDArray
 
 from casest.declaration.shapes import Array
+from casest.estimate import reasons as words
+from casest.estimate.reasons import ALONE, Code
 from casest.fleet.fit import Flags
-
-
-class Code(IntFlag):
-    """What may speak against an estimate, in the order in which it is said."""
-
-    READING = 1
-    NOT_FINITE = 2
-    NO_REDUNDANCY = 4
-    NOT_DETERMINED = 8
-    BOUND = 16
-    NOT_SETTLED = 32
-    NO_MINIMUM = 64
-    MISSHAPEN = 128
-    AMBIGUOUS = 256
-    NOISE = 512
-    LOUD = 1024
-    CORRELATED = 2048
 
 
 @dataclass
 class _Figures:
     """Codes with the figures that their words quote; the sensor axis is the last, W or S long.
 
-    `where` first sample that is not finite; `bound` unknown on its bound; `step` last step in
-    standard deviations; `low` and `high` rise of the cost over that of a parabola; `second` second
-    order of the noise over the noise; `smallest` singular value and its direction `weakest` (n, W).
+    `where` first sample that is not finite; `equations` how many there are; `bound` unknown on its
+    bound, with its bounds `lower` and `upper`; `step` last step in standard deviations; `low` and
+    `high` rise of the cost over that of a parabola; `second` second order of the noise over the
+    noise; `smallest` singular value and its direction `weakest` (n, W).
     """
 
     code: NDArray[np.int_]
     where: NDArray[np.int_]
+    equations: NDArray[np.int_]
     bound: NDArray[np.int_]
+    lower: Array
+    upper: Array
     step: Array
     low: Array
     high: Array
@@ -57,7 +45,10 @@ def _blank(n: int, width: int) -> _Figures:
     return _Figures(
         code=none,
         where=none.copy(),
+        equations=none.copy(),
         bound=none.copy(),
+        lower=nan.copy(),
+        upper=nan.copy(),
         step=nan,
         low=nan.copy(),
         high=nan.copy(),
@@ -102,7 +93,7 @@ class Verdicts(Sequence[tuple[str, ...]]):
 
     names: tuple[str, ...]
     figures: _Figures
-    replaced: dict[int, tuple[bool, tuple[str, ...]]] = field(default_factory=dict)
+    replaced: dict[int, tuple[Code, tuple[str, ...]]] = field(default_factory=dict)
 
     @classmethod
     def empty(cls, names: tuple[str, ...], size: int) -> Verdicts:
@@ -115,16 +106,20 @@ class Verdicts(Sequence[tuple[str, ...]]):
             own = getattr(judged, f.name)
             getattr(self.figures, f.name)[..., span] = own[..., : span.stop - span.start]
 
-    def replace(self, i: int, trusted: bool, reasons: tuple[str, ...]) -> None:
+    def replace(self, i: int, code: Code, reasons: tuple[str, ...]) -> None:
         """Say of sensor i what was found out about it alone."""
-        self.replaced[i] = (trusted, reasons)
+        self.replaced[i] = (code, reasons)
+
+    def code(self, i: int) -> Code:
+        """What speaks against sensor i."""
+        return self.replaced[i][0] if i in self.replaced else Code(int(self.figures.code[i]))
 
     @property
     def trusted(self) -> Flags:
         """Is the sensor's estimate believed, (S,)?"""
         found = np.asarray(self.figures.code == 0)
-        for i, (trusted, _) in self.replaced.items():
-            found[i] = trusted
+        for i, (code, _) in self.replaced.items():
+            found[i] = not code
         return found
 
     def __len__(self) -> int:
@@ -140,53 +135,32 @@ class Verdicts(Sequence[tuple[str, ...]]):
         i = range(len(self))[i]
         if i in self.replaced:
             return self.replaced[i][1]
-        code = Code(int(self.figures.code[i]))
+        code = self.code(i)
         # A fit to readings that are no numbers, or that has no fit, has nothing else to say.
-        for only in (Code.READING, Code.NOT_FINITE, Code.NO_REDUNDANCY, Code.NOT_DETERMINED):
+        for only in ALONE:
             if only in code:
                 return (self._against(only, i),)
         return tuple(self._against(c, i) for c in Code if c in code) or self._for(i)
 
     def _against(self, code: Code, i: int) -> str:
-        f = self.figures
-        return {
-            Code.READING: f"sample {f.where[i]} is not finite: measure this sensor again",
-            Code.NOT_FINITE: "the residual is not finite at the best point found; give start=",
-            Code.NO_REDUNDANCY: (
-                f"no redundancy: as many or fewer equations than the {len(self.names)} unknowns; "
-                "record more"
+        f, n = self.figures, len(self.names)
+        said: dict[Code, Callable[[], str]] = {
+            Code.READING: lambda: words.reading(f.where[i]),
+            Code.NOT_FINITE: lambda: words.not_finite("give start="),
+            Code.NO_REDUNDANCY: lambda: words.no_redundancy(f.equations[i], n, "record more"),
+            Code.NOT_DETERMINED: lambda: words.not_determined(
+                f"{self._weakest(i)}; vary the motion"
             ),
-            Code.NOT_DETERMINED: f"not determined: {self._weakest(i)}; vary the motion",
-            Code.BOUND: (
-                f"`{self.names[f.bound[i]]}` ended on its bound: the data ask for a value outside, "
-                "or do not determine it"
-            ),
-            Code.NOT_SETTLED: (
-                f"not determined well enough to settle: {self._weakest(i)}; vary the motion"
-                if f.smallest[i] < 1e-3
-                else "not a stationary point: the last step was still "
-                f"{f.step[i]:.2g} standard deviations long"
-            ),
-            Code.NO_MINIMUM: "no minimum: the exact curvature is not positive in some direction",
-            Code.MISSHAPEN: (
-                "too uncertain for its intervals: two standard deviations away the cost rises "
-                f"{f.low[i]:.2g} to {f.high[i]:.2g} times as much as they assume; vary the motion"
-            ),
-            Code.AMBIGUOUS: f"another solution fits alike or better, along {self._weakest(i)}",
-            Code.NOISE: (
-                "the noise is too large for the curvature of the fitted surface (second-order part "
-                f"{f.second[i]:.2g} of the noise): the readings cover too little, or average more "
-                "of them"
-            ),
-            Code.LOUD: (
-                f"the residual ({f.sigma[i]:.3g}) is larger than the noise= of a sound sensor: the "
-                "sensor is bad, or does not follow the model"
-            ),
-            Code.CORRELATED: (
-                "residuals of neighbouring samples are alike: a time series, or a missing effect; "
-                "average readings at rest, or call calibrate"
-            ),
-        }[code]
+            Code.BOUND: lambda: words.bound(self.names[f.bound[i]], f.lower[i], f.upper[i]),
+            Code.NOT_SETTLED: lambda: words.not_settled(f.step[i], f.smallest[i], self._weakest(i)),
+            Code.NO_MINIMUM: words.no_minimum,
+            Code.MISSHAPEN: lambda: words.misshapen(f.low[i], f.high[i]),
+            Code.AMBIGUOUS: lambda: words.ambiguous_along(self._weakest(i)),
+            Code.NOISE: lambda: words.noise(f.second[i]),
+            Code.LOUD: lambda: words.loud(f.sigma[i]),
+            Code.CORRELATED: lambda: words.CORRELATED,
+        }
+        return said[code]()
 
     def _weakest(self, i: int) -> str:
         direction = self.figures.weakest[:, i]
@@ -197,8 +171,7 @@ class Verdicts(Sequence[tuple[str, ...]]):
     def _for(self, i: int) -> tuple[str, ...]:
         f = self.figures
         return (
-            f"stationary: the step left is at most {f.step[i]:.1g} standard deviations",
-            "a minimum: steps shrink, and the cost rises along the weakest direction",
-            "intervals describe the cost two standard deviations away within "
-            f"{f.low[i]:.2f}-{f.high[i]:.2f}",
+            words.stationary(f.step[i], at_most=True),
+            words.minimum(),
+            words.intervals(f.low[i], f.high[i]),
         )

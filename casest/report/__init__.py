@@ -1,1 +1,1 @@
-"""What a person reads. Imports results and below; never one another's rooms."""
+"""What a person reads. Text and page import results and nothing else, nor each other."""

@@ -8,9 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from casest.comparison.judge import Comparison, Trial
 from casest.errors import DataError, UsageError
-from casest.estimate.certificate import SAME
+from casest.results.comparison import RIGHT, Ended, SolversCompared
 
 #: Okabe & Ito's colours, told apart by the colour-blind too; markers say the same again.
 COLOURS = ("#0072B2", "#56B4E9", "#009E73", "#000000", "#D55E00", "#E69F00", "#CC79A7")
@@ -22,7 +21,7 @@ FLOOR = 1e-6
 CEILING = 1e6
 
 
-def draw(found: Comparison, folder: Path) -> list[Path]:
+def draw(result: SolversCompared, folder: Path) -> list[Path]:
     """Write `compare.png` and `compare.svg`; returns their paths.
 
     Raises UsageError where matplotlib is missing, DataError where the folder cannot be written.
@@ -35,8 +34,8 @@ def draw(found: Comparison, folder: Path) -> list[Path]:
         ) from None
     figure = figure_of(figsize=(8, 5), layout="constrained")
     axes = figure.add_subplot()
-    _points(axes, found)
-    _furniture(axes, found)
+    _points(axes, result)
+    _furniture(axes, result)
     paths = [folder / "compare.png", folder / "compare.svg"]
     try:
         for path in paths:
@@ -46,21 +45,21 @@ def draw(found: Comparison, folder: Path) -> list[Path]:
     return paths
 
 
-def _points(axes: Any, found: Comparison) -> None:
+def _points(axes: Any, result: SolversCompared) -> None:
     """A large mark from the same start, small ones from the spread; open where it is not right."""
-    own = [row for row in found.rows if row.own]
-    solvers = [row for row in found.rows if not row.own]
+    own = [row for row in result.solvers if row.own_estimator]
+    solvers = [row for row in result.solvers if not row.own_estimator]
     for k, row in enumerate(solvers):
         colour, marker = COLOURS[k % len(COLOURS)], MARKERS[k % len(MARKERS)]
-        for trial in row.spread:
-            _mark(axes, found, trial, colour, marker, 22)
-        if row.first is not None:
-            _mark(axes, found, row.first, colour, marker, 90)
-        axes.scatter([], [], s=60, color=colour, marker=marker, label=row.solver)
+        for trial in row.spread.trials:
+            _mark(axes, result, trial, colour, marker, 22)
+        if row.same_start is not None:
+            _mark(axes, result, row.same_start, colour, marker, 90)
+        axes.scatter([], [], s=60, color=colour, marker=marker, label=row.name)
     for k, row in enumerate(own, 1):
-        if row.first is not None and np.isfinite(row.first.cost):
-            _number(axes, k, row.first.seconds, _height(found, row.first))
-            axes.scatter([], [], s=60, color=GREY, marker=f"${k}$", label=row.solver)
+        if row.same_start is not None and np.isfinite(row.same_start.cost):
+            _number(axes, k, row.same_start.seconds, _height(result, row.same_start))
+            axes.scatter([], [], s=60, color=GREY, marker=f"${k}$", label=row.name)
 
 
 def _number(axes: Any, k: int, x: float, y: float) -> None:
@@ -71,31 +70,31 @@ def _number(axes: Any, k: int, x: float, y: float) -> None:
 
 
 def _mark(
-    axes: Any, found: Comparison, trial: Trial, colour: str, marker: str, size: float
+    axes: Any, result: SolversCompared, trial: Ended, colour: str, marker: str, size: float
 ) -> None:
     if not np.isfinite(trial.cost):
         return
     face = colour if trial.right else "none"
-    height = _height(found, trial)
+    height = _height(result, trial)
     axes.scatter(
         [trial.seconds], [height], s=size, marker=marker, facecolors=face, edgecolors=colour
     )
 
 
-def _height(found: Comparison, trial: Trial) -> float:
+def _height(result: SolversCompared, trial: Ended) -> float:
     """√(2Δ)/σ: the cost's excess as a distance in standard deviations."""
-    distance = float(np.sqrt(2 * max(trial.excess, 0.0))) / found.sigma
+    distance = float(np.sqrt(2 * max(trial.excess, 0.0))) / result.noise.sigma
     return float(np.clip(distance, FLOOR, CEILING))
 
 
-def _furniture(axes: Any, found: Comparison) -> None:
+def _furniture(axes: Any, result: SolversCompared) -> None:
     axes.set_xscale("log")
     axes.set_yscale("log")
     axes.set_ylim(FLOOR / 3, CEILING * 3)
-    axes.axhline(SAME, color=GREY, linestyle="--", linewidth=1)
+    axes.axhline(RIGHT, color=GREY, linestyle="--", linewidth=1)
     axes.annotate(
         "right below this line",
-        (1, SAME),
+        (1, RIGHT),
         xycoords=("axes fraction", "data"),
         xytext=(-4, 4),
         textcoords="offset points",
@@ -105,10 +104,10 @@ def _furniture(axes: Any, found: Comparison) -> None:
     )
     axes.set_xlabel("time of one run [s]")
     axes.set_ylabel("cost excess √(2Δ)/σ [standard deviations]")
-    start = "the automatic start" if found.automatic else "the start given"
-    lost = sum(not np.isfinite(t.cost) for row in found.rows for t in row.spread)
+    start = "the automatic start" if result.same_start == "automatic" else "the start given"
+    lost = sum(not np.isfinite(t.cost) for row in result.solvers for t in row.spread.trials)
     axes.set_title(
-        f"{found.estimate.problem.model.name}: large from {start}, small from the spread;\n"
+        f"{result.declared}: large from {start}, small from the spread;\n"
         f"filled: at the optimum, open: not{f'; {lost} gave no answer' if lost else ''}",
         fontsize="medium",
     )

@@ -1,4 +1,5 @@
 """What every command leaves behind, as values that text, page and JSON read.
 
-Imports diagnose and below.
+Frozen, and built once: what is decided is decided here or below, never when it is printed. Imports
+comparison, correction and below.
 """

@@ -1,19 +1,20 @@
-"""`result.json` and `residuals.csv` of a closed loop, in the fixed form."""
+"""What a closed loop leaves: `result.json` and `residuals.csv` in their fixed form."""
 
 from __future__ import annotations
 
 import csv
 import io
-import re
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from msgspec import UNSET, Struct, UnsetType
+from msgspec.structs import asdict, replace
 
 from casest.declaration.effect import Attached
 from casest.declaration.shapes import Array
-from casest.declaration.symbols import Constant
 from casest.diagnose.closing import Closing
 from casest.diagnose.detectability import detectable, invisible
 from casest.diagnose.formula.terms import source
@@ -21,12 +22,112 @@ from casest.diagnose.selection.cross_validation import rms
 from casest.diagnose.selection.found import Found
 from casest.estimate.calibrate import Estimate
 from casest.leastsquares.problem import Problem
-from casest.results.calibration import attachment, calibration_result, parameter_table
+from casest.results.application import formula_of
 from casest.results.file import plain
+from casest.results.fitted import (
+    Fitted,
+    JudgedSection,
+    NoiseModel,
+    attachment,
+    correlation_of,
+    fitted_content,
+    noise_of,
+)
+from casest.results.residuals import Residuals, residuals_of, side_of
+from casest.results.result import Certificate, Explained, Number, Numbers, Parameter
 from casest.results.units import resolved, unit_table
+from casest.results.values import parameter_table
 
 #: How many of those that are not told apart from an effect are named beside it; others come after.
 NEAREST = 2
+
+#: Largest shift of each declared parameter.
+Shifts = dict[str, float]
+
+
+class Effect(Struct, frozen=True, kw_only=True):
+    """An effect that was added, with the evidence.
+
+    `columns`, `numbers` and `file` are there where it can be attached again.
+    """
+
+    name: str
+    on: str | None
+    column: str | None
+    parameters: dict[str, Parameter]
+    p_value: Number
+    holdout_gain: Number
+    formula: str
+    indistinguishable_from: list[str]
+    less_likely: list[str]
+    would_separate: list[str]
+    instead_would_move: dict[str, Shifts]
+    columns: dict[str, str] | UnsetType = UNSET
+    numbers: dict[str, float] | UnsetType = UNSET
+    file: str | UnsetType = UNSET
+
+
+class Hidden(Struct, frozen=True):
+    """An effect that these data cannot show, and what a typical size of it would do unseen."""
+
+    name: str
+    column: str | None
+    typical: dict[str, float]
+    units: dict[str, str]
+    would_move: Shifts
+    share_left: Number
+    shown_by: str
+
+
+class Unexplained(Struct, frozen=True):
+    """What is left: share of the held-out variance, where; causes of which none was added."""
+
+    fraction: Number
+    where: str
+    one_of: list[str]
+    would_move: dict[str, Shifts]
+    would_separate: list[str]
+
+
+class Detectable(Struct, frozen=True):
+    """The smallest size of an effect's parameter that would nearly always have been found."""
+
+    name: str
+    parameter: str
+    size: Number
+    unit: str
+
+
+class Closed(Fitted, frozen=True, kw_only=True, dict=True):
+    """The content of `result.json` of `close`.
+
+    Beside the file: `docs`, what each added effect says of itself; `closing`, what the loop left.
+    """
+
+    unwritten = (*Fitted.unwritten, "docs", "closing")
+
+    noise: NoiseModel
+    before: JudgedSection
+    after: JudgedSection
+    effects: list[Effect]
+    invisible: list[Hidden]
+    unexplained: Unexplained
+    moved: dict[str, Numbers]
+    smallest_detectable: list[Detectable]
+    refused: list[Explained]
+    not_tried: list[Explained]
+    docs: dict[str, str]
+    closing: Closing
+
+    @cached_property
+    def residuals(self) -> Residuals:
+        """What is drawn of the residuals: before and after, or of one fit if nothing was added."""
+        closing, runs = self.closing, self.closing.runs
+        fits = [("before", "before", closing.before), ("after", "after", closing.after)]
+        if not closing.effects:
+            fits = [("residual", "after", closing.after)]
+        sides = [side_of(*fit, Problem(fit[2].model, runs)) for fit in fits]
+        return residuals_of(sides, closing.after, runs, noise_of(self.noise))
 
 
 def closing_result(
@@ -36,110 +137,100 @@ def closing_result(
     data: Sequence[str],
     command: str = "",
     held_out: tuple[Sequence[Array], Sequence[Array]] | None = None,
-) -> dict[str, Any]:
-    """The content of `result.json` for `close`: see the design, 10.
+) -> Closed:
+    """What `close` leaves: see the design, 10.
 
     `held_out` are residuals before and after on a record of its own; else the cross-fitted ones.
     """
-    left = closing.misfit
-    common = calibration_result(closing.after, model_name=model_name, data=data, command=command)
-    estimate = common.pop("estimate")
+    left, shared = closing.misfit, fitted_content(closing.after, model_name, data, command)
+    units: dict[str, str] = shared["units"]
     before, after = held_out or (closing.before_held_out, closing.after_held_out)
-    sections = {
-        "before": _section(closing.before, closing, before),
-        "after": _section(closing.after, closing, after) | {"correlation": estimate["correlation"]},
-    }
-    first = list(common)
-    place = first.index("noise") + 1
-    ordered = {k: common[k] for k in first[:place]} | sections
-    ordered |= {k: common[k] for k in first[place:]}
-    ordered["trusted"] = closing.after.certificate.trusted
-    ordered["verdict"] = closing.verdict
-    ordered["noise"] |= left.noise
-    ordered["effects"] = [_effect(f, closing) for f in closing.effects]
-    ordered["invisible"] = [
-        {
-            "name": i.name,
-            "column": i.column,
-            "typical": {k: plain(v) for k, v in i.typical.items()},
-            "units": {k: resolved(u, common["units"]) for k, u in i.units.items()},
-            "would_move": {k: plain(v) for k, v in i.would_move.items()},
-            "share_left": plain(i.share),
-            "shown_by": i.shown_by,
-        }
+    fitted = _section(closing.after, closing, after)
+    shared["noise"] = NoiseModel(**asdict(shared["noise"]), **left.noise)
+    return Closed(
+        **shared,
+        verdict=closing.verdict,
+        before=_section(closing.before, closing, before),
+        after=replace(fitted, correlation=correlation_of(closing.after)),
+        effects=[_effect(f, closing) for f in closing.effects],
+        invisible=_invisible(closing, units),
+        unexplained=_unexplained(closing),
+        misfit=None,
+        moved=_moved(closing),
+        smallest_detectable=[
+            Detectable(d.name, d.parameter, plain(d.size), resolved(d.unit, units))
+            for d in detectable(closing)
+        ],
+        refused=[Explained(s.name, s.reason) for s in closing.refused],
+        not_tried=[Explained(s.name, s.reason) for s in closing.skipped],
+        docs={f.candidate.name: getattr(f.candidate.effect, "doc", "") for f in closing.effects},
+        closing=closing,
+    )
+
+
+def _invisible(closing: Closing, units: Mapping[str, str]) -> list[Hidden]:
+    return [
+        Hidden(
+            name=i.name,
+            column=i.column,
+            typical={k: plain(v) for k, v in i.typical.items()},
+            units={k: resolved(u, units) for k, u in i.units.items()},
+            would_move={k: plain(v) for k, v in i.would_move.items()},
+            share_left=plain(i.share),
+            shown_by=i.shown_by,
+        )
         for i in invisible(closing)
     ]
-    fraction = np.nan if closing.verdict is None else left.fraction
-    ordered["unexplained"] = {
-        "fraction": plain(fraction),
-        "where": left.where,
-        **_open(closing),
-    }
-    ordered["moved"] = _moved(closing)
-    ordered["smallest_detectable"] = [
-        {
-            "name": d.name,
-            "parameter": d.parameter,
-            "size": plain(d.size),
-            "unit": resolved(d.unit, common["units"]),
-        }
-        for d in detectable(closing)
-    ]
-    ordered["refused"] = [{"name": s.name, "reason": s.reason} for s in closing.refused]
-    ordered["not_tried"] = [{"name": s.name, "reason": s.reason} for s in closing.skipped]
-    return ordered
 
 
-def _section(estimate: Estimate, closing: Closing, held_out: Sequence[Array]) -> dict[str, Any]:
-    problem = Problem(estimate.model, closing.runs)
-    residuals = problem.residuals(estimate.point)
-    axes = estimate.model.axes
-    by_axis = {axis: plain(rms([r[:, [k]] for r in held_out])) for k, axis in enumerate(axes)}
-    certificate = estimate.certificate
-    table = unit_table(estimate.model, closing.runs)
-    return {
-        "rmse_fit": plain(rms(residuals)),
-        "rmse_holdout": plain(rms(held_out)),
-        "rmse_holdout_by_axis": by_axis,
-        "certificate": {"trusted": certificate.trusted, "reasons": list(certificate.reasons)},
-        "parameters": parameter_table(estimate, table),
-    }
+def _section(estimate: Estimate, closing: Closing, held_out: Sequence[Array]) -> JudgedSection:
+    residuals = Problem(estimate.model, closing.runs).residuals(estimate.point)
+    axes, certificate = estimate.model.axes, estimate.certificate
+    return JudgedSection(
+        rmse_fit=plain(rms(residuals)),
+        rmse_holdout=plain(rms(held_out)),
+        rmse_holdout_by_axis={
+            axis: plain(rms([r[:, [k]] for r in held_out])) for k, axis in enumerate(axes)
+        },
+        certificate=Certificate(certificate.trusted, list(certificate.reasons)),
+        parameters=parameter_table(estimate, unit_table(estimate.model, closing.runs)),
+    )
 
 
-def _effect(found: Found, closing: Closing) -> dict[str, Any]:
+def _effect(found: Found, closing: Closing) -> Effect:
     table = unit_table(closing.after.model, closing.runs)
     everything = parameter_table(closing.after, table)
-    attached = _attached(found, closing)
-    return {
-        "name": found.candidate.name,
-        "on": found.candidate.on,
-        "column": found.candidate.column,
-        "parameters": {
-            n.removeprefix(found.candidate.label + "."): everything[n] for n in found.names
+    candidate, attached, alike = found.candidate, _attached(found, closing), _alike(found, closing)
+    effect = Effect(
+        name=candidate.name,
+        on=candidate.on,
+        column=candidate.column,
+        parameters={n.removeprefix(candidate.label + "."): everything[n] for n in found.names},
+        p_value=plain(found.p_value),
+        holdout_gain=plain(found.gain),
+        formula=_formula(found, attached),
+        indistinguishable_from=alike[:NEAREST],
+        less_likely=alike[NEAREST:],
+        would_separate=_measurements(alike[:NEAREST], closing),
+        instead_would_move={
+            label: _shifts(found.rivals[label], closing) for label in alike[:NEAREST]
         },
-        "p_value": plain(found.p_value),
-        "holdout_gain": plain(found.gain),
-        "formula": _formula(found, attached),
-        "indistinguishable_from": _alike(found, closing)[:NEAREST],
-        "less_likely": _alike(found, closing)[NEAREST:],
-        "would_separate": _separating(found, closing),
-        "instead_would_move": {
-            label: _shifts(found.rivals[label], closing)
-            for label in _alike(found, closing)[:NEAREST]
-        },
-    } | ({} if attached is None else attachment(attached))
+    )
+    return effect if attached is None else replace(effect, **asdict(attachment(attached)))
 
 
-def _open(closing: Closing) -> dict[str, Any]:
-    """Causes of which none was added, since the parameters hang on which of them it is."""
+def _unexplained(closing: Closing) -> Unexplained:
+    """What is left, and causes of which none was added: the parameters hang on which it is."""
     left = closing.undecided
     names = left.names if left else ()
     moves = left.moves if left else {}
-    return {
-        "one_of": list(names),
-        "would_move": {label: _shifts(moves[label], closing) for label in names if label in moves},
-        "would_separate": _measurements(names, closing) if len(names) > 1 else [],
-    }
+    return Unexplained(
+        plain(np.nan if closing.verdict is None else closing.misfit.fraction),
+        closing.misfit.where,
+        list(names),
+        {label: _shifts(moves[label], closing) for label in names if label in moves},
+        _measurements(names, closing) if len(names) > 1 else [],
+    )
 
 
 def _alike(found: Found, closing: Closing) -> list[str]:
@@ -148,25 +239,13 @@ def _alike(found: Found, closing: Closing) -> list[str]:
     return [label for label in found.indistinguishable_from if label not in added]
 
 
-def _shifts(rival: Mapping[str, Array], closing: Closing) -> dict[str, Any]:
+def _shifts(rival: Mapping[str, Array], closing: Closing) -> Shifts:
     """Largest shift of each declared parameter that is more than its standard deviation."""
     found = {}
     for name, shift in rival.items():
         if name in closing.after.std and np.any(np.abs(shift) > closing.after.std[name]):
             found[name] = plain(np.max(np.abs(shift)))
     return found
-
-
-def formula_source(closing: Closing) -> str:
-    """Python text of the formula that was found, for `--effects`; empty where there is none."""
-    return "".join(source(a.effect) for a in closing.after.model.effects)
-
-
-def name_file(content: dict[str, Any], path: Path) -> None:
-    """Say where the formula's source has been written: `apply` reads it there."""
-    for e in content["effects"]:
-        if e["name"] == "formula":
-            e["file"] = str(path.resolve())
 
 
 def _attached(found: Found, closing: Closing) -> Attached | None:
@@ -180,22 +259,6 @@ def _formula(found: Found, attached: Attached | None) -> str:
         effect = found.candidate.effect
         return effect.formula if effect else f"{found.candidate.freed} is an unknown"
     return formula_of(attached)
-
-
-def formula_of(attached: Attached) -> str:
-    """What the effect does where it is attached, its columns and numbers put in."""
-    formula = attached.effect.formula or attached.effect.doc.partition("\n")[0]
-    for name, column in attached.columns:
-        formula = formula.replace(name, column)
-    for name, declared in attached.effect.declarations:
-        if isinstance(declared, Constant) and not declared.dims:
-            formula = re.sub(rf"\b{name}\b", f"{float(declared.array):.6g}", formula)
-    return formula
-
-
-def _separating(found: Found, closing: Closing) -> list[str]:
-    """Measurements that would separate the effect from those that explain the data as well."""
-    return _measurements(_alike(found, closing)[:NEAREST], closing)
 
 
 def _measurements(labels: Sequence[str], closing: Closing) -> list[str]:
@@ -218,6 +281,21 @@ def _moved(closing: Closing) -> dict[str, Any]:
                 z = (closing.after.values[name] - value) / closing.before.std[name]
             moved[name] = plain(np.where(np.isfinite(z), z, np.nan))
     return moved
+
+
+# -- files -----------------------------------------------------------------------------------------
+
+
+def formula_source(closing: Closing) -> str:
+    """Python text of the formula that was found, for `--effects`; empty where there is none."""
+    return "".join(source(a.effect) for a in closing.after.model.effects)
+
+
+def with_formula_in(result: Closed, path: Path) -> Closed:
+    """The result that says where the formula's source is written: `apply` reads it there."""
+    file = str(path.resolve())
+    effects = [replace(e, file=file) if e.name == "formula" else e for e in result.effects]
+    return replace(result, effects=effects)
 
 
 def residual_rows(
@@ -245,8 +323,3 @@ def residual_rows(
                     row = [run.file, run.name, int(run.rows[k]), t, axis, split, *pair]
                     writer.writerow(row)
     return text.getvalue()
-
-
-def formula_lines(content: Mapping[str, Any]) -> list[str]:
-    """A line per effect for the terminal."""
-    return [f"{e['name']}: {e['formula']}" for e in content["effects"]]

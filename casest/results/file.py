@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -20,24 +20,19 @@ from casest.errors import DataError
 RESULT, RESIDUALS = "result.json", "residuals.csv"
 
 
-def reproduce(command: str, data: Sequence[str]) -> dict[str, Any]:
-    """Files of a result: written whole or not at all, read back, and what a file is instead."""
-    return {
-        "command": command,
-        "python": platform.python_version(),
-        **_versions(),
-        "sha256": {name: _digest(name) for name in data},
-    }
+def versions() -> dict[str, str]:
+    """Versions of Python and of what computes."""
+    return {"python": platform.python_version(), **_versions()}
 
 
 @cache
 def _versions() -> dict[str, str]:
-    """Files of a result: written whole or not at all, read back, and what a file is instead."""
+    """Looked up once, for it takes as long as a small fit."""
     return {name: version(name) for name in ("casadi", "numpy", "scipy")}
 
 
-def _digest(name: str) -> str:
-    """Files of a result: written whole or not at all, read back, and what a file is instead."""
+def digest(name: str) -> str:
+    """SHA-256 of a data file; of a folder (a ROS 2 bag), of its files' in order of their names."""
     path = file_and_topics(name)[0]
     whole = hashlib.sha256()
     for file in sorted(path.iterdir()) if path.is_dir() else [path]:
@@ -51,17 +46,19 @@ def _digest(name: str) -> str:
 
 
 def plain(value: Any) -> Any:
-    """Files of a result: written whole or not at all, read back, and what a file is instead."""
+    """Numbers, and what holds them, for JSON; what is not finite becomes null."""
     if value is None or isinstance(value, str | bool | int):
         return value
-    if isinstance(value, np.ndarray) and value.ndim:
+    if isinstance(value, dict):
+        return {name: plain(v) for name, v in value.items()}
+    if isinstance(value, list | tuple) or (isinstance(value, np.ndarray) and value.ndim):
         return [plain(v) for v in value]
     number = float(value)
     return number if np.isfinite(number) else None
 
 
 def save(folder: Path, result: Mapping[str, Any], residuals: str | None) -> None:
-    """Files of a result: written whole or not at all, read back, and what a file is instead."""
+    """Write both files into a folder (made if missing), each whole or not at all."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -72,12 +69,12 @@ def save(folder: Path, result: Mapping[str, Any], residuals: str | None) -> None
 
 
 def as_json(result: Mapping[str, Any]) -> str:
-    """Files of a result: written whole or not at all, read back, and what a file is instead."""
+    """The result as text: strict JSON, two blanks of indentation."""
     return json.dumps(result, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
 
 
 def load_result(path: Path) -> dict[str, Any]:
-    """Files of a result: written whole or not at all, read back, and what a file is instead."""
+    """A saved result (a folder stands for the `result.json` in it)."""
     if path.is_dir():
         path = path / RESULT
     try:
@@ -103,7 +100,7 @@ def load_result(path: Path) -> dict[str, Any]:
 
 
 def made_by(path: Path) -> str:
-    """Files of a result: written whole or not at all, read back, and what a file is instead."""
+    """The command that made a saved result; empty where Python did."""
     return str(load_result(path).get("reproduce", {}).get("command", ""))
 
 
@@ -117,7 +114,7 @@ _WRITERS = {
 
 
 def _instead(folder: Path) -> str:
-    """Files of a result: written whole or not at all, read back, and what a file is instead."""
+    """What a folder without a result holds, and how one is made."""
     make = f"casest calibrate (or close) MODEL DATA -o {folder} makes one"
     found = next((name for name in _WRITERS if (folder / name).exists()), None)
     if found:
@@ -126,7 +123,7 @@ def _instead(folder: Path) -> str:
 
 
 def saved_parameters(result: Mapping[str, Any]) -> dict[str, Any]:
-    """Files of a result: written whole or not at all, read back, and what a file is instead."""
+    """Parameters of a saved result, after the loop was closed if it was."""
     block = result.get("after") or result.get("estimate") or {}
     found: dict[str, Any] = block.get("parameters", {})
     return found

@@ -1,4 +1,4 @@
-"""`result.json` and `residuals.csv` of a loop closed in motion, in the fixed form of `close`."""
+"""What a loop closed in motion leaves: `result.json` in the form of `close`, `residuals.csv`."""
 
 from __future__ import annotations
 
@@ -6,73 +6,199 @@ import csv
 import inspect
 import io
 from collections.abc import Mapping, Sequence
-from typing import Any
+from functools import cached_property
 
 import numpy as np
+from msgspec import Struct
 
-from casest import __version__
 from casest.declaration.shapes import Array
 from casest.diagnose.motion.fit import Fit, forgotten, rise
-from casest.diagnose.motion.loop import UNEXPLAINED, Added, MotionClosing
+from casest.diagnose.motion.loop import Added, MotionClosing
 from casest.diagnose.motion.score_test import Score
 from casest.effects.moving import Candidate
-from casest.results.file import plain, reproduce
+from casest.results.closing import Detectable
+from casest.results.file import plain
+from casest.results.fitted import JudgedSection
 from casest.results.observability import assumed
+from casest.results.result import (
+    Certificate,
+    Explained,
+    Number,
+    Numbers,
+    Parameter,
+    Reproduced,
+    Result,
+    reproduced,
+)
+from casest.results.rounding import rounded
+from casest.results.trajectory import Innovations, Trajectory, trajectory_of
 
 #: Noncentrality from which an effect is found nearly always, and below which nobody could find it.
 SEEN, UNSEEN = 45.0, 9.0
 
 
-def motion_result(
-    closing: MotionClosing, *, model_name: str, data: Sequence[str], command: str = ""
-) -> dict[str, Any]:
-    """The content of `result.json` for `close` of an estimator in motion: see the design, 10.
+class Intensities(Struct, frozen=True):
+    """Noise intensities that match the record: of the declared and of the extended estimator."""
+
+    before: dict[str, float]
+    after: dict[str, float]
+
+
+class MotionNoise(Struct, frozen=True):
+    """Noise of the readings, and the intensities: matched ones beside those declared."""
+
+    sigma: list[Number]
+    unit: str
+    intensities: Intensities
+    declared: dict[str, float]
+
+
+class MotionEffect(Struct, frozen=True):
+    """An effect that was added, or noise with a colour, with the evidence."""
+
+    name: str
+    on: str
+    parameters: dict[str, Parameter]
+    column: None
+    p_value: Number
+    holdout_gain: Number
+    formula: str
+    indistinguishable_from: list[str]
+    would_separate: list[str]
+
+
+class MotionHidden(Struct, frozen=True):
+    """An effect that the trajectory cannot show, and what a typical size of it would do unseen."""
+
+    name: str
+    on: str
+    column: None
+    typical: dict[str, float]
+    would_move: dict[str, float]
+    shown_by: str
+
+
+class Left(Struct, frozen=True):
+    """What of the innovations foretells others: its share of their variance, and how far."""
+
+    fraction: Number
+    where: str
+
+
+class MotionSection(JudgedSection, frozen=True, kw_only=True):
+    """An estimator before or after the loop, with its likelihood; no correlation is kept."""
+
+    log_likelihood: float
+
+
+class MotionClosed(Result, frozen=True, kw_only=True, dict=True):
+    """The content of `result.json` of `close` of an estimator in motion: see the design, 10.
 
     Errors are one-step innovations, rms of one axis, after the start is forgotten; `parameters`
     are the states at the end of the record and the numbers of the effects.
     """
-    declared, after = closing.declared, closing.after
-    left = closing.left
-    misfit = left.p_value < UNEXPLAINED
+
+    unwritten = ("closing",)
+
+    data: list[str]
+    runs: list[str]
+    constants: dict[str, Numbers]
+    verdict: str | None
+    trusted: bool
+    noise: MotionNoise
+    before: MotionSection
+    after: MotionSection
+    effects: list[MotionEffect]
+    invisible: list[MotionHidden]
+    unexplained: Left
+    moved: dict[str, Numbers]
+    smallest_detectable: list[Detectable]
+    refused: list[Explained]
+    innovations: Innovations
+    units: dict[str, str]
+    notes: list[str]
+    convention: str
+    reproduce: Reproduced
+    closing: MotionClosing
+
+    @property
+    def risen(self) -> float:
+        """Rise of the log-likelihood by what was added."""
+        return self.after.log_likelihood - self.before.log_likelihood
+
+    @cached_property
+    def trajectory(self) -> Trajectory:
+        """States and innovations along the record, after the loop."""
+        return trajectory_of(self.closing.after.found)
+
+
+def motion_result(
+    closing: MotionClosing, *, model_name: str, data: Sequence[str], command: str = ""
+) -> MotionClosed:
+    """What `close` leaves of an estimator in motion."""
+    declared, after, left = closing.declared, closing.after, closing.left
     period = float(np.median(np.diff(after.found.time)))
     complete = np.isfinite(after.found.innovations).all(axis=1)
     between = float(np.median(np.diff(after.found.time[complete])))
-    return {
-        "casest": __version__,
-        "model": model_name,
-        "data": list(data),
-        "runs": [closing.run.name],
-        "constants": {c.name: plain(c.array) for c in declared.constants},
-        "verdict": _verdict(closing, misfit) if _trusted(after) else None,
-        "trusted": _trusted(after),
-        "noise": {
-            "sigma": plain(np.sqrt(np.diag(after.model.noise) / period)),
-            "unit": _unit(closing),
-            "intensities": {"before": plain_all(closing.before.intensities),
-                            "after": plain_all(after.intensities)},
-            "declared": _declared(closing),
-        },
-        "before": _section(closing.before, closing, 0),
-        "after": _section(after, closing, 1),
-        "effects": [_effect(a, closing) for a in closing.effects],
-        "invisible": [i for s in closing.first for i in _invisible(s, closing)],
-        "unexplained": {
-            "fraction": plain(left.share if misfit else 0.0),
-            "where": f"innovations foretell those within {left.lag * between:.3g} s after them"
-            if misfit else "",
-        },
-        "moved": _moved(closing),
-        "smallest_detectable": [_detectable(s) for s in closing.first if np.any(s.information)],
-        "refused": [{"name": name, "reason": why} for name, why in closing.refused],
-        "innovations": _innovations(after),
-        "units": {s.name: s.unit for s in declared.states},
-        "notes": assumed(closing.run),
-        "convention": inspect.getdoc(declared.function) or "",
-        "reproduce": reproduce(command, data),
-    }  # fmt: skip
+    where = f"innovations foretell those within {left.lag * between:.3g} s after them"
+    return MotionClosed(
+        model=model_name,
+        data=list(data),
+        runs=[closing.run.name],
+        constants={c.name: plain(c.array) for c in declared.constants},
+        verdict=closing.verdict,
+        trusted=after.trusted,
+        noise=MotionNoise(
+            plain(np.sqrt(np.diag(after.model.noise) / period)),
+            _unit(closing),
+            Intensities(plain_all(closing.before.intensities), plain_all(after.intensities)),
+            _declared(closing),
+        ),
+        before=_section(closing.before, closing, 0),
+        after=_section(after, closing, 1),
+        effects=[_effect(a, closing) for a in closing.effects],
+        invisible=[i for s in closing.first for i in _invisible(s, closing)],
+        unexplained=Left(plain(left.share), where) if closing.misfit else Left(0.0, ""),
+        moved=_moved(closing),
+        smallest_detectable=[_detectable(s) for s in closing.first if np.any(s.information)],
+        refused=[Explained(name, why) for name, why in closing.refused],
+        innovations=_innovations(after),
+        units={s.name: s.unit for s in declared.states},
+        notes=assumed(closing.run),
+        convention=inspect.getdoc(declared.function) or "",
+        reproduce=reproduced(command, data),
+        closing=closing,
+    )
 
 
-def plain_all(values: Mapping[str, float]) -> dict[str, Any]:
+def sentence(result: MotionClosed) -> str:
+    """The verdict in one sentence."""
+    names = [f"{e.name} of {e.on}" for e in result.effects]
+    if result.verdict is None:
+        return "no trustworthy estimate"
+    if result.verdict == "adequate":
+        return "adequate: nothing that this trajectory can show is missing"
+    if result.verdict == "extended":
+        verb = "was" if len(names) == 1 else "were"
+        return f"extended: {', '.join(names)} {verb} missing; what is left is noise"
+    beside = f" beside {', '.join(names)}" if names else ""
+    return f"unexplained: the innovations are not white{beside}, and no candidate says why"
+
+
+def numbers_of(effect: MotionEffect) -> str:
+    """`; k = 0.1996 ± 0.0004 s`: the numbers of an effect."""
+    said = []
+    for name, p in effect.parameters.items():
+        values, stds = (np.atleast_1d(np.array(v, float)) for v in (p.value, p.std))
+        pairs = zip(values, np.broadcast_to(stds, values.shape), strict=True)
+        shown = [" ± ".join(rounded(v, s)) if np.isfinite(s) else f"{v:.3g}" for v, s in pairs]
+        text = ", ".join(shown)
+        unit = "" if p.unit == "1" else f" {p.unit}"
+        said.append(f"{name} = {text}{unit}")
+    return f"; {', '.join(said)}"
+
+
+def plain_all(values: Mapping[str, float]) -> dict[str, float]:
     """Numbers by name, for JSON."""
     return {name: plain(value) for name, value in values.items()}
 
@@ -93,30 +219,20 @@ def axes(closing: MotionClosing) -> list[str]:
     return names
 
 
-def _verdict(closing: MotionClosing, misfit: bool) -> str:
-    if misfit:
-        return "unexplained"
-    return "extended" if closing.effects else "adequate"
-
-
-def _trusted(fit: Fit) -> bool:
-    return bool(np.isfinite(fit.likelihood)) and fit.last_step < 1.0
-
-
 def _unit(closing: MotionClosing) -> str:
     units = {s.unit or "1" for s in closing.declared.signals
              if s.name in closing.declared.measured_signals}  # fmt: skip
     return ", ".join(sorted(units))
 
 
-def _declared(closing: MotionClosing) -> dict[str, Any]:
+def _declared(closing: MotionClosing) -> dict[str, float]:
     model = closing.declared
     outputs = zip(model.traced.measured, model.traced.outputs, strict=True)
     readings = {name: model.sensors.get(name, o.intensity) for name, o in outputs}
     return plain_all({**{s.name: s.intensity for s in model.states}, **model.sensors, **readings})
 
 
-def _section(fit: Fit, closing: MotionClosing, side: int) -> dict[str, Any]:
+def _section(fit: Fit, closing: MotionClosing, side: int) -> MotionSection:
     counted = forgotten(closing.before) & forgotten(closing.after)
     own = fit.by_reading(fit.found.innovations)[counted]
     hidden = closing.held_out[side][counted]
@@ -126,62 +242,62 @@ def _section(fit: Fit, closing: MotionClosing, side: int) -> dict[str, Any]:
     reasons = [f"normalised squared innovations: {mean:.3g} on average, {len(names)} expected"]
     if fit.added:
         reasons.append(f"the last step of the fit is {fit.last_step:.2g} standard deviations long")
-    return {
-        "rmse_fit": plain(np.sqrt(np.nanmean(own**2))),
-        "rmse_holdout": plain(np.sqrt(np.nanmean(hidden**2))),
-        "rmse_holdout_by_axis": dict(zip(names, map(plain, by_axis), strict=True)),
-        "log_likelihood": plain(closing.before.likelihood + rise(fit, closing.before)),
-        "certificate": {"trusted": _trusted(fit), "reasons": reasons},
-        "parameters": _states(fit, closing) | _numbers(fit),
-    }
+    return MotionSection(
+        rmse_fit=plain(np.sqrt(np.nanmean(own**2))),
+        rmse_holdout=plain(np.sqrt(np.nanmean(hidden**2))),
+        rmse_holdout_by_axis=dict(zip(names, map(plain, by_axis), strict=True)),
+        log_likelihood=plain(closing.before.likelihood + rise(fit, closing.before)),
+        certificate=Certificate(fit.trusted, reasons),
+        parameters=_states(fit, closing) | _numbers(fit),
+    )
 
 
-def _states(fit: Fit, closing: MotionClosing) -> dict[str, Any]:
+def _states(fit: Fit, closing: MotionClosing) -> dict[str, Parameter]:
     """The declared states at the end of the record."""
     model, found = closing.declared, fit.found
     return {
-        name: {"value": plain(found.x[-1][where]), "std": plain(found.std[-1][where]),
-               "unit": model[name].unit}
+        name: _number(found.x[-1][where], found.std[-1][where], model[name].unit)
         for name, where in model.slices().items()
-    }  # fmt: skip
+    }
 
 
-def _numbers(fit: Fit) -> dict[str, Any]:
+def _number(value: Numbers, std: Numbers, unit: str) -> Parameter:
+    return Parameter(value=plain(value), std=plain(std), unit=unit)
+
+
+def _numbers(fit: Fit) -> dict[str, Parameter]:
     if fit.answers is None:
         return {}
     return {
-        candidate.state: {"value": plain(value), "std": plain(fit.std[where]),
-                          "unit": candidate.unit}
+        candidate.state: _number(value, fit.std[where], candidate.unit)
         for (candidate, value), where in zip(fit.added, fit.answers.columns, strict=True)
-    }  # fmt: skip
+    }
 
 
-def _effect(added: Added, closing: MotionClosing) -> dict[str, Any]:
+def _effect(added: Added, closing: MotionClosing) -> MotionEffect:
     candidate, fit = added.candidate, closing.after
-    common = {"column": None, "p_value": plain(added.p_value), "holdout_gain": plain(added.gain)}
+    evidence = None, plain(added.p_value), plain(added.gain)
     if not isinstance(candidate, Candidate):
         name, _, on = candidate.label.partition(" of ")
         q = fit.intensities[candidate.state]
+        std = np.sqrt(q * candidate.tau / 2)
         parameters = {
-            "correlation_time": {"value": candidate.tau, "std": None, "unit": "s"},
-            "std": {"value": plain(np.sqrt(q * candidate.tau / 2)), "std": None,
-                    "unit": candidate.unit},
-        }  # fmt: skip
-        return {"name": name, "on": on, "parameters": parameters, **common,
-                "formula": f"{on} holds noise whose correlation falls by e over correlation_time",
-                "indistinguishable_from": [], "would_separate": []}  # fmt: skip
+            "correlation_time": _number(candidate.tau, None, "s"),
+            "std": _number(std, None, candidate.unit),
+        }
+        said = f"{on} holds noise whose correlation falls by e over correlation_time"
+        return MotionEffect(name, on, parameters, *evidence, said, [], [])
     by_label = {s.candidate.label: s.candidate for s in closing.first}
-    return {
-        "name": candidate.effect.name,
-        "on": candidate.on,
-        "parameters": {"k": _numbers(fit)[candidate.state]},
-        **common,
-        "formula": formula(candidate),
-        "indistinguishable_from": list(added.indistinguishable_from),
-        "would_separate": [
-            f"{label}: {by_label[label].effect.shown_by}" for label in added.indistinguishable_from
-        ],
-    }
+    alike = list(added.indistinguishable_from)
+    return MotionEffect(
+        candidate.effect.name,
+        candidate.on,
+        {"k": _numbers(fit)[candidate.state]},
+        *evidence,
+        formula(candidate),
+        alike,
+        [f"{label}: {by_label[label].effect.shown_by}" for label in alike],
+    )
 
 
 def formula(candidate: Candidate) -> str:
@@ -190,7 +306,7 @@ def formula(candidate: Candidate) -> str:
     return said.replace("reading", candidate.on).replace("omega", candidate.turn or "omega")
 
 
-def _invisible(score: Score, closing: MotionClosing) -> list[dict[str, Any]]:
+def _invisible(score: Score, closing: MotionClosing) -> list[MotionHidden]:
     """An effect whose typical size the data could not have shown, if it would move a state."""
     candidate = score.candidate
     if any(a.candidate is candidate for a in closing.effects):
@@ -205,27 +321,20 @@ def _invisible(score: Score, closing: MotionClosing) -> list[dict[str, Any]]:
     }
     if not would:
         return []
-    return [
-        {
-            "name": candidate.effect.name,
-            "on": candidate.on,
-            "column": None,
-            "typical": {"k": plain(candidate.typical)},
-            "would_move": would,
-            "shown_by": candidate.effect.shown_by,
-        }
-    ]
+    typical = {"k": plain(candidate.typical)}
+    name, shown_by = candidate.effect.name, candidate.effect.shown_by
+    return [MotionHidden(name, candidate.on, None, typical, would, shown_by)]
 
 
-def _detectable(score: Score) -> dict[str, Any]:
+def _detectable(score: Score) -> Detectable:
     information = np.diag(score.information)
     alive = information * score.candidate.typical**2 > 1e-4
     size = float(np.sqrt(SEEN / information[alive]).max()) if alive.any() else np.nan
-    return {"name": score.candidate.label, "parameter": score.candidate.state,
-            "size": plain(size), "unit": score.candidate.unit}  # fmt: skip
+    candidate = score.candidate
+    return Detectable(candidate.label, candidate.state, plain(size), candidate.unit)
 
 
-def _moved(closing: MotionClosing) -> dict[str, Any]:
+def _moved(closing: MotionClosing) -> dict[str, Numbers]:
     """How far each state moved at the end of the record, in its standard deviations before."""
     before, after = closing.before.found, closing.after.found
     n = closing.declared.size
@@ -234,18 +343,18 @@ def _moved(closing: MotionClosing) -> dict[str, Any]:
     return {name: plain(z[where]) for name, where in closing.declared.slices().items()}
 
 
-def _innovations(fit: Fit) -> dict[str, Any]:
+def _innovations(fit: Fit) -> Innovations:
     nu, counted = fit.found.innovations, forgotten(fit)
     normalised = fit.found.normalised_innovations
     whole = nu[np.isfinite(normalised)]
     lag1 = [np.corrcoef(own[:-1], own[1:])[0, 1] for own in whole.T]
-    return {
-        "rms": plain(np.sqrt(np.nanmean(nu[counted] ** 2, axis=0))),
-        "normalised_mean": plain(np.nanmean(normalised[counted])),
-        "expected": nu.shape[1],
-        "missing_readings": int(np.sum(~np.isfinite(normalised))),
-        "lag1_correlation": plain(np.array(lag1)),
-    }
+    return Innovations(
+        plain(np.sqrt(np.nanmean(nu[counted] ** 2, axis=0))),
+        plain(np.nanmean(normalised[counted])),
+        nu.shape[1],
+        int(np.sum(~np.isfinite(normalised))),
+        plain(np.array(lag1)),
+    )
 
 
 def residual_rows(closing: MotionClosing) -> str:

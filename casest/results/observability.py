@@ -1,80 +1,154 @@
-"""`casest observe`: what data, a trajectory, or any record of a model can show."""
+"""What `casest observe` leaves: what data, a trajectory, or any record of a model can show."""
 
 from __future__ import annotations
 
-import textwrap
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
+from msgspec import UNSET, Struct, UnsetType
 
-from casest import __version__
 from casest.data.run import Run
 from casest.data.timing import GAP
 from casest.declaration.model import Model
 from casest.dynamics import Dynamics
 from casest.dynamics.filter import filtered
-from casest.dynamics.gramian import Observed, gramian, observed, window_eigenvalues
+from casest.dynamics.gramian import Observed as Seen
+from casest.dynamics.gramian import gramian, observed, window_eigenvalues
 from casest.dynamics.structural import Structure, structure
 from casest.dynamics.transition import linearised
 from casest.errors import DeclarationError, UsageError
-from casest.estimate.calibrate import Estimate, attempt
+from casest.estimate.calibrate import attempt
 from casest.results.file import plain
+from casest.results.fitted import WeakCombination, weak_of
+from casest.results.result import Number, Numbers, Reproduced, Result, reproduced
 
 #: Windows over which the smallest eigenvalue is followed: this share of the record unless told.
 WINDOW = 0.1
 
 
-def observe_parameters(model: Model, runs: Sequence[Run]) -> tuple[dict[str, Any], Estimate]:
+class Observed(Result, frozen=True, kw_only=True, dict=True):
+    """What every `observe.json` begins with."""
+
+    notes: list[str] | UnsetType = UNSET
+    rank: int
+    unknowns: int
+    structural_rank: int | UnsetType | None = UNSET
+    unobservable: list[str]
+
+    @property
+    def observable(self) -> bool:
+        """Is every unknown determined?"""
+        return self.rank == self.unknowns
+
+
+class ObservedParameters(Observed, frozen=True, kw_only=True, dict=True):
+    """The content of `observe.json` for a calibration's data."""
+
+    weak: list[WeakCombination]
+    std: dict[str, Numbers]
+    trusted: bool
+    data: list[str]
+    reproduce: Reproduced
+
+
+class Structural(Struct, frozen=True):
+    """Rank of the readings and `order` of their derivatives; `gap`: how clear-cut that rank is."""
+
+    rank: int
+    undetermined: list[str]
+    unobservable: list[str]
+    order: int
+    inputs: list[str]
+    gap: Number
+
+
+class ObservedStructure(Observed, frozen=True, kw_only=True, dict=True):
+    """The content of `observe.json` without data. `std` is empty: how well needs a record."""
+
+    std: dict[str, Numbers]
+    structural: Structural
+    constant_inputs: Structural
+    tolerance: str
+    data: list[str]
+    reproduce: Reproduced
+
+
+class Windows(Struct, frozen=True):
+    """Eigenvalues of the Gramian over windows, in units of what was known beforehand."""
+
+    length_s: Number
+    end_s: list[float]
+    smallest_eigenvalue: list[float]
+    informative_from_s: Number
+    eigenvalues: list[list[float]]
+
+
+class ObservedMotion(Observed, frozen=True, kw_only=True, dict=True):
+    """The content of `observe.json` for a trajectory. `std`: what the readings alone allow."""
+
+    notes: list[str]
+    structural_rank: int | None
+    std: dict[str, Numbers]
+    units: dict[str, str]
+    eigenvalues: list[Number]
+    tolerance: str
+    windows: Windows
+    data: list[str]
+    reproduce: Reproduced
+
+
+#: What `casest observe` leaves.
+Observability = ObservedParameters | ObservedStructure | ObservedMotion
+
+
+def observe_parameters(
+    model: Model, runs: Sequence[Run], *, data: Sequence[str] = (), command: str = ""
+) -> ObservedParameters:
     """What a static model's data determine: rank, null directions in words, std of each value."""
     found = attempt(model, runs)
     identified = found.identifiability
-    return {
-        "casest": __version__,
-        "model": model.name,
-        "rank": identified.rank,
-        "unknowns": identified.unknowns,
-        "unobservable": list(identified.unobservable),
-        "weak": [
-            {"direction": w.words, "inflation": plain(w.inflation), "std": plain(w.std)}
-            for w in found.weak
-        ],
-        "std": {name: plain(value) for name, value in found.std.items()},
-        "trusted": found.certificate.trusted,
-    }, found
+    return ObservedParameters(
+        model=model.name,
+        rank=identified.rank,
+        unknowns=identified.unknowns,
+        unobservable=list(identified.unobservable),
+        weak=weak_of(found),
+        std={name: plain(value) for name, value in found.std.items()},
+        trusted=found.certificate.trusted,
+        data=list(data),
+        reproduce=reproduced(command, data),
+    )
 
 
-def observe_structure(model: Dynamics) -> dict[str, Any]:
-    """What any record could show: structural rank with inputs that vary freely, and held constant.
-
-    `std` is empty: how well needs a record.
-    """
+def observe_structure(model: Dynamics, *, command: str = "") -> ObservedStructure:
+    """What any record could show: structural rank with inputs that vary freely, or held."""
     free = structure(model)
     held = structure(model, varying=False) if free.inputs else free
-    return {
-        "casest": __version__,
-        "model": model.name,
-        "notes": [],
-        "rank": free.rank,
-        "unknowns": free.unknowns,
-        "unobservable": list(free.unobservable),
-        "std": {},
-        "structural": _structural(free),
-        "constant_inputs": _structural(held),
-        "tolerance": "singular values below 1e-10 of the largest count as zero; the smallest that "
+    return ObservedStructure(
+        model=model.name,
+        notes=[],
+        rank=free.rank,
+        unknowns=free.unknowns,
+        unobservable=list(free.unobservable),
+        std={},
+        structural=_structural(free),
+        constant_inputs=_structural(held),
+        tolerance="singular values below 1e-10 of the largest count as zero; the smallest that "
         f"counts is {min(free.gap, held.gap):.1g} times the largest that does not",
-    }
+        data=[],
+        reproduce=reproduced(command, ()),
+    )
 
 
-def _structural(found: Structure) -> dict[str, Any]:
-    return {
-        "rank": found.rank,
-        "undetermined": list(found.undetermined),
-        "unobservable": list(found.unobservable),
-        "order": found.order,
-        "inputs": list(found.inputs),
-        "gap": plain(found.gap),
-    }
+def _structural(found: Structure) -> Structural:
+    return Structural(
+        found.rank,
+        list(found.undetermined),
+        list(found.unobservable),
+        found.order,
+        list(found.inputs),
+        plain(found.gap),
+    )
 
 
 def _structural_rank(model: Dynamics) -> int | None:
@@ -85,7 +159,14 @@ def _structural_rank(model: Dynamics) -> int | None:
         return None
 
 
-def observe_motion(model: Dynamics, run: Run, window: float | None = None) -> dict[str, Any]:
+def observe_motion(
+    model: Dynamics,
+    run: Run,
+    window: float | None = None,
+    *,
+    data: Sequence[str] = (),
+    command: str = "",
+) -> ObservedMotion:
     """What a trajectory makes observable, by the Gramian over the whole record and over windows.
 
     `std` is what the readings alone allow at the beginning of the record, per state. A nonlinear
@@ -104,27 +185,28 @@ def observe_motion(model: Dynamics, run: Run, window: float | None = None) -> di
     ends, eigenvalues = window_eigenvalues(model, system, length)
     telling = np.flatnonzero(eigenvalues[:, 0] > 1)
     std = {name: plain(seen.std[where]) for name, where in model.slices().items()}
-    return {
-        "casest": __version__,
-        "model": model.name,
-        "notes": [*assumed(run), *_readings_alone(model), *_too_short(seen, run)],
-        "rank": seen.rank,
-        "unknowns": seen.unknowns,
-        "structural_rank": _structural_rank(model),
-        "unobservable": list(seen.unobservable),
-        "std": std,
-        "units": {s.name: s.unit for s in model.states},
-        "eigenvalues": plain(seen.eigenvalues / max(float(seen.eigenvalues[0]), 1e-300)),
-        "tolerance": "eigenvalues of the Gramian scaled to a unit diagonal, below 1e-11 of the "
+    return ObservedMotion(
+        model=model.name,
+        notes=[*assumed(run), *_readings_alone(model), *_too_short(seen, run)],
+        rank=seen.rank,
+        unknowns=seen.unknowns,
+        structural_rank=_structural_rank(model),
+        unobservable=list(seen.unobservable),
+        std=std,
+        units={s.name: s.unit for s in model.states},
+        eigenvalues=plain(seen.eigenvalues / max(float(seen.eigenvalues[0]), 1e-300)),
+        tolerance="eigenvalues of the Gramian scaled to a unit diagonal, below 1e-11 of the "
         "largest, count as zero",
-        "windows": {
-            "length_s": plain(length),
-            "end_s": plain(ends),
-            "smallest_eigenvalue": plain(eigenvalues[:, 0]),
-            "informative_from_s": plain(ends[telling[0]]) if telling.size else None,
-            "eigenvalues": plain(eigenvalues),
-        },
-    }
+        windows=Windows(
+            plain(length),
+            plain(ends),
+            plain(eigenvalues[:, 0]),
+            plain(ends[telling[0]]) if telling.size else None,
+            plain(eigenvalues),
+        ),
+        data=list(data),
+        reproduce=reproduced(command, data),
+    )
 
 
 def assumed(run: Run) -> list[str]:
@@ -152,7 +234,7 @@ def _readings_alone(model: Dynamics) -> list[str]:
     ]
 
 
-def _too_short(seen: Observed, run: Run) -> list[str]:
+def _too_short(seen: Seen, run: Run) -> list[str]:
     if seen.rank == seen.unknowns:
         return []
     words = too_short(run, seen.unknowns)
@@ -170,91 +252,24 @@ def too_short(run: Run, unknowns: int) -> list[str]:
     ]
 
 
-def observe_text(content: Mapping[str, Any]) -> str:
-    """Rank, what is hidden in words, and the standard deviations that the data allow."""
-    if "structural" in content:
-        return structure_text(content)
-    lines = [f"{content['model']}: rank {content['rank']} of {content['unknowns']}"]
-    lines += [f"  - {words}" for words in content["unobservable"]]
-    lines += [f"  {could}" for could in [could_reach(content)] if could]
-    if not content["unobservable"]:
-        lines.append("  every unknown is determined by these data")
-    lines += ["", "  standard deviation that these data allow:"]
-    shown_units = content.get("units", {})
-    for name, std in content["std"].items():
-        rows = std if isinstance(std, list) else [std]
-        rows = rows if rows and isinstance(rows[0], list) else [rows]
-        for k, row in enumerate(rows):
-            shown = ", ".join(map(number_or_not, row))
-            unit = shown_units.get(name, "") if k == 0 else ""
-            lines.append(f"    {name if k == 0 else '':<16} {shown} {unit}".rstrip())
-    if "windows" in content:
-        w = content["windows"]
-        low, high = min(w["smallest_eigenvalue"]), max(w["smallest_eigenvalue"])
-        lines += [
-            "",
-            f"  over windows of {w['length_s']:.3g} s the smallest eigenvalue (information over "
-            f"prior) goes from {low:.3g} to {high:.3g};",
-            f"  {window_words(w)}",
-        ]
-    return "\n".join(wrapped([*lines, *note_lines(content)]))
-
-
-def wrapped(lines: Sequence[str]) -> list[str]:
-    """Lines that fit 80 columns."""
-    return [
-        textwrap.fill(line, 80, subsequent_indent=" " * 4, break_on_hyphens=False) for line in lines
-    ]
-
-
-def window_words(windows: Mapping[str, Any]) -> str:
+def window_words(windows: Windows) -> str:
     """Since when a window alone tells every state more than was known beforehand."""
-    since = windows["informative_from_s"]
+    since = windows.informative_from_s
     if since is None:
         return "no window alone tells every state more than was known beforehand"
     return f"the first window that tells every state more than was known ends at {since:.4g} s"
 
 
-def could_reach(content: Mapping[str, Any]) -> str:
+def could_reach(result: Observability) -> str:
     """Whether another record could show what this one hides; empty where it hides nothing."""
-    could = content.get("structural_rank")
-    if could is None or content["rank"] == content["unknowns"]:
+    could = result.structural_rank if isinstance(result, ObservedMotion) else None
+    if could is None or result.observable:
         return ""
-    if could > content["rank"]:
+    if could > result.rank:
         return f"another motion could show more: the structural rank is {could}"
     return f"no motion shows more: the structural rank is {could} too"
 
 
-def structure_text(content: Mapping[str, Any]) -> str:
-    """Structural rank and what no record can determine, in words."""
-    free, held, n = content["structural"], content["constant_inputs"], content["unknowns"]
-    order = f"{free['order']} {'derivative' if free['order'] == 1 else 'derivatives'}"
-    lines = [
-        f"{content['model']}: structural rank {free['rank']} of {n} "
-        f"(readings and {order} of them, at random points)"
-    ]
-    inputs = " and ".join(free["inputs"])
-    if free["rank"] == n:
-        how = ""
-        if inputs:
-            how = f" where {inputs} vary" if held["rank"] < n else f" even with {inputs} constant"
-        lines.append(f"  suitable data determine every state and parameter{how}")
-    else:
-        lines += [f"  - {words}" for words in free["unobservable"]]
-        lines.append(f"  not determined by any record: {', '.join(free['undetermined'])}")
-    if held["rank"] < free["rank"]:
-        lines += ["", f"  with {inputs} held constant: rank {held['rank']} of {n}"]
-        lines += [f"  - {words}" for words in held["unobservable"]]
-        lines.append(f"  then not determined: {', '.join(held['undetermined'])}")
-    return "\n".join(wrapped(lines))
-
-
-def note_lines(content: Mapping[str, Any]) -> list[str]:
-    """What was assumed, a line each."""
-    notes = content.get("notes", [])
-    return ["", *(f"  note: {note}" for note in notes)] if notes else []
-
-
-def number_or_not(value: Any) -> str:
+def number_or_not(value: Number) -> str:
     """A number, or that there is none."""
     return "not determined" if value is None else f"{value:.3g}"

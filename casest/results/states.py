@@ -1,70 +1,133 @@
-"""`casest filter`: the states along a trajectory, and whether the noise is as declared."""
+"""What `casest filter` leaves: states along a trajectory, and whether the noise is as declared."""
 
 from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
+from msgspec import UNSET, Struct, UnsetType
 
-from casest import __version__
 from casest.data.run import Run
 from casest.dynamics import Dynamics
 from casest.dynamics.filter import Filtered, filtered
 from casest.dynamics.intensities import Tuned, intensities, units
 from casest.results.file import plain
-from casest.results.observability import assumed, note_lines, number_or_not, too_short, wrapped
+from casest.results.observability import assumed, too_short
+from casest.results.result import Number, Reproduced, Result, reproduced
+from casest.results.trajectory import Innovations, Trajectory, trajectory_of
+
+#: Between these shares of what is expected innovations are called as large as expected.
+SMALLEST, LARGEST = 0.8, 1.25
+
+
+class FinalState(Struct, frozen=True):
+    """A state at the end of the record, and how well the smoother knows it along the way."""
+
+    value: list[Number]
+    std: list[Number]
+    smoothed_std_median: list[Number]
+    unit: str
+
+
+class UsedIntensities(Struct, frozen=True):
+    """Noise intensities: declared and used ones, how sure those are that the data gave."""
+
+    how: str
+    declared: dict[str, Number]
+    used: dict[str, Number]
+    spread: dict[str, Number]
+    units: dict[str, str]
+    declared_normalised_mean: Number
+
+
+class States(Result, frozen=True, kw_only=True, dict=True):
+    """The content of `filter.json`; `filtered`: states and covariances.
+
+    `allan`: what a record at rest said, per signal. `as_expected`: are the innovations as large as
+    the noise intensities say?
+    """
+
+    unwritten = ("as_expected", "filtered")
+
+    notes: list[str]
+    samples: int
+    states: dict[str, FinalState]
+    intensities: UsedIntensities
+    innovations: Innovations
+    allan: Mapping[str, Any] | UnsetType = UNSET
+    data: list[str]
+    reproduce: Reproduced
+    as_expected: bool
+    filtered: Filtered
+
+    @cached_property
+    def trajectory(self) -> Trajectory:
+        """States and innovations along the record."""
+        return trajectory_of(self.filtered)
 
 
 def follow(
-    model: Dynamics, run: Run, tuned: Tuned | None = None
-) -> tuple[dict[str, Any], Filtered]:
+    model: Dynamics,
+    run: Run,
+    tuned: Tuned | None = None,
+    *,
+    allan: Mapping[str, Any] | None = None,
+    data: Sequence[str] = (),
+    command: str = "",
+) -> States:
     """States over time by the Kalman filter, and whether the innovations are as expected.
 
     `tuned`: the same model with other noise intensities, used in place of the declared ones, which
-    are shown beside them.
+    are shown beside them; `allan`: what a record at rest said of them.
     """
     declared = filtered(model, run, smooth=tuned is None)
     found = filtered(tuned.model, run) if tuned else declared
-    model, before = found.model, model
-    mean, normalised = _normalised_mean(found), found.normalised_innovations
-    m = found.innovations.shape[1]
-    final = {
-        name: {
-            "value": plain(found.x[-1][where]),
-            "std": plain(found.std[-1][where]),
-            "smoothed_std_median": plain(_median_std(found, where)),
-            "unit": model[name].unit,
-        }
-        for name, where in model.slices().items()
-    }
+    mean, m = _normalised_mean(found), found.innovations.shape[1]
+    return States(
+        model=found.model.name,
+        notes=[*assumed(run), *_unsettled(found), *_too_short(run, found.model.size)],
+        samples=len(found.time),
+        states=_final(found),
+        intensities=UsedIntensities(
+            tuned.how if tuned else "as declared",
+            _plain_values(intensities(model)),
+            _plain_values(intensities(found.model)),
+            _plain_values(tuned.spread) if tuned else {},
+            units(found.model),
+            plain(_normalised_mean(declared)),
+        ),
+        innovations=Innovations(
+            plain(np.sqrt(np.nanmean(found.innovations**2, axis=0))),
+            plain(mean),
+            m,
+            int(np.sum(~np.isfinite(found.normalised_innovations))),
+            plain(_lag1(found.innovations)),
+        ),
+        allan=allan or UNSET,
+        data=list(data),
+        reproduce=reproduced(command, data),
+        as_expected=bool(SMALLEST < mean / m < LARGEST),
+        filtered=found,
+    )
+
+
+def _final(found: Filtered) -> dict[str, FinalState]:
     return {
-        "casest": __version__,
-        "model": model.name,
-        "notes": [*assumed(run), *_unsettled(found), *_too_short(run, model.size)],
-        "samples": len(found.time),
-        "states": final,
-        "intensities": {
-            "how": tuned.how if tuned else "as declared",
-            "declared": _plain_values(intensities(before)),
-            "used": _plain_values(intensities(model)),
-            "spread": _plain_values(tuned.spread) if tuned else {},
-            "units": units(model),
-            "declared_normalised_mean": plain(_normalised_mean(declared)),
-        },
-        "innovations": {
-            "rms": plain(np.sqrt(np.nanmean(found.innovations**2, axis=0))),
-            "normalised_mean": plain(mean),
-            "expected": m,
-            "missing_readings": int(np.sum(~np.isfinite(normalised))),
-            "lag1_correlation": plain(_lag1(found.innovations)),
-        },
-    }, found
+        name: FinalState(
+            plain(found.x[-1][where]),
+            plain(found.std[-1][where]),
+            plain(_median_std(found, where)),
+            found.model[name].unit,
+        )
+        for name, where in found.model.slices().items()
+    }
 
 
-def _plain_values(values: Mapping[str, float]) -> dict[str, Any]:
+def _plain_values(values: Mapping[str, float]) -> dict[str, Number]:
     return {name: plain(value) for name, value in values.items()}
 
 
@@ -116,41 +179,7 @@ def states_csv(found: Filtered) -> str:
     return text.getvalue()
 
 
-def filter_text(content: Mapping[str, Any]) -> str:
-    """Final states and the innovations' verdict."""
-    lines = [f"{content['model']}: {content['samples']} samples", "", "  at the end of the record:"]
-    for name, s in content["states"].items():
-        for k, (value, std) in enumerate(zip(s["value"], s["std"], strict=True)):
-            label = name if len(s["value"]) == 1 else f"{name}[{k}]"
-            lines.append(f"    {label:<14} {value:>12.5g} ± {std:<10.2g} {s['unit']}")
-    lines += ["", *intensity_lines(content)]
-    i = content["innovations"]
-    lines += ["", f"  innovations are {filter_verdict(content)}"]
-    if i["missing_readings"]:
-        lines.append(f"  {i['missing_readings']} samples without a complete reading")
-    return "\n".join(wrapped([*lines, *note_lines(content)]))
-
-
-def intensity_lines(content: Mapping[str, Any]) -> list[str]:
-    """Noise intensities, declared ones beside those that were used."""
-    said, expected = content["intensities"], content["innovations"]["expected"]
-    declared, used, spread = said["declared"], said["used"], said["spread"]
-    same = declared == used
-    lines = ["  noise intensities " + ("as declared:" if same else f"{said['how']}:")]
-    if not same:
-        lines.append(f"    {'':<14} {'declared':>12} {'used':>12}")
-    for name in dict.fromkeys([*declared, *used]):
-        columns = [declared.get(name)] if same else [declared.get(name), used.get(name)]
-        shown = " ".join(f"{'-' if not v else format(v, '.3g'):>12}" for v in columns)
-        share = "" if same else intensity_spread(spread, name)
-        lines.append(f"    {name:<14} {shown} {said['units'][name]}{share and ' ' + share}")
-    means = [said["declared_normalised_mean"]]
-    means += [] if same else [content["innovations"]["normalised_mean"]]
-    shown = " ".join(f"{number_or_not(v):>12}" for v in means)
-    return [*lines, f"    {'innovations²':<14} {shown} ({expected} expected)"]
-
-
-def intensity_spread(spread: Mapping[str, Any], name: str) -> str:
+def intensity_spread(spread: Mapping[str, Number], name: str) -> str:
     """How sure an intensity is, where the data gave it."""
     if name not in spread:
         return ""
@@ -160,13 +189,12 @@ def intensity_spread(spread: Mapping[str, Any], name: str) -> str:
     return f"± {100 * share:.2g} %" if share < 0.5 else f"(within a factor of {np.exp(share):.2g})"
 
 
-def filter_verdict(content: Mapping[str, Any]) -> str:
+def verdict_words(result: States) -> str:
     """How large the innovations are beside what the noise intensities say."""
-    said = content["innovations"]
-    ratio = (said["normalised_mean"] or float("nan")) / said["expected"]
-    if 0.8 < ratio < 1.25:
+    if result.as_expected:
         return "as large as the noise intensities say"
+    mean = result.innovations.normalised_mean or float("nan")
     return (
-        f"{ratio:.2g} times as large (squared) as the noise intensities say: match them "
-        "(--sensor-noise, --rest or --noise ml)"
+        f"{mean / result.innovations.expected:.2g} times as large (squared) as the noise "
+        "intensities say: match them (--sensor-noise, --rest or --noise ml)"
     )

@@ -81,12 +81,13 @@ def in_part(kept: Any) -> list[int] | None:
 
 
 def narrowed(
-    values: Mapping[str, Array], candidate: Candidate, kept: list[int]
+    values: Mapping[str, Array], candidate: Candidate, model: Model, kept: list[int]
 ) -> dict[str, Array]:
-    """Values of the restricted effect's unknowns, from those of the whole one."""
+    """Values of the restricted effect's unknowns, from those of the whole one in the model."""
+    own = model.unknowns_of(candidate.label)
     found: dict[str, Array] = {}
     for name, value in values.items():
-        if not name.startswith(candidate.label + ".") or np.ndim(value) != 1:
+        if name not in own or np.ndim(value) != 1:
             found[name] = value
             continue
         for i in kept:

@@ -15,6 +15,7 @@ from casest.declaration.effect import NOISE, Effect
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
 from casest.declaration.symbols import Parameter
+from casest.effects import shipped
 from casest.effects.placing import placed_in, with_numbers
 from casest.errors import CasestError, UsageError
 
@@ -76,8 +77,8 @@ class Candidate:
 
     def parameters(self, extended: Model) -> list[Parameter]:
         """Its unknowns in the extended model."""
-        own = self.label + "."
-        return [p for p in extended.parameters if p.name.startswith(own) or p.name == self.freed]
+        own = extended.unknowns_of(self.label)
+        return [p for p in extended.parameters if p.name in own or p.name == self.freed]
 
 
 @dataclass(frozen=True)
@@ -107,7 +108,7 @@ def candidates(
         except CasestError as error:
             skipped.append(Skipped(effect.name, str(error)))
             continue
-        for columns in _columns_for(placed, channels, runs):
+        for columns in _columns_for(placed, channels):
             candidate = Candidate(with_numbers(placed, columns, runs), columns)
             try:
                 found.append(_tried(candidate, model, runs))
@@ -120,14 +121,13 @@ def candidates(
     return found, skipped
 
 
-def _columns_for(
-    effect: Effect, channels: Mapping[str, bool], runs: Sequence[Run]
-) -> list[tuple[tuple[str, str], ...]]:
-    """For effects that read a channel: every column that may be it."""
-    if not any(s.name == "channel" for s in effect.extras):
+def _columns_for(effect: Effect, channels: Mapping[str, bool]) -> list[tuple[tuple[str, str], ...]]:
+    """For effects that say for which argument a column is looked for: every one that may be it."""
+    if not effect.columns:
         return [()]
-    warm = effect.name.startswith("temperature")
-    return [(("channel", name),) for name, is_warm in channels.items() if is_warm == warm]
+    ((argument, kind),) = effect.columns
+    fits = {"temperature": (True,), "other": (False,), "any": (True, False)}[kind]
+    return [((argument, name),) for name, is_warm in channels.items() if is_warm in fits]
 
 
 def usable_columns(model: Model, runs: Sequence[Run]) -> list[str]:
@@ -186,8 +186,8 @@ def _tried(candidate: Candidate, model: Model, runs: Sequence[Run]) -> Candidate
     for s in extended.signals:
         if any(s.name not in run.signals for run in runs):
             raise UsageError(f"the data have no {s.name!r}")
-    if effect is not None and not effect.function.__module__.startswith("casest.effects"):
-        check_units(extended)  # a user's own; those of the catalogue are tested
+    if effect is not None and not shipped(effect):
+        check_units(extended)
     return candidate
 
 

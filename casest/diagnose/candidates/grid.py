@@ -29,7 +29,7 @@ LOWEST, FEWEST = 0.7, 6
 LONGEST = 1 << 18
 
 
-def profiled(
+def on_grid(
     found: Sequence[Candidate],
     runs: Sequence[Run],
     residuals: Sequence[Array],
@@ -186,7 +186,7 @@ def _bends(t: Array, r: Array) -> Iterator[tuple[float, float]]:
         size[max(0, at - n // 20) : at + n // 20] = 0
 
 
-def held_value(candidate: Candidate) -> tuple[str, str, float] | None:
+def grid_value(candidate: Candidate) -> tuple[str, str, float] | None:
     """Name, kind and value of what a profile holds: a level or a moment."""
     profile = dict(candidate.effect.profile) if candidate.effect else {}
     for name, kind in profile.items():
@@ -219,7 +219,7 @@ def within(kind: str, value: float, runs: Sequence[Run], axes: int) -> bool:
     )
 
 
-def holding(score: Score, name: str, value: float) -> Score:
+def at_grid_value(score: Score, name: str, value: float) -> Score:
     """The score's candidate with another value held."""
     assert score.candidate.effect is not None
     effect = score.candidate.effect.holding(**{name: float(f"{value:.9g}")})

@@ -1,8 +1,8 @@
 """Outside the catalogue: a formula of few terms in what is recorded.
 
 Terms may read columns, time, the quantities of the model, and products of two. Which of them a
-residual asks for is searched as in `search`; then the formula has to pass the same gate as any
-effect of the catalogue: a certificate, and the error on held-out data.
+residual asks for is told by `matching_pursuit`; then the formula has to pass what any effect of the
+catalogue has to: a certificate, and the error on held-out data.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from casest.declaration.symbols import Signal, param
 from casest.declaration.tracing import flat
 from casest.diagnose.candidates.candidates import Candidate, usable_columns
 from casest.diagnose.candidates.score_test import Score, scores, slope_of, widened
-from casest.diagnose.formula.matching_pursuit import Chosen, Rows, search
+from casest.diagnose.formula.matching_pursuit import Chosen, Rows, matching_pursuit
 from casest.diagnose.formula.terms import Shape, Term, Variable, formula_effect, library
 from casest.diagnose.levels import CLIPPED, PIECE
 from casest.diagnose.misfit.dependence import slow_shapes
@@ -33,7 +33,7 @@ from casest.diagnose.noise.noise_model import MIDDLE
 from casest.diagnose.selection.acceptance import accepted
 from casest.diagnose.selection.found import Found, Undecided
 from casest.diagnose.selection.model_evidence import SMALL, Fitted, by_evidence
-from casest.diagnose.selection.random_walk import wanders
+from casest.diagnose.selection.random_walk import is_random_walk
 from casest.diagnose.selection.refit import joined
 from casest.diagnose.selection.state import Work
 from casest.effects.placing import placed_in
@@ -116,7 +116,7 @@ def _has_a_name(term: Term, model: Model) -> bool:
 def _kept(
     work: Work, before: Fitted, score: Score, fitted: Fitted, replaced: Sequence[Found]
 ) -> Fitted | None:
-    """The fit with the formula in the place of these effects, if it passes the gate."""
+    """The fit with the formula in the place of these effects, if it is accepted."""
     passed = accepted(work, before, score, fitted)
     if passed is None:
         return None
@@ -162,7 +162,7 @@ def _sought(work: Work, current: Fitted) -> tuple[Score, Fitted] | None:
         enough = library.independent_after(fitted)
         if sum(map(len, enough)) < sum(map(len, batches)):
             batches = enough
-        elif not wander and wanders(work.runs, current, fitted, chosen.score):
+        elif not wander and is_random_walk(work.runs, current, fitted, chosen.score):
             wander = True
         else:
             break
@@ -177,13 +177,6 @@ def _terms(model: Model) -> tuple[Term, ...]:
     return getattr(own[0], "terms", ()) if own else ()
 
 
-def _without(fitted: Fitted, label: str) -> tuple[Model, dict[str, Array]]:
-    """The model without an effect, and the values of what it has left."""
-    effects = tuple(a for a in fitted.model.effects if a.label != label)
-    values = {k: v for k, v in fitted.values.items() if not k.startswith(label + ".")}
-    return replace(fitted.model, effects=effects), values
-
-
 def _alone(work: Work, fitted: Fitted) -> tuple[Fitted, list[Found]]:
     """Without the effects that only stood for what the formula says; and those."""
     replaced = []
@@ -191,7 +184,7 @@ def _alone(work: Work, fitted: Fitted) -> tuple[Fitted, list[Found]]:
         label = found.candidate.label
         if found.score is None or not found.names or found.candidate.freed or label == NAME:
             continue
-        without = work.crossed(work.fitted(*_without(fitted, label)))
+        without = work.crossed(work.fitted(*fitted.without(label)))
         whole = work.crossed(fitted)
         if without is not None and (whole is None or not work.confirmed(without, whole)):
             fitted = without
@@ -204,7 +197,7 @@ def _tried(
 ) -> tuple[Score, Fitted] | None:
     """The model refitted with the formula, in place of one that it has; the score."""
     work.original[candidate.label] = candidate
-    model, values = _without(current, NAME)
+    model, values = current.without(NAME)
     wide = widened(model, work.runs, values, [candidate])
     (score,) = scores(wide, [candidate], current.noise, work.folds.batches)
     score = replace(score, p_value=min(1.0, chosen.score.p_value * candidate.trials))
@@ -276,7 +269,7 @@ class _Library:
 
         reads = [shape.reads for shape in self.shapes]
         count = sum(map(len, batches))
-        return search(
+        return matching_pursuit(
             rows, unknowns, self.size, reads, self.state.sigma, problem.residual_count, count
         )
 

@@ -242,7 +242,7 @@ def _something(score: Score) -> NDArray[np.bool_]:
     return kept
 
 
-def search(
+def matching_pursuit(
     rows: Callable[[Sequence[int]], Iterator[Rows]],
     unknowns: int,
     axes: int,

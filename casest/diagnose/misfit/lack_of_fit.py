@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from casest.declaration.shapes import Array
 from casest.diagnose.candidates.candidates import usable_columns
-from casest.diagnose.levels import CLIPPED, DOUBT, STRETCHES
+from casest.diagnose.levels import BEYOND_WALK, CLIPPED, STRETCHES
 from casest.diagnose.misfit.dependence import (
     ORDER,
     Dependence,
@@ -256,7 +256,7 @@ def _jump(state: State) -> Finding | None:
     if not found:
         return None
     better, at, run, length = max(found, key=lambda f: f[0])
-    if better <= DOUBT:
+    if better <= BEYOND_WALK:
         return None
     row = min(int(at * length), len(run) - 1)
     where = f"t = {run.time[row]:.4g} s" if run.time is not None else f"sample {row}"
@@ -298,4 +298,4 @@ def _wanders(state: State, found: Sequence[Variable], tests: Sequence[Dependence
         if before is not None and after is not None:
             walk += likelihood_of_walk(power(before)) - r.shape[1]
             shaped += likelihood_of_white(power(after))
-    return walk > shaped - cost - DOUBT
+    return walk > shaped - cost - BEYOND_WALK

@@ -51,6 +51,11 @@ class Fit:
     last_step: float = 0.0
 
     @property
+    def trusted(self) -> bool:
+        """Is it the most likely one, as far as its scoring says?"""
+        return bool(np.isfinite(self.likelihood)) and self.last_step < 1.0
+
+    @property
     def unknowns(self) -> int:
         """Numbers that were estimated beside the states and intensities."""
         return sum(c.size for c, _ in self.added) + (2 if self.colour else 0)

@@ -65,6 +65,20 @@ class MotionClosing:
     left: Whiteness
     held_out: tuple[Array, Array]
 
+    @property
+    def misfit(self) -> bool:
+        """Are the innovations not white after the loop?"""
+        return self.left.p_value < UNEXPLAINED
+
+    @property
+    def verdict(self) -> str | None:
+        """adequate, extended or unexplained; None without a trusted estimate."""
+        if not self.after.trusted:
+            return None
+        if self.misfit:
+            return "unexplained"
+        return "extended" if self.effects else "adequate"
+
 
 def close_motion(
     model: Dynamics, run: Run, *, say: Callable[[str], None] = lambda _: None

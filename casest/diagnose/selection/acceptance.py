@@ -1,4 +1,4 @@
-"""The gate: what an effect must pass to stay, and the plainest form in which it does."""
+"""Acceptance: what an effect must pass to stay, and the plainest form in which it does."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from casest.diagnose.candidates.axes import narrowed, significant_axes, without_dead
 from casest.diagnose.candidates.candidates import Candidate
-from casest.diagnose.candidates.grid import held_value
+from casest.diagnose.candidates.grid import grid_value
 from casest.diagnose.candidates.score_test import Score
 from casest.diagnose.selection.cross_validation import undetermined
 from casest.diagnose.selection.model_evidence import Fitted
@@ -57,10 +57,9 @@ def pruned(
         return fitted, candidate
     effect = restricted(candidate.effect, kept, fitted.model)
     smaller = replace(candidate, effect=effect, traced=None)
+    values = narrowed(fitted.values, candidate, fitted.model, kept)
     try:
-        again = work.crossed(
-            work.fitted(smaller.added_to(base), narrowed(fitted.values, candidate, kept))
-        )
+        again = work.crossed(work.fitted(smaller.added_to(base), values))
     except CasestError:
         return fitted, candidate
     if again is None or work.confirmed(again, fitted):
@@ -76,12 +75,11 @@ def _plainer(work: Work, fitted: Fitted, candidate: Candidate) -> tuple[Fitted, 
     effect = work.original[candidate.label].effect
     if effect is None or not effect.plain:
         return fitted, candidate
-    held, label = held_value(candidate), candidate.label + "."
+    held = grid_value(candidate)
     begun = effect.starting(**{held[0]: held[2]}) if held else effect
     smaller = replace(candidate, effect=begun.holding(**dict(effect.plain)), traced=None)
-    values = {n: v for n, v in fitted.values.items() if not n.startswith(label)}
+    base, values = fitted.without(candidate.label)
     try:
-        base = replace(fitted.model, effects=fitted.model.effects[:-1])
         again = work.crossed(work.fitted(smaller.added_to(base), values))
     except CasestError:
         return fitted, candidate

@@ -16,7 +16,7 @@ from casest.estimate.calibrate import Estimate, attempt
 from casest.leastsquares.problem import Problem
 
 
-def filled(work: Work, current: Fitted) -> Fitted:
+def on_all_axes(work: Work, current: Fitted) -> Fitted:
     """Axes that were nothing beside what was still missing may be something now."""
     for k, found in enumerate(work.found[:-1]):
         fuller = _on_all_axes(work, current, found)
@@ -36,10 +36,7 @@ def _on_all_axes(work: Work, current: Fitted, found: Found) -> tuple[Fitted, Can
     declared = work.original[label].effect
     if declared is None or declared.plain:
         return None
-    base = replace(
-        current.model, effects=tuple(a for a in current.model.effects if a.label != label)
-    )
-    values = {k: v for k, v in current.values.items() if not k.startswith(label + ".")}
+    base, values = current.without(label)
     try:
         candidate = whole(work, found.score, base)
         model = candidate.added_to(base)
@@ -60,16 +57,13 @@ def _on_all_axes(work: Work, current: Fitted, found: Found) -> tuple[Fitted, Can
     return slim, candidate
 
 
-def weeded(work: Work, current: Fitted) -> Fitted:
+def backward_eliminated(work: Work, current: Fitted) -> Fitted:
     """Each kept effect must still earn its place."""
     for found in list(work.found[:-1]):
         label = found.candidate.label
         if found.candidate.freed or not found.names:
             continue
-        effects = tuple(a for a in current.model.effects if a.label != label)
-        values = {k: v for k, v in current.values.items() if not k.startswith(label + ".")}
-        model = replace(current.model, effects=effects)
-        without = work.crossed(work.fitted(model, values))
+        without = work.crossed(work.fitted(*current.without(label)))
         if without is not None and not work.confirmed(without, current):
             work.found.remove(found)
             work.refuse(found.candidate, "no longer needed beside what came later")
@@ -77,7 +71,7 @@ def weeded(work: Work, current: Fitted) -> Fitted:
     return current
 
 
-def proved(work: Work, current: Fitted) -> tuple[Fitted, Estimate]:
+def certified(work: Work, current: Fitted) -> tuple[Fitted, Estimate]:
     """The last estimate, with intervals; without effects that leave one without an end."""
     while work.found:
         with only_tried(False):

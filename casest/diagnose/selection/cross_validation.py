@@ -15,7 +15,7 @@ from casest.declaration.shapes import Array
 from casest.diagnose.levels import STRETCHES
 from casest.errors import DataError
 from casest.estimate.calibrate import Estimate
-from casest.estimate.certificate import PRACTICALLY_NULL
+from casest.estimate.reasons import PRACTICALLY_NULL
 from casest.leastsquares.identifiability import identify
 from casest.leastsquares.problem import Problem
 from casest.leastsquares.weights import weighted

@@ -11,8 +11,6 @@ from casest.diagnose.candidates.score_test import Score
 
 #: What is refused where nothing can be held out.
 HELD_OUT_DATA = "held-out data"
-#: Effects that are a property of the noise, and leave a model adequate.
-OF_NOISE = frozenset({"outliers", "bias_wander"})
 
 
 @dataclass(frozen=True)
@@ -29,6 +27,11 @@ class Found:
     gain: float
     names: tuple[str, ...] = ()
     rivals: Mapping[str, Mapping[str, Array]] = field(default_factory=dict)
+
+    @property
+    def of_noise(self) -> bool:
+        """Is it a property of the noise, which leaves a model adequate?"""
+        return self.candidate.effect is not None and self.candidate.effect.kind == "noise"
 
     @property
     def indistinguishable_from(self) -> tuple[str, ...]:

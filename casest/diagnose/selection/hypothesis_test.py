@@ -1,8 +1,8 @@
-"""What is asked for: an effect of the user's own is a hypothesis that was there before the data.
+"""Hypothesis tests: an effect of the user's own is a hypothesis that was there before the data.
 
-It is not looked for among all that could be: a chance of 1 % is enough, by the plain F test of its
-refit, which in a few poses sees more than a score whose noise the same few poses must tell. Signs
-of the noise that are flipped, and held-out data, must confirm it as they do everything else.
+What is asked for is not looked for among all that could be: a chance of 1 % is enough, by the plain
+F test of its refit, which in a few poses sees more than a score whose noise the same few poses must
+tell. Signs of the noise that are flipped, and held-out data, must confirm it as all else.
 """
 
 from __future__ import annotations
@@ -19,24 +19,22 @@ from casest.diagnose.selection.model_evidence import (
     confirmed_by_flips,
     cost_of,
 )
-from casest.diagnose.selection.refit import contenders
+from casest.diagnose.selection.refit import refitted
 from casest.diagnose.selection.state import Work
-from casest.effects import CATALOGUE
+from casest.effects import shipped
 from casest.leastsquares.problem import Problem
 
 #: Chance that any effect that is asked for is called significant where there is none.
 CHANCE = 0.01
 
-_SHIPPED = {effect.name for effect in CATALOGUE}
 
-
-def asked_for(work: Work, ranked: Sequence[Score]) -> list[Score]:
+def hypotheses(work: Work, ranked: Sequence[Score]) -> list[Score]:
     """The user's own effects, and those that he knows to be there."""
-    own = {e.name for e in work.catalogue} - _SHIPPED | work.known
+    own = {e.name for e in work.catalogue if not shipped(e)} | work.known
     return [s for s in ranked if s.candidate.name in own]
 
 
-def asked(
+def hypothesis_test(
     work: Work, current: Fitted, ranked: Sequence[Score], chance: float = CHANCE
 ) -> tuple[list[tuple[Score, Fitted]], float]:
     """What is asked for, refitted, beside what explains as much; and the p-value it must have.
@@ -44,11 +42,11 @@ def asked(
     Only what is asked for has one: the others are there to be told apart from it. That there is no
     more of an effect than noise would have is noted.
     """
-    own = [s for s in asked_for(work, ranked) if s.freedom]
+    own = [s for s in hypotheses(work, ranked) if s.freedom]
     confirmed = {s.candidate.label for s in confirmed_by_flips(own, own, chance)}
     labels = {s.candidate.label for s in own}
     limit, tried = chance / max(len(labels), 1), []
-    for score, fitted in contenders(work, current, best_of_each(own, current), ranked):
+    for score, fitted in refitted(work, current, best_of_each(own, current), ranked):
         label, p_value = score.candidate.label, 1.0
         if label in labels:
             p_value = _of_refit(work, current, score, fitted)
@@ -66,7 +64,7 @@ def asked(
 
 def note_unseen(work: Work, ranked: Sequence[Score]) -> None:
     """Say what the data cannot show of what is asked for, and what does not apply to them."""
-    for label in {s.candidate.label: None for s in asked_for(work, ranked)}:
+    for label in {s.candidate.label: None for s in hypotheses(work, ranked)}:
         scores = [s for s in ranked if s.candidate.label == label]
         if not any(s.freedom for s in scores):
             work.refuse(scores[0].candidate, "these data cannot show it")

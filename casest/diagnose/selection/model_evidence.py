@@ -9,7 +9,7 @@ import numpy as np
 
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
-from casest.diagnose.candidates.grid import held_value
+from casest.diagnose.candidates.grid import grid_value
 from casest.diagnose.candidates.score_test import Score, second_freedom
 from casest.diagnose.selection.cross_validation import FAR, Folds, gain
 
@@ -44,6 +44,13 @@ class Fitted:
     lighter: tuple[tuple[int, float], ...] = ()
     moved: float = 0.0
 
+    def without(self, label: str) -> tuple[Model, dict[str, Array]]:
+        """The model without an effect, and the values of what it has left."""
+        own = self.model.unknowns_of(label)
+        left = tuple(a for a in self.model.effects if a.label != label)
+        values = {n: v for n, v in self.values.items() if n not in own}
+        return replace(self.model, effects=left), values
+
 
 def cost_of(fitted: Fitted) -> float:
     """Sum of squared residuals."""
@@ -57,7 +64,7 @@ def clipped_squares(fitted: Fitted, sigma: float) -> float:
 
 def unknowns_of(score: Score, fitted: Fitted) -> int:
     """Of the fit; a level or moment that was looked for is one more."""
-    return fitted.unknowns + (held_value(score.candidate) is not None)
+    return fitted.unknowns + (grid_value(score.candidate) is not None)
 
 
 def price_of(score: Score, fitted: Fitted, price: float) -> float:
@@ -103,7 +110,7 @@ def as_good(
     ]
 
 
-def gentlest_first(
+def least_loss_first(
     tried: Sequence[tuple[Score, Fitted]], folds: Folds, known: Collection[str] = ()
 ) -> list[tuple[Score, Fitted]]:
     """Of those that are as good as the best, first the one that moves the parameters least.

@@ -8,7 +8,7 @@ import numpy as np
 
 from casest.data.run import Run
 from casest.diagnose.candidates.score_test import Score
-from casest.diagnose.levels import CLIPPED, DOUBT
+from casest.diagnose.levels import BEYOND_WALK, CLIPPED
 from casest.diagnose.noise.noise_model import (
     likelihood_of_walk,
     likelihood_of_white,
@@ -21,7 +21,7 @@ from casest.diagnose.selection.model_evidence import Fitted
 SLOW_SHARE = 0.5
 
 
-def wanders(runs: Sequence[Run], before: Fitted, after: Fitted, score: Score) -> bool:
+def is_random_walk(runs: Sequence[Run], before: Fitted, after: Fitted, score: Score) -> bool:
     """Does a random walk explain the slow part of the residual as well as what was added does?
 
     Log-likelihoods of what is seen at slow rates, less what the fitted sizes cost. What lowers the
@@ -43,4 +43,4 @@ def wanders(runs: Sequence[Run], before: Fitted, after: Fitted, score: Score) ->
             fallen += float(np.sum(old**2 - new**2))
     if slow < SLOW_SHARE * fallen:
         return False
-    return walk > plain + DOUBT and walk > shaped - cost - DOUBT
+    return walk > plain + BEYOND_WALK and walk > shaped - cost - BEYOND_WALK

@@ -1,4 +1,4 @@
-"""The contest: the most promising candidates refitted, the best explanation first."""
+"""Refit: the most promising candidates refitted, the best explanation first."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from casest.declaration.model import Model
 from casest.diagnose.candidates.axes import lighter, living_axes
 from casest.diagnose.candidates.candidates import Candidate
-from casest.diagnose.candidates.grid import freed_again, held_value, holding, strides, within
+from casest.diagnose.candidates.grid import at_grid_value, freed_again, grid_value, strides, within
 from casest.diagnose.candidates.score_test import Score
 from casest.diagnose.selection.expected_loss import apart
 from casest.diagnose.selection.model_evidence import (
@@ -27,7 +27,7 @@ from casest.leastsquares.problem import Point, Problem
 from casest.leastsquares.weights import weighted
 
 #: Candidates that are refitted in a round, and those that score as well as the best of them.
-CONTENDERS, MORE = 6, 4
+REFITTED, MORE = 6, 4
 #: Steps of one size that a level or moment may take from where the grid found it; rivals of the
 #: best take them too, where they leave at most this share of what it explains.
 STRIDES, NEAR = 6, 0.3
@@ -35,7 +35,7 @@ STRIDES, NEAR = 6, 0.3
 WORSE = 2
 
 
-def contenders(
+def refitted(
     work: Work, current: Fitted, significant: Sequence[Score], ranked: Sequence[Score]
 ) -> list[tuple[Score, Fitted]]:
     """The most promising candidates refitted, the best explanation first.
@@ -43,12 +43,12 @@ def contenders(
     With them those that may explain as much without being significant: they are not told apart.
     """
     best = best_of_each(significant, current)
-    tried = _refitted(work, current, best[:CONTENDERS])
+    tried = _refitted(work, current, best[:REFITTED])
     if not tried:
         return []
     winner, labels = tried[0][0], {s.candidate.label for s in best}
     rest = [s for s in ranked if s.candidate.label not in labels]
-    near = best[CONTENDERS:] + best_of_each(rest, current)
+    near = best[REFITTED:] + best_of_each(rest, current)
     near = [s for s in near if s.freedom and as_promising(s, winner)]
     tried += _refitted(work, current, near[:MORE])
     return by_evidence(tried)
@@ -69,7 +69,7 @@ def _refitted(work: Work, current: Fitted, chosen: Sequence[Score]) -> list[tupl
 
 def _sharpened(work: Work, current: Fitted, score: Score, fitted: Fitted) -> tuple[Score, Fitted]:
     """With the best level or moment near the one that was found: the grid is coarse."""
-    held = held_value(score.candidate)
+    held = grid_value(score.candidate)
     if held is None:
         return score, fitted
     name, kind, value = held
@@ -81,7 +81,7 @@ def _sharpened(work: Work, current: Fitted, score: Score, fitted: Fitted) -> tup
                 at += way * step
                 if not within(kind, at, work.runs, len(current.model.axes)):
                     break
-                moved = holding(score, name, at)
+                moved = at_grid_value(score, name, at)
                 found = joined(work, current, moved)
                 if found is not None and cost_of(found) < cost_of(best[1]):
                     best, value, worse = (moved, found), at, 0
@@ -138,13 +138,19 @@ def _finite(cost: float) -> float:
 
 def _stepped(problem: Problem, start: Point, candidate: Candidate, score: Score) -> Point:
     """The start moved by the score's first-order step in the candidate's own unknowns."""
-    own = {p.name for p in candidate.parameters(problem.model)}
+    own = {p.name for p in candidate.parameters(problem.model)} - _frequencies(candidate)
     x, used = start.x.copy(), 0
     for slot in problem.slots:
-        if slot.parameter.name in own and slot.parameter.name.rpartition(".")[2] != "frequency":
+        if slot.parameter.name in own:
             width = slot.x.stop - slot.x.start
             if used + width <= len(score.step):
                 x[slot.x] = x[slot.x] + score.step[used : used + width]
                 used += width
     # What the declared parameters had taken over goes back.
     return Point(problem.inside(x), start.references)
+
+
+def _frequencies(candidate: Candidate) -> set[str]:
+    """Its unknowns that were held when it was scored, and are free again."""
+    profile = candidate.effect.profile if candidate.effect else ()
+    return {f"{candidate.label}.{name}" for name, kind in profile if kind == "frequency"}

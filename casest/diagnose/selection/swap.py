@@ -27,7 +27,7 @@ SURE = 10.0
 NEARER = 0.1
 
 
-def cautious(work: Work, current: Fitted) -> Fitted:
+def swapped(work: Work, current: Fitted) -> Fitted:
     """With another effect, or none, in place of the one added last, where that one may do harm.
 
     Beside causes that are still missing nothing is known of that: it is asked at the end.
@@ -36,9 +36,9 @@ def cautious(work: Work, current: Fitted) -> Fitted:
     if step is None or not work.found or work.found[-1].score is not step.score:
         return current
     if step.share >= SMALL:
-        gentler = _gentler(work, step)
-        if gentler is not None:
-            return gentler
+        other = _of_less_loss(work, step)
+        if other is not None:
+            return other
     near = _opposed(work, step)
     if not hangs_on_which(work, step.fitted, near):
         return current
@@ -47,7 +47,7 @@ def cautious(work: Work, current: Fitted) -> Fitted:
     return step.before
 
 
-def _gentler(work: Work, step: Step) -> Fitted | None:
+def _of_less_loss(work: Work, step: Step) -> Fitted | None:
     """With a cause that explains alike and brings the parameters nearer whichever of them it is.
 
     None where the one that was added does, or where there is none such.

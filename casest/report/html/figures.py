@@ -16,6 +16,8 @@ from casest.report.html.page import escaped, prose, tag
 
 #: Arrays up to this length are written out as numbers.
 SHORT = 400
+#: Half width of a 95 % band in standard deviations.
+BAND = 1.96
 
 
 @dataclass

@@ -5,16 +5,24 @@ from __future__ import annotations
 import math
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
-from casest.estimate.calibrate import Estimate
+from casest import __version__
 from casest.report.html.numbers import number, printed, printed_unit, with_unit
 from casest.report.html.page import escaped, paragraph, points, section, table, tag
-from casest.report.html.story import Story
 from casest.report.next_command import typed_words
-from casest.report.text.calibration import entry_rows, rounded
+from casest.results.fitted import (
+    Correlation,
+    DeclaredIn,
+    Fitted,
+    NoiseModel,
+    Samples,
+    WeakCombination,
+)
+from casest.results.result import Reproduced
+from casest.results.rounding import rounded
+from casest.results.values import Entry, Held
 
 #: Correlation from which on a pair is spoken of, and how many pairs and directions are.
 STRONG, SPOKEN = 0.9, 8
@@ -23,42 +31,39 @@ STRONG, SPOKEN = 0.9, 8
 # -- values ----------------------------------------------------------------------------------------
 
 
-def parameters(story: Story) -> str:
+def parameters(result: Fitted) -> str:
     """Values with uncertainty; beside each other and how far they moved, where there are two."""
-    found = story.last
-    rows = [
-        [f"`{name}`", *map(printed, _cells(*numbers)), printed_unit(unit)]
-        for name, unit, numbers in entry_rows(found, found.values, found.std, *found.interval_reach)
-    ]
+    sides = result.residuals.sides
+    rows = [[f"`{e.name}`", *map(printed, _cells(e)), printed_unit(e.unit)] for e in result.entries]
     head = ["parameter", "value", "± std", "95 % from", "to", "unit"]
     said = "± is one standard deviation; the interval holds 95 %."
-    if len(story.sides) > 1:
+    if len(sides) > 1:
         head = ["parameter", "before", "± std", "after", *head[2:5], "moved", "unit"]
-        rows = list(_beside(rows, story))
+        rows = list(_beside(rows, sides[0].entries, result.entries))
         said += " Moved: in the value's own standard deviation before."
     shown = table(head, rows, range(1, len(head) - 1))
-    return section("parameters", "Parameters", paragraph(said), shown, _held(story))
+    return section("parameters", "Parameters", paragraph(said), shown, _held(result.held))
 
 
-def _cells(value: float, std: float, below: float, above: float) -> list[str]:
+def _cells(e: Entry) -> list[str]:
     """Value, standard deviation and interval, as far as they are known."""
-    shown, spread = rounded(value, std)
-    ends = [value - below, value + above]
-    known = math.isfinite(std) and std > 0
+    shown, spread = rounded(e.value, e.std)
+    ends = [e.value - e.below, e.value + e.above]
+    known = math.isfinite(e.std) and e.std > 0
     return [shown, spread, *(_places(end, spread) if known else "–" for end in ends)]
 
 
-def _beside(rows: Sequence[list[str]], story: Story) -> Iterator[list[str]]:
+def _beside(
+    rows: Sequence[list[str]], first: Sequence[Entry], last: Sequence[Entry]
+) -> Iterator[list[str]]:
     """Rows with the values before in front and how far they moved at the end."""
-    first, last = (side.estimate for side in story.sides)
-    before = {name: v for name, _, v in entry_rows(first, first.values, first.std)}
-    after = entry_rows(last, last.values)
-    for (label, *cells, unit), (name, _, (value,)) in zip(rows, after, strict=True):
-        if name not in before:
+    before = {e.name: e for e in first}
+    for (label, *cells, unit), e in zip(rows, last, strict=True):
+        if e.name not in before:
             yield [label, "", "", *cells, "added", unit]
             continue
-        old, std = before[name]
-        moved = (value - old) / std if std > 0 else math.nan
+        old, std = before[e.name].value, before[e.name].std
+        moved = (e.value - old) / std if std > 0 else math.nan
         there = printed(f"{moved:+.1f}") if math.isfinite(moved) else "–"
         yield [label, *map(printed, rounded(old, std)), *cells, there, unit]
 
@@ -70,14 +75,12 @@ def _places(value: float, spread: str) -> str:
     return f"{value:.{len(spread.partition('.')[2])}f}"
 
 
-def _held(story: Story) -> str:
+def _held(held: Sequence[Held]) -> str:
     """Constants: as much a part of the answer as the unknowns."""
     rows = []
-    for c in story.last.model.constants:
-        value = ", ".join(f"{v:.9g}" for v in np.ravel(c.array))
-        rows.append(
-            [f"`{c.name}`", printed(value), printed_unit(story.units.get(c.name, "")) or "1"]
-        )
+    for c in held:
+        value = ", ".join(f"{v:.9g}" for v in np.ravel(c.value))
+        rows.append([f"`{c.name}`", printed(value), printed_unit(c.unit) or "1"])
     if not rows:
         return ""
     said = "Held at these values; their own uncertainty is not in the standard deviations above."
@@ -87,28 +90,27 @@ def _held(story: Story) -> str:
 # -- what is uncertain about them ------------------------------------------------------------------
 
 
-def uncertain(story: Story, content: Mapping[str, Any]) -> str:
+def uncertain(result: Fitted) -> str:
     """Rank, strong correlations and weak directions, in words."""
-    found, identified = story.last, content["identifiability"]
+    identified = result.identifiability
     said = [
         paragraph(
-            f"The data determine {identified['rank']} of {identified['unknowns']} unknowns."
-            + ("" if identified["unobservable"] else " None is left undetermined.")
+            f"The data determine {identified.rank} of {identified.unknowns} unknowns."
+            + ("" if identified.unobservable else " None is left undetermined.")
         ),
-        points(identified["unobservable"]),
+        points(identified.unobservable),
     ]
-    weak = sorted(identified["weak"], key=lambda w: -(w["inflation"] or 0))
+    weak = sorted(identified.weak, key=lambda w: -w.inflation)
     if weak:
-        units = dict(zip(found.names, found.problem.units, strict=True))
         said += [
             tag("h3", "Weak combinations"),
             paragraph(
                 "These values can be wrong together by as much as is written (one standard "
                 "deviation of the combination) with hardly a change of the residual:"
             ),
-            points(_weak(w, units) for w in weak[:SPOKEN]),
+            points(_weak(w, result.unknown_units) for w in weak[:SPOKEN]),
         ]
-    pairs = list(_pairs(found))
+    pairs = list(_pairs(result.correlation))
     if pairs:
         rest = len(pairs) - SPOKEN
         said += [
@@ -118,25 +120,24 @@ def uncertain(story: Story, content: Mapping[str, Any]) -> str:
             if rest > 0
             else "",
         ]
-    elif found.certificate.trusted:
+    elif result.trusted:
         said.append(paragraph(f"No two unknowns are correlated beyond ±{STRONG}."))
     return section("uncertain", "What belongs together", *said)
 
 
-def _weak(weak: Mapping[str, Any], units: Mapping[str, str]) -> str:
+def _weak(weak: WeakCombination, units: Mapping[str, str]) -> str:
     parts = []
-    for part in weak["direction"].split(", "):
+    for part in weak.direction.split(", "):
         name, _, value = part.rpartition(" ")
         unit = printed_unit(units.get(name, ""))
         parts.append(f"`{name}` by {printed(value)} {unit}".removesuffix(" 1").strip())
-    return f"{', '.join(parts)}: {weak['inflation']:.0f} times less certain than each alone."
+    return f"{', '.join(parts)}: {weak.inflation:.0f} times less certain than each alone."
 
 
-def _pairs(found: Estimate) -> Iterator[tuple[str, str, float]]:
+def _pairs(found: Correlation) -> Iterator[tuple[str, str, float]]:
     """Pairs of strongly correlated unknowns, the strongest first."""
-    std = np.sqrt(np.diag(found.covariance))
-    with np.errstate(all="ignore"):
-        matrix = np.nan_to_num(found.covariance / np.outer(std, std))
+    size = len(found.names)
+    matrix = np.nan_to_num(np.array(found.matrix, dtype=float).reshape(size, size))
     first, second = np.nonzero(np.triu(np.abs(matrix) > STRONG, 1))
     order = np.argsort(-np.abs(matrix[first, second]))
     for i, j in zip(first[order], second[order], strict=True):
@@ -151,78 +152,78 @@ def _pair(one: str, other: str, correlation: float) -> str:
 # -- why it is believed ----------------------------------------------------------------------------
 
 
-def certified(story: Story, content: Mapping[str, Any]) -> str:
+def certified(result: Fitted) -> str:
     """The certificate of each fit, and how it was found."""
     said = []
-    for side in story.sides:
-        certificate = side.estimate.certificate
-        if len(story.sides) > 1:
+    for side in result.residuals.sides:
+        if len(result.residuals.sides) > 1:
             said.append(tag("h3", f"Fit {escaped(side.name)}"))
-        verb = "believed" if certificate.trusted else "refused"
+        verb = "believed" if side.trusted else "refused"
         said.append(paragraph(f"The fit is {verb} because:"))
-        said.append(points(certificate.reasons))
-    solver = content["solver"]
-    if solver.get("name"):
+        said.append(points(side.reasons))
+    solver = result.solver
+    seconds = solver.seconds if isinstance(solver.seconds, float) else None
+    if solver.name:
         said.append(
             paragraph(
-                f"Solver: {solver['name']}, {solver.get('iterations', '–')} iterations, "
-                f"{number(solver.get('seconds'))} s. A solver's own claim of success counts for "
+                f"Solver: {solver.name}, {solver.iterations} iterations, "
+                f"{number(seconds)} s. A solver's own claim of success counts for "
                 "nothing here."
             )
         )
-    said.append(tag("h3", "Noise") + points(_noise(story, content)))
+    said.append(tag("h3", "Noise") + points(_noise(result)))
     return section("certificate", "How the fit was certified", *said)
 
 
-def _noise(story: Story, content: Mapping[str, Any]) -> Iterator[str]:
-    noise = content["noise"]
+def _noise(result: Fitted) -> Iterator[str]:
+    noise, residuals = result.noise, result.residuals
+    axes, unit = residuals.axes, residuals.unit
     each = ", ".join(
-        f"{axis} {with_unit(s, story.unit)}" if len(story.axes) > 1 else with_unit(s, story.unit)
-        for axis, s in zip(story.axes, story.sigma.tolist(), strict=True)
+        f"{axis} {with_unit(s, unit)}" if len(axes) > 1 else with_unit(s, unit)
+        for axis, s in zip(axes, residuals.sigma.tolist(), strict=True)
     )
     yield f"Standard deviation of one residual: {each}."
-    if noise.get("from_repeats"):
-        repeats, residual = (
-            with_unit(noise[k], story.unit) for k in ("from_repeats", "from_residual")
-        )
+    if noise.from_repeats:
+        repeats, residual = (with_unit(v, unit) for v in (noise.from_repeats, noise.from_residual))
         yield f"From the scatter within rest intervals: {repeats}; from the residual: {residual}."
-    if noise.get("colour"):
-        near = noise.get("lag1_correlation")
+    if isinstance(noise, NoiseModel) and noise.colour:
+        near = noise.lag1_correlation
         beside = "" if near is None else f"; correlation of neighbours {number(near)}"
-        yield f"Colour: {noise['colour']}{beside}."
-    if story.correlated_over > 1:
+        yield f"Colour: {noise.colour}{beside}."
+    if residuals.correlated_over > 1:
         yield (
-            f"Residuals are correlated over {number(story.correlated_over)} samples; standard "
+            f"Residuals are correlated over {number(residuals.correlated_over)} samples; standard "
             "deviations come from batches of samples."
         )
-    if noise.get("outlier_share"):
-        yield f"Outliers: {noise['outlier_share']:.2%} of the samples."
-    yield f"{noise['degrees_of_freedom']} degrees of freedom."
+    if isinstance(noise, NoiseModel) and noise.outlier_share:
+        yield f"Outliers: {noise.outlier_share:.2%} of the samples."
+    yield f"{noise.degrees_of_freedom} degrees of freedom."
 
 
 # -- how to get it again ---------------------------------------------------------------------------
 
 
-def reproduction(content: Mapping[str, Any], notes: Sequence[str] = ()) -> str:
+def reproduction(
+    again: Reproduced,
+    notes: Sequence[str] = (),
+    declared: DeclaredIn | None = None,
+    samples: Sequence[Samples] = (),
+) -> str:
     """Command, versions, digests."""
-    again = dict(content.get("reproduce") or {})
-    command, digests = again.pop("command", ""), again.pop("sha256", {})
     said = []
-    if command:
-        words = typed_words(command)
-        shown = textwrap.dedent(words.lines()) if words else command
+    if again.command:
+        words = typed_words(again.command)
+        shown = textwrap.dedent(words.lines()) if words else again.command
         said.append(tag("pre", tag("code", escaped(shown))))
-    versions = {"casest": content["casest"], **again}
-    said.append(table(["software", "version"], [[k, str(v)] for k, v in versions.items()]))
-    rows = [[f"`{name}`", f"`{digest}`"] for name, digest in digests.items()]
-    declared = content.get("declared_in") or {}
-    if declared:
-        rows.append([f"`{declared['file']}` (the model)", f"`{declared['sha256']}`"])
+    versions = [["casest", __version__], ["python", again.python], ["casadi", again.casadi],
+                ["numpy", again.numpy], ["scipy", again.scipy]]  # fmt: skip
+    said.append(table(["software", "version"], versions))
+    rows = [[f"`{name}`", f"`{digest}`"] for name, digest in again.sha256.items()]
+    if declared and declared.file:
+        rows.append([f"`{declared.file}` (the model)", f"`{declared.sha256}`"])
     said.append(table(["file", "SHA-256"], rows))
-    samples = content.get("samples")
-    if isinstance(samples, list):
-        shown = [[f"`{s['run']}`", str(s["samples"]), str(s["readings"])] for s in samples]
-        said.append(table(["run", "samples", "readings"], shown, [1, 2]))
+    counts = [[f"`{s.run}`", str(s.samples), str(s.readings)] for s in samples]
+    said.append(table(["run", "samples", "readings"], counts, [1, 2]))
     if notes:
         said += [tag("h3", "Noted while reading and fitting"), points(notes)]
     return section("reproduce", "How to get it again", *said)

@@ -9,11 +9,10 @@ import numpy as np
 
 from casest.data.run import Index
 from casest.declaration.shapes import Array
-from casest.diagnose.misfit.dependence import Variable
-from casest.report.html.figures import Figures, axis, panel
+from casest.report.html.figures import BAND, Figures, axis, panel
 from casest.report.html.frequency import over_frequency
 from casest.report.html.page import details, paragraph, tag
-from casest.report.html.story import BAND, Story
+from casest.results.residuals import Residuals, Variable
 
 #: Samples that are drawn one by one; from this many on least and greatest of groups are kept.
 WHOLE = 120_000
@@ -23,19 +22,19 @@ POINTS, BINS, IN_BIN = 300, 30, 15
 AT_ONCE = 4
 
 
-def residual_figures(story: Story, figures: Figures) -> str:
+def residual_figures(residuals: Residuals, figures: Figures) -> str:
     """All figures of the residual, or why one is missing."""
     return "".join(
         [
-            over_time(story, figures),
-            over_variables(story, figures),
-            *over_frequency(story, figures),
+            over_time(residuals, figures),
+            over_variables(residuals, figures),
+            *over_frequency(residuals, figures),
         ]
     )
 
 
-def _label(story: Story, a: int) -> str:
-    return story.of_axis("residual", a)
+def _label(residuals: Residuals, a: int) -> str:
+    return residuals.of_axis("residual", a)
 
 
 def _band(half: float) -> list[dict[str, float]]:
@@ -45,14 +44,14 @@ def _band(half: float) -> list[dict[str, float]]:
 # -- over time -------------------------------------------------------------------------------------
 
 
-def over_time(story: Story, figures: Figures) -> str:
+def over_time(residuals: Residuals, figures: Figures) -> str:
     """Every residual over time, the runs end to end."""
-    x, label, unit, marks = _places(story)
-    whole = [np.concatenate(side.residuals) for side in story.sides]
-    breaks = _breaks(story)
+    x, label, unit, marks = _places(residuals)
+    whole = [np.concatenate(side.residuals) for side in residuals.sides]
+    breaks = _breaks(residuals)
     panels, outside = [], 0
-    for a, side, title in story.panels():
-        limit = _limit([w[:, a] for w in whole], story.sigma[a])
+    for a, side, title in residuals.panels():
+        limit = _limit([w[:, a] for w in whole], residuals.sigma[a])
         y = np.concatenate(side.residuals)[:, a]
         outside += int(np.sum(np.abs(y) > limit))
         y = np.clip(y, -limit, limit)
@@ -63,9 +62,9 @@ def over_time(story: Story, figures: Figures) -> str:
             panel(
                 title,
                 axis(label, unit, float(x.min()), float(x.max()), room=0.02 if few else 0.0),
-                axis(_label(story, a), story.unit, -limit, limit, room=0.06),
+                axis(_label(residuals, a), residuals.unit, -limit, limit, room=0.06),
                 [figures.series("points" if few else "line", side.look, at, y=y)],
-                bands=_band(BAND * story.sigma[a]),
+                bands=_band(BAND * residuals.sigma[a]),
                 marks=marks,
             )
         )
@@ -75,18 +74,20 @@ def over_time(story: Story, figures: Figures) -> str:
     if outside:
         note += f" {outside} values further out are drawn at the edge."
     caption = (
-        "Residual over time." if unit == "s" else f"Residual of every {story.kind}.",
+        "Residual over time." if unit == "s" else f"Residual of every {residuals.kind}.",
         f"Shaded, between the dashes: the 95 % band of the noise.{note}",
     )
-    return figures.add("over-time", caption, panels, two=len(story.sides) > 1, zoom=len(x) > POINTS)
+    return figures.add(
+        "over-time", caption, panels, two=len(residuals.sides) > 1, zoom=len(x) > POINTS
+    )
 
 
-def _places(story: Story) -> tuple[Array, str, str, list[dict[str, Any]]]:
+def _places(residuals: Residuals) -> tuple[Array, str, str, list[dict[str, Any]]]:
     """Where each sample stands, the axis's label and unit, and where runs begin."""
-    several = len(story.runs) > 1
-    timed = all(run.time is not None for run in story.runs)
+    several = len(residuals.runs) > 1
+    timed = all(run.time is not None for run in residuals.runs)
     found, marks, begin = [], [], 0.0
-    for run in story.runs:
+    for run in residuals.runs:
         if timed and run.time is not None:
             place = run.time - run.time[0] if several else np.asarray(run.time, float)
         else:
@@ -94,18 +95,18 @@ def _places(story: Story) -> tuple[Array, str, str, list[dict[str, Any]]]:
         found.append(place + begin)
         marks.append({"x": float(found[-1][0]), "name": run.name})
         begin = float(found[-1][-1]) + (float(np.median(np.diff(place))) if len(run) > 1 else 1.0)
-    label = "time" if timed else f"{story.kind} number"
+    label = "time" if timed else f"{residuals.kind} number"
     if several:
         label += ", runs end to end"
     return np.concatenate(found), label, "s" if timed else "1", marks if several else []
 
 
-def _breaks(story: Story) -> Index:
+def _breaks(residuals: Residuals) -> Index:
     """Samples before which a line is interrupted: a gap in time, or another run."""
-    ends = np.cumsum([len(run) for run in story.runs])
+    ends = np.cumsum([len(run) for run in residuals.runs])
     found = [
         np.flatnonzero(np.diff(run.block)) + 1 + end - len(run)
-        for run, end in zip(story.runs, ends, strict=True)
+        for run, end in zip(residuals.runs, ends, strict=True)
         if not run.spread
     ]
     return np.unique(np.concatenate([*found, ends[:-1]])).astype(int)
@@ -144,65 +145,65 @@ def _limit(residuals: Sequence[Array], sigma: float) -> float:
 # -- over columns and quantities -------------------------------------------------------------------
 
 
-def over_variables(story: Story, figures: Figures) -> str:
+def over_variables(residuals: Residuals, figures: Figures) -> str:
     """The residual over each column, input and quantity, what it depends on most first."""
-    ranked = sorted(story.variables, key=lambda v: -_dependence(story, v))
+    ranked = sorted(residuals.variables, key=lambda v: -_dependence(residuals, v))
     if not ranked:
         return paragraph(
             "No column beside the signals and no quantity varies in these data: there is nothing "
             "to draw the residual over.",
             "soft",
         )
-    drawn = [_over(story, v, k, figures) for k, v in enumerate(ranked)]
+    drawn = [_over(residuals, v, k, figures) for k, v in enumerate(ranked)]
     more = drawn[AT_ONCE:]
     folded = details(f"More columns and quantities ({len(more)})", *more) if more else ""
     said = paragraph(
         "Each point is the mean residual of a bin of equally many samples; the shaded band holds "
         "95 % of such means if there is only noise. What the residual depends on most comes first."
-        if _binned(story)
+        if _binned(residuals)
         else "Shaded: the 95 % band of the noise."
     )
     head = tag("h3", "Residual over each column and quantity")
     return head + said + "".join(drawn[:AT_ONCE]) + folded
 
 
-def _binned(story: Story) -> bool:
-    return sum(map(len, story.runs)) > POINTS
+def _binned(residuals: Residuals) -> bool:
+    return sum(map(len, residuals.runs)) > POINTS
 
 
-def _over(story: Story, variable: Variable, number: int, figures: Figures) -> str:
-    unit = story.variable_unit(variable.name)
+def _over(residuals: Residuals, variable: Variable, number: int, figures: Figures) -> str:
+    unit = variable.unit
     name = f"column {variable.name}" if variable.name.isdigit() else variable.name
-    x = _place_of(variable)
+    x = variable.values
     panels = []
-    for a, side, title in story.panels():
+    for a, side, title in residuals.panels():
         y = np.concatenate(side.residuals)[:, a]
-        if _binned(story):
-            at, mean, half = bins(x, y, story.sigma[a], story.correlated_over)
-            top = _top(story, a, x)
+        if _binned(residuals):
+            at, mean, half = bins(x, y, residuals.sigma[a], residuals.correlated_over)
+            top = _top(residuals, a, x)
             drawn = [
                 figures.series("ribbon", "band", at, low=-half, high=half),
                 figures.series("line", side.look, at, y=mean),
             ]
             bands = []
         else:
-            top = _limit([np.concatenate(s.residuals)[:, a] for s in story.sides], story.sigma[a])
+            top = _limit(
+                [np.concatenate(s.residuals)[:, a] for s in residuals.sides], residuals.sigma[a]
+            )
             drawn = [figures.series("points", side.look, x, y=np.clip(y, -top, top))]
-            bands = _band(BAND * story.sigma[a])
-        label = _label(story, a).replace("residual", "mean") if _binned(story) else _label(story, a)
+            bands = _band(BAND * residuals.sigma[a])
+        label = (
+            _label(residuals, a).replace("residual", "mean")
+            if _binned(residuals)
+            else _label(residuals, a)
+        )
         across = axis(name, unit, float(x.min()), float(x.max()), room=0.02)
-        upright = axis(label, story.unit, -top, top, room=0.08)
+        upright = axis(label, residuals.unit, -top, top, room=0.08)
         panels.append(panel(title, across, upright, drawn, bands=bands, height=155))
     turn = " (one turn)" if variable.turns else ""
     nobody = "" if unit else " Its unit is not stated."
     caption = (f"Over {name}{turn}.", nobody.strip())
-    return figures.add(f"over-variable-{number}", caption, panels, two=len(story.sides) > 1)
-
-
-def _place_of(variable: Variable) -> Array:
-    """Values of all runs; an angle that goes round within one turn."""
-    x = np.concatenate(variable.values)
-    return x % (2 * np.pi) if variable.turns else x
+    return figures.add(f"over-variable-{number}", caption, panels, two=len(residuals.sides) > 1)
 
 
 def bins(
@@ -219,24 +220,24 @@ def bins(
     return at, mean, BAND * sigma * np.sqrt(correlated_over / n[used])
 
 
-def _top(story: Story, a: int, x: Array) -> float:
+def _top(residuals: Residuals, a: int, x: Array) -> float:
     """Half height of the panels of an axis, the same before and after."""
     found = []
-    for side in story.sides:
+    for side in residuals.sides:
         _, mean, half = bins(
-            x, np.concatenate(side.residuals)[:, a], story.sigma[a], story.correlated_over
+            x, np.concatenate(side.residuals)[:, a], residuals.sigma[a], residuals.correlated_over
         )
         found += [float(np.abs(mean).max()), float(np.nan_to_num(half).max())]
     return max(found) or 1.0
 
 
-def _dependence(story: Story, variable: Variable) -> float:
+def _dependence(residuals: Residuals, variable: Variable) -> float:
     """Mean square of the bins' means over that of noise, on the worst axis, at first."""
-    x, side = _place_of(variable), story.sides[0]
+    x, side = variable.values, residuals.sides[0]
     found = []
-    for a in range(len(story.axes)):
+    for a in range(len(residuals.axes)):
         y = np.concatenate(side.residuals)[:, a]
-        _, mean, half = bins(x, y, story.sigma[a], story.correlated_over)
+        _, mean, half = bins(x, y, residuals.sigma[a], residuals.correlated_over)
         with np.errstate(all="ignore"):
             found.append(float(np.nan_to_num(np.mean((mean / half) ** 2))))
     return max(found)

@@ -20,7 +20,7 @@ from casest.declaration.shapes import Array
 from casest.declaration.symbols import Parameter
 from casest.errors import DataError, UsageError
 from casest.results.file import load_result
-from casest.results.saved_model import saved_model
+from casest.saved.model import saved_model
 
 
 def corrected_csv(

@@ -13,7 +13,6 @@ import numpy as np
 
 from casest import __version__
 from casest.correction import runtime
-from casest.correction.apply import table_of, without
 from casest.correction.c import c_source
 from casest.correction.inverse import Correction, invertible
 from casest.correction.numpy_module import as_data, python_source
@@ -24,7 +23,8 @@ from casest.declaration.shapes import Array
 from casest.declaration.symbols import Signal
 from casest.errors import DataError, UsageError
 from casest.results.file import load_result, plain
-from casest.results.saved_model import saved_model
+from casest.saved.apply import table_of, without
+from casest.saved.model import saved_model
 
 #: What the JSON form calls itself; its schema is `casest/correction/correction.schema.json`.
 FORMAT = "casest-correction-1"

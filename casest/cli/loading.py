@@ -1,0 +1,114 @@
+"""The model and the records that a command line names, with its options applied."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from casest.cli.assignments import Assignments
+from casest.cli.options import ModelOptions, MotionOptions, ReadingOptions
+from casest.cli.shared import progress
+from casest.errors import UsageError
+
+if TYPE_CHECKING:
+    from casest.data.run import Run
+    from casest.declaration.model import Model
+    from casest.dynamics import Dynamics
+
+
+def declared_model(name: str, options: ModelOptions) -> Model:
+    """The model with --set, --free, --fix, --shared, --per-run and --effects applied."""
+    from casest.results.find import find_model
+
+    model = _with_effects(find_model(name), options.effects)
+    model = _with_constants(model, options.constants, name)
+    for symbol in options.free:
+        model = model.freed(symbol)
+    for given in options.fix:
+        symbol, value = given.of(model)
+        model = model.having(**{symbol: value})
+    for symbol in options.shared:
+        model = model.scoped(symbol, "all")
+    for symbol in options.per_run:
+        model = model.scoped(symbol, "run")
+    return model
+
+
+def _with_effects(model: Model, files: Sequence[str]) -> Model:
+    from casest.declaration.dimensions import check_units
+    from casest.effects.placing import placed_in
+    from casest.results.find import find_effects
+
+    for file in files:
+        for effect in find_effects(file):
+            model = model.with_effect(placed_in(effect, model))
+            check_units(model)
+    return model
+
+
+def _with_constants(model: Model, constants: Assignments, name: str) -> Model:
+    from casest.declaration.symbols import Constant, Parameter, constant
+
+    for given in constants:
+        symbol, value = given.of(model)
+        if isinstance(model[symbol], Parameter):
+            raise UsageError(
+                f"{symbol} is an unknown of {name}, not a constant; hold it with --fix {given.text}"
+            )
+        value = value if isinstance(value, Constant) else constant(value, "")
+        model = model.having(**{symbol: value})
+    return model
+
+
+def records(model: Model, data: Sequence[str], options: ReadingOptions) -> tuple[Run, ...]:
+    """The runs in the files."""
+    from casest.data import load_runs
+
+    progress(f"reading {', '.join(data)}")
+    seen: set[Path] = set()
+    for name in data:
+        if Path(name).resolve() in seen:
+            raise UsageError(f"{name} is given twice: it would count as two records")
+        seen.add(Path(name).resolve())
+    return load_runs(list(data), model.signals, **options.keywords())
+
+
+def held_out(
+    model: Model, apart: Sequence[str], data: Sequence[str], options: ReadingOptions
+) -> tuple[Run, ...]:
+    """The runs in the files `apart`, which the fit to `data` never saw."""
+    fitted = {Path(name).resolve() for name in data}
+    for name in apart:
+        if Path(name).resolve() in fitted:
+            raise UsageError(f"--holdout {name}: the fit has seen this file; give another record")
+    return records(model, apart, options) if apart else ()
+
+
+def moving_model(name: str, constants: Assignments, options: MotionOptions) -> Dynamics:
+    """The estimator in motion with --set, --intensity and --std applied."""
+    from casest.dynamics import Dynamics
+    from casest.results.find import find_any
+
+    moving = find_any(name)
+    if not isinstance(moving, Dynamics):
+        raise UsageError(f"{name} is no estimator in motion: casest calibrate, close or observe it")
+    moving = moving.having(**dict(given.number() for given in constants))
+    intensities = dict(given.number() for given in options.intensities)
+    sensed = {s.name: intensities.pop(s.name) for s in moving.signals if s.name in intensities}
+    moving = moving.driven(**intensities).sensing(**sensed)
+    return moving.known_to(**dict(given.number() for given in options.stds))
+
+
+def trajectory(moving: Dynamics, name: str, data: Sequence[str], options: ReadingOptions) -> Run:
+    """The one record of the estimator that is called `name` on the command line."""
+    from casest.data import load_runs
+
+    if len(data) != 1:
+        raise UsageError(f"{name}: a trajectory is one file, not {len(data)}")
+    progress(f"reading {data[0]}")
+    gaps = moving.may_be_missing
+    runs = load_runs(list(data), moving.signals, gaps=gaps, **options.keywords())
+    if len(runs) != 1:
+        raise UsageError(f"{data[0]} holds {len(runs)} runs; a trajectory is one")
+    return runs[0]

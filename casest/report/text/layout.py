@@ -1,0 +1,73 @@
+"""Layout of what a prompt prints: 80 columns, points, tables of values, colours."""
+
+from __future__ import annotations
+
+import os
+import re
+import textwrap
+from collections.abc import Iterator, Sequence
+from typing import TextIO
+
+from casest.declaration.shapes import in_digits
+from casest.results.rounding import rounded
+from casest.results.values import Entry, Held
+
+WIDTH = 80
+
+#: Verdicts and their colours (SGR codes): red, green, yellow.
+_COLOURS = {
+    r"NOT\s+TRUSTED|unexplained(?=:)|no\s+trustworthy\s+estimate": 31,
+    r"trusted,\s+but\s+the\s+residual\s+is\s+not\s+noise|extended(?=:)": 33,
+    r"trusted$|adequate(?=:)": 32,
+}
+
+
+def coloured(text: str, stream: TextIO) -> str:
+    """The text with its verdict in colour on a terminal, where NO_COLOR does not forbid it."""
+    if not stream.isatty() or os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb":
+        return text
+    head, gap, rest = text.partition("\n\n")
+    for verdict, code in _COLOURS.items():
+        head, found = re.subn(verdict, f"\x1b[1;{code}m\\g<0>\x1b[0m", head, count=1)
+        if found:
+            break
+    return head + gap + rest
+
+
+def item(text: str) -> str:
+    """A point of a list, wrapped."""
+    return textwrap.fill(text, WIDTH, initial_indent="  - ", subsequent_indent="    ")
+
+
+def wrapped(lines: Sequence[str]) -> list[str]:
+    """Lines that fit 80 columns."""
+    return [
+        textwrap.fill(line, WIDTH, subsequent_indent=" " * 4, break_on_hyphens=False)
+        for line in lines
+    ]
+
+
+def note_lines(notes: Sequence[str]) -> list[str]:
+    """What was assumed, a line each."""
+    return ["", *(f"  note: {note}" for note in notes)] if notes else []
+
+
+def value_table(entries: Sequence[Entry]) -> Iterator[str]:
+    """One line per value: name, value ± standard deviation, unit."""
+    rows = [(e.name, *rounded(e.value, e.std), e.unit) for e in entries]
+    width = max(len(r[0]) for r in rows)
+    left = max(len(r[1]) for r in rows)
+    middle = max(len(r[2]) for r in rows)
+    yield f"  {'parameter':<{width}}  {'value':>{left}}   {'std':<{middle}}  unit"
+    for name, value_text, std_text, unit in rows:
+        yield f"  {name:<{width}}  {value_text:>{left}} ± {std_text:<{middle}}  {unit}".rstrip()
+
+
+def held_lines(held: Sequence[Held]) -> Iterator[str]:
+    """Constants, and parameters held at a value: as much a part of the answer as the unknowns."""
+    for c in held:
+        unit = "" if c.unit == "1" else c.unit
+        line = f"  {c.name} = {in_digits(c.value, 9)} {unit}".rstrip() + " (held)"
+        yield textwrap.fill(line, WIDTH, subsequent_indent="      ", break_on_hyphens=False)
+    if any(c.frozen for c in held):
+        yield "  (the uncertainty of held values is not in the standard deviations above)"

@@ -1,0 +1,359 @@
+"""What calibrate and close leave in common: errors, certificate, values, what is uncertain."""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+from collections.abc import Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any, ClassVar
+
+import casadi as ca
+import numpy as np
+from msgspec import UNSET, Struct, UnsetType
+
+from casest.declaration.effect import Attached
+from casest.declaration.model import Model
+from casest.declaration.shapes import Array
+from casest.declaration.symbols import Constant
+from casest.estimate.calibrate import Estimate
+from casest.leastsquares.agreement import between_runs
+from casest.results.application import Application, application_of
+from casest.results.file import plain
+from casest.results.residuals import Residuals
+from casest.results.result import (
+    Certificate,
+    Number,
+    Numbers,
+    Parameter,
+    Reproduced,
+    Result,
+    reproduced,
+)
+from casest.results.units import unit_table
+from casest.results.values import Entry, Held, entries, held
+
+
+class Noise(Struct, frozen=True):
+    """Standard deviation of one residual on each axis, and where it comes from."""
+
+    sigma: list[float]
+    unit: str
+    from_residual: Number
+    from_repeats: Number
+    degrees_of_freedom: int
+    correlated_over_samples: Number
+
+
+class NoiseModel(Noise, frozen=True):
+    """The noise after the loop: also its colour, tails and inequality."""
+
+    sigma_by_axis: list[float]
+    colour: str
+    lag1_correlation: Number
+    colour_p_value: Number
+    wander: Number
+    wander_p_value: Number
+    tail_degrees_of_freedom: Number
+    outlier_share: float
+    quantisation_step: Number
+    largest_over_smallest: Number
+    unequal_p_value: Number
+
+
+class Correlation(Struct, frozen=True):
+    """Correlation of the unknowns: null where the data do not determine one."""
+
+    names: list[str]
+    matrix: list[list[Number]]
+
+
+class Section(Struct, frozen=True, kw_only=True):
+    """One fit: errors (held-out ones null where nothing was), certificate, parameters."""
+
+    rmse_fit: Number
+    rmse_holdout: Number
+    rmse_holdout_by_axis: dict[str, Number] | UnsetType = UNSET
+    log_likelihood: Number | UnsetType = UNSET
+    certificate: Certificate
+    parameters: dict[str, Parameter]
+    correlation: Correlation | UnsetType = UNSET
+
+
+class JudgedSection(Section, frozen=True, kw_only=True):
+    """One fit that held-out data have judged, axis by axis."""
+
+    rmse_holdout_by_axis: dict[str, Number]
+
+
+class Attachment(Struct, frozen=True):
+    """What is needed to attach an effect again: where, and the numbers it was told."""
+
+    name: str
+    on: str | None
+    columns: dict[str, str]
+    numbers: dict[str, float]
+    file: str
+
+
+class WeakCombination(Struct, frozen=True):
+    """A combination that is determined `inflation` times worse than its parameters alone."""
+
+    direction: str
+    inflation: float
+    std: Number
+
+
+class Identified(Struct, frozen=True):
+    """What the data determine of the unknowns."""
+
+    rank: int
+    unknowns: int
+    unobservable: list[str]
+    weak: list[WeakCombination]
+
+
+class Scatter(Struct, frozen=True):
+    """Agreement of several runs on what they share."""
+
+    F: Number
+    freedom: list[Number]
+    p_value: Number
+    furthest: str
+
+
+class Doubt(Struct, frozen=True):
+    """What in the residual speaks against the model."""
+
+    where: str
+    p_value: Number
+
+
+class Corrected(Struct, frozen=True):
+    """The corrected quantity, and the range it had in the fit, for inverting it later."""
+
+    name: str
+    low: float | UnsetType = UNSET
+    high: float | UnsetType = UNSET
+
+
+class Solver(Struct, frozen=True):
+    """What found the estimate; nothing is said of it where there was nothing to solve."""
+
+    name: str | None
+    iterations: int | UnsetType | None = UNSET
+    evaluations: int | UnsetType | None = UNSET
+    seconds: Number | UnsetType = UNSET
+    least_squares_seconds: Number | UnsetType = UNSET
+
+
+class Samples(Struct, frozen=True):
+    """How many samples a run has, of how many readings."""
+
+    run: str
+    samples: int
+    readings: int
+
+
+class DeclaredIn(Struct, frozen=True):
+    """File of the model's declaration and its digest, so that an edited model is noticed."""
+
+    file: str | UnsetType = UNSET
+    sha256: str | UnsetType = UNSET
+
+
+class Fitted(Result, frozen=True, kw_only=True, dict=True):
+    """What calibrate and close leave in common.
+
+    Beside the file: `declared`, the model's own name; `kind`, what its samples are; `entries` of
+    the values, the unit of each unknown, and the constants `held`; the estimate `found` that a
+    reader takes away, of which `residuals` and `application` are made when a page asks for them.
+    """
+
+    unwritten: ClassVar[tuple[str, ...]] = (
+        "declared",
+        "kind",
+        "entries",
+        "unknown_units",
+        "held",
+        "found",
+    )
+
+    data: list[str]
+    runs: list[str]
+    constants: dict[str, Numbers]
+    scopes: dict[str, str]
+    verdict: str | None
+    trusted: bool
+    noise: Noise
+    estimate: Section | UnsetType = UNSET
+    before: Section | UnsetType = UNSET
+    after: Section | UnsetType = UNSET
+    effects: Sequence[Any]
+    identifiability: Identified
+    scatter_between_runs: Scatter | None
+    invisible: Sequence[Any] | None
+    unexplained: Any
+    misfit: list[Doubt] | None
+    corrected: Corrected | None
+    units: dict[str, str]
+    solver: Solver
+    samples: list[Samples]
+    notes: list[str]
+    convention: str
+    declared_in: DeclaredIn
+    reproduce: Reproduced
+    declared: str
+    kind: str
+    entries: tuple[Entry, ...]
+    unknown_units: dict[str, str]
+    held: tuple[Held, ...]
+    found: Estimate
+
+    @property
+    def correlation(self) -> Correlation:
+        """Correlation of the unknowns."""
+        last = self.after or self.estimate
+        assert last
+        assert last.correlation
+        return last.correlation
+
+    @cached_property
+    def residuals(self) -> Residuals:
+        """What is drawn of the residuals: of one fit, or before and after."""
+        raise NotImplementedError
+
+    @cached_property
+    def application(self) -> Application:
+        """How the result is applied."""
+        return application_of(self.found.model, self.residuals.units, trusted=self.trusted)
+
+
+def fitted_content(
+    estimate: Estimate, model_name: str, data: Sequence[str], command: str
+) -> dict[str, Any]:
+    """The fields that a calibration and a closed loop have in common."""
+    problem, identified = estimate.problem, estimate.identifiability
+    table = unit_table(problem.model, problem.runs)
+    units = {name: unit for name, unit in table.items() if "[" not in name}
+    return {
+        "model": model_name,
+        "data": list(data),
+        "runs": [run.name for run in problem.runs],
+        "constants": {c.name: plain(c.array) for c in problem.model.constants},
+        "scopes": {p.name: p.scope for p in problem.model.parameters},
+        "trusted": estimate.certificate.trusted,
+        "noise": _noise(estimate, table["residual"]),
+        "identifiability": Identified(
+            identified.rank,
+            identified.unknowns,
+            list(identified.unobservable),
+            weak_of(estimate),
+        ),
+        "scatter_between_runs": _scatter(estimate),
+        "corrected": _corrected_range(estimate),
+        "units": units,
+        "solver": _solver(estimate),
+        "samples": [Samples(run.name, len(run), int(np.sum(run.count))) for run in problem.runs],
+        "notes": [note for run in problem.runs for note in run.notes] + list(estimate.notes),
+        "convention": inspect.getdoc(problem.model.function) or "",
+        "declared_in": _declared_in(problem.model),
+        "reproduce": reproduced(command, data),
+        "declared": estimate.model.name,
+        "kind": "rest intervals" if problem.runs[0].spread else "samples",
+        "entries": entries(estimate),
+        "unknown_units": dict(zip(estimate.names, problem.units, strict=True)),
+        "held": held(problem.model, units),
+        "found": estimate,
+    }
+
+
+def weak_of(estimate: Estimate) -> list[WeakCombination]:
+    """Combinations that are determined, but badly."""
+    return [WeakCombination(w.words, w.inflation, plain(w.std)) for w in estimate.weak]
+
+
+def correlation_of(estimate: Estimate) -> Correlation:
+    """Correlation of the unknowns."""
+    std = np.sqrt(np.diag(estimate.covariance))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        matrix = np.asarray(estimate.covariance / np.outer(std, std))
+    return Correlation(list(estimate.names), plain(matrix))
+
+
+def _noise(estimate: Estimate, unit: str) -> Noise:
+    noise = estimate.noise
+    return Noise(
+        [float(noise.sigma)] * len(estimate.model.axes),
+        unit,
+        plain(noise.residual),
+        plain(noise.repeats),
+        noise.degrees_of_freedom,
+        plain(estimate.correlated_over),
+    )
+
+
+def noise_of(noise: Noise) -> tuple[Array, str]:
+    """σ of one residual on each axis (m,), and its unit."""
+    sigma = np.array(noise.sigma)
+    each = noise.sigma_by_axis if isinstance(noise, NoiseModel) else ()
+    if len(each) > 1 and all(each):  # unequal axes, with the mean square of the fit
+        sigma = sigma * np.asarray(each) / np.sqrt(np.mean(np.square(each)))
+    return sigma, noise.unit
+
+
+def _scatter(estimate: Estimate) -> Scatter | None:
+    """Agreement of several runs on what they share; null for one run, or a refused estimate."""
+    if not estimate.certificate.trusted:
+        return None
+    found = between_runs(estimate.problem, estimate.point, estimate.correlated_over)
+    if found is None:
+        return None
+    freedom = [plain(f) for f in found.freedom]
+    return Scatter(plain(found.F), freedom, plain(found.p_value), found.worst)
+
+
+def attachment(attached: Attached) -> Attachment:
+    """Where an effect is attached, and the numbers it was told."""
+    numbers = {
+        n: float(d.array)
+        for n, d in attached.effect.declarations
+        if isinstance(d, Constant) and not d.dims
+    }
+    file = Path(inspect.unwrap(attached.effect.function).__code__.co_filename).resolve()
+    name, columns = attached.effect.name, dict(attached.columns)
+    return Attachment(name, attached.on, columns, numbers, str(file))
+
+
+def _corrected_range(estimate: Estimate) -> Corrected | None:
+    """Name of the corrected quantity and the range it had in the fit."""
+    name = estimate.model.traced.corrected
+    if name is None:
+        return None
+    declared = ca.densify(ca.vec(estimate.model.traced.quantities[name].declared))
+    values = estimate.problem.evaluate(estimate.point, {"c": declared})
+    finite = np.concatenate([v[0][np.isfinite(v[0])] for v in values])
+    if not finite.size:
+        return Corrected(name)
+    return Corrected(name, float(finite.min()), float(finite.max()))
+
+
+def _solver(estimate: Estimate) -> Solver:
+    if not estimate.outcomes:
+        return Solver(None)
+    first, extra = estimate.outcomes[0], estimate.extra
+    return Solver(
+        extra.get("estimator", first.solver),
+        first.iterations,
+        first.evaluations,
+        plain(extra.get("seconds", first.seconds)),
+        plain(extra["least_squares_seconds"]) if "least_squares_seconds" in extra else UNSET,
+    )
+
+
+def _declared_in(model: Model) -> DeclaredIn:
+    path = Path(model.function.__code__.co_filename).resolve()
+    if not path.exists():
+        return DeclaredIn()
+    return DeclaredIn(str(path), hashlib.sha256(path.read_bytes()).hexdigest())

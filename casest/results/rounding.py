@@ -1,0 +1,20 @@
+"""Numbers beside their standard deviation, as text and page write them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def rounded(value: float, std: float) -> tuple[str, str]:
+    """Value and standard deviation to two digits of the latter, as a metrologist writes them."""
+    if not np.isfinite(std):
+        return "–", "not determined"
+    if std <= 1e-15 * abs(value):  # below what a double holds
+        return f"{value:.9g}", f"{std:.1g}"
+    digits = 1 - int(np.floor(np.log10(std)))
+    if -6 <= digits <= 9 and abs(value) < 1e7:
+        places = max(digits, 0)
+        return f"{value:.{places}f}", f"{std:.{places}f}"
+    exponent = int(np.floor(np.log10(max(abs(value), std))))
+    places = max(exponent + digits, 0)
+    return f"{value:.{places}e}", f"{std:.1e}"

@@ -1,0 +1,88 @@
+"""Values of a fit: every entry of a parameter with its spread, and what was held."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+from casest.declaration.model import Model
+from casest.declaration.shapes import Array
+from casest.estimate.calibrate import Estimate
+from casest.results.file import plain
+from casest.results.result import Parameter
+from casest.results.units import entry_units, unit_table
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One number of a parameter: `below` and `above` is how far its 95 % interval reaches.
+
+    The name says of which run it is, if there are several; a unit of 1 is empty.
+    """
+
+    name: str
+    unit: str
+    value: float
+    std: float
+    below: float
+    above: float
+
+
+@dataclass(frozen=True)
+class Held:
+    """A constant; `frozen`: it was an unknown, and has an uncertainty of its own."""
+
+    name: str
+    value: Array
+    unit: str
+    frozen: bool
+
+
+def entries(estimate: Estimate) -> tuple[Entry, ...]:
+    """Every entry of every parameter, in the order of the declaration."""
+    return tuple(_entries(estimate))
+
+
+def _entries(found: Estimate) -> Iterator[Entry]:
+    known = _stated(unit_table(found.model, found.problem.runs))
+    numbers = (found.values, found.std, *found.interval_reach)
+    for p in found.model.parameters:
+        units = entry_units(p, known)
+        several = found.values[p.name].ndim > len(p.shape.dims)
+        for r in range(len(found.values[p.name]) if several else 1):
+            run = f" ({found.problem.runs[r].name})" if several else ""
+            own = [of[p.name][r] if several else of[p.name] for of in numbers]
+            for name, i, unit in zip(p.entry_names, p.shape.entries, units, strict=True):
+                shown = "" if unit == "1" else unit
+                yield Entry(name + run, shown, *(float(v[i]) for v in own))
+
+
+def held(model: Model, units: Mapping[str, str]) -> tuple[Held, ...]:
+    """Constants, and parameters held at a value."""
+    return tuple(
+        Held(c.name, c.array, units.get(c.name, ""), c.frozen is not None) for c in model.constants
+    )
+
+
+def parameter_table(estimate: Estimate, table: Mapping[str, str]) -> dict[str, Parameter]:
+    """Value, standard deviations, interval and unit of every parameter."""
+    reach = estimate.interval_reach
+    known = _stated(table)
+    found = {}
+    for p in estimate.model.parameters:
+        value, std = estimate.values[p.name], estimate.std[p.name]
+        below, above = reach[0][p.name], reach[1][p.name]
+        own = entry_units(p, known)
+        found[p.name] = Parameter(
+            value=plain(value),
+            std=plain(std),
+            robust_std=plain(estimate.robust[p.name]),
+            interval95=[plain(value - below), plain(value + above)],
+            unit=own[0] if len(set(own)) == 1 else own,
+        )
+    return found
+
+
+def _stated(table: Mapping[str, str]) -> dict[str, str]:
+    """Units of whole symbols, without those of entries."""
+    return {n: u for n, u in table.items() if "[" not in n}

@@ -1,0 +1,118 @@
+"""The verdict of a closed loop in words, and what hangs on causes that are not told apart."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Protocol, TypeVar
+
+from casest.diagnose.selection.cross_validation import FAR
+from casest.diagnose.selection.found import HELD_OUT_DATA
+from casest.effects import CATALOGUE
+from casest.results.closing import Closed, Effect, Shifts, Unexplained
+from casest.results.result import Number, Parameter
+
+#: Samples that resemble each other from which on noise may as well be a lag or a hysteresis.
+COLOURED = 20
+#: Measurements that would tell causes apart, of which so many are named.
+NAMED = 4
+
+
+def sentence(result: Closed) -> str:
+    """The verdict in one sentence."""
+    names = [e.name + (f" ({e.column})" if e.column else "") for e in result.effects]
+    if result.verdict is None:
+        held_out = "no verdict: nothing can be held out"
+        return held_out if result.trusted else "no trustworthy estimate"
+    untried = _untried(result)
+    if result.verdict == "adequate":
+        said = "nothing that these data can show is missing"
+        if not names and not result.smallest_detectable:
+            said = f"nothing is found; {len(result.not_tried)} effects do not apply here"
+        noise = f"; {', '.join(names)} belong to the noise" if names else ""
+        return f"adequate: {said}{noise}{untried}"
+    if result.verdict == "extended":
+        verb = "was" if len(names) == 1 else "were"
+        left = _remaining_noise(result.noise.correlated_over_samples)
+        return f"extended: {', '.join(names)} {verb} missing; what is left is {left}{untried}"
+    found = f"beside {', '.join(names)} " if names else ""
+    causes = result.unexplained.one_of
+    if causes:
+        several = " or ".join(causes) if 1 < len(causes) < 4 else "several causes"
+        return f"unexplained: {found}a misfit remains that {several} explain alike"
+    return f"unexplained: {found}a misfit remains that no candidate explains"
+
+
+def _remaining_noise(correlated_over: Number) -> str:
+    """What noise is called that resembles itself over so many samples."""
+    over = correlated_over or 1
+    return (
+        "noise" if over < COLOURED else f"coloured noise (alike over {over:.0f} samples), or a lag"
+    )
+
+
+class _Named(Protocol):
+    @property
+    def name(self) -> str: ...
+
+
+_N = TypeVar("_N", bound=_Named)
+
+
+def of_the_user(named: Sequence[_N]) -> list[_N]:
+    """Those that are not shipped: what the user gave."""
+    shipped = {e.name for e in CATALOGUE}
+    return [n for n in named if n.name.partition("(")[0] not in shipped]
+
+
+def _untried(result: Closed) -> str:
+    """The user's own effects that could not be tried."""
+    own = of_the_user(result.not_tried)
+    names = [s.name for s in own if not s.reason.startswith("column ")]
+    return f"; {', '.join(names)} could not be tried" if names else ""
+
+
+def refusals(result: Closed) -> Iterator[str]:
+    """What was not added, and why."""
+    for r in result.refused:
+        what = "nothing was" if r.name == HELD_OUT_DATA else f"{r.name} was not"
+        yield f"{what} added: {r.reason}"
+
+
+def judged(gain: str) -> str:
+    """By how much an effect makes held-out data better predicted, and how that is counted."""
+    return (
+        f"The mean square error on held-out data falls by {gain}, residuals "
+        f"beyond {FAR:g} standard deviations of the noise counted as {FAR:g}."
+    )
+
+
+def instead(effect: Effect, parameters: Mapping[str, Parameter]) -> Iterator[str]:
+    """What hangs on which of the causes it is."""
+    for label, shifts in effect.instead_would_move.items():
+        if shifts:
+            words = _moved_by(shifts, parameters)
+            yield f"were it {label} instead, the parameters would move: {words}"
+
+
+def undecided(left: Unexplained, parameters: Mapping[str, Parameter]) -> Iterator[str]:
+    """Causes of which none was added: what each would do, what would tell them apart."""
+    for label, shifts in left.would_move.items():
+        if shifts:
+            yield f"{label} would move the parameters: {_moved_by(shifts, parameters)}"
+    yield from (f"to tell {words}" for words in left.would_separate[:NAMED])
+    shipped = {e.name for e in CATALOGUE}
+    names = [label.partition("(")[0] for label in left.would_move]
+    if name := next((n for n in names if n in shipped), ""):
+        yield f"who knows which of them is there says so, as --effects {name}"
+
+
+def _moved_by(shifts: Shifts, parameters: Mapping[str, Parameter]) -> str:
+    """`offset by 0.05 m/s^2, …`."""
+    return ", ".join(
+        f"{name} by {size:.2g} {_first(parameters[name].unit)}".removesuffix(" 1").rstrip()
+        for name, size in shifts.items()
+    )
+
+
+def _first(unit: Any) -> str:
+    return _first(unit[0]) if isinstance(unit, list) else str(unit)

@@ -1,0 +1,1 @@
+"""What a saved result is used for: its model again, corrected data, exports. Imports correction."""

@@ -1,0 +1,131 @@
+"""A user's own effect says of itself what the shipped ones do: no name is special."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from casest import (
+    DeclarationError,
+    Residual,
+    Run,
+    close,
+    constant,
+    effect,
+    exp,
+    model,
+    param,
+    quantity,
+    signal,
+)
+from casest.diagnose.candidates.candidates import candidates
+from casest.effects.placing import prepared
+
+
+@model
+def cell(force=signal("N"), v=signal("mV"), *, zero=param("mV"), gain=param("mV/N", start=1.0)):
+    load = quantity("load", force, "N")
+    reading = quantity("reading", zero + gain * load, "mV")
+    return Residual(measured=v, predicted=reading, corrected=load)
+
+
+@effect(on="output", columns={"warmth": "temperature"}, numbers={"about": "mean"})
+def sagging(y, warmth, *, k=param("[y]/[warmth]"), about=constant(0.0)):
+    return y + k * (warmth - about)
+
+
+@effect(on="noise", seen_in="tails")
+def shots(r):
+    return exp(-((r / 6) ** 4))
+
+
+def recorded(count=400, seed=3):
+    """Loads with a temperature and a supply beside them; noise of 5 µV."""
+    rng = np.random.default_rng(seed)
+    force = 20 * np.sin(np.linspace(0, 31, count))
+    warmth, supply = 30 + 5 * rng.standard_normal((2, count))
+    v = 0.3 + 0.5 * force + 0.005 * rng.standard_normal(count)
+    signals = {"force": force[:, None], "v": v[:, None]}
+    run = Run.raw("cell", signals, units={"force": "N", "v": "mV"}, time=0.1 * np.arange(count))
+    columns = {"case": warmth, "supply": supply}
+    return replace(run, columns=columns, column_units={"case": "degC", "supply": "V"})
+
+
+def shifted(run, by):
+    return replace(run, signals={**run.signals, "v": run.signals["v"] + by[:, None]})
+
+
+@pytest.mark.parametrize(
+    ("kind", "expected"),
+    [
+        ("temperature", ["sagging(case)"]),
+        ("other", ["sagging(supply)"]),
+        ("any", ["sagging(case)", "sagging(supply)"]),
+    ],
+)
+def test_an_effect_says_which_columns_are_looked_at_for_it(kind, expected):
+    runs = prepared(cell, [recorded()])
+    found, _ = candidates(cell, runs, [replace(sagging, columns=(("warmth", kind),))])
+    assert [c.label for c in found] == expected
+
+
+def test_a_number_of_an_effect_is_what_data_say():
+    run = recorded()
+    ((candidate,), _) = candidates(cell, prepared(cell, [run]), [sagging])
+    about = dict(candidate.effect.declarations)["about"]
+    assert float(about.array) == pytest.approx(run.columns["case"].mean(), rel=1e-5)
+
+
+def test_an_own_effect_finds_its_column():
+    run = recorded()
+    warmth = run.columns["case"]
+    found = close(cell, [shifted(run, 0.004 * (warmth - 30))], catalogue=[sagging])
+    assert [f.candidate.label for f in found.effects] == ["sagging(case)"]
+    k = found.after.values["sagging(case).k"]
+    assert abs(k - 0.004) < 4 * found.after.std["sagging(case).k"]
+    assert found.verdict == "extended"
+
+
+def test_an_own_effect_on_the_noise_is_used_where_readings_lie_far_out():
+    run = recorded()
+    far = np.where(np.arange(400) % 50 == 7, 0.5, 0.0)
+    found = close(cell, [shifted(run, far)], catalogue=[shots])
+    assert [f.candidate.label for f in found.effects] == ["shots"]
+    assert abs(found.after.values["zero"] - 0.3) < 4 * found.after.std["zero"]
+    assert found.verdict == "adequate"
+    assert close(cell, [run], catalogue=[shots]).effects == ()
+
+
+@pytest.mark.parametrize(
+    ("said", "message"),
+    [
+        (
+            {"columns": {"heat": "any"}},
+            "effect sag: columns= names 'heat', which is no argument that it reads",
+        ),
+        (
+            {"columns": {"warmth": "warm"}},
+            "effect sag: columns= says 'warm': give temperature or other or any",
+        ),
+        (
+            {"columns": {"warmth": "any", "supply": "any"}},
+            "effect sag: columns= names 2 arguments, and one column is looked for",
+        ),
+        ({"numbers": {"at": "mean"}}, "numbers= names 'at', which is none of its parameters"),
+        ({"numbers": {"k": "median"}}, "numbers= says 'median': give mean or duration"),
+        (
+            {"seen_in": "tails"},
+            "seen_in= is for effects on the noise, and this one acts on 'output'",
+        ),
+        ({"seen_in": "spikes", "on": "noise"}, "seen_in= says 'spikes': give tails or random walk"),
+    ],
+)
+def test_what_an_effect_cannot_say_is_refused_with_what_it_can(said, message):
+    def sag(y, warmth, supply, *, k=param("1")):
+        return y + k * warmth
+
+    with pytest.raises(DeclarationError) as refused:
+        effect(**{"on": "output", **said})(sag)
+    assert message in str(refused.value)
