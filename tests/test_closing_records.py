@@ -12,10 +12,11 @@ import pytest
 from casest import load_runs
 from casest.cli import run
 from casest.diagnose.loop import close
-from casest.diagnose.selection.found import OF_NOISE
+from casest.effects import CATALOGUE
 from casest.results.find import find_model
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "at_rest.py"
+OF_NOISE = {effect.name for effect in CATALOGUE if effect.kind == "noise"}
 COOLING = (
     "psim-thermal/TVCtest3_7_20.csv", "--columns", "v=gyrox,gyroy,gyroz", "--unit", "v=rad/s",
     "--scale", "temp=int16/256+25", "--unit", "temp=degC",

@@ -15,7 +15,7 @@ from casest.errors import CasestError
 
 
 def prepared(model: Model, runs: Sequence[Run]) -> tuple[Run, ...]:
-    """Where an effect acts on these data: its quantity, columns as signals, numbers it is told."""
+    """Runs whose time and usable columns can be read like signals."""
     names = set.intersection(*[set(_usable(run)) for run in runs]) if runs else set()
     found = []
     for run in runs:
@@ -26,7 +26,7 @@ def prepared(model: Model, runs: Sequence[Run]) -> tuple[Run, ...]:
 
 
 def _usable(run: Run) -> dict[str, Array]:
-    """Where an effect acts on these data: its quantity, columns as signals, numbers it is told."""
+    """Numeric columns, and the time, as signals (N, 1)."""
     found = {} if run.time is None else {"t": np.asarray(run.time, float)[:, None]}
     for name, values in run.columns.items():
         if np.issubdtype(values.dtype, np.number):
@@ -35,7 +35,7 @@ def _usable(run: Run) -> dict[str, Array]:
 
 
 def placed_in(effect: Effect, model: Model) -> Effect:
-    """Where an effect acts on these data: its quantity, columns as signals, numbers it is told."""
+    """The effect on the model's own quantity instead of "input" or "output"."""
     corrected = model.traced.corrected
     predicted = next(
         (q.name for q in model.quantities.values() if model.traced.residual.predicted is q.value),
@@ -56,7 +56,7 @@ def placed_in(effect: Effect, model: Model) -> Effect:
 def with_numbers(
     effect: Effect, columns: tuple[tuple[str, str], ...], runs: Sequence[Run]
 ) -> Effect:
-    """Where an effect acts on these data: its quantity, columns as signals, numbers it is told."""
+    """Numbers that come from the data: the channel's mean, the record's duration."""
     values: dict[str, float] = {}
     for name, what in effect.numbers:
         if what == "mean" and columns:

@@ -28,13 +28,13 @@ from casest.estimate.reasons import (
     NOTHING,
     ON_BOUND,
     PRACTICALLY_NULL,
+    SAME,
     SECOND_ORDER,
     SHAPE,
     SLOPE,
     STEP,
     Code,
 )
-from casest.estimate.reasons import SAME as SAME
 from casest.leastsquares.identifiability import Identifiability
 from casest.leastsquares.problem import Point, Problem
 from casest.leastsquares.sums import few_of, second_order

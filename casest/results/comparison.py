@@ -10,7 +10,7 @@ from msgspec import Struct
 from casest.comparison.judge import Comparison, Row, Trial
 from casest.data.write import write_atomically
 from casest.errors import DataError
-from casest.estimate.certificate import SAME
+from casest.estimate.reasons import SAME
 from casest.results.file import as_json
 from casest.results.result import Result
 from casest.results.units import unit_table
