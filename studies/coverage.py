@@ -157,9 +157,9 @@ def one(name: str, seed: int) -> dict[str, Any]:
 
 HEAD = """# Coverage of the printed intervals
 
-Made by `make study-coverage` (`python studies/coverage.py`): how many of the 95 % intervals hold the
-truth, pooled over all unknowns, and the rms of the z-scores (1, and a little more where few rows say
-how large the noise is). Refused fits print no intervals.
+Made by `make study-coverage` (`python studies/coverage.py`): how many of the 95 % intervals hold
+the truth, pooled over all unknowns, and the rms of the z-scores (1, and a little more where few
+rows say how large the noise is). Refused fits print no intervals.
 
 | what | fits | refused | intervals | held, % | ± | rms z |
 | --- | --- | --- | --- | --- | --- | --- |"""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
+from numpy.typing import NDArray
 
 from casest.declaration.shapes import Array
 from casest.estimate.correlation import batches
@@ -21,20 +22,33 @@ MANY_RESIDUALS = 10
 
 
 def covariance_of(
-    problem: Problem, point: Point, R: Array, sigma: float, correlated_over: float
+    problem: Problem,
+    point: Point,
+    R: Array,
+    sigma: float,
+    correlated_over: float,
+    free: NDArray[np.bool_] | None = None,
 ) -> Array:
-    """The covariance (n, n) that is printed: robust, but for few residuals."""
+    """The covariance (n, n) that is printed: robust, but for few residuals.
+
+    Unknowns that are not `free` are held where they are, and have none.
+    """
     if has_noise_effects(problem.model):
-        plain = problem.with_weights(None)
-        return np.asarray(variance_factor(problem, point) * inverse_normal(plain.factor(point)[0]))
+        plain = problem.with_weights(None).factor(point)[0]
+        return np.asarray(variance_factor(problem, point) * inverse_normal(plain, free))
     many = problem.residual_count >= MANY_RESIDUALS * problem.unknowns
     if correlated_over > 1 or many:
-        return sandwich(problem, point, R, correlated_over)
-    return np.asarray(sigma**2 * inverse_normal(R))
+        return sandwich(problem, point, R, correlated_over, free)
+    return np.asarray(sigma**2 * inverse_normal(R, free))
 
 
-def inverse_normal(R: Array) -> Array:
-    """(JᵀJ)⁻¹ from the triangular factor, with unit columns inside; pseudo-inverse if singular."""
+def inverse_normal(R: Array, free: NDArray[np.bool_] | None = None) -> Array:
+    """(JᵀJ)⁻¹ from the triangular factor, with unit columns inside; pseudo-inverse if singular.
+
+    Of the `free` unknowns alone where some are held: their rows and columns are zero.
+    """
+    if free is not None and not free.all():
+        R = np.where(free, R, 0.0)
     norms = np.linalg.norm(R, axis=0)
     scale = np.where(norms > 0, norms, 1.0)
     _, singular, Vt = np.linalg.svd(R / scale)
@@ -43,14 +57,20 @@ def inverse_normal(R: Array) -> Array:
     return np.asarray((half @ half.T) / np.outer(scale, scale))
 
 
-def sandwich(problem: Problem, point: Point, R: Array, correlated_over: float) -> Array:
+def sandwich(
+    problem: Problem,
+    point: Point,
+    R: Array,
+    correlated_over: float,
+    free: NDArray[np.bool_] | None = None,
+) -> Array:
     """Covariance (n, n) that holds when noise differs from place to place, or is correlated.
 
     HC3 (MacKinnon & White 1985). Of correlated residuals over batches of samples at least ten
     correlation times long (Liang & Zeger 1986); where there are too few of those for n² numbers,
     JᵀSJ by frequencies, with a smooth spectrum S of the noise.
     """
-    bread = inverse_normal(R)
+    bread = inverse_normal(R, free)
     if correlated_over <= 1:
         return np.asarray(bread @ squares_of_gradients(problem, point, bread=bread) @ bread)
     least, enough = 10 * correlated_over, MANY_BATCHES * problem.unknowns
