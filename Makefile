@@ -5,7 +5,8 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
 .PHONY: demo test lint types format wheel bench study study-starts study-nist study-loop \
-	study-motion study-records study-asked study-slow figures docs clean
+	study-motion study-records study-asked study-slow study-coverage study-deceptive study-mutation \
+	figures docs clean
 
 demo: $(READY)
 	$(BIN)/casest demo
@@ -44,6 +45,9 @@ study-starts: $(READY)
 
 study-nist: $(READY)
 	$(BIN)/python studies/nist.py
+
+study-coverage: $(READY)
+	$(BIN)/python studies/coverage.py
 
 study-loop: $(READY)
 	$(BIN)/python studies/loop.py

@@ -118,7 +118,7 @@ def by_default(certified: Certified, model: Model) -> dict[str, Any]:
     certificate = found.certificate
     return {
         "digits": fewest_digits(found.values, certified.values),
-        "std": fewest_digits(found.std, certified.std),
+        "std": fewest_digits(found.plain, certified.std),
         "claims": certificate.trusted,
         "profiled": certificate.profile is not None,
         "reason": certificate.reasons[0],

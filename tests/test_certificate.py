@@ -182,7 +182,7 @@ def test_a_parameter_on_its_bound_is_named_with_the_bound():
     bounded = decay.having(k=param(start=0.5, bounds=(0.0, 1.0)))
     found = attempt(bounded, [decay_run()])
     assert not found.certificate.trusted
-    assert found.certificate.at_bound == ("k",)
+    assert [b.name for b in found.certificate.at_bound] == ["k"]
     assert "`k` ended on its bound (0, 1)" in found.certificate.reasons[0]
 
 

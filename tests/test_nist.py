@@ -27,7 +27,8 @@ def test_the_certified_values_are_found_from_either_start_alone(name, start, cer
     nist = certified(name)
     found = attempt(nist.begun_at(nist.starts[start - 1]), [nist.run])
     assert fewest_digits(found.values, nist.values) >= VALUES
-    squares, std = 2 * found.problem.cost(found.point), found.std
+    # What NIST certifies takes the noise to be alike everywhere.
+    squares, std = 2 * found.problem.cost(found.point), found.plain
     if name == "Lanczos1":
         assert squares == pytest.approx(nist.squares, rel=ROUNDED)
         assert {n: float(s) for n, s in std.items()} == pytest.approx(nist.std, rel=ROUNDED)

@@ -429,7 +429,8 @@ def test_on_the_measured_record_pair_and_single_sensors_agree(ckexplorer):
     joint, alone, _ = ckexplorer
     z = agreement(joint, alone)
     print("\ndifferences in standard deviations:", np.round(z, 1))
-    assert np.max(np.abs(z)) < 3
+    # One in a hundred such records has a larger one among its differences.
+    assert np.max(np.abs(z)) < stats.norm.isf(0.005 / len(z))
 
 
 def test_on_held_out_blocks_of_the_measured_record_the_dip_scatters_less(ckexplorer):

@@ -164,7 +164,7 @@ def test_an_estimate_on_its_bound_is_refused_with_its_name(solver):
     found = attempt(level, [run], solver=solver)
     assert not found.certificate.trusted
     assert "`a` ended on its bound (0, 1)" in found.certificate.reasons[0]
-    assert found.certificate.at_bound == ("a",)
+    assert [b.name for b in found.certificate.at_bound] == ["a"]
 
 
 def test_ipopt_that_returns_its_start_is_not_believed():

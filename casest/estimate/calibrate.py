@@ -9,6 +9,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from casest.data.run import Run
 from casest.declaration.model import Model
@@ -16,16 +17,16 @@ from casest.declaration.shapes import Array
 from casest.engine.threads import one_thread
 from casest.errors import DataError, NotTrusted, UsageError
 from casest.estimate import reasons as words
-from casest.estimate.certificate import Certificate, certify
+from casest.estimate.certificate import Certificate, certify, one_sided
 from casest.estimate.correlation import ENOUGH, TABLE, correlation_time
-from casest.estimate.covariance import inverse_normal, sandwich
+from casest.estimate.covariance import covariance_of, inverse_normal, sandwich
+from casest.estimate.on_bounds import free_of, on_bounds
 from casest.estimate.profile_likelihood import half_width
 from casest.estimate.reasons import NEAR, POOR, Code
 from casest.estimate.remarks import NOTABLE_BIAS, notes
 from casest.leastsquares.identifiability import Identifiability, Weak, identify, weak_directions
 from casest.leastsquares.problem import Point, Problem
 from casest.leastsquares.sums import repeat_noise, second_order_bias
-from casest.leastsquares.weights import has_noise_effects, variance_factor
 from casest.solve.interrupt import stopped
 from casest.solve.outcome import Outcome
 from casest.solve.strategy import SOLVERS, best_of, solve, valleys
@@ -53,10 +54,10 @@ class Estimate:
     """Parameters by name with covariance, certificate, residuals.
 
     `values` and `std` have the parameters' shapes (a leading run axis for per-run ones if there
-    are several runs); `robust` is the standard deviation from the sandwich form, which `std` equals
-    where residuals are correlated over more than one sample. Both are taken at the least-squares
-    `optimum`, where `point` is not it; `shift` (n, n) is what second-order noise adds, a
-    bias of up to `bias` standard deviations.
+    are several runs). `std` is `robust`, the sandwich form, where residuals are correlated over
+    more than one sample or are many for each unknown, else `plain`. All are taken at the
+    least-squares `optimum`, where `point` is not it; `shift` (n, n) is what second-order noise
+    adds, a bias of up to `bias` standard deviations.
     `covariance` (n, n) is of the unknowns `names`. Where the data do not determine a value its std
     is NaN.
     """
@@ -85,16 +86,31 @@ class Estimate:
         return self.problem.model
 
     @cached_property
+    def plain(self) -> Mapping[str, Array]:
+        """Standard deviations if the noise were alike everywhere and independent: σ²(JᵀJ)⁻¹."""
+        R = self.problem.factor(self.optimum or self.point)[0]
+        return self._spread(self.noise.sigma**2 * inverse_normal(R, self.free))
+
+    @cached_property
     def robust(self) -> Mapping[str, Array]:
         """Standard deviations from the sandwich form, shaped like `std`."""
         if self.identifiability.rank == 0:
             return self.std
         at = self.optimum or self.point
         R = self.problem.factor(at)[0]
-        covariance = sandwich(self.problem, at, R, self.correlated_over) + self.shift
-        unknown = self.identifiability.touched
+        return self._spread(sandwich(self.problem, at, R, self.correlated_over, self.free))
+
+    @property
+    def free(self) -> NDArray[np.bool_]:
+        """Which unknowns are on no bound, (n,)."""
+        return free_of(self.problem.unknowns, self.certificate.at_bound)
+
+    def _spread(self, covariance: Array) -> Mapping[str, Array]:
+        """Standard deviations by name; NaN where nothing is determined, and on a bound."""
+        covariance = covariance + self.shift
+        unknown = np.logical_or(self.identifiability.touched, ~self.free)
         covariance[unknown, :] = covariance[:, unknown] = np.nan
-        return self.problem.spread(at, covariance)
+        return self.problem.spread(self.optimum or self.point, covariance)
 
     @cached_property
     def notes(self) -> tuple[str, ...]:
@@ -115,17 +131,32 @@ class Estimate:
         """How far the 95 % interval of every value reaches below and above it, shaped like `std`.
 
         Student's t times `std`, or the profile of the cost where that is no parabola (widened as
-        `std` is, where residuals are correlated).
+        `std` is, where residuals are correlated). No interval reaches beyond a bound; that of an
+        unknown on one has one end, at 95 %.
         """
-        profile, at = self.certificate.profile, self.optimum or self.point
+        at, ends = self.optimum or self.point, []
+        quantile = one_sided(self.problem, self.correlated_over)
+        for side, squares in enumerate(self._squared_reach()):
+            reach = np.sqrt(np.diag(squares))
+            for b in self.certificate.at_bound:
+                reach[b.index] = 0.0 if b.upper == bool(side) else b.reach(quantile)
+            reach = np.minimum(reach, np.maximum(np.abs(self.problem.bounds[side] - at.x), 0))
+            np.fill_diagonal(squares, reach**2)
+            ends.append(self.problem.spread(at, squares))
+        return ends[0], ends[1]
+
+    def _squared_reach(self) -> tuple[Array, Array]:
+        """Squares of the reach below and above, (n, n) each as a covariance, as if unbounded."""
+        profile = self.certificate.profile
         if profile is None:
             half = half_width(int(self.noise.degrees_of_freedom / self.correlated_over))
-            linear = {name: half * std for name, std in self.std.items()}
-            return linear, linear
-        plain = self.noise.sigma**2 * inverse_normal(self.problem.factor(at)[0])
-        wider = np.sqrt(np.diag(self.covariance) / np.diag(plain))
-        below, above = ((wider * profile[:, k]) ** 2 for k in (0, 1))
-        return self.problem.spread(at, np.diag(below)), self.problem.spread(at, np.diag(above))
+            linear = half**2 * self.covariance
+            return linear.copy(), linear.copy()
+        R = self.problem.factor(self.optimum or self.point)[0]
+        plain = self.noise.sigma**2 * np.diag(inverse_normal(R, self.free))
+        with np.errstate(invalid="ignore", divide="ignore"):
+            wider = np.sqrt(np.diag(self.covariance) / plain)
+        return np.diag((wider * profile[:, 0]) ** 2), np.diag((wider * profile[:, 1]) ** 2)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -281,16 +312,24 @@ def _estimate(
     dof = problem.residual_count - identified.rank
     noise = _noise(problem, point, float(np.sqrt(2 * best.cost)), dof)
     correlated = correlation_time(problem, point)
-    covariance = _covariance(problem, point, R, noise.sigma, correlated)
-    bias = second_order_bias(problem, point, noise.sigma, inverse_normal(R))
-    relative = float(np.max(np.abs(bias) / np.sqrt(np.diag(covariance)), initial=0.0))
+    free = free_of(problem.unknowns, on_bounds(problem, point, R, factor[1], noise.sigma))
+    covariance = covariance_of(problem, point, R, noise.sigma, correlated, free)
+    bias = second_order_bias(problem, point, noise.sigma, inverse_normal(R, free))
+    relative = float(np.max(np.abs(bias[free]) / np.sqrt(np.diag(covariance)[free]), initial=0.0))
     shift = np.outer(bias, bias) if relative > NOTABLE_BIAS else 0.0
     covariance = covariance + shift
     factored = (R, factor[1], rest)
     certificate = certify(
-        problem, best, outcomes, identified, factored, noise.sigma, intervals=intervals
+        problem,
+        best,
+        outcomes,
+        identified,
+        factored,
+        noise.sigma,
+        intervals=intervals,
+        correlated_over=correlated,
     )
-    unknown = identified.touched
+    unknown = np.logical_or(identified.touched, ~free)
     covariance[unknown, :] = covariance[:, unknown] = np.nan
     return Estimate(
         problem,
@@ -401,16 +440,6 @@ def _judged(optimum: Estimate, point: Point, values: Mapping[str, Any], name: st
     if not abs(distance[worst]) <= NEAR:
         return certificate.refused(Code.MODEL, far)
     return replace(certificate, reasons=(far, *certificate.reasons))
-
-
-def _covariance(problem: Problem, point: Point, R: Array, sigma: float, correlated: float) -> Array:
-    """The covariance that is printed: plain, unless the noise is known to be otherwise."""
-    if has_noise_effects(problem.model):
-        plain = problem.with_weights(None)
-        return np.asarray(variance_factor(problem, point) * inverse_normal(plain.factor(point)[0]))
-    if correlated > 1:
-        return sandwich(problem, point, R, correlated)
-    return np.asarray(sigma**2 * inverse_normal(R))
 
 
 def _noise(problem: Problem, point: Point, length: float, dof: int) -> Noise:

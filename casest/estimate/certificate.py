@@ -14,25 +14,28 @@ from functools import reduce
 from operator import or_
 
 import numpy as np
+from numpy.typing import NDArray
 
 from casest.declaration.shapes import Array
 from casest.estimate import reasons as words
 from casest.estimate.covariance import inverse_normal
+from casest.estimate.on_bounds import OnBound, free_of, of_the_free, on_bounds
 from casest.estimate.profile_likelihood import Profile, half_width, profiled
 from casest.estimate.reasons import (
     ALIKE,
     APART,
     BENT,
+    BEYOND,
     CURVATURE,
     LINEAR,
     NOTHING,
-    ON_BOUND,
     PRACTICALLY_NULL,
     SAME,
     SECOND_ORDER,
     SHAPE,
     SLOPE,
     STEP,
+    WALKED,
     Code,
 )
 from casest.leastsquares.identifiability import Identifiability
@@ -51,8 +54,8 @@ class Certificate:
     """Evidence for (or against) an estimate: the figures, and in words why it is (not) trusted.
 
     `profile` (n, 2): how far below and above each unknown its 95 % interval reaches, by the profile
-    of the cost, where the cost is no parabola; None where the linear intervals describe it. `code`
-    says which reasons speak against it.
+    of the cost, where the cost is no parabola; None where the linear intervals describe it.
+    `at_bound` are the unknowns on a bound. `code` says which reasons speak against it.
     """
 
     trusted: bool
@@ -63,7 +66,7 @@ class Certificate:
     starts: int
     agreeing: int
     shape: tuple[float, float]
-    at_bound: tuple[str, ...]
+    at_bound: tuple[OnBound, ...]
     profile: Array | None = None
     code: Code = NOTHING
 
@@ -81,22 +84,29 @@ def certify(
     sigma: float,
     *,
     intervals: bool = True,
+    correlated_over: float = 1.0,
 ) -> Certificate:
     """Judge the best of several outcomes. Reasons say what speaks against it, or else for it.
 
     `sigma` is the standard deviation of one residual, NaN where nothing shows it. Without
-    `intervals`, those that the likelihood would have to give are taken to have ends.
+    `intervals`, those that the likelihood would have to give are taken to have ends. Residuals
+    alike over `correlated_over` samples say less of what lies beyond a bound.
     """
-    R = factor[0]
     against: list[tuple[Code, str]] = []
     rounding = rounding_error(problem, best.point)
+    noise = max(sigma if np.isfinite(sigma) else 0.0, rounding)
+    at_bound = on_bounds(problem, best.point, factor[0], factor[1], noise)
+    free = free_of(problem.unknowns, at_bound)
+    whole, factor = factor[0], of_the_free(factor, free)
+    R = factor[0]
     slope, step = _slope_and_step(factor, sigma, rounding)
     # What cannot be told from rounding is no slope, however small the residual.
     exact = float(np.linalg.norm(factor[1])) <= 10 * rounding * np.sqrt(problem.residual_count)
-    at_bound = _active(problem, best.point, R, max(sigma if np.isfinite(sigma) else 0, rounding))
     against += _undetermined(identified)
+    far = BEYOND * np.sqrt(correlated_over)
     if not against:
-        against += [(Code.BOUND, _bound_words(problem, name)) for name in at_bound]
+        wrong = [b for b in at_bound if b.open or not b.beyond <= far]
+        against += [(Code.BOUND, _bound_words(problem, b)) for b in wrong]
     if not against and not np.isfinite(sigma):
         way = "record more, or rest intervals whose scatter shows it"
         counts = problem.residual_count, problem.unknowns
@@ -106,7 +116,7 @@ def certify(
     elif slope > SLOPE and step > STEP and not exact and not against:
         smallest = identified.singular_values[-1] / identified.singular_values[0]
         against.append((Code.NOT_SETTLED, words.not_settled(step, smallest, identified.weakest)))
-    curvature = _curvature(problem, best.point, R) if not against else float("nan")
+    curvature = _curvature(problem, best.point, R, free) if not against else float("nan")
     if not against and not curvature > CURVATURE:
         against.append((Code.NO_MINIMUM, words.no_minimum(curvature)))
     agreeing = sum(_same(problem, best, other, sigma, rounding) for other in others)
@@ -116,21 +126,22 @@ def certify(
         against.append((Code.NOISE, words.noise(second)))
     profile = None
     if not against:
-        shape, misshapen = _shape(problem, best, R, max(sigma, rounding))
+        shape, misshapen = _shape(problem, best, R, max(sigma, rounding), free)
         if not LINEAR[0] <= shape[0] <= shape[1] <= LINEAR[1]:
             if not intervals and _has_likelihood(problem):
                 misshapen = []
             else:
-                profile = _profile(problem, best, R, sigma)
+                profile = _profile(problem, best, R, sigma, free)
         if profile is not None:
             misshapen = []
-        against += misshapen or _ambiguous(problem, best, others, R, sigma)
+        against += misshapen or _ambiguous(problem, best, others, whole, sigma)
     against.sort(key=lambda reason: reason[0])
     speaking_for = (
         words.stationary(step),
         words.minimum(curvature),
         words.agreement(agreeing, len(others)),
         _intervals(shape, profile is not None),
+        *(_held_words(problem, b, correlated_over) for b in at_bound),
     )
     return Certificate(
         not against,
@@ -170,24 +181,28 @@ def _has_likelihood(problem: Problem) -> bool:
     return not (problem.model.implicit or curved or problem.sequential)
 
 
-def _profile(problem: Problem, best: Outcome, R: Array, sigma: float) -> Array | None:
+def _profile(
+    problem: Problem, best: Outcome, R: Array, sigma: float, free: NDArray[np.bool_]
+) -> Array | None:
     """95 % intervals of the likelihood, (n, 2), or None where one has no end.
 
     For models that predict readings: of an implicit residual the likelihood is known to first
-    order only, and unknowns on curved sets have no interval.
+    order only, and unknowns on curved sets have no interval. Those on a bound have none here.
     """
     if not _has_likelihood(problem):
         return None
-    around = Profile(problem, best.point, best.cost, sigma**2 * inverse_normal(R), sigma)
+    covariance = np.zeros((problem.unknowns, problem.unknowns))
+    covariance[np.ix_(free, free)] = sigma**2 * inverse_normal(R)
+    around = Profile(problem, best.point, best.cost, covariance, sigma)
     rise = half_width(problem.residual_count - problem.unknowns) ** 2
-    found = []
+    found = np.zeros((problem.unknowns, 2))
     with np.errstate(all="ignore"):
-        for j in range(problem.unknowns):
-            interval = around.interval(j, rise)
+        for j in np.flatnonzero(free):
+            interval = around.interval(int(j), rise)
             if interval is None:
                 return None
-            found.append(interval)
-    return np.array(found)
+            found[j] = interval
+    return found
 
 
 def _slope_and_step(
@@ -200,23 +215,33 @@ def _slope_and_step(
     return slope, left / max(sigma if np.isfinite(sigma) else 0.0, rounding)
 
 
-def _active(problem: Problem, point: Point, R: Array, noise: float) -> tuple[str, ...]:
-    """Unknowns on a bound: nearer to it than a thousandth of their standard deviation alone."""
+def _bound_words(problem: Problem, b: OnBound) -> str:
     lower, upper = problem.bounds
-    norms = np.linalg.norm(R, axis=0)
-    width = ON_BOUND * noise / np.where(norms > 0, norms, np.inf)
-    active = (point.x <= lower + width) | (point.x >= upper - width)
-    return tuple(problem.names[i] for i in np.flatnonzero(active))
+    beyond = None if b.open else b.beyond
+    return words.bound(b.name, lower[b.index], upper[b.index], beyond)
 
 
-def _bound_words(problem: Problem, name: str) -> str:
-    i = problem.names.index(name)
-    return words.bound(name, problem.bounds[0][i], problem.bounds[1][i])
+def _held_words(problem: Problem, b: OnBound, correlated_over: float) -> str:
+    reach = b.reach(one_sided(problem, correlated_over))
+    end = b.bound - reach if b.upper else b.bound + reach
+    return words.held(b.name, b.bound, end, b.upper, b.beyond)
 
 
-def _curvature(problem: Problem, point: Point, R: Array) -> float:
-    """Smallest eigenvalue of the exact Hessian relative to JᵀJ: 1 for a linear problem."""
-    hessian = problem.hessian(point)
+def one_sided(problem: Problem, correlated_over: float = 1.0) -> float:
+    """Where the interval of an unknown on its bound ends, in standard deviations without colour.
+
+    That is where the usual interval would end: so the two together hold the truth in 95 % at least,
+    wherever it lies.
+    """
+    freedom = int((problem.residual_count - problem.unknowns) / correlated_over)
+    return half_width(freedom) * float(np.sqrt(correlated_over))
+
+
+def _curvature(problem: Problem, point: Point, R: Array, free: NDArray[np.bool_]) -> float:
+    """Smallest eigenvalue of the free unknowns' exact Hessian relative to JᵀJ: 1 if linear."""
+    hessian = problem.hessian(point)[np.ix_(free, free)]
+    if not free.any():
+        return 1.0
     inverse = np.linalg.inv(R)
     relative = inverse.T @ hessian @ inverse
     if not np.all(np.isfinite(relative)):
@@ -234,33 +259,48 @@ def _same(problem: Problem, best: Outcome, other: Outcome, sigma: float, roundin
 
 
 def _shape(
-    problem: Problem, best: Outcome, R: Array, sigma: float
+    problem: Problem, best: Outcome, R: Array, sigma: float, free: NDArray[np.bool_]
 ) -> tuple[tuple[float, float], list[tuple[Code, str]]]:
     """Walk two standard deviations along every principal direction: is the cost what intervals say?
 
     The ratio of the cost's rise to the quadratic one is 1 for a linear problem. Below SHAPE the
     intervals are too narrow. Above, the valley may only be bent: up to BENT the other unknowns are
     fitted again with this direction held (profile; Bates & Watts 1988, ch. 6). A valley bent more
-    than that is a curve, for which standard deviations and correlations mean nothing.
+    than that is a curve, for which standard deviations and correlations mean nothing. Where a bound
+    comes first the walk ends there, as the interval will.
     """
-    norms = np.linalg.norm(R, axis=0)
-    _, singular, Vt = np.linalg.svd(R / norms)
+    wide = np.zeros((len(R), problem.unknowns))
+    wide[:, free] = R
+    norms = np.where(free, np.linalg.norm(wide, axis=0), 1.0)
+    _, singular, Vt = np.linalg.svd(wide / norms)
     ratios, against, few = [1.0], [], _few_around(problem, best.point, sigma)
-    for k in range(len(norms) - 1, -1, -1):
+    for k in range(len(R) - 1, -1, -1):
         for sign in (1, -1):
             step = sign * 2 * sigma / singular[k] * Vt[k] / norms
-            ratio = few(step) if few else None
+            inside = _inside(problem, best.point, step)
+            if inside < WALKED:
+                continue
+            step, noise = inside * step, inside * sigma
+            ratio = few(step) if few and inside == 1 else None
             if ratio is None or not LINEAR[0] <= ratio <= LINEAR[1]:
-                ratio = _rise(problem, best, best.point, step, sigma)
+                ratio = _rise(problem, best, best.point, step, noise)
             if SHAPE[1] < ratio <= BENT:
                 row = Vt[k] * norms * singular[k]
                 there = profiled(problem, best.point, step, row)
-                ratio = _rise(problem, best, there, np.zeros_like(step), sigma)
+                ratio = _rise(problem, best, there, np.zeros_like(step), noise)
             if not SHAPE[0] <= ratio <= SHAPE[1]:
                 said = words.misshapen(ratio, ratio, _largest(problem, step, norms))
                 against.append((Code.MISSHAPEN, said))
             ratios.append(ratio)
     return (float(min(ratios)), float(max(ratios))), against[:1]
+
+
+def _inside(problem: Problem, point: Point, step: Array) -> float:
+    """Share of the step that stays within the bounds."""
+    lower, upper = problem.bounds
+    with np.errstate(divide="ignore", invalid="ignore"):
+        room = np.where(step > 0, upper - point.x, lower - point.x) / step
+    return float(min(1.0, np.min(room[step != 0], initial=np.inf)))
 
 
 def _few_around(

@@ -1,20 +1,54 @@
-"""Covariance of an estimate: plain, and robust against unequal noise (sandwich)."""
+"""Covariance of an estimate: plain, or robust against unequal and correlated noise."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
+from numpy.typing import NDArray
 
 from casest.declaration.shapes import Array
 from casest.estimate.correlation import batches
+from casest.estimate.spectrum import Stretch, by_frequency, noise_spectrum
 from casest.leastsquares.problem import Point, Problem
 from casest.leastsquares.sums import squares_of_gradients
+from casest.leastsquares.weights import has_noise_effects, variance_factor
 
-#: Fewer batches than this say too little; the plain covariance is then widened as a whole.
-FEWEST_BATCHES = 30
+#: Batches per unknown from which on those say enough of correlated noise by themselves.
+MANY_BATCHES = 20
+#: Residuals for each unknown from which on the robust form is as sharp as the plain one, and right
+#: where the noise differs from place to place. Of fewer the plain one makes more.
+MANY_RESIDUALS = 10
 
 
-def inverse_normal(R: Array) -> Array:
-    """(JᵀJ)⁻¹ from the triangular factor, with unit columns inside; pseudo-inverse if singular."""
+def covariance_of(
+    problem: Problem,
+    point: Point,
+    R: Array,
+    sigma: float,
+    correlated_over: float,
+    free: NDArray[np.bool_] | None = None,
+) -> Array:
+    """The covariance (n, n) that is printed: robust, but for few residuals.
+
+    Unknowns that are not `free` are held where they are, and have none.
+    """
+    if has_noise_effects(problem.model):
+        plain = problem.with_weights(None).factor(point)[0]
+        return np.asarray(variance_factor(problem, point) * inverse_normal(plain, free))
+    many = problem.residual_count >= MANY_RESIDUALS * problem.unknowns
+    if correlated_over > 1 or many:
+        return sandwich(problem, point, R, correlated_over, free)
+    return np.asarray(sigma**2 * inverse_normal(R, free))
+
+
+def inverse_normal(R: Array, free: NDArray[np.bool_] | None = None) -> Array:
+    """(JᵀJ)⁻¹ from the triangular factor, with unit columns inside; pseudo-inverse if singular.
+
+    Of the `free` unknowns alone where some are held: their rows and columns are zero.
+    """
+    if free is not None and not free.all():
+        R = np.where(free, R, 0.0)
     norms = np.linalg.norm(R, axis=0)
     scale = np.where(norms > 0, norms, 1.0)
     _, singular, Vt = np.linalg.svd(R / scale)
@@ -23,26 +57,49 @@ def inverse_normal(R: Array) -> Array:
     return np.asarray((half @ half.T) / np.outer(scale, scale))
 
 
-def sandwich(problem: Problem, point: Point, R: Array, correlated_over: float) -> Array:
+def sandwich(
+    problem: Problem,
+    point: Point,
+    R: Array,
+    correlated_over: float,
+    free: NDArray[np.bool_] | None = None,
+) -> Array:
     """Covariance (n, n) that holds when noise differs from place to place, or is correlated.
 
-    HC3 (MacKinnon & White 1985); over batches of samples ten correlation times long where residuals
-    are correlated (Liang & Zeger 1986). Too few batches for n² numbers give standard deviations
-    but no correlations: those are then taken from the plain covariance.
+    HC3 (MacKinnon & White 1985). Of correlated residuals over batches of samples at least ten
+    correlation times long (Liang & Zeger 1986); where there are too few of those for n² numbers,
+    JᵀSJ by frequencies, with a smooth spectrum S of the noise.
     """
-    bread = inverse_normal(R)
+    bread = inverse_normal(R, free)
     if correlated_over <= 1:
         return np.asarray(bread @ squares_of_gradients(problem, point, bread=bread) @ bread)
-    length = int(np.ceil(10 * correlated_over))
-    firsts = [batches(run, length) for run in problem.runs]
+    least, enough = 10 * correlated_over, MANY_BATCHES * problem.unknowns
+    longest = min(len(run) for run in problem.runs) * len(problem.runs) / (2 * enough)
+    firsts = [batches(run, int(np.ceil(max(least, longest)))) for run in problem.runs]
     groups = sum(len(first) for first in firsts)
-    if groups < FEWEST_BATCHES:
-        plain = 2 * problem.cost(point) / max(problem.residual_count - problem.unknowns, 1)
-        return np.asarray(correlated_over * plain * bread)
-    correction = groups / max(groups - 1, 1)
-    robust = correction * bread @ squares_of_gradients(problem, point, firsts) @ bread
-    if groups >= 20 * problem.unknowns:
-        return np.asarray(robust)
-    with np.errstate(invalid="ignore"):  # nothing is known of an unknown that no residual has
-        ratio = np.sqrt(np.diag(robust) / np.diag(bread))
-    return np.asarray(bread * np.outer(ratio, ratio))
+    if groups >= enough:
+        middle = groups / (groups - 1) * squares_of_gradients(problem, point, firsts)
+        return np.asarray(bread @ middle @ bread)
+    return np.asarray(bread @ _by_frequencies(problem, point, bread) @ bread)
+
+
+def _by_frequencies(problem: Problem, point: Point, bread: Array) -> Array:
+    """JᵀSJ (n, n): S the covariance of noise with a smooth spectrum, of each axis its own."""
+    parts = [part for block in _stretches(problem, point) for part in by_frequency(block, bread)]
+    axes = range(len(problem.model.axes))
+    spectra = [noise_spectrum([part.powers for part in parts if part.axis == k]) for k in axes]
+    middle = np.zeros((problem.unknowns, problem.unknowns))
+    for part in parts:
+        power = spectra[part.axis](part.powers.frequency)
+        middle[np.ix_(part.x, part.x)] += (part.jacobian.T * power) @ part.jacobian
+    return middle
+
+
+def _stretches(problem: Problem, point: Point) -> Iterator[Stretch]:
+    """Uninterrupted samples of each run, weighted."""
+    for block in problem.blocks(point):
+        root = 1.0 if block.weights is None else np.sqrt(block.weights)
+        residual, jacobian = block.residual * root, (block.jacobian.T * np.transpose(root)).T
+        where = problem.runs[block.run].block[block.span]
+        for own in np.split(np.arange(len(where)), np.flatnonzero(np.diff(where)) + 1):
+            yield Stretch(block.x, residual[own], jacobian[own])

@@ -105,11 +105,21 @@ class Profile:
         """Distances below and above unknown j at which 2·cost has risen by rise·σ².
 
         That is the interval of its likelihood, of whatever shape the cost is (Bates & Watts 1988,
-        ch. 6). None where an end lies outside the bounds, or beyond REACH times the linear one.
+        ch. 6). An end beyond a bound is the bound. None where there is none within REACH times the
+        linear one.
         """
-        below = self._end(j, -1, rise)
-        above = self._end(j, 1, rise) if below is not None else None
+        below = self._end_or_bound(j, -1, rise)
+        above = self._end_or_bound(j, 1, rise) if below is not None else None
         return None if below is None or above is None else (below, above)
+
+    def _end_or_bound(self, j: int, sign: int, rise: float) -> float | None:
+        """The end, or the distance to the bound where the cost has not risen so far there."""
+        room = float(abs(self.problem.bounds[0 if sign < 0 else 1][j] - self.best.x[j]))
+        if np.isfinite(room) and room < REACH * np.sqrt(rise * self.covariance[j, j]):
+            there = self._held(self.best, j, sign * room * (1 - 1e-9))
+            if there is None or 2 * (self.problem.cost(there) - self.cost) < rise * self.sigma**2:
+                return room
+        return self._end(j, sign, rise)
 
     def _end(self, j: int, sign: int, rise: float) -> float | None:
         """One end: outwards in short steps, each from the last point found, then between two."""

@@ -29,6 +29,11 @@ LINEAR = (0.7, 2.0)
 BENT = 1e3
 #: Standard deviations from a bound, of the unknown alone, within which it is on it.
 ON_BOUND = 1e-3
+#: Standard deviations beyond a bound that the data may ask for where the truth lies on it: noise
+#: asks for more in one of two thousand.
+BEYOND = 3.3
+#: Share of two standard deviations within its bounds from which on a direction is walked along.
+WALKED = 0.2
 #: An implicit residual is the noise of the reading to first order only; the second-order part must
 #: stay below this share of it. (A flat ellipsoid through poses in a plane "fits" by that part.)
 SECOND_ORDER = 0.07
@@ -127,11 +132,23 @@ def practically_not_determined(direction: str) -> str:
     return f"practically not determined: {direction}; the motion does not separate them"
 
 
-def bound(name: str, lower: float, upper: float) -> str:
-    """BOUND: the unknown, and where it may be."""
+def bound(name: str, lower: float, upper: float, beyond: float | None = None) -> str:
+    """BOUND: the unknown, where it may be, and how many standard deviations beyond it would go."""
+    asked = "the data ask for a value outside, or do not determine it"
+    if beyond is not None:
+        asked = (
+            f"the data ask for a value {beyond:.3g} standard deviations beyond it: the bound or "
+            "the model is wrong; declare other bounds, or hold it with --fix"
+        )
+    return f"`{name}` ended on its bound ({lower:.4g}, {upper:.4g}): {asked}"
+
+
+def held(name: str, bound: float, end: float, upper: bool, beyond: float) -> str:
+    """For an unknown on its bound: how far inside it may be, and what the data would rather."""
+    rather = f"; the data ask for {beyond:.2g} standard deviations more" if beyond >= 0.05 else ""
     return (
-        f"`{name}` ended on its bound ({lower:.4g}, {upper:.4g}): the data ask for a value "
-        "outside, or do not determine it"
+        f"`{name}` is on its bound {bound:.4g} ({'above' if upper else 'below'} {end:.3g} with "
+        f"95 % confidence{rather}); the other standard deviations hold it there"
     )
 
 

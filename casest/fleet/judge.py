@@ -19,6 +19,7 @@ from casest.declaration.shapes import Array
 from casest.declaration.tracing import function_of
 from casest.engine import Replay
 from casest.estimate.correlation import ENOUGH
+from casest.estimate.covariance import MANY_RESIDUALS
 from casest.estimate.profile_likelihood import HOLD
 from casest.estimate.reasons import (
     ALIKE,
@@ -34,6 +35,7 @@ from casest.estimate.reasons import (
     STEP,
     TIME_SERIES,
     TOO_LARGE,
+    WALKED,
     Code,
 )
 from casest.estimate.remarks import NOTABLE_BIAS
@@ -41,7 +43,7 @@ from casest.fleet.fit import Bounds, Fits, Flags, Places, minimise, padded, resi
 from casest.fleet.linear import cholesky, dot, form, inverse, lengths, times, whole
 from casest.fleet.sums import Hold, Sensors, SideBySide, Squares
 from casest.fleet.verdicts import Judged
-from casest.leastsquares.per_sample import laplacian, slope_in_sample
+from casest.leastsquares.per_sample import laplacian, residual_and_jacobian, slope_in_sample
 from casest.solve.strategy import PARABOLA
 
 #: Steps must have shrunk to this share of the ones before, else second derivatives are computed.
@@ -97,6 +99,8 @@ class Judge:
         unit = here.sigma / here.scale
         np.multiply(here.inverse, unit[:, None], out=found.covariance)
         found.covariance *= unit
+        for k in _groups(count >= MANY_RESIDUALS * len(unit)):
+            found.covariance[:, :, k] = self._robust(here.some(k), sensors.some(k))
         if shift is not None:
             found.covariance[:] += shift
         found.std[:] = np.sqrt(np.einsum("iis->is", found.covariance))
@@ -192,8 +196,15 @@ class Judge:
     ) -> Array:
         """Rise of the cost along a scaled direction, both ways, over that of a parabola, (2, W)."""
         step = _walk(here, direction, deviations)
-        rises = [self._rise(here, sensors, bounds, way) for way in (step, -step)]
-        return np.array(rises) / (0.5 * deviations**2 * here.noise**2)
+        parabola = 0.5 * deviations**2 * here.noise**2
+        ratios = []
+        for way in (step, -step):
+            share = _inside(here.fits.x, way, bounds)
+            rise = self._rise(here, sensors, bounds, share * way)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                ratio = rise / (parabola * share**2)
+            ratios.append(np.where(share < WALKED, 1.0, ratio))
+        return np.array(ratios)
 
     def _rise(self, here: Local, sensors: Sensors, bounds: Bounds, step: Array) -> Array:
         x = here.fits.x + step
@@ -253,6 +264,20 @@ class Judge:
                 found.add(Code.AMBIGUOUS, _another(here.some(j), other), k[j])
 
     # -- the noise -------------------------------------------------------------------------------
+
+    def _robust(self, here: Local, sensors: Sensors) -> Array:
+        """Covariance (n, n, W) that holds where noise differs from place to place (HC3)."""
+        bread = whole(here.inverse) / (here.scale * here.scale[:, None])
+        J = _dense(residual_and_jacobian(self.model), here.fits.x, sensors, 1)
+        residual = self.squares.residuals(here.fits.x, sensors).transpose(1, 2, 0)
+        leverage = np.einsum("manw,abw,lbnw->nwml", J, bread, J, optimize=True)
+        left = np.eye(len(J)) - np.where(np.isfinite(leverage), leverage, 0.0)
+        # A residual that the fit follows entirely says nothing: keep the inverse finite.
+        values, vectors = np.linalg.eigh(left)
+        inverse = (vectors / np.maximum(values, 1e-3)[..., None, :]) @ vectors.swapaxes(-1, -2)
+        unseen = np.einsum("nwml,nwl->mnw", inverse, residual)
+        pulls = np.einsum("abw,mbnw,mnw->anw", bread, J, unseen, optimize=True)
+        return np.asarray(np.einsum("anw,bnw->abw", pulls, pulls))
 
     def _second_order(
         self, found: Judged, here: Local, sensors: Sensors, count: Array
@@ -328,6 +353,13 @@ def _walk(here: Local, direction: Array, deviations: float) -> Array:
     return np.asarray(unit * (deviations * here.noise / np.sqrt(form(here.fits.matrix, unit))))
 
 
+def _inside(x: Array, step: Array, bounds: Bounds) -> Array:
+    """Share (W,) of a step (n, W) that stays within the bounds."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        room = np.where(step > 0, bounds.upper - x, bounds.lower - x) / step
+    return np.asarray(np.clip(np.where(step == 0, np.inf, room).min(axis=0), 0.0, 1.0))
+
+
 def _parabolic(ratios: Array) -> Flags:
     return np.asarray(((ratios >= PARABOLA[0]) & (ratios <= PARABOLA[1])).all(axis=0))
 
@@ -381,14 +413,14 @@ def _bend(model: Model, x: Array, sensors: Sensors) -> Array:
 
 
 @lru_cache(maxsize=64)
-def _beside(replay: Replay) -> SideBySide:
-    return SideBySide(replay, replay.entries(0))
+def _beside(replay: Replay, output: int) -> SideBySide:
+    return SideBySide(replay, replay.entries(output))
 
 
-def _dense(replay: Replay, x: Array, sensors: Sensors) -> Array:
-    """The first output of every sample, (rows, columns, N, W)."""
-    row, column = replay.sparsity[0]
-    found = np.zeros((*replay.shapes[0], *sensors.samples.shape[1:]))
-    for span, s, values in _beside(replay).chunks(x, sensors):
+def _dense(replay: Replay, x: Array, sensors: Sensors, output: int = 0) -> Array:
+    """One output of every sample, (rows, columns, N, W)."""
+    row, column = replay.sparsity[output]
+    found = np.zeros((*replay.shapes[output], *sensors.samples.shape[1:]))
+    for span, s, values in _beside(replay, output).chunks(x, sensors):
         found[row, column, span, s] = values
     return found

@@ -79,7 +79,7 @@ def calibration_result(
             plain(certificate.step),
             plain(certificate.curvature),
             [certificate.agreeing, certificate.starts],
-            list(certificate.at_bound),
+            [b.name for b in certificate.at_bound],
         ),
         parameters=parameter_table(estimate, table),
         correlation=correlation_of(estimate),

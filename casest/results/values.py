@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
+import numpy as np
+
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
 from casest.estimate.calibrate import Estimate
@@ -26,6 +28,15 @@ class Entry:
     std: float
     below: float
     above: float
+
+    @property
+    def on_bound(self) -> str:
+        """For a value on its bound the end of its interval in words; else empty."""
+        if np.isfinite(self.std) or not np.isfinite(self.below + self.above):
+            return ""
+        if self.above:
+            return f"on its bound; below {self.value + self.above:.2g} (95 %)"
+        return f"on its bound; above {self.value - self.below:.2g} (95 %)"
 
 
 @dataclass(frozen=True)

@@ -47,6 +47,9 @@ def parameters(result: Fitted) -> str:
 
 def _cells(e: Entry) -> list[str]:
     """Value, standard deviation and interval, as far as they are known."""
+    if e.on_bound:
+        reached = (f"{end:.4g}" for end in (e.value - e.below, e.value + e.above))
+        return [f"{e.value:.6g}", "on its bound", *reached]
     shown, spread = rounded(e.value, e.std)
     ends = [e.value - e.below, e.value + e.above]
     known = math.isfinite(e.std) and e.std > 0

@@ -54,13 +54,19 @@ def note_lines(notes: Sequence[str]) -> list[str]:
 
 def value_table(entries: Sequence[Entry]) -> Iterator[str]:
     """One line per value: name, value ± standard deviation, unit."""
-    rows = [(e.name, *rounded(e.value, e.std), e.unit) for e in entries]
+    rows = [(e.name, *_value_and_std(e), e.unit) for e in entries]
     width = max(len(r[0]) for r in rows)
     left = max(len(r[1]) for r in rows)
     middle = max(len(r[2]) for r in rows)
     yield f"  {'parameter':<{width}}  {'value':>{left}}   {'std':<{middle}}  unit"
     for name, value_text, std_text, unit in rows:
-        yield f"  {name:<{width}}  {value_text:>{left}} ± {std_text:<{middle}}  {unit}".rstrip()
+        sign = " " if std_text.startswith("on its bound") else "±"
+        line = f"  {name:<{width}}  {value_text:>{left}} {sign} {std_text:<{middle}}  {unit}"
+        yield line.rstrip()
+
+
+def _value_and_std(e: Entry) -> tuple[str, str]:
+    return (f"{e.value:.6g}", e.on_bound) if e.on_bound else rounded(e.value, e.std)
 
 
 def held_lines(held: Sequence[Held]) -> Iterator[str]:
