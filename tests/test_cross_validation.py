@@ -1,4 +1,4 @@
-"""Held-out data are held out: nothing that predicts a sample has seen it, and the gate believes it."""
+"""Held-out data are held out: what predicts a sample has not seen it, and the gate listens."""
 
 from __future__ import annotations
 

@@ -74,7 +74,8 @@ def cross_fitted(
     """Residuals (N, m) of each run, each from a fit that did not see its block.
 
     `values` are those of the fit to everything: where each fit begins. Effects on the noise count
-    through the weights of that fit. NaN where a fit to the others leaves open what a block hangs on.
+    through the weights of that fit. NaN where a fit to the others leaves open what a block hangs
+    on.
     """
     whole = Problem(model, tuple(runs))
     found = tuple(np.full((len(run), len(model.axes)), np.nan) for run in runs)
