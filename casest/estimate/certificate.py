@@ -40,6 +40,8 @@ FOLLOWED = 1000
 #: An implicit residual is the noise of the reading to first order only; the second-order part must
 #: stay below this share of it. (A flat ellipsoid through poses in a plane "fits" by that part.)
 SECOND_ORDER = 0.07
+#: A whole turn, in the units of angles.
+TURN = {"rad": 2 * np.pi, "deg": 360.0}
 #: Singular values of the column-scaled Jacobian below this leave a direction undetermined for all
 #: practical purposes: its standard deviation is 10⁵ times that of each parameter alone.
 PRACTICALLY_NULL = 1e-5
@@ -307,9 +309,9 @@ def _apart(problem: Problem, best: Outcome, other: Outcome, R: Array, sigma: flo
 
 def _unturned(problem: Problem, difference: Array) -> Array:
     """Differences of angles without their whole turns: 0.5 and 0.5 + 2π are one solution."""
-    angle = np.array([unit == "rad" for unit in problem.units])
-    wrapped = (difference + np.pi) % (2 * np.pi) - np.pi
-    return np.where(angle, wrapped, difference)
+    turn = np.array([TURN.get(unit, np.inf) for unit in problem.units])
+    whole = np.where(np.isfinite(turn), turn, 0.0)
+    return np.asarray(difference - whole * np.round(difference / turn))
 
 
 def _rise(problem: Problem, best: Outcome, point: Point, step: Array, sigma: float) -> float:
