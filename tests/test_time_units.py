@@ -51,10 +51,11 @@ def test_a_declared_unit_of_time_is_the_one_that_the_model_works_in(
 @pytest.mark.parametrize("unit", ["ms", "min"])
 def test_a_derivative_is_by_the_declared_time(tmp_path, unit):
     """An angle of 0.3·sin(2t) read by its rate: 0.6·cos(2t) rad/s, in rad per the unit."""
+    start = 2e-3 if unit == "ms" else 120.0
 
     @model
     def rate_of_swing(t=signal(unit), y=signal(f"rad/{unit}"), *, size=param("rad", start=0.1),
-                      w=param(f"rad/{unit}", start=2 * (1e-3 if unit == "ms" else 60))):  # fmt: skip
+                      w=param(f"rad/{unit}", start=start)):  # fmt: skip
         angle = quantity("angle", size * sin(w * t), "rad")
         return Residual(measured=y, predicted=der(angle, t))
 
