@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
 .PHONY: demo test lint types format wheel bench study study-starts study-nist study-loop \
-	study-motion study-records study-asked figures docs clean
+	study-motion study-records study-asked study-mutation figures docs clean
 
 demo: $(READY)
 	$(BIN)/casest demo
@@ -57,6 +57,9 @@ study-asked: $(READY)
 
 study-records: $(READY)
 	$(BIN)/python studies/records.py
+
+study-mutation: $(READY)
+	$(BIN)/python studies/mutation.py
 
 figures: $(READY)
 	$(BIN)/python studies/figures.py

@@ -74,7 +74,7 @@ def white(rng):
 @pytest.mark.parametrize("unknowns", [1, 3])
 def test_a_score_of_white_noise_is_as_significant_as_chance_has_it(unknowns):
     rng = np.random.default_rng(unknowns)
-    p = p_values(rng, 2500, lambda r: r.standard_normal((400, unknowns)), white)
+    p = p_values(rng, 1500, lambda r: r.standard_normal((400, unknowns)), white)
     for chance in (0.5, 0.1, 0.05, 0.01):
         low, high = expected(len(p), chance)
         # The inflation is never below that of the residual: a little on the safe side.
@@ -94,7 +94,7 @@ def test_a_score_of_coloured_noise_is_no_more_significant():
     def slow(r):
         return np.sin(2 * np.pi * (t * r.uniform(0.5, 2) + r.uniform()))[:, None]
 
-    p = p_values(rng, 1200, slow, coloured, N=2400, length=60)
+    p = p_values(rng, 800, slow, coloured, N=2400, length=60)
     for chance in (0.1, 0.05, 0.01):
         low, high = expected(len(p), chance)
         assert 0.6 * low <= np.sum(p < chance) <= 1.2 * high
@@ -113,9 +113,9 @@ def unequal(r):
 def test_what_an_effect_explains_of_few_batches_is_given_back():
     """Else their noise would look smaller than it is. Those five are twice as noisy as the others,
     which five alone tell badly: 8 % where 5 % are said, and 12 % if nothing were given back."""
-    p = p_values(np.random.default_rng(5), 3000, in_few, unequal)
+    p = p_values(np.random.default_rng(5), 2500, in_few, unequal)
     assert 0.05 < np.mean(p < 0.05) < 0.1
-    even = p_values(np.random.default_rng(6), 1500, in_few, white)
+    even = p_values(np.random.default_rng(6), 600, in_few, white)
     assert 0.01 < np.mean(even < 0.05) < 0.05
 
 
@@ -144,13 +144,13 @@ def test_of_many_trials_the_best_is_as_significant_as_chance_has_it():
     """Twenty frequencies, levels or moments are tried, and the best is kept."""
     rng, best = np.random.default_rng(8), []
     tried = replace(NOBODY, trials=20)
-    for _ in range(500):
+    for _ in range(300):
         X, G = rng.standard_normal((400, 2)), rng.standard_normal((400, 20))
         columns = [G[:, [k]] for k in range(20)]
         best.append(min(s.p_value for s in judged(X, columns, white(rng), 10, tried)))
-    low, high = expected(500, 0.05)
+    low, high = expected(300, 0.05)
     assert 0.5 * low <= np.sum(np.array(best) < 0.05) <= high
-    assert np.sum(np.array(best) < 0.3) >= 0.5 * expected(500, 0.3)[0]
+    assert np.sum(np.array(best) < 0.3) >= 0.5 * expected(300, 0.3)[0]
 
 
 def records(rng, count, candidates=4):
@@ -164,13 +164,13 @@ def records(rng, count, candidates=4):
 def test_flipped_signs_pass_noise_as_rarely_as_the_level_says():
     """Of four candidates any: at a chance of 5 %, and at the level of the search, 0.4 %."""
     at_five, at_level = 0, 0
-    for found in records(np.random.default_rng(9), 1000):
+    for found in records(np.random.default_rng(9), 800):
         if confirmed_by_flips(found, found, 0.05):
             at_five += 1
             at_level += bool(confirmed_by_flips(found, found))
-    low, high = expected(1000, 0.05)
+    low, high = expected(800, 0.05)
     assert low <= at_five <= high
-    low, high = expected(1000, 0.004)
+    low, high = expected(800, 0.004)
     assert max(low, 1) <= at_level <= high
 
 
@@ -217,7 +217,7 @@ class Typical:
 @pytest.mark.parametrize("size", [1.0, 1.6])
 def test_innovations_that_are_noise_show_an_effect_as_rarely_as_chance_has_it(size):
     """Also where they are larger than the model says: their scatter between stretches tells."""
-    p = in_motion(np.random.default_rng(11), 3000, size)
+    p = in_motion(np.random.default_rng(11), 1500, size)
     for chance in (0.1, 0.05, 0.01):
         low, high = expected(len(p), chance)
         # The larger of two p-values of the same noise
@@ -264,10 +264,10 @@ def test_runs_that_agree_are_said_to_disagree_as_rarely_as_chance_has_it(share, 
 
 
 def test_noise_is_called_a_misfit_as_rarely_as_its_budget_says():
-    """Half a percent of records; ten times as many would be 15 of 300."""
+    """Half a percent of records; ten times as many would be ten of 200."""
     rng, called = np.random.default_rng(14), 0
-    for _ in range(300):
-        problem, point = pooled([series(rng, 300, 0.0)])
+    for _ in range(200):
+        problem, point = pooled([series(rng, 200, 0.0)])
         state = state_of(problem, point, folded(problem.runs).batches)
         called += left_over(state, problem.residuals(point)).significant
-    assert called <= expected(300, 0.005)[1]
+    assert called <= expected(200, 0.005)[1]
