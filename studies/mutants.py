@@ -17,7 +17,7 @@ TESTS: dict[str, tuple[str, ...]] = {
     "estimate/held_out": ("cross_validation",),
     "leastsquares/weights": ("spread", "effect_kinds"),
     "leastsquares/sums": ("spread", "certificate_limits", "norm_limits"),
-    "leastsquares/agreement": ("scatter",),
+    "leastsquares/agreement": ("scatter", "false_alarms"),
     "fleet/": ("batch_certificate", "batch"),
     "diagnose/selection/cross_validation": ("cross_validation",),
     "diagnose/selection/state": ("cross_validation",),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -60,6 +62,21 @@ def test_whole_turns_of_an_angle_are_one_solution(turns):
     said = judged(problem, values, [half])
     assert not said.trusted
     assert "two solutions fit alike" in said.reasons[0]
+
+
+def test_half_a_turn_is_another_solution_where_the_readings_repeat_after_it():
+    @model
+    def twice(heading=signal("rad"), y=signal("uT"), *,
+              field=param("uT", start=20.0), turned=param("rad", start=0.4)):  # fmt: skip
+        return Residual(measured=y, predicted=field * cos(2 * (heading + turned)))
+
+    run = turned_by(0.5)
+    run = replace(run, signals={**run.signals, "heading": run.signals["heading"] / 2})
+    values = {n: float(v) for n, v in attempt(twice, [run]).values.items()}
+    problem = Problem(twice, (run,))
+    assert judged(problem, values, [{**values, "turned": values["turned"] + 2 * np.pi}]).trusted
+    said = judged(problem, values, [{**values, "turned": values["turned"] + np.pi}])
+    assert "two solutions fit alike: `turned`" in said.reasons[0]
 
 
 def test_from_a_start_turns_away_the_angle_is_found_and_believed():
