@@ -25,6 +25,7 @@ TESTS: dict[str, tuple[str, ...]] = {
     "diagnose/selection/model_evidence": ("false_alarms",),
     "diagnose/candidates/score_test": ("false_alarms",),
     "diagnose/motion/score_test": ("false_alarms", "closing_motion"),
+    "diagnose/motion/loop": ("cross_validation", "closing_motion"),
     "diagnose/misfit/lack_of_fit": ("false_alarms", "adequacy"),
     "diagnose/loop": ("false_alarms", "cross_validation"),
     "dynamics/extended": ("gaps", "extended"),
@@ -165,6 +166,7 @@ MUTANTS = tuple(
             "_with_own(model, values, fitted)",
             "_with_own(model, values, scored)",
         ),
+        ("diagnose/motion/loop.py", "H[~hidden], z[~hidden]", "H, z"),
         ("data/splits.py", "(run.count > 1).any()", "(run.count > 1e9).any()"),
         # -- evidence and score tests --------------------------------------------------------------
         (EVIDENCE, "FALSE_ALARM = 0.004", "FALSE_ALARM = 0.04"),

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from casest import Residual, Run, effect, model, param, quantity, signal
 from casest.diagnose.loop import close
+from casest.diagnose.motion.loop import held_out
 from casest.diagnose.selection.cross_validation import check_folds, cross_fitted, folded, gain
 from casest.diagnose.selection.state import HELD_OUT
 from casest.effects import CATALOGUE
@@ -155,6 +157,32 @@ def test_of_a_record_of_its_own_the_scored_half_is_unseen():
 def test_without_parameters_of_its_own_all_of_a_record_is_scored():
     run = series(np.random.default_rng(5))
     assert split(run, (line,)) == (None, run)
+
+
+# -- in motion -------------------------------------------------------------------------------------
+
+
+def test_numbers_that_foretell_a_block_of_a_flight_have_not_seen_it():
+    """As NumPy's least squares on the whitened innovations of all other blocks has them."""
+    rng = np.random.default_rng(8)
+    z, H = rng.standard_normal((200, 2)), rng.standard_normal((200, 2, 3))
+    L = np.linalg.cholesky(np.array([[2.0, 0.3], [0.3, 0.5]])) * np.ones((200, 1, 1))
+    folds = np.arange(200) // 10 % 4
+
+    def foretold(z, nu):
+        answers = SimpleNamespace(H=H, z=z, L=L)
+        fit = SimpleNamespace(found=SimpleNamespace(innovations=nu), answers=answers)
+        return held_out(fit, folds)
+
+    nothing = np.zeros((200, 2))
+    usual = foretold(z, nothing)
+    for fold in range(4):
+        own = folds == fold
+        far = foretold(np.where(own[:, None], HUGE, z), nothing)
+        np.testing.assert_array_equal(far[own], usual[own])
+        numbers = np.linalg.lstsq(H[~own].reshape(-1, 3), z[~own].ravel())[0]
+        expected = -np.einsum("kij,kjl,l->ki", L[own], H[own], numbers)
+        np.testing.assert_allclose(usual[own], expected, atol=1e-12)
 
 
 # -- the gate --------------------------------------------------------------------------------------
