@@ -10,9 +10,13 @@ import re
 import numpy as np
 import pytest
 import simulators as sim
+from scipy.optimize import lsq_linear
 from test_batch import NORM, flat, line, recorded
 
 from casest import Residual, Run, attempt, calibrate_many, model, param, signal
+from casest.fleet.fit import Bounds, minimise
+from casest.fleet.sums import Sensors, Squares
+from casest.leastsquares.per_sample import residual_and_jacobian
 from casest_problems.norm import closed_form_many
 
 
@@ -175,6 +179,23 @@ def test_beside_an_unknown_that_stays_on_its_bound_the_others_are_fitted():
             assert abs(found.values["a"][i] - a) < 1e-5 * found.std["a"][i]
             assert abs(found.values["b"][i] - b) < 1e-5 * found.std["b"][i]
     assert found.trusted.mean() > 0.8
+
+
+def test_with_unknowns_on_their_bounds_the_others_go_where_scipy_has_them():
+    """Linear least squares within bounds: a third of the slopes lie beyond."""
+    rng = np.random.default_rng(13)
+    x, z, noise = rng.standard_normal((3, 40, 25))
+    z = 0.8 * x + 0.6 * z
+    y = rng.uniform(0.5, 1.3, (40, 1)) * x - 2 * z + 0.3 * noise
+    squares = Squares(residual_and_jacobian(held))
+    samples = np.ascontiguousarray(np.array([x, z, y]).transpose(0, 2, 1))
+    limits = [np.tile(np.array(part)[:, None], 40) for part in ([0.0, -np.inf], [1.0, np.inf])]
+    begin = np.tile([[0.5], [0.0]], 40)
+    found = minimise(squares, Sensors(samples, None), begin, Bounds(*limits), near=False)
+    for i in range(40):
+        expected = lsq_linear(np.c_[x[i], z[i]], y[i], ([0, -np.inf], [1, np.inf]), tol=1e-14).x
+        np.testing.assert_allclose(found.x[:, i], expected, atol=1e-6)
+    assert 5 < np.sum(found.x[0] > 1 - 1e-9) < 35
 
 
 # -- what else one alone would be asked ------------------------------------------------------------

@@ -193,14 +193,18 @@ def switched(y, switch=signal("1"), *, k=param("V")):
     return y + k * switch
 
 
-def switched_record(seed, in_folds):
-    """A switch that moves the readings: closed in every second stretch of those folds."""
+def switched_record(seed, in_folds, idle=(), size=0.05):
+    """A switch that moves the readings: closed in every second stretch of those folds.
+
+    In the `idle` stretches it is closed as well, and moves nothing.
+    """
     rng = np.random.default_rng(seed)
     run = series(rng, 1200)
     (fold,), (first,) = folded((run,)).of, folded((run,)).batches
     batch = np.searchsorted(first, np.arange(len(run)), side="right") - 1
     closed = (np.isin(fold, in_folds) & (batch % 2 == 0)).astype(float)
-    y = run.signals["y"] + 0.05 * closed[:, None]
+    y = run.signals["y"] + size * closed[:, None]
+    closed[np.isin(batch, idle)] = 1.0
     return replace(run, signals={**run.signals, "y": y}, columns={"switch": closed},
                    column_units={"switch": "1"})  # fmt: skip
 
@@ -221,6 +225,23 @@ def test_what_held_out_data_cannot_confirm_is_not_added(seed):
     found, rest, *_ = np.linalg.lstsq(columns, y, rcond=None)
     std = np.sqrt(rest[0] / (len(x) - 3) * np.linalg.inv(columns.T @ columns)[2, 2])
     assert found[2, 0] / std > 4
+
+
+@pytest.mark.parametrize("seed", range(1, 5))
+def test_what_held_out_data_deny_is_not_added(seed):
+    """It moves the readings by two σ in the stretches of one fold, and in two others it does
+    nothing: significant, and each fold speaks against what the rest foretells of it."""
+    (fold,), (first,) = folded_parts(seed)
+    others = [int(b) for b in np.flatnonzero(fold[first] != 0)[:2]]
+    closing = close(line, [switched_record(seed, [0], others, 0.2)], catalogue=[switched])
+    assert closing.effects == ()
+    said = {r.reason for r in closing.refused if r.name.startswith("switched")}
+    assert said == {"too small to matter here: held-out data do not confirm it"}
+
+
+def folded_parts(seed):
+    folds = folded((series(np.random.default_rng(seed), 1200),))
+    return folds.of, folds.batches
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -253,6 +274,26 @@ def test_a_cause_of_nothing_passes_the_gate_as_rarely_as_its_level_says():
         sums.append(gained)
     assert 1 <= passed <= 8
     assert np.mean(sums) < 0
+
+
+def test_noise_that_is_alike_within_a_stretch_passes_the_gate_no_more_often():
+    """Half of the variance common to each stretch, and a column that is constant in each: what is
+    gained is as uncertain as the stretches are few."""
+    rng, passed = np.random.default_rng(9), 0
+    folds = folded((series(rng, 400),))
+    (of,), (first,) = folds.of, folds.batches
+    batch = np.searchsorted(first, np.arange(400), side="right") - 1
+    for _ in range(1500):
+        common, column = rng.standard_normal((2, batch[-1] + 1))[:, batch]
+        noise = (rng.standard_normal(400) + common) / np.sqrt(2)
+        before, after = noise.copy(), np.empty(400)
+        for k in range(folds.count):
+            seen = of != k
+            slope = column[seen] @ noise[seen] / (column[seen] @ column[seen])
+            after[~seen] = (noise - slope * column)[~seen]
+        gained, error = gain([before[:, None]], [after[:, None]], folds, 1.0)
+        passed += gained > HELD_OUT * error
+    assert passed <= 15
 
 
 def test_what_a_fit_to_the_rest_cannot_foretell_is_refused():

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 from scipy.integrate import quad_vec, solve_ivp
+from test_dynamics import flight
 from test_extended import DAMPING, G_OVER_L, THETA, XI, pendulum_of, swing, swung
 
 from casest import Run, cross, norm_2, signal
@@ -18,6 +19,7 @@ from casest.dynamics.filter import filtered, trajectory
 from casest.dynamics.gramian import gramian, gramian_by_ode
 from casest.dynamics.record import least_squares
 from casest.dynamics.transition import linearised, process_noise
+from casest_problems.bias_gravity import bias_gravity
 
 STEP = 0.05
 
@@ -180,6 +182,20 @@ def test_a_reading_stands_for_its_own_time_and_for_none_of_a_gap():
     # The integral over 99 steps and one of the usual length for the gap; readings are 100.
     for W in (gramian(resting, system), gramian_by_ode(resting, system)):
         assert W[0, 0] == pytest.approx(99 * STEP / 0.04, rel=1e-9)
+
+
+def test_readings_of_several_components_are_taken_one_after_the_other_as_all_at_once():
+    """Three velocities that share a lot: by steps, by matrices, and by the textbook's gain."""
+    run = flight(4.0)[0]
+    x, P, before_x, before_P, innovations, S = extended(bias_gravity, run)
+    found = filtered(bias_gravity, run)
+    std = found.std
+    assert np.max(np.abs(x - found.x) / std) < 1e-4
+    np.testing.assert_allclose(P[-1], found.P[-1], atol=1e-6 * P[-1].max())
+    C = np.hstack([np.eye(3), np.zeros((3, 6))])
+    K = before_P @ C.T @ np.linalg.inv(S)
+    taken = before_x + np.einsum("kij,kj->ki", K, innovations)
+    assert np.max(np.abs(x - taken) / std) < 1e-6
 
 
 # -- noise along the motion ------------------------------------------------------------------------
