@@ -1,4 +1,4 @@
-"""Time in the model's own unit, runs in the order of the file, and units of two letters more."""
+"""Time in the model's own unit, runs in the order of the file, raw counts, kHz and mGal."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import pytest
 
 from casest import Residual, attempt, der, effect, model, param, quantity, signal, sin
 from casest.data import load_runs
+from casest.data.scaling import parse_scale
 from casest.effects import CATALOGUE
 from casest.errors import UnitError
 from casest.units import conversion
@@ -165,3 +166,13 @@ def test_a_gravimeters_reading_is_read_in_its_unit(tmp_path):
     path = written(tmp_path / "g.csv", values[:, None], "y [mGal]")
     (run,) = load_runs(path, gravimeter.signals)
     assert attempt(gravimeter, [run]).values["level"] == pytest.approx(5009.5e-5, rel=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["int8", "int16", "int32", "uint8", "uint16"])
+def test_raw_counts_are_read_as_a_processor_reads_their_bits(kind):
+    """Both ends, both sides of the sign, as NumPy's own integers wrap."""
+    size = 2 ** int("".join(filter(str.isdigit, kind)))
+    stored = np.array([0, 1, size // 2 - 1, size // 2, size // 2 + 1, size - 1])
+    expected = stored.astype(np.uint64).astype(f"u{kind.lstrip('u')}").astype(kind)
+    found = parse_scale(f"{kind}/4").apply(stored.astype(float), "f", "c")
+    np.testing.assert_array_equal(found, expected.astype(float) / 4)
