@@ -65,6 +65,9 @@ study-slow: $(READY)
 study-records: $(READY)
 	$(BIN)/python studies/records.py
 
+study-mutation: $(READY)
+	$(BIN)/python studies/mutation.py
+
 figures: $(READY)
 	$(BIN)/python studies/figures.py
 

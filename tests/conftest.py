@@ -12,7 +12,8 @@ import pytest
 LONGEST = (
     "norm_limits", "nist", "norm_statistics", "closing_records", "pages", "readme", "loop",
     "adequacy", "examples", "cli", "solvers", "pair", "formula", "closing_motion", "kernel",
-    "export", "profile", "batch", "report", "compare", "replay", "wheel", "certificate",
+    "false_alarms", "spread", "export", "profile", "batch", "report", "compare", "replay", "wheel",
+    "certificate",
 )  # fmt: skip
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import scipy.integrate
 import scipy.linalg
 from scipy.spatial.transform import Rotation
 
@@ -210,24 +211,46 @@ def test_the_riccati_equation_settles_where_scipy_and_python_control_say(control
     np.testing.assert_allclose(P, by_control, rtol=1e-8)
 
 
-def test_a_stiff_riccati_equation_stays_symmetric_and_positive():
-    """Measurement intensity 1e-6 against process 1e-3."""
+@pytest.mark.parametrize("theta", [1e-4, 1e-8])
+def test_a_stiff_riccati_equation_is_solved_as_an_implicit_integrator_does(theta):
+    """Readings so good that the variance falls a million times within the first step."""
 
     @dynamics
-    def stiff(a=signal(3, "m/s^2"), omega=signal(3, "rad/s"), v=signal(3, "m/s"), *,
-              velocity=state(3, "m/s", intensity=1e-3), gravity=state(3, "m/s^2", intensity=1e-4),
-              bias=state(3, "m/s^2", intensity=1e-5)):  # fmt: skip
-        from casest import cross
+    def stiff(
+        u=signal("m/s^2"),
+        y=signal("m"),
+        *,
+        position=state("m", intensity=1e-3, std=100.0),
+        velocity=state("m/s", intensity=0.02, std=10.0),
+    ):
+        rates = {"position": velocity, "velocity": u - 0.8 * velocity - 1.5 * position}
+        return Motion(rates=rates, outputs=(measured(y, position, intensity=theta),))
 
-        rates = {"velocity": a - cross(omega, velocity) + gravity - bias,
-                 "gravity": -cross(omega, gravity)}  # fmt: skip
-        return Motion(rates=rates, outputs=(measured(v, velocity, intensity=1e-6),))
+    def rate(_, z):
+        P = np.array([[z[0], z[1]], [z[1], z[2]]])
+        slope = A @ P + P @ A.T + XI - P @ C.T @ C @ P / theta
+        return slope[[0, 0, 1], [0, 1, 1]]
 
+    run = cart_run(100)
+    found = riccati(stiff, linearised(stiff, run))
+    expected = scipy.integrate.solve_ivp(
+        rate, (0, run.time[-1]), [1e4, 0.0, 100.0], "Radau", run.time, rtol=1e-9, atol=1e-16
+    ).y.T  # fmt: skip
+    np.testing.assert_allclose(found[1:, [0, 0, 1], [0, 1, 1]], expected[1:], rtol=1e-5)
+    settled = scipy.linalg.solve_continuous_are(A.T, C.T, XI, [[theta]])
+    np.testing.assert_allclose(found[-1], settled, rtol=1e-3)
+
+
+def test_a_stiff_riccati_equation_of_nine_states_stays_positive():
+    """Measurement intensity 1e-6 against process 1e-3."""
+    model = bias_gravity.driven(velocity=1e-3, gravity=1e-4, bias=1e-5).sensing(v=1e-6)
     t = np.arange(0, 20, 0.01)
-    P = riccati(stiff, linearised(stiff, motionless(turning("all round", t), t)))
+    P = riccati(model, linearised(model, motionless(turning("all round", t), t)))
     assert np.all(np.isfinite(P))
-    np.testing.assert_array_equal(P, P.transpose(0, 2, 1))
     assert np.linalg.eigvalsh(P[1:]).min() > 0
+    # Where the velocity is read so well its variance settles at √(ΞΘ) of a walk, or above.
+    assert np.all(P[-1, range(3), range(3)] > np.sqrt(1e-3 * 1e-6))
+    assert np.all(P[-1, range(3), range(3)] < 1.5 * np.sqrt(1e-3 * 1e-6))
 
 
 # -- filter and smoother -----------------------------------------------------------------------

@@ -10,7 +10,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 PROGRAMS = sorted([*ROOT.glob("studies/*.py"), *ROOT.glob("benchmarks/*.py")])
-HELPERS = {"loop_table", "resumed", "by_hand", "fused"}
+HELPERS = {"loop_table", "mutants", "resumed", "by_hand", "fused"}
 
 
 @pytest.mark.parametrize("path", PROGRAMS, ids=lambda p: f"{p.parent.name}/{p.stem}")
@@ -22,3 +22,14 @@ def test_every_name_that_a_study_needs_is_there(path, monkeypatch):
     monkeypatch.setitem(sys.modules, name, module)
     spec.loader.exec_module(module)
     assert path.stem in HELPERS or callable(module.main)
+
+
+def test_every_mistake_of_the_mutation_study_is_in_the_code_once(monkeypatch):
+    """The list follows the code: what moves must be moved there too."""
+    monkeypatch.setattr(sys, "path", [str(ROOT / "studies"), *sys.path])
+    mutants = importlib.import_module("mutants")
+    for m in mutants.MUTANTS:
+        text = (ROOT / "casest" / m.path).read_text(encoding="utf-8")
+        assert (m.path, m.old, text.count(m.old)) == (m.path, m.old, 1)
+        assert all((ROOT / "tests" / name).exists() for name in m.tests)
+    assert len({m.name for m in mutants.MUTANTS}) == len(mutants.MUTANTS)

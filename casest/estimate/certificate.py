@@ -47,6 +47,8 @@ from casest.solve.trust_region import LITTLE, trust_region
 
 #: Iterations in which another outcome is followed, to see whether it is a solution of its own.
 FOLLOWED = 1000
+#: A whole turn, in the units of angles.
+TURN = {"rad": 2 * np.pi, "deg": 360.0}
 
 
 @dataclass(frozen=True)
@@ -358,9 +360,9 @@ def _apart(problem: Problem, best: Outcome, other: Outcome, R: Array, sigma: flo
 
 def _unturned(problem: Problem, difference: Array) -> Array:
     """Differences of angles without their whole turns: 0.5 and 0.5 + 2π are one solution."""
-    angle = np.array([unit == "rad" for unit in problem.units])
-    wrapped = (difference + np.pi) % (2 * np.pi) - np.pi
-    return np.where(angle, wrapped, difference)
+    turn = np.array([TURN.get(unit, np.inf) for unit in problem.units])
+    whole = np.where(np.isfinite(turn), turn, 0.0)
+    return np.asarray(difference - whole * np.round(difference / turn))
 
 
 def _rise(problem: Problem, best: Outcome, point: Point, step: Array, sigma: float) -> float:

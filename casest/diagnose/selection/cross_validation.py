@@ -17,7 +17,7 @@ from casest.errors import DataError
 from casest.estimate.calibrate import Estimate
 from casest.estimate.reasons import PRACTICALLY_NULL
 from casest.leastsquares.identifiability import identify
-from casest.leastsquares.problem import Problem
+from casest.leastsquares.problem import Point, Problem
 from casest.leastsquares.weights import weighted
 from casest.solve.trust_region import trust_region
 
@@ -25,6 +25,8 @@ from casest.solve.trust_region import trust_region
 FOLDS = 4
 #: Variance of what a fit to the rest foretells of a part, in those of the noise, at most.
 UNCERTAIN = 10.0
+#: Share of the squares of its unknowns, each alone, by which a direction moves a prediction at all.
+OPEN = 1e-10
 #: A residual counts as at most this many robust standard deviations.
 FAR = 4.0
 #: Iterations of a fit that begins at the fit to everything, and gain (in σ²) that ends it.
@@ -72,7 +74,8 @@ def cross_fitted(
     """Residuals (N, m) of each run, each from a fit that did not see its block.
 
     `values` are those of the fit to everything: where each fit begins. Effects on the noise count
-    through the weights of that fit.
+    through the weights of that fit. NaN where a fit to the others leaves open what a block hangs
+    on.
     """
     whole = Problem(model, tuple(runs))
     found = tuple(np.full((len(run), len(model.axes)), np.nan) for run in runs)
@@ -88,12 +91,25 @@ def cross_fitted(
             tolerance=ENOUGH / max(problem.residual_count, 1),
         )
         point = whole.point(problem.values(fit.point))
-        for r, fold in enumerate(folds.of):
-            hidden = Problem(
-                model, tuple(run.take(f == k) for run, f in zip(runs, folds.of, strict=True))
-            )
-            found[r][fold == k] = hidden.residuals(point)[r]
+        hidden = Problem(
+            model, tuple(run.take(f == k) for run, f in zip(runs, folds.of, strict=True))
+        )
+        if _left_open(problem, fit.point, hidden, point):
+            continue
+        for r, residual in enumerate(hidden.residuals(point)):
+            found[r][folds.of[r] == k] = residual
     return found
+
+
+def _left_open(rest: Problem, fitted: Point, hidden: Problem, point: Point) -> bool:
+    """Does what is held out hang on anything that the rest does not determine?
+
+    A fit leaves that as it was at its beginning, which has seen what is held out.
+    """
+    null = identify(rest, fitted).null
+    own = hidden.normal(point).matrix
+    moved = np.einsum("ik,ij,jk->k", null, own, null)
+    return bool(np.any(moved > OPEN * np.einsum("ik,ii->k", null**2, own)))
 
 
 def gain(

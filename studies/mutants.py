@@ -1,0 +1,259 @@
+"""The small plausible mistakes of studies/mutation.py, the test files that should notice, and what
+is to be said of those that nothing notices."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import NamedTuple
+
+ROOT = Path(__file__).parents[1]
+
+#: Fastest test files of each module, the likeliest to notice first.
+TESTS: dict[str, tuple[str, ...]] = {
+    "estimate/certificate": ("certificate_limits", "angles_and_rivals", "certificate"),
+    "estimate/covariance": ("spread", "norm_statistics"),
+    "estimate/correlation": ("spread", "adequacy"),
+    "estimate/held_out": ("cross_validation",),
+    "leastsquares/weights": ("spread", "effect_kinds"),
+    "leastsquares/sums": ("spread", "certificate_limits", "norm_limits"),
+    "leastsquares/agreement": ("scatter", "false_alarms"),
+    "fleet/": ("batch_certificate", "batch"),
+    "diagnose/selection/cross_validation": ("cross_validation",),
+    "diagnose/selection/state": ("cross_validation",),
+    "diagnose/selection/acceptance": ("cross_validation",),
+    "diagnose/selection/model_evidence": ("false_alarms",),
+    "diagnose/candidates/score_test": ("false_alarms",),
+    "diagnose/motion/score_test": ("false_alarms", "closing_motion"),
+    "diagnose/motion/loop": ("cross_validation", "closing_motion"),
+    "diagnose/misfit/lack_of_fit": ("false_alarms", "adequacy"),
+    "diagnose/loop": ("false_alarms", "cross_validation"),
+    "dynamics/extended": ("gaps", "extended"),
+    "dynamics/filter": ("gaps", "extended", "dynamics"),
+    "dynamics/discrete": ("discrete", "dynamics"),
+    "dynamics/riccati": ("dynamics",),
+    "dynamics/stepping": ("gaps", "dynamics"),
+    "dynamics/gramian": ("gaps", "dynamics"),
+    "dynamics/known": ("extended",),
+    "dynamics/record": ("gaps", "dynamics"),
+    "dynamics/transition": ("gaps", "discrete", "dynamics"),
+    "correction/": ("two_roots", "apply"),
+    "data/timing": ("time_units", "bind"),
+    "data/bind": ("time_units", "bind"),
+    "data/splits": ("splits",),
+    "data/rest": ("rest",),
+    "data/scaling": ("time_units", "bind"),
+    "data/delimited": ("table",),
+    "data/converting": ("time_units", "bind"),
+    "units": ("units", "time_units"),
+}
+
+
+class Mutant(NamedTuple):
+    """A mistake: in a module, this snippet becomes that."""
+
+    path: str
+    old: str
+    new: str
+
+    @property
+    def name(self) -> str:
+        """How it is named: the module and a digest of the change."""
+        digest = hashlib.sha256(f"{self.old}\n{self.new}".encode()).hexdigest()[:6]
+        return f"{self.path.removesuffix('.py')} {digest}"
+
+    @property
+    def tests(self) -> tuple[str, ...]:
+        """Names of the test files that run, in order."""
+        found = [names for prefix, names in TESTS.items() if self.path.startswith(prefix)]
+        if not found:
+            raise SystemExit(f"{self.path}: no test files are named for it; add them to TESTS")
+        return tuple(f"test_{name}.py" for name in found[-1])
+
+    def identity(self, root: Path = ROOT) -> str:
+        """Of the module and of the tests as they are there: what a record holds for."""
+        parts = [root / "casest" / self.path, *(root / "tests" / test for test in self.tests)]
+        digest = hashlib.sha256(b"".join(p.read_bytes() for p in parts)).hexdigest()[:12]
+        return f"{self.name} {digest}"
+
+
+CERTIFICATE, JUDGE = "estimate/certificate.py", "fleet/judge.py"
+SCORE, EVIDENCE = "diagnose/candidates/score_test.py", "diagnose/selection/model_evidence.py"
+CROSS, STATE = "diagnose/selection/cross_validation.py", "diagnose/selection/state.py"
+TRANSITION, EXTENDED = "dynamics/transition.py", "dynamics/extended.py"
+
+MUTANTS = tuple(
+    Mutant(*parts)
+    for parts in (
+        # -- the certificate -----------------------------------------------------------------------
+        (CERTIFICATE, "SLOPE = 1e-5", "SLOPE = 1e-2"),
+        (CERTIFICATE, "STEP = 1e-4", "STEP = 1.0"),
+        (CERTIFICATE, "PRACTICALLY_NULL = 1e-5", "PRACTICALLY_NULL = 1e-9"),
+        (CERTIFICATE, "SHAPE = (0.5, 10.0)", "SHAPE = (0.05, 100.0)"),
+        (CERTIFICATE, "SECOND_ORDER = 0.07", "SECOND_ORDER = 0.7"),
+        (CERTIFICATE, "not curvature > 1e-9", "not curvature > -1e9"),
+        (CERTIFICATE, "< 1.92 * sigma**2", "< 0.0192 * sigma**2"),
+        (CERTIFICATE, "> 10 * sigma", "> 1000 * sigma"),
+        (CERTIFICATE, "> 10 * sigma", "> 1 * sigma"),
+        (CERTIFICATE, '{"rad": 2 * np.pi, "deg": 360.0}', '{"rad": np.pi, "deg": 180.0}'),
+        (CERTIFICATE, "against += words or _ambiguous", "against += words and _ambiguous"),
+        (CERTIFICATE, "width = 1e-3 * noise", "width = 0.0 * noise"),
+        (CERTIFICATE, "excess <= max(SAME", "excess <= 1e4 * max(SAME"),
+        (
+            CERTIFICATE,
+            "step = sign * 2 * sigma / singular[k]",
+            "step = sign * 0.2 * sigma / singular[k]",
+        ),
+        # -- the covariance ------------------------------------------------------------------------
+        ("estimate/covariance.py", "correlated_over * plain * bread", "plain * bread"),
+        ("estimate/covariance.py", "bread=bread) @ bread", "bread=None) @ bread"),
+        ("estimate/covariance.py", "10 * correlated_over", "1 * correlated_over"),
+        ("estimate/covariance.py", "groups / max(groups - 1, 1)", "max(groups - 1, 1) / groups"),
+        ("estimate/correlation.py", "2 * pairs.sum() - 1", "pairs.sum()"),
+        ("estimate/correlation.py", "neighbours < 2.33", "neighbours < 23.3"),
+        ("leastsquares/weights.py", "/ np.mean(slope) ** 2", "/ np.mean(w) ** 2"),
+        ("leastsquares/weights.py", "np.sum((w * r) ** 2)", "np.sum(w * r**2)"),
+        ("leastsquares/weights.py", "np.median(everything)) / 0.6745", "np.median(everything))"),
+        (
+            "leastsquares/sums.py",
+            "return np.asarray(-bread @ slope)",
+            "return np.asarray(0 * slope)",
+        ),
+        ("leastsquares/sums.py", 'np.einsum("nmk,nk->nm", inverse, residual)', "residual"),
+        ("leastsquares/agreement.py", "/ variance / correlated_over", "/ variance"),
+        # -- many sensors --------------------------------------------------------------------------
+        (JUDGE, "suspect = ~_parabolic(ratios)", "suspect = np.zeros(len(k), bool)"),
+        (JUDGE, "(near & (away > 10)) | lower", "near & (away > 10)"),
+        (JUDGE, "(near & (away > 10)) | lower", "lower"),
+        (JUDGE, "found.covariance[:] += shift", "pass"),
+        (JUDGE, "found.add(Code.BOUND,", "(lambda *_: None)(Code.BOUND,"),
+        (
+            JUDGE,
+            "np.where(inside & np.isfinite(rise), rise, np.inf)",
+            "np.where(np.isfinite(rise), rise, np.inf)",
+        ),
+        (JUDGE, "elongated = found.smallest <= 0.1", "elongated = found.smallest <= 0.001"),
+        (JUDGE, "SAFETY = 3.5", "SAFETY = 0.035"),
+        (JUDGE, "SHRUNK = 0.1", "SHRUNK = 1e9"),
+        (JUDGE, "ALIKE = 5.0", "ALIKE = 50.0"),
+        (
+            JUDGE,
+            "found.add(Code.NO_REDUNDANCY, freedom <= 0)",
+            "found.add(Code.NO_REDUNDANCY, freedom < 0)",
+        ),
+        (JUDGE, "2 * fits.cost / np.where(freedom > 0, freedom, np.nan)", "2 * fits.cost / count"),
+        ("fleet/fit.py", "np.clip(x + step, bounds.lower, bounds.upper) - x, held)", "step, held)"),
+        # -- cross-validation and held-out data ----------------------------------------------------
+        (CROSS, "run.take(fold != k)", "run.take(fold != k - 99)"),
+        (
+            CROSS,
+            "weighted(Problem(model, seen), values)",
+            "weighted(Problem(model, tuple(runs)), values)",
+        ),
+        (CROSS, "FAR = 4.0", "FAR = 0.4"),
+        (CROSS, "np.sum(b**2 - a**2)", "np.sum(b**2 + a**2)"),
+        (
+            CROSS,
+            "max(wide / sigma**4, 4 * white / sigma**2)",
+            "min(wide / sigma**4, 4 * white / sigma**2)",
+        ),
+        (CROSS, "10 * correlated_over", "0.1 * correlated_over"),
+        (CROSS, "spread < UNCERTAIN * part", "spread < 1e9 * UNCERTAIN * part"),
+        (STATE, "gained > HELD_OUT * error", "gained > -1e9 * error"),
+        (STATE, "HELD_OUT = 1.64", "HELD_OUT = 0.164"),
+        (
+            "estimate/held_out.py",
+            "_with_own(model, values, fitted)",
+            "_with_own(model, values, scored)",
+        ),
+        ("diagnose/motion/loop.py", "H[~hidden], z[~hidden]", "H, z"),
+        ("data/splits.py", "(run.count > 1).any()", "(run.count > 1e9).any()"),
+        # -- evidence and score tests --------------------------------------------------------------
+        (EVIDENCE, "FALSE_ALARM = 0.004", "FALSE_ALARM = 0.04"),
+        (EVIDENCE, "price = 2 * float(np.log(np.log(", "price = 1 * float(np.log(np.log("),
+        (EVIDENCE, "flips @ s.batches", "0.3 * flips @ s.batches"),
+        (SCORE, "min(1.0, p * candidate.trials)", "min(1.0, p)"),
+        (SCORE, "turned / np.sqrt(np.clip(1 - values, LEAST_LEFT, None))", "turned"),
+        (SCORE, "max(np.sum(noise**2) / freedom, least)", "least"),
+        (SCORE, "effective < LEAST_BATCHES", "effective < 0"),
+        (SCORE, "gain / inflation / freedom", "gain / inflation"),
+        (SCORE, "(1 - explained) * (1 + price)", "(1 - explained) * (1 - price)"),
+        ("diagnose/motion/score_test.py", "return max(own, float(", "return min(own, float("),
+        ("diagnose/motion/score_test.py", "(count - rank) / rank", "count / rank * 2"),
+        # -- filters -------------------------------------------------------------------------------
+        (TRANSITION, "0.5 * (intensity[:-1] + last)", "intensity[:-1]"),
+        (TRANSITION, "np.where(moved @ driven,", "np.where(driven,"),
+        (TRANSITION, "Phi[gaps].transpose(0, 2, 1) + own", "Phi[gaps].transpose(0, 2, 1)"),
+        (TRANSITION, "np.where(steps > GAP * usual, usual, steps)", "steps"),
+        (TRANSITION, "h**2 / 12 * bend", "h**2 / 6 * bend"),
+        (TRANSITION, "0.5 * (step[1:] + step[:-1])", "step[1:]"),
+        (EXTENDED, "P + ca.diag(gap)) @ Phi.T + Q + ca.diag(gap)", "P) @ Phi.T + Q"),
+        (EXTENDED, "intensity(middle, middle_u)", "intensity(x, u)"),
+        (EXTENDED, "Q = with_lost(model, np.diff(time), Phi, Q)", "pass"),
+        (EXTENDED, "- ca.dot(c, after_x - before_x)", ""),
+        ("dynamics/filter.py", "first = first or (along, P)", "first = (along, P)"),
+        (
+            "dynamics/filter.py",
+            "np.diag(model.noise)[None] / steps_to(system)",
+            "np.diag(model.noise)[None] * steps_to(system)",
+        ),
+        ("dynamics/discrete.py", "+ G @ steps.Q @ G.transpose(0, 2, 1)", ""),
+        ("dynamics/discrete.py", "np.where(self.present[:, :, None], self.C, 0.0)", "self.C"),
+        ("dynamics/riccati.py", "both[:, n:, n:] = -A", "both[:, n:, n:] = A"),
+        (
+            "dynamics/riccati.py",
+            "P = np.add(half, half.T, out=later)",
+            "P = np.add(half, half, out=later)",
+        ),
+        (
+            "dynamics/stepping.py",
+            "symmetric(P - PC @ (PC / s).T)",
+            "symmetric(P + PC @ (PC / s).T)",
+        ),
+        (
+            "dynamics/gramian.py",
+            "h = counted(system.steps)[:, None, None]",
+            "h = system.steps[:, None, None]",
+        ),
+        ("dynamics/known.py", "S[:, np.arange(count), np.arange(count)] += hidden", "pass"),
+        # -- corrections and readers ---------------------------------------------------------------
+        (
+            "correction/c.py",
+            "fabs(value[i] - MIDDLE) > away) away = fabs(value[i] - MIDDLE)",
+            "fabs(value[i]) > away) away = fabs(value[i])",
+        ),
+        ("correction/c.py", "<= CLOSE * {largest}", "<= 1e30 * CLOSE * {largest}"),
+        ("correction/runtime.py", 'np.abs(v - newton["middle"])', "np.abs(v)"),
+        ("correction/inverse.py", "np.abs(found - middle).max", "np.abs(found).max"),
+        ("data/timing.py", '1000.0 if found[2] == "kHz" else 1.0', "1.0"),
+        ("data/timing.py", "return values * factor, None", "return values, None"),
+        ("data/timing.py", "GAP = 5.0", "GAP = 50.0"),
+        ("data/bind.py", "labels[np.sort(first)]", "labels[first]"),
+        ("data/bind.py", "(time * factor)[:, None]", "time[:, None]"),
+        ("data/rest.py", "covariance[0] * inflation / (n - 1)", "covariance[0] / (n - 1)"),
+        ("data/scaling.py", "unsigned >= range_ / 2", "unsigned > range_ / 2"),
+        ("data/delimited.py", 'replace(",", ".").split', 'replace(",", "").split'),
+        ("units.py", '"mGal": _si(1e-5', '"mGal": _si(1e-3'),
+        ("units.py", '"kHz": _si(1e3', '"kHz": _si(1e6'),
+    )
+)
+#: What is to be said of those that survive, by module and mistake.
+JUDGED: dict[tuple[str, str], str] = {
+    (CERTIFICATE, "> 1 * sigma"): (
+        "what ended near the best is followed first and ends in it; a solution of its own between "
+        "one deviation and eight bends the cost, which is asked before"
+    ),
+    ("estimate/covariance.py", "max(groups - 1, 1) / groups"): (
+        "too small to matter: 3 % of a standard deviation with the fewest batches, 30"
+    ),
+    (JUDGE, "SHRUNK = 1e9"): (
+        "equivalent in the verdict: where the cost is no parabola second derivatives are asked "
+        "anyway, and fits end in no maximum"
+    ),
+    ("data/splits.py", "(run.count > 1e9).any()"): (
+        "equivalent: a mean of a rest interval is one sample, which is not cut"
+    ),
+    ("dynamics/riccati.py", "P = np.add(half, half, out=later)"): (
+        "equivalent but for rounding: the fraction is symmetric by itself"
+    ),
+}

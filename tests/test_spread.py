@@ -1,0 +1,176 @@
+"""Printed standard deviations where noise is not what the textbook has: outliers, colour, unequal.
+
+By simulation, against the spread of the estimates themselves.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from casest import Residual, Run, model, param, signal
+from casest.effects import CATALOGUE
+from casest.estimate.calibrate import attempt
+from casest.estimate.covariance import sandwich
+from casest.leastsquares.problem import Problem
+from casest.leastsquares.weights import variance_factor, weights
+
+TRUTH = np.array([2.0, 1.0])
+OUTLIERS = next(e for e in CATALOGUE if e.name == "outliers")
+
+
+@model
+def line(x=signal(), y=signal(), *, slope=param(), level=param()):
+    return Residual(measured=y, predicted=level + slope * x)
+
+
+def fits(count, noise, n, seed=0):
+    """Errors (count, 2) of lines in time, their printed std, and the estimates themselves."""
+    rng = np.random.default_rng(seed)
+    found = []
+    for _ in range(count):
+        x = rng.uniform(-1, 1, (n, 1))
+        y = 1 + 2 * x + noise(rng, x)
+        run = Run.raw("r", {"x": x, "y": y}, units={}, time=np.arange(n) * 0.01)
+        found.append(attempt(line, [run], solver="trust-region"))
+    values, std = (
+        np.array([[p["slope"], p["level"]] for p in parts])
+        for parts in ([f.values for f in found], [f.std for f in found])
+    )
+    return values - TRUTH, std, found
+
+
+def coverage(error, std, quantile):
+    return float(np.mean(np.abs(error) <= quantile * std))
+
+
+def contaminated(rng, x):
+    """One reading in twenty is eight times as far off."""
+    far = rng.random(x.shape) < 0.05
+    return 0.1 * rng.standard_normal(x.shape) * np.where(far, 8.0, 1.0)
+
+
+def normal(rng, x):
+    return 0.1 * rng.standard_normal(x.shape)
+
+
+def reweighted(count, noise, n=60):
+    """Lines fitted with the weights of `outliers`, by NumPy: errors (count, 2), std, and errors and
+    std of least squares."""
+    rng, declared, found = np.random.default_rng(0), line.with_effect(OUTLIERS), []
+    curve = weight_of_residuals(declared)
+    for _ in range(count):
+        x = rng.uniform(-1, 1, (n, 1))
+        y = 1 + 2 * x + noise(rng, x)
+        problem = Problem(declared, (Run.raw("r", {"x": x, "y": y}, units={}),))
+        X, plain = np.c_[x, np.ones(n)], np.linalg.lstsq(np.c_[x, np.ones(n)], y[:, 0])[0]
+        at = plain
+        for _ in range(25):
+            r = np.abs(y[:, 0] - X @ at)
+            root = np.sqrt(np.interp(r / np.median(r) * 0.6745, *curve))
+            at = np.linalg.lstsq(root[:, None] * X, root * y[:, 0])[0]
+        unit = np.diag(np.linalg.inv(X.T @ X))
+        own = variance_factor(problem, at_values(problem, at))
+        left = np.sum((y[:, 0] - X @ plain) ** 2) / (n - 2)
+        found.append((at - TRUTH, np.sqrt(own * unit), plain - TRUTH, np.sqrt(left * unit)))
+    return np.array(found).transpose(1, 0, 2)
+
+
+def weight_of_residuals(declared):
+    """Residuals in robust standard deviations and what they weigh, both (4001,)."""
+    r = np.linspace(0, 1, 4001) ** 6  # half of them small: up to 43 standard deviations
+    run = Run.raw("r", {"x": 0 * r[:, None], "y": r[:, None]}, units={})
+    problem = Problem(declared, (run,))
+    return r / np.median(r) * 0.6745, weights(problem, problem.point({}))[0][:, 0]
+
+
+def at_values(problem, values):
+    return problem.point({"slope": values[0], "level": values[1]})
+
+
+def rms(x):
+    return float(np.sqrt(np.mean(np.square(x))))
+
+
+def test_hubers_std_is_that_of_the_estimates_under_contamination():
+    """400 lines with outliers that count less: neither too narrow nor too wide."""
+    error, std, plain, _ = reweighted(400, contaminated)
+    assert rms(error / std) == pytest.approx(1, abs=0.09)  # known to 2.5 %
+    assert 0.93 < coverage(error, std, 2.0) < 0.97
+    assert rms(plain) > 1.25 * rms(error)  # of least squares
+
+
+def test_hubers_std_without_contamination_says_what_the_weights_cost():
+    error, std, plain, own = reweighted(200, normal)
+    assert 1.0 < np.mean(std) / np.mean(own) < 1.15
+    assert np.mean(std) / np.mean(own) == pytest.approx(rms(error) / rms(plain), abs=0.05)
+
+
+def test_hubers_std_is_the_one_that_is_printed():
+    rng = np.random.default_rng(1)
+    x = rng.uniform(-1, 1, (60, 1))
+    run = Run.raw("r", {"x": x, "y": 1 + 2 * x + contaminated(rng, x)}, units={})
+    found = attempt(line.with_effect(OUTLIERS), [run], solver="trust-region")
+    X = np.c_[x, np.ones(60)]
+    factor = variance_factor(found.problem, found.point)
+    expected = np.sqrt(factor * np.diag(np.linalg.inv(X.T @ X)))
+    np.testing.assert_allclose([found.std["slope"], found.std["level"]], expected, rtol=1e-9)
+
+
+def unequal(rng, x):
+    """Ten times as noisy at the ends as in the middle."""
+    return 0.1 * rng.standard_normal(x.shape) * (0.1 + np.abs(x))
+
+
+def test_the_robust_std_is_right_in_few_rows_of_unequal_noise():
+    """HC3 in 16 rows: on the safe side, where the plain one and the sandwich without leverage are
+    too narrow."""
+    rng, errors, robust, plain = np.random.default_rng(2), [], [], []
+    for _ in range(1000):
+        x = rng.uniform(-1, 1, (16, 1))
+        y = 1 + 2 * x + unequal(rng, x)
+        problem = Problem(line, (Run.raw("r", {"x": x, "y": y}, units={}),))
+        X = np.c_[x, np.ones(16)]
+        values = np.linalg.lstsq(X, y[:, 0])[0]
+        point = at_values(problem, values)
+        spread = sandwich(problem, point, problem.factor(point)[0], 1.0)
+        errors.append(values[0] - 2)
+        robust.append(np.sqrt(spread[0, 0]))
+        left = np.sum((y[:, 0] - X @ values) ** 2) / 14
+        plain.append(np.sqrt(left * np.linalg.inv(X.T @ X)[0, 0]))
+    assert 1.0 < rms(robust) / rms(errors) < 1.25
+    assert rms(plain) / rms(errors) < 0.85
+
+
+def of_colour(share):
+    def noise(rng, x):
+        white = rng.standard_normal(len(x) + 200)
+        found = np.empty_like(white)
+        found[0] = white[0]
+        for k in range(1, len(white)):
+            found[k] = share * found[k - 1] + white[k]
+        return 0.1 * found[200:, None]
+
+    return noise
+
+
+def test_correlated_noise_widens_the_std_as_much_as_it_spreads_the_estimates():
+    """AR(1) of 0.8: a level is known nine times less well than from as many white readings."""
+    error, std, found = fits(180, of_colour(0.8), 800)
+    ratio = np.sqrt(np.mean(std[:, 1] ** 2) / np.mean(error[:, 1] ** 2))
+    assert 0.87 < ratio < 1.13
+    over = np.mean([f.correlated_over for f in found])
+    assert over == pytest.approx((1 + 0.8) / (1 - 0.8), rel=0.12)
+
+
+def test_correlated_noise_in_few_batches_widens_it_too():
+    error, std, found = fits(180, of_colour(0.8), 240)
+    assert np.median([240 / (10 * f.correlated_over) for f in found]) < 30
+    ratio = np.sqrt(np.mean(std[:, 1] ** 2) / np.mean(error[:, 1] ** 2))
+    assert 0.8 < ratio < 1.15
+
+
+def test_white_noise_in_time_is_hardly_ever_taken_for_coloured():
+    """One series in a hundred gets past by the level that is asked of neighbours."""
+    found = fits(300, normal, 150, seed=1)[2]
+    assert np.sum([f.correlated_over > 1 for f in found]) <= 9  # 3 expected, 1 in 1000 above 9
