@@ -20,6 +20,7 @@ from casest.estimate.correlation import ENOUGH, TABLE, correlation_time
 from casest.estimate.covariance import inverse_normal, sandwich
 from casest.estimate.profile_likelihood import half_width
 from casest.estimate.remarks import NOTABLE_BIAS, notes
+from casest.estimate.valley import Evidence, judged, looked_for, remarks
 from casest.leastsquares.identifiability import Identifiability, Weak, identify, weak_directions
 from casest.leastsquares.problem import Point, Problem
 from casest.leastsquares.sums import repeat_noise, second_order_bias
@@ -78,6 +79,7 @@ class Estimate:
     bias: float = 0.0
     shift: Array | float = 0.0
     optimum: Point | None = None
+    evidence: Evidence | None = None
     extra: Mapping[str, Any] = field(default_factory=dict)
 
     @property
@@ -109,7 +111,7 @@ class Estimate:
         dof = problem.residual_count - self.identifiability.rank
         with np.errstate(all="ignore"):
             found = notes(problem, at, dof, self.correlated_over, self.bias)
-            return (*found, *_of_tables(problem, at))
+            return (*remarks(problem, self.evidence), *found, *_of_tables(problem, at))
 
     @cached_property
     def interval_reach(self) -> tuple[Mapping[str, Array], Mapping[str, Array]]:
@@ -198,7 +200,10 @@ def _attempt(
         seed=seed,
         automatic=start is None,
     )
+    outcomes, evidence = looked_for(problem, first, outcomes, seed)
     found = _estimate(problem, best_of(outcomes), outcomes, began, intervals)
+    certificate = judged(problem, found.certificate, evidence)
+    found = replace(found, certificate=certificate, evidence=evidence)
     if start is None and model.starter is None and found.certificate.trusted:
         found = _looked_at_for_a_better_one(found)
     if stopped():
@@ -279,6 +284,9 @@ def _estimate(
     point = best.point
     factor = problem.factor(point)
     R, _, rest = factor
+    if not np.isfinite(R).all():
+        reason = "a derivative of the residual is not finite at the best point found; give --start"
+        return _refused(problem, point, reason, began)
     identified = identify(problem, point, R)
     dof = problem.residual_count - identified.rank
     noise = _noise(problem, point, float(np.sqrt(2 * best.cost)), dof)

@@ -1,0 +1,285 @@
+"""Which values of an unknown are worth a start: from the model's structure and what the data span.
+
+What a function of its own scale (a sine, an exponential) takes must move by LEAST over the record
+at least, and by no more than half a turn between neighbouring rows (Nyquist). What is added to a
+term of the samples, a place or a threshold, lies where that term lies. Bounds are kept.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import casadi as ca
+import numpy as np
+
+from casest.declaration.model import Model
+from casest.declaration.shapes import Array
+from casest.declaration.tracing import function_of, sample_symbol
+from casest.engine import Replay
+from casest.engine.graph import Graph, Value
+from casest.leastsquares.neighbours import inputs
+from casest.leastsquares.problem import Point, Problem
+
+#: An argument that moves by less than this over the record bends nothing.
+LEAST = 0.1
+#: Neighbouring rows and others that are looked at.
+PAIRS = 150
+#: Sizes of an unknown that are tried for its reach: every unit is somebody's.
+SIZES = 10.0 ** np.arange(-15, 15.01, 0.25)
+#: Where nothing says how large an unknown is: this many times its start, up and down.
+AROUND = 1e3
+
+_PERIODIC = {ca.OP_SIN, ca.OP_COS, ca.OP_TAN}
+_SCALED = _PERIODIC | {
+    ca.OP_EXP,
+    ca.OP_EXPM1,
+    ca.OP_TANH,
+    ca.OP_SINH,
+    ca.OP_COSH,
+    ca.OP_ERF,
+    ca.OP_ATAN,
+    ca.OP_ATAN2,
+}
+_POWERS = {ca.OP_POW, ca.OP_CONSTPOW}
+_SUMS = {ca.OP_ADD, ca.OP_SUB}
+
+
+class Piece(NamedTuple):
+    """Values between `low` and `high`, evenly, or by their size (`log`) with a sign."""
+
+    low: float
+    high: float
+    log: bool = False
+    sign: float = 1.0
+
+    def at(self, share: Array) -> Array:
+        """The values at shares from 0 to 1 of the way."""
+        if self.log:
+            return self.sign * self.low * (self.high / self.low) ** share
+        return self.low + (self.high - self.low) * share
+
+    def within(self, lower: float, upper: float) -> Piece | None:
+        """What of it lies within bounds."""
+        if self.log:
+            near, far = sorted((self.sign * lower, self.sign * upper))
+            low, high = max(self.low, near), min(self.high, far)
+        else:
+            low, high = max(self.low, lower), min(self.high, upper)
+        return self._replace(low=low, high=high) if low < high else None
+
+
+class Node(NamedTuple):
+    """An argument of a scaled function (`place` None), or an unknown term added to `argument`."""
+
+    argument: int
+    place: int | None
+    periodic: bool
+    unknowns: frozenset[int]
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """What the nodes need, as a function of (parameters, sample) with one output `u`."""
+
+    nodes: tuple[Node, ...]
+    replay: Replay
+
+
+def reach(problem: Problem, start: Point, unknowns: list[int]) -> dict[int, tuple[Piece, ...]]:
+    """For every one of these unknowns the pieces of its axis that are worth a start."""
+    lower, upper = problem.bounds
+    found: dict[int, list[Piece]] = {j: [] for j in unknowns}
+    for r in range(len(problem.runs)):
+        own, _ = problem.seen(r)
+        for k, j in enumerate(own):
+            if j in found and not found[j]:
+                found[j] = list(_of_one(problem, start, r, k))
+    pieces = {}
+    for j, own_pieces in found.items():
+        inside = [p.within(lower[j], upper[j]) for p in own_pieces]
+        kept = [p for p in inside if p is not None]
+        pieces[j] = tuple(kept or _nothing_known(float(start.x[j]), lower[j], upper[j]))
+    return pieces
+
+
+def _nothing_known(start: float, lower: float, upper: float) -> list[Piece]:
+    if np.isfinite(lower) and np.isfinite(upper):
+        return [Piece(lower, upper)]
+    size = abs(start) or 1.0
+    both = [Piece(size / AROUND, size * AROUND, True, sign) for sign in (1.0, -1.0)]
+    kept = [p.within(lower, upper) for p in both]
+    return [p for p in kept if p is not None] or [Piece(start, start + size)]
+
+
+def _of_one(problem: Problem, start: Point, r: int, k: int) -> list[Piece]:
+    """Pieces for unknown k, in model order, of what one run sees."""
+    arguments = _arguments(problem.model)
+    concerned = [node for node in arguments.nodes if k in node.unknowns]
+    if not concerned:
+        return []
+    samples = problem.samples[r].dense
+    rows, pairs = _rows(inputs(problem.model, samples))
+    values = _values(problem, start, r, k, samples[rows])
+    begin, found = float(start.x[problem.seen(r)[0][k]]), []
+    for node in concerned:
+        if node.place is None:
+            found += _of_rate(values[:, :, node.argument], pairs, node.periodic, begin)
+        else:
+            found += _of_place(values, node, len(rows), begin)
+    return list(dict.fromkeys(found))
+
+
+def _sizes() -> Array:
+    """Values of one unknown at which all nodes are looked at; the first three say if it is a
+    line."""
+    return np.concatenate([[0.0, 1.0, 2.0], SIZES, -SIZES])
+
+
+def _values(problem: Problem, start: Point, r: int, k: int, samples: Array) -> Array:
+    """All nodes' values, (sizes and the start, rows, nodes), with the other unknowns at the
+    start."""
+    replay, parameters = _arguments(problem.model).replay, problem.parameters(start, r)
+    tables = []
+    for size in [*_sizes(), parameters[k]]:
+        parameters[k] = size
+        tables.append(replay(parameters, samples)[0][:, :, 0])
+    return np.array(tables)
+
+
+def _of_rate(u: Array, pairs: Any, periodic: bool, start: float) -> list[Piece]:
+    """Sizes at which an argument moves enough over the record, and not too fast between rows."""
+    u = u[3:-1]
+    span = u.max(axis=1) - u.min(axis=1)
+    steps = np.quantile(np.abs(u[:, pairs[:, 0]] - u[:, pairs[:, 1]]), 0.5 if periodic else 0.1, 1)
+    ways: list[Piece] = []
+    signs = (1.0, -1.0) if start >= 0 else (-1.0, 1.0)
+    for sign in signs:
+        half = slice(0, len(SIZES)) if sign > 0 else slice(len(SIZES), None)
+        good = (span[half] >= LEAST) & (steps[half] <= np.pi)
+        # What the argument does without this unknown, or rounds to, is no measure of it.
+        moved = np.abs(np.gradient(span[half], np.log(SIZES))) > 1e-3 * span[half]
+        moved &= span[half] > 1e-9 * np.abs(u[half]).max(axis=1)
+        sizes = SIZES[good & moved]
+        if len(sizes) < 2:
+            continue
+        low, high = float(sizes[0]), float(sizes[-1])
+        if periodic:
+            ways.append(Piece(*sorted((sign * low, sign * high))))
+        if not periodic or sign == signs[0]:
+            ways.append(Piece(low, high, True, sign))
+    return ways
+
+
+def _of_place(values: Array, node: Node, rows: int, start: float) -> list[Piece]:
+    """Where an added term meets that of the samples, evenly and by size."""
+    term, own = values[-1, :, node.argument], values[:3, 0, node.place]
+    slope, bent = own[1] - own[0], own[2] - 2 * own[1] + own[0]
+    span = float(term.max() - term.min())
+    if not (np.isfinite(span) and span > 0 and abs(slope) > 0) or abs(bent) > 1e-9 * abs(slope):
+        return []
+    if node.periodic:
+        turn = np.pi / abs(slope)
+        return [Piece(start - turn, start + turn)]
+    ends = sorted((t - own[0]) / slope for t in (term.min(), term.max()))
+    size = span / abs(slope)
+    found = [Piece(ends[0] - 0.1 * size, ends[1] + 0.1 * size)]
+    return [*found, *(Piece(size / rows / 10, 3 * size, True, sign) for sign in (1.0, -1.0))]
+
+
+def _rows(x: Array) -> tuple[Any, Any]:
+    """Some rows, and pairs of neighbours among them (their places)."""
+    distinct = np.unique(x, axis=0, return_index=True)[1]
+    if len(distinct) < 3:
+        distinct = np.arange(len(x))
+    if x.shape[1] == 1:
+        near = np.column_stack([distinct[:-1], distinct[1:]])
+    else:
+        from scipy.spatial import cKDTree
+
+        nearest = cKDTree(x[distinct]).query(x[distinct], 2)[1][:, 1]
+        near = np.column_stack([distinct, distinct[nearest]])
+    chosen = near[np.unique(np.linspace(0, len(near) - 1, min(len(near), PAIRS)).astype(int))]
+    ends = np.concatenate([x.argmin(axis=0), x.argmax(axis=0)])
+    rows, places = np.unique(np.concatenate([chosen.ravel(), ends]), return_inverse=True)
+    return rows, places[: chosen.size].reshape(-1, 2)
+
+
+@lru_cache(maxsize=64)
+def _arguments(model: Model) -> Arguments:
+    """The nodes of the residual's expression graph."""
+    graph = Graph(function_of(model, {"r": model.traced.expression}))
+    count = model.traced.coordinates.numel()
+    reached = _reached(graph, count)
+    outputs: list[Any] = []
+    expressions = _expressions(graph, model)
+    nodes: list[Node] = []
+
+    def asked(expression: Any) -> int:
+        outputs.append(expression)
+        return len(outputs) - 1
+
+    sines = {j for v in graph.values if v.code in _PERIODIC and v.operands for j in v.operands}
+    for i, value in enumerate(graph.values):
+        if value.kind != "operation" or not value.per_sample:
+            continue
+        for a in value.operands if value.code in _SCALED else ():
+            if graph.values[a].per_sample and reached[a]:
+                periodic = value.code in _PERIODIC
+                nodes.append(Node(asked(expressions[a]), None, periodic, reached[a]))
+        if value.code in _POWERS and reached[value.operands[1]]:
+            a, b = value.operands
+            exponent = expressions[b] * ca.log(ca.fabs(expressions[a]))
+            nodes.append(Node(asked(exponent), None, False, reached[b]))
+        if value.code in _SUMS:
+            nodes += _of_sum(graph, value, expressions, reached, i in sines, asked)
+    u = ca.densify(ca.vertcat(*outputs)) if outputs else ca.SX.zeros(1)
+    return Arguments(tuple(nodes), Replay(function_of(model, {"u": u})))
+
+
+def _of_sum(
+    graph: Graph, value: Value, expressions: Any, reached: Any, periodic: bool, asked: Any
+) -> list[Node]:
+    """An unknown added to a term of the samples, or such a term beside a number."""
+    nodes = []
+    a, b = value.operands
+    for own, term in ((a, b), (b, a)):
+        if graph.values[own].per_sample or not graph.values[term].per_sample:
+            continue
+        if reached[own]:
+            met = expressions[term] if value.code == ca.OP_SUB else -expressions[term]
+            place = Node(asked(met), asked(expressions[own]), periodic, reached[own])
+            nodes.append(place)
+        elif reached[term] and graph.values[term].code not in _SCALED:
+            ratio = expressions[term] / expressions[own]
+            nodes.append(Node(asked(ratio), None, False, reached[term]))
+    return nodes
+
+
+def _reached(graph: Graph, count: int) -> list[frozenset[int]]:
+    """Unknowns that every value of the graph depends on."""
+    reached: list[frozenset[int]] = []
+    for value in graph.values:
+        if value.kind == "parameter" and value.code < count:
+            reached.append(frozenset([value.code]))
+        else:
+            reached.append(frozenset().union(*(reached[j] for j in value.operands)))
+    return reached
+
+
+def _expressions(graph: Graph, model: Model) -> list[Any]:
+    """Every value of the graph in symbols again."""
+    t, sample = model.traced, sample_symbol(model)
+    parameters = ca.vertcat(t.coordinates, t.references)
+    found: list[Any] = []
+    for value in graph.values:
+        operands = [found[j] for j in value.operands]
+        if value.kind == "constant":
+            found.append(ca.SX(value.constant))
+        elif value.kind == "operation":
+            make = ca.SX.unary if len(operands) == 1 else ca.SX.binary
+            found.append(make(value.code, *operands))
+        else:
+            found.append((parameters if value.kind == "parameter" else sample)[value.code])
+    return found
