@@ -24,8 +24,21 @@ import numpy as np
 import resumed
 from scipy.optimize import least_squares
 
-from casest import Model, Residual, Run, atan2, attempt, cos, exp, inf, model, param, signal, sin
-from casest import vertcat
+from casest import (
+    Model,
+    Residual,
+    Run,
+    atan2,
+    attempt,
+    cos,
+    exp,
+    inf,
+    model,
+    param,
+    signal,
+    sin,
+    vertcat,
+)
 
 ROOT = Path(__file__).resolve().parent.parent
 TABLE = ROOT / "studies" / "deceptive.md"
@@ -116,9 +129,7 @@ def saturation(x=signal(), y=signal(), *, most=param(start=1.0), half=param(star
 
 
 @model
-def encoder(
-    x=signal(), y=signal(2), *, size=param(start=1.0), rate=param(start=1.0), zero=param()
-):
+def encoder(x=signal(), y=signal(2), *, size=param(start=1.0), rate=param(start=1.0), zero=param()):
     angle = rate * x + zero
     return Residual(measured=y, predicted=size * vertcat(cos(angle), sin(angle)))
 
@@ -221,8 +232,9 @@ FAMILIES: dict[str, Family] = {
     ),
     "sine and cosine of an angle": Family(
         encoder,
-        lambda x, size, rate, zero: size
-        * np.column_stack([np.cos(rate * x + zero), np.sin(rate * x + zero)]),
+        lambda x, size, rate, zero: (
+            size * np.column_stack([np.cos(rate * x + zero), np.sin(rate * x + zero)])
+        ),
         lambda rng, top: {
             "size": rng.uniform(0.7, 1.4),
             "rate": rng.uniform(2, min(15, top)),
@@ -358,8 +370,8 @@ def page(records: list[dict[str, Any]], seed: int) -> str:
     lines = [
         "# Models with many valleys",
         "",
-        "Made by `make study-deceptive` (`python studies/deceptive.py`). Each fit: a declared model",
-        f"with one declared start far from the truth; {', '.join(map(str, ROWS))} rows, evenly",
+        "Made by `make study-deceptive` (`python studies/deceptive.py`). Each fit: a declared",
+        f"model with one declared start far from the truth; {', '.join(map(str, ROWS))} rows, evenly",
         f"spaced or at random, in order or out of it; noise of {', '.join(map(str, NOISES))}",
         "beside a signal of about one, all drawn at random. *Right* is the function to which",
         "SciPy's `least_squares` comes from the truth (they differ by less than a tenth of the",

@@ -170,7 +170,8 @@ def attempt(
 ) -> Estimate:
     """The same as `calibrate`, but a refused estimate is returned instead of raised.
 
-    Without `intervals`, those that only the likelihood can give are left out: each takes fits.
+    Without `intervals`, those that only the likelihood can give are left out: each takes fits. So
+    is the search for a better valley: the start is taken to lie in the right one.
     """
     # What is not finite is found and named, not warned about.
     with np.errstate(all="ignore"), one_thread():
@@ -200,7 +201,9 @@ def _attempt(
         seed=seed,
         automatic=start is None,
     )
-    outcomes, evidence = looked_for(problem, first, outcomes, seed)
+    evidence = None
+    if intervals:
+        outcomes, evidence = looked_for(problem, first, outcomes, seed, start is not None)
     found = _estimate(problem, best_of(outcomes), outcomes, began, intervals)
     certificate = judged(problem, found.certificate, evidence)
     found = replace(found, certificate=certificate, evidence=evidence)

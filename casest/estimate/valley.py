@@ -18,10 +18,12 @@ from casest.leastsquares.neighbours import Scatter, scatter
 from casest.leastsquares.per_sample import linear
 from casest.leastsquares.problem import Point, Problem
 from casest.leastsquares.weights import has_noise_effects
-from casest.solve.equivalent import between_rows, same_function
-from casest.solve.global_search import CLOSE, EFFORTS, Search, search
+from casest.solve.aliases import folded, others
+from casest.solve.equivalent import between_rows, limit_of, roughness, same_on
+from casest.solve.global_search import EFFORTS, Search, search
 from casest.solve.outcome import Outcome
 from casest.solve.strategy import best_of, valleys
+from casest.solve.trust_region import LITTLE, trust_region
 
 #: Chance of noise from which on the residual is as large as neighbours say (no search), and below
 #: which it is larger than they say (a misfit).
@@ -42,12 +44,14 @@ AGAIN = 3
 class Evidence:
     """For a valley: the scatter of neighbours at the best point, and the search, where one was.
 
-    `equal`: another point that is the same function of the inputs, if any was met.
+    `equal`: other points that are the same function of the inputs; `aliases`: rates that the rows
+    cannot tell from those given.
     """
 
     scatter: Scatter | None
     search: Search | None = None
-    equal: Point | None = None
+    equal: tuple[Point, ...] = ()
+    aliases: tuple[str, ...] = ()
 
     @property
     def vouched(self) -> bool:
@@ -75,12 +79,12 @@ class Evidence:
 
 
 def looked_for(
-    problem: Problem, first: Point, outcomes: tuple[Outcome, ...], seed: int
+    problem: Problem, first: Point, outcomes: tuple[Outcome, ...], seed: int, stated: bool
 ) -> tuple[tuple[Outcome, ...], Evidence | None]:
     """The outcomes with the lowest that a search found in front, and the evidence.
 
     None for models that have their own start from the data, are linear in all unknowns or predict
-    no reading row by row.
+    no reading row by row. `stated`: the start is the user's own.
     """
     best = best_of(outcomes)
     if not _searchable(problem) or not np.isfinite(best.cost):
@@ -88,8 +92,11 @@ def looked_for(
     evidence = Evidence(scatter(problem, best.point))
     if not (evidence.vouched or (evidence.scatter is None and valleys(outcomes) == 1)):
         outcomes, evidence = _searched(problem, first, outcomes, seed)
-    outcomes, equal = _in_one_form(problem, outcomes)
-    return outcomes, replace(evidence, equal=equal)
+    if not stated:
+        outcomes = (*outcomes, *folded(problem, best_of(outcomes)))
+    outcomes, equal = _in_one_form(problem, outcomes, stated)
+    aliases = tuple(others(problem, best_of(outcomes).point))
+    return outcomes, replace(evidence, equal=equal, aliases=aliases)
 
 
 def _searched(
@@ -107,22 +114,36 @@ def _searched(
 
 
 def _in_one_form(
-    problem: Problem, outcomes: tuple[Outcome, ...]
-) -> tuple[tuple[Outcome, ...], Point | None]:
-    """Outcomes that are the best one under other names, as that one; and one of those."""
+    problem: Problem, outcomes: tuple[Outcome, ...], stated: bool
+) -> tuple[tuple[Outcome, ...], tuple[Point, ...]]:
+    """Outcomes that predict on all rows as the best does, as one; and what else it may be called.
+
+    Of aliases, which agree on the rows only, the smoothest is meant, unless a start is `stated`.
+    """
     best = best_of(outcomes)
-    variance = 2 * best.cost / max(problem.residual_count - problem.unknowns, 1)
-    size, moved, other = np.abs(best.point.x), None, None
-    found = []
-    for o in outcomes:
-        away = np.abs(o.point.x - best.point.x) > 0.05 * size
-        if o.cost - best.cost < CLOSE * variance and away.any():
-            moved = moved or between_rows(problem)
-            if same_function(problem, moved, o.point, best.point, float(np.sqrt(variance))):
-                other = o.point
-                o = replace(o, point=best.point)
-        found.append(o)
-    return tuple(found), other
+    limit = limit_of(problem, best)
+    alike = [o for o in outcomes if o is best or same_on(problem, o.point, best.point, limit)]
+    if all(_near(o.point, best.point) for o in alike):
+        return outcomes, ()
+    moved, meant = between_rows(problem), best
+    rough = [roughness(problem, moved, o.point) for o in alike]
+    if not stated and min(rough) < 0.9 * roughness(problem, moved, best.point):
+        meant = trust_region(problem, alike[int(np.argmin(rough))].point, damping=LITTLE)
+    named = [
+        o.point
+        for o in alike
+        if not _near(o.point, meant.point) and same_on(moved, o.point, meant.point, limit)
+    ]
+    known = {id(o) for o in alike}
+    as_one = [
+        replace(o, point=meant.point, cost=meant.cost) if id(o) in known else o for o in outcomes
+    ]
+    return (tuple(as_one) if meant is best else (meant, *as_one)), tuple(named[:1])
+
+
+def _near(a: Point, b: Point) -> bool:
+    """Are two points one solution, ended at to different precision?"""
+    return bool(np.all(np.abs(a.x - b.x) <= 0.05 * np.maximum(np.abs(a.x), np.abs(b.x))))
 
 
 def _searchable(problem: Problem) -> bool:
@@ -220,10 +241,16 @@ def remarks(problem: Problem, evidence: Evidence | None) -> Iterator[str]:
         return
     if evidence.search is not None and evidence.scatter is not None and evidence.misfit:
         yield _misfit(evidence.scatter)
-    if evidence.equal is not None:
+    if evidence.aliases:
+        yield (
+            f"evenly spaced rows cannot tell rates that turn whole turns more from one row to the "
+            f"next: {', '.join(evidence.aliases)} (and multiples) fits alike; what is given is "
+            "the slowest, or that at the stated start; bounds leave the others out"
+        )
+    if evidence.equal:
         there = ", ".join(
             f"`{name}` = {x:.6g}"
-            for name, x in zip(problem.names, evidence.equal.x, strict=True)
+            for name, x in zip(problem.names, evidence.equal[0].x, strict=True)
         )
         yield (
             f"other values are the same function of the inputs ({there}): of such equal solutions "

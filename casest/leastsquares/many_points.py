@@ -14,16 +14,36 @@ from typing import NamedTuple
 import casadi as ca
 import numpy as np
 
+from casest.data.run import Index
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
-from casest.declaration.tracing import sample_symbol
+from casest.declaration.tracing import function_of, sample_symbol
 from casest.engine import Replay
+from casest.engine.graph import Graph
 from casest.leastsquares.problem import Problem
 
 #: Rows (points times samples) that are evaluated at once.
 ROWS = 200_000
 #: Models with more unknowns have theirs chosen one after the other, not as the largest set.
 ALL_SETS = 10
+
+_CORNERS = {
+    ca.OP_ATAN2,
+    ca.OP_FABS,
+    ca.OP_FLOOR,
+    ca.OP_CEIL,
+    ca.OP_SIGN,
+    ca.OP_COPYSIGN,
+    ca.OP_FMIN,
+    ca.OP_FMAX,
+    ca.OP_FMOD,
+    ca.OP_REMAINDER,
+    ca.OP_IF_ELSE_ZERO,
+    ca.OP_LT,
+    ca.OP_LE,
+    ca.OP_EQ,
+    ca.OP_NE,
+}
 
 
 class Normals(NamedTuple):
@@ -34,7 +54,7 @@ class Normals(NamedTuple):
     matrix: Array
 
 
-def normals(problem: Problem, references: Array, x: Array, of: Array) -> Iterator[Normals]:
+def normals(problem: Problem, references: Array, x: Array, of: Index) -> Iterator[Normals]:
     """Costs (P,), slopes (P, k) and matrices (P, k, k) for the unknowns `of` (k,), in parts.
 
     x: (points, n). One tuple for every part of the points, in their order. Not weighted.
@@ -44,7 +64,7 @@ def normals(problem: Problem, references: Array, x: Array, of: Array) -> Iterato
         yield _normals(problem, references, x[start : start + length], of)
 
 
-def _normals(problem: Problem, references: Array, x: Array, of: Array) -> Normals:
+def _normals(problem: Problem, references: Array, x: Array, of: Index) -> Normals:
     points, k = len(x), len(of)
     total, slope, matrix = np.zeros(points), np.zeros((points, k)), np.zeros((points, k, k))
     whole = np.zeros(problem.unknowns)
@@ -87,12 +107,14 @@ def separable(model: Model) -> tuple[int, ...]:
     Golub & Pereyra 1973: those need not be searched for.
     """
     t = model.traced
-    n = t.coordinates.numel()
-    bent = np.zeros((n, n), dtype=bool)
-    for i in range(t.expression.numel()):
-        rows, columns = ca.hessian(t.expression[i], t.coordinates)[0].sparsity().get_triplet()
-        bent[rows, columns] = True
-    flat = [j for j in range(n) if not bent[j, j]]
+    n, each = t.coordinates.numel(), ca.symvar(t.coordinates)
+    J = ca.jacobian(t.expression, t.coordinates)
+    # By what the derivative is written in, not by its value: an angle that is wrapped has a slope
+    # of one everywhere, and is no line.
+    bent = np.array([[ca.depends_on(J[:, j], x) for x in each] for j in range(n)], dtype=bool)
+    bent |= bent.T
+    broken = _broken(model)
+    flat = [j for j in range(n) if not bent[j, j] and j not in broken]
     if len(flat) <= ALL_SETS:
         sets = (s for k in range(len(flat), 0, -1) for s in combinations(flat, k))
         return next((s for s in sets if not bent[np.ix_(s, s)].any()), ())
@@ -101,3 +123,14 @@ def separable(model: Model) -> tuple[int, ...]:
         if not bent[j, chosen].any():
             chosen.append(j)
     return tuple(sorted(chosen))
+
+
+def _broken(model: Model) -> set[int]:
+    """Unknowns that a function with corners or steps is asked of, whose slope does not show it."""
+    graph = Graph(function_of(model, {"r": model.traced.expression}))
+    count, found = model.traced.coordinates.numel(), set()
+    for value in graph.values:
+        if value.kind == "operation" and value.code in _CORNERS:
+            below = (graph.values[i] for i in graph.needed(value.operands))
+            found |= {v.code for v in below if v.kind == "parameter" and v.code < count}
+    return found

@@ -147,7 +147,7 @@ def _nearest(x: Array, centres: Any) -> Any:
     from scipy.spatial import cKDTree
 
     k = min(2 * (x.shape[1] + 1), len(x) - 1)
-    found = cKDTree(x).query(x[centres], k + 1)[1]
+    found = np.asarray(cKDTree(x).query(x[centres], k + 1)[1])
     own = found == centres[:, None]
     # Among many equal rows a row may not be its own nearest: the last one is left out then.
     own[~own.any(axis=1), -1] = True

@@ -10,8 +10,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from casest.declaration.shapes import Array
 from casest.declaration.tracing import reached_signals
 from casest.leastsquares.problem import Point, Problem
+from casest.solve.outcome import Outcome
 
 #: Difference of two predictions between the rows, in standard deviations of the noise.
 SAME = 0.1
@@ -35,16 +37,27 @@ def between_rows(problem: Problem, seed: int = 0) -> Problem:
     return Problem(model, tuple(runs))
 
 
-def same_function(problem: Problem, moved: Problem, a: Point, b: Point, sigma: float) -> bool:
-    """Do two points predict the same, on the rows and between them?"""
+def same_on(where: Problem, a: Point, b: Point, limit: float) -> bool:
+    """Do two points predict the same there, to a limit (root mean square)?"""
+    pairs = zip(where.residuals(a), where.residuals(b), strict=True)
+    away = np.concatenate([(p - q).ravel() for p, q in pairs])
+    away = away[np.isfinite(away)]
+    return bool(away.size and np.sqrt(np.mean(away**2)) <= limit)
+
+
+def limit_of(problem: Problem, best: Outcome) -> float:
+    """Below this two predictions are the same: a share of the noise, or of the readings."""
     measured = problem.model.traced.measured
-    readings = np.concatenate([run.signals[measured].ravel() for run in problem.runs])
-    limit = max(SAME * sigma, EXACT * float(np.std(readings)))
-    for where in (problem, moved):
-        away = np.concatenate(
-            [(p - q).ravel() for p, q in zip(where.residuals(a), where.residuals(b), strict=True)]
-        )
-        away = away[np.isfinite(away)]
-        if not away.size or np.sqrt(np.mean(away**2)) > limit:
-            return False
-    return True
+    readings = np.concatenate([run.signals[measured or ""].ravel() for run in problem.runs])
+    freedom = max(problem.residual_count - problem.unknowns, 1)
+    return max(SAME * float(np.sqrt(2 * best.cost / freedom)), EXACT * float(np.std(readings)))
+
+
+def roughness(problem: Problem, moved: Problem, point: Point) -> float:
+    """How much predictions change from the rows to between them: of aliases, the least is meant."""
+    both = zip(_predicted(problem, point), _predicted(moved, point), strict=True)
+    return float(sum(np.nansum((p - q) ** 2) for p, q in both))
+
+
+def _predicted(problem: Problem, point: Point) -> list[Array]:
+    return [v[0] for v in problem.evaluate(point, {"p": problem.model.traced.predicted})]

@@ -14,10 +14,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from casest.data.run import Index
 from casest.declaration.shapes import Array
-from casest.leastsquares.many_points import normals, separable
+from casest.leastsquares.many_points import Normals, normals, separable
 from casest.leastsquares.problem import Point, Problem
-from casest.solve.equivalent import between_rows, same_function
+from casest.solve.equivalent import limit_of, same_on
 from casest.solve.interrupt import stopped
 from casest.solve.outcome import Outcome
 from casest.solve.reach import Piece, reach
@@ -47,7 +48,7 @@ class Search:
     """What a search found: the best `outcome`; `places` looked at, `followed` and `arrived` there.
 
     `valleys`: different ends of those that were followed; `bent`: unknowns that were searched, in
-    which the residual is not linear. `rivals`: ends that fit about as well and are other functions.
+    which the residual is not linear. `rivals`: ends that fit about as well and predict otherwise.
     """
 
     outcome: Outcome
@@ -130,28 +131,21 @@ def _on(pieces: tuple[Piece, ...], shares: Array) -> Array:
     return found
 
 
-def _projected(
-    problem: Problem, first: Point, x: Array, linear: Array
-) -> tuple[Array, Array]:
+def _projected(problem: Problem, first: Point, x: Array, linear: Index) -> tuple[Array, Array]:
     """The linear unknowns at their best for every place, within bounds; costs (inf: none)."""
     lower, upper = (b[linear] for b in problem.bounds)
-    x, costs, start = x.copy(), [], 0
-    for part in normals(problem, first.references, x.copy(), linear):
+    there, costs = x.copy(), []
+    start = 0
+    for part in normals(problem, first.references, x, linear):
         own = slice(start, start + len(part.cost))
-        start = own.stop
-        scale = np.sqrt(np.maximum(np.einsum("pii->pi", part.matrix), 1e-300))
-        matrix = part.matrix / (scale[:, :, None] * scale[:, None, :])
-        matrix = matrix + 1e-9 * np.eye(len(linear))
-        good = np.isfinite(matrix).all(axis=(1, 2)) & np.isfinite(part.slope).all(axis=1)
-        matrix[~good] = np.eye(len(linear))
-        step = -np.linalg.solve(matrix, (part.slope / scale)[:, :, None])[:, :, 0] / scale
-        there = np.clip(x[own][:, linear] + step, lower, upper)
-        step = there - x[own][:, linear]
-        x[start - len(part.cost) : start, linear] = there
+        step = _damped_steps(part, np.full(len(part.cost), 1e-9))
+        best = np.clip(x[own][:, linear] + step, lower, upper)
+        there[own, linear], start = best, own.stop
+        step = best - x[own][:, linear]
         bend = 0.5 * np.einsum("pi,pij,pj->p", step, part.matrix, step)
         cost = part.cost + np.einsum("pi,pi->p", step, part.slope) + bend
-        costs.append(np.where(good & np.isfinite(cost), cost, np.inf))
-    return x, np.concatenate(costs)
+        costs.append(np.where(np.isfinite(cost), cost, np.inf))
+    return there, np.concatenate(costs)
 
 
 def _chosen(cost: Array, shares: Array) -> Array:
@@ -167,34 +161,39 @@ def _chosen(cost: Array, shares: Array) -> Array:
 def _followed(problem: Problem, first: Point, x: Array) -> tuple[Array, Array]:
     """Where STEPS damped Gauss-Newton steps lead from every place; costs there."""
     lower, upper = problem.bounds
-    every = np.arange(problem.unknowns)
+    here = _all_normals(problem, first, x)
     damping = np.full(len(x), 1e-2)
-
-    def at(x: Array):
-        parts = list(normals(problem, first.references, x, every))
-        return tuple(np.concatenate(values) for values in zip(*parts, strict=True))
-
-    cost, slope, matrix = at(x)
     for _ in range(STEPS):
         if stopped():
             break
-        diagonal = np.maximum(np.einsum("pii->pi", matrix), 1e-300)
-        scale = np.sqrt(diagonal)
-        system = matrix / (scale[:, :, None] * scale[:, None, :])
-        system = system + damping[:, None, None] * np.eye(len(every))
-        good = np.isfinite(system).all(axis=(1, 2)) & np.isfinite(slope).all(axis=1)
-        system[~good] = np.eye(len(every))
-        slope_scaled = np.where(good[:, None], slope / scale, 0.0)
-        step = -np.linalg.solve(system, slope_scaled[:, :, None])[:, :, 0] / scale
-        trial = np.clip(x + step, lower, upper)
-        there = at(trial)
-        better = there[0] < cost
+        trial = np.clip(x + _damped_steps(here, damping), lower, upper)
+        there = _all_normals(problem, first, trial)
+        better = there.cost < here.cost
         x = np.where(better[:, None], trial, x)
-        cost = np.where(better, there[0], cost)
-        slope = np.where(better[:, None], there[1], slope)
-        matrix = np.where(better[:, None, None], there[2], matrix)
+        here = Normals(
+            np.where(better, there.cost, here.cost),
+            np.where(better[:, None], there.slope, here.slope),
+            np.where(better[:, None, None], there.matrix, here.matrix),
+        )
         damping = np.where(better, np.maximum(damping * 0.2, 1e-9), damping * 8)
-    return x, np.where(np.isfinite(cost), cost, np.inf)
+    return x, np.where(np.isfinite(here.cost), here.cost, np.inf)
+
+
+def _all_normals(problem: Problem, first: Point, x: Array) -> Normals:
+    parts = list(normals(problem, first.references, x, np.arange(problem.unknowns)))
+    return Normals(*(np.concatenate(values) for values in zip(*parts, strict=True)))
+
+
+def _damped_steps(here: Normals, damping: Array) -> Array:
+    """Levenberg-Marquardt steps (P, n), each with its own damping; none where it is not finite."""
+    scale = np.sqrt(np.maximum(np.einsum("pii->pi", here.matrix), 1e-300))
+    system = here.matrix / (scale[:, :, None] * scale[:, None, :])
+    slope = here.slope / scale
+    good = np.isfinite(system).all(axis=(1, 2)) & np.isfinite(slope).all(axis=1)
+    one = np.eye(scale.shape[1])
+    system = np.where(good[:, None, None], system, one) + damping[:, None, None] * one
+    slope = np.where(good[:, None], slope, 0.0)
+    return np.asarray(-np.linalg.solve(system, slope[:, :, None])[:, :, 0] / scale)
 
 
 def _distinct(costs: Array) -> int:
@@ -212,7 +211,7 @@ def _polished(
 
     Of equal ones that most like the start is best; the one known before, where none is lower.
     """
-    found, tried = [best], []
+    found, tried = [best], list[tuple[float, Array]]()
     for k in np.argsort(costs, kind="stable"):
         if len(tried) >= POLISHED or not np.isfinite(costs[k]):
             break
@@ -241,5 +240,5 @@ def _rivals(problem: Problem, best: Outcome, others: list[Outcome]) -> tuple[Out
     near = [o for o in others if o is not best and o.cost - best.cost < CLOSE * variance]
     if not near:
         return ()
-    moved, sigma = between_rows(problem), float(np.sqrt(variance))
-    return tuple(o for o in near if not same_function(problem, moved, o.point, best.point, sigma))
+    limit = limit_of(problem, best)
+    return tuple(o for o in near if not same_on(problem, o.point, best.point, limit))

@@ -104,6 +104,24 @@ def reach(problem: Problem, start: Point, unknowns: list[int]) -> dict[int, tupl
     return pieces
 
 
+def periodic_arguments(problem: Problem, point: Point) -> list[tuple[int, Array]]:
+    """Unknowns that a sine's argument is a line in, each with its slope in all rows that see it."""
+    arguments, slopes = _arguments(problem.model), dict[int, list[Array]]()
+    for r, samples in enumerate(problem.samples):
+        own, parameters = problem.seen(r)[0], problem.parameters(point, r)
+        for node in arguments.nodes:
+            for k in node.unknowns if node.periodic and node.place is None else ():
+                three = []
+                for value in (-1.0, 0.0, 1.0):
+                    parameters[k] = value
+                    three.append(arguments.replay(parameters, samples)[0][:, node.argument, 0])
+                parameters[k] = point.x[own[k]]
+                slope = three[2] - three[1]
+                if np.allclose(slope, three[1] - three[0], rtol=1e-9, atol=1e-300):
+                    slopes.setdefault(int(own[k]), []).append(slope)
+    return [(j, np.concatenate(each)) for j, each in slopes.items()]
+
+
 def _nothing_known(start: float, lower: float, upper: float) -> list[Piece]:
     if np.isfinite(lower) and np.isfinite(upper):
         return [Piece(lower, upper)]
@@ -166,7 +184,7 @@ def _of_rate(u: Array, pairs: Any, periodic: bool, start: float) -> list[Piece]:
             continue
         low, high = float(sizes[0]), float(sizes[-1])
         if periodic:
-            ways.append(Piece(*sorted((sign * low, sign * high))))
+            ways.append(Piece(min(sign * low, sign * high), max(sign * low, sign * high)))
         if not periodic or sign == signs[0]:
             ways.append(Piece(low, high, True, sign))
     return ways
@@ -198,7 +216,7 @@ def _rows(x: Array) -> tuple[Any, Any]:
     else:
         from scipy.spatial import cKDTree
 
-        nearest = cKDTree(x[distinct]).query(x[distinct], 2)[1][:, 1]
+        nearest = np.asarray(cKDTree(x[distinct]).query(x[distinct], 2)[1])[:, 1]
         near = np.column_stack([distinct, distinct[nearest]])
     chosen = near[np.unique(np.linspace(0, len(near) - 1, min(len(near), PAIRS)).astype(int))]
     ends = np.concatenate([x.argmin(axis=0), x.argmax(axis=0)])
