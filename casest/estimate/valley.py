@@ -8,7 +8,7 @@ better than chance.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,16 +18,19 @@ from casest.leastsquares.neighbours import Scatter, scatter
 from casest.leastsquares.per_sample import linear
 from casest.leastsquares.problem import Point, Problem
 from casest.leastsquares.weights import has_noise_effects
-from casest.solve.aliases import folded, others
+from casest.solve.aliases import folded, others, without_turns
 from casest.solve.equivalent import between_rows, limit_of, roughness, same_on
-from casest.solve.global_search import EFFORTS, Search, search
+from casest.solve.global_search import EFFORTS, Search, search, unlike
 from casest.solve.outcome import Outcome
+from casest.solve.reach import turning
 from casest.solve.strategy import best_of, valleys
 from casest.solve.trust_region import LITTLE, trust_region
 
 #: Chance of noise from which on the residual is as large as neighbours say (no search), and below
 #: which it is larger than they say (a misfit).
 AS_LARGE, LARGER = 0.01, 1e-3
+#: And variance of the residual over that of neighbours up to which these vouch for it.
+MOST = 1.5
 #: Share of the readings' spread that neighbours must show as a course to vouch for a valley.
 COURSE = 0.75
 #: Share of that course that a model must explain for its valley to be believed beside a misfit.
@@ -36,6 +39,8 @@ EXPLAINED = 0.5
 LITTLE_LEFT = 0.9
 #: Chance, over all valleys seen, of explaining so much by accident.
 ACCIDENT = 1e-3
+#: Half turns between neighbouring rows that these can still follow.
+FASTEST = 1.2
 #: Times that a search must have come to one valley from different places.
 AGAIN = 3
 
@@ -60,7 +65,9 @@ class Evidence:
         if found is None:
             return False
         exact = found.explained > 1 - 1e-9
-        return exact or (found.p_value() >= AS_LARGE and found.resolved >= COURSE)
+        # Few rows refuse little: as large means so in size too.
+        as_large = found.p_value() >= AS_LARGE and found.residual <= MOST * found.neighbours
+        return exact or (as_large and found.resolved >= COURSE)
 
     @property
     def settled(self) -> bool:
@@ -86,25 +93,38 @@ def looked_for(
     None for models that have their own start from the data, are linear in all unknowns or predict
     no reading row by row. `stated`: the start is the user's own.
     """
-    best = best_of(outcomes)
-    if not _searchable(problem) or not np.isfinite(best.cost):
+    if not _searchable(problem) or not np.isfinite(best_of(outcomes).cost):
         return outcomes, None
+    allowed = _rows_can_follow(problem, first, stated)
+    # A sine that turns at random from row to row is fitted to noise as well as to anything.
+    outcomes = tuple(o for o in outcomes if allowed(o.point)) or outcomes
+    best = best_of(outcomes)
     evidence = Evidence(scatter(problem, best.point))
     if not (evidence.vouched or (evidence.scatter is None and valleys(outcomes) == 1)):
-        outcomes, evidence = _searched(problem, first, outcomes, seed)
+        outcomes, evidence = _searched(problem, first, outcomes, seed, allowed)
     if not stated:
-        outcomes = (*outcomes, *folded(problem, best_of(outcomes)))
-    outcomes, equal = _in_one_form(problem, outcomes, stated)
+        outcomes = (*outcomes, *folded(problem, first, best_of(outcomes)))
+    outcomes, equal = _in_one_form(problem, first, outcomes, stated)
     aliases = tuple(others(problem, best_of(outcomes).point))
     return outcomes, replace(evidence, equal=equal, aliases=aliases)
 
 
+def _rows_can_follow(problem: Problem, first: Point, stated: bool) -> Callable[[Point], bool]:
+    """May a solution count? No faster than the rows can follow, or the declared start is."""
+    fastest = max(FASTEST, turning(problem, first))
+    return lambda point: stated or turning(problem, point) <= fastest
+
+
 def _searched(
-    problem: Problem, first: Point, outcomes: tuple[Outcome, ...], seed: int
+    problem: Problem,
+    first: Point,
+    outcomes: tuple[Outcome, ...],
+    seed: int,
+    allowed: Callable[[Point], bool],
 ) -> tuple[tuple[Outcome, ...], Evidence]:
     best = best_of(outcomes)
     for effort in EFFORTS:
-        found = search(problem, first, best, seed, effort)
+        found = search(problem, first, best, seed, effort, allowed)
         if found.outcome is not best:
             outcomes, best = (found.outcome, *outcomes), found.outcome
         evidence = Evidence(scatter(problem, best.point), found)
@@ -114,11 +134,12 @@ def _searched(
 
 
 def _in_one_form(
-    problem: Problem, outcomes: tuple[Outcome, ...], stated: bool
+    problem: Problem, first: Point, outcomes: tuple[Outcome, ...], stated: bool
 ) -> tuple[tuple[Outcome, ...], tuple[Point, ...]]:
     """Outcomes that predict on all rows as the best does, as one; and what else it may be called.
 
-    Of aliases, which agree on the rows only, the smoothest is meant, unless a start is `stated`.
+    Of aliases, which agree on the rows only, the smoothest is meant, unless a start is `stated`;
+    of equal functions the one most like the start.
     """
     best = best_of(outcomes)
     limit = limit_of(problem, best)
@@ -127,12 +148,14 @@ def _in_one_form(
         return outcomes, ()
     moved, meant = between_rows(problem), best
     rough = [roughness(problem, moved, o.point) for o in alike]
-    if not stated and min(rough) < 0.9 * roughness(problem, moved, best.point):
-        meant = trust_region(problem, alike[int(np.argmin(rough))].point, damping=LITTLE)
+    own = roughness(problem, moved, best.point) if stated else min(rough)
+    smooth = [o for o, size in zip(alike, rough, strict=True) if abs(size - own) <= 0.1 * own]
+    like = min(smooth, key=lambda o: unlike(o.point.x, first.x))
+    if not _near(like.point, best.point):
+        meant = trust_region(problem, like.point, damping=LITTLE)
+    turned = [replace(o.point, x=without_turns(problem, o.point, meant.point)) for o in alike]
     named = [
-        o.point
-        for o in alike
-        if not _near(o.point, meant.point) and same_on(moved, o.point, meant.point, limit)
+        p for p in turned if not _near(p, meant.point) and same_on(moved, p, meant.point, limit)
     ]
     known = {id(o) for o in alike}
     as_one = [

@@ -39,24 +39,42 @@ def _even(slope: Array) -> float | None:
     return distance if even and np.median(gaps) <= HOLES * distance else None
 
 
-def folded(problem: Problem, best: Outcome) -> list[Outcome]:
-    """The best solution at the slowest rates that predict the same, where its own are others."""
+def folded(problem: Problem, first: Point, best: Outcome) -> list[Outcome]:
+    """The best solution at the slowest rates that predict the same, and phases next to the start.
+
+    Empty where it is that already.
+    """
     lower, upper = problem.bounds
-    x, turned = best.point.x.copy(), False
-    for j, period in periods(problem, best.point).items():
-        slow = x[j] - period * np.round(x[j] / period)
-        if slow != x[j] and lower[j] <= slow <= upper[j]:
-            x[j], turned = slow, True
-    if not turned:
+    x, phases = best.point.x.copy(), []
+    rates = periods(problem, best.point)
+    for j, slope in periodic_arguments(problem, best.point):
+        period, middle = rates.get(j), 0.0
+        if np.ptp(slope) <= EVEN * np.abs(slope).max() and slope[0]:
+            period, middle = 2 * np.pi / abs(float(slope[0])), float(first.x[j])
+            phases.append((j, period))
+        if period is not None:
+            there = x[j] - period * np.round((x[j] - middle) / period)
+            x[j] = there if lower[j] <= there <= upper[j] else x[j]
+    if np.array_equal(x, best.point.x):
         return []
     starts = [Point(x, best.point.references)]
-    for j in {j for j, slope in periodic_arguments(problem, best.point) if not np.ptp(slope)}:
-        for quarter in (1, 2, 3):
-            there = x.copy()
-            there[j] += quarter * np.pi / 2
-            starts.append(Point(problem.inside(there), best.point.references))
+    for j, period in phases:  # another rate may begin with another phase
+        for quarter in (0.25, 0.5, -0.25):
+            turned = x.copy()
+            turned[j] += quarter * period
+            starts.append(Point(problem.inside(turned), best.point.references))
     nearest = min(starts, key=problem.cost)
     return [trust_region(problem, nearest, damping=LITTLE)]
+
+
+def without_turns(problem: Problem, point: Point, like: Point) -> Array:
+    """Unknowns (n,) with their phases within half a turn of those of another point."""
+    x = point.x.copy()
+    for j, slope in periodic_arguments(problem, point):
+        if np.ptp(slope) <= EVEN * np.abs(slope).max() and slope[0]:
+            period = 2 * np.pi / abs(float(slope[0]))
+            x[j] -= period * np.round((x[j] - like.x[j]) / period)
+    return x
 
 
 def others(problem: Problem, point: Point) -> list[str]:

@@ -10,6 +10,7 @@ answer.
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -31,7 +32,7 @@ FEW = 200
 #: Residuals that are computed in all to look over the places: at first, and where that leaves the
 #: question open (together up to five seconds); places at most, for each unknown that is searched.
 EFFORTS = (1.2e7, 4e7)
-EACH = 64
+EACH, MORE = 32, 16
 #: Places that are followed: the best of all, and the best of every cell.
 BEST, CELLS = 64, 192
 #: Damped steps of each, and ends that are followed to their optimum.
@@ -61,11 +62,17 @@ class Search:
 
 
 def search(
-    problem: Problem, first: Point, best: Outcome, seed: int = 0, effort: float = EFFORTS[0]
+    problem: Problem,
+    first: Point,
+    best: Outcome,
+    seed: int = 0,
+    effort: float = EFFORTS[0],
+    allowed: Callable[[Point], bool] = lambda point: True,
 ) -> Search:
     """Look for a lower valley than the best one known.
 
-    Of equal ones that most like the start, `first`, is taken. `effort`: residuals to compute.
+    Of equal ones that most like the start, `first`, is taken. `effort`: residuals to compute;
+    `allowed`: is an end there to count?
     """
     began, small = time.perf_counter(), _some(problem, ROWS, seed)
     few = _some(small, FEW, seed)
@@ -79,7 +86,7 @@ def search(
     x, cost = _projected(few, first, x, linear)
     chosen = _chosen(cost, shares)
     ends, costs = _followed(small, first, np.vstack([x[chosen], best.point.x]))
-    outcome, others = _polished(problem, first, best, ends, costs)
+    outcome, others = _polished(problem, first, best, ends, costs, allowed)
     known = small.cost(outcome.point)
     own = costs[:-1]
     arrived = int(np.sum(own <= known * (1 + ONE_VALLEY)))
@@ -109,7 +116,7 @@ def _some(problem: Problem, rows: int, seed: int) -> Problem:
 
 def _places(problem: Problem, dimensions: int, effort: float) -> int:
     """How many: a power of two, as the sequence wants it."""
-    wanted = min(effort / problem.residual_count, float(EACH) ** dimensions * 8)
+    wanted = min(effort / problem.residual_count, float(EACH) ** dimensions * MORE)
     return 1 << max(int(np.log2(max(wanted, 1))), 6)
 
 
@@ -205,11 +212,16 @@ def _distinct(costs: Array) -> int:
 
 
 def _polished(
-    problem: Problem, first: Point, best: Outcome, ends: Array, costs: Array
+    problem: Problem,
+    first: Point,
+    best: Outcome,
+    ends: Array,
+    costs: Array,
+    allowed: Callable[[Point], bool],
 ) -> tuple[Outcome, list[Outcome]]:
     """The best end at its optimum, of all rows, and the others that were followed there.
 
-    Of equal ones that most like the start is best; the one known before, where none is lower.
+    Of equal ones that most like the start is best: the one known before, unless its signs differ.
     """
     found, tried = [best], list[tuple[float, Array]]()
     for k in np.argsort(costs, kind="stable"):
@@ -218,17 +230,21 @@ def _polished(
         signs = np.sign(ends[k])
         if any(costs[k] <= c * (1 + 1e-3) and np.array_equal(signs, s) for c, s in tried):
             continue
-        tried.append((costs[k], signs))
         start = Point(problem.inside(ends[k]), first.references)
-        found.append(trust_region(problem, start, damping=LITTLE))
+        if not allowed(start):
+            continue
+        tried.append((costs[k], signs))
+        end = trust_region(problem, start, damping=LITTLE)
+        found += [end] if allowed(end.point) else []
     lowest = min(o.cost for o in found if np.isfinite(o.cost))
     equal = [o for o in found if o.cost <= lowest * (1 + 1e-9)]
-    if any(o is best for o in equal):
-        return best, found[1:]
-    return min(equal, key=lambda o: _unlike(o.point.x, first.x)), found
+    like = min(equal, key=lambda o: unlike(o.point.x, first.x))
+    known = any(o is best for o in equal)
+    fewer = unlike(like.point.x, first.x)[0] < unlike(best.point.x, first.x)[0]
+    return (best if known and not fewer else like), found
 
 
-def _unlike(x: Array, start: Array) -> tuple[int, float]:
+def unlike(x: Array, start: Array) -> tuple[int, float]:
     """Signs that differ from the start's, then how far away."""
     signs = int(np.sum(np.sign(x) * np.sign(start) < 0))
     return signs, float(np.linalg.norm((x - start) / np.maximum(np.abs(start), 1.0)))

@@ -27,7 +27,8 @@ LEAST = 0.1
 #: Neighbouring rows and others that are looked at.
 PAIRS = 150
 #: Sizes of an unknown that are tried for its reach: every unit is somebody's.
-SIZES = 10.0 ** np.arange(-15, 15.01, 0.25)
+NEXT = 10**0.25
+SIZES = NEXT ** np.arange(-60.0, 61.0)
 #: Where nothing says how large an unknown is: this many times its start, up and down.
 AROUND = 1e3
 
@@ -102,6 +103,22 @@ def reach(problem: Problem, start: Point, unknowns: list[int]) -> dict[int, tupl
         kept = [p for p in inside if p is not None]
         pieces[j] = tuple(kept or _nothing_known(float(start.x[j]), lower[j], upper[j]))
     return pieces
+
+
+def turning(problem: Problem, point: Point) -> float:
+    """How far sines' arguments turn between neighbouring rows, in half turns: 1 is Nyquist's limit.
+
+    The median of the rows; the fastest argument. Zero where there is none.
+    """
+    arguments, fastest = _arguments(problem.model), 0.0
+    places = [n.argument for n in arguments.nodes if n.periodic and n.place is None]
+    for r, samples in enumerate(problem.samples if places else ()):
+        dense = samples.dense
+        rows, pairs = _rows(inputs(problem.model, dense))
+        u = arguments.replay(problem.parameters(point, r), dense[rows])[0][:, places, 0]
+        steps = np.median(np.abs(u[pairs[:, 0]] - u[pairs[:, 1]]), axis=0) / np.pi
+        fastest = max(fastest, float(np.max(np.where(np.isfinite(steps), steps, np.inf))))
+    return fastest
 
 
 def periodic_arguments(problem: Problem, point: Point) -> list[tuple[int, Array]]:
@@ -182,7 +199,8 @@ def _of_rate(u: Array, pairs: Any, periodic: bool, start: float) -> list[Piece]:
         sizes = SIZES[good & moved]
         if len(sizes) < 2:
             continue
-        low, high = float(sizes[0]), float(sizes[-1])
+        # To the next size: the limits lie between two.
+        low, high = float(sizes[0] / NEXT), float(sizes[-1] * NEXT)
         if periodic:
             ways.append(Piece(min(sign * low, sign * high), max(sign * low, sign * high)))
         if not periodic or sign == signs[0]:
