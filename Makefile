@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
 .PHONY: demo test lint types format wheel bench study study-starts study-nist study-loop \
-	study-motion study-records study-asked figures docs clean
+	study-motion study-records study-asked study-deceptive figures docs clean
 
 demo: $(READY)
 	$(BIN)/casest demo
@@ -54,6 +54,9 @@ study-motion: $(READY)
 
 study-asked: $(READY)
 	$(BIN)/python studies/asked.py
+
+study-deceptive: $(READY)
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python studies/deceptive.py
 
 study-records: $(READY)
 	$(BIN)/python studies/records.py

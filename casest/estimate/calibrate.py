@@ -18,9 +18,10 @@ from casest.errors import DataError, NotTrusted, UsageError
 from casest.estimate.certificate import Certificate, certify
 from casest.estimate.correlation import ENOUGH, TABLE, correlation_time
 from casest.estimate.covariance import inverse_normal, sandwich
+from casest.estimate.evidence import Evidence, judged, remarks
 from casest.estimate.profile_likelihood import half_width
 from casest.estimate.remarks import NOTABLE_BIAS, notes
-from casest.estimate.valley import Evidence, judged, looked_for, remarks
+from casest.estimate.valley import looked_for
 from casest.leastsquares.identifiability import Identifiability, Weak, identify, weak_directions
 from casest.leastsquares.problem import Point, Problem
 from casest.leastsquares.sums import repeat_noise, second_order_bias
