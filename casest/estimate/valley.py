@@ -14,9 +14,9 @@ from casest.leastsquares.problem import Point, Problem
 from casest.leastsquares.weights import has_noise_effects
 from casest.solve.aliases import folded, others, without_turns
 from casest.solve.equivalent import between_rows, limit_of, roughness, same_on
-from casest.solve.global_search import EFFORTS, search, unlike
+from casest.solve.global_search import EFFORTS, ROWS, search, some_rows, unlike
 from casest.solve.outcome import Outcome
-from casest.solve.reach import turning
+from casest.solve.reach import neighbouring, turning
 from casest.solve.strategy import best_of, valleys
 from casest.solve.trust_region import LITTLE, trust_region
 
@@ -50,8 +50,9 @@ def looked_for(
 
 def _rows_can_follow(problem: Problem, first: Point, stated: bool) -> Callable[[Point], bool]:
     """May a solution count? No faster than the rows can follow, or the declared start is."""
-    fastest = max(FASTEST, turning(problem, first))
-    return lambda point: stated or turning(problem, point) <= fastest
+    near = neighbouring(problem)
+    fastest = max(FASTEST, turning(problem, first, near))
+    return lambda point: stated or turning(problem, point, near) <= fastest
 
 
 def _searched(
@@ -64,12 +65,11 @@ def _searched(
     best = best_of(outcomes)
     for effort in EFFORTS:
         found = search(problem, first, best, seed, effort, allowed)
-        if found.outcome is not best:
-            outcomes, best = (found.outcome, *outcomes), found.outcome
+        best = found.outcome
         evidence = Evidence(scatter(problem, best.point), found)
         if evidence.settled:
             break
-    return (*outcomes, *found.rivals), evidence
+    return (best, *outcomes, *found.rivals), evidence
 
 
 def _in_one_form(
@@ -82,6 +82,7 @@ def _in_one_form(
     """
     best = best_of(outcomes)
     limit = limit_of(problem, best)
+    whole, problem = problem, some_rows(problem, ROWS)
     alike = [o for o in outcomes if o is best or same_on(problem, o.point, best.point, limit)]
     if all(_near(o.point, best.point) for o in alike):
         return outcomes, ()
@@ -91,7 +92,7 @@ def _in_one_form(
     smooth = [o for o, size in zip(alike, rough, strict=True) if abs(size - own) <= 0.1 * own]
     like = min(smooth, key=lambda o: unlike(o.point.x, first.x))
     if not _near(like.point, best.point):
-        meant = trust_region(problem, like.point, damping=LITTLE)
+        meant = trust_region(whole, like.point, damping=LITTLE)
     turned = [replace(o.point, x=without_turns(problem, o.point, meant.point)) for o in alike]
     named = [
         p for p in turned if not _near(p, meant.point) and same_on(moved, p, meant.point, limit)

@@ -25,6 +25,8 @@ from casest.leastsquares.problem import Point, Problem
 
 #: Rows of one run that are predicted from their neighbours; of more, evenly chosen ones.
 CENTRES = 3000
+#: Rows of one run that are looked at in all.
+LONG = 50_000
 #: Fewer pseudo-residuals than this say nothing.
 FEWEST = 10
 
@@ -79,10 +81,11 @@ def scatter(problem: Problem, point: Point) -> Scatter | None:
     squares = np.zeros(3)
     dof = count = 0.0
     for r, samples in enumerate(problem.samples):
-        y, e, plain = _reading(model)(problem.parameters(point, r), samples)
+        chosen = _some(samples.dense)
+        y, e, plain = _reading(model)(problem.parameters(point, r), chosen)
         if len(y) < FEWEST or not np.isfinite(e).all():
             continue
-        C = predictors(inputs(model, samples.dense))
+        C = predictors(inputs(model, chosen))
         y, e = y[:, :, 0], e[:, :, 0]
         rest = y - _fitted(plain, y)
         rows, axes = C.shape[0], y.shape[1]
@@ -99,6 +102,13 @@ def scatter(problem: Problem, point: Point) -> Scatter | None:
         float(squares[1] / count),
         (float(freedom), float(dof)),
     )
+
+
+def _some(samples: Array) -> Array:
+    """Rows of a longer record, chosen at random: enough to have near neighbours."""
+    if len(samples) <= LONG:
+        return samples
+    return samples[np.sort(np.random.default_rng(0).permutation(len(samples))[:LONG])]
 
 
 def inputs(model: Model, samples: Array) -> Array:

@@ -73,8 +73,8 @@ def search(
     Of equal ones that most like the start, `first`, is taken. `effort`: residuals to compute;
     `allowed`: is an end there to count?
     """
-    began, small = time.perf_counter(), _some(problem, ROWS, seed)
-    few = _some(small, FEW, seed)
+    began, small = time.perf_counter(), some_rows(problem, ROWS, seed)
+    few = some_rows(small, FEW, seed)
     linear = np.array(_linear(problem), dtype=int)
     bent = np.setdiff1d(np.arange(problem.unknowns), linear)
     shares = _spread(len(bent), _places(few, len(bent), effort), seed)
@@ -100,7 +100,7 @@ def _linear(problem: Problem) -> list[int]:
     return sorted({int(problem.seen(r)[0][k]) for r in range(len(problem.runs)) for k in own})
 
 
-def _some(problem: Problem, rows: int, seed: int) -> Problem:
+def some_rows(problem: Problem, rows: int, seed: int = 0) -> Problem:
     """The problem on some of its rows, chosen at random."""
     rng = np.random.default_rng(seed)
     limit = max(rows // len(problem.runs), 10)

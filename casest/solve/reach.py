@@ -68,17 +68,21 @@ def reach(problem: Problem, start: Point, unknowns: list[int]) -> dict[int, tupl
     return pieces
 
 
-def turning(problem: Problem, point: Point) -> float:
+def neighbouring(problem: Problem) -> list[tuple[Any, Any]]:
+    """Of every run some rows, and pairs of neighbours among them (their places)."""
+    return [_rows(inputs(problem.model, samples.dense)) for samples in problem.samples]
+
+
+def turning(problem: Problem, point: Point, near: list[tuple[Any, Any]]) -> float:
     """How far sines' arguments turn between neighbouring rows, in half turns: 1 is Nyquist's limit.
 
     The median of the rows; the fastest argument. Zero where there is none.
     """
     arguments, fastest = arguments_of(problem.model), 0.0
     places = [n.argument for n in arguments.nodes if n.periodic and n.place is None]
-    for r, samples in enumerate(problem.samples if places else ()):
-        dense = samples.dense
-        rows, pairs = _rows(inputs(problem.model, dense))
-        u = arguments.replay(problem.parameters(point, r), dense[rows])[0][:, places, 0]
+    for r, (rows, pairs) in enumerate(near if places else ()):
+        samples = np.column_stack([c[rows] for c in problem.samples[r].columns])
+        u = arguments.replay(problem.parameters(point, r), samples)[0][:, places, 0]
         steps = np.median(np.abs(u[pairs[:, 0]] - u[pairs[:, 1]]), axis=0) / np.pi
         fastest = max(fastest, float(np.max(np.where(np.isfinite(steps), steps, np.inf))))
     return fastest
