@@ -83,5 +83,6 @@ def others(problem: Problem, point: Point) -> list[str]:
     return [
         f"`{problem.names[j]}` ± {period:.6g}"
         for j, period in periods(problem, point).items()
+        if "." not in problem.names[j]  # an effect's frequency is that of the line that was seen
         if lower[j] <= point.x[j] - period or point.x[j] + period <= upper[j]
     ]

@@ -15,10 +15,10 @@ from casest.declaration.tracing import reached_signals
 from casest.leastsquares.problem import Point, Problem
 from casest.solve.outcome import Outcome
 
-#: Difference of two predictions between the rows, in standard deviations of the noise.
+#: Length of the difference of two predictions, in standard deviations of the noise.
 SAME = 0.1
-#: And as a share of the readings, where there is no noise.
-EXACT = 1e-6
+#: And root mean square as a share of the readings, where there is no noise.
+EXACT = 1e-7
 
 
 def between_rows(problem: Problem, seed: int = 0) -> Problem:
@@ -46,11 +46,12 @@ def same_on(where: Problem, a: Point, b: Point, limit: float) -> bool:
 
 
 def limit_of(problem: Problem, best: Outcome) -> float:
-    """Below this two predictions are the same: a share of the noise, or of the readings."""
+    """Below this (root mean square) two predictions of all rows are the same solution's."""
     measured = problem.model.traced.measured
     readings = np.concatenate([run.signals[measured or ""].ravel() for run in problem.runs])
-    freedom = max(problem.residual_count - problem.unknowns, 1)
-    return max(SAME * float(np.sqrt(2 * best.cost / freedom)), EXACT * float(np.std(readings)))
+    count = problem.residual_count
+    sigma = np.sqrt(2 * best.cost / max(count - problem.unknowns, 1))
+    return float(max(SAME * sigma / np.sqrt(count), EXACT * np.std(readings)))
 
 
 def roughness(problem: Problem, moved: Problem, point: Point) -> float:
