@@ -79,7 +79,9 @@ def judged(problem: Problem, certificate: Certificate, evidence: Evidence | None
     """The certificate in the light of the evidence: refused, or with one more reason."""
     if evidence is None or not certificate.trusted:
         return certificate
-    against = _rival(problem, evidence) or _against(evidence, certificate.agreeing)
+    # Of those that agree one is the answer itself, and one what the search handed back.
+    others = max(certificate.agreeing - 2, 0)
+    against = _rival(problem, evidence) or _against(evidence, others)
     if against is not None:
         return replace(certificate, trusted=False, reasons=(against,))
     found = evidence.search
@@ -98,7 +100,7 @@ def judged(problem: Problem, certificate: Certificate, evidence: Evidence | None
 def _against(evidence: Evidence, agreeing: int) -> str | None:
     """What speaks against the valley, in words; None where nothing does.
 
-    `agreeing` starts around the first one ended there, beside those of the search.
+    `agreeing` other ways ended there, beside those of the search.
     """
     found, looked = evidence.scatter, evidence.search
     if looked is None or evidence.vouched:
