@@ -62,6 +62,9 @@ study-asked: $(READY)
 study-slow: $(READY)
 	$(BIN)/python studies/slow.py
 
+study-deceptive: $(READY)
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python studies/deceptive.py
+
 study-records: $(READY)
 	$(BIN)/python studies/records.py
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from casest.cli import run
-from casest.solve import strategy
+from casest.solve import global_search, many_descents, strategy
 from casest.solve.trust_region import trust_region
 
 HEAD = """
@@ -122,7 +122,9 @@ def test_a_solver_that_runs_out_of_iterations_is_not_trusted(line, monkeypatch, 
     def hasty(problem, start, **options):
         return trust_region(problem, start, **{**options, "max_iterations": 1})
 
-    monkeypatch.setattr(strategy, "trust_region", hasty)
+    for ways in (strategy, global_search):
+        monkeypatch.setattr(ways, "trust_region", hasty)
+    monkeypatch.setattr(many_descents, "STEPS", 1)
     path = declared(line, "a=param(start=40.0), b=param(start=-6.0)", "a * exp(b * x / 10)")
     model = [path, str(line / "d.csv"), "--solver", "trust-region", "-o", str(line / "out")]
     code = run(["calibrate", *model])

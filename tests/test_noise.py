@@ -12,6 +12,7 @@ from casest.estimate.calibrate import attempt
 from casest.estimate.correlation import batches, correlation_time
 from casest.leastsquares.problem import Problem
 from casest.leastsquares.weights import robust_scale
+from casest.results.find import find_model
 
 
 @model
@@ -43,6 +44,16 @@ def autoregressive(rho, n, rng):
 
 def fitted(y):
     return attempt(level.starting(from_zero), [series(y)], solver="trust-region")
+
+
+def test_readings_that_are_a_random_walk_are_no_wheel():
+    """Nothing turned: both records were fitted, and believed, before anybody asked."""
+    wheel = find_model("wheel")
+    for seed, count, size in ((5, 1200, 0.02), (18, 3000, 0.1), (2, 3000, 0.1)):
+        rng, t = np.random.default_rng(seed), np.arange(count) / 100
+        v = size * np.cumsum(rng.standard_normal((count, 3)), axis=0)
+        run = Run.raw("walk", {"t": t[:, None], "v": v}, units={"t": "s", "v": "m/s^2"}, time=t)
+        assert not attempt(wheel, [run]).certificate.trusted
 
 
 def test_white_residuals_leave_the_std_of_a_mean_as_it_is():

@@ -20,10 +20,12 @@ from casest.estimate import reasons as words
 from casest.estimate.certificate import Certificate, certify, one_sided
 from casest.estimate.correlation import ENOUGH, TABLE, correlation_time
 from casest.estimate.covariance import covariance_of, inverse_normal, sandwich
+from casest.estimate.evidence import Evidence, judged, remarks
 from casest.estimate.on_bounds import free_of, on_bounds
 from casest.estimate.profile_likelihood import half_width
-from casest.estimate.reasons import NEAR, POOR, Code
+from casest.estimate.reasons import NEAR, POOR, STARTS, WORTH, Code
 from casest.estimate.remarks import NOTABLE_BIAS, notes
+from casest.estimate.valley import looked_for
 from casest.leastsquares.identifiability import Identifiability, Weak, identify, weak_directions
 from casest.leastsquares.problem import Point, Problem
 from casest.leastsquares.sums import repeat_noise, second_order_bias
@@ -78,6 +80,7 @@ class Estimate:
     bias: float = 0.0
     shift: Array | float = 0.0
     optimum: Point | None = None
+    evidence: Evidence | None = None
     extra: Mapping[str, Any] = field(default_factory=dict)
 
     @property
@@ -124,7 +127,7 @@ class Estimate:
         dof = problem.residual_count - self.identifiability.rank
         with np.errstate(all="ignore"):
             found = notes(problem, at, dof, self.correlated_over, self.bias)
-            return (*found, *_of_tables(problem, at))
+            return (*remarks(problem, self.evidence), *found, *_of_tables(problem, at))
 
     @cached_property
     def interval_reach(self) -> tuple[Mapping[str, Array], Mapping[str, Array]]:
@@ -198,7 +201,8 @@ def attempt(
 ) -> Estimate:
     """The same as `calibrate`, but a refused estimate is returned instead of raised.
 
-    Without `intervals`, those that only the likelihood can give are left out: each takes fits.
+    Without `intervals`, those that only the likelihood can give are left out: each takes fits. So
+    is the search for a better valley: the start is taken to lie in the right one.
     """
     # What is not finite is found and named, not warned about.
     with np.errstate(all="ignore"), one_thread():
@@ -228,9 +232,16 @@ def _attempt(
         seed=seed,
         automatic=start is None,
     )
+    evidence = None
+    if intervals:
+        outcomes, evidence = looked_for(problem, first, outcomes, seed, start is not None)
     found = _estimate(problem, best_of(outcomes), outcomes, began, intervals)
+    certificate = judged(problem, found.certificate, evidence)
+    found = replace(found, certificate=certificate, evidence=evidence)
     if start is None and model.starter is None and found.certificate.trusted:
         found = _looked_at_for_a_better_one(found)
+    if found.certificate.trusted:
+        found = _no_random_walk(found)
     if stopped():
         refused = found.certificate.refused(Code.INTERRUPTED, words.INTERRUPTED)
         return replace(found, certificate=refused)
@@ -308,6 +319,9 @@ def _estimate(
     point = best.point
     factor = problem.factor(point)
     R, _, rest = factor
+    if not np.isfinite(R).all():
+        reason = "a derivative of the residual is not finite at the best point found; give --start"
+        return _refused(problem, point, Code.NOT_FINITE, reason, began)
     identified = identify(problem, point, R)
     dof = problem.residual_count - identified.rank
     noise = _noise(problem, point, float(np.sqrt(2 * best.cost)), dof)
@@ -362,6 +376,17 @@ def _looked_at_for_a_better_one(found: Estimate) -> Estimate:
     if timed or over <= POOR:
         return found
     reason = words.poor_valley(len(found.outcomes), places, over)
+    return replace(found, certificate=found.certificate.refused(Code.POOR_VALLEY, reason))
+
+
+def _no_random_walk(found: Estimate) -> Estimate:
+    """Refuse a fit that nothing agrees with, to a record worth too few independent readings."""
+    agreeing, starts = found.certificate.agreeing, len(found.outcomes)
+    worth = found.problem.residual_count / found.correlated_over
+    unknowns = found.problem.unknowns
+    if agreeing > 1 or starts < STARTS or worth >= WORTH * unknowns:
+        return found
+    reason = words.wandering(starts - 1, found.correlated_over, worth, unknowns)
     return replace(found, certificate=found.certificate.refused(Code.POOR_VALLEY, reason))
 
 

@@ -45,6 +45,9 @@ WEAK = 1e-3
 #: Neighbouring rows of a table over which residuals are alike, from which on the fit is poor: an
 #: autoregression of 0.8. Of NIST's 27 problems one has more at its solution, and one valley.
 POOR = 9.0
+#: Independent residuals for each unknown that a wandering residual must be worth, where no other of
+#: at least STARTS ended in the same place: a random walk alone fits many a motion.
+WORTH, STARTS = 5, 4
 #: Correlation of neighbouring residuals, in standard deviations of that of independent ones, from
 #: which on the samples of a sensor among many are taken for a time series.
 TIME_SERIES = 5.0
@@ -225,6 +228,15 @@ def poor_valley(starts: int, places: int, over: float) -> str:
         f"{starts} starts ended in {places} places, and even the best leaves residuals that are "
         f"alike over {over:.2g} rows: there may be a better one, or the model lacks something; "
         "give --start near the solution"
+    )
+
+
+def wandering(starts: int, over: float, worth: float, unknowns: int) -> str:
+    """POOR_VALLEY, of a record in time: a residual that wanders, and nothing that agrees."""
+    return (
+        f"none of {starts} other starts ended here, and the residuals are alike over {over:.2g} "
+        f"samples: worth {worth:.2g} independent ones for {unknowns} unknowns, which whatever "
+        "wanders could fit; record more motion"
     )
 
 

@@ -384,6 +384,10 @@ class Problem:
         parameters = self.parameters(point, r)
         return triangular_factor(self._with_jacobian, parameters, self.samples[r], self._weight(r))
 
+    def seen(self, r: int) -> tuple[Any, Any]:
+        """Numbers of the unknowns and of the references that one run sees, in model order."""
+        return self._selections[r]
+
     def parameters(self, point: Point, r: int) -> Array:
         """What the per-sample functions of one run are given: its unknowns and its references."""
         x, ref = self._selections[r]

@@ -220,7 +220,9 @@ def _singular(problem: Problem, first: Point) -> bool:
     if identify(problem, first).rank == problem.unknowns:
         return False
     reached = trust_region(problem, first, max_iterations=OPINION).point
-    return identify(problem, reached).rank < problem.unknowns
+    R = problem.factor(reached)[0]
+    # Where a derivative overflows nothing is determined.
+    return not np.isfinite(R).all() or identify(problem, reached, R).rank < problem.unknowns
 
 
 def _fine(problem: Problem) -> float:
@@ -265,7 +267,7 @@ def _along_the_weakest(problem: Problem, best: Outcome) -> tuple[Outcome, ...]:
         return ()
     R = problem.factor(best.point)[0]
     norms = np.linalg.norm(R, axis=0)
-    if not np.all(norms > 0):
+    if not (np.isfinite(norms).all() and np.all(norms > 0)):
         return ()
     _, singular, Vt = np.linalg.svd(R / norms)
     if singular[-1] > 0.1 * singular[0] or singular[-1] < 1e-8 * singular[0]:

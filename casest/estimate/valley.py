@@ -1,0 +1,120 @@
+"""Is it the right valley? A search, where the rows themselves leave it open."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from casest.estimate.evidence import Evidence
+from casest.leastsquares.neighbours import scatter
+from casest.leastsquares.per_sample import linear
+from casest.leastsquares.problem import Point, Problem
+from casest.leastsquares.weights import has_noise_effects
+from casest.solve.aliases import folded, others, without_turns
+from casest.solve.equivalent import between_rows, limit_of, roughness, same_on
+from casest.solve.global_search import EFFORTS, ROWS, search, some_rows, unlike
+from casest.solve.outcome import Outcome
+from casest.solve.reach import neighbouring, turning
+from casest.solve.strategy import best_of, valleys
+from casest.solve.trust_region import LITTLE, trust_region
+
+#: Half turns between neighbouring rows that these can still follow.
+FASTEST = 1.2
+
+
+def looked_for(
+    problem: Problem, first: Point, outcomes: tuple[Outcome, ...], seed: int, stated: bool
+) -> tuple[tuple[Outcome, ...], Evidence | None]:
+    """The outcomes with the lowest that a search found in front, and the evidence.
+
+    None for models that have their own start from the data, are linear in all unknowns or predict
+    no reading row by row. `stated`: the start is the user's own.
+    """
+    if not _searchable(problem) or not np.isfinite(best_of(outcomes).cost):
+        return outcomes, None
+    allowed = _rows_can_follow(problem, first, stated)
+    # A sine that turns at random from row to row is fitted to noise as well as to anything.
+    outcomes = tuple(o for o in outcomes if allowed(o.point)) or outcomes
+    best = best_of(outcomes)
+    evidence = Evidence(scatter(problem, best.point))
+    if not (evidence.vouched or (evidence.scatter is None and valleys(outcomes) == 1)):
+        outcomes, evidence = _searched(problem, first, outcomes, seed, allowed)
+    if not stated:
+        outcomes = (*outcomes, *folded(problem, first, best_of(outcomes)))
+    outcomes, equal = _in_one_form(problem, first, outcomes, stated)
+    aliases = tuple(others(problem, best_of(outcomes).point))
+    return outcomes, replace(evidence, equal=equal, aliases=aliases)
+
+
+def _rows_can_follow(problem: Problem, first: Point, stated: bool) -> Callable[[Point], bool]:
+    """May a solution count? No faster than the rows can follow, or the declared start is."""
+    near = neighbouring(problem)
+    fastest = max(FASTEST, turning(problem, first, near))
+    return lambda point: stated or turning(problem, point, near) <= fastest
+
+
+def _searched(
+    problem: Problem,
+    first: Point,
+    outcomes: tuple[Outcome, ...],
+    seed: int,
+    allowed: Callable[[Point], bool],
+) -> tuple[tuple[Outcome, ...], Evidence]:
+    best = best_of(outcomes)
+    for effort in EFFORTS:
+        found = search(problem, first, best, seed, effort, allowed)
+        best = found.outcome
+        evidence = Evidence(scatter(problem, best.point), found)
+        if evidence.settled:
+            break
+    return (best, *outcomes, *found.rivals), evidence
+
+
+def _in_one_form(
+    problem: Problem, first: Point, outcomes: tuple[Outcome, ...], stated: bool
+) -> tuple[tuple[Outcome, ...], tuple[Point, ...]]:
+    """Outcomes that predict on all rows as the best does, as one; and what else it may be called.
+
+    Of aliases, which agree on the rows only, the smoothest is meant, unless a start is `stated`;
+    of equal functions the one most like the start.
+    """
+    best = best_of(outcomes)
+    limit = limit_of(problem, best)
+    whole, problem = problem, some_rows(problem, ROWS)
+    alike = [o for o in outcomes if o is best or same_on(problem, o.point, best.point, limit)]
+    if all(_near(o.point, best.point) for o in alike):
+        return outcomes, ()
+    moved, meant = between_rows(problem), best
+    rough = [roughness(problem, moved, o.point) for o in alike]
+    own = roughness(problem, moved, best.point) if stated else min(rough)
+    smooth = [o for o, size in zip(alike, rough, strict=True) if abs(size - own) <= 0.1 * own]
+    like = min(smooth, key=lambda o: unlike(o.point.x, first.x))
+    if not _near(like.point, best.point):
+        meant = trust_region(whole, like.point, damping=LITTLE)
+    turned = [replace(o.point, x=without_turns(problem, o.point, meant.point)) for o in alike]
+    named = [
+        p for p in turned if not _near(p, meant.point) and same_on(moved, p, meant.point, limit)
+    ]
+    known = {id(o) for o in alike}
+    as_one = [
+        replace(o, point=meant.point, cost=meant.cost) if id(o) in known else o for o in outcomes
+    ]
+    return (tuple(as_one) if meant is best else (meant, *as_one)), tuple(named[:1])
+
+
+def _near(a: Point, b: Point) -> bool:
+    """Are two points one solution, ended at to different precision?"""
+    return bool(np.all(np.abs(a.x - b.x) <= 0.05 * np.maximum(np.abs(a.x), np.abs(b.x))))
+
+
+def _searchable(problem: Problem) -> bool:
+    model = problem.model
+    return not (
+        model.starter is not None
+        or model.implicit
+        or problem.sequential
+        or has_noise_effects(model)
+        or linear(model)
+    )
