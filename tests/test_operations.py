@@ -347,7 +347,7 @@ def test_what_is_not_exported_is_named(tmp_path, capsys):
 
 #: Modules with an algebra of their own, to which an operation that they do not name is opaque: sums
 #: multiplied out, from which zero a temperature counts, how far an unknown reaches.
-ALGEBRAS = {"grouping.py", "temperatures.py", "reach.py"}
+ALGEBRAS = {"grouping.py", "temperatures.py", "arguments.py"}
 
 
 def test_no_other_module_lists_operations():

@@ -226,10 +226,8 @@ def test_a_motors_current_beside_a_magnetometer_is_found_and_what_is_left_is_noi
         sensor, per_ampere, run = drone(seed, skew=declared is norm_triangular)
         closing = close(declared.having(norm=sensor.norm), [run])
         result = closing_result(closing, model_name=declared.name, data=())
-        assert [(e["name"], e["column"]) for e in result["effects"]] == [
-            ("channel_bias", "current")
-        ]
-        assert result["verdict"] == "extended"
+        assert [(e.name, e.column) for e in result.effects] == [("channel_bias", "current")]
+        assert result.verdict == "extended"
         z.append(z_values(closing.after, sensor, per_ampere, run.columns["current"]))
     z = np.concatenate(z)
     assert np.abs(z).max() < 4

@@ -67,6 +67,8 @@ class Operation:
     #: Has no SIMD form everywhere: gets a loop to itself in compiled kernels, so that it does not
     #: keep what stands beside it from being vectorised.
     alone: bool = False
+    #: Has corners, steps or turns: its slope at a place does not say what it does elsewhere.
+    broken: bool = False
 
     @property
     def arity(self) -> int:
@@ -191,34 +193,37 @@ OPERATIONS = (
     Operation(ca.OP_ATANH, "atanh", np.arctanh, "atanh({0})", Units.PURE, "np.arctanh", alone=True),
     Operation(
         ca.OP_ATAN2, "atan2", np.arctan2, "atan2({0}, {1})", Units.COMPARED, "np.arctan2",
-        alone=True,
+        alone=True, broken=True,
     ),
     Operation(
         ca.OP_HYPOT, "hypot", np.hypot, "hypot({0}, {1})", Units.SAME, "np.hypot", alone=True
     ),
     Operation(
         ca.OP_FMIN, "fmin", _fmin, "(({0} <= {1}) | ({1} != {1})) ? {0} : {1}", Units.SAME,
-        "np.fmin", real="fmin({0}, {1})",
+        "np.fmin", real="fmin({0}, {1})", broken=True,
     ),
     Operation(
         ca.OP_FMAX, "fmax", _fmax, "(({0} >= {1}) | ({1} != {1})) ? {0} : {1}", Units.SAME,
-        "np.fmax", real="fmax({0}, {1})",
+        "np.fmax", real="fmax({0}, {1})", broken=True,
     ),
-    Operation(ca.OP_FABS, "fabs", np.fabs, "fabs({0})", Units.FIRST, "np.abs"),
+    Operation(ca.OP_FABS, "fabs", np.fabs, "fabs({0})", Units.FIRST, "np.abs", broken=True),
     # Rounded to a whole number of the unit that the reading happens to be in: taken as it is.
-    Operation(ca.OP_FLOOR, "floor", np.floor, "floor({0})", Units.FIRST, "np.floor"),
-    Operation(ca.OP_CEIL, "ceil", np.ceil, "ceil({0})", Units.FIRST, "np.ceil"),
-    Operation(ca.OP_FMOD, "fmod", np.fmod, "fmod({0}, {1})", Units.SAME, None, alone=True),
+    Operation(ca.OP_FLOOR, "floor", np.floor, "floor({0})", Units.FIRST, "np.floor", broken=True),
+    Operation(ca.OP_CEIL, "ceil", np.ceil, "ceil({0})", Units.FIRST, "np.ceil", broken=True),
+    Operation(
+        ca.OP_FMOD, "fmod", np.fmod, "fmod({0}, {1})", Units.SAME, None, alone=True, broken=True
+    ),
     Operation(
         ca.OP_REMAINDER, "remainder", _remainder, "remainder({0}, {1})", Units.SAME, None,
-        alone=True,
+        alone=True, broken=True,
     ),
     Operation(
         ca.OP_SIGN, "sign", _sign, "{0} < 0 ? -1.0 : {0} > 0 ? 1.0 : {0}", Units.ANY, "np.sign",
-        real="(real)(({0} > 0) - ({0} < 0))",
+        real="(real)(({0} > 0) - ({0} < 0))", broken=True,
     ),
     Operation(
-        ca.OP_COPYSIGN, "copysign", np.copysign, "copysign({0}, {1})", Units.SAME, "np.copysign"
+        ca.OP_COPYSIGN, "copysign", np.copysign, "copysign({0}, {1})", Units.SAME, "np.copysign",
+        broken=True,
     ),
     Operation(ca.OP_ERF, "erf", _erf, "erf({0})", Units.PURE, None, alone=True),
     Operation(
@@ -227,19 +232,19 @@ OPERATIONS = (
     Operation(ca.OP_LIFT, "assign", np.positive, "{0}", Units.FIRST, "lambda a: a", same=True),
     Operation(
         ca.OP_LT, "less", np.less, "{0} < {1}", Units.COMPARED, "lambda a, b: 1.0 * (a < b)",
-        real="(real)({0} < {1})",
+        real="(real)({0} < {1})", broken=True,
     ),
     Operation(
         ca.OP_LE, "less_equal", np.less_equal, "{0} <= {1}", Units.COMPARED,
-        "lambda a, b: 1.0 * (a <= b)", real="(real)({0} <= {1})",
+        "lambda a, b: 1.0 * (a <= b)", real="(real)({0} <= {1})", broken=True,
     ),
     Operation(
         ca.OP_EQ, "equal", np.equal, "{0} == {1}", Units.COMPARED, "lambda a, b: 1.0 * (a == b)",
-        real="(real)({0} == {1})",
+        real="(real)({0} == {1})", broken=True,
     ),
     Operation(
         ca.OP_NE, "not_equal", np.not_equal, "{0} != {1}", Units.COMPARED,
-        "lambda a, b: 1.0 * (a != b)", real="(real)({0} != {1})",
+        "lambda a, b: 1.0 * (a != b)", real="(real)({0} != {1})", broken=True,
     ),
     Operation(
         ca.OP_NOT, "not", np.logical_not, "!{0}", Units.PURE, "lambda a: 1.0 * (a == 0)",
@@ -255,7 +260,7 @@ OPERATIONS = (
     ),
     Operation(
         ca.OP_IF_ELSE_ZERO, "if_else_zero", _if_else_zero, "{0} != 0 ? {1} : 0.0", Units.LAST,
-        "lambda a, b: np.where(a != 0, b, 0.0)", real="({0} != 0) ? {1} : (real)0",
+        "lambda a, b: np.where(a != 0, b, 0.0)", real="({0} != 0) ? {1} : (real)0", broken=True,
     ),
 )  # fmt: skip
 

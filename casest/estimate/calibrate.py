@@ -384,7 +384,8 @@ def _no_random_walk(found: Estimate) -> Estimate:
     agreeing, starts = found.certificate.agreeing, len(found.outcomes)
     worth = found.problem.residual_count / found.correlated_over
     unknowns = found.problem.unknowns
-    if agreeing > 1 or starts < STARTS or worth >= WORTH * unknowns:
+    alone = agreeing <= 1 and starts >= STARTS and found.correlated_over > POOR
+    if not alone or worth >= WORTH * unknowns:
         return found
     reason = words.wandering(starts - 1, found.correlated_over, worth, unknowns)
     return replace(found, certificate=found.certificate.refused(Code.POOR_VALLEY, reason))

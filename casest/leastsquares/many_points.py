@@ -20,30 +20,13 @@ from casest.declaration.shapes import Array
 from casest.declaration.tracing import function_of, sample_symbol
 from casest.engine import Replay
 from casest.engine.graph import Graph
+from casest.engine.operations import BY_CODE
 from casest.leastsquares.problem import Problem
 
 #: Rows (points times samples) that are evaluated at once.
 ROWS = 200_000
 #: Models with more unknowns have theirs chosen one after the other, not as the largest set.
 ALL_SETS = 10
-
-_CORNERS = {
-    ca.OP_ATAN2,
-    ca.OP_FABS,
-    ca.OP_FLOOR,
-    ca.OP_CEIL,
-    ca.OP_SIGN,
-    ca.OP_COPYSIGN,
-    ca.OP_FMIN,
-    ca.OP_FMAX,
-    ca.OP_FMOD,
-    ca.OP_REMAINDER,
-    ca.OP_IF_ELSE_ZERO,
-    ca.OP_LT,
-    ca.OP_LE,
-    ca.OP_EQ,
-    ca.OP_NE,
-}
 
 
 class Normals(NamedTuple):
@@ -130,7 +113,7 @@ def _broken(model: Model) -> set[int]:
     graph = Graph(function_of(model, {"r": model.traced.expression}))
     count, found = model.traced.coordinates.numel(), set()
     for value in graph.values:
-        if value.kind == "operation" and value.code in _CORNERS:
+        if value.kind == "operation" and BY_CODE[value.code].broken:
             below = (graph.values[i] for i in graph.needed(value.operands))
             found |= {v.code for v in below if v.kind == "parameter" and v.code < count}
     return found
