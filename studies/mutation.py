@@ -12,7 +12,6 @@ follows the code.
 
 from __future__ import annotations
 
-import atexit
 import os
 import shutil
 import subprocess
@@ -43,7 +42,8 @@ def main() -> None:
     known = {record["identity"] for record in kept(RECORDS)}
     left = [m for m in wanted if m.identity() not in known]
     if left:
-        done(tried, [tuple(m) for m in left], RECORDS, workers=1)
+        with tempfile.TemporaryDirectory(prefix="mutation-") as folder:
+            done(tried, [(folder, *m) for m in left], RECORDS, workers=1)
     TABLE.write_text(table(), encoding="utf-8")
     print(f"{TABLE.relative_to(ROOT)}: {summary()}")
 
@@ -60,17 +60,17 @@ def _check(mutant: Mutant) -> None:
 # -- one mistake -----------------------------------------------------------------------------------
 
 
-def tried(path: str, old: str, new: str) -> dict[str, Any]:
-    """Make the mistake in the copy, run the tests, take it back."""
-    mutant, began = Mutant(path, old, new), time.perf_counter()
-    module = _copy() / "casest" / path
+def tried(folder: str, path: str, old: str, new: str) -> dict[str, Any]:
+    """Make the mistake in the copy in that folder, run the tests, take it back."""
+    mutant, began, copy = Mutant(path, old, new), time.perf_counter(), _copy(folder)
+    module = copy / "casest" / path
     text = module.read_text(encoding="utf-8")
     by = ""
     try:
         for test in mutant.tests:
-            _check_unchanged(test)
+            _check_unchanged(copy, test)
             _write(module, text.replace(old, new))
-            code, words = _run(test)
+            code, words = _run(copy, test)
             _write(module, text)
             if code != 0:
                 by = _first_failure(words) or f"{test}: exit code {code}"
@@ -78,14 +78,14 @@ def tried(path: str, old: str, new: str) -> dict[str, Any]:
     finally:
         _write(module, text)
     seconds = round(time.perf_counter() - began, 1)
-    identity = mutant.identity(_copy())
+    identity = mutant.identity(copy)
     return {"identity": identity, "name": mutant.name, "by": by, "seconds": seconds}
 
 
 @cache
-def _check_unchanged(test: str) -> None:
+def _check_unchanged(copy: Path, test: str) -> None:
     """The tests must pass on the package as it is, in the copy as it is."""
-    code, words = _run(test)
+    code, words = _run(copy, test)
     if code != 0:
         raise SystemExit(f"{test} fails without any mistake:\n{words}")
 
@@ -97,10 +97,9 @@ def _write(module: Path, text: str) -> None:
 
 
 @cache
-def _copy() -> Path:
-    """A folder with the package and its tests, gone when the process ends."""
-    folder = Path(tempfile.mkdtemp(prefix="mutation-"))
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+def _copy(place: str) -> Path:
+    """The folder, with the package and its tests in it."""
+    folder = Path(place)
     for name in COPIED:
         if (ROOT / name).is_dir():
             shutil.copytree(
@@ -124,9 +123,8 @@ def _environment(folder: Path) -> dict[str, str]:
             "OPENBLAS_NUM_THREADS": "1"}  # fmt: skip
 
 
-def _run(test: str) -> tuple[int, str]:
+def _run(folder: Path, test: str) -> tuple[int, str]:
     """Exit code and output of one test file in the copy, up to its first failure."""
-    folder = _copy()
     command = [sys.executable, "-m", "pytest", "-x", "-q", "--tb=line", "-p", "no:cacheprovider",
                str(folder / "tests" / test)]  # fmt: skip
     try:
