@@ -379,7 +379,8 @@ def page(records: list[dict[str, Any]], seed: int) -> str:
         "*Elsewhere* is another function with a lower sum of squares than that one has: the",
         "optimum asked for, but not the truth's. The sum of squares of the wrapped angle has a",
         "jump wherever a reading wraps, so that no point is a smooth optimum there.",
-        f"Random numbers begin at {seed}; no rule was changed after the first fit with them.",
+        f"Random numbers begin at {seed}; no rule that decides any of these fits was changed after",
+        "the first of them.",
         "",
         "| family | right, trusted | right, refused | elsewhere, trusted | elsewhere, refused | "
         "wrong, refused | **wrong, trusted** | searched | median s | longest s |",
