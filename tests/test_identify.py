@@ -194,8 +194,8 @@ def test_a_weak_direction_is_named_with_its_inflation_and_standard_deviation():
     assert "slope" in weak.words
     assert "level" in weak.words
     # that direction carries all but a hundredth of the level's own uncertainty
-    level = float(found.std["level"])
-    slope = float(found.std["slope"])
+    level = float(found.plain["level"])
+    slope = float(found.plain["slope"])
     assert weak.std == pytest.approx(level if weak.unit == "V" else slope, rel=0.01)
     covariance = found.noise.sigma**2 * np.linalg.inv(A.T @ A)
     assert slope == pytest.approx(np.sqrt(covariance[0, 0]), rel=1e-7)

@@ -124,11 +124,6 @@ CASES = {
     ),
     "no residual at the start": (logarithm, {"x": X, "y": 2 * X + noise(30)}, {}, Code.NOT_FINITE),
     "the valley of the start": (wave, {"x": Z, "y": np.sin(1.1 * Z) + noise(40)}, {}, NOTHING),
-    "a start at a maximum": (even, {"x": X, "y": 0.5 * X + noise(30)}, {}, Code.NOT_DETERMINED),
-    "a lower valley far away": (two_decays, two_of(0.008), {}, Code.AMBIGUOUS),
-    "a higher valley far away": (
-        two_decays, two_of(0.008), {"a": 0.8, "b": 1.2}, Code.AMBIGUOUS,
-    ),
     "poses in a small cap": (
         NORM, {"v": sphere(lambda r: sim.cap(24, r, np.radians(45)), 0.03)}, {}, Code.MISSHAPEN,
     ),
@@ -171,36 +166,44 @@ def test_what_only_one_of_them_asks_is_said_by_no_other():
     assert NOTHING == ONE_ONLY & MANY_ONLY
     said = {first(expected) for *_, expected in CASES.values()} - {NOTHING}
     shared = {c for c in Code if c not in ONE_ONLY | MANY_ONLY}
-    assert shared - said == {Code.NOT_SETTLED, Code.NO_MINIMUM}  # no fit of these data ends so
+    # No fit of these data ends in the first two; one searches where many say the third.
+    assert shared - said == {Code.NOT_SETTLED, Code.NO_MINIMUM, Code.AMBIGUOUS}
 
 
 # -- where they differ -----------------------------------------------------------------------------
 
 
-@pytest.mark.xfail(strict=True, reason="many look for a second valley along one direction only")
 @pytest.mark.parametrize(
-    ("declared", "signals", "start"),
+    ("declared", "signals", "start", "refused"),
     [
-        (squared, {"x": X, "y": 1 + 4 * X + noise(30)}, {}),
-        (two_decays, two_of(0.002), {}),
+        (even, {"x": X, "y": 0.5 * X + noise(30)}, {}, Code.NOT_DETERMINED),
+        (two_decays, two_of(0.008), {}, Code.AMBIGUOUS),
+        (two_decays, two_of(0.008), {"a": 0.8, "b": 1.2}, Code.AMBIGUOUS),
+        (two_decays, two_of(0.012), {}, Code.AMBIGUOUS),
     ],
-    ids=["the mirrored one", "the wrong one of two"],
+    ids=["a start at a maximum", "a lower valley", "a higher valley", "the higher of two"],
 )
-def test_a_second_valley_is_seen_by_both(declared, signals, start):
+def test_many_refuse_what_one_finds_by_a_search(declared, signals, start, refused):
     one, many = both(declared, signals, **start)
-    assert not one.certificate.trusted
+    assert one.certificate.trusted, one.certificate.reasons
+    assert first(many.reasons.code(0)) is refused
+
+
+@pytest.mark.xfail(strict=True, reason="many look for a second valley along one direction only")
+def test_the_wrong_one_of_two_valleys_is_refused_by_many():
+    one, many = both(two_decays, two_of(0.002))
+    assert one.values["a"] < one.values["b"] or not one.certificate.trusted
     assert not many.trusted[0]
 
 
-def test_many_refuse_the_higher_of_two_valleys_where_one_finds_the_lower():
-    one, many = both(two_decays, two_of(0.012))
-    assert one.certificate.trusted
-    assert one.values["a"] < one.values["b"]
-    assert many.reasons.code(0) is Code.AMBIGUOUS
+def test_the_mirrored_solution_is_said_by_one():
+    """±a are one function of the input: which is meant no data tell, and the start says."""
+    one, _ = both(squared, {"x": X, "y": 1 + 4 * X + noise(30)})
+    assert any("other values are the same function" in note for note in one.notes)
 
 
-@pytest.mark.xfail(strict=True, reason="one trusts a small residual that is no smaller elsewhere")
-def test_a_far_frequency_is_found_or_refused_by_both():
+def test_a_far_frequency_is_found_by_one_and_refused_by_many():
     one, many = both(wave, {"x": Z, "y": np.sin(5 * Z) + noise(40)})
     assert not many.trusted[0]
-    assert not one.certificate.trusted or one.values["w"] == pytest.approx(5, abs=0.01)
+    assert one.certificate.trusted
+    assert one.values["w"] == pytest.approx(5, abs=0.01)

@@ -259,7 +259,7 @@ def test_shared_and_per_run_parameters_together_are_one_linear_regression():
     found = attempt(line, runs)
     solution, std = direct(runs)
     estimate = [found.values["slope"], found.values["bend"], *found.values["level"]]
-    spread = [found.std["slope"], found.std["bend"], *found.std["level"]]
+    spread = [found.plain["slope"], found.plain["bend"], *found.plain["level"]]
     np.testing.assert_allclose(estimate, solution, rtol=1e-9)
     np.testing.assert_allclose(spread, std, rtol=1e-8)
 

@@ -326,7 +326,7 @@ def _estimate(
     dof = problem.residual_count - identified.rank
     noise = _noise(problem, point, float(np.sqrt(2 * best.cost)), dof)
     correlated = correlation_time(problem, point)
-    free = free_of(problem.unknowns, on_bounds(problem, point, R, factor[1], noise.sigma))
+    free = free_of(problem.unknowns, on_bounds(problem, point, factor, noise.sigma))
     covariance = covariance_of(problem, point, R, noise.sigma, correlated, free)
     bias = second_order_bias(problem, point, noise.sigma, inverse_normal(R, free))
     relative = float(np.max(np.abs(bias[free]) / np.sqrt(np.diag(covariance)[free]), initial=0.0))

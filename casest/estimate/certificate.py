@@ -97,7 +97,7 @@ def certify(
     against: list[tuple[Code, str]] = []
     rounding = rounding_error(problem, best.point)
     noise = max(sigma if np.isfinite(sigma) else 0.0, rounding)
-    at_bound = on_bounds(problem, best.point, factor[0], factor[1], noise)
+    at_bound = on_bounds(problem, best.point, factor, noise)
     free = free_of(problem.unknowns, at_bound)
     whole, factor = factor[0], of_the_free(factor, free)
     R = factor[0]

@@ -79,9 +79,14 @@ def _integrated(stretches: list[Array]) -> float:
 
 
 def batches(run: Run, length: int) -> NDArray[np.int_]:
-    """First sample of every batch: consecutive samples share one, blocks never do."""
+    """First sample of every batch: consecutive samples share one, blocks never do.
+
+    Rests followed each other, each a block of its own.
+    """
     if not is_series(run) or length <= 1:
         return np.arange(len(run))
+    if run.spread:
+        return np.arange(0, len(run), length)
     starts = np.flatnonzero(np.diff(run.block, prepend=run.block[:1] - 1))
     ends = np.append(starts[1:], len(run))
     parts = [np.arange(start, end, length) for start, end in zip(starts, ends, strict=True)]

@@ -14,8 +14,9 @@ from casest.leastsquares.problem import Point, Problem
 from casest.leastsquares.sums import squares_of_gradients
 from casest.leastsquares.weights import has_noise_effects, variance_factor
 
-#: Batches per unknown from which on those say enough of correlated noise by themselves.
-MANY_BATCHES = 20
+#: Batches per unknown from which on those say enough of correlated noise by themselves; and of all,
+#: below which neither they nor a spectrum do: the plain covariance is then widened as a whole.
+MANY_BATCHES, FEWEST_BATCHES = 20, 30
 #: Residuals for each unknown from which on the robust form is as sharp as the plain one, and right
 #: where the noise differs from place to place. Of fewer the plain one makes more.
 MANY_RESIDUALS = 10
@@ -80,6 +81,9 @@ def sandwich(
     if groups >= enough:
         middle = groups / (groups - 1) * squares_of_gradients(problem, point, firsts)
         return np.asarray(bread @ middle @ bread)
+    if groups < FEWEST_BATCHES:
+        plain = 2 * problem.cost(point) / max(problem.residual_count - problem.unknowns, 1)
+        return np.asarray(correlated_over * plain * bread)
     return np.asarray(bread @ _by_frequencies(problem, point, bread) @ bread)
 
 
@@ -100,6 +104,7 @@ def _stretches(problem: Problem, point: Point) -> Iterator[Stretch]:
     for block in problem.blocks(point):
         root = 1.0 if block.weights is None else np.sqrt(block.weights)
         residual, jacobian = block.residual * root, (block.jacobian.T * np.transpose(root)).T
-        where = problem.runs[block.run].block[block.span]
+        run = problem.runs[block.run]
+        where = np.zeros(len(residual)) if run.spread else run.block[block.span]
         for own in np.split(np.arange(len(where)), np.flatnonzero(np.diff(where)) + 1):
             yield Stretch(block.x, residual[own], jacobian[own])

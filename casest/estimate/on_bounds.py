@@ -46,17 +46,20 @@ class OnBound:
 
 
 def on_bounds(
-    problem: Problem, point: Point, R: Array, t: Array, noise: float
+    problem: Problem, point: Point, factor: tuple[Array, Array, float], noise: float
 ) -> tuple[OnBound, ...]:
     """Unknowns nearer to a bound than ON_BOUND of their standard deviation that do not turn back.
 
-    R (n, n) and t = Qᵀr (n,) come from the Jacobian's triangular factor, `noise` is the standard
-    deviation of a residual.
+    `factor` is the Jacobian's: R (n, n), t = Qᵀr (n,) and the length of the rest; `noise` the
+    standard deviation of a residual, with the bounds held.
     """
-    return tuple(_found(problem, point, R, t, noise))
+    return tuple(_found(problem, point, factor, noise))
 
 
-def _found(problem: Problem, point: Point, R: Array, t: Array, noise: float) -> Iterator[OnBound]:
+def _found(
+    problem: Problem, point: Point, factor: tuple[Array, Array, float], noise: float
+) -> Iterator[OnBound]:
+    R, t, rest = factor
     lower, upper = problem.bounds
     norms = np.linalg.norm(R, axis=0)
     width = ON_BOUND * noise / np.where(norms > 0, norms, np.inf)
@@ -68,17 +71,23 @@ def _found(problem: Problem, point: Point, R: Array, t: Array, noise: float) -> 
         for i in range(slot.x.start, slot.x.stop)
         if slot.parameter.shape.positive_diagonal
     }
+    freedom = max(problem.residual_count - problem.unknowns, 1)
     for i in near:
         others = np.setdiff1d(np.arange(len(norms)), near)
         Q, triangle = np.linalg.qr(R[:, np.append(others, i)])
         length = float(triangle[-1, -1])
-        # The step that the others' optimum leaves to this one, outwards.
-        step = -float(Q[:, -1] @ t) / length * (1 if above[i] else -1) if length else 0.0
-        std = noise / abs(length) if length else float("inf")
-        if step / std >= -STEP:
+        pull = float(Q[:, -1] @ t) * float(np.sign(length))
+        # What the bound costs is no noise.
+        squares = float(t @ t) + rest**2 - pull**2
+        free = float(np.sqrt(max(squares, 0.0) / freedom))
+        # The step that the others' optimum leaves to this one goes against the slope.
+        scale: float = max(min(noise, free), 1e-3 * noise, 1e-300)
+        beyond = (-pull if above[i] else pull) / scale
+        if beyond >= -STEP and length:
             bound = float(upper[i] if above[i] else lower[i])
-            beyond, never = float(max(step / std, 0)), problem.model.implicit or i in positive
-            yield OnBound(int(i), problem.names[i], bound, bool(above[i]), std, beyond, never)
+            std, never = noise / abs(length), problem.model.implicit or i in positive
+            at = bound, bool(above[i]), std, max(beyond, 0.0), never
+            yield OnBound(int(i), problem.names[i], *at)
 
 
 def free_of(unknowns: int, held: tuple[OnBound, ...]) -> NDArray[np.bool_]:

@@ -25,6 +25,7 @@ from casest.estimate.reasons import (
     ALIKE,
     APART,
     BENT,
+    BEYOND,
     CURVATURE,
     ON_BOUND,
     PRACTICALLY_NULL,
@@ -74,17 +75,19 @@ class Judge:
 
     def __init__(self, model: Model, squares: Squares, noise: float | None) -> None:
         self.model, self.squares, self.expected = model, squares, noise
+        positive = [p.shape.positive_diagonal for p in model.parameters for _ in p.entry_names]
+        self.open: Flags = np.array(positive, dtype=bool) | model.implicit
 
     def __call__(self, sensors: Sensors, fits: Fits, bounds: Bounds) -> Judged:
         """Judge W sensors."""
         count = residual_counts(self.squares, sensors)
         here, freedom = self._local(fits, count)
         found = Judged.of(here.fits.x.shape, here.sigma, np.sqrt(2 * fits.cost / count))
+        found.equations[:] = count
         found.step[:] = np.sqrt(fits.left) * np.minimum(fits.shrink, 1.0) / here.noise
         self._readings(found, sensors)
         self._determined(found, here)
-        self._bounded(found, here, bounds)
-        found.equations[:] = count
+        here, held = self._bounded(found, here, sensors, bounds)
         found.add(Code.NO_REDUNDANCY, freedom <= 0)
         found.add(Code.NOT_FINITE, ~np.isfinite(fits.cost))
         slope = np.sqrt(fits.left / (2 * fits.cost))
@@ -103,6 +106,8 @@ class Judge:
             found.covariance[:, :, k] = self._robust(here.some(k), sensors.some(k))
         if shift is not None:
             found.covariance[:] += shift
+        for i, k in zip(*np.nonzero(held), strict=True):
+            found.covariance[i, :, k] = found.covariance[:, i, k] = np.nan
         found.std[:] = np.sqrt(np.einsum("iis->is", found.covariance))
         return found
 
@@ -152,14 +157,47 @@ class Judge:
         null = ~(found.smallest >= PRACTICALLY_NULL) | nil.any(axis=0)
         found.add(Code.NOT_DETERMINED, np.asarray(usable & null))
 
-    def _bounded(self, found: Judged, here: Local, bounds: Bounds) -> None:
-        width = ON_BOUND * here.noise / here.scale
-        active = (here.fits.x <= bounds.lower + width) | (here.fits.x >= bounds.upper - width)
-        found.bound[:] = np.argmax(active, axis=0)
+    def _bounded(
+        self, found: Judged, here: Local, sensors: Sensors, bounds: Bounds
+    ) -> tuple[Local, Flags]:
+        """The fits with the unknowns held that rightly lie on a bound, and which those are, (n, W).
+
+        See `estimate.on_bounds`: there the cost must rise inwards, and the data may ask for little
+        beyond. Held, an unknown is coupled to no other.
+        """
+        x, width = here.fits.x, ON_BOUND * here.noise / here.scale
+        above = x >= bounds.upper - width
+        near = (x <= bounds.lower + width) | above
+        held, wrong = np.zeros_like(near), np.zeros_like(near)
+        for k in _groups(np.asarray(near.any(axis=0))):
+            slope = self._gradient(here.some(k), sensors.some(k))
+            inwards = np.where(above[:, k], -slope, slope)
+            rows = whole(here.fits.matrix[:, :, k])
+            for j, s in enumerate(k):
+                on = np.flatnonzero(near[:, s])
+                squares = 2 * here.fits.cost[s], found.equations[s] - len(x)
+                beyond = _beyond(rows[:, :, j], on, inwards[on, j], here.noise[s], *squares)
+                wrong[on, s] = ~(beyond <= BEYOND) | self.open[on]
+                held[on, s] = ~wrong[on, s] & (beyond >= -STEP)
+                wrong[on, s] &= beyond >= -STEP
+        found.bound[:] = np.argmax(np.where(wrong.any(axis=0), wrong, near), axis=0)
         found.lower[:], found.upper[:] = (
             np.take_along_axis(side, found.bound[None], axis=0)[0] for side in bounds
         )
-        found.add(Code.BOUND, np.asarray(active.any(axis=0)))
+        found.add(Code.BOUND, np.asarray(wrong.any(axis=0)))
+        held &= ~wrong.any(axis=0)
+        if not held.any():
+            return here, held
+        apart = held[:, None] | held
+        apart[np.arange(len(x)), np.arange(len(x))] = False
+        matrix = np.where(apart, 0.0, here.fits.matrix)
+        fits = here.fits._replace(matrix=matrix)
+        return self._local(fits, found.equations.astype(float))[0], held
+
+    def _gradient(self, here: Local, sensors: Sensors) -> Array:
+        """Slope (n, W) of the cost."""
+        residuals = self.squares.residuals(here.fits.x, sensors)
+        return self.squares.pulled(here.fits.x, sensors, residuals)
 
     def _loud(self, sigma: Array, freedom: Array) -> Flags:
         from scipy.stats import chi2  # imported late: SciPy's statistics load slowly
@@ -338,6 +376,25 @@ class Judge:
         second = np.sqrt((shift**2).sum(axis=(0, 1)) / count) / here.sigma
         pulled = self.squares.pulled(x, sensors, shift) / here.scale
         return second, -times(here.inverse, pulled) / here.scale
+
+
+def _beyond(
+    matrix: Array, on: Places, slope: Array, noise: float, squares: float, freedom: float
+) -> Array:
+    """Standard deviations by which the data ask for values beyond their bounds; negative: inside.
+
+    `matrix` (n, n) is JᵀJ, `slope` that of the cost inwards at the unknowns `on`. What a bound
+    costs of the residual's sum of `squares` is no noise.
+    """
+    free = np.setdiff1d(np.arange(len(matrix)), on).astype(int)
+    found = np.empty(len(on))
+    for j, i in enumerate(on):
+        across = matrix[free, i]
+        left = matrix[i, i] - across @ np.linalg.lstsq(matrix[np.ix_(free, free)], across, None)[0]
+        pull = slope[j] / np.sqrt(left) if left > 0 else np.inf
+        free = np.sqrt(max(squares - pull**2, 0.0) / max(freedom, 1))
+        found[j] = pull / max(min(noise, free), 1e-3 * noise, 1e-300)
+    return found
 
 
 def _rounding(fits: Fits, count: Array) -> Array:
