@@ -73,7 +73,7 @@ def _found(
     }
     freedom = max(problem.residual_count - problem.unknowns, 1)
     for i in near:
-        others = np.setdiff1d(np.arange(len(norms)), near)
+        others = np.setdiff1d(np.arange(len(norms)), near).astype(int)
         Q, triangle = np.linalg.qr(R[:, np.append(others, i)])
         length = float(triangle[-1, -1])
         pull = float(Q[:, -1] @ t) * float(np.sign(length))

@@ -392,8 +392,8 @@ def _beyond(
         across = matrix[free, i]
         left = matrix[i, i] - across @ np.linalg.lstsq(matrix[np.ix_(free, free)], across, None)[0]
         pull = slope[j] / np.sqrt(left) if left > 0 else np.inf
-        free = np.sqrt(max(squares - pull**2, 0.0) / max(freedom, 1))
-        found[j] = pull / max(min(noise, free), 1e-3 * noise, 1e-300)
+        rest = float(np.sqrt(max(squares - pull**2, 0.0) / max(freedom, 1)))
+        found[j] = pull / max(min(noise, rest), 1e-3 * noise, 1e-300)
     return found
 
 
