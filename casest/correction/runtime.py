@@ -55,26 +55,31 @@ def solved(program: dict[str, Any], x: Any, start: Any) -> Any:
     return np.where(good[:, None], value, np.nan)
 
 
-def corrected(program: dict[str, Any], x: Any) -> Any:
-    """Corrected values (N, n) of readings and what else is needed, (N, width)."""
+def attempted(program: dict[str, Any], x: Any) -> Any:
+    """Corrected values (N, n) of readings and what else is needed, (N, width); NaN for none."""
     x = np.asarray(x, dtype=float)
     width, n = sum(i["size"] for i in program["inputs"]), program["output"]["size"]
     if x.ndim != 2 or x.shape[1] != width:
         raise ValueError(f"x has shape {x.shape}, not (N, {width})")
     with np.errstate(all="ignore"):
         if program["kind"] == "direct":
-            best = run(program, x, n)
-        else:
-            best = np.full((len(x), n), np.nan)
-            newton = program["newton"]
-            at, size = newton["measured"]
-            starts = [np.full((len(x), n), s) for s in newton["starts"]]
-            starts += [x[:, at : at + size]] if size == n else []
-            for start in starts:
-                found = solved(program, x, start)
-                away = [np.abs(v - newton["middle"]).max(axis=1) for v in (found, best)]
-                better = np.isfinite(away[0]) & ~(away[0] >= away[1])
-                best[better] = found[better]
+            return run(program, x, n)
+        best = np.full((len(x), n), np.nan)
+        newton = program["newton"]
+        at, size = newton["measured"]
+        starts = [np.full((len(x), n), s) for s in newton["starts"]]
+        starts += [x[:, at : at + size]] if size == n else []
+        for start in starts:
+            found = solved(program, x, start)
+            away = [np.abs(v - newton["middle"]).max(axis=1) for v in (found, best)]
+            better = np.isfinite(away[0]) & ~(away[0] >= away[1])
+            best[better] = found[better]
+    return best
+
+
+def corrected(program: dict[str, Any], x: Any) -> Any:
+    """Corrected values; ValueError names the first row that has none."""
+    best = attempted(program, x)
     bad = np.flatnonzero(~np.isfinite(best).all(axis=1))
     if bad.size:
         raise ValueError(f"row {bad[0]}: outside what the model can produce ({bad.size} rows)")
