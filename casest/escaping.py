@@ -14,10 +14,16 @@ _UNSEEN = ("Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp")
 
 
 def visible(text: str, keep: str = "") -> str:
-    r"""The text with every character that has no shape, but those to `keep`, written as \x1b."""
-    if text.isascii() and text.isprintable():
+    r"""The text with every character that has no shape, but those to `keep`, written as \u001b.
+
+    That is also how JSON writes them, so that printed JSON stays what it was.
+    """
+    if text.isprintable():
         return text
-    return "".join(c if c in keep or not _unseen(c) else _written(c) for c in text)
+    for character in set(text) - set(keep):
+        if _unseen(character):
+            text = text.replace(character, _written(character))
+    return text
 
 
 def _unseen(character: str) -> bool:
@@ -25,10 +31,9 @@ def _unseen(character: str) -> bool:
 
 
 def _written(character: str) -> str:
-    code = ord(character)
-    return (
-        f"\\x{code:02x}" if code < 256 else f"\\u{code:04x}" if code < 65536 else f"\\U{code:08x}"
-    )
+    """By its one or two units of UTF-16."""
+    units = character.encode("utf-16-be", "surrogatepass")
+    return "".join(f"\\u{units[k]:02x}{units[k + 1]:02x}" for k in range(0, len(units), 2))
 
 
 def terminal(text: str) -> str:
@@ -60,8 +65,3 @@ def c_identifier(text: str) -> str:
 def python_docstring(text: str) -> str:
     """For the inside of a triple-quoted string; its lines are kept."""
     return visible(text, keep="\n").replace("\\", "\\\\").replace('"', '\\"')
-
-
-def python_comment(text: str) -> str:
-    """For what stands behind # on one line."""
-    return visible(text)

@@ -20,6 +20,7 @@ from casest.data.run import Run
 from casest.data.write import write_atomically
 from casest.declaration.shapes import Array
 from casest.errors import DataError, UsageError
+from casest.escaping import terminal
 from casest.results.saved import SavedResult, saved_correction
 
 #: Samples corrected at once: memory does not grow with the record.
@@ -141,7 +142,7 @@ def _bracket(unit: str | None) -> str:
 def write_or_print(text: str, output: Path | None) -> Path | None:
     """To a .csv file, to corrected.csv in a folder (returns which), or to standard output."""
     if output is None:
-        sys.stdout.write(text)
+        sys.stdout.write(terminal(text) if sys.stdout.isatty() else text)
         return None
     if output.suffix != ".csv":
         output.mkdir(parents=True, exist_ok=True)
