@@ -34,7 +34,24 @@ def echo(text: str, *, verdict: bool = False, err: bool = False, nl: bool = True
     click.echo(text, err=err, nl=nl)
 
 
-@click.group(context_settings={"help_option_names": ["-h", "--help"]})
+class Careful(click.Group):
+    """Refuses a command whose results would be written over a file that it reads."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Before anything is read or computed."""
+        from casest.errors import UsageError
+        from casest.report.next_command import typed_words
+        from casest.results.written import overwritten
+
+        words = typed_words(shlex.join(["casest", *(ctx.obj or [])]))
+        if words and (lost := overwritten(words.name, words.output, words.read)):
+            raise UsageError(
+                f"-o {words.output}: {lost} is read, and would be written over; give another -o"
+            )
+        return super().invoke(ctx)
+
+
+@click.group(cls=Careful, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__, prog_name="casest")
 def commands() -> None:
     """Calibrate sensors, prove the answer, and say what the data could not determine.

@@ -22,6 +22,7 @@ from casest.declaration.shapes import Array
 from casest.errors import DataError, UsageError
 from casest.escaping import terminal
 from casest.results.saved import SavedResult, saved_correction
+from casest.results.written import corrected_file
 
 #: Samples corrected at once: memory does not grow with the record.
 PIECE = 8192
@@ -144,8 +145,10 @@ def write_or_print(text: str, output: Path | None) -> Path | None:
     if output is None:
         sys.stdout.write(terminal(text) if sys.stdout.isatty() else text)
         return None
-    if output.suffix != ".csv":
-        output.mkdir(parents=True, exist_ok=True)
-        output = output / "corrected.csv"
+    output = corrected_file(output)
+    try:
+        output.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DataError(f"{output.parent}: cannot be made ({error.strerror})") from None
     write_atomically(output, text)
     return output
