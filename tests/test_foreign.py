@@ -24,6 +24,15 @@ def cell(force=signal("N"), y=signal("mV"), *, zero=param("mV"), gain=param("mV/
     reading = quantity("reading", zero + gain * true, "mV")
     return Residual(measured=y, predicted=reading, corrected=true)
 '''
+TILTED = """
+from casest import Residual, attitude, model, param, quantity, signal
+
+
+@model
+def tilted(f=signal(3, "N"), y=signal(3, "N"), R=attitude(), *, zero=param(3, "N")):
+    force = quantity("force", f, "N")
+    return Residual(measured=y, predicted=R.T @ force + zero, corrected=force)
+"""
 BEND = """
 from casest import effect, param
 
@@ -102,8 +111,11 @@ def test_a_result_that_names_another_file_does_not_run_it(fitted, capsys, where)
     (fitted / "out/result.json").write_text(json.dumps(content), encoding="utf-8")
     applied(capsys, "out", "a.csv")
     assert run(["export", "out", "--to", "c", "-o", "c.c"]) == 0
-    with pytest.raises(UsageError, match=r"evil\.py has changed since the result was made"):
-        saved_model(content)
+    if where == "a result's own name":  # the declaration that was recorded is meant
+        assert saved_model(content)[0].name == "cell"
+    else:
+        with pytest.raises(UsageError, match=r"evil\.py has changed since the result was made"):
+            saved_model(content)
     assert not trace.exists()
 
 
@@ -159,3 +171,50 @@ def test_each_run_is_corrected_and_exported_with_its_own_numbers(tmp_path, capsy
     capsys.readouterr()
     assert run(["export", "out", "--to", "c", "--run", "3"]) == 1
     assert "--run 3: there are runs 0 to 2" in capsys.readouterr().err
+
+
+def test_a_unit_that_the_fit_did_not_know_is_asked_of_nobody(tmp_path, capsys, monkeypatch):
+    """Counts without a unit: the exported correction takes them as the result does."""
+    monkeypatch.chdir(tmp_path)
+    rng = np.random.default_rng(3)
+    v = rng.standard_normal((30, 3))
+    v = 500 * v / np.linalg.norm(v, axis=1, keepdims=True) + [3, -2, 1] + rng.standard_normal(3)
+    v += 0.1 * rng.standard_normal((30, 3))
+    np.savetxt("v.csv", v, delimiter=",", header="vx,vy,vz", comments="")
+    assert run(["calibrate", "norm-diagonal", "v.csv", "--set", "norm=500", "-o", "out"]) == 0
+    assert run(["export", "out", "--to", "json", "-o", "c.json"]) == 0
+    assert json.loads(Path("c.json").read_text("utf-8"))["program"]["inputs"][0]["unit"] == "[v]"
+    printed = []
+    for result in ("out", "c.json"):
+        capsys.readouterr()
+        assert run(["apply", result, "v.csv"]) == 0
+        printed.append(capsys.readouterr().out.splitlines())
+    lengths = [np.linalg.norm([float(x) for x in row.split(",")[-3:]]) for row in printed[0][1:]]
+    np.testing.assert_allclose(lengths, 500, rtol=2e-3)
+    assert printed[0][1:] == printed[1][1:]
+
+
+def test_an_attitude_is_read_as_one_from_whatever_carries_the_correction(
+    tmp_path, capsys, monkeypatch
+):
+    """A correction that reads a rotation, given as a quaternion in other columns."""
+    monkeypatch.chdir(tmp_path)
+    Path("tilted.py").write_text(TILTED, encoding="utf-8")
+    from scipy.spatial.transform import Rotation
+
+    rng = np.random.default_rng(7)
+    turned = Rotation.random(60, random_state=7)
+    true = rng.uniform(-5, 5, (60, 3))
+    reading = turned.inv().apply(true) + [0.1, -0.2, 0.3] + 1e-4 * rng.standard_normal((60, 3))
+    q = turned.as_quat()[:, [3, 0, 1, 2]]
+    head = "fx [N],fy [N],fz [N],yx [N],yy [N],yz [N],qw,qx,qy,qz"
+    table = np.hstack([true, reading, q])
+    np.savetxt("a.csv", table, delimiter=",", header=head, comments="")
+    assert run(["calibrate", "tilted.py", "a.csv", "-o", "out"]) == 0
+    assert run(["export", "out", "--to", "json", "-o", "c.json"]) == 0
+    for result in ("out", "c.json"):
+        capsys.readouterr()
+        assert run(["apply", result, "a.csv"]) == 0
+        rows = capsys.readouterr().out.splitlines()[1:]
+        found = np.array([row.split(",")[-3:] for row in rows], dtype=float)
+        np.testing.assert_allclose(found, true, atol=2e-3)

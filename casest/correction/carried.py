@@ -66,6 +66,8 @@ def carried(
         model, left = invertible(fitted)
         correction = Correction(model)
         points, differing = _points(model, correction, values, len(runs))
+        if not np.isfinite(points).all():
+            return f"the estimate of model {fitted.name} has parameters without a value"
         known = _of_run(model, values, 0, len(runs))
         names = [s.name for s in correction.signals]
         built = program(correction, known, units, around, _largest(correction, runs), differing)
@@ -117,5 +119,7 @@ def _readings(runs: Sequence[Run], names: Sequence[str], *, each: bool) -> list[
     """Samples of what is needed, evenly over each run or over all of them."""
     parts = [np.hstack([np.asarray(run.signals[n], float) for n in names]) for run in runs]
     parts = parts if each else [np.vstack(parts)]
+    parts = [p[np.isfinite(p).all(axis=1)] for p in parts]
     count = TESTED_EACH if each else TESTED
-    return [p[np.unique(np.linspace(0, len(p) - 1, count).round().astype(int))] for p in parts]
+    return [p[np.unique(np.linspace(0, len(p), count, endpoint=False).astype(int))] if len(p) else p
+            for p in parts]  # fmt: skip

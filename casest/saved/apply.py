@@ -25,7 +25,7 @@ from casest.results.saved import SavedResult, saved_correction
 from casest.results.written import corrected_file
 
 #: Samples corrected at once: memory does not grow with the record.
-PIECE = 8192
+PIECE = 4096
 
 
 def corrected_csv(

@@ -22,7 +22,8 @@ from casest.results.find import find_effects, find_model
 def saved_model(result: Mapping[str, Any]) -> tuple[Model, dict[str, Any]]:
     """Model and parameter values of a saved result: effects, constants and scopes as they were.
 
-    Files of declarations are run for that, and only those whose SHA-256 the result has recorded.
+    Files of declarations are run for that: those that lie where they were, and whose SHA-256 is
+    the one that the result has recorded.
     """
     model, units = _found_model(result), result.get("units", {})
     parameters = (result.get("after") or result.get("estimate") or {}).get("parameters", {})
@@ -56,7 +57,7 @@ def _found_model(result: Mapping[str, Any]) -> Model:
     path, colon, own = name.partition(":")
     if not path.endswith(".py"):
         return find_model(name)
-    file = Path(path) if Path(path).exists() else Path(declared.get("file", path))
+    file = Path(declared.get("file", path))
     _refuse_changed(file, declared.get("sha256"))
     return find_model(f"{file}{colon}{own}")
 
