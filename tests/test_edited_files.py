@@ -48,6 +48,9 @@ TEXTS: list[Callable[[str], str]] = [
     lambda text: text.replace('"model"', '"model" : "\\ud800", "model"', 1),
     lambda text: "[" + text + "]",
     lambda text: "null",
+    lambda text: text.replace("1", "1" + 6000 * "0", 1),
+    lambda text: text.replace('["input", 0, 0]', f'["input", 0, 1{6000 * "0"}]'),
+    lambda text: text.replace('["input", 0, 0]', f'["constant", 0, 1{6000 * "0"}]'),
 ]
 
 
@@ -205,11 +208,12 @@ def change(content: Any, key: str, value: Any) -> None:
         ("steps.0", ["input", 10**9, 0], "steps[0]: there is no place 1000000000"),
         ("steps.0", ["input", 0, 7], "steps[0]: there is no input 7"),
         ("steps.0", ["constant", 0, "x"], "steps[0]: 'x' is no number"),
+        ("steps.0", ["constant", 0, 10**400], "steps[0]: 1000000"),
         ("steps.0", ["add", 0, 0], "steps[0]: add has 1 operands"),
         ("steps.0", ["sin", 0, 0], "steps[0]: nothing is in register [0]"),
         ("steps.0", "add", "steps[0]: Expected `array`, got `str`"),
         ("steps", [], "fewer steps"),
-        ("registers", 10**12, "registers: Expected `int` <= 1000000"),
+        ("registers", 10**12, "registers: Expected `int` <= 100000"),
         ("inputs.0.size", 0, "inputs[0].size: Expected `int` >= 1"),
         ("inputs.0.size", 10**9, "inputs[0].size: Expected `int` <= 4096"),
         ("kind", "newtno", "kind: Invalid enum value 'newtno'"),

@@ -218,3 +218,27 @@ def test_an_attitude_is_read_as_one_from_whatever_carries_the_correction(
         rows = capsys.readouterr().out.splitlines()[1:]
         found = np.array([row.split(",")[-3:] for row in rows], dtype=float)
         np.testing.assert_allclose(found, true, atol=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (("zero + gain * true", "zero + gain * true[0]"), "do not determine the 2 components"),
+        (("    return Residual", "    return  Residual"), "its correction fails: nothing"),
+    ],
+)
+def test_a_fit_is_kept_where_its_correction_cannot_be_built(tmp_path, monkeypatch, change, said):
+    monkeypatch.chdir(tmp_path)
+    text = CELL.replace(*change)
+    if "true[0]" in text:
+        text = text.replace('signal("N")', 'signal(2, "N")')
+    else:
+        text += "\n\n@cell.with_inverse\ndef cell(known, reading):\n"
+        text += "    raise ValueError('nothing')\n"
+    Path("cell.py").write_text(text, encoding="utf-8")
+    table = np.loadtxt(record(tmp_path / "a.csv"), delimiter=",", skiprows=1)
+    np.savetxt("b.csv", table[:, [0, 0, 1]], delimiter=",", header="f0 [N],f1 [N],y [mV]",
+               comments="")  # fmt: skip
+    data = ["b.csv", "--columns", "force=f0,f1"] if "true[0]" in text else ["a.csv"]
+    assert run(["calibrate", "cell.py", *data, "-o", "out"]) == 0
+    assert said in json.loads(Path("out/result.json").read_text("utf-8"))["correction"]["reason"]

@@ -14,7 +14,7 @@ from casest.data.run import Run
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
 from casest.declaration.symbols import Signal
-from casest.errors import CasestError
+from casest.errors import CasestError, UsageError, last_line
 
 #: Readings of the fit that are kept for the self-test of an export: in all, or of each run.
 TESTED, TESTED_EACH = 16, 4
@@ -63,24 +63,36 @@ def carried(
     the range that the corrected quantity had in the fit.
     """
     try:
-        model, left = invertible(fitted)
-        correction = Correction(model)
-        points, differing = _points(model, correction, values, len(runs))
-        if not np.isfinite(points).all():
-            return f"the estimate of model {fitted.name} has parameters without a value"
-        known = _of_run(model, values, 0, len(runs))
-        names = [s.name for s in correction.signals]
-        built = program(correction, known, units, around, _largest(correction, runs), differing)
-        return Carried(
-            fitted.name,
-            replace(built, left=left),
-            fitted.signals,
-            tuple(tuple(map(float, p[differing])) for p in points) if differing else (),
-            tuple(_readings(runs, names, each=bool(differing))),
-            of_their_time(model),
-        )
+        return _carried(fitted, values, runs, units, around)
     except CasestError as error:
         return str(error)
+    except Exception as error:  # an inverse of the user's own: the fit is not lost for it
+        return f"model {fitted.name}: its correction fails: {last_line(error)}"
+
+
+def _carried(
+    fitted: Model,
+    values: Mapping[str, Any],
+    runs: Sequence[Run],
+    units: Mapping[str, str],
+    around: tuple[float, float] | None,
+) -> Carried:
+    model, left = invertible(fitted)
+    correction = Correction(model)
+    points, differing = _points(model, correction, values, len(runs))
+    if not np.isfinite(points).all():
+        raise UsageError(f"model {fitted.name} was fitted without a value for every parameter")
+    known = _of_run(model, values, 0, len(runs))
+    names = [s.name for s in correction.signals]
+    built = program(correction, known, units, around, _largest(correction, runs), differing)
+    return Carried(
+        fitted.name,
+        replace(built, left=left),
+        fitted.signals,
+        tuple(tuple(map(float, p[differing])) for p in points) if differing else (),
+        tuple(_readings(runs, names, each=bool(differing))),
+        of_their_time(model),
+    )
 
 
 def _of_run(model: Model, values: Mapping[str, Any], which: int, runs: int) -> dict[str, Any]:

@@ -7,6 +7,7 @@ that names the key.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Annotated, Any, Literal, TypeVar
@@ -24,7 +25,7 @@ from casest.errors import DataError
 
 T = TypeVar("T")
 #: More of anything is no correction: it would take memory or hours.
-_WIDEST, _LONGEST, _STARTS = 4096, 1_000_000, 100
+_WIDEST, _LONGEST, _STARTS = 4096, 100_000, 100
 _Size = Annotated[int, Meta(ge=1, le=_WIDEST)]
 _Step = Annotated[list[Any], Meta(min_length=3, max_length=4)]
 
@@ -141,23 +142,28 @@ def _check_steps(built: Program, where: str) -> None:
         arity = 1 if operation in ("input", "constant", "output") else _arity(operation, here)
         _refuse(len(operands) != arity, f"{here}: {operation} has {len(operands)} operands")
         _refuse(not _among(place, outputs if operation == "output" else built.registers),
-                f"{here}: there is no place {place!r}")  # fmt: skip
+                f"{here}: there is no place {place!r:.60}")  # fmt: skip
         if operation == "constant":
-            number = isinstance(operands[0], int | float) and abs(operands[0]) <= 1.8e308
-            _refuse(not number, f"{here}: {operands[0]!r} is no number")
+            _refuse(not _finite(operands[0]), f"{here}: {operands[0]!r:.60} is no number")
         elif operation == "input":
-            _refuse(not _among(operands[0], width), f"{here}: there is no input {operands[0]!r}")
+            _refuse(
+                not _among(operands[0], width), f"{here}: there is no input {operands[0]!r:.60}"
+            )
         else:
             unset = [r for r in operands if type(r) is not int or r not in known]
-            _refuse(bool(unset), f"{here}: nothing is in register {unset[:1]}")
+            _refuse(bool(unset), f"{here}: nothing is in register {unset[:1]!s:.60}")
         (given if operation == "output" else known).add(place)
     _refuse(len(given) < outputs, f"{where}.steps: {outputs - len(given)} outputs are not set")
 
 
 def _arity(operation: Any, here: str) -> int:
     known = isinstance(operation, str) and operation in ARITIES
-    _refuse(not known, f"{here}: no operation is called {operation!r}")
+    _refuse(not known, f"{here}: no operation is called {operation!r:.60}")
     return ARITIES[operation]
+
+
+def _finite(value: Any) -> bool:
+    return isinstance(value, int | float) and abs(value) <= sys.float_info.max
 
 
 def _among(place: Any, count: int) -> bool:

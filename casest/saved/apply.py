@@ -24,8 +24,8 @@ from casest.escaping import terminal
 from casest.results.saved import SavedResult, saved_correction
 from casest.results.written import corrected_file
 
-#: Samples corrected at once: memory does not grow with the record.
-PIECE = 4096
+#: Samples corrected at once, and numbers held for them: memory does not grow with the record.
+PIECE, HELD = 4096, 2**24
 
 
 def corrected_csv(
@@ -51,7 +51,8 @@ def corrected(program: Program, run: Run) -> Array:
     """The corrected quantity of every sample, (N, size); DataError names the row without any."""
     steps, names = as_data(program), [i.name for i in program.inputs]
     x = np.hstack([np.asarray(run.signals[name], dtype=float) for name in names])
-    pieces = [runtime.attempted(steps, x[k : k + PIECE]) for k in range(0, len(x), PIECE)]
+    rows = max(1, min(PIECE, HELD // max(1, program.registers)))
+    pieces = [runtime.attempted(steps, x[k : k + rows]) for k in range(0, len(x), rows)]
     found: Array = np.vstack(pieces)
     bad = np.flatnonzero(~np.isfinite(found).all(axis=1))
     if bad.size:
