@@ -73,6 +73,7 @@ def test_what_is_read_is_not_written_over(folder, capsys, words):
         "calibrate norm-diagonal v.csv --set norm=9.8 --fix scale=@out/result.json -o other",
         "calibrate norm-diagonal out/corrected.csv --set norm=9.8 -o out",
         "calibrate norm-diagonal v.csv --set norm=9.8 -o out",
+        "calibrate norm-diagonal v.csv --set norm=9.8 -o norm-diagonal",
     ],
 )
 def test_what_is_not_read_may_be_written_over(folder, words):

@@ -29,8 +29,8 @@ def overwritten(command: str, output: str | Path | None, words: Sequence[str]) -
     if output is None:
         return ""
     lost = {_entry(path) for path in _targets(command, Path(output))}
-    for word in words:
-        for path in _read(word):
+    for k, word in enumerate(words):
+        for path in _read(word, result=k == 0 and command in ("apply", "export")):
             # A link in the place of the output is replaced itself, not what it leads to.
             if lost & {_entry(path), os.path.realpath(path)}:
                 return word
@@ -58,12 +58,13 @@ def _targets(command: str, output: Path) -> list[Path]:
     return [output / name for name in _NAMES[command]] if command in _NAMES else [output]
 
 
-def _read(word: str) -> Iterator[Path]:
-    """Files that a word may name: itself, `name=@result`, `file.py:name`, `flight.bag:/imu`."""
-    for text in (word, word.rpartition("@")[2]):
-        for part in (text, text.partition(":")[0]):
-            yield Path(part)
-            yield Path(part) / "result.json"
+def _read(word: str, *, result: bool) -> Iterator[Path]:
+    """Files that a word may name: itself, `file.py:name`, `flight.bag:/imu`, `name=@result`."""
+    _, held, named = word.rpartition("@")
+    for text in (word, word.partition(":")[0], named):
+        yield Path(text)
+    if result or held:  # a folder stands for the result in it
+        yield Path(named) / "result.json"
 
 
 def _entry(path: Path) -> str:
