@@ -11,6 +11,7 @@ import pytest
 
 from casest import UsageError
 from casest.cli import run
+from casest.results.saved import saved_result
 from casest.saved.model import saved_model
 
 CELL = '''
@@ -242,3 +243,30 @@ def test_a_fit_is_kept_where_its_correction_cannot_be_built(tmp_path, monkeypatc
     data = ["b.csv", "--columns", "force=f0,f1"] if "true[0]" in text else ["a.csv"]
     assert run(["calibrate", "cell.py", *data, "-o", "out"]) == 0
     assert said in json.loads(Path("out/result.json").read_text("utf-8"))["correction"]["reason"]
+
+
+@pytest.mark.parametrize("limit", ["inf", "-inf"])
+def test_a_limit_at_infinity_is_carried_and_exported(tmp_path, capsys, monkeypatch, limit):
+    """JSON has no infinity; a correction may: here for every reading without a value."""
+    monkeypatch.chdir(tmp_path)
+    text = CELL.replace("import Residual", "import Residual, if_else, fabs")
+    text = text.replace(
+        "zero + gain * true", f"if_else(fabs(true) < 1e3, zero + gain * true, {limit})"
+    )
+    Path("cell.py").write_text("from math import inf\n" + text, encoding="utf-8")
+    record(tmp_path / "a.csv")
+    assert run(["calibrate", "cell.py", "a.csv", "-o", "out"]) == 0
+    np.testing.assert_allclose(applied(capsys, "out", "a.csv"), np.linspace(-10, 10, 60), atol=2e-3)
+    assert run(["export", "out", "--to", "json", "-o", "c.json"]) == 0
+    json.loads(Path("c.json").read_text("utf-8"), parse_constant=pytest.fail)
+
+
+def test_a_parameter_is_taken_from_a_result_in_motion(tmp_path):
+    content = {
+        "model": "bias-gravity",
+        "trusted": True,
+        "after": {"parameters": {"b": {"value": [1, 2, 3], "std": [1, 1, 1], "unit": "m/s^2"}}},
+        "innovations": {},
+    }
+    (tmp_path / "result.json").write_text(json.dumps(content), encoding="utf-8")
+    assert saved_result(tmp_path).parameters["b"].value == [1, 2, 3]

@@ -38,13 +38,13 @@ class _Reproduced(Struct, frozen=True):
 
 
 class SavedResult(Struct, frozen=True, kw_only=True):
-    """A result of `calibrate` or `close` as it is used again."""
+    """A result of `calibrate` or `close` as it is used again; of an estimator in motion too."""
 
     model: str
     trusted: bool
-    data: list[str]
-    runs: list[str]
-    constants: dict[str, Any]
+    data: list[str] = []
+    runs: list[str] = []
+    constants: dict[str, Any] = {}
     scopes: dict[str, str] = {}
     units: dict[str, str] = {}
     convention: str = ""
@@ -63,13 +63,7 @@ class SavedResult(Struct, frozen=True, kw_only=True):
 
 def saved_result(path: Path) -> SavedResult:
     """The checked content of a saved result (a folder stands for the `result.json` in it)."""
-    content = load_result(path)
-    if "innovations" in content:
-        raise UsageError(
-            f"the result is of {content['model']}, an estimator in motion: it has states over time "
-            f"(casest filter {content['model']} DATA) and no correction"
-        )
-    return typed(content, SavedResult, str(result_file(path)))
+    return typed(load_result(path), SavedResult, str(result_file(path)))
 
 
 def saved_correction(path: Path, *, force: bool = False, what: str) -> tuple[SavedResult, Carried]:
@@ -78,6 +72,11 @@ def saved_correction(path: Path, *, force: bool = False, what: str) -> tuple[Sav
     `what` is to be done to a refused result only with `force`.
     """
     result = saved_result(path)
+    if result.innovations is not None:
+        raise UsageError(
+            f"the result is of {result.model}, an estimator in motion: it has states over time "
+            f"(casest filter {result.model} DATA) and no correction"
+        )
     if not result.trusted and not force:
         raise UsageError(f"{path}: this estimate was refused; --force {what} it all the same")
     if result.correction is None:
