@@ -29,6 +29,7 @@ from casest.data.write import write_atomically
 from casest.errors import library
 from casest.leastsquares.problem import Problem
 from casest.results.find import find_effects, find_model
+from casest.saved.model import saved_model
 from casest.solve.strategy import solve
 from casest_problems import norm, rate_table, wheel
 
@@ -68,11 +69,6 @@ def saved(readings, tmp_path, capsys):
     return out
 
 
-def test_a_result_without_a_parameters_value(saved, readings, capsys):
-    edited(saved, lambda r: r["estimate"]["parameters"].pop("offset"))
-    assert "no value for 'offset'" in failing(capsys, "apply", saved, readings)
-
-
 def test_fixing_from_a_result_that_lacks_refuses_or_misses_the_parameter(saved, readings, capsys):
     command = ["calibrate", "norm-diagonal", readings, *G, "--fix"]
     assert "no parameter 'scale'" in _after(
@@ -104,10 +100,19 @@ def test_a_fixed_value_in_another_unit_than_the_data_need(saved, tmp_path, capsy
     assert "is in m/s^2, but with these data it must be in count" in error
 
 
-def test_an_effects_file_that_has_gone_since_the_calibration(saved, readings, capsys):
+def test_an_effects_file_that_has_gone_since_the_calibration(saved):
+    result = json.loads((saved / "result.json").read_text(encoding="utf-8"))
     effect = {"name": "bend", "on": "corrected", "columns": {}, "file": "/nowhere/bend.py"}
-    edited(saved, lambda r: r["effects"].append(effect))
-    assert "fitted with the effect bend" in failing(capsys, "apply", saved, readings)
+    result["effects"].append(effect)
+    with pytest.raises(UsageError, match=r"was fitted with the effect bend: /nowhere/bend\.py: no"):
+        saved_model(result)
+
+
+def test_a_result_without_a_parameters_value(saved):
+    result = json.loads((saved / "result.json").read_text(encoding="utf-8"))
+    del result["estimate"]["parameters"]["offset"]
+    with pytest.raises(DataError, match="no value for 'offset'"):
+        saved_model(result)
 
 
 def test_a_start_for_a_constant(readings, capsys):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import shutil
+import stat
 from pathlib import Path
 
 import casadi as ca
@@ -379,6 +380,83 @@ def test_without_a_folder_to_write_to_numpy_takes_over(tmp_path, is_compiled):
     assert not is_compiled(file)
     assert not is_compiled(file / "below")
     assert not is_compiled(Path("/proc/casest"))
+
+
+@pytest.mark.parametrize("base", ["", "relative"])
+def test_without_a_home_numpy_takes_over(tmp_path, monkeypatch, is_compiled, base):
+    """No home folder at all, as in some containers; a cache folder that is named relatively."""
+
+    def home():
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.setattr(Path, "home", home)
+    assert not is_compiled("", XDG_CACHE_HOME=base)
+    assert not Path("relative").exists()
+    assert is_compiled("", XDG_CACHE_HOME=str(tmp_path))
+
+
+posix = pytest.mark.skipif(not hasattr(os, "geteuid"), reason="no owners of files on this system")
+
+
+@posix
+def test_what_is_cached_is_the_users_alone(tmp_path, is_compiled):
+    before = os.umask(0)
+    try:
+        assert is_compiled(tmp_path / "new")
+    finally:
+        os.umask(before)
+    (library,) = (tmp_path / "new").iterdir()
+    modes = [stat.S_IMODE(path.stat().st_mode) for path in (tmp_path / "new", library)]
+    assert modes == [0o700, 0o700]
+
+
+@posix
+@pytest.mark.parametrize("mode", [0o770, 0o707, 0o722])
+def test_a_folder_that_others_can_write_is_no_cache(tmp_path, is_compiled, mode):
+    (tmp_path / "open").mkdir()
+    (tmp_path / "open").chmod(mode)
+    assert not is_compiled(tmp_path / "open")
+    (tmp_path / "open" / "below").mkdir(mode=0o700)  # others could exchange it
+    assert not is_compiled(tmp_path / "open" / "below")
+    (tmp_path / "open").chmod(0o1777)  # as /tmp is
+    assert is_compiled(tmp_path / "open" / "below")
+
+
+@posix
+def test_a_folder_that_is_a_link_is_no_cache(tmp_path, is_compiled):
+    (tmp_path / "own").mkdir()
+    (tmp_path / "link").symlink_to(tmp_path / "own")
+    assert not is_compiled(tmp_path / "link")
+    assert is_compiled(tmp_path / "link" / "below")
+
+
+@posix
+def test_a_folder_or_a_file_of_another_user_is_no_cache(tmp_path, monkeypatch, is_compiled):
+    assert is_compiled(tmp_path / "own")
+    monkeypatch.setattr(os, "geteuid", lambda: 12345)
+    assert not is_compiled(tmp_path / "own")
+    monkeypatch.undo()
+    assert is_compiled(tmp_path / "own")
+
+
+@posix
+@pytest.mark.parametrize("how", ["others can write it", "a link"])
+def test_a_library_that_others_may_have_written_is_built_again(tmp_path, is_compiled, how):
+    assert is_compiled(tmp_path / "first")
+    (library,) = (tmp_path / "first").iterdir()
+    other = tmp_path / "second" / library.name
+    other.parent.mkdir()
+    if how == "a link":
+        other.symlink_to(library)
+    else:
+        shutil.copy(library, other)
+        other.chmod(0o777)
+    before = os.lstat(other).st_ino
+    assert is_compiled(other.parent)
+    found = os.lstat(other)
+    assert found.st_ino != before
+    assert stat.S_ISREG(found.st_mode)
+    assert stat.S_IMODE(found.st_mode) == 0o700
 
 
 def test_a_model_that_is_only_tried_is_not_compiled_unless_its_record_is_very_long(monkeypatch):

@@ -63,13 +63,13 @@ def test_imports_go_only_down(path):
     assert climbing == set(), f"{own} (floor {floor(own)}) imports upwards: {sorted(climbing)}"
 
 
-#: What text and page may read beside results: what is theirs, errors, the name of a data file, and
-#: types of what a result holds (a run with its times and gaps, an array and its digits).
+#: What text and page may read beside results: what is theirs, errors, escaping, the name of a data
+#: file, and types of what a result holds (a run with its times and gaps, an array and its digits).
 READ = {
     "text": ["casest.report.text", "casest.report.next_command"],
     "html": ["casest.report.html", "casest.report.next_command"],
 }
-BESIDE = ["casest.results", "casest.errors", "casest.units"]
+BESIDE = ["casest.results", "casest.errors", "casest.escaping", "casest.units"]
 EXACTLY = {"casest.__version__", "casest.data.logs", "casest.data.run", "casest.declaration.shapes"}
 
 

@@ -343,6 +343,9 @@ def test_what_is_not_exported_is_named(tmp_path, capsys):
     said = capsys.readouterr().err
     assert "the correction uses the operation erf, which is not exported" in said
     assert "correct with casest apply" in said
+    assert command(["apply", str(tmp_path / "o"), str(tmp_path / "d.csv")]) == 0
+    rows = capsys.readouterr().out.splitlines()[1:]
+    np.testing.assert_allclose([float(row.split(",")[-1]) for row in rows], x, atol=0.02)
 
 
 #: Modules with an algebra of their own, to which an operation that they do not name is opaque: sums

@@ -88,7 +88,7 @@ def export(
     """The correction of a saved RESULT, ready to run on the device."""
     from casest.correction.inverse import TIMED
     from casest.report.next_command import following
-    from casest.results.file import made_by
+    from casest.results.saved import saved_result
     from casest.saved import apply as correcting
     from casest.saved.export import exported
 
@@ -103,4 +103,4 @@ def export(
         return
     write(output, text)
     echo(f"Written: {output}")
-    echo(f"\n{following(typed(), file=output, fitted=made_by(result_path))}")
+    echo(f"\n{following(typed(), file=output, fitted=saved_result(result_path).reproduce.command)}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -51,7 +50,6 @@ def calibration(model_name: str, data: Sequence[str], options: FitOptions, comma
     from casest.estimate.held_out import score
     from casest.report.html import calibration_page
     from casest.report.text.calibration import calibration_text
-    from casest.report.text.layout import coloured
     from casest.results.calibration import calibration_result, residual_rows
     from casest.results.file import as_json, save
     from casest.solve.interrupt import interruptible
@@ -80,7 +78,7 @@ def calibration(model_name: str, data: Sequence[str], options: FitOptions, comma
     if options.as_json:
         echo(as_json(result.content()), nl=False)
     else:
-        echo(coloured(calibration_text(result, options.output), sys.stdout))
+        echo(calibration_text(result, options.output), verdict=True)
     if not found.certificate.trusted:
         reason = found.certificate.reasons[0]
         echo(f"casest: no trustworthy estimate: {reason}", err=True)
@@ -114,7 +112,6 @@ def closing(model_name: str, data: Sequence[str], options: FitOptions, command: 
     from casest.effects import CATALOGUE
     from casest.report.html import closing_page
     from casest.report.text.closing import closing_text
-    from casest.report.text.layout import coloured
     from casest.results.closing import (
         closing_result,
         formula_source,
@@ -159,7 +156,7 @@ def closing(model_name: str, data: Sequence[str], options: FitOptions, command: 
     if options.as_json:
         echo(as_json(result.content()), nl=False)
     else:
-        echo(coloured(closing_text(result, options.output), sys.stdout))
+        echo(closing_text(result, options.output), verdict=True)
     return 0
 
 
@@ -169,7 +166,6 @@ def closing_in_motion(
     """Filter, diagnose the innovations, add what is missing, save, print."""
     from casest.diagnose.motion import loop
     from casest.report.html import closing_motion_page
-    from casest.report.text.layout import coloured
     from casest.report.text.motion import motion_text
     from casest.results.file import as_json, save
     from casest.results.motion import motion_result, residual_rows
@@ -190,10 +186,10 @@ def closing_in_motion(
     if options.as_json:
         echo(as_json(result.content()), nl=False)
     else:
-        echo(coloured(motion_text(result, options.output), sys.stdout))
+        echo(motion_text(result, options.output), verdict=True)
     if not result.trusted:
         reason = result.after.certificate.reasons[-1]
-        click.echo(f"casest: no trustworthy estimate: {reason}", err=True)
+        echo(f"casest: no trustworthy estimate: {reason}", err=True)
         return NotTrusted.exit_code
     return 0
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import click
 
 from casest import __version__
 from casest.cli.waiting import Waiting
+from casest.escaping import one_line, terminal
 
 shown = Waiting()
 
@@ -17,13 +19,39 @@ shown = Waiting()
 progress = shown.say
 
 
-def echo(text: str, **how: Any) -> None:
-    """Print, after what was said of the waiting is wiped away."""
+def echo(text: str, *, verdict: bool = False, err: bool = False, nl: bool = True) -> None:
+    """Print, after what was said of the waiting is wiped away.
+
+    Names that others wrote may hold escape sequences: none reaches the terminal, and an error is
+    one line. A `verdict` is coloured.
+    """
     shown.done()
-    click.echo(text, **how)
+    text = one_line(text) if err else terminal(text)
+    if verdict:
+        from casest.report.text.layout import coloured
+
+        text = coloured(text, sys.stdout)
+    click.echo(text, err=err, nl=nl)
 
 
-@click.group(context_settings={"help_option_names": ["-h", "--help"]})
+class Careful(click.Group):
+    """Refuses a command whose results would be written over a file that it reads."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Before anything is read or computed."""
+        from casest.errors import UsageError
+        from casest.report.next_command import typed_words
+        from casest.results.written import overwritten
+
+        words = typed_words(shlex.join(["casest", *(ctx.obj or [])]))
+        if words and (lost := overwritten(words.name, words.output, words.read)):
+            raise UsageError(
+                f"-o {words.output}: {lost} is read, and would be written over; give another -o"
+            )
+        return super().invoke(ctx)
+
+
+@click.group(cls=Careful, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__, prog_name="casest")
 def commands() -> None:
     """Calibrate sensors, prove the answer, and say what the data could not determine.

@@ -12,7 +12,7 @@ from casest import units
 from casest.declaration.model import Model
 from casest.declaration.symbols import Constant, constant
 from casest.errors import CasestError, UsageError
-from casest.results.file import load_result, saved_parameters
+from casest.results.saved import numbers, saved_result
 
 #: What stands behind the last number; an exponent is part of the number.
 _UNIT_BEHIND = re.compile(r"(?![eE][-+]?\d)[A-Za-z°µ%][^,;]*$")
@@ -71,21 +71,18 @@ def _declared_unit(symbol: Any) -> str:
 
 
 def _from_result(name: str, path: str) -> Constant:
-    result = load_result(Path(path))
-    parameters = saved_parameters(result)
+    result = saved_result(Path(path))
+    parameters = result.parameters
     if name not in parameters:
         raise UsageError(
             f"{path} has no parameter {name!r} (it has {', '.join(parameters) or 'none'})"
         )
-    if result.get("trusted") is False:
+    if not result.trusted:
         raise UsageError(
             f"{path}: its estimate was refused; calibrate again before using its {name}"
         )
     found = parameters[name]
-    if any(v is None for v in np.ravel(np.array(found["value"], dtype=object))):
-        raise UsageError(f"{path}: its {name} has no value")
-    unit = found["unit"]
-    return _constant(found["value"], unit if isinstance(unit, str) else unit[0])
+    return _constant(numbers(found.value, f"{path}: its {name}"), found.first_unit)
 
 
 def _constant(value: Any, unit: str) -> Constant:

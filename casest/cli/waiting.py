@@ -7,6 +7,8 @@ import sys
 import threading
 import time
 
+from casest.escaping import one_line
+
 PATIENCE = 1.0  # s before anything is said
 _TICK = 0.5  # s between two looks at the clock
 
@@ -26,7 +28,7 @@ class Waiting:
 
     def say(self, words: str) -> None:
         """What is going on from now on; the clock starts with the first words."""
-        self._words = words
+        self._words = one_line(words)
         if self._thread is None and sys.stderr.isatty():
             self._begin, self._width = time.monotonic(), 0
             self._over.clear()

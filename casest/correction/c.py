@@ -9,6 +9,7 @@ from casest.correction.inverse import LEFT
 from casest.correction.program import Program
 from casest.declaration.shapes import Array
 from casest.engine.operations import OPERATIONS
+from casest.escaping import c_comment
 
 _C = {operation.name: operation.exported_c for operation in OPERATIONS}
 _NEWTON = """
@@ -138,20 +139,24 @@ def c_source(program: Program, name: str, single: bool, test: tuple[Array, Array
 
 def _head(program: Program, name: str, single: bool) -> str:
     """What a reader must know to call it."""
-    lines = [
-        f"/* {program.output.name} of {program.model}, exported by casest {__version__}.",
-        " *",
+    said = [
+        f"{program.output.name} of {program.model}, exported by casest {__version__}.",
+        "",
+        "x: one sample,",
     ]
-    lines += [" * x: one sample,"]
     place = 0
     for i in program.inputs:
         places = f"x[{place}]" if i.size == 1 else f"x[{place}]..x[{place + i.size - 1}]"
-        lines.append(f" *   {places}  {i.name} [{i.unit or '1'}]")
+        said.append(f"  {places}  {i.name} [{i.unit or '1'}]")
         place += i.size
-    lines += [
-        f" * corrected: {program.output.size} values [{program.output.unit or '1'}].",
-        *([f" * {LEFT}{', '.join(program.left)}."] if program.left else []),
-        " * Returns 0, or 1 where the reading lies outside what the model can produce. */",
+    said += [
+        f"corrected: {program.output.size} values [{program.output.unit or '1'}].",
+        *([f"{LEFT}{', '.join(program.left)}."] if program.left else []),
+        "Returns 0, or 1 where the reading lies outside what the model can produce.",
+    ]
+    lines = [
+        *(f"{' *' if k else '/*'} {c_comment(line)}".rstrip() for k, line in enumerate(said)),
+        " */",
         "#include <math.h>",
         "#include <tgmath.h>",
         "",

@@ -233,13 +233,13 @@ class Correction:
             traced = self.model.traced
             value = ca.vec(self.model.inverter(dict(traced.symbols), traced.reading))
             return "direct", function_of(self.model, {"c": ca.densify(value)})
-        rest, wanted, step = self._cut.expression, self._wanted, self._step()
+        rest, wanted = self._cut.expression, self._wanted
         if rest.numel() != wanted.numel():
             raise UsageError(
                 f"model {self.model.name}: {rest.numel()} readings do not determine the "
                 f"{wanted.numel()} components of {self.name}"
             )
-        sample = sample_symbol(self.model, self._cut)
+        sample, step = sample_symbol(self.model, self._cut), self._step()
         if self.affine:
             value = ca.densify(ca.substitute(step, wanted, ca.SX.zeros(wanted.numel())))
             return "direct", ca.Function("inverse", [self._point(), sample], [value])

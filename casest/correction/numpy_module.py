@@ -6,13 +6,12 @@ import inspect
 import json
 from typing import Any
 
-import numpy as np
-
 from casest import __version__
 from casest.correction import numpy_table, runtime
 from casest.correction.inverse import LEFT
-from casest.correction.program import Program
+from casest.correction.program import Input, Program
 from casest.declaration.shapes import Array
+from casest.escaping import python_docstring
 
 _TEST = '''
 
@@ -43,15 +42,14 @@ def python_source(program: Program, test: tuple[Array, Array]) -> str:
     _, _, body = text.partition("from __future__ import annotations\n")
     body = body.replace(numpy_table.IMPORT, numpy_table.TEXT, 1)
     signals = ", ".join(f"{i.name} ({i.size}, {i.unit or '1'})" for i in program.inputs)
-    head = (
-        f'"""{program.output.name} of {program.model}, exported by casest {__version__}.\n\n'
+    said = (
+        f"{program.output.name} of {program.model}, exported by casest {__version__}.\n\n"
         f"correct(x): x (N, {program.width}) holds {signals};\n"
         f"returns (N, {program.output.size}) in {program.output.unit or '1'}. Raises ValueError\n"
         "naming the row whose reading lies outside what the model can produce.\n"
         + (f"\n{LEFT}\n{', '.join(program.left)}.\n" if program.left else "")
-        + '"""\n\n'
-        "from __future__ import annotations\n"
     )
+    head = f'"""{python_docstring(said)}"""\n\nfrom __future__ import annotations\n'
     tail = (
         f"\n\nPROGRAM = {_loaded(as_data(program))}\n\n\n"
         "def correct(x: Any) -> Any:\n"
@@ -80,12 +78,8 @@ def as_data(program: Program) -> dict[str, Any]:
     """The program as plain data, for JSON."""
     found: dict[str, Any] = {
         "kind": program.kind,
-        "inputs": [{"name": i.name, "size": i.size, "unit": i.unit} for i in program.inputs],
-        "output": {
-            "name": program.output.name,
-            "size": program.output.size,
-            "unit": program.output.unit,
-        },
+        "inputs": [_values(i) for i in program.inputs],
+        "output": _values(program.output),
         "registers": program.registers,
         "steps": [list(step) for step in program.steps],
     }
@@ -99,6 +93,6 @@ def as_data(program: Program) -> dict[str, Any]:
     return found
 
 
-def corrected(program: Program, x: Any) -> Any:
-    """The program run by the same text that is exported."""
-    return runtime.corrected(as_data(program), np.asarray(x, dtype=float))
+def _values(i: Input) -> dict[str, Any]:
+    found: dict[str, Any] = {"name": i.name, "size": i.size, "unit": i.unit}
+    return found if i.kind == "plain" else {**found, "kind": i.kind}

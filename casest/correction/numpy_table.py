@@ -22,3 +22,20 @@ TEXT = _text()
 _found: dict[str, Any] = {"Any": Any, "np": np}
 exec(TEXT, _found)  # what runs here is what is exported, to the letter
 OPERATIONS: dict[str, Any] = _found["OPERATIONS"]
+
+
+def _with(operation: operations.Operation) -> Any:
+    """One that is not exported, by the function that computes it in a fit."""
+
+    def computed(*operands: Any) -> Any:
+        arrays = np.broadcast_arrays(*(np.asarray(a, dtype=float) for a in operands))
+        out = np.empty(arrays[0].shape)
+        operation.kernel(*arrays, out)
+        return out
+
+    return computed
+
+
+OPERATIONS |= {o.name: _with(o) for o in operations.OPERATIONS if o.numpy is None}
+#: How many operands each has.
+ARITIES = {o.name: o.arity for o in operations.OPERATIONS}

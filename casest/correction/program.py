@@ -8,8 +8,8 @@ solution and what is left of the reading; the target iterates.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import casadi as ca
@@ -17,7 +17,7 @@ import numpy as np
 
 from casest.correction.inverse import Correction
 from casest.declaration.shapes import Array
-from casest.engine.operations import operation_of
+from casest.engine.operations import OPERATIONS, operation_of
 from casest.errors import UsageError
 
 
@@ -28,6 +28,7 @@ class Input:
     name: str
     size: int
     unit: str
+    kind: Literal["plain", "rotation"] = "plain"
 
 
 @dataclass(frozen=True)
@@ -36,8 +37,10 @@ class Program:
 
     `steps` are [operation, register, operands…]: "input" has the number of the input, "constant"
     a value, "output" (with the register as operand) the number of the output. `starts` are the
-    levels where Newton's method begins, the reading itself among them where `from_reading`;
-    `measured` is the place of the reading among the inputs. `left` are effects that stay in.
+    levels where Newton's method begins, the reading itself among them where it has as many numbers
+    as what is corrected; `measured` is the place of the reading among the inputs. `left` are
+    effects that stay in. `own` numbers of one run follow the inputs (and the trial value): see
+    `of_run`.
     """
 
     model: str
@@ -51,11 +54,25 @@ class Program:
     measured: tuple[int, int] | None = None
     largest: float = 1.0
     left: tuple[str, ...] = ()
+    own: int = 0
 
     @property
     def width(self) -> int:
         """Numbers per sample."""
         return sum(i.size for i in self.inputs)
+
+    def of_run(self, numbers: Sequence[float]) -> Program:
+        """The program of one run: its own numbers put in."""
+        if len(numbers) != self.own:
+            raise ValueError(f"{len(numbers)} numbers of a run, not {self.own}")
+        first = self.width + (self.output.size if self.kind == "newton" else 0)
+        steps = tuple(
+            ("constant", step[1], float(numbers[step[2] - first]))
+            if step[0] == "input" and step[2] >= first
+            else step
+            for step in self.steps
+        )
+        return replace(self, steps=steps, own=0)
 
 
 def program(
@@ -64,50 +81,57 @@ def program(
     units: Mapping[str, str],
     around: tuple[float, float] | None,
     largest: float,
+    differing: Sequence[int] = (),
 ) -> Program:
     """The correction with its parameters put in as numbers.
 
     `around` is the range that the corrected quantity had in the fit, `largest` the size of the
-    largest reading there, both for Newton's method.
+    largest reading there, both for Newton's method. Entries of the model's point that are
+    `differing` between runs stay inputs.
     """
     model = correction.model
     kind, function = correction.as_function()
     parameters = np.concatenate(model.point(dict(values)))
-    inputs = tuple(Input(s.name, s.size, units.get(s.name, "")) for s in correction.signals)
-    bound = _bound(function, parameters, correction, inputs, trial=kind == "newton")
+    inputs = tuple(Input(s.name, s.size, units.get(s.name, ""), s.kind) for s in correction.signals)
+    if not inputs:
+        raise UsageError(
+            f"model {model.name}: {correction.name} is computed from no signal: there is nothing "
+            "to correct"
+        )
+    bound = _bound(function, parameters, correction, differing, trial=kind == "newton")
     steps, registers = _steps(bound)
     output = Input(correction.name, correction.size, units.get(correction.name, ""))
+    built = Program(model.name, kind, inputs, output, registers, steps, own=len(differing))
     if kind == "direct":
-        return Program(model.name, "direct", inputs, output, registers, steps)
+        return built
     levels = [] if around is None else [0.5 * sum(around), around[0], around[1]]
     names = [i.name for i in inputs]
     at = names.index(correction.measured)
     measured = sum(i.size for i in inputs[:at]), inputs[at].size
     starts = (*levels, 0.0, 1.0, -1.0, 100.0, -100.0)
     middle = levels[0] if levels else 0.0
-    return Program(
-        model.name, "newton", inputs, output, registers, steps, starts, middle, measured, largest
-    )
+    return replace(built, starts=starts, middle=middle, measured=measured, largest=largest)
 
 
 def _bound(
-    function: Any,
-    parameters: Array,
-    correction: Correction,
-    inputs: Sequence[Input],
-    trial: bool,
+    function: Any, parameters: Array, correction: Correction, differing: Sequence[int], trial: bool
 ) -> Any:
-    """The function of the needed inputs alone (and the trial value), parameters put in."""
-    x = ca.SX.sym("x", sum(i.size for i in inputs) + (correction.size if trial else 0))
+    """The function of the needed inputs alone (trial value, numbers of a run), parameters in."""
+    needed = [s.name for s in correction.signals]
+    width = sum(s.size for s in correction.signals)
+    last = width + (correction.size if trial else 0)
+    x = ca.SX.sym("x", last + len(differing))
     wanted, place = {}, 0
-    for i in inputs:
-        wanted[i.name] = x[place : place + i.size]
-        place += i.size
-    sample = [wanted.get(s.name, ca.SX.zeros(s.size)) for s in correction.model.signals]
-    arguments = [ca.SX(ca.DM(parameters)), ca.vertcat(*sample)]
-    if trial:
-        arguments[1] = ca.vertcat(arguments[1], x[place:])
-    out = ca.simplify(ca.densify(function(*arguments)))
+    for s in correction.signals:
+        wanted[s.name] = x[place : place + s.size]
+        place += s.size
+    signals = correction.model.signals
+    sample = [wanted[s.name] if s.name in needed else ca.SX.zeros(s.size) for s in signals]
+    point = ca.SX(ca.DM(parameters))
+    for k, entry in enumerate(differing):
+        point[entry] = x[last + k]
+    sample += [x[width:last]] if trial else []
+    out = ca.simplify(ca.densify(function(point, ca.vertcat(*sample))))
     return ca.Function("correction", [x], [ca.densify(out)])
 
 
@@ -118,17 +142,35 @@ def _steps(function: Any) -> tuple[tuple[tuple[Any, ...], ...], int]:
         op = function.instruction_id(k)
         ins, outs = function.instruction_input(k), function.instruction_output(k)
         if op == ca.OP_CONST:
-            found.append(("constant", outs[0], float(function.instruction_constant(k))))
+            found.extend(_constant(outs[0], float(function.instruction_constant(k))))
         elif op == ca.OP_INPUT:
             found.append(("input", outs[0], ins[1]))
         elif op == ca.OP_OUTPUT:
             found.append(("output", outs[1], ins[0]))
         else:
             operation = operation_of(op, "the correction")
-            if operation.numpy is None:
-                raise UsageError(
-                    f"the correction uses the operation {operation.name}, which is not exported:"
-                    " write the model without it, or correct with casest apply"
-                )
             found.append((operation.name, outs[0], *ins[: operation.arity]))
     return tuple(found), int(function.sz_w())
+
+
+def _constant(place: int, value: float) -> Iterator[tuple[Any, ...]]:
+    """A constant; JSON has no infinity, so that one is computed."""
+    if np.isfinite(value):
+        yield "constant", place, value
+        return
+    yield "constant", place, 1e308
+    yield "mul", place, place, place
+    if np.isnan(value):
+        yield "sub", place, place, place
+    elif value < 0:
+        yield "neg", place, place
+
+
+def refuse_unexported(built: Program) -> None:
+    """Raise UsageError where the program has an operation that other languages lack."""
+    for operation in OPERATIONS:
+        if operation.numpy is None and operation.name in {step[0] for step in built.steps}:
+            raise UsageError(
+                f"the correction uses the operation {operation.name}, which is not exported:"
+                " write the model without it, or correct with casest apply"
+            )

@@ -14,6 +14,7 @@ def write_atomically(path: str | os.PathLike[str], text: str) -> None:
     """Write `text` (UTF-8) to `path` so that it holds the old content or all of the new.
 
     The text goes to a temporary name in the same folder, reaches the disk, and is then renamed.
+    What is no character, as in the name of a file that is not UTF-8, becomes a question mark.
     Raises DataError where the folder is missing or cannot be written.
     """
     target = Path(path)
@@ -25,7 +26,7 @@ def write_atomically(path: str | os.PathLike[str], text: str) -> None:
             f"give a folder that exists and may be written to"
         ) from error
     try:
-        with os.fdopen(handle, "w", encoding="utf-8", newline="\n") as file:
+        with os.fdopen(handle, "w", encoding="utf-8", errors="replace", newline="\n") as file:
             file.write(text)
             file.flush()
             os.fsync(file.fileno())

@@ -200,7 +200,7 @@ def _is_mathematical(number: float) -> bool:
     """Small whole numbers and their inverses; others may be conversions, as 0.01745 or 1000."""
     size = abs(number)
     candidates = (size, 1 / size if size else 0.0)
-    return any(abs(x - round(x)) < 1e-12 and round(x) <= 12 for x in candidates)
+    return any(abs(x - round(x)) < 1e-12 for x in candidates if x < 12.5)
 
 
 def _operated(operation: Operation, operands: list[Size], name: str) -> Size:

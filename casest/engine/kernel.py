@@ -1,9 +1,9 @@
 """Least-squares sums compiled by the machine's C compiler, where there is one.
 
-Built once per content (source, compiler, flags, processor) and kept in the user's cache folder;
-two processes that build at once each write a file of their own and rename it. A file that is not
-whole is built again. Whatever goes wrong, the replay with NumPy takes over without a word: the
-numbers agree to rounding.
+Built once per content (source, compiler, flags, processor) and kept in the user's cache folder
+(`cache`); two processes that build at once each write a file of their own and rename it. A file
+that is not whole, or that another user may have written, is built again. Whatever goes wrong, the
+replay with NumPy takes over without a word: the numbers agree to rounding.
 
 Environment: CASEST_KERNEL=off switches it off, =always builds it for small data too;
 CASEST_CACHE names the folder; CC the compiler.
@@ -27,6 +27,7 @@ from pathlib import Path
 
 import numpy as np
 
+from casest.engine.cache import kernel_folder, own_file
 from casest.engine.emit import source, source_of_sum
 from casest.engine.operations import Floats
 from casest.engine.replay import Columns, Entry, Replay
@@ -211,12 +212,13 @@ def library(text: str, flag_sets: Sequence[list[str]], *, build: bool = True) ->
     if compiler is None:
         return None
     try:
-        folder = cache_folder()
-        folder.mkdir(parents=True, exist_ok=True)
+        folder = kernel_folder()
+        if folder is None:
+            return None
         machine = [compiler, _version(compiler), _processor()]
         paths = [folder / f"{_key([text, *machine, *flags])}.so" for flags in flag_sets]
         for path in paths:
-            if _whole(path):
+            if own_file(path) and _whole(path):
                 return ctypes.CDLL(str(path))
         for flags, path in zip(flag_sets if build else [], paths, strict=False):
             if _compiled(compiler, text, flags, path):
@@ -257,6 +259,7 @@ def _compiled(compiler: str, text: str, flags: list[str], path: Path) -> bool:
         with made.open("r+b") as file:
             digest = hashlib.sha256(file.read()).digest()
             file.write(digest)
+        os.chmod(made, 0o700)
         os.replace(made, path)
         return True
 
@@ -285,15 +288,6 @@ def _processor() -> str:
         return f"{platform.machine()} {platform.processor()} {platform.node()}"
     wanted = ("model name", "flags", "Features", "CPU part")
     return "\n".join(sorted({line for line in lines if line.startswith(wanted)}))
-
-
-def cache_folder() -> Path:
-    """Where compiled kernels are kept."""
-    named = os.environ.get("CASEST_CACHE")
-    if named:
-        return Path(named)
-    base = os.environ.get("XDG_CACHE_HOME")
-    return (Path(base) if base else Path.home() / ".cache") / "casest"
 
 
 @lru_cache(maxsize=1)

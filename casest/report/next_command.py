@@ -7,8 +7,11 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from casest.results.written import apart
+
 WIDTH = 80
 
+_OUTPUT = ("-o", "--output")
 _FLAGS = ("--at-rest", "--json", "--force", "--float")
 _READING = ("--columns", "--unit", "--scale", "--rate", "--time-zero")
 _MODEL = ("--set", "--free", "--fix", "--shared", "--per-run", "--effects", "--at-rest")
@@ -29,9 +32,20 @@ class Typed:
         return Typed(name, arguments or self.arguments, kept)
 
     def into(self, output: str | Path) -> Typed:
-        """The same command with results written to `output`."""
-        kept = tuple(pair for pair in self.options if pair[0] not in ("-o", "--output"))
-        return replace(self, options=(*kept, ("-o", str(output))))
+        """The same command with results written to `output`, or beside it if that is read."""
+        kept = tuple(pair for pair in self.options if pair[0] not in _OUTPUT)
+        return replace(self, options=(*kept, ("-o", str(apart(self.name, output, self.read)))))
+
+    @property
+    def read(self) -> tuple[str, ...]:
+        """Arguments and values of options that may name a file to be read."""
+        values = (value for flag, value in self.options if value and flag not in _OUTPUT)
+        return (*self.arguments, *values)
+
+    @property
+    def output(self) -> str | None:
+        """Where results are written; None where nothing says it."""
+        return next((v for flag, v in reversed(self.options) if flag in _OUTPUT), None)
 
     def lines(self) -> str:
         """The command, indented; a long one continues on the next line as a shell reads it."""

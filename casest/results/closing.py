@@ -30,6 +30,7 @@ from casest.results.fitted import (
     NoiseModel,
     attachment,
     correlation_of,
+    digest_of_source,
     fitted_content,
     noise_of,
 )
@@ -65,6 +66,7 @@ class Effect(Struct, frozen=True, kw_only=True):
     columns: dict[str, str] | UnsetType = UNSET
     numbers: dict[str, float] | UnsetType = UNSET
     file: str | UnsetType = UNSET
+    sha256: str | UnsetType = UNSET
 
 
 class Hidden(Struct, frozen=True):
@@ -293,8 +295,10 @@ def formula_source(closing: Closing) -> str:
 
 def with_formula_in(result: Closed, path: Path) -> Closed:
     """The result that says where the formula's source is written: `apply` reads it there."""
-    file = str(path.resolve())
-    effects = [replace(e, file=file) if e.name == "formula" else e for e in result.effects]
+    file, sha256 = str(path.resolve()), digest_of_source(path)
+    effects = [
+        replace(e, file=file, sha256=sha256) if e.name == "formula" else e for e in result.effects
+    ]
     return replace(result, effects=effects)
 
 

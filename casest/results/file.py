@@ -11,6 +11,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from casest.data.logs import file_and_topics
@@ -18,6 +19,8 @@ from casest.data.write import write_atomically
 from casest.errors import DataError
 
 RESULT, RESIDUALS = "result.json", "residuals.csv"
+#: The key of a result under which it carries its correction.
+CORRECTION = "correction"
 
 
 def versions() -> dict[str, str]:
@@ -69,19 +72,38 @@ def save(folder: Path, result: Mapping[str, Any], residuals: str | None) -> None
 
 
 def as_json(result: Mapping[str, Any]) -> str:
-    """The result as text: strict JSON, two blanks of indentation."""
-    return json.dumps(result, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    """The result as text: strict JSON, two blanks of indentation; the correction on one line."""
+    rest = {name: value for name, value in result.items() if name != CORRECTION}
+    text = json.dumps(rest, indent=2, ensure_ascii=False, allow_nan=False)
+    if CORRECTION in result:
+        program = json.dumps(result[CORRECTION], ensure_ascii=False, allow_nan=False)
+        text = f'{text.removesuffix("}").rstrip()},\n  "{CORRECTION}": {program}\n}}'
+    return text + "\n"
+
+
+def result_file(path: Path) -> Path:
+    """A folder stands for the `result.json` in it."""
+    return path / RESULT if path.is_dir() else path
+
+
+def load_json(path: Path) -> Any:
+    """The content of a JSON file; ValueError where it is none, OSError where it cannot be read."""
+    try:
+        return msgspec.json.decode(path.read_bytes())
+    except (msgspec.MsgspecError, RecursionError) as error:
+        raise ValueError(str(error)) from None
 
 
 def load_result(path: Path) -> dict[str, Any]:
     """A saved result (a folder stands for the `result.json` in it)."""
-    if path.is_dir():
-        path = path / RESULT
+    path = result_file(path)
     try:
-        result = json.loads(path.read_text(encoding="utf-8"))
+        result = load_json(path)
     except (FileNotFoundError, NotADirectoryError):
         raise DataError(f"{path}: no such result; {_instead(path.parent)}") from None
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read ({error.strerror})") from None
+    except ValueError as error:
         near = path.with_name(RESULT)
         hint = f"; did you mean {near}?" if near.exists() and near != path else ""
         raise DataError(f"{path}: not a result.json ({error}){hint}") from None
@@ -97,11 +119,6 @@ def load_result(path: Path) -> dict[str, Any]:
         by = f", but what `casest {writer}` writes" if writer else ": it holds no estimate"
         raise DataError(f"{path}: not a result of calibrate or close{by}")
     return result
-
-
-def made_by(path: Path) -> str:
-    """The command that made a saved result; empty where Python did."""
-    return str(load_result(path).get("reproduce", {}).get("command", ""))
 
 
 #: What other commands leave in their folders.
@@ -120,10 +137,3 @@ def _instead(folder: Path) -> str:
     if found:
         return f"the folder holds {found} of `casest {_WRITERS[found]}`; {make}"
     return make
-
-
-def saved_parameters(result: Mapping[str, Any]) -> dict[str, Any]:
-    """Parameters of a saved result, after the loop was closed if it was."""
-    block = result.get("after") or result.get("estimate") or {}
-    found: dict[str, Any] = block.get("parameters", {})
-    return found

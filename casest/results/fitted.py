@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import inspect
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
@@ -13,6 +13,8 @@ import casadi as ca
 import numpy as np
 from msgspec import UNSET, Struct, UnsetType
 
+from casest.correction.carried import carried
+from casest.correction.reading import carried_data
 from casest.declaration.effect import Attached
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
@@ -95,6 +97,7 @@ class Attachment(Struct, frozen=True):
     columns: dict[str, str]
     numbers: dict[str, float]
     file: str
+    sha256: str | UnsetType
 
 
 class WeakCombination(Struct, frozen=True):
@@ -204,6 +207,7 @@ class Fitted(Result, frozen=True, kw_only=True, dict=True):
     convention: str
     declared_in: DeclaredIn
     reproduce: Reproduced
+    correction: dict[str, Any]
     declared: str
     kind: str
     entries: tuple[Entry, ...]
@@ -235,6 +239,7 @@ def fitted_content(
 ) -> dict[str, Any]:
     """The fields that a calibration and a closed loop have in common."""
     problem, identified = estimate.problem, estimate.identifiability
+    corrected = _corrected_range(estimate)
     table = unit_table(problem.model, problem.runs)
     units = {name: unit for name, unit in table.items() if "[" not in name}
     return {
@@ -252,7 +257,7 @@ def fitted_content(
             weak_of(estimate),
         ),
         "scatter_between_runs": _scatter(estimate),
-        "corrected": _corrected_range(estimate),
+        "corrected": corrected,
         "units": units,
         "solver": _solver(estimate),
         "samples": [Samples(run.name, len(run), int(np.sum(run.count))) for run in problem.runs],
@@ -260,6 +265,7 @@ def fitted_content(
         "convention": inspect.getdoc(problem.model.function) or "",
         "declared_in": _declared_in(problem.model),
         "reproduce": reproduced(command, data),
+        "correction": _correction(estimate, units, corrected),
         "declared": estimate.model.name,
         "kind": "rest intervals" if problem.runs[0].spread else "samples",
         "entries": entries(estimate),
@@ -323,7 +329,7 @@ def attachment(attached: Attached) -> Attachment:
     }
     file = Path(inspect.unwrap(attached.effect.function).__code__.co_filename).resolve()
     name, columns = attached.effect.name, dict(attached.columns)
-    return Attachment(name, attached.on, columns, numbers, str(file))
+    return Attachment(name, attached.on, columns, numbers, str(file), digest_of_source(file))
 
 
 def _corrected_range(estimate: Estimate) -> Corrected | None:
@@ -337,6 +343,17 @@ def _corrected_range(estimate: Estimate) -> Corrected | None:
     if not finite.size:
         return Corrected(name)
     return Corrected(name, float(finite.min()), float(finite.max()))
+
+
+def _correction(
+    estimate: Estimate, units: Mapping[str, str], corrected: Corrected | None
+) -> dict[str, Any]:
+    """What it takes to correct readings without the model's source; else the reason why not."""
+    around = None
+    if corrected and corrected.low is not UNSET and corrected.high is not UNSET:
+        around = (corrected.low, corrected.high)
+    found = carried(estimate.model, estimate.values, estimate.problem.runs, units, around)
+    return {"reason": found} if isinstance(found, str) else carried_data(found)
 
 
 def _solver(estimate: Estimate) -> Solver:
@@ -353,7 +370,12 @@ def _solver(estimate: Estimate) -> Solver:
 
 
 def _declared_in(model: Model) -> DeclaredIn:
-    path = Path(model.function.__code__.co_filename).resolve()
+    path = Path(inspect.unwrap(model.function).__code__.co_filename).resolve()
     if not path.exists():
         return DeclaredIn()
-    return DeclaredIn(str(path), hashlib.sha256(path.read_bytes()).hexdigest())
+    return DeclaredIn(str(path), digest_of_source(path))
+
+
+def digest_of_source(path: Path) -> str | UnsetType:
+    """SHA-256 of a file of declarations as it is now; UNSET where there is none."""
+    return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else UNSET

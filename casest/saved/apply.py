@@ -11,16 +11,21 @@ from typing import Any
 
 import numpy as np
 
-from casest.correction.inverse import Correction, invertible, of_their_time
+from casest.correction import runtime
+from casest.correction.carried import Carried
+from casest.correction.numpy_module import as_data
+from casest.correction.program import Program
 from casest.data import load_runs
 from casest.data.run import Run
 from casest.data.write import write_atomically
-from casest.declaration.model import Model
 from casest.declaration.shapes import Array
-from casest.declaration.symbols import Parameter
 from casest.errors import DataError, UsageError
-from casest.results.file import load_result
-from casest.saved.model import saved_model
+from casest.escaping import terminal
+from casest.results.saved import SavedResult, saved_correction
+from casest.results.written import corrected_file
+
+#: Samples corrected at once, and numbers held for them: memory does not grow with the record.
+PIECE, HELD = 4096, 2**24
 
 
 def corrected_csv(
@@ -28,34 +33,46 @@ def corrected_csv(
 ) -> tuple[str, tuple[str, ...]]:
     """CSV with time, the readings and the corrected readings, units in the header.
 
-    Beside it the effects that are left in the readings (see `invertible`).
+    Beside it the effects that are left in the readings (see `invertible`). The correction is the
+    one that the result carries: nothing of the model's source is run.
     """
-    result = load_result(path)
-    if not result.get("trusted", True) and not force:
-        raise UsageError(f"{path}: this estimate was refused; --force applies it all the same")
-    saved, values = saved_model(result)
-    model, left = invertible(saved)
-    correction = Correction(model)
-    which = _run_number(model, correction, result, data)
-    needed = {
-        n: _of_one_run(saved[n], v, which) for n, v in values.items() if n in correction.parameters
-    }
-    spare = {s.name for s in model.signals} - {s.name for s in correction.signals}
-    runs = load_runs([data], correction.signals, **without(spare, arguments))
+    result, carried = saved_correction(path, force=force, what="applies")
+    program = carried.of_run(_run_number(carried, result, data))[0]
+    spare = {s.name for s in carried.signals} - {s.name for s in carried.needed}
+    runs = load_runs([data], carried.needed, **without(spare, arguments))
     _same_units(result, runs, data)
-    known = result.get("corrected") or {}
-    around = (known["low"], known["high"]) if "low" in known else None
-    given, unit = correction.signals, result.get("units", {}).get(correction.name)
-    found = [correction(run, needed, around) for run in runs]
-    return table_of(runs, [s.name for s in given], found, correction.name, unit), left
+    found = [corrected(program, run) for run in runs]
+    unit = result.units.get(program.output.name)
+    given = [s.name for s in carried.needed]
+    return table_of(runs, given, found, program.output.name, unit), program.left
+
+
+def corrected(program: Program, run: Run) -> Array:
+    """The corrected quantity of every sample, (N, size); DataError names the row without any."""
+    steps, names = as_data(program), [i.name for i in program.inputs]
+    x = np.hstack([np.asarray(run.signals[name], dtype=float) for name in names])
+    rows = max(1, min(PIECE, HELD // max(1, program.registers)))
+    pieces = [runtime.attempted(steps, x[k : k + rows]) for k in range(0, len(x), rows)]
+    found: Array = np.vstack(pieces)
+    bad = np.flatnonzero(~np.isfinite(found).all(axis=1))
+    if bad.size:
+        at, size = program.measured or (0, program.width)
+        row = int(bad[0])
+        value = np.array2string(x[row, at : at + size], precision=6)
+        raise DataError(
+            f"{run.file}: row {int(run.rows[row])}: reading {value} has no {program.output.name} "
+            f"in the model ({bad.size} of {len(run)} rows): it lies outside what the model "
+            "can produce; remove the rows, or calibrate over a wider range"
+        )
+    return found
 
 
 def of_another_time(path: Path, data: str | None = None) -> tuple[str, ...]:
     """Effects that follow the time of the fitted record, unless it is that record again."""
-    result = load_result(path)
-    if data is not None and Path(data).resolve() in {Path(d).resolve() for d in result["data"]}:
+    result, carried = saved_correction(path, force=True, what="reads")
+    if data is not None and Path(data).resolve() in {Path(d).resolve() for d in result.data}:
         return ()
-    return of_their_time(invertible(saved_model(result)[0])[0])
+    return carried.timed
 
 
 def without(spare: Iterable[str], arguments: Mapping[str, Any]) -> dict[str, Any]:
@@ -67,29 +84,23 @@ def without(spare: Iterable[str], arguments: Mapping[str, Any]) -> dict[str, Any
     return kept
 
 
-def _run_number(model: Model, correction: Correction, result: Mapping[str, Any], data: str) -> int:
+def _run_number(carried: Carried, result: SavedResult, data: str) -> int:
     """Which fitted run the data are: matters where the correction differs from run to run."""
-    differing = {p.name for p in model.parameters if p.scope == "run"} & correction.parameters
-    if len(result["runs"]) == 1 or not differing:
+    if not carried.own:
         return 0
-    files = [Path(name).resolve() for name in result["data"]]
-    if len(files) == len(result["runs"]) and Path(data).resolve() in files:
+    files = [Path(name).resolve() for name in result.data]
+    if len(files) == len(result.runs) and Path(data).resolve() in files:
         return files.index(Path(data).resolve())
-    name = sorted(differing)[0]
+    name = next((n for n, scope in result.scopes.items() if scope == "run"), "a parameter")
     raise UsageError(
         f"{name} differs from run to run, and {data} is none of the fitted files; calibrate with "
         f"--shared {name} to apply the result to new data"
     )
 
 
-def _of_one_run(parameter: Parameter, value: Array, which: int) -> Array:
-    """The value of one run; only several runs have a run axis."""
-    return value[which] if value.ndim > len(parameter.shape.dims) else value
-
-
-def _same_units(result: Mapping[str, Any], runs: tuple[Run, ...], data: str) -> None:
+def _same_units(result: SavedResult, runs: tuple[Run, ...], data: str) -> None:
     for name, unit in runs[0].units.items():
-        fitted = result.get("units", {}).get(name)
+        fitted = result.units.get(name)
         if fitted and unit and "[" not in fitted and unit != fitted:
             raise DataError(
                 f"{data}: signal {name} is in {unit}, the result was made in {fitted}; "
@@ -133,10 +144,12 @@ def _bracket(unit: str | None) -> str:
 def write_or_print(text: str, output: Path | None) -> Path | None:
     """To a .csv file, to corrected.csv in a folder (returns which), or to standard output."""
     if output is None:
-        sys.stdout.write(text)
+        sys.stdout.write(terminal(text) if sys.stdout.isatty() else text)
         return None
-    if output.suffix != ".csv":
-        output.mkdir(parents=True, exist_ok=True)
-        output = output / "corrected.csv"
+    output = corrected_file(output)
+    try:
+        output.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DataError(f"{output.parent}: cannot be made ({error.strerror})") from None
     write_atomically(output, text)
     return output

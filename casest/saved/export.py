@@ -3,33 +3,32 @@
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from msgspec import Struct
 
 from casest import __version__
 from casest.correction import runtime
 from casest.correction.c import c_source
-from casest.correction.inverse import Correction, invertible
+from casest.correction.carried import Carried
 from casest.correction.numpy_module import as_data, python_source
-from casest.correction.program import Program, program
+from casest.correction.program import Program, refuse_unexported
+from casest.correction.reading import program_read, typed
 from casest.data import load_runs
-from casest.declaration.model import Model
 from casest.declaration.shapes import Array
 from casest.declaration.symbols import Signal
 from casest.errors import DataError, UsageError
-from casest.results.file import load_result, plain
-from casest.saved.apply import table_of, without
-from casest.saved.model import saved_model
+from casest.escaping import c_identifier
+from casest.results.file import load_json
+from casest.results.saved import SavedResult, saved_correction
+from casest.saved.apply import corrected, table_of, without
 
 #: What the JSON form calls itself; its schema is `casest/correction/correction.schema.json`.
 FORMAT = "casest-correction-1"
-#: Samples of the self-test.
-TESTED = 16
 
 
 def exported(
@@ -41,85 +40,55 @@ def exported(
     force: bool = False,
 ) -> str:
     """Text of the exported correction. `run` chooses among runs whose corrections differ."""
-    result = load_result(path)
-    if not result.get("trusted", True) and not force:
-        raise UsageError(f"{path}: this estimate was refused; --force exports it all the same")
-    saved, values = saved_model(result)
-    model, left = invertible(saved)
-    correction = Correction(model)
-    several = len(result["runs"]) > 1
-    own = {p.name for p in model.parameters if p.scope == "run"} & correction.parameters
-    if several and own and not 0 <= run < len(result["runs"]):
-        raise UsageError(f"--run {run}: there are runs 0 to {len(result['runs']) - 1}")
-    known = {n: _of_run(saved[n], np.asarray(v), run) for n, v in values.items()}
-    own_names = {p.name for p in model.parameters}
-    known = {n: v for n, v in known.items() if n in own_names}
-    found = result.get("corrected") or {}
-    around = (found["low"], found["high"]) if "low" in found else None
-    samples, largest = _samples(correction, known, around)
-    built = program(correction, known, result.get("units", {}), around, largest)
-    built = replace(built, left=left)
-    expected = runtime.corrected(as_data(built), samples)
+    result, carried = saved_correction(path, force=force, what="exports")
+    if carried.own and not 0 <= run < len(result.runs):
+        raise UsageError(f"--run {run}: there are runs 0 to {len(result.runs) - 1}")
+    bound, readings = carried.of_run(run if carried.own else 0)
+    built = replace(bound, model=carried.model)
+    refuse_unexported(built)
+    test = _test(built, readings, path)
     if to == "json":
-        return _as_json(built, saved, result, known)
+        return _as_json(built, carried, result, run)
     if to == "python":
-        return python_source(built, (samples, expected))
-    name = "correct_" + re.sub(r"\W", "_", model.name)
-    return c_source(built, name, single, (samples, expected))
+        return python_source(built, test)
+    return c_source(built, f"correct_{c_identifier(carried.model)}", single, test)
 
 
-def _of_run(parameter: Any, value: Array, run: int) -> Array:
-    return value[run] if value.ndim > len(parameter.shape.dims) else value
+def _test(built: Program, readings: Array, path: Path) -> tuple[Array, Array]:
+    """Readings of the fit that have a corrected value, and that."""
+    expected = runtime.attempted(as_data(built), readings)
+    good = np.isfinite(expected).all(axis=1)
+    if not good.any():
+        raise DataError(f"{path}: no reading of the fit has a corrected value; calibrate again")
+    return readings[good], expected[good]
 
 
-def _samples(
-    correction: Correction, values: Mapping[str, Any], around: tuple[float, float] | None
-) -> tuple[Array, float]:
-    """Samples (TESTED, width) whose corrected values lie in the range of the fit; largest reading.
-
-    An explicit model predicts the readings; an implicit one is given readings of that size.
-    """
-    low, high = around or (-1.0, 1.0)
-    rng = np.random.default_rng(0)
-    wanted = rng.uniform(low, high, (TESTED, correction.size))
-    width = sum(s.size for s in correction.signals)
-    if correction.model.implicit:
-        found = rng.uniform(low, high, (TESTED, width))
-        return found, float(np.abs(found).max())
-    readings = correction.readings(values, wanted)
-    samples, place = np.zeros((TESTED, width)), 0
-    for s in correction.signals:
-        if s.name == correction.measured:
-            samples[:, place : place + s.size] = readings
-        place += s.size
-    return samples, float(np.abs(readings).max())
-
-
-def _as_json(
-    built: Program, model: Model, result: Mapping[str, Any], values: Mapping[str, Any]
-) -> str:
+def _as_json(built: Program, carried: Carried, result: SavedResult, run: int) -> str:
+    several = len(result.runs) > 1
     content = {
         "format": FORMAT,
         "casest": __version__,
-        "model": result["model"],
-        "signals": [s.name for s in model.signals],
+        "model": result.model,
+        "signals": [s.name for s in carried.signals],
         "not_undone": list(built.left),
-        "convention": result.get("convention", ""),
-        "data": result["data"],
+        "convention": result.convention,
+        "data": result.data,
         "parameters": {
-            name: {**p, "value": plain(values.get(name, p["value"]))}
-            for name, p in _with_std(result).items()
+            name: {
+                "value": _of_run(p.value, run, several and result.scopes.get(name) == "run"),
+                "std": p.std,
+                "unit": p.unit,
+            }
+            for name, p in result.parameters.items()
         },
-        "constants": result["constants"],
+        "constants": result.constants,
         "program": as_data(built),
     }
     return json.dumps(content, indent=1) + "\n"
 
 
-def _with_std(result: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    estimate = result.get("estimate") or result.get("after") or {}
-    found = estimate.get("parameters", {})
-    return {n: {k: p[k] for k in ("value", "std", "unit")} for n, p in found.items()}
+def _of_run(value: Any, run: int, own: bool) -> Any:
+    return value[run] if own and isinstance(value, list) and run < len(value) else value
 
 
 def is_exported(path: Path) -> bool:
@@ -127,10 +96,19 @@ def is_exported(path: Path) -> bool:
     if not path.is_file() or path.suffix != ".json":
         return False
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = load_json(path)
     except (OSError, ValueError):
         return False
     return isinstance(content, dict) and str(content.get("format", "")).startswith("casest-corr")
+
+
+class _Exported(Struct):
+    """What is read of an exported correction."""
+
+    format: str
+    program: dict[str, Any]
+    signals: list[str] = []
+    not_undone: list[str] = []
 
 
 def applied(path: Path, data: str, arguments: Mapping[str, Any]) -> tuple[str, tuple[str, ...]]:
@@ -138,19 +116,18 @@ def applied(path: Path, data: str, arguments: Mapping[str, Any]) -> tuple[str, t
 
     Beside it the effects that are left in the readings.
     """
-    content = json.loads(path.read_text(encoding="utf-8"))
-    if content["format"] != FORMAT:
-        raise UsageError(f"{path}: format {content['format']!r}; this casest reads {FORMAT}")
-    steps, out = content["program"], content["program"]["output"]
-    signals = [Signal(i["name"], i["size"], i["unit"] or None) for i in steps["inputs"]]
-    spare = set(content.get("signals", [])) - {s.name for s in signals}
+    content = typed(load_json(path), _Exported, str(path))
+    if content.format != FORMAT:
+        raise UsageError(f"{path}: format {content.format!r}; this casest reads {FORMAT}")
+    built = program_read(content.program, f"{path}: program", left=content.not_undone)
+    signals = [Signal(i.name, i.size, _unit(i.unit), i.kind) for i in built.inputs]
+    spare = set(content.signals) - {s.name for s in signals}
     runs = load_runs([data], signals, **without(spare, arguments))
-    found = []
-    for run in runs:
-        x = np.hstack([np.asarray(run.signals[s.name]) for s in signals])
-        try:
-            found.append(runtime.corrected(steps, x))
-        except ValueError as error:
-            raise DataError(f"{run.file}: {error}") from None
-    text = table_of(runs, [s.name for s in signals], found, out["name"], out["unit"])
-    return text, tuple(content.get("not_undone", []))
+    found, out = [corrected(built, run) for run in runs], built.output
+    text = table_of(runs, [s.name for s in signals], found, out.name, out.unit)
+    return text, built.left
+
+
+def _unit(stated: str) -> str | None:
+    """The unit of an input; None where the fit knew none, so that any will do."""
+    return stated if stated and "[" not in stated else None

@@ -10,24 +10,23 @@ from typing import Any
 
 import numpy as np
 
+from casest import effects
 from casest.declaration.effect import Effect
 from casest.declaration.model import Model
 from casest.declaration.symbols import constant
 from casest.effects.on_axes import axis_name, restricted
 from casest.errors import DataError, UsageError
-from casest.results.file import saved_parameters
 from casest.results.find import find_effects, find_model
 
 
 def saved_model(result: Mapping[str, Any]) -> tuple[Model, dict[str, Any]]:
-    """Model and parameter values of a saved result: effects, constants and scopes as they were."""
-    if "innovations" in result:
-        raise UsageError(
-            f"the result is of {result['model']}, an estimator in motion: it has states over time "
-            f"(casest filter {result['model']} DATA) and no correction"
-        )
+    """Model and parameter values of a saved result: effects, constants and scopes as they were.
+
+    Files of declarations are run for that: those that lie where they were, and whose SHA-256 is
+    the one that the result has recorded.
+    """
     model, units = _found_model(result), result.get("units", {})
-    parameters = saved_parameters(result)
+    parameters = (result.get("after") or result.get("estimate") or {}).get("parameters", {})
     for saved in result.get("effects", []):
         if "file" not in saved:  # a constant that was freed
             continue
@@ -56,29 +55,34 @@ def _found_model(result: Mapping[str, Any]) -> Model:
     """The model where it was when the result was made, and as it was."""
     name, declared = str(result["model"]), result.get("declared_in") or {}
     path, colon, own = name.partition(":")
-    if path.endswith(".py") and not Path(path).exists() and Path(declared.get("file", "")).exists():
-        name = declared["file"] + colon + own
-    model = find_model(name)
-    source = Path(model.function.__code__.co_filename)
-    shipped = not name.partition(":")[0].endswith(".py")
-    if not shipped and declared and source.exists():
-        now = hashlib.sha256(source.read_bytes()).hexdigest()
-        if now != declared["sha256"]:
-            raise UsageError(
-                f"{source} has changed since the result was made: calibrate again (the parameters "
-                "belong to the old declaration)"
-            )
-    return model
+    if not path.endswith(".py"):
+        return find_model(name)
+    file = Path(declared.get("file", path))
+    _refuse_changed(file, declared.get("sha256"))
+    return find_model(f"{file}{colon}{own}")
 
 
 def _found_effect(saved: Mapping[str, Any]) -> Effect:
-    """The effect of that name in the file that declared it."""
+    """The effect of that name: casest's own, or from the file that declared it, as it was."""
+    file, shipped = Path(saved["file"]), Path(effects.__file__).parent
     try:
-        return find_effects(f"{saved['file']}:{saved['name']}")[0]
-    except UsageError as error:
+        if file.parent == shipped:
+            return next(e for e in effects.CATALOGUE if e.name == saved["name"])
+        _refuse_changed(file, saved.get("sha256"))
+        return find_effects(f"{file}:{saved['name']}")[0]
+    except (UsageError, StopIteration) as error:
         raise UsageError(
-            f"the result was fitted with the effect {saved['name']}: {error}"
+            f"the result was fitted with the effect {saved['name']}: {error or 'there is none'}"
         ) from None
+
+
+def _refuse_changed(source: Path, recorded: str | None) -> None:
+    """Refuse a file of declarations that is not the one that the result was made with, unrun."""
+    if source.is_file() and hashlib.sha256(source.read_bytes()).hexdigest() != recorded:
+        raise UsageError(
+            f"{source} has changed since the result was made: calibrate again (the parameters "
+            "belong to the old declaration)"
+        )
 
 
 def _as_it_was(effect: Effect, saved: Mapping[str, Any], own: set[str], model: Model) -> Effect:

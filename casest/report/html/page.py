@@ -15,11 +15,12 @@ from importlib.resources import files
 from typing import Any
 
 from casest import __version__
+from casest.escaping import terminal, visible
 
 
 def escaped(text: Any) -> str:
-    """The text as HTML shows it."""
-    return html.escape(str(text), quote=True)
+    """The text as HTML shows it, characters without a shape as they are written."""
+    return html.escape(terminal(str(text)), quote=True)
 
 
 def tag(name: str, *inside: str, **attributes: str) -> str:
@@ -130,6 +131,7 @@ def _digest(text: str) -> str:
 def _for_script(data: Any) -> str:
     """JSON that cannot end the element that holds it."""
     text = json.dumps(data, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
-    for sign in "<>&\u2028\u2029":
+    text = visible(text)
+    for sign in "<>&":
         text = text.replace(sign, f"\\u{ord(sign):04x}")
     return text

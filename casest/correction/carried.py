@@ -1,0 +1,137 @@
+"""The correction that a result carries: applied and exported without the model's source."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from casest.correction.inverse import Correction, invertible, of_their_time
+from casest.correction.program import Program, program
+from casest.data.run import Run
+from casest.declaration.model import Model
+from casest.declaration.shapes import Array
+from casest.declaration.symbols import Signal
+from casest.errors import CasestError, UsageError, last_line
+
+#: Readings of the fit that are kept for the self-test of an export: in all, or of each run.
+TESTED, TESTED_EACH = 16, 4
+
+
+@dataclass(frozen=True)
+class Carried:
+    """A program and what belongs to it.
+
+    `model` is the declared name; `signals` are all of the model's, as declared, to bind data to.
+    `own` numbers of each run, where the correction differs between runs, else none. `readings`
+    (n, width) of the fit, one array, or one for each run. `timed` are effects that follow the time
+    of the fitted record.
+    """
+
+    model: str
+    program: Program
+    signals: tuple[Signal, ...]
+    own: tuple[tuple[float, ...], ...]
+    readings: tuple[Array, ...]
+    timed: tuple[str, ...]
+
+    @property
+    def needed(self) -> tuple[Signal, ...]:
+        """The signals that the correction reads."""
+        names = [i.name for i in self.program.inputs]
+        return tuple(s for s in self.signals if s.name in names)
+
+    def of_run(self, which: int) -> tuple[Program, Array]:
+        """The program of one run, and readings of it; of all where they share one."""
+        if not self.own:
+            return self.program, self.readings[0]
+        return self.program.of_run(self.own[which]), self.readings[which]
+
+
+def carried(
+    fitted: Model,
+    values: Mapping[str, Any],
+    runs: Sequence[Run],
+    units: Mapping[str, str],
+    around: tuple[float, float] | None,
+) -> Carried | str:
+    """The correction of a fitted model, or why there is none.
+
+    `values` have a leading axis of runs where a parameter differs between several; `around` is
+    the range that the corrected quantity had in the fit.
+    """
+    try:
+        return _carried(fitted, values, runs, units, around)
+    except CasestError as error:
+        return str(error)
+    except Exception as error:  # an inverse of the user's own: the fit is not lost for it
+        return f"model {fitted.name}: its correction fails: {last_line(error)}"
+
+
+def _carried(
+    fitted: Model,
+    values: Mapping[str, Any],
+    runs: Sequence[Run],
+    units: Mapping[str, str],
+    around: tuple[float, float] | None,
+) -> Carried:
+    model, left = invertible(fitted)
+    correction = Correction(model)
+    points, differing = _points(model, correction, values, len(runs))
+    if not np.isfinite(points).all():
+        raise UsageError(f"model {fitted.name} was fitted without a value for every parameter")
+    known = _of_run(model, values, 0, len(runs))
+    names = [s.name for s in correction.signals]
+    built = program(correction, known, units, around, _largest(correction, runs), differing)
+    return Carried(
+        fitted.name,
+        replace(built, left=left),
+        fitted.signals,
+        tuple(tuple(map(float, p[differing])) for p in points) if differing else (),
+        tuple(_readings(runs, names, each=bool(differing))),
+        of_their_time(model),
+    )
+
+
+def _of_run(model: Model, values: Mapping[str, Any], which: int, runs: int) -> dict[str, Any]:
+    """Values of one run."""
+    found = {}
+    for p in model.parameters:
+        value = np.asarray(values[p.name])
+        found[p.name] = value[which] if p.scope == "run" and runs > 1 else value
+    return found
+
+
+def _points(
+    model: Model, correction: Correction, values: Mapping[str, Any], runs: int
+) -> tuple[list[Array], list[int]]:
+    """The model's point in each run, and which of its entries differ in what is needed."""
+    own = {p.name for p in model.parameters if p.scope == "run"} & correction.parameters
+    first = _of_run(model, values, 0, runs)
+    if runs < 2 or not own:
+        return [np.concatenate(model.point(first))], []
+    points = []
+    for k in range(runs):
+        one = _of_run(model, values, k, runs)
+        points.append(np.concatenate(model.point(first | {n: one[n] for n in own})))
+    return points, np.flatnonzero(np.ptp(points, axis=0) != 0).tolist()
+
+
+def _largest(correction: Correction, runs: Sequence[Run]) -> float:
+    """The largest reading of the fit; 1 where nothing is compared with it."""
+    name = correction.measured
+    sizes = [np.abs(run.signals[name]).max(initial=0.0) for run in runs if name in run.signals]
+    finite = [float(s) for s in sizes if np.isfinite(s) and s > 0]
+    return max(finite, default=1.0)
+
+
+def _readings(runs: Sequence[Run], names: Sequence[str], *, each: bool) -> list[Array]:
+    """Samples of what is needed, evenly over each run or over all of them."""
+    parts = [np.hstack([np.asarray(run.signals[n], float) for n in names]) for run in runs]
+    parts = parts if each else [np.vstack(parts)]
+    parts = [p[np.isfinite(p).all(axis=1)] for p in parts]
+    count = TESTED_EACH if each else TESTED
+    return [p[np.unique(np.linspace(0, len(p), count, endpoint=False).astype(int))] if len(p) else p
+            for p in parts]  # fmt: skip

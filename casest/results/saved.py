@@ -1,0 +1,100 @@
+"""What is read of a saved result again, checked: a file may have been edited, or sent by others."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from msgspec import UNSET, Struct, UnsetType
+
+from casest.correction.carried import Carried
+from casest.correction.reading import carried_read, typed
+from casest.declaration.shapes import Array
+from casest.errors import DataError, UsageError
+from casest.results.file import load_result, result_file
+
+
+class SavedParameter(Struct, frozen=True):
+    """Value and standard deviation, nested by the parameter's shape; unit, or one per entry."""
+
+    value: Any
+    std: Any
+    unit: str | list[str]
+
+    @property
+    def first_unit(self) -> str:
+        """The unit, of the first entry where they differ."""
+        return self.unit if isinstance(self.unit, str) else next(iter(self.unit), "")
+
+
+class _Section(Struct, frozen=True):
+    parameters: dict[str, SavedParameter]
+
+
+class _Reproduced(Struct, frozen=True):
+    command: str = ""
+
+
+class SavedResult(Struct, frozen=True, kw_only=True):
+    """A result of `calibrate` or `close` as it is used again; of an estimator in motion too."""
+
+    model: str
+    trusted: bool
+    data: list[str] = []
+    runs: list[str] = []
+    constants: dict[str, Any] = {}
+    scopes: dict[str, str] = {}
+    units: dict[str, str] = {}
+    convention: str = ""
+    estimate: _Section | UnsetType = UNSET
+    after: _Section | UnsetType = UNSET
+    innovations: Any = None
+    correction: dict[str, Any] | None = None
+    reproduce: _Reproduced = _Reproduced()
+
+    @property
+    def parameters(self) -> Mapping[str, SavedParameter]:
+        """After the loop was closed, if it was."""
+        found = self.after or self.estimate
+        return found.parameters if found else {}
+
+
+def saved_result(path: Path) -> SavedResult:
+    """The checked content of a saved result (a folder stands for the `result.json` in it)."""
+    return typed(load_result(path), SavedResult, str(result_file(path)))
+
+
+def saved_correction(path: Path, *, force: bool = False, what: str) -> tuple[SavedResult, Carried]:
+    """A saved result and the correction that it carries; nothing of the model's source is run.
+
+    `what` is to be done to a refused result only with `force`.
+    """
+    result = saved_result(path)
+    if result.innovations is not None:
+        raise UsageError(
+            f"the result is of {result.model}, an estimator in motion: it has states over time "
+            f"(casest filter {result.model} DATA) and no correction"
+        )
+    if not result.trusted and not force:
+        raise UsageError(f"{path}: this estimate was refused; --force {what} it all the same")
+    if result.correction is None:
+        raise DataError(
+            f"{path}: was made by an older casest, and carries no correction: calibrate again"
+        )
+    if "reason" in result.correction:
+        raise UsageError(str(result.correction["reason"]))
+    where = f"{result_file(path)}: correction"
+    return result, carried_read(result.correction, where, len(result.runs))
+
+
+def numbers(value: Any, where: str) -> Array:
+    """A saved value (any shape) as numbers; DataError where it is none."""
+    try:
+        found = np.array(value, dtype=float)
+    except (TypeError, ValueError, OverflowError):
+        raise DataError(f"{where}: {value!r:.60} are no numbers; calibrate again") from None
+    if not np.isfinite(found).all():
+        raise DataError(f"{where}: has no value; calibrate again")
+    return found
