@@ -69,8 +69,7 @@ def compare(model_name: str, data: tuple[str, ...], options: CompareOptions) -> 
     """Run every solver on MODEL and DATA, from one start and from a spread of starts.
 
     Each is judged by the certified optimum: where it ended, what it claims, what it took. Exit
-    code 0: done; 1: bad input; 2: no certified optimum to judge by, or interrupted (what is done
-    is shown and written all the same).
+    code 0: done; 1: bad input; 2: no certified optimum to judge by (all is shown and written).
     """
     from casest.comparison.judge import SIZES
     from casest.comparison.judge import compare as compared
@@ -97,11 +96,9 @@ def compare(model_name: str, data: tuple[str, ...], options: CompareOptions) -> 
         echo(as_json(result.content()), nl=False)
     else:
         echo(comparison_text(result, written))
-    if found.interrupted:
-        echo(f"casest: interrupted after {found.done} of {found.planned} runs", err=True)
-    elif not found.certified:
+    if not found.certified:
         echo("casest: no certified optimum to judge by", err=True)
-    return 0 if found.certified and not found.interrupted else NotTrusted.exit_code
+    return 0 if found.certified else NotTrusted.exit_code
 
 
 def written_comparison(result: SolversCompared, folder: Path) -> list[Path]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import Any
 
 import click
 
+from casest.cli.command import printed
 from casest.cli.flags import Kind, refuse, taking
 from casest.cli.loading import declared_model, held_out, moving_model, records, trajectory
 from casest.cli.options import DATA, RESULTS, FitOptions, MotionOptions, model_argument
@@ -54,15 +54,13 @@ def calibration(model_name: str, data: Sequence[str], options: FitOptions, comma
     from casest.report.text.layout import coloured
     from casest.results.calibration import calibration_result, residual_rows
     from casest.results.file import as_json, save
-    from casest.solve.interrupt import interruptible
 
     model = declared_model(model_name, options.model)
     runs = records(model, data, options.reading)
     hidden = held_out(model, options.holdout, data, options.reading)
     start = dict(given.start(model) for given in options.starts) or None
     progress(f"fitting {model_name}")
-    with interruptible():
-        found = attempt(model, runs, start=start, solver=options.solver, seed=options.seed)
+    found = attempt(model, runs, start=start, solver=options.solver, seed=options.seed)
     holdout = score(found, hidden) if hidden else None
     progress("asking whether the residual is noise")
     result = calibration_result(
@@ -80,7 +78,7 @@ def calibration(model_name: str, data: Sequence[str], options: FitOptions, comma
     if options.as_json:
         echo(as_json(result.content()), nl=False)
     else:
-        echo(coloured(calibration_text(result, options.output), sys.stdout))
+        echo(coloured(calibration_text(result, options.output), printed()))
     if not found.certificate.trusted:
         reason = found.certificate.reasons[0]
         echo(f"casest: no trustworthy estimate: {reason}", err=True)
@@ -159,7 +157,7 @@ def closing(model_name: str, data: Sequence[str], options: FitOptions, command: 
     if options.as_json:
         echo(as_json(result.content()), nl=False)
     else:
-        echo(coloured(closing_text(result, options.output), sys.stdout))
+        echo(coloured(closing_text(result, options.output), printed()))
     return 0
 
 
@@ -190,10 +188,10 @@ def closing_in_motion(
     if options.as_json:
         echo(as_json(result.content()), nl=False)
     else:
-        echo(coloured(motion_text(result, options.output), sys.stdout))
+        echo(coloured(motion_text(result, options.output), printed()))
     if not result.trusted:
         reason = result.after.certificate.reasons[-1]
-        click.echo(f"casest: no trustworthy estimate: {reason}", err=True)
+        echo(f"casest: no trustworthy estimate: {reason}", err=True)
         return NotTrusted.exit_code
     return 0
 
@@ -223,10 +221,12 @@ def refused(
 @click.option("-o", "--output", default=Path("out"), **RESULTS)
 def demo(output: Path) -> int:
     """Close the loop on a shipped record with an effect that its model lacks."""
+    from casest.data.write import written_together
     from casest.demo import WHEEL, comparison
 
     words = f"casest close wheel {WHEEL} -o {output}"
     echo(f"$ {words}\n")
-    code = closing("wheel", (str(WHEEL),), FitOptions(output=output), words)
+    with written_together():  # `comparison` reads them
+        code = closing("wheel", (str(WHEEL),), FitOptions(output=output), words)
     echo("\n" + comparison(output))
     return code

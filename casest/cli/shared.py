@@ -9,7 +9,9 @@ from typing import Any
 import click
 
 from casest import __version__
+from casest.cli.command import Command, printed
 from casest.cli.waiting import Waiting
+from casest.errors import DataError
 
 shown = Waiting()
 
@@ -20,7 +22,15 @@ progress = shown.say
 def echo(text: str, **how: Any) -> None:
     """Print, after what was said of the waiting is wiped away."""
     shown.done()
-    click.echo(text, **how)
+    if how.get("err"):
+        click.echo(text, **how)
+        return
+    try:
+        click.echo(text, file=printed(), **how)
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        raise DataError(f"standard output cannot be written ({error.strerror})") from None
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
@@ -30,6 +40,9 @@ def commands() -> None:
 
     MODEL is a shipped name (see `casest list`) or `file.py[:name]`.
     """
+
+
+commands.command_class = Command
 
 
 def typed() -> str:
@@ -57,7 +70,6 @@ def reported(folder: Path, page: str) -> None:
 def write(path: Path, text: str) -> None:
     """A file in a folder that is made if it is missing."""
     from casest.data.write import write_atomically
-    from casest.errors import DataError
 
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

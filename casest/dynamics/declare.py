@@ -345,7 +345,7 @@ def _trace(declared: Dynamics) -> Traced:
         motion = declared.function(**symbols, **xs, **numbers)
     except CasestError:
         raise
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         text = str(error).strip().splitlines()
         raise DeclarationError(
             f"dynamics {declared.name}: {text[-1] if text else type(error).__name__}"

@@ -26,7 +26,6 @@ from casest.leastsquares.identifiability import Identifiability, Weak, identify,
 from casest.leastsquares.problem import Point, Problem
 from casest.leastsquares.sums import repeat_noise, second_order_bias
 from casest.leastsquares.weights import has_noise_effects, variance_factor
-from casest.solve.interrupt import stopped
 from casest.solve.outcome import Outcome
 from casest.solve.strategy import SOLVERS, best_of, solve, valleys
 
@@ -200,9 +199,6 @@ def _attempt(
     found = _estimate(problem, best_of(outcomes), outcomes, began, intervals)
     if start is None and model.starter is None and found.certificate.trusted:
         found = _looked_at_for_a_better_one(found)
-    if stopped():
-        refused = found.certificate.refused(Code.INTERRUPTED, words.INTERRUPTED)
-        return replace(found, certificate=refused)
     return _by_estimator(found, own[solver], solver) if solver in own else found
 
 

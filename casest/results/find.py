@@ -146,6 +146,8 @@ def load_file(path: Path) -> ModuleType:
     """Run a Python file of declarations; whatever is wrong in it becomes one line with place."""
     if not path.exists():
         raise UsageError(f"{path}: no such file")
+    if path.is_dir():
+        raise UsageError(f"{path}: is a folder; give the .py file in it")
     spec = spec_from_file_location(f"casest_user_{path.stem}", path)
     if spec is None or spec.loader is None:
         raise UsageError(f"{path}: not a Python file")
@@ -161,7 +163,7 @@ def load_file(path: Path) -> ModuleType:
         ) from None
     except CasestError as error:
         raise type(error)(f"{_place(error, path)}: {error}") from None
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise DeclarationError(f"{_place(error, path)}: {type(error).__name__}: {error}") from None
     finally:
         sys.path.remove(str(path.parent))

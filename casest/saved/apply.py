@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import sys
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -130,11 +129,8 @@ def _bracket(unit: str | None) -> str:
     return f" [{unit}]" if unit and "[" not in unit and unit != "1" else ""
 
 
-def write_or_print(text: str, output: Path | None) -> Path | None:
-    """To a .csv file, to corrected.csv in a folder (returns which), or to standard output."""
-    if output is None:
-        sys.stdout.write(text)
-        return None
+def write_to(output: Path, text: str) -> Path:
+    """To a .csv file, or to corrected.csv in a folder; returns which."""
     if output.suffix != ".csv":
         output.mkdir(parents=True, exist_ok=True)
         output = output / "corrected.csv"
