@@ -35,23 +35,29 @@ def run(arguments: Sequence[str] | None = None) -> int:
     try:
         words = list(sys.argv[1:] if arguments is None else arguments)
         result = commands.main(words, prog_name="casest", standalone_mode=False, obj=words)
+        _close_output()
         return result if isinstance(result, int) else 0
     except click.exceptions.NoArgsIsHelpError as error:
         echo(error.format_message())
         return 1
-    except BrokenPipeError:
+    except SystemExit as error:  # click's own: after completions, or help into a closed pipe
         _close_output()
-        return 0
-    except (Exception, KeyboardInterrupt, SystemExit) as error:
-        text, code = _said(error)
-        if code == INTERNAL and os.environ.get("CASEST_TRACEBACK"):
-            traceback.print_exc()
-        with suppress(OSError):
-            echo(f"casest: {text}", err=True)
-        _close_output()
-        return code
+        return error.code if isinstance(error.code, int) else int(error.code is not None)
+    except BaseException as error:
+        return _ended(error)
     finally:
         shown.done()
+
+
+def _ended(error: BaseException) -> int:
+    """Say what ended the command; its exit code."""
+    text, code = _said(error)
+    if code == INTERNAL and os.environ.get("CASEST_TRACEBACK"):
+        traceback.print_exc()
+    with suppress(OSError):
+        echo(f"casest: {text}", err=True)
+    _close_output()
+    return code
 
 
 def _said(error: BaseException) -> tuple[str, int]:
@@ -62,8 +68,6 @@ def _said(error: BaseException) -> tuple[str, int]:
         return "interrupted; nothing was written", INTERRUPTED
     if isinstance(error, click.ClickException):
         return error.format_message(), 1
-    if isinstance(error, SystemExit):
-        return f"the model's code ended the program (SystemExit: {error}); let it return instead", 1
     first = (str(error).strip().splitlines() or [""])[0]
     if isinstance(error, MemoryError):
         return f"out of memory ({first or 'nothing is left'}); give a shorter record", 1

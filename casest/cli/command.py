@@ -10,7 +10,7 @@ from typing import Any, TextIO
 
 import click
 
-from casest.errors import UsageError
+from casest.errors import DeclarationError, UsageError
 from casest.interruption import too_late
 
 #: Bytes of address space below which linear algebra does not fail but waits for memory for ever:
@@ -38,19 +38,21 @@ class Command(click.Command):
         if sys.stdout is None:
             raise UsageError("standard output is closed; send it to a file, or to /dev/null")
         _refuse_little_memory()
-        token, closed = _printed.set(sys.stdout), None
+        token = _printed.set(sys.stdout)
         try:
             with redirect_stdout(sys.stderr), written_together():
                 try:
                     result = super().invoke(ctx)
-                except BrokenPipeError as error:
-                    result, closed = None, error
+                except SystemExit as error:
+                    raise DeclarationError(
+                        f"the model's code ends the program (SystemExit: {error}); let it return"
+                    ) from None
+                except BrokenPipeError:  # who reads no further has seen enough
+                    result = None
                 too_late()
+            return result
         finally:
             _printed.reset(token)
-        if closed:
-            raise closed
-        return result
 
 
 def _refuse_little_memory() -> None:

@@ -158,9 +158,9 @@ def load_file(path: Path) -> ModuleType:
     try:
         spec.loader.exec_module(module)
     except SyntaxError as error:
-        raise DeclarationError(
-            f"{error.filename}, line {error.lineno}: {error.msg}: {(error.text or '').strip()!r}"
-        ) from None
+        where = f"{error.filename or path}" + (f", line {error.lineno}" if error.lineno else "")
+        text = f": {error.text.strip()!r}" if error.text else ""
+        raise DeclarationError(f"{where}: {error.msg}{text}") from None
     except CasestError as error:
         raise type(error)(f"{_place(error, path)}: {error}") from None
     except (Exception, SystemExit) as error:
@@ -174,8 +174,12 @@ def _refuse_duplicates(path: Path) -> None:
     """A second function of one name would silently replace the first."""
     try:
         tree = ast.parse(path.read_text(encoding="utf-8"))
-    except (SyntaxError, UnicodeDecodeError):
+    except (SyntaxError, UnicodeDecodeError, ValueError):
         return  # running the file says where
+    except RecursionError:
+        raise DeclarationError(
+            f"{path}: an expression is too long for Python; build it up in several lines or a loop"
+        ) from None
     seen: dict[str, int] = {}
     for node in tree.body:
         if isinstance(node, ast.FunctionDef):
@@ -196,5 +200,6 @@ def _place(error: BaseException, path: Path) -> str:
         if Path(traceback.tb_frame.f_code.co_filename).resolve() == path.resolve():
             line = traceback.tb_lineno
         traceback = traceback.tb_next
+    linecache.checkcache(str(path))
     text = linecache.getline(str(path), line).strip().rstrip(",")
     return f"{path}, line {line}" + (f", {text!r}" if text else "")
