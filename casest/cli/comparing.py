@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from casest.cli.assignments import Assignment, Assignments
 from casest.cli.flags import Kind, flag, taking
-from casest.cli.loading import declared_model, records
+from casest.cli.loading import model_and_records
 from casest.cli.options import DATA, FOLDER, ModelOptions, ReadingOptions, Words, model_argument
 from casest.cli.shared import commands, echo, progress, typed
 from casest.errors import NotTrusted, UsageError
@@ -77,8 +77,7 @@ def compare(model_name: str, data: tuple[str, ...], options: CompareOptions) -> 
     from casest.results.comparison import comparison_result
     from casest.results.file import as_json
 
-    model = declared_model(model_name, options.model)
-    runs = records(model, data, options.reading)
+    model, runs = model_and_records(model_name, data, options.model, options.reading)
     found = compared(
         model,
         runs,

@@ -6,6 +6,7 @@ import ast
 import difflib
 import importlib
 import linecache
+import re
 import sys
 from collections.abc import Sequence
 from importlib.util import module_from_spec, spec_from_file_location
@@ -107,15 +108,46 @@ def find_effects(name: str) -> tuple[Effect, ...]:
     return found
 
 
+def find_asked(text: str) -> tuple[tuple[Effect, str], ...]:
+    """Effects as --effects names them, with the column that they are to follow, else empty.
+
+    `NAME(COLUMN)` of a shipped one, `FILE(COLUMN)` or `FILE:NAME(COLUMN)` of one's own.
+    """
+    found = re.fullmatch(r"(.+?)\(([^()]+)\)", text)
+    if found is None:
+        return tuple((effect, "") for effect in find_effects(text))
+    name, column = found[1], found[2].strip()
+    shipped = {e.name: e for e in CATALOGUE}
+    if name not in shipped:
+        several = find_effects(name)
+        if len(several) > 1:
+            raise UsageError(
+                f"--effects {text}: {name} declares {', '.join(e.name for e in several)}: say "
+                f"which, as {name}:{several[0].name}({column})"
+            )
+    effect = shipped[name] if name in shipped else several[0]
+    if len(effect.columns) != 1:
+        raise UsageError(f"--effects {text}: {effect.name} follows no column; leave ({column}) out")
+    return ((effect, column),)
+
+
 def _whole(effect: Effect) -> Effect:
     """A shipped effect that needs neither a column nor a value that must be looked for."""
-    missing = "the column it follows" if any(s.name == "channel" for s in effect.extras) else ""
-    if effect.profile:
-        missing = f"its {', '.join(n for n, _ in effect.profile)}, which only `casest close` finds"
-    if missing:
+    if any(s.name == "channel" for s in effect.extras):
         raise UsageError(
-            f"--effects {effect.name}: this effect needs {missing}. Declare it in a file of your "
-            "own, with the value or column in it"
+            f"--effects {effect.name}: this effect needs the column it follows: "
+            f"--effects '{effect.name}(COLUMN)'"
+        )
+    return without_grid(effect)
+
+
+def without_grid(effect: Effect) -> Effect:
+    """The effect, unless it has a value that must be looked for."""
+    if effect.profile:
+        missing = ", ".join(name for name, _ in effect.profile)
+        raise UsageError(
+            f"--effects {effect.name}: this effect needs its {missing}, which only `casest close` "
+            "finds. Declare it in a file of your own, with the value in it"
         )
     return effect
 
