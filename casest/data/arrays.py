@@ -53,7 +53,7 @@ def read_matlab(file: Path) -> Contents:
             f"{file}: is MATLAB v7.3 (HDF5), which is not read; "
             f"save it again with save('{file.name}', ..., '-v7')"
         ) from error
-    except (ValueError, TypeError, OSError) as error:
+    except Exception as error:  # a damaged file can fail anywhere in the library
         raise DataError(f"{file}: cannot be read as MATLAB ({error})") from error
     arrays: dict[str, Any] = {}
     for name, value in found.items():

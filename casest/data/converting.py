@@ -32,7 +32,8 @@ def vector(
     notes = [*_overruled(table, signal, names, options), *_missing(table, signal, values)]
     if target is not None and None in stated:
         silent = " ".join(n for n, u in zip(names, stated, strict=True) if u is None)
-        size = f"median length {np.nanmedian(np.linalg.norm(values, axis=1)):.4g}"
+        with np.errstate(over="ignore"):
+            size = f"median length {np.nanmedian(np.linalg.norm(values, axis=1)):.4g}"
         notes.append(
             f"{signal.name}: no unit stated for {silent}, taken as {target} ({size}); "
             f"if that is wrong say --unit {signal.name}=…"
