@@ -174,7 +174,7 @@ def test_too_little_memory_for_the_data_is_said(capsys, monkeypatch):
     def little(*_):
         raise MemoryError("Unable to allocate 14.7 MiB")
 
-    monkeypatch.setattr(fitting, "records", little)
+    monkeypatch.setattr(fitting, "model_and_records", little)
     assert run(["calibrate", *POSES]) == 1
     assert capsys.readouterr().err == (
         "casest: out of memory (Unable to allocate 14.7 MiB); give a shorter record\n"
