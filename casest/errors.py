@@ -31,16 +31,22 @@ class UsageError(CasestError):
     """A command or call asks for something that does not exist or does not fit."""
 
 
-def last_line(error: Exception) -> str:
+def last_line(error: BaseException) -> str:
     """The last line of an error from elsewhere, or in plain words where it is CasADi's own."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     text = lines[-1] if lines else type(error).__name__
+    if isinstance(error, SystemExit):
+        return f"it ends the program (SystemExit: {text})"
     if "truth value" in text:
         return (
             "an `if` cannot ask about signals or unknowns, which have no value yet; "
             "write if_else(condition, one, other)"
         )
     return text
+
+
+#: How `casest` ends where it is at fault itself, and where Ctrl-C was pressed.
+INTERNAL, INTERRUPTED = 3, 130
 
 
 class NotTrusted(CasestError):

@@ -205,3 +205,31 @@ def test_an_effect_on_an_implicit_models_corrected_quantity_is_in_the_correction
     np.testing.assert_allclose(lengths, sensor.norm, rtol=1e-9)
     straight = (fresh - found.values["offset"]) * found.values["scale"]
     assert np.std(np.linalg.norm(straight, axis=1)) > 1e-3 * sensor.norm
+
+
+@pytest.mark.parametrize("form", ["C", "Python", "apply"])
+@pytest.mark.parametrize(
+    ("body", "said"),
+    [
+        ("Residual(measured=y, predicted=w, corrected=w)", "w, which corrected= names, is y as"),
+        ("Residual(implicit=w - y, corrected=quantity('e', x))", "e, which corrected= names, is x"),
+        ("Residual(implicit=w - y, corrected=quantity('e', 2 * a))", "is no signal's"),
+    ],
+    ids=["prediction", "input", "number"],
+)
+def test_a_correction_that_changes_nothing_is_refused(body, said, form, tmp_path, capsys):
+    """The reference is calibrated against, and `corrected` names what is predicted of it."""
+    (tmp_path / "m.py").write_text(
+        "from casest import *\n@model\n"
+        "def line(x=signal('m'), y=signal('m'), *, a=param('1')):\n"
+        f"    '''A line.'''\n    w = quantity('w', a * x)\n    return {body}\n"
+    )
+    (tmp_path / "d.csv").write_text("x [m],y [m]\n1,2\n2,4.1\n3,6\n4,8.1\n")
+    data, out = str(tmp_path / "d.csv"), str(tmp_path / "out")
+    assert run(["calibrate", str(tmp_path / "m.py"), data, "-o", out]) == 0
+    capsys.readouterr()
+    assert run(["apply", out, data] if form == "apply" else ["export", out, "--to", form.lower()])
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert said in printed.err
+    assert "nothing to correct" in printed.err

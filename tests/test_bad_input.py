@@ -294,7 +294,10 @@ def test_an_effect_that_fails_is_named_by_effect_file_and_line(refused):
         (["--effects", "nowhere.py"], "nowhere.py: no such file"),
         (["--effects", "quadratc"], "no shipped effect; did you mean 'quadratic'?"),
         (["--effects", "vibration"], "needs its frequency, which only `casest close` finds"),
-        (["--effects", "temperature_bias"], "this effect needs the column it follows"),
+        (
+            ["--effects", "temperature_bias"],
+            "this effect needs the column it follows: --effects 'temperature_bias(COLUMN)'",
+        ),
         (["--holdout", "nowhere.csv"], "nowhere.csv: no such file"),
         (["--bogus"], "No such option '--bogus'"),
     ],

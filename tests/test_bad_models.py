@@ -133,18 +133,3 @@ def test_a_solver_that_runs_out_of_iterations_is_not_trusted(line, monkeypatch, 
     assert result["trusted"] is False
     assert "not a stationary point" in result["estimate"]["certificate"]["reasons"][0]
     assert "standard deviations long" in capsys.readouterr().err
-
-
-def test_ctrl_c_keeps_the_best_point_so_far_and_trusts_nothing(line, capsys):
-    more = """
-def begin(model, runs):
-    os.kill(os.getpid(), signals.SIGINT)
-    return {}
-bad = bad.starting(begin)
-"""
-    path = declared(line, "a=param(start=1.0), b=param(start=1.0)", "a + b * x**2", more)
-    code, result = fitted(line, path)
-    assert code == 2
-    assert result["trusted"] is False
-    assert "interrupted" in result["estimate"]["certificate"]["reasons"][0]
-    assert "best point so far" in capsys.readouterr().err

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import signal
-import threading
 from dataclasses import replace
 
 import numpy as np
@@ -264,28 +261,6 @@ def test_a_run_that_takes_too_long_is_stopped(name, monkeypatch):
     assert row(found, name).first.status == "stopped: no answer within 3 s"
 
 
-@pytest.mark.parametrize("name", ["ipopt", "ipopt-exact", "sqpmethod", "trust-region", "scipy-lm"])
-def test_ctrl_c_inside_a_solver_ends_with_what_is_done(name, monkeypatch):
-    solve, seen = SOLVERS[name], []
-
-    def pressed(problem, start):
-        seen.append(start)
-        if len(seen) == 5:  # three times the same start, and one of the spread
-            threading.Timer(0.002, os.kill, (os.getpid(), signal.SIGINT)).start()
-            for _ in range(500):
-                solve(problem, start)
-        return solve(problem, start)
-
-    monkeypatch.setitem(SOLVERS, name, pressed)
-    before = signal.getsignal(signal.SIGINT)
-    found = compare(wave, [wave_run()], starts=4, sizes=(1e-3,), solvers=[name])
-    assert found.interrupted
-    assert (found.done, found.planned) == (2, 5)
-    assert row(found, name).first.right
-    assert signal.getsignal(signal.SIGINT) is before
-    assert "interrupted after 2 of 5 runs" in told(found)
-
-
 def test_without_a_finite_start_there_is_nothing_to_compare():
     @model
     def rooted(y=casest.signal(), *, a=param(start=-1.0)):
@@ -335,7 +310,7 @@ def test_the_command_writes_what_it_prints(record, tmp_path, capsys):
     assert printed.err == ""
     content = json.loads(printed.out)
     assert content == json.loads((out / "compare.json").read_text(encoding="utf-8"))
-    assert (content["certified"], content["interrupted"]) == (True, False)
+    assert content["certified"] is True
     assert content["best"]["unit"] == "(m/s^2)^2"
     assert content["spread"] == {"starts": 2, "sizes": [0.1], "seed": 0}
     ipopt, closed = content["solvers"]
@@ -387,17 +362,6 @@ def test_a_refused_fit_is_exit_code_2_with_the_table_printed(tmp_path, capsys):
 def test_bad_input_is_exit_code_1(record, capsys):
     assert run(arguments(record, "--solver", "snopt")) == 1
     assert "unknown solver 'snopt' for norm-triangular" in capsys.readouterr().err
-
-
-def test_an_interrupted_command_is_exit_code_2(record, capsys, monkeypatch):
-    def pressed(problem, start):
-        raise KeyboardInterrupt
-
-    monkeypatch.setitem(SOLVERS, "scipy-lm", pressed)
-    assert run(arguments(record, "--starts", "0")) == 2
-    printed = capsys.readouterr()
-    assert printed.err == "casest: interrupted after 4 of 12 runs\n"
-    assert "\n  ipopt " in printed.out
 
 
 def test_a_plot_without_a_folder_is_named(poses, tmp_path):

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import multiprocessing
 import os
 import shutil
 import stat
+import subprocess
+import sys
 from pathlib import Path
 
 import casadi as ca
@@ -25,6 +28,7 @@ from test_replay import (
     unary,
 )
 
+from casest.demo import WHEEL
 from casest.engine import Replay, cost, kernel, normal_equations, residuals, rows, summed
 from casest.engine.operations import OPERATIONS
 from casest.leastsquares.per_sample import residual_and_jacobian
@@ -473,3 +477,20 @@ def test_a_model_that_is_only_tried_is_not_compiled_unless_its_record_is_very_lo
     replay = Replay(function(p, s, r, ca.jacobian(r, p)))
     cost(replay, [2.0], np.linspace(0, 1, 10_000)[:, None])
     assert compiled(replay)
+
+
+def test_a_result_says_which_kernel_it_is_of_and_they_differ_in_the_last_digits(tmp_path, cache):
+    def estimate(wish, expected):
+        environment = {**os.environ, "CASEST_KERNEL": wish, "CASEST_CACHE": str(cache)}
+        words = [sys.executable, "-c", "from casest.cli import main; main()", "calibrate", "wheel"]
+        subprocess.run([*words, str(WHEEL), "-o", str(tmp_path)], env=environment, check=True)
+        result = json.loads((tmp_path / "result.json").read_text(encoding="utf-8"))
+        assert result["solver"]["kernel"] == expected
+        return result["estimate"]
+
+    numpy, compiled = estimate("off", "numpy"), estimate("always", "compiled")
+    assert estimate("always", "compiled") == compiled
+    for name, p in numpy["parameters"].items():
+        value, std = np.array(p["value"]), np.array(p["std"])
+        other = np.array(compiled["parameters"][name]["value"])
+        assert (np.abs(value - other) <= 1e-9 * std).all()

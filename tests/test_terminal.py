@@ -255,7 +255,7 @@ def test_the_line_is_wiped_away_before_an_error(impatient, monkeypatch, tmp_path
     terminal = Terminal()
     monkeypatch.setattr("sys.stderr", terminal)
     monkeypatch.setattr("casest.data.bind.read_table", lambda path: time.sleep(0.05))
-    assert run(["calibrate", "norm-diagonal", "poses.csv"]) == 2
+    assert run(["calibrate", "norm-diagonal", "poses.csv"]) == 3
     last = terminal.getvalue().rpartition("\r")[2]
     assert last.startswith("casest: ")
     assert "reading poses.csv" in terminal.getvalue()

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import os
 import sys
+import traceback
 from collections.abc import Sequence
+from contextlib import suppress
 
 import click
 
 from casest.cli import comparing, completing, correcting, fitting, motion, simulating
 from casest.cli.shared import commands, echo, shown
-from casest.errors import CasestError
+from casest.errors import INTERNAL, INTERRUPTED, CasestError
+from casest.interruption import remember
 
 __all__ = ["commands", "main", "run"]
 
@@ -19,7 +22,11 @@ ROOMS = (fitting, motion, comparing, correcting, simulating, completing)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Entry point: exit code 0 done, 1 bad input, 2 no trustworthy estimate."""
+    """Entry point: exit code 0 done, 1 bad input, 2 no trustworthy estimate.
+
+    3: internal error; 130: Ctrl-C. Neither leaves a file.
+    """
+    remember()
     sys.exit(run(arguments))
 
 
@@ -28,30 +35,56 @@ def run(arguments: Sequence[str] | None = None) -> int:
     try:
         words = list(sys.argv[1:] if arguments is None else arguments)
         result = commands.main(words, prog_name="casest", standalone_mode=False, obj=words)
+        _close_output()
         return result if isinstance(result, int) else 0
-    except CasestError as error:
-        echo(f"casest: {error}", err=True)
-        return error.exit_code
     except click.exceptions.NoArgsIsHelpError as error:
         echo(error.format_message())
         return 1
-    except click.ClickException as error:
-        echo(f"casest: {error.format_message()}", err=True)
-        return 1
-    except (click.Abort, KeyboardInterrupt):
-        echo("casest: interrupted; nothing was written", err=True)
-        return 2
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
-    except Exception as error:
-        if os.environ.get("CASEST_TRACEBACK"):
-            raise
-        text = f"{type(error).__name__}: {error}".splitlines()[0]
-        echo(
-            f"casest: internal error, please report it ({text}); CASEST_TRACEBACK=1 shows where",
-            err=True,
-        )
-        return 2
+    except SystemExit as error:  # click's own: after completions, or help into a closed pipe
+        _close_output()
+        return error.code if isinstance(error.code, int) else int(error.code is not None)
+    except BaseException as error:
+        return _ended(error)
     finally:
         shown.done()
+
+
+def _ended(error: BaseException) -> int:
+    """Say what ended the command; its exit code."""
+    text, code = _said(error)
+    if code == INTERNAL and os.environ.get("CASEST_TRACEBACK"):
+        traceback.print_exc()
+    with suppress(OSError):
+        echo(f"casest: {text}", err=True)
+    _close_output()
+    return code
+
+
+def _said(error: BaseException) -> tuple[str, int]:
+    """What is said of an error, and the exit code."""
+    if isinstance(error, CasestError):
+        return str(error), error.exit_code
+    if isinstance(error, click.Abort | KeyboardInterrupt):
+        return "interrupted; nothing was written", INTERRUPTED
+    if isinstance(error, click.ClickException):
+        return error.format_message(), 1
+    first = (str(error).strip().splitlines() or [""])[0]
+    if isinstance(error, MemoryError):
+        return f"out of memory ({first or 'nothing is left'}); give a shorter record", 1
+    if isinstance(error, OSError) and error.filename is not None:
+        return f"{error.filename}: {error.strerror}", 1
+    return (
+        f"internal error ({type(error).__name__}: {first}), nothing was written; please report it "
+        "with the command and `casest --version`; CASEST_TRACEBACK=1 shows where",
+        INTERNAL,
+    )
+
+
+def _close_output() -> None:
+    """Drop what could not be printed: Python would try again at its end, and complain."""
+    try:
+        sys.stdout.flush()
+    except AttributeError:  # closed from the beginning
+        return
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

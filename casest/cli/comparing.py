@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from casest.cli.assignments import Assignment, Assignments
 from casest.cli.flags import Kind, flag, taking
-from casest.cli.loading import declared_model, records
+from casest.cli.loading import model_and_records
 from casest.cli.options import DATA, FOLDER, ModelOptions, ReadingOptions, Words, model_argument
 from casest.cli.shared import commands, echo, progress, typed
 from casest.errors import NotTrusted, UsageError
@@ -69,8 +69,7 @@ def compare(model_name: str, data: tuple[str, ...], options: CompareOptions) -> 
     """Run every solver on MODEL and DATA, from one start and from a spread of starts.
 
     Each is judged by the certified optimum: where it ended, what it claims, what it took. Exit
-    code 0: done; 1: bad input; 2: no certified optimum to judge by, or interrupted (what is done
-    is shown and written all the same).
+    code 0: done; 1: bad input; 2: no certified optimum to judge by (all is shown and written).
     """
     from casest.comparison.judge import SIZES
     from casest.comparison.judge import compare as compared
@@ -78,8 +77,7 @@ def compare(model_name: str, data: tuple[str, ...], options: CompareOptions) -> 
     from casest.results.comparison import comparison_result
     from casest.results.file import as_json
 
-    model = declared_model(model_name, options.model)
-    runs = records(model, data, options.reading)
+    model, runs = model_and_records(model_name, data, options.model, options.reading)
     found = compared(
         model,
         runs,
@@ -97,11 +95,9 @@ def compare(model_name: str, data: tuple[str, ...], options: CompareOptions) -> 
         echo(as_json(result.content()), nl=False)
     else:
         echo(comparison_text(result, written))
-    if found.interrupted:
-        echo(f"casest: interrupted after {found.done} of {found.planned} runs", err=True)
-    elif not found.certified:
+    if not found.certified:
         echo("casest: no certified optimum to judge by", err=True)
-    return 0 if found.certified and not found.interrupted else NotTrusted.exit_code
+    return 0 if found.certified else NotTrusted.exit_code
 
 
 def written_comparison(result: SolversCompared, folder: Path) -> list[Path]:

@@ -54,9 +54,12 @@ def apply(result_path: Path, data: str, options: ApplyOptions) -> None:
         echo(f"casest: {LEFT}{', '.join(left)}", err=True)
     if timed:
         echo(f"casest: {TIMED}{', '.join(timed)}", err=True)
-    if path := correcting.write_or_print(text, options.output):
-        echo(f"Written: {path}")
-        echo(f"\n{following(typed(), file=path)}")
+    if options.output is None:
+        echo(text, nl=False)
+        return
+    path = correcting.write_to(options.output, text)
+    echo(f"Written: {path}")
+    echo(f"\n{following(typed(), file=path)}")
 
 
 @commands.command()

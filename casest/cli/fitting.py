@@ -5,15 +5,25 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from casest.cli.flags import Kind, refuse, taking
-from casest.cli.loading import declared_model, held_out, moving_model, records, trajectory
+from casest.cli.loading import (
+    declared_model,
+    held_out,
+    model_and_records,
+    moving_model,
+    records,
+    trajectory,
+)
 from casest.cli.options import DATA, RESULTS, FitOptions, MotionOptions, model_argument
 from casest.cli.shared import commands, echo, progress, reported, typed, write
 from casest.errors import NotTrusted
+
+if TYPE_CHECKING:
+    from casest.declaration.effect import Effect
 
 
 @commands.command("list")
@@ -52,15 +62,12 @@ def calibration(model_name: str, data: Sequence[str], options: FitOptions, comma
     from casest.report.text.calibration import calibration_text
     from casest.results.calibration import calibration_result, residual_rows
     from casest.results.file import as_json, save
-    from casest.solve.interrupt import interruptible
 
-    model = declared_model(model_name, options.model)
-    runs = records(model, data, options.reading)
+    model, runs = model_and_records(model_name, data, options.model, options.reading)
     hidden = held_out(model, options.holdout, data, options.reading)
     start = dict(given.start(model) for given in options.starts) or None
     progress(f"fitting {model_name}")
-    with interruptible():
-        found = attempt(model, runs, start=start, solver=options.solver, seed=options.seed)
+    found = attempt(model, runs, start=start, solver=options.solver, seed=options.seed)
     holdout = score(found, hidden) if hidden else None
     progress("asking whether the residual is noise")
     result = calibration_result(
@@ -119,11 +126,8 @@ def closing(model_name: str, data: Sequence[str], options: FitOptions, command: 
         with_formula_in,
     )
     from casest.results.file import as_json, save
-    from casest.results.find import find_effects
 
-    asked = options.model.effects
-    known = {e.name for e in CATALOGUE} & {*asked}
-    own = tuple(e for path in asked if path not in known for e in find_effects(path))
+    known, own = asked_effects(options.model.effects)
     model = declared_model(model_name, replace(options.model, effects=()))
     runs = records(model, data, options.reading)
     apart = held_out(model, options.holdout, data, options.reading)
@@ -158,6 +162,22 @@ def closing(model_name: str, data: Sequence[str], options: FitOptions, command: 
     else:
         echo(closing_text(result, options.output), verdict=True)
     return 0
+
+
+def asked_effects(asked: Sequence[str]) -> tuple[set[str], tuple[Effect, ...]]:
+    """Names of shipped effects that --effects says are there; those to try beside the catalogue."""
+    from casest.effects import CATALOGUE
+    from casest.results.find import find_asked
+
+    catalogue = {e.name for e in CATALOGUE}
+    known, own = catalogue & {*asked}, []
+    for text in asked:
+        for effect, column in find_asked(text) if text not in known else ():
+            if column and effect.name in catalogue:
+                known.add(text)
+            columns = tuple((name, f"={column}") for name, _ in effect.columns)
+            own.append(replace(effect, columns=columns) if column else effect)
+    return known, tuple(own)
 
 
 def closing_in_motion(
@@ -219,10 +239,12 @@ def refused(
 @click.option("-o", "--output", default=Path("out"), **RESULTS)
 def demo(output: Path) -> int:
     """Close the loop on a shipped record with an effect that its model lacks."""
+    from casest.data.write import written_together
     from casest.demo import WHEEL, comparison
 
     words = f"casest close wheel {WHEEL} -o {output}"
     echo(f"$ {words}\n")
-    code = closing("wheel", (str(WHEEL),), FitOptions(output=output), words)
+    with written_together():  # `comparison` reads them
+        code = closing("wheel", (str(WHEEL),), FitOptions(output=output), words)
     echo("\n" + comparison(output))
     return code

@@ -38,13 +38,26 @@ def declared_model(name: str, options: ModelOptions) -> Model:
 def _with_effects(model: Model, files: Sequence[str]) -> Model:
     from casest.declaration.dimensions import check_units
     from casest.effects.placing import placed_in
-    from casest.results.find import find_effects
+    from casest.results.find import find_asked, without_grid
 
-    for file in files:
-        for effect in find_effects(file):
-            model = model.with_effect(placed_in(effect, model))
+    for text in files:
+        for effect, column in find_asked(text):
+            columns = {name: column for name, _ in effect.columns} if column else {}
+            effect = without_grid(effect) if column else effect
+            model = model.with_effect(placed_in(effect, model), columns=columns)
             check_units(model)
     return model
+
+
+def model_and_records(
+    name: str, data: Sequence[str], options: ModelOptions, reading: ReadingOptions
+) -> tuple[Model, tuple[Run, ...]]:
+    """The declared model and the runs in the files, from which its effects are told numbers."""
+    from casest.effects.placing import told
+
+    model = declared_model(name, options)
+    runs = records(model, data, reading)
+    return told(model, runs), runs
 
 
 def _with_constants(model: Model, constants: Assignments, name: str) -> Model:

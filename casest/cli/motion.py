@@ -10,7 +10,7 @@ import click
 
 from casest.cli.assignments import Assignment, Assignments
 from casest.cli.flags import Kind, flag, taking
-from casest.cli.loading import declared_model, moving_model, records, trajectory
+from casest.cli.loading import model_and_records, moving_model, trajectory
 from casest.cli.options import (
     DATA,
     FOLDER,
@@ -73,10 +73,9 @@ def observe(model_name: str, data: tuple[str, ...], options: ObserveOptions) -> 
 
     fits = isinstance(find_any(model_name), Model)
     if fits:
-        model = declared_model(model_name, options.model)
         if not data:
             raise UsageError(f"{model_name}: what can be seen depends on the record: give DATA")
-        runs = records(model, data, options.reading)
+        model, runs = model_and_records(model_name, data, options.model, options.reading)
         progress(f"fitting {model_name}")
         result: Observability = observe_parameters(model, runs, data=data, command=typed())
     else:

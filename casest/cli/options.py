@@ -69,7 +69,7 @@ class ModelOptions:
         (),
         "--effects",
         only=Kind.FITTED,
-        metavar="FILE|NAME",
+        metavar="FILE|NAME|NAME(COLUMN)",
         help="Your own effects; or a shipped one that you know to be there.",
     )
 

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import shlex
-import sys
 from pathlib import Path
 from typing import Any
 
 import click
 
 from casest import __version__
+from casest.cli.command import Command, printed
 from casest.cli.waiting import Waiting
+from casest.errors import DataError
 from casest.escaping import one_line, terminal
 
 shown = Waiting()
@@ -27,11 +28,19 @@ def echo(text: str, *, verdict: bool = False, err: bool = False, nl: bool = True
     """
     shown.done()
     text = one_line(text) if err else terminal(text)
+    if err:
+        click.echo(text, err=True, nl=nl)
+        return
     if verdict:
         from casest.report.text.layout import coloured
 
-        text = coloured(text, sys.stdout)
-    click.echo(text, err=err, nl=nl)
+        text = coloured(text, printed())
+    try:
+        click.echo(text, file=printed(), nl=nl)
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        raise DataError(f"standard output cannot be written ({error.strerror})") from None
 
 
 class Careful(click.Group):
@@ -60,6 +69,9 @@ def commands() -> None:
     """
 
 
+commands.command_class = Command
+
+
 def typed() -> str:
     """The command as it can be typed again."""
     return shlex.join(["casest", *click.get_current_context().obj])
@@ -85,7 +97,6 @@ def reported(folder: Path, page: str) -> None:
 def write(path: Path, text: str) -> None:
     """A file in a folder that is made if it is missing."""
     from casest.data.write import write_atomically
-    from casest.errors import DataError
 
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -29,7 +29,7 @@ class Waiting:
     def say(self, words: str) -> None:
         """What is going on from now on; the clock starts with the first words."""
         self._words = one_line(words)
-        if self._thread is None and sys.stderr.isatty():
+        if self._thread is None and sys.stderr is not None and sys.stderr.isatty():
             self._begin, self._width = time.monotonic(), 0
             self._over.clear()
             self._thread = threading.Thread(target=self._watch, daemon=True)

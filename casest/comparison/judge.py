@@ -101,7 +101,7 @@ class Comparison:
 
     `best` is the lowest cost that anything found inside the bounds, `sigma` the standard deviation
     of one residual that judges it. `certified` says that the estimate is trusted and that nothing
-    found a better point. `planned` and `done` count runs of solvers: fewer where interrupted.
+    found a better point.
     """
 
     estimate: Estimate
@@ -114,13 +114,6 @@ class Comparison:
     starts: int
     seed: int
     automatic: bool
-    planned: int
-    done: int
-
-    @property
-    def interrupted(self) -> bool:
-        """Was it stopped before all was done?"""
-        return self.done < self.planned
 
 
 def compare(
@@ -139,9 +132,9 @@ def compare(
 
     `sizes` are taken in turn: how far a start lies from the first, as a share of each unknown's
     size. `solvers` names those wanted (all). A run is stopped after `limit` seconds, one of the
-    spread after PATIENCE times the solver's own time where that is less. Ctrl-C ends the
-    comparison with what is done so far. Raises DataError or UsageError where nothing can be
-    fitted, NotTrusted where not even the cost at the start is finite.
+    spread after PATIENCE times the solver's own time where that is less. Raises DataError or
+    UsageError where nothing can be fitted, NotTrusted where not even the cost at the start is
+    finite.
     """
     names = _wanted(model, solvers)
     _check(starts, sizes, limit)
@@ -169,8 +162,6 @@ def compare(
         starts,
         seed,
         start is None,
-        len(tasks),
-        len(ended),
     )
 
 

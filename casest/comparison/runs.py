@@ -1,17 +1,14 @@
-"""Running solvers under a clock: each ends by itself, when its time is over, or on Ctrl-C."""
+"""Running solvers under a clock: each ends by itself, or when its time is over."""
 
 from __future__ import annotations
 
 import io
-import signal
-import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from collections.abc import Callable, Sequence
+from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass, field, replace
 from functools import partial
 from statistics import median
-from typing import Any
 
 import numpy as np
 
@@ -61,14 +58,13 @@ class Ended:
 
 
 class _Clock:
-    """When a run has to end: its time is over, or Ctrl-C was pressed."""
+    """When a run has to end."""
 
-    def __init__(self) -> None:
-        self.deadline, self.stopped = np.inf, False
+    deadline = np.inf
 
     @property
     def over(self) -> bool:
-        return self.stopped or time.perf_counter() > self.deadline
+        return time.perf_counter() > self.deadline
 
 
 class _OutOfTime(Exception):
@@ -119,7 +115,7 @@ class _Limited(Problem):
 def tasks_of(
     model: Model, names: Sequence[str], starts: Sequence[tuple[float, Point]]
 ) -> list[Task]:
-    """What to run, start by start: an interrupted comparison is one of all solvers."""
+    """What to run, start by start."""
     own = [name for name, _ in model.estimators if name in names]
     ours = [name for name in names if name in SOLVERS]
     tasks = [Task(name, size, point) for size, point in starts for name in ours]
@@ -130,42 +126,18 @@ def tasks_of(
 def run_all(
     tasks: Sequence[Task], problem: Problem, limit: float, say: Callable[[str], None]
 ) -> list[Ended]:
-    """Run the tasks one by one, until Ctrl-C."""
+    """Run the tasks one by one."""
     clock = _Clock()
     ended: list[Ended] = []
     usual: dict[str, float] = {}
     limited = _Limited(problem.model, problem.runs, problem.weights, clock)
-    with _interruptible(clock):
-        try:
-            for k, task in enumerate(tasks, 1):
-                say(f"{task.solver} ({k} of {len(tasks)})")
-                patience = max(PATIENCE * usual.get(task.solver, np.inf), LEAST)
-                result = _repeated(task, limited, min(limit, patience))
-                if clock.stopped:
-                    break
-                ended.append(result)
-                usual.setdefault(task.solver, result.seconds)
-        except KeyboardInterrupt:
-            pass
+    for k, task in enumerate(tasks, 1):
+        say(f"{task.solver} ({k} of {len(tasks)})")
+        patience = max(PATIENCE * usual.get(task.solver, np.inf), LEAST)
+        result = _repeated(task, limited, min(limit, patience))
+        ended.append(result)
+        usual.setdefault(task.solver, result.seconds)
     return ended
-
-
-@contextmanager
-def _interruptible(clock: _Clock) -> Iterator[None]:
-    """Remember Ctrl-C: CasADi swallows it inside callbacks. Only the main thread gets signals."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-
-    def stop(_number: int, _frame: Any) -> None:
-        clock.stopped = True
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGINT, stop)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before or signal.SIG_DFL)
 
 
 def _repeated(task: Task, problem: _Limited, limit: float) -> Ended:

@@ -18,6 +18,7 @@ from casest.declaration.shapes import Array
 from casest.declaration.symbols import Signal
 from casest.declaration.tracing import (
     Traced,
+    flat,
     function_of,
     reached_parameters,
     reached_signals,
@@ -102,6 +103,25 @@ class Correction:
                 "corrected= names, so that no reading says anything of it: compute the prediction "
                 "from what quantity(…) returned"
             )
+        if not self.signals or self._changes_nothing():
+            what = f"is {self.signals[0].name} as it is given" if self.signals else "is no signal's"
+            raise UsageError(
+                f"model {self.model.name}: {self.name}, which corrected= names, {what}: there is "
+                "nothing to correct; name the quantity that is computed from the reading, or of "
+                "which the reading is predicted"
+            )
+
+    def _changes_nothing(self) -> bool:
+        """Is the corrected quantity one of the signals, whatever the parameters are?"""
+        if self.model.implicit:
+            symbols, wanted = self.model.traced.symbols, ca.vec(self._wanted)
+            given = [flat(symbols[s.name]) for s in self.signals]
+            return any(g.shape == wanted.shape and (wanted - g).is_zero() for g in given)
+        reading = flat(self._cut.symbols[str(self._cut.measured)])
+        wanted = ca.vec(self._wanted)
+        same = self.model.inverter is None and wanted.shape == reading.shape
+        rest = self._cut.expression
+        return same and ca.simplify(ca.substitute(rest, self._wanted, reading)).is_zero()
 
     @property
     def name(self) -> str:

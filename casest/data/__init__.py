@@ -6,7 +6,7 @@ from casest.data.rest import at_rest
 from casest.data.run import Run
 from casest.data.splits import interleaved_blocks
 from casest.data.table import Column, Table, read_table
-from casest.data.write import write_atomically
+from casest.data.write import write_atomically, written_together
 
 __all__ = [
     "Column",
@@ -19,4 +19,5 @@ __all__ = [
     "load_runs",
     "read_table",
     "write_atomically",
+    "written_together",
 ]

@@ -35,7 +35,9 @@ def vector(
     if target is not None and None in stated:
         silent = " ".join(n for n, u in zip(names, stated, strict=True) if u is None)
         whole = values[np.isfinite(values).all(axis=1)]
-        size = f"median length {np.median(np.linalg.norm(whole, axis=1)) if len(whole) else 0:.4g}"
+        with np.errstate(over="ignore"):
+            length = np.median(np.linalg.norm(whole, axis=1)) if len(whole) else 0
+        size = f"median length {length:.4g}"
         notes.append(
             f"{signal.name}: no unit stated for {silent}, taken as {target} ({size}); "
             f"if that is wrong say --unit {signal.name}=…"

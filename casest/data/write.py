@@ -1,42 +1,81 @@
-"""Writing results so that a reader never meets half a file."""
+"""Writing results so that a reader never meets half a file, nor half of what belongs together."""
 
 from __future__ import annotations
 
 import contextlib
 import os
 import tempfile
+from collections.abc import Iterator
+from contextvars import ContextVar
 from pathlib import Path
 
 from casest.errors import DataError
+from casest.interruption import held_back
+
+#: Files written so far of those that appear together: name to come by temporary name.
+_together: ContextVar[dict[str, Path] | None] = ContextVar("together", default=None)
 
 
-def write_atomically(path: str | os.PathLike[str], text: str) -> None:
-    """Write `text` (UTF-8) to `path` so that it holds the old content or all of the new.
+@contextlib.contextmanager
+def written_together() -> Iterator[None]:
+    """Within it files keep temporary names; all get their own at its end, none on an error."""
+    pending: dict[str, Path] = {}
+    token = _together.set(pending)
+    try:
+        yield
+        _rename(pending)
+    finally:
+        _together.reset(token)
+        for temporary in pending:
+            with contextlib.suppress(OSError):
+                os.unlink(temporary)
+
+
+def write_atomically(path: str | os.PathLike[str], text: str | bytes) -> None:
+    """Write text (in UTF-8) or bytes to `path`: it holds the old content or all of the new.
 
     The text goes to a temporary name in the same folder, reaches the disk, and is then renamed.
     What is no character, as in the name of a file that is not UTF-8, becomes a question mark.
     Raises DataError where the folder is missing or cannot be written.
     """
-    target = Path(path)
+    pending = _together.get()
+    if pending is not None:
+        _write(Path(path), text, pending)
+        return
+    with written_together():
+        write_atomically(path, text)
+
+
+def _write(target: Path, text: str | bytes, pending: dict[str, Path]) -> None:
+    """The text under a temporary name, which `pending` lists from the moment it exists."""
     try:
-        handle, temporary = tempfile.mkstemp(prefix=f".{target.name}.", dir=target.parent)
+        with held_back():
+            handle, temporary = tempfile.mkstemp(prefix=f".{target.name}.", dir=target.parent)
+            pending[temporary] = target
     except OSError as error:
         raise DataError(
             f"{target}: cannot be written ({error.strerror}); "
             f"give a folder that exists and may be written to"
         ) from error
     try:
-        with os.fdopen(handle, "w", encoding="utf-8", errors="replace", newline="\n") as file:
-            file.write(text)
+        with os.fdopen(handle, "wb") as file:
+            file.write(text.encode(errors="replace") if isinstance(text, str) else text)
             file.flush()
             os.fsync(file.fileno())
         os.chmod(temporary, _usual_mode())  # mkstemp makes files that only the owner can read
-        os.replace(temporary, target)
     except OSError as error:
         raise DataError(f"{target}: cannot be written ({error.strerror})") from error
-    finally:
-        with contextlib.suppress(FileNotFoundError):
-            os.unlink(temporary)
+
+
+def _rename(pending: dict[str, Path]) -> None:
+    """Give every file its name: all of them, also where Ctrl-C is pressed meanwhile."""
+    with held_back():
+        for temporary, target in list(pending.items()):
+            try:
+                os.replace(temporary, target)
+            except OSError as error:
+                raise DataError(f"{target}: cannot be written ({error.strerror})") from error
+            del pending[temporary]
 
 
 def _usual_mode() -> int:

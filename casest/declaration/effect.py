@@ -250,7 +250,7 @@ def evaluated(declared: Effect, *args: Any, **kwargs: Any) -> SX:
     code = declared.function.__code__
     try:
         found = declared.function(*args, **kwargs)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         line, traceback = code.co_firstlineno, error.__traceback__
         while traceback is not None:
             if traceback.tb_frame.f_code is code:

@@ -184,7 +184,7 @@ def _run_body(model: Declared, running: Trace, symbols: Mapping[str, SX]) -> Res
             f"model {model.name}, {_where(model.function)}: {error}; "
             "declare it in the model's signature, or import it"
         ) from None
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise DeclarationError(
             f"model {model.name}, {_where(model.function)}: {last_line(error)}"
         ) from error

@@ -73,9 +73,10 @@ def close(
 ) -> Closing:
     """Fit, trace the residual to effects of the catalogue, add those that held-out data confirm.
 
-    Where several causes explain the data alike, those that are `known` to be there come first.
-    Where nothing can be held out, nothing is added, and `refused` says so. Raises NotTrusted, with
-    the refused estimate, where the declared model itself has no trustworthy fit.
+    Where several causes explain the data alike, those that are `known` to be there come first: by
+    name, or as `temperature_bias(temp)`. Where nothing can be held out, nothing is added, and
+    `refused` says so. Raises NotTrusted, with the refused estimate, where the declared model itself
+    has no trustworthy fit.
     """
     before = attempt(model, runs, start=start, seed=seed)
     if not before.certificate.trusted:
@@ -212,7 +213,7 @@ def _first_accepted(
             continue
         step = Step(current, score, fitted, tried, passed[2] / passed[0].noise ** 2)
         near = as_good(tried, work.folds, STRONG)
-        known = score.candidate.name in work.known
+        known = score.candidate.among(work.known)
         if step.share < SMALL and not known and hangs_on_which(work, fitted, near):
             leave_open(work, step, near)
             return None

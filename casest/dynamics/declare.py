@@ -16,7 +16,7 @@ from casest.declaration.physics import SX
 from casest.declaration.shapes import Array
 from casest.declaration.symbols import Constant, Signal
 from casest.declaration.tracing import flat
-from casest.errors import CasestError, DeclarationError, UsageError
+from casest.errors import CasestError, DeclarationError, UsageError, last_line
 
 
 @dataclass(frozen=True)
@@ -345,11 +345,8 @@ def _trace(declared: Dynamics) -> Traced:
         motion = declared.function(**symbols, **xs, **numbers)
     except CasestError:
         raise
-    except Exception as error:
-        text = str(error).strip().splitlines()
-        raise DeclarationError(
-            f"dynamics {declared.name}: {text[-1] if text else type(error).__name__}"
-        ) from None
+    except (Exception, SystemExit) as error:
+        raise DeclarationError(f"dynamics {declared.name}: {last_line(error)}") from None
     if not isinstance(motion, Motion):
         raise DeclarationError(f"dynamics {declared.name} must return Motion(rates=…, outputs=…)")
     rates = []

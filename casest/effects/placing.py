@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from casest.data.run import Run
-from casest.declaration.effect import Effect
+from casest.declaration.effect import Attached, Effect
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
 from casest.errors import CasestError
@@ -51,6 +51,17 @@ def placed_in(effect: Effect, model: Model) -> Effect:
         word = "declares no corrected quantity" if effect.on == "input" else "names no prediction"
         raise CasestError(f"model {model.name} {word}")
     return replace(effect, on=place)
+
+
+def told(model: Model, runs: Sequence[Run]) -> Model:
+    """The model whose effects that follow a column are told their numbers by these runs."""
+
+    def numbered(attached: Attached) -> Attached:
+        if not attached.columns:
+            return attached
+        return replace(attached, effect=with_numbers(attached.effect, attached.columns, runs))
+
+    return replace(model, effects=tuple(numbered(a) for a in model.effects))
 
 
 def with_numbers(

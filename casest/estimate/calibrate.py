@@ -29,7 +29,6 @@ from casest.estimate.valley import looked_for
 from casest.leastsquares.identifiability import Identifiability, Weak, identify, weak_directions
 from casest.leastsquares.problem import Point, Problem
 from casest.leastsquares.sums import repeat_noise, second_order_bias
-from casest.solve.interrupt import stopped
 from casest.solve.outcome import Outcome
 from casest.solve.strategy import SOLVERS, best_of, solve, valleys
 
@@ -242,9 +241,6 @@ def _attempt(
         found = _looked_at_for_a_better_one(found)
     if found.certificate.trusted:
         found = _no_random_walk(found)
-    if stopped():
-        refused = found.certificate.refused(Code.INTERRUPTED, words.INTERRUPTED)
-        return replace(found, certificate=refused)
     return _by_estimator(found, own[solver], solver) if solver in own else found
 
 

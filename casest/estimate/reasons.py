@@ -60,8 +60,6 @@ NEAR = 3.0
 class Code(IntFlag):
     """What may speak against an estimate, in the order in which it is said."""
 
-    #: The user stopped it.
-    INTERRUPTED = auto()
     #: A reading is no number. (One: files are refused, or the residual is NOT_FINITE at the start.)
     READING = auto()
     NOT_FINITE = auto()
@@ -95,7 +93,7 @@ class Code(IntFlag):
 #: Nothing speaks against it.
 NOTHING = Code(0)
 #: Asked of one sensor alone.
-ONE_ONLY = Code.INTERRUPTED | Code.POOR_VALLEY | Code.MODEL
+ONE_ONLY = Code.POOR_VALLEY | Code.MODEL
 #: Asked of many alone.
 MANY_ONLY = Code.READING | Code.LOUD | Code.CORRELATED
 #: Beside these nothing else is worth saying of a sensor among many.
@@ -103,8 +101,6 @@ ALONE = (Code.READING, Code.NOT_FINITE, Code.NO_REDUNDANCY, Code.NOT_DETERMINED)
 
 
 # -- words against ---------------------------------------------------------------------------------
-
-INTERRUPTED = "interrupted: this is the best point so far, not an optimum"
 
 
 def reading(sample: int) -> str:

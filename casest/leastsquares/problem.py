@@ -165,7 +165,8 @@ class Problem:
     def bounds(self) -> tuple[Array, Array]:
         """Lower and upper bound of every unknown; data may tighten the declared ones."""
         lower, upper = np.full(self.unknowns, -np.inf), np.full(self.unknowns, np.inf)
-        from_data = self.model.limiter(self.model, self.runs) if self.model.limiter else {}
+        with np.errstate(all="ignore"):  # a reading of 1e300 has a square that is not finite
+            from_data = self.model.limiter(self.model, self.runs) if self.model.limiter else {}
         for s in self.slots:
             if s.parameter.shape.curved:
                 continue
@@ -328,6 +329,11 @@ class Problem:
     @cached_property
     def _with_jacobian(self) -> Replay:
         return residual_and_jacobian(self.model)
+
+    @property
+    def compiled(self) -> bool:
+        """Have sums been computed by a compiled kernel? Else by NumPy, with other last digits."""
+        return any(kernel is not None for kernel in self._with_jacobian.kernels.values())
 
     @cached_property
     def _recursion(self) -> Recursion | None:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from importlib import import_module
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from casest.data.write import write_atomically
 from casest.errors import DataError, UsageError
 from casest.results.comparison import RIGHT, Ended, SolversCompared
 
@@ -39,9 +41,11 @@ def draw(result: SolversCompared, folder: Path) -> list[Path]:
     paths = [folder / "compare.png", folder / "compare.svg"]
     try:
         for path in paths:
-            figure.savefig(path, dpi=150)
-    except OSError as error:
-        raise DataError(f"{folder}: no plot can be written ({error.strerror})") from None
+            drawn = BytesIO()
+            figure.savefig(drawn, format=path.suffix[1:], dpi=150)
+            write_atomically(path, drawn.getvalue())
+    except DataError as error:
+        raise DataError(f"no plot can be written: {error}") from None
     return paths
 
 

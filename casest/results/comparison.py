@@ -50,13 +50,6 @@ class Spread(Struct, frozen=True):
     seed: int
 
 
-class Counted(Struct, frozen=True):
-    """Runs of solvers."""
-
-    planned: int
-    done: int
-
-
 class Ended(Struct, frozen=True):
     """Where a solver ended from one start; NaN or None is what does not exist."""
 
@@ -112,8 +105,6 @@ class SolversCompared(Result, frozen=True, kw_only=True, dict=True):
     noise: ResidualNoise
     same_start: str
     spread: Spread
-    interrupted: bool
-    runs: Counted
     solvers: list[Compared]
     declared: str
     samples: int
@@ -137,8 +128,6 @@ def comparison_result(
         noise=ResidualNoise(found.sigma, unit),
         same_start="automatic" if found.automatic else "given",
         spread=Spread(found.starts, list(found.sizes), found.seed),
-        interrupted=found.interrupted,
-        runs=Counted(found.planned, found.done),
         solvers=[_compared(row, found.best) for row in found.rows],
         declared=problem.model.name,
         samples=sum(len(run) for run in problem.runs),

@@ -6,6 +6,7 @@ import ast
 import difflib
 import importlib
 import linecache
+import re
 import sys
 from collections.abc import Sequence
 from importlib.util import module_from_spec, spec_from_file_location
@@ -107,15 +108,46 @@ def find_effects(name: str) -> tuple[Effect, ...]:
     return found
 
 
+def find_asked(text: str) -> tuple[tuple[Effect, str], ...]:
+    """Effects as --effects names them, with the column that they are to follow, else empty.
+
+    `NAME(COLUMN)` of a shipped one, `FILE(COLUMN)` or `FILE:NAME(COLUMN)` of one's own.
+    """
+    found = re.fullmatch(r"(.+?)\(([^()]+)\)", text)
+    if found is None:
+        return tuple((effect, "") for effect in find_effects(text))
+    name, column = found[1], found[2].strip()
+    shipped = {e.name: e for e in CATALOGUE}
+    if name not in shipped:
+        several = find_effects(name)
+        if len(several) > 1:
+            raise UsageError(
+                f"--effects {text}: {name} declares {', '.join(e.name for e in several)}: say "
+                f"which, as {name}:{several[0].name}({column})"
+            )
+    effect = shipped[name] if name in shipped else several[0]
+    if len(effect.columns) != 1:
+        raise UsageError(f"--effects {text}: {effect.name} follows no column; leave ({column}) out")
+    return ((effect, column),)
+
+
 def _whole(effect: Effect) -> Effect:
     """A shipped effect that needs neither a column nor a value that must be looked for."""
-    missing = "the column it follows" if any(s.name == "channel" for s in effect.extras) else ""
-    if effect.profile:
-        missing = f"its {', '.join(n for n, _ in effect.profile)}, which only `casest close` finds"
-    if missing:
+    if any(s.name == "channel" for s in effect.extras):
         raise UsageError(
-            f"--effects {effect.name}: this effect needs {missing}. Declare it in a file of your "
-            "own, with the value or column in it"
+            f"--effects {effect.name}: this effect needs the column it follows: "
+            f"--effects '{effect.name}(COLUMN)'"
+        )
+    return without_grid(effect)
+
+
+def without_grid(effect: Effect) -> Effect:
+    """The effect, unless it has a value that must be looked for."""
+    if effect.profile:
+        missing = ", ".join(name for name, _ in effect.profile)
+        raise UsageError(
+            f"--effects {effect.name}: this effect needs its {missing}, which only `casest close` "
+            "finds. Declare it in a file of your own, with the value in it"
         )
     return effect
 
@@ -146,6 +178,8 @@ def load_file(path: Path) -> ModuleType:
     """Run a Python file of declarations; whatever is wrong in it becomes one line with place."""
     if not path.exists():
         raise UsageError(f"{path}: no such file")
+    if path.is_dir():
+        raise UsageError(f"{path}: is a folder; give the .py file in it")
     spec = spec_from_file_location(f"casest_user_{path.stem}", path)
     if spec is None or spec.loader is None:
         raise UsageError(f"{path}: not a Python file")
@@ -156,12 +190,12 @@ def load_file(path: Path) -> ModuleType:
     try:
         spec.loader.exec_module(module)
     except SyntaxError as error:
-        raise DeclarationError(
-            f"{error.filename}, line {error.lineno}: {error.msg}: {(error.text or '').strip()!r}"
-        ) from None
+        where = f"{error.filename or path}" + (f", line {error.lineno}" if error.lineno else "")
+        text = f": {error.text.strip()!r}" if error.text else ""
+        raise DeclarationError(f"{where}: {error.msg}{text}") from None
     except CasestError as error:
         raise type(error)(f"{_place(error, path)}: {error}") from None
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise DeclarationError(f"{_place(error, path)}: {type(error).__name__}: {error}") from None
     finally:
         sys.path.remove(str(path.parent))
@@ -172,8 +206,12 @@ def _refuse_duplicates(path: Path) -> None:
     """A second function of one name would silently replace the first."""
     try:
         tree = ast.parse(path.read_text(encoding="utf-8"))
-    except (SyntaxError, UnicodeDecodeError):
+    except (SyntaxError, UnicodeDecodeError, ValueError):
         return  # running the file says where
+    except RecursionError:
+        raise DeclarationError(
+            f"{path}: an expression is too long for Python; build it up in several lines or a loop"
+        ) from None
     seen: dict[str, int] = {}
     for node in tree.body:
         if isinstance(node, ast.FunctionDef):
@@ -194,5 +232,6 @@ def _place(error: BaseException, path: Path) -> str:
         if Path(traceback.tb_frame.f_code.co_filename).resolve() == path.resolve():
             line = traceback.tb_lineno
         traceback = traceback.tb_next
+    linecache.checkcache(str(path))
     text = linecache.getline(str(path), line).strip().rstrip(",")
     return f"{path}, line {line}" + (f", {text!r}" if text else "")

@@ -7,7 +7,7 @@ import inspect
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import casadi as ca
 import numpy as np
@@ -149,6 +149,7 @@ class Solver(Struct, frozen=True):
     evaluations: int | UnsetType | None = UNSET
     seconds: Number | UnsetType = UNSET
     least_squares_seconds: Number | UnsetType = UNSET
+    kernel: Literal["compiled", "numpy"] | UnsetType = UNSET
 
 
 class Samples(Struct, frozen=True):
@@ -366,6 +367,7 @@ def _solver(estimate: Estimate) -> Solver:
         first.evaluations,
         plain(extra.get("seconds", first.seconds)),
         plain(extra["least_squares_seconds"]) if "least_squares_seconds" in extra else UNSET,
+        "compiled" if estimate.problem.compiled else "numpy",
     )
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import sys
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,6 @@ from casest.data.run import Run
 from casest.data.write import write_atomically
 from casest.declaration.shapes import Array
 from casest.errors import DataError, UsageError
-from casest.escaping import terminal
 from casest.results.saved import SavedResult, saved_correction
 from casest.results.written import corrected_file
 
@@ -141,11 +139,8 @@ def _bracket(unit: str | None) -> str:
     return f" [{unit}]" if unit and "[" not in unit and unit != "1" else ""
 
 
-def write_or_print(text: str, output: Path | None) -> Path | None:
-    """To a .csv file, to corrected.csv in a folder (returns which), or to standard output."""
-    if output is None:
-        sys.stdout.write(terminal(text) if sys.stdout.isatty() else text)
-        return None
+def write_to(output: Path, text: str) -> Path:
+    """To a .csv file, or to corrected.csv in a folder; returns which."""
     output = corrected_file(output)
     try:
         output.parent.mkdir(parents=True, exist_ok=True)

@@ -16,8 +16,8 @@ import casadi as ca
 import numpy as np
 
 from casest.declaration.shapes import Array
+from casest.interruption import held_back, waits
 from casest.leastsquares.problem import Point, Problem
-from casest.solve.interrupt import stopped
 from casest.solve.outcome import Outcome
 
 #: Solvers kept for the next problem of as many unknowns.
@@ -65,7 +65,8 @@ def run_nlpsol(
     lower, upper = problem.bounds
     with _solver(plugin, problem.unknowns, settings) as solver, np.errstate(invalid="ignore"):
         solver.scaled = scaled
-        found = solver.nlpsol(x0=z0, lbx=lower / scaled.scale, ubx=upper / scaled.scale)
+        with held_back():
+            found = solver.nlpsol(x0=z0, lbx=lower / scaled.scale, ubx=upper / scaled.scale)
         stats = solver.nlpsol.stats()
     z = np.array(found["x"]).ravel()
     # After Invalid_Option and the like IPOPT returns the start without a word: read its status.
@@ -118,7 +119,7 @@ class _Scaled:
     def cost(self, z: Array) -> float:
         """Scaled cost; with its slope, for nearly every point that IPOPT tries is accepted."""
         # What is not finite makes IPOPT's line search give up: after Ctrl-C, or at long last.
-        given_up = stopped() or self.evaluations > PATIENCE
+        given_up = waits() or self.evaluations > PATIENCE
         return float("nan") if given_up else float(self.normal(z).cost / self.unit)
 
     def gradient(self, z: Array) -> Array:

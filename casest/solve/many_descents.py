@@ -8,7 +8,6 @@ from casest.data.run import Index
 from casest.declaration.shapes import Array
 from casest.leastsquares.many_points import Normals, normals
 from casest.leastsquares.problem import Point, Problem
-from casest.solve.interrupt import stopped
 
 #: Damped steps of each.
 STEPS = 16
@@ -37,8 +36,6 @@ def followed(problem: Problem, first: Point, x: Array) -> tuple[Array, Array]:
     here = _all_normals(problem, first, x)
     damping = np.full(len(x), 1e-2)
     for _ in range(STEPS):
-        if stopped():
-            break
         trial = np.clip(x + _damped_steps(here, damping), lower, upper)
         there = _all_normals(problem, first, trial)
         better = there.cost < here.cost

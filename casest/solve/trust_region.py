@@ -14,7 +14,6 @@ import numpy as np
 from casest.declaration.shapes import Array
 from casest.engine import Normal
 from casest.leastsquares.problem import Point
-from casest.solve.interrupt import stopped
 from casest.solve.outcome import LeastSquares, Outcome
 
 #: Relative gain from which on the normal equations' squared condition number may tell.
@@ -121,9 +120,6 @@ def trust_region(
     growth, evaluations, status = 2.0, 1, "iteration limit"
     iterations = 0
     while iterations < max_iterations:
-        if stopped():
-            status = "interrupted"
-            break
         iterations += 1
         if not here.finite():
             status = "cost or slope is not finite"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -62,6 +62,10 @@ class Candidate:
         """Name and column, as in the parameters' names: `temperature_bias(temp)`."""
         return self.name + (f"({self.column})" if self.column else "")
 
+    def among(self, names: Collection[str]) -> bool:
+        """Is it called so, with its column or without?"""
+        return self.name in names or self.label in names
+
     def added_to(self, model: Model) -> Model:
         """The model with it. Raises where it does not apply."""
         if self.traced is not None and self.traced[0] is model:
@@ -110,6 +114,8 @@ def candidates(
             continue
         for columns in _columns_for(placed, channels):
             candidate = Candidate(with_numbers(placed, columns, runs), columns)
+            if any(c.label == candidate.label and c.effect == candidate.effect for c in found):
+                continue  # of the catalogue, and asked for with its column
             try:
                 found.append(_tried(candidate, model, runs))
             except CasestError as error:
@@ -122,10 +128,15 @@ def candidates(
 
 
 def _columns_for(effect: Effect, channels: Mapping[str, bool]) -> list[tuple[tuple[str, str], ...]]:
-    """For effects that say for which argument a column is looked for: every one that may be it."""
+    """For effects that say for which argument a column is looked for: every one that may be it.
+
+    `=temp` for the one of that name.
+    """
     if not effect.columns:
         return [()]
     ((argument, kind),) = effect.columns
+    if kind.startswith("="):
+        return [((argument, name),) for name in channels if kind == "=" + name]
     fits = {"temperature": (True,), "other": (False,), "any": (True, False)}[kind]
     return [((argument, name),) for name, is_warm in channels.items() if is_warm in fits]
 

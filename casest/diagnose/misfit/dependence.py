@@ -131,7 +131,8 @@ def _distinct(found: Sequence[Variable]) -> list[Variable]:
         x = np.concatenate(variable.values)
         if not np.all(np.isfinite(x)) or np.ptp(x) <= 1e-9 * max(np.abs(x).max(), 1e-300):
             continue
-        x = (x - x.mean()) / np.linalg.norm(x - x.mean())
+        x = (x - x.mean()) / np.ptp(x)  # first: the squares of 1e-300 are zero
+        x /= np.linalg.norm(x)
         # An angle that time is a copy of still goes round.
         if variable.turns or all(abs(x @ other) < 0.9999 for other in seen):
             kept.append(variable)

@@ -31,7 +31,7 @@ CHANCE = 0.01
 def hypotheses(work: Work, ranked: Sequence[Score]) -> list[Score]:
     """The user's own effects, and those that he knows to be there."""
     own = {e.name for e in work.catalogue if not shipped(e)} | work.known
-    return [s for s in ranked if s.candidate.name in own]
+    return [s for s in ranked if s.candidate.among(own)]
 
 
 def hypothesis_test(
@@ -69,8 +69,9 @@ def note_unseen(work: Work, ranked: Sequence[Score]) -> None:
         if not any(s.freedom for s in scores):
             work.refuse(scores[0].candidate, "these data cannot show it")
     of_noise = {e.name for e in work.catalogue if e.on == NOISE}
-    for name in sorted(work.known - of_noise - {s.candidate.name for s in ranked}):
-        reasons = [s.reason for s in work.skipped if s.name.partition("(")[0] == name]
+    seen = {name for s in ranked for name in (s.candidate.name, s.candidate.label)}
+    for name in sorted(work.known - of_noise - seen):
+        reasons = [s.reason for s in work.skipped if name in (s.name, s.name.partition("(")[0])]
         reason = reasons[0] if reasons else "the data have no column that it could follow"
         work.refused.append(Skipped(name, reason))
 

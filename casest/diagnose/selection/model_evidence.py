@@ -124,8 +124,8 @@ def least_loss_first(
     matter = NEXT_TO_NOTHING * sum(r.size for r in tried[0][1].residuals)
     near = as_good(tried, folds, min(BARE_MENTION, matter))
     near.sort(key=lambda pair: pair[1].moved)
-    said = [p for p in as_good(tried, folds, STRONG) if p[0].candidate.name in known]
-    leaders = said + [p for p in near if p[0].candidate.name not in known]
+    said = [p for p in as_good(tried, folds, STRONG) if p[0].candidate.among(known)]
+    leaders = said + [p for p in near if not p[0].candidate.among(known)]
     led = {id(fitted) for _, fitted in leaders}
     return leaders + [pair for pair in tried if id(pair[1]) not in led]
 

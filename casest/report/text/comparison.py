@@ -139,9 +139,6 @@ def _share(row: Compared, size: float) -> str:
 
 def _words(result: SolversCompared) -> Iterator[str]:
     """What the tables cannot say."""
-    if result.interrupted:
-        done, planned = result.runs.done, result.runs.planned
-        yield f"interrupted after {done} of {planned} runs; what was done is shown"
     if result.best.by != "certified":
         yield (
             f"{result.best.by} found a lower cost than the certified fit: there is another valley; "
