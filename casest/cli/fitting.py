@@ -154,7 +154,7 @@ def closing(model_name: str, data: Sequence[str], options: FitOptions, command: 
         formula = formula_source(found)
         if formula:
             write(options.output / "formula.py", formula)
-            result = with_formula_in(result, options.output / "formula.py")
+            result = with_formula_in(result, options.output / "formula.py", formula)
         save(options.output, result.content(), residual_rows(found, hidden))
         reported(options.output, closing_page(result, str(options.output)))
     if options.as_json:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import hashlib
 import io
 from collections.abc import Mapping, Sequence
 from functools import cached_property
@@ -30,7 +31,6 @@ from casest.results.fitted import (
     NoiseModel,
     attachment,
     correlation_of,
-    digest_of_source,
     fitted_content,
     noise_of,
 )
@@ -293,9 +293,9 @@ def formula_source(closing: Closing) -> str:
     return "".join(source(a.effect) for a in closing.after.model.effects)
 
 
-def with_formula_in(result: Closed, path: Path) -> Closed:
-    """The result that says where the formula's source is written: `apply` reads it there."""
-    file, sha256 = str(path.resolve()), digest_of_source(path)
+def with_formula_in(result: Closed, path: Path, source: str) -> Closed:
+    """The result that says where the formula's source will be, with the digest of its text."""
+    file, sha256 = str(path.resolve()), hashlib.sha256(source.encode()).hexdigest()
     effects = [
         replace(e, file=file, sha256=sha256) if e.name == "formula" else e for e in result.effects
     ]
