@@ -55,6 +55,7 @@ class Parameter(Struct, frozen=True, kw_only=True):
 
     value: Numbers
     std: Numbers
+    plain_std: Numbers = UNSET
     robust_std: Numbers = UNSET
     interval95: Numbers = UNSET
     unit: str | list[str]

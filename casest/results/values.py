@@ -87,6 +87,7 @@ def parameter_table(estimate: Estimate, table: Mapping[str, str]) -> dict[str, P
         found[p.name] = Parameter(
             value=plain(value),
             std=plain(std),
+            plain_std=plain(estimate.plain[p.name]),
             robust_std=plain(estimate.robust[p.name]),
             interval95=[plain(value - below), plain(value + above)],
             unit=own[0] if len(set(own)) == 1 else own,
