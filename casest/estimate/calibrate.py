@@ -90,6 +90,8 @@ class Estimate:
     @cached_property
     def plain(self) -> Mapping[str, Array]:
         """Standard deviations if the noise were alike everywhere and independent: σ²(JᵀJ)⁻¹."""
+        if self.identifiability.rank == 0:
+            return self.std
         R = self.problem.factor(self.optimum or self.point)[0]
         return self._spread(self.noise.sigma**2 * inverse_normal(R, self.free))
 
