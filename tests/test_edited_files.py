@@ -264,3 +264,20 @@ def test_what_is_wrong_in_a_result_is_named(folder, tmp_path, key, value, said):
     with pytest.raises(CasestError) as refused:
         corrected_csv(tmp_path / "out", str(folder / "a.csv"), {})
     assert said in str(refused.value)
+
+
+@pytest.mark.parametrize("key", ["value", "trusted"])
+def test_values_or_trust_edited_by_hand_are_refused_for_the_correction_is_of_others(
+    folder, tmp_path, capsys, key
+):
+    content = json.loads((folder / "direct" / "result.json").read_text(encoding="utf-8"))
+    if key == "trusted":
+        content["trusted"] = not content["trusted"]
+    else:
+        parameter = next(iter(content["estimate"]["parameters"].values()))
+        parameter["value"] = json.loads(json.dumps(parameter["value"]).replace("1", "2"))
+    (tmp_path / "result.json").write_text(json.dumps(content), encoding="utf-8")
+    assert run(["export", str(tmp_path), "--to", "c", "--force"]) == 1
+    assert "its parameters are not those that its correction was made from" in (
+        capsys.readouterr().err
+    )

@@ -8,6 +8,7 @@ from scipy import optimize, stats
 
 from casest import Residual, Run, attempt, exp, inf, model, param, quantity, signal
 from casest.report.text.layout import value_table
+from casest.results.observability import observe_parameters
 from casest.results.values import entries
 
 SIGMA = 0.1
@@ -169,3 +170,16 @@ def test_the_prompt_says_where_its_interval_ends():
     (line,) = [line for line in lines if "second" in line]
     assert "0   on its bound; below 0.0" in line
     assert "not determined" not in line
+
+
+def test_what_the_data_see_of_a_value_on_its_bound_is_its_std_were_it_free():
+    (seed,) = seeds_with_a_zero(1)
+    _, _, run = mixed(seed, [1, 0, 2])
+    free = param(start=0.5)
+    unbounded = attempt(mixture.having(first=free, second=free, third=free), [run])
+    seen = observe_parameters(mixture, [run])
+    assert float(seen.std["second"]) == pytest.approx(float(unbounded.plain["second"]), rel=0.1)
+
+
+def test_an_end_of_the_bounds_that_is_none_is_open():
+    assert param(start=0.5, bounds=(0, None)) == param(start=0.5, bounds=(0, inf))

@@ -42,6 +42,8 @@ def folder(tmp_path, monkeypatch):
         "apply out/c.json v.csv -o out/../v.csv",
         "export out --to json -o out/result.json",
         "export link.json --to json -o out/result.json",
+        "export out --to c -o v.csv",
+        "export link.json --to python -o ./v.csv",
         "export out --to c --output out/result.json",
         "calibrate norm-diagonal v.csv --fix scale=@out/result.json -o out",
         "calibrate norm-diagonal v.csv --fix scale=@out -o out",

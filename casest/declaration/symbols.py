@@ -115,7 +115,8 @@ def param(
     `param("rad")` is a scalar, `param(3, "m/s^2")` a vector, `param(lower(3))` a triangular
     matrix, `param(unit_vector)` a direction; `unit` may be a tuple with one unit per entry, and
     `[v]` in a unit stands for the unit of the signal, constant or quantity `v`. `bounds` are
-    (lower, upper), numbers or arrays of the value's shape. `per="run"`: each run has its own.
+    (lower, upper), numbers or arrays of the value's shape, None for no end. `per="run"`: each run
+    has its own.
     """
     if isinstance(shape, str):
         form, unit = array_shape(None), shape
@@ -179,7 +180,8 @@ def _bounds(shape: Shape, bounds: Any) -> tuple[tuple[float, ...], tuple[float, 
             low, high = bounds
         except (TypeError, ValueError):
             raise DeclarationError(f"bounds {bounds!r} are not a pair (lower, upper)") from None
-        lower, upper = shape.spread(low), shape.spread(high)
+        lower = shape.spread(-np.inf if low is None else low)
+        upper = shape.spread(np.inf if high is None else high)
     bad = np.flatnonzero(~(lower < upper))
     if bad.size:
         raise DeclarationError(

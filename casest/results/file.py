@@ -48,6 +48,12 @@ def digest(name: str) -> str:
     return whole.hexdigest()
 
 
+def digest_of_values(values: Mapping[str, Any], trusted: bool) -> str:
+    """What a correction was made from: the parameters' values, and whether they are trusted."""
+    text = json.dumps([trusted, sorted(values.items())], allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
 def plain(value: Any) -> Any:
     """Numbers, and what holds them, for JSON; what is not finite becomes null."""
     if value is None or isinstance(value, str | bool | int):

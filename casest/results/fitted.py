@@ -22,7 +22,7 @@ from casest.declaration.symbols import Constant
 from casest.estimate.calibrate import Estimate
 from casest.leastsquares.agreement import between_runs
 from casest.results.application import Application, application_of
-from casest.results.file import plain
+from casest.results.file import digest_of_values, plain
 from casest.results.residuals import Residuals
 from casest.results.result import (
     Certificate,
@@ -354,7 +354,10 @@ def _correction(
     if corrected and corrected.low is not UNSET and corrected.high is not UNSET:
         around = (corrected.low, corrected.high)
     found = carried(estimate.model, estimate.values, estimate.problem.runs, units, around)
-    return {"reason": found} if isinstance(found, str) else carried_data(found)
+    if isinstance(found, str):
+        return {"reason": found}
+    values = {name: plain(value) for name, value in estimate.values.items()}
+    return {"of": digest_of_values(values, estimate.certificate.trusted), **carried_data(found)}
 
 
 def _solver(estimate: Estimate) -> Solver:

@@ -106,14 +106,17 @@ def observe_parameters(
 ) -> ObservedParameters:
     """What a static model's data determine: rank, null directions in words, std of each value."""
     found = attempt(model, runs)
-    identified = found.identifiability
+    identified, covariance = found.identifiability, found.covariance.copy()
+    for b in found.certificate.at_bound:  # what the data would say of it were it free
+        covariance[b.index, b.index] = b.std**2
+    std = found.problem.spread(found.point, covariance)
     return ObservedParameters(
         model=model.name,
         rank=identified.rank,
         unknowns=identified.unknowns,
         unobservable=list(identified.unobservable),
         weak=weak_of(found),
-        std={name: plain(value) for name, value in found.std.items()},
+        std={name: plain(value) for name, value in std.items()},
         trusted=found.certificate.trusted,
         data=list(data),
         reproduce=reproduced(command, data),

@@ -13,7 +13,7 @@ from casest.correction.carried import Carried
 from casest.correction.reading import carried_read, typed
 from casest.declaration.shapes import Array
 from casest.errors import DataError, UsageError
-from casest.results.file import load_result, result_file
+from casest.results.file import digest_of_values, load_result, result_file
 
 
 class SavedParameter(Struct, frozen=True):
@@ -85,6 +85,12 @@ def saved_correction(path: Path, *, force: bool = False, what: str) -> tuple[Sav
         )
     if "reason" in result.correction:
         raise UsageError(str(result.correction["reason"]))
+    values = {name: p.value for name, p in result.parameters.items()}
+    if result.correction.get("of") != digest_of_values(values, result.trusted):
+        raise DataError(
+            f"{result_file(path)}: its parameters are not those that its correction was made from; "
+            "a result is not edited by hand: calibrate again, with --fix what is to be held"
+        )
     where = f"{result_file(path)}: correction"
     return result, carried_read(result.correction, where, len(result.runs))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -23,7 +24,8 @@ _UNTOLD = {"simulate": "simulated"}
 def overwritten(command: str, output: str | Path | None, words: Sequence[str]) -> str:
     """The word that names a file which the command would write over; empty if there is none.
 
-    `words` are its arguments and the values of its options but -o.
+    `words` are its arguments and the values of its options but -o. What a result was made from
+    counts as read with it.
     """
     output = output or _UNTOLD.get(command)
     if output is None:
@@ -65,6 +67,20 @@ def _read(word: str, *, result: bool) -> Iterator[Path]:
         yield Path(text)
     if result or held:  # a folder stands for the result in it
         yield Path(named) / "result.json"
+    if result:
+        yield from _made_from(Path(word))
+
+
+def _made_from(result: Path) -> Iterator[Path]:
+    """Data, model and effects that a saved result was made from, as far as it can be read."""
+    try:
+        text = (result / "result.json" if result.is_dir() else result).read_text(encoding="utf-8")
+        content = json.loads(text)
+        declared, effects = content.get("declared_in") or {}, content.get("effects") or []
+        names = [*content.get("data", []), declared.get("file"), *(e.get("file") for e in effects)]
+    except (OSError, ValueError, TypeError, AttributeError):
+        return  # whoever reads it says what is wrong
+    yield from (Path(name) for name in names if isinstance(name, str))
 
 
 def _entry(path: Path) -> str:

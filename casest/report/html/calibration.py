@@ -70,9 +70,9 @@ def _asked(result: Calibration) -> str:
     if result.doubtful:
         return "Something did not: the residual is no noise, as is said above."
     return (
-        "Nothing in the residual speaks against the model: it does not depend on any column, "
-        "quantity or time, holds no line, and is as large as repeats say. What the values have "
-        "swallowed would not show there."
+        "Nothing in the residual speaks against the model. It was asked whether it depends on a "
+        "column or quantity; of a record in time, whether on that, and for lines; and how large it "
+        "is, where repeats say so. What the values have swallowed would not show there."
     )
 
 
