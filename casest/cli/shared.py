@@ -13,6 +13,7 @@ from casest.cli.command import Command, printed
 from casest.cli.waiting import Waiting
 from casest.errors import DataError
 from casest.escaping import one_line, terminal
+from casest.interruption import too_late
 
 shown = Waiting()
 
@@ -34,6 +35,7 @@ def echo(text: str, *, verdict: bool = False, err: bool = False, nl: bool = True
     if verdict:
         from casest.report.text.layout import coloured
 
+        too_late()  # what is said now to be written will be
         text = coloured(text, printed())
     try:
         click.echo(text, file=printed(), nl=nl)
@@ -82,6 +84,7 @@ def last_words(output: Path | None, files: str, **known: Any) -> None:
     from casest.report.next_command import following
 
     if output is not None:
+        too_late()
         echo(f"\nWritten: {output}/{files}")
     if words := following(typed(), output, **known):
         echo(f"\n{words}")
