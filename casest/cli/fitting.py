@@ -55,7 +55,7 @@ def calibrate(model_name: str, data: tuple[str, ...], options: FitOptions) -> in
 
 def calibration(model_name: str, data: Sequence[str], options: FitOptions, command: str) -> int:
     """Read, fit, save, print; the exit code says whether the estimate is trusted."""
-    from casest.diagnose.misfit.specification_test import doubts
+    from casest.diagnose.misfit.left import doubts
     from casest.estimate.calibrate import attempt
     from casest.estimate.held_out import score
     from casest.report.html import calibration_page

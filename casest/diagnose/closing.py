@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -10,17 +10,21 @@ import numpy as np
 from casest.data.run import Run
 from casest.declaration.shapes import Array
 from casest.diagnose.candidates.candidates import Skipped
-from casest.diagnose.candidates.score_test import Score
-from casest.diagnose.misfit.lack_of_fit import Misfit, left_over, state_of
-from casest.diagnose.selection.cross_validation import Folds
-from casest.diagnose.selection.found import Found, Undecided
+from casest.diagnose.cross_validation import Folds
+from casest.diagnose.found import Found, Undecided
+from casest.diagnose.misfit.left import Misfit, left_over
+from casest.diagnose.visibility import Visible
 from casest.estimate.calibrate import Estimate
 from casest.leastsquares.problem import Problem
 
 
 @dataclass(frozen=True)
 class Closing:
-    """What the loop leaves: the estimate before and after, what was added, what was refused."""
+    """What the loop leaves: the estimate before and after, what was added, what was refused.
+
+    `visible`: what these data could show of each effect that was tried; `undecided`: causes that are
+    there, of which none was added.
+    """
 
     before: Estimate
     after: Estimate
@@ -30,27 +34,23 @@ class Closing:
     skipped: tuple[Skipped, ...]
     refused: tuple[Skipped, ...]
     folds: Folds
-    remaining: tuple[Score, ...]
-    first: tuple[Score, ...]
+    visible: tuple[Visible, ...]
     runs: tuple[Run, ...]
-    noise: float = 0.0
     undecided: Undecided | None = None
 
     @cached_property
     def misfit(self) -> Misfit:
         """What is left after the loop, tested beside the noise as it is."""
         problem = Problem(self.after.model, self.runs)
-        point = problem.point(self.after.values)
         with np.errstate(all="ignore"):
-            state = state_of(problem, point, self.folds.batches)
-            left = left_over(state, self.after_held_out, self.after.correlated_over)
-        if self.undecided is None:
-            return left
-        names = self.undecided.names
-        several = " and other shapes" if len(names) == 1 else ""
-        where = f"which {' or '.join(names)}{several} explain alike"
-        fraction = max(left.fraction, self.undecided.share)
-        return replace(left, significant=True, fraction=fraction, where=where)
+            return left_over(
+                problem,
+                problem.point(self.after.values),
+                self.folds.batches,
+                self.after_held_out,
+                self.after.correlated_over,
+                self.undecided,
+            )
 
     @property
     def verdict(self) -> str | None:

@@ -11,9 +11,9 @@ import numpy as np
 from casest.declaration.model import Model
 from casest.declaration.symbols import Parameter
 from casest.diagnose.candidates.candidates import Candidate, typical_sizes
-from casest.diagnose.candidates.score_test import Score
 from casest.diagnose.closing import Closing
-from casest.diagnose.levels import SURVIVES
+from casest.diagnose.levels import LEVELS
+from casest.diagnose.visibility import Visible
 
 #: Noncentrality of the score from which on an effect is found nearly always.
 SEEN = 45.0
@@ -52,7 +52,7 @@ def invisible(closing: Closing) -> list[Invisible]:
     """Candidates whose typical size the data could not have shown."""
     model, added = closing.before.model, {f.candidate.label for f in closing.effects}
     found: dict[str, Invisible] = {}
-    for score in closing.first:
+    for score in closing.visible:
         candidate = score.candidate
         if candidate.label in added or candidate.label in found:
             continue
@@ -60,8 +60,8 @@ def invisible(closing: Closing) -> list[Invisible]:
         typical = typical_sizes(candidate, parameters, model)
         if typical is None or len(typical) > len(score.survives):
             continue
-        seen = np.diag(score.information)[: len(typical)] * typical**2 / score.inflation
-        hidden = (seen < UNSEEN) | (score.survives[: len(typical)] < SURVIVES)
+        seen = np.diag(score.information)[: len(typical)] * typical**2
+        hidden = (seen < UNSEEN) | (score.survives[: len(typical)] < LEVELS.survives)
         moves = _moves(closing, score, typical, hidden)
         if hidden.any() and moves:
             names = [p.name.rpartition(".")[2] for p in parameters]
@@ -103,7 +103,7 @@ def _shown_by(candidate: Candidate) -> str:
 
 
 def _moves(
-    closing: Closing, score: Score, typical: np.ndarray, hidden: np.ndarray
+    closing: Closing, score: Visible, typical: np.ndarray, hidden: np.ndarray
 ) -> dict[str, float]:
     """Shift of each declared parameter by a typical size of what is hidden, where it matters."""
     problem, std = closing.before.problem, np.sqrt(np.diag(closing.before.covariance))
@@ -120,15 +120,15 @@ def detectable(closing: Closing) -> list[Detectable]:
     """For every visible candidate parameter the smallest size that would have been found."""
     model, found = closing.before.model, []
     seen = {f.candidate.label for f in closing.effects}  # found, at the sizes that they have
-    for score in closing.first:
+    for score in closing.visible:
         candidate = score.candidate
-        if candidate.label in seen or candidate.trials > 1:
+        if candidate.label in seen:
             continue
         seen.add(candidate.label)
         place = 0
         for p in _own(candidate, model):
             width = p.shape.coordinates
-            information = np.diag(score.information)[place : place + width] / score.inflation
+            information = np.diag(score.information)[place : place + width]
             alive = score.survives[place : place + width] > 1e-4
             place += width
             if np.any(alive):

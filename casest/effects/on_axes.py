@@ -44,12 +44,18 @@ def restricted(effect: Effect, kept: Sequence[int], model: Model) -> Effect:
     more = {own: null.get(n, 0.0) for n, (_, p) in vectors.items() for own in p.values()}
     typical = dict(effect.typical)
     sizes = {own: typical[n] for n, (_, p) in vectors.items() if n in typical for own in p.values()}
+    plain = {
+        own: value
+        for name, value in effect.plain
+        for own in (vectors[name][1].values() if name in vectors else [name])
+    }
     return replace(
         effect,
         function=function,
         declarations=tuple(declarations),
         null=tuple(sorted({**null, **more}.items())),
         typical=tuple({**typical, **sizes}.items()),
+        plain=tuple(plain.items()),
     )
 
 

@@ -64,26 +64,46 @@ def by_frequency(stretch: Stretch, bread: Array) -> Iterator[Part]:
         yield Part(k, stretch.x, Powers(frequency, residual[:, k] ** 2, left), J)
 
 
+class Bands:
+    """Frequencies (N,) in cycles per sample, put together in bands once for all curves."""
+
+    def __init__(self, frequency: Array) -> None:
+        self._order = np.argsort(frequency, kind="stable")
+        log = np.log(frequency[self._order])
+        edges = np.unique(np.round(np.geomspace(FIRST, max(len(log), FIRST), BANDS)).astype(int))
+        self._edges = np.concatenate([[0], edges[edges < len(log)]])
+        self._size = np.diff(np.append(self._edges, len(log)))
+        self._middle = np.add.reduceat(log, self._edges) / self._size
+        self._log = np.log(frequency)
+
+    def curve(self, power: Array, left: Array) -> Array:
+        """The most likely smooth spectrum (N,) of powers (N,), of which a fit left a share each."""
+        return self.smooth(power, left)(self._log)
+
+    def smooth(self, power: Array, left: Array) -> Callable[[Array], Array]:
+        """The same as a function of the logarithm of the frequency."""
+        count = np.add.reduceat(left[self._order], self._edges)
+        mean = np.add.reduceat(power[self._order], self._edges) / np.maximum(count, 1e-300)
+        told = (count > LEFT * self._size) & (mean > 0)
+        if not told.any():
+            return lambda log: np.full(np.shape(log), 1e-300)
+        middle = self._middle[told]
+        low, high = float(middle.min()), float(middle.max())
+        order = min(ORDER, int(told.sum()) - 1)
+
+        def shapes(log: Array) -> Array:
+            place = np.clip(2 * (log - low) / max(high - low, 1e-300) - 1, -1, 1)
+            return np.asarray(np.polynomial.legendre.legvander(place, order))
+
+        curve = _most_likely(shapes(middle), mean[told], count[told])
+        return lambda log: np.exp(shapes(log) @ curve)
+
+
 def noise_spectrum(parts: Sequence[Powers]) -> Callable[[Array], Array]:
     """Power over frequency (cycles per sample), by Whittle's likelihood of the parts' powers."""
     f, power, left = (np.concatenate(column) for column in zip(*parts, strict=True))
-    order = np.argsort(f)
-    f, power, left = f[order], power[order], left[order]
-    edges = np.unique(np.round(np.geomspace(FIRST, len(f), BANDS)).astype(int))
-    edges = np.concatenate([[0], edges[edges < len(f)]])
-    count = np.add.reduceat(left, edges)
-    mean = np.add.reduceat(power, edges) / np.maximum(count, 1e-300)
-    size = np.diff(np.append(edges, len(f)))
-    middle = np.add.reduceat(np.log(f), edges) / size
-    told = (count > LEFT * size) & (mean > 0)
-    low, high = float(middle[told].min()), float(middle[told].max())
-
-    def shapes(log_frequency: Array) -> Array:
-        place = np.clip(2 * (log_frequency - low) / max(high - low, 1e-300) - 1, -1, 1)
-        return np.asarray(np.polynomial.legendre.legvander(place, ORDER))
-
-    curve = _most_likely(shapes(middle[told]), mean[told], count[told])
-    return lambda frequency: np.exp(shapes(np.log(frequency)) @ curve)
+    smooth = Bands(f).smooth(power, left)
+    return lambda frequency: smooth(np.log(frequency))
 
 
 def _most_likely(shapes: Array, mean: Array, count: Array) -> Array:

@@ -19,8 +19,8 @@ from casest.declaration.shapes import Array
 from casest.diagnose.closing import Closing
 from casest.diagnose.detectability import detectable, invisible
 from casest.diagnose.formula.terms import source
-from casest.diagnose.selection.cross_validation import rms
-from casest.diagnose.selection.found import Found
+from casest.diagnose.cross_validation import rms
+from casest.diagnose.found import Found
 from casest.estimate.calibrate import Estimate
 from casest.leastsquares.problem import Problem
 from casest.results.application import formula_of
@@ -265,7 +265,7 @@ def _formula(found: Found, attached: Attached | None) -> str:
 
 def _measurements(labels: Sequence[str], closing: Closing) -> list[str]:
     """What would show each of these effects."""
-    by_label = {s.candidate.label: s.candidate for s in closing.first}
+    by_label = {s.candidate.label: s.candidate for s in closing.visible}
     said = []
     for label in labels:
         other = by_label.get(label)

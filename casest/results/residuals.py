@@ -10,7 +10,7 @@ import numpy as np
 from casest.data.run import Run
 from casest.declaration.shapes import Array
 from casest.diagnose.candidates.candidates import usable_columns
-from casest.diagnose.misfit.dependence import variables
+from casest.diagnose.misfit.variables import variables
 from casest.estimate.calibrate import Estimate
 from casest.estimate.correlation import is_series
 from casest.leastsquares.problem import Problem

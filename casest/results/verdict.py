@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Protocol, TypeVar
 
-from casest.diagnose.selection.cross_validation import FAR
-from casest.diagnose.selection.found import HELD_OUT_DATA
+from casest.diagnose.evidence.held_out import FAR
+from casest.diagnose.found import HELD_OUT_DATA
 from casest.effects import CATALOGUE
 from casest.results.closing import Closed, Effect, Shifts, Unexplained
 from casest.results.result import Number, Parameter

@@ -22,6 +22,8 @@ from casest.errors import CasestError, UsageError
 #: Columns whose name or unit says that they are temperatures.
 _TEMPERATURE = re.compile(r"temp|(^|_)t_?(deg)?c$|celsius|kelvin", re.IGNORECASE)
 _DEGREES = {"degC", "K", "kelvin", "degree_Celsius", "°C"}
+#: What is searched over first and fitted then: an effect is smooth in it.
+SMOOTH = ("frequency", "timescale")
 #: Columns that number things instead of measuring them.
 _LABELS = re.compile(
     r"^(run|pose|index|(first_|last_)?row|count|sample|seq|id|nr|no)$", re.IGNORECASE
@@ -38,6 +40,8 @@ class Candidate:
     effect: Effect | None
     columns: tuple[tuple[str, str], ...] = ()
     freed: str = ""
+    #: Values that it is held at, of what it is searched over; so many were looked through.
+    held: tuple[tuple[str, float], ...] = ()
     trials: int = 1
     #: The model that it was tried on, and that model with it: tracing takes longer than scoring.
     traced: tuple[Model, Model] | None = field(default=None, compare=False, repr=False)
@@ -68,6 +72,16 @@ class Candidate:
 
     def added_to(self, model: Model) -> Model:
         """The model with it. Raises where it does not apply."""
+        if self.freed:
+            return model.freed(self.freed)
+        if not self.held:
+            return self.traced_on(model)
+        assert self.effect is not None
+        effect = self.effect.holding(**dict(self.held))
+        return model.with_effect(effect, columns=dict(self.columns))
+
+    def traced_on(self, model: Model) -> Model:
+        """The model with it, nothing held."""
         if self.traced is not None and self.traced[0] is model:
             return self.traced[1]
         if self.freed:
@@ -77,11 +91,23 @@ class Candidate:
 
     def on_model(self, model: Model) -> Candidate:
         """The candidate that remembers the model with it. Raises where it does not apply."""
-        return replace(self, traced=(model, replace(self, traced=None).added_to(model)))
+        return replace(self, traced=(model, replace(self, traced=None).traced_on(model)))
+
+    def free(self) -> Candidate:
+        """With its frequency or time constant unknown again, from where it was found."""
+        if self.effect is None:
+            return self
+        smooth = {n for n, kind in self.effect.profile if kind in SMOOTH}
+        begun = {n: v for n, v in self.held if n in smooth}
+        if not begun:
+            return self
+        left = tuple((n, v) for n, v in self.held if n not in smooth)
+        return replace(self, effect=self.effect.starting(**begun), held=left, traced=None)
 
     def parameters(self, extended: Model) -> list[Parameter]:
         """Its unknowns in the extended model."""
         own = extended.unknowns_of(self.label)
+        own -= {f"{self.label}.{name}" for name, _ in self.held}
         return [p for p in extended.parameters if p.name in own or p.name == self.freed]
 
 
@@ -187,11 +213,6 @@ def _tried(candidate: Candidate, model: Model, runs: Sequence[Run]) -> Candidate
     """The candidate on the model. Raises where it does not apply here."""
     if any(a.label == candidate.label for a in model.effects):
         raise UsageError("already in the model")
-    if candidate.effect is not None and candidate.effect.kind == "sequence":
-        raise UsageError(
-            "it acts on the sequence of samples, and has no slope for each of them to be found by; "
-            "`calibrate --effects` fits it"
-        )
     candidate = candidate.on_model(model)
     effect, extended = candidate.effect, candidate.added_to(model)
     for s in extended.signals:

@@ -1,127 +1,174 @@
-"""Where to look for effects that have a frequency, a moment or a level: a few values of each.
+"""Where to look for what has a moment, a level, a frequency or a time constant.
 
-The residual itself says where: its periodogram, its cumulative sum, the largest readings. What was
-looked through is counted as trials, and makes the p-value larger.
+The residual itself says where: its cumulative sum, its periodogram, the largest readings. How much was
+looked through is counted, and paid for.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from casest.data.run import Run
 from casest.declaration.shapes import Array
 from casest.diagnose.candidates.candidates import Candidate
-from casest.diagnose.candidates.score_test import Score
-from casest.diagnose.levels import CLIPPED
+from casest.diagnose.evidence.linear import Linear
 
-#: Lines of the periodogram, moments and levels that are tried.
-LINES, MOMENTS, LEVELS = 4, 3, 3
-#: Moments that are tried where the residual does not say: an implicit one has no axes of its own.
-EVEN = 15
-#: Residuals before and after a moment, at least: three poses at the end are fitted by any step.
-BESIDE = 8
+#: Values on each grid: moments beside the best one, edges of pulses, levels, time constants, lines.
+MOMENTS, EDGES, LEVELS_TRIED, CONSTANTS, LINES = 15, 60, 24, 8, 3
+#: The shortest time constant, in samples: a shorter one is a delay.
+SHORTEST = 3.0
 #: Share of the readings that the lowest level lets through, and fewest beyond the highest.
 LOWEST, FEWEST = 0.7, 6
-#: Samples of the longest periodogram.
-LONGEST = 1 << 18
 
 
-def on_grid(
-    found: Sequence[Candidate],
-    runs: Sequence[Run],
-    residuals: Sequence[Array],
-    readings: Sequence[Array] | None,
-    sigma: float,
-) -> list[Candidate]:
-    """Candidates with a profile replaced by some with its value held."""
-    expanded: list[Candidate] = []
-    clipped = [np.clip(r, -CLIPPED * sigma, CLIPPED * sigma) for r in residuals]
-    for candidate in found:
-        profile = dict(candidate.effect.profile) if candidate.effect else {}
-        if not profile:
-            expanded.append(candidate)
-            continue
-        assert candidate.effect is not None
-        ((name, kind),) = profile.items()
-        # What is cut off is far out: the level is looked for in the residual as it is.
-        seen = residuals if kind == "level" else clipped
-        values, trials = _values(kind, runs, seen, readings)
-        for value in values:
-            effect = candidate.effect.holding(**{name: float(f"{value:.9g}")})
-            expanded.append(replace(candidate, effect=effect, trials=trials, traced=None))
-    return expanded
+@dataclass(frozen=True)
+class Seen:
+    """What a grid is laid over: the push Pᵀr (N, q) of the residual on what the sensor gives, the
+    prediction (N, q) if there is one, the time (N,) if there is one, and the linear problem."""
+
+    push: Array
+    reading: Array | None
+    time: Array | None
+    linear: Linear
 
 
-def freed_again(candidate: Candidate, original: Candidate) -> Candidate:
-    """The candidate with its frequency unknown again, starting where it was found."""
-    if candidate.effect is None or original.effect is None:
-        return candidate
-    profile = dict(original.effect.profile)
-    smooth = [n for n, kind in profile.items() if kind == "frequency"]
-    if not smooth:
-        return candidate
-    held = {n: float(d.array) for n, d in candidate.effect.declarations if n in smooth}
-    return replace(candidate, effect=original.effect.starting(**held), traced=None)
+def on_grid(candidate: Candidate, seen: Seen) -> list[Candidate]:
+    """The candidate at values of what it is searched over, `trials` saying among how many."""
+    profile = dict(candidate.effect.profile) if candidate.effect else {}
+    if not profile:
+        return [candidate]
+    values, trials = _values(tuple(profile.values()), seen)
+    return [
+        replace(candidate, held=_held(dict(zip(profile, v, strict=True))), trials=int(trials))
+        for v in values
+    ]
 
 
-def _values(
-    kind: str,
-    runs: Sequence[Run],
-    residuals: Sequence[Array],
-    readings: Sequence[Array] | None,
-) -> tuple[list[float], int]:
-    if kind == "frequency":
-        return _lines(runs, residuals)
-    if kind == "time":
-        return _moments(runs, residuals) if readings is not None else _even(runs, residuals)
-    if readings is None:
+def _held(values: Mapping[str, float]) -> tuple[tuple[str, float], ...]:
+    return tuple((n, float(f"{v:.9g}")) for n, v in values.items())
+
+
+Values = tuple[list[tuple[float, ...]], float]
+
+
+def _values(kinds: tuple[str, ...], seen: Seen) -> Values:
+    if kinds == ("level",):
+        return _levels(seen)
+    if seen.time is None:
         return [], 1
-    return _levels(np.concatenate(residuals), np.concatenate(readings))
+    if kinds == ("time",):
+        return _moments(seen)
+    if kinds == ("time", "time"):
+        return _pulses(seen)
+    if kinds == ("frequency",):
+        return _lines(seen)
+    return _constants(seen)
 
 
-def _levels(r: Array, y: Array) -> tuple[list[float], int]:
-    """Levels beyond which the residual grows most with what the reading exceeds them by."""
-    order = np.argsort(-np.abs(y).ravel())
-    size, inward = np.abs(y).ravel()[order], (r * np.sign(y)).ravel()[order]
-    if len(size) < 4 * FEWEST:
+def _levels(seen: Seen) -> Values:
+    if seen.reading is None:
         return [], 1
-    beyond = np.unique(np.geomspace(FEWEST, (1 - LOWEST) * len(size), 24).astype(int))
-    beyond = beyond[beyond < len(size)]
-    # Σr(|y| − level) and Σ(|y| − level)² over the readings beyond each level, from running sums.
-    sums = np.cumsum(np.column_stack([size**0, size, size**2, inward, inward * size]), axis=0)
-    level = size[beyond]
-    n, first, second, plain, product = sums[beyond - 1].T
-    spread = second - 2 * level * first + n * level**2
+    size = np.sort(np.abs(seen.reading).ravel())
+    least, most = LOWEST * len(size), len(size) - FEWEST
+    if most <= least:
+        return [], 1
+    beyond = np.unique(np.geomspace(len(size) - least, FEWEST, LEVELS_TRIED).astype(int))
+    levels = np.unique([float(f"{size[-b]:.6g}") for b in beyond])
     # Rows of one pose are predicted alike: what nothing exceeds but by rounding is no level.
-    exceeded = spread > 1e-9 * second
-    gain = np.where(exceeded, (product - level * plain) ** 2 / np.maximum(spread, 1e-300), 0.0)
-    _, once = np.unique(level, return_index=True)
-    best = sorted((k for k in once if gain[k] > 0), key=lambda k: -gain[k])[:LEVELS]
-    return [float(level[k]) for k in best], len(beyond)
+    levels = [v for v in levels if np.count_nonzero(size > v * (1 + 1e-6)) >= FEWEST]
+    return [(v,) for v in levels], max(len(levels), 1)
 
 
-def _lines(runs: Sequence[Run], residuals: Sequence[Array]) -> tuple[list[float], int]:
-    """Frequencies (rad/s) that stand out of their neighbourhood, of the longest run."""
-    run, r = max(zip(runs, residuals, strict=True), key=lambda pair: len(pair[0]))
-    if "t" not in run.signals or len(run) < 64:
+def _edge(count: int) -> int:
+    return max(4, count // 100)
+
+
+def _bends(push: Array) -> tuple[Array, Array]:
+    """Cumulative sums of the push, each axis by its own size; gain of a step before each row."""
+    z = push - push.mean(axis=0)
+    z = z / (z.std(axis=0) + 1e-300)
+    n = len(z)
+    sums = np.vstack([np.zeros((1, z.shape[1])), np.cumsum(z, axis=0)])
+    i = np.arange(1, n)
+    return sums, (sums[1:-1] ** 2).sum(axis=1) / (i * (n - i) / n)
+
+
+def _between(time: Array, k: int) -> float:
+    return float(0.5 * (time[k - 1] + time[k]))
+
+
+def _moments(seen: Seen) -> Values:
+    assert seen.time is not None
+    n, edge = len(seen.time), _edge(len(seen.time))
+    if n < 4 * edge:
         return [], 1
-    t = run.signals["t"][:, 0]
-    step = float(np.median(np.diff(t)))
-    if not step > 0:
+    gain = _bends(seen.push)[1]
+    best = edge + int(np.argmax(gain[edge - 1 : n - edge]))
+    even = np.linspace(edge, n - edge, MOMENTS).astype(int)
+    chosen = sorted({best, *even.tolist()})
+    return [(_between(seen.time, k),) for k in chosen if 0 < k < n], n
+
+
+def _pulses(seen: Seen) -> Values:
+    assert seen.time is not None
+    time, n = seen.time, len(seen.time)
+    edge = _edge(n)
+    if n < 8 * edge:
         return [], 1
-    # On an even grid; gaps stay empty.
+    sums = _bends(seen.push)[0]
+
+    def gain(a: Array | int, b: Array | int) -> Array:
+        inside = np.maximum(np.asarray(b) - np.asarray(a), 1)
+        moved = ((sums[b] - sums[a]) ** 2).sum(axis=-1) / (inside * (1 - inside / n) + 1e-9)
+        return np.asarray(np.where(np.asarray(b) - np.asarray(a) >= edge, moved, 0.0))
+
+    grid = np.unique(np.linspace(edge, n - edge, EDGES).astype(int))
+    a, b = (g.ravel() for g in np.meshgrid(grid, grid, indexing="ij"))
+    best = int(np.argmax(gain(a, b)))
+    first, last = int(a[best]), int(b[best])
+    reach = max(2, n // EDGES)
+    for _ in range(2):
+        near = np.arange(max(1, first - reach), min(last - edge, first + reach) + 1)
+        if len(near):
+            first = int(near[np.argmax(gain(near, np.full_like(near, last)))])
+        near = np.arange(max(first + edge, last - reach), min(n - 1, last + reach) + 1)
+        if len(near):
+            last = int(near[np.argmax(gain(np.full_like(near, first), near))])
+    sixth = np.linspace(0, n, 7).astype(int)[1:-1]
+    pairs = {(first, last)} | {(int(i), int(j)) for i in sixth for j in sixth if i < j}
+    found = [(_between(time, i), _between(time, j)) for i, j in sorted(pairs)]
+    return found, n * n / 2
+
+
+def _constants(seen: Seen) -> Values:
+    assert seen.time is not None
+    step = float(np.median(np.diff(seen.time))) if len(seen.time) > 1 else 0.0
+    longest = float(np.ptp(seen.time)) / 4
+    if not longest > SHORTEST * step > 0:
+        return [], 1
+    return [(float(v),) for v in np.geomspace(SHORTEST * step, longest, CONSTANTS)], CONSTANTS
+
+
+def _lines(seen: Seen) -> Values:
+    """Frequencies (rad/s) that stand out of their neighbourhood, of the longest span."""
+    assert seen.time is not None
+    if not seen.linear.spans:
+        return [], 1
+    span = max(seen.linear.spans, key=lambda s: s.stop - s.start)
+    t, r = seen.time[span], seen.push[span]
+    step = float(np.median(np.diff(t))) if len(t) > 1 else 0.0
+    if len(t) < 64 or not step > 0:
+        return [], 1
     place = np.round((t - t[0]) / step).astype(int)
-    keep = (place >= 0) & (place < LONGEST)
-    length = int(place[keep].max()) + 1
-    power = np.zeros(length // 2 + 1)
-    for k in range(r.shape[1]):
-        even = np.zeros(length)
-        even[place[keep]] = r[keep, k]
-        power += np.abs(np.fft.rfft(even)) ** 2
-    power[:2] = 0
+    length = int(place.max()) + 1
+    if length > 4 * len(t):
+        return [], 1
+    even = np.zeros((length, r.shape[1]))
+    even[place] = (r - r.mean(axis=0)) / (r.std(axis=0) + 1e-300)
+    power = (np.abs(np.fft.rfft(even, axis=0)) ** 2).sum(axis=1)
+    power[: max(5, length // 200)] = 0
     width = max(8, length // 200)
     level = np.convolve(power, np.ones(2 * width + 1) / (2 * width + 1), "same")
     ratio = power / np.maximum(level, 1e-300 + 1e-12 * power.max(initial=0.0))
@@ -131,7 +178,8 @@ def _lines(runs: Sequence[Run], residuals: Sequence[Array]) -> tuple[list[float]
             break
         if all(abs(int(k) - b) > 2 for b in best):
             best.append(int(k))
-    return [2 * np.pi * _refined(power, k) / (length * step) for k in best], length // 2
+    found = [(2 * np.pi * _refined(power, k) / (length * step),) for k in best]
+    return found, length // 2
 
 
 def _refined(power: Array, k: int) -> float:
@@ -143,84 +191,26 @@ def _refined(power: Array, k: int) -> float:
     return k + 0.5 * (a - c) / bend if bend < 0 else float(k)
 
 
-def _moments(runs: Sequence[Run], residuals: Sequence[Array]) -> tuple[list[float], int]:
-    """Moments (s) at which the cumulative sum of the residual bends most."""
-    found: list[tuple[float, float]] = []
-    for run, r in zip(runs, residuals, strict=True):
-        if "t" not in run.signals or len(run) < 8:
-            continue
-        found += list(_bends(run.signals["t"][:, 0], r))
-    found.sort(reverse=True)
-    count = max((len(run) for run in runs), default=2)
-    return [when for _, when in found[:MOMENTS]], max(int(8 * np.log(max(count, 2))), 1)
+def nearer(candidate: Candidate, seen: Seen, scale: float) -> list[Candidate]:
+    """The candidate at values around its own, `scale` of the distance on the first grid away."""
+    if candidate.effect is None:
+        return []
+    profile, held = dict(candidate.effect.profile), dict(candidate.held)
+    return [
+        replace(candidate, held=_held({**held, name: moved}))
+        for name, value in held.items()
+        for moved in _steps(profile[name], value, seen, scale)
+    ]
 
 
-def _even(runs: Sequence[Run], residuals: Sequence[Array]) -> tuple[list[float], int]:
-    """Moments (s) that cut the longest run into parts of as many samples."""
-    run, r = max(zip(runs, residuals, strict=True), key=lambda pair: len(pair[0]))
-    edge = least_beside(*r.shape)
-    if "t" not in run.signals or len(run) <= 2 * edge:
-        return [], 1
-    t = run.signals["t"][:, 0]
-    at = np.unique(np.linspace(edge - 1, len(t) - edge - 1, EVEN).round().astype(int))
-    return [float(0.5 * (t[k] + t[k + 1])) for k in at], max(int(8 * np.log(len(t))), 1)
-
-
-def least_beside(samples: int, axes: int) -> int:
-    """Samples before and after a moment, at least."""
-    return max(2, samples // 50, -(-BESIDE // axes))
-
-
-def _bends(t: Array, r: Array) -> Iterator[tuple[float, float]]:
-    n = len(t)
-    k = np.arange(1, n)
-    total = np.cumsum(r - r.mean(axis=0), axis=0)[:-1]
-    size = np.sum(total**2, axis=1) / (k * (n - k) / n)
-    edge = least_beside(*r.shape)
-    size[: edge - 1] = size[n - edge :] = 0
-    for _ in range(MOMENTS):
-        at = int(np.argmax(size))
-        if not size[at] > 0:
-            return
-        yield float(size[at]), float(0.5 * (t[at] + t[at + 1]))
-        size[max(0, at - n // 20) : at + n // 20] = 0
-
-
-def grid_value(candidate: Candidate) -> tuple[str, str, float] | None:
-    """Name, kind and value of what a profile holds: a level or a moment."""
-    profile = dict(candidate.effect.profile) if candidate.effect else {}
-    for name, kind in profile.items():
-        assert candidate.effect is not None
-        for n, d in candidate.effect.declarations:
-            if n == name and kind in ("level", "time"):
-                return name, kind, float(d.array)
-    return None
-
-
-def strides(kind: str, value: float, runs: Sequence[Run]) -> list[float]:
-    """From coarse to fine: shares of a level; samples around a moment."""
+def _steps(kind: str, value: float, seen: Seen, scale: float) -> list[float]:
     if kind == "level":
-        return [abs(value) * 0.02 / 4**k for k in range(4)]
-    times = [run.signals["t"][:, 0] for run in runs if "t" in run.signals]
-    gap = min((float(np.median(np.diff(t))) for t in times if len(t) > 1), default=1.0)
-    return [gap * n for n in (8, 2, 1)]
-
-
-def within(kind: str, value: float, runs: Sequence[Run], axes: int) -> bool:
-    """Does a run have enough samples before and after the moment?"""
-    if kind != "time":
-        return True
-    times = [run.signals["t"][:, 0] for run in runs if "t" in run.signals]
-    return any(
-        least_beside(len(t), axes)
-        <= np.count_nonzero(t <= value)
-        <= len(t) - least_beside(len(t), axes)
-        for t in times
-    )
-
-
-def at_grid_value(score: Score, name: str, value: float) -> Score:
-    """The score's candidate with another value held."""
-    assert score.candidate.effect is not None
-    effect = score.candidate.effect.holding(**{name: float(f"{value:.9g}")})
-    return replace(score, candidate=replace(score.candidate, effect=effect, traced=None))
+        return [value * (1 + s * 0.06 * scale) for s in (-1, -0.5, 0.5, 1)]
+    if kind == "timescale":
+        return [value * float(np.exp(s * 0.7 * scale)) for s in (-1, -0.5, 0.5, 1)]
+    if kind == "frequency" or seen.time is None:
+        return []
+    gap = float(np.median(np.diff(seen.time)))
+    reach = max(1, round(len(seen.time) / MOMENTS / 2 * scale))
+    steps = sorted({max(1, round(reach * s)) for s in (0.25, 0.5, 1)})
+    return [value + way * k * gap for k in steps for way in (-1, 1)]

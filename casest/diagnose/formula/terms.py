@@ -31,8 +31,6 @@ _TAKEN = frozenset(
     ]
 )
 _FILES = count(1)
-#: Waves over the range of a variable: cycles are tried in steps of a quarter, from and up to.
-WAVES = range(3, 17)
 #: Multiples of an angle, and shapes of one variable: kind and order.
 MULTIPLES = range(1, 9)
 SHAPES = (("power", 1), ("power", 2), ("power", 3), ("abs", 1), ("exp", 2), ("exp", -2),
@@ -139,14 +137,14 @@ class Term:
 
 
 def library(variables: Sequence[Variable]) -> list[Shape]:
-    """Powers 1 to 3, size, exponentials, saturation and waves of each; products of two."""
+    """Powers 1 to 3, size, exponentials and saturation of each; multiples of an angle; products of two."""
     straight = [v for v in variables if not v.angle]
     found = [Shape(kind, (v,), k) for v in straight for kind, k in SHAPES]
     found += [
         Shape(kind, (v,), k)
         for v in variables
-        if v.name != "t"  # waves in time are the catalogue's vibration, or wander
-        for k in (MULTIPLES if v.angle else WAVES)
+        if v.angle
+        for k in MULTIPLES
         for kind in ("sin", "cos")
     ]
     return found + [Shape("product", pair) for pair in combinations(straight, 2)]

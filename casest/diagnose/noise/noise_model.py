@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from casest.data.run import Run
 from casest.declaration.shapes import Array
-from casest.diagnose.levels import CLIPPED
+from casest.diagnose.levels import LEVELS
 from casest.diagnose.noise.tails import even_scale, outlier_share, tails
 from casest.estimate.correlation import is_series
 from casest.leastsquares.weights import robust_scale
@@ -84,7 +84,7 @@ def noise_model(
 ) -> NoiseModel:
     """The noise of residuals (N, m) per run; `measured` names the signal that was read."""
     sigma = _sigma(residuals)
-    clipped = [np.clip(r / sigma, -CLIPPED, CLIPPED) for r in residuals]
+    clipped = [np.clip(r / sigma, -LEVELS.clip, LEVELS.clip) for r in residuals]
     unequal_p = equal_noise(clipped, batches)
     unequal = unequal_p < ALARM
     even = even_scale(residuals, batches, unequal)
@@ -102,7 +102,7 @@ def noise_model(
         wander_p=wander_p,
         freedom=np.inf if outliers else found.freedom,
         outliers=outliers,
-        step=_step(runs, measured),
+        step=step_of(runs, measured),
         unequal=_ratio(clipped, batches) if unequal else 1.0,
         unequal_p=unequal_p,
     )
@@ -164,14 +164,6 @@ def _wander(runs: Sequence[Run], clipped: Sequence[Array], sigma: Array) -> tupl
     walks = [_walk(power, run) for run, power in known]
     size = float(np.sqrt(np.mean(walks) * np.mean(sigma**2)))
     return size, wander_p_value([power for _, power in known])
-
-
-def wander_of(runs: Sequence[Run], residuals: Sequence[Array]) -> float | None:
-    """The chance of as much slow variation without a random walk; None where it is not small."""
-    sigma = _sigma(residuals)
-    clipped = [np.clip(r / sigma, -CLIPPED, CLIPPED) for r in residuals]
-    _, p = _wander(runs, clipped, sigma)
-    return p if p < ALARM else None
 
 
 def slow_power(run: Run, r: Array) -> Array | None:
@@ -293,7 +285,7 @@ def _ratio(clipped: Sequence[Array], batches: Sequence[NDArray[np.int_]]) -> flo
     return max(spreads) / max(min(spreads), 1e-300)
 
 
-def _step(runs: Sequence[Run], measured: str | None) -> float:
+def step_of(runs: Sequence[Run], measured: str | None) -> float:
     """Step of a quantised reading, 0 where nearly every reading is another value."""
     from casest.data.stillness import resolution
 

@@ -1,4 +1,4 @@
-"""What was found so far: an effect with its evidence, or causes that explain alike."""
+"""What was found: an effect with its evidence, or causes that explain alike."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 
 from casest.declaration.shapes import Array
 from casest.diagnose.candidates.candidates import Candidate
-from casest.diagnose.candidates.score_test import Score
 
 #: What is refused where nothing can be held out.
 HELD_OUT_DATA = "held-out data"
@@ -15,18 +14,19 @@ HELD_OUT_DATA = "held-out data"
 
 @dataclass(frozen=True)
 class Found:
-    """An effect that was added, with the evidence: a score, but for one on the noise.
+    """An effect that was added, with the evidence.
 
-    `rivals`: what the data do not tell apart from it, nearest first, each with how far the declared
-    parameters would move were it the cause instead.
+    `gain`: fall of the held-out mean square; `ratios` of the held-out squares after over before, on
+    interleaved pieces, whole stretches and whole regions. `rivals`: what the data do not tell apart
+    from it, nearest first, each with how far the declared parameters would move were it the cause.
     """
 
     candidate: Candidate
-    score: Score | None
     p_value: float
     gain: float
     names: tuple[str, ...] = ()
     rivals: Mapping[str, Mapping[str, Array]] = field(default_factory=dict)
+    ratios: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def of_noise(self) -> bool:
@@ -41,10 +41,10 @@ class Found:
 
 @dataclass(frozen=True)
 class Undecided:
-    """Something is missing, and these causes explain it alike; what is added hangs on which it is.
+    """Something is missing, and what it is hangs on more than the data say.
 
-    `share` of the held-out mean square that any of them would take away; `moves`: how far each
-    would move the declared parameters, where that is known.
+    `share` of the mean square that the first would take away; `moves`: how far each would move the
+    declared parameters, where that is known.
     """
 
     names: tuple[str, ...]

@@ -27,8 +27,6 @@ FOLDS = 4
 UNCERTAIN = 10.0
 #: Share of the squares of its unknowns, each alone, by which a direction moves a prediction at all.
 OPEN = 1e-10
-#: A residual counts as at most this many robust standard deviations.
-FAR = 4.0
 #: Iterations of a fit that begins at the fit to everything, and gain (in σ²) that ends it.
 ITERATIONS, ENOUGH = 30, 1e-3
 
@@ -110,26 +108,6 @@ def _left_open(rest: Problem, fitted: Point, hidden: Problem, point: Point) -> b
     own = hidden.normal(point).matrix
     moved = np.einsum("ik,ij,jk->k", null, own, null)
     return bool(np.any(moved > OPEN * np.einsum("ik,ii->k", null**2, own)))
-
-
-def gain(
-    before: Sequence[Array], after: Sequence[Array], folds: Folds, sigma: float
-) -> tuple[float, float]:
-    """How much the squares fall from one model's residuals to another's, in σ²; standard error.
-
-    Were the second model right, with residuals r and predictions that differ by δ, the squares
-    would fall by Σ(δ² + 2rδ): the error is that of 2Σrδ, from batch to batch and not below that
-    of white noise. So what is gained in a few batches only is a gain as well. Far residuals count
-    as FAR standard deviations.
-    """
-    total, wide, white = 0.0, 0.0, 0.0
-    for b, a, first in zip(before, after, folds.batches, strict=True):
-        b, a = (np.clip(r, -FAR * sigma, FAR * sigma) for r in (b, a))
-        moved = b - a
-        total += float(np.sum(b**2 - a**2))
-        wide += float(np.sum(np.add.reduceat(np.sum(2 * a * moved, axis=1), first) ** 2))
-        white += float(np.sum(moved**2))
-    return total / sigma**2, float(np.sqrt(max(wide / sigma**4, 4 * white / sigma**2)))
 
 
 def rms(residuals: Sequence[Array]) -> float:

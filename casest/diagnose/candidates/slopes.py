@@ -1,0 +1,182 @@
+"""Slopes of the residual in what a candidate would add, at its null value: no refit.
+
+All candidates share the symbols of the model as it is, so that one evaluation serves many. What acts
+on the sequence of samples is differentiated through its recursion.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from casest.data.run import Run
+from casest.declaration.model import Model
+from casest.declaration.shapes import Array
+from casest.declaration.symbols import Signal
+from casest.declaration.tracing import flat
+from casest.diagnose.candidates.candidates import Candidate
+from casest.engine import Columns, Replay
+from casest.errors import CasestError
+from casest.leastsquares.problem import Point, Problem
+
+Index = NDArray[np.int_]
+#: Columns that are evaluated at once.
+WIDEST = 120
+
+
+def rows_of(runs: Sequence[Run], most: int) -> list[Index]:
+    """Of each run the rows that are looked at: all, or evenly chosen ones of a long record."""
+    every = -(-sum(map(len, runs)) // most)
+    return [np.arange(0, len(run), every) for run in runs]
+
+
+def slopes(
+    problem: Problem, point: Point, found: Sequence[Candidate], rows: Sequence[Index]
+) -> Iterator[tuple[Candidate, Array | CasestError]]:
+    """Every candidate with its columns (N, m, k) in the rows of all runs; or why there are none.
+
+    Per-run unknowns have columns of their own for each run.
+    """
+    axes = len(problem.model.axes)
+    direct = [c for c in found if not _sequential(c, problem.model)]
+    size = max(1, WIDEST // (3 * axes))
+    for k in range(0, len(direct), size):
+        yield from _direct(problem, point, direct[k : k + size], rows)
+    for candidate in found:
+        if candidate not in direct:
+            try:
+                yield candidate, _through_recursion(problem, point, candidate, rows)
+            except CasestError as error:
+                yield candidate, error
+
+
+def _sequential(candidate: Candidate, model: Model) -> bool:
+    """Does a sample's residual depend on those before it?"""
+    kinds = {a.kind for a in model.effects}
+    if candidate.effect is not None:
+        kinds.add(candidate.effect.kind)
+    return bool(kinds & {"sequence", "lag"})
+
+
+def _direct(
+    problem: Problem, point: Point, found: Sequence[Candidate], rows: Sequence[Index]
+) -> Iterator[tuple[Candidate, Array | CasestError]]:
+    model, kept, slopes, scopes = problem.model, [], [], []
+    signals = list(model.signals)
+    symbols = {s.name: model.traced.symbols[s.name] for s in signals}
+    for candidate in found:
+        try:
+            slope, per_run, more = slope_of(candidate, model, symbols)
+        except CasestError as error:
+            yield candidate, error
+            continue
+        signals += more
+        kept.append(candidate)
+        slopes.append(slope)
+        scopes.append(np.array(per_run, bool))
+    if not kept:
+        return
+    base = model.traced
+    inputs = [
+        ca.vertcat(base.coordinates, base.references),
+        ca.vertcat(*[flat(symbols[s.name]) for s in signals]),
+    ]
+    together = ca.densify(ca.horzcat(*slopes))
+    replay = Replay(ca.Function("slopes", inputs, [together], ["parameters", "sample"], ["G"]))
+    values = []
+    for r, run in enumerate(problem.runs):
+        samples = Columns([run.signals[s.name] for s in signals])
+        every = slice(None, None, rows[r][1] - rows[r][0]) if len(rows[r]) > 1 else slice(None)
+        (G,) = replay(problem.parameters(point, r), samples[every])
+        weight = None if problem.weights is None else problem.weights[r][rows[r]]
+        values.append(np.nan_to_num(G if weight is None else G * np.sqrt(weight)[:, :, None]))
+    place = 0
+    for candidate, per_run in zip(kept, scopes, strict=True):
+        own = slice(place, place + len(per_run))
+        place = own.stop
+        yield candidate, _side_by_side([v[:, :, own] for v in values], per_run)
+
+
+def _side_by_side(parts: Sequence[Array], per_run: NDArray[np.bool_]) -> Array:
+    """Columns of the runs below each other; those per run beside each other."""
+    if len(parts) == 1 or not per_run.any():
+        return np.concatenate(parts)
+    own = int(per_run.sum())
+    shared = int((~per_run).sum())
+    found = np.zeros((sum(map(len, parts)), parts[0].shape[1], shared + own * len(parts)))
+    row = 0
+    for r, part in enumerate(parts):
+        here = slice(row, row + len(part))
+        found[here, :, :shared] = part[:, :, ~per_run]
+        found[here, :, shared + r * own : shared + (r + 1) * own] = part[:, :, per_run]
+        row = here.stop
+    return found
+
+
+def _through_recursion(
+    problem: Problem, point: Point, candidate: Candidate, rows: Sequence[Index]
+) -> Array:
+    """Columns of the candidate's own unknowns in the extended problem."""
+    extended = candidate.added_to(problem.model)
+    wide = Problem(extended, problem.runs)
+    start = wide.start().references  # null values
+    values = {**wide.values(Point(wide.start().x, start)), **problem.values(point)}
+    at = wide.point(values)
+    names = {p.name for p in candidate.parameters(extended)}
+    own = np.concatenate(
+        [np.arange(s.x.start, s.x.stop) for s in wide.slots if s.parameter.name in names]
+    )
+    axes = len(extended.axes)
+    total = sum(map(len, rows))
+    found, row = np.zeros((total, axes, wide.unknowns)), 0
+    offsets = np.cumsum([0, *map(len, rows)])
+    for block in wide.blocks(at):
+        inside = (rows[block.run] >= block.span.start) & (rows[block.run] < block.span.stop)
+        chosen = rows[block.run][inside] - block.span.start
+        here = offsets[block.run] + np.flatnonzero(inside)
+        part = np.zeros((len(chosen), axes, wide.unknowns))
+        part[:, :, block.x] = block.jacobian[chosen]
+        if problem.weights is not None:
+            part *= np.sqrt(problem.weights[block.run][block.span][chosen])[:, :, None]
+        found[here] = part
+        row += len(chosen)
+    return np.nan_to_num(found[:, :, own])
+
+
+def slope_of(
+    candidate: Candidate, model: Model, symbols: dict[str, Any]
+) -> tuple[Any, list[bool], list[Signal]]:
+    """∂r/∂(its unknowns) at null in the model's symbols; which are per run; signals it adds."""
+    extended = candidate.traced_on(model)
+    traced, base = extended.traced, model.traced
+    held = {f"{candidate.label}.{name}": value for name, value in candidate.held}
+    own = {p.name for p in candidate.parameters(extended)}
+    more = [s for s in extended.signals if s.name not in symbols]
+    for s in more:
+        symbols[s.name] = ca.SX.sym(s.name, s.size)
+    place, mine, scopes, old, new, k = 0, [], [], [], [], 0
+    for p in extended.parameters:
+        width = p.shape.coordinates
+        here = traced.coordinates[place : place + width]
+        if p.name in held:
+            old.append(here)
+            new.append(ca.DM(held[p.name]))
+        elif p.name in own:
+            mine.append(here)
+            scopes += [p.scope == "run"] * width
+            old.append(here)
+            new.append(ca.DM(p.start_value()))
+        else:
+            old.append(here)
+            new.append(base.coordinates[k : k + width])
+            k += width
+        place += width
+    slope = ca.jacobian(traced.expression, ca.vertcat(*mine))
+    old += [traced.references, *(flat(traced.symbols[s.name]) for s in extended.signals)]
+    new += [base.references, *(flat(symbols[s.name]) for s in extended.signals)]
+    return ca.substitute(slope, ca.vertcat(*old), ca.vertcat(*new)), scopes, more
+

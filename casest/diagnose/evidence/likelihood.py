@@ -1,0 +1,149 @@
+"""How likely a residual is beside some columns, its noise estimated together with them.
+
+The cosine transform of coloured noise is nearly independent from frequency to frequency, with the
+spectrum as its variance, and −2 log L = Σ log S + R²/S (P. Whittle, 1953). The spectrum is a smooth
+curve, fitted to what these very columns leave, with the power given back that the fit takes from each
+frequency: estimated from a residual that still holds the cause, it would count the cause as noise; without
+the leverage, smooth columns would win in noise of any colour. Poses and tables have white noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from casest.declaration.shapes import Array
+from casest.diagnose.evidence.linear import Linear, robust_sd
+from casest.diagnose.levels import LEVELS
+from casest.estimate.spectrum import Bands
+
+#: Rounds in which coefficients and spectrum follow each other: more change nothing.
+REWEIGHTED = 2
+#: Share of the power at a frequency that a fit leaves, at least.
+LEFT = 0.05
+
+
+@dataclass(frozen=True)
+class Explained:
+    """−2 log L beside some columns; the spectrum S and what is left (N·m,), by frequency.
+
+    `values`: of the orthonormal declared unknowns, then of the columns (p + k,).
+    """
+
+    cost: float
+    spectrum: Array
+    left: Array
+    values: Array
+
+
+class Likelihood:
+    """A linear problem by frequency; residuals far out count as less, about a given course."""
+
+    def __init__(self, linear: Linear, about: Array | None = None) -> None:
+        self.linear = linear
+        self.shape = linear.residual.shape
+        self.about = about
+
+    @cached_property
+    def _bands(self) -> Bands:
+        frequency = np.empty(self.shape[0])
+        for span in self.linear.spans:
+            n = span.stop - span.start
+            frequency[span] = (np.arange(n) + 0.5) / (2 * n)
+        return Bands(frequency)
+
+    @cached_property
+    def declared(self) -> Array:
+        """Orthonormal columns (N·m, p) of the unknowns."""
+        return self.by_frequency(self.linear.basis.reshape(*self.shape, -1))
+
+    @cached_property
+    def residual(self) -> Array:
+        """(N·m,), what is far from `about` (N, m) brought near to it."""
+        r = self.linear.residual
+        if self.linear.series:
+            course = np.zeros_like(r) if self.about is None else self.about
+            far = LEVELS.clip * robust_sd(r - course)
+            r = course + np.clip(r - course, -far, far)
+        return self.by_frequency(r[:, :, None])[:, 0]
+
+    def by_frequency(self, columns: Array) -> Array:
+        """(N, m, k) as (N·m, k): each stretch by its cosines."""
+        from scipy.fft import dct
+
+        if self.linear.coloured:
+            found = np.empty(columns.shape)
+            for span in self.linear.spans:
+                found[span] = dct(columns[span], axis=0, norm="ortho")
+            columns = found
+        return columns.reshape(columns.shape[0] * columns.shape[1], -1)
+
+    def in_time(self, columns: Array) -> Array:
+        """(N·m, k) as (N, m, k) again."""
+        from scipy.fft import idct
+
+        columns = columns.reshape(*self.shape, -1)
+        if not self.linear.coloured:
+            return columns
+        found = np.empty(columns.shape)
+        for span in self.linear.spans:
+            found[span] = idct(columns[span], axis=0, norm="ortho")
+        return found
+
+    def beyond(self, columns: Array) -> Array:
+        """Orthonormal (N·m, k) of what columns (N, m, q) do that the unknowns cannot."""
+        flat = columns.reshape(self.residual.size, -1)
+        size = np.linalg.norm(flat, axis=0)
+        flat = self.by_frequency((flat[:, size > 0] / size[size > 0]).reshape(*self.shape, -1))
+        Q = self.declared
+        left = flat - Q @ (Q.T @ flat)
+        left -= Q @ (Q.T @ left)
+        values, vectors = np.linalg.eigh(left.T @ left)
+        kept = values > max(self.linear.least**2, 1e-8 * values.max(initial=0.0))
+        return np.asarray(left @ (vectors[:, kept] / np.sqrt(values[kept])))
+
+    def beside(
+        self, columns: Sequence[Array] = (), start: Array | None = None, rounds: int = REWEIGHTED
+    ) -> Explained:
+        """The residual beside the unknowns and orthonormal columns (N·m, k) each."""
+        X = np.concatenate([self.declared, *columns], axis=1)
+        R, S = self.residual, start
+        if S is None:
+            S, rounds = np.ones_like(R), rounds + 1
+        if not self.linear.coloured:
+            values = X.T @ R if not columns else np.linalg.lstsq(X, R, rcond=None)[0]
+            left = R - X @ values
+            power = max(float(left @ left) / len(R), 1e-300)
+            return Explained(len(R) * np.log(power), np.full_like(R, power), left, values)
+        for _ in range(rounds):
+            root = 1 / np.sqrt(S)
+            Xw = X * root[:, None]
+            values, taken = _solved(Xw, R * root)
+            left = R - X @ values
+            S = self._spectrum(left, 1 - taken)
+        return Explained(float(np.sum(np.log(S) + left**2 / S)), S, left, values)
+
+    def _spectrum(self, left: Array, free: Array) -> Array:
+        """Of every axis, from what is left and the share that the fit leaves free."""
+        power, free = (left**2).reshape(self.shape), np.clip(free, LEFT, 1).reshape(self.shape)
+        curves = [self._bands.curve(power[:, a], free[:, a]) for a in range(self.shape[1])]
+        return np.stack(curves, axis=1).ravel()
+
+    def course(self, explained: Explained, columns: Sequence[Array]) -> Array:
+        """What unknowns and columns explain, (N, m) in time."""
+        X = np.concatenate([self.declared, *columns], axis=1)
+        return self.in_time((X @ explained.values)[:, None])[:, :, 0]
+
+
+def _solved(X: Array, y: Array) -> tuple[Array, NDArray[Any]]:
+    """Least squares, and the leverage of each row."""
+    A = X.T @ X
+    size = np.sqrt(np.maximum(np.diag(A), 1e-300))
+    inverse = np.linalg.inv(A / np.outer(size, size) + 1e-12 * np.eye(len(A)))
+    inverse /= np.outer(size, size)
+    return inverse @ (X.T @ y), np.einsum("ij,ij->i", X @ inverse, X)

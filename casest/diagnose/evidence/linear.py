@@ -1,0 +1,143 @@
+"""A fit as a linear problem: residuals and slopes, row by row, and the parts that are held out.
+
+Near its optimum a fit is linear in its unknowns: what another column would gain, and how well the
+rest of a record foretells a part of it, follow from residuals r and slopes J without a refit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from casest.declaration.shapes import Array
+from casest.diagnose.levels import LEVELS
+
+Index = NDArray[np.int_]
+
+#: Regions of poses.
+FEW_REGIONS = 6
+
+
+@dataclass(frozen=True)
+class Parts:
+    """Three ways to hold a record out, the fold of each row (N,) in each.
+
+    pieces: interleaved, which know their neighbours; stretches: whole parts of the record; regions:
+    whole parts of what the sensor met, wherever in the record.
+    """
+
+    pieces: Index
+    stretches: Index
+    regions: Index
+
+    @property
+    def each(self) -> dict[str, Index]:
+        """By name."""
+        return {"pieces": self.pieces, "stretches": self.stretches, "regions": self.regions}
+
+
+@dataclass(frozen=True)
+class Linear:
+    """Residuals (N, m) at a fit and their slopes (N, m, p) in its unknowns.
+
+    `spans` are stretches of evenly spaced rows: their noise may have a colour. Without any, rows
+    are poses, or of a table, and their noise is white. `least`: share of a cause's length that must
+    survive beside the unknowns.
+    """
+
+    residual: Array
+    slopes: Array
+    spans: tuple[slice, ...]
+    parts: Parts
+    least: float = LEVELS.survives
+
+    @property
+    def coloured(self) -> bool:
+        """Is the noise taken to have a colour?"""
+        return bool(self.spans)
+
+    @property
+    def series(self) -> bool:
+        """Are there rows enough for tests from part to part?"""
+        return len(self.residual) >= LEVELS.series
+
+    @cached_property
+    def basis(self) -> Array:
+        """Orthonormal (N·m, p) of what the unknowns do to the residuals."""
+        flat = self.slopes.reshape(self.residual.size, -1)
+        size = np.linalg.norm(flat, axis=0)
+        alive = size > 0
+        if not alive.any():
+            return np.zeros((self.residual.size, 0))
+        Q, R = np.linalg.qr(flat[:, alive] / size[alive])
+        U, s, _ = np.linalg.svd(R)
+        return np.asarray(Q @ U[:, s > 1e-9 * s[0]])
+
+    def without(self, columns: Array, part: Array) -> Linear:
+        """The problem as if some unknowns were not there: `columns` (N, m, p − k) are the slopes of
+        the others, `part` (N, m) is what the fit took away by them."""
+        return replace(self, residual=self.residual + part, slopes=columns)
+
+
+def robust_sd(residual: Array) -> Array:
+    """Standard deviation of each axis (m,) from the median of absolute residuals."""
+    centred = residual - np.median(residual, axis=0)
+    return np.asarray(1.4826 * np.median(np.abs(centred), axis=0) + 1e-300)
+
+
+def parts_of(blocks: Index, runs: Index, inputs: Array) -> Parts:
+    """Folds of rows in time order; `blocks`, `runs` (N,) their numbers, `inputs` (N, q) what the
+    sensor met there.
+
+    Blocks (poses, bursts) stay whole where there are enough of them. Every run is cut alike: what
+    belongs to a run alone is foretold by the rest of it.
+    """
+    count = len(blocks)
+    place, size = _place(blocks, runs)
+    if count < LEVELS.series:
+        single = np.unique(np.stack([runs, place]), axis=1, return_inverse=True)[1].ravel()
+        stretches = place * min(LEVELS.stretches, max(count // 3, 2)) // size
+        return Parts(single, stretches, _regions(inputs, FEW_REGIONS))
+    pieces = place * LEVELS.pieces // size % LEVELS.folds
+    stretches = place * LEVELS.stretches // size
+    return Parts(pieces, stretches, _regions(inputs, LEVELS.regions))
+
+
+def _place(blocks: Index, runs: Index) -> tuple[Index, Index]:
+    """Number of each row's unit within its run, and the units of that run: blocks where a run has
+    enough of them, else rows."""
+    place, size = np.zeros_like(blocks), np.ones_like(blocks)
+    for run in np.unique(runs):
+        own = np.flatnonzero(runs == run)
+        number = np.unique(blocks[own], return_inverse=True)[1]
+        if number.max() + 1 < 2 * LEVELS.stretches:
+            number = np.arange(len(own))
+        place[own], size[own] = number, number.max() + 1
+    return place, size
+
+
+def _regions(inputs: Array, count: int) -> Index:
+    """Cells of what the sensor met, by k-means (J. MacQueen, 1967)."""
+    from scipy.cluster.vq import kmeans2
+
+    varies = np.ptp(inputs, axis=0) > 1e-9 * np.abs(inputs).max(initial=1e-300)
+    if not varies.any():
+        return np.arange(len(inputs)) * count // len(inputs)
+    x = inputs[:, varies]
+    chosen = x[:: max(1, len(x) // 4000)]
+    count = min(count, len(np.unique(chosen, axis=0)))
+    centres, _ = kmeans2(chosen, count, minit="++", seed=3)
+    centres = centres[np.isfinite(centres).all(axis=1)]
+    away = ((x[:, None, :] - centres[None]) ** 2).sum(axis=2)
+    return np.asarray(away.argmin(axis=1))
+
+
+def spans_of(blocks: Index, runs: Index) -> tuple[slice, ...]:
+    """Stretches of rows of one block of one run."""
+    change = np.flatnonzero((np.diff(blocks) != 0) | (np.diff(runs) != 0)) + 1
+    edges: Sequence[int] = [0, *change.tolist(), len(blocks)]
+    return tuple(slice(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True))

@@ -1,0 +1,220 @@
+"""What a cause is worth: twice the log of its likelihood over none, less what its unknowns cost.
+
+The price is Schwarz's (1978), with its extension for what was looked through (J. Chen, Z. Chen, 2008):
+2 log of the number of variants of one cause, and of families of causes. With few rows the likelihood
+ratio with Zellner's prior of the weight of one observation stands in its place, which is exact there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+
+from casest.declaration.shapes import Array
+from casest.diagnose.evidence.likelihood import Explained, Likelihood
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A cause in its columns (N, m, k): slopes of the residual in its unknowns.
+
+    `what` it is to whom asks; `family` its name for all that is a variant of it; `variants`: how many were
+    looked through; `axes` (k,): the axis that each column belongs to, where that is a matter of axes.
+    """
+
+    what: Any
+    family: str
+    columns: Array
+    variants: float = 1.0
+    axes: Array | None = None
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """A trial (several, if they come together) with what it is worth.
+
+    gain: 2 log L over none; freedom: unknowns; score: gain less the price; `basis` orthonormal columns
+    (N·m, k) by frequency.
+    """
+
+    trials: tuple[Trial, ...]
+    basis: Array = field(repr=False)
+    explained: Explained = field(repr=False)
+    gain: float = 0.0
+    freedom: int = 0
+    score: float = -np.inf
+    p_value: float = 1.0
+
+    @property
+    def families(self) -> tuple[str, ...]:
+        """Of its trials."""
+        return tuple(t.family for t in self.trials)
+
+    @property
+    def columns(self) -> list[Array]:
+        """(N, m, k) of each trial."""
+        return [t.columns for t in self.trials]
+
+
+def worth(gain: float, freedom: int, searched: float, likelihood: Likelihood) -> float:
+    """The score of a gain; `searched`: log of what was looked through."""
+    n = len(likelihood.residual)
+    rest = max(n - likelihood.declared.shape[1], 2)
+    if likelihood.linear.coloured:
+        return gain - freedom * float(np.log(rest)) - 2 * searched
+    left = np.exp(-gain / n)  # share of the squares that is left
+    ratio = (rest - freedom) * np.log1p(n) - rest * np.log1p(n * left)
+    return float(ratio - 2 * searched)
+
+
+def p_value(gain: float, freedom: int, searched: float, likelihood: Likelihood) -> float:
+    """Of the F test, shared among what was looked through."""
+    from scipy.special import fdtrc
+
+    n = len(likelihood.residual)
+    rest = n - likelihood.declared.shape[1] - freedom
+    if rest < 1 or freedom < 1:
+        return 1.0
+    F = np.expm1(min(gain / n, 700.0)) * rest / freedom
+    return float(min(1.0, fdtrc(freedom, rest, F) * np.exp(min(searched, 700.0))))
+
+
+def screened(trial: Trial, likelihood: Likelihood, white: tuple[Array, Array, Array]) -> float:
+    """The gain of a trial under the noise beside none, less its price: cheap, to choose among variants.
+
+    `white`: 1/√S of none, orthonormal whitened unknowns and the whitened residual beyond them.
+    """
+    root, Q, r = white
+    flat = trial.columns.reshape(len(root), -1)
+    size = np.linalg.norm(flat, axis=0)
+    if not np.any(size > 0):
+        return -np.inf
+    G = (flat[:, size > 0] / size[size > 0]).reshape(*likelihood.shape, -1)
+    G = likelihood.by_frequency(G) * root[:, None]
+    before = (G**2).sum(axis=0)
+    G = G - Q @ (Q.T @ G)
+    alive = (G**2).sum(axis=0) > likelihood.linear.least**2 * before
+    if not alive.any():
+        return -np.inf
+    gain, freedom = _gain(G[:, alive].T @ G[:, alive], G[:, alive].T @ r)
+    return worth(gain, freedom, 0.0, likelihood)
+
+
+def whitened(likelihood: Likelihood, none: Explained) -> tuple[Array, Array, Array]:
+    """What `screened` needs of the fit as it is."""
+    root = 1 / np.sqrt(none.spectrum)
+    Q = likelihood.declared * root[:, None]
+    if Q.shape[1]:
+        Q = np.linalg.solve(np.linalg.cholesky(Q.T @ Q), Q.T).T
+    r = likelihood.residual * root
+    return root, Q, r - Q @ (Q.T @ r)
+
+
+def _gain(H: Array, g: Array) -> tuple[float, int]:
+    """gᵀH⁻¹g over the directions that are told apart, and how many they are."""
+    size = np.sqrt(np.maximum(np.diag(H), 1e-300))
+    values, vectors = np.linalg.eigh(H / np.outer(size, size))
+    good = values > 1e-6 * values.max(initial=0.0)
+    return float(np.sum((vectors[:, good].T @ (g / size)) ** 2 / values[good])), int(good.sum())
+
+
+def judged(
+    trials: Sequence[Trial],
+    likelihood: Likelihood,
+    none: Explained,
+    *,
+    start: Explained | None = None,
+    families: int = 1,
+    rounds: int = 2,
+) -> Evidence | None:
+    """Trials together, beside a noise of their own; None where the unknowns do all that they do."""
+    basis = likelihood.beyond(np.concatenate([t.columns for t in trials], axis=2))
+    if not basis.shape[1] or not _leaves_enough(basis.shape[1], likelihood):
+        return None
+    before = Evidence(tuple(trials), basis, start or none)
+    return again(before, likelihood, none, families, rounds)
+
+
+def again(
+    evidence: Evidence, likelihood: Likelihood, none: Explained, families: int, rounds: int = 2
+) -> Evidence:
+    """The same where the likelihood has changed."""
+    found = likelihood.beside([evidence.basis], evidence.explained.spectrum, rounds)
+    gain, freedom = none.cost - found.cost, evidence.basis.shape[1]
+    searched = _searched(evidence.trials, families)
+    score = worth(gain, freedom, searched, likelihood)
+    return replace(evidence, explained=found, gain=gain, freedom=freedom, score=score,
+                   p_value=p_value(gain, freedom, searched, likelihood))  # fmt: skip
+
+
+def _searched(trials: Sequence[Trial], families: int) -> float:
+    """Log of how much was looked through to find these."""
+    several = len({t.family for t in trials}) * float(np.log(families))
+    return sum(float(np.log(t.variants)) for t in trials) + several
+
+
+def _leaves_enough(freedom: int, likelihood: Likelihood) -> bool:
+    rest = len(likelihood.residual) - likelihood.declared.shape[1]
+    return rest - freedom >= max(4, rest / 4)
+
+
+def on_fewer_axes(evidence: Evidence, likelihood: Likelihood) -> list[int] | None:
+    """Axes on which a trial is worth its price; None for all of them.
+
+    By the part of the gain that each choice keeps, under the spectrum beside the whole trial.
+    """
+    (trial,) = evidence.trials
+    if trial.axes is None:
+        return None
+    names = np.unique(trial.axes)
+    if len(names) < 2:
+        return None
+    root, Q, r = whitened(likelihood, evidence.explained)
+    size = np.linalg.norm(trial.columns.reshape(-1, trial.columns.shape[2]), axis=0)
+    G = likelihood.by_frequency(trial.columns / np.maximum(size, 1e-300)) * root[:, None]
+    before = (G**2).sum(axis=0)
+    G = G - Q @ (Q.T @ G)
+    alive = (G**2).sum(axis=0) > likelihood.linear.least**2 * before
+    H, g = G.T @ G, G.T @ r
+    best: tuple[float, list[int] | None] = (-np.inf, None)
+    for count in range(1, len(names) + 1):
+        ways = list(combinations(names, count))
+        searched = float(np.log(trial.variants)) + float(np.log(len(ways)))
+        for kept in ways:
+            own = np.flatnonzero(np.isin(trial.axes, kept) & alive)
+            if not len(own):
+                continue
+            gain, freedom = _gain(H[np.ix_(own, own)], g[own])
+            score = worth(gain, freedom, searched, likelihood)
+            if score > best[0] + 1e-9:
+                best = (score, [int(k) for k in kept])
+    return None if best[1] is None or len(best[1]) == len(names) else best[1]
+
+
+def shift(evidence: Evidence, likelihood: Likelihood) -> Array:
+    """How the declared unknowns move where the trial is added, by what they predict (p,)."""
+    root = 1 / np.sqrt(evidence.explained.spectrum)
+    Q = likelihood.declared
+    flat = np.concatenate(evidence.columns, axis=2)
+    G = likelihood.by_frequency(flat)
+    size = np.maximum(np.linalg.norm(G, axis=0), 1e-300)
+    X = np.concatenate([Q, G / size], axis=1) * root[:, None]
+    values = np.linalg.lstsq(X, likelihood.residual * root, rcond=1e-9)[0]
+    alone = np.linalg.lstsq(Q * root[:, None], likelihood.residual * root, rcond=1e-9)[0]
+    return np.asarray(values[: Q.shape[1]] - alone)
+
+
+def expected_loss(found: Sequence[Evidence], likelihood: Likelihood) -> tuple[Array, float]:
+    """Of each choice, were each of the others the truth: how far off the declared parameters would be,
+    by what they predict; and that of choosing none. Weights are those of the evidence.
+    """
+    moved = np.array([shift(e, likelihood) for e in found] + [0 * shift(found[0], likelihood)])
+    scores = np.array([e.score for e in found] + [0.0])
+    weight = np.exp(0.5 * (scores - scores.max()))
+    away = ((moved[:, None, :] - moved[None, :, :]) ** 2).sum(axis=2)
+    loss = away @ (weight / weight.sum())
+    return loss[:-1], float(loss[-1])

@@ -1,0 +1,200 @@
+"""Is what is left noise? As large as an independent estimate of it says, and flat.
+
+`calibrate` and `close` ask the same of a fit, and so agree. A colour that reaches over a few samples is
+noise; a slow course is none, whatever it is: its share is said, and that its cause is not known.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from casest.declaration.shapes import Array
+from casest.diagnose.candidates.candidates import usable_columns
+from casest.diagnose.found import Undecided
+from casest.diagnose.levels import LEVELS
+from casest.diagnose.misfit.pure_error import pure_error
+from casest.diagnose.misfit.structure import structures
+from casest.diagnose.misfit.variables import variables
+from casest.diagnose.noise.noise_model import noise_model, step_of
+from casest.diagnose.noise.slow_course import slow_course
+from casest.diagnose.noise.spectral_line import strongest_line
+from casest.effects.placing import prepared
+from casest.estimate.calibrate import Estimate
+from casest.leastsquares.agreement import between_runs
+from casest.leastsquares.problem import Point, Problem
+from casest.leastsquares.weights import robust_scale, weighted
+
+#: Longer records are not asked by `calibrate`: all residuals are looked at at once.
+LONGEST = 200_000
+#: Residual over a step of the reading below which rounding alone, 1/√12 = 0.29, may be all of it.
+ROUNDED = 0.45
+#: Held-out residuals beyond so many robust standard deviations do not count in a share.
+FAR = 6.0
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Evidence of a misfit: where, in words, and σ of the noise beside it."""
+
+    where: str
+    p_value: float
+    sigma: float
+
+
+def doubts(estimate: Estimate) -> list[Finding] | None:
+    """What of a calibration's residual is no noise. None where nothing is asked: a refused estimate, or
+    one of more than LONGEST samples."""
+    runs = estimate.problem.runs
+    if not estimate.certificate.trusted or sum(map(len, runs)) > LONGEST:
+        return None
+    problem = Problem(estimate.model, prepared(estimate.model, runs))
+    with np.errstate(all="ignore"):
+        return findings(problem, problem.point(estimate.values), estimate.correlated_over)
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """What is left beyond noise: share of the held-out variance, and where it lives.
+
+    `noise` holds what is known of the noise itself.
+    """
+
+    significant: bool
+    fraction: float
+    where: str
+    noise: Mapping[str, Any]
+
+
+def left_over(
+    problem: Problem,
+    point: Point,
+    batches: Sequence[NDArray[np.int_]],
+    held_out: Sequence[Array],
+    correlated_over: float = 1.0,
+    undecided: Undecided | None = None,
+) -> Misfit:
+    """The misfit of a closed model, with the noise beside it."""
+    noise = noise_model(
+        problem.runs,
+        problem.residuals(point),
+        batches,
+        measured=problem.model.traced.measured,
+        correlated_over=correlated_over,
+        levels=predictions(problem, point),
+    )
+    found = findings(problem, point, correlated_over)
+    everything = np.concatenate([r.ravel() for r in held_out])
+    everything = everything[np.abs(everything) <= FAR * robust_scale(held_out)]
+    variance = float(np.mean(everything**2)) if everything.size else np.nan
+    sigma = min((f.sigma for f in found), default=np.sqrt(variance))
+    fraction = max(0.0, 1 - sigma**2 / variance) if variance > 0 else 0.0
+    where = [f.where for f in found[:3]]
+    if undecided is not None:
+        fraction = max(fraction, undecided.share)
+        several = " and other shapes" if len(undecided.names) == 1 else ""
+        where = [f"which {' or '.join(undecided.names[:3])}{several} explain alike", *where]
+    return Misfit(bool(where), float(fraction), "; ".join(where), noise.content)
+
+
+def predictions(problem: Problem, point: Point) -> list[Array] | None:
+    """What the model predicts, (N, m) per run; None for an implicit or sequential one."""
+    predicted = problem.model.traced.predicted
+    if predicted is None or problem.sequential:
+        return None
+    return [v[0][:, :, 0] for v in problem.evaluate(point, {"p": predicted})]
+
+
+def findings(problem: Problem, point: Point, correlated_over: float = 1.0) -> list[Finding]:
+    """All that is significant: between repeats, in time, over what is recorded, between runs."""
+    residuals = problem.residuals(point)
+    problem = weighted(problem, problem.values(point))
+    freedom = max(problem.residual_count - problem.unknowns, 1)
+    sigma = robust_scale(residuals) * float(np.sqrt(problem.residual_count / freedom))
+    clipped = _clipped(problem, residuals, sigma)
+    found = _repeats(problem, point, clipped)
+    found += _slow(problem, clipped, sigma) or _follows(problem, point, clipped, sigma)
+    line = strongest_line(problem.runs, clipped)
+    if line is not None and line.p_value < LEVELS.misfit:
+        found.append(Finding(f"a line at {line.frequency:.4g} {line.unit}", line.p_value, sigma))
+    if not any("course" in f.where for f in found):
+        found += _runs(problem, point, correlated_over, sigma)
+    return found
+
+
+def _clipped(problem: Problem, residuals: Sequence[Array], sigma: float) -> list[Array]:
+    """Residuals, those far out counted as less, as the fit does."""
+    limit, kept = LEVELS.clip * sigma, problem.weights
+    found = [np.clip(r, -limit, limit) for r in residuals]
+    return found if kept is None else [r * w for r, w in zip(found, kept, strict=True)]
+
+
+def _repeats(problem: Problem, point: Point, clipped: Sequence[Array]) -> list[Finding]:
+    tested = pure_error(problem, point, clipped, problem.unknowns)
+    if tested is None or tested.p_value >= LEVELS.misfit:
+        return []
+    where = (
+        f"between {tested.between}: the residual is {np.sqrt(tested.F):.1f} times what the scatter "
+        "within them explains"
+    )
+    return [Finding(where, tested.p_value, tested.sigma)]
+
+
+def _slow(problem: Problem, clipped: Sequence[Array], sigma: float) -> list[Finding]:
+    """A slow course of unknown cause. What rounding to a step leaves of a slow input is known."""
+    found = slow_course(problem.runs, clipped)
+    if found is None or found.p_value >= LEVELS.misfit or found.share < LEVELS.share:
+        return []
+    if sigma < ROUNDED * step_of(problem.runs, problem.model.traced.measured):
+        return []
+    where = (
+        f"{100 * found.share:.0f} % of it is a slow course over about {found.samples} samples"
+        f"{_when(problem, clipped, found.samples)}, of unknown cause"
+    )
+    return [Finding(where, found.p_value, sigma * float(np.sqrt(1 - min(found.share, 1))))]
+
+
+def _when(problem: Problem, clipped: Sequence[Array], samples: int) -> str:
+    """Where it is strongest: a stretch of time."""
+    best: tuple[float, str] = (0.0, "")
+    for run, r in zip(problem.runs, clipped, strict=True):
+        if run.time is None or len(r) < 3 * samples:
+            continue
+        edges = np.arange(0, len(r) - samples + 1, max(samples // 2, 1))
+        sums = np.vstack([np.zeros((1, r.shape[1])), np.cumsum(r, axis=0)])
+        size = np.sum((sums[edges + samples] - sums[edges]) ** 2, axis=1)
+        k = int(np.argmax(size))
+        if size[k] > best[0]:
+            a, b = run.time[edges[k]], run.time[min(edges[k] + samples, len(r) - 1)]
+            best = (float(size[k]), f", strongest from t = {a:.4g} to {b:.4g} s")
+    return best[1]
+
+
+def _follows(
+    problem: Problem, point: Point, clipped: Sequence[Array], sigma: float
+) -> list[Finding]:
+    if any(run.spread for run in problem.runs):
+        return []
+    read = variables(problem, point, usable_columns(problem.model, problem.runs))
+    found = [
+        s
+        for s in structures(clipped, read)
+        if s.p_value < LEVELS.misfit and s.share > LEVELS.share
+    ]
+    if not found:
+        return []
+    best = max(found, key=lambda s: s.share)
+    where = f"{100 * best.share:.0f} % of it follows {best.name}"
+    return [Finding(where, best.p_value, sigma * float(np.sqrt(1 - min(best.share, 1))))]
+
+
+def _runs(problem: Problem, point: Point, correlated_over: float, sigma: float) -> list[Finding]:
+    scatter = between_runs(problem, point, correlated_over)
+    if scatter is None or scatter.p_value >= LEVELS.misfit:
+        return []
+    where = f"between runs: {scatter.worst} is {scatter.away:.0f} standard deviations off"
+    return [Finding(where, scatter.p_value, sigma)]

@@ -1,0 +1,52 @@
+"""Is a residual a function of something? Neighbours in its order are alike then.
+
+Rows are put in the order of a variable and averaged over blocks; the squared differences of neighbouring
+means against their variance (J. von Neumann, 1941) are 1 on average for what follows nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from casest.declaration.shapes import Array
+from casest.diagnose.levels import LEVELS
+from casest.diagnose.misfit.variables import Variable
+
+
+@dataclass(frozen=True)
+class Structure:
+    """What the residual follows, the share of its variance that does, and the chance of as much."""
+
+    name: str
+    share: float
+    p_value: float
+
+
+def structures(residuals: Sequence[Array], variables: Sequence[Variable]) -> list[Structure]:
+    """Of every variable, the least likely first; residuals (N, m) of each run, clipped."""
+    r = np.concatenate(residuals)
+    found = []
+    for variable in variables:
+        x = np.concatenate(variable.values)
+        if variable.turns:
+            x = np.mod(x, 2 * np.pi)
+        found.append(_structure(variable.name, r[np.argsort(x, kind="stable")], len(variables)))
+    return sorted((f for f in found if f is not None), key=lambda f: f.p_value)
+
+
+def _structure(name: str, r: Array, tried: int) -> Structure | None:
+    from scipy.special import ndtr
+
+    size = max(LEVELS.block, len(r) // LEVELS.blocks)
+    count = len(r) // size
+    if count < 8:
+        return None
+    means = r[: count * size].reshape(count, size, -1).mean(axis=1)
+    steps = np.mean(np.diff(means, axis=0) ** 2, axis=0) / 2
+    variance = np.maximum(means.var(axis=0, ddof=1), 1e-300)
+    z = (1 - steps / variance) / np.sqrt((count - 2) / (count**2 - 1.0))
+    share = float(np.maximum(variance - steps, 0).sum() / max(r.var(axis=0).sum(), 1e-300))
+    return Structure(name, share, float(min(1.0, ndtr(-z.max()) * len(z) * tried)))

@@ -1,0 +1,492 @@
+"""The loop, for residuals and for innovations: rank, refit, confirm, eliminate.
+
+A `Subject` knows its model: what could be missing there, in which columns it shows, how to refit. The loop
+knows nothing of models: it asks which cause explains most, whether what was held out confirms it, and
+what cannot be told apart. A state of the search is a value: what is tried and dropped leaves no trace.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import combinations
+from typing import Any, Generic, Protocol, TypeVar
+
+import numpy as np
+
+from casest.diagnose.evidence.held_out import Fall, fall, squares, standard_errors
+from casest.diagnose.evidence.likelihood import Explained, Likelihood
+from casest.diagnose.evidence.linear import Linear
+from casest.diagnose.evidence.score import (
+    Evidence,
+    Trial,
+    again,
+    expected_loss,
+    judged,
+    on_fewer_axes,
+    screened,
+    whitened,
+)
+from casest.diagnose.levels import LEVELS
+
+F = TypeVar("F")
+
+
+class Subject(Protocol[F]):
+    """What is searched. Fits are values; `what` of a trial is the subject's own."""
+
+    def linear(self, fit: F) -> Linear:
+        """The fit as a linear problem."""
+        ...
+
+    def trials(self, fit: F) -> Sequence[Trial]:
+        """All that could be missing, in its columns; of what has a grid, one for each value."""
+        ...
+
+    def nearer(self, fit: F, trial: Trial, scale: float) -> Sequence[Trial]:
+        """Variants of a trial around its value on a grid."""
+        ...
+
+    def on_axes(self, fit: F, trial: Trial, axes: Sequence[int]) -> Trial:
+        """The trial on some of its axes only."""
+        ...
+
+    def refit(self, fit: F, added: Sequence[Trial]) -> F | str:
+        """The fit with these in the model; or why there is none."""
+        ...
+
+    def certified(self, fit: F) -> F | str:
+        """The fit, proved; or why it is refused."""
+        ...
+
+    def without(self, fit: F, what: Any) -> F | None:
+        """The fit without something that was added."""
+        ...
+
+    def apart(self, fit: F, kept: Kept) -> tuple[Linear, Trial] | None:
+        """The linear problem as if a cause were not there, and the cause as a trial of it."""
+        ...
+
+    def asked(self, what: Any) -> bool:
+        """Did the user say that it is there?"""
+        ...
+
+    def label(self, what: Any) -> str:
+        """What it is called."""
+        ...
+
+    def formula(self, fit: F, ranking: Ranking) -> Evidence | None:
+        """The best description outside the catalogue."""
+        ...
+
+
+@dataclass(frozen=True)
+class Ranking:
+    """Causes by what they are worth, beside one fit; the best of each family, best first."""
+
+    linear: Linear
+    likelihood: Likelihood = field(repr=False)
+    none: Explained = field(repr=False)
+    found: tuple[Evidence, ...]
+    families: int
+
+
+@dataclass(frozen=True)
+class Rival:
+    """A cause that is not told apart from one that was added: how the score differs, and the t of the
+    difference of held-out squares."""
+
+    what: Any
+    score: float
+    t: float
+    evidence: Evidence = field(repr=False)
+
+
+@dataclass(frozen=True)
+class Kept:
+    """A cause that was added, its evidence when it was, what held-out parts said, its rivals."""
+
+    what: Any
+    evidence: Evidence
+    falls: dict[str, Fall]
+    rivals: tuple[Rival, ...] = ()
+
+
+@dataclass(frozen=True)
+class Refused:
+    """What explained much but was not added, and why."""
+
+    what: Any
+    why: str
+    evidence: Evidence | None = None
+
+
+@dataclass(frozen=True)
+class State(Generic[F]):
+    """A search as it stands: the fit, what it has been given, what was refused.
+
+    `open`: causes of which one is there, but not one to add.
+    """
+
+    fit: F
+    kept: tuple[Kept, ...] = ()
+    refused: tuple[Refused, ...] = ()
+    open: tuple[Evidence, ...] = ()
+    first: Ranking | None = None
+    last: Ranking | None = None
+
+    def refusing(self, what: Any, why: str, evidence: Evidence | None = None) -> State[F]:
+        """The state with a refusal, which is said once."""
+        if any(r.what == what and r.why == why for r in self.refused):
+            return self
+        return replace(self, refused=(*self.refused, Refused(what, why, evidence)))
+
+
+def search(
+    subject: Subject[F],
+    fit: F,
+    say: Callable[[str], None] = lambda _: None,
+    begun: State[F] | None = None,
+) -> State[F]:
+    """Add what is missing, one cause or a pair at a time, until nothing is confirmed any more."""
+    state = State(fit) if begun is None else replace(begun, fit=fit)
+    for _ in range(LEVELS.rounds):
+        ranking = ranked(subject, state.fit)
+        state = replace(state, first=state.first or ranking, last=ranking, open=())
+        bigger = _with_the_best(subject, state, ranking, say)
+        if len(bigger.kept) == len(state.kept):
+            state = bigger
+            break
+        state = bigger
+    else:
+        state = replace(state, last=ranked(subject, state.fit))
+    smaller = eliminated(subject, state)
+    if len(smaller.kept) < len(state.kept):
+        smaller = replace(smaller, last=ranked(subject, smaller.fit))
+    return with_rivals(subject, smaller)
+
+
+# -- rank ------------------------------------------------------------------------------------------
+
+
+def ranked(subject: Subject[F], fit: F) -> Ranking:
+    """Every cause beside a fit: the best variants of each family, each with a noise of its own."""
+    ranking = ranked_of(subject.linear(fit), list(subject.trials(fit)))
+    found = [_on_its_axes(subject, fit, e, ranking) for e in ranking.found]
+    return _about_the_best(replace(ranking, found=_best_first(found)))
+
+
+def ranked_of(linear: Linear, trials: Sequence[Trial]) -> Ranking:
+    """The best variant of each family, with a noise of its own."""
+    likelihood = Likelihood(linear)
+    none = likelihood.beside()
+    families = max(len({t.family for t in trials}), 1)
+    white = whitened(likelihood, none)
+    best: dict[str, tuple[float, Trial]] = {}
+    for trial in trials:
+        promise = screened(trial, likelihood, white)
+        if promise > best.get(trial.family, (-np.inf, trial))[0]:
+            best[trial.family] = (promise, trial)
+    found = [
+        judged([trial], likelihood, none, families=families) for _, trial in best.values()
+    ]
+    several = _best_first([e for e in found if e is not None])
+    return Ranking(linear, likelihood, none, several, families)
+
+
+def _best_first(found: Sequence[Evidence]) -> tuple[Evidence, ...]:
+    return tuple(sorted(found, key=lambda e: -e.score))
+
+
+def _on_its_axes(subject: Subject[F], fit: F, evidence: Evidence, ranking: Ranking) -> Evidence:
+    """Without the axes that are not worth their price."""
+    axes = on_fewer_axes(evidence, ranking.likelihood)
+    if axes is None:
+        return evidence
+    trial = subject.on_axes(fit, evidence.trials[0], axes)
+    less = judged([trial], ranking.likelihood, ranking.none, start=evidence.explained,
+                  families=ranking.families)  # fmt: skip
+    return less if less is not None and less.score > evidence.score else evidence
+
+
+def _about_the_best(ranking: Ranking) -> Ranking:
+    """The same with what is far out told from the best course: far from none may be the cause."""
+    if not ranking.found or not ranking.linear.series:
+        return ranking
+    best, families = ranking.found[0], ranking.families
+    if best.score < 0:
+        return ranking
+    course = ranking.likelihood.course(best.explained, [best.basis])
+    likelihood = Likelihood(ranking.linear, course)
+    likelihood.__dict__["declared"] = ranking.likelihood.declared
+    none = likelihood.beside(start=ranking.none.spectrum)
+    found = _best_first([again(e, likelihood, none, families, 1) for e in ranking.found])
+    return Ranking(ranking.linear, likelihood, none, found, families)
+
+
+def pairs(ranking: Ranking) -> list[Evidence]:
+    """The best causes two by two: what neither shows alone."""
+    best = ranking.found[: LEVELS.contenders]
+    found = []
+    for one, other in combinations(best, 2):
+        both = judged(
+            [*one.trials, *other.trials],
+            ranking.likelihood,
+            ranking.none,
+            start=one.explained,
+            families=ranking.families,
+        )
+        if both is not None and both.freedom > max(one.freedom, other.freedom):
+            found.append(both)
+    return sorted(found, key=lambda e: -e.score)
+
+
+# -- confirm ---------------------------------------------------------------------------------------
+
+
+def falls(ranking: Ranking, evidence: Evidence) -> dict[str, Fall]:
+    """What the columns of a cause do to each kind of held-out squares."""
+    columns = [ranking.likelihood.in_time(evidence.basis)]
+    return {k: fall(ranking.linear, columns, p) for k, p in ranking.linear.parts.each.items()}
+
+
+def holds_out(found: dict[str, Fall], linear: Linear) -> bool:
+    """Are pieces, whole stretches and whole regions foretold better?
+
+    From part to part where there are parts enough; a region may be foretold worse by chance alone.
+    """
+    if not linear.series:
+        return found["pieces"].ratio < 1
+    steady = min(found["pieces"].t, found["stretches"].t) > LEVELS.confirmed
+    return steady and all(f.ratio < 1 for f in found.values())
+
+
+def significant(evidence: Evidence, linear: Linear) -> bool:
+    """Strong evidence in a series; in poses the F test, shared among all that was tried."""
+    return evidence.score > LEVELS.strong if linear.series else evidence.p_value < LEVELS.chance
+
+
+def _with_the_best(
+    subject: Subject[F], state: State[F], ranking: Ranking, say: Callable[[str], None]
+) -> State[F]:
+    """The state with the best cause that held-out parts confirm; as it is if none is."""
+    state, asked = _hypotheses(subject, state, ranking)
+    options = [e for e in (*ranking.found, *pairs(ranking)) if significant(e, ranking.linear)]
+    options.sort(key=lambda e: -e.score)
+    passing = asked or _passing(ranking, options)
+    refits = _refitted(subject, state.fit, ranking, passing)
+    described = None if asked else subject.formula(state.fit, ranking)
+    if described is not None and _describes(described, [r.evidence for r in refits], ranking):
+        refits = [*_refitted(subject, state.fit, ranking, [described]), *refits]
+    for k, refit in enumerate(refits):
+        fit = subject.certified(refit.fit)
+        if not isinstance(fit, str):
+            return _kept(subject, state, ranking, replace(refit, fit=fit), say)
+        state = state.refusing(refit.evidence.trials[0].what, fit, refit.evidence)
+        later = refits[k + 1].evidence.score if k + 1 < len(refits) else 0.0
+        if refit.evidence.score > later + LEVELS.strong:
+            break  # what explains clearly less is not the cause
+    for evidence in [e for e in options if e not in passing][:2]:
+        state = state.refusing(evidence.trials[0].what, NOT_HELD_OUT, evidence)
+    return replace(state, open=tuple(options[: LEVELS.contenders]))
+
+
+def _hypotheses(
+    subject: Subject[F], state: State[F], ranking: Ranking
+) -> tuple[State[F], list[Evidence]]:
+    """What the user says is there: a hypothesis that was there before the data, by its F test."""
+    asked = [e for e in ranking.found if subject.asked(e.trials[0].what)]
+    found = []
+    for evidence in asked:
+        alone = again(evidence, ranking.likelihood, ranking.none, len(asked), 1)
+        if alone.p_value >= LEVELS.chance:
+            why = f"no more of it than noise would have (p = {alone.p_value:.2g})"
+            state = state.refusing(evidence.trials[0].what, why, alone)
+        elif falls(ranking, alone)["pieces"].ratio < 1:
+            found.append(alone)
+    return state, sorted(found, key=lambda e: -e.score)
+
+
+@dataclass(frozen=True)
+class Refit(Generic[F]):
+    """A cause in the model, fitted: `evidence` with the score of this fit."""
+
+    fit: F
+    evidence: Evidence
+
+
+def _refitted(
+    subject: Subject[F], fit: F, ranking: Ranking, options: Sequence[Evidence]
+) -> list[Refit[F]]:
+    """Causes by what their refits are worth; of equal ones first what would do the least harm."""
+    found: list[Refit[F]] = []
+    for evidence in options[: LEVELS.contenders]:
+        evidence = sharpened(subject, fit, ranking, evidence)
+        better = subject.refit(fit, evidence.trials)
+        if isinstance(better, str):
+            continue
+        cost = Likelihood(subject.linear(better)).beside(start=evidence.explained.spectrum).cost
+        score = evidence.score + evidence.explained.cost - cost
+        found.append(Refit(better, replace(evidence, score=score)))
+    found.sort(key=lambda r: -r.evidence.score)
+    near = [r for r in found if r.evidence.score > found[0].evidence.score - LEVELS.strong]
+    if len(near) > 1:
+        loss, _ = expected_loss([r.evidence for r in near], ranking.likelihood)
+        best = near[int(np.argmin(loss))]
+        found = [best, *[r for r in found if r is not best]]
+    return found
+
+
+def _kept(
+    subject: Subject[F], state: State[F], ranking: Ranking, refit: Refit[F],
+    say: Callable[[str], None],
+) -> State[F]:  # fmt: skip
+    seen, kept = falls(ranking, refit.evidence), state.kept
+    for trial in refit.evidence.trials:
+        say(f"{subject.label(trial.what)}: held-out error falls")
+        kept = (*kept, Kept(trial.what, refit.evidence, seen))
+    return replace(state, fit=refit.fit, kept=kept)
+
+
+NOT_HELD_OUT = "held-out data do not confirm it"
+
+
+def _passing(ranking: Ranking, options: Sequence[Evidence]) -> list[Evidence]:
+    """Those that hold out, down to where none has any weight beside the best of them."""
+    found: list[Evidence] = []
+    for evidence in options[: 3 * LEVELS.contenders]:
+        if found and evidence.score < found[0].score - 2 * LEVELS.strong:
+            break
+        seen = falls(ranking, evidence)
+        if not holds_out(seen, ranking.linear):
+            continue
+        if len(evidence.trials) > 1 and not _better_than_its_parts(evidence, seen, ranking):
+            continue
+        found.append(evidence)
+    return found
+
+
+def _better_than_its_parts(both: Evidence, seen: dict[str, Fall], ranking: Ranking) -> bool:
+    """Does a pair foretell stretches and regions better than each of the two?"""
+    for trial in both.trials:
+        (one,) = [e for e in ranking.found if e.trials[0] is trial]
+        if one.score > both.score - LEVELS.strong:
+            return False
+        alone = falls(ranking, one)
+        names = ("stretches", "regions") if ranking.linear.series else ("pieces",)
+        if any(seen[k].ratio >= alone[k].ratio for k in names):
+            return False
+    return True
+
+
+def _describes(formula: Evidence, names: Sequence[Evidence], ranking: Ranking) -> bool:
+    """Is a description so much better than any cause with a name, wherever it is held out?"""
+    best = names[0].score if names else 0.0
+    if formula.score < best + LEVELS.described:
+        return False
+    seen = falls(ranking, formula)
+    if any(f.ratio >= 1 or f.t < LEVELS.confirmed for f in seen.values()):
+        return False
+    if not names:
+        return True
+    named = falls(ranking, names[0])
+    return all(seen[k].ratio < named[k].ratio for k in ("stretches", "regions"))
+
+
+def sharpened(subject: Subject[F], fit: F, ranking: Ranking, evidence: Evidence) -> Evidence:
+    """At the best value near the one that a grid had: the grid is coarse."""
+    for k, trial in enumerate(evidence.trials):
+        others = [t for t in evidence.trials if t is not trial]
+        for scale in (1.0, 0.3, 0.1):
+            for moved in subject.nearer(fit, evidence.trials[k], scale):
+                both = [*others[:k], moved, *others[k:]]
+                found = judged(both, ranking.likelihood, ranking.none, start=evidence.explained,
+                               families=ranking.families, rounds=1)  # fmt: skip
+                if found is not None and found.score > evidence.score:
+                    evidence = found
+    return evidence
+
+
+# -- eliminate -------------------------------------------------------------------------------------
+
+
+def eliminated(subject: Subject[F], state: State[F]) -> State[F]:
+    """Each cause must earn its place again beside the others; the weakest goes first."""
+    families = state.first.families if state.first else 1
+    while len(state.kept) > 1:
+        judged_ = [(k, *_beside_the_others(subject, state.fit, k, families)) for k in state.kept]
+        weak = [
+            (e.score if e is not None else -np.inf, k)
+            for k, ranking, e in judged_
+            if not _earns_its_place(subject, k, ranking, e)
+        ]
+        if not weak:
+            return state
+        gone = min(weak, key=lambda pair: pair[0])[1]
+        fit = subject.without(state.fit, gone.what)
+        if fit is None:
+            return state
+        state = replace(state, fit=fit, kept=tuple(k for k in state.kept if k is not gone))
+        state = state.refusing(gone.what, "no longer needed beside what came later")
+    return state
+
+
+def _beside_the_others(
+    subject: Subject[F], fit: F, kept: Kept, families: int
+) -> tuple[Ranking | None, Evidence | None]:
+    """A cause judged as if it came last, in this fit."""
+    found = subject.apart(fit, kept)
+    if found is None:
+        return None, None
+    linear, trial = found
+    likelihood = Likelihood(linear)
+    none = likelihood.beside()
+    evidence = judged([trial], likelihood, none, families=families)
+    return Ranking(linear, likelihood, none, (), families), evidence
+
+
+def _earns_its_place(
+    subject: Subject[F], kept: Kept, ranking: Ranking | None, evidence: Evidence | None
+) -> bool:
+    if ranking is None or evidence is None or not significant(evidence, ranking.linear):
+        return False
+    return subject.asked(kept.what) or holds_out(falls(ranking, evidence), ranking.linear)
+
+
+# -- what is not told apart ------------------------------------------------------------------------
+
+
+def with_rivals(subject: Subject[F], state: State[F]) -> State[F]:
+    """Each cause beside those that explain as much in its place, the others kept."""
+    if not state.kept:
+        return state
+    others = list(subject.trials(state.fit))
+    kept = tuple(replace(k, rivals=_rivals(subject, state, k, others)) for k in state.kept)
+    return replace(state, kept=kept)
+
+
+def _rivals(
+    subject: Subject[F], state: State[F], kept: Kept, others: Sequence[Trial]
+) -> tuple[Rival, ...]:
+    """By evidence, or by held-out stretches (Vuong 1989): a score alone does not say so."""
+    found = subject.apart(state.fit, kept)
+    if found is None:
+        return ()
+    linear, own = found
+    ranking = ranked_of(linear, [own, *(t for t in others if t.family != own.family)])
+    mine = [e for e in ranking.found if e.trials[0] is own]
+    if not mine:
+        return ()
+    stretches = linear.parts.stretches
+    without = squares(linear, [], stretches)
+    best = squares(linear, [ranking.likelihood.in_time(mine[0].basis)], stretches)
+    gained, rivals = float((without - best).sum()), []
+    for e in ranking.found:
+        if e is mine[0] or e.score < LEVELS.strong or len(rivals) == 2 * LEVELS.contenders:
+            continue
+        lost = squares(linear, [ranking.likelihood.in_time(e.basis)], stretches) - best
+        t, behind = standard_errors(lost), mine[0].score - e.score
+        as_well = t < LEVELS.apart and float(lost.sum()) < LEVELS.alike * gained
+        if behind < LEVELS.strong or (linear.series and as_well):
+            rivals.append(Rival(e.trials[0].what, behind, t, e))
+    return tuple(rivals)

@@ -1,1 +1,0 @@
-"""Refits judged: which candidate stays. Imports candidates, noise, levels."""
