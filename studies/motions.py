@@ -68,7 +68,7 @@ def cycles(rng: Rng, t: Array, count: int) -> Array:
     ends[0], ends[1] = 0.0, 1.0
     place = (t - t[0]) / np.ptp(t) * 2 * count
     k = np.minimum(place.astype(int), 2 * count - 1)
-    return np.asarray(ends[k] + (ends[k + 1] - ends[k]) * (1 - np.cos(np.pi * (place - k))) / 2)
+    return np.asarray(ends[k] + (ends[k + 1] - ends[k]) * (place - k))
 
 
 def chamber(rng: Rng, n: int, step: float) -> Array:

@@ -146,11 +146,11 @@ def creeping(rng: Rng, size: float) -> Record:
     full, truth, sigma = _cell(rng)
     slow = between(rng, 20, 150)
     if rng.random() < 0.5:
-        bent = rng.uniform(0.5, 0.9)
+        bent = rng.uniform(0.75, 0.95)
         answer = lambda s: 1 - np.exp(-((s / slow) ** bent))  # noqa: E731
     else:
         share = rng.uniform(0.3, 0.7)
-        answer = lambda s: 1 - share * np.exp(-s / slow) - (1 - share) * np.exp(-6 * s / slow)  # noqa: E731
+        answer = lambda s: 1 - share * np.exp(-s / slow) - (1 - share) * np.exp(-3 * s / slow)  # noqa: E731
 
     def record(rng: Rng, _: bool) -> World:
         n = int(rng.integers(500, 2000))
@@ -191,7 +191,7 @@ def plays(x: Array, radius: float) -> Array:
 def cycled(rng: Rng, size: float) -> Record:
     """A load cell whose readings up and down differ by twice `size` of full scale."""
     full, truth, sigma = _cell(rng)
-    radius = full * rng.uniform(0.02, 0.1)
+    radius = full * between(rng, 0.001, 0.01)
     loop = bouc_wen if rng.random() < 0.5 else plays
 
     def record(rng: Rng, _: bool) -> World:
@@ -241,8 +241,8 @@ def warming(rng: Rng, size: float) -> Record:
 
 
 def late_thermometer(rng: Rng, size: float) -> Record:
-    """A thermometer whose element follows the air by `size` samples, its sheath by a fifth."""
-    step, warm = float(rng.choice([1.0, 2.0, 5.0])), between(rng, 0.02, 0.3)
+    """A thermometer whose element follows the air by `size` samples, its sheath by a tenth."""
+    step, warm = float(rng.choice([1.0, 2.0, 5.0])), between(rng, 0.05, 0.5)
     bead = rng.random() < 0.5
     if bead:
         truth = {"r25": 10_000 * rng.uniform(0.95, 1.05), "beta": rng.uniform(3300, 4000)}
@@ -259,7 +259,7 @@ def late_thermometer(rng: Rng, size: float) -> Record:
     def record(rng: Rng, _: bool) -> World:
         n = int(rng.integers(400, 2500))
         air = chamber(rng, n, step)
-        felt = lagged(lagged(air, size / 5), size)
+        felt = lagged(lagged(air, size / 10), size)
         names = ("thermistor" if bead else "platinum", "reference", "resistance")
         given, clean = air[::DENSE], read(felt[::DENSE])
         t = step * np.arange(n)
@@ -568,11 +568,11 @@ def bent_by_warmth(rng: Rng, size: float) -> Record:
     def record(rng: Rng, _: bool) -> World:
         n = int(rng.integers(400, 2000))
         t, warm = 1.0 * np.arange(n), chamber(rng, n, 1.0)[::DENSE]
-        shape = np.cosh((warm - best) / 12) - 1
-        added = np.outer(size * shape / 3, each)
+        shape = 2 * np.cosh((warm - best) / 25) - 2
+        added = np.outer(size * shape, each)
         clean = bias + added
-        middle = np.cosh((warm.mean() - best) / 12) - 1
-        zeros = (0.0, added.mean(axis=0), size * middle / 3 * each)
+        middle = 2 * np.cosh((warm.mean() - best) / 25) - 2
+        zeros = (0.0, added.mean(axis=0), size * middle * each)
         every = {**columns(rng, t), "temperature": warm - 273.15}
         return World(
             "gyro_at_rest", "v", {"v": _noisy(rng, clean, sigma)}, {"v": "rad/s"}, clean,
@@ -595,12 +595,14 @@ class Kind:
     right: tuple[str, ...]
 
 
+#: Largest sizes are such that the best single term (one time constant, a sign, a cubic) leaves
+#: less than 0.45 of the noise, which is 10 % of the error, in 88 to 100 of 100 visible worlds.
 KINDS: dict[str, Kind] = {
-    "load cell that creeps": Kind(creeping, (5e-4, 2e-2), ("creep",)),
-    "load cell with hysteresis": Kind(cycled, (1e-4, 1e-2), ("hysteresis",)),
+    "load cell that creeps": Kind(creeping, (3e-4, 6e-3), ("creep",)),
+    "load cell with hysteresis": Kind(cycled, (3e-5, 6e-4), ("hysteresis",)),
     "load cell that warms up": Kind(warming, (1e-4, 1e-2), ("warm_up",)),
     "gain by sign": Kind(one_sided, (2e-4, 3e-2), ("gain_by_sign",)),
-    "late thermometer": Kind(late_thermometer, (0.05, 8.0), LATE),
+    "late thermometer": Kind(late_thermometer, (0.05, 3.0), LATE),
     "gravity once per turn": Kind(turned_shaft, (1e-4, 1e-2), ("harmonic",)),
     "soft iron, one gain": Kind(
         partial(soft_iron, one=True), (1e-3, 0.1), ("soft_iron", "axis_gain", "cross_axis")
@@ -615,7 +617,7 @@ KINDS: dict[str, Kind] = {
     "field that sways": Kind(sway, (5e-4, 2e-2), ("reference_wander",)),
     "late attitude": Kind(late_attitude, (0.05, 5.0), LATE[:-1]),
     "bias bent by warmth": Kind(
-        bent_by_warmth, (3e-4, 2e-2), ("temperature_curve", "temperature_bias")
+        bent_by_warmth, (3e-4, 1e-2), ("temperature_curve", "temperature_bias")
     ),
 }
 
