@@ -5,7 +5,7 @@
     python studies/loop_worlds.py --first 5000 --seeds 10     # other seeds
     python studies/loop_worlds.py --only creep --workers 1    # kinds whose name contains this
 
-Sensors of users' own and shipped ones with the effects of `studies/sensors.py`, which shares no
+Sensors of users' own and shipped ones with the effects of `studies/sensors`, which shares no
 code with the catalogue and no formula where physics has more to it; each once more without. Each
 world is kept in `out/loop_worlds.jsonl`, so that an interrupted study goes on where it stopped;
 the table is written to `studies/loop_worlds.md`. `--table` writes it from what is there.
@@ -34,7 +34,8 @@ import own_models  # noqa: E402
 import resumed  # noqa: E402
 import sensors  # noqa: E402
 import worlds_table  # noqa: E402
-from sensors import KINDS, World  # noqa: E402
+from sensors import KINDS  # noqa: E402
+from sensors.world import World  # noqa: E402
 
 from casest import Closing, Estimate, Model, NotTrusted, Run, close, effect, param, signal  # noqa: E402
 from casest.effects.placing import prepared  # noqa: E402

@@ -90,7 +90,7 @@ def table(records: Sequence[Record]) -> str:
         "# Closing the loop: what real sensors do",
         "",
         "Made by `make study-worlds` (`python studies/loop_worlds.py`). Sensors of users' own and",
-        "shipped ones from `studies/sensors.py`, which shares no code with the catalogue; each",
+        "shipped ones from `studies/sensors`, which shares no code with the catalogue; each",
         "world has a second record of the same sensor, moved differently. The oracle is the",
         "declared model with what truly happens to the reading, to a scale that it fits. Visible:",
         "without noise the declared model leaves at least 45 σ², and 0.04 σ² per residual (2 % of",

@@ -12,7 +12,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PROGRAMS = sorted([*ROOT.glob("studies/*.py"), *ROOT.glob("benchmarks/*.py")])
 HELPERS = {
-    "loop_table", "mutants", "resumed", "by_hand", "fused", "motions", "sensors", "own_models",
+    "loop_table", "mutants", "resumed", "by_hand", "fused", "own_models", "noise_records",
     "worlds_table",
 }  # fmt: skip
 
@@ -93,14 +93,14 @@ def behind(late, early):
 
 @pytest.mark.parametrize("samples", [1, 3, 5])
 def test_the_recorded_attitude_is_late_by_as_many_samples(study, samples):
-    sensors = study("sensors")
+    sensors = study("sensors.three_axes")
     rng = np.random.default_rng(samples)
     world = sensors.late_attitude(rng, float(samples))(rng, True)
     assert behind(world.plain[0], world.clean) == samples
 
 
 def test_the_thermometer_is_late_by_the_time_constants_of_element_and_sheath(study):
-    sensors = study("sensors")
+    sensors = study("sensors.one_reading")
     rng = np.random.default_rng(1)
     world = sensors.late_thermometer(rng, 5.0)(rng, True)
     sense = np.sign(np.corrcoef(world.plain[0][:, 0], world.signals["reference"][:, 0])[0, 1])
@@ -108,7 +108,7 @@ def test_the_thermometer_is_late_by_the_time_constants_of_element_and_sheath(stu
 
 
 def test_a_load_that_stays_is_answered_by_the_whole_creep_in_the_end(study):
-    sensors = study("sensors")
+    sensors = study("sensors.one_reading")
     rng = np.random.default_rng(0)
     t = np.arange(200_000.0)
     load = np.where(t > 10, 1.0, 0.0)
@@ -125,7 +125,7 @@ def test_a_load_that_stays_is_answered_by_the_whole_creep_in_the_end(study):
 @pytest.mark.parametrize("loop", ["bouc_wen", "plays"])
 def test_up_and_down_differ_by_twice_the_size(study, loop):
     x = 0.5 - 0.5 * np.cos(np.linspace(0, 6 * np.pi, 1201))
-    z = getattr(study("sensors"), loop)(x, 0.05)
+    z = getattr(study("sensors.one_reading"), loop)(x, 0.05)
     up, down = (z[500], z[700])  # the second cycle, half way
     assert x[500] == pytest.approx(x[700]) == pytest.approx(0.5)
     assert up == pytest.approx(1, abs=0.02)
@@ -133,7 +133,7 @@ def test_up_and_down_differ_by_twice_the_size(study, loop):
 
 
 def test_soft_iron_makes_an_ellipsoid_of_the_sphere(study):
-    sensors = study("sensors")
+    sensors = study("sensors.three_axes")
     rng = np.random.default_rng(2)
     world = sensors.soft_iron(rng, 0.1, one=True)(rng, True)
     x, y, z = (world.clean - world.truth["offset"]).T
@@ -144,7 +144,7 @@ def test_soft_iron_makes_an_ellipsoid_of_the_sphere(study):
 
 
 def test_noises_are_what_they_are_called(study):
-    noises = study("noises")
+    noises = study("noise_records")
     records = {
         kind: [noises.record_of(kind, seed)[1] for seed in range(5)] for kind in noises.NOISES
     }
