@@ -95,8 +95,10 @@ def behind(late, early):
 def test_the_recorded_attitude_is_late_by_as_many_samples(study, samples):
     sensors = study("sensors.three_axes")
     rng = np.random.default_rng(samples)
-    world = sensors.late_attitude(rng, float(samples))(rng, True)
-    assert behind(world.plain[0], world.clean) == samples
+    record = sensors.late_attitude(rng, float(samples))
+    first, second = record(rng, True), record(rng, False)
+    assert behind(first.plain[0], first.clean) == behind(second.plain[0], second.clean) == samples
+    assert first.time[1] == second.time[1]  # late by the same time in both
 
 
 def test_the_thermometer_is_late_by_the_time_constants_of_element_and_sheath(study):

@@ -271,9 +271,10 @@ def sway(rng: Rng, size: float) -> Record:
 def late_attitude(rng: Rng, size: float) -> Record:
     """A robot whose recorded attitude is `size` samples old."""
     earth, sigma, hard = _earth(rng), between(rng, 0.1, 0.8), rng.uniform(-20, 20, 3)
+    rate = float(rng.choice([10.0, 25.0, 50.0]))
 
     def record(rng: Rng, _: bool) -> World:
-        n, rate = int(rng.integers(600, 2500)), float(rng.choice([10.0, 25.0, 50.0]))
+        n = int(rng.integers(600, 2500))
         dense = turning(rng, rng.uniform(0.7, 1.5))(np.arange((n + 10) * DENSE) / rate / DENSE)
         now = 10 * DENSE + DENSE * np.arange(n)
         true, recorded = dense[now], dense[now - round(size * DENSE)]
