@@ -16,7 +16,7 @@ sys.path[:0] = [str(ROOT / "studies"), str(ROOT / "tests")]
 
 import worlds  # noqa: E402
 from sensors.motions import Array, Rng, between, columns, staircase, turning, waves  # noqa: E402
-from sensors.three_axes import FIELD, GRAVITY  # noqa: E402
+from sensors.vectors import FIELD, GRAVITY  # noqa: E402
 from sensors.world import World  # noqa: E402
 
 # -- records without noise: what is read is the clean reading --------------------------------------

@@ -93,7 +93,7 @@ def behind(late, early):
 
 @pytest.mark.parametrize("samples", [1, 3, 5])
 def test_the_recorded_attitude_is_late_by_as_many_samples(study, samples):
-    sensors = study("sensors.three_axes")
+    sensors = study("sensors.magnetometers")
     rng = np.random.default_rng(samples)
     record = sensors.late_attitude(rng, float(samples))
     first, second = record(rng, True), record(rng, False)
@@ -135,7 +135,7 @@ def test_up_and_down_differ_by_twice_the_size(study, loop):
 
 
 def test_soft_iron_makes_an_ellipsoid_of_the_sphere(study):
-    sensors = study("sensors.three_axes")
+    sensors = study("sensors.magnetometers")
     rng = np.random.default_rng(2)
     world = sensors.soft_iron(rng, 0.1, one=True)(rng, True)
     x, y, z = (world.clean - world.truth["offset"]).T

@@ -15,18 +15,10 @@ from functools import partial
 
 import numpy as np
 
+from sensors.magnetometers import late_attitude, magnet, motor, soft_iron, sway
 from sensors.motions import between
 from sensors.one_reading import creeping, cycled, late_thermometer, one_sided, turned_shaft, warming
-from sensors.three_axes import (
-    bent_by_warmth,
-    few_poses,
-    late_attitude,
-    magnet,
-    motor,
-    soft_iron,
-    sway,
-    unlike_axes,
-)
+from sensors.three_axes import bent_by_warmth, few_poses, unlike_axes
 from sensors.world import Sensor, World
 
 #: Names that say the same of these records: two series against each other in time. A lag of which
