@@ -198,7 +198,7 @@ def _judged(closing: Closing, first: World, second: World) -> dict[str, Any]:
         oracle = knowing(declared, first)
         _, values = fitted(oracle, told(run, first), start)
     after, kept = carried(closing.after)
-    truths = sum(np.size(first.truth[n]) for n in first.compared)
+    truths = sum(declared[name].shape.size for name in first.compared)
     return {
         "noncentrality": 2 * cost / first.sigma**2,
         "truths": int(truths),

@@ -31,11 +31,10 @@ def _compass(
     )  # fmt: skip
 
 
-def _iron(rng: Rng, *, skew: bool = True) -> tuple[Array, Array]:
+def _iron(rng: Rng) -> tuple[Array, Array]:
     """Answer (3, 3), lower triangular, and offset in µT of a magnetometer."""
     M = np.diag(1 + rng.uniform(-0.08, 0.08, 3))
-    if skew:
-        M += np.tril(rng.uniform(-0.05, 0.05, (3, 3)), -1)
+    M += np.tril(rng.uniform(-0.05, 0.05, (3, 3)), -1)
     return M, rng.uniform(-20, 20, 3)
 
 
