@@ -6,6 +6,7 @@ READY := $(VENV)/.ready
 
 .PHONY: demo test lint types format wheel bench study study-starts study-nist study-loop \
 	study-motion study-records study-asked study-slow study-coverage study-deceptive study-mutation \
+	study-worlds study-noises \
 	figures docs clean
 
 demo: $(READY)
@@ -51,6 +52,12 @@ study-coverage: $(READY)
 
 study-loop: $(READY)
 	$(BIN)/python studies/loop.py
+
+study-worlds: $(READY)
+	$(BIN)/python studies/loop_worlds.py
+
+study-noises: $(READY)
+	$(BIN)/python studies/noises.py
 
 study-motion: $(READY)
 	$(BIN)/python studies/flight.py
