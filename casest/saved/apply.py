@@ -17,7 +17,7 @@ from casest.correction.numpy_module import as_data
 from casest.correction.program import Program
 from casest.data import load_runs
 from casest.data.run import Run
-from casest.data.write import write_atomically
+from casest.data.write import make_folder, write_atomically
 from casest.declaration.shapes import Array
 from casest.declaration.symbols import Signal
 from casest.errors import DataError, UsageError
@@ -196,9 +196,6 @@ def _bracket(unit: str | None) -> str:
 def write_to(output: Path, text: str) -> Path:
     """To a .csv file, or to corrected.csv in a folder; returns which."""
     output = corrected_file(output)
-    try:
-        output.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise DataError(f"{output.parent}: cannot be made ({error.strerror})") from None
+    make_folder(output.parent)
     write_atomically(output, text)
     return output

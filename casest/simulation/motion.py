@@ -19,7 +19,7 @@ import numpy as np
 from casest import __version__
 from casest.data import load_runs
 from casest.data.run import Run
-from casest.data.write import write_atomically
+from casest.data.write import make_folder, write_atomically
 from casest.declaration.shapes import Array
 from casest.declaration.tracing import flat
 from casest.dynamics.declare import Dynamics
@@ -283,7 +283,7 @@ def written_motion(
         "effects": list(made.effects),
     }  # fmt: skip
     paths = folder / "record.csv", folder / "truth.json", folder / "truth.csv"
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     time = np.asarray(made.run.time)
     heads = [f"{n} [{u}]" for n, u in zip(model.names, model.state_units, strict=True)]
     write_atomically(paths[0], record_text(model.signals, made.run))

@@ -25,7 +25,7 @@ from casest import __version__
 from casest.correction.inverse import Correction
 from casest.data import load_runs
 from casest.data.run import Run
-from casest.data.write import write_atomically
+from casest.data.write import make_folder, write_atomically
 from casest.declaration.effect import NOISE, Effect
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
@@ -293,7 +293,7 @@ def written(
         "effects": [a.label for a in model.effects],
     }
     record, truth_file = folder / "record.csv", folder / "truth.json"
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     write_atomically(record, text)
     write_atomically(truth_file, json.dumps(content, indent=1) + "\n")
     return record, truth_file
