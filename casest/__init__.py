@@ -75,9 +75,9 @@ if TYPE_CHECKING:
     from casest.errors import NotTrusted as NotTrusted
     from casest.errors import UnitError as UnitError
     from casest.errors import UsageError as UsageError
-    from casest.estimate.calibrate import Estimate as Estimate
     from casest.estimate.calibrate import attempt as attempt
     from casest.estimate.calibrate import calibrate as calibrate
+    from casest.estimate.estimate import Estimate as Estimate
     from casest.fleet.calibrate_many import Batch as Batch
     from casest.fleet.calibrate_many import calibrate_many as calibrate_many
 

@@ -38,7 +38,7 @@ from casest.diagnose import detectability, loop  # noqa: E402
 from casest.diagnose.selection.cross_validation import cross_fitted, rms  # noqa: E402
 from casest.effects import CATALOGUE  # noqa: E402
 from casest.effects.placing import prepared  # noqa: E402
-from casest.estimate.calibrate import Estimate  # noqa: E402
+from casest.estimate.estimate import Estimate  # noqa: E402
 from casest.leastsquares.problem import Problem  # noqa: E402
 from casest.results.find import find_model  # noqa: E402
 from casest.solve.trust_region import trust_region  # noqa: E402

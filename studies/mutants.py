@@ -128,7 +128,7 @@ MUTANTS = tuple(
         (JUDGE, "(near & (away > APART)) | lower", "near & (away > APART)"),
         (JUDGE, "(near & (away > APART)) | lower", "lower"),
         (JUDGE, "found.covariance[:] += shift", "pass"),
-        (JUDGE, "found.add(Code.BOUND,", "(lambda *_: None)(Code.BOUND,"),
+        ("fleet/on_bounds.py", "found.add(Code.BOUND,", "(lambda *_: None)(Code.BOUND,"),
         (
             JUDGE,
             "np.where(inside & np.isfinite(rise), rise, np.inf)",
@@ -143,7 +143,11 @@ MUTANTS = tuple(
             "found.add(Code.NO_REDUNDANCY, freedom <= 0)",
             "found.add(Code.NO_REDUNDANCY, freedom < 0)",
         ),
-        (JUDGE, "2 * fits.cost / np.where(freedom > 0, freedom, np.nan)", "2 * fits.cost / count"),
+        (
+            "fleet/local.py",
+            "2 * fits.cost / np.where(freedom > 0, freedom, np.nan)",
+            "2 * fits.cost / count",
+        ),
         ("fleet/fit.py", "np.clip(x + step, bounds.lower, bounds.upper) - x, held)", "step, held)"),
         # -- cross-validation and held-out data ----------------------------------------------------
         (CROSS, "run.take(fold != k)", "run.take(fold != k - 99)"),

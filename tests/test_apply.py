@@ -233,3 +233,95 @@ def test_a_correction_that_changes_nothing_is_refused(body, said, form, tmp_path
     assert printed.out == ""
     assert said in printed.err
     assert "nothing to correct" in printed.err
+
+
+# -- readings that are not as those of the fit -----------------------------------------------------
+
+
+def spheres(folder, **headers):
+    """The same readings of ±9.8 m/s² under headers of several units, `name="[g]"`, and a fit of
+    those called `fitted`."""
+    rng = np.random.default_rng(0)
+    v = rng.standard_normal((40, 3))
+    v = 9.8 * v / np.linalg.norm(v, axis=1)[:, None] + [0.3, 0.2, -0.1]
+    v += 0.01 * rng.standard_normal(v.shape)
+    for name, (unit, factor) in headers.items():
+        head = ",".join(f"v{a}{unit}" for a in "xyz")
+        np.savetxt(folder / f"{name}.csv", factor * v, "%.9f", ",", header=head, comments="")
+    fit = ["calibrate", "norm-diagonal", str(folder / "fitted.csv"), "--set", "norm=9.8"]
+    assert run([*fit, "-o", str(folder / "out")]) == 0
+
+
+def correcting(folder, data, capsys):
+    """Exit code, corrected values and what is said."""
+    capsys.readouterr()
+    code = run(["apply", str(folder / "out"), str(folder / data)])
+    said = capsys.readouterr()
+    rows = [[float(x) for x in line.split(",")[-3:]] for line in said.out.splitlines()[1:]]
+    return code, np.array(rows), " ".join(said.err.split())
+
+
+def test_readings_in_another_unit_than_those_of_the_fit_are_converted(tmp_path, capsys):
+    spheres(tmp_path, fitted=(" [m/s^2]", 1), g=(" [g]", 1 / 9.80665), mm=(" [mm/s^2]", 1e3))
+    expected = correcting(tmp_path, "fitted.csv", capsys)[1]
+    assert np.linalg.norm(expected, axis=1) == pytest.approx(9.8, abs=0.05)
+    for other in ("g.csv", "mm.csv"):
+        code, found, said = correcting(tmp_path, other, capsys)
+        assert (code, said) == (0, "")
+        np.testing.assert_allclose(found, expected, atol=1e-7)
+
+
+def test_readings_in_a_unit_that_does_not_convert_are_refused(tmp_path, capsys):
+    spheres(tmp_path, fitted=(" [m/s^2]", 1), tesla=(" [T]", 1), raw=(" [count]", 1))
+    for other, unit in (("tesla.csv", "T"), ("raw.csv", "count")):
+        code, _, said = correcting(tmp_path, other, capsys)
+        assert code == 1
+        assert f"{other}: column vx is in {unit} and signal v wants m/s^2" in said
+
+
+def test_a_unit_that_only_one_of_fit_and_data_states_is_said(tmp_path, capsys):
+    spheres(tmp_path, fitted=(" [m/s^2]", 1), silent=("", 1))
+    code, _, said = correcting(tmp_path, "silent.csv", capsys)
+    assert code == 0
+    assert "v: no unit stated for vx vy vz, taken as m/s^2" in said
+    spheres(tmp_path, fitted=("", 1), stated=(" [g]", 1))
+    code, _, said = correcting(tmp_path, "stated.csv", capsys)
+    assert code == 0
+    assert "v is in g; nobody stated the unit of v when the result was made" in said
+
+
+def test_readings_far_from_what_the_calibration_saw_are_counted_once(tmp_path, capsys):
+    spheres(tmp_path, fitted=(" [m/s^2]", 1), near=(" [m/s^2]", 1.02), far=(" [m/s^2]", 1.5))
+    assert correcting(tmp_path, "near.csv", capsys)[2] == ""
+    readings = np.loadtxt(tmp_path / "fitted.csv", delimiter=",", skiprows=1)
+    margin = 0.1 * np.ptp(readings, axis=0)
+    low, high = readings.min(axis=0) - margin, readings.max(axis=0) + margin
+    outside = ((1.5 * readings < low) | (1.5 * readings > high)).any(axis=1).sum()
+    assert 10 < outside < 40
+    _, _, said = correcting(tmp_path, "far.csv", capsys)
+    assert said.startswith(f"casest: {outside} of 40 rows lie outside what the calibration saw")
+    x = readings[:, 0]
+    ranges = f"vx {1.5 * x.min():.4g} to {1.5 * x.max():.4g} ({x.min():.4g} to {x.max():.4g}), vy "
+    assert ranges in said
+    assert said.count("extrapolates") == 1
+
+
+def test_a_temperature_beyond_those_of_the_fit_is_said(tmp_path, capsys):
+    rng = np.random.default_rng(1)
+    v = rng.standard_normal((60, 3))
+    v = 9.8 * v / np.linalg.norm(v, axis=1)[:, None]
+    temp = rng.uniform(20, 30, 60)
+    reading = v + np.outer(temp - 25, [0.02, -0.01, 0.03]) + 0.005 * rng.standard_normal(v.shape)
+    head = "vx [m/s^2],vy [m/s^2],vz [m/s^2],temp"
+    for name, shift, unit in (("a", 0, "degC"), ("hot", 40, "degC"), ("kelvin", 273.15, "K")):
+        table, named = np.column_stack([reading, temp + shift]), f"{head} [{unit}]"
+        np.savetxt(tmp_path / f"{name}.csv", table, "%.9f", ",", header=named, comments="")
+    fit = ["calibrate", "norm-diagonal", str(tmp_path / "a.csv"), "--set", "norm=9.8"]
+    asked = ["--effects", "temperature_bias(temp)", "-o", str(tmp_path / "out")]
+    assert run([*fit, *asked]) == 0
+    expected = correcting(tmp_path, "a.csv", capsys)[1]
+    _, found, said = correcting(tmp_path, "kelvin.csv", capsys)
+    assert said == ""
+    np.testing.assert_allclose(found, expected, atol=1e-7)
+    said = correcting(tmp_path, "hot.csv", capsys)[2]
+    assert "60 of 60 rows lie outside what the calibration saw, in brackets: temp 6" in said

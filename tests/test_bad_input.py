@@ -355,22 +355,6 @@ def test_a_refusal_leaves_an_earlier_result_as_it_was(refused, tmp_path, capsys)
     assert {p.name: p.read_bytes() for p in (tmp_path / "kept").iterdir()} == before
 
 
-def test_readings_in_another_unit_than_the_results_are_refused_or_converted(
-    refused, tmp_path, capsys
-):
-    v = np.random.default_rng(0).standard_normal((30, 3))
-    v = 9.8 * v / np.linalg.norm(v, axis=1)[:, None] + 0.01 * np.random.default_rng(1).normal(
-        size=(30, 3)
-    )
-    rows = "\n".join(",".join(f"{x:.6f}" for x in r) for r in v) + "\n"
-    (tmp_path / "si.csv").write_text("vx [m/s^2],vy [m/s^2],vz [m/s^2]\n" + rows, encoding="utf-8")
-    (tmp_path / "g.csv").write_text("vx [g],vy [g],vz [g]\n" + rows, encoding="utf-8")
-    assert run(["calibrate", "norm-diagonal", "si.csv", "--set", "norm=9.8", "-o", "si"]) == 0
-    capsys.readouterr()
-    text = refused("apply", "si", "g.csv")
-    assert "g.csv: signal v is in g, the result was made in m/s^2" in text
-
-
 @pytest.mark.parametrize("content", ["{", "[]", '{"no": "model"}', ""])
 def test_what_is_no_result_is_not_applied(refused, content):
     text = refused("apply", "r.json", "good.csv", files={"r.json": content})

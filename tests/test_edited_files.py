@@ -252,6 +252,8 @@ def test_what_is_wrong_in_a_program_is_named(folder, tmp_path, key, value, said)
         ("units.r", 3, "units[...]: Expected `str`, got `int`"),
         ("correction.signals", [], "correction.signals: none is the program's input 'r'"),
         ("correction.own", [[1.0]], "correction.own: not 1 numbers for each of 2 runs"),
+        ("correction.range", [[0.0, 1.0]] * 9, "correction.range: not low and high of"),
+        ("correction.range.0", [1.0, 0.0], "correction.range: not low and high of"),
         ("correction.readings.0.0", [1.0, 2.0], "correction.readings: 2 numbers in a row"),
         ("runs", ["a"], "runs"),
     ],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 
 import numpy as np
@@ -93,9 +94,49 @@ def test_a_column_that_would_not_be_tried_is_tried_where_it_is_named(record):
     _, found = result("close", "norm-diagonal", "poses.csv", *asked)
     refused = {r["name"]: r["reason"] for r in found["refused"]}
     assert "no more of it than noise would have" in refused["channel_bias(temp)"]
-    _, found = result("close", "norm-diagonal", "poses.csv", "--effects", "channel_bias(volts)")
-    refused = {r["name"]: r["reason"] for r in found["refused"]}
-    assert refused["channel_bias(volts)"] == "the data have no column that it could follow"
+
+
+def spoiled(cell: str, column: int = 3):
+    """The record with that cell in two rows of its column of currents."""
+    with open("poses.csv", encoding="utf-8") as file:
+        head, *rows = file.read().splitlines()
+    for k in (7, 30):
+        cells = rows[k].split(",")
+        cells[column] = cell
+        rows[k] = ",".join(cells)
+    with open("spoiled.csv", "w", encoding="utf-8") as file:
+        file.write("\n".join([head, *rows]) + "\n")
+
+
+@pytest.mark.parametrize("command", ["calibrate", "close"])
+@pytest.mark.parametrize("cell", ["", "nan"])
+def test_a_row_without_the_followed_column_is_dropped_as_one_without_a_reading(
+    record, command, cell
+):
+    spoiled(cell)
+    asked = ["--effects", "channel_bias(Motor_Current)"]
+    code, found = result(command, "norm-diagonal", "spoiled.csv", *asked)
+    assert code == 0
+    assert found["effects"][0]["name"] == "channel_bias"
+    with open("out/residuals.csv", encoding="utf-8") as file:
+        rows = {int(line["row"]) for line in csv.DictReader(file)}
+    assert rows == {*range(200)} - {7, 30}
+    said = "2 of 200 rows dropped: 2 without motor current, the first row 7"
+    assert any(said in note for note in found["notes"])
+
+
+@pytest.mark.parametrize("command", ["calibrate", "close"])
+@pytest.mark.parametrize("cell", ["inf", "ERR"])
+def test_a_followed_column_that_holds_no_number_is_refused_as_a_reading_is(
+    record, command, cell, capsys
+):
+    spoiled(cell)
+    asked = ["--effects", "channel_bias(motor current)"]
+    assert run([command, "norm-diagonal", "spoiled.csv", *G, *asked]) == 1
+    said = f"column motor current row 7 holds '{cell}' (and 1 more such rows)"
+    assert said in capsys.readouterr().err
+    spoiled(cell, column=4)  # a column that nobody asked for is left out
+    assert run([command, "norm-diagonal", "spoiled.csv", *G, *asked]) == 0
 
 
 @pytest.mark.parametrize(
@@ -115,3 +156,9 @@ def test_what_cannot_follow_a_column_is_said(record, asked, said, capsys):
         file.write(own + own[own.index("@effect") :].replace("pull", "push"))
     assert run(["calibrate", "norm-diagonal", "poses.csv", *G, "--effects", asked]) == 1
     assert said in capsys.readouterr().err
+
+
+def test_close_refuses_a_column_that_is_not_there_as_calibrate_does(record, capsys):
+    words = ["close", "norm-diagonal", "poses.csv", *G, "--effects"]
+    assert run([*words, "channel_bias(motor curent)"]) == 1
+    assert "no column motor curent" in capsys.readouterr().err

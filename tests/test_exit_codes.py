@@ -202,7 +202,26 @@ def test_a_full_standard_output_is_said_and_nothing_is_written(tmp_path):
         done = ended("calibrate", *POSES, "-o", str(tmp_path / "out"), stdout=full)
     assert done.returncode == 1
     assert done.stderr == ("casest: standard output cannot be written (No space left on device)\n")
-    assert not written(tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full")
+@pytest.mark.parametrize(
+    ("words", "output"),
+    [
+        (["simulate", "norm-diagonal", "--directions", "9"], "simulated"),
+        (["compare", *POSES, "--starts", "1"], "compared"),
+        (["apply", "fit", *POSES[1:6]], "corrected/new.csv"),
+        (["export", "fit", "--to", "c"], "device/new.c"),
+    ],
+)
+def test_a_command_that_fails_leaves_no_empty_folder(tmp_path, monkeypatch, words, output):
+    monkeypatch.chdir(tmp_path)
+    assert run(["calibrate", *POSES, "-o", "fit"]) == 0
+    with open("/dev/full", "w") as full:
+        done = ended(*words, "-o", output, stdout=full)
+    assert "standard output cannot be written" in done.stderr
+    assert (done.returncode, os.listdir(tmp_path)) == (1, ["fit"])
 
 
 def test_a_closed_standard_output_is_said_before_anything_is_computed(tmp_path):

@@ -16,6 +16,7 @@ import casest
 from casest import Residual, Run, model, param
 from casest.comparison.judge import SOLVERS, compare
 from casest.data import write_atomically, written_together
+from casest.data.write import make_folder
 from casest.demo import RECORD, WHEEL
 from casest.interruption import held_back, waits
 from casest.solve.ipopt import ipopt
@@ -207,6 +208,22 @@ def test_files_written_together_appear_at_the_end_or_not_at_all(tmp_path):
     assert sorted(os.listdir(tmp_path)) == ["a.txt", "b.bin"]
     assert (tmp_path / "a.txt").read_text() == "two"
     assert (tmp_path / "b.bin").read_bytes() == b"\x00\r\n"
+
+
+def test_a_folder_that_was_made_for_files_that_never_came_is_removed(tmp_path):
+    (tmp_path / "there").mkdir()
+
+    @written_together()
+    def into(folder, wrong):
+        make_folder(folder)
+        two_texts_and_bytes.__wrapped__(folder, wrong)
+
+    for folder in (tmp_path / "out" / "deep", tmp_path / "there" / "new", tmp_path / "there"):
+        with pytest.raises(KeyboardInterrupt):
+            into(folder, wrong=True)
+    assert [p.name for p in tmp_path.rglob("*")] == ["there"]  # an empty one of the user's stays
+    into(tmp_path / "out" / "deep", wrong=False)
+    assert sorted(os.listdir(tmp_path / "out" / "deep")) == ["a.txt", "b.bin"]
 
 
 def test_ctrl_c_while_files_get_their_names_waits_until_all_have_them(tmp_path, monkeypatch):

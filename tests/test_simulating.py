@@ -58,6 +58,24 @@ def test_an_effect_that_was_added_is_what_the_loop_finds(tmp_path, capsys):
     assert abs(sine["value"] - 0.3) < 5 * sine["std"]
 
 
+def test_the_known_length_is_found_by_what_the_residual_does_and_not_by_its_name(tmp_path):
+    (tmp_path / "sphere.py").write_text(
+        "from casest import Residual, constant, model, norm_2, param, quantity, signal\n"
+        "@model\n"
+        'def sphere(m=signal(3), *, centre=param(3, "[m]"), norm=constant(2.0), '
+        'earth=constant(48.0, "[m]")):\n'
+        '    """A field of known strength; `norm` is something else."""\n'
+        '    field = quantity("field", m - centre, "[m]")\n'
+        '    return Residual(implicit=norm * (norm_2(field) - earth), unit="[m]",\n'
+        '                    corrected=field, axes=("norm",))\n',
+        encoding="utf-8",
+    )
+    record, _ = made(tmp_path / "out", str(tmp_path / "sphere.py"), "--directions", "20",
+                     "--value", "centre=1,2,3")  # fmt: skip
+    readings = np.loadtxt(record, delimiter=",", skiprows=1)
+    assert np.linalg.norm(readings - [1, 2, 3], axis=1) == pytest.approx(48, rel=1e-9)
+
+
 def test_other_signals_and_columns_come_from_a_file(tmp_path, capsys):
     (tmp_path / "cell.py").write_text(
         "from casest import Residual, model, param, quantity, signal\n"

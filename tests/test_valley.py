@@ -6,22 +6,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import valleys
+from valleys import sine, sine_and_level, step, wrapped
 
 from casest import (
     NotTrusted,
     Residual,
     Run,
-    atan2,
     attempt,
     calibrate,
-    cos,
     exp,
     fabs,
-    inf,
     model,
     param,
     signal,
-    sin,
 )
 from casest.estimate.calibrate import _estimate
 from casest.estimate.certificate import Certificate
@@ -40,28 +38,8 @@ def as_run(**signals):
     return Run.raw("r", columns, units={}, file="r.csv")
 
 
-@model
-def sine(x=signal(), y=signal(), *, w=param(start=1.0), p=param()):
-    return Residual(measured=y, predicted=sin(w * x + p))
-
-
-@model
-def sine_and_level(
-    x=signal(), y=signal(), *, size=param(start=1.0), w=param(start=1.0), p=param(), level=param()
-):
-    return Residual(measured=y, predicted=level + size * sin(w * x + p))
-
-
-@model
-def peak(
-    x=signal(),
-    y=signal(),
-    *,
-    height=param(start=1.0),
-    place=param(start=0.0),
-    width=param(start=1.0, bounds=(0.0, inf)),
-):
-    return Residual(measured=y, predicted=height * exp(-0.5 * ((x - place) / width) ** 2))
+#: On no level of its own.
+peak = valleys.peak.having(level=0.0)
 
 
 def sine_run(w=9.0, p=0.5, n=80, noise=0.05, seed=0, even=True, shuffled=False, unit=1.0):
@@ -139,10 +117,6 @@ def test_unknowns_that_enter_linearly_are_projected_out():
 
 
 def test_a_slope_of_one_is_no_line_where_an_angle_is_wrapped_or_bent():
-    @model
-    def wrapped(x=signal(), y=signal(), *, w=param(start=1.0), p=param()):
-        return Residual(measured=y, predicted=atan2(sin(w * x + p), cos(w * x + p)))
-
     @model
     def corner(x=signal(), y=signal(), *, a=param(start=1.0), c=param()):
         return Residual(measured=y, predicted=a * fabs(x - c))
@@ -300,19 +274,6 @@ def test_two_valleys_that_the_data_hardly_tell_apart_are_refused_with_both_value
     problem, search = a_search(arrived=50, rivals=[other.outcome])
     text = refusal(Scatter(0.5, 0.5, 1.0, 0.5, (78.0, 40.0)), search, problem)
     assert text.startswith("two valleys fit nearly alike: `w` = 1 and 7; give bounds")
-
-
-@model
-def step(
-    x=signal(),
-    y=signal(),
-    *,
-    level=param(),
-    height=param(start=1.0),
-    place=param(start=-20.0),
-    width=param(start=1.0, bounds=(0.0, inf)),
-):
-    return Residual(measured=y, predicted=level + height / (1 + exp(-(x - place) / width)))
 
 
 def step_run():

@@ -45,11 +45,15 @@ def apply(result_path: Path, data: str, options: ApplyOptions) -> None:
     progress(f"correcting {data}")
     timed: tuple[str, ...] = ()
     if is_exported(result_path):
-        text, left = applied(result_path, data, arguments)
+        text, left, remarks = applied(result_path, data, arguments)
     else:
-        text, left = correcting.corrected_csv(result_path, data, arguments, force=options.force)
+        text, left, remarks = correcting.corrected_csv(
+            result_path, data, arguments, force=options.force
+        )
         timed = correcting.of_another_time(result_path, data)
     shown.done()
+    for remark in remarks:
+        echo(f"casest: {remark}", err=True)
     if left:
         echo(f"casest: {LEFT}{', '.join(left)}", err=True)
     if timed:

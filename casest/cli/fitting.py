@@ -127,10 +127,10 @@ def closing(model_name: str, data: Sequence[str], options: FitOptions, command: 
     )
     from casest.results.file import as_json, save
 
-    known, own = asked_effects(options.model.effects)
+    known, own, followed = asked_effects(options.model.effects)
     model = declared_model(model_name, replace(options.model, effects=()))
-    runs = records(model, data, options.reading)
-    apart = held_out(model, options.holdout, data, options.reading)
+    runs = records(model, data, options.reading, followed)
+    apart = held_out(model, options.holdout, data, options.reading, followed)
     start = dict(given.start(model) for given in options.starts) or None
     progress(f"fitting {model_name}, looking for effects")
     try:
@@ -164,20 +164,24 @@ def closing(model_name: str, data: Sequence[str], options: FitOptions, command: 
     return 0
 
 
-def asked_effects(asked: Sequence[str]) -> tuple[set[str], tuple[Effect, ...]]:
-    """Names of shipped effects that --effects says are there; those to try beside the catalogue."""
+def asked_effects(
+    asked: Sequence[str],
+) -> tuple[set[str], tuple[Effect, ...], tuple[str, ...]]:
+    """Names of shipped effects that --effects says are there; those to try beside the catalogue;
+    columns that they are said to follow."""
     from casest.effects import CATALOGUE
     from casest.results.find import find_asked
 
     catalogue = {e.name for e in CATALOGUE}
-    known, own = catalogue & {*asked}, []
+    known, own, followed = catalogue & {*asked}, [], dict[str, None]()
     for text in asked:
         for effect, column in find_asked(text) if text not in known else ():
             if column and effect.name in catalogue:
                 known.add(text)
+            followed |= {column: None} if column else {}
             columns = tuple((name, f"={column}") for name, _ in effect.columns)
             own.append(replace(effect, columns=columns) if column else effect)
-    return known, tuple(own)
+    return known, tuple(own), tuple(followed)
 
 
 def closing_in_motion(

@@ -74,8 +74,10 @@ def _with_constants(model: Model, constants: Assignments, name: str) -> Model:
     return model
 
 
-def records(model: Model, data: Sequence[str], options: ReadingOptions) -> tuple[Run, ...]:
-    """The runs in the files."""
+def records(
+    model: Model, data: Sequence[str], options: ReadingOptions, followed: Sequence[str] = ()
+) -> tuple[Run, ...]:
+    """The runs in the files; `followed` columns matter as signals do (see `load_runs`)."""
     from casest.data import load_runs
 
     progress(f"reading {', '.join(data)}")
@@ -84,18 +86,24 @@ def records(model: Model, data: Sequence[str], options: ReadingOptions) -> tuple
         if Path(name).resolve() in seen:
             raise UsageError(f"{name} is given twice: it would count as two records")
         seen.add(Path(name).resolve())
-    return load_runs(list(data), model.signals, **options.keywords())
+    known = {"t", *model.quantities, *(s.name for s in model.signals)}
+    extra = [column for column in followed if column not in known]
+    return load_runs(list(data), model.signals, extra=extra, **options.keywords())
 
 
 def held_out(
-    model: Model, apart: Sequence[str], data: Sequence[str], options: ReadingOptions
+    model: Model,
+    apart: Sequence[str],
+    data: Sequence[str],
+    options: ReadingOptions,
+    followed: Sequence[str] = (),
 ) -> tuple[Run, ...]:
     """The runs in the files `apart`, which the fit to `data` never saw."""
     fitted = {Path(name).resolve() for name in data}
     for name in apart:
         if Path(name).resolve() in fitted:
             raise UsageError(f"--holdout {name}: the fit has seen this file; give another record")
-    return records(model, apart, options) if apart else ()
+    return records(model, apart, options, followed) if apart else ()
 
 
 def moving_model(name: str, constants: Assignments, options: MotionOptions) -> Dynamics:

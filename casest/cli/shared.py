@@ -99,10 +99,7 @@ def reported(folder: Path, page: str) -> None:
 
 def write(path: Path, text: str) -> None:
     """A file in a folder that is made if it is missing."""
-    from casest.data.write import write_atomically
+    from casest.data.write import make_folder, write_atomically
 
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise DataError(f"{path.parent}: cannot be made ({error.strerror})") from None
+    make_folder(path.parent)
     write_atomically(path, text)

@@ -20,7 +20,8 @@ from casest.declaration.model import Model
 from casest.declaration.shapes import Array
 from casest.engine.threads import one_thread
 from casest.errors import NotTrusted, UsageError
-from casest.estimate.calibrate import Estimate, attempt
+from casest.estimate.calibrate import attempt
+from casest.estimate.estimate import Estimate
 from casest.estimate.reasons import SAME
 from casest.leastsquares.problem import Point, Problem
 from casest.leastsquares.sums import rounding as rounding_error

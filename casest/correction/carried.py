@@ -27,7 +27,8 @@ class Carried:
     `model` is the declared name; `signals` are all of the model's, as declared, to bind data to.
     `own` numbers of each run, where the correction differs between runs, else none. `readings`
     (n, width) of the fit, one array, or one for each run. `timed` are effects that follow the time
-    of the fitted record.
+    of the fitted record. `seen` (low, high) of each number of a sample in the fit, empty where an
+    older result does not say.
     """
 
     model: str
@@ -36,6 +37,7 @@ class Carried:
     own: tuple[tuple[float, ...], ...]
     readings: tuple[Array, ...]
     timed: tuple[str, ...]
+    seen: tuple[tuple[float, float], ...] = ()
 
     @property
     def needed(self) -> tuple[Signal, ...]:
@@ -92,6 +94,7 @@ def _carried(
         tuple(tuple(map(float, p[differing])) for p in points) if differing else (),
         tuple(_readings(runs, names, each=bool(differing))),
         of_their_time(model),
+        _seen(runs, names),
     )
 
 
@@ -125,6 +128,17 @@ def _largest(correction: Correction, runs: Sequence[Run]) -> float:
     sizes = [np.abs(run.signals[name]).max(initial=0.0) for run in runs if name in run.signals]
     finite = [float(s) for s in sizes if np.isfinite(s) and s > 0]
     return max(finite, default=1.0)
+
+
+def _seen(runs: Sequence[Run], names: Sequence[str]) -> tuple[tuple[float, float], ...]:
+    """Range of each number of a sample in the fit."""
+    parts = [np.hstack([np.asarray(run.signals[n], float) for n in names]) for run in runs]
+    samples = np.vstack(parts)
+    samples = samples[np.isfinite(samples).all(axis=1)]
+    if not len(samples):
+        return ()
+    low, high = samples.min(axis=0).tolist(), samples.max(axis=0).tolist()
+    return tuple(zip(low, high, strict=True))
 
 
 def _readings(runs: Sequence[Run], names: Sequence[str], *, each: bool) -> list[Array]:

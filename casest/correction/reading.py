@@ -68,6 +68,7 @@ class _Carried(Struct):
     readings: Annotated[list[list[list[float]]], Meta(min_length=1)]
     not_undone: list[str]
     follows_time: list[str]
+    range: list[tuple[float, float]] = []
 
 
 def carried_data(found: Carried) -> dict[str, Any]:
@@ -82,6 +83,7 @@ def carried_data(found: Carried) -> dict[str, Any]:
         "readings": [part.tolist() for part in found.readings],
         "not_undone": list(found.program.left),
         "follows_time": list(found.timed),
+        "range": [list(pair) for pair in found.seen],
     }
 
 
@@ -185,6 +187,8 @@ def carried_read(content: Any, where: str, runs: int) -> Carried:
     _refuse(len(found.readings) != several, f"{where}.readings: not those of {several} runs")
     for row in (row for part in found.readings for row in part):
         _refuse(len(row) != program.width, f"{where}.readings: {len(row)} numbers in a row")
+    wrong = len(found.range) not in (0, program.width) or any(a > b for a, b in found.range)
+    _refuse(wrong, f"{where}.range: not low and high of {program.width} numbers")
     known = {s.name: s for s in found.signals}
     _refuse(len(known) < len(found.signals), f"{where}.signals: two have one name")
     for i in program.inputs:
@@ -198,4 +202,5 @@ def carried_read(content: Any, where: str, runs: int) -> Carried:
         tuple(map(tuple, found.own)),
         tuple(np.array(part, float).reshape(-1, program.width) for part in found.readings),
         tuple(found.follows_time),
+        tuple(found.range),
     )

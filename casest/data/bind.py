@@ -61,7 +61,8 @@ def load_runs(
     * scales: per signal or column how raw counts become values, {"temp": "int16/256+25"}.
     * rate: samples per second, instead of a time column or a rate stated above the table.
     * at_rest: average the rest intervals; names of further columns that must be at rest too.
-    * extra: columns that must be there; like a signal's, their empty cells cost the row.
+    * extra: columns that must be there; like a signal's, their empty cells cost the row, and the
+      run calls them as they are called here.
     * gaps: signals whose cells may be empty; a reading that is missing is NaN in the run.
     * time_zero: "first" makes each run's first sample t = 0, "column" keeps the column's own zero.
 
@@ -356,6 +357,7 @@ def _others(
     columns: dict[str, Array | Labels] = {}
     units: dict[str, str | None] = {}
     notes = []
+    called = {find_column(table, name, "the model"): name for name in options.extra}
     for name, column in table.columns.items():
         if name in used:
             continue
@@ -369,8 +371,10 @@ def _others(
         if name in options.scales:
             values = options.scales[name].apply(np.asarray(values, float), table.file, name)
             unit = None if unit == column.unit and unit in ("count", "raw", "LSB") else unit
-        columns[name] = values
-        units[name] = unit_names.canonical(unit) if unit and unit_names.known(unit) else None
+        columns[called.get(name, name)] = values
+        units[called.get(name, name)] = (
+            unit_names.canonical(unit) if unit and unit_names.known(unit) else None
+        )
     return columns, units, notes
 
 

@@ -7,28 +7,59 @@ import os
 import tempfile
 from collections.abc import Iterator
 from contextvars import ContextVar
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from casest.errors import DataError
 from casest.interruption import held_back
 
-#: Files written so far of those that appear together: name to come by temporary name.
-_together: ContextVar[dict[str, Path] | None] = ContextVar("together", default=None)
+
+@dataclass(frozen=True)
+class _Pending:
+    """Files written so far of those that appear together, name to come by temporary name; folders
+    that were made for them, outer ones first."""
+
+    files: dict[str, Path] = field(default_factory=dict)
+    folders: list[Path] = field(default_factory=list)
+
+
+_together: ContextVar[_Pending | None] = ContextVar("together", default=None)
 
 
 @contextlib.contextmanager
 def written_together() -> Iterator[None]:
-    """Within it files keep temporary names; all get their own at its end, none on an error."""
-    pending: dict[str, Path] = {}
+    """Within it files keep temporary names; all get their own at its end, none on an error.
+
+    A folder that was made for them and holds nothing in the end is removed again.
+    """
+    pending = _Pending()
     token = _together.set(pending)
     try:
         yield
-        _rename(pending)
+        _rename(pending.files)
     finally:
         _together.reset(token)
-        for temporary in pending:
+        for temporary in pending.files:
             with contextlib.suppress(OSError):
                 os.unlink(temporary)
+        for folder in reversed(pending.folders):
+            with contextlib.suppress(OSError):  # it is not empty
+                folder.rmdir()
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder to write into, and those above it, where there is none.
+
+    Raises DataError where it cannot be made.
+    """
+    pending = _together.get()
+    try:
+        missing = [f for f in (folder, *folder.parents) if not f.exists()]
+        if pending is not None:
+            pending.folders.extend(reversed(missing))
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DataError(f"{folder}: cannot be made ({error.strerror}); give another -o") from None
 
 
 def write_atomically(path: str | os.PathLike[str], text: str | bytes) -> None:
@@ -40,7 +71,7 @@ def write_atomically(path: str | os.PathLike[str], text: str | bytes) -> None:
     """
     pending = _together.get()
     if pending is not None:
-        _write(Path(path), text, pending)
+        _write(Path(path), text, pending.files)
         return
     with written_together():
         write_atomically(path, text)

@@ -14,7 +14,7 @@ from casest.diagnose.cross_validation import Folds
 from casest.diagnose.found import Found, Undecided
 from casest.diagnose.misfit.left import Misfit, left_over
 from casest.diagnose.visibility import Visible
-from casest.estimate.calibrate import Estimate
+from casest.estimate.estimate import Estimate
 from casest.leastsquares.problem import Problem
 
 

@@ -14,7 +14,7 @@ from casest.declaration.model import Model
 from casest.declaration.shapes import Array
 from casest.diagnose.levels import STRETCHES
 from casest.errors import DataError
-from casest.estimate.calibrate import Estimate
+from casest.estimate.estimate import Estimate
 from casest.estimate.reasons import PRACTICALLY_NULL
 from casest.leastsquares.identifiability import identify
 from casest.leastsquares.problem import Point, Problem

@@ -25,7 +25,8 @@ from casest.effects.placing import prepared
 from casest.engine.kernel import only_tried
 from casest.engine.threads import one_thread
 from casest.errors import DataError, NotTrusted
-from casest.estimate.calibrate import Estimate, attempt
+from casest.estimate.calibrate import attempt
+from casest.estimate.estimate import Estimate
 from casest.leastsquares.problem import Problem
 
 

@@ -284,7 +284,7 @@ def _with_the_best(
             return _kept(subject, state, ranking, replace(refit, fit=fit), say)
         state = state.refusing(refit.evidence.trials[0].what, fit, refit.evidence)
         later = refits[k + 1].evidence.score if k + 1 < len(refits) else 0.0
-        if refit.evidence.score > later + LEVELS.strong:
+        if len(refit.evidence.trials) == 1 and refit.evidence.score > later + LEVELS.strong:
             break  # what explains clearly less is not the cause
     for evidence in [e for e in options if e not in passing][:2]:
         state = state.refusing(evidence.trials[0].what, NOT_HELD_OUT, evidence)

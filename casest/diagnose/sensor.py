@@ -29,7 +29,8 @@ from casest.effects.on_axes import restricted
 from casest.effects.placing import placed_in
 from casest.engine.kernel import only_tried
 from casest.errors import CasestError
-from casest.estimate.calibrate import Estimate, attempt
+from casest.estimate.calibrate import attempt
+from casest.estimate.estimate import Estimate
 from casest.leastsquares.problem import Point, Problem
 from casest.leastsquares.weights import robust_scale, weighted
 from casest.solve.trust_region import trust_region
@@ -240,20 +241,27 @@ class Sensor:
     def refit(self, fit: Fit, added: Sequence[Trial]) -> Fit | str:
         """The fit with these effects, from their first-order sizes, if it can be trusted."""
         try:
-            found = self._with(fit, [t.what.free() for t in added])
+            found = self._with(fit, [t.what for t in added], fit.values)
+            if found is not None and any(t.what.free() is not t.what for t in added):
+                # From the sizes at the value of the grid: at nothing, no slope tells a frequency.
+                found = self._with(fit, [t.what.free() for t in added], found.values)
             plain = [_plain(t.what) for t in added]
             if found is not None and any(p is not None for p in plain):
                 simple = [p or t.what.free() for p, t in zip(plain, added, strict=True)]
-                found = _simpler(found, self._with(fit, simple))
+                found = _simpler(found, self._with(fit, simple, fit.values))
         except (CasestError, np.linalg.LinAlgError) as error:
             return f"its refit fails: {error}"
         return "its refit fails: the residual is not finite" if found is None else found
 
-    def _with(self, fit: Fit, added: Sequence[Candidate]) -> Fit | None:
-        model, values = fit.model, dict(fit.values)
+    def _with(
+        self, fit: Fit, added: Sequence[Candidate], values: Mapping[str, Array]
+    ) -> Fit | None:
+        model = fit.model
         for candidate in added:
             model = candidate.added_to(model)
-        return self.fitted(model, {**self._nulls(model, values), **values})
+        own = {p.name for p in model.parameters}
+        begun = {n: v for n, v in values.items() if n in own}
+        return self.fitted(model, {**self._nulls(model, begun), **begun})
 
     def certified(self, fit: Fit) -> Fit | str:
         """The fit, proved; or why it is refused."""

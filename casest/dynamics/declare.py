@@ -23,7 +23,8 @@ from casest.errors import CasestError, DeclarationError, UsageError, last_line
 class State:
     """A state: `size` numbers in `unit`; `intensity` of the white noise that drives it, unit²/s.
 
-    `start` and `std` describe what is known of it at the beginning.
+    `start` and `std` describe what is known of it at the beginning. `of_data`: the intensity was
+    taken from the record at hand, so that a search for the most likely one begins there.
     """
 
     name: str
@@ -32,6 +33,7 @@ class State:
     intensity: float
     start: tuple[float, ...]
     std: float
+    of_data: bool = False
 
 
 def state(

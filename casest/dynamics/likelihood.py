@@ -200,10 +200,9 @@ def _scoring(
 
 
 def first_guess(ready: Prepared, run: Run) -> dict[str, float]:
-    """Of a signal: its fourth differences, where little but noise is left. Of a state: little."""
+    """Of a signal: its fourth differences, where little but noise is left. Of a state: little, or
+    what was taken from these data before."""
     model, guess = ready.model, {}
-    stds = {s.name: s.std for s in model.states}
-    intensities = {s.name: s.intensity for s in model.states}
     duration = float(np.sum(ready.period))
     for name in ready.names:
         if name in run.signals:
@@ -212,10 +211,9 @@ def first_guess(ready: Prepared, run: Run) -> dict[str, float]:
             variance = float(np.median(fourth**2)) / 0.4549 / _FOURTH if len(fourth) else 0.0
             scale = 1e-12 * float(np.nanmean(values**2)) or 1e-12
             guess[name] = max(variance, scale) * float(np.median(ready.period))
-        elif name.endswith("_colour"):
-            guess[name] = intensities[name]
         else:
-            guess[name] = 1e-6 * stds[name] ** 2 / duration
+            own = model[name]
+            guess[name] = own.intensity if own.of_data else 1e-6 * own.std**2 / duration
     return guess
 
 

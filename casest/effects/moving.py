@@ -29,7 +29,8 @@ class MotionEffect:
     `changed(value, k, body)`: on an input the reading and on an output the prediction, with the
     effect's numbers k; `body` gives the derivative of a prediction and the turn rate. `size` and
     `unit` depend on the signal's; `typical` is of the size found in practice. `vector`: for three
-    components; `turning`: for a speed of a body whose rate of turn is measured.
+    components; `turning`: for a speed of a body whose rate of turn is measured; `in_time`: its one
+    number is how late the reading is (s), so that readings can be moved by whole samples first.
     """
 
     name: str
@@ -42,6 +43,11 @@ class MotionEffect:
     shown_by: str
     vector: bool = False
     turning: bool = False
+    in_time: bool = False
+
+    def state_of(self, signal: str) -> str:
+        """Name of its numbers on that signal, as a state: `omega_bias`."""
+        return f"{signal}_{self.name}"
 
 
 @dataclass(frozen=True)
@@ -91,7 +97,7 @@ TIME_DELAY = MotionEffect(
     "time_delay", "output", "prediction, k earlier", lambda _: 1, lambda u: "s",
     # Whole samples are moved (delays.py); over the rest of less than one the rate is constant.
     lambda _: 0.01, lambda y, k, body: y - (k - body.moved) * body.rate,
-    "an event that all sensors see",
+    "an event that all sensors see", in_time=True,
 )  # fmt: skip
 LEVER_ARM = MotionEffect(
     "lever_arm", "output", "prediction + omega × k", _same, lambda _: "m",
@@ -133,7 +139,7 @@ class Candidate:
     @property
     def state(self) -> str:
         """Name of its numbers as a state: `omega_bias`."""
-        return f"{self.on}_{self.effect.name}"
+        return self.effect.state_of(self.on)
 
     @property
     def moved(self) -> str:
@@ -156,7 +162,7 @@ def candidates(model: Dynamics, run: Run) -> list[Candidate]:
                 continue
             if effect.turning and not (turn and s.unit == "m/s"):
                 continue
-            if effect is BIAS and _estimated(model, s.name):
+            if effect.on == "input" and _estimated(model, effect, s):
                 continue
             unit, size = effect.unit(s.unit or "1"), effect.size(s.size)
             typical = effect.typical(_rms(run.signals[s.name]))
@@ -166,10 +172,12 @@ def candidates(model: Dynamics, run: Run) -> list[Candidate]:
     return found
 
 
-def _estimated(model: Dynamics, name: str) -> bool:
-    """Is a bias of that input a state already: a constant that acts as the input does?"""
+def _estimated(model: Dynamics, effect: MotionEffect, signal: Signal) -> bool:
+    """Are the effect's numbers on that input a state already: a constant that acts as they do?"""
     t, where = model.traced, model.slices()
-    slope = ca.jacobian(t.f, t.symbols[name])
+    reading, k = t.symbols[signal.name], ca.SX.sym("k", effect.size(signal.size))
+    moved = ca.substitute(ca.jacobian(effect.changed(reading, k, Body()), k), k, 0)
+    slope = ca.jacobian(t.f, reading) @ moved
     for s in model.states:
         own = where[s.name]
         if s.size != slope.size2() or not t.f[own].is_zero():
@@ -178,7 +186,7 @@ def _estimated(model: Dynamics, name: str) -> bool:
         sample = ca.vertcat(t.x, *[ca.vec(symbol) for symbol in t.symbols.values()])
         point = np.random.default_rng(0).standard_normal(sample.numel())
         found = ca.Function("pair", [sample], [ca.densify(pair)])(point).full().T
-        if np.allclose(found[0], -found[1]):
+        if np.allclose(found[0], found[1]):
             return True
     return False
 
@@ -224,7 +232,7 @@ def _with(model: Dynamics, candidate: Candidate, value: Array | None) -> Dynamic
     @wraps(inner)
     def function(**given: Any) -> Motion:
         k = given.pop(name) if value is None else ca.SX(ca.DM(value))
-        moved = given.pop(candidate.moved) if effect is TIME_DELAY else 0.0
+        moved = given.pop(candidate.moved) if effect.in_time else 0.0
         if effect.on == "input":
             corrected = effect.changed(given[candidate.on], k, Body())
             return inner(**{**given, candidate.on: corrected})
@@ -232,7 +240,7 @@ def _with(model: Dynamics, candidate: Candidate, value: Array | None) -> Dynamic
         return _reading(motion, given, candidate, k, moved)
 
     grown = replace(model, function=function)
-    if effect is TIME_DELAY:
+    if effect.in_time:
         grown = replace(grown, signals=(*model.signals, Signal(candidate.moved, 1, "s")))
     if value is not None:
         return grown
@@ -276,5 +284,5 @@ def _coloured(model: Dynamics, colour: Colour) -> Dynamics:
 
     own = state(colour.size, colour.unit, std=colour.std,
                 intensity=2 * colour.std**2 / colour.tau)  # fmt: skip
-    states = (*model.states, replace(own, name=name))
+    states = (*model.states, replace(own, name=name, of_data=True))
     return replace(model, function=function, states=states)

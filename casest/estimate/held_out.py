@@ -15,7 +15,7 @@ from casest.data.splits import interleaved_blocks
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
 from casest.errors import UsageError
-from casest.estimate.calibrate import Estimate
+from casest.estimate.estimate import Estimate
 from casest.leastsquares.problem import Problem
 from casest.solve.trust_region import trust_region
 

@@ -8,16 +8,10 @@ are is the sensor's own data, never its neighbours.
 
 from __future__ import annotations
 
-from functools import lru_cache
-from typing import NamedTuple
-
-import casadi as ca
 import numpy as np
 
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
-from casest.declaration.tracing import function_of
-from casest.engine import Replay
 from casest.estimate.correlation import ENOUGH
 from casest.estimate.covariance import MANY_RESIDUALS
 from casest.estimate.profile_likelihood import HOLD
@@ -25,9 +19,7 @@ from casest.estimate.reasons import (
     ALIKE,
     APART,
     BENT,
-    BEYOND,
     CURVATURE,
-    ON_BOUND,
     PRACTICALLY_NULL,
     SAME,
     SECOND_ORDER,
@@ -40,11 +32,15 @@ from casest.estimate.reasons import (
     Code,
 )
 from casest.estimate.remarks import NOTABLE_BIAS
-from casest.fleet.fit import Bounds, Fits, Flags, Places, minimise, padded, residual_counts
-from casest.fleet.linear import cholesky, dot, form, inverse, lengths, times, whole
-from casest.fleet.sums import Hold, Sensors, SideBySide, Squares
+from casest.fleet.covariance import sandwich
+from casest.fleet.derivatives import bend, dense
+from casest.fleet.fit import Bounds, Fits, Flags, Places, minimise, residual_counts
+from casest.fleet.linear import cholesky, dot, form, times, whole
+from casest.fleet.local import Local, groups, local, rounding
+from casest.fleet.on_bounds import bounded
+from casest.fleet.sums import Hold, Sensors, Squares
 from casest.fleet.verdicts import Judged
-from casest.leastsquares.per_sample import laplacian, residual_and_jacobian, slope_in_sample
+from casest.leastsquares.per_sample import laplacian, slope_in_sample
 from casest.solve.strategy import PARABOLA
 
 #: Steps must have shrunk to this share of the ones before, else second derivatives are computed.
@@ -54,44 +50,29 @@ SHRUNK = 0.1
 SAFETY = 3.5
 
 
-class Local(NamedTuple):
-    """Fits with what follows from them: lengths of J's columns (n, W), (JᵀJ)⁻¹ in units of those
-    (n, n, W), σ (W,), and σ or rounding, whichever is larger (W,)."""
-
-    fits: Fits
-    scale: Array
-    inverse: Array
-    sigma: Array
-    noise: Array
-
-    def some(self, k: Places) -> Local:
-        """Those of the sensors at these places."""
-        fits = self.fits.some(k)
-        return Local(fits, self.scale[:, k], self.inverse[:, :, k], self.sigma[k], self.noise[k])
-
-
 class Judge:
     """Verdicts on fits of one model."""
 
     def __init__(self, model: Model, squares: Squares, noise: float | None) -> None:
         self.model, self.squares, self.expected = model, squares, noise
         positive = [p.shape.positive_diagonal for p in model.parameters for _ in p.entry_names]
-        self.open: Flags = np.array(positive, dtype=bool) | model.implicit
+        # A bound is no answer for these: the residual is open towards it.
+        self.never: Flags = np.array(positive, dtype=bool) | model.implicit
 
     def __call__(self, sensors: Sensors, fits: Fits, bounds: Bounds) -> Judged:
         """Judge W sensors."""
         count = residual_counts(self.squares, sensors)
-        here, freedom = self._local(fits, count)
+        here, freedom = local(fits, count)
         found = Judged.of(here.fits.x.shape, here.sigma, np.sqrt(2 * fits.cost / count))
         found.equations[:] = count
         found.step[:] = np.sqrt(fits.left) * np.minimum(fits.shrink, 1.0) / here.noise
         self._readings(found, sensors)
         self._determined(found, here)
-        here, held = self._bounded(found, here, sensors, bounds)
+        here, held = bounded(found, here, sensors, bounds, self.squares, self.never)
         found.add(Code.NO_REDUNDANCY, freedom <= 0)
         found.add(Code.NOT_FINITE, ~np.isfinite(fits.cost))
         slope = np.sqrt(fits.left / (2 * fits.cost))
-        exact = np.sqrt(fits.left) <= 10 * _rounding(fits, count) * np.sqrt(count)
+        exact = np.sqrt(fits.left) <= 10 * rounding(fits, count) * np.sqrt(count)
         settled = (found.step <= STEP) | (slope <= SLOPE) | exact
         found.add(Code.NOT_SETTLED, np.logical_not(settled))
         if self.expected is not None:
@@ -102,23 +83,16 @@ class Judge:
         unit = here.sigma / here.scale
         np.multiply(here.inverse, unit[:, None], out=found.covariance)
         found.covariance *= unit
-        for k in _groups(count >= MANY_RESIDUALS * len(unit)):
-            found.covariance[:, :, k] = self._robust(here.some(k), sensors.some(k))
+        for k in groups(count >= MANY_RESIDUALS * len(unit)):
+            found.covariance[:, :, k] = sandwich(
+                self.model, self.squares, here.some(k), sensors.some(k)
+            )
         if shift is not None:
             found.covariance[:] += shift
         for i, k in zip(*np.nonzero(held), strict=True):
             found.covariance[i, :, k] = found.covariance[:, i, k] = np.nan
         found.std[:] = np.sqrt(np.einsum("iis->is", found.covariance))
         return found
-
-    def _local(self, fits: Fits, count: Array) -> tuple[Local, Array]:
-        scale = lengths(fits.matrix)
-        factor = cholesky(fits.matrix)
-        factor /= scale[:, None]
-        freedom = count - len(scale)
-        sigma = np.sqrt(2 * fits.cost / np.where(freedom > 0, freedom, np.nan))
-        noise = np.maximum(np.where(np.isfinite(sigma), sigma, 0.0), _rounding(fits, count))
-        return Local(fits, scale, inverse(factor), sigma, noise), freedom
 
     # -- questions to every sensor -----------------------------------------------------------------
 
@@ -157,48 +131,6 @@ class Judge:
         null = ~(found.smallest >= PRACTICALLY_NULL) | nil.any(axis=0)
         found.add(Code.NOT_DETERMINED, np.asarray(usable & null))
 
-    def _bounded(
-        self, found: Judged, here: Local, sensors: Sensors, bounds: Bounds
-    ) -> tuple[Local, Flags]:
-        """The fits with the unknowns held that rightly lie on a bound, and which those are, (n, W).
-
-        See `estimate.on_bounds`: there the cost must rise inwards, and the data may ask for little
-        beyond. Held, an unknown is coupled to no other.
-        """
-        x, width = here.fits.x, ON_BOUND * here.noise / here.scale
-        above = x >= bounds.upper - width
-        near = (x <= bounds.lower + width) | above
-        held, wrong = np.zeros_like(near), np.zeros_like(near)
-        for k in _groups(np.asarray(near.any(axis=0))):
-            slope = self._gradient(here.some(k), sensors.some(k))
-            inwards = np.where(above[:, k], -slope, slope)
-            rows = whole(here.fits.matrix[:, :, k])
-            for j, s in enumerate(k):
-                on = np.flatnonzero(near[:, s])
-                squares = 2 * here.fits.cost[s], found.equations[s] - len(x)
-                beyond = _beyond(rows[:, :, j], on, inwards[on, j], here.noise[s], *squares)
-                wrong[on, s] = ~(beyond <= BEYOND) | self.open[on]
-                held[on, s] = ~wrong[on, s] & (beyond >= -STEP)
-                wrong[on, s] &= beyond >= -STEP
-        found.bound[:] = np.argmax(np.where(wrong.any(axis=0), wrong, near), axis=0)
-        found.lower[:], found.upper[:] = (
-            np.take_along_axis(side, found.bound[None], axis=0)[0] for side in bounds
-        )
-        found.add(Code.BOUND, np.asarray(wrong.any(axis=0)))
-        held &= ~wrong.any(axis=0)
-        if not held.any():
-            return here, held
-        apart = held[:, None] | held
-        apart[np.arange(len(x)), np.arange(len(x))] = False
-        matrix = np.where(apart, 0.0, here.fits.matrix)
-        fits = here.fits._replace(matrix=matrix)
-        return self._local(fits, found.equations.astype(float))[0], held
-
-    def _gradient(self, here: Local, sensors: Sensors) -> Array:
-        """Slope (n, W) of the cost."""
-        residuals = self.squares.residuals(here.fits.x, sensors)
-        return self.squares.pulled(here.fits.x, sensors, residuals)
-
     def _loud(self, sigma: Array, freedom: Array) -> Flags:
         from scipy.stats import chi2  # imported late: SciPy's statistics load slowly
 
@@ -213,7 +145,7 @@ class Judge:
         residuals = self.squares.residuals(here.fits.x, sensors)
         along = np.einsum("mns,mns->s", residuals[:, 1:], residuals[:, :-1])
         share = along / (2 * here.fits.cost)
-        exact = here.sigma < 10 * _rounding(here.fits, np.ones(len(along)))
+        exact = here.sigma < 10 * rounding(here.fits, np.ones(len(along)))
         alike = share * np.sqrt(residuals[..., 0].size) > TIME_SERIES
         found.add(Code.CORRELATED, np.logical_and(alike, np.logical_not(exact)))
 
@@ -223,10 +155,10 @@ class Judge:
         ratios = self._both_ways(here, sensors, bounds, found.weakest, 2.0)
         found.low[:], found.high[:] = ratios.min(axis=0), ratios.max(axis=0)
         plain = (here.fits.shrink <= SHRUNK) & _parabolic(ratios)
-        for k in _groups(~plain & ~found.refused):
+        for k in groups(~plain & ~found.refused):
             self._thorough(found, here.some(k), sensors.some(k), bounds.some(k), k)
         elongated = found.smallest <= 0.1
-        for k in _groups(elongated & ~found.refused):
+        for k in groups(elongated & ~found.refused):
             self._second_valley(found, here.some(k), sensors.some(k), bounds.some(k), k)
 
     def _both_ways(
@@ -255,7 +187,7 @@ class Judge:
     ) -> None:
         """Second derivatives, and the cost along every principal direction."""
         matrix = whole(here.fits.matrix)
-        bent = matrix + _bend(self.model, here.fits.x, sensors)
+        bent = matrix + bend(self.model, here.fits.x, sensors)
         scale = here.scale * here.scale[:, None]
         # Positive definite, and so beyond rounding.
         factor = cholesky((bent - CURVATURE * matrix) / scale)
@@ -268,7 +200,7 @@ class Judge:
             for sign, ratio in zip((1, -1), ratios, strict=True):
                 # The valley may only be bent: fit the other unknowns with this direction held.
                 step = sign * _walk(here, vectors[:, i], 2.0)
-                for j in _groups((ratio > SHAPE[1]) & (ratio <= BENT)):
+                for j in groups((ratio > SHAPE[1]) & (ratio <= BENT)):
                     ratio[j] = self._profiled(
                         here.some(j), sensors.some(j), bounds.some(j), step[:, j]
                     )
@@ -295,27 +227,13 @@ class Judge:
         suspect = ~_parabolic(ratios)
         for sign in (1, -1):
             step = sign * _walk(here, found.weakest[:, k], 6.0)
-            for j in _groups(suspect):
+            for j in groups(suspect):
                 near = bounds.some(j)
                 start = near.inside((here.fits.x + step)[:, j])
                 other = minimise(self.squares, sensors.some(j), start, near, near=False)
                 found.add(Code.AMBIGUOUS, _another(here.some(j), other), k[j])
 
     # -- the noise -------------------------------------------------------------------------------
-
-    def _robust(self, here: Local, sensors: Sensors) -> Array:
-        """Covariance (n, n, W) that holds where noise differs from place to place (HC3)."""
-        bread = whole(here.inverse) / (here.scale * here.scale[:, None])
-        J = _dense(residual_and_jacobian(self.model), here.fits.x, sensors, 1)
-        residual = self.squares.residuals(here.fits.x, sensors).transpose(1, 2, 0)
-        leverage = np.einsum("manw,abw,lbnw->nwml", J, bread, J, optimize=True)
-        left = np.eye(len(J)) - np.where(np.isfinite(leverage), leverage, 0.0)
-        # A residual that the fit follows entirely says nothing: keep the inverse finite.
-        values, vectors = np.linalg.eigh(left)
-        inverse = (vectors / np.maximum(values, 1e-3)[..., None, :]) @ vectors.swapaxes(-1, -2)
-        unseen = np.einsum("nwml,nwl->mnw", inverse, residual)
-        pulls = np.einsum("abw,mbnw,mnw->anw", bread, J, unseen, optimize=True)
-        return np.asarray(np.einsum("anw,bnw->abw", pulls, pulls))
 
     def _second_order(
         self, found: Judged, here: Local, sensors: Sensors, count: Array
@@ -327,7 +245,7 @@ class Judge:
         found.second[:] = self._screened(here, sensors)
         suspect = ~(found.second <= enough) & ~found.refused
         shift = None
-        for k in _groups(suspect):
+        for k in groups(suspect):
             second, bias = self._exact_second_order(here.some(k), sensors.some(k), count[k])
             found.second[k] = second
             found.add(Code.NOISE, ~(second <= SECOND_ORDER), k)
@@ -366,8 +284,8 @@ class Judge:
     ) -> tuple[Array, Array]:
         """The same from second derivatives (W,), and the shift of the unknowns (n, W)."""
         m, x = self.squares.residual_count, here.fits.x
-        slopes = _dense(slope_in_sample(self.model), x, sensors)
-        bends = _dense(laplacian(self.model), x, sensors)
+        slopes = dense(slope_in_sample(self.model), x, sensors)
+        bends = dense(laplacian(self.model), x, sensors)
         ends = np.cumsum([0, *(s.size for s in self.model.signals)])
         squares = np.add.reduceat((slopes**2).sum(axis=2), ends[:-1], axis=1).max(axis=0)
         slope2 = squares * m / count
@@ -376,31 +294,6 @@ class Judge:
         second = np.sqrt((shift**2).sum(axis=(0, 1)) / count) / here.sigma
         pulled = self.squares.pulled(x, sensors, shift) / here.scale
         return second, -times(here.inverse, pulled) / here.scale
-
-
-def _beyond(
-    matrix: Array, on: Places, slope: Array, noise: float, squares: float, freedom: float
-) -> Array:
-    """Standard deviations by which the data ask for values beyond their bounds; negative: inside.
-
-    `matrix` (n, n) is JᵀJ, `slope` that of the cost inwards at the unknowns `on`. What a bound
-    costs of the residual's sum of `squares` is no noise.
-    """
-    free = np.setdiff1d(np.arange(len(matrix)), on).astype(int)
-    found = np.empty(len(on))
-    for j, i in enumerate(on):
-        across = matrix[free, i]
-        left = matrix[i, i] - across @ np.linalg.lstsq(matrix[np.ix_(free, free)], across, None)[0]
-        pull = slope[j] / np.sqrt(left) if left > 0 else np.inf
-        rest = float(np.sqrt(max(squares - pull**2, 0.0) / max(freedom, 1)))
-        found[j] = pull / max(min(noise, rest), 1e-3 * noise, 1e-300)
-    return found
-
-
-def _rounding(fits: Fits, count: Array) -> Array:
-    """Rounding error of one residual, from the sizes of what is added up in it, (W,)."""
-    reach = np.einsum("iis,is->s", fits.matrix, fits.x**2) * len(fits.x) / count
-    return np.asarray(4 * np.finfo(float).eps * np.sqrt(reach) + 1e-300)
 
 
 def _walk(here: Local, direction: Array, deviations: float) -> Array:
@@ -430,12 +323,6 @@ def _another(here: Local, other: Fits) -> Flags:
     return np.asarray((near & (away > APART)) | lower)
 
 
-def _groups(chosen: Flags) -> list[Places]:
-    """The chosen places in one group that NumPy handles alike, if there are any."""
-    k = np.flatnonzero(chosen)
-    return [padded(k)] if k.size else []
-
-
 def _thinned(sensors: Sensors) -> Sensors:
     """A third of the samples, at least eight of them."""
     every = max(1, min(3, sensors.samples.shape[1] // 8))
@@ -447,37 +334,3 @@ def _moved(sensors: Sensors, own: slice, signs: Array, move: Array) -> Sensors:
     samples = sensors.samples.copy()
     samples[own] += signs[:, :, None] * move
     return Sensors(samples, sensors.mask)
-
-
-@lru_cache(maxsize=64)
-def _bends(model: Model) -> tuple[Replay, SideBySide]:
-    """Σ r ∂²r of one sample, lower triangle: what the Hessian of ½rᵀr has beyond JᵀJ."""
-    t = model.traced
-    force = ca.SX.sym("force", t.expression.numel())
-    second = ca.tril(ca.hessian(ca.dot(force, t.expression), t.coordinates)[0])
-    replay = Replay(function_of(model, {"B": ca.substitute(second, force, t.expression)}))
-    return replay, SideBySide(replay, replay.entries(0))
-
-
-def _bend(model: Model, x: Array, sensors: Sensors) -> Array:
-    """The same summed over samples, both triangles, (n, n, W)."""
-    replay, beside = _bends(model)
-    row, column = replay.sparsity[0]
-    total = np.zeros((len(x), *x.shape))
-    for _, s, values in beside.chunks(x, sensors):
-        total[row, column, s] += np.add.reduce(values, axis=1)
-    return whole(total)
-
-
-@lru_cache(maxsize=64)
-def _beside(replay: Replay, output: int) -> SideBySide:
-    return SideBySide(replay, replay.entries(output))
-
-
-def _dense(replay: Replay, x: Array, sensors: Sensors, output: int = 0) -> Array:
-    """One output of every sample, (rows, columns, N, W)."""
-    row, column = replay.sparsity[output]
-    found = np.zeros((*replay.shapes[output], *sensors.samples.shape[1:]))
-    for span, s, values in _beside(replay, output).chunks(x, sensors):
-        found[row, column, span, s] = values
-    return found

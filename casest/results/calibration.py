@@ -9,7 +9,7 @@ from functools import cached_property
 
 from casest.diagnose.misfit.left import Finding
 from casest.effects.placing import prepared
-from casest.estimate.calibrate import Estimate
+from casest.estimate.estimate import Estimate
 from casest.results.file import plain
 from casest.results.fitted import (
     Attachment,

@@ -21,7 +21,7 @@ from casest.diagnose.detectability import detectable, invisible
 from casest.diagnose.formula.terms import source
 from casest.diagnose.cross_validation import rms
 from casest.diagnose.found import Found
-from casest.estimate.calibrate import Estimate
+from casest.estimate.estimate import Estimate
 from casest.leastsquares.problem import Problem
 from casest.results.application import formula_of
 from casest.results.file import plain

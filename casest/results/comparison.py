@@ -8,8 +8,7 @@ from pathlib import Path
 from msgspec import Struct
 
 from casest.comparison.judge import Comparison, Row, Trial
-from casest.data.write import write_atomically
-from casest.errors import DataError
+from casest.data.write import make_folder, write_atomically
 from casest.estimate.reasons import SAME
 from casest.results.file import as_json
 from casest.results.result import Result
@@ -169,9 +168,6 @@ def _ended(trial: Trial, best: float) -> Ended:
 
 def save(folder: Path, result: SolversCompared) -> Path:
     """Write `compare.json` into a folder (made if missing); returns its path."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise DataError(f"{folder}: cannot be made ({error.strerror}); give another -o") from None
+    make_folder(folder)
     write_atomically(folder / "compare.json", as_json(result.content()))
     return folder / "compare.json"

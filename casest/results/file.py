@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 
 from casest.data.logs import file_and_topics
-from casest.data.write import write_atomically
+from casest.data.write import make_folder, write_atomically
 from casest.errors import DataError
 
 RESULT, RESIDUALS = "result.json", "residuals.csv"
@@ -68,10 +68,7 @@ def plain(value: Any) -> Any:
 
 def save(folder: Path, result: Mapping[str, Any], residuals: str | None) -> None:
     """Write both files into a folder (made if missing), each whole or not at all."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise DataError(f"{folder}: cannot be made ({error.strerror}); give another -o") from None
+    make_folder(folder)
     if residuals is not None:
         write_atomically(folder / RESIDUALS, residuals)
     write_atomically(folder / RESULT, as_json(result))

@@ -133,7 +133,7 @@ def find_asked(text: str) -> tuple[tuple[Effect, str], ...]:
 
 def _whole(effect: Effect) -> Effect:
     """A shipped effect that needs neither a column nor a value that must be looked for."""
-    if any(s.name == "channel" for s in effect.extras):
+    if effect.columns:
         raise UsageError(
             f"--effects {effect.name}: this effect needs the column it follows: "
             f"--effects '{effect.name}(COLUMN)'"

@@ -19,7 +19,7 @@ from casest.declaration.effect import Attached
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
 from casest.declaration.symbols import Constant
-from casest.estimate.calibrate import Estimate
+from casest.estimate.estimate import Estimate
 from casest.leastsquares.agreement import between_runs
 from casest.results.application import Application, application_of
 from casest.results.file import digest_of_values, plain

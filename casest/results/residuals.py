@@ -11,8 +11,8 @@ from casest.data.run import Run
 from casest.declaration.shapes import Array
 from casest.diagnose.candidates.candidates import usable_columns
 from casest.diagnose.misfit.variables import variables
-from casest.estimate.calibrate import Estimate
 from casest.estimate.correlation import is_series
+from casest.estimate.estimate import Estimate
 from casest.leastsquares.problem import Problem
 from casest.results.units import unit_table
 from casest.results.values import Entry, entries

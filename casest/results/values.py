@@ -9,7 +9,7 @@ import numpy as np
 
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
-from casest.estimate.calibrate import Estimate
+from casest.estimate.estimate import Estimate
 from casest.results.file import plain
 from casest.results.result import Parameter
 from casest.results.units import entry_units, unit_table

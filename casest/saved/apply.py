@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -16,33 +17,94 @@ from casest.correction.numpy_module import as_data
 from casest.correction.program import Program
 from casest.data import load_runs
 from casest.data.run import Run
-from casest.data.write import write_atomically
+from casest.data.write import make_folder, write_atomically
 from casest.declaration.shapes import Array
+from casest.declaration.symbols import Signal
 from casest.errors import DataError, UsageError
 from casest.results.saved import SavedResult, saved_correction
 from casest.results.written import corrected_file
 
 #: Samples corrected at once, and numbers held for them: memory does not grow with the record.
 PIECE, HELD = 4096, 2**24
+#: Share of what the calibration saw by which a reading may leave it without a remark: noise, and
+#: poses that are not the extreme ones, do. Ranges that are named in one.
+MARGIN, SAID = 0.1, 3
+
+
+class Applied(NamedTuple):
+    """CSV with time, the readings and the corrected readings, units in the header.
+
+    Beside it the effects that are `left` in the readings (see `invertible`), and `remarks`: how
+    the data were read, and where they leave what the calibration saw.
+    """
+
+    text: str
+    left: tuple[str, ...]
+    remarks: tuple[str, ...]
 
 
 def corrected_csv(
     path: Path, data: str, arguments: Mapping[str, Any], *, force: bool = False
-) -> tuple[str, tuple[str, ...]]:
-    """CSV with time, the readings and the corrected readings, units in the header.
+) -> Applied:
+    """The data corrected as the result says.
 
-    Beside it the effects that are left in the readings (see `invertible`). The correction is the
-    one that the result carries: nothing of the model's source is run.
+    The correction is the one that the result carries: nothing of the model's source is run.
+    Readings are converted to the unit that they had in the fit, or refused.
     """
     result, carried = saved_correction(path, force=force, what="applies")
     program = carried.of_run(_run_number(carried, result, data))[0]
     spare = {s.name for s in carried.signals} - {s.name for s in carried.needed}
-    runs = load_runs([data], carried.needed, **without(spare, arguments))
-    _same_units(result, runs, data)
+    needed = [s if s.unit else replace(s, unit=fitted_unit(result, s)) for s in carried.needed]
+    runs = load_runs([data], needed, **without(spare, arguments))
     found = [corrected(program, run) for run in runs]
     unit = result.units.get(program.output.name)
-    given = [s.name for s in carried.needed]
-    return table_of(runs, given, found, program.output.name, unit), program.left
+    text = table_of(runs, [s.name for s in needed], found, program.output.name, unit)
+    notes = dict.fromkeys(note for run in runs for note in run.notes)
+    far = () if _was_fitted(result, data) else extrapolated(carried, runs)
+    return Applied(text, program.left, (*notes, *_of_units(result, runs, data), *far))
+
+
+def fitted_unit(result: SavedResult, signal: Signal) -> str | None:
+    """The unit that a signal had in the fit; None where nobody knew it, so that any will do."""
+    stated = result.units.get(signal.name, "")
+    return stated if stated and "[" not in stated and signal.kind == "plain" else None
+
+
+def _of_units(result: SavedResult, runs: Sequence[Run], data: str) -> Iterator[str]:
+    """That a unit cannot be compared with that of the fit, which nobody stated."""
+    for name, unit in runs[0].units.items():
+        if unit and result.units.get(name) == f"[{name}]":
+            yield (
+                f"{data}: {name} is in {unit}; nobody stated the unit of {name} when the result "
+                "was made, and it is taken to be the same: calibrate again with --unit to be sure"
+            )
+
+
+def extrapolated(carried: Carried, runs: Sequence[Run]) -> Iterator[str]:
+    """How many samples lie outside what the calibration saw, and in which numbers."""
+    if not carried.seen:
+        return
+    place, far, said = 0, [np.zeros(len(run), dtype=bool) for run in runs], []
+    for i in carried.program.inputs:
+        own = carried.seen[place : place + i.size]
+        place += i.size
+        if i.kind == "rotation" or i.name == "t":  # of time, `of_another_time` speaks
+            continue
+        for k, (axis, (low, high)) in enumerate(zip(axes(i.size), own, strict=True)):
+            margin = MARGIN * (high - low) + 1e-9 * max(abs(low), abs(high))
+            parts = [run.signals[i.name][:, k] for run in runs]
+            beyond = [(x < low - margin) | (x > high + margin) for x in parts]
+            if any(b.any() for b in beyond):
+                far = [f | b for f, b in zip(far, beyond, strict=True)]
+                least, most = min(x.min() for x in parts), max(x.max() for x in parts)
+                said.append(f"{i.name}{axis} {least:.4g} to {most:.4g} ({low:.4g} to {high:.4g})")
+    if said:
+        count, rows = sum(int(f.sum()) for f in far), sum(map(len, runs))
+        more = f" and {len(said) - SAID} more" if len(said) > SAID else ""
+        yield (
+            f"{count} of {rows} rows lie outside what the calibration saw, in brackets: "
+            f"{', '.join(said[:SAID])}{more}; there the correction extrapolates"
+        )
 
 
 def corrected(program: Program, run: Run) -> Array:
@@ -68,9 +130,11 @@ def corrected(program: Program, run: Run) -> Array:
 def of_another_time(path: Path, data: str | None = None) -> tuple[str, ...]:
     """Effects that follow the time of the fitted record, unless it is that record again."""
     result, carried = saved_correction(path, force=True, what="reads")
-    if data is not None and Path(data).resolve() in {Path(d).resolve() for d in result.data}:
-        return ()
-    return carried.timed
+    return () if data is not None and _was_fitted(result, data) else carried.timed
+
+
+def _was_fitted(result: SavedResult, data: str) -> bool:
+    return Path(data).resolve() in {Path(d).resolve() for d in result.data}
 
 
 def without(spare: Iterable[str], arguments: Mapping[str, Any]) -> dict[str, Any]:
@@ -96,16 +160,6 @@ def _run_number(carried: Carried, result: SavedResult, data: str) -> int:
     )
 
 
-def _same_units(result: SavedResult, runs: tuple[Run, ...], data: str) -> None:
-    for name, unit in runs[0].units.items():
-        fitted = result.units.get(name)
-        if fitted and unit and "[" not in fitted and unit != fitted:
-            raise DataError(
-                f"{data}: signal {name} is in {unit}, the result was made in {fitted}; "
-                f"give the data in {fitted} (--unit says what a file's numbers are)"
-            )
-
-
 def table_of(
     runs: Sequence[Run], given: Sequence[str], found: Sequence[Array], name: str, unit: str | None
 ) -> str:
@@ -117,8 +171,8 @@ def table_of(
     header = ["run"] * several + ["row"] + ["t [s]"] * (first.time is not None)
     for signal in given:
         own = _bracket(first.units.get(signal))
-        header += [f"{signal}{a}{own}" for a in _axes(first.signals[signal])]
-    header += [f"{name}{'_' * bool(a)}{a}{_bracket(unit)}" for a in _axes(found[0])]
+        header += [f"{signal}{a}{own}" for a in axes(first.signals[signal].shape[1])]
+    header += [f"{name}{'_' * bool(a)}{a}{_bracket(unit)}" for a in axes(found[0].shape[1])]
     writer.writerow(header)
     for run, value in zip(runs, found, strict=True):
         numbers = np.column_stack([*(run.signals[signal] for signal in given), value])
@@ -130,8 +184,8 @@ def table_of(
     return text.getvalue()
 
 
-def _axes(values: Array) -> list[str]:
-    size = values.shape[1]
+def axes(size: int) -> list[str]:
+    """What follows a signal's name in a header, for each of its numbers."""
     return [""] if size == 1 else list("xyz") if size == 3 else [str(i) for i in range(size)]
 
 
@@ -142,9 +196,6 @@ def _bracket(unit: str | None) -> str:
 def write_to(output: Path, text: str) -> Path:
     """To a .csv file, or to corrected.csv in a folder; returns which."""
     output = corrected_file(output)
-    try:
-        output.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise DataError(f"{output.parent}: cannot be made ({error.strerror})") from None
+    make_folder(output.parent)
     write_atomically(output, text)
     return output

@@ -25,7 +25,7 @@ from casest.errors import DataError, UsageError
 from casest.escaping import c_identifier
 from casest.results.file import load_json
 from casest.results.saved import SavedResult, saved_correction
-from casest.saved.apply import corrected, table_of, without
+from casest.saved.apply import Applied, corrected, table_of, without
 
 #: What the JSON form calls itself; its schema is `casest/correction/correction.schema.json`.
 FORMAT = "casest-correction-1"
@@ -111,11 +111,8 @@ class _Exported(Struct):
     not_undone: list[str] = []
 
 
-def applied(path: Path, data: str, arguments: Mapping[str, Any]) -> tuple[str, tuple[str, ...]]:
-    """CSV of readings and corrected values by an exported JSON correction alone.
-
-    Beside it the effects that are left in the readings.
-    """
+def applied(path: Path, data: str, arguments: Mapping[str, Any]) -> Applied:
+    """The data corrected by an exported JSON correction alone."""
     content = typed(load_json(path), _Exported, str(path))
     if content.format != FORMAT:
         raise UsageError(f"{path}: format {content.format!r}; this casest reads {FORMAT}")
@@ -125,7 +122,8 @@ def applied(path: Path, data: str, arguments: Mapping[str, Any]) -> tuple[str, t
     runs = load_runs([data], signals, **without(spare, arguments))
     found, out = [corrected(built, run) for run in runs], built.output
     text = table_of(runs, [s.name for s in signals], found, out.name, out.unit)
-    return text, built.left
+    notes = dict.fromkeys(note for run in runs for note in run.notes)
+    return Applied(text, built.left, tuple(notes))
 
 
 def _unit(stated: str) -> str | None:

@@ -19,15 +19,15 @@ import numpy as np
 from casest import __version__
 from casest.data import load_runs
 from casest.data.run import Run
-from casest.data.write import write_atomically
+from casest.data.write import make_folder, write_atomically
 from casest.declaration.shapes import Array
 from casest.declaration.tracing import flat
 from casest.dynamics.declare import Dynamics
 from casest.dynamics.extended import over_samples, replay
 from casest.dynamics.transition import checked_time, steps_to
 from casest.effects.moving import (
+    CATALOGUE,
     COLOURED,
-    TIME_DELAY,
     Body,
     Candidate,
     Colour,
@@ -89,7 +89,7 @@ def simulated_motion(
     values = dict(values or {})
     model = model.beginning(**{s.name: values.pop(s.name) for s in model.states
                                if s.name in values})  # fmt: skip
-    early = _longest_delay(values)
+    early = _longest_delay(model, values)
     if inputs is None:
         course = random_course(model, t, rng, early=early)
     else:
@@ -193,10 +193,10 @@ def _numbers(kind: _Kind, value: Array) -> Any:
     return {"correlation_time": plain(value[0]), "std": plain(value[1]), "unit": kind.unit}
 
 
-def _longest_delay(values: Mapping[str, Any]) -> float:
+def _longest_delay(model: Dynamics, values: Mapping[str, Any]) -> float:
     """How long before the record the truth must be known, s."""
-    given = [np.max(np.asarray(v, float), initial=0.0) for n, v in values.items()
-             if n.endswith(f"_{TIME_DELAY.name}")]  # fmt: skip
+    late = {e.state_of(s.name) for e in CATALOGUE if e.in_time for s in model.signals}
+    given = [np.max(np.asarray(v, float), initial=0.0) for n, v in values.items() if n in late]
     return float(max([1.0, *given]))
 
 
@@ -205,18 +205,18 @@ def _sensed(
 ) -> dict[str, Array]:
     """What sensors read without noise, (N, size) each."""
     of_mean = [(kind, value) for kind, value in placed if isinstance(kind, Candidate)]
-    delays = {k.on: float(v[0]) for k, v in of_mean if k.effect is TIME_DELAY}
-    changed = [(k, v) for k, v in of_mean if k.effect.on == "output" and k.effect is not TIME_DELAY]
+    delays = {k: float(v[0]) for k, v in of_mean if k.effect.in_time}
+    changed = [(k, v) for k, v in of_mean if k.effect.on == "output" and k not in delays]
     there = extended(model, changed)
     signals = course.inputs(t)
     for kind, value in of_mean:
         if kind.effect.on == "input":
             signals[kind.on] = _misread(kind, value, signals[kind.on])
     signals |= _outputs(there, course, t)
-    for name, late in delays.items():
+    for kind, late in delays.items():
         if not -(t[1] - t[0]) <= late < t[-1] - t[0]:
-            raise UsageError(f"--value {name}_{TIME_DELAY.name}={late:g}: not within the record")
-        signals[name] = _outputs(there, course, np.minimum(t - late, t[-1]))[name]
+            raise UsageError(f"--value {kind.state}={late:g}: not within the record")
+        signals[kind.on] = _outputs(there, course, np.minimum(t - late, t[-1]))[kind.on]
     return signals
 
 
@@ -283,7 +283,7 @@ def written_motion(
         "effects": list(made.effects),
     }  # fmt: skip
     paths = folder / "record.csv", folder / "truth.json", folder / "truth.csv"
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     time = np.asarray(made.run.time)
     heads = [f"{n} [{u}]" for n, u in zip(model.names, model.state_units, strict=True)]
     write_atomically(paths[0], record_text(model.signals, made.run))

@@ -25,11 +25,12 @@ from casest import __version__
 from casest.correction.inverse import Correction
 from casest.data import load_runs
 from casest.data.run import Run
-from casest.data.write import write_atomically
+from casest.data.write import make_folder, write_atomically
 from casest.declaration.effect import NOISE, Effect
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
 from casest.declaration.symbols import Signal
+from casest.declaration.tracing import function_of
 from casest.effects.placing import placed_in, prepared, with_numbers
 from casest.errors import UsageError
 from casest.leastsquares.problem import Problem
@@ -213,16 +214,16 @@ def _of_directions(
     model: Model, run: Run, values: Mapping[str, Array], rng: np.random.Generator
 ) -> tuple[str, Array]:
     """Readings that correct to random directions of the known length."""
-    lengths = [c for c in model.constants if c.name == "norm"]
     plain_signals = [s for s in model.signals if s.kind == "plain" and s.size == 3]
-    corrected = model.traced.corrected
-    if not lengths or len(plain_signals) != 1 or corrected is None:
+    length = _known_length(model, values)
+    if length is None or len(plain_signals) != 1:
         raise UsageError(
-            f"{model.name} is implicit and has no `norm`: its readings cannot be simulated"
+            f"{model.name} is implicit, and no constant of it is the length of what is corrected: "
+            "its readings cannot be simulated"
         )
     name = plain_signals[0].name
     target = rng.standard_normal((len(run), 3))
-    target *= float(lengths[0].array) / np.linalg.norm(target, axis=1, keepdims=True)
+    target *= length / np.linalg.norm(target, axis=1, keepdims=True)
     function = Correction(model).as_function()[1]
     point = np.concatenate(model.point(dict(values)))
     v = ca.SX.sym("v", 3)
@@ -239,6 +240,33 @@ def _of_directions(
             if np.linalg.norm(step) <= 1e-14 * (1 + np.linalg.norm(readings[k])):
                 break
     return name, readings
+
+
+def _known_length(model: Model, values: Mapping[str, Array]) -> float | None:
+    """The constant that is the length of what is corrected: the residual says so, being zero then.
+
+    It is tried at random readings, with each constant in turn set to the length that they have.
+    """
+    corrected = model.traced.corrected
+    if corrected is None or model.traced.quantities[corrected].value.shape != (3, 1):
+        return None
+    point = np.concatenate(model.point(dict(values)))
+    sample = np.random.default_rng(0).standard_normal(sum(s.size for s in model.signals))
+
+    def tried(**lengths: float) -> tuple[float, float]:
+        """Size of the residual, and length of what is corrected."""
+        of = model.having(**lengths)
+        corrected_now = of.traced.quantities[corrected].value
+        outputs = {"residual": of.traced.expression, "corrected": corrected_now}
+        found = function_of(of, outputs)(point, sample)
+        return float(ca.norm_2(found[0])), float(ca.norm_2(found[1]))
+
+    length = tried()[1]
+    for c in (c for c in model.constants if not c.dims):
+        near, far = tried(**{c.name: length})[0], tried(**{c.name: 2 * length})[0]
+        if near < 1e-9 * far:
+            return float(c.array)
+    return None
 
 
 def written(
@@ -265,7 +293,7 @@ def written(
         "effects": [a.label for a in model.effects],
     }
     record, truth_file = folder / "record.csv", folder / "truth.json"
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     write_atomically(record, text)
     write_atomically(truth_file, json.dumps(content, indent=1) + "\n")
     return record, truth_file

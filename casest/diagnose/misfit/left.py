@@ -24,7 +24,7 @@ from casest.diagnose.noise.noise_model import noise_model, step_of
 from casest.diagnose.noise.slow_course import slow_course
 from casest.diagnose.noise.spectral_line import strongest_line
 from casest.effects.placing import prepared
-from casest.estimate.calibrate import Estimate
+from casest.estimate.estimate import Estimate
 from casest.leastsquares.agreement import between_runs
 from casest.leastsquares.problem import Point, Problem
 from casest.leastsquares.weights import robust_scale, weighted
