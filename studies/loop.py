@@ -35,7 +35,7 @@ from casest import Model, Run, effect, param, signal  # noqa: E402
 from casest.declaration.physics import cos, exp, tanh  # noqa: E402
 from casest.declaration.shapes import each  # noqa: E402
 from casest.diagnose import detectability, loop  # noqa: E402
-from casest.diagnose.selection.cross_validation import cross_fitted, rms  # noqa: E402
+from casest.diagnose.cross_validation import cross_fitted, rms  # noqa: E402
 from casest.effects import CATALOGUE  # noqa: E402
 from casest.effects.placing import prepared  # noqa: E402
 from casest.estimate.estimate import Estimate  # noqa: E402

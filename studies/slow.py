@@ -30,7 +30,7 @@ from scipy.stats import beta  # noqa: E402
 from thermistor import thermistor  # noqa: E402
 
 from casest import Model, Residual, Run, attempt, model, param, quantity, signal  # noqa: E402
-from casest.diagnose.misfit.specification_test import doubts  # noqa: E402
+from casest.diagnose.misfit.left import doubts  # noqa: E402
 from casest_problems.norm import norm_triangular  # noqa: E402
 
 TABLE = ROOT / "studies" / "slow.md"
