@@ -107,14 +107,18 @@ def test_an_own_effect_on_the_noise_is_used_where_readings_lie_far_out():
         ),
         (
             {"columns": {"warmth": "warm"}},
-            "effect sag: columns= says 'warm': give temperature or other or any",
+            "effect sag: columns= says 'warm': give temperature or other or any or angle",
         ),
         (
             {"columns": {"warmth": "any", "supply": "any"}},
             "effect sag: columns= names 2 arguments, and one column is looked for",
         ),
         ({"numbers": {"at": "mean"}}, "numbers= names 'at', which is none of its parameters"),
-        ({"numbers": {"k": "median"}}, "numbers= says 'median': give mean or duration"),
+        ({"numbers": {"k": "median"}}, "numbers= says 'median': give mean or duration or radian"),
+        (
+            {"profile": {"k": "moment"}},
+            "effect sag: profile= says 'moment': give frequency or time or timescale or level",
+        ),
         (
             {"seen_in": "tails"},
             "seen_in= is for effects on the noise, and this one acts on 'output'",
