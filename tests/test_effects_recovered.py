@@ -231,6 +231,19 @@ def test_an_offset_that_bends_with_a_column(effect, column):
     assert_recovered(fitted(cell, effect, run, channel=column), bend=0.004)
 
 
+@pytest.mark.parametrize(
+    ("effect", "column"),
+    [(effects.temperature_gain_curve, "warm"), (effects.channel_gain_curve, "amps")],
+)
+def test_a_gain_that_bends_with_a_column(effect, column):
+    b, x = known_field(), 22 + 6 * np.sin(0.11 * T) + 0.05 * T
+    bend = np.array([4e-5, 6e-5, -3e-5])
+    away = x - np.mean(x)
+    read = b + np.column_stack([b[:, i] * away * away * bend[i] for i in range(3)])
+    found = fitted(compass, effect, of_compass(read, b, **{column: x}), channel=column)
+    assert_recovered(found, bend=bend, k=np.zeros(3), hard=HARD)
+
+
 @pytest.mark.parametrize("unit", ["deg", "rad"])
 def test_harmonics_of_a_recorded_angle_in_its_own_unit(unit):
     """cos² is half a constant and half a second harmonic; a phasor's real part is a first one."""

@@ -14,9 +14,11 @@ from casest.effects.columns import (
     channel_bias,
     channel_curve,
     channel_gain,
+    channel_gain_curve,
     temperature_bias,
     temperature_curve,
     temperature_gain,
+    temperature_gain_curve,
 )
 from casest.effects.course import bias_course, reference_wander
 from casest.effects.motion import (
@@ -60,9 +62,11 @@ CATALOGUE: tuple[Effect, ...] = (
     temperature_bias,
     temperature_gain,
     temperature_curve,
+    temperature_gain_curve,
     channel_bias,
     channel_gain,
     channel_curve,
+    channel_gain_curve,
     harmonic,
     second_harmonic,
     time_delay,

@@ -60,6 +60,27 @@ def temperature_curve(
 
 
 @effect(
+    on="input",
+    typical={"k": 3e-4, "bend": 1e-5},
+    shown_by="large inputs at three values of the channel or more",
+    formula="u·(1 + k·(channel − at) + bend·(channel − at)²)",
+    columns={"channel": "temperature"},
+    numbers={"at": "mean"},
+)
+def temperature_gain_curve(
+    u: SX,
+    channel: SX,
+    *,
+    k: SX = param(each, "1/[channel]"),
+    bend: SX = param(each, "1/[channel]^2"),
+    at: SX = constant(0.0),
+) -> SX:
+    """A gain that follows temperature in a bent line, about its mean `at`."""
+    x = channel - at
+    return u * (1 + k * x + bend * x**2)
+
+
+@effect(
     on="output",
     shown_by="the same input at two values of the channel",
     formula="y + k·(channel − at)",
@@ -105,3 +126,23 @@ def channel_curve(
     """An offset that follows another recorded channel in a bent line, about its mean `at`."""
     x = channel - at
     return y + k * x + bend * x**2
+
+
+@effect(
+    on="input",
+    shown_by="large inputs at three values of the channel or more",
+    formula="u·(1 + k·(channel − at) + bend·(channel − at)²)",
+    columns={"channel": "other"},
+    numbers={"at": "mean"},
+)
+def channel_gain_curve(
+    u: SX,
+    channel: SX,
+    *,
+    k: SX = param(each, "1/[channel]"),
+    bend: SX = param(each, "1/[channel]^2"),
+    at: SX = constant(0.0),
+) -> SX:
+    """A gain that follows another recorded channel in a bent line, about its mean `at`."""
+    x = channel - at
+    return u * (1 + k * x + bend * x**2)
