@@ -288,12 +288,12 @@ def test_the_angle_that_a_wheel_turns_by_is_left_to_the_effects_on_it():
     assert angles(wheel, prepared(wheel, [run])) == ["roll"]
 
 
-@pytest.mark.parametrize(("unit", "said"), [(None, "no unit"), ("V", "V")])
+@pytest.mark.parametrize(("unit", "said"), [(None, "has no unit"), ("V", "is in V")])
 def test_a_harmonic_of_what_is_no_angle_is_refused_with_the_unit(unit, said):
     b = known_field()
     run = of_compass(b, b, heading=T)
     run.units["heading"] = unit
-    with pytest.raises(UnitError, match=f"heading is in {said}, .* --unit heading=deg"):
+    with pytest.raises(UnitError, match=f"heading {said}, .* --unit heading=deg"):
         fitted(compass, effects.harmonic, run, channel="heading")
 
 

@@ -77,13 +77,16 @@ def test_an_angle_is_a_column_in_deg_or_rad_and_is_told_how_many_rad_that_is():
     turned = 3.0 * np.arange(400)
     run = replace(
         run,
-        columns={**run.columns, "heading": turned, "slope": turned**2, "rate": turned**3},
+        columns={
+            **run.columns,
+            **{"heading": turned, "slope": turned**2, "rate": turned**3, "theta_rad": turned**4},
+        },
         column_units={**run.column_units, "heading": "deg", "slope": "rad", "rate": "deg/s"},
     )
     found, _ = candidates(cell, prepared(cell, [run]), [harmonic])
-    assert [c.label for c in found] == ["harmonic(heading)", "harmonic(slope)"]
+    assert [c.label for c in found] == [f"harmonic({n})" for n in ("heading", "slope", "theta_rad")]
     numbers = [float(dict(c.effect.declarations)["radian"].array) for c in found]
-    assert numbers == pytest.approx([np.pi / 180, 1.0])
+    assert numbers == pytest.approx([np.pi / 180, 1.0, 1.0])
 
 
 def test_a_harmonic_of_a_column_without_a_unit_is_not_tried_and_says_why():
@@ -92,7 +95,7 @@ def test_a_harmonic_of_a_column_without_a_unit_is_not_tried_and_says_why():
     asked = replace(harmonic, columns=(("channel", "=heading"),))
     found, skipped = candidates(cell, prepared(cell, [run]), [asked])
     assert not found
-    assert "heading is in no unit, and an angle is in deg or rad" in skipped[0].reason
+    assert "heading has no unit, and an angle is in deg or rad" in skipped[0].reason
 
 
 def test_a_number_of_an_effect_is_what_data_say():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -13,6 +14,9 @@ from casest.declaration.model import Model
 from casest.declaration.shapes import Array
 from casest.errors import CasestError, UnitError
 from casest.units import conversion, known, size
+
+#: How a name says the unit of an angle: theta_rad.
+_ENDING = re.compile(r"[_ ](rad|deg)$", re.IGNORECASE)
 
 
 def prepared(model: Model, runs: Sequence[Run]) -> tuple[Run, ...]:
@@ -94,27 +98,32 @@ def angles(model: Model, runs: Sequence[Run]) -> list[str]:
     But for `angle`, which a model turns by: what goes with it is what the mounting declares, and
     axis_wobble.
     """
-    recorded = [n for n in (runs[0].columns if runs else ()) if _is_angle(runs[0].units.get(n))]
-    own = [s.name for s in model.signals if s.size == 1 and _is_angle(s.unit)]
-    inner = [n for n, q in model.quantities.items() if not q.dims and _is_angle(q.unit)]
+    recorded = [n for n in (runs[0].columns if runs else ()) if _angle(n, runs[0].units.get(n))]
+    own = [s.name for s in model.signals if s.size == 1 and _angle(s.name, s.unit)]
+    inner = [n for n, q in model.quantities.items() if not q.dims and _angle(n, q.unit)]
     found = dict.fromkeys([*recorded, *own, *inner])
     return [n for n in found if n != "angle" or n not in model.quantities]
 
 
-def _is_angle(unit: str | None) -> bool:
-    return bool(unit) and known(str(unit)) and size(str(unit))[1] == size("rad")[1]
+def _angle(name: str, unit: str | None) -> str:
+    """The unit of an angle, which a name may end with (theta_rad); empty for what is none."""
+    if not unit:
+        ending = _ENDING.search(name)
+        return ending[1].lower() if ending else ""
+    return unit if known(unit) and size(unit)[1] == size("rad")[1] else ""
 
 
 def _radian(column: str, runs: Sequence[Run], model: Model | None) -> float:
     """Radians for each unit of a column, signal or quantity."""
     inner = model.quantities if model is not None else {}
-    of_runs = {run.units.get(column) for run in runs if column in run.signals}
-    found = of_runs or {inner[column].unit if column in inner else None}
-    units = sorted(unit or "no unit" for unit in found)
-    if not all(map(_is_angle, found)):
-        raise UnitError(
-            f"{column} is in {units[0]}, and an angle is in deg or rad: --unit {column}=deg"
-        )
+    given = {run.units.get(column) for run in runs if column in run.signals}
+    given = given or {inner[column].unit if column in inner else None}
+    units = {_angle(column, unit) for unit in given}
+    if "" in units:
+        other = next(unit for unit in given if not _angle(column, unit))
+        has = f"is in {other}" if other else "has no unit"
+        raise UnitError(f"{column} {has}, and an angle is in deg or rad: --unit {column}=deg")
     if len(units) > 1:
-        raise UnitError(f"{column} is in {' and in '.join(units)}: give all files in one of them")
-    return conversion(units[0], "rad")[0]
+        both = " and in ".join(sorted(units))
+        raise UnitError(f"{column} is in {both}: give all files in one of them")
+    return conversion(units.pop(), "rad")[0]

@@ -29,13 +29,14 @@ def cross_axis(u: SX, *, k: SX = param(3)) -> SX:
     return vertcat(u[0], u[1] + k[0] * u[0], u[2] + k[1] * u[0] + k[2] * u[1])
 
 
+# Without a typical size, as soft_iron: what a declared gain or scale takes up is not hidden in it.
 @effect(
     on="input",
     shown_by="inputs of known size along each axis",
     formula="u·(1 + k)",
 )
 def axis_gain(u: SX, *, k: SX = param(each)) -> SX:
-    """Each axis has a gain of its own. No typical size: a declared gain takes all of it up."""
+    """Each axis has a gain of its own."""
     return u * (1 + k)
 
 
@@ -48,7 +49,7 @@ def soft_iron(u: SX, *, k: SX = param(9)) -> SX:
     """Every axis sees every other: iron that turns with the sensor bends the field into them.
 
     K row by row (Vasconcelos et al. 2011, C_SI − 1), gains on its diagonal. As much of it is
-    determined as the declared gains, axes and mounting leave. No typical size, as for axis_gain.
+    determined as the declared gains, axes and mounting leave.
     """
     _three_axes(u)
     return u + vertcat(*(dot(k[row : row + 3], u) for row in (0, 3, 6)))
@@ -61,8 +62,7 @@ def soft_iron(u: SX, *, k: SX = param(9)) -> SX:
     formula="u + k·|u|",
 )
 def gain_by_sign(u: SX, *, k: SX = param(each)) -> SX:
-    """The gain is 1 + k for inputs above zero, 1 − k below (IEEE Std 1293, scale factor
-    asymmetry)."""
+    """A gain of 1 + k for inputs above zero, 1 − k below: scale factor asymmetry (IEEE Std 528)."""
     return u + k * fabs(u)
 
 
