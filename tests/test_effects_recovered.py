@@ -22,9 +22,11 @@ from casest import (
     sin,
 )
 from casest.declaration.dimensions import check_units
+from casest.effects.on_axes import restricted
 from casest.effects.placing import angles, placed_in, prepared, told
 from casest.errors import CasestError
 from casest.results.find import find_model
+from casest.saved.model import saved_model
 
 N, NOISE, FIELD = 600, 0.02, 48.0
 HARD, ZERO, STEP = np.array([5.0, -8.0, 2.0]), 0.3, 0.1
@@ -112,6 +114,24 @@ def test_soft_iron_is_all_nine_numbers_of_a_field_bent_by_iron():
         response += pulls * np.outer(seen_by, rod)
     found = fitted(compass, effects.soft_iron, of_compass(bent, b))
     assert_recovered(found, hard=HARD, k=response.ravel())
+
+
+def test_some_terms_of_soft_iron_are_named_by_row_and_column_and_kept_in_a_result():
+    b, seen = known_field(), [[1, 0.03, 0], [0, 1, 0], [-0.02, 0, 1]]
+    placed = replace(effects.soft_iron, on="field")
+    part = restricted(placed, [1, 6], compass)
+    found = fitted(compass, part, of_compass(b @ np.array(seen).T, b))
+    assert_recovered(found, k_xy=0.03, k_zx=-0.02, hard=HARD)
+    # What a result keeps of it: the whole effect's name, and the unknowns that it had.
+    kept = {"name": "soft_iron", "on": "corrected", "file": effects.__file__, "columns": {}}
+    numbers = {n: {"value": v} for n, v in (("soft_iron.k_xy", 0.03), ("soft_iron.k_zx", -0.02))}
+    numbers |= {"scale": {"value": [1, 1, 1]}, "offset": {"value": [0, 0, 0]}}
+    again, _ = saved_model(
+        {"model": "norm-diagonal", "effects": [kept], "constants": {"norm": 1.0},
+         "estimate": {"parameters": numbers}}
+    )  # fmt: skip
+    added = [p.name for p in again.parameters if p.name.startswith("soft_iron")]
+    assert added == ["soft_iron.k_xy", "soft_iron.k_zx"]
 
 
 def test_a_gain_that_differs_by_the_sign_of_the_input():
