@@ -13,6 +13,7 @@ from casest import (
     Residual,
     Run,
     UnitError,
+    UsageError,
     calibrate,
     effects,
     model,
@@ -21,6 +22,7 @@ from casest import (
     signal,
     sin,
 )
+from casest.correction.inverse import Correction, invertible
 from casest.declaration.dimensions import check_units
 from casest.effects.on_axes import restricted
 from casest.effects.placing import angles, placed_in, prepared, told
@@ -204,6 +206,18 @@ def test_a_field_that_sways_is_an_error_of_the_reference_and_of_no_offset():
     assert np.isclose(found.rmse, NOISE, rtol=0.05)
     other = fitted(compass, effects.bias_course, run)  # which no offset can explain
     assert other.rmse > 3 * NOISE
+
+
+def test_a_field_that_sways_is_not_taken_out_of_what_the_magnetometer_felt():
+    b, sway = known_field(), 0.006 * swaying()
+    run = of_compass(b * (1 + sway)[:, None], b)
+    found = fitted(compass, effects.reference_wander, run)
+    with pytest.raises(UsageError, match=r"describes a record .reference_wander.: not undone"):
+        Correction(found.model)
+    kept, left = invertible(found.model)
+    assert left == ("reference_wander",)
+    felt = Correction(kept)(run, {"hard": found.values["hard"]})
+    assert np.abs(felt - b * (1 + sway)[:, None]).max() < 5 * NOISE
 
 
 def test_an_offset_that_wanders_is_no_error_of_the_reference():
