@@ -30,8 +30,8 @@ from casest.errors import DataError, UsageError
 
 #: What is said of effects that a correction leaves in the readings.
 LEFT = (
-    "not undone, since that would amplify the noise without bound or carry the course of one record "
-    "to another: "
+    "not undone, since that would amplify the noise without bound or carry the course of one "
+    "record to another: "
 )
 
 #: What is said of effects that follow the time of the record they were found in.
