@@ -21,7 +21,7 @@ from casest import (
     signal,
 )
 from casest.diagnose.candidates.candidates import candidates
-from casest.effects import harmonic, pulse, warm_up
+from casest.effects import bias_course, harmonic, pulse, warm_up
 from casest.effects.placing import prepared
 
 
@@ -103,6 +103,13 @@ def test_a_number_of_an_effect_is_what_data_say():
     ((candidate,), _) = candidates(cell, prepared(cell, [run]), [sagging])
     about = dict(candidate.effect.declarations)["about"]
     assert float(about.array) == pytest.approx(run.columns["case"].mean(), rel=1e-5)
+
+
+def test_an_effect_with_as_many_unknowns_as_there_are_residuals_is_not_tried():
+    for count, tried in ((8, 0), (9, 1)):  # two of the cell's, six of the course
+        found, skipped = candidates(cell, prepared(cell, [recorded(count)]), [bias_course])
+        assert len(found) == tried
+        assert tried or skipped[-1].reason == "with it there are 8 unknowns for 8 residuals"
 
 
 @pytest.mark.parametrize(("effect", "said"), [(pulse, "start and stop"), (warm_up, "tau")])

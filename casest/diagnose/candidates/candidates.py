@@ -211,7 +211,18 @@ def _tried(candidate: Candidate, model: Model, runs: Sequence[Run]) -> Candidate
             raise UsageError(f"the data have no {s.name!r}")
     if effect is not None and not shipped(effect):
         check_units(extended)
+    _refuse_more_than_data(extended, runs)
     return candidate
+
+
+def _refuse_more_than_data(extended: Model, runs: Sequence[Run]) -> None:
+    """As many unknowns as residuals fit anything, and leave no noise to judge it by."""
+    unknowns = sum(
+        p.shape.coordinates * (len(runs) if p.scope == "run" else 1) for p in extended.parameters
+    )
+    residuals = sum(map(len, runs)) * len(extended.axes)
+    if unknowns >= residuals:
+        raise UsageError(f"with it there are {unknowns} unknowns for {residuals} residuals")
 
 
 def typical_sizes(candidate: Candidate, parameters: Sequence[Parameter], model: Model) -> Any:
