@@ -124,3 +124,31 @@ def test_a_unit_in_brackets_is_that_of_the_symbol_it_names():
     check_units(ratio)
     with pytest.raises(UnitError, match=r"\[u\]"):
         check_units(wrong)
+
+
+def test_powers_of_a_unit_that_only_data_state_are_followed():
+    def bent(unit):
+        @model
+        def ratio(u=signal(1), w=signal(1), *, k=param(unit)):
+            return Residual(measured=w, predicted=k * u**3)
+
+        return ratio
+
+    check_units(bent("[w]/[u]^3"))
+    check_units(bent("[w]/([u])^2/[u]"))
+    with pytest.raises(UnitError, match=r"\[u\]\^"):
+        check_units(bent("[w]/[u]^2"))
+
+
+def test_a_unit_in_brackets_may_be_that_of_a_quantity():
+    def lever(unit):
+        @model
+        def arm(x=signal("mm"), v=signal("V"), *, k=param(unit)):
+            path = quantity("path", 2 * x, "mm")
+            return Residual(measured=v, predicted=k * path)
+
+        return arm
+
+    check_units(lever("V/[path]"))
+    with pytest.raises(UnitError, match="prediction of v"):
+        check_units(lever("V*[path]"))

@@ -21,6 +21,7 @@ from casest import (
     signal,
 )
 from casest.diagnose.candidates.candidates import candidates
+from casest.effects import bias_course, harmonic, pulse, warm_up
 from casest.effects.placing import prepared
 
 
@@ -71,11 +72,51 @@ def test_an_effect_says_which_columns_are_looked_at_for_it(kind, expected):
     assert [c.label for c in found] == expected
 
 
+def test_an_angle_is_a_column_in_deg_or_rad_and_is_told_how_many_rad_that_is():
+    run = recorded()
+    turned = 3.0 * np.arange(400)
+    run = replace(
+        run,
+        columns={
+            **run.columns,
+            **{"heading": turned, "slope": turned**2, "rate": turned**3, "theta_rad": turned**4},
+        },
+        column_units={**run.column_units, "heading": "deg", "slope": "rad", "rate": "deg/s"},
+    )
+    found, _ = candidates(cell, prepared(cell, [run]), [harmonic])
+    assert [c.label for c in found] == [f"harmonic({n})" for n in ("heading", "slope", "theta_rad")]
+    numbers = [float(dict(c.effect.declarations)["radian"].array) for c in found]
+    assert numbers == pytest.approx([np.pi / 180, 1.0, 1.0])
+
+
+def test_a_harmonic_of_a_column_without_a_unit_is_not_tried_and_says_why():
+    run = recorded()
+    run = replace(run, columns={**run.columns, "heading": np.arange(400.0)})
+    asked = replace(harmonic, columns=(("channel", "=heading"),))
+    found, skipped = candidates(cell, prepared(cell, [run]), [asked])
+    assert not found
+    assert "heading has no unit, and an angle is in deg or rad" in skipped[0].reason
+
+
 def test_a_number_of_an_effect_is_what_data_say():
     run = recorded()
     ((candidate,), _) = candidates(cell, prepared(cell, [run]), [sagging])
     about = dict(candidate.effect.declarations)["about"]
     assert float(about.array) == pytest.approx(run.columns["case"].mean(), rel=1e-5)
+
+
+def test_an_effect_with_as_many_unknowns_as_there_are_residuals_is_not_tried():
+    for count, tried in ((8, 0), (9, 1)):  # two of the cell's, six of the course
+        found, skipped = candidates(cell, prepared(cell, [recorded(count)]), [bias_course])
+        assert len(found) == tried
+        assert tried or skipped[-1].reason == "with it there are 8 unknowns for 8 residuals"
+
+
+@pytest.mark.parametrize(("effect", "said"), [(pulse, "start and stop"), (warm_up, "tau")])
+def test_what_is_not_searched_for_is_said(effect, said):
+    found, skipped = candidates(cell, prepared(cell, [recorded()]), [effect])
+    assert not found
+    assert skipped[0].reason == f"its {said} are not searched for"
 
 
 def test_an_own_effect_finds_its_column():
@@ -107,14 +148,18 @@ def test_an_own_effect_on_the_noise_is_used_where_readings_lie_far_out():
         ),
         (
             {"columns": {"warmth": "warm"}},
-            "effect sag: columns= says 'warm': give temperature or other or any",
+            "effect sag: columns= says 'warm': give temperature or other or any or angle",
         ),
         (
             {"columns": {"warmth": "any", "supply": "any"}},
             "effect sag: columns= names 2 arguments, and one column is looked for",
         ),
         ({"numbers": {"at": "mean"}}, "numbers= names 'at', which is none of its parameters"),
-        ({"numbers": {"k": "median"}}, "numbers= says 'median': give mean or duration"),
+        ({"numbers": {"k": "median"}}, "numbers= says 'median': give mean or duration or radian"),
+        (
+            {"profile": {"k": "moment"}},
+            "effect sag: profile= says 'moment': give frequency or time or timescale or level",
+        ),
         (
             {"seen_in": "tails"},
             "seen_in= is for effects on the noise, and this one acts on 'output'",

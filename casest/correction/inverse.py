@@ -29,7 +29,10 @@ from casest.engine import Replay
 from casest.errors import DataError, UsageError
 
 #: What is said of effects that a correction leaves in the readings.
-LEFT = "not undone, which would amplify the noise without bound: "
+LEFT = (
+    "not undone, since that would amplify the noise without bound or carry the course of one "
+    "record to another: "
+)
 
 #: What is said of effects that follow the time of the record they were found in.
 TIMED = "found at the times of the fitted record, and a guess for any other: "
@@ -41,11 +44,18 @@ STEPS, HALVINGS = 60, 30
 def invertible(model: Model) -> tuple[Model, tuple[str, ...]]:
     """The model without the effects that a correction of single samples cannot undo; their labels.
 
-    Those are effects on the sequence of samples, and those that act on rates of the reading.
+    Those are effects on the sequence of samples, those that act on rates of the reading, and what
+    describes the course of the fitted record, which says nothing of another one.
     """
     if model.traced.corrected is None:
         return model, ()
-    left = [a for a in model.effects if a.kind == "sequence" or _acts_on_a_rate(model, a)]
+    left = [
+        a
+        for a in model.effects
+        if a.kind == "sequence"
+        or (a.effect.describes and a.kind != "noise")
+        or _acts_on_a_rate(model, a)
+    ]
     kept = tuple(a for a in model.effects if a not in left)
     return replace(model, effects=kept), tuple(a.label for a in left)
 
@@ -91,8 +101,8 @@ class Correction:
         left = invertible(self.model)[1]
         if left:
             raise UsageError(
-                f"model {self.model.name} has an effect on the sequence of samples or on rates "
-                f"({', '.join(left)}): undoing it would amplify the noise without bound; "
+                f"model {self.model.name} has an effect on the sequence of samples, on rates, or "
+                f"one that describes a record ({', '.join(left)}): {LEFT.rpartition(':')[0]}; "
                 "`invertible` gives the model without it"
             )
         if not self.model.implicit and not ca.depends_on(

@@ -18,7 +18,7 @@ from typing import Any
 import casadi as ca
 
 from casest import units
-from casest.declaration.effect import Attached
+from casest.declaration.effect import Attached, of_columns
 from casest.declaration.model import Model
 from casest.declaration.symbols import Constant, param
 from casest.declaration.temperatures import Zero, followed, of_symbol, refuse_other_zero
@@ -140,6 +140,8 @@ def _size(unit: str, model: Model) -> Size:
     own: dict[str, Fraction] = {}
     for match in _PLACEHOLDER.finditer(text):
         power = -_ONE if text[: match.start()].rstrip("( ").endswith("/") else _ONE
+        raised = _POWER.match(text, match.end())
+        power *= int(raised[1]) if raised else 1
         own[match[0]] = own.get(match[0], Fraction(0)) + power
     factor, dimension = units.size(_PLACEHOLDER.sub("1", text) or "1")
     # An angle is a ratio of lengths: rad counts as 1, deg as the factor to it.
@@ -148,11 +150,12 @@ def _size(unit: str, model: Model) -> Size:
 
 
 _PLACEHOLDER = re.compile(r"\[([^\]]+)\]")
+_POWER = re.compile(r"[) ]*(?:\^|\*\*) *(\d+)")
 
 
 def _replacement(name: str, model: Model) -> str:
-    """The unit of a symbol in brackets, or the placeholder itself where it has none."""
-    symbol = model.symbols.get(name)
+    """The unit of a symbol or quantity in brackets, or the placeholder where it has none."""
+    symbol = model.symbols.get(name) or model.quantities.get(name)
     unit = symbol.unit if symbol is not None else None
     if not unit or "," in unit or unit == f"[{name}]":
         return f"[{name}]"
@@ -168,7 +171,8 @@ def _open(attached: Attached) -> Attached:
     found, more = [], []
     for name, declared in attached.effect.declarations:
         if isinstance(declared, Constant) and declared.unit and not declared.dims:
-            opened = param(declared.unit, start=float(declared.array))
+            unit = of_columns(declared.unit, dict(attached.columns))
+            opened = param(unit, start=float(declared.array))
             more.append(replace(opened, name=f"{attached.label}.{name}"))
             declared = more[-1]
         found.append((name, declared))

@@ -20,9 +20,11 @@ Kind = Literal["quantity", "signal", "noise", "sequence"]
 #: What an effect on the noise acts on, instead of a quantity.
 NOISE = "noise"
 #: What an effect may say of a column that is looked for among those recorded: a temperature, any
-#: other, or both; of a number that data tell; and of where one on the noise shows itself.
-COLUMNS = ("temperature", "other", "any")
-NUMBERS = ("mean", "duration")
+#: other, or both, or an angle; of a number that data tell; of what is searched over a grid; and of
+#: where one on the noise shows itself.
+COLUMNS = ("temperature", "other", "any", "angle")
+NUMBERS = ("mean", "duration", "radian")
+PROFILES = ("frequency", "time", "timescale", "level")
 TAILS, RANDOM_WALK = "tails", "random walk"
 
 
@@ -33,12 +35,14 @@ class Effect:
     `on` names what it acts on; `extras` are further signals, columns or quantities it reads;
     `null` maps each parameter to the value at which the effect vanishes (0 unless told).
     For tracing a residual: `typical` sizes of the parameters, each in its unit; `profile` the
-    parameters that are searched over a grid (name -> "frequency", "time" or "level"), because the
-    effect is not smooth in them or has many valleys; `shown_by` the measurement that shows it;
-    `plain` the form that it is tried in once it was found; `columns` the argument for which a
-    recorded column is looked for (name -> "temperature", "other" or "any"); `numbers` those that
-    data tell (name -> "mean" of that column, or "duration" of the record); `seen_in` where an
-    effect on the noise shows itself: the "tails" of the residuals, or a "random walk" in them.
+    parameters that are searched over a grid (name -> "frequency", "time", "timescale" or "level"),
+    because the effect is not smooth in them or has many valleys; `shown_by` the measurement that
+    shows it; `plain` the form that it is tried in once it was found; `columns` the argument for
+    which a recorded column is looked for (name -> "temperature", "other", "any" or "angle", which
+    is also a scalar signal or quantity of the model in rad or deg); `numbers` those that data tell
+    (name -> "mean" of that column, "radian": rad for each of its unit, or "duration" of the
+    record); `seen_in` where an effect on the noise shows itself: the "tails" of the residuals, or a
+    "random walk" in them; `describes`: it says what a course looks like, and names no cause.
     """
 
     name: str
@@ -59,6 +63,7 @@ class Effect:
     columns: tuple[tuple[str, str], ...] = ()
     numbers: tuple[tuple[str, str], ...] = ()
     seen_in: str = ""
+    describes: bool = False
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         """Evaluate the effect's own function."""
@@ -98,6 +103,7 @@ def effect(
     columns: Mapping[str, str] | None = None,
     numbers: Mapping[str, str] | None = None,
     seen_in: str = "",
+    describes: bool = False,
 ) -> Callable[[Callable[..., Any]], Effect]:
     """Declare an effect: first argument the value acted on, further ones signals or columns.
 
@@ -121,7 +127,8 @@ def effect(
             ("numbers", numbers),
         ):  # fmt: skip
             _refuse_unknown(function.__name__, word, given or {}, [name for name, _ in keyword])
-        _refuse_other_words(function.__name__, on, extras, columns or {}, numbers or {}, seen_in)
+        said = {"columns": columns or {}, "numbers": numbers or {}, "profile": profile or {}}
+        _refuse_other_words(function.__name__, on, extras, said, seen_in)
         declared_kind: Kind = kind or ("noise" if on == NOISE else "quantity")
         declarations = tuple(_declaration(function.__name__, name, d) for name, d in keyword)
         return Effect(
@@ -141,6 +148,7 @@ def effect(
             tuple((columns or {}).items()),
             tuple((numbers or {}).items()),
             seen_in,
+            describes,
         )
 
     return declare
@@ -159,11 +167,11 @@ def _refuse_other_words(
     name: str,
     on: str,
     extras: Sequence[Signal],
-    columns: Mapping[str, str],
-    numbers: Mapping[str, str],
+    given: Mapping[str, Mapping[str, str]],
     seen_in: str,
 ) -> None:
-    """What is said of columns, numbers and the noise must be what the loop knows."""
+    """What is said of columns, numbers, grids and the noise must be what the loop knows."""
+    columns = given["columns"]
     for argument in set(columns) - {s.name for s in extras}:
         raise DeclarationError(
             f"effect {name}: columns= names {argument!r}, which is no argument that it reads"
@@ -176,14 +184,13 @@ def _refuse_other_words(
         raise DeclarationError(
             f"effect {name}: seen_in= is for effects on the noise, and this one acts on {on!r}"
         )
-    said: list[tuple[str, str, tuple[str, ...]]]
-    said = [("columns", w, COLUMNS) for w in columns.values()]
-    said += [("numbers", w, NUMBERS) for w in numbers.values()]
+    known_words = {"columns": COLUMNS, "numbers": NUMBERS, "profile": PROFILES}
+    said = [(word, w, known_words[word]) for word, own in given.items() for w in own.values()]
     said += [("seen_in", seen_in, (TAILS, RANDOM_WALK))] if seen_in else []
-    for word, given, known_words in said:
-        if given not in known_words:
+    for word, what, known_ones in said:
+        if what not in known_ones:
             raise DeclarationError(
-                f"effect {name}: {word}= says {given!r}: give {' or '.join(known_words)}"
+                f"effect {name}: {word}= says {what!r}: give {' or '.join(known_ones)}"
             )
 
 
@@ -294,7 +301,7 @@ def attach(
         first = next(iter(inspect.signature(declared.function).parameters))
         own = units.get(on) or f"[{on}]"
         own = f"({own})" if set("/*") & set(own) else own
-        renamed = tuple(_of_columns(u.replace(f"[{first}]", own), columns) for u in parameter.units)
+        renamed = tuple(of_columns(u.replace(f"[{first}]", own), columns) for u in parameter.units)
         for unit in renamed:
             if "[" not in unit and unit and not known(unit):
                 raise UnitError(f"effect {label}: {name} has unknown unit {unit!r}")
@@ -303,7 +310,7 @@ def attach(
     return Attached(declared, on, kind, label, renamed_columns, tuple(parameters), inner)
 
 
-def _of_columns(unit: str, columns: Mapping[str, str]) -> str:
+def of_columns(unit: str, columns: Mapping[str, str]) -> str:
     """The unit with the names of the columns that an effect reads: [channel] is [tyre temp]."""
     for name, column in columns.items():
         if not set("[]") & set(column):

@@ -203,7 +203,8 @@ class Sensor:
     def trials(self, fit: Fit) -> list[Trial]:
         """Every candidate in its columns, over its grid."""
         seen = self.seen(fit, self.linear(fit))
-        expanded = [c for one in self.found(fit)[0] for c in on_grid(one, seen)]
+        causes = [c for c in self.found(fit)[0] if not _describes(c) or self.asked(c)]
+        expanded = [c for one in causes for c in on_grid(one, seen)]
         return self.trials_of(fit, expanded)
 
     def trials_of(self, fit: Fit, several: Sequence[Candidate]) -> list[Trial]:
@@ -393,6 +394,11 @@ class Sensor:
 def replace_effects(fit: Fit, model: Model) -> Fit:
     """The fit as if its model were another."""
     return replace(fit, model=model)
+
+
+def _describes(candidate: Candidate) -> bool:
+    """Is it a course of unknown cause?"""
+    return candidate.effect is not None and candidate.effect.describes
 
 
 def _plain(candidate: Candidate) -> Candidate | None:

@@ -8,15 +8,19 @@ that name. So a user's own model gets every effect whose quantity it has.
 from __future__ import annotations
 
 from casest.declaration.effect import Effect
-from casest.effects.bias import (
-    bias_drift,
-    bias_step,
+from casest.effects.angles import harmonic, second_harmonic
+from casest.effects.bias import bias_drift, bias_step, pulse, warm_up
+from casest.effects.columns import (
     channel_bias,
+    channel_curve,
     channel_gain,
-    reference_drift,
+    channel_gain_curve,
     temperature_bias,
+    temperature_curve,
     temperature_gain,
+    temperature_gain_curve,
 )
+from casest.effects.course import bias_course, reference_wander
 from casest.effects.motion import (
     axis_wobble,
     imbalance,
@@ -25,21 +29,27 @@ from casest.effects.motion import (
     vibration,
 )
 from casest.effects.noise import bias_wander, outliers
-from casest.effects.reference import table_angle
+from casest.effects.reference import reference_drift, table_angle
 from casest.effects.response import (
+    axis_gain,
     cross_axis,
     cross_quadratic,
     cubic,
     dead_zone,
+    gain_by_sign,
     quadratic,
     saturation,
     signed_cubic,
     signed_quadratic,
+    soft_iron,
 )
 from casest.effects.timing import axis_delay, hysteresis, low_pass, time_delay
 
 CATALOGUE: tuple[Effect, ...] = (
+    axis_gain,
     cross_axis,
+    soft_iron,
+    gain_by_sign,
     quadratic,
     signed_quadratic,
     cubic,
@@ -47,10 +57,18 @@ CATALOGUE: tuple[Effect, ...] = (
     cross_quadratic,
     bias_drift,
     bias_step,
+    pulse,
+    warm_up,
     temperature_bias,
     temperature_gain,
+    temperature_curve,
+    temperature_gain_curve,
     channel_bias,
     channel_gain,
+    channel_curve,
+    channel_gain_curve,
+    harmonic,
+    second_harmonic,
     time_delay,
     axis_delay,
     low_pass,
@@ -64,6 +82,8 @@ CATALOGUE: tuple[Effect, ...] = (
     hysteresis,
     table_angle,
     reference_drift,
+    reference_wander,
+    bias_course,
     bias_wander,
     outliers,
 )

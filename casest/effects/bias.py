@@ -1,11 +1,11 @@
-"""Offsets and gains that change: with time, at an event, with temperature, with any channel."""
+"""Offsets that change: with time, at an event, after switching on."""
 
 from __future__ import annotations
 
 from casest.declaration.effect import effect
-from casest.declaration.physics import SX
+from casest.declaration.physics import SX, exp, inf
 from casest.declaration.shapes import each
-from casest.declaration.symbols import constant, param, signal
+from casest.declaration.symbols import param, signal
 
 
 @effect(
@@ -35,68 +35,31 @@ def bias_step(
 
 @effect(
     on="output",
-    typical={"k": 2e-3},
-    shown_by="the same pose at two temperatures, not rising with time alone",
-    formula="y + k·(channel − at)",
-    columns={"channel": "temperature"},
-    numbers={"at": "mean"},
+    typical={"k": 0.02},
+    profile={"start": "time", "stop": "time"},
+    shown_by="the same pose before, during and after the event",
+    formula="y + k from t = start on, until t = stop",
 )
-def temperature_bias(
-    y: SX, channel: SX, *, k: SX = param(each, "[y]/[channel]"), at: SX = constant(0.0)
+def pulse(
+    y: SX,
+    t: SX = signal("s"),
+    *,
+    k: SX = param(each, "[y]"),
+    start: SX = param("s"),
+    stop: SX = param("s"),
 ) -> SX:
-    """An offset that follows temperature, about its mean `at`."""
-    return y + k * (channel - at)
-
-
-@effect(
-    on="input",
-    typical={"k": 3e-4},
-    shown_by="large inputs at two temperatures, not rising with time alone",
-    formula="u·(1 + k·(channel − at))",
-    columns={"channel": "temperature"},
-    numbers={"at": "mean"},
-)
-def temperature_gain(
-    u: SX, channel: SX, *, k: SX = param(each, "1/[channel]"), at: SX = constant(0.0)
-) -> SX:
-    """A gain that follows temperature, about its mean `at`."""
-    return u * (1 + k * (channel - at))
+    """An offset between two moments: a magnet that comes and goes, a motor that runs."""
+    return y + k * (t > start) * (t <= stop)
 
 
 @effect(
     on="output",
-    shown_by="the same input at two values of the channel",
-    formula="y + k·(channel − at)",
-    columns={"channel": "other"},
-    numbers={"at": "mean"},
+    typical={"k": 0.02},
+    profile={"tau": "timescale"},
+    null={"tau": inf},
+    shown_by="the first pose repeated: soon after switching on, and when it has long been on",
+    formula="y + k·exp(−t/tau)",
 )
-def channel_bias(
-    y: SX, channel: SX, *, k: SX = param(each, "[y]/[channel]"), at: SX = constant(0.0)
-) -> SX:
-    """An offset that follows another recorded channel, about its mean `at`."""
-    return y + k * (channel - at)
-
-
-@effect(
-    on="input",
-    shown_by="large inputs at two values of the channel",
-    formula="u·(1 + k·(channel − at))",
-    columns={"channel": "other"},
-    numbers={"at": "mean"},
-)
-def channel_gain(
-    u: SX, channel: SX, *, k: SX = param(each, "1/[channel]"), at: SX = constant(0.0)
-) -> SX:
-    """A gain that follows another recorded channel, about its mean `at`."""
-    return u * (1 + k * (channel - at))
-
-
-@effect(
-    on="input",
-    typical={"k": 1e-6},
-    shown_by="the same pose at the beginning and at the end, for large and small inputs",
-    formula="u·(1 + k·t)",
-)
-def reference_drift(u: SX, t: SX = signal("s"), *, k: SX = param("1/s")) -> SX:
-    """The known reference (field, gravity, table) changes size with time."""
-    return u * (1 + k * t)
+def warm_up(y: SX, t: SX = signal("s"), *, k: SX = param(each, "[y]"), tau: SX = param("s")) -> SX:
+    """An offset that dies away from the start of the record: what settles after switching on."""
+    return y + k * exp(-t / tau)

@@ -6,6 +6,7 @@ from casest.declaration.effect import effect
 from casest.declaration.physics import SX, cos, der, sin
 from casest.declaration.shapes import each
 from casest.declaration.symbols import constant, param, signal
+from casest.effects.course import legendre
 
 
 @effect(
@@ -59,17 +60,9 @@ def speed_polynomial(
     c: SX = param(4, "rad", per="run"),
     duration: SX = constant(1.0, "s"),
 ) -> SX:
-    """Higher terms of the speed law: degrees 5 to 8 in the angle (drag is no cubic).
-
-    Legendre's polynomials over the record: powers could not be told apart.
-    """
-    x = 2 * t / duration - 1
-    before, here, more = x**0, x, 0 * x
-    for degree in range(2, 9):
-        before, here = here, ((2 * degree - 1) * x * here - (degree - 1) * before) / degree
-        if degree >= 5:
-            more = more + c[degree - 5] * here
-    return angle + more
+    """Higher terms of the speed law: degrees 5 to 8 in the angle (drag is no cubic)."""
+    course = legendre(t, duration, 8)[5:]
+    return angle + sum(c[k] * p for k, p in enumerate(course))
 
 
 @effect(

@@ -22,6 +22,7 @@ def outliers(r: SX) -> SX:
     shown_by="a long record at rest (Allan deviation)",
     formula="y + a random walk (its size: wander, under noise)",
     seen_in="random walk",
+    describes=True,
 )
 def bias_wander(r: SX) -> SX:
     """The offset walks at random: bias instability (IEEE Std 952).

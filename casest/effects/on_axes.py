@@ -59,6 +59,18 @@ def restricted(effect: Effect, kept: Sequence[int], model: Model) -> Effect:
     )
 
 
+def lengths(effect: Effect, model: Model) -> set[int]:
+    """How long the effect's vectors of unknowns are, where it is attached."""
+    place = model.quantities.get(effect.on)
+    own = [
+        d.decided((place.declared.numel() if place else 0,)) if isinstance(d, Undecided) else d
+        for _, d in effect.declarations
+    ]
+    return {d.shape.size for d in own if isinstance(d, Parameter) and len(d.shape.dims) == 1}
+
+
 def axis_name(i: int, size: int) -> str:
-    """As in the names of the restricted unknowns."""
+    """As in the names of the restricted unknowns; of a 3x3 matrix by row and column."""
+    if size == 9:
+        return "xyz"[i // 3] + "xyz"[i % 3]
     return "xyz"[i] if size == 3 else str(i)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -11,7 +12,11 @@ from casest.data.run import Run
 from casest.declaration.effect import Attached, Effect
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
-from casest.errors import CasestError
+from casest.errors import CasestError, UnitError
+from casest.units import conversion, known, size
+
+#: How a name says the unit of an angle: theta_rad.
+_ENDING = re.compile(r"[_ ](rad|deg)$", re.IGNORECASE)
 
 
 def prepared(model: Model, runs: Sequence[Run]) -> tuple[Run, ...]:
@@ -54,26 +59,71 @@ def placed_in(effect: Effect, model: Model) -> Effect:
 
 
 def told(model: Model, runs: Sequence[Run]) -> Model:
-    """The model whose effects that follow a column are told their numbers by these runs."""
+    """The model whose effects are told their numbers by these runs."""
 
     def numbered(attached: Attached) -> Attached:
-        if not attached.columns:
-            return attached
-        return replace(attached, effect=with_numbers(attached.effect, attached.columns, runs))
+        own = with_numbers(attached.effect, attached.columns, runs, model)
+        return attached if own is attached.effect else replace(attached, effect=own)
 
     return replace(model, effects=tuple(numbered(a) for a in model.effects))
 
 
 def with_numbers(
-    effect: Effect, columns: tuple[tuple[str, str], ...], runs: Sequence[Run]
+    effect: Effect,
+    columns: tuple[tuple[str, str], ...],
+    runs: Sequence[Run],
+    model: Model | None = None,
 ) -> Effect:
-    """Numbers that come from the data: the channel's mean, the record's duration."""
+    """Numbers that come from the data: the channel's mean and unit, the record's duration.
+
+    `model` tells the unit of a channel that is one of its quantities. Raises UnitError where a
+    channel should be an angle and is none.
+    """
     values: dict[str, float] = {}
     for name, what in effect.numbers:
         if what == "mean" and columns:
             x = np.concatenate([run.signals[columns[0][1]][:, 0] for run in runs])
             values[name] = float(f"{np.mean(x):.6g}")
+        if what == "radian" and columns:
+            values[name] = _radian(columns[0][1], runs, model)
         if what == "duration":
             ends = [float(np.ptp(run.signals["t"])) for run in runs if "t" in run.signals]
             values[name] = float(f"{max(ends, default=1.0) or 1.0:.6g}")
     return effect.holding(**values) if values else effect
+
+
+def angles(model: Model, runs: Sequence[Run]) -> list[str]:
+    """Recorded columns, scalar signals and quantities that are angles. `runs` are prepared.
+
+    But for `angle`, which a model turns by: what goes with it is what the mounting declares, and
+    axis_wobble.
+    """
+    recorded = [n for n in (runs[0].columns if runs else ()) if _angle(n, runs[0].units.get(n))]
+    own = [s.name for s in model.signals if s.size == 1 and _angle(s.name, s.unit)]
+    inner = [n for n, q in model.quantities.items() if not q.dims and _angle(n, q.unit)]
+    found = dict.fromkeys([*recorded, *own, *inner])
+    return [n for n in found if n != "angle" or n not in model.quantities]
+
+
+def _angle(name: str, unit: str | None) -> str:
+    """The unit of an angle, which a name may end with (theta_rad); empty for what is none."""
+    if not unit:
+        ending = _ENDING.search(name)
+        return ending[1].lower() if ending else ""
+    return unit if known(unit) and size(unit)[1] == size("rad")[1] else ""
+
+
+def _radian(column: str, runs: Sequence[Run], model: Model | None) -> float:
+    """Radians for each unit of a column, signal or quantity."""
+    inner = model.quantities if model is not None else {}
+    given = {run.units.get(column) for run in runs if column in run.signals}
+    given = given or {inner[column].unit if column in inner else None}
+    units = {_angle(column, unit) for unit in given}
+    if "" in units:
+        other = next(unit for unit in given if not _angle(column, unit))
+        has = f"is in {other}" if other else "has no unit"
+        raise UnitError(f"{column} {has}, and an angle is in deg or rad: --unit {column}=deg")
+    if len(units) > 1:
+        both = " and in ".join(sorted(units))
+        raise UnitError(f"{column} is in {both}: give all files in one of them")
+    return conversion(units.pop(), "rad")[0]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from casest.declaration.effect import effect
-from casest.declaration.physics import SX, fabs, fmax, inf, sign, vertcat
+from casest.declaration.physics import SX, dot, fabs, fmax, inf, sign, vertcat
 from casest.declaration.shapes import each
 from casest.declaration.symbols import param
 from casest.errors import UsageError
@@ -27,6 +27,43 @@ def cross_axis(u: SX, *, k: SX = param(3)) -> SX:
     """
     _three_axes(u)
     return vertcat(u[0], u[1] + k[0] * u[0], u[2] + k[1] * u[0] + k[2] * u[1])
+
+
+# Without a typical size, as soft_iron: what a declared gain or scale takes up is not hidden in it.
+@effect(
+    on="input",
+    shown_by="inputs of known size along each axis",
+    formula="u·(1 + k)",
+)
+def axis_gain(u: SX, *, k: SX = param(each)) -> SX:
+    """Each axis has a gain of its own."""
+    return u * (1 + k)
+
+
+@effect(
+    on="input",
+    shown_by="known directions that cover the sphere (a norm sees six of the nine)",
+    formula="u + K·u, K of three rows: k[0] k[1] k[2]; k[3] k[4] k[5]; k[6] k[7] k[8]",
+)
+def soft_iron(u: SX, *, k: SX = param(9)) -> SX:
+    """Every axis sees every other: iron that turns with the sensor bends the field into them.
+
+    K row by row (Vasconcelos et al. 2011, C_SI − 1), gains on its diagonal. As much of it is
+    determined as the declared gains, axes and mounting leave.
+    """
+    _three_axes(u)
+    return u + vertcat(*(dot(k[row : row + 3], u) for row in (0, 3, 6)))
+
+
+@effect(
+    on="input",
+    typical={"k": 1e-3},
+    shown_by="inputs of both signs on each axis",
+    formula="u + k·|u|",
+)
+def gain_by_sign(u: SX, *, k: SX = param(each)) -> SX:
+    """A gain of 1 + k for inputs above zero, 1 − k below: scale factor asymmetry (IEEE Std 528)."""
+    return u + k * fabs(u)
 
 
 @effect(

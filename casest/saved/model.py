@@ -14,7 +14,7 @@ from casest import effects
 from casest.declaration.effect import Effect
 from casest.declaration.model import Model
 from casest.declaration.symbols import constant
-from casest.effects.on_axes import axis_name, restricted
+from casest.effects.on_axes import axis_name, lengths, restricted
 from casest.errors import DataError, UsageError
 from casest.results.find import find_effects, find_model
 
@@ -90,7 +90,7 @@ def _as_it_was(effect: Effect, saved: Mapping[str, Any], own: set[str], model: M
     effect = effect.holding(**saved.get("numbers", {}))
     if own <= {n for n, _ in effect.declarations} or saved["on"] not in model.quantities:
         return effect
-    size = model.quantities[saved["on"]].declared.numel()
-    ends = {n.rpartition("_")[2] for n in own}
+    placed, ends = replace(effect, on=saved["on"]), {n.rpartition("_")[2] for n in own}
+    size = max(lengths(placed, model))
     kept = [i for i in range(size) if axis_name(i, size) in ends]
-    return replace(restricted(replace(effect, on=saved["on"]), kept, model), on=effect.on)
+    return replace(restricted(placed, kept, model), on=effect.on)

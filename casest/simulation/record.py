@@ -58,7 +58,7 @@ def with_effects(
                 "readings yourself"
             )
         columns = _columns_of(effect, found[2], model, run)
-        effect = with_numbers(placed_in(effect, model), columns, prepared(model, (run,)))
+        effect = with_numbers(placed_in(effect, model), columns, prepared(model, (run,)), model)
         model = model.with_effect(effect, columns=dict(columns))
     return model
 

@@ -16,7 +16,7 @@ from casest.declaration.model import Model
 from casest.declaration.shapes import Array
 from casest.declaration.symbols import Parameter
 from casest.effects import shipped
-from casest.effects.placing import placed_in, with_numbers
+from casest.effects.placing import angles, placed_in, with_numbers
 from casest.errors import CasestError, UsageError
 
 #: Columns whose name or unit says that they are temperatures.
@@ -129,6 +129,8 @@ def candidates(
     found: list[Candidate] = []
     skipped: list[Skipped] = []
     channels, unusable = _channels(model, runs)
+    unfit = {s.name for s in unusable}
+    turning = [n for n in angles(model, runs) if n not in unfit]
     skipped += unusable
     for effect in catalogue:
         if effect.on == NOISE:
@@ -138,11 +140,13 @@ def candidates(
         except CasestError as error:
             skipped.append(Skipped(effect.name, str(error)))
             continue
-        for columns in _columns_for(placed, channels):
-            candidate = Candidate(with_numbers(placed, columns, runs), columns)
-            if any(c.label == candidate.label and c.effect == candidate.effect for c in found):
-                continue  # of the catalogue, and asked for with its column
+        for columns in _columns_for(placed, channels, turning):
+            candidate = Candidate(placed, columns)
             try:
+                told = with_numbers(placed, columns, runs, model)
+                candidate = replace(candidate, effect=told)
+                if any(c.label == candidate.label and c.effect == told for c in found):
+                    continue  # of the catalogue, and asked for with its column
                 found.append(_tried(candidate, model, runs))
             except CasestError as error:
                 skipped.append(Skipped(candidate.label, str(error)))
@@ -153,16 +157,21 @@ def candidates(
     return found, skipped
 
 
-def _columns_for(effect: Effect, channels: Mapping[str, bool]) -> list[tuple[tuple[str, str], ...]]:
+def _columns_for(
+    effect: Effect, channels: Mapping[str, bool], turning: Sequence[str]
+) -> list[tuple[tuple[str, str], ...]]:
     """For effects that say for which argument a column is looked for: every one that may be it.
 
-    `=temp` for the one of that name.
+    `=temp` for the one of that name. `turning`: angles, also those that the model declares.
     """
     if not effect.columns:
         return [()]
     ((argument, kind),) = effect.columns
     if kind.startswith("="):
-        return [((argument, name),) for name in channels if kind == "=" + name]
+        every = dict.fromkeys([*channels, *turning])
+        return [((argument, name),) for name in every if kind == "=" + name]
+    if kind == "angle":
+        return [((argument, name),) for name in turning if name != effect.on]
     fits = {"temperature": (True,), "other": (False,), "any": (True, False)}[kind]
     return [((argument, name),) for name, is_warm in channels.items() if is_warm in fits]
 
@@ -220,7 +229,18 @@ def _tried(candidate: Candidate, model: Model, runs: Sequence[Run]) -> Candidate
             raise UsageError(f"the data have no {s.name!r}")
     if effect is not None and not shipped(effect):
         check_units(extended)
+    _refuse_more_than_data(extended, runs)
     return candidate
+
+
+def _refuse_more_than_data(extended: Model, runs: Sequence[Run]) -> None:
+    """As many unknowns as residuals fit anything, and leave no noise to judge it by."""
+    unknowns = sum(
+        p.shape.coordinates * (len(runs) if p.scope == "run" else 1) for p in extended.parameters
+    )
+    residuals = sum(map(len, runs)) * len(extended.axes)
+    if unknowns >= residuals:
+        raise UsageError(f"with it there are {unknowns} unknowns for {residuals} residuals")
 
 
 def typical_sizes(candidate: Candidate, parameters: Sequence[Parameter], model: Model) -> Any:

@@ -1,0 +1,148 @@
+"""Offsets and gains that follow a column: temperature, or any other that was recorded."""
+
+from __future__ import annotations
+
+from casest.declaration.effect import effect
+from casest.declaration.physics import SX
+from casest.declaration.shapes import each
+from casest.declaration.symbols import constant, param
+
+
+@effect(
+    on="output",
+    typical={"k": 2e-3},
+    shown_by="the same pose at two temperatures, not rising with time alone",
+    formula="y + k·(channel − at)",
+    columns={"channel": "temperature"},
+    numbers={"at": "mean"},
+)
+def temperature_bias(
+    y: SX, channel: SX, *, k: SX = param(each, "[y]/[channel]"), at: SX = constant(0.0)
+) -> SX:
+    """An offset that follows temperature, about its mean `at`."""
+    return y + k * (channel - at)
+
+
+@effect(
+    on="input",
+    typical={"k": 3e-4},
+    shown_by="large inputs at two temperatures, not rising with time alone",
+    formula="u·(1 + k·(channel − at))",
+    columns={"channel": "temperature"},
+    numbers={"at": "mean"},
+)
+def temperature_gain(
+    u: SX, channel: SX, *, k: SX = param(each, "1/[channel]"), at: SX = constant(0.0)
+) -> SX:
+    """A gain that follows temperature, about its mean `at`."""
+    return u * (1 + k * (channel - at))
+
+
+@effect(
+    on="output",
+    typical={"k": 2e-3, "bend": 1e-4},
+    shown_by="the same input at three values of the channel or more",
+    formula="y + k·(channel − at) + bend·(channel − at)²",
+    columns={"channel": "temperature"},
+    numbers={"at": "mean"},
+)
+def temperature_curve(
+    y: SX,
+    channel: SX,
+    *,
+    k: SX = param(each, "[y]/[channel]"),
+    bend: SX = param(each, "[y]/[channel]^2"),
+    at: SX = constant(0.0),
+) -> SX:
+    """An offset that follows temperature in a bent line, about its mean `at`."""
+    x = channel - at
+    return y + k * x + bend * x**2
+
+
+@effect(
+    on="input",
+    typical={"k": 3e-4, "bend": 1e-5},
+    shown_by="large inputs at three values of the channel or more",
+    formula="u·(1 + k·(channel − at) + bend·(channel − at)²)",
+    columns={"channel": "temperature"},
+    numbers={"at": "mean"},
+)
+def temperature_gain_curve(
+    u: SX,
+    channel: SX,
+    *,
+    k: SX = param(each, "1/[channel]"),
+    bend: SX = param(each, "1/[channel]^2"),
+    at: SX = constant(0.0),
+) -> SX:
+    """A gain that follows temperature in a bent line, about its mean `at`."""
+    x = channel - at
+    return u * (1 + k * x + bend * x**2)
+
+
+@effect(
+    on="output",
+    shown_by="the same input at two values of the channel",
+    formula="y + k·(channel − at)",
+    columns={"channel": "other"},
+    numbers={"at": "mean"},
+)
+def channel_bias(
+    y: SX, channel: SX, *, k: SX = param(each, "[y]/[channel]"), at: SX = constant(0.0)
+) -> SX:
+    """An offset that follows another recorded channel, about its mean `at`."""
+    return y + k * (channel - at)
+
+
+@effect(
+    on="input",
+    shown_by="large inputs at two values of the channel",
+    formula="u·(1 + k·(channel − at))",
+    columns={"channel": "other"},
+    numbers={"at": "mean"},
+)
+def channel_gain(
+    u: SX, channel: SX, *, k: SX = param(each, "1/[channel]"), at: SX = constant(0.0)
+) -> SX:
+    """A gain that follows another recorded channel, about its mean `at`."""
+    return u * (1 + k * (channel - at))
+
+
+@effect(
+    on="output",
+    shown_by="the same input at three values of the channel or more",
+    formula="y + k·(channel − at) + bend·(channel − at)²",
+    columns={"channel": "other"},
+    numbers={"at": "mean"},
+)
+def channel_curve(
+    y: SX,
+    channel: SX,
+    *,
+    k: SX = param(each, "[y]/[channel]"),
+    bend: SX = param(each, "[y]/[channel]^2"),
+    at: SX = constant(0.0),
+) -> SX:
+    """An offset that follows another recorded channel in a bent line, about its mean `at`."""
+    x = channel - at
+    return y + k * x + bend * x**2
+
+
+@effect(
+    on="input",
+    shown_by="large inputs at three values of the channel or more",
+    formula="u·(1 + k·(channel − at) + bend·(channel − at)²)",
+    columns={"channel": "other"},
+    numbers={"at": "mean"},
+)
+def channel_gain_curve(
+    u: SX,
+    channel: SX,
+    *,
+    k: SX = param(each, "1/[channel]"),
+    bend: SX = param(each, "1/[channel]^2"),
+    at: SX = constant(0.0),
+) -> SX:
+    """A gain that follows another recorded channel in a bent line, about its mean `at`."""
+    x = channel - at
+    return u * (1 + k * x + bend * x**2)
