@@ -11,9 +11,7 @@ from casest import Residual, attitude, effect, horzcat, model, param, quantity, 
 def compass(m=signal(3, "uT"), attitude=attitude(), *, earth=param(3, "uT"), hard=param(3, "uT")):
     """The earth's field, seen from the body, and what the body's own iron adds (hard iron)."""
     field = quantity("field", attitude.T @ earth, "uT")
-    return Residual(
-        measured=m, predicted=quantity("reading", field + hard, "uT"), corrected=field
-    )
+    return Residual(measured=m, predicted=quantity("reading", field + hard, "uT"), corrected=field)
 
 
 @effect(on="field", formula="field + K·field, tr K = 0")

@@ -41,13 +41,22 @@ STEPS, HALVINGS = 60, 30
 def invertible(model: Model) -> tuple[Model, tuple[str, ...]]:
     """The model without the effects that a correction of single samples cannot undo; their labels.
 
-    Those are effects on the sequence of samples, and those that act on rates of the reading.
+    Those are effects on the sequence of samples, those that act on rates of the reading, and lags
+    of a signal that the correction reads.
     """
     if model.traced.corrected is None:
         return model, ()
-    left = [a for a in model.effects if a.kind == "sequence" or _acts_on_a_rate(model, a)]
+    left = [a for a in model.effects if _looks_elsewhere(model, a) or _acts_on_a_rate(model, a)]
     kept = tuple(a for a in model.effects if a not in left)
     return replace(model, effects=kept), tuple(a.label for a in left)
+
+
+def _looks_elsewhere(model: Model, attached: Attached) -> bool:
+    """Does the correction of one sample need others, for this effect?"""
+    if attached.kind != "time":
+        return attached.kind == "sequence"
+    cut = trace(model, cut=model.traced.corrected)
+    return attached.on in reached_signals(model, cut, cut.expression)
 
 
 def of_their_time(model: Model) -> tuple[str, ...]:

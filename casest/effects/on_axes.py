@@ -50,6 +50,8 @@ def restricted(effect: Effect, kept: Sequence[int], model: Model) -> Effect:
         declarations=tuple(declarations),
         null=tuple(sorted({**null, **more}.items())),
         typical=tuple({**typical, **sizes}.items()),
+        otherwise=effect.otherwise
+        and restricted(replace(effect.otherwise, on=effect.on), kept, model),
     )
 
 

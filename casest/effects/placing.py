@@ -11,6 +11,7 @@ from casest.data.run import Run
 from casest.declaration.effect import Attached, Effect
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
+from casest.declaration.symbols import Parameter
 from casest.errors import CasestError
 
 
@@ -57,11 +58,27 @@ def told(model: Model, runs: Sequence[Run]) -> Model:
     """The model whose effects that follow a column are told their numbers by these runs."""
 
     def numbered(attached: Attached) -> Attached:
+        attached = _begun(attached, runs)
         if not attached.columns:
             return attached
         return replace(attached, effect=with_numbers(attached.effect, attached.columns, runs))
 
     return replace(model, effects=tuple(numbered(a) for a in model.effects))
+
+
+def _begun(attached: Attached, runs: Sequence[Run]) -> Attached:
+    """Time scales are looked for from the middle, on a scale of ratios, of step and duration."""
+    scales = {name for name, what in attached.effect.profile if what == "timescale"}
+    times = [run.time for run in runs if run.time is not None and len(run) > 1]
+    if not scales or not times:
+        return attached
+    middle = max(float(np.sqrt(np.median(np.diff(t)) * np.ptp(t))) for t in times)
+
+    def begun(p: Parameter) -> Parameter:
+        own = p.name.rpartition(".")[2] in scales
+        return replace(p, start=(float(f"{middle:.3g}"),) * p.shape.size) if own else p
+
+    return replace(attached, parameters=tuple(map(begun, attached.parameters)))
 
 
 def with_numbers(
