@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
+
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import Rotation, Slerp
 
 from casest import (
     DeclarationError,
@@ -14,17 +17,22 @@ from casest import (
     UsageError,
     attitude,
     effect,
+    load_runs,
     model,
     param,
     quantity,
     signal,
 )
+from casest.cli import run as command
 from casest.correction.inverse import Correction, invertible
 from casest.effects import axis_delay, creep, hysteresis, low_pass, signal_lag
 from casest.effects.placing import placed_in, told
 from casest.estimate.calibrate import attempt
 from casest.leastsquares.problem import Problem
-from casest.results.find import find_model
+from casest.results.find import find_effects, find_model
+from casest.saved.model import saved_model
+
+EXAMPLES = Path(__file__).parent.parent / "examples"
 
 
 @model
@@ -131,23 +139,39 @@ def cycled(half=3.0, noise=0.05, load_noise=0.0, seed=2):
     return run_of(np.arange(1201.0), load=load + load_noise * rng.standard_normal(1201), reading=y)
 
 
-@pytest.mark.parametrize("load_noise", [0.0, 0.3])
-def test_the_loop_of_a_cycled_cell_is_as_wide_as_it_was_made(load_noise):
-    """Also where noise in the recorded load turns it round at nearly every sample.
-
-    It was made to turn at once, and the effect turns over 2 % of the span: that much of the width
-    is what the gain may be off by.
-    """
-    run = cycled(load_noise=load_noise)
-    turns = np.diff(np.sign(np.diff(run.signals["load"][:, 0])))
-    assert (np.count_nonzero(turns) > 200) == (load_noise > 0)
-    extended = with_shipped(cell, hysteresis)
-    found = attempt(extended, [run])
-    assert found.values["hysteresis.k"] == pytest.approx(3.0, rel=0.04)
-    assert found.values["gain"] == pytest.approx(2.0, abs=0.02 * 2 * 3.0 / 100 * 5)
+def test_the_loop_of_a_cycled_cell_is_as_wide_as_it_was_made():
+    run = cycled()
+    found = attempt(with_shipped(cell, hysteresis), [run])
+    assert found.values["hysteresis.k"] == pytest.approx(3.0, abs=0.01)
+    assert found.values["gain"] == pytest.approx(2.0, abs=0.001)
     plain = attempt(cell, [run])
     after, before = (np.std(e.problem.residuals(e.point)[0]) for e in (found, plain))
-    assert after < before / 3
+    assert after < before / 25
+
+
+def test_noise_in_the_recorded_load_does_not_turn_the_loop_round():
+    """The load's own noise turns it round at hundreds of samples."""
+    run = cycled(load_noise=0.3)
+    assert np.count_nonzero(np.diff(np.sign(np.diff(run.signals["load"][:, 0])))) > 400
+    found = attempt(with_shipped(cell, hysteresis), [run])
+    assert found.values["hysteresis.k"] == pytest.approx(3.0, rel=0.05)
+    assert found.values["gain"] == pytest.approx(2.0, abs=0.006)
+    assert np.std(found.problem.residuals(found.point)[0]) < 1.25 * 2.0 * 0.3
+
+
+def test_backlash_is_a_loop_that_turns_over_its_whole_width():
+    run = cycled(half=0.0, noise=0.0)
+    middle, play = 1.5, []
+    for x in 1.5 + 2.0 * run.signals["load"][:, 0]:
+        middle = min(max(middle, x - 3.0), x + 3.0)
+        play.append(middle)
+    y = np.array(play) + 0.05 * np.random.default_rng(6).standard_normal(len(run))
+    found = attempt(
+        with_shipped(cell, hysteresis), [run_of(run.time, load=run.signals["load"], reading=y)]
+    )
+    assert found.values["hysteresis.k"] == pytest.approx(3.0, abs=0.01)
+    assert found.values["hysteresis.turn"] == pytest.approx(6.0 / 200.0, rel=0.02)
+    assert np.std(found.problem.residuals(found.point)[0]) < 0.055
 
 
 @pytest.mark.parametrize(
@@ -159,7 +183,7 @@ def test_the_loop_of_a_cycled_cell_is_as_wide_as_it_was_made(load_noise):
         (low_pass, "output", {"low_pass.tau": 2.0}),
         (low_pass, "output", {"low_pass.tau": 0.0}),
         (low_pass, "force", {"low_pass@force.tau": -0.1}),
-        (hysteresis, "output", {"hysteresis.k": 1.0}),
+        (hysteresis, "output", {"hysteresis.k": 1.0, "hysteresis.turn": 0.1}),
         (hysteresis, "output", {"hysteresis.k": 0.0}),
     ],
 )
@@ -172,7 +196,7 @@ def test_slopes_are_difference_quotients_also_where_the_effect_vanishes(added, o
     point = problem.point({"zero": 1.0, "gain": 1.9, **at})
     numeric = difference_quotients(problem, point)
     np.testing.assert_allclose(problem.jacobian(point), numeric, rtol=1e-6, atol=2e-7)
-    assert np.abs(numeric[:, -1 if "tau" not in extended.parameters[-1].name else -2]).max() > 0.1
+    assert np.abs(numeric[:, 2]).max() > 0.1  # the size of the effect, behind zero and gain
 
 
 def test_at_its_null_an_effect_with_memory_changes_nothing():
@@ -280,19 +304,19 @@ def late(delay, noise=0.1, rate=50.0, seconds=40.0, seed=4):
     return run_of(time, m=m, attitude=tumbling(time).reshape(-1, 9))
 
 
-@pytest.mark.parametrize("delay", [0.013, -0.027, 0.33])
-def test_a_lag_of_the_attitude_is_found_also_over_many_samples(delay):
-    run = late(delay)
-    # Before the record begins nobody knows the attitude: those samples are left out.
-    run = run.take(slice(20, -20)) if abs(delay) < 0.1 else run
-    found = attempt(compass.with_effect(signal_lag, on="attitude"), [run])
-    if abs(delay) > 0.1:  # the record's first third of a second is held, and wrong
-        assert found.values["signal_lag(attitude).delay"] == pytest.approx(delay, abs=3e-3)
-        return
+@pytest.mark.parametrize("delay", [0.013, -0.027, 0.05])
+def test_a_lag_of_the_attitude_is_found_whichever_sign_it_has(delay):
+    found = attempt(compass.with_effect(signal_lag, on="attitude"), [late(delay)])
     assert found.certificate.trusted
-    assert abs(found.values["signal_lag(attitude).delay"] - delay) < 4 * 1e-4
     assert found.std["signal_lag(attitude).delay"] < 1e-4
+    assert found.values["signal_lag(attitude).delay"] == pytest.approx(delay, abs=4e-4)
     np.testing.assert_allclose(found.values["earth"], EARTH, atol=0.05)
+
+
+def test_a_lag_of_many_samples_is_found_though_the_start_of_the_record_is_lost():
+    """17 samples: of the first 14 nobody knows the attitude, and they pull."""
+    found = attempt(compass.with_effect(signal_lag, on="attitude"), [late(0.33)])
+    assert found.values["signal_lag(attitude).delay"] == pytest.approx(0.33, abs=3e-3)
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.013, 0.33])
@@ -325,10 +349,12 @@ def test_a_gap_is_not_bridged_by_a_late_signal():
     )
     at = {"zero": 0.0, "gain": 1.0, "signal_lag(load).delay": 0.3}
     seen = load - problem.residuals(problem.point(at))[0][:, 0]
-    # What the load was 0.3 s before, and in each part nothing before its first sample.
-    slope = 5 / 49
-    np.testing.assert_allclose(seen[:50], np.maximum(load[:50] - 3 * slope, 0), atol=1e-9)
-    np.testing.assert_allclose(seen[50:], np.maximum(load[50:] - 3 * slope, 40), atol=1e-9)
+    # Each part goes straight on for three samples beyond its first, as the load did.
+    np.testing.assert_allclose(seen[:50], load[:50] - 3 * 5 / 49, atol=1e-9)
+    np.testing.assert_allclose(seen[50:], load[50:] - 3 * 5 / 49, atol=1e-9)
+    held = load - problem.residuals(problem.point({**at, "signal_lag(load).delay": 1.0}))[0][:, 0]
+    np.testing.assert_allclose(held[50:58], 40 - 3 * 5 / 49, atol=1e-9)
+    np.testing.assert_allclose(held[60:], load[60:] - 10 * 5 / 49, atol=1e-9)
 
 
 def test_a_column_that_an_effect_reads_may_come_late_too():
@@ -388,3 +414,98 @@ def test_readings_are_corrected_without_the_attitude_that_came_late():
     values = {"earth": EARTH, "hard": HARD, "signal_lag(attitude).delay": 0.1}
     found = Correction(compass.with_effect(signal_lag, on="attitude"))(run, values)
     np.testing.assert_allclose(found, run.signals["m"] - HARD, atol=1e-12)
+
+
+# -- measured, and on the command line -------------------------------------------------------------
+
+
+def lag_by_hand(file, quaternion):
+    """Lag and rms of "field in the body and hard iron", attitude by slerp, on a grid of lags."""
+    table = np.genfromtxt(file, delimiter=",", skip_header=1)
+    time, m = table[:, 0], table[:, 1:4]
+    if quaternion:
+        turned = Rotation.from_quat(table[:, [5, 6, 7, 4]])
+    else:
+        turned = Rotation.from_euler("ZYX", np.deg2rad(table[:, [6, 5, 4]]))
+    path = Slerp(time, turned)
+    inner = (time > time[0] + 0.2) & (time < time[-1] - 0.2)
+    lags = np.arange(-0.02, 0.08, 0.005)
+    squares = []
+    for lag in lags:
+        R = path(time[inner] - lag).as_matrix()
+        columns = np.concatenate([R.transpose(0, 2, 1), np.tile(np.eye(3), (len(R), 1, 1))], axis=2)
+        squares.append(np.linalg.lstsq(columns.reshape(-1, 6), m[inner].ravel())[1][0])
+    near = slice(max(int(np.argmin(squares)) - 3, 0), int(np.argmin(squares)) + 4)
+    a, b, _ = np.polyfit(lags[near], np.array(squares)[near], 2)
+    return -b / (2 * a)
+
+
+@pytest.mark.parametrize(
+    ("file", "quaternion", "within"),
+    [
+        ("broad/mag26.csv", True, 0.3e-3),
+        ("ardupilot-log171/MAG_all.csv", False, 4e-3),
+        ("ardupilot-log171/MAG2_all.csv", False, 4e-3),
+        ("ardupilot-log171/MAG3_all.csv", False, 4e-3),
+    ],
+)
+def test_the_lag_of_a_logged_attitude_is_what_slerp_and_a_grid_find(
+    shared_data, file, quaternion, within
+):
+    declared = find_model(str(EXAMPLES / "compass.py"))
+    runs = load_runs([shared_data / file], declared.signals)
+    found = attempt(declared.with_effect(signal_lag, on="attitude"), runs)
+    assert found.certificate.trusted
+    by_hand = lag_by_hand(shared_data / file, quaternion)
+    assert found.values["signal_lag(attitude).delay"] == pytest.approx(by_hand, abs=within)
+
+
+def test_a_lag_and_soft_iron_together_take_what_the_record_supports(shared_data):
+    """SOURCE.md: 15 ms, and 1.36 to 0.87 uT held out by a fit of its own."""
+    declared = find_model(str(EXAMPLES / "compass.py"))
+    (iron,) = find_effects(str(EXAMPLES / "compass.py:soft_iron"))
+    runs = load_runs([shared_data / "broad/mag26.csv"], declared.signals)
+    rms = []
+    for tried in (declared, declared.with_effect(iron).with_effect(signal_lag, on="attitude")):
+        found = attempt(tried, runs)
+        rms.append(np.sqrt(np.mean(found.problem.residuals(found.point)[0] ** 2)))
+    assert found.values["signal_lag(attitude).delay"] == pytest.approx(0.015, abs=1e-3)
+    np.testing.assert_allclose(rms, [1.36, 0.87], atol=0.05)
+
+
+def test_a_saved_result_with_a_lag_and_a_memory_is_read_and_applied_again(tmp_path, capsys):
+    run = late(0.05, seconds=20.0)
+    true = np.einsum("nij,i->nj", tumbling(run.time - 0.05), EARTH)
+    slow = np.transpose([behind(run.time, axis, 2.0, 20) for axis in true.T])
+    run.signals["m"][:] -= 0.3 * (true - slow)
+    head = "t [s],mx [uT],my [uT],mz [uT]," + ",".join(f"attitude{i}" for i in range(9))
+    table = np.column_stack([run.time, run.signals["m"], run.signals["attitude"]])
+    record = tmp_path / "waved.csv"
+    np.savetxt(record, table, delimiter=",", header=head, comments="")
+    asked = ["--effects", "signal_lag(attitude)", "--effects", "creep"]
+    code = command(
+        ["calibrate", str(EXAMPLES / "compass.py"), str(record), *asked, "-o", str(tmp_path / "o")]
+    )
+    assert code == 0
+    saved = json.loads((tmp_path / "o" / "result.json").read_text(encoding="utf-8"))
+    assert [(e["name"], e["on"]) for e in saved["effects"]] == [
+        ("signal_lag", "attitude"), ("creep", "reading")
+    ]  # fmt: skip
+    again, values = saved_model(saved)
+    assert [e.label for e in again.effects] == ["signal_lag(attitude)", "creep"]
+    assert values["signal_lag(attitude).delay"] == pytest.approx(0.05, abs=1e-3)
+    corrected = tmp_path / "corrected.csv"
+    assert command(["apply", str(tmp_path / "o"), str(record), "-o", str(corrected)]) == 0
+    assert "not undone, which would amplify the noise without bound: creep" in (
+        capsys.readouterr().err
+    )
+    field = np.genfromtxt(corrected, delimiter=",", names=True)
+    hard = np.array(saved["estimate"]["parameters"]["hard"]["value"])
+    expected = table[:, 1:4] - hard
+    found = np.column_stack([field[n] for n in field.dtype.names if n.startswith("field")])
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+
+
+def test_a_lag_on_the_command_line_needs_its_signal(capsys):
+    assert command(["calibrate", "norm-diagonal", "x.csv", "--effects", "signal_lag"]) == 1
+    assert "--effects 'signal_lag(SIGNAL)'" in capsys.readouterr().err

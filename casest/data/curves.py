@@ -13,6 +13,9 @@ from casest.data.timing import blocks
 
 Array = NDArray[np.float64]
 
+#: Samples beyond the end of a stretch over which a signal is thought to go on as it did.
+REACH = 3
+
 
 @dataclass(frozen=True)
 class Curve:
@@ -41,21 +44,25 @@ class Curve:
     def at(self, wanted: Array) -> tuple[Array, Array]:
         """Values and their rates of change per s, (N, k) each, at one time for each sample.
 
-        Each within its own stretch; beyond its ends the end holds, and nothing changes there.
+        Each within its own stretch. Beyond an end it goes straight on for REACH samples, and then
+        holds: what was there nobody recorded.
         """
         ends = np.searchsorted(self.stretch, np.arange(len(self.pieces) + 1))
         found = [
-            self._within(piece, wanted[a:b], self.time[a], self.time[b - 1])
+            self._within(piece, self.time[a:b], wanted[a:b])
             for piece, (a, b) in zip(self.pieces, pairwise(ends), strict=True)
         ]
         value, rate = (np.concatenate(parts) for parts in zip(*found, strict=True))
         return (value, rate)
 
     def _within(
-        self, piece: Callable[[Array, int], Array], wanted: Array, first: float, last: float
+        self, piece: Callable[[Array, int], Array], time: Array, wanted: Array
     ) -> tuple[Array, Array]:
-        held = np.clip(wanted, first, last)
-        value, rate = piece(held, 0), piece(held, 1)
+        reach = REACH * float(np.median(np.diff(time))) if len(time) > 1 else 0.0
+        held = np.clip(wanted, time[0] - reach, time[-1] + reach)
+        inside = np.clip(held, time[0], time[-1])
+        rate = piece(inside, 1)
+        value = piece(inside, 0) + rate * (held - inside)[:, None]
         rate = np.where((held == wanted)[:, None], rate, 0.0)
         return turned(value, rate) if self.rotation else (value, rate)
 

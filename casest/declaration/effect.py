@@ -40,15 +40,15 @@ class Effect:
     `on` names what it acts on; `extras` are further signals, columns or quantities it reads;
     `null` maps each parameter to the value at which the effect vanishes (0 unless told).
     For tracing a residual: `typical` sizes of the parameters, each in its unit; `profile` the
-    parameters that are searched over a grid (name -> "frequency", "time", "level" or "timescale"),
-    because the effect is not smooth in them or has many valleys; `shown_by` the measurement that
-    shows it; `plain` the form that it is tried in once it was found; `columns` the argument for
-    which a recorded column is looked for (name -> "temperature", "other" or "any"); `numbers` those
-    that data tell (name -> "mean" of that column, or "duration" of the record); `seen_in` where an
-    effect on the noise shows itself: the "tails" of the residuals, or a "random walk" in them;
-    `memory` what one on the sequence keeps from sample to sample, and what each begins from (the
-    value acted on, or zero); `otherwise` the form that it takes in a model where it is not
-    applicable as it stands.
+    parameters that are searched over a grid (name -> "frequency", "time", "level", "timescale" or
+    "share"), because the effect is not smooth in them or has many valleys; `shown_by` the
+    measurement that shows it; `plain` the form that it is tried in once it was found; `columns` the
+    argument for which a recorded column is looked for (name -> "temperature", "other" or "any");
+    `numbers` those that data tell (name -> "mean" of that column, or "duration" of the record);
+    `seen_in` where an effect on the noise shows itself: the "tails" of the residuals, or a "random
+    walk" in them; `memory` what one on the sequence keeps from sample to sample, and what each
+    begins from (the value acted on, or a number); `otherwise` the form that it takes in a model
+    where it is not applicable as it stands.
     """
 
     name: str

@@ -11,8 +11,6 @@ from casest.declaration.symbols import param, signal
 
 #: Time (s) in which a reading with hysteresis turns round, far below a sample's.
 TURN = 1e-3
-#: Part of a record's span over which a reading with hysteresis turns round, where it has no rate.
-TURN_SHARE = 0.02
 #: Time (s) below which none is told from zero.
 SHORTEST = 1e-9
 
@@ -98,16 +96,21 @@ def creep(
     return y - k * gap, gap, y
 
 
-@effect(on="output", kind="sequence", memory={"middle": "y"})
+@effect(on="output", kind="sequence", profile={"turn": "share"}, memory={"middle": "y"})
 def _looped(
-    y: SX, middle: SX, span: SX, *, k: SX = param(each, "[y]"), share: float = TURN_SHARE
+    y: SX,
+    middle: SX,
+    span: SX,
+    *,
+    k: SX = param(each, "[y]"),
+    turn: SX = param(start=0.02, bounds=(1e-3, 0.5)),
 ) -> tuple[SX, ...]:
     """A reading that lags behind by k, whichever way it moved last, run through the record.
 
-    It turns round over the share of the record's span (elastic play, Prandtl's element): what moves
-    less, as noise does, switches nothing.
+    It turns round over the part `turn` of the record's span (Prandtl's element: sharp for a small
+    one, play where it is 2k): what moves less, as noise does, switches nothing.
     """
-    half = fmax(share * span / 2, 1e-12)
+    half = fmax(turn * span / 2, 1e-12)
     middle = fmin(fmax(middle, y - half), y + half)
     return y - k * (y - middle) / half, middle
 
@@ -123,8 +126,8 @@ def hysteresis(y: SX, t: SX = signal("s"), *, k: SX = param(each, "[y]")) -> SX:
     """A reading that lags behind by k, whichever way it moves: a loop 2k high.
 
     It turns round within TURN: a jump has no derivative, and when it turns depends on parameters.
-    Where nothing says how fast it changes, the record does, and it turns over TURN_SHARE of its
-    span.
+    Where nothing says how fast it changes, it follows the record, and turns over the part `turn` of
+    its span: that is fitted too.
     """
     rate = der(y, t)
     return y - k * rate / sqrt(rate**2 + (TURN * der(rate, t)) ** 2 + 1e-12)

@@ -22,6 +22,8 @@ from casest.dynamics import Dynamics
 from casest.effects import CATALOGUE
 from casest.errors import CasestError, DeclarationError, UsageError
 
+#: Values of effects that a fit finds from where they start, without a grid.
+STARTED = ("timescale", "share")
 #: Shipped models: name on the command line -> module and attribute in `casest_problems`.
 SHIPPED = {
     "wheel": ("wheel", "wheel"),
@@ -151,7 +153,7 @@ def _whole(effect: Effect) -> Effect:
 
 def without_grid(effect: Effect) -> Effect:
     """The effect, unless it has a value that must be looked for."""
-    missing = ", ".join(name for name, what in effect.profile if what != "timescale")
+    missing = ", ".join(name for name, what in effect.profile if what not in STARTED)
     if missing:
         raise UsageError(
             f"--effects {effect.name}: this effect needs its {missing}, which only `casest close` "
