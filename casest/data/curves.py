@@ -18,62 +18,95 @@ REACH = 3
 
 
 @dataclass(frozen=True)
-class Curve:
-    """Samples `values` (N, k) at `time` (N,) in s, of the stretches that `stretch` (N,) numbers.
+class Piece:
+    """A stretch of a record without gaps: spline(t, 0) its values at times t, spline(t, 1) rates.
 
-    Of a rotation k is 9, and what is interpolated is its quaternion, made a unit one again: that
-    is the same curve in whatever frames the rotation is written, for steps well below half a turn.
+    `step` is the usual time between its samples, in s.
     """
 
-    time: Array
+    first: float
+    last: float
+    step: float
+    spline: Callable[[Array, int], Array]
+
+    def at(self, wanted: Array) -> tuple[Array, Array]:
+        """Values and rates (N, k) at any time: straight on for REACH samples, and then held."""
+        reach = REACH * self.step
+        held = np.clip(wanted, self.first - reach, self.last + reach)
+        inside = np.clip(held, self.first, self.last)
+        rate = self.spline(inside, 1)
+        value = self.spline(inside, 0) + rate * (held - inside)[:, None]
+        return value, np.where((held == wanted)[:, None], rate, 0.0)
+
+
+@dataclass(frozen=True)
+class Curve:
+    """The samples of a record, and what was between them: `stretch` (N,) is the piece of each.
+
+    Of a rotation, nine numbers row by row, the quaternion is interpolated and made a unit one
+    again: that is the same curve in whatever frames the rotation is written, for steps well below
+    half a turn.
+    """
+
     stretch: NDArray[np.int_]
-    pieces: tuple[Callable[[Array, int], Array], ...]
+    pieces: tuple[Piece, ...]
     rotation: bool
 
     @classmethod
     def through(
         cls, time: Array, values: Array, block: NDArray[np.int_], *, rotation: bool = False
     ) -> Curve:
-        """A curve through the samples of one record: `block` and gaps in time cut it."""
+        """A curve through samples `values` (N, k) at `time` (N,) in s, cut by `block` and gaps."""
         stretch = blocks(time, block, np.arange(len(time)))
         numbers = quaternions(values) if rotation else values
         ends = np.searchsorted(stretch, np.arange(stretch[-1] + 2))
         pieces = [_piece(time[a:b], numbers[a:b]) for a, b in pairwise(ends)]
-        return cls(time, stretch, tuple(pieces), rotation)
+        return cls(stretch, tuple(pieces), rotation)
 
-    def at(self, wanted: Array) -> tuple[Array, Array]:
-        """Values and their rates of change per s, (N, k) each, at one time for each sample.
+    def at(self, wanted: Array, stretch: NDArray[np.int_]) -> tuple[Array, Array]:
+        """Values and their rates of change per s, (N, k) each, at times (N,) in s.
 
-        Each within its own stretch. Beyond an end it goes straight on for REACH samples, and then
-        holds: what was there nobody recorded.
+        `stretch` (N,) says by which piece each is told; what was beyond its ends nobody recorded.
         """
-        ends = np.searchsorted(self.stretch, np.arange(len(self.pieces) + 1))
-        found = [
-            self._within(piece, self.time[a:b], wanted[a:b])
-            for piece, (a, b) in zip(self.pieces, pairwise(ends), strict=True)
-        ]
-        value, rate = (np.concatenate(parts) for parts in zip(*found, strict=True))
-        return (value, rate)
-
-    def _within(
-        self, piece: Callable[[Array, int], Array], time: Array, wanted: Array
-    ) -> tuple[Array, Array]:
-        reach = REACH * float(np.median(np.diff(time))) if len(time) > 1 else 0.0
-        held = np.clip(wanted, time[0] - reach, time[-1] + reach)
-        inside = np.clip(held, time[0], time[-1])
-        rate = piece(inside, 1)
-        value = piece(inside, 0) + rate * (held - inside)[:, None]
-        rate = np.where((held == wanted)[:, None], rate, 0.0)
+        order = np.argsort(stretch, kind="stable")
+        ends = np.searchsorted(stretch[order], np.arange(len(self.pieces) + 1))
+        own = zip(self.pieces, pairwise(ends), strict=True)
+        found = [piece.at(wanted[order[a:b]]) for piece, (a, b) in own]
+        back = np.argsort(order)
+        value, rate = (np.concatenate(parts)[back] for parts in zip(*found, strict=True))
         return turned(value, rate) if self.rotation else (value, rate)
 
+    @property
+    def _ends(self) -> tuple[Array, Array]:
+        return np.array([p.first for p in self.pieces]), np.array([p.last for p in self.pieces])
 
-def _piece(time: Array, values: Array) -> Callable[[Array, int], Array]:
-    if len(time) > 1:
-        from scipy.interpolate import CubicSpline  # imported late: SciPy loads slowly
+    def nearest(self, wanted: Array) -> NDArray[np.int_]:
+        """The piece that was recorded at each of the times (N,), or the next one to it."""
+        first, last = (
+            np.array([getattr(p, end) for p in self.pieces]) for end in ("first", "last")
+        )
+        middles = (last[:-1] + first[1:]) / 2
+        return np.searchsorted(middles, wanted).astype(np.int_)
 
-        spline = CubicSpline(time, values, axis=0)
-        return lambda t, order: np.asarray(spline(t, order))
-    return lambda t, order: np.repeat(values if order == 0 else 0 * values, len(t), axis=0)
+    def covers(self, wanted: Array) -> NDArray[np.bool_]:
+        """Which of the times (N,) lie within a piece."""
+        own = self.nearest(wanted)
+        first, last = (
+            np.array([getattr(p, end) for p in self.pieces]) for end in ("first", "last")
+        )
+        return np.asarray((wanted >= first[own]) & (wanted <= last[own]))
+
+
+def _piece(time: Array, values: Array) -> Piece:
+    first, last = float(time[0]), float(time[-1])
+    if len(time) < 2:
+        alone = lambda t, order: np.repeat(values if order == 0 else 0 * values, len(t), axis=0)  # noqa: E731
+        return Piece(first, last, 0.0, alone)
+    from scipy.interpolate import CubicSpline  # imported late: SciPy loads slowly
+
+    spline = CubicSpline(time, values, axis=0)
+    step = float(np.median(np.diff(time)))
+    return Piece(first, last, step, lambda t, order: np.asarray(spline(t, order)))
 
 
 def quaternions(rotations: Array) -> Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +11,7 @@ from casest.data.run import Run
 from casest.declaration.effect import Attached, Effect
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
-from casest.declaration.symbols import Parameter
+from casest.effects.lateness import likely_lag
 from casest.errors import CasestError
 
 
@@ -58,7 +58,7 @@ def told(model: Model, runs: Sequence[Run]) -> Model:
     """The model whose effects that follow a column are told their numbers by these runs."""
 
     def numbered(attached: Attached) -> Attached:
-        attached = _begun(attached, runs)
+        attached = _begun(attached, model, runs)
         if not attached.columns:
             return attached
         return replace(attached, effect=with_numbers(attached.effect, attached.columns, runs))
@@ -66,19 +66,27 @@ def told(model: Model, runs: Sequence[Run]) -> Model:
     return replace(model, effects=tuple(numbered(a) for a in model.effects))
 
 
-def _begun(attached: Attached, runs: Sequence[Run]) -> Attached:
-    """Time scales are looked for from the middle, on a scale of ratios, of step and duration."""
-    scales = {name for name, what in attached.effect.profile if what == "timescale"}
+def _begun(attached: Attached, model: Model, runs: Sequence[Run]) -> Attached:
+    """Times of an effect begin where the records say: neither zero nor a guess is near."""
+    if attached.kind == "time":
+        measured = model.traced.measured or ""
+        start = likely_lag(runs, measured, attached.on)
+        own = {p.name.rpartition(".")[2] for p in attached.parameters if start}
+        return _starting(attached, own, start)
     times = [run.time for run in runs if run.time is not None and len(run) > 1]
-    if not scales or not times:
-        return attached
-    middle = max(float(np.sqrt(np.median(np.diff(t)) * np.ptp(t))) for t in times)
+    scales = {name for name, what in attached.effect.profile if what == "timescale" and times}
+    # In the middle of step and duration, on a scale of ratios.
+    middles = [float(np.sqrt(np.median(np.diff(t)) * np.ptp(t))) for t in times]
+    return _starting(attached, scales, max(middles, default=0.0))
 
-    def begun(p: Parameter) -> Parameter:
-        own = p.name.rpartition(".")[2] in scales
-        return replace(p, start=(float(f"{middle:.3g}"),) * p.shape.size) if own else p
 
-    return replace(attached, parameters=tuple(map(begun, attached.parameters)))
+def _starting(attached: Attached, names: Collection[str], value: float) -> Attached:
+    start = float(f"{value:.6g}")
+    parameters = tuple(
+        replace(p, start=(start,)) if p.name.rpartition(".")[2] in names else p
+        for p in attached.parameters
+    )
+    return replace(attached, parameters=parameters)
 
 
 def with_numbers(

@@ -58,13 +58,20 @@ class Staged:
     ) -> tuple[Array, Array]:
         """A signal at the times at which the effect says that it is taken, and its slopes."""
         at, slope = moment(parameters, time[:, None])
-        value, rate = self._curve(r, attached.on, time).at(at[:, 0, 0])
+        wanted, curve = at[:, 0, 0], self._curve(r, attached.on, time)
+        # Within its own record a signal crosses no gap; another file's has gaps of its own.
+        apart = attached.on in self.runs[r].elsewhere
+        value, rate = curve.at(wanted, curve.nearest(wanted) if apart else curve.stretch)
         return value, rate[:, :, None] * slope
 
     def _curve(self, r: int, name: str, time: Array) -> Curve:
         if (r, name) not in self._curves:
             run, rotation = self.runs[r], self.model[name].kind == "rotation"
-            made = Curve.through(time, run.signals[name], run.block, rotation=rotation)
+            other = run.elsewhere.get(name)
+            if other is not None:
+                made = Curve.through(other.time, other.values, other.block, rotation=rotation)
+            else:
+                made = Curve.through(time, run.signals[name], run.block, rotation=rotation)
             self._curves[r, name] = made
         return self._curves[r, name]
 
