@@ -14,7 +14,7 @@ from casest import (
     UnitError,
     UsageError,
     effect,
-    fmax,
+    exp,
     model,
     param,
     quantity,
@@ -474,19 +474,30 @@ def test_correcting_a_sequence_undoes_it_or_refuses():
     np.testing.assert_allclose(found, 1.2 * run.signals["x"], atol=1e-9)
 
 
-def test_a_second_effect_on_the_sequence_is_refused():
+def test_a_second_effect_on_the_sequence_acts_on_what_the_first_gives():
     @effect(on="reading", kind="sequence")
-    def other(value, previous, dt, *, k=param()):
-        return value + k * fmax(previous, 0)
+    def slow(value, previous, dt, *, tau=param("s", bounds=(0.0, 10.0))):
+        return previous + (value - previous) * dt / (dt + tau)
 
-    with pytest.raises(UsageError, match="already has an effect on the sequence"):
-        chain.with_effect(low_pass).with_effect(other)
+    twice = lagged(lagged(0.1 + 1.2 * drive(), DT, 0.05), DT, 0.2)
+    problem = Problem(
+        chain.with_effect(low_pass).with_effect(slow), (run_of(t=TIME, y=twice, x=drive()),)
+    )
+    at = {"gain": 1.2, "bias": 0.1, "low_pass.tau": 0.05, "slow.tau": 0.2}
+    np.testing.assert_allclose(problem.residuals(problem.point(at))[0], 0, atol=1e-13)
 
 
-def test_a_sequence_acts_on_the_prediction_only():
-    with pytest.raises(UsageError) as refused:
-        chain.with_effect(low_pass, on="u")
-    assert "u is not what the model predicts" in str(refused.value)
+def test_a_sequence_may_act_before_the_prediction():
+    y = 0.1 + np.exp(lagged(1.2 * drive(), DT, 0.05))
+
+    @model
+    def bent(y=signal("V"), x=signal("V"), *, gain=param(start=1.0), bias=param("V")):
+        u = quantity("u", gain * x, "V")
+        return Residual(measured=y, predicted=bias + exp(u), corrected=u)
+
+    problem = Problem(bent.with_effect(low_pass, on="u"), (run_of(y=y, x=drive()),))
+    at = {"gain": 1.2, "bias": 0.1, "low_pass@u.tau": 0.05}
+    np.testing.assert_allclose(problem.residuals(problem.point(at))[0], 0, atol=1e-13)
 
 
 def test_a_sequence_without_time_asks_for_it():

@@ -44,20 +44,29 @@ STEPS, HALVINGS = 60, 30
 def invertible(model: Model) -> tuple[Model, tuple[str, ...]]:
     """The model without the effects that a correction of single samples cannot undo; their labels.
 
-    Those are effects on the sequence of samples, those that act on rates of the reading, and what
-    describes the course of the fitted record, which says nothing of another one.
+    Those are effects on the sequence of samples, those that act on rates of the reading, lags of a
+    signal that the correction reads, and what describes the course of the fitted record, which says
+    nothing of another one.
     """
     if model.traced.corrected is None:
         return model, ()
     left = [
         a
         for a in model.effects
-        if a.kind == "sequence"
+        if _looks_elsewhere(model, a)
         or (a.effect.describes and a.kind != "noise")
         or _acts_on_a_rate(model, a)
     ]
     kept = tuple(a for a in model.effects if a not in left)
     return replace(model, effects=kept), tuple(a.label for a in left)
+
+
+def _looks_elsewhere(model: Model, attached: Attached) -> bool:
+    """Does the correction of one sample need others, for this effect?"""
+    if attached.kind != "time":
+        return attached.kind == "sequence"
+    cut = trace(model, cut=model.traced.corrected)
+    return attached.on in reached_signals(model, cut, cut.expression)
 
 
 def of_their_time(model: Model) -> tuple[str, ...]:

@@ -15,6 +15,7 @@ from casest import units as unit_names
 from casest.data import checks, timing
 from casest.data.converting import numbers, rotation, vector
 from casest.data.finding import Choice, as_names, find_column, find_columns
+from casest.data.joining import joined, parts_of, shared_out
 from casest.data.logs import file_and_topics
 from casest.data.matching import find_by_name
 from casest.data.options import Options, refuse_unknown_names, stated_unit
@@ -55,6 +56,9 @@ def load_runs(
 ) -> tuple[Run, ...]:
     """Read files and bind their columns to `signals`: one run per file and `run` label.
 
+    A path `a.csv+b.csv` is one run of two files, each with a clock of its own: at the samples of a,
+    within what b recorded too, the columns of b are interpolated.
+
     * columns: per signal its columns by name or position, {"v": ("ax", "ay", "az")}; also
       "t", "run" and "pose" where those columns are called otherwise.
     * units: per signal or column the unit of its values, where the file states none or a wrong one.
@@ -85,14 +89,31 @@ def load_runs(
         tuple(extra),
         frozenset(gaps),
     )
-    tables = [read_table(path) for path in listed]
-    refuse_unknown_names(tables, wanted, options)
-    runs = [run for table in tables for run in _runs(table, wanted, options)]
+    groups = [[read_table(part) for part in parts_of(path)] for path in listed]
+    refuse_unknown_names([table for tables in groups for table in tables], wanted, options)
+    runs = [run for tables in groups for run in _group_runs(tables, wanted, options)]
     runs = _named_apart(runs)
     if at_rest is not False:
         also = () if at_rest is True else tuple(at_rest)
         runs = [averaged_at_rest(run, also=also) for run in runs]
     return tuple(runs)
+
+
+def _group_runs(tables: Sequence[Table], signals: Sequence[Signal], options: Options) -> list[Run]:
+    """The runs of one file, or the one run of several files."""
+    if len(tables) == 1:
+        return _runs(tables[0], signals, options)
+    apart = replace(options, time_zero="column")
+    parts = []
+    for table, own, chosen in shared_out(tables, signals, apart):
+        runs = _runs(table, own, chosen)
+        if len(runs) > 1:
+            raise DataError(
+                f"{table.file}: holds {len(runs)} runs, and files joined by + are one: give the "
+                "runs in files of their own"
+            )
+        parts += runs
+    return [joined(parts, signals, options.time_zero)]
 
 
 def _runs(table: Table, signals: Sequence[Signal], options: Options) -> list[Run]:

@@ -17,6 +17,20 @@ Index = NDArray[np.int_]
 
 
 @dataclass(frozen=True)
+class Series:
+    """What another file recorded, as it stands there: values (N, k) at `time` (N,).
+
+    The time is in s, on the run's clock as far as that is known; `block` (N,) as in a run.
+    """
+
+    file: str
+    time: Array
+    values: Array
+    block: Index
+    rotation: bool = False
+
+
+@dataclass(frozen=True)
 class Run:
     """N samples of one record.
 
@@ -29,6 +43,7 @@ class Run:
     spread: per signal (N, size), standard error of each mean; empty for a raw record.
     correlation: per signal (N, size, size), of the errors of one mean's components; may be missing.
     notes: what was assumed, skipped or looks wrong, one sentence each.
+    elsewhere: signals and columns that come from another file than the first, as they are there.
     """
 
     name: str
@@ -44,6 +59,7 @@ class Run:
     spread: Mapping[str, Array]
     notes: tuple[str, ...] = ()
     correlation: Mapping[str, Array] = field(default_factory=dict)
+    elsewhere: Mapping[str, Series] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Refuse parts of unequal length: they would be matched wrongly without a sign."""

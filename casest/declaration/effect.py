@@ -15,7 +15,14 @@ from casest.declaration.symbols import Constant, Parameter, Signal, Undecided, n
 from casest.errors import DeclarationError, UnitError, last_line
 from casest.units import known
 
-Kind = Literal["quantity", "signal", "noise", "sequence"]
+Kind = Literal["quantity", "signal", "noise", "sequence", "time"]
+
+#: Kinds that look at other samples than a residual's own.
+OVER_TIME: tuple[Kind, ...] = ("sequence", "time")
+#: What `on` says of an effect that delays any recorded signal: `with_effect(…, on=…)` says which.
+RECORDED = "recorded"
+#: Arguments of an effect on the sequence that casest gives, beside the value and what it keeps.
+PREVIOUS, STEP, SPAN = "previous", "dt", "span"
 
 #: What an effect on the noise acts on, instead of a quantity.
 NOISE = "noise"
@@ -24,25 +31,28 @@ NOISE = "noise"
 #: where one on the noise shows itself.
 COLUMNS = ("temperature", "other", "any", "angle")
 NUMBERS = ("mean", "duration", "radian")
-PROFILES = ("frequency", "time", "timescale", "level")
+PROFILES = ("frequency", "time", "timescale", "level", "share")
 TAILS, RANDOM_WALK = "tails", "random walk"
 
 
 @dataclass(frozen=True)
 class Effect:
-    """A function of one quantity, signal, the noise, or the sequence of samples.
+    """A function of one quantity, signal, the noise, the sequence of samples, or a signal's time.
 
     `on` names what it acts on; `extras` are further signals, columns or quantities it reads;
     `null` maps each parameter to the value at which the effect vanishes (0 unless told).
     For tracing a residual: `typical` sizes of the parameters, each in its unit; `profile` the
-    parameters that are searched over a grid (name -> "frequency", "time", "timescale" or "level"),
-    because the effect is not smooth in them or has many valleys; `shown_by` the measurement that
-    shows it; `plain` the form that it is tried in once it was found; `columns` the argument for
-    which a recorded column is looked for (name -> "temperature", "other", "any" or "angle", which
-    is also a scalar signal or quantity of the model in rad or deg); `numbers` those that data tell
-    (name -> "mean" of that column, "radian": rad for each of its unit, or "duration" of the
-    record); `seen_in` where an effect on the noise shows itself: the "tails" of the residuals, or a
-    "random walk" in them; `describes`: it says what a course looks like, and names no cause.
+    parameters that are searched over a grid (name -> "frequency", "time", "timescale", "level" or
+    "share"), because the effect is not smooth in them or has many valleys; `shown_by` the
+    measurement that shows it; `plain` the form that it is tried in once it was found; `columns` the
+    argument for which a recorded column is looked for (name -> "temperature", "other", "any" or
+    "angle", which is also a scalar signal or quantity of the model in rad or deg); `numbers` those
+    that data tell (name -> "mean" of that column, "radian": rad for each of its unit, or "duration"
+    of the record); `seen_in` where an effect on the noise shows itself: the "tails" of the
+    residuals, or a "random walk" in them; `describes`: it says what a course looks like, and names
+    no cause; `memory` what one on the sequence keeps from sample to sample, and what each begins
+    from (the value acted on, or a number); `otherwise` the form that it takes in a model where it
+    is not applicable as it stands.
     """
 
     name: str
@@ -64,6 +74,8 @@ class Effect:
     numbers: tuple[tuple[str, str], ...] = ()
     seen_in: str = ""
     describes: bool = False
+    memory: tuple[tuple[str, str | float], ...] = ()
+    otherwise: Effect | None = None
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         """Evaluate the effect's own function."""
@@ -79,7 +91,7 @@ class Effect:
             (n, Constant(n, (float(values[n]),), getattr(d, "unit", "")) if n in values else d)
             for n, d in self.declarations
         )
-        return replace(self, declarations=held)
+        return replace(self, declarations=held, otherwise=self._other("holding", values))
 
     def starting(self, **values: float) -> Effect:
         """The same effect with other start values of scalar parameters."""
@@ -87,7 +99,23 @@ class Effect:
             (n, replace(d, start=(float(values[n]),)) if n in values else d)
             for n, d in self.declarations
         )
-        return replace(self, declarations=moved)
+        return replace(self, declarations=moved, otherwise=self._other("starting", values))
+
+    def _other(self, changed: str, values: Mapping[str, float]) -> Effect | None:
+        """Its other form, changed likewise."""
+        other = self.otherwise
+        return None if other is None else getattr(other, changed)(**values)
+
+
+def label_of(declared: Effect, on: str, columns: Mapping[str, str], *, moved: bool) -> str:
+    """What an effect of a model is called: with the columns it reads, and where it acts if moved.
+
+    One on a signal's time is always called with the signal.
+    """
+    if declared.kind == "time":
+        return f"{declared.name}({on})"
+    label = declared.name + "".join(f"({c})" for c in columns.values())
+    return f"{label}@{on}" if moved else label
 
 
 def effect(
@@ -104,20 +132,29 @@ def effect(
     numbers: Mapping[str, str] | None = None,
     seen_in: str = "",
     describes: bool = False,
+    memory: Mapping[str, str | float] | None = None,
+    otherwise: Effect | None = None,
 ) -> Callable[[Callable[..., Any]], Effect]:
     """Declare an effect: first argument the value acted on, further ones signals or columns.
 
     The kind follows from `on`: the name of a quantity or of a signal of the model, or `"noise"`
     (then the function returns the weight of a sample whose residual is r standard deviations).
-    `kind="sequence"`: the arguments are (value, previous, dt), where `previous` is the result for
-    the sample before and `dt` the time since then in seconds; the function gives the next one.
+    `kind="sequence"`: the function gives the value of one sample from that of its own and from
+    what was before. Arguments that it may name: `previous`, the result for the sample before; `dt`,
+    the time since then in s; `span`, how far the value goes from its least to its greatest in the
+    run; and those of `memory`, each of the value's shape, {name: what it begins from}: 0, or the
+    name of the first argument. With `memory` it returns the result and then, in that order, what is
+    kept for the next sample. Where a gap in time ends, all begins anew.
+    `kind="time"`: the first argument is the time of a sample in s, and the function gives the time
+    at which the signal named by `on` is taken from its record, between samples by splines.
     """
+    kept = {PREVIOUS, STEP, SPAN, *(memory or {})}
 
     def declare(function: Callable[..., Any]) -> Effect:
         positional, keyword = _signature(function)
         extras = []
         for name, default in positional[1:]:
-            if kind == "sequence" and name in ("previous", "dt"):
+            if kind == "sequence" and name in kept:
                 continue
             extras.append(
                 named(default, name) if isinstance(default, Signal) else Signal(name, 1, None)
@@ -129,6 +166,12 @@ def effect(
             _refuse_unknown(function.__name__, word, given or {}, [name for name, _ in keyword])
         said = {"columns": columns or {}, "numbers": numbers or {}, "profile": profile or {}}
         _refuse_other_words(function.__name__, on, extras, said, seen_in)
+        _refuse_other_memory(function.__name__, positional, memory or {}, kind)
+        if kind == "time" and extras:
+            raise DeclarationError(
+                f'effect {function.__name__}: kind="time" takes the time of a sample and '
+                f"nothing else, not {extras[0].name!r}"
+            )
         declared_kind: Kind = kind or ("noise" if on == NOISE else "quantity")
         declarations = tuple(_declaration(function.__name__, name, d) for name, d in keyword)
         return Effect(
@@ -149,6 +192,8 @@ def effect(
             tuple((numbers or {}).items()),
             seen_in,
             describes,
+            tuple((memory or {}).items()),
+            otherwise,
         )
 
     return declare
@@ -191,6 +236,28 @@ def _refuse_other_words(
         if what not in known_ones:
             raise DeclarationError(
                 f"effect {name}: {word}= says {what!r}: give {' or '.join(known_ones)}"
+            )
+
+
+def _refuse_other_memory(
+    name: str, positional: Sequence[tuple[str, Any]], memory: Mapping[str, Any], kind: Kind | None
+) -> None:
+    """What is kept is an argument, and begins from the value acted on or from a number."""
+    first, *others = (argument for argument, _ in positional)
+    for kept, start in memory.items():
+        if kind != "sequence":
+            raise DeclarationError(
+                f'effect {name}: memory= is for kind="sequence", and this one is none'
+            )
+        if kept not in others or kept in (PREVIOUS, STEP, SPAN):
+            raise DeclarationError(
+                f"effect {name}: memory= names {kept!r}: give it as an argument behind {first!r}, "
+                f"other than {PREVIOUS}, {STEP} and {SPAN}"
+            )
+        if start != first and not isinstance(start, int | float):
+            raise DeclarationError(
+                f"effect {name}: {kept} begins from {start!r}: give {first!r}, which it acts on, "
+                "or a number"
             )
 
 
@@ -237,9 +304,35 @@ class Attached:
         """Those of them that data give; `inner` are quantities of the model."""
         return tuple(s for s in self.reads if s.name not in self.inner)
 
-    def apply(self, value: SX, symbols: Mapping[str, SX], **more: SX) -> SX:
+    @property
+    def keeps(self) -> tuple[tuple[str, str | float], ...]:
+        """What an effect on the sequence carries from sample to sample, and what it begins from."""
+        first = next(iter(inspect.signature(self.effect.function).parameters))
+        return self.effect.memory or ((PREVIOUS, first),)
+
+    @property
+    def spanned(self) -> bool:
+        """Does an effect on the sequence ask how far its value goes in a run?"""
+        return SPAN in inspect.signature(self.effect.function).parameters
+
+    def apply(self, value: SX, symbols: Mapping[str, SX]) -> SX:
         """The value with the effect in it, from the model's symbols by name."""
         extras = [symbols[s.name] for s in self.reads]
+        return evaluated(self.effect, value, *extras, **self._numbers(symbols))
+
+    def step(
+        self, value: SX, symbols: Mapping[str, SX], before: Mapping[str, SX], dt: SX, span: SX
+    ) -> tuple[SX, ...]:
+        """Of an effect on the sequence: the value with it, then what is kept for the next sample.
+
+        `before` holds what was kept at the sample before, by name.
+        """
+        read = {s.name: symbols[r.name] for s, r in _paired(self)}
+        given = {**before, STEP: dt, SPAN: span, **read}
+        return stepped(self.effect, value, given, self._numbers(symbols))
+
+    def _numbers(self, symbols: Mapping[str, SX]) -> dict[str, Any]:
+        """Its unknowns and constants, by the names that its function has for them."""
         unknowns = {p.name.rpartition(".")[2]: symbols[p.name] for p in self.parameters}
         numbers: dict[str, Any] = {
             n: d.array for n, d in self.effect.declarations if isinstance(d, Constant)
@@ -249,7 +342,33 @@ class Attached:
                 if isinstance(d, Parameter):
                     numbers[n] = d.shape.unpack(d.start_value())
         numbers = {n: float(a) if a.ndim == 0 else a for n, a in numbers.items()}
-        return evaluated(self.effect, value, *more.values(), *extras, **unknowns, **numbers)
+        return {**unknowns, **numbers}
+
+
+def _paired(attached: Attached) -> list[tuple[Signal, Signal]]:
+    """What it reads: as the effect's function calls it, and as the model and the data do."""
+    return list(zip(attached.effect.extras, attached.reads, strict=True))
+
+
+def stepped(
+    declared: Effect, value: SX, given: Mapping[str, Any], numbers: Mapping[str, Any]
+) -> tuple[SX, ...]:
+    """Result and memory of an effect on the sequence; the result is kept where it has no memory.
+
+    Raises DeclarationError where it returns another number of values than it declares.
+    """
+    asked = inspect.signature(declared.function).parameters
+    taken = {name: v for name, v in given.items() if name in asked}
+    found = evaluated(declared, value, **taken, **numbers)
+    if not declared.memory:
+        return ca.SX(found), ca.SX(found)
+    if not isinstance(found, tuple) or len(found) != 1 + len(declared.memory):
+        names = ", ".join(name for name, _ in declared.memory)
+        raise DeclarationError(
+            f"effect {declared.name}: with memory={{…}} it returns the result and then what is "
+            f"kept: return result, {names}"
+        )
+    return tuple(ca.SX(v) for v in found)
 
 
 def evaluated(declared: Effect, *args: Any, **kwargs: Any) -> SX:
@@ -346,9 +465,16 @@ def check_null(
             unknowns[name] = attached.effect.null_of(name)
     if attached.kind == "noise" and not unknowns:
         return  # weights without a parameter: there is nothing that could vanish
-    more = [ca.SX.sym("previous", *shape), ca.SX.sym("dt")] if attached.kind == "sequence" else []
+    more: list[SX] = []
     numbers = {n: float(v.ravel()[0]) if v.size == 1 else ca.SX(ca.DM(v)) for n, v in nulls.items()}
-    changed = ca.SX(evaluated(attached.effect, value, *more, *symbols.values(), **numbers))
+    if attached.kind == "sequence":
+        kept = {name: ca.SX.sym(name, *shape) for name, _ in attached.keeps}
+        given = {**kept, STEP: ca.SX.sym(STEP), SPAN: ca.SX.sym(SPAN, *shape)}
+        more = list(given.values())
+        own = {s.name: symbols[r.name] for s, r in _paired(attached)}
+        changed = stepped(attached.effect, value, {**given, **own}, numbers)[0]
+    else:
+        changed = ca.SX(evaluated(attached.effect, value, *symbols.values(), **numbers))
     if changed.shape != shape:
         raise DeclarationError(
             f"effect {attached.label} changes the shape of {attached.on} from {shape} to "

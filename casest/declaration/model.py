@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
+import casadi as ca
 import numpy as np
 
 from casest.declaration.changing import (
@@ -16,7 +17,17 @@ from casest.declaration.changing import (
     converted_constant,
     converted_parameter,
 )
-from casest.declaration.effect import NOISE, Attached, Effect, Kind, attach, check_null
+from casest.declaration.effect import (
+    NOISE,
+    OVER_TIME,
+    RECORDED,
+    Attached,
+    Effect,
+    Kind,
+    attach,
+    check_null,
+    label_of,
+)
 from casest.declaration.physics import Quantity, Residual
 from casest.declaration.sampson import sampson
 from casest.declaration.shapes import Array
@@ -211,23 +222,47 @@ class Model:
         Raises UsageError where the effect is not applicable: its quantity or signal does not
         exist here.
         """
-        target = on or added.on
-        columns = dict(columns or {})
-        label = added.name + "".join(f"({c})" for c in columns.values())
-        label = label if on is None or on == added.on else f"{label}@{on}"
+        form = added.otherwise
+        if form is None:
+            return self._with_effect(added, on or added.on, dict(columns or {}), on)
+        try:
+            return self.with_effect(replace(added, otherwise=None), on=on, columns=columns)
+        except UsageError:
+            return self.with_effect(replace(form, on=added.on), on=on, columns=columns)
+
+    def _with_effect(
+        self, added: Effect, target: str, columns: dict[str, str], on: str | None
+    ) -> Model:
+        label = label_of(added, target, columns, moved=on is not None and on != added.on)
         taken = {a.label for a in self.effects}
         if label in taken:
             raise UsageError(f"model {self.name} already has the effect {label}")
         attached = self._attached(added, target, columns, label)
         shapes = {n: (q.declared.size1(), q.declared.size2()) for n, q in self.quantities.items()}
-        check_null(attached, self._target_shape(target), shapes)
+        shape = (1, 1) if attached.kind == "time" else self._target_shape(target)
+        check_null(attached, shape, shapes)
         made = replace(self, effects=(*self.effects, attached))
-        if attached.kind in ("quantity", "signal") and not _reaches_residual(made, attached):
-            why = f"its residual does not depend on {target}"
-            if target in self.quantities and "t" in {s.name for s in added.extras}:
-                why = f"how fast {target} changes is unknown: it is not declared as a function of t"
+        if why := made._not_applicable(attached):
             raise UsageError(f"effect {label} is not applicable to model {self.name}: {why}")
         return made
+
+    def _not_applicable(self, attached: Attached) -> str:
+        """Why an effect of this model does nothing in it, or cannot be; else empty."""
+        on = attached.on
+        if any(a.kind in OVER_TIME for a in self.effects):
+            try:
+                traced = self.staged
+            except DeclarationError as error:
+                return str(error)
+            found = [stage.given for stage in traced.stages if stage.attached is attached]
+            reached = ca.vertcat(traced.expression, *(stage.taken for stage in traced.stages))
+            if found and not ca.depends_on(reached, found[0]):
+                return f"its residual does not depend on {on}"
+        if attached.kind in ("quantity", "signal") and not _reaches_residual(self, attached):
+            if on in self.quantities and "t" in {s.name for s in attached.effect.extras}:
+                return f"how fast {on} changes is unknown: it is not declared as a function of t"
+            return f"its residual does not depend on {on}"
+        return ""
 
     def _attached(
         self, added: Effect, target: str, columns: Mapping[str, str], label: str
@@ -261,9 +296,11 @@ class Model:
             found = self.quantities[target]
             if added.kind != "sequence":
                 return "quantity", found.dims, found.unit
-            self._check_sequence(added, found)
+            self._check_sequence(added)
             return "sequence", found.dims, found.unit
         signals = {s.name: s for s in self.signals}
+        if added.kind == "time":
+            return "time", (), self._checked_recorded(added, target)
         if target in signals:
             dims = () if signals[target].size == 1 else (signals[target].size,)
             return "signal", dims, signals[target].unit or f"[{target}]"
@@ -272,13 +309,36 @@ class Model:
             f"it acts on {target!r}, and the model has {', '.join([*self.quantities, *signals])}"
         )
 
-    def _check_sequence(self, added: Effect, found: Quantity) -> None:
-        if any(a.kind == "sequence" for a in self.effects):
-            raise UsageError(f"model {self.name} already has an effect on the sequence of samples")
-        if self.traced.residual.predicted is not found.value:
+    @property
+    def recorded(self) -> tuple[str, ...]:
+        """Signals that another instrument than the measured one may give, late: not t."""
+        if self.implicit:
+            return ()
+        return tuple(s.name for s in self.signals if s.name not in ("t", self.traced.measured))
+
+    def _checked_recorded(self, added: Effect, target: str) -> str:
+        """The unit of a recorded signal that comes at another time."""
+        if target in self.recorded:
+            return self[target].unit or f"[{target}]"
+        why = f"{target} is what it measures" if target in self.symbols else f"it has no {target!r}"
+        if target == "t":
+            why = "t is the time of its samples"
+        if target == RECORDED and self.recorded:
+            why = "say of which signal"
+        elif target == RECORDED:
+            why = "it has no signal but the time and what it measures"
+        if self.implicit:
+            why = "its residual is no signal that could come late against another"
+        there = f": it has {', '.join(self.recorded)}" if self.recorded else ""
+        raise UsageError(
+            f"effect {added.name} is not applicable to model {self.name}: {why}{there}"
+        )
+
+    def _check_sequence(self, added: Effect) -> None:
+        if self.implicit:
             raise UsageError(
                 f"effect {added.name} is not applicable to model {self.name}: it acts on the "
-                f"sequence of predicted readings, and {found.name} is not what the model predicts"
+                "sequence of predicted readings, and this model's residual is no reading"
             )
 
     def start(self, function: Callable[..., Any]) -> Model:
@@ -342,6 +402,11 @@ class Model:
             return found
         return sampson(self, found, trace(self, straight=True))
 
+    @cached_property
+    def staged(self) -> Traced:
+        """The body with a symbol in the place of what each effect gives that looks at others."""
+        return trace(self, staged=True)
+
     # -- numbers -------------------------------------------------------------------------------
 
     def __call__(self, **values: Any) -> dict[str, Array]:
@@ -356,7 +421,7 @@ class Model:
         missing = [s.name for s in self.signals if s.name not in values]
         if missing:
             raise UsageError(f"model {self.name} needs the signal {missing[0]!r}")
-        if any(a.kind == "sequence" for a in self.effects):
+        if any(a.kind in OVER_TIME for a in self.effects):
             raise UsageError(
                 f"model {self.name} has an effect on the sequence of samples: single samples have "
                 "no prediction of their own; evaluate it on a run (leastsquares.problem)"

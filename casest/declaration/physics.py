@@ -56,6 +56,8 @@ class Trace:
     quantities: dict[str, Quantity] = field(default_factory=dict)
     handed: dict[str, SX] = field(default_factory=dict)
     steps: list[tuple[SX, SX]] = field(default_factory=list)
+    #: Effects that look at other samples (tracing.Stage), in the order of the body.
+    stages: list[Any] = field(default_factory=list)
 
     def enter(self, name: str, expression: Any, unit: str, *, implied: bool = False) -> SX:
         """Record a quantity and hand back what the rest of the body shall see."""
@@ -124,6 +126,10 @@ def der(expression: SX, variable: SX) -> SX:
     trace = current_trace.get()
     if trace is not None and trace.naming and expression.is_symbolic():
         return ca.SX.sym(f"der({expression})")
+    for stage in [] if trace is None else trace.stages:
+        if ca.depends_on(ca.vec(ca.SX(expression)), stage.given):
+            on, label = stage.attached.on, stage.attached.label
+            raise DeclarationError(f"how fast {on} changes is unknown once {label} acts on it")
     return ca.jtimes(ca.SX(expression), variable, ca.SX.ones(*variable.shape))
 
 

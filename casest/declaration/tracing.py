@@ -88,22 +88,47 @@ class Traced:
     measured: str | None
     corrected: str | None
     steps: tuple[tuple[SX, SX], ...] = ()
+    stages: tuple[Stage, ...] = ()
+
+
+@dataclass(frozen=True)
+class Stage:
+    """An effect that looks at other samples, where it acts.
+
+    `taken` is what it takes at a sample, one column: the value acted on, then what else it reads;
+    `given` the symbol that stands for what it gives, a column as long as the value; `shape` is the
+    value's, and `read` the names and shapes of what else it reads.
+    """
+
+    attached: Attached
+    taken: SX
+    given: SX
+    shape: tuple[int, int] = (1, 1)
+    read: tuple[tuple[str, tuple[int, int]], ...] = ()
 
 
 def trace(
-    model: Declared, cut: str | None = None, naming: bool = False, straight: bool = False
+    model: Declared,
+    cut: str | None = None,
+    naming: bool = False,
+    straight: bool = False,
+    staged: bool = False,
 ) -> Traced:
     """Run the model's body on symbols.
 
     `cut` replaces a quantity (before its effects) by a free symbol; `naming` replaces every
     quantity by a symbol of its name after it is computed, for printing; `straight` puts a free
-    symbol in the place of what each effect adds, listed in `steps` with what it stands for.
+    symbol in the place of what each effect adds, listed in `steps` with what it stands for;
+    `staged` one in the place of what each effect that looks at other samples gives, listed in
+    `stages`. Without it those effects are left out.
     """
     symbols, coordinates, references = _symbols(model)
     running = Trace(cut=cut, naming=naming, straight=straight, reserved=frozenset(symbols))
     for attached in model.effects:
         if attached.kind == "quantity":
             running.effects.setdefault(attached.on, []).append(_applied(attached, symbols, running))
+        if attached.kind == "sequence" and staged:
+            running.effects.setdefault(attached.on, []).append(_staged(attached, symbols, running))
     residual = _run_body(model, running, symbols)
     measured = _name_of(residual.measured, symbols)
     if residual.measured is not None and measured is None:
@@ -121,6 +146,7 @@ def trace(
         None if residual.measured is None else ca.vec(residual.measured),
         measured,
         _corrected(model, residual, running, symbols),
+        stages=tuple(running.stages),
     )
     on_signals = [a for a in model.effects if a.kind == "signal"]
     for attached in on_signals:
@@ -130,6 +156,9 @@ def trace(
     for attached in reversed(on_signals):
         if attached.on != traced.measured:
             traced = _with_signal_effect(traced, attached, running)
+    for attached in model.effects if staged else ():
+        if attached.kind == "time":
+            traced = _with_other_time(traced, attached)
     return replace(traced, steps=tuple(running.steps))
 
 
@@ -161,6 +190,18 @@ def _symbols(model: Declared) -> tuple[dict[str, SX], list[SX], list[SX]]:
 def _applied(attached: Attached, symbols: Mapping[str, SX], running: Trace) -> Callable[[SX], SX]:
     def apply(value: SX) -> SX:
         return attached.apply(value, {**running.handed, **symbols})
+
+    return apply
+
+
+def _staged(attached: Attached, symbols: Mapping[str, SX], running: Trace) -> Callable[[SX], SX]:
+    def apply(value: SX) -> SX:
+        there = {s.name: {**running.handed, **symbols}[s.name] for s in attached.reads}
+        taken = ca.vertcat(ca.vec(value), *map(flat, there.values()))
+        given = ca.SX.sym(attached.label, value.numel())
+        read = tuple((name, x.shape) for name, x in there.items())
+        running.stages.append(Stage(attached, taken, given, value.shape, read))
+        return ca.reshape(given, *value.shape)
 
     return apply
 
@@ -226,21 +267,37 @@ def _with_signal_effect(traced: Traced, attached: Attached, running: Trace) -> T
     plain = flat(symbol)
     changed = running.passed(plain, flat(ca.SX(attached.apply(symbol, traced.symbols))))
 
-    def late(expression: SX) -> SX:
-        return ca.substitute(expression, plain, changed)
-
     if running.straight:  # what was there before reads the signal as it has become
         *others, own = running.steps
-        running.steps = [own, *((step, late(change)) for step, change in others)]
+        late = [(step, ca.substitute(change, plain, changed)) for step, change in others]
+        running.steps = [own, *late]
+    return _substituted(traced, plain, changed)
+
+
+def _with_other_time(traced: Traced, attached: Attached) -> Traced:
+    """A signal taken at another time is what its record gives there: a symbol in its place."""
+    plain = flat(traced.symbols[attached.on])
+    given = ca.SX.sym(attached.label, plain.numel())
+    traced = _substituted(traced, plain, given)
+    return replace(traced, stages=(Stage(attached, plain, given), *traced.stages))
+
+
+def _substituted(traced: Traced, plain: SX, changed: SX) -> Traced:
+    """The body with one signal changed, after it has been run."""
+
+    def put(expression: SX) -> SX:
+        return ca.substitute(expression, plain, changed)
+
     quantities = {
-        name: replace(q, declared=late(q.declared), value=late(q.value))
+        name: replace(q, declared=put(q.declared), value=put(q.value))
         for name, q in traced.quantities.items()
     }
     return replace(
         traced,
         quantities=quantities,
-        expression=late(traced.expression),
-        predicted=None if traced.predicted is None else late(traced.predicted),
+        expression=put(traced.expression),
+        predicted=None if traced.predicted is None else put(traced.predicted),
+        stages=tuple(replace(stage, taken=put(stage.taken)) for stage in traced.stages),
     )
 
 

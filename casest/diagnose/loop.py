@@ -123,17 +123,13 @@ def without_outliers(sensor: Sensor, fit: Fit, folds: Folds) -> tuple[Fit, Found
     return better, Found(Candidate(effect), p_value, 0.0)
 
 
-def certified(
-    sensor: Sensor, state: State[Fit], before: Estimate
-) -> tuple[State[Fit], Estimate]:
+def certified(sensor: Sensor, state: State[Fit], before: Estimate) -> tuple[State[Fit], Estimate]:
     """The last estimate, with intervals; without effects that leave one without an end."""
     from dataclasses import replace
 
     while True:
         with only_tried(False):
-            after = attempt(
-                state.fit.model, sensor.runs, start=state.fit.values, seed=sensor.seed
-            )
+            after = attempt(state.fit.model, sensor.runs, start=state.fit.values, seed=sensor.seed)
         if after.certificate.trusted:
             return state, after
         if not state.kept:
@@ -191,4 +187,3 @@ def _undecided(sensor: Sensor, state: State[Fit]) -> Undecided | None:
 
 
 __all__ = ["Closing", "Found", "close", "rms"]
-

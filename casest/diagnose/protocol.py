@@ -187,9 +187,7 @@ def ranked_of(linear: Linear, trials: Sequence[Trial]) -> Ranking:
         promise = screened(trial, likelihood, white)
         if promise > best.get(trial.family, (-np.inf, trial))[0]:
             best[trial.family] = (promise, trial)
-    found = [
-        judged([trial], likelihood, none, families=families) for _, trial in best.values()
-    ]
+    found = [judged([trial], likelihood, none, families=families) for _, trial in best.values()]
     several = _best_first([e for e in found if e is not None])
     return Ranking(linear, likelihood, none, several, families)
 

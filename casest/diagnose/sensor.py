@@ -9,19 +9,18 @@ from functools import cached_property
 import numpy as np
 
 from casest.data.run import Run
-from casest.declaration.effect import NOISE, Effect
+from casest.declaration.effect import NOISE, Effect, effect
 from casest.declaration.model import Model
 from casest.declaration.physics import SX
-from casest.declaration.effect import effect
 from casest.declaration.shapes import Array, each
 from casest.declaration.symbols import param
 from casest.diagnose.candidates.axes import axes_of
 from casest.diagnose.candidates.candidates import Candidate, Skipped, candidates
 from casest.diagnose.candidates.grid import Seen, nearer, on_grid
-from casest.diagnose.formula.search import NAME, described, readable, with_sizes
 from casest.diagnose.candidates.slopes import rows_of, slopes
 from casest.diagnose.evidence.linear import Linear, Parts, parts_of, spans_of
 from casest.diagnose.evidence.score import Evidence, Trial
+from casest.diagnose.formula.search import NAME, described, readable, with_sizes
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.protocol import Kept, Ranking, Rival
 from casest.effects import shipped
@@ -93,9 +92,7 @@ class Sensor:
     def proved(self, fit: Fit) -> Estimate:
         """An estimate whose trust is known; its intervals are left for the end."""
         with only_tried(False):
-            return attempt(
-                fit.model, self.runs, start=fit.values, seed=self.seed, intervals=False
-            )
+            return attempt(fit.model, self.runs, start=fit.values, seed=self.seed, intervals=False)
 
     # -- the loop's questions --------------------------------------------------------------------
 
@@ -172,7 +169,9 @@ class Sensor:
             return np.zeros((len(self._numbers[0]), 1))
         problem, point = self._problem(fit)
         found = problem.evaluate(point, {"q": value})
-        parts = [f[0].reshape(len(f[0]), -1)[rows] for f, rows in zip(found, self.rows, strict=True)]
+        parts = [
+            f[0].reshape(len(f[0]), -1)[rows] for f, rows in zip(found, self.rows, strict=True)
+        ]
         return np.nan_to_num(np.concatenate(parts))
 
     def seen(self, fit: Fit, linear: Linear) -> Seen:
@@ -233,9 +232,7 @@ class Sensor:
         """The trial on some of its axes."""
         candidate: Candidate = trial.what
         assert candidate.effect is not None and trial.axes is not None
-        less = replace(
-            candidate, effect=restricted(candidate.effect, axes, fit.model), traced=None
-        )
+        less = replace(candidate, effect=restricted(candidate.effect, axes, fit.model), traced=None)
         own = np.isin(trial.axes, list(axes))
         return replace(trial, what=less, columns=trial.columns[:, :, own], axes=None)
 
@@ -296,7 +293,9 @@ class Sensor:
         linear = self.linear(fit)
         everything = np.concatenate([np.arange(x.start, x.stop) for x, _ in own])
         profile = dict(what.effect.profile) if what.effect else {}
-        sizes = [x for x, name in own if name.rpartition(".")[2] not in profile] or [x for x, _ in own]
+        sizes = [x for x, name in own if name.rpartition(".")[2] not in profile] or [
+            x for x, _ in own
+        ]
         columns = linear.slopes[:, :, np.concatenate([np.arange(x.start, x.stop) for x in sizes])]
         part = self._residual_without(fit, what) - linear.residual
         variants = max(t.variants for t in kept.evidence.trials if t.family == what.label)

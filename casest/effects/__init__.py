@@ -43,7 +43,14 @@ from casest.effects.response import (
     signed_quadratic,
     soft_iron,
 )
-from casest.effects.timing import axis_delay, hysteresis, low_pass, time_delay
+from casest.effects.timing import (
+    axis_delay,
+    creep,
+    hysteresis,
+    low_pass,
+    signal_lag,
+    time_delay,
+)
 
 CATALOGUE: tuple[Effect, ...] = (
     axis_gain,
@@ -72,6 +79,8 @@ CATALOGUE: tuple[Effect, ...] = (
     time_delay,
     axis_delay,
     low_pass,
+    creep,
+    signal_lag,
     saturation,
     dead_zone,
     vibration,
@@ -88,7 +97,7 @@ CATALOGUE: tuple[Effect, ...] = (
     outliers,
 )
 
-_FUNCTIONS = frozenset(e.function for e in CATALOGUE)
+_FUNCTIONS = frozenset(f.function for e in CATALOGUE for f in (e, e.otherwise) if f is not None)
 
 
 def shipped(effect: Effect) -> bool:

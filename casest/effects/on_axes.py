@@ -56,6 +56,8 @@ def restricted(effect: Effect, kept: Sequence[int], model: Model) -> Effect:
         null=tuple(sorted({**null, **more}.items())),
         typical=tuple({**typical, **sizes}.items()),
         plain=tuple(plain.items()),
+        otherwise=effect.otherwise
+        and restricted(replace(effect.otherwise, on=effect.on), kept, model),
     )
 
 

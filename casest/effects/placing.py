@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +12,7 @@ from casest.data.run import Run
 from casest.declaration.effect import Attached, Effect
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
+from casest.effects.lateness import likely_lag
 from casest.errors import CasestError, UnitError
 from casest.units import conversion, known, size
 
@@ -62,10 +63,34 @@ def told(model: Model, runs: Sequence[Run]) -> Model:
     """The model whose effects are told their numbers by these runs."""
 
     def numbered(attached: Attached) -> Attached:
+        attached = _begun(attached, model, runs)
         own = with_numbers(attached.effect, attached.columns, runs, model)
         return attached if own is attached.effect else replace(attached, effect=own)
 
     return replace(model, effects=tuple(numbered(a) for a in model.effects))
+
+
+def _begun(attached: Attached, model: Model, runs: Sequence[Run]) -> Attached:
+    """Times of an effect begin where the records say: neither zero nor a guess is near."""
+    if attached.kind == "time":
+        measured = model.traced.measured or ""
+        start = likely_lag(runs, measured, attached.on)
+        own = {p.name.rpartition(".")[2] for p in attached.parameters if start}
+        return _starting(attached, own, start)
+    times = [run.time for run in runs if run.time is not None and len(run) > 1]
+    scales = {name for name, what in attached.effect.profile if what == "timescale" and times}
+    # In the middle of step and duration, on a scale of ratios.
+    middles = [float(np.sqrt(np.median(np.diff(t)) * np.ptp(t))) for t in times]
+    return _starting(attached, scales, max(middles, default=0.0))
+
+
+def _starting(attached: Attached, names: Collection[str], value: float) -> Attached:
+    start = float(f"{value:.6g}")
+    parameters = tuple(
+        replace(p, start=(start,)) if p.name.rpartition(".")[2] in names else p
+        for p in attached.parameters
+    )
+    return replace(attached, parameters=parameters)
 
 
 def with_numbers(

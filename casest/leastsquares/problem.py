@@ -16,6 +16,7 @@ import casadi as ca
 import numpy as np
 
 from casest.data.run import Run
+from casest.declaration.effect import OVER_TIME
 from casest.declaration.model import Model
 from casest.declaration.physics import chart
 from casest.declaration.shapes import Array
@@ -34,7 +35,7 @@ from casest.engine import (
 )
 from casest.errors import DataError, NotTrusted, UsageError
 from casest.leastsquares.per_sample import residual_and_jacobian
-from casest.leastsquares.sequence import Recursion
+from casest.leastsquares.sequence import Staged
 
 
 @dataclass(frozen=True)
@@ -324,7 +325,7 @@ class Problem:
     @property
     def sequential(self) -> bool:
         """Does a sample's residual depend on the samples before?"""
-        return self._recursion is not None
+        return self._staged is not None
 
     @cached_property
     def _with_jacobian(self) -> Replay:
@@ -336,16 +337,16 @@ class Problem:
         return any(kernel is not None for kernel in self._with_jacobian.kernels.values())
 
     @cached_property
-    def _recursion(self) -> Recursion | None:
-        """Where an effect acts on the sequence of samples, rows come from a recursion."""
-        sequential = any(a.kind == "sequence" for a in self.model.effects)
-        return Recursion(self.model) if sequential else None
+    def _staged(self) -> Staged | None:
+        """Where an effect looks at other samples, rows come from the record as a whole."""
+        sequential = any(a.kind in OVER_TIME for a in self.model.effects)
+        return Staged(self.model, self.runs) if sequential else None
 
     def _rows(self, point: Point, r: int, span: slice = slice(None)) -> tuple[Array, Array]:
         """Residuals (N, m) and Jacobians (N, m, n of the run) of one run, unweighted."""
         parameters = self.parameters(point, r)
-        if self._recursion is not None:
-            found = self._recursion.rows(parameters, self.samples[r].dense, self.runs[r])
+        if self._staged is not None:
+            found = self._staged.rows(parameters, self.samples[r].dense, r)
             return found[0][span], found[1][span]
         return rows(self._with_jacobian, parameters, self.samples[r][span])
 
@@ -371,13 +372,13 @@ class Problem:
         return both.reshape(-1, both.shape[2])
 
     def _run_cost(self, point: Point, r: int) -> float:
-        if self._recursion is not None:
+        if self._staged is not None:
             return 0.5 * float(np.sum(self._weighted_rows(point, r)[:, -1] ** 2))
         parameters = self.parameters(point, r)
         return cost(self._with_jacobian, parameters, self.samples[r], self._weight(r))
 
     def _run_normal(self, point: Point, r: int) -> Normal:
-        if self._recursion is not None:
+        if self._staged is not None:
             both = self._weighted_rows(point, r)
             product = both.T @ both
             return Normal(0.5 * float(product[-1, -1]), product[:-1, -1], product[:-1, :-1])
@@ -385,7 +386,7 @@ class Problem:
         return normal_equations(self._with_jacobian, parameters, self.samples[r], self._weight(r))
 
     def _run_factor(self, point: Point, r: int) -> Array:
-        if self._recursion is not None:
+        if self._staged is not None:
             return np.asarray(np.linalg.qr(self._weighted_rows(point, r), mode="r"))
         parameters = self.parameters(point, r)
         return triangular_factor(self._with_jacobian, parameters, self.samples[r], self._weight(r))
@@ -462,7 +463,7 @@ class Problem:
     def hessian(self, point: Point) -> Array:
         """Exact second derivative of the cost, (n, n); Gauss-Newton for sequences of samples."""
         matrix = self.normal(point).matrix.copy()
-        if self._recursion is not None:
+        if self._staged is not None:
             return matrix
         for r, samples in enumerate(self.samples):
             x = self._selections[r][0]

@@ -1,95 +1,138 @@
-"""Effects on the sequence of samples: predictions that depend on the sample before.
+"""Effects that look at other samples than a residual's own: memory, and signals that come late.
 
-A filter in the sensor makes the reading a recursion y[k] = F(y[k−1], x[k], dt[k]; θ) over the
-model's prediction x. Its derivative follows the same recursion (forward sensitivity), and CasADi
-runs both in one accumulated map.
+Each is a stage: what it takes at every sample is computed first, then what it gives, with its
+slopes in the parameters, and that takes the place of a symbol in what comes after. A memory is run
+through sample by sample; a signal at another time is taken from its record by splines.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Any
+from functools import cached_property, lru_cache
 
 import casadi as ca
 import numpy as np
 
+from casest.data.curves import Curve
 from casest.data.run import Run
+from casest.declaration.effect import Attached
 from casest.declaration.model import Model
+from casest.declaration.physics import SX
 from casest.declaration.shapes import Array
-from casest.declaration.tracing import function_of, sample_symbol
+from casest.declaration.tracing import sample_symbol
 from casest.engine import Replay
 from casest.errors import DataError
-
-#: Samples per accumulated map: long enough to hide the call, short enough to build at once.
-CHUNK = 512
+from casest.leastsquares.memory import Memory
 
 
 @dataclass(frozen=True)
-class Recursion:
-    """Residual and Jacobian of an explicit model with an effect on the sequence of samples."""
+class Staged:
+    """Residual and Jacobian of an explicit model with effects that look at other samples."""
 
     model: Model
+    runs: tuple[Run, ...]
 
     @cached_property
-    def _both_sides(self) -> Replay:
-        """Prediction and reading of one sample, with their Jacobians."""
-        t = self.model.traced
-        outputs = {
-            "x": ca.densify(t.predicted),
-            "Jx": ca.jacobian(t.predicted, t.coordinates),
-            "z": ca.densify(t.reading),
-            "Jz": ca.jacobian(t.reading, t.coordinates),
-        }
-        return Replay(function_of(self.model, outputs))
+    def _curves(self) -> dict[tuple[int, str], Curve]:
+        return {}
 
-    @cached_property
-    def _steps(self) -> Any:
-        """(state, inputs, parameters) -> state, state = [y, dy/dθ], over CHUNK samples."""
-        t = self.model.traced
-        m, n = t.predicted.numel(), t.coordinates.numel()
-        y, S = ca.SX.sym("y", m), ca.SX.sym("S", m, n)
-        x, J, dt = ca.SX.sym("x", m), ca.SX.sym("J", m, n), ca.SX.sym("dt")
-        attached = next(a for a in self.model.effects if a.kind == "sequence")
-        new = ca.vec(ca.SX(attached.apply(x, t.symbols, previous=y, dt=dt)))
-        slope = ca.jacobian(new, x) @ J + ca.jacobian(new, y) @ S + ca.jacobian(new, t.coordinates)
-        inputs = ca.vertcat(x, ca.vec(J), dt, sample_symbol(self.model))
-        step = ca.Function(
-            "step",
-            [ca.vertcat(y, ca.vec(S)), inputs, ca.vertcat(t.coordinates, t.references)],
-            [ca.vertcat(new, ca.vec(slope))],
-        )
-        return step.mapaccum("steps", CHUNK)
+    def rows(self, parameters: Array, samples: Array, r: int) -> tuple[Array, Array]:
+        """Residuals (N, m) and Jacobians (N, m, n) of run r, block by block of its record."""
+        *stages, last = _programs(self.model)
+        time = _time(self.runs[r])
+        given = np.zeros((len(samples), 0))
+        slopes = np.zeros((len(samples), 0, self.model.staged.coordinates.numel()))
+        for stage in stages:
+            if stage.moment is not None:
+                more = self._late(stage.attached, stage.moment, parameters, r, time)
+            else:
+                assert stage.memory is not None
+                taken = _chained(stage.taken, parameters, samples, given, slopes)
+                more = stage.memory.along(parameters, *taken, time, self.runs[r].block)
+            given = np.concatenate([given, more[0]], axis=1)
+            slopes = np.concatenate([slopes, more[1]], axis=1)
+        return _chained(last.taken, parameters, samples, given, slopes)
 
-    def rows(self, parameters: Array, samples: Array, run: Run) -> tuple[Array, Array]:
-        """Residuals (N, m) and Jacobians (N, m, n) with the recursion applied block by block."""
-        if run.time is None:
-            raise DataError(
-                f"{run.file}: a sequence effect needs time: give a time column or --rate"
-            )
-        x, Jx, z, Jz = self._both_sides(parameters, samples)
-        dt = np.diff(run.time, prepend=run.time[:1])
-        y, S = np.empty_like(x[:, :, 0]), np.empty_like(Jx)
-        for block in np.unique(run.block):
-            own = np.flatnonzero(run.block == block)
-            # The first sample of a block starts from a settled filter.
-            dt[own[0]] = np.median(np.diff(run.time[own])) if len(own) > 1 else 0.0
-            y[own], S[own] = self._block(x[own, :, 0], Jx[own], dt[own], samples[own], parameters)
-        return z[:, :, 0] - y, Jz - S
-
-    def _block(
-        self, x: Array, J: Array, dt: Array, samples: Array, parameters: Array
+    def _late(
+        self, attached: Attached, moment: Replay, parameters: Array, r: int, time: Array
     ) -> tuple[Array, Array]:
-        count, m, n = J.shape
-        state = np.concatenate([x[0], J[0].T.ravel()])
-        inputs = np.hstack([x, J.transpose(0, 2, 1).reshape(count, -1), dt[:, None], samples])
-        padded = -count % CHUNK
-        inputs = np.vstack([inputs, np.repeat(inputs[-1:], padded, axis=0)])
-        constants = np.repeat(parameters[:, None], CHUNK, axis=1)
-        found = []
-        for k in range(0, len(inputs), CHUNK):
-            states = np.array(self._steps(state, inputs[k : k + CHUNK].T, constants))
-            found.append(states.T)
-            state = states[:, -1]
-        states = np.vstack(found)[:count]
-        return states[:, :m], states[:, m:].reshape(count, n, m).transpose(0, 2, 1)
+        """A signal at the times at which the effect says that it is taken, and its slopes."""
+        at, slope = moment(parameters, time[:, None])
+        wanted, curve = at[:, 0, 0], self._curve(r, attached.on, time)
+        # Within its own record a signal crosses no gap; another file's has gaps of its own.
+        apart = attached.on in self.runs[r].elsewhere
+        value, rate = curve.at(wanted, curve.nearest(wanted) if apart else curve.stretch)
+        return value, rate[:, :, None] * slope
+
+    def _curve(self, r: int, name: str, time: Array) -> Curve:
+        if (r, name) not in self._curves:
+            run, rotation = self.runs[r], self.model[name].kind == "rotation"
+            other = run.elsewhere.get(name)
+            if other is not None:
+                made = Curve.through(other.time, other.values, other.block, rotation=rotation)
+            else:
+                made = Curve.through(time, run.signals[name], run.block, rotation=rotation)
+            self._curves[r, name] = made
+        return self._curves[r, name]
+
+
+@dataclass(frozen=True)
+class Program:
+    """What is computed of one stage: what it takes, and how it goes on from it.
+
+    The last of a model's is its residual, with no effect behind it.
+    """
+
+    attached: Attached
+    taken: Replay
+    moment: Replay | None = None
+    memory: Memory | None = None
+
+
+@lru_cache(maxsize=64)
+def _programs(model: Model) -> tuple[Program, ...]:
+    traced, found, given = model.staged, [], ca.SX(0, 1)
+    parameters = ca.vertcat(traced.coordinates, traced.references)
+
+    def slopes(expression: SX, *of: SX) -> list[SX]:
+        return [ca.densify(expression), *(ca.jacobian(expression, x) for x in of)]
+
+    def replay(expression: SX) -> Replay:
+        sample = ca.vertcat(sample_symbol(model, traced), given)
+        outputs = slopes(expression, traced.coordinates, given)
+        return _replay("stage", [parameters, sample], outputs)
+
+    for stage in traced.stages:
+        if stage.attached.kind == "time":
+            t = ca.SX.sym("t")
+            moment = ca.SX(stage.attached.apply(t, traced.symbols))
+            outputs = slopes(moment, traced.coordinates)
+            f = _replay("moment", [parameters, t], outputs)
+            found.append(Program(stage.attached, f, moment=f))
+        else:
+            memory = Memory(model, stage)
+            found.append(Program(stage.attached, replay(stage.taken), memory=memory))
+        given = ca.vertcat(given, stage.given)
+    return (*found, Program(traced.stages[-1].attached, replay(traced.expression)))
+
+
+def _replay(name: str, inputs: list[SX], outputs: list[SX]) -> Replay:
+    names = [f"out{k}" for k in range(len(outputs))]
+    return Replay(ca.Function(name, inputs, outputs, ["parameters", "sample"], names))
+
+
+def _time(run: Run) -> Array:
+    if run.time is None:
+        raise DataError(
+            f"{run.file or run.name}: an effect that looks at other samples needs time: give a "
+            "time column or --rate"
+        )
+    return run.time
+
+
+def _chained(
+    taken: Replay, parameters: Array, samples: Array, given: Array, slopes: Array
+) -> tuple[Array, Array]:
+    """Values (N, m) and slopes in the parameters (N, m, n), also by way of the stages before."""
+    value, direct, through = taken(parameters, np.hstack([samples, given]))
+    return value[:, :, 0], direct + through @ slopes if given.size else direct

@@ -17,9 +17,9 @@ from msgspec.structs import asdict, replace
 from casest.declaration.effect import Attached
 from casest.declaration.shapes import Array
 from casest.diagnose.closing import Closing
+from casest.diagnose.cross_validation import rms
 from casest.diagnose.detectability import detectable, invisible
 from casest.diagnose.formula.terms import source
-from casest.diagnose.cross_validation import rms
 from casest.diagnose.found import Found
 from casest.estimate.estimate import Estimate
 from casest.leastsquares.problem import Problem

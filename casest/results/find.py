@@ -9,18 +9,21 @@ import linecache
 import re
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 from casest.declaration.dimensions import check_units
-from casest.declaration.effect import Effect
+from casest.declaration.effect import RECORDED, Effect
 from casest.declaration.model import Model
 from casest.dynamics import Dynamics
 from casest.effects import CATALOGUE
 from casest.errors import CasestError, DeclarationError, UsageError
 
+#: Values of effects that a fit finds from where they start, without a grid.
+STARTED = ("timescale", "share")
 #: Shipped models: name on the command line -> module and attribute in `casest_problems`.
 SHIPPED = {
     "wheel": ("wheel", "wheel"),
@@ -126,6 +129,8 @@ def find_asked(text: str) -> tuple[tuple[Effect, str], ...]:
                 f"which, as {name}:{several[0].name}({column})"
             )
     effect = shipped[name] if name in shipped else several[0]
+    if effect.kind == "time":
+        return ((replace(effect, on=column), ""),)
     if len(effect.columns) != 1:
         raise UsageError(f"--effects {text}: {effect.name} follows no column; leave ({column}) out")
     return ((effect, column),)
@@ -133,6 +138,11 @@ def find_asked(text: str) -> tuple[tuple[Effect, str], ...]:
 
 def _whole(effect: Effect) -> Effect:
     """A shipped effect that needs neither a column nor a value that must be looked for."""
+    if effect.on == RECORDED:
+        raise UsageError(
+            f"--effects {effect.name}: this effect needs the signal that it delays: "
+            f"--effects '{effect.name}(SIGNAL)'"
+        )
     if effect.columns:
         raise UsageError(
             f"--effects {effect.name}: this effect needs the column it follows: "
@@ -143,8 +153,8 @@ def _whole(effect: Effect) -> Effect:
 
 def without_grid(effect: Effect) -> Effect:
     """The effect, unless it has a value that must be looked for."""
-    if effect.profile:
-        missing = ", ".join(name for name, _ in effect.profile)
+    missing = ", ".join(name for name, what in effect.profile if what not in STARTED)
+    if missing:
         raise UsageError(
             f"--effects {effect.name}: this effect needs its {missing}, which only `casest close` "
             "finds. Declare it in a file of your own, with the value in it"

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from casest import effects
-from casest.declaration.effect import Effect
+from casest.declaration.effect import Effect, label_of
 from casest.declaration.model import Model
 from casest.declaration.symbols import constant
 from casest.effects.on_axes import axis_name, lengths, restricted
@@ -31,11 +31,12 @@ def saved_model(result: Mapping[str, Any]) -> tuple[Model, dict[str, Any]]:
         if "file" not in saved:  # a constant that was freed
             continue
         columns, on = saved.get("columns") or {}, saved["on"]
-        label = saved["name"] + "".join(f"({c})" for c in columns.values())
-        moved = any(n.startswith(f"{label}@{on}.") for n in parameters)
-        label += f"@{on}" if moved else ""
+        effect = _found_effect(saved)
+        moved_label = label_of(effect, on, columns, moved=True)
+        moved = any(n.startswith(f"{moved_label}.") for n in parameters)
+        label = label_of(effect, on, columns, moved=moved)
         own = {n.removeprefix(label + ".") for n in parameters if n.startswith(label + ".")}
-        effect = _as_it_was(_found_effect(saved), saved, own, model)
+        effect = _as_it_was(effect, saved, own, model)
         effect = effect if moved else replace(effect, on=on)
         model = model.with_effect(effect, on=on, columns=columns)
     for name in parameters:

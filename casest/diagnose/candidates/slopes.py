@@ -179,4 +179,3 @@ def slope_of(
     old += [traced.references, *(flat(traced.symbols[s.name]) for s in extended.signals)]
     new += [base.references, *(flat(symbols[s.name]) for s in extended.signals)]
     return ca.substitute(slope, ca.vertcat(*old), ca.vertcat(*new)), scopes, more
-

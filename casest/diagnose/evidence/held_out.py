@@ -37,7 +37,9 @@ def foretold(linear: Linear, columns: Sequence[Array], parts: Index) -> Array:
     return found.reshape(linear.residual.shape)
 
 
-def fall(linear: Linear, columns: Sequence[Array], parts: Index, beside: Sequence[Array] = ()) -> Fall:
+def fall(
+    linear: Linear, columns: Sequence[Array], parts: Index, beside: Sequence[Array] = ()
+) -> Fall:
     """Of the squares by columns, `beside` others."""
     before, after = (squares(linear, c, parts) for c in (beside, [*beside, *columns]))
     gained = before - after
@@ -52,8 +54,10 @@ def standard_errors(gained: Array) -> float:
 
 def _errors(linear: Linear, columns: Sequence[Array], parts: Index) -> list[Array]:
     far = FAR * robust_sd(linear.residual)
-    e = np.clip(foretold(linear, columns, parts), -far, far) if linear.series else foretold(
-        linear, columns, parts
+    e = (
+        np.clip(foretold(linear, columns, parts), -far, far)
+        if linear.series
+        else foretold(linear, columns, parts)
     )
     return [e[parts == k] ** 2 for k in np.unique(parts)]
 

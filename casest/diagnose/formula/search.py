@@ -55,7 +55,9 @@ class Read:
         return np.asarray(self.slope * np.nan_to_num(shape.values(x))[:, None, :])
 
 
-def described(read: Read, likelihood: Likelihood, none: Explained, families: int) -> Evidence | None:
+def described(
+    read: Read, likelihood: Likelihood, none: Explained, families: int
+) -> Evidence | None:
     """The best description: terms are added while they are worth their price."""
     shapes = library([v for v in read.variables if v.half > 0])
     if not shapes:

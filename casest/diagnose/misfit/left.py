@@ -181,9 +181,7 @@ def _follows(
         return []
     read = variables(problem, point, usable_columns(problem.model, problem.runs))
     found = [
-        s
-        for s in structures(clipped, read)
-        if s.p_value < LEVELS.misfit and s.share > LEVELS.share
+        s for s in structures(clipped, read) if s.p_value < LEVELS.misfit and s.share > LEVELS.share
     ]
     if not found:
         return []
