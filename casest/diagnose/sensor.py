@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -36,6 +36,8 @@ from casest.solve.trust_region import trust_region
 
 #: What survives of an implicit residual's slopes, in noise over reading, at least.
 BEYOND = 5.0
+#: Models whose candidates are remembered.
+REMEMBERED = 4
 #: Iterations of a fit that begins at the fit to everything, and gain (in σ²) that ends it.
 ITERATIONS, ENOUGH = 30, 1e-3
 
@@ -66,8 +68,10 @@ class Sensor:
     catalogue: tuple[Effect, ...]
     known: frozenset[str] = frozenset()
     seed: int = 0
-    say: Callable[[str], None] = lambda _: None
-    untrusted: list[tuple[Candidate, str]] = field(default_factory=list)
+    #: Candidates on the models that were asked about last: tracing takes longer than scoring.
+    remembered: list[tuple[Model, tuple[list[Candidate], list[Skipped]]]] = field(
+        default_factory=list, repr=False
+    )
 
     # -- fits ----------------------------------------------------------------------------------
 
@@ -163,16 +167,23 @@ class Sensor:
         traced = fit.model.traced
         name = traced.corrected
         value = fit.model.quantities[name].value if name else traced.predicted
-        if value is None or any(a.kind in ("sequence", "lag") for a in fit.model.effects):
-            value = traced.predicted
         if value is None:
             return np.zeros((len(self._numbers[0]), 1))
         problem, point = self._problem(fit)
+        if problem.sequential:  # what it met is what it met without a memory as well
+            return self._met(self._instant(fit))
         found = problem.evaluate(point, {"q": value})
         parts = [
             f[0].reshape(len(f[0]), -1)[rows] for f, rows in zip(found, self.rows, strict=True)
         ]
         return np.nan_to_num(np.concatenate(parts))
+
+    def _instant(self, fit: Fit) -> Fit:
+        """The fit without what looks at other samples."""
+        kept = tuple(a for a in fit.model.effects if a.kind not in OVER_TIME)
+        model = replace(fit.model, effects=kept)
+        own = {p.name for p in model.parameters}
+        return replace(fit, model=model, values={n: v for n, v in fit.values.items() if n in own})
 
     def seen(self, fit: Fit, linear: Linear) -> Seen:
         """What grids are laid over."""
@@ -197,7 +208,12 @@ class Sensor:
 
     def found(self, fit: Fit) -> tuple[list[Candidate], list[Skipped]]:
         """What could be missing, and what does not apply here."""
-        return candidates(fit.model, self.runs, self.catalogue)
+        for model, found in self.remembered:
+            if model is fit.model:
+                return found
+        self.remembered.append((fit.model, candidates(fit.model, self.runs, self.catalogue)))
+        del self.remembered[:-REMEMBERED]
+        return self.remembered[-1][1]
 
     def trials(self, fit: Fit) -> list[Trial]:
         """Every candidate in its columns, over its grid."""
@@ -422,11 +438,3 @@ def _simpler(full: Fit, plain: Fit | None) -> Fit:
         for f in (full, plain)
     ]
     return plain if worth[1] < worth[0] else full
-
-
-def sensor(
-    model: Model, runs: Sequence[Run], catalogue: Sequence[Effect], known: Collection[str] = (),
-    seed: int = 0, say: Callable[[str], None] = lambda _: None,
-) -> Sensor:  # fmt: skip
-    """The subject of a search."""
-    return Sensor(model, tuple(runs), tuple(catalogue), frozenset(known), seed, say)

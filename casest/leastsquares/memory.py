@@ -23,10 +23,11 @@ from casest.engine import Recursion
 
 @dataclass(frozen=True)
 class Memory:
-    """One stage of a model, of an effect on the sequence of samples."""
+    """One stage of a model, of an effect on the sequence of samples; `own` as in `Staged.rows`."""
 
     model: Model
     stage: Stage
+    own: tuple[int, ...] | None = None
 
     @property
     def size(self) -> int:
@@ -36,7 +37,12 @@ class Memory:
     @property
     def unknowns(self) -> int:
         """Number n of the parameters that slopes are taken in."""
-        return int(self.model.staged.coordinates.numel())
+        return int(self._coordinates.numel())
+
+    @property
+    def _coordinates(self) -> SX:
+        every = self.model.staged.coordinates
+        return every if self.own is None else every[list(self.own)]
 
     def along(
         self, parameters: Array, x: Array, X: Array, time: Array, block: NDArray[np.int_]
@@ -67,7 +73,7 @@ class Memory:
         outputs = []
         for found in (after, given):
             slope = ca.jacobian(found, s) @ slopes + ca.jacobian(found, x) @ X
-            slope += ca.jacobian(found, span) @ Y + ca.jacobian(found, traced.coordinates)
+            slope += ca.jacobian(found, span) @ Y + ca.jacobian(found, self._coordinates)
             outputs.append(ca.densify(ca.vertcat(found, ca.vec(ca.densify(slope)))))
         outputs = ca.substitute(outputs, [s], [ca.if_else(first, begin, s)])
         reach = [span, ca.vec(Y)] if self.stage.attached.spanned else []

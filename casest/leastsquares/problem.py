@@ -7,7 +7,7 @@ parameters that each run has for itself, run after run. Every run sees its own s
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
@@ -349,6 +349,18 @@ class Problem:
             found = self._staged.rows(parameters, self.samples[r].dense, r)
             return found[0][span], found[1][span]
         return rows(self._with_jacobian, parameters, self.samples[r][span])
+
+    def columns(self, point: Point, r: int, names: Collection[str]) -> Array:
+        """Slopes (N, m, k) of one run's residuals in some of its parameters alone, unweighted."""
+        own, place = [], 0
+        for p in self.model.parameters:
+            if p.name in names:
+                own += list(range(place, place + p.shape.coordinates))
+            place += p.shape.coordinates
+        if self._staged is None:
+            return self._rows(point, r)[1][:, :, own]
+        parameters = self.parameters(point, r)
+        return self._staged.rows(parameters, self.samples[r].dense, r, tuple(own))[1]
 
     def blocks(self, point: Point) -> Iterator[Block]:
         """Residuals and Jacobians of all samples, piece by piece, unweighted."""

@@ -36,12 +36,18 @@ class Staged:
     def _curves(self) -> dict[tuple[int, str], Curve]:
         return {}
 
-    def rows(self, parameters: Array, samples: Array, r: int) -> tuple[Array, Array]:
-        """Residuals (N, m) and Jacobians (N, m, n) of run r, block by block of its record."""
-        *stages, last = _programs(self.model)
+    def rows(
+        self, parameters: Array, samples: Array, r: int, own: tuple[int, ...] | None = None
+    ) -> tuple[Array, Array]:
+        """Residuals (N, m) and Jacobians (N, m, n) of run r, block by block of its record.
+
+        `own`: the coordinates that slopes are taken in, where not in all.
+        """
+        *stages, last = _programs(self.model, own)
         time = _time(self.runs[r])
         given = np.zeros((len(samples), 0))
-        slopes = np.zeros((len(samples), 0, self.model.staged.coordinates.numel()))
+        count = self.model.staged.coordinates.numel() if own is None else len(own)
+        slopes = np.zeros((len(samples), 0, count))
         for stage in stages:
             if stage.moment is not None:
                 more = self._late(stage.attached, stage.moment, parameters, r, time)
@@ -90,8 +96,9 @@ class Program:
 
 
 @lru_cache(maxsize=64)
-def _programs(model: Model) -> tuple[Program, ...]:
+def _programs(model: Model, own: tuple[int, ...] | None = None) -> tuple[Program, ...]:
     traced, found, given = model.staged, [], ca.SX(0, 1)
+    coordinates = traced.coordinates if own is None else traced.coordinates[list(own)]
     parameters = ca.vertcat(traced.coordinates, traced.references)
 
     def slopes(expression: SX, *of: SX) -> list[SX]:
@@ -99,18 +106,18 @@ def _programs(model: Model) -> tuple[Program, ...]:
 
     def replay(expression: SX) -> Replay:
         sample = ca.vertcat(sample_symbol(model, traced), given)
-        outputs = slopes(expression, traced.coordinates, given)
+        outputs = slopes(expression, coordinates, given)
         return _replay("stage", [parameters, sample], outputs)
 
     for stage in traced.stages:
         if stage.attached.kind == "time":
             t = ca.SX.sym("t")
             moment = ca.SX(stage.attached.apply(t, traced.symbols))
-            outputs = slopes(moment, traced.coordinates)
+            outputs = slopes(moment, coordinates)
             f = _replay("moment", [parameters, t], outputs)
             found.append(Program(stage.attached, f, moment=f))
         else:
-            memory = Memory(model, stage)
+            memory = Memory(model, stage, own)
             found.append(Program(stage.attached, replay(stage.taken), memory=memory))
         given = ca.vertcat(given, stage.given)
     return (*found, Program(traced.stages[-1].attached, replay(traced.expression)))

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casest.data.run import Run
+from casest.declaration.effect import OVER_TIME
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
 from casest.declaration.symbols import Signal
@@ -49,7 +50,7 @@ def slopes(
     for candidate in found:
         if candidate not in direct:
             try:
-                yield candidate, _through_recursion(problem, point, candidate, rows)
+                yield candidate, _through_record(problem, point, candidate, rows)
             except CasestError as error:
                 yield candidate, error
 
@@ -59,7 +60,7 @@ def _sequential(candidate: Candidate, model: Model) -> bool:
     kinds = {a.kind for a in model.effects}
     if candidate.effect is not None:
         kinds.add(candidate.effect.kind)
-    return bool(kinds & {"sequence", "lag"})
+    return bool(kinds & set(OVER_TIME))
 
 
 def _direct(
@@ -117,34 +118,24 @@ def _side_by_side(parts: Sequence[Array], per_run: NDArray[np.bool_]) -> Array:
     return found
 
 
-def _through_recursion(
+def _through_record(
     problem: Problem, point: Point, candidate: Candidate, rows: Sequence[Index]
 ) -> Array:
     """Columns of the candidate's own unknowns in the extended problem."""
-    extended = candidate.added_to(problem.model)
+    extended = candidate.traced_on(problem.model)
     wide = Problem(extended, problem.runs)
-    start = wide.start().references  # null values
-    values = {**wide.values(Point(wide.start().x, start)), **problem.values(point)}
-    at = wide.point(values)
-    names = {p.name for p in candidate.parameters(extended)}
-    own = np.concatenate(
-        [np.arange(s.x.start, s.x.stop) for s in wide.slots if s.parameter.name in names]
-    )
-    axes = len(extended.axes)
-    total = sum(map(len, rows))
-    found, row = np.zeros((total, axes, wide.unknowns)), 0
-    offsets = np.cumsum([0, *map(len, rows)])
-    for block in wide.blocks(at):
-        inside = (rows[block.run] >= block.span.start) & (rows[block.run] < block.span.stop)
-        chosen = rows[block.run][inside] - block.span.start
-        here = offsets[block.run] + np.flatnonzero(inside)
-        part = np.zeros((len(chosen), axes, wide.unknowns))
-        part[:, :, block.x] = block.jacobian[chosen]
+    held = {f"{candidate.label}.{name}": np.array(value) for name, value in candidate.held}
+    at = wide.point({**wide.values(wide.start()), **problem.values(point), **held})
+    own = candidate.parameters(extended)
+    names = {p.name for p in own}
+    parts = []
+    for r, chosen in enumerate(rows):
+        part = wide.columns(at, r, names)[chosen]
         if problem.weights is not None:
-            part *= np.sqrt(problem.weights[block.run][block.span][chosen])[:, :, None]
-        found[here] = part
-        row += len(chosen)
-    return np.nan_to_num(found[:, :, own])
+            part = part * np.sqrt(problem.weights[r][chosen])[:, :, None]
+        parts.append(np.nan_to_num(part))
+    per_run = [p.scope == "run" for p in own for _ in range(p.shape.coordinates)]
+    return _side_by_side(parts, np.array(per_run, bool))
 
 
 def slope_of(
