@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from casest.data.run import Run
-from casest.declaration.effect import NOISE, Effect, effect
+from casest.declaration.effect import NOISE, OVER_TIME, Effect, effect
 from casest.declaration.model import Model
 from casest.declaration.physics import SX
 from casest.declaration.shapes import Array, each

@@ -25,7 +25,8 @@ class Fall:
 
 def squares(linear: Linear, columns: Sequence[Array], parts: Index) -> Array:
     """Held-out squares of every part (parts,), each by a fit to the others; columns (N, m, k)."""
-    return np.array([np.sum(e) for e in _errors(linear, columns, parts)])
+    e = _near(linear, foretold(linear, columns, parts))
+    return np.bincount(parts, np.sum(e**2, axis=1))
 
 
 def foretold(linear: Linear, columns: Sequence[Array], parts: Index) -> Array:
@@ -37,13 +38,24 @@ def foretold(linear: Linear, columns: Sequence[Array], parts: Index) -> Array:
     return found.reshape(linear.residual.shape)
 
 
-def fall(
-    linear: Linear, columns: Sequence[Array], parts: Index, beside: Sequence[Array] = ()
-) -> Fall:
-    """Of the squares by columns, `beside` others."""
-    before, after = (squares(linear, c, parts) for c in (beside, [*beside, *columns]))
-    gained = before - after
-    return Fall(float(after.sum() / max(before.sum(), 1e-300)), standard_errors(gained))
+def fall(linear: Linear, columns: Sequence[Array], parts: Index) -> Fall:
+    """Of the squares by columns.
+
+    Were they right, with errors a after and predictions that differ by δ, the squares would fall by
+    Σ(δ² + 2aδ): the error of the fall is that of 2Σaδ, from batch to batch of the record, and not
+    below that of white noise. So what is gained in a few places only is a gain as well.
+    """
+    b, a = (foretold(linear, c, parts) for c in ((), columns))
+    moved, nearer = b - a, np.abs(a) < np.abs(b)
+    # What is far from both is neither's; what one of them is far from counts in full.
+    least = _near(linear, np.where(nearer, a, b))
+    a, b = np.where(nearer, least, least - moved), np.where(nearer, least + moved, least)
+    gained = float(np.sum(b**2) - np.sum(a**2))
+    wide = np.bincount(linear.parts.batches, np.sum(2 * a * moved, axis=1))
+    white = 4 * float(np.mean(a**2)) * float(np.sum(moved**2))
+    spread = np.sqrt(max(float(np.sum(wide**2)), white))
+    ratio = float(np.sum(a**2) / max(np.sum(b**2), 1e-300))
+    return Fall(ratio, float(gained / max(spread, 1e-300)))
 
 
 def standard_errors(gained: Array) -> float:
@@ -52,14 +64,10 @@ def standard_errors(gained: Array) -> float:
     return float(gained.sum() / max(spread, 1e-300))
 
 
-def _errors(linear: Linear, columns: Sequence[Array], parts: Index) -> list[Array]:
+def _near(linear: Linear, e: Array) -> Array:
+    """Errors (N, m), those far out counted as less: by what is far before."""
     far = FAR * robust_sd(linear.residual)
-    e = (
-        np.clip(foretold(linear, columns, parts), -far, far)
-        if linear.series
-        else foretold(linear, columns, parts)
-    )
-    return [e[parts == k] ** 2 for k in np.unique(parts)]
+    return np.clip(e, -far, far) if linear.series else e
 
 
 def _fits(linear: Linear, flat: Array, parts: Index):  # type: ignore[no-untyped-def]

@@ -27,12 +27,14 @@ class Parts:
     """Three ways to hold a record out, the fold of each row (N,) in each.
 
     pieces: interleaved, which know their neighbours; stretches: whole parts of the record; regions:
-    whole parts of what the sensor met, wherever in the record.
+    whole parts of what the sensor met, wherever in the record. `batches` are parts of the record whose
+    noises are taken to be independent.
     """
 
     pieces: Index
     stretches: Index
     regions: Index
+    batches: Index
 
     @property
     def each(self) -> dict[str, Index]:
@@ -101,10 +103,11 @@ def parts_of(blocks: Index, runs: Index, inputs: Array) -> Parts:
     if count < LEVELS.series:
         single = np.unique(np.stack([runs, place]), axis=1, return_inverse=True)[1].ravel()
         stretches = place * min(LEVELS.stretches, max(count // 3, 2)) // size
-        return Parts(single, stretches, _regions(inputs, FEW_REGIONS))
-    pieces = place * LEVELS.pieces // size % LEVELS.folds
+        return Parts(single, stretches, _regions(inputs, FEW_REGIONS), single)
+    batches = place * LEVELS.pieces // size
     stretches = place * LEVELS.stretches // size
-    return Parts(pieces, stretches, _regions(inputs, LEVELS.regions))
+    regions = _regions(inputs, LEVELS.regions)
+    return Parts(batches % LEVELS.folds, stretches, regions, batches + LEVELS.pieces * runs)
 
 
 def _place(blocks: Index, runs: Index) -> tuple[Index, Index]:

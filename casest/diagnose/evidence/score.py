@@ -185,10 +185,10 @@ def on_fewer_axes(evidence: Evidence, likelihood: Likelihood) -> list[int] | Non
         ways = list(combinations(names, count))
         searched = float(np.log(trial.variants)) + float(np.log(len(ways)))
         for kept in ways:
-            own = np.flatnonzero(np.isin(trial.axes, kept) & alive)
-            if not len(own):
-                continue
-            gain, freedom = _gain(H[np.ix_(own, own)], g[own])
+            own = np.flatnonzero(np.isin(trial.axes, kept))
+            gain, freedom = _gain(H[np.ix_(own, own)], g[own]) if alive[own].all() else (0.0, 0)
+            if freedom < len(own):
+                continue  # what the unknowns, or other axes, can do has no size of its own
             score = worth(gain, freedom, searched, likelihood)
             if score > best[0] + 1e-9:
                 best = (score, [int(k) for k in kept])
