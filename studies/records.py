@@ -28,6 +28,7 @@ from record_rows import OF_NOISE, RECORDS, Record
 
 from casest import CasestError, Run, load_runs
 from casest.cli import run
+from casest.effects.placing import prepared
 from casest.estimate.held_out import residuals
 from casest.leastsquares.problem import Problem
 from casest.results.find import find_model
@@ -75,7 +76,8 @@ def closed(record: Record) -> Row:
             return {"name": record.name, "error": f"exit code {code}", "seconds": seconds}
         result = json.loads((folder / "result.json").read_text(encoding="utf-8"))
         row = {"name": record.name, "seconds": seconds, **_said(result)}
-        runs = load_runs([file], find_model(model).signals, **record.reading)
+        declared = find_model(model)
+        runs = prepared(declared, load_runs([file], declared.signals, **record.reading))
         return row | {"stretches": _on_stretches(result, model, runs)}
 
 
