@@ -17,8 +17,10 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from record_files import ROOT, found
 from record_rows import RECORDS, SKEW, Record
+from scipy.stats import f as f_distribution
 from subsets import p_value, positions
 
 from casest.cli import run
@@ -26,8 +28,6 @@ from casest.cli import run
 TABLE = ROOT / "studies" / "agreement.md"
 #: Of the F test.
 LEVEL = 0.01
-#: By how much two fits of one model may differ.
-SAME = 0.01
 
 TEN = Record(
     "MPU-6050, ten rest positions",
@@ -47,9 +47,10 @@ TEN = Record(
 HEAD = """# Records of rest positions: one answer
 
 Made by `python studies/agreement.py`. Left: is more missing than six unknowns of `norm-diagonal`:
-by `calibrate`'s doubt, by `close` (the skew is named), by the F test (p). Right: is anything missing
-beside the nine unknowns: by `calibrate norm-triangular`'s doubt, by `close norm-triangular`, by
-`close norm-diagonal` once it has the skew; errors of the fit of both.
+by `calibrate`'s doubt, by `close` (the skew is named), by the F test (p). Right: is anything
+missing beside the nine unknowns: by `calibrate norm-triangular`'s doubt, by `close
+norm-triangular`, by `close norm-diagonal` once it has the skew; and the errors of the fits of both,
+equal but for what terms that were left away explain by chance (F test again).
 
 | record | doubt | named | p | doubt | unexplained | unexplained | errors | agreed |
 | --- | --- | --- | --- | --- | --- | --- | --- | --- |
@@ -77,22 +78,30 @@ def row(record: Record) -> str:
         return f"| {record.name} | - | - | - | - | - | - | - | refused |\n"
     names = {e["name"] for e in results["close", "norm-diagonal"]["effects"]}
     norm = float(record.options[1].partition("=")[2].split()[0])
-    p = p_value(positions(record).signals["v"], norm)
+    v = positions(record).signals["v"]
+    p = p_value(v, norm)
     more = (bool(results["calibrate", "norm-diagonal"]["misfit"]), bool(names & SKEW))
     left = (
         bool(results["calibrate", "norm-triangular"]["misfit"]),
         results["close", "norm-triangular"]["verdict"] == "unexplained",
         results["close", "norm-diagonal"]["verdict"] == "unexplained",
     )
-    errors = [
-        results["close", f"norm-{m}"]["after"]["rmse_fit"] for m in ("triangular", "diagonal")
-    ]
-    same = abs(errors[0] / errors[1] - 1) < SAME
+    ends = [results["close", f"norm-{m}"]["after"] for m in ("triangular", "diagonal")]
+    same = alike(ends, len(v))
     agreed = len({*more, p < LEVEL}) == 1 and len({*left}) == 1 and same
     words = ["yes" if word else "no" for word in (*more, *left)]
     cells = [record.name, *words[:2], f"{p:.1g}", *words[2:],
-             " and ".join(f"{e:.4g}" for e in errors), "yes" if agreed else "**no**"]  # fmt: skip
+             " and ".join(f"{e['rmse_fit']:.4g}" for e in ends), "yes" if agreed else "**no**"]  # fmt: skip
     return "| " + " | ".join(cells) + " |\n"
+
+
+def alike(ends: list[dict[str, Any]], number: int) -> bool:
+    """Whether nine unknowns fit `number` positions no better than the terms that close kept."""
+    nine, kept = (number * end["rmse_fit"] ** 2 for end in ends)
+    free = number - 9
+    size = sum(np.size(p["value"]) for p in ends[1]["parameters"].values())
+    fewer = max(9 - size, 1)
+    return bool(f_distribution.sf((kept - nine) / fewer / (nine / free), fewer, free) > LEVEL)
 
 
 def main() -> None:
