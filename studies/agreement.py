@@ -90,8 +90,9 @@ def row(record: Record) -> str:
     same = alike(ends, len(v))
     agreed = len({*more, p < LEVEL}) == 1 and len({*left}) == 1 and same
     words = ["yes" if word else "no" for word in (*more, *left)]
-    cells = [record.name, *words[:2], f"{p:.1g}", *words[2:],
-             " and ".join(f"{e['rmse_fit']:.4g}" for e in ends), "yes" if agreed else "**no**"]  # fmt: skip
+    errors = " and ".join(f"{e['rmse_fit']:.4g}" for e in ends)
+    verdict = "yes" if agreed else "**no**"
+    cells = [record.name, *words[:2], f"{p:.1g}", *words[2:], errors, verdict]
     return "| " + " | ".join(cells) + " |\n"
 
 

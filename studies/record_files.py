@@ -87,6 +87,23 @@ def _gyro(source: str, name: str, columns: tuple[int, ...], unit: str) -> Callab
     return made
 
 
+def _on_one_clock(first: str, second: str, name: str) -> Callable[[Path], Path]:
+    """Two instruments in one table, as if their clocks had begun together."""
+
+    def made(folder: Path) -> Path:
+        a, b = (
+            np.loadtxt(MADE[part](folder), delimiter=",", skiprows=1) for part in (first, second)
+        )
+        a = a[(a[:, 0] >= b[0, 0]) & (a[:, 0] <= b[-1, 0])]
+        later = np.column_stack([np.interp(a[:, 0], b[:, 0], column) for column in b[:, 1:].T])
+        units = "deg/s" if first == "bno_w.csv" else "rad/s"
+        header = "t [s]" + "".join(f",w_{axis} [{units}]" for axis in "xyz")
+        header += "".join(f",u_{axis} [rad/s]" for axis in "xyz")
+        return table(name, header, np.column_stack([a, later]), folder)
+
+    return made
+
+
 def _text(name: str, text: str) -> Callable[[Path], Path]:
     def made(folder: Path) -> Path:
         (folder / name).write_text(text, encoding="utf-8")
@@ -112,6 +129,8 @@ MADE: dict[str, Callable[[Path], Path]] = {
     "mcu_w.csv": _gyro("twistnsync/twist_mcu.csv", "w", (0, 1, 2, 3), "rad/s"),
     "phone_u.csv": _gyro("twistnsync/twist_phone.csv", "u", (0, 1, 2, 3), "rad/s"),
     "bno_w.csv": _gyro("swing-project/lag_bno055.csv", "w", (0, 4, 5, 6), "deg/s"),
+    "twist.csv": _on_one_clock("mcu_w.csv", "phone_u.csv", "twist.csv"),
+    "swing.csv": _on_one_clock("bno_w.csv", "iphone_u.csv", "swing.csv"),
     "iphone_u.csv": _gyro("swing-project/lag_iphone.csv", "u", (7, 8, 9, 10), "rad/s"),
 }
 

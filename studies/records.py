@@ -31,6 +31,7 @@ from casest.cli import run
 from casest.effects.placing import prepared
 from casest.estimate.held_out import residuals
 from casest.leastsquares.problem import Problem
+from casest.leastsquares.weights import weighted
 from casest.results.find import find_model
 from casest.saved.model import saved_model
 from casest.solve.trust_region import trust_region
@@ -42,6 +43,10 @@ LIMIT = 120.0
 PATIENCE = 4 * LIMIT
 #: Stretches of a record, each held out whole once.
 STRETCHES = 10
+#: Robust standard deviations beyond which a held-out reading is a bad one; an error is its model's.
+BAD = 20.0
+#: Median size of normal deviates.
+NORMAL_MEDIAN = 0.6745
 
 HEAD = """# Measured records
 
@@ -49,7 +54,7 @@ Made by `make study-records` (`python studies/records.py`): each row is one `cas
 most {limit:.0f} s of processor time. Errors are root mean squares in the unit of the reading,
 before → after: of casest's own folds, and of {stretches} stretches of the record (of poses: groups
 of neighbours), each held out whole and predicted by a fit of the model, as it was declared and as
-it was closed, to all others.
+it was closed, to all others; readings off by {bad:.0f} robust standard deviations are left away.
 What a record can support was computed with NumPy and SciPy alone; the judgement is computed from
 that (`studies/record_rows.py`): *right*, *unhelpful* (true, but a cause that the record shows is
 not named, or too much is left) or *wrong*. Of a field that sways, a cycled cell with hysteresis, a
@@ -75,6 +80,9 @@ def closed(record: Record) -> Row:
         if not (folder / "result.json").is_file():
             return {"name": record.name, "error": f"exit code {code}", "seconds": seconds}
         result = json.loads((folder / "result.json").read_text(encoding="utf-8"))
+        if "before" not in result:
+            (why, *_) = result["estimate"]["certificate"]["reasons"]
+            return {"name": record.name, "error": f"refused: {why}", "seconds": seconds}
         row = {"name": record.name, "seconds": seconds, **_said(result)}
         declared = find_model(model)
         runs = prepared(declared, load_runs([file], declared.signals, **record.reading))
@@ -130,10 +138,17 @@ def held_out(model: Any, values: Any, runs: tuple[Run, ...]) -> float:
             inside = np.zeros(len(whole), dtype=bool)
             inside[stretch] = True
             others = (*runs[:k], _apart(whole, ~inside), *runs[k + 1 :])
-            fit = Problem(model, others)
+            fit = weighted(Problem(model, others), values)
             point = trust_region(fit, fit.point(values)).point
             rows.append(residuals(model, fit.values(point), None, whole.take(inside)).ravel())
-    return float(np.sqrt(np.nanmean(np.concatenate(rows) ** 2)))
+    return _rms(np.concatenate(rows))
+
+
+def _rms(errors: Any) -> float:
+    """Root mean square, bad samples left away: three readings of -8e6 would hide all others."""
+    sizes = np.abs(errors[np.isfinite(errors)])
+    robust = np.median(sizes) / NORMAL_MEDIAN
+    return float(np.sqrt(np.mean(sizes[sizes <= BAD * robust] ** 2)))
 
 
 def stretches(whole: Run) -> list[Any]:
@@ -224,7 +239,7 @@ def table(rows: dict[str, Row]) -> str:
     done = [(r, rows[r.name]) for r in RECORDS if r.name in rows]
     verdicts = [judged(record, row).partition(":")[0] for record, row in done]
     count = {word: verdicts.count(word) for word in ("right", "unhelpful", "wrong")}
-    head = HEAD.format(limit=LIMIT, stretches=STRETCHES, all=len(done), **count)
+    head = HEAD.format(limit=LIMIT, bad=BAD, stretches=STRETCHES, all=len(done), **count)
     lines = [head, f"| {' | '.join(COLUMNS)} |", "| --- " * len(COLUMNS) + "|"]
     return "\n".join(lines + [line(record, row) for record, row in done]) + "\n"
 
@@ -236,7 +251,7 @@ def apart(record: Record) -> Row:
     try:
         done = subprocess.run(words, capture_output=True, text=True, timeout=PATIENCE, cwd=ROOT)
         row: Row = json.loads(done.stdout.splitlines()[-1])
-        if "error" in row:
+        if row.get("error", "").startswith("exit code"):
             row["error"] = (done.stderr.strip().splitlines() or [row["error"]])[-1]
     except subprocess.TimeoutExpired:
         return {

@@ -10,7 +10,10 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 PROGRAMS = sorted([*ROOT.glob("studies/*.py"), *ROOT.glob("benchmarks/*.py")])
-HELPERS = {"loop_table", "mutants", "resumed", "by_hand", "fused"}
+HELPERS = {
+    *("loop_table", "mutants", "resumed", "by_hand", "fused"),
+    *("record_files", "record_models", "record_rows"),
+}
 
 
 @pytest.mark.parametrize("path", PROGRAMS, ids=lambda p: f"{p.parent.name}/{p.stem}")
