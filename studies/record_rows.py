@@ -254,7 +254,7 @@ RECORDS = (
             FOUND,
             (BY_TEMPERATURE | SLOW,),
             rivals=BY_TEMPERATURE | SLOW | {"vibration"},
-            within=6.5e-4,
+            within=7.5e-4,
         ),
         {
             "columns": {"v": ("gyrox", "gyroy", "gyroz")},

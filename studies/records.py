@@ -43,10 +43,8 @@ LIMIT = 120.0
 PATIENCE = 4 * LIMIT
 #: Stretches of a record, each held out whole once.
 STRETCHES = 10
-#: Robust standard deviations beyond which a held-out reading is a bad one; an error is its model's.
-BAD = 20.0
-#: Median size of normal deviates.
-NORMAL_MEDIAN = 0.6745
+#: Share of the held-out errors, the largest, that is left away: bad samples.
+LEFT_AWAY = 0.005
 
 HEAD = """# Measured records
 
@@ -54,7 +52,7 @@ Made by `make study-records` (`python studies/records.py`): each row is one `cas
 most {limit:.0f} s of processor time. Errors are root mean squares in the unit of the reading,
 before → after: of casest's own folds, and of {stretches} stretches of the record (of poses: groups
 of neighbours), each held out whole and predicted by a fit of the model, as it was declared and as
-it was closed, to all others; readings off by {bad:.0f} robust standard deviations are left away.
+it was closed, to all others; the largest {away:.1%} of these errors are left away (bad samples).
 What a record can support was computed with NumPy and SciPy alone; the judgement is computed from
 that (`studies/record_rows.py`): *right*, *unhelpful* (true, but a cause that the record shows is
 not named, or too much is left) or *wrong*. Of a field that sways, a cycled cell with hysteresis, a
@@ -145,10 +143,9 @@ def held_out(model: Any, values: Any, runs: tuple[Run, ...]) -> float:
 
 
 def _rms(errors: Any) -> float:
-    """Root mean square, bad samples left away: three readings of -8e6 would hide all others."""
-    sizes = np.abs(errors[np.isfinite(errors)])
-    robust = np.median(sizes) / NORMAL_MEDIAN
-    return float(np.sqrt(np.mean(sizes[sizes <= BAD * robust] ** 2)))
+    """Root mean square without the largest: three readings of -8e6 would hide all others."""
+    sizes = np.sort(np.abs(errors[np.isfinite(errors)]))
+    return float(np.sqrt(np.mean(sizes[: len(sizes) - int(LEFT_AWAY * len(sizes))] ** 2)))
 
 
 def stretches(whole: Run) -> list[Any]:
@@ -239,7 +236,7 @@ def table(rows: dict[str, Row]) -> str:
     done = [(r, rows[r.name]) for r in RECORDS if r.name in rows]
     verdicts = [judged(record, row).partition(":")[0] for record, row in done]
     count = {word: verdicts.count(word) for word in ("right", "unhelpful", "wrong")}
-    head = HEAD.format(limit=LIMIT, bad=BAD, stretches=STRETCHES, all=len(done), **count)
+    head = HEAD.format(limit=LIMIT, away=LEFT_AWAY, stretches=STRETCHES, all=len(done), **count)
     lines = [head, f"| {' | '.join(COLUMNS)} |", "| --- " * len(COLUMNS) + "|"]
     return "\n".join(lines + [line(record, row) for record, row in done]) + "\n"
 

@@ -96,6 +96,7 @@ def test_stretches_are_predicted_by_a_fit_to_the_others(study):
     run = Run.raw("a", {"y": y[:, None]}, units={"y": "m"})
     tenths = y.reshape(10, 20)
     means = [np.delete(tenths, k, axis=0).mean() for k in range(10)]
-    expected = np.sqrt(np.mean((tenths - np.array(means)[:, None]) ** 2))
+    errors = np.sort(np.abs(tenths - np.array(means)[:, None]).ravel())
+    expected = np.sqrt(np.mean(errors[:-1] ** 2))  # of 200 the largest is left away
     found = study.held_out(level, {"zero": np.array(0.0)}, (run,))
     assert found == pytest.approx(expected, rel=1e-9)
