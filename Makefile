@@ -73,7 +73,9 @@ study-deceptive: $(READY)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python studies/deceptive.py
 
 study-records: $(READY)
-	$(BIN)/python studies/records.py
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python studies/records.py
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python studies/agreement.py
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python studies/subsets.py
 
 study-mutation: $(READY)
 	$(BIN)/python studies/mutation.py

@@ -12,9 +12,9 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PROGRAMS = sorted([*ROOT.glob("studies/*.py"), *ROOT.glob("benchmarks/*.py")])
 HELPERS = {
-    "loop_table", "mutants", "resumed", "by_hand", "fused", "own_models", "noise_records",
-    "worlds_table",
-}  # fmt: skip
+    *("loop_table", "mutants", "resumed", "by_hand", "fused", "own_models", "noise_records"),
+    *("worlds_table", "record_files", "record_models", "record_rows"),
+}
 
 
 @pytest.mark.parametrize("path", PROGRAMS, ids=lambda p: f"{p.parent.name}/{p.stem}")
