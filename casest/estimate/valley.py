@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from casest.declaration.model import Model
 from casest.estimate.evidence import Evidence
 from casest.leastsquares.neighbours import scatter
 from casest.leastsquares.per_sample import linear
@@ -32,9 +33,9 @@ def looked_for(
     None for models that have their own start from the data, are linear in all unknowns or predict
     no reading row by row. `stated`: the start is the user's own.
     """
-    if not _searchable(problem) or not np.isfinite(best_of(outcomes).cost):
+    if not searchable(problem.model) or not np.isfinite(best_of(outcomes).cost):
         return outcomes, None
-    allowed = _rows_can_follow(problem, first, stated)
+    allowed = rows_can_follow(problem, first, stated)
     # A sine that turns at random from row to row is fitted to noise as well as to anything.
     outcomes = tuple(o for o in outcomes if allowed(o.point)) or outcomes
     best = best_of(outcomes)
@@ -48,7 +49,7 @@ def looked_for(
     return outcomes, replace(evidence, equal=equal, aliases=aliases)
 
 
-def _rows_can_follow(problem: Problem, first: Point, stated: bool) -> Callable[[Point], bool]:
+def rows_can_follow(problem: Problem, first: Point, stated: bool) -> Callable[[Point], bool]:
     """May a solution count? No faster than the rows can follow, or the declared start is."""
     near = neighbouring(problem)
     fastest = max(FASTEST, turning(problem, first, near))
@@ -109,12 +110,12 @@ def _near(a: Point, b: Point) -> bool:
     return bool(np.all(np.abs(a.x - b.x) <= 0.05 * np.maximum(np.abs(a.x), np.abs(b.x))))
 
 
-def _searchable(problem: Problem) -> bool:
-    model = problem.model
+def searchable(model: Model) -> bool:
+    """May there be several valleys, and does nothing but a declared start say which is meant?"""
     return not (
         model.starter is not None
         or model.implicit
-        or problem.sequential
         or has_noise_effects(model)
         or linear(model)
+        or any(a.kind == "sequence" for a in model.effects)
     )

@@ -120,6 +120,22 @@ class Judge:
         noise = np.maximum(np.where(np.isfinite(sigma), sigma, 0.0), _rounding(fits, count))
         return Local(fits, scale, inverse(factor), sigma, noise), freedom
 
+    def rivalled(self, sensors: Sensors, fits: Fits, other: Fits) -> Flags:
+        """Is the other fit of a sensor lower, or elsewhere and hardly told from the first?"""
+        return _another(self._local(fits, residual_counts(self.squares, sensors))[0], other)
+
+    def asked_of_many(self, sensors: Sensors, x: Array) -> Judged:
+        """What only many are asked, of W sensors that were fitted otherwise, at x (n, W)."""
+        normals, nothing = self.squares.normals(x, sensors), np.zeros(x.shape[1])
+        fits = Fits(x, normals.cost, normals.matrix, nothing, nothing)
+        count = residual_counts(self.squares, sensors)
+        here, freedom = self._local(fits, count)
+        found = Judged.of(x.shape, here.sigma, np.sqrt(2 * fits.cost / count))
+        if self.expected is not None:
+            found.add(Code.LOUD, self._loud(here.sigma, freedom))
+        self._independent(found, here, sensors)
+        return found
+
     # -- questions to every sensor -----------------------------------------------------------------
 
     def _readings(self, found: Judged, sensors: Sensors) -> None:
