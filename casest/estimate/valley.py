@@ -12,6 +12,7 @@ from casest.estimate.evidence import Evidence
 from casest.leastsquares.neighbours import scatter
 from casest.leastsquares.per_sample import linear
 from casest.leastsquares.problem import Point, Problem
+from casest.leastsquares.sums import rounding
 from casest.leastsquares.weights import has_noise_effects
 from casest.solve.aliases import folded, others, without_turns
 from casest.solve.equivalent import between_rows, limit_of, roughness, same_on
@@ -21,6 +22,8 @@ from casest.solve.reach import neighbouring, turning
 from casest.solve.strategy import best_of, valleys
 from casest.solve.trust_region import LITTLE, trust_region
 
+#: Costs that differ by no more than this share are those of one function under two names.
+EQUAL = 1e-9
 #: Half turns between neighbouring rows that these can still follow.
 FASTEST = 1.2
 
@@ -85,6 +88,7 @@ def _in_one_form(
     limit = limit_of(problem, best)
     whole, problem = problem, some_rows(problem, ROWS)
     alike = [o for o in outcomes if o is best or same_on(problem, o.point, best.point, limit)]
+    alike = _equal(whole, best, alike)
     if all(_near(o.point, best.point) for o in alike):
         return outcomes, ()
     moved, meant = between_rows(problem), best
@@ -103,6 +107,23 @@ def _in_one_form(
         replace(o, point=meant.point, cost=meant.cost) if id(o) in known else o for o in outcomes
     ]
     return (tuple(as_one) if meant is best else (meant, *as_one)), tuple(named[:1])
+
+
+def _equal(problem: Problem, best: Outcome, alike: list[Outcome]) -> list[Outcome]:
+    """Those of them that lead to the cost of the best to rounding.
+
+    Valleys that are only nearly the same function end at other costs: they are rivals.
+    """
+    within = (10 * rounding(problem, best.point)) ** 2 * problem.residual_count
+    ends, found = list[Outcome](), list[Outcome]()
+    for o in alike:
+        end = next((e for e in (best, *ends) if _near(e.point, o.point)), None)
+        if end is None:
+            end = trust_region(problem, o.point, damping=LITTLE)
+            ends.append(end)
+        if abs(end.cost - best.cost) <= EQUAL * best.cost + within:
+            found.append(o)
+    return found
 
 
 def _near(a: Point, b: Point) -> bool:

@@ -230,7 +230,8 @@ class Judge:
         along = np.einsum("mns,mns->s", residuals[:, 1:], residuals[:, :-1])
         share = along / (2 * here.fits.cost)
         exact = here.sigma < 10 * _rounding(here.fits, np.ones(len(along)))
-        alike = share * np.sqrt(residuals[..., 0].size) > TIME_SERIES
+        count = residual_counts(self.squares, sensors)
+        alike = (share * np.sqrt(count) > TIME_SERIES) & (count >= ENOUGH * len(residuals))
         found.add(Code.CORRELATED, np.logical_and(alike, np.logical_not(exact)))
 
     # -- is it a minimum, and do intervals describe the cost around it? --------------------------

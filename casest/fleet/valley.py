@@ -77,17 +77,21 @@ class Doubt:
         return np.asarray((doubtful & ~hopeless)[:count])
 
     def _elsewhere(self, ended: Ended, unseen: Flags) -> Flags:
-        """Do starts around that of each sensor end lower, or elsewhere and alike?
+        """Do starts around that of each sensor, or the declared one, end lower, or elsewhere alike?
 
         Where its rows show no scatter (`unseen`), all must end at one cost.
         """
         normals = self.squares.normals(ended.begin, ended.sensors)
         diagonal = np.einsum("iis->is", normals.matrix)
         steps = list(around(ended.begin, normals.cost, diagonal))
-        rivalled, several = self._ends(ended, steps[:STARTS])
+        near, far = steps[:STARTS], steps[STARTS:]
+        if self.stated:
+            declared = np.concatenate([p.start_value() for p in self.model.parameters])
+            near.append(declared[:, None] - ended.begin)
+        rivalled, several = self._ends(ended, near)
         # One valley more is a reason to look for others.
         for k in _left(several & ~rivalled):
-            rivalled[k] = self._ends(ended.some(k), [s[:, k] for s in steps[STARTS:]])[0]
+            rivalled[k] = self._ends(ended.some(k), [s[:, k] for s in far])[0]
         return np.asarray(rivalled | (unseen & several))
 
     def _ends(self, ended: Ended, steps: Sequence[Array]) -> tuple[Flags, Flags]:
