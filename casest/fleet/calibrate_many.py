@@ -96,6 +96,10 @@ def calibrate_many(
     Standard deviations and covariances are of JᵀJ at the solution or at most a tenth of a standard
     deviation from it: a fit that is as near takes its last step without summing JᵀJ again.
 
+    Where a model's declared start may lie in a wrong valley, a sensor whose rows do not vouch for
+    its fit is calibrated alone, as by `calibrate`: some tenths of a second each. A model with a
+    start from the data, or linear in its unknowns, has none of these.
+
     `noise` is the standard deviation of one residual that a sound sensor has: one with
     significantly more is refused. Up to `retry` refused sensors are calibrated once more one by
     one, with IPOPT and second opinions.
