@@ -103,7 +103,8 @@ def page(records: list[dict[str, Any]], seed: int) -> str:
         "`studies/deceptive.md` whose sum of squares is smooth, as sensors of one model in",
         "`calibrate_many`; the words are the same. *Together*: those that stayed with the others;",
         "of these, *otherwise alone* have another verdict by `attempt`, and *away* is the largest",
-        f"difference of a value, in its standard deviations. Random numbers begin at {seed}.",
+        "difference of a value, in its standard deviations; *seconds* are those of a busy machine.",
+        f"Random numbers begin at {seed}; of {SENSORS} sensors these are the first.",
         "",
         "| family | sensors | right, trusted | elsewhere, trusted | **wrong, trusted** | refused | "
         "together | otherwise alone | away | seconds each |",
