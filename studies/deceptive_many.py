@@ -104,7 +104,7 @@ def page(records: list[dict[str, Any]], seed: int) -> str:
         "`calibrate_many`; the words are the same. *Together*: those that stayed with the others;",
         "of these, *otherwise alone* have another verdict by `attempt`, and *away* is the largest",
         "difference of a value, in its standard deviations; *seconds* are those of a busy machine.",
-        f"Random numbers begin at {seed}; of {SENSORS} sensors of a family these are the first. Of two",
+        f"Random numbers begin at {seed}; of {SENSORS} sensors of each these are the first. Of two",
         "decays number 174 has its two terms exchanged alone: the same function, and far away.",
         "",
         "| family | sensors | right, trusted | elsewhere, trusted | **wrong, trusted** | refused | "
