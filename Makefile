@@ -5,8 +5,8 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
 .PHONY: demo test lint types format wheel bench study study-starts study-nist study-loop \
-	study-motion study-records study-asked study-slow study-coverage study-deceptive study-mutation \
-	study-worlds study-noises \
+	study-motion study-records study-asked study-slow study-coverage study-deceptive \
+	study-deceptive-many study-mutation study-worlds study-noises \
 	figures docs clean
 
 demo: $(READY)
@@ -68,6 +68,9 @@ study-asked: $(READY)
 
 study-slow: $(READY)
 	$(BIN)/python studies/slow.py
+
+study-deceptive-many: $(READY)
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python studies/deceptive_many.py
 
 study-deceptive: $(READY)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python studies/deceptive.py

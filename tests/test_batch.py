@@ -20,7 +20,6 @@ from casest import (
     model,
     param,
     signal,
-    sin,
     unit_vector,
 )
 from casest.results.find import find_model
@@ -329,19 +328,6 @@ def test_a_value_beyond_its_bound_is_refused_and_one_inside_is_not():
     found = calibrate_many(capped, {"x": x, "y": y})
     assert list(found.trusted) == [True, False]
     assert "`slope` ended on its bound" in found.reasons[1][0]
-
-
-@model
-def wave(x=signal(), y=signal(), *, w=param(start=1.0)):
-    return Residual(measured=y, predicted=sin(w * x))
-
-
-def test_a_false_valley_is_not_trusted_where_one_calibration_does_not():
-    x = np.linspace(0, 6, 40)
-    noise = 0.01 * np.random.default_rng(17).standard_normal((3, 40))
-    y = np.sin(np.array([[1.1], [2.6], [5.0]]) * x) + noise
-    found = calibrate_many(wave, {"x": np.tile(x, (3, 1)), "y": y}, noise=0.01)
-    assert list(found.trusted) == [True, False, False]
 
 
 def test_a_time_series_with_correlated_noise_is_refused():

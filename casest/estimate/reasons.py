@@ -75,8 +75,8 @@ class Code(IntFlag):
     #: The cost around it. (Many: all directions only as above; no profile of the likelihood, the
     #: standard deviations are printed as they are.)
     MISSHAPEN = auto()
-    #: Another solution. (Many: only along the weakest direction, of sensors whose least singular
-    #: value is below 0.1; no other algorithm, no other starts.)
+    #: Another solution. (Many: along the weakest direction, of sensors whose least singular value
+    #: is below 0.1. Of models that are searched `fleet.valley` says who is asked alone.)
     AMBIGUOUS = auto()
     #: Second order of the readings' noise, of implicit models. (Many: screened first.)
     NOISE = auto()
@@ -92,7 +92,7 @@ class Code(IntFlag):
 
 #: Nothing speaks against it.
 NOTHING = Code(0)
-#: Asked of one sensor alone.
+#: Asked of one sensor alone, of many only where they are calibrated alone.
 ONE_ONLY = Code.POOR_VALLEY | Code.MODEL
 #: Asked of many alone.
 MANY_ONLY = Code.READING | Code.LOUD | Code.CORRELATED

@@ -7,10 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from casest.declaration.model import Model
 from casest.estimate.evidence import Evidence
 from casest.leastsquares.neighbours import scatter
 from casest.leastsquares.per_sample import linear
 from casest.leastsquares.problem import Point, Problem
+from casest.leastsquares.sums import rounding
 from casest.leastsquares.weights import has_noise_effects
 from casest.solve.aliases import folded, others, without_turns
 from casest.solve.equivalent import between_rows, limit_of, roughness, same_on
@@ -20,6 +22,8 @@ from casest.solve.reach import neighbouring, turning
 from casest.solve.strategy import best_of, valleys
 from casest.solve.trust_region import LITTLE, trust_region
 
+#: Costs that differ by no more than this share are those of one function under two names.
+EQUAL = 1e-9
 #: Half turns between neighbouring rows that these can still follow.
 FASTEST = 1.2
 
@@ -32,9 +36,9 @@ def looked_for(
     None for models that have their own start from the data, are linear in all unknowns or predict
     no reading row by row. `stated`: the start is the user's own.
     """
-    if not _searchable(problem) or not np.isfinite(best_of(outcomes).cost):
+    if not searchable(problem.model) or not np.isfinite(best_of(outcomes).cost):
         return outcomes, None
-    allowed = _rows_can_follow(problem, first, stated)
+    allowed = rows_can_follow(problem, first, stated)
     # A sine that turns at random from row to row is fitted to noise as well as to anything.
     outcomes = tuple(o for o in outcomes if allowed(o.point)) or outcomes
     best = best_of(outcomes)
@@ -48,7 +52,7 @@ def looked_for(
     return outcomes, replace(evidence, equal=equal, aliases=aliases)
 
 
-def _rows_can_follow(problem: Problem, first: Point, stated: bool) -> Callable[[Point], bool]:
+def rows_can_follow(problem: Problem, first: Point, stated: bool) -> Callable[[Point], bool]:
     """May a solution count? No faster than the rows can follow, or the declared start is."""
     near = neighbouring(problem)
     fastest = max(FASTEST, turning(problem, first, near))
@@ -84,6 +88,7 @@ def _in_one_form(
     limit = limit_of(problem, best)
     whole, problem = problem, some_rows(problem, ROWS)
     alike = [o for o in outcomes if o is best or same_on(problem, o.point, best.point, limit)]
+    alike = _equal(whole, best, alike)
     if all(_near(o.point, best.point) for o in alike):
         return outcomes, ()
     moved, meant = between_rows(problem), best
@@ -104,17 +109,34 @@ def _in_one_form(
     return (tuple(as_one) if meant is best else (meant, *as_one)), tuple(named[:1])
 
 
+def _equal(problem: Problem, best: Outcome, alike: list[Outcome]) -> list[Outcome]:
+    """Those of them that lead to the cost of the best to rounding.
+
+    Valleys that are only nearly the same function end at other costs: they are rivals.
+    """
+    within = (10 * rounding(problem, best.point)) ** 2 * problem.residual_count
+    ends, found = list[Outcome](), list[Outcome]()
+    for o in alike:
+        end = next((e for e in (best, *ends) if _near(e.point, o.point)), None)
+        if end is None:
+            end = trust_region(problem, o.point, damping=LITTLE)
+            ends.append(end)
+        if abs(end.cost - best.cost) <= EQUAL * best.cost + within:
+            found.append(o)
+    return found
+
+
 def _near(a: Point, b: Point) -> bool:
     """Are two points one solution, ended at to different precision?"""
     return bool(np.all(np.abs(a.x - b.x) <= 0.05 * np.maximum(np.abs(a.x), np.abs(b.x))))
 
 
-def _searchable(problem: Problem) -> bool:
-    model = problem.model
+def searchable(model: Model) -> bool:
+    """May there be several valleys, and does nothing but a declared start say which is meant?"""
     return not (
         model.starter is not None
         or model.implicit
-        or problem.sequential
         or has_noise_effects(model)
         or linear(model)
+        or any(a.kind == "sequence" for a in model.effects)
     )

@@ -23,14 +23,19 @@ from casest.declaration.symbols import Parameter
 from casest.engine.threads import one_thread
 from casest.errors import DataError, UsageError
 from casest.estimate.calibrate import attempt
-from casest.fleet.fit import Bounds, minimise
+from casest.estimate.reasons import Code
+from casest.estimate.valley import searchable
+from casest.fleet.fit import Bounds, Places, minimise, padded
 from casest.fleet.judge import Judge
 from casest.fleet.sums import NARROWEST, Sensors, Squares, widest
+from casest.fleet.valley import Doubt, Ended
 from casest.fleet.verdicts import Verdicts
 from casest.leastsquares.per_sample import residual_and_jacobian
 from casest.leastsquares.weights import has_noise_effects
 
 Values = Mapping[str, Array]
+#: Names of the bounds of a parameter.
+SIDES = ("lower", "upper")
 #: `function(model, signals) -> {name: value (S, …) or (value, lower, upper)}`.
 Start = Mapping[str, Any] | Callable[[Model, Values], Mapping[str, Any]]
 
@@ -91,6 +96,10 @@ def calibrate_many(
 
     Standard deviations and covariances are of JᵀJ at the solution or at most a tenth of a standard
     deviation from it: a fit that is as near takes its last step without summing JᵀJ again.
+
+    Where a model's declared start may lie in a wrong valley, a sensor whose rows do not vouch for
+    its fit is calibrated alone, as by `calibrate`: some tenths of a second each. A model with a
+    start from the data, or linear in its unknowns, has none of these.
 
     `noise` is the standard deviation of one residual that a sound sensor has: one with
     significantly more is refused. Up to `retry` refused sensors are calibrated once more one by
@@ -255,10 +264,14 @@ class _Job:
     noise: float | None
     squares: Squares = field(init=False)
     judge: Judge = field(init=False)
+    doubt: Doubt | None = field(init=False)
 
     def __post_init__(self) -> None:
         self.squares = Squares(residual_and_jacobian(self.model))
         self.judge = Judge(self.model, self.squares, self.noise)
+        stated = self.start is not None
+        doubt = Doubt(self.model, self.squares, self.judge, stated)
+        self.doubt = doubt if searchable(self.model) else None
 
     def run(self, span: slice, result: _Result) -> None:
         """Fit and judge the sensors of a block."""
@@ -273,6 +286,10 @@ class _Job:
         result.sigma[span] = judged.sigma[:size]
         result.rmse[span] = judged.rmse[:size]
         result.verdicts.put(span, judged)
+        if self.doubt is not None:
+            ended = Ended(sensors, x, fits, bounds)
+            doubtful = self.doubt(ended, judged, lambda k: self._as_run(span.start + k), size)
+            self._one_by_one(span, ended, np.flatnonzero(doubtful), result)
 
     def _sensors(self, span: slice) -> Sensors:
         """Readings by column, the last sensor repeated up to a width that NumPy handles alike."""
@@ -370,12 +387,47 @@ class _Job:
         }
         return Run.raw(f"sensor {i}", signals, units={s.name: s.unit for s in self.model.signals})
 
-    def retry(self, i: int, result: _Result) -> None:
+    def _one_by_one(self, span: slice, ended: Ended, places: Places, result: _Result) -> None:
+        """Calibrate these of a block by themselves, from where they began."""
+        for k in places:
+            i, x = span.start + int(k), ended.begin[:, k]
+            if self.start is None:
+                self.retry(i, result)
+                continue
+            values = {n: v[0] for n, v in _unpacked(self.model, x[None]).items()}
+            self.retry(i, result, self._within(ended.bounds, int(k)), values)
+        trusted = places[result.verdicts.trusted[span.start + places]]
+        if not trusted.size:
+            return
+        trusted = padded(trusted)
+        x = np.ascontiguousarray(result.x[span.start + trusted].T)
+        judged = self.judge.asked_of_many(ended.sensors.some(trusted), x)
+        for k, code, sigma in zip(trusted, judged.code, judged.sigma, strict=True):
+            result.verdicts.ask(span.start + int(k), Code(int(code)), float(sigma))
+
+    def _within(self, bounds: Bounds, k: int) -> Model:
+        """The model with the bounds that a sensor's start brings."""
+        lower, upper = (side[:, k] for side in bounds)
+        declared = [np.concatenate([getattr(p, n) for p in self.model.parameters]) for n in SIDES]
+        if np.array_equal(lower, declared[0]) and np.array_equal(upper, declared[1]):
+            return self.model
+        own = [_unpacked(self.model, side[None]) for side in (lower, upper)]
+        limits = {n: (own[0][n][0], own[1][n][0]) for n in own[0]}
+        return self.model.bounded(lambda model, runs: limits)
+
+    def retry(
+        self,
+        i: int,
+        result: _Result,
+        model: Model | None = None,
+        start: Mapping[str, Array] | None = None,
+    ) -> None:
         """Calibrate one sensor by itself; what that finds takes the place of what was found."""
-        if not all(np.isfinite(r[i]).all() for r in self.readings):
+        run = self._as_run(i)
+        if not all(np.isfinite(values).all() for values in run.signals.values()):
             return
         try:
-            found = attempt(self.model, [self._as_run(i)])
+            found = attempt(model or self.model, [run], start=start)
         except DataError:  # too few samples, which the sensor's reasons say already
             return
         result.x[i], result.covariance[i] = found.point.x, found.covariance

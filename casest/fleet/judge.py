@@ -94,6 +94,22 @@ class Judge:
         found.std[:] = np.sqrt(np.einsum("iis->is", found.covariance))
         return found
 
+    def rivalled(self, sensors: Sensors, fits: Fits, other: Fits) -> Flags:
+        """Is the other fit of a sensor lower, or elsewhere and hardly told from the first?"""
+        return _another(local(fits, residual_counts(self.squares, sensors))[0], other)
+
+    def asked_of_many(self, sensors: Sensors, x: Array) -> Judged:
+        """What only many are asked, of W sensors that were fitted otherwise, at x (n, W)."""
+        normals, nothing = self.squares.normals(x, sensors), np.zeros(x.shape[1])
+        fits = Fits(x, normals.cost, normals.matrix, nothing, nothing)
+        count = residual_counts(self.squares, sensors)
+        here, freedom = local(fits, count)
+        found = Judged.of(x.shape, here.sigma, np.sqrt(2 * fits.cost / count))
+        if self.expected is not None:
+            found.add(Code.LOUD, self._loud(here.sigma, freedom))
+        self._independent(found, here, sensors)
+        return found
+
     # -- questions to every sensor -----------------------------------------------------------------
 
     def _readings(self, found: Judged, sensors: Sensors) -> None:
@@ -146,7 +162,8 @@ class Judge:
         along = np.einsum("mns,mns->s", residuals[:, 1:], residuals[:, :-1])
         share = along / (2 * here.fits.cost)
         exact = here.sigma < 10 * rounding(here.fits, np.ones(len(along)))
-        alike = share * np.sqrt(residuals[..., 0].size) > TIME_SERIES
+        count = residual_counts(self.squares, sensors)
+        alike = (share * np.sqrt(count) > TIME_SERIES) & (count >= ENOUGH * len(residuals))
         found.add(Code.CORRELATED, np.logical_and(alike, np.logical_not(exact)))
 
     # -- is it a minimum, and do intervals describe the cost around it? --------------------------

@@ -110,6 +110,12 @@ class Verdicts(Sequence[tuple[str, ...]]):
         """Say of sensor i what was found out about it alone."""
         self.replaced[i] = (code, reasons)
 
+    def ask(self, i: int, code: Code, sigma: float) -> None:
+        """Hold against sensor i, trusted alone, what only many are asked: LOUD and CORRELATED."""
+        said = {Code.LOUD: words.loud(sigma), Code.CORRELATED: words.CORRELATED}
+        if code:
+            self.replaced[i] = (code, tuple(said[c] for c in code))
+
     def code(self, i: int) -> Code:
         """What speaks against sensor i."""
         return self.replaced[i][0] if i in self.replaced else Code(int(self.figures.code[i]))

@@ -81,8 +81,8 @@ def scatter(problem: Problem, point: Point) -> Scatter | None:
     squares = np.zeros(3)
     dof = count = 0.0
     for r, samples in enumerate(problem.samples):
-        chosen = _some(samples.dense)
-        y, e, plain = _reading(model)(problem.parameters(point, r), chosen)
+        chosen = samples.dense[some_of(len(samples))]
+        y, e, plain = reading_of(model)(problem.parameters(point, r), chosen)
         if len(y) < FEWEST or not np.isfinite(e).all():
             continue
         C = predictors(inputs(model, chosen))
@@ -90,7 +90,7 @@ def scatter(problem: Problem, point: Point) -> Scatter | None:
         rest = y - _fitted(plain, y)
         rows, axes = C.shape[0], y.shape[1]
         squares += [np.sum((C @ y) ** 2), np.sum((C @ e) ** 2), np.mean(rest**2) * rows * axes]
-        dof += rows**2 / float((C @ C.T).power(2).sum()) * axes
+        dof += float(freedom_of(C)[0]) * axes
         count += rows * axes
     if count < FEWEST:
         return None
@@ -104,72 +104,104 @@ def scatter(problem: Problem, point: Point) -> Scatter | None:
     )
 
 
-def _some(samples: Array) -> Array:
-    """Rows of a longer record, chosen at random: enough to have near neighbours."""
-    if len(samples) <= LONG:
-        return samples
-    return samples[np.sort(np.random.default_rng(0).permutation(len(samples))[:LONG])]
+def some_of(count: int) -> Any:
+    """Which rows of so many are looked at, chosen at random: enough to have near neighbours."""
+    if count <= LONG:
+        return slice(None)
+    return np.sort(np.random.default_rng(0).permutation(count)[:LONG])
 
 
 def inputs(model: Model, samples: Array) -> Array:
     """What the prediction reads of each sample, (N, d), each column by its own spread."""
-    read = samples[:, list(_read(model))]
-    size = read.std(axis=0)
-    varies = size > 1e-12 * np.abs(read).max(axis=0)
-    size = np.where(varies, size, 1.0)
+    read, varies = by_spread(samples[:, list(read_by(model))])
     # Rows that differ in nothing are all neighbours.
-    return np.asarray((read / size)[:, varies]) if varies.any() else np.zeros((len(read), 1))
+    return np.asarray(read[:, varies]) if varies.any() else np.zeros((len(read), 1))
+
+
+def by_spread(read: Array) -> tuple[Array, Array]:
+    """Columns (…, N, d), each by its own spread, and which of them have one, (…, d)."""
+    size = read.std(axis=-2)
+    varies = size > 1e-12 * np.abs(read).max(axis=-2)
+    return read / np.where(varies, size, 1.0)[..., None, :], varies
 
 
 def predictors(x: Array) -> Any:
     """Sparse (rows, N): each row times the readings is one reading less its neighbours' line.
 
-    Of length one, so that noise keeps its size.
+    Of length one, so that noise keeps its size. `x` is (N, d), or (S, N, d) for S records, whose
+    blocks stand side by side in one matrix, (S·rows, S·N).
     """
     from scipy.sparse import csr_array
 
-    count, dimensions = x.shape
+    x = x.reshape(-1, *x.shape[-2:])
+    records, count, dimensions = x.shape
     centres = np.unique(np.linspace(0, count - 1, min(count, CENTRES)).astype(int))
-    near = _nearest_in_one(x, centres) if dimensions == 1 else _nearest(x, centres)
-    weights = -_weights(x[near] - x[centres][:, None, :])
-    columns = np.column_stack([centres, near])
-    values = np.column_stack([np.ones(len(centres)), weights])
+    near = _nearest_in_one(x[:, :, 0], centres) if dimensions == 1 else _nearest(x, centres)
+    first = count * np.arange(records)[:, None, None]
+    columns = np.concatenate(
+        [np.broadcast_to(centres, near[..., :1].shape[:2])[..., None], near], 2
+    )
+    columns = (columns + first).reshape(-1, columns.shape[2])
+    flat = x.reshape(-1, dimensions)
+    weights = -_weights(flat[columns[:, 1:]] - flat[columns[:, :1]])
+    values = np.column_stack([np.ones(len(columns)), weights])
     values /= np.linalg.norm(values, axis=1)[:, None]
-    rows = np.repeat(np.arange(len(centres)), columns.shape[1])
-    return csr_array((values.ravel(), (rows, columns.ravel())), shape=(len(centres), count))
+    rows = np.repeat(np.arange(len(columns)), columns.shape[1])
+    return csr_array((values.ravel(), (rows, columns.ravel())), shape=(len(columns), len(flat)))
+
+
+def freedom_of(C: Any, records: int = 1) -> Array:
+    """Degrees of freedom of the variance that predictors give, for each of the records, (S,)."""
+    shared = np.asarray((C @ C.T).power(2).sum(axis=1)).reshape(records, -1)
+    return np.asarray(shared.shape[1] ** 2 / shared.sum(axis=1))
 
 
 def _nearest_in_one(x: Array, centres: Any) -> Any:
-    """The rows before and after in the order of the one input."""
-    order = np.argsort(x[:, 0], kind="stable")
-    place = np.empty(len(x), dtype=int)
-    place[order] = np.arange(len(x))
-    at = np.clip(place[centres], 1, len(x) - 2)
-    before, after = order[at - 1], order[at + 1]
+    """The rows before and after in the order of the one input, (S, rows, 2)."""
+    order = np.argsort(x, axis=1, kind="stable")
+    place = np.argsort(order, axis=1)
+    at = np.clip(place[:, centres], 1, x.shape[1] - 2)
+    before, middle, after = (np.take_along_axis(order, at + k, axis=1) for k in (-1, 0, 1))
     # At an end the other two neighbours: the middle of the three stands for itself.
-    middle = order[at]
     before = np.where(before == centres, middle, before)
     after = np.where(after == centres, middle, after)
-    return np.column_stack([before, after])
+    return np.stack([before, after], axis=2)
 
 
 def _nearest(x: Array, centres: Any) -> Any:
     from scipy.spatial import cKDTree
 
-    k = min(2 * (x.shape[1] + 1), len(x) - 1)
-    found = np.asarray(cKDTree(x).query(x[centres], k + 1)[1])
+    k = min(2 * (x.shape[2] + 1), x.shape[1] - 1)
+    found = np.array([cKDTree(own).query(own[centres], k + 1)[1] for own in x])
     own = found == centres[:, None]
     # Among many equal rows a row may not be its own nearest: the last one is left out then.
-    own[~own.any(axis=1), -1] = True
-    return found[~own].reshape(len(centres), k)
+    own[~own.any(axis=2), -1] = True
+    return found[~own].reshape(*found.shape[:2], k)
 
 
 def _weights(away: Array) -> Array:
     """Weights of a local straight line at its centre, from neighbours at `away` (rows, k, d)."""
-    rows, k, d = away.shape
     scale = np.sqrt(np.mean(away**2, axis=(1, 2), keepdims=True))
-    design = np.ones((rows, k, d + 1))
-    design[:, :, 1:] = away / np.where(scale > 0, scale, 1.0)
+    u = away / np.where(scale > 0, scale, 1.0)
+    if u.shape[1:] == (2, 1):
+        return _between_two(u[:, :, 0])
+    return _at_centre(u)
+
+
+def _between_two(u: Array) -> Array:
+    """The same where the line goes through both; of one place, their mean; (rows, 2)."""
+    apart = u[:, 1] - u[:, 0]
+    close = ~(np.abs(apart) > 0.01)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        found = np.column_stack([u[:, 1], -u[:, 0]]) / apart[:, None]
+    if close.any():
+        found[close] = _at_centre(u[close, :, None])
+    return found
+
+
+def _at_centre(u: Array) -> Array:
+    design = np.ones((*u.shape[:2], u.shape[2] + 1))
+    design[:, :, 1:] = u
     return np.asarray(np.linalg.pinv(design, rcond=1e-3)[:, 0, :])
 
 
@@ -184,7 +216,7 @@ def _fitted(plain: Array, y: Array) -> Array:
 
 
 @lru_cache(maxsize=64)
-def _reading(model: Model) -> Replay:
+def reading_of(model: Model) -> Replay:
     """Reading, residual, and columns of J that no unknown bends, of one sample."""
     t = model.traced
     J = ca.densify(ca.jacobian(t.expression, t.coordinates))
@@ -197,7 +229,7 @@ def _reading(model: Model) -> Replay:
 
 
 @lru_cache(maxsize=64)
-def _read(model: Model) -> tuple[int, ...]:
+def read_by(model: Model) -> tuple[int, ...]:
     """Places in a sample of the numbers that the prediction depends on."""
     t, sample = model.traced, sample_symbol(model)
     columns = ca.jacobian(t.predicted, sample).sparsity().get_triplet()[1]

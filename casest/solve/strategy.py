@@ -14,6 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from casest.declaration.shapes import Array
 from casest.errors import UsageError
 from casest.leastsquares.identifiability import identify
 from casest.leastsquares.per_sample import linear
@@ -35,6 +36,8 @@ STARTS, SPREAD = 8, 0.3
 FURTHER = 24
 #: Ratio of the costs of a few samples from which on there is no need to look at all of them.
 CLEARLY = 1.1
+#: Costs that differ by more than this share are those of different valleys.
+APART = 1e-3
 #: Rise of the cost over that of a parabola within which there is no second valley.
 PARABOLA = (0.8, 1.25)
 #: Solvers of the least-squares problem.
@@ -118,9 +121,9 @@ def _other_starts(problem: Problem, first: Point, automatic: bool) -> Sequence[P
 
 
 def valleys(outcomes: Sequence[Outcome]) -> int:
-    """In how many different costs did they end, to a thousandth?"""
+    """In how many different costs did they end?"""
     costs = sorted(_cost(o) for o in outcomes)
-    apart = [b > a * (1 + 1e-3) + 1e-300 for a, b in itertools.pairwise(costs) if np.isfinite(b)]
+    apart = [b > a * (1 + APART) + 1e-300 for a, b in itertools.pairwise(costs) if np.isfinite(b)]
     return 1 + sum(apart)
 
 
@@ -232,15 +235,23 @@ def _fine(problem: Problem) -> float:
 
 def _perturbations(problem: Problem, first: Point, seed: int) -> Iterator[Point]:
     """Starts around the first one."""
-    rng = np.random.default_rng(seed)
     normal = problem.normal(first)
-    columns = np.sqrt(np.where(np.diag(normal.matrix) > 0, np.diag(normal.matrix), np.inf))
-    # An unknown that is zero has no size of its own: what changes the residual by its own length.
-    size = np.maximum(np.abs(first.x), np.sqrt(2 * normal.cost) / columns)
-    for _ in range(STARTS + FURTHER):
-        step = SPREAD * size * rng.standard_normal(len(first.x))
+    for step in around(first.x, normal.cost, np.diag(normal.matrix), seed):
         moved = problem.moved(first, step)
         yield Point(problem.inside(moved.x), moved.references)
+
+
+def around(x: Array, cost: Array | float, diagonal: Array, seed: int = 0) -> Iterator[Array]:
+    """Steps from a start x (n,) to others around it, by the cost there and the diagonal of JᵀJ.
+
+    For W sensors x and the diagonal are (n, W), cost (W,).
+    """
+    rng = np.random.default_rng(seed)
+    columns = np.sqrt(np.where(diagonal > 0, diagonal, np.inf))
+    # An unknown that is zero has no size of its own: what changes the residual by its own length.
+    size = np.maximum(np.abs(x), np.sqrt(2 * cost) / columns)
+    for _ in range(STARTS + FURTHER):
+        yield np.asarray((SPREAD * size.T * rng.standard_normal(len(x))).T)
 
 
 def _around_the_sphere(problem: Problem, first: Point) -> tuple[Outcome, ...]:
@@ -274,14 +285,16 @@ def _along_the_weakest(problem: Problem, best: Outcome) -> tuple[Outcome, ...]:
         return ()
     sigma = np.sqrt(2 * best.cost / max(problem.residual_count - problem.unknowns, 1))
     step = 6 * sigma / singular[-1] * Vt[-1] / norms
-    found = []
+    starts, rises = [], []
     for sign in (1, -1):
         moved = problem.moved(best.point, sign * step)
-        start = Point(problem.inside(moved.x), moved.references)
-        rise = (problem.cost(start) - best.cost) / (18 * sigma**2) if sigma > 0 else np.inf
-        if not PARABOLA[0] <= rise <= PARABOLA[1]:
-            found.append(_opinion(problem, start))
-    return tuple(found)
+        starts.append(Point(problem.inside(moved.x), moved.references))
+        rise = problem.cost(starts[-1]) - best.cost
+        rises.append(rise / (18 * sigma**2) if sigma > 0 else np.inf)
+    # A cost that is bent one way may lead to a second valley the other way.
+    if all(PARABOLA[0] <= rise <= PARABOLA[1] for rise in rises):
+        return ()
+    return tuple(_opinion(problem, start) for start in starts)
 
 
 def _reweighted(problem: Problem, point: Point) -> tuple[Problem, Point]:

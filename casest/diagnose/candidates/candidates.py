@@ -11,7 +11,7 @@ import numpy as np
 
 from casest.data.run import Run
 from casest.declaration.dimensions import check_units
-from casest.declaration.effect import NOISE, Effect
+from casest.declaration.effect import NOISE, RECORDED, Effect
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
 from casest.declaration.symbols import Parameter
@@ -64,6 +64,8 @@ class Candidate:
     @property
     def label(self) -> str:
         """Name and column, as in the parameters' names: `temperature_bias(temp)`."""
+        if self.effect is not None and self.effect.kind == "time":
+            return f"{self.name}({self.on})"
         return self.name + (f"({self.column})" if self.column else "")
 
     def among(self, names: Collection[str]) -> bool:
@@ -132,7 +134,7 @@ def candidates(
     unfit = {s.name for s in unusable}
     turning = [n for n in angles(model, runs) if n not in unfit]
     skipped += unusable
-    for effect in catalogue:
+    for effect in _placed(model, catalogue):
         if effect.on == NOISE:
             continue
         try:
@@ -155,6 +157,15 @@ def candidates(
         if constant.frozen is None and not constant.dims:
             found.append(candidate)
     return found, skipped
+
+
+def _placed(model: Model, catalogue: Sequence[Effect]) -> list[Effect]:
+    """The catalogue, what delays a recorded signal once for each of them."""
+    found: list[Effect] = []
+    for effect in catalogue:
+        several = model.recorded if effect.on == RECORDED else (effect.on,)
+        found += [replace(effect, on=on) for on in several]
+    return found
 
 
 def _columns_for(
