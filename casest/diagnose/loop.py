@@ -76,12 +76,11 @@ def _closed(sensor: Sensor, before: Estimate, folds: Folds, say: Callable[[str],
     declared = sensor.fitted(before.model, before.values)
     if declared is None:
         raise NotTrusted("the residual is not finite at the optimum")
-    fit, outliers = without_outliers(sensor, declared, folds)
-    state = search(sensor, fit, say)
-    if outliers is None:  # what was missing may have hidden them
-        found, outliers = without_outliers(sensor, state.fit, folds)
-        if outliers is not None:
-            state = search(sensor, found, say, state)
+    state = search(sensor, declared, say)
+    # What is missing may look like outliers, not they like it: far residuals count as less.
+    fit, outliers = without_outliers(sensor, state.fit, folds)
+    if outliers is not None:
+        state = search(sensor, fit, say, state)
     state, after = certified(sensor, state, before)
     effects = [] if outliers is None else [outliers]
     effects += [_found(sensor, state, k, after) for k in state.kept]

@@ -204,7 +204,8 @@ def _on_its_axes(subject: Subject[F], fit: F, evidence: Evidence, ranking: Ranki
     trial = subject.on_axes(fit, evidence.trials[0], axes)
     less = judged([trial], ranking.likelihood, ranking.none, start=evidence.explained,
                   families=ranking.families)  # fmt: skip
-    return less if less is not None and less.score > evidence.score else evidence
+    whole = evidence.freedom == evidence.trials[0].columns.shape[2]  # else no size of its own
+    return less if less is not None and (less.score > evidence.score or not whole) else evidence
 
 
 def _about_the_best(ranking: Ranking) -> Ranking:
@@ -273,8 +274,11 @@ def _with_the_best(
     options.sort(key=lambda e: -e.score)
     passing = asked or _passing(ranking, options)
     refits = _refitted(subject, state.fit, ranking, passing)
+    torn = [] if asked else _torn_between(refits, ranking)
+    if torn:
+        return replace(state, open=tuple(torn))
     described = None if asked else subject.formula(state.fit, ranking)
-    if described is not None and _describes(described, [r.evidence for r in refits], ranking):
+    if described is not None and _describes(subject, described, refits, ranking):
         refits = [*_refitted(subject, state.fit, ranking, [described]), *refits]
     for k, refit in enumerate(refits):
         fit = subject.certified(refit.fit)
@@ -318,7 +322,7 @@ def _refitted(
 ) -> list[Refit[F]]:
     """Causes by what their refits are worth; of equal ones first what would do the least harm."""
     found: list[Refit[F]] = []
-    for evidence in options[: LEVELS.contenders]:
+    for evidence in _with_parts(options[: LEVELS.contenders], ranking):
         evidence = sharpened(subject, fit, ranking, evidence)
         better = subject.refit(fit, evidence.trials)
         if isinstance(better, str):
@@ -327,12 +331,37 @@ def _refitted(
         score = evidence.score + evidence.explained.cost - cost
         found.append(Refit(better, replace(evidence, score=score)))
     found.sort(key=lambda r: -r.evidence.score)
-    near = [r for r in found if r.evidence.score > found[0].evidence.score - LEVELS.strong]
+    near = _near(found)
     if len(near) > 1:
-        loss, _ = expected_loss([r.evidence for r in near], ranking.likelihood)
-        best = near[int(np.argmin(loss))]
+        loss, _ = expected_loss(near, ranking.likelihood)
+        best = found[int(np.argmin(loss))]
         found = [best, *[r for r in found if r is not best]]
     return found
+
+
+def _near(refits: Sequence[Refit[F]]) -> list[Evidence]:
+    """Those that the evidence does not tell from the best."""
+    best = max((r.evidence.score for r in refits), default=0.0)
+    return [r.evidence for r in refits if r.evidence.score > best - LEVELS.strong]
+
+
+def _torn_between(refits: Sequence[Refit[F]], ranking: Ranking) -> list[Evidence]:
+    """Causes of which each, were it the wrong one, would leave the declared parameters further off than
+    none of them: what is added hangs on which it is."""
+    near = _near(refits)
+    if len(near) < 2:
+        return []
+    loss, none = expected_loss(near, ranking.likelihood)
+    return near if none < loss.min() else []
+
+
+def _with_parts(options: Sequence[Evidence], ranking: Ranking) -> list[Evidence]:
+    """What comes in pairs alone as well: a refit may need one of them only."""
+    alone = {e.trials[0].family: e for e in ranking.found}
+    parts = [alone[t.family] for e in options if len(e.trials) > 1 for t in e.trials[:1]]
+    parts += [alone[t.family] for e in options if len(e.trials) > 1 for t in e.trials[1:]]
+    several = {id(e): e for e in (*options, *parts) if significant(e, ranking.linear)}
+    return list(several.values())
 
 
 def _kept(
@@ -377,9 +406,14 @@ def _better_than_its_parts(both: Evidence, seen: dict[str, Fall], ranking: Ranki
     return True
 
 
-def _describes(formula: Evidence, names: Sequence[Evidence], ranking: Ranking) -> bool:
-    """Is a description so much better than any cause with a name, wherever it is held out?"""
-    best = names[0].score if names else 0.0
+def _describes(
+    subject: Subject[F], formula: Evidence, names: Sequence[Refit[F]], ranking: Ranking
+) -> bool:
+    """Is a description so much better than causes with a name, wherever it is held out?
+
+    Than the best cause, and what has a name beside that one: terms of a formula may be several causes.
+    """
+    best = max((r.evidence.score for r in names), default=0.0)
     if formula.score < best + LEVELS.described:
         return False
     seen = falls(ranking, formula)
@@ -387,8 +421,12 @@ def _describes(formula: Evidence, names: Sequence[Evidence], ranking: Ranking) -
         return False
     if not names:
         return True
-    named = falls(ranking, names[0])
-    return all(seen[k].ratio < named[k].ratio for k in ("stretches", "regions"))
+    named = falls(ranking, names[0].evidence)
+    if any(seen[k].ratio >= named[k].ratio for k in ("stretches", "regions")):
+        return False
+    beside = ranked(subject, names[0].fit).found
+    second = max((e.score for e in beside[:1]), default=0.0)
+    return formula.score >= best + max(second, 0.0) + LEVELS.described
 
 
 def sharpened(subject: Subject[F], fit: F, ranking: Ranking, evidence: Evidence) -> Evidence:
@@ -485,6 +523,6 @@ def _rivals(
         lost = squares(linear, [ranking.likelihood.in_time(e.basis)], stretches) - best
         t, behind = standard_errors(lost), mine[0].score - e.score
         as_well = t < LEVELS.apart and float(lost.sum()) < LEVELS.alike * gained
-        if behind < LEVELS.strong or (linear.series and as_well):
+        if behind < LEVELS.strong or as_well:
             rivals.append(Rival(e.trials[0].what, behind, t, e))
     return tuple(rivals)

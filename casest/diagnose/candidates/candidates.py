@@ -238,10 +238,14 @@ def _tried(candidate: Candidate, model: Model, runs: Sequence[Run]) -> Candidate
     for s in extended.signals:
         if any(s.name not in run.signals for run in runs):
             raise UsageError(f"the data have no {s.name!r}")
-    if effect is not None and not shipped(effect):
-        check_units(extended)
     _refuse_more_than_data(extended, runs)
-    return candidate
+    if effect is None:
+        return candidate
+    if not shipped(effect):
+        check_units(extended)
+    # In the form that it takes in this model.
+    own = replace(extended.effects[-1].effect, on=effect.on)
+    return replace(candidate, effect=own)
 
 
 def _refuse_more_than_data(extended: Model, runs: Sequence[Run]) -> None:

@@ -17,6 +17,8 @@ from casest.diagnose.evidence.linear import Linear
 
 #: Values on each grid: moments beside the best one, edges of pulses, levels, time constants, lines.
 MOMENTS, EDGES, LEVELS_TRIED, CONSTANTS, LINES = 15, 60, 24, 8, 3
+#: Shares of a span in which a loop may turn round.
+SHARES = (0.003, 0.01, 0.03, 0.1, 0.3)
 #: The shortest time constant, in samples: a shorter one is a delay.
 SHORTEST = 3.0
 #: Share of the readings that the lowest level lets through, and fewest beyond the highest.
@@ -58,6 +60,8 @@ def _values(kinds: tuple[str, ...], seen: Seen) -> Values:
         return _levels(seen)
     if seen.time is None:
         return [], 1
+    if kinds == ("share",):
+        return [(float(v),) for v in SHARES], len(SHARES)
     if kinds == ("time",):
         return _moments(seen)
     if kinds == ("time", "time"):
@@ -206,7 +210,7 @@ def nearer(candidate: Candidate, seen: Seen, scale: float) -> list[Candidate]:
 def _steps(kind: str, value: float, seen: Seen, scale: float) -> list[float]:
     if kind == "level":
         return [value * (1 + s * 0.06 * scale) for s in (-1, -0.5, 0.5, 1)]
-    if kind == "timescale":
+    if kind in ("timescale", "share"):
         return [value * float(np.exp(s * 0.7 * scale)) for s in (-1, -0.5, 0.5, 1)]
     if kind == "frequency" or seen.time is None:
         return []
