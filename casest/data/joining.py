@@ -6,11 +6,9 @@ within what they recorded: no gap is bridged. As it was recorded it is kept besi
 
 from __future__ import annotations
 
-import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -28,14 +26,6 @@ from casest.units import conversion
 
 #: Samples of the first file that the others must cover.
 _FEWEST = 2
-
-
-def parts_of(path: str | os.PathLike[str]) -> list[str]:
-    """The files that a + joins; a file with a + in its own name is one."""
-    text = os.fspath(path)
-    parts = [part.strip() for part in text.split("+")]
-    alone = len(parts) == 1 or Path(text).exists() or not all(parts)
-    return [text] if alone else parts
 
 
 def stems(tables: Sequence[Table]) -> list[str]:
