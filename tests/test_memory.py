@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -250,6 +251,32 @@ def test_an_effect_with_memory_stands_beside_ordinary_ones_in_their_order():
     assert np.abs(first.residuals(first.point(at))[0]).max() < 2e-3
     other = Problem(with_shipped(cell.with_effect(bent), low_pass), (run,))
     assert np.abs(other.residuals(other.point(at))[0]).max() > 0.1
+
+
+def test_samples_taken_from_a_record_remember_what_came_before_them():
+    """A stretch that is held out is predicted with the creep and the lag that lead into it."""
+    run = crept(noise=0.0)
+    part = run.take(np.arange(500, 600)).take(slice(None, None, 2))
+    extended = with_shipped(cell, creep).with_effect(signal_lag, on="load")
+    at = {"zero": 1.0, "gain": 1.9, "creep.k": 0.1, "creep.tau": 200.0}
+    both = [Problem(extended, (r,)) for r in (run, part)]
+    points = [p.point({**at, "signal_lag(load).delay": 1.7}) for p in both]
+    whole, own = (p.residuals(x)[0] for p, x in zip(both, points, strict=True))
+    np.testing.assert_allclose(own, whole[500:600:2], atol=1e-12)
+    slopes = both[0].jacobian(points[0])[500:600:2]
+    np.testing.assert_allclose(both[1].jacobian(points[1]), slopes, atol=1e-12)
+
+
+def test_samples_whose_input_was_changed_stand_alone():
+    run = crept(noise=0.0).take(slice(500, 600))
+    changed = run_of(run.time, load=run.signals["load"] + 1.0, reading=run.signals["reading"])
+    shifted = replace(run, signals={**run.signals, "load": run.signals["load"] + 1.0})
+    at = {"zero": 1.0, "gain": 1.9, "creep.k": 0.1, "creep.tau": 200.0}
+    found = []
+    for r in (changed, shifted):
+        problem = Problem(with_shipped(cell, creep), (r,))
+        found.append(problem.residuals(problem.point(at))[0])
+    np.testing.assert_allclose(*found, atol=1e-12)
 
 
 def test_a_norm_refuses_memory_and_lags_with_the_reason():

@@ -174,7 +174,7 @@ def _at(run: Run, time: Array) -> Run:
     if "t" in signals:
         factor, _ = conversion("s", run.units["t"] or "s")
         signals["t"] = (time * factor)[:, None]
-    return replace(run, signals=signals, time=time)
+    return replace(run, signals=signals, time=time, whole=None, places=None)
 
 
 def _with_other(whole: Run, run: Run, clock: Array, wanted: Sequence[Signal]) -> Run:
