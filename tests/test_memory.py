@@ -123,7 +123,8 @@ def test_a_lagging_thermometer_is_recovered_though_its_input_is_a_column():
     y = behind(time, 3.0 + 0.5 * load, tau=4.0)
     y += 0.01 * np.random.default_rng(1).standard_normal(len(time))
     extended = with_shipped(cell, low_pass)
-    assert extended.effects[0].kind == "sequence"
+    used = extended.effects[0].effect
+    assert (used.kind, used.name, used.typical) == ("sequence", "low_pass", low_pass.typical)
     found = attempt(extended, [run_of(time, load=load, reading=y)])
     assert found.certificate.trusted
     for name, true in (("zero", 3.0), ("gain", 0.5), ("low_pass.tau", 4.0)):
@@ -425,6 +426,7 @@ def test_a_lag_and_a_memory_act_both():
 @pytest.mark.parametrize(
     ("on", "why"),
     [
+        ("t", "t is the time of its samples: it has attitude"),
         ("m", "m is what it measures: it has attitude"),
         ("current", "it has no 'current': it has attitude"),
         (None, "say of which signal: it has attitude"),
