@@ -9,7 +9,7 @@ import pytest
 from models.same_body import same_body
 from scipy.spatial.transform import Rotation
 
-from casest import DataError, load_runs, signal
+from casest import DataError, UsageError, load_runs, signal
 from casest.cli import run as command
 from casest.declaration.symbols import attitude, named
 from casest.effects import signal_lag
@@ -153,6 +153,21 @@ def test_files_without_a_time_in_common_or_any_are_refused(tmp_path):
         read(f"{a}+{d}", X)
     with pytest.raises(DataError, match=r"a\.csv: no columns .*c\.csv: no columns|no column"):
         read(f"{a}+{c}", named(signal("K"), "warmth"))
+
+
+def test_one_rate_for_two_clocks_is_refused(tmp_path):
+    pair, _ = two(tmp_path)
+    with pytest.raises(UsageError, match="--rate 50: files joined by"):
+        read(pair, W, rate=50)
+
+
+def test_a_signal_of_the_second_file_keeps_its_name_beside_a_column_of_the_first(tmp_path):
+    nine = np.arange(9.0)
+    a = written(tmp_path / "a.csv", "t,v [V],x", nine, np.cos(nine), 7 * nine)
+    b = written(tmp_path / "b.csv", "t,y [V]", nine, np.sin(nine))
+    run = read(f"{a}+{b}", named(signal("V"), "v"), X, columns={"x": "b.y"})
+    np.testing.assert_allclose(run.signals["x"][:, 0], np.sin(nine), atol=1e-9)
+    np.testing.assert_allclose(run.columns["x"], 7 * nine)
 
 
 def test_a_file_with_a_plus_in_its_name_is_one(tmp_path):

@@ -21,7 +21,7 @@ from casest.data.options import Options
 from casest.data.run import Array, Run, Series
 from casest.data.table import Table
 from casest.declaration.symbols import Signal
-from casest.errors import DataError
+from casest.errors import DataError, UsageError
 from casest.units import conversion
 
 #: Samples of the first file that the others must cover.
@@ -43,8 +43,13 @@ def shared_out(
 ) -> list[tuple[Table, tuple[Signal, ...], Options]]:
     """Each file with the signals that it holds, and what is said of its columns.
 
-    Raises DataError for a signal that no file holds, or more than one.
+    Raises DataError for a signal that no file holds, or more than one; UsageError for a rate.
     """
+    if options.rate is not None:
+        raise UsageError(
+            f"--rate {options.rate:g}: files joined by + have clocks of their own; leave it out, "
+            "and name their time columns with --columns t=…"
+        )
     said = [_said(table, stem, tables, options) for table, stem in _called(tables)]
     own: list[list[Signal]] = [[] for _ in tables]
     for signal in signals:
@@ -186,13 +191,13 @@ def _with_other(whole: Run, run: Run, clock: Array, wanted: Sequence[Signal]) ->
     for name, one in _series(run, clock, wanted).items():
         curve = Curve.through(one.time, one.values, one.block, rotation=one.rotation)
         values = curve.at(whole.time, curve.nearest(whole.time))[0]
+        if name in run.signals:
+            signals[name], elsewhere[name] = values, one
+            continue
         # Two columns of one name are told apart by their file.
         called = f"{stem}.{name}" if name in {*columns, *signals} else name
+        columns[called], column_units[called] = values[:, 0], run.column_units.get(name)
         elsewhere[called] = one
-        if name in run.signals:
-            signals[called] = values
-        else:
-            columns[called], column_units[called] = values[:, 0], run.column_units.get(name)
     piece = Curve.through(clock, clock[:, None], run.block).nearest(whole.time)
     cuts = (np.diff(whole.block) != 0) | (np.diff(piece) != 0)
     return replace(
