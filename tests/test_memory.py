@@ -538,3 +538,24 @@ def test_a_saved_result_with_a_lag_and_a_memory_is_read_and_applied_again(tmp_pa
 def test_a_lag_on_the_command_line_needs_its_signal(capsys):
     assert command(["calibrate", "norm-diagonal", "x.csv", "--effects", "signal_lag"]) == 1
     assert "--effects 'signal_lag(SIGNAL)'" in capsys.readouterr().err
+
+
+def test_a_simulated_record_has_the_memory_and_the_lag_that_were_asked_for(tmp_path):
+    time = np.arange(0, 30, 0.1)
+    mass = 2 + np.sin(time)
+    given = tmp_path / "mass.csv"
+    table = np.column_stack([time, mass])
+    np.savetxt(given, table, delimiter=",", header="t [s],mass [kg]", comments="")
+    cell = str(Path(__file__).parent / "models" / "load_cell.py:load_cell")
+    asked = ["--effect", "low_pass", "--effect", "signal_lag(mass)", "--noise", "0"]
+    sizes = ["low_pass.tau=2", "signal_lag(mass).delay=0.5", "zero=0", "sensitivity=1"]
+    values = [word for size in sizes for word in ("--value", size)]
+    code = command(
+        ["simulate", cell, "--input", str(given), *asked, *values, "-o", str(tmp_path / "sim")]
+    )
+    assert code == 0
+    record = np.genfromtxt(tmp_path / "sim" / "record.csv", delimiter=",", names=True)
+    (reading,) = (record[n] for n in record.dtype.names if n.startswith("output"))
+    late = 9.80665 * (2 + np.sin(time - 0.5))
+    assert np.abs(reading - behind(time, late, 2.0))[150:].max() < 0.02
+    assert np.abs(reading - 9.80665 * mass)[150:].max() > 5
