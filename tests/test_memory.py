@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -122,7 +123,8 @@ def test_a_lagging_thermometer_is_recovered_though_its_input_is_a_column():
     y = behind(time, 3.0 + 0.5 * load, tau=4.0)
     y += 0.01 * np.random.default_rng(1).standard_normal(len(time))
     extended = with_shipped(cell, low_pass)
-    assert extended.effects[0].kind == "sequence"
+    used = extended.effects[0].effect
+    assert (used.kind, used.name, used.typical) == ("sequence", "low_pass", low_pass.typical)
     found = attempt(extended, [run_of(time, load=load, reading=y)])
     assert found.certificate.trusted
     for name, true in (("zero", 3.0), ("gain", 0.5), ("low_pass.tau", 4.0)):
@@ -250,6 +252,32 @@ def test_an_effect_with_memory_stands_beside_ordinary_ones_in_their_order():
     assert np.abs(first.residuals(first.point(at))[0]).max() < 2e-3
     other = Problem(with_shipped(cell.with_effect(bent), low_pass), (run,))
     assert np.abs(other.residuals(other.point(at))[0]).max() > 0.1
+
+
+def test_samples_taken_from_a_record_remember_what_came_before_them():
+    """A stretch that is held out is predicted with the creep and the lag that lead into it."""
+    run = crept(noise=0.0)
+    part = run.take(np.arange(500, 600)).take(slice(None, None, 2))
+    extended = with_shipped(cell, creep).with_effect(signal_lag, on="load")
+    at = {"zero": 1.0, "gain": 1.9, "creep.k": 0.1, "creep.tau": 200.0}
+    both = [Problem(extended, (r,)) for r in (run, part)]
+    points = [p.point({**at, "signal_lag(load).delay": 1.7}) for p in both]
+    whole, own = (p.residuals(x)[0] for p, x in zip(both, points, strict=True))
+    np.testing.assert_allclose(own, whole[500:600:2], atol=1e-12)
+    slopes = both[0].jacobian(points[0])[500:600:2]
+    np.testing.assert_allclose(both[1].jacobian(points[1]), slopes, atol=1e-12)
+
+
+def test_samples_whose_input_was_changed_stand_alone():
+    run = crept(noise=0.0).take(slice(500, 600))
+    changed = run_of(run.time, load=run.signals["load"] + 1.0, reading=run.signals["reading"])
+    shifted = replace(run, signals={**run.signals, "load": run.signals["load"] + 1.0})
+    at = {"zero": 1.0, "gain": 1.9, "creep.k": 0.1, "creep.tau": 200.0}
+    found = []
+    for r in (changed, shifted):
+        problem = Problem(with_shipped(cell, creep), (r,))
+        found.append(problem.residuals(problem.point(at))[0])
+    np.testing.assert_allclose(*found, atol=1e-12)
 
 
 def test_a_norm_refuses_memory_and_lags_with_the_reason():
@@ -398,6 +426,7 @@ def test_a_lag_and_a_memory_act_both():
 @pytest.mark.parametrize(
     ("on", "why"),
     [
+        ("t", "t is the time of its samples: it has attitude"),
         ("m", "m is what it measures: it has attitude"),
         ("current", "it has no 'current': it has attitude"),
         (None, "say of which signal: it has attitude"),
@@ -509,3 +538,24 @@ def test_a_saved_result_with_a_lag_and_a_memory_is_read_and_applied_again(tmp_pa
 def test_a_lag_on_the_command_line_needs_its_signal(capsys):
     assert command(["calibrate", "norm-diagonal", "x.csv", "--effects", "signal_lag"]) == 1
     assert "--effects 'signal_lag(SIGNAL)'" in capsys.readouterr().err
+
+
+def test_a_simulated_record_has_the_memory_and_the_lag_that_were_asked_for(tmp_path):
+    time = np.arange(0, 30, 0.1)
+    mass = 2 + np.sin(time)
+    given = tmp_path / "mass.csv"
+    table = np.column_stack([time, mass])
+    np.savetxt(given, table, delimiter=",", header="t [s],mass [kg]", comments="")
+    cell = str(Path(__file__).parent / "models" / "load_cell.py:load_cell")
+    asked = ["--effect", "low_pass", "--effect", "signal_lag(mass)", "--noise", "0"]
+    sizes = ["low_pass.tau=2", "signal_lag(mass).delay=0.5", "zero=0", "sensitivity=1"]
+    values = [word for size in sizes for word in ("--value", size)]
+    code = command(
+        ["simulate", cell, "--input", str(given), *asked, *values, "-o", str(tmp_path / "sim")]
+    )
+    assert code == 0
+    record = np.genfromtxt(tmp_path / "sim" / "record.csv", delimiter=",", names=True)
+    (reading,) = (record[n] for n in record.dtype.names if n.startswith("output"))
+    late = 9.80665 * (2 + np.sin(time - 0.5))
+    assert np.abs(reading - behind(time, late, 2.0))[150:].max() < 0.02
+    assert np.abs(reading - 9.80665 * mass)[150:].max() > 5

@@ -15,8 +15,8 @@ from casest import units as unit_names
 from casest.data import checks, timing
 from casest.data.converting import numbers, rotation, vector
 from casest.data.finding import Choice, as_names, find_column, find_columns
-from casest.data.joining import joined, parts_of, shared_out
-from casest.data.logs import file_and_topics
+from casest.data.joining import joined, shared_out
+from casest.data.logs import file_and_topics, parts_of
 from casest.data.matching import find_by_name
 from casest.data.options import Options, refuse_unknown_names, stated_unit
 from casest.data.rest import at_rest as averaged_at_rest

@@ -6,11 +6,9 @@ within what they recorded: no gap is bridged. As it was recorded it is kept besi
 
 from __future__ import annotations
 
-import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -23,19 +21,11 @@ from casest.data.options import Options
 from casest.data.run import Array, Run, Series
 from casest.data.table import Table
 from casest.declaration.symbols import Signal
-from casest.errors import DataError
+from casest.errors import DataError, UsageError
 from casest.units import conversion
 
 #: Samples of the first file that the others must cover.
 _FEWEST = 2
-
-
-def parts_of(path: str | os.PathLike[str]) -> list[str]:
-    """The files that a + joins; a file with a + in its own name is one."""
-    text = os.fspath(path)
-    parts = [part.strip() for part in text.split("+")]
-    alone = len(parts) == 1 or Path(text).exists() or not all(parts)
-    return [text] if alone else parts
 
 
 def stems(tables: Sequence[Table]) -> list[str]:
@@ -53,8 +43,13 @@ def shared_out(
 ) -> list[tuple[Table, tuple[Signal, ...], Options]]:
     """Each file with the signals that it holds, and what is said of its columns.
 
-    Raises DataError for a signal that no file holds, or more than one.
+    Raises DataError for a signal that no file holds, or more than one; UsageError for a rate.
     """
+    if options.rate is not None:
+        raise UsageError(
+            f"--rate {options.rate:g}: files joined by + have clocks of their own; leave it out, "
+            "and name their time columns with --columns t=…"
+        )
     said = [_said(table, stem, tables, options) for table, stem in _called(tables)]
     own: list[list[Signal]] = [[] for _ in tables]
     for signal in signals:
@@ -184,7 +179,7 @@ def _at(run: Run, time: Array) -> Run:
     if "t" in signals:
         factor, _ = conversion("s", run.units["t"] or "s")
         signals["t"] = (time * factor)[:, None]
-    return replace(run, signals=signals, time=time)
+    return replace(run, signals=signals, time=time, whole=None, places=None)
 
 
 def _with_other(whole: Run, run: Run, clock: Array, wanted: Sequence[Signal]) -> Run:
@@ -196,13 +191,13 @@ def _with_other(whole: Run, run: Run, clock: Array, wanted: Sequence[Signal]) ->
     for name, one in _series(run, clock, wanted).items():
         curve = Curve.through(one.time, one.values, one.block, rotation=one.rotation)
         values = curve.at(whole.time, curve.nearest(whole.time))[0]
+        if name in run.signals:
+            signals[name], elsewhere[name] = values, one
+            continue
         # Two columns of one name are told apart by their file.
         called = f"{stem}.{name}" if name in {*columns, *signals} else name
+        columns[called], column_units[called] = values[:, 0], run.column_units.get(name)
         elsewhere[called] = one
-        if name in run.signals:
-            signals[called] = values
-        else:
-            columns[called], column_units[called] = values[:, 0], run.column_units.get(name)
     piece = Curve.through(clock, clock[:, None], run.block).nearest(whole.time)
     cuts = (np.diff(whole.block) != 0) | (np.diff(piece) != 0)
     return replace(

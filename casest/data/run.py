@@ -44,6 +44,7 @@ class Run:
     correlation: per signal (N, size, size), of the errors of one mean's components; may be missing.
     notes: what was assumed, skipped or looks wrong, one sentence each.
     elsewhere: signals and columns that come from another file than the first, as they are there.
+    whole: the record that these samples were taken from, where `places` (N,) says; None of a whole.
     """
 
     name: str
@@ -60,6 +61,8 @@ class Run:
     notes: tuple[str, ...] = ()
     correlation: Mapping[str, Array] = field(default_factory=dict)
     elsewhere: Mapping[str, Series] = field(default_factory=dict)
+    whole: Run | None = None
+    places: Index | None = None
 
     def __post_init__(self) -> None:
         """Refuse parts of unequal length: they would be matched wrongly without a sign."""
@@ -97,7 +100,11 @@ class Run:
         return len(self.rows)
 
     def take(self, chosen: NDArray[np.int_] | NDArray[np.bool_] | slice) -> Run:
-        """Return the samples given by an index, a mask or a slice, as a run of the same name."""
+        """Return the samples given by an index, a mask or a slice, as a run of the same name.
+
+        It remembers the whole record: what happened before a sample may still be felt in it.
+        """
+        places = np.arange(len(self)) if self.places is None else self.places
         rows = self.rows[chosen] if isinstance(chosen, slice) else np.asarray(self.rows)[chosen]
         return replace(
             self,
@@ -109,6 +116,8 @@ class Run:
             count=self.count[chosen],
             spread={name: values[chosen] for name, values in self.spread.items()},
             correlation={name: values[chosen] for name, values in self.correlation.items()},
+            whole=self if self.whole is None else self.whole,
+            places=places[chosen],
         )
 
     def covariance(self, name: str) -> Array:

@@ -228,7 +228,9 @@ class Model:
         try:
             return self.with_effect(replace(added, otherwise=None), on=on, columns=columns)
         except UsageError:
-            return self.with_effect(replace(form, on=added.on), on=on, columns=columns)
+            told = {n: getattr(added, n) for n in ("name", "on", "typical", "shown_by")}
+            said = form.formula or added.formula
+            return self.with_effect(replace(form, **told, formula=said), on=on, columns=columns)
 
     def _with_effect(
         self, added: Effect, target: str, columns: dict[str, str], on: str | None

@@ -12,6 +12,7 @@ from casest.data.run import Run
 from casest.declaration.effect import Attached, Effect
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
+from casest.declaration.symbols import Parameter
 from casest.effects.lateness import likely_lag
 from casest.errors import CasestError, UnitError
 from casest.units import conversion, known, size
@@ -77,20 +78,32 @@ def _begun(attached: Attached, model: Model, runs: Sequence[Run]) -> Attached:
         start = likely_lag(runs, measured, attached.on)
         own = {p.name.rpartition(".")[2] for p in attached.parameters if start}
         return _starting(attached, own, start)
+    scales = {name for name, what in attached.effect.profile if what == "timescale"}
     times = [run.time for run in runs if run.time is not None and len(run) > 1]
-    scales = {name for name, what in attached.effect.profile if what == "timescale" and times}
-    # In the middle of step and duration, on a scale of ratios.
-    middles = [float(np.sqrt(np.median(np.diff(t)) * np.ptp(t))) for t in times]
-    return _starting(attached, scales, max(middles, default=0.0))
+    if not scales or not times:
+        return attached
+    step = min(float(np.median(np.diff(t))) for t in times)
+    duration = max(float(np.ptp(t)) for t in times)
+    # In the middle of what the record can tell apart, on a scale of ratios.
+    return _starting(attached, scales, float(np.sqrt(step * duration)), (step, duration))
 
 
-def _starting(attached: Attached, names: Collection[str], value: float) -> Attached:
-    start = float(f"{value:.6g}")
-    parameters = tuple(
-        replace(p, start=(start,)) if p.name.rpartition(".")[2] in names else p
-        for p in attached.parameters
-    )
-    return replace(attached, parameters=parameters)
+def _starting(
+    attached: Attached,
+    names: Collection[str],
+    value: float,
+    bounds: tuple[float, float] | None = None,
+) -> Attached:
+    """With scalar parameters that begin at a value, within bounds and their own."""
+
+    def begun(p: Parameter) -> Parameter:
+        if p.name.rpartition(".")[2] not in names:
+            return p
+        low, high = bounds or (-np.inf, np.inf)
+        lower, upper = max(p.lower[0], low), min(p.upper[0], high)
+        return replace(p, start=(float(f"{value:.6g}"),), lower=(lower,), upper=(upper,))
+
+    return replace(attached, parameters=tuple(map(begun, attached.parameters)))
 
 
 def with_numbers(

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 from casest.declaration.effect import RECORDED, effect
 from casest.declaration.physics import SX, der, exp, fabs, fmax, fmin, sqrt
 from casest.declaration.shapes import each
@@ -38,7 +36,12 @@ def axis_delay(y: SX, t: SX = signal("s"), *, delay: SX = param(each, "s")) -> S
     return y - delay * rate + delay**2 / 2 * der(rate, t)
 
 
-@effect(on="output", kind="sequence", memory={"rate": 0.0, "before": "y"})
+@effect(
+    on="output",
+    kind="sequence",
+    memory={"rate": 0.0, "before": "y"},
+    formula="y − tau·lowpass(dy/dt, tau)",
+)
 def _filtered(y: SX, rate: SX, before: SX, dt: SX, *, tau: SX = param("s")) -> tuple[SX, ...]:
     """A first-order filter with time constant tau on all axes, run through the record.
 
@@ -56,7 +59,7 @@ def _filtered(y: SX, rate: SX, before: SX, dt: SX, *, tau: SX = param("s")) -> t
     typical={"tau": 5e-3},
     shown_by="the same motion at two speeds: a lag shrinks the faster one, a delay does not",
     formula="y − tau·dy/dt + tau²·d²y/dt²",
-    otherwise=replace(_filtered, name="low_pass"),
+    otherwise=_filtered,
 )
 def low_pass(y: SX, t: SX = signal("s"), *, tau: SX = param("s")) -> SX:
     """A first-order filter with time constant tau on all axes.
@@ -96,7 +99,13 @@ def creep(
     return y - k * gap, gap, y
 
 
-@effect(on="output", kind="sequence", profile={"turn": "share"}, memory={"middle": "y"})
+@effect(
+    on="output",
+    kind="sequence",
+    profile={"turn": "share"},
+    memory={"middle": "y"},
+    formula="y − k·(y − play(y, w))/w, w = turn·span/2",
+)
 def _looped(
     y: SX,
     middle: SX,
@@ -120,7 +129,7 @@ def _looped(
     typical={"k": 0.02},
     shown_by="the same input approached from above and from below",
     formula="y − k·sign(dy/dt)",
-    otherwise=replace(_looped, name="hysteresis"),
+    otherwise=_looped,
 )
 def hysteresis(y: SX, t: SX = signal("s"), *, k: SX = param(each, "[y]")) -> SX:
     """A reading that lags behind by k, whichever way it moves: a loop 2k high.

@@ -7,14 +7,14 @@ through sample by sample; a signal at another time is taken from its record by s
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 
 import casadi as ca
 import numpy as np
 
 from casest.data.curves import Curve
-from casest.data.run import Run
+from casest.data.run import Index, Run, Series
 from casest.declaration.effect import Attached
 from casest.declaration.model import Model
 from casest.declaration.physics import SX
@@ -26,6 +26,59 @@ from casest.leastsquares.memory import Memory
 
 
 @dataclass(frozen=True)
+class Record:
+    """What effects look at of a run: the record that its samples were taken from.
+
+    `samples` (N, k) are the model's signals there, `places` those of the run's own samples.
+    """
+
+    run: Run
+    samples: Array
+    time: Array
+    places: Index | slice
+    curves: dict[str, Curve] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, model: Model, run: Run) -> Record:
+        """The whole record where the samples are its own still, else the samples alone."""
+        whole, places = _origin(model, run)
+        if whole.time is None:
+            raise DataError(
+                f"{run.file or run.name}: an effect that looks at other samples needs time: give a "
+                "time column or --rate"
+            )
+        samples = np.hstack([np.asarray(whole.signals[s.name], float) for s in model.signals])
+        return cls(whole, samples, np.asarray(whole.time, float), places)
+
+    def at(self, name: str, wanted: Array, *, rotation: bool) -> tuple[Array, Array]:
+        """A signal and its rate (N, k) at a time for each sample of the record."""
+        if name not in self.curves:
+            own = Series("", self.time, self.run.signals[name], self.run.block)
+            one = self.run.elsewhere.get(name, own)
+            made = Curve.through(one.time, one.values, one.block, rotation=rotation)
+            self.curves[name] = made
+        curve = self.curves[name]
+        # Within its own record a signal crosses no gap; another file's has gaps of its own.
+        apart = name in self.run.elsewhere
+        return curve.at(wanted, curve.nearest(wanted) if apart else curve.stretch)
+
+
+def _origin(model: Model, run: Run) -> tuple[Run, Index | slice]:
+    """The record that a run was taken from, and where; itself where a signal was changed since.
+
+    But for the measured one: what is measured leads to no prediction.
+    """
+    whole, places = run.whole, run.places
+    if whole is None or places is None or len(places) != len(run):
+        return run, slice(None)
+    for name in (s.name for s in model.signals if s.name != model.traced.measured):
+        own, there = run.signals[name], whole.signals.get(name)
+        if there is None or not np.array_equal(there[places], own, equal_nan=True):
+            return run, slice(None)
+    return whole, places
+
+
+@dataclass(frozen=True)
 class Staged:
     """Residual and Jacobian of an explicit model with effects that look at other samples."""
 
@@ -33,9 +86,10 @@ class Staged:
     runs: tuple[Run, ...]
 
     @cached_property
-    def _curves(self) -> dict[tuple[int, str], Curve]:
-        return {}
+    def _records(self) -> tuple[Record, ...]:
+        return tuple(Record.of(self.model, run) for run in self.runs)
 
+<<<<<<< HEAD
     def rows(
         self, parameters: Array, samples: Array, r: int, own: tuple[int, ...] | None = None
     ) -> tuple[Array, Array]:
@@ -48,50 +102,47 @@ class Staged:
         given = np.zeros((len(samples), 0))
         count = self.model.staged.coordinates.numel() if own is None else len(own)
         slopes = np.zeros((len(samples), 0, count))
+=======
+    def rows(self, parameters: Array, samples: Array, r: int) -> tuple[Array, Array]:
+        """Residuals (N, m) and Jacobians (N, m, n) of the samples of run r.
+
+        Effects follow the record that the samples were taken from, block by block.
+        """
+        *stages, last = _programs(self.model)
+        record = self._records[r]
+        given = np.zeros((len(record.samples), 0))
+        slopes = np.zeros((len(given), 0, self.model.staged.coordinates.numel()))
+>>>>>>> memory
         for stage in stages:
-            if stage.moment is not None:
-                more = self._late(stage.attached, stage.moment, parameters, r, time)
+            if stage.memory is None:
+                more = self._late(stage, parameters, record)
             else:
-                assert stage.memory is not None
-                taken = _chained(stage.taken, parameters, samples, given, slopes)
-                more = stage.memory.along(parameters, *taken, time, self.runs[r].block)
+                taken = _chained(stage.taken, parameters, record.samples, given, slopes)
+                more = stage.memory.along(parameters, *taken, record.time, record.run.block)
             given = np.concatenate([given, more[0]], axis=1)
             slopes = np.concatenate([slopes, more[1]], axis=1)
-        return _chained(last.taken, parameters, samples, given, slopes)
+        own = given[record.places], slopes[record.places]
+        return _chained(last.taken, parameters, samples, *own)
 
-    def _late(
-        self, attached: Attached, moment: Replay, parameters: Array, r: int, time: Array
-    ) -> tuple[Array, Array]:
+    def _late(self, stage: Program, parameters: Array, record: Record) -> tuple[Array, Array]:
         """A signal at the times at which the effect says that it is taken, and its slopes."""
-        at, slope = moment(parameters, time[:, None])
-        wanted, curve = at[:, 0, 0], self._curve(r, attached.on, time)
-        # Within its own record a signal crosses no gap; another file's has gaps of its own.
-        apart = attached.on in self.runs[r].elsewhere
-        value, rate = curve.at(wanted, curve.nearest(wanted) if apart else curve.stretch)
+        name = stage.attached.on
+        wanted, slope = stage.taken(parameters, record.time[:, None])
+        rotation = self.model[name].kind == "rotation"
+        value, rate = record.at(name, wanted[:, 0, 0], rotation=rotation)
         return value, rate[:, :, None] * slope
-
-    def _curve(self, r: int, name: str, time: Array) -> Curve:
-        if (r, name) not in self._curves:
-            run, rotation = self.runs[r], self.model[name].kind == "rotation"
-            other = run.elsewhere.get(name)
-            if other is not None:
-                made = Curve.through(other.time, other.values, other.block, rotation=rotation)
-            else:
-                made = Curve.through(time, run.signals[name], run.block, rotation=rotation)
-            self._curves[r, name] = made
-        return self._curves[r, name]
 
 
 @dataclass(frozen=True)
 class Program:
     """What is computed of one stage: what it takes, and how it goes on from it.
 
-    The last of a model's is its residual, with no effect behind it.
+    Of an effect on a signal's time that is the time asked for. The last of a model's is its
+    residual, with no effect behind it.
     """
 
     attached: Attached
     taken: Replay
-    moment: Replay | None = None
     memory: Memory | None = None
 
 
@@ -115,7 +166,7 @@ def _programs(model: Model, own: tuple[int, ...] | None = None) -> tuple[Program
             moment = ca.SX(stage.attached.apply(t, traced.symbols))
             outputs = slopes(moment, coordinates)
             f = _replay("moment", [parameters, t], outputs)
-            found.append(Program(stage.attached, f, moment=f))
+            found.append(Program(stage.attached, f))
         else:
             memory = Memory(model, stage, own)
             found.append(Program(stage.attached, replay(stage.taken), memory=memory))
@@ -126,15 +177,6 @@ def _programs(model: Model, own: tuple[int, ...] | None = None) -> tuple[Program
 def _replay(name: str, inputs: list[SX], outputs: list[SX]) -> Replay:
     names = [f"out{k}" for k in range(len(outputs))]
     return Replay(ca.Function(name, inputs, outputs, ["parameters", "sample"], names))
-
-
-def _time(run: Run) -> Array:
-    if run.time is None:
-        raise DataError(
-            f"{run.file or run.name}: an effect that looks at other samples needs time: give a "
-            "time column or --rate"
-        )
-    return run.time
 
 
 def _chained(

@@ -57,6 +57,9 @@ def with_effects(
                 f"--effect {text}: it describes noise and makes none; add the noise to the "
                 "readings yourself"
             )
+        if effect.kind == "time":
+            model = model.with_effect(effect, on=found[2])
+            continue
         columns = _columns_of(effect, found[2], model, run)
         effect = with_numbers(placed_in(effect, model), columns, prepared(model, (run,)), model)
         model = model.with_effect(effect, columns=dict(columns))
@@ -68,6 +71,7 @@ def _columns_of(
 ) -> tuple[tuple[str, str], ...]:
     """The column that the effect reads: as named, else the only one that there is."""
     inner = {*model.quantities, *(s.name for s in model.signals), *run.columns}
+    inner |= set() if run.time is None else {"t"}
     wanted = [s.name for s in effect.extras if s.name not in inner]
     if not wanted:
         return ()

@@ -34,7 +34,18 @@ def file_and_topics(path: str | os.PathLike[str]) -> tuple[Path, tuple[str, ...]
     return file, tuple(name.strip() for name in found[2].split(",") if name.strip())
 
 
+def parts_of(path: str | os.PathLike[str]) -> list[str]:
+    """The files that a + joins; a file with a + in its own name is one."""
+    text = os.fspath(path)
+    parts = [part.strip() for part in text.split("+")]
+    alone = len(parts) == 1 or Path(text).exists() or not all(parts)
+    return [text] if alone else parts
+
+
 def file_name(path: str | os.PathLike[str]) -> str:
     """Name of a record without its folder: "flight.bag:/imu/data" keeps its topic."""
-    file, topics = file_and_topics(path)
-    return f"{file.name}:{','.join(topics)}" if topics else file.name
+    names = []
+    for part in parts_of(path):
+        file, topics = file_and_topics(part)
+        names.append(f"{file.name}:{','.join(topics)}" if topics else file.name)
+    return "+".join(names)
