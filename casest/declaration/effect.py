@@ -31,7 +31,7 @@ NOISE = "noise"
 #: where one on the noise shows itself.
 COLUMNS = ("temperature", "other", "any", "angle")
 NUMBERS = ("mean", "duration", "radian")
-PROFILES = ("frequency", "time", "timescale", "level", "share")
+PROFILES = ("frequency", "time", "timescale", "level", "share", "lag")
 TAILS, RANDOM_WALK = "tails", "random walk"
 
 
@@ -42,8 +42,8 @@ class Effect:
     `on` names what it acts on; `extras` are further signals, columns or quantities it reads;
     `null` maps each parameter to the value at which the effect vanishes (0 unless told).
     For tracing a residual: `typical` sizes of the parameters, each in its unit; `profile` the
-    parameters that are searched over a grid (name -> "frequency", "time", "timescale", "level" or
-    "share"), because the effect is not smooth in them or has many valleys; `shown_by` the
+    parameters that are searched over a grid (name -> "frequency", "time", "timescale", "level",
+    "share" or "lag"), because the effect is not smooth in them or has many valleys; `shown_by` the
     measurement that shows it; `plain` the form that it is tried in once it was found; `columns` the
     argument for which a recorded column is looked for (name -> "temperature", "other", "any" or
     "angle", which is also a scalar signal or quantity of the model in rad or deg); `numbers` those

@@ -24,6 +24,7 @@ from casest.diagnose.formula.search import NAME, described, readable, with_sizes
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.protocol import Kept, Ranking, Rival
 from casest.effects import shipped
+from casest.effects.lateness import likely_lag
 from casest.effects.on_axes import restricted
 from casest.effects.placing import placed_in
 from casest.engine.kernel import only_tried
@@ -219,8 +220,14 @@ class Sensor:
         """Every candidate in its columns, over its grid."""
         seen = self.seen(fit, self.linear(fit))
         causes = [c for c in self.found(fit)[0] if not _describes(c) or self.asked(c)]
-        expanded = [c for one in causes for c in on_grid(one, seen)]
+        expanded = [c for one in causes for c in on_grid(one, seen, self._likely(fit, one))]
         return self.trials_of(fit, expanded)
+
+    def _likely(self, fit: Fit, candidate: Candidate) -> float:
+        """A lag that two records show by how lively each of them is."""
+        if candidate.effect is None or candidate.effect.kind != "time":
+            return 0.0
+        return likely_lag(self.runs, fit.model.traced.measured or "", candidate.on)
 
     def trials_of(self, fit: Fit, several: Sequence[Candidate]) -> list[Trial]:
         problem, point = self._problem(fit)

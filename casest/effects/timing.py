@@ -146,6 +146,7 @@ def hysteresis(y: SX, t: SX = signal("s"), *, k: SX = param(each, "[y]")) -> SX:
     on=RECORDED,
     kind="time",
     typical={"delay": 1e-2},
+    profile={"delay": "lag"},
     shown_by="a quick turn from rest, seen by both instruments",
     formula="x(t − delay)",
 )

@@ -89,30 +89,19 @@ class Staged:
     def _records(self) -> tuple[Record, ...]:
         return tuple(Record.of(self.model, run) for run in self.runs)
 
-<<<<<<< HEAD
     def rows(
         self, parameters: Array, samples: Array, r: int, own: tuple[int, ...] | None = None
     ) -> tuple[Array, Array]:
-        """Residuals (N, m) and Jacobians (N, m, n) of run r, block by block of its record.
-
-        `own`: the coordinates that slopes are taken in, where not in all.
-        """
-        *stages, last = _programs(self.model, own)
-        time = _time(self.runs[r])
-        given = np.zeros((len(samples), 0))
-        count = self.model.staged.coordinates.numel() if own is None else len(own)
-        slopes = np.zeros((len(samples), 0, count))
-=======
-    def rows(self, parameters: Array, samples: Array, r: int) -> tuple[Array, Array]:
         """Residuals (N, m) and Jacobians (N, m, n) of the samples of run r.
 
-        Effects follow the record that the samples were taken from, block by block.
+        Effects follow the record that the samples were taken from, block by block. `own`: the
+        coordinates that slopes are taken in, where not in all.
         """
-        *stages, last = _programs(self.model)
+        *stages, last = _programs(self.model, own)
         record = self._records[r]
         given = np.zeros((len(record.samples), 0))
-        slopes = np.zeros((len(given), 0, self.model.staged.coordinates.numel()))
->>>>>>> memory
+        count = self.model.staged.coordinates.numel() if own is None else len(own)
+        slopes = np.zeros((len(given), 0, count))
         for stage in stages:
             if stage.memory is None:
                 more = self._late(stage, parameters, record)
@@ -121,8 +110,8 @@ class Staged:
                 more = stage.memory.along(parameters, *taken, record.time, record.run.block)
             given = np.concatenate([given, more[0]], axis=1)
             slopes = np.concatenate([slopes, more[1]], axis=1)
-        own = given[record.places], slopes[record.places]
-        return _chained(last.taken, parameters, samples, *own)
+        here = given[record.places], slopes[record.places]
+        return _chained(last.taken, parameters, samples, *here)
 
     def _late(self, stage: Program, parameters: Array, record: Record) -> tuple[Array, Array]:
         """A signal at the times at which the effect says that it is taken, and its slopes."""

@@ -23,7 +23,7 @@ from casest.effects import CATALOGUE
 from casest.errors import CasestError, DeclarationError, UsageError
 
 #: Values of effects that a fit finds from where they start, without a grid.
-STARTED = ("timescale", "share")
+STARTED = ("timescale", "share", "lag")
 #: Shipped models: name on the command line -> module and attribute in `casest_problems`.
 SHIPPED = {
     "wheel": ("wheel", "wheel"),

@@ -17,6 +17,8 @@ from casest.diagnose.evidence.linear import Linear
 
 #: Values on each grid: moments beside the best one, edges of pulses, levels, time constants, lines.
 MOMENTS, EDGES, LEVELS_TRIED, CONSTANTS, LINES = 15, 60, 24, 8, 3
+#: Lags of a recorded signal, each way.
+LAGS = 8
 #: Shares of a span in which a loop may turn round.
 SHARES = (0.003, 0.01, 0.03, 0.1, 0.3)
 #: The shortest time constant, in samples: a shorter one is a delay.
@@ -36,12 +38,15 @@ class Seen:
     linear: Linear
 
 
-def on_grid(candidate: Candidate, seen: Seen) -> list[Candidate]:
-    """The candidate at values of what it is searched over, `trials` saying among how many."""
+def on_grid(candidate: Candidate, seen: Seen, likely: float = 0.0) -> list[Candidate]:
+    """The candidate at values of what it is searched over, `trials` saying among how many.
+
+    `likely`: a lag that the records show by themselves.
+    """
     profile = dict(candidate.effect.profile) if candidate.effect else {}
     if not profile:
         return [candidate]
-    values, trials = _values(tuple(profile.values()), seen)
+    values, trials = _values(tuple(profile.values()), seen, likely)
     return [
         replace(candidate, held=_held(dict(zip(profile, v, strict=True))), trials=int(trials))
         for v in values
@@ -55,11 +60,13 @@ def _held(values: Mapping[str, float]) -> tuple[tuple[str, float], ...]:
 Values = tuple[list[tuple[float, ...]], float]
 
 
-def _values(kinds: tuple[str, ...], seen: Seen) -> Values:
+def _values(kinds: tuple[str, ...], seen: Seen, likely: float = 0.0) -> Values:
     if kinds == ("level",):
         return _levels(seen)
     if seen.time is None:
         return [], 1
+    if kinds == ("lag",):
+        return _lags(seen, likely)
     if kinds == ("share",):
         return [(float(v),) for v in SHARES], len(SHARES)
     if kinds == ("time",):
@@ -155,6 +162,18 @@ def _constants(seen: Seen) -> Values:
     return [(float(v),) for v in np.geomspace(SHORTEST * step, longest, CONSTANTS)], CONSTANTS
 
 
+def _lags(seen: Seen, likely: float) -> Values:
+    """From half a sample on, in steps of a factor, both ways; and what the records show."""
+    assert seen.time is not None
+    step = float(np.median(np.diff(seen.time))) if len(seen.time) > 1 else 0.0
+    longest = float(np.ptp(seen.time)) / 40
+    if not longest > step > 0:
+        return [], 1
+    sizes = step * np.geomspace(0.5, max(longest / step, 1.0), LAGS)
+    found = [*(-sizes), *sizes, *([likely] if likely else [])]
+    return [(float(v),) for v in found], len(found)
+
+
 def _lines(seen: Seen) -> Values:
     """Frequencies (rad/s) that stand out of their neighbourhood, of the longest span."""
     assert seen.time is not None
@@ -210,7 +229,7 @@ def nearer(candidate: Candidate, seen: Seen, scale: float) -> list[Candidate]:
 def _steps(kind: str, value: float, seen: Seen, scale: float) -> list[float]:
     if kind == "level":
         return [value * (1 + s * 0.06 * scale) for s in (-1, -0.5, 0.5, 1)]
-    if kind in ("timescale", "share"):
+    if kind in ("timescale", "share", "lag"):
         return [value * float(np.exp(s * 0.7 * scale)) for s in (-1, -0.5, 0.5, 1)]
     if kind == "frequency" or seen.time is None:
         return []

@@ -127,6 +127,8 @@ def _through_record(
     held = {f"{candidate.label}.{name}": np.array(value) for name, value in candidate.held}
     at = wide.point({**wide.values(wide.start()), **problem.values(point), **held})
     own = candidate.parameters(extended)
+    if not own:
+        return _secant(problem, point, wide, at, candidate, rows)
     names = {p.name for p in own}
     parts = []
     for r, chosen in enumerate(rows):
@@ -136,6 +138,24 @@ def _through_record(
         parts.append(np.nan_to_num(part))
     per_run = [p.scope == "run" for p in own for _ in range(p.shape.coordinates)]
     return _side_by_side(parts, np.array(per_run, bool))
+
+
+def _secant(
+    problem: Problem,
+    point: Point,
+    wide: Problem,
+    at: Point,
+    candidate: Candidate,
+    rows: Sequence[Index],
+) -> Array:
+    """What a lag that is held changes, per second of it: it may be longer than any slope reaches."""
+    ((_, size),) = candidate.held
+    pairs = zip(wide.residuals(at), problem.residuals(point), strict=True)
+    parts = [(a - b)[chosen] / size for (a, b), chosen in zip(pairs, rows, strict=True)]
+    if problem.weights is not None:
+        weights = zip(parts, problem.weights, rows, strict=True)
+        parts = [part * np.sqrt(w[chosen]) for part, w, chosen in weights]
+    return np.nan_to_num(np.concatenate(parts))[:, :, None]
 
 
 def slope_of(
