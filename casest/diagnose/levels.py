@@ -15,6 +15,8 @@ class Levels:
     chance: of naming anything where nothing is missing, in poses; shared among all families.
     strong: difference of twice the log of two likelihoods, less what the unknowns cost, that is
         strong evidence (Kass & Raftery 1995).
+    clear: the same between two causes: the wrong one of two leads by as much in one of a thousand
+        records at most.
     confirmed: standard errors by which held-out squares must fall, one-sided 5 %.
     apart: standard errors between two causes' held-out squares, two-sided 5 % (Vuong 1989).
     alike: share of what a cause gains that another may lose and still explain the same.
@@ -34,6 +36,7 @@ class Levels:
     series: int = 100
     chance: float = 0.01
     strong: float = 6.0
+    clear: float = 10.0
     confirmed: float = 1.64
     apart: float = 2.0
     alike: float = 0.1

@@ -27,7 +27,11 @@ from casest.engine.threads import one_thread
 from casest.errors import DataError, NotTrusted
 from casest.estimate.calibrate import attempt
 from casest.estimate.estimate import Estimate
+from casest.estimate.reasons import Code
 from casest.leastsquares.problem import Problem
+
+#: What no effect that is added could mend.
+HOPELESS = Code.READING | Code.NOT_FINITE | Code.NO_REDUNDANCY | Code.NOT_DETERMINED
 
 
 def close(
@@ -45,13 +49,30 @@ def close(
     Where several causes explain the data alike, those that are `known` to be there come first: by
     name, or as `temperature_bias(temp)`. Where nothing can be held out, nothing is added, and
     `refused` says so. Raises NotTrusted, with the refused estimate, where the declared model itself
-    has no trustworthy fit.
+    has no trustworthy fit, and what it lacks is not found either.
     """
     before = attempt(model, runs, start=start, seed=seed)
-    if not before.certificate.trusted:
-        error = NotTrusted("no trustworthy estimate: " + "; ".join(before.certificate.reasons))
-        error.estimate = before
-        raise error
+    if before.certificate.trusted:
+        return _searched(before, model, runs, catalogue, known, seed, say)
+    error = NotTrusted("no trustworthy estimate: " + "; ".join(before.certificate.reasons))
+    error.estimate = before
+    if not before.certificate.code & HOPELESS:  # what is missing may be why
+        closing = _searched(before, model, runs, catalogue, known, seed, say)
+        if closing.effects and closing.after.certificate.trusted:
+            return closing
+    raise error
+
+
+def _searched(
+    before: Estimate,
+    model: Model,
+    runs: Sequence[Run],
+    catalogue: Sequence[Effect],
+    known: Collection[str],
+    seed: int,
+    say: Callable[[str], None],
+) -> Closing:
+    """The loop from a declared fit."""
     with np.errstate(all="ignore"), one_thread(), only_tried():
         ready = prepared(model, runs)
         try:

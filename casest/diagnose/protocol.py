@@ -342,7 +342,7 @@ def _refitted(
 def _near(refits: Sequence[Refit[F]]) -> list[Evidence]:
     """Those that the evidence does not tell from the best."""
     best = max((r.evidence.score for r in refits), default=0.0)
-    return [r.evidence for r in refits if r.evidence.score > best - LEVELS.strong]
+    return [r.evidence for r in refits if r.evidence.score > best - LEVELS.clear]
 
 
 def _torn_between(refits: Sequence[Refit[F]], ranking: Ranking) -> list[Evidence]:
@@ -523,6 +523,6 @@ def _rivals(
         lost = squares(linear, [ranking.likelihood.in_time(e.basis)], stretches) - best
         t, behind = standard_errors(lost), mine[0].score - e.score
         as_well = t < LEVELS.apart and float(lost.sum()) < LEVELS.alike * gained
-        if behind < LEVELS.strong or as_well:
+        if behind < LEVELS.clear or as_well:
             rivals.append(Rival(e.trials[0].what, behind, t, e))
     return tuple(rivals)
