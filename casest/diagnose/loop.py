@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -145,8 +146,6 @@ def without_outliers(sensor: Sensor, fit: Fit, folds: Folds) -> tuple[Fit, Found
 
 def certified(sensor: Sensor, state: State[Fit], before: Estimate) -> tuple[State[Fit], Estimate]:
     """The last estimate, with intervals; without effects that leave one without an end."""
-    from dataclasses import replace
-
     while True:
         with only_tried(False):
             after = attempt(state.fit.model, sensor.runs, start=state.fit.values, seed=sensor.seed)
@@ -159,7 +158,8 @@ def certified(sensor: Sensor, state: State[Fit], before: Estimate) -> tuple[Stat
         if fit is None:
             return state, before
         why = f"its fit is refused: {after.certificate.reasons[0]}"
-        state = replace(state, fit=fit, kept=state.kept[:-1]).refusing(last.what, why)
+        state = replace(state, fit=fit, kept=state.kept[:-1], open=(last.evidence, *state.open))
+        state = state.refusing(last.what, why)
 
 
 def _found(sensor: Sensor, state: State[Fit], kept: Kept, after: Estimate) -> Found:

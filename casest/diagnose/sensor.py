@@ -18,6 +18,7 @@ from casest.diagnose.candidates.axes import axes_of
 from casest.diagnose.candidates.candidates import Candidate, Skipped, candidates
 from casest.diagnose.candidates.grid import Seen, nearer, on_grid
 from casest.diagnose.candidates.slopes import rows_of, slopes
+from casest.diagnose.cross_validation import undetermined
 from casest.diagnose.evidence.linear import Linear, Parts, parts_of, spans_of
 from casest.diagnose.evidence.score import Evidence, Trial
 from casest.diagnose.formula.search import NAME, described, readable, with_sizes
@@ -285,11 +286,9 @@ class Sensor:
         return self.fitted(model, {**self._nulls(model, begun), **begun})
 
     def certified(self, fit: Fit) -> Fit | str:
-        """The fit, proved; or why it is refused."""
-        estimate = self.proved(fit)
-        if not estimate.certificate.trusted:
-            return f"its fit is refused: {estimate.certificate.reasons[0]}"
-        return replace(fit, values=estimate.values)
+        """The fit, if the data determine it; or why it is refused. The last one is proved."""
+        why = undetermined(Problem(fit.model, self.runs), fit.values)
+        return f"its fit is refused: {why}" if why else fit
 
     def _nulls(self, model: Model, values: Mapping[str, Array]) -> dict[str, Array]:
         problem = Problem(model, self.runs)
