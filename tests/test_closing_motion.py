@@ -13,10 +13,11 @@ from flights import Sensors
 from casest import DataError, Run, cli, cross, norm_2, signal
 from casest.diagnose.motion.delays import by_reading, shifted
 from casest.diagnose.motion.fit import fitted, rise
+from casest.diagnose.motion.innovations import Innovations
 from casest.diagnose.motion.loop import close_motion
-from casest.diagnose.motion.score_test import scores
 from casest.diagnose.motion.sensitivity import sensitivity
 from casest.diagnose.motion.whiteness import whiteness
+from casest.diagnose.protocol import ranked
 from casest.dynamics import Motion, constraint, dynamics, measured, state
 from casest.dynamics.filter import filtered
 from casest.dynamics.likelihood import first_guess, likelihood, matched, prepared
@@ -134,9 +135,10 @@ def test_readings_slower_than_the_inputs_are_enough():
     run = Run.raw("slow", {**run.signals, "v": v}, units=flights.UNITS, time=run.time)
     fit = fitted(bias_gravity, run, filtered(bias_gravity, run).smoothed)
     tried = [c for c in candidates(bias_gravity, run) if c.label == "lever_arm of v"]
-    (score,) = scores(sensitivity(bias_gravity, [], tried, run, fit.found), tried)
-    assert score.p_value < 1e-4
-    better = fitted(bias_gravity, run, fit.found.smoothed, added=[(tried[0], score.step)])
+    subject = Innovations(run, tuple(tried))
+    (evidence,) = ranked(subject, fit).found
+    assert evidence.p_value < 1e-4
+    better = subject.refit(fit, evidence.trials)
     ((_, arm),) = better.added
     assert np.all(np.abs(arm - [0.3, -0.1, 0.2]) < 4 * better.std)
 

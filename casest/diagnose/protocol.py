@@ -55,6 +55,10 @@ class Subject(Protocol[F]):
         """The fit with these in the model; or why there is none."""
         ...
 
+    def gain(self, fit: F, better: F, evidence: Evidence) -> float:
+        """2 log of the likelihood of a refit over that of the fit, each with a noise of its own."""
+        ...
+
     def certified(self, fit: F) -> F | str:
         """The fit, proved; or why it is refused."""
         ...
@@ -272,25 +276,47 @@ def _with_the_best(
     state, asked = _hypotheses(subject, state, ranking)
     options = [e for e in (*ranking.found, *pairs(ranking)) if significant(e, ranking.linear)]
     options.sort(key=lambda e: -e.score)
-    passing = asked or _passing(ranking, options)
-    refits = _refitted(subject, state.fit, ranking, passing)
-    torn = [] if asked else _torn_between(refits, ranking)
-    if torn:
-        return replace(state, open=tuple(torn))
     described = None if asked else subject.formula(state.fit, ranking)
-    if described is not None and _describes(subject, described, refits, ranking):
-        refits = [*_refitted(subject, state.fit, ranking, [described]), *refits]
+    left, tried = options, list[Evidence]()
+    while True:
+        passing = asked or _passing(ranking, left)
+        refits = _refitted(subject, state.fit, ranking, passing)
+        torn = [] if asked else _torn_between(refits, ranking)
+        if torn:
+            return replace(state, open=tuple(torn))
+        if described is not None and _describes(subject, described, refits, ranking):
+            refits = [*_refitted(subject, state.fit, ranking, [described]), *refits]
+        bigger, over = _first_certified(subject, state, ranking, refits, say)
+        if len(bigger.kept) > len(state.kept):
+            return bigger
+        state, tried = bigger, [*tried, *passing]
+        # A linear promise that no refit keeps: what comes after it.
+        left = [] if asked else [e for e in left if e not in passing]
+        if over or not passing or not (left or asked):
+            break
+        asked, left = [], left or options
+    for evidence in [e for e in options if e not in tried][:2]:
+        state = state.refusing(evidence.trials[0].what, NOT_HELD_OUT, evidence)
+    return replace(state, open=tuple(options[: LEVELS.contenders]))
+
+
+def _first_certified(
+    subject: Subject[F],
+    state: State[F],
+    ranking: Ranking,
+    refits: Sequence[Refit[F]],
+    say: Callable[[str], None],
+) -> tuple[State[F], bool]:
+    """The state with the first refit that is proved, if there is one; and is the search over?"""
     for k, refit in enumerate(refits):
         fit = subject.certified(refit.fit)
         if not isinstance(fit, str):
-            return _kept(subject, state, ranking, replace(refit, fit=fit), say)
+            return _kept(subject, state, ranking, replace(refit, fit=fit), say), True
         state = state.refusing(refit.evidence.trials[0].what, fit, refit.evidence)
         later = refits[k + 1].evidence.score if k + 1 < len(refits) else 0.0
         if len(refit.evidence.trials) == 1 and refit.evidence.score > later + LEVELS.strong:
-            break  # what explains clearly less is not the cause
-    for evidence in [e for e in options if e not in passing][:2]:
-        state = state.refusing(evidence.trials[0].what, NOT_HELD_OUT, evidence)
-    return replace(state, open=tuple(options[: LEVELS.contenders]))
+            return state, True  # what explains clearly less is not the cause
+    return state, False
 
 
 def _hypotheses(
@@ -327,9 +353,10 @@ def _refitted(
         better = subject.refit(fit, evidence.trials)
         if isinstance(better, str):
             continue
-        cost = Likelihood(subject.linear(better)).beside(start=evidence.explained.spectrum).cost
-        score = evidence.score + evidence.explained.cost - cost
+        score = evidence.score - evidence.gain + subject.gain(fit, better, evidence)
         found.append(Refit(better, replace(evidence, score=score)))
+    least = LEVELS.strong if ranking.linear.series else 0.0
+    found = [r for r in found if r.evidence.score > least or subject.asked(_first(r).what)]
     found.sort(key=lambda r: -r.evidence.score)
     near = _near(found)
     if len(near) > 1:
@@ -337,6 +364,10 @@ def _refitted(
         best = found[int(np.argmin(loss))]
         found = [best, *[r for r in found if r is not best]]
     return found
+
+
+def _first(refit: Refit[F]) -> Trial:
+    return refit.evidence.trials[0]
 
 
 def _near(refits: Sequence[Refit[F]]) -> list[Evidence]:

@@ -19,6 +19,7 @@ from casest.diagnose.candidates.candidates import Candidate, Skipped, candidates
 from casest.diagnose.candidates.grid import Seen, nearer, on_grid
 from casest.diagnose.candidates.slopes import rows_of, slopes
 from casest.diagnose.cross_validation import undetermined
+from casest.diagnose.evidence.likelihood import Likelihood
 from casest.diagnose.evidence.linear import Linear, Parts, parts_of, spans_of
 from casest.diagnose.evidence.score import Evidence, Trial
 from casest.diagnose.formula.search import NAME, described, readable, with_sizes
@@ -284,6 +285,11 @@ class Sensor:
         own = {p.name for p in model.parameters}
         begun = {n: v for n, v in values.items() if n in own}
         return self.fitted(model, {**self._nulls(model, begun), **begun})
+
+    def gain(self, fit: Fit, better: Fit, evidence: Evidence) -> float:
+        """2 log of the likelihood of a refit over that of the fit, each with a noise of its own."""
+        refit = Likelihood(self.linear(better)).beside(start=evidence.explained.spectrum)
+        return evidence.gain + evidence.explained.cost - refit.cost
 
     def certified(self, fit: Fit) -> Fit | str:
         """The fit, if the data determine it; or why it is refused. The last one is proved."""

@@ -14,7 +14,7 @@ from msgspec import Struct
 from casest.declaration.shapes import Array
 from casest.diagnose.motion.fit import Fit, forgotten, rise
 from casest.diagnose.motion.loop import Added, MotionClosing
-from casest.diagnose.motion.score_test import Score
+from casest.diagnose.motion.visibility import Visible
 from casest.effects.moving import Candidate
 from casest.results.closing import Detectable
 from casest.results.file import plain
@@ -306,7 +306,7 @@ def formula(candidate: Candidate) -> str:
     return said.replace("reading", candidate.on).replace("omega", candidate.turn or "omega")
 
 
-def _invisible(score: Score, closing: MotionClosing) -> list[MotionHidden]:
+def _invisible(score: Visible, closing: MotionClosing) -> list[MotionHidden]:
     """An effect whose typical size the data could not have shown, if it would move a state."""
     candidate = score.candidate
     if any(a.candidate is candidate for a in closing.effects):
@@ -326,7 +326,7 @@ def _invisible(score: Score, closing: MotionClosing) -> list[MotionHidden]:
     return [MotionHidden(name, candidate.on, None, typical, would, shown_by)]
 
 
-def _detectable(score: Score) -> Detectable:
+def _detectable(score: Visible) -> Detectable:
     information = np.diag(score.information)
     alive = information * score.candidate.typical**2 > 1e-4
     size = float(np.sqrt(SEEN / information[alive]).max()) if alive.any() else np.nan

@@ -1,9 +1,9 @@
-"""The loop in motion: filter, look at the innovations, add the best effect, judge it, again."""
+"""The loop in motion: filter, look at the innovations, add what is missing, judged on held-out time."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,30 +11,29 @@ from numpy.typing import NDArray
 from casest.data.run import Run
 from casest.data.splits import interleaved_blocks
 from casest.declaration.shapes import Array
+from casest.diagnose.levels import LEVELS
 from casest.diagnose.motion.fit import Fit, coloured, fitted, forgotten, rise
-from casest.diagnose.motion.score_test import Score, scores, stretches
+from casest.diagnose.motion.innovations import Innovations
 from casest.diagnose.motion.sensitivity import sensitivity
+from casest.diagnose.motion.visibility import Visible, visible
 from casest.diagnose.motion.whiteness import Whiteness, whiteness
+from casest.diagnose.protocol import Kept, State, search
 from casest.dynamics.declare import Dynamics
 from casest.dynamics.filter import filtered
-from casest.dynamics.likelihood import applied, first_guess, likelihood
+from casest.dynamics.likelihood import first_guess, likelihood
 from casest.effects.moving import Candidate, Colour, candidates
 from casest.errors import DataError
 
-#: Chance, under an estimator that lacks nothing, that any candidate is called significant.
-FALSE_ALARM = 0.004
-#: The held-out gain must exceed this many of its own standard errors.
-HELD_OUT = 1.64
-#: Candidates whose log-likelihoods differ by less are not told apart.
-ALIKE = 3.0
-#: Candidates that are refitted in a round, rounds, blocks and folds of held-out time.
-CONTENDERS, ROUNDS, BLOCKS, FOLDS = 3, 6, 40, 4
 #: Whiteness below which noise with a colour is tried; gain of likelihood that asks for it too.
 SUSPECT, ASKS = 0.05, 10.0
+#: Blocks and folds of held-out time.
+BLOCKS, FOLDS = 40, 4
 #: Significance of what is left.
 UNEXPLAINED = 1e-4
 #: Samples below which nothing can be held out.
 SHORTEST = 400
+#: Rivals that are named.
+NEAREST = 2
 
 
 @dataclass(frozen=True)
@@ -61,7 +60,7 @@ class MotionClosing:
     after: Fit
     effects: tuple[Added, ...]
     refused: tuple[tuple[str, str], ...]
-    first: tuple[Score, ...]
+    first: tuple[Visible, ...]
     left: Whiteness
     held_out: tuple[Array, Array]
 
@@ -94,182 +93,87 @@ def close_motion(
             f"{run.file or run.name}: {len(run)} samples are too few to hold some of them out; "
             f"closing the loop needs {SHORTEST} at least"
         )
-    return _Loop(model, run, say).closed()
+    folds = interleaved_blocks(run, BLOCKS, FOLDS)
+    before = fitted(model, run, filtered(model, run).smoothed)
+    subject = Innovations(run, tuple(candidates(model, run)))
+    with np.errstate(all="ignore"):
+        state = search(subject, before, say)
+        current, colour = _coloured(state.fit, run, folds, say)
+        if colour is not None:
+            state = search(subject, current, say, state)
+    found = sensitivity(model, [], subject.tried, before.run, before.found)
+    added = tuple(_added(k, state) for k in state.kept)
+    one, two = (f.by_reading(held_out(f, folds)) for f in (before, state.fit))
+    return MotionClosing(
+        model,
+        run,
+        before,
+        state.fit.with_spread(),
+        (*added, *([colour] if colour is not None else [])),
+        tuple((r.what.label, r.why) for r in state.refused),
+        visible(found, subject.tried),
+        _left(state.fit),
+        (one, two),
+    )
 
 
-class _Loop:
-    """The state of one closing: the fit as it grows."""
+def _added(kept: Kept, state: State[Fit]) -> Added:
+    there = {k.what.label for k in state.kept}
+    alike = [r.what.label for r in kept.rivals if r.what.label not in there]
+    count = int(np.isfinite(state.fit.found.innovations).sum())
+    gained = 0.5 * kept.evidence.gain / count
+    return Added(kept.what, kept.evidence.p_value, gained, tuple(alike[:NEAREST]))
 
-    def __init__(self, model: Dynamics, run: Run, say: Callable[[str], None]) -> None:
-        self.model, self.run, self.say = model, run, say
-        self.folds = interleaved_blocks(run, BLOCKS, FOLDS)
-        self.tried = candidates(model, run)
-        self.limit = FALSE_ALARM / (len(self.tried) + 1)
-        self.added: list[Added] = []
-        self.refused: list[tuple[str, str]] = []
 
-    def closed(self) -> MotionClosing:
-        """Run the loop."""
-        along = filtered(self.model, self.run).smoothed
-        before = current = fitted(self.model, self.run, along)
-        ranked, left = self._judged(current)
-        first = ranked
-        for _ in range(ROUNDS):
-            better = self._with_effect(current, ranked) or self._with_colour(current, left)
-            if better is None:
-                break
-            before = before.lighter()
-            current = self._weeded(better)
-            ranked, left = self._judged(current)
-        one, two = (f.by_reading(held_out(f, self.folds)) for f in (before, current))
-        there = {a.candidate.label for a in self.added}
-        added = tuple(
-            replace(a, indistinguishable_from=tuple(
-                x for x in a.indistinguishable_from if x not in there))
-            for a in self.added
-        )  # fmt: skip
-        return MotionClosing(
-            self.model,
-            self.run,
-            before,
-            current.with_spread(),
-            added,
-            tuple(self.refused),
-            tuple(first),
-            left,
-            (one, two),
-        )
+def _left(fit: Fit) -> Whiteness:
+    """Are the innovations white?"""
+    found = sensitivity(fit.base, fit.added, [], fit.run, fit.found)
+    return whiteness(found.z[np.isfinite(fit.found.innovations).all(axis=1)])
 
-    def _judged(self, fit: Fit) -> tuple[list[Score], Whiteness]:
-        """Scores of every candidate that is not there yet; are the innovations white?"""
-        there = [c for c, _ in fit.added]
-        rest = [c for c in self.tried if c not in there]
-        found = sensitivity(fit.base, fit.added, rest, fit.run, fit.found)
-        whole = np.isfinite(fit.found.innovations).all(axis=1)
-        return scores(found, rest), whiteness(found.z[whole])
 
-    def _with_effect(self, current: Fit, ranked: list[Score]) -> Fit | None:
-        """The fit with the best effect that held-out time confirms; None if none does."""
-        promising = self._promising(ranked) or self._promising(self._strictly(current))
-        alike: list[tuple[Score, Fit]] = []
-        for score in promising[:CONTENDERS]:
-            fit = self._refitted(current, score).lighter()
-            if self._likelier(fit, current, score.candidate.size):
-                alike.append((score, fit))
-            best = max((f.evidence(current) for _, f in alike), default=0.0)
-            alike = [(s, f) for s, f in alike if best - f.evidence(current) < ALIKE]
-        if not alike:
-            return None
-        # Of those that explain it alike, the one that is met more often.
-        score, chosen = min(alike, key=lambda pair: self.tried.index(pair[0].candidate))
-        gained = self._confirmed(current, chosen)
-        if gained is None:
-            self._refuse(score.candidate.label, "held-out time does not confirm it")
-            return None
-        others = tuple(s.candidate.label for s, fit in alike if fit is not chosen)
-        self.added.append(Added(score.candidate, score.p_value, gained, others[:2]))
-        self.say(f"{score.candidate.label}: held-out innovations become smaller")
-        return chosen
+def _coloured(
+    fit: Fit, run: Run, folds: NDArray[np.int_], say: Callable[[str], None]
+) -> tuple[Fit, Added | None]:
+    """The fit with correlated noise on an output, if the innovations ask for it."""
+    if not (_left(fit).p_value < SUSPECT or _noise_is_odd(fit, run)):
+        return fit, None
+    from scipy.special import chdtrc
 
-    def _promising(self, ranked: list[Score]) -> list[Score]:
-        """Significant ones, those left out that would gain less than half of the best."""
-        significant = [s for s in ranked if s.p_value <= self.limit]
-        most = max((s.gain for s in significant), default=0.0)
-        return sorted((s for s in significant if s.gain > 0.5 * most), key=lambda s: -s.gain)
+    trial = coloured(fit, run)
+    risen = max(rise(trial, fit), 0.0)
+    p_value = min(1.0, 4 * float(chdtrc(2, 2 * risen)))
+    gained = _confirmed(fit, trial, folds)
+    if p_value > LEVELS.misfit or trial.colour is None or gained is None:
+        return fit, None
+    say(f"{trial.colour.label}: the noise is correlated")
+    whole = fitted(fit.base, run, fit.found.smoothed, added=fit.added, colour=trial.colour,
+                   start=trial.intensities)  # fmt: skip
+    return whole, Added(trial.colour, p_value, gained, ())
 
-    def _strictly(self, current: Fit) -> list[Score]:
-        """Scores with no more noise than the sensors' own: a large effect that the matched
-        intensities have swallowed stands out again. Empty where these say the same."""
-        if not self._noise_is_odd(current):
-            return []
-        model = applied(current.model, self._of_sensors(current))
-        found = filtered(model, current.run, spread=False)
-        rest = [c for c in self.tried if all(c is not a for a, _ in current.added)]
-        return scores(sensitivity(current.base, current.added, rest, current.run, found), rest)
 
-    def _refitted(self, current: Fit, score: Score) -> Fit:
-        return fitted(current.base, self.run, current.found.smoothed,
-                      added=(*current.added, (score.candidate, score.step)),
-                      colour=current.colour, start=current.intensities)  # fmt: skip
+def _noise_is_odd(fit: Fit, run: Run) -> bool:
+    """Are the intensities far from what the signals themselves show from sample to sample?"""
+    guess = first_guess(fit.ready, run)
+    kept = {*fit.ready.readings}
+    own = {
+        name: value if name in kept else min(guess[name], value)
+        for name, value in fit.intensities.items()
+    }
+    return bool(fit.likelihood - likelihood(fit.ready, own) > ASKS)
 
-    def _likelier(self, fit: Fit, current: Fit, size: int) -> bool:
-        """Is the rise of likelihood more than so many more numbers gain from noise?"""
-        from scipy.special import chdtrc
 
-        risen = 2 * rise(fit, current)
-        return bool(np.isfinite(risen) and risen > 0 and chdtrc(size, risen) <= self.limit)
-
-    def _with_colour(self, current: Fit, white: Whiteness) -> Fit | None:
-        """The fit with correlated noise on an output, if the innovations ask for it."""
-        if current.colour or not (white.p_value < SUSPECT or self._noise_is_odd(current)):
-            return None
-        from scipy.special import chdtrc
-
-        trial = coloured(current, self.run)
-        risen = max(rise(trial, current), 0.0)
-        p_value = min(1.0, 4 * float(chdtrc(2, 2 * risen)))
-        if p_value > self.limit or trial.colour is None:
-            return None
-        gained = self._confirmed(current, trial)
-        if gained is None:
-            self._refuse(trial.colour.label, "held-out time does not confirm it")
-            return None
-        self.added.append(Added(trial.colour, p_value, gained, ()))
-        self.say(f"{trial.colour.label}: the noise is correlated")
-        return trial
-
-    def _noise_is_odd(self, fit: Fit) -> bool:
-        """Are the intensities far from what the signals themselves show from sample to sample?"""
-        return fit.likelihood - likelihood(fit.ready, self._of_sensors(fit)) > ASKS
-
-    def _of_sensors(self, fit: Fit) -> dict[str, float]:
-        """Intensities of inputs and states no larger than the signals' noise from sample to sample
-        says; those of readings as they are."""
-        guess = first_guess(fit.ready, self.run)
-        kept = {*fit.ready.readings, *({fit.colour.state} if fit.colour else ())}
-        return {
-            name: value if name in kept else min(guess[name], value)
-            for name, value in fit.intensities.items()
-        }
-
-    def _confirmed(self, current: Fit, better: Fit) -> float | None:
-        """Held-out gain of log-likelihood per reading, if it exceeds its own error."""
-        before, after = (_densities(f, held_out(f, self.folds)) for f in (current, better))
-        if current.shifts != better.shifts:  # the first readings are of one of them alone
-            lost = ~(forgotten(current) & forgotten(better))
-            before[lost] = after[lost] = np.nan
-        part = stretches(len(before), BLOCKS)
-        gains = np.bincount(part, np.nan_to_num(after - before))
-        error = float(np.sqrt(len(gains)) * np.std(gains, ddof=1))
-        total = float(gains.sum())
-        count = int(np.isfinite(current.found.innovations).sum())
-        return total / count if total > HELD_OUT * error else None
-
-    def _weeded(self, fit: Fit) -> Fit:
-        """Without effects that are nothing any more beside what came later."""
-        from scipy.special import chdtrc
-
-        if fit.answers is None or len(self.added) < 2:
-            return fit
-        H = fit.answers.H
-        covariance = np.linalg.inv(np.einsum("kij,kil->jl", H, H))
-        kept = []
-        for (candidate, value), where in zip(fit.added, fit.answers.columns, strict=True):
-            squared = float(value @ np.linalg.solve(covariance[where, where], value))
-            if chdtrc(candidate.size, squared) <= self.limit:
-                kept.append((candidate, value))
-        if len(kept) == len(fit.added):
-            return fit
-        gone = [c for c, _ in fit.added if all(c is not k for k, _ in kept)]
-        self.added = [a for a in self.added if a.candidate not in gone]
-        for candidate in gone:
-            self._refuse(candidate.label, "no longer needed beside what came later")
-        return fitted(fit.base, self.run, fit.found.smoothed, added=kept, colour=fit.colour,
-                      start=fit.intensities)  # fmt: skip
-
-    def _refuse(self, label: str, why: str) -> None:
-        if (label, why) not in self.refused:
-            self.refused.append((label, why))
+def _confirmed(current: Fit, better: Fit, folds: NDArray[np.int_]) -> float | None:
+    """Held-out gain of log-likelihood per reading, if it exceeds its own error."""
+    before, after = (_densities(f, held_out(f, folds)) for f in (current, better))
+    if current.shifts != better.shifts:  # the first readings are of one of them alone
+        lost = ~(forgotten(current) & forgotten(better))
+        before[lost] = after[lost] = np.nan
+    part = np.arange(len(before)) * BLOCKS // len(before)
+    gains = np.bincount(part, np.nan_to_num(after - before))
+    error = float(np.sqrt(len(gains)) * np.std(gains, ddof=1))
+    total = float(gains.sum())
+    count = int(np.isfinite(current.found.innovations).sum())
+    return total / count if total > LEVELS.confirmed * error else None
 
 
 def held_out(fit: Fit, folds: NDArray[np.int_]) -> Array:

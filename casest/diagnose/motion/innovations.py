@@ -1,0 +1,122 @@
+"""A filter's innovations as what the loop searches: effects on its signals, refitted with the noise."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from casest.data.run import Run
+from casest.declaration.shapes import Array
+from casest.diagnose.evidence.linear import Linear, Parts, parts_of, spans_of
+from casest.diagnose.evidence.score import Evidence, Trial
+from casest.diagnose.motion.fit import Fit, fitted, rise
+from casest.diagnose.motion.sensitivity import sensitivity
+from casest.diagnose.protocol import Kept, Ranking
+from casest.effects.moving import Candidate
+
+
+@dataclass(frozen=True)
+class Innovations:
+    """A record of an estimator in motion, and what may be missing: the loop's subject.
+
+    Whitened innovations are linear in constants that the model lacks, the states already marginal
+    (Willsky & Jones 1976): that is all that the loop asks for.
+    """
+
+    run: Run
+    tried: tuple[Candidate, ...]
+
+    def linear(self, fit: Fit) -> Linear:
+        """Whitened innovations, and their answers to the numbers that were added."""
+        rest = [c for c, _ in fit.added]
+        found = fit.answers or sensitivity(fit.base, fit.added, rest, fit.run, fit.found)
+        number = np.zeros(len(found.z), dtype=int)
+        return Linear(found.z, -found.H, spans_of(fit.run.block, number), self._parts(fit))
+
+    def _parts(self, fit: Fit) -> Parts:
+        """Regions are those of the inputs: of what the body did."""
+        measured = set(fit.base.measured_signals)
+        names = [s.name for s in fit.base.signals if s.name not in measured and s.name != "t"]
+        inputs = [np.nan_to_num(fit.run.signals[n]) for n in names]
+        met = np.hstack(inputs) if inputs else np.zeros((len(fit.run), 1))
+        return parts_of(fit.run.block, np.zeros(len(fit.run), dtype=int), met)
+
+    def trials(self, fit: Fit) -> list[Trial]:
+        """Every effect that is not there, in what the innovations answer to it."""
+        there = [c for c, _ in fit.added]
+        rest = [c for c in self.tried if c not in there]
+        found = sensitivity(fit.base, fit.added, rest, fit.run, fit.found)
+        return [
+            Trial(c, c.label, -found.H[:, :, where])
+            for c, where in zip(rest, found.columns, strict=True)
+        ]
+
+    def nearer(self, fit: Fit, trial: Trial, scale: float) -> list[Trial]:
+        """Nothing has a grid."""
+        return []
+
+    def on_axes(self, fit: Fit, trial: Trial, axes: Sequence[int]) -> Trial:
+        """The trial: its numbers come together."""
+        return trial
+
+    def refit(self, fit: Fit, added: Sequence[Trial]) -> Fit | str:
+        """Numbers and intensities in turn, from the first-order step."""
+        more = tuple((t.what, _step(self.linear(fit), t)) for t in added)
+        found = fitted(
+            fit.base,
+            self.run,
+            fit.found.smoothed,
+            added=(*fit.added, *more),
+            colour=fit.colour,
+            start=fit.intensities,
+        )
+        return found if np.isfinite(found.likelihood) else "its refit fails"
+
+    def gain(self, fit: Fit, better: Fit, evidence: Evidence) -> float:
+        """2 log of the likelihood over that of the fit, on the readings of both."""
+        return 2 * rise(better, fit)
+
+    def certified(self, fit: Fit) -> Fit | str:
+        """The fit, if its scoring has come to an end."""
+        return fit if fit.trusted else "its fit is refused: the scoring has not come to an end"
+
+    def without(self, fit: Fit, what: Candidate) -> Fit | None:
+        """The fit without an effect that was added."""
+        kept = [(c, v) for c, v in fit.added if c is not what]
+        return fitted(fit.base, self.run, fit.found.smoothed, added=kept, colour=fit.colour,
+                      start=fit.intensities)  # fmt: skip
+
+    def apart(self, fit: Fit, kept: Kept) -> tuple[Linear, Trial] | None:
+        """The innovations as if an effect were not there, and the effect as a trial of them."""
+        if fit.answers is None:
+            return None
+        linear, pairs = self.linear(fit), zip(fit.added, fit.answers.columns, strict=True)
+        ((value, where),) = [(v, w) for (c, v), w in pairs if c is kept.what]
+        columns = linear.slopes[:, :, where]
+        others = np.delete(linear.slopes, np.arange(where.start, where.stop), axis=2)
+        return linear.without(others, -(columns @ value)), Trial(
+            kept.what, kept.what.label, columns
+        )
+
+    def asked(self, what: Any) -> bool:
+        """Nothing is."""
+        return False
+
+    def label(self, what: Candidate) -> str:
+        """`bias of omega`."""
+        return what.label
+
+    def formula(self, fit: Fit, ranking: Ranking) -> Evidence | None:
+        """None: innovations are not described."""
+        return None
+
+
+def _step(linear: Linear, trial: Trial) -> Array:
+    """First-order numbers of an effect beside those that are there."""
+    J = np.concatenate([linear.slopes, trial.columns], axis=2).reshape(linear.residual.size, -1)
+    size = np.maximum(np.linalg.norm(J, axis=0), 1e-300)
+    found = np.linalg.lstsq(J / size, -linear.residual.ravel(), rcond=1e-10)[0] / size
+    return np.asarray(found[linear.slopes.shape[2] :])
