@@ -7,7 +7,7 @@ what cannot be told apart. A state of the search is a value: what is tried and d
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 from typing import Any, Generic, Protocol, TypeVar
@@ -93,6 +93,18 @@ class Ranking:
     none: Explained = field(repr=False)
     found: tuple[Evidence, ...]
     families: int
+    order: Mapping[str, int] = field(default_factory=dict, repr=False)
+
+    @property
+    def causes(self) -> tuple[Evidence, ...]:
+        """Those that have a name of their own."""
+        return tuple(e for e in self.found if not e.trials[0].describes)
+
+    @property
+    def description(self) -> Evidence | None:
+        """The best course of unknown cause, if there is evidence for one."""
+        found = [e for e in self.found if e.trials[0].describes and e.score > LEVELS.strong]
+        return found[0] if found else None
 
 
 @dataclass(frozen=True)
@@ -193,7 +205,8 @@ def ranked_of(linear: Linear, trials: Sequence[Trial]) -> Ranking:
             best[trial.family] = (promise, trial)
     found = [judged([trial], likelihood, none, families=families) for _, trial in best.values()]
     several = _best_first([e for e in found if e is not None])
-    return Ranking(linear, likelihood, none, several, families)
+    order = {family: k for k, family in enumerate(dict.fromkeys(t.family for t in trials))}
+    return Ranking(linear, likelihood, none, several, families, order)
 
 
 def _best_first(found: Sequence[Evidence]) -> tuple[Evidence, ...]:
@@ -224,12 +237,12 @@ def _about_the_best(ranking: Ranking) -> Ranking:
     likelihood.__dict__["declared"] = ranking.likelihood.declared
     none = likelihood.beside(start=ranking.none.spectrum)
     found = _best_first([again(e, likelihood, none, families, 1) for e in ranking.found])
-    return Ranking(ranking.linear, likelihood, none, found, families)
+    return replace(ranking, likelihood=likelihood, none=none, found=found)
 
 
 def pairs(ranking: Ranking) -> list[Evidence]:
     """The best causes two by two: what neither shows alone."""
-    best = ranking.found[: LEVELS.contenders]
+    best = ranking.causes[: LEVELS.contenders]
     found = []
     for one, other in combinations(best, 2):
         both = judged(
@@ -274,9 +287,13 @@ def _with_the_best(
 ) -> State[F]:
     """The state with the best cause that held-out parts confirm; as it is if none is."""
     state, asked = _hypotheses(subject, state, ranking)
-    options = [e for e in (*ranking.found, *pairs(ranking)) if significant(e, ranking.linear)]
+    course = ranking.description.score if ranking.description else -np.inf
+    every = (*ranking.causes, *pairs(ranking))
+    options = [e for e in every if significant(e, ranking.linear) and e.score > course]
     options.sort(key=lambda e: -e.score)
     described = None if asked else subject.formula(state.fit, ranking)
+    if described is not None and described.score < course + LEVELS.described:
+        described = None
     left, tried = options, list[Evidence]()
     while True:
         passing = asked or _passing(ranking, left)
@@ -361,7 +378,9 @@ def _refitted(
     near = _near(found)
     if len(near) > 1:
         loss, _ = expected_loss(near, ranking.likelihood)
-        best = found[int(np.argmin(loss))]
+        # Of equal ones the first of the catalogue: what is met more often.
+        usual = [min(ranking.order.get(f, 0) for f in e.families) for e in near]
+        best = found[min(range(len(near)), key=lambda k: (float(f"{loss[k]:.3g}"), usual[k]))]
         found = [best, *[r for r in found if r is not best]]
     return found
 
@@ -406,6 +425,8 @@ def _kept(
     return replace(state, fit=refit.fit, kept=kept)
 
 
+#: Parts that are held out whole.
+FAR_AWAY = ("stretches", "regions")
 NOT_HELD_OUT = "held-out data do not confirm it"
 
 
@@ -425,14 +446,17 @@ def _passing(ranking: Ranking, options: Sequence[Evidence]) -> list[Evidence]:
 
 
 def _better_than_its_parts(both: Evidence, seen: dict[str, Fall], ranking: Ranking) -> bool:
-    """Does a pair foretell stretches and regions better than each of the two?"""
+    """Does a pair foretell much more of whole parts than each of the two alone?
+
+    Else the better one comes first, and the other one beside it, if it is there.
+    """
+    names = FAR_AWAY if ranking.linear.series else ("pieces",)
     for trial in both.trials:
         (one,) = [e for e in ranking.found if e.trials[0] is trial]
         if one.score > both.score - LEVELS.strong:
             return False
         alone = falls(ranking, one)
-        names = ("stretches", "regions") if ranking.linear.series else ("pieces",)
-        if any(seen[k].ratio >= alone[k].ratio for k in names):
+        if any(1 - alone[k].ratio > (1 - LEVELS.alike) * (1 - seen[k].ratio) for k in names):
             return False
     return True
 
@@ -453,8 +477,8 @@ def _describes(
     if not names:
         return True
     named = falls(ranking, names[0].evidence)
-    if any(seen[k].ratio >= named[k].ratio for k in ("stretches", "regions")):
-        return False
+    if any(1 - named[k].ratio > (1 - LEVELS.alike) * (1 - seen[k].ratio) for k in FAR_AWAY):
+        return False  # what has a name explains as much
     beside = ranked(subject, names[0].fit).found
     second = max((e.score for e in beside[:1]), default=0.0)
     return formula.score >= best + max(second, 0.0) + LEVELS.described
@@ -549,11 +573,11 @@ def _rivals(
     best = squares(linear, [ranking.likelihood.in_time(mine[0].basis)], stretches)
     gained, rivals = float((without - best).sum()), []
     for e in ranking.found:
-        if e is mine[0] or e.score < LEVELS.strong or len(rivals) == 2 * LEVELS.contenders:
+        if e is mine[0] or e.score < LEVELS.strong or e.trials[0].describes:
             continue
         lost = squares(linear, [ranking.likelihood.in_time(e.basis)], stretches) - best
         t, behind = standard_errors(lost), mine[0].score - e.score
         as_well = t < LEVELS.apart and float(lost.sum()) < LEVELS.alike * gained
         if behind < LEVELS.clear or as_well:
             rivals.append(Rival(e.trials[0].what, behind, t, e))
-    return tuple(rivals)
+    return tuple(rivals[: 2 * LEVELS.contenders])

@@ -221,8 +221,9 @@ class Sensor:
     def trials(self, fit: Fit) -> list[Trial]:
         """Every candidate in its columns, over its grid."""
         seen = self.seen(fit, self.linear(fit))
-        causes = [c for c in self.found(fit)[0] if not _describes(c) or self.asked(c)]
-        expanded = [c for one in causes for c in on_grid(one, seen, self._likely(fit, one))]
+        expanded = [
+            c for one in self.found(fit)[0] for c in on_grid(one, seen, self._likely(fit, one))
+        ]
         return self.trials_of(fit, expanded)
 
     def _likely(self, fit: Fit, candidate: Candidate) -> float:
@@ -238,7 +239,9 @@ class Sensor:
             if isinstance(columns, CasestError):
                 continue
             axes = self._axes(fit, candidate, columns.shape[2])
-            found.append(Trial(candidate, candidate.label, columns, candidate.trials, axes))
+            describes = _describes(candidate) and not self.asked(candidate)
+            family, trials = candidate.label, candidate.trials
+            found.append(Trial(candidate, family, columns, trials, axes, describes))
         return found
 
     def _axes(self, fit: Fit, candidate: Candidate, count: int) -> Array | None:
@@ -264,7 +267,8 @@ class Sensor:
     def refit(self, fit: Fit, added: Sequence[Trial]) -> Fit | str:
         """The fit with these effects, from their first-order sizes, if it can be trusted."""
         try:
-            found = self._with(fit, [t.what for t in added], fit.values)
+            first = [t.what.free() if _is_lag(t.what) else t.what for t in added]
+            found = self._with(fit, first, fit.values)
             if found is not None and any(t.what.free() is not t.what for t in added):
                 # From the sizes at the value of the grid: at nothing, no slope tells a frequency.
                 found = self._with(fit, [t.what.free() for t in added], found.values)
@@ -287,9 +291,14 @@ class Sensor:
         return self.fitted(model, {**self._nulls(model, begun), **begun})
 
     def gain(self, fit: Fit, better: Fit, evidence: Evidence) -> float:
-        """2 log of the likelihood of a refit over that of the fit, each with a noise of its own."""
-        refit = Likelihood(self.linear(better)).beside(start=evidence.explained.spectrum)
-        return evidence.gain + evidence.explained.cost - refit.cost
+        """2 log of the likelihood of a refit over that of the fit, each with a noise of its own.
+
+        What is far out is told from the refit in both.
+        """
+        before, after = self.linear(fit), self.linear(better)
+        none = Likelihood(before, before.residual - after.residual).beside()
+        refit = Likelihood(after).beside(start=evidence.explained.spectrum)
+        return none.cost - refit.cost
 
     def certified(self, fit: Fit) -> Fit | str:
         """The fit, if the data determine it; or why it is refused. The last one is proved."""
@@ -421,6 +430,11 @@ class Sensor:
 def replace_effects(fit: Fit, model: Model) -> Fit:
     """The fit as if its model were another."""
     return replace(fit, model=model)
+
+
+def _is_lag(candidate: Candidate) -> bool:
+    """Is it nothing but a time, which cannot be held?"""
+    return candidate.effect is not None and candidate.effect.kind == "time"
 
 
 def _describes(candidate: Candidate) -> bool:

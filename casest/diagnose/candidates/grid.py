@@ -191,7 +191,9 @@ def _lines(seen: Seen) -> Values:
     even = np.zeros((length, r.shape[1]))
     even[place] = (r - r.mean(axis=0)) / (r.std(axis=0) + 1e-300)
     power = (np.abs(np.fft.rfft(even, axis=0)) ** 2).sum(axis=1)
+    # The slowest are a course; the fastest one is the sampling's own.
     power[: max(5, length // 200)] = 0
+    power[-max(2, length // 200) :] = 0
     width = max(8, length // 200)
     level = np.convolve(power, np.ones(2 * width + 1) / (2 * width + 1), "same")
     ratio = power / np.maximum(level, 1e-300 + 1e-12 * power.max(initial=0.0))

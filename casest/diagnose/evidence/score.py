@@ -23,7 +23,8 @@ class Trial:
     """A cause in its columns (N, m, k): slopes of the residual in its unknowns.
 
     `what` it is to whom asks; `family` its name for all that is a variant of it; `variants`: how many were
-    looked through; `axes` (k,): the axis that each column belongs to, where that is a matter of axes.
+    looked through; `axes` (k,): the axis that each column belongs to, where that is a matter of axes;
+    `describes`: it is no cause, but what a cause must explain more than.
     """
 
     what: Any
@@ -31,6 +32,7 @@ class Trial:
     columns: Array
     variants: float = 1.0
     axes: Array | None = None
+    describes: bool = False
 
 
 @dataclass(frozen=True)

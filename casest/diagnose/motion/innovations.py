@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from casest.data.run import Run
 from casest.declaration.shapes import Array
@@ -16,6 +17,9 @@ from casest.diagnose.motion.fit import Fit, fitted, rise
 from casest.diagnose.motion.sensitivity import sensitivity
 from casest.diagnose.protocol import Kept, Ranking
 from casest.effects.moving import Candidate
+
+#: Times that a refit goes on where its scoring has not come to an end.
+AGAIN = 3
 
 
 @dataclass(frozen=True)
@@ -33,16 +37,19 @@ class Innovations:
         """Whitened innovations, and their answers to the numbers that were added."""
         rest = [c for c, _ in fit.added]
         found = fit.answers or sensitivity(fit.base, fit.added, rest, fit.run, fit.found)
-        number = np.zeros(len(found.z), dtype=int)
-        return Linear(found.z, -found.H, spans_of(fit.run.block, number), self._parts(fit))
+        rows = _rows(fit)
+        block = fit.run.block[rows]
+        spans = spans_of(block, np.zeros_like(block))
+        return Linear(found.z[rows], -found.H[rows], spans, self._parts(fit, rows))
 
-    def _parts(self, fit: Fit) -> Parts:
+    def _parts(self, fit: Fit, rows: NDArray[np.int_]) -> Parts:
         """Regions are those of the inputs: of what the body did."""
         measured = set(fit.base.measured_signals)
         names = [s.name for s in fit.base.signals if s.name not in measured and s.name != "t"]
         inputs = [np.nan_to_num(fit.run.signals[n]) for n in names]
         met = np.hstack(inputs) if inputs else np.zeros((len(fit.run), 1))
-        return parts_of(fit.run.block, np.zeros(len(fit.run), dtype=int), met)
+        block = fit.run.block[rows]
+        return parts_of(block, np.zeros_like(block), met[rows])
 
     def trials(self, fit: Fit) -> list[Trial]:
         """Every effect that is not there, in what the innovations answer to it."""
@@ -50,7 +57,7 @@ class Innovations:
         rest = [c for c in self.tried if c not in there]
         found = sensitivity(fit.base, fit.added, rest, fit.run, fit.found)
         return [
-            Trial(c, c.label, -found.H[:, :, where])
+            Trial(c, c.label, -found.H[_rows(fit)][:, :, where])
             for c, where in zip(rest, found.columns, strict=True)
         ]
 
@@ -65,23 +72,23 @@ class Innovations:
     def refit(self, fit: Fit, added: Sequence[Trial]) -> Fit | str:
         """Numbers and intensities in turn, from the first-order step."""
         more = tuple((t.what, _step(self.linear(fit), t)) for t in added)
-        found = fitted(
-            fit.base,
-            self.run,
-            fit.found.smoothed,
-            added=(*fit.added, *more),
-            colour=fit.colour,
-            start=fit.intensities,
-        )
-        return found if np.isfinite(found.likelihood) else "its refit fails"
+        numbers, along, start = (*fit.added, *more), fit.found.smoothed, fit.intensities
+        for _ in range(AGAIN):
+            found = fitted(fit.base, self.run, along, added=numbers, colour=fit.colour, start=start)
+            if not np.isfinite(found.likelihood):
+                return "its refit fails"
+            if found.trusted:
+                return found
+            numbers, along, start = found.added, found.found.smoothed, found.intensities
+        return "its refit does not come to an end"
 
     def gain(self, fit: Fit, better: Fit, evidence: Evidence) -> float:
         """2 log of the likelihood over that of the fit, on the readings of both."""
         return 2 * rise(better, fit)
 
     def certified(self, fit: Fit) -> Fit | str:
-        """The fit, if its scoring has come to an end."""
-        return fit if fit.trusted else "its fit is refused: the scoring has not come to an end"
+        """The fit: its scoring has come to an end."""
+        return fit
 
     def without(self, fit: Fit, what: Candidate) -> Fit | None:
         """The fit without an effect that was added."""
@@ -112,6 +119,11 @@ class Innovations:
     def formula(self, fit: Fit, ranking: Ranking) -> Evidence | None:
         """None: innovations are not described."""
         return None
+
+
+def _rows(fit: Fit) -> NDArray[np.int_]:
+    """Rows in which anything was read."""
+    return np.flatnonzero(np.isfinite(fit.found.innovations).any(axis=1))
 
 
 def _step(linear: Linear, trial: Trial) -> Array:
