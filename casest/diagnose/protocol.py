@@ -101,6 +101,13 @@ class Ranking:
         return tuple(e for e in self.found if not e.trials[0].describes)
 
     @property
+    def least(self) -> float:
+        """What a refit must be worth: strong evidence, and more than a course of unknown cause."""
+        course = self.description
+        least = LEVELS.strong if self.linear.series else 0.0
+        return least if course is None else max(least, course.score)
+
+    @property
     def description(self) -> Evidence | None:
         """The best course of unknown cause, if there is evidence for one."""
         found = [e for e in self.found if e.trials[0].describes and e.score > LEVELS.strong]
@@ -287,13 +294,10 @@ def _with_the_best(
 ) -> State[F]:
     """The state with the best cause that held-out parts confirm; as it is if none is."""
     state, asked = _hypotheses(subject, state, ranking)
-    course = ranking.description.score if ranking.description else -np.inf
     every = (*ranking.causes, *pairs(ranking))
-    options = [e for e in every if significant(e, ranking.linear) and e.score > course]
+    options = [e for e in every if significant(e, ranking.linear)]
     options.sort(key=lambda e: -e.score)
     described = None if asked else subject.formula(state.fit, ranking)
-    if described is not None and described.score < course + LEVELS.described:
-        described = None
     left, tried = options, list[Evidence]()
     while True:
         passing = asked or _passing(ranking, left)
@@ -372,7 +376,7 @@ def _refitted(
             continue
         score = evidence.score - evidence.gain + subject.gain(fit, better, evidence)
         found.append(Refit(better, replace(evidence, score=score)))
-    least = LEVELS.strong if ranking.linear.series else 0.0
+    least = ranking.least
     found = [r for r in found if r.evidence.score > least or subject.asked(_first(r).what)]
     found.sort(key=lambda r: -r.evidence.score)
     near = _near(found)
@@ -431,15 +435,22 @@ NOT_HELD_OUT = "held-out data do not confirm it"
 
 
 def _passing(ranking: Ranking, options: Sequence[Evidence]) -> list[Evidence]:
-    """Those that hold out, down to where none has any weight beside the best of them."""
+    """Those that hold out, down to where none has any weight beside the best of them.
+
+    A linear promise may be far from a refit's: of causes alone the first few count in any case.
+    """
     found: list[Evidence] = []
-    for evidence in options[: 3 * LEVELS.contenders]:
-        if found and evidence.score < found[0].score - 2 * LEVELS.strong:
-            break
+    alone = 0
+    for evidence in options:
+        far = bool(found) and evidence.score < found[0].score - 2 * LEVELS.strong
+        several = len(evidence.trials) > 1
+        if far and (several or alone >= LEVELS.contenders):
+            continue
+        alone += not several
         seen = falls(ranking, evidence)
         if not holds_out(seen, ranking.linear):
             continue
-        if len(evidence.trials) > 1 and not _better_than_its_parts(evidence, seen, ranking):
+        if several and not _better_than_its_parts(evidence, seen, ranking):
             continue
         found.append(evidence)
     return found

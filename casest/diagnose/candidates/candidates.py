@@ -160,10 +160,12 @@ def candidates(
 
 
 def _placed(model: Model, catalogue: Sequence[Effect]) -> list[Effect]:
-    """The catalogue, what delays a recorded signal once for each of them."""
+    """The catalogue, what delays a recorded signal once for each that the body reads."""
+    followed = {column for a in model.effects for _, column in a.columns}
+    signals = [name for name in model.recorded if name not in followed]
     found: list[Effect] = []
     for effect in catalogue:
-        several = model.recorded if effect.on == RECORDED else (effect.on,)
+        several = signals if effect.on == RECORDED else (effect.on,)
         found += [replace(effect, on=on) for on in several]
     return found
 

@@ -74,7 +74,12 @@ class Innovations:
         more = tuple((t.what, _step(self.linear(fit), t)) for t in added)
         numbers, along, start = (*fit.added, *more), fit.found.smoothed, fit.intensities
         for _ in range(AGAIN):
-            found = fitted(fit.base, self.run, along, added=numbers, colour=fit.colour, start=start)
+            try:
+                found = fitted(
+                    fit.base, self.run, along, added=numbers, colour=fit.colour, start=start
+                )
+            except np.linalg.LinAlgError as error:
+                return f"its refit fails: {error}"
             if not np.isfinite(found.likelihood):
                 return "its refit fails"
             if found.trusted:
