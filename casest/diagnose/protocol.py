@@ -14,7 +14,13 @@ from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
-from casest.diagnose.evidence.held_out import Fall, fall, squares, standard_errors
+from casest.diagnose.evidence.held_out import (
+    Fall,
+    fall,
+    fall_between,
+    squares,
+    standard_errors,
+)
 from casest.diagnose.evidence.likelihood import Explained, Likelihood
 from casest.diagnose.evidence.linear import Linear
 from casest.diagnose.evidence.score import (
@@ -24,8 +30,10 @@ from casest.diagnose.evidence.score import (
     expected_loss,
     judged,
     on_fewer_axes,
+    p_value,
     screened,
     whitened,
+    worth,
 )
 from casest.diagnose.levels import LEVELS
 
@@ -43,6 +51,10 @@ class Subject(Protocol[F]):
         """All that could be missing, in its columns; of what has a grid, one for each value."""
         ...
 
+    def shown(self, fit: F) -> Sequence[Trial]:
+        """What is refitted whatever its columns promise."""
+        ...
+
     def nearer(self, fit: F, trial: Trial, scale: float) -> Sequence[Trial]:
         """Variants of a trial around its value on a grid."""
         ...
@@ -57,6 +69,10 @@ class Subject(Protocol[F]):
 
     def gain(self, fit: F, better: F, evidence: Evidence) -> float:
         """2 log of the likelihood of a refit over that of the fit, each with a noise of its own."""
+        ...
+
+    def rise(self, less: F, fit: F) -> float:
+        """2 log of the likelihood of a fit over that of one with less in it."""
         ...
 
     def certified(self, fit: F) -> F | str:
@@ -100,12 +116,12 @@ class Ranking:
         """Those that have a name of their own."""
         return tuple(e for e in self.found if not e.trials[0].describes)
 
-    @property
-    def least(self) -> float:
-        """What a refit must be worth: strong evidence, and more than a course of unknown cause."""
+    def enough(self, score: float, gain: float) -> bool:
+        """Is it strong evidence, and as much as a course of unknown cause explains, but for little?"""
         course = self.description
-        least = LEVELS.strong if self.linear.series else 0.0
-        return least if course is None else max(least, course.score)
+        if score <= (LEVELS.strong if self.linear.series else 0.0):
+            return False
+        return course is None or score > course.score or gain > (1 - LEVELS.alike) * course.gain
 
     @property
     def description(self) -> Evidence | None:
@@ -195,8 +211,12 @@ def search(
 def ranked(subject: Subject[F], fit: F) -> Ranking:
     """Every cause beside a fit: the best variants of each family, each with a noise of its own."""
     ranking = ranked_of(subject.linear(fit), list(subject.trials(fit)))
-    found = [_on_its_axes(subject, fit, e, ranking) for e in ranking.found]
-    return _about_the_best(replace(ranking, found=_best_first(found)))
+    found = _best_first([_on_its_axes(subject, fit, e, ranking) for e in ranking.found])
+    ranking = _about_the_best(replace(ranking, found=found))
+    near = [e for e in ranking.causes[: LEVELS.contenders] if e.score > -LEVELS.clear]
+    finer = {e.trials[0].family: sharpened(subject, fit, ranking, e) for e in near}
+    found = tuple(finer.get(e.trials[0].family, e) for e in ranking.found)
+    return replace(ranking, found=_best_first(found))
 
 
 def ranked_of(linear: Linear, trials: Sequence[Trial]) -> Ranking:
@@ -302,6 +322,8 @@ def _with_the_best(
     while True:
         passing = asked or _passing(ranking, left)
         refits = _refitted(subject, state.fit, ranking, passing)
+        if not asked and not tried:
+            refits = _best_refits([*refits, *_shown(subject, state.fit, ranking)])
         torn = [] if asked else _torn_between(refits, ranking)
         if torn:
             return replace(state, open=tuple(torn))
@@ -358,10 +380,12 @@ def _hypotheses(
 
 @dataclass(frozen=True)
 class Refit(Generic[F]):
-    """A cause in the model, fitted: `evidence` with the score of this fit."""
+    """A cause in the model, fitted: `evidence` with the score of this fit; `falls` if they are not
+    those of its columns."""
 
     fit: F
     evidence: Evidence
+    falls: dict[str, Fall] | None = None
 
 
 def _refitted(
@@ -374,10 +398,10 @@ def _refitted(
         better = subject.refit(fit, evidence.trials)
         if isinstance(better, str):
             continue
-        score = evidence.score - evidence.gain + subject.gain(fit, better, evidence)
-        found.append(Refit(better, replace(evidence, score=score)))
-    least = ranking.least
-    found = [r for r in found if r.evidence.score > least or subject.asked(_first(r).what)]
+        gain = subject.gain(fit, better, evidence)
+        score = evidence.score - evidence.gain + gain
+        if ranking.enough(score, gain) or subject.asked(evidence.trials[0].what):
+            found.append(Refit(better, replace(evidence, gain=gain, score=score)))
     found.sort(key=lambda r: -r.evidence.score)
     near = _near(found)
     if len(near) > 1:
@@ -387,10 +411,6 @@ def _refitted(
         best = found[min(range(len(near)), key=lambda k: (float(f"{loss[k]:.3g}"), usual[k]))]
         found = [best, *[r for r in found if r is not best]]
     return found
-
-
-def _first(refit: Refit[F]) -> Trial:
-    return refit.evidence.trials[0]
 
 
 def _near(refits: Sequence[Refit[F]]) -> list[Evidence]:
@@ -409,6 +429,37 @@ def _torn_between(refits: Sequence[Refit[F]], ranking: Ranking) -> list[Evidence
     return near if none < loss.min() else []
 
 
+def _best_refits(refits: Sequence[Refit[F]]) -> list[Refit[F]]:
+    """The first stays, unless another one is clearly worth more."""
+    if not refits:
+        return []
+    best = max(refits, key=lambda r: r.evidence.score)
+    clear = best.evidence.score > refits[0].evidence.score + LEVELS.clear
+    first = best if clear else refits[0]
+    return [first, *[r for r in refits if r is not first]]
+
+
+def _shown(subject: Subject[F], fit: F, ranking: Ranking) -> list[Refit[F]]:
+    """What the records show by themselves, refitted: held-out parts by the refit itself."""
+    found = []
+    for trial in subject.shown(fit):
+        evidence = judged([trial], ranking.likelihood, ranking.none, families=ranking.families)
+        better = subject.refit(fit, [trial])
+        if evidence is None or isinstance(better, str):
+            continue
+        gain = subject.gain(fit, better, evidence)
+        score = evidence.score - evidence.gain + gain
+        seen = _falls_of_refit(ranking.linear, subject.linear(better))
+        if ranking.enough(score, gain) and holds_out(seen, ranking.linear):
+            found.append(Refit(better, replace(evidence, gain=gain, score=score), seen))
+    return found
+
+
+def _falls_of_refit(before: Linear, after: Linear) -> dict[str, Fall]:
+    """Held-out squares of two fits, each near its own optimum."""
+    return {k: fall_between(before, after, parts) for k, parts in before.parts.each.items()}
+
+
 def _with_parts(options: Sequence[Evidence], ranking: Ranking) -> list[Evidence]:
     """What comes in pairs alone as well: a refit may need one of them only."""
     alone = {e.trials[0].family: e for e in ranking.found}
@@ -422,7 +473,7 @@ def _kept(
     subject: Subject[F], state: State[F], ranking: Ranking, refit: Refit[F],
     say: Callable[[str], None],
 ) -> State[F]:  # fmt: skip
-    seen, kept = falls(ranking, refit.evidence), state.kept
+    seen, kept = refit.falls or falls(ranking, refit.evidence), state.kept
     for trial in refit.evidence.trials:
         say(f"{subject.label(trial.what)}: held-out error falls")
         kept = (*kept, Kept(trial.what, refit.evidence, seen))
@@ -514,45 +565,39 @@ def sharpened(subject: Subject[F], fit: F, ranking: Ranking, evidence: Evidence)
 
 def eliminated(subject: Subject[F], state: State[F]) -> State[F]:
     """Each cause must earn its place again beside the others; the weakest goes first."""
-    families = state.first.families if state.first else 1
     while len(state.kept) > 1:
-        judged_ = [(k, *_beside_the_others(subject, state.fit, k, families)) for k in state.kept]
-        weak = [
-            (e.score if e is not None else -np.inf, k)
-            for k, ranking, e in judged_
-            if not _earns_its_place(subject, k, ranking, e)
-        ]
+        weak = []
+        for kept in state.kept:
+            base = subject.without(state.fit, kept.what)
+            score = None if base is None else _beside_the_others(subject, state, kept, base)
+            if score is not None:
+                weak.append((score, kept, base))
         if not weak:
             return state
-        gone = min(weak, key=lambda pair: pair[0])[1]
-        fit = subject.without(state.fit, gone.what)
-        if fit is None:
-            return state
+        _, gone, fit = min(weak, key=lambda w: w[0])
+        assert fit is not None
         state = replace(state, fit=fit, kept=tuple(k for k in state.kept if k is not gone))
         state = state.refusing(gone.what, "no longer needed beside what came later")
     return state
 
 
-def _beside_the_others(
-    subject: Subject[F], fit: F, kept: Kept, families: int
-) -> tuple[Ranking | None, Evidence | None]:
-    """A cause judged as if it came last, in this fit."""
-    found = subject.apart(fit, kept)
-    if found is None:
-        return None, None
-    linear, trial = found
-    likelihood = Likelihood(linear)
-    none = likelihood.beside()
-    evidence = judged([trial], likelihood, none, families=families)
-    return Ranking(linear, likelihood, none, (), families), evidence
+def _beside_the_others(subject: Subject[F], state: State[F], kept: Kept, base: F) -> float | None:
+    """What a cause is worth that does not earn its place as the last one; None if it does.
 
-
-def _earns_its_place(
-    subject: Subject[F], kept: Kept, ranking: Ranking | None, evidence: Evidence | None
-) -> bool:
-    if ranking is None or evidence is None or not significant(evidence, ranking.linear):
-        return False
-    return subject.asked(kept.what) or holds_out(falls(ranking, evidence), ranking.linear)
+    `base` is the fit without it.
+    """
+    linear, whole = subject.linear(base), subject.linear(state.fit)
+    none, gain = Likelihood(linear), subject.rise(base, state.fit)
+    freedom = max(whole.basis.shape[1] - linear.basis.shape[1], 1)
+    families = state.first.families if state.first else 1
+    searched = float(np.log(kept.evidence.trials[0].variants * families))
+    score = worth(gain, freedom, searched, none)
+    strong = score > LEVELS.strong if linear.series else (
+        p_value(gain, freedom, searched, none) < LEVELS.chance
+    )
+    if strong and (subject.asked(kept.what) or linear.residual.shape != whole.residual.shape):
+        return None  # rows that moved in time are others
+    return None if strong and holds_out(_falls_of_refit(linear, whole), linear) else score
 
 
 # -- what is not told apart ------------------------------------------------------------------------
@@ -560,21 +605,19 @@ def _earns_its_place(
 
 def with_rivals(subject: Subject[F], state: State[F]) -> State[F]:
     """Each cause beside those that explain as much in its place, the others kept."""
-    if not state.kept:
-        return state
-    others = list(subject.trials(state.fit))
-    kept = tuple(replace(k, rivals=_rivals(subject, state, k, others)) for k in state.kept)
+    kept = tuple(replace(k, rivals=_rivals(subject, state, k)) for k in state.kept)
     return replace(state, kept=kept)
 
 
-def _rivals(
-    subject: Subject[F], state: State[F], kept: Kept, others: Sequence[Trial]
-) -> tuple[Rival, ...]:
+def _rivals(subject: Subject[F], state: State[F], kept: Kept) -> tuple[Rival, ...]:
     """By evidence, or by held-out stretches (Vuong 1989): a score alone does not say so."""
-    found = subject.apart(state.fit, kept)
-    if found is None:
+    apart, base = subject.apart(state.fit, kept), subject.without(state.fit, kept.what)
+    if apart is None or base is None:
         return ()
-    linear, own = found
+    linear, own, others = subject.linear(base), apart[1], list(subject.trials(base))
+    if own.columns.shape[:2] != linear.residual.shape:  # rows that moved in time are others
+        (own, *_) = [t for t in others if t.family == own.family]
+    # Slopes and grids are those of the fit without it: in its own, others follow it.
     ranking = ranked_of(linear, [own, *(t for t in others if t.family != own.family)])
     mine = [e for e in ranking.found if e.trials[0] is own]
     if not mine:

@@ -43,6 +43,8 @@ BEYOND = 5.0
 REMEMBERED = 4
 #: Iterations of a fit that begins at the fit to everything, and gain (in σ²) that ends it.
 ITERATIONS, ENOUGH = 30, 1e-3
+#: Iterations of a fit that is to stay, and standard deviations that a step may be long there.
+LONG, RESTLESS = 100, 1e-2
 
 
 @dataclass(frozen=True)
@@ -76,6 +78,9 @@ class Sensor:
         default_factory=list, repr=False
     )
 
+    linears: list[tuple[Fit, Linear]] = field(default_factory=list, repr=False)
+    looked: list[tuple[Fit, Seen]] = field(default_factory=list, repr=False)
+
     # -- fits ----------------------------------------------------------------------------------
 
     def fitted(self, model: Model, values: Mapping[str, Array]) -> Fit | None:
@@ -105,8 +110,14 @@ class Sensor:
 
     def linear(self, fit: Fit) -> Linear:
         """Residuals and slopes in the rows that are looked at."""
+        for known, linear in self.linears:
+            if known is fit:
+                return linear
         residual, J = self._rows(*self._problem(fit))
-        return Linear(residual, J, self._spans, self._parts(fit), self._least(fit))
+        linear = Linear(residual, J, self._spans, self._parts(fit), self._least(fit))
+        self.linears.append((fit, linear))
+        del self.linears[:-REMEMBERED]
+        return linear
 
     def _least(self, fit: Fit) -> float:
         """Slopes of an implicit residual contain the residual: what survives must be more."""
@@ -190,6 +201,14 @@ class Sensor:
 
     def seen(self, fit: Fit, linear: Linear) -> Seen:
         """What grids are laid over."""
+        for known, seen in self.looked:
+            if known is fit:
+                return seen
+        self.looked.append((fit, self._seen(fit, linear)))
+        del self.looked[:-REMEMBERED]
+        return self.looked[-1][1]
+
+    def _seen(self, fit: Fit, linear: Linear) -> Seen:
         problem, point = self._problem(fit)
         found = self._shift(fit)
         push = -linear.residual
@@ -230,7 +249,20 @@ class Sensor:
         """A lag that two records show by how lively each of them is."""
         if candidate.effect is None or candidate.effect.kind != "time":
             return 0.0
-        return likely_lag(self.runs, fit.model.traced.measured or "", candidate.on)
+        name, measured = candidate.on, fit.model.traced.measured
+        rotation = any(s.name == name and s.kind == "rotation" for s in fit.model.signals)
+        return likely_lag(self.runs, measured or "", name, within=True, rotation=rotation)
+
+    def shown(self, fit: Fit) -> list[Trial]:
+        """Long lags that the records show by themselves: a slope does not reach as far."""
+        times = [run.time for run in self.runs if run.time is not None and len(run) > 1]
+        step = float(np.median(np.diff(times[0]))) if times else np.inf
+        found = []
+        for candidate in self.found(fit)[0]:
+            lag = self._likely(fit, candidate)
+            if abs(lag) > 2 * step:
+                found.append(replace(candidate, held=(("delay", lag),), trials=len(times[0])))
+        return self.trials_of(fit, found)
 
     def trials_of(self, fit: Fit, several: Sequence[Candidate]) -> list[Trial]:
         problem, point = self._problem(fit)
@@ -291,19 +323,29 @@ class Sensor:
         return self.fitted(model, {**self._nulls(model, begun), **begun})
 
     def gain(self, fit: Fit, better: Fit, evidence: Evidence) -> float:
-        """2 log of the likelihood of a refit over that of the fit, each with a noise of its own.
+        """2 log of the likelihood of a refit over that of the fit, each with a noise of its own."""
+        refit = Likelihood(self.linear(better)).beside(start=evidence.explained.spectrum)
+        return evidence.gain + evidence.explained.cost - refit.cost
 
-        What is far out is told from the refit in both.
-        """
-        before, after = self.linear(fit), self.linear(better)
-        none = Likelihood(before, before.residual - after.residual).beside()
-        refit = Likelihood(after).beside(start=evidence.explained.spectrum)
-        return none.cost - refit.cost
+    def rise(self, less: Fit, fit: Fit) -> float:
+        """2 log of the likelihood of a fit over that of one with less in it."""
+        costs = [Likelihood(self.linear(f)).beside().cost for f in (less, fit)]
+        return costs[0] - costs[1]
 
     def certified(self, fit: Fit) -> Fit | str:
-        """The fit, if the data determine it; or why it is refused. The last one is proved."""
-        why = undetermined(Problem(fit.model, self.runs), fit.values)
-        return f"its fit is refused: {why}" if why else fit
+        """The fit, if the data determine it and it is at rest; or why it is refused.
+
+        The last one is proved.
+        """
+        problem, _ = self._problem(fit)
+        found = trust_region(problem, problem.point(fit.values), max_iterations=LONG)
+        values = problem.values(found.point)
+        why = undetermined(problem, values)
+        normal = problem.normal(found.point)
+        step = np.linalg.lstsq(normal.matrix, normal.gradient, rcond=1e-12)[0]
+        if not why and np.sqrt(max(step @ normal.gradient, 0)) > RESTLESS * fit.noise:
+            why = "not a stationary point"
+        return f"its fit is refused: {why}" if why else replace(fit, values=values)
 
     def _nulls(self, model: Model, values: Mapping[str, Array]) -> dict[str, Array]:
         problem = Problem(model, self.runs)

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from casest.data.curves import Curve
-from casest.data.run import Run
+from casest.data.run import Run, Series
 from casest.declaration.shapes import Array
 
 #: Most steps of the grid on which lags are tried.
@@ -20,17 +20,23 @@ GRID = 2**16
 FARTHEST = 0.5
 
 
-def likely_lag(runs: Sequence[Run], measured: str, name: str) -> float:
+def likely_lag(
+    runs: Sequence[Run], measured: str, name: str, *, within: bool = False, rotation: bool = False
+) -> float:
     """Time in s by which the signal `measured` follows `name` of another file; 0 if untold.
 
-    Of several runs that of the longest is taken.
+    With `within` also one of the same file, which is a `rotation` or not. Of several runs that of
+    the longest is taken.
     """
-    told = [run for run in runs if name in run.elsewhere and run.time is not None and len(run) > 3]
+    told = [run for run in runs if name in run.elsewhere or (within and name in run.signals)]
+    told = [run for run in told if run.time is not None and len(run) > 3]
     if not told:
         return 0.0
     run = max(told, key=lambda r: float(np.ptp(np.asarray(r.time))))
     assert run.time is not None
-    other = run.elsewhere[name]
+    other = run.elsewhere.get(name) or Series(
+        file=run.file, time=run.time, values=run.signals[name], block=run.block, rotation=rotation
+    )
     step = max(float(np.median(np.diff(run.time))), float(np.ptp(run.time)) / GRID)
     mine = Curve.through(run.time, run.signals[measured], run.block)
     its = Curve.through(other.time, other.values, other.block, rotation=other.rotation)

@@ -23,7 +23,7 @@ from casest.errors import CasestError, UsageError
 _TEMPERATURE = re.compile(r"temp|(^|_)t_?(deg)?c$|celsius|kelvin", re.IGNORECASE)
 _DEGREES = {"degC", "K", "kelvin", "degree_Celsius", "°C"}
 #: What is searched over first and fitted then: an effect is smooth in it.
-SMOOTH = ("frequency", "timescale", "share", "lag")
+SMOOTH = ("frequency", "timescale", "lag")
 #: Columns that number things instead of measuring them.
 _LABELS = re.compile(
     r"^(run|pose|index|(first_|last_)?row|count|sample|seq|id|nr|no)$", re.IGNORECASE

@@ -16,7 +16,7 @@ from casest.diagnose.candidates.candidates import Candidate
 from casest.diagnose.evidence.linear import Linear
 
 #: Values on each grid: moments beside the best one, edges of pulses, levels, time constants, lines.
-MOMENTS, EDGES, LEVELS_TRIED, CONSTANTS, LINES = 15, 60, 24, 8, 3
+MOMENTS, EDGES, PULSES, LEVELS_TRIED, CONSTANTS, LINES = 15, 60, 10, 24, 8, 3
 #: Lags of a recorded signal, each way.
 LAGS = 8
 #: Shares of a span in which a loop may turn round.
@@ -147,8 +147,8 @@ def _pulses(seen: Seen) -> Values:
         near = np.arange(max(first + edge, last - reach), min(n - 1, last + reach) + 1)
         if len(near):
             last = int(near[np.argmax(gain(np.full_like(near, first), near))])
-    sixth = np.linspace(0, n, 7).astype(int)[1:-1]
-    pairs = {(first, last)} | {(int(i), int(j)) for i in sixth for j in sixth if i < j}
+    even = np.linspace(0, n, PULSES + 1).astype(int)[1:-1]
+    pairs = {(first, last)} | {(int(i), int(j)) for i in even for j in even if i < j}
     found = [(_between(time, i), _between(time, j)) for i, j in sorted(pairs)]
     return found, n * n / 2
 

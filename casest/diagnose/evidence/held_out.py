@@ -13,6 +13,8 @@ from casest.diagnose.levels import LEVELS
 
 #: Robust standard deviations (before) that a held-out residual counts as at most.
 FAR = 4.0
+#: Share of what the whole record says of a direction that the rest of it must say.
+OPEN = 0.2
 
 
 @dataclass(frozen=True)
@@ -30,22 +32,61 @@ def squares(linear: Linear, columns: Sequence[Array], parts: Index) -> Array:
 
 
 def foretold(linear: Linear, columns: Sequence[Array], parts: Index) -> Array:
-    """Held-out residuals (N, m)."""
-    flat = np.concatenate([linear.basis, *[_flat(c, linear) for c in columns]], axis=1)
-    y, found = linear.residual.ravel(), np.empty(linear.residual.size)
-    for own, values in _fits(linear, flat, parts):
-        found[own] = y[own] - flat[own] @ values
+    """Held-out residuals (N, m). What the rest of the record leaves open of the columns is nothing."""
+    flat = [_flat(c, linear) for c in columns]
+    E = np.concatenate(flat, axis=1) if flat else np.zeros((linear.residual.size, 0))
+    X, p = np.concatenate([linear.basis, E], axis=1), linear.basis.shape[1]
+    y, seen = linear.residual.ravel(), clipped(linear).ravel()
+    row = np.repeat(parts, linear.residual.shape[1])
+    A, b, found = X.T @ X, X.T @ seen, np.empty(len(y))
+    for k in np.unique(parts):
+        own = np.flatnonzero(row == k)
+        rest = A - X[own].T @ X[own]
+        T = _determined(A, rest, p)
+        values = T @ np.linalg.lstsq(T.T @ rest @ T, T.T @ (b - X[own].T @ seen[own]), 1e-9)[0]
+        found[own] = y[own] - X[own] @ values
     return found.reshape(linear.residual.shape)
 
 
-def fall(linear: Linear, columns: Sequence[Array], parts: Index) -> Fall:
-    """Of the squares by columns.
+def _determined(whole: Array, rest: Array, p: int) -> Array:
+    """The p unknowns, and of the columns after them the directions that the rest says enough of."""
+    if len(whole) == p:
+        return np.eye(p)
+    here, there = (_beyond(A, p) for A in (whole, rest))
+    values, vectors = np.linalg.eigh(here)
+    kept = values > 1e-9 * values.max(initial=1e-300)
+    root = vectors[:, kept] / np.sqrt(values[kept])
+    share, turned = np.linalg.eigh(root.T @ there @ root)
+    ways = (root @ turned)[:, share > OPEN]
+    found = np.zeros((len(whole), p + ways.shape[1]))
+    found[:p, :p] = np.eye(p)
+    found[p:, p:] = ways
+    return found
 
-    Were they right, with errors a after and predictions that differ by δ, the squares would fall by
+
+def _beyond(A: Array, p: int) -> Array:
+    """Information of the columns after p unknowns, beside those."""
+    inner = np.linalg.lstsq(A[:p, :p], A[:p, p:], 1e-9)[0] if p else np.zeros((0, len(A)))
+    return np.asarray(A[p:, p:] - A[p:, :p] @ inner)
+
+
+def fall(linear: Linear, columns: Sequence[Array], parts: Index) -> Fall:
+    """Of the squares by columns."""
+    return _fall(linear, *(foretold(linear, c, parts) for c in ((), columns)))
+
+
+def fall_between(before: Linear, after: Linear, parts: Index) -> Fall:
+    """Of the squares from one fit to another, each near its own optimum."""
+    return _fall(before, *(foretold(fit, [], parts) for fit in (before, after)))
+
+
+def _fall(linear: Linear, b: Array, a: Array) -> Fall:
+    """Of the squares from errors b to errors a, (N, m) each.
+
+    Were the second ones right, with predictions that differ by δ, the squares would fall by
     Σ(δ² + 2aδ): the error of the fall is that of 2Σaδ, from batch to batch of the record, and not
     below that of white noise. So what is gained in a few places only is a gain as well.
     """
-    b, a = (foretold(linear, c, parts) for c in ((), columns))
     moved, nearer = b - a, np.abs(a) < np.abs(b)
     # What is far from both is neither's; what one of them is far from counts in full.
     least = _near(linear, np.where(nearer, a, b))
@@ -68,17 +109,6 @@ def _near(linear: Linear, e: Array) -> Array:
     """Errors (N, m), those far out counted as less: by what is far before."""
     far = FAR * robust_sd(linear.residual)
     return np.clip(e, -far, far) if linear.series else e
-
-
-def _fits(linear: Linear, flat: Array, parts: Index):  # type: ignore[no-untyped-def]
-    """Rows of each part, and the least-squares values of the others."""
-    row = np.repeat(parts, linear.residual.shape[1])
-    y = clipped(linear).ravel()
-    A, b = flat.T @ flat, flat.T @ y
-    for k in np.unique(parts):
-        own = np.flatnonzero(row == k)
-        X = flat[own]
-        yield own, np.linalg.lstsq(A - X.T @ X, b - X.T @ y[own], rcond=1e-9)[0]
 
 
 def clipped(linear: Linear) -> Array:

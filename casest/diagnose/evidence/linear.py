@@ -86,9 +86,12 @@ class Linear:
 
 
 def robust_sd(residual: Array) -> Array:
-    """Standard deviation of each axis (m,) from the median of absolute residuals."""
-    centred = residual - np.median(residual, axis=0)
-    return np.asarray(1.4826 * np.median(np.abs(centred), axis=0) + 1e-300)
+    """Standard deviation of each axis (m,) by the nearest 95 % of the residuals.
+
+    Not by the nearest half: where a sensor moves now and then, that is its rest alone.
+    """
+    centred = np.abs(residual - np.median(residual, axis=0))
+    return np.asarray(np.quantile(centred, 0.95, axis=0) / 1.96 + 1e-300)
 
 
 def parts_of(blocks: Index, runs: Index, inputs: Array) -> Parts:

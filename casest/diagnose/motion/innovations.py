@@ -61,6 +61,10 @@ class Innovations:
             for c, where in zip(rest, found.columns, strict=True)
         ]
 
+    def shown(self, fit: Fit) -> list[Trial]:
+        """Nothing."""
+        return []
+
     def nearer(self, fit: Fit, trial: Trial, scale: float) -> list[Trial]:
         """Nothing has a grid."""
         return []
@@ -90,6 +94,10 @@ class Innovations:
     def gain(self, fit: Fit, better: Fit, evidence: Evidence) -> float:
         """2 log of the likelihood over that of the fit, on the readings of both."""
         return 2 * rise(better, fit)
+
+    def rise(self, less: Fit, fit: Fit) -> float:
+        """The same of two fits."""
+        return 2 * rise(fit, less)
 
     def certified(self, fit: Fit) -> Fit | str:
         """The fit: its scoring has come to an end."""
