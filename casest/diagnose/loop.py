@@ -170,7 +170,7 @@ def _found(sensor: Sensor, state: State[Fit], kept: Kept, after: Estimate) -> Fo
     fall = (1 - ratios["pieces"]) / max(ratios["pieces"], 1e-300) * state.fit.noise**2
     added = {k.what.label for k in state.kept}
     rivals = {
-        r.what.label: sensor.moved_by(state.fit, kept, r)
+        r.what.label: sensor.moved_by(state.fit, r)
         for r in kept.rivals
         if r.what.label not in added
     }

@@ -14,6 +14,7 @@ from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
+from casest.declaration.shapes import Array
 from casest.diagnose.evidence.held_out import (
     Fall,
     fall,
@@ -132,13 +133,14 @@ class Ranking:
 
 @dataclass(frozen=True)
 class Rival:
-    """A cause that is not told apart from one that was added: how the score differs, and the t of the
-    difference of held-out squares."""
+    """A cause that is not told apart from one that was added: how the score differs, the t of the
+    difference of held-out squares, and the fit with it instead."""
 
     what: Any
     score: float
     t: float
     evidence: Evidence = field(repr=False)
+    fit: Any = field(repr=False)
 
 
 @dataclass(frozen=True)
@@ -623,15 +625,38 @@ def _rivals(subject: Subject[F], state: State[F], kept: Kept) -> tuple[Rival, ..
     if not mine:
         return ()
     stretches = linear.parts.stretches
-    without = squares(linear, [], stretches)
-    best = squares(linear, [ranking.likelihood.in_time(mine[0].basis)], stretches)
-    gained, rivals = float((without - best).sum()), []
-    for e in ranking.found:
-        if e is mine[0] or e.score < LEVELS.strong or e.trials[0].describes:
+    without, best = (squares(linear, c, stretches) for c in ([], [_in_time(ranking, mine[0])]))
+    rivals = []
+    for e in ranking.causes:
+        if e is mine[0] or e.score < LEVELS.strong or len(rivals) == LEVELS.contenders:
             continue
-        lost = squares(linear, [ranking.likelihood.in_time(e.basis)], stretches) - best
-        t, behind = standard_errors(lost), mine[0].score - e.score
-        as_well = t < LEVELS.apart and float(lost.sum()) < LEVELS.alike * gained
-        if behind < LEVELS.clear or as_well:
-            rivals.append(Rival(e.trials[0].what, behind, t, e))
-    return tuple(rivals[: 2 * LEVELS.contenders])
+        lost = squares(linear, [_in_time(ranking, e)], stretches) - best
+        if _as_well(mine[0].score - e.score, lost, without - best):
+            rivals.append(e)
+    after = subject.linear(state.fit)
+    target = mine[0].score - mine[0].gain + subject.rise(base, state.fit)
+    found = []
+    for e in rivals:  # what the columns promise, a refit must keep
+        fit = subject.refit(base, e.trials)
+        if isinstance(fit, str):
+            continue
+        behind = target - (e.score - e.gain + subject.rise(base, fit))
+        other = subject.linear(fit)
+        lost = np.zeros(1)
+        if {x.residual.shape for x in (linear, after, other)} == {linear.residual.shape}:
+            own_, its = (squares(x, [], stretches) for x in (after, other))
+            lost, best = its - own_, own_
+        if _as_well(behind, lost, without - best):
+            found.append(Rival(e.trials[0].what, behind, standard_errors(lost), e, fit))
+    return tuple(found)
+
+
+def _in_time(ranking: Ranking, evidence: Evidence) -> Array:
+    return ranking.likelihood.in_time(evidence.basis)
+
+
+def _as_well(behind: float, lost: Array, gained: Array) -> bool:
+    """Not clearly less evidence, or what was held out is foretold as well."""
+    little = float(lost.sum()) < LEVELS.alike * float(gained.sum())
+    alike = len(lost) > 1 and standard_errors(lost) < LEVELS.apart and little
+    return behind < LEVELS.clear or alike

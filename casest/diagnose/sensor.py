@@ -434,14 +434,9 @@ class Sensor:
             made = with_sizes(made, {k: float(fit.values[n]) for k, n in own.items()})
         return replace(what, effect=made, held=(), traced=None)
 
-    def moved_by(self, fit: Fit, kept: Kept, rival: Rival) -> dict[str, Array]:
+    def moved_by(self, fit: Fit, rival: Rival) -> dict[str, Array]:
         """How far the declared parameters would move, were a rival there instead."""
-        base = self.without(fit, kept.what)
-        if base is None:
-            return {}
-        other = self.refit(base, rival.evidence.trials)
-        if isinstance(other, str):
-            return {}
+        other: Fit = rival.fit
         return {n: other.values[n] - v for n, v in fit.values.items() if n in other.values}
 
     def label(self, what: Candidate) -> str:
