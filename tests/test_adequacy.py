@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from casest import Residual, Run, model, param, quantity, signal
-from casest.diagnose.misfit.lack_of_fit import Misfit, left_over, state_of
+from casest.diagnose.cross_validation import folded
+from casest.diagnose.misfit.left import Misfit, left_over
 from casest.diagnose.noise.noise_model import equal_noise, lag_one, noise_model
 from casest.diagnose.noise.tails import outlier_share, outliers_p_value, tails
-from casest.diagnose.selection.cross_validation import folded
 from casest.effects.placing import prepared
 from casest.estimate.correlation import correlation_time
 from casest.leastsquares.problem import Problem
@@ -90,8 +90,8 @@ def judged(run, declared=channels) -> Misfit:
     problem = Problem(declared, runs)
     point = trust_region(problem, problem.start()).point
     correlated = correlation_time(problem, point)
-    state = state_of(problem, point, folded(runs, correlated).batches)
-    return left_over(state, state.residuals, correlated)
+    batches = folded(runs, correlated).batches
+    return left_over(problem, point, batches, problem.residuals(point), correlated)
 
 
 # -- no misfit -------------------------------------------------------------------------------------

@@ -13,8 +13,8 @@ from casest import Residual, attempt, close, load_runs, model, param, quantity, 
 from casest.cli import run
 from casest.data.run import Run
 from casest.demo import WHEEL
-from casest.diagnose.misfit import specification_test
-from casest.diagnose.misfit.specification_test import doubts
+from casest.diagnose.misfit import left
+from casest.diagnose.misfit.left import doubts
 from casest.results.closing import closing_result
 from casest_problems.norm import norm_full, norm_triangular
 from casest_problems.wheel import wheel
@@ -87,7 +87,7 @@ def test_a_refused_estimate_is_not_asked():
 def test_a_long_record_is_not_asked(monkeypatch):
     """All residuals at once would cost the memory that a fit does not need."""
     found = attempt(norm_triangular.having(norm=sim.GRAVITY), poses())
-    monkeypatch.setattr(specification_test, "LONGEST", 59)
+    monkeypatch.setattr(left, "LONGEST", 59)
     assert doubts(found) is None
 
 

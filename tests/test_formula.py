@@ -236,16 +236,16 @@ def test_effects_of_the_users_own_that_cannot_be_used_are_named(bench, tmp_path,
 
 def test_a_candidate_whose_refit_fails_is_named_and_the_loop_goes_on(bench, tmp_path, monkeypatch):
     """The refit of one candidate meets a matrix that cannot be solved."""
-    from casest.diagnose.selection.state import Work
+    from casest.diagnose.sensor import Sensor
 
-    fitted = Work.fitted
+    fitted = Sensor.fitted
 
     def failing(self, model, values):
         if any(a.label == "temperature_bias(temperature)" for a in model.effects):
             raise np.linalg.LinAlgError("singular matrix")
         return fitted(self, model, values)
 
-    monkeypatch.setattr(Work, "fitted", failing)
+    monkeypatch.setattr(Sensor, "fitted", failing)
     code, result = closed()
     assert code == 0
     reasons = {s["name"]: s["reason"] for s in result["refused"]}
