@@ -1,4 +1,4 @@
-"""What a cause is worth: its likelihood, its price and its chance, against answers made elsewhere."""
+"""What a cause is worth: likelihood, price and chance, against answers made elsewhere."""
 
 from __future__ import annotations
 
@@ -133,7 +133,7 @@ def slow_ones(t):
 
 SLOWEST = pytest.mark.xfail(
     strict=True,
-    reason="the spectrum is flat below the middle of its first 24 frequencies, where a walk is not: "
+    reason="the spectrum is flat below the middle of its first 24 frequencies, and a walk is not: "
     "strong evidence in 58 of 150 records, and held-out stretches confirm nearly all of it",
 )
 
@@ -157,15 +157,15 @@ def test_smooth_causes_do_not_win_in_coloured_noise(kind):
 
 SHORT = pytest.mark.xfail(
     strict=True,
-    reason="between the middle of the spectrum's first band (24 frequencies) and the next no power is "
-    "asked, and the curve has holes there, down to S = 1e-3 of white noise: 49 of 600 instead of 15",
+    reason="between the middle of the spectrum's first band (24 frequencies) and the next no power "
+    "is asked, and the curve has holes there, S = 1e-3 in white noise: 49 of 600, not 15",
 )
 
 
 @pytest.mark.parametrize("N", [pytest.param(150, marks=SHORT), 600, 2000])
 def test_an_unknown_of_nothing_is_worth_its_price_as_rarely_as_schwarz_says(N):
-    """Twice the log of the likelihood ratio is a χ² of one degree of freedom, the price log N: 2.5 %
-    of 150 residuals, 0.6 % of 2000. A spectrum of its own for each makes it a little more."""
+    """Twice the log of the likelihood ratio is a χ² of one degree of freedom, the price log N:
+    2.5 % of 150 residuals, 0.6 % of 2000. A spectrum of its own for each makes it a little more."""
     rng, bought, records = np.random.default_rng(6), 0, 300 if N > 1000 else 600
     for _ in range(records):
         found = evidence_of(rng.standard_normal(N), np.ones(N), rng.standard_normal(N))
@@ -174,9 +174,7 @@ def test_an_unknown_of_nothing_is_worth_its_price_as_rarely_as_schwarz_says(N):
     assert low <= bought <= 1.2 * high
 
 
-@pytest.mark.xfail(
-    strict=True, reason="as above: the worst of 40 records of 100 samples is at 1474"
-)
+@pytest.mark.xfail(strict=True, reason="as above: in 40 records of 100 samples up to 1474")
 def test_a_spectrum_of_white_noise_has_no_holes():
     """No single one of 100 powers is far above it: a χ² exceeds 25 once in two million."""
     rng = np.random.default_rng(6)
@@ -302,8 +300,8 @@ def test_what_neither_of_two_causes_shows_alone_both_show_together():
 
 
 def leaning(*slants, size=30.0):
-    """Causes that explain the same, each the likelier by nothing, and lean on the one declared unknown
-    by a slant each: where one is added, that unknown moves by −slant times the cause's size."""
+    """Causes that explain the same, and lean on the one declared unknown by a slant each: where one
+    is added, that unknown moves by −slant times the cause's size."""
     rng = np.random.default_rng(15)
     Q = np.linalg.qr(rng.standard_normal((60, 2)))[0]
     x, u = Q.T

@@ -12,16 +12,11 @@ from msgspec.structs import replace as changed
 
 import casest as c
 from casest import Run
-from casest.diagnose.candidates.axes import lighter
 from casest.diagnose.loop import close, rms
 from casest.effects import CATALOGUE
-from casest.effects.on_axes import restricted
-from casest.effects.placing import prepared
-from casest.leastsquares.problem import Problem
 from casest.results.closing import Effect, Unexplained, closing_result
 from casest.results.find import find_model
 from casest.results.verdict import sentence, undecided
-from casest.solve.trust_region import trust_region
 
 
 def record(world, seed=0):
@@ -168,23 +163,6 @@ def test_an_offset_that_walks_at_random_is_noise_and_neither_drift_nor_step():
 def test_a_steady_offset_does_not_wander():
     found = [labels(close(constant_bias, [wandering(0.0, seed)])) for seed in range(6)]
     assert not any(found)
-
-
-def test_what_an_axis_less_would_cost_is_what_a_fit_without_it_costs():
-    world = worlds.made("table", [8], {"bias_drift": 8e-5})
-    drift = replace(next(e for e in CATALOGUE if e.name == "bias_drift"), on="reading")
-    whole = declared(world).with_effect(drift)
-    runs = prepared(whole, (record(world),))
-    problem = Problem(whole, runs)
-    fit = trust_region(problem, problem.point({}), tolerance=1e-12)
-    own = [p for p in whole.parameters if p.name.startswith("bias_drift")]
-    ways = dict(zip(["x", "y", "z"], lighter(problem, fit.point, own, world.sigma), strict=False))
-    for axis, others in (("x", [1, 2]), ("y", [0, 2]), ("z", [0, 1])):
-        less = declared(world).with_effect(restricted(drift, others, whole))
-        without = Problem(less, runs)
-        cost = trust_region(without, without.point({}), tolerance=1e-12).cost - fit.cost
-        assert ways[axis][0] == 1
-        assert ways[axis][1] == pytest.approx(2 * cost / world.sigma**2, rel=0.02)
 
 
 def test_a_cause_too_small_to_be_told_from_others_is_not_added():
