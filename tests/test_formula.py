@@ -60,7 +60,7 @@ def closed(*more, data="bench.csv", folder="out"):
 @pytest.mark.xfail(
     strict=True,
     reason="terms are taken greedily: product, tanh(temperature), supply, where the temperature "
-    "itself is linear; what tanh leaves is then a vibration at 0.514 rad/s, three times the temperature's",
+    "itself is linear; what tanh leaves is then a vibration at 0.514 rad/s, thrice that of it",
 )
 def test_nothing_else_is_found_beside_a_product_of_two_columns(bench):
     _, result = closed()
