@@ -53,23 +53,27 @@ def runs():
 
 
 def by_differences(candidate: Candidate, runs, size):
-    """Central differences (N, m, k) of the residual in each of its numbers, from null."""
+    """Central differences (N, m, k) of the residual in each of its numbers, from null.
+
+    Shared numbers first, then those of the first run, and so on.
+    """
     wide = Problem(candidate.traced_on(cell), runs)
     held = {f"{candidate.label}.{n}": np.array(x) for n, x in candidate.held}
     start = {**wide.values(wide.start()), **VALUES, **held}
     columns = []
-    for p in candidate.parameters(candidate.traced_on(cell)):
+    for number, p in enumerate(candidate.parameters(candidate.traced_on(cell))):
         null = np.asarray(start[p.name], float)
-        for k in range(null.size):
-            step = np.zeros(null.size)
+        for k in np.ndindex(null.shape):
+            step = np.zeros(null.shape)
             step[k] = size
-            step = step.reshape(null.shape, order="F")
-            ends = [
-                wide.residuals(wide.point({**start, p.name: null + sign * step}))
-                for sign in (1, -1)
-            ]
-            columns.append((np.concatenate(ends[0]) - np.concatenate(ends[1])) / (2 * size))
-    return np.stack(columns, axis=2)
+            up, down = (
+                np.concatenate(wide.residuals(wide.point({**start, p.name: null + s})))
+                for s in (step, -step)
+            )
+            run = k[0] if p.scope == "run" else -1
+            columns.append((run, number, k, (up - down) / (2 * size)))
+    columns.sort(key=lambda column: column[:3])
+    return np.stack([difference for *_, difference in columns], axis=2)
 
 
 def test_the_slopes_of_every_candidate_are_those_of_the_residual(runs):
