@@ -31,8 +31,8 @@ def test_what_follows_nothing_is_as_significant_as_chance_has_it(axes):
 
 @pytest.mark.xfail(
     strict=True,
-    reason="18 of 2000 below 0.001, not 2: the law is that of means of one size, and of unequal ones "
-    "a few make the ratio",
+    reason="18 of 2000 below 0.001, not 2: the law is that of means of one size, and of unequal "
+    "ones a few make the ratio",
 )
 def test_noise_may_have_any_tails_and_be_larger_where_the_variable_is():
     """As noise that grows with speed over the speed."""
