@@ -20,15 +20,17 @@ TESTS: dict[str, tuple[str, ...]] = {
     "leastsquares/sums": ("spread", "certificate_limits", "norm_limits"),
     "leastsquares/agreement": ("scatter", "false_alarms"),
     "fleet/": ("batch_certificate", "batch"),
-    "diagnose/selection/cross_validation": ("cross_validation",),
-    "diagnose/selection/state": ("cross_validation",),
-    "diagnose/selection/acceptance": ("cross_validation",),
-    "diagnose/selection/model_evidence": ("false_alarms",),
-    "diagnose/candidates/score_test": ("false_alarms",),
-    "diagnose/motion/score_test": ("false_alarms", "closing_motion"),
+    "diagnose/cross_validation": ("cross_validation",),
+    "diagnose/evidence/held_out": ("cross_validation", "false_alarms"),
+    "diagnose/evidence/linear": ("cross_validation", "evidence"),
+    "diagnose/evidence/likelihood": ("evidence", "false_alarms"),
+    "diagnose/evidence/score": ("evidence", "false_alarms"),
+    "diagnose/levels": ("evidence", "cross_validation", "false_alarms", "formula", "loop"),
+    "diagnose/protocol": ("cross_validation", "evidence", "false_alarms", "formula", "loop"),
+    "diagnose/candidates/slopes": ("slopes",),
     "diagnose/motion/loop": ("cross_validation", "closing_motion"),
-    "diagnose/misfit/lack_of_fit": ("false_alarms", "adequacy"),
-    "diagnose/loop": ("false_alarms", "cross_validation"),
+    "diagnose/misfit/structure": ("structure", "adequacy"),
+    "diagnose/misfit/left": ("adequacy", "doubt", "slow_course"),
     "dynamics/extended": ("gaps", "extended"),
     "dynamics/filter": ("gaps", "extended", "dynamics"),
     "dynamics/discrete": ("discrete", "dynamics"),
@@ -80,8 +82,10 @@ class Mutant(NamedTuple):
 
 CERTIFICATE, JUDGE = "estimate/certificate.py", "fleet/judge.py"
 REASONS = "estimate/reasons.py"
-SCORE, EVIDENCE = "diagnose/candidates/score_test.py", "diagnose/selection/model_evidence.py"
-CROSS, STATE = "diagnose/selection/cross_validation.py", "diagnose/selection/state.py"
+SCORE, LIKELIHOOD = "diagnose/evidence/score.py", "diagnose/evidence/likelihood.py"
+PARTS, LINEAR = "diagnose/evidence/held_out.py", "diagnose/evidence/linear.py"
+CROSS, PROTOCOL = "diagnose/cross_validation.py", "diagnose/protocol.py"
+LEVELS = "diagnose/levels.py"
 TRANSITION, EXTENDED = "dynamics/transition.py", "dynamics/extended.py"
 
 MUTANTS = tuple(
@@ -156,17 +160,22 @@ MUTANTS = tuple(
             "weighted(Problem(model, seen), values)",
             "weighted(Problem(model, tuple(runs)), values)",
         ),
-        (CROSS, "FAR = 4.0", "FAR = 0.4"),
-        (CROSS, "np.sum(b**2 - a**2)", "np.sum(b**2 + a**2)"),
-        (
-            CROSS,
-            "max(wide / sigma**4, 4 * white / sigma**2)",
-            "min(wide / sigma**4, 4 * white / sigma**2)",
-        ),
         (CROSS, "10 * correlated_over", "0.1 * correlated_over"),
         (CROSS, "spread < UNCERTAIN * part", "spread < 1e9 * UNCERTAIN * part"),
-        (STATE, "gained > HELD_OUT * error", "gained > -1e9 * error"),
-        (STATE, "HELD_OUT = 1.64", "HELD_OUT = 0.164"),
+        (PARTS, "A - X.T @ X, b - X.T @ y[own]", "A, b"),
+        (PARTS, "np.sum(b**2) - np.sum(a**2)", "np.sum(b**2) + np.sum(a**2)"),
+        (PARTS, "max(float(np.sum(wide**2)), white)", "white"),
+        (PARTS, "max(float(np.sum(wide**2)), white)", "float(np.sum(wide**2))"),
+        (PARTS, "return np.clip(e, -far, far) if linear.series else e", "return e"),
+        (
+            LINEAR,
+            "stretches = place * LEVELS.stretches // size",
+            "stretches = batches % LEVELS.folds",
+        ),
+        (LINEAR, "regions = _regions(inputs, LEVELS.regions)", "regions = batches % LEVELS.folds"),
+        (PROTOCOL, "all(f.ratio < 1 for f in found.values())", "True"),
+        (PROTOCOL, "if not holds_out(seen, ranking.linear):", "if False:"),
+        (LEVELS, "confirmed: float = 1.64", "confirmed: float = 0.0"),
         (
             "estimate/held_out.py",
             "_with_own(model, values, fitted)",
@@ -175,17 +184,30 @@ MUTANTS = tuple(
         ("diagnose/motion/loop.py", "H[~hidden], z[~hidden]", "H, z"),
         ("data/splits.py", "(run.count > 1).any()", "(run.count > 1e9).any()"),
         # -- evidence and score tests --------------------------------------------------------------
-        (EVIDENCE, "FALSE_ALARM = 0.004", "FALSE_ALARM = 0.04"),
-        (EVIDENCE, "price = 2 * float(np.log(np.log(", "price = 1 * float(np.log(np.log("),
-        (EVIDENCE, "flips @ s.batches", "0.3 * flips @ s.batches"),
-        (SCORE, "min(1.0, p * candidate.trials)", "min(1.0, p)"),
-        (SCORE, "turned / np.sqrt(np.clip(1 - values, LEAST_LEFT, None))", "turned"),
-        (SCORE, "max(np.sum(noise**2) / freedom, least)", "least"),
-        (SCORE, "effective < LEAST_BATCHES", "effective < 0"),
-        (SCORE, "gain / inflation / freedom", "gain / inflation"),
-        (SCORE, "(1 - explained) * (1 + price)", "(1 - explained) * (1 - price)"),
-        ("diagnose/motion/score_test.py", "return max(own, float(", "return min(own, float("),
-        ("diagnose/motion/score_test.py", "(count - rank) / rank", "count / rank * 2"),
+        (LEVELS, "strong: float = 6.0", "strong: float = 0.0"),
+        (LEVELS, "chance: float = 0.01", "chance: float = 0.1"),
+        (LEVELS, "described: float = 30.0", "described: float = -1000.0"),
+        (
+            SCORE,
+            "gain - freedom * float(np.log(rest))",
+            "gain - 0.2 * freedom * float(np.log(rest))",
+        ),
+        (SCORE, "- 2 * searched\n    left", "\n    left"),
+        (SCORE, "(rest - freedom) * np.log1p(n)", "rest * np.log1p(n)"),
+        (SCORE, "* rest / freedom", "* n / freedom"),
+        (SCORE, "for t in trials) + several", "for t in trials)"),
+        (SCORE, "if freedom < len(own):", "if False:"),
+        (SCORE, "away @ (weight / weight.sum())", "away[:, 0]"),
+        (SCORE, "weight = np.exp(0.5 * (scores - scores.max()))", "weight = np.ones_like(scores)"),
+        (
+            LIKELIHOOD,
+            "S = self._spectrum(left, 1 - taken)",
+            "S = self._spectrum(left, 1 + 0 * taken)",
+        ),
+        (LIKELIHOOD, "np.sum(np.log(S) + left**2 / S)", "np.sum(left**2 / S)"),
+        (LIKELIHOOD, "kept = values > max(self.linear.least**2,", "kept = values > min(0.0,"),
+        ("diagnose/misfit/structure.py", "(1 - steps / variance)", "(1 - 0.9 * steps / variance)"),
+        ("diagnose/misfit/structure.py", "* len(z) * tried", "* tried"),
         # -- filters -------------------------------------------------------------------------------
         (TRANSITION, "0.5 * (intensity[:-1] + last)", "intensity[:-1]"),
         (TRANSITION, "np.where(moved @ driven,", "np.where(driven,"),

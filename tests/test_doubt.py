@@ -13,8 +13,8 @@ from casest import Residual, attempt, close, load_runs, model, param, quantity, 
 from casest.cli import run
 from casest.data.run import Run
 from casest.demo import WHEEL
-from casest.diagnose.misfit import specification_test
-from casest.diagnose.misfit.specification_test import doubts
+from casest.diagnose.misfit import left
+from casest.diagnose.misfit.left import doubts
 from casest.results.closing import closing_result
 from casest_problems.norm import norm_full, norm_triangular
 from casest_problems.wheel import wheel
@@ -48,14 +48,21 @@ def poses(count=60, noise=5e-3, seed=0):
 def test_an_undeclared_effect_is_seen_and_where():
     found = doubts(attempt(wheel, load_runs([WHEEL], wheel.signals)))
     assert found is not None
-    assert "turn of angle" in found[0].where
+    assert found[0].where == "9 % of it follows angle"
     assert found[0].p_value < 0.0025
 
 
-def test_a_temperature_that_rises_all_the_time_is_named_beside_a_wander():
-    found = doubts(attempt(cell, [transmitter()]))
-    assert found is not None
-    assert found[0].where == "wanders, or varies with temp"
+@pytest.mark.xfail(
+    strict=True,
+    reason="nothing is asked of fewer than 160 rows: means of 20 rows, eight of them at least; the "
+    "pressures come again eight times, but not one after the other, which alone counts as repeats",
+)
+@pytest.mark.parametrize("order", [None, 5])
+def test_a_temperature_that_moves_a_sensor_by_a_hundred_deviations_is_a_doubt(order):
+    """As `close` says of it, which finds both effects."""
+    run = transmitter(None if order is None else np.random.default_rng(order))
+    found = doubts(attempt(cell, [run]))
+    assert any("temp" in f.where for f in found)
 
 
 def test_two_effects_of_one_column_on_a_prediction_without_a_name_are_both_found():
@@ -87,7 +94,7 @@ def test_a_refused_estimate_is_not_asked():
 def test_a_long_record_is_not_asked(monkeypatch):
     """All residuals at once would cost the memory that a fit does not need."""
     found = attempt(norm_triangular.having(norm=sim.GRAVITY), poses())
-    monkeypatch.setattr(specification_test, "LONGEST", 59)
+    monkeypatch.setattr(left, "LONGEST", 59)
     assert doubts(found) is None
 
 
@@ -95,10 +102,10 @@ def test_the_prompt_says_so_first_and_offers_close_alone(tmp_path, capsys):
     assert run(["calibrate", "wheel", str(WHEEL), "-o", str(tmp_path)]) == 0
     head, note = " ".join(capsys.readouterr().out.split()).partition("parameter value")[0::2]
     assert "trusted, but the residual is not noise" in head
-    assert "varies twice per turn of angle" in head
+    assert "9 % of it follows angle" in head
     assert "Next: does the model lack an effect? casest close" in note
     assert "casest apply" not in note
     content = json.loads((tmp_path / "result.json").read_text(encoding="utf-8"))
     assert content["trusted"] is True
-    assert content["misfit"][0]["where"] == "varies twice per turn of angle"
-    assert content["misfit"][0]["p_value"] == pytest.approx(5e-4, rel=0.5)
+    assert content["misfit"][0]["where"] == "9 % of it follows angle"
+    assert content["misfit"][0]["p_value"] < 1e-9

@@ -145,12 +145,16 @@ def test_a_sensor_never_heard_of_is_closed_with_units_and_numbers_of_its_columns
     result = json.loads((out / "result.json").read_text(encoding="utf-8"))
     assert result["verdict"] == "extended"
     (found,) = result["effects"]
-    assert (found["name"], found["column"]) == ("temperature_gain", "tyre temp")
+    assert (found["name"], found["column"]) == ("temperature_gain_curve", "tyre temp")
     k = found["parameters"]["k"]
     assert k["unit"] == "1/K"
     # The distance belongs to a larger tyre: fewer ticks, by the growth from the mean temperature.
     assert abs(k["value"] + 4e-4) < 5 * k["std"] + 4e-4**2 * 15
-    assert found["formula"] == f"u·(1 + k·(tyre temp − {np.mean(T.round(3)):.6g}))"
+    # And of 1/(1 + x) it is x² that bends it: up to eight ticks, of a noise of three.
+    bend = found["parameters"]["bend"]
+    assert abs(bend["value"] - 4e-4**2) < 4 * bend["std"]
+    about = f"(tyre temp − {np.mean(T.round(3)):.6g})"
+    assert found["formula"] == f"u·(1 + k·{about} + bend·{about}²)"
 
 
 BODY = """

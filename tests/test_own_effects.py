@@ -112,11 +112,30 @@ def test_an_effect_with_as_many_unknowns_as_there_are_residuals_is_not_tried():
         assert tried or skipped[-1].reason == "with it there are 8 unknowns for 8 residuals"
 
 
-@pytest.mark.parametrize(("effect", "said"), [(pulse, "start and stop"), (warm_up, "tau")])
-def test_what_is_not_searched_for_is_said(effect, said):
-    found, skipped = candidates(cell, prepared(cell, [recorded()]), [effect])
-    assert not found
-    assert skipped[0].reason == f"its {said} are not searched for"
+def test_moments_of_an_effect_are_searched_for():
+    """Two samples off at either edge would move its size by less than its deviation."""
+    run = recorded()
+    there = (run.time > 12.03) & (run.time < 20.03)
+    closing = close(cell, [shifted(run, 0.02 * there)], catalogue=[pulse])
+    assert [f.candidate.label for f in closing.effects] == ["pulse"]
+    numbers = dict(closing.effects[0].candidate.effect.declarations)
+    assert float(numbers["start"].array) == pytest.approx(12.03, abs=0.25)
+    assert float(numbers["stop"].array) == pytest.approx(20.03, abs=0.25)
+    assert closing.after.values["pulse.k"] == pytest.approx(0.02, abs=4 * 0.005 / np.sqrt(80))
+
+
+def test_a_time_constant_of_an_effect_is_searched_for_and_fitted():
+    """Its size is that of what fades: the offset is the one that it ends at."""
+    run = recorded()
+    warmer = shifted(run, -0.02 * np.exp(-run.time / 6))
+    closing = close(cell, [warmer], catalogue=[warm_up])
+    assert [f.candidate.label for f in closing.effects] == ["warm_up"]
+    for name, truth in (("warm_up.k", -0.02), ("warm_up.tau", 6.0), ("zero", 0.3)):
+        assert abs(closing.after.values[name] - truth) < 4 * closing.after.std[name]
+
+
+def test_neither_is_found_where_nothing_happens():
+    assert close(cell, [recorded()], catalogue=[warm_up, pulse]).effects == ()
 
 
 def test_an_own_effect_finds_its_column():

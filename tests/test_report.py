@@ -99,7 +99,7 @@ def test_a_residual_that_is_no_noise_is_said_at_the_top(browser, tmp_path):
     assert run(["calibrate", "wheel", str(WHEEL), "-o", str(tmp_path)]) == 0
     browser.open(tmp_path / "report.html")
     assert text(browser, "h1").startswith("Trusted, but the residual is not noise")
-    assert "varies twice per turn of angle" in text(browser, "header + .doubt")
+    assert "9 % of it follows angle" in text(browser, "header + .doubt")
 
 
 def test_every_section_is_there_and_the_contents_lead_to_it(browser, closed):

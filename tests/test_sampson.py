@@ -22,7 +22,7 @@ from casest import (
     quantity,
     signal,
 )
-from casest.diagnose.misfit.dependence import variables
+from casest.diagnose.misfit.variables import variables
 from casest.effects import CATALOGUE
 from casest.leastsquares.problem import Problem
 from casest.results.closing import closing_result

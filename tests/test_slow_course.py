@@ -12,8 +12,9 @@ from scipy.signal import butter, lfilter
 
 from casest import Residual, Run, attempt, model, param, quantity, signal
 from casest.cli import run as casest
-from casest.diagnose.misfit.specification_test import COURSES, doubts
-from casest.diagnose.noise.slow_course import COLOUR, FAST, LEAST, MEMORY, SLOW, slow_course
+from casest.diagnose.levels import LEVELS
+from casest.diagnose.misfit.left import doubts
+from casest.diagnose.noise.slow_course import COLOUR, FAST, MEMORY, SLOW, slow_course
 from casest.results.find import find_model
 from casest_problems.norm import norm_triangular
 
@@ -36,7 +37,7 @@ def series(values, **more):
 
 def seen(values):
     found = slow_course(*series(values))
-    return found.p_value < COURSES and found.share >= LEAST
+    return found.p_value < LEVELS.misfit and found.share >= LEVELS.share
 
 
 def filtered(b, a, seed, n=2000):
@@ -117,10 +118,10 @@ def test_the_axis_with_the_course_counts_and_so_do_all_runs():
     rng, t = np.random.default_rng(0), np.arange(500)
     noise = rng.standard_normal((500, 3))
     noise[:, 1] += np.sin(2 * np.pi * t / 150)
-    assert slow_course(*series(noise)).p_value < COURSES
+    assert slow_course(*series(noise)).p_value < LEVELS.misfit
     runs, values = zip(*(series(noise[a:b]) for a, b in ((0, 240), (240, 500))), strict=True)
     both = slow_course([r[0] for r in runs], [v[0] for v in values])
-    assert both.p_value < COURSES
+    assert both.p_value < LEVELS.misfit
 
 
 # -- noise -----------------------------------------------------------------------------------------

@@ -10,9 +10,10 @@ import simulators as sim
 from scipy.spatial.transform import Rotation
 
 from casest import Run, calibrate
-from casest.diagnose.candidates.candidates import candidates
-from casest.diagnose.candidates.score_test import scores, widened
-from casest.diagnose.levels import SURVIVES
+from casest.diagnose.levels import LEVELS
+from casest.diagnose.protocol import ranked, significant
+from casest.diagnose.sensor import Sensor
+from casest.diagnose.visibility import visible
 from casest.effects import cross_axis
 from casest.effects.placing import prepared
 from casest.leastsquares.identifiability import identify
@@ -76,22 +77,18 @@ def test_what_cross_axis_and_radius_need_to_be_seen(setup, cross, radius, both):
     assert counted == (cross, radius, both)
 
 
-def score_of(name, runs):
-    """How much of a candidate's trace survives beside what is declared."""
-    found = calibrate(wheel, runs)
-    ready = prepared(wheel, runs)
-    listed, _ = candidates(wheel, ready, (cross_axis,))
-    wide = widened(wheel, ready, found.values, listed)
-    batches = [np.arange(0, len(run), 100) for run in ready]
-    return {s.candidate.name: s for s in scores(wide, listed, found.noise.sigma, batches)}[name]
-
-
 @pytest.mark.parametrize("name", ["cross_axis", "radius"])
 def test_one_mounting_at_one_tilt_hides_both(name):
     run = spun(ONE, 45, cross=CROSS, radius=0.29, sigma=0.02)
-    score = score_of(name, [run])
-    assert np.all(score.survives < 1e2 * SURVIVES)
-    assert score.p_value > 1e-3  # nothing is "found" although both are wrong
+    ready = prepared(wheel, [run])
+    sensor = Sensor(wheel, ready, (cross_axis,))
+    fit = sensor.fitted(wheel, calibrate(wheel, [run]).values)
+    listed = sensor.found(fit)[0]
+    seen = {v.candidate.name: v for v in visible(sensor.linear(fit), sensor.trials_of(fit, listed))}
+    assert np.all(seen[name].survives < LEVELS.survives)
+    # Nothing is "found" although both are wrong.
+    ranking = ranked(sensor, fit)
+    assert not any(significant(e, ranking.linear) for e in ranking.found)
 
 
 def test_three_mountings_give_both_back():

@@ -1,1 +1,1 @@
-"""What could be missing, and what each would gain, without a refit. Imports noise, levels."""
+"""What could be missing, and the slopes of the residual in it. Imports evidence."""

@@ -1,1 +1,1 @@
-"""Outside the catalogue: a formula of few terms. Imports misfit, selection and below."""
+"""Outside the catalogue: a formula of few terms. Imports candidates, evidence, levels."""

@@ -1,1 +1,1 @@
-"""Is what is left noise? Imports selection, candidates, noise, levels."""
+"""Is what is left noise? Imports candidates, noise, levels."""
