@@ -10,6 +10,7 @@ from casest.results.observability import (
     ObservedMotion,
     ObservedParameters,
     ObservedStructure,
+    combination_words,
     could_reach,
     number_or_not,
     window_words,
@@ -67,8 +68,11 @@ def structure_text(result: ObservedStructure) -> str:
     else:
         lines += [f"  - {words}" for words in free.unobservable]
         lines.append(f"  not determined by any record: {', '.join(free.undetermined)}")
+        lines += [f"  {known}" for known in [combination_words(free)] if known]
     if held.rank < free.rank:
         lines += ["", f"  with {inputs} held constant: rank {held.rank} of {n}"]
         lines += [f"  - {words}" for words in held.unobservable]
         lines.append(f"  then not determined: {', '.join(held.undetermined)}")
+        lines += [f"  {known}" for known in [combination_words(held)] if known]
+    lines += note_lines(result.notes or [])
     return "\n".join(wrapped(lines))

@@ -1,0 +1,134 @@
+"""Rank of the readings' power series by the unknowns, in exact arithmetic modulo a prime.
+
+Sedoglavic (2002): at a random point the rank modulo a prime is never more than the true one, and
+less only where all its minors are multiples of the prime there, which is as likely as their degree
+over the prime.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import casadi as ca
+import numpy as np
+
+from casest.declaration.physics import SX
+from casest.declaration.tracing import flat
+from casest.dynamics.declare import Dynamics
+from casest.dynamics.structural.field import PRIME, Echelon, Residues, spanned
+from casest.dynamics.structural.points import Points, points
+from casest.dynamics.structural.program import Program, program_of
+from casest.dynamics.structural.series import Series
+
+#: Points at once: their series stay within a few hundred megabytes.
+TOGETHER = 8
+
+
+@dataclass(frozen=True)
+class Question:
+    """What is asked of a model: with inputs that vary or not, states that are known at the
+    beginning, and inputs that nobody measures."""
+
+    model: Dynamics
+    varying: bool = True
+    known: tuple[str, ...] = ()
+    unmeasured: tuple[str, ...] = ()
+
+    @cached_property
+    def inputs(self) -> tuple[str, ...]:
+        """Signals that rates or outputs are computed from."""
+        t = self.model.traced
+        used = ca.vertcat(t.f, t.h, t.g)
+        names = [s.name for s in self.model.signals]
+        return tuple(n for n in names if ca.depends_on(used, flat(t.symbols[n])))
+
+    def places(self, names: Sequence[str]) -> list[int]:
+        """Where the numbers of some inputs are among those of all inputs."""
+        found, place = [], 0
+        for name in self.inputs:
+            size = self.model.traced.symbols[name].numel()
+            found += list(range(place, place + size)) if name in names else []
+            place += size
+        return found
+
+    @cached_property
+    def known_places(self) -> list[int]:
+        """Where the states that are known at the beginning are among the unknowns."""
+        where = self.model.slices()
+        return [i for name in self.known for i in range(where[name].start, where[name].stop)]
+
+
+class Exact:
+    """Answers about one model. Raises Inexact where it cannot be computed modulo a prime."""
+
+    def __init__(self, asked: Question, seed: int, extra: SX | None = None) -> None:
+        t = asked.model.traced
+        self.asked, self.n = asked, asked.model.size
+        symbols = [flat(t.symbols[name]) for name in asked.inputs]
+        u = ca.vertcat(*symbols) if symbols else ca.SX(0, 1)
+        told = [t.f, ca.vertcat(t.h, t.g), ca.SX(0, 1) if extra is None else extra]
+        function = ca.Function("model", [t.x, u], [ca.densify(e) for e in told], {"cse": True})
+        self.program: Program = program_of(function)
+        self._rng = np.random.default_rng(seed)
+        self.pool: Points = points(self.program, self.n, u.numel(), self._rng)
+        self._varied = self._series_of_inputs(self.n + 2)
+
+    def _series_of_inputs(self, orders: int) -> Residues:
+        count, m = self.pool.inputs.shape
+        found = np.zeros((count, orders, m), np.int64)
+        if self.asked.varying:
+            found[:] = self._rng.integers(0, PRIME, found.shape)
+        clock = self.asked.places(["t"])
+        found[:, 1:, clock] = 0
+        found[:, 1, clock] = 1
+        return found
+
+    def series(self, which: slice, orders: int) -> Series:
+        """Series at some points of the pool."""
+        free = self.asked.places(self.asked.unmeasured)
+        return Series(self.program, self.pool[which], self._varied[which, :orders], free)
+
+    @cached_property
+    def reached(self) -> int:
+        """The order of the readings' derivatives from which on none adds to their rank.
+
+        Of unmeasured inputs that order is n: what the readings say of the states whatever these
+        were grows with each of n orders, or not any more.
+        """
+        series = self.series(slice(0, 1), self.n + 1)
+        found = Echelon(series.unknowns)
+        free = bool(self.asked.unmeasured)
+        for order in range(self.n + 1):
+            before = found.rank
+            series.forward()
+            for row in series.output(1)[0]:
+                found.add(row)
+            # Once an order adds nothing, none after it does: each derivative of the rows is then
+            # a combination of those before it.
+            if not free and (found.rank == before or found.rank == series.unknowns):
+                return order
+        return self.n
+
+    def hidden(self, which: slice) -> list[Residues]:
+        """At each of some points a basis (n, k) of what changes no reading."""
+        series = self.series(which, self.reached + 1)
+        rows = []
+        for _ in range(self.reached + 1):
+            series.forward()
+            rows.append(series.output(1))
+        stacked = np.concatenate(rows, axis=1)
+        return [self._null(own) for own in stacked]
+
+    def _null(self, rows: Residues) -> Residues:
+        known = np.zeros((len(self.asked.known_places), rows.shape[1]), np.int64)
+        known[range(len(known)), self.asked.known_places] = 1
+        null = spanned(np.concatenate([known, rows])).null()[: self.n]
+        return null if not self.asked.unmeasured else spanned(null.T).rows.T
+
+    def gradients(self, which: slice) -> Residues:
+        """Of the extra functions at some points, (count, rows, n)."""
+        series = self.series(which, 1)
+        series.forward()
+        return series.output(2)[..., : self.n]
