@@ -129,10 +129,27 @@ def observe_parameters(
     )
 
 
-def observe_structure(model: Dynamics, *, command: str = "") -> ObservedStructure:
-    """What any record could show: structural rank with inputs that vary freely, or held."""
-    free = structure(model)
-    held = structure(model, varying=False) if free.inputs else free
+def observe_structure(
+    model: Dynamics,
+    *,
+    known: Sequence[str] = (),
+    unmeasured: Sequence[str] = (),
+    experiments: int = 1,
+    command: str = "",
+) -> ObservedStructure:
+    """What any record could show: structural rank with inputs that vary freely, or held.
+
+    `known` states at the beginning, `unmeasured` inputs and several `experiments` as in
+    `structure`.
+    """
+
+    def ranked(varying: bool) -> Structure:
+        return structure(
+            model, varying=varying, known=known, unmeasured=unmeasured, experiments=experiments
+        )
+
+    free = ranked(varying=True)
+    held = ranked(varying=False) if free.inputs else free
     return ObservedStructure(
         model=model.name,
         notes=[f"not in exact arithmetic: {free.rounded}"] if free.rounded else [],

@@ -26,7 +26,8 @@ from casest.errors import UsageError
 class Structure:
     """Structural rank among n states and parameters.
 
-    `undetermined` are those that no record can show, `unobservable` says in words how they may
+    `undetermined` are those that no record can show, after them inputs that were not measured and
+    cannot be found either; `unobservable` says in words how they may
     change without a trace, `combinations` which functions of them are determined all the same
     (locally; `more` of them have no short formula); `order` is that of the highest derivative of
     the readings used; `varying` whether inputs were free functions of time, `inputs` their names.
@@ -96,23 +97,25 @@ def structure(
     known: Sequence[str] = (),
     unmeasured: Sequence[str] = (),
     experiments: int = 1,
+    per_run: Sequence[str] = (),
     seed: int = 0,
 ) -> Structure:
     """Structural rank of a model, from power series of its readings at random points.
 
     `varying`: inputs with free derivatives of every order; else constant. `known`: states whose
     value at the beginning is known. `unmeasured`: inputs that vary and nobody knows. `experiments`:
-    so many records with the same parameters (states without rate and noise), each with states and
-    inputs of its own; those of the second are called `x (2)`.
+    so many records with the same parameters (states without rate and noise that are not
+    `per_run`), each with states and inputs of its own; those of the second are called `x (2)`, and
+    are known or not measured as those of the first.
 
     Exact, modulo a prime, where rates and outputs are made of arithmetic, roots, exponentials,
     logarithms, sines and what follows from them; else in floating point, and `rounded` says why.
     Raises DeclarationError where no point is found at which the readings' derivatives are finite,
     UsageError for names that are not the model's.
     """
-    model = several(model, experiments)
-    asked = Question(model, varying, tuple(known), tuple(unmeasured))
-    _checked(asked)
+    _checked(Question(model, varying, tuple(known), tuple(unmeasured)), per_run)
+    model, copies = several(model, experiments, per_run)
+    asked = Question(model, varying, copies(known), copies(unmeasured))
     floating.finite(model)
     try:
         return _exactly(asked, Exact(asked, seed))
@@ -126,13 +129,13 @@ def structure(
         hidden = tuple(words(model, one) for one in found.hidden)
         return Structure(
             model, found.rank, found.order, found.gap, found.undetermined, hidden, varying,
-            asked.inputs, rounded=str(why),
+            asked.measured, rounded=str(why),
         )  # fmt: skip
 
 
-def _checked(asked: Question) -> None:
+def _checked(asked: Question, per_run: Sequence[str]) -> None:
     model = asked.model
-    for name in asked.known:
+    for name in (*asked.known, *per_run):
         _ = model[name]
     for name in asked.unmeasured:
         if name not in asked.inputs or name == "t":
@@ -145,6 +148,7 @@ def _exactly(asked: Question, exact: Exact) -> Structure:
     null = exact.hidden(slice(0, 1))[0]
     hidden = [bool(row.any()) for row in null]
     undetermined = tuple(n for n, h in zip(model.names, hidden, strict=True) if h)
+    inputs = exact.hidden_inputs() if asked.unmeasured else ()
     sentences: list[str] = []
     formulas: list[str] = []
     more = 0
@@ -161,8 +165,8 @@ def _exactly(asked: Question, exact: Exact) -> Structure:
             formulas += found.formulas
             more += found.more
     return Structure(
-        model, model.size - null.shape[1], exact.reached, np.inf, undetermined, tuple(sentences),
-        asked.varying, asked.inputs, tuple(formulas), more, _question=asked,
+        model, model.size - null.shape[1], exact.reached, np.inf, undetermined + inputs, tuple(sentences),
+        asked.varying, asked.measured, tuple(formulas), more, _question=asked,
     )  # fmt: skip
 
 

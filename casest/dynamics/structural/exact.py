@@ -53,6 +53,11 @@ class Question:
             place += size
         return found
 
+    @property
+    def measured(self) -> tuple[str, ...]:
+        """Inputs that are known."""
+        return tuple(name for name in self.inputs if name not in self.unmeasured)
+
     @cached_property
     def known_places(self) -> list[int]:
         """Where the states that are known at the beginning are among the unknowns."""
@@ -78,8 +83,8 @@ class Exact:
     def _series_of_inputs(self, orders: int) -> Residues:
         count, m = self.pool.inputs.shape
         found = np.zeros((count, orders, m), np.int64)
-        if self.asked.varying:
-            found[:] = self._rng.integers(0, PRIME, found.shape)
+        vary = range(m) if self.asked.varying else self.asked.places(self.asked.unmeasured)
+        found[:, :, vary] = self._rng.integers(0, PRIME, (count, orders, len(vary)))
         clock = self.asked.places(["t"])
         found[:, 1:, clock] = 0
         found[:, 1, clock] = 1
@@ -112,7 +117,22 @@ class Exact:
         return self.n
 
     def hidden(self, which: slice) -> list[Residues]:
-        """At each of some points a basis (n, k) of what changes no reading."""
+        """At each of some points a basis (n, k) of how the unknowns change without a trace."""
+        found = [null[: self.n] for null in self._nulls(which)]
+        return [spanned(null.T).rows.T for null in found] if self.asked.unmeasured else found
+
+    def hidden_inputs(self) -> tuple[str, ...]:
+        """Unmeasured inputs that no record determines, number by number."""
+        names = [
+            name if size == 1 else f"{name}[{i}]"
+            for name in self.asked.unmeasured
+            for size in [self.asked.model.traced.symbols[name].numel()]
+            for i in range(size)
+        ]
+        null = self._nulls(slice(0, 1))[0][self.n :: self.reached + 1]
+        return tuple(n for n, row in zip(names, null, strict=True) if row.any())
+
+    def _nulls(self, which: slice) -> list[Residues]:
         series = self.series(which, self.reached + 1)
         rows = []
         for _ in range(self.reached + 1):
@@ -124,8 +144,7 @@ class Exact:
     def _null(self, rows: Residues) -> Residues:
         known = np.zeros((len(self.asked.known_places), rows.shape[1]), np.int64)
         known[range(len(known)), self.asked.known_places] = 1
-        null = spanned(np.concatenate([known, rows])).null()[: self.n]
-        return null if not self.asked.unmeasured else spanned(null.T).rows.T
+        return spanned(np.concatenate([known, rows])).null()
 
     def gradients(self, which: slice) -> Residues:
         """Of the extra functions at some points, (count, rows, n)."""

@@ -2,28 +2,38 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
 from casest.dynamics.declare import Constraint, Dynamics, Measured, Motion
 from casest.errors import UsageError
 
+#: The names that some names have in all records.
+Copies = Callable[[Sequence[str]], tuple[str, ...]]
 
-def several(model: Dynamics, count: int) -> Dynamics:
-    """A model of `count` records at once. Parameters are states without a rate and noise."""
+
+def several(model: Dynamics, count: int, per_run: Sequence[str] = ()) -> tuple[Dynamics, Copies]:
+    """A model of `count` records at once. Parameters, states without a rate and noise, are shared
+    but for `per_run`."""
     if count < 1:
         raise UsageError(f"{model.name}: experiments={count}: there must be one at least")
-    if count == 1:
-        return model
     t, where = model.traced, model.slices()
     shared = {
-        s.name for s in model.states if not s.intensity and t.f[where[s.name]].is_zero()
+        s.name for s in model.states if s.name not in per_run and not s.intensity and t.f[where[s.name]].is_zero()
     }  # fmt: skip
     names = [*(s.name for s in model.signals), *(s.name for s in model.states)]
     own = [name for name in names if name not in shared]
 
     def named(name: str, k: int) -> str:
         return f"{name} ({k})" if k > 1 and name in own else name
+
+    def copies(some: Sequence[str]) -> tuple[str, ...]:
+        every = [named(name, k) for k in range(1, count + 1) for name in some]
+        return tuple(dict.fromkeys(every))
+
+    if count == 1:
+        return model, copies
 
     def function(**given: Any) -> Motion:
         rates: dict[str, Any] = {}
@@ -45,6 +55,5 @@ def several(model: Dynamics, count: int) -> Dynamics:
         ]  # fmt: skip
         return tuple(found)
 
-    return replace(
-        model, function=function, signals=repeated(model.signals), states=repeated(model.states)
-    )
+    signals, states = repeated(model.signals), repeated(model.states)
+    return replace(model, function=function, signals=signals, states=states), copies
