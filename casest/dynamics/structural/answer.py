@@ -18,7 +18,7 @@ from casest.dynamics.structural.experiments import several
 from casest.dynamics.structural.field import PRIME, Residues
 from casest.dynamics.structural.laws import laws, sparse
 from casest.dynamics.structural.program import Inexact
-from casest.dynamics.structural.words import words
+from casest.dynamics.structural.words import listed, words
 from casest.errors import UsageError
 
 
@@ -159,14 +159,16 @@ def _exactly(asked: Question, exact: Exact) -> Structure:
         sentences = [words(model, law) for law in found_laws]
         settled = [i for i, h in enumerate(hidden) if not h]
         for group in groups(bases[0]):
-            if any(found_laws[k].says_all for k in group.hidden):
+            if all(found_laws[k].says_all for k in group.hidden):
                 continue
             found = combinations(group, model.names, settled, told)
             formulas += found.formulas
             more += found.more
+    if asked.unmeasured:
+        sentences = [f"{s} while {listed(asked.unmeasured)} is free" for s in sentences]
     return Structure(
-        model, model.size - null.shape[1], exact.reached, np.inf, undetermined + inputs, tuple(sentences),
-        asked.varying, asked.measured, tuple(formulas), more, _question=asked,
+        model, model.size - null.shape[1], exact.reached, np.inf, undetermined + inputs,
+        tuple(sentences), asked.varying, asked.measured, tuple(formulas), more, _question=asked,
     )  # fmt: skip
 
 

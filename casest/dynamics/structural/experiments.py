@@ -18,10 +18,9 @@ def several(model: Dynamics, count: int, per_run: Sequence[str] = ()) -> tuple[D
     but for `per_run`."""
     if count < 1:
         raise UsageError(f"{model.name}: experiments={count}: there must be one at least")
-    t, where = model.traced, model.slices()
-    shared = {
-        s.name for s in model.states if s.name not in per_run and not s.intensity and t.f[where[s.name]].is_zero()
-    }  # fmt: skip
+    f, where = model.traced.f, model.slices()
+    still = [s.name for s in model.states if not s.intensity and f[where[s.name]].is_zero()]
+    shared = set(still) - set(per_run)
     names = [*(s.name for s in model.signals), *(s.name for s in model.states)]
     own = [name for name in names if name not in shared]
 
