@@ -342,7 +342,9 @@ def experiments() -> list[str]:
             published_count = counts[min(n - 3, len(counts) - 1)]
             count, took = enough(compartments(graph, n), 7)
             agrees = "yes" if count == published_count else "**no**"
-            rows.append([graph.__name__, str(n), f"{count} ({published_count})", f"{took:.1f}", agrees])
+            rows.append(
+                [graph.__name__, str(n), f"{count} ({published_count})", f"{took:.1f}", agrees]
+            )
             print(*rows[-1], flush=True)
     text = [
         "## Experiments that are enough",

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -44,11 +45,28 @@ class Question:
         names = [s.name for s in self.model.signals]
         return tuple(n for n in names if ca.depends_on(used, flat(t.symbols[n])))
 
+    @cached_property
+    def free(self) -> dict[str, SX]:
+        """What is free in each input: all its numbers, of a rotation three (Cayley)."""
+        turned = {s.name for s in self.model.signals if s.kind == "rotation"}
+        symbols = self.model.traced.symbols
+        return {n: ca.SX.sym(n, 3) if n in turned else flat(symbols[n]) for n in self.inputs}
+
+    def told(self, extra: SX | None) -> Any:
+        """The function of states and of what is free in the inputs: rates, readings, `extra`."""
+        t = self.model.traced
+        told = [t.f, ca.vertcat(t.h, t.g), ca.SX(0, 1) if extra is None else extra]
+        for name, c in self.free.items():
+            if (symbol := t.symbols[name]).shape == (3, 3):
+                told = ca.substitute(told, [flat(symbol)], [flat(_rotation(c))])
+        u = ca.vertcat(*self.free.values()) if self.free else ca.SX(0, 1)
+        return ca.Function("model", [t.x, u], [ca.densify(e) for e in told], {"cse": True})
+
     def places(self, names: Sequence[str]) -> list[int]:
         """Where the numbers of some inputs are among those of all inputs."""
         found, place = [], 0
-        for name in self.inputs:
-            size = self.model.traced.symbols[name].numel()
+        for name, symbol in self.free.items():
+            size = symbol.numel()
             found += list(range(place, place + size)) if name in names else []
             place += size
         return found
@@ -65,19 +83,21 @@ class Question:
         return [i for name in self.known for i in range(where[name].start, where[name].stop)]
 
 
+def _rotation(c: SX) -> SX:
+    """The rotation with Cayley's parameters c: rational in them, and almost every one."""
+    square = ca.dot(c, c)
+    return ((1 - square) * ca.SX.eye(3) + 2 * ca.skew(c) + 2 * c @ c.T) / (1 + square)
+
+
 class Exact:
     """Answers about one model. Raises Inexact where it cannot be computed modulo a prime."""
 
     def __init__(self, asked: Question, seed: int, extra: SX | None = None) -> None:
-        t = asked.model.traced
         self.asked, self.n = asked, asked.model.size
-        symbols = [flat(t.symbols[name]) for name in asked.inputs]
-        u = ca.vertcat(*symbols) if symbols else ca.SX(0, 1)
-        told = [t.f, ca.vertcat(t.h, t.g), ca.SX(0, 1) if extra is None else extra]
-        function = ca.Function("model", [t.x, u], [ca.densify(e) for e in told], {"cse": True})
-        self.program: Program = program_of(function)
+        told = asked.told(extra)
+        self.program: Program = program_of(told)
         self._rng = np.random.default_rng(seed)
-        self.pool: Points = points(self.program, self.n, u.numel(), self._rng)
+        self.pool: Points = points(self.program, self.n, told.numel_in(1), self._rng)
         self._varied = self._series_of_inputs(self.n + 2)
 
     def _series_of_inputs(self, orders: int) -> Residues:
@@ -126,7 +146,7 @@ class Exact:
         names = [
             name if size == 1 else f"{name}[{i}]"
             for name in self.asked.unmeasured
-            for size in [self.asked.model.traced.symbols[name].numel()]
+            for size in [self.asked.free[name].numel()]
             for i in range(size)
         ]
         null = self._nulls(slice(0, 1))[0][self.n :: self.reached + 1]
