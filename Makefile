@@ -6,7 +6,7 @@ READY := $(VENV)/.ready
 
 .PHONY: demo test lint types format wheel bench study study-starts study-nist study-loop \
 	study-motion study-records study-asked study-slow study-coverage study-deceptive study-mutation \
-	figures docs clean
+	study-structural figures docs clean
 
 demo: $(READY)
 	$(BIN)/casest demo
@@ -67,6 +67,9 @@ study-deceptive: $(READY)
 
 study-records: $(READY)
 	$(BIN)/python studies/records.py
+
+study-structural: $(READY)
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python studies/structural.py
 
 study-mutation: $(READY)
 	$(BIN)/python studies/mutation.py

@@ -203,6 +203,7 @@ def cases() -> Iterator[Case]:
         "HIV, infection rate eta(t) unknown", "Martinelli, arXiv:2304.14288", hiv,
         {"unmeasured": ["eta"]}, {"Tu", "Ti", "N", "delta", "eta"},
     )  # fmt: skip
+    yield from glucose()
     two = system(
         "two compartments",
         "x1' = -(k1e + k12)*x1 + k21*x2 + b*u; x2' = k12*x1 - k21*x2; y = x1",
@@ -216,9 +217,20 @@ def cases() -> Iterator[Case]:
     )  # fmt: skip
 
 
-def parameters(found: Structure, names: Sequence[str]) -> list[str]:
-    """Those of some names that are not determined."""
-    return [n for n in names if n in found.undetermined]
+def glucose() -> Iterator[Case]:
+    """The βIG model of glucose G, insulin I and beta cells B, whose powers are no whole numbers;
+    p and si unknown, the rest known (values of Karin et al. 2016)."""
+    equations = (
+        "G' = 1/30 + u - (0.001 + si*I)*G; "
+        "B' = B*(0.021/1440/(1 + (8.4/G)^1.7) - 0.025/1440/(1 + (G/4.8)^8.5)); "
+        "I' = p*B*G^2/(7.85^2 + G^2) - 0.3*I; "
+    )
+    source = "Villaverde & Banga, PLoS Comput. Biol. 13 (2017) e1005878 (STRIKE-GOLDD)"
+    seen = system("glucose", equations + "y = G", ["u"])
+    yield Case("βIG, glucose measured", source, seen, {}, {"B", "I", "p", "si"})
+    yield Case("βIG, glucose measured, p known", source, seen, {"known": ["p"]}, {"B", "I", "si"})
+    every = system("all", equations + "y1 = G; y2 = I; y3 = B", ["u"])
+    yield Case("βIG, glucose, insulin and cells measured", source, every, {}, set())
 
 
 def compartments(graph: Callable[[int], list[list[int]]], n: int) -> Published:
@@ -266,7 +278,7 @@ def lost(found: Structure, names: Sequence[str]) -> int:
     """How many directions of the parameters are hidden: their number less the rank they add to
     what the initial states alone have."""
     alone = [n for n in found.model.names if n not in names]
-    fixed = structure(found.model, varying=False, known=[n for n in names])
+    fixed = structure(found.model, varying=False, known=names)
     hidden_states = len(alone) - (fixed.rank - len(names))
     return found.unknowns - found.rank - hidden_states
 
@@ -282,9 +294,10 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
 
 def main() -> None:
     """Compare everything, write the page."""
-    rows, agreed, times = [], 0, []
+    rows, agreed, functions, times = [], 0, 0, []
     for model in published(MODELS.read_text(encoding="utf-8")):
         row, agrees, took = compared(model)
+        functions += len(model.determined)
         rows.append(row)
         agreed += agrees
         times.append(took)
@@ -298,8 +311,8 @@ def main() -> None:
         "Formulas: functions of what is not determined that casest finds, of all that there are",
         "independent of each other.",
         "",
-        f"**{agreed} of {len(rows)} models agree in everything**; the slowest takes "
-        f"{max(times):.2f} s, all {sum(times):.1f} s, on one core.",
+        f"**{agreed} of {len(rows)} models agree in everything**, {functions} published functions "
+        f"among it; the slowest takes {max(times):.2f} s, all {sum(times):.1f} s, on one core.",
         "",
         *table(
             [
@@ -326,7 +339,8 @@ def other_questions() -> list[str]:
         found = structure(case.model.declared(), **case.asked)
         agrees = set(found.undetermined) == case.hidden
         shown = ", ".join(found.undetermined) or "none"
-        rows.append([case.words, shown, "yes" if agrees else "**no**", case.source])
+        words = case.words + (" (in floating point)" if found.rounded else "")
+        rows.append([words, shown, "yes" if agrees else "**no**", case.source])
         print(*rows[-1], flush=True)
     head = ["question", "not determined", "as published", "published in"]
     lines = ["## Known, unmeasured, constant", "", *table(head, rows)]

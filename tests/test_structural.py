@@ -337,6 +337,14 @@ def test_what_has_no_exact_answer_is_said_with_the_reason(reading, why):
     assert np.isfinite(found.gap)
 
 
+def test_a_rounded_answer_takes_known_states():
+    model = moving(lambda a, b, c: [-fabs(b * c)], lambda a, b, c: a, *"abc")
+    assert structure(model).undetermined == ("b", "c")
+    found = structure(model, known=["c"])
+    assert "fabs" in found.rounded
+    assert found.observable
+
+
 def test_exponents_that_differ_by_a_number_are_in_proportion():
     """exp(a + 1)/exp(a) is e wherever a is: c and d are seen as c·e + d."""
     model = moving(lambda a, c, d: [-a], lambda a, c, d: c * exp(a + 1) + d * exp(a), *"acd")
@@ -542,10 +550,10 @@ def test_a_question_about_what_is_not_there_is_refused(asked, why):
         structure(lotka_volterra(["prey"]), **asked)
 
 
-def test_only_an_exact_answer_takes_known_states():
-    model = moving(lambda a, b: [-fabs(b)], lambda a, b: a, *"ab")
+def test_only_an_exact_answer_takes_inputs_that_are_not_measured():
+    model = moving(lambda a, b, w: [w - fabs(b)], lambda a, b, w: a, *"ab", inputs="w")
     with pytest.raises(UsageError, match="asks for exact arithmetic, and fabs has no power"):
-        structure(model, known=["a"])
+        structure(model, unmeasured=["w"])
     with pytest.raises(UsageError, match="motion: not known exactly: fabs has no power series"):
         structure(model).determines(lambda a: a)
 

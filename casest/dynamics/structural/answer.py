@@ -120,12 +120,11 @@ def structure(
     try:
         return _exactly(asked, Exact(asked, seed))
     except Inexact as why:
-        if asked.unmeasured or asked.known:
+        if asked.unmeasured:
             raise UsageError(
-                f"{model.name}: what is known beforehand or not measured asks for exact "
-                f"arithmetic, and {why}"
+                f"{model.name}: an input that is not measured asks for exact arithmetic, and {why}"
             ) from None
-        found = floating.ranked(model, varying, seed)
+        found = floating.ranked(model, varying, seed, asked.known_places)
         hidden = tuple(words(model, one) for one in found.hidden)
         return Structure(
             model, found.rank, found.order, found.gap, found.undetermined, hidden, varying,

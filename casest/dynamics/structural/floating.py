@@ -47,8 +47,11 @@ def finite(model: Dynamics) -> None:
     _Lie(model, varying=True).points(np.random.default_rng(0), 1)
 
 
-def ranked(model: Dynamics, varying: bool, seed: int) -> Ranked:
-    """Structural rank of a model, from Lie derivatives at random points."""
+def ranked(model: Dynamics, varying: bool, seed: int, known: Sequence[int] = ()) -> Ranked:
+    """Structural rank of a model, from Lie derivatives at random points.
+
+    `known` are the places of states whose value at the beginning is known.
+    """
     lie = _Lie(model, varying)
     points = lie.points(np.random.default_rng(seed), POINTS)
     rank, order = 0, -1
@@ -60,6 +63,11 @@ def ranked(model: Dynamics, varying: bool, seed: int) -> Ranked:
         # then a combination of those before it.
         if rank in (before, model.size):
             break
+    if known:  # each is one more reading, at the beginning alone
+        beside = np.eye(model.size)[list(known)]
+        stacked = [np.vstack([lie.jacobian(order, point), beside]) for point in points]
+        found = [_ranked(one) for one in stacked]
+        rank = max(r for r, _, _ in found)
     best = [k for k, (r, _, _) in enumerate(found) if r == rank]
     nulls = [found[k][2] for k in best]
     hidden = np.max([np.linalg.norm(N, axis=1) for N in nulls], axis=0) > 1e-6

@@ -161,18 +161,24 @@ class Program:
         return self._known["angle", quotient]
 
 
+#: A number is taken for a fraction if numerator times denominator is at most this: one that is none
+#: is as near to such a fraction as rounding about once in 10⁵ times.
+HEIGHT = 1e10
+
+
 def short(value: float) -> Fraction | None:
     """The fraction of small numbers that a value is but for rounding; None: it is none."""
     if not math.isfinite(value):
         return None
-    found = Fraction(value).limit_denominator(10_000)
+    largest = math.sqrt(HEIGHT / abs(value)) if value else 1.0
+    found = Fraction(value).limit_denominator(max(1, int(min(largest, 1e12))))
     return found if math.isclose(float(found), value, rel_tol=4e-16) else None
 
 
 def written(value: float) -> Fraction | None:
     """The fraction that a number of the model was written as; None: it must have been rounded.
 
-    1/3 and 0.25 and 9.80665 are exact, 0.8660254037844386 and 3.141592653589793 are not.
+    1/3 and 0.021/1440 and 9.80665 are exact, 0.8660254037844386 and 3.141592653589793 are not.
     """
     found = short(value)
     if found is not None or not math.isfinite(value):
