@@ -33,7 +33,7 @@ from casest.dynamics.declare import Dynamics, State
 from casest.dynamics.structural import floating, structure
 from casest.dynamics.structural.field import PRIME, fraction, inverse, power, residue, root
 from casest.dynamics.structural.points import points
-from casest.dynamics.structural.program import program_of
+from casest.dynamics.structural.program import Inexact, program_of
 from casest.dynamics.structural.series import Series
 from casest_problems.bias_gravity import bias_gravity, bias_gravity_position
 
@@ -328,6 +328,7 @@ def test_functions_that_are_not_rational_have_the_rank_of_floating_point(name, v
         (lambda a, b: log(a) + b * log(a * a), "one logarithm or angle is a combination"),
         (lambda a, b: sin(a) + b * sin(a + np.pi / 2), "exponents differ by constants"),
         (lambda a, b: exp(log(a) / 3) * b, "a fraction of a logarithm"),
+        (lambda a, b: exp(a) + b * exp(np.pi * a), "in no simple proportion"),
     ],
 )
 def test_what_has_no_exact_answer_is_said_with_the_reason(reading, why):
@@ -343,6 +344,22 @@ def test_a_rounded_answer_takes_known_states():
     found = structure(model, known=["c"])
     assert "fabs" in found.rounded
     assert found.observable
+
+
+def test_a_model_that_divides_by_nothing_has_no_point():
+    steps = program(lambda x: ([1], 1 / (1 - sin(x[0]) ** 2 - cos(x[0]) ** 2)), 1)
+    with pytest.raises(Inexact, match="too few points at which nothing is divided by zero"):
+        points(steps, 1, 0, np.random.default_rng(0))
+
+
+def test_a_long_sum_has_an_exponential():
+    """Steps by the thousand are followed one after the other."""
+    model = moving(
+        lambda a, b: [-b],
+        lambda a, b: exp(-1e-9 * sum((a * b + k) ** 2 for k in range(800))),
+        *"ab",
+    )
+    assert structure(model).rank == 2
 
 
 def test_exponents_that_differ_by_a_number_are_in_proportion():

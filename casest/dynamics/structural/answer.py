@@ -27,12 +27,12 @@ class Structure:
     """Structural rank among n states and parameters.
 
     `undetermined` are those that no record can show, after them inputs that were not measured and
-    cannot be found either; `unobservable` says in words how they may
-    change without a trace, `combinations` which functions of them are determined all the same
-    (locally; `more` of them have no short formula); `order` is that of the highest derivative of
-    the readings used; `varying` whether inputs were free functions of time, `inputs` their names.
-    `rounded` says why the rank is one of floating-point numbers (empty: it is exact); `gap` is then
-    the smallest singular value that counts over the largest that does not.
+    cannot be found either; `unobservable` says in words how they may change without a trace,
+    `combinations` which functions of them are determined all the same, locally (`more` of them have
+    no short formula). `order` is that of the highest derivative of the readings used; `varying`
+    whether inputs were free functions of time, `inputs` their names. `rounded` says why the rank is
+    one of floating-point numbers (empty: it is exact); `gap` is then the smallest singular value
+    that counts over the largest that does not, and infinite where it is exact.
     """
 
     model: Dynamics

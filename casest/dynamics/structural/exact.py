@@ -119,8 +119,8 @@ class Exact:
     def reached(self) -> int:
         """The order of the readings' derivatives from which on none adds to their rank.
 
-        Of unmeasured inputs that order is n: what the readings say of the states whatever these
-        were grows with each of n orders, or not any more.
+        Of unmeasured inputs that order is n: what the readings say of the states, whatever these
+        were, no later derivative adds to (Di Benedetto, Grizzle & Moog 1989).
         """
         series = self.series(slice(0, 1), self.n + 1)
         found = Echelon(series.unknowns)

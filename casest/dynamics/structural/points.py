@@ -27,10 +27,11 @@ from casest.dynamics.structural.field import (
     spanned,
 )
 from casest.dynamics.structural.program import Begin, Inexact, Program
+from casest.dynamics.structural.turns import multiple, times, turn
 
-#: Points in a pool without roots. Even roots double it, up to so many: each exists at every second
-#: point.
-POOL, ROOTS = 128, 8
+#: Points in a pool without roots, and how many must be left. Even roots double the pool, up to so
+#: many: each exists at every second point.
+POOL, LEFT, ROOTS = 128, 70, 8
 
 
 @dataclass(frozen=True)
@@ -56,10 +57,14 @@ def points(program: Program, states: int, inputs: int, rng: np.random.Generator)
     while True:
         start = _Start(program, states, inputs, POOL << even, rng, scales)
         try:
-            return start.points()
+            found = start.points()
         except _Halved as again:
             # A later exponent is a fraction of an earlier one: the earlier begins as a power.
             scales[again.path] = scales.get(again.path, 1) * again.times
+            continue
+        if len(found.states) < LEFT:
+            raise Inexact("there are too few points at which nothing is divided by zero")
+        return found
 
 
 class _Halved(Exception):
@@ -109,7 +114,11 @@ class _Start:
 
     def points(self) -> Points:
         """Points at which every step has a value."""
-        values = [self.value(i) for i in range(len(self.program.steps))]
+        values = []
+        for i in range(len(self.program.steps)):
+            values.append(self.value(i))
+            if self.program.begins:  # in order: asked for at the end of a long sum, it would nest
+                self.tangent(i)
         stacked = np.array(values, np.int64).reshape(len(values), self.count)
         kept = self.good
         return Points(self.x[:, kept].T, self.u[:, kept].T, stacked[:, kept])
@@ -198,14 +207,20 @@ class _Start:
         return d[0] * inverse(v) % PRIME
 
     def _shares(self, basis: Sequence[Residues], tangent: Residues) -> list[Fraction] | None:
-        """Rational shares of other tangents in one; None: it is independent of them."""
+        """Rational shares of other tangents in one; None: it is independent of them.
+
+        The others stay independent also with irrational shares, so that these are the only ones.
+        """
         where = np.flatnonzero(self.good)[: 2 * len(basis) + 8]
         columns = np.array([b[where] for b in basis] + [tangent[where]])
         null = spanned(columns.T).null()
         if not null.size:
             return None
         shares = [fraction(int(-value % PRIME)) for value in null[:-1, 0]]
-        return [s for s in shares if s is not None] if None not in shares else None
+        rational = [s for s in shares if s is not None]
+        if len(rational) < len(shares):
+            raise Inexact("exponents or roots are in no simple proportion")
+        return rational
 
     def _begin_roots(self, of: tuple[int, ...], tangent: Residues) -> None:
         """All constant powers of one value, from one root of it."""
@@ -229,10 +244,10 @@ class _Start:
         scale = self.scales.get(begin.paths[0], 1)
         part = pow(scale, -1, PRIME)
         free = self.random()
-        e: tuple[Residues, ...] = _turn(free) if group == "circle" else (free,)
+        e: tuple[Residues, ...] = turn(free) if group == "circle" else (free,)
         w = self.value(begin.of[0]) * part % PRIME
         self.basis.append(_Basis(begin, group, w, e, tangent * part % PRIME))
-        self._keep(begin, _power(e, scale))
+        self._keep(begin, multiple(e, scale))
 
     def _keep(self, begin: Begin, e: Sequence[Residues]) -> None:
         self._values.update(zip(begin.paths, e, strict=True))
@@ -251,9 +266,9 @@ class _Start:
                     raise Inexact("an exponent is a fraction of a logarithm or an angle")
                 raise _Halved(of.begin.paths[0], share.denominator)
             if share:
-                e = _times(e, _power(self._of(of), share.numerator))
+                e = times(e, multiple(self._of(of), share.numerator))
                 rest = (rest - share.numerator * of.exponent) % PRIME
-        return _times(e, self._of_constant(rest, group))
+        return times(e, self._of_constant(rest, group))
 
     def _of(self, basis: _Basis) -> tuple[Residues, ...]:
         """exp(l): of an angle, the cosine and sine that it has."""
@@ -276,32 +291,7 @@ class _Start:
             return (one, 0 * one) if group == "circle" else (one,)
         free = one * int(self.rng.integers(1, PRIME))
         if number not in self._constants:
-            self._constants[number] = _turn(free) if group == "circle" else (free,)
+            self._constants[number] = turn(free) if group == "circle" else (free,)
         if len(self._constants[number]) != (2 if group == "circle" else 1):
             raise Inexact("exponents differ by constants")
         return self._constants[number]
-
-
-def _turn(t: Residues) -> tuple[Residues, Residues]:
-    """A point of the circle: cosine and sine of an angle with the tangent of its half t."""
-    square = t * t % PRIME
-    under = inverse((1 + square) % PRIME)
-    return (1 - square) % PRIME * under % PRIME, 2 * t * under % PRIME
-
-
-def _times(a: Sequence[Residues], b: Sequence[Residues]) -> tuple[Residues, ...]:
-    """exp(l) of a sum of exponents: product of numbers, or of turns."""
-    if len(a) == 1:
-        return (a[0] * b[0] % PRIME,)
-    cos = (a[0] * b[0] % PRIME - a[1] * b[1] % PRIME) % PRIME
-    return cos, (a[0] * b[1] % PRIME + a[1] * b[0] % PRIME) % PRIME
-
-
-def _power(e: Sequence[Residues], exponent: int) -> tuple[Residues, ...]:
-    if len(e) == 1:
-        return (power(e[0], exponent),)
-    base = (e[0], e[1] if exponent > 0 else -e[1] % PRIME)
-    found: tuple[Residues, ...] = base
-    for _ in range(abs(exponent) - 1):
-        found = _times(found, base)
-    return found
