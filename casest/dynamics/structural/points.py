@@ -2,13 +2,13 @@
 
 exp(w) is a residue of its own, algebraically independent of w, unless w is a combination of other
 exponents and logarithms with rational coefficients (Ax 1971; Rosenlicht 1976). Such combinations
-are looked for in tangents at many points at once, and kept: exp(2w) is exp(w)², and cosine and sine
-of a sum are those of its terms put together.
+are looked for in tangents at many points at once, and kept: exp(2w) is exp(w)², cosine and sine of
+a sum are those of its terms put together, and a root of a product is made of their roots.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 from math import lcm
@@ -72,7 +72,21 @@ class _Halved(Exception):
         self.path, self.times = path, times
 
 
-@dataclass
+@dataclass(frozen=True, eq=False)
+class _Root:
+    """A root e of what is independent of all others, and its logarithmic tangent."""
+
+    path: int
+    value: Residues
+    tangent: Residues
+
+    @property
+    def e(self) -> tuple[Residues, ...]:
+        """As that of an exponent."""
+        return (self.value,)
+
+
+@dataclass(frozen=True, eq=False)
 class _Basis:
     """An exponent l that others are combinations of, with e = exp(l), at every point.
 
@@ -84,6 +98,11 @@ class _Basis:
     exponent: Residues
     e: tuple[Residues, ...]
     tangent: Residues
+
+    @property
+    def path(self) -> int:
+        """Where it begins."""
+        return self.begin.paths[0]
 
 
 @dataclass
@@ -98,8 +117,7 @@ class _Start:
     scales: dict[int, int]
     good: NDArray[np.bool_] = field(init=False)
     basis: list[_Basis] = field(default_factory=list)
-    #: Logarithmic tangents of what roots were taken of.
-    roots: list[Residues] = field(default_factory=list)
+    roots: list[_Root] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self.good = np.ones(self.count, bool)
@@ -181,7 +199,7 @@ class _Start:
         if not np.any(tangent[self.good]):
             raise Inexact(f"{begin.kind} of what does not vary")
         if begin.kind == "root":
-            self._begin_roots(begin.of, tangent)
+            self._begin_roots(begin.paths[0], begin.of, tangent)
             return
         own = [k for k, b in enumerate(self.basis) if b.group == group]
         shares = self._shares([self.basis[k].tangent for k in own], tangent)
@@ -222,23 +240,44 @@ class _Start:
             raise Inexact("exponents or roots are in no simple proportion")
         return rational
 
-    def _begin_roots(self, of: tuple[int, ...], tangent: Residues) -> None:
+    def _begin_roots(self, path: int, of: tuple[int, ...], tangent: Residues) -> None:
         """All constant powers of one value, from one root of it."""
         alike = [b for b in self.program.begins.values() if b.kind == "root" and b.of == of]
-        degree = lcm(*(b.exponent.denominator for b in alike))
-        found = self._rooted(self.value(of[0]), tangent, degree)
+        degree = lcm(*(b.exponent.denominator for b in alike)) * self.scales.get(path, 1)
+        found = self._rooted(path, self.value(of[0]), tangent, degree)
         for b in alike:
             self._values[b.paths[0]] = power(found, int(b.exponent * degree))
 
-    def _rooted(self, v: Residues, tangent: Residues, degree: int) -> Residues:
+    def _rooted(self, path: int, v: Residues, tangent: Residues, degree: int) -> Residues:
         """A root of v; which of them does not matter while it is independent of all others."""
-        others = [*self.roots, *(b.tangent for b in self.basis if b.begin.kind == "exp")]
-        if self._shares(others, tangent) is not None:
-            raise Inexact("one root is a combination of other roots, powers or exponentials")
-        self.roots.append(tangent)
+        self.good &= v != 0
+        others: list[_Root | _Basis] = [b for b in self.basis if b.begin.kind == "exp"]
+        others += self.roots
+        shares = self._shares([b.tangent for b in others], tangent)
+        if shares is not None:
+            return self._dependent(v, degree, dict(zip(others, shares, strict=True)))
         found, exists = root(v, degree)
-        self.good &= exists & (v != 0)
+        if degree % 2 == 0 and exists[self.good].all():
+            raise Inexact("the root of a square may have either sign")
+        self.good &= exists
+        self.roots.append(_Root(path, found, tangent * pow(degree, -1, PRIME) % PRIME))
         return found
+
+    def _dependent(
+        self, v: Residues, degree: int, shares: Mapping[_Root | _Basis, Fraction]
+    ) -> Residues:
+        """The root of a constant times powers of others: made of their roots."""
+        found = np.ones(self.count, np.int64)
+        for other, share in shares.items():
+            if (share / degree).denominator != 1:
+                raise _Halved(other.path, (share / degree).denominator)
+            found = found * power(other.e[0], int(share / degree)) % PRIME
+        rest = v * inverse(power(found, degree)) % PRIME
+        left = {fraction(int(value)) for value in rest[self.good][:4]}
+        number = left.pop()
+        if left or number is None or number < 0:
+            raise Inexact("roots differ by a constant that is no simple fraction")
+        return found * _root_of(number, degree) % PRIME
 
     def _begin_free(self, begin: Begin, group: str, tangent: Residues) -> None:
         scale = self.scales.get(begin.paths[0], 1)
@@ -264,7 +303,7 @@ class _Start:
             if share.denominator != 1:
                 if of.begin.kind in ("log", "angle"):
                     raise Inexact("an exponent is a fraction of a logarithm or an angle")
-                raise _Halved(of.begin.paths[0], share.denominator)
+                raise _Halved(of.path, share.denominator)
             if share:
                 e = times(e, multiple(self._of(of), share.numerator))
                 rest = (rest - share.numerator * of.exponent) % PRIME
@@ -277,7 +316,7 @@ class _Start:
         v = basis.e[1]
         square = (1 + v * v % PRIME) % PRIME
         growth = 2 * v * self.tangent(basis.begin.of[1]) % PRIME * inverse(square) % PRIME
-        cos = inverse(self._rooted(square, growth, 2))
+        cos = inverse(self._rooted(basis.path, square, growth, 2))
         return cos, v * cos % PRIME
 
     def _of_constant(self, rest: Residues, group: str) -> tuple[Residues, ...]:
@@ -295,3 +334,14 @@ class _Start:
         if len(self._constants[number]) != (2 if group == "circle" else 1):
             raise Inexact("exponents differ by constants")
         return self._constants[number]
+
+
+def _root_of(number: Fraction, degree: int) -> int:
+    """The positive root of a fraction where it is one, else any residue that is a root."""
+    parts = [round(part ** (1 / degree)) for part in (number.numerator, number.denominator)]
+    if Fraction(*parts) ** degree == number:
+        return residue(Fraction(*parts))
+    found, exists = root(np.array([residue(number)]), degree)
+    if not exists[0]:
+        raise Inexact(f"{number} has no root of degree {degree} modulo the prime")
+    return int(found[0])
