@@ -676,7 +676,7 @@ def pond(rain=signal(), y=signal(), *, fish=state(), seen=state(), lost=state(),
 """
 
 
-HIVE = """
+FORCES = """
 from casest import fabs, signal
 from casest.dynamics import Motion, dynamics, measured, state
 
@@ -685,13 +685,17 @@ def force(w=signal(), y=signal(), *, x=state(), v=state(), m=state()):
     return Motion(rates={"x": v, "v": w / m}, outputs=(measured(y, x, intensity=1.0),))
 
 @dynamics
+def pushes(w=signal(), v=signal(), y=signal(), *, x=state()):
+    return Motion(rates={"x": w + v}, outputs=(measured(y, x, intensity=1.0),))
+
+@dynamics
 def corner(y=signal(), *, x=state(), v=state()):
     return Motion(rates={"x": fabs(v)}, outputs=(measured(y, x, intensity=1.0),))
 """
 
 
 def test_observe_takes_what_is_known_not_measured_and_repeated(told, tmp_path):
-    (tmp_path / "m.py").write_text(HIVE, encoding="utf-8")
+    (tmp_path / "m.py").write_text(FORCES, encoding="utf-8")
     force = str(tmp_path / "m.py") + ":force"
     assert "structural rank 3 of 3" in told(force)
     said = told(force, "--unmeasured", "w")
@@ -700,10 +704,19 @@ def test_observe_takes_what_is_known_not_measured_and_repeated(told, tmp_path):
     assert "not determined by any record: m, w" in said
     assert "rank 3 of 3" in told(force, "--unmeasured", "w", "--known", "m")
     assert "structural rank 5 of 5" in told(force, "--experiments", "2")
+    said = told(str(tmp_path / "m.py") + ":pushes", "--unmeasured", "w", "--unmeasured", "v")
+    assert "suitable data determine every state and parameter" in said
+    assert "not determined by any record: w, v" in said
+
+
+def test_no_experiment_is_refused_at_the_prompt(capsys, tmp_path):
+    (tmp_path / "m.py").write_text(FORCES, encoding="utf-8")
+    assert run(["observe", f"{tmp_path / 'm.py'}:force", "--experiments", "0"]) == 1
+    assert "experiments=0: there must be one at least" in capsys.readouterr().err
 
 
 def test_observe_says_why_a_rank_is_not_exact(told, tmp_path):
-    (tmp_path / "m.py").write_text(HIVE, encoding="utf-8")
+    (tmp_path / "m.py").write_text(FORCES, encoding="utf-8")
     said = " ".join(told(str(tmp_path / "m.py") + ":corner").split())
     assert "note: not in exact arithmetic: fabs has no power series" in said
 

@@ -122,7 +122,7 @@ def observe(model_name: str, data: tuple[str, ...], options: ObserveOptions) -> 
                 moving,
                 known=said.known,
                 unmeasured=said.unmeasured,
-                experiments=said.experiments or 1,
+                experiments=1 if said.experiments is None else said.experiments,
                 command=typed(),
             )
     if options.result.output:

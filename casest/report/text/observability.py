@@ -67,6 +67,7 @@ def structure_text(result: ObservedStructure) -> str:
         lines.append(f"  suitable data determine every state and parameter{how}")
     else:
         lines += [f"  - {words}" for words in free.unobservable]
+    if free.undetermined:
         lines.append(f"  not determined by any record: {', '.join(free.undetermined)}")
         lines += [f"  {known}" for known in [combination_words(free)] if known]
     if held.rank < free.rank:
