@@ -6,8 +6,7 @@ READY := $(VENV)/.ready
 
 .PHONY: demo test lint types format wheel bench study study-starts study-nist study-loop \
 	study-motion study-records study-asked study-slow study-coverage study-deceptive \
-	study-deceptive-many study-mutation study-worlds study-noises \
-	figures docs clean
+	study-deceptive-many study-mutation study-worlds study-noises study-structural \
 
 demo: $(READY)
 	$(BIN)/casest demo
@@ -79,6 +78,9 @@ study-records: $(READY)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python studies/records.py
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python studies/agreement.py
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python studies/subsets.py
+
+study-structural: $(READY)
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python studies/structural.py
 
 study-mutation: $(READY)
 	$(BIN)/python studies/mutation.py

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import click
 
 from casest.cli.assignments import Assignment, Assignments
-from casest.cli.flags import Kind, flag, taking
+from casest.cli.flags import Kind, flag, refuse, taking
 from casest.cli.loading import model_and_records, moving_model, trajectory
 from casest.cli.options import (
     DATA,
@@ -38,12 +38,41 @@ class OutputOptions:
 
 
 @dataclass(frozen=True, slots=True)
+class StructuralOptions:
+    """What the structural rank supposes."""
+
+    known: tuple[str, ...] = flag(
+        (),
+        "--known",
+        only=Kind.MOVING,
+        metavar="STATE",
+        help="Without DATA: its value at the beginning is known.",
+    )
+    unmeasured: tuple[str, ...] = flag(
+        (),
+        "--unmeasured",
+        only=Kind.MOVING,
+        metavar="INPUT",
+        help="Without DATA: an input that varies and nobody knows.",
+    )
+    experiments: int | None = flag(
+        None,
+        "--experiments",
+        only=Kind.MOVING,
+        type=int,
+        metavar="NUMBER",
+        help="Without DATA: so many records with the same parameters.",
+    )
+
+
+@dataclass(frozen=True, slots=True)
 class ObserveOptions:
     """Options of `observe`."""
 
     model: ModelOptions = field(default_factory=ModelOptions)
     reading: ReadingOptions = field(default_factory=ReadingOptions)
     motion: MotionOptions = field(default_factory=MotionOptions)
+    structural: StructuralOptions = field(default_factory=StructuralOptions)
     result: OutputOptions = field(default_factory=OutputOptions)
     window: float | None = flag(
         None, "--window", type=float, metavar="SECONDS", help="Of the sliding eigenvalue."
@@ -72,6 +101,9 @@ def observe(model_name: str, data: tuple[str, ...], options: ObserveOptions) -> 
     )
 
     fits = isinstance(find_any(model_name), Model)
+    if fits or data:
+        why = "is a question about an estimator in motion without DATA"
+        refuse(options.structural, Kind.MOVING, why)
     if fits:
         if not data:
             raise UsageError(f"{model_name}: what can be seen depends on the record: give DATA")
@@ -85,7 +117,14 @@ def observe(model_name: str, data: tuple[str, ...], options: ObserveOptions) -> 
             progress("what the trajectory shows")
             result = observe_motion(moving, run, options.window, data=data, command=typed())
         else:
-            result = observe_structure(moving, command=typed())
+            said = options.structural
+            result = observe_structure(
+                moving,
+                known=said.known,
+                unmeasured=said.unmeasured,
+                experiments=1 if said.experiments is None else said.experiments,
+                command=typed(),
+            )
     if options.result.output:
         from casest.report.html import observe_page
 

@@ -50,6 +50,7 @@ class Closing:
                 self.after_held_out,
                 self.after.correlated_over,
                 self.undecided,
+                wanders=any(f.wanders for f in self.effects),
             )
 
     @property

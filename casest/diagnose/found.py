@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from casest.declaration.effect import RANDOM_WALK
 from casest.declaration.shapes import Array
 from casest.diagnose.candidates.candidates import Candidate
 
@@ -32,6 +33,11 @@ class Found:
     def of_noise(self) -> bool:
         """Is it a property of the noise, which leaves a model adequate?"""
         return self.candidate.effect is not None and self.candidate.effect.kind == "noise"
+
+    @property
+    def wanders(self) -> bool:
+        """Is it an offset that was declared to walk at random?"""
+        return self.candidate.effect is not None and self.candidate.effect.seen_in == RANDOM_WALK
 
     @property
     def indistinguishable_from(self) -> tuple[str, ...]:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from casest.data.run import Run
-from casest.declaration.effect import TAILS, Effect
+from casest.declaration.effect import RANDOM_WALK, TAILS, Effect
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
 from casest.diagnose.candidates.candidates import Candidate, Skipped
@@ -106,6 +106,7 @@ def _closed(sensor: Sensor, before: Estimate, folds: Folds, say: Callable[[str],
     state, after = certified(sensor, state, before)
     effects = [] if outliers is None else [outliers]
     effects += [_found(sensor, state, k, after) for k in state.kept]
+    effects += [Found(Candidate(e), 0.0, 0.0) for e in _declared_walks(sensor)]
     found, skipped = sensor.found(declared)
     del found
     return Closing(
@@ -121,6 +122,11 @@ def _closed(sensor: Sensor, before: Estimate, folds: Folds, say: Callable[[str],
         sensor.runs,
         _undecided(sensor, state),
     )
+
+
+def _declared_walks(sensor: Sensor) -> list[Effect]:
+    """What the user says of the noise: that the offset walks at random."""
+    return [e for e in sensor.catalogue if e.seen_in == RANDOM_WALK and e.name in sensor.known]
 
 
 def held_out(sensor: Sensor, fit: Fit, folds: Folds) -> tuple[Array, ...]:

@@ -84,6 +84,10 @@ class Subject(Protocol[F]):
         """The fit without something that was added."""
         ...
 
+    def wider(self, fit: F, what: Any) -> tuple[Any, F] | None:
+        """Something that was added on some axes only, and the fit with it on all of them."""
+        ...
+
     def apart(self, fit: F, kept: Kept) -> tuple[Linear, Trial] | None:
         """The linear problem as if a cause were not there, and the cause as a trial of it."""
         ...
@@ -201,7 +205,7 @@ def search(
         state = bigger
     else:
         state = replace(state, last=ranked(subject, state.fit))
-    smaller = eliminated(subject, state)
+    smaller = eliminated(subject, _on_all_axes(subject, state))
     if len(smaller.kept) < len(state.kept):
         smaller = replace(smaller, last=ranked(subject, smaller.fit))
     return with_rivals(subject, smaller)
@@ -563,6 +567,27 @@ def sharpened(subject: Subject[F], fit: F, ranking: Ranking, evidence: Evidence)
 
 
 # -- eliminate -------------------------------------------------------------------------------------
+
+
+def _on_all_axes(subject: Subject[F], state: State[F]) -> State[F]:
+    """Axes that were nothing beside what was still missing may be something now."""
+    for k, kept in enumerate(state.kept):
+        found = subject.wider(state.fit, kept.what)
+        if found is None:
+            continue
+        what, fit = found
+        none, all_ = Likelihood(subject.linear(state.fit)), subject.linear(fit)
+        more = all_.basis.shape[1] - none.declared.shape[1]
+        if more < 1 or isinstance(subject.certified(fit), str):
+            continue
+        if worth(subject.rise(state.fit, fit), more, 0.0, none) > LEVELS.strong:
+            trials = tuple(replace(t, what=what) if t.what == kept.what else t
+                           for t in kept.evidence.trials)  # fmt: skip
+            evidence = replace(kept.evidence, trials=trials)
+            several = list(state.kept)
+            several[k] = replace(kept, what=what, evidence=evidence)
+            state = replace(state, fit=fit, kept=tuple(several))
+    return state
 
 
 def eliminated(subject: Subject[F], state: State[F]) -> State[F]:

@@ -361,6 +361,18 @@ class Sensor:
         values = {n: v for n, v in fit.values.items() if n not in own}
         return self.fitted(replace(fit.model, effects=left), values)
 
+    def wider(self, fit: Fit, what: Candidate) -> tuple[Candidate, Fit] | None:
+        """An effect that was added on some axes only, and the fit with it on all of them."""
+        base = self.without(fit, what)
+        if base is None or what.effect is None:
+            return None
+        whole = next((c for c in self.found(base)[0] if c.label == what.label), None)
+        if whole is None or what.parameters(fit.model) == whole.parameters(whole.traced_on(base.model)):
+            return None
+        whole = replace(whole, held=what.held, trials=what.trials)
+        found = self.refit(base, [Trial(whole, whole.label, np.zeros((0, 0, 0)))])
+        return None if isinstance(found, str) else (whole, found)
+
     def apart(self, fit: Fit, kept: Kept) -> tuple[Linear, Trial] | None:
         """The linear problem as if an effect were not there, and the effect as a trial of it."""
         what: Candidate = kept.what

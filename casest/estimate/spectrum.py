@@ -16,8 +16,8 @@ from casest.declaration.shapes import Array
 
 #: Bands of frequencies over which powers are put together before the curve is fitted.
 BANDS = 40
-#: Frequencies in the first band; below it the spectrum is taken as flat.
-FIRST = 24
+#: Frequencies in the first band; within it the spectrum is taken as flat.
+FIRST = 8
 #: Order of the curve.
 ORDER = 4
 #: The least share of a band that the fit must have left to be asked.
@@ -75,6 +75,7 @@ class Bands:
         self._size = np.diff(np.append(self._edges, len(log)))
         self._middle = np.add.reduceat(log, self._edges) / self._size
         self._log = np.log(frequency)
+        self._edge = float(log[min(FIRST, len(log)) - 1])
 
     def curve(self, power: Array, left: Array) -> Array:
         """The most likely smooth spectrum (N,) of powers (N,), of which a fit left a share each."""
@@ -88,6 +89,8 @@ class Bands:
         if not told.any():
             return lambda log: np.full(np.shape(log), 1e-300)
         middle = self._middle[told]
+        # Flat to the first band's end: nothing holds a curve between its middle and there.
+        middle = np.where(middle == self._middle[0], max(self._edge, middle[0]), middle)
         low, high = float(middle.min()), float(middle.max())
         order = min(ORDER, int(told.sum()) - 1)
 

@@ -52,7 +52,11 @@ class ObservedParameters(Observed, frozen=True, kw_only=True, dict=True):
 
 
 class Structural(Struct, frozen=True):
-    """Rank of the readings and `order` of their derivatives; `gap`: how clear-cut that rank is."""
+    """Rank of the readings and `order` of their derivatives.
+
+    `combinations` of what is undetermined are determined all the same, and `more` without a short
+    formula. `gap`: how clear-cut a rank in floating point is; none where it is exact.
+    """
 
     rank: int
     undetermined: list[str]
@@ -60,6 +64,8 @@ class Structural(Struct, frozen=True):
     order: int
     inputs: list[str]
     gap: Number
+    combinations: list[str]
+    more: int
 
 
 class ObservedStructure(Observed, frozen=True, kw_only=True, dict=True):
@@ -123,23 +129,48 @@ def observe_parameters(
     )
 
 
-def observe_structure(model: Dynamics, *, command: str = "") -> ObservedStructure:
-    """What any record could show: structural rank with inputs that vary freely, or held."""
-    free = structure(model)
-    held = structure(model, varying=False) if free.inputs else free
+def observe_structure(
+    model: Dynamics,
+    *,
+    known: Sequence[str] = (),
+    unmeasured: Sequence[str] = (),
+    experiments: int = 1,
+    command: str = "",
+) -> ObservedStructure:
+    """What any record could show: structural rank with inputs that vary freely, or held.
+
+    `known` states at the beginning, `unmeasured` inputs and several `experiments` as in
+    `structure`.
+    """
+
+    def ranked(varying: bool) -> Structure:
+        return structure(
+            model, varying=varying, known=known, unmeasured=unmeasured, experiments=experiments
+        )
+
+    free = ranked(varying=True)
+    held = ranked(varying=False) if free.inputs else free
     return ObservedStructure(
         model=model.name,
-        notes=[],
+        notes=[f"not in exact arithmetic: {free.rounded}"] if free.rounded else [],
         rank=free.rank,
         unknowns=free.unknowns,
         unobservable=list(free.unobservable),
         std={},
         structural=_structural(free),
         constant_inputs=_structural(held),
-        tolerance="singular values below 1e-10 of the largest count as zero; the smallest that "
-        f"counts is {min(free.gap, held.gap):.1g} times the largest that does not",
+        tolerance=_tolerance(free, held),
         data=[],
         reproduce=reproduced(command, ()),
+    )
+
+
+def _tolerance(free: Structure, held: Structure) -> str:
+    if not free.rounded:
+        return "exact arithmetic modulo a prime at random points: no threshold"
+    return (
+        "singular values below 1e-10 of the largest count as zero; the smallest that "
+        f"counts is {min(free.gap, held.gap):.1g} times the largest that does not"
     )
 
 
@@ -151,6 +182,8 @@ def _structural(found: Structure) -> Structural:
         found.order,
         list(found.inputs),
         plain(found.gap),
+        list(found.combinations),
+        found.more,
     )
 
 
@@ -261,6 +294,16 @@ def window_words(windows: Windows) -> str:
     if since is None:
         return "no window alone tells every state more than was known beforehand"
     return f"the first window that tells every state more than was known ends at {since:.4g} s"
+
+
+def combination_words(found: Structural) -> str:
+    """Which functions of what is undetermined are determined; empty where there are none."""
+    parts = list(found.combinations)
+    if found.more:
+        what = "combination" if found.more == 1 else "combinations"
+        parts.append(f"{found.more} more {what} without a short formula" if parts else
+                     f"{found.more} {what} without a short formula")  # fmt: skip
+    return f"determined all the same: {', '.join(parts)}" if parts else ""
 
 
 def could_reach(result: Observability) -> str:

@@ -33,17 +33,20 @@ from casest.leastsquares.weights import robust_scale, weighted
 LONGEST = 200_000
 #: Residual over a step of the reading below which rounding alone, 1/√12 = 0.29, may be all of it.
 ROUNDED = 0.45
+#: What stands for the time among variables.
+TIMES = ("time", "place in the record")
 #: Held-out residuals beyond so many robust standard deviations do not count in a share.
 FAR = 6.0
 
 
 @dataclass(frozen=True)
 class Finding:
-    """Evidence of a misfit: where, in words, and σ of the noise beside it."""
+    """Evidence of a misfit: where, in words, σ of the noise beside it, and its share if known."""
 
     where: str
     p_value: float
     sigma: float
+    share: float = 0.0
 
 
 def doubts(estimate: Estimate) -> list[Finding] | None:
@@ -77,6 +80,8 @@ def left_over(
     held_out: Sequence[Array],
     correlated_over: float = 1.0,
     undecided: Undecided | None = None,
+    *,
+    wanders: bool = False,
 ) -> Misfit:
     """The misfit of a closed model, with the noise beside it."""
     noise = noise_model(
@@ -87,12 +92,13 @@ def left_over(
         correlated_over=correlated_over,
         levels=predictions(problem, point),
     )
-    found = findings(problem, point, correlated_over)
+    found = findings(problem, point, correlated_over, wanders=wanders)
     everything = np.concatenate([r.ravel() for r in held_out])
     everything = everything[np.abs(everything) <= FAR * robust_scale(held_out)]
     variance = float(np.mean(everything**2)) if everything.size else np.nan
     sigma = min((f.sigma for f in found), default=np.sqrt(variance))
     fraction = max(0.0, 1 - sigma**2 / variance) if variance > 0 else 0.0
+    fraction = max([fraction, *(f.share for f in found)])
     where = [f.where for f in found[:3]]
     if undecided is not None:
         fraction = max(fraction, undecided.share)
@@ -109,15 +115,22 @@ def predictions(problem: Problem, point: Point) -> list[Array] | None:
     return [v[0][:, :, 0] for v in problem.evaluate(point, {"p": predicted})]
 
 
-def findings(problem: Problem, point: Point, correlated_over: float = 1.0) -> list[Finding]:
-    """All that is significant: between repeats, in time, over what is recorded, between runs."""
+def findings(
+    problem: Problem, point: Point, correlated_over: float = 1.0, *, wanders: bool = False
+) -> list[Finding]:
+    """All that is significant: between repeats, in time, over what is recorded, between runs.
+
+    Of noise that was declared to wander no slow course is asked.
+    """
     residuals = problem.residuals(point)
     problem = weighted(problem, problem.values(point))
     freedom = max(problem.residual_count - problem.unknowns, 1)
     sigma = robust_scale(residuals) * float(np.sqrt(problem.residual_count / freedom))
     clipped = _clipped(problem, residuals, sigma)
     found = _repeats(problem, point, clipped)
-    found += _slow(problem, clipped, sigma) or _follows(problem, point, clipped, sigma)
+    slow = [] if wanders else _slow(problem, clipped, sigma)
+    follows = _follows(problem, point, clipped, sigma, [] if slow or wanders else TIMES)
+    found += follows + slow
     line = strongest_line(problem.runs, clipped)
     if line is not None and line.p_value < LEVELS.misfit:
         found.append(Finding(f"a line at {line.frequency:.4g} {line.unit}", line.p_value, sigma))
@@ -155,7 +168,8 @@ def _slow(problem: Problem, clipped: Sequence[Array], sigma: float) -> list[Find
         f"{100 * found.share:.0f} % of it is a slow course over about {found.samples} samples"
         f"{_when(problem, clipped, found.samples)}, of unknown cause"
     )
-    return [Finding(where, found.p_value, sigma * float(np.sqrt(1 - min(found.share, 1))))]
+    left = sigma * float(np.sqrt(1 - min(found.share, 1)))
+    return [Finding(where, found.p_value, left, found.share)]
 
 
 def _when(problem: Problem, clipped: Sequence[Array], samples: int) -> str:
@@ -175,8 +189,13 @@ def _when(problem: Problem, clipped: Sequence[Array], samples: int) -> str:
 
 
 def _follows(
-    problem: Problem, point: Point, clipped: Sequence[Array], sigma: float
+    problem: Problem,
+    point: Point,
+    clipped: Sequence[Array],
+    sigma: float,
+    times: Sequence[str],
 ) -> list[Finding]:
+    """What it follows: a column, a quantity; of the `times` only where no slow course says so."""
     if any(run.spread for run in problem.runs):
         return []
     read = variables(problem, point, usable_columns(problem.model, problem.runs))
@@ -187,7 +206,8 @@ def _follows(
         return []
     best = max(found, key=lambda s: s.share)
     where = f"{100 * best.share:.0f} % of it follows {best.name}"
-    return [Finding(where, best.p_value, sigma * float(np.sqrt(1 - min(best.share, 1))))]
+    left = sigma * float(np.sqrt(1 - min(best.share, 1)))
+    return [Finding(where, best.p_value, left, best.share)]
 
 
 def _runs(problem: Problem, point: Point, correlated_over: float, sigma: float) -> list[Finding]:

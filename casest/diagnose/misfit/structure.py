@@ -15,6 +15,9 @@ from casest.declaration.shapes import Array
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.misfit.variables import Variable
 
+#: Means at least, and rows in each.
+FEWEST, SHORTEST = 8, 4
+
 
 @dataclass(frozen=True)
 class Structure:
@@ -40,9 +43,9 @@ def structures(residuals: Sequence[Array], variables: Sequence[Variable]) -> lis
 def _structure(name: str, r: Array, tried: int) -> Structure | None:
     from scipy.special import ndtr
 
-    size = max(LEVELS.block, len(r) // LEVELS.blocks)
-    count = len(r) // size
-    if count < 8:
+    size = max(min(LEVELS.block, len(r) // FEWEST), len(r) // LEVELS.blocks)
+    count = len(r) // size if size >= SHORTEST else 0
+    if count < FEWEST:
         return None
     means = r[: count * size].reshape(count, size, -1).mean(axis=1)
     steps = np.mean(np.diff(means, axis=0) ** 2, axis=0) / 2

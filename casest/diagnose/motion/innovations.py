@@ -109,6 +109,10 @@ class Innovations:
         return fitted(fit.base, self.run, fit.found.smoothed, added=kept, colour=fit.colour,
                       start=fit.intensities)  # fmt: skip
 
+    def wider(self, fit: Fit, what: Candidate) -> tuple[Candidate, Fit] | None:
+        """Numbers come together."""
+        return None
+
     def apart(self, fit: Fit, kept: Kept) -> tuple[Linear, Trial] | None:
         """The innovations as if an effect were not there, and the effect as a trial of them."""
         if fit.answers is None:

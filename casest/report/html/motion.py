@@ -19,6 +19,8 @@ from casest.results.observability import (
     ObservedMotion,
     ObservedParameters,
     ObservedStructure,
+    Structural,
+    combination_words,
     could_reach,
     window_words,
 )
@@ -71,8 +73,14 @@ def _directions(result: Observability) -> str:
         points(result.unobservable),
         tag("h3", "Weak combinations") + points(weak) if weak else "",
         paragraph(_sentence(could_reach(result))) if could_reach(result) else "",
+        _combinations(result.structural) if isinstance(result, ObservedStructure) else "",
         paragraph(_sentence(tolerance), "soft") if tolerance else "",
     )
+
+
+def _combinations(found: Structural) -> str:
+    known = combination_words(found)
+    return paragraph(_sentence(known)) if known else ""
 
 
 def _sentence(words: str) -> str:
@@ -87,7 +95,8 @@ def _constant_inputs(result: ObservedStructure) -> str:
     inputs = " and ".join(f"`{name}`" for name in held.inputs)
     said = f"Rank {held.rank} of {result.unknowns} while {inputs} stay as they are."
     hidden = points(held.unobservable)
-    return section("constant", "With constant inputs", paragraph(said), hidden)
+    known = _combinations(held)
+    return section("constant", "With constant inputs", paragraph(said), hidden, known)
 
 
 def _deviations(result: Observability) -> str:

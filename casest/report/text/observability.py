@@ -10,6 +10,7 @@ from casest.results.observability import (
     ObservedMotion,
     ObservedParameters,
     ObservedStructure,
+    combination_words,
     could_reach,
     number_or_not,
     window_words,
@@ -66,9 +67,13 @@ def structure_text(result: ObservedStructure) -> str:
         lines.append(f"  suitable data determine every state and parameter{how}")
     else:
         lines += [f"  - {words}" for words in free.unobservable]
+    if free.undetermined:
         lines.append(f"  not determined by any record: {', '.join(free.undetermined)}")
+        lines += [f"  {known}" for known in [combination_words(free)] if known]
     if held.rank < free.rank:
         lines += ["", f"  with {inputs} held constant: rank {held.rank} of {n}"]
         lines += [f"  - {words}" for words in held.unobservable]
         lines.append(f"  then not determined: {', '.join(held.undetermined)}")
+        lines += [f"  {known}" for known in [combination_words(held)] if known]
+    lines += note_lines(result.notes or [])
     return "\n".join(wrapped(lines))

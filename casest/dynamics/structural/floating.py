@@ -1,15 +1,11 @@
-"""What any record could show: rank of the observability codistribution from Lie derivatives.
+"""Structural rank in floating point, from Lie derivatives at random points.
 
-The readings and their derivatives along the motion, y, ẏ, ÿ, …, are functions of the state; where
-their Jacobian has full rank at almost every point, the state is (locally) observable from suitable
-data (Hermann & Krener 1977). Parameters are states without a rate, so that the same rank says
-whether they are identifiable. Inputs are functions of time with derivatives of any size, or held
-constant, which may show less (Villaverde et al. 2019).
+For models that no power series modulo a prime can follow: corners, steps, rounded constants.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -20,7 +16,7 @@ from casest.declaration.physics import SX
 from casest.declaration.shapes import Array
 from casest.declaration.tracing import flat
 from casest.dynamics.declare import Dynamics
-from casest.dynamics.gramian import sentence
+from casest.dynamics.structural.words import Hidden
 from casest.errors import DeclarationError
 
 #: A singular value of the Jacobian, its rows and columns brought to one size, counts as zero below
@@ -35,43 +31,29 @@ ATTEMPTS = 50
 
 
 @dataclass(frozen=True)
-class Structure:
-    """Structural rank among n states and parameters.
+class Ranked:
+    """Rank, order of the highest derivative, gap between what counts and what does not, the states
+    that are not determined, and the hidden directions."""
 
-    `undetermined` are those that no record can show, `unobservable` says in words how they may
-    change without a trace; `order` is that of the highest derivative of the readings used;
-    `gap` (smallest singular value that counts, over the largest that does not) shows how clear the
-    rank is; `varying` whether inputs were free functions of time, `inputs` their names.
-    """
-
-    model: Dynamics
     rank: int
     order: int
     gap: float
     undetermined: tuple[str, ...]
-    unobservable: tuple[str, ...]
-    varying: bool
-    inputs: tuple[str, ...]
-
-    @property
-    def unknowns(self) -> int:
-        """Number n of states and parameters."""
-        return self.model.size
-
-    @property
-    def observable(self) -> bool:
-        """Can suitable data determine every state and parameter?"""
-        return self.rank == self.unknowns
+    hidden: tuple[Hidden, ...]
 
 
-def structure(model: Dynamics, *, varying: bool = True, seed: int = 0) -> Structure:
+def finite(model: Dynamics) -> None:
+    """Raise DeclarationError where no point is found at which rates and outputs are finite."""
+    _Lie(model, varying=True).points(np.random.default_rng(0), 1)
+
+
+def ranked(model: Dynamics, varying: bool, seed: int, known: Sequence[int] = ()) -> Ranked:
     """Structural rank of a model, from Lie derivatives at random points.
 
-    `varying`: inputs with free derivatives of every order; else constant. Raises DeclarationError
-    where no point is found at which the readings' derivatives are finite.
+    `known` are the places of states whose value at the beginning is known.
     """
     lie = _Lie(model, varying)
-    points = lie.points(np.random.default_rng(seed))
+    points = lie.points(np.random.default_rng(seed), POINTS)
     rank, order = 0, -1
     while True:
         order += 1
@@ -81,20 +63,22 @@ def structure(model: Dynamics, *, varying: bool = True, seed: int = 0) -> Struct
         # then a combination of those before it.
         if rank in (before, model.size):
             break
+    if known:  # each is one more reading, at the beginning alone
+        beside = np.eye(model.size)[list(known)]
+        stacked = [np.vstack([lie.jacobian(order, point), beside]) for point in points]
+        found = [_ranked(one) for one in stacked]
+        rank = max(r for r, _, _ in found)
     best = [k for k, (r, _, _) in enumerate(found) if r == rank]
     nulls = [found[k][2] for k in best]
     hidden = np.max([np.linalg.norm(N, axis=1) for N in nulls], axis=0) > 1e-6
-    states = [points[k][: model.size] for k in best]
+    states = np.array([points[k][: model.size] for k in best])
     vectors = [lie.vectors(points[k]) for k in best]
-    return Structure(
-        model,
+    return Ranked(
         rank,
         order,
         min(found[k][1] for k in best),
         tuple(n for n, h in zip(model.names, hidden, strict=True) if h),
         tuple(_laws(model, nulls, states, vectors)) if rank < model.size else (),
-        varying,
-        lie.inputs,
     )
 
 
@@ -134,7 +118,7 @@ class _Lie:
             place += size
         return found
 
-    def points(self, rng: np.random.Generator) -> list[Array]:
+    def points(self, rng: np.random.Generator, count: int) -> list[Array]:
         """Points (state, inputs and their derivatives) at which all that may be asked is finite."""
         found: list[Array] = []
         n, size = self.model.size, self.chain[0].numel()
@@ -150,7 +134,7 @@ class _Lie:
             point = np.concatenate([x, inputs.ravel()])
             if self._holds(point):
                 found.append(point)
-            if len(found) == POINTS:
+            if len(found) == count:
                 return found
         raise DeclarationError(
             f"dynamics {self.model.name}: rates or outputs are not finite at {ATTEMPTS} random "
@@ -199,25 +183,31 @@ def _ranked(jacobian: Array) -> tuple[int, float, Array]:
 def _laws(
     model: Dynamics,
     nulls: Sequence[Array],
-    states: Sequence[Array],
+    states: Array,
     vectors: Sequence[Mapping[str, Array]],
-) -> list[str]:
-    """How the state may change without a trace, a sentence per hidden direction."""
+) -> Iterator[Hidden]:
+    """The law of each hidden direction."""
     pivots = _pivots(nulls[0])
     bases = [N @ np.linalg.inv(N[pivots]) for N in nulls]
-    found = []
     for k, pivot in enumerate(pivots):
         directions = np.array([B[:, k] for B in bases])
         directions[np.abs(directions) < 1e-7 * np.abs(directions).max()] = 0.0
+        touched = np.flatnonzero(np.abs(directions).max(axis=0))
         along = _along(model, directions, vectors)
-        found.append(along or _law(model, directions, np.array(states), pivot))
-    return found
+        shift = directions[0] if _same(directions) else None
+        growth = directions[:, touched] / states[:, touched] * states[:, pivot : pivot + 1]
+        powers = growth[0] if _same(growth) else None
+        yield Hidden(tuple(touched.tolist()), along, shift, powers)
+
+
+def _same(values: Array) -> bool:
+    return bool(np.ptp(values, axis=0).max() < 1e-6 * np.abs(values).max())
 
 
 def _along(
     model: Dynamics, directions: Array, vectors: Sequence[Mapping[str, Array]]
 ) -> str | None:
-    """A direction that follows an input: gravity and bias along the rate of turn."""
+    """The input that a direction follows: gravity and bias along the rate of turn."""
     own = {n: directions[:, w] for n, w in model.slices().items() if directions[:, w].any()}
     if any(parts.shape[1] != 3 for parts in own.values()):
         return None
@@ -225,10 +215,7 @@ def _along(
         unit = np.array([v[name] / np.linalg.norm(v[name]) for v in vectors])
         if all(np.abs(np.cross(parts, unit)).max() < 1e-7 * np.abs(parts).max()
                for parts in own.values()):  # fmt: skip
-            names = list(own)
-            if len(names) == 1:
-                return f"{names[0]} along {name} changes no reading"
-            return f"{_listed(names)} along {name} cannot be told apart"
+            return name
     return None
 
 
@@ -237,35 +224,3 @@ def _pivots(null: Array) -> list[int]:
     from scipy.linalg import qr
 
     return sorted(int(i) for i in qr(null.T, pivoting=True)[2][: null.shape[1]])
-
-
-def _law(model: Dynamics, directions: Array, states: Array, pivot: int) -> str:
-    touched = np.flatnonzero(np.abs(directions).max(axis=0))
-    names = [model.names[i] for i in touched]
-    if len(touched) == 1:
-        return f"{names[0]} changes no reading"
-    if np.ptp(directions, axis=0).max() < 1e-6 * np.abs(directions).max():
-        return sentence(model, directions[0])
-    growth = directions[:, touched] / states[:, touched] * states[:, pivot : pivot + 1]
-    if np.ptp(growth, axis=0).max() < 1e-6 * np.abs(growth).max():
-        return _scaling(names, growth[0])
-    return f"{_listed(names)} cannot all be told apart: only combinations of them are seen"
-
-
-def _scaling(names: Sequence[str], powers: Array) -> str:
-    """What is multiplied by λ to which power: `predator·λ, b/λ`."""
-    if len(names) == 2 and np.allclose(powers, powers[0]):
-        return f"only the quotient of {names[0]} and {names[1]} is seen"
-    if len(names) == 2 and np.isclose(powers[0], -powers[1]):
-        return f"only the product of {names[0]} and {names[1]} is seen"
-    powers = np.round(powers / np.abs(powers).min() * np.sign(powers[0]), 6)
-    terms = []
-    for power in dict.fromkeys(powers.tolist()):
-        same = [n for n, p in zip(names, powers, strict=True) if p == power]
-        factor = {1.0: "λ", -1.0: "1/λ"}.get(power, f"λ^{power:.3g}")
-        terms.append(f"{_listed(same)} by {factor}")
-    return f"multiplying {_listed(terms)} changes no reading"
-
-
-def _listed(names: Sequence[str]) -> str:
-    return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
