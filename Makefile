@@ -7,6 +7,7 @@ READY := $(VENV)/.ready
 .PHONY: demo test lint types format wheel bench study study-starts study-nist study-loop \
 	study-motion study-records study-asked study-slow study-coverage study-deceptive \
 	study-deceptive-many study-mutation study-worlds study-noises study-structural \
+	figures docs clean
 
 demo: $(READY)
 	$(BIN)/casest demo

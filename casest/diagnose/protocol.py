@@ -619,8 +619,10 @@ def _beside_the_others(subject: Subject[F], state: State[F], kept: Kept, base: F
     families = state.first.families if state.first else 1
     searched = float(np.log(kept.evidence.trials[0].variants * families))
     score = worth(gain, freedom, searched, none)
-    strong = score > LEVELS.strong if linear.series else (
-        p_value(gain, freedom, searched, none) < LEVELS.chance
+    strong = (
+        score > LEVELS.strong
+        if linear.series
+        else (p_value(gain, freedom, searched, none) < LEVELS.chance)
     )
     if strong and (subject.asked(kept.what) or linear.residual.shape != whole.residual.shape):
         return None  # rows that moved in time are others

@@ -367,7 +367,9 @@ class Sensor:
         if base is None or what.effect is None:
             return None
         whole = next((c for c in self.found(base)[0] if c.label == what.label), None)
-        if whole is None or what.parameters(fit.model) == whole.parameters(whole.traced_on(base.model)):
+        if whole is None or what.parameters(fit.model) == whole.parameters(
+            whole.traced_on(base.model)
+        ):
             return None
         whole = replace(whole, held=what.held, trials=what.trials)
         found = self.refit(base, [Trial(whole, whole.label, np.zeros((0, 0, 0)))])
