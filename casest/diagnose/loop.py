@@ -103,7 +103,9 @@ def _closed(sensor: Sensor, before: Estimate, folds: Folds, say: Callable[[str],
     fit, outliers = without_outliers(sensor, state.fit, folds)
     if outliers is not None:
         state = search(sensor, fit, say, state)
-    state, after = certified(sensor, state, before)
+    after = before
+    if state.fit is not declared:
+        state, after = certified(sensor, state, before)
     effects = [] if outliers is None else [outliers]
     effects += [_found(sensor, state, k, after) for k in state.kept]
     effects += [Found(Candidate(e), 0.0, 0.0) for e in _declared_walks(sensor)]
@@ -116,7 +118,7 @@ def _closed(sensor: Sensor, before: Estimate, folds: Folds, say: Callable[[str],
         held_out(sensor, state.fit, folds),
         tuple(effects),
         tuple(skipped),
-        _refused(sensor, state),
+        _refused(sensor, state, declared),
         folds,
         _visible(sensor, declared),
         sensor.runs,
@@ -183,12 +185,12 @@ def _found(sensor: Sensor, state: State[Fit], kept: Kept, after: Estimate) -> Fo
     return Found(candidate, kept.evidence.p_value, float(fall), names, rivals, ratios)
 
 
-def _refused(sensor: Sensor, state: State[Fit]) -> tuple[Skipped, ...]:
+def _refused(sensor: Sensor, state: State[Fit], declared: Fit) -> tuple[Skipped, ...]:
     added = {k.what.label for k in state.kept}
     said = {r.what.label: r.why for r in reversed(state.refused) if r.what.label not in added}
     ranked = state.first.found if state.first else ()
     shown = {e.trials[0].family for e in ranked}
-    asked, skipped = sensor.unseen(state.fit, shown)
+    asked, skipped = sensor.unseen(declared, shown)
     return (
         *(Skipped(name, why) for name, why in said.items()),
         *asked,
@@ -197,8 +199,8 @@ def _refused(sensor: Sensor, state: State[Fit]) -> tuple[Skipped, ...]:
 
 
 def _visible(sensor: Sensor, declared: Fit) -> tuple[Visible, ...]:
-    plain = [c for c in sensor.found(declared)[0] if c.effect is None or not c.effect.profile]
-    return visible(sensor.linear(declared), sensor.trials_of(declared, plain))
+    plain = [t for t in sensor.trials(declared) if not t.what.held]
+    return visible(sensor.linear(declared), plain)
 
 
 def _undecided(sensor: Sensor, state: State[Fit]) -> Undecided | None:

@@ -39,6 +39,8 @@ from casest.solve.trust_region import trust_region
 
 #: What survives of an implicit residual's slopes, in noise over reading, at least.
 BEYOND = 5.0
+#: Samples of a block up to which it is a pose.
+LONGEST_POSE = 32
 #: Models whose candidates are remembered.
 REMEMBERED = 4
 #: Iterations of a fit that begins at the fit to everything, and gain (in σ²) that ends it.
@@ -80,6 +82,7 @@ class Sensor:
 
     linears: list[tuple[Fit, Linear]] = field(default_factory=list, repr=False)
     looked: list[tuple[Fit, Seen]] = field(default_factory=list, repr=False)
+    shown_in: list[tuple[Fit, list[Trial]]] = field(default_factory=list, repr=False)
 
     # -- fits ----------------------------------------------------------------------------------
 
@@ -233,17 +236,29 @@ class Sensor:
         for model, found in self.remembered:
             if model is fit.model:
                 return found
-        self.remembered.append((fit.model, candidates(fit.model, self.runs, self.catalogue)))
+        catalogue = [e for e in self.catalogue if self._in_time or e.kind not in OVER_TIME]
+        self.remembered.append((fit.model, candidates(fit.model, self.runs, catalogue)))
         del self.remembered[:-REMEMBERED]
         return self.remembered[-1][1]
 
+    @cached_property
+    def _in_time(self) -> bool:
+        """Do samples follow each other? In poses each begins anew, and nothing comes late."""
+        blocks = sum(len(np.unique(run.block)) for run in self.runs)
+        return sum(map(len, self.runs)) >= LONGEST_POSE * blocks
+
     def trials(self, fit: Fit) -> list[Trial]:
         """Every candidate in its columns, over its grid."""
+        for known, trials in self.shown_in:
+            if known is fit:
+                return trials
         seen = self.seen(fit, self.linear(fit))
         expanded = [
             c for one in self.found(fit)[0] for c in on_grid(one, seen, self._likely(fit, one))
         ]
-        return self.trials_of(fit, expanded)
+        self.shown_in.append((fit, self.trials_of(fit, expanded)))
+        del self.shown_in[:-1]
+        return self.shown_in[-1][1]
 
     def _likely(self, fit: Fit, candidate: Candidate) -> float:
         """A lag that two records show by how lively each of them is."""
@@ -425,7 +440,7 @@ class Sensor:
 
     def unseen(self, fit: Fit, shown: Collection[str]) -> tuple[list[Skipped], list[Skipped]]:
         """What is asked for and these data cannot show; and what of it does not apply to them."""
-        found, skipped = self.found(replace_effects(fit, self.model))
+        found, skipped = self.found(fit)
         hidden = [c for c in found if self.asked(c) and c.label not in shown]
         silent = [Skipped(c.label, "these data cannot show it") for c in hidden]
         of_noise = {e.name for e in self.catalogue if e.on == NOISE}
@@ -476,11 +491,6 @@ class Sensor:
             return None
         ((_, slope),) = slopes(problem, point, [probe], self.rows)
         return None if isinstance(slope, CasestError) else (probe.on, slope)
-
-
-def replace_effects(fit: Fit, model: Model) -> Fit:
-    """The fit as if its model were another."""
-    return replace(fit, model=model)
 
 
 def _is_lag(candidate: Candidate) -> bool:
