@@ -1,8 +1,9 @@
 """The loop, for residuals and for innovations: rank, refit, confirm, eliminate.
 
-A `Subject` knows its model: what could be missing there, in which columns it shows, how to refit. The loop
-knows nothing of models: it asks which cause explains most, whether what was held out confirms it, and
-what cannot be told apart. A state of the search is a value: what is tried and dropped leaves no trace.
+A `Subject` knows its model: what could be missing there, in which columns it shows, how to refit.
+The loop knows nothing of models: it asks which cause explains most, whether what was held out
+confirms it, and what cannot be told apart. A state of the search is a value: what is tried and
+dropped leaves no trace.
 """
 
 from __future__ import annotations
@@ -122,7 +123,7 @@ class Ranking:
         return tuple(e for e in self.found if not e.trials[0].describes)
 
     def enough(self, score: float, gain: float) -> bool:
-        """Is it strong evidence, and as much as a course of unknown cause explains, but for little?"""
+        """Is it strong evidence, and nearly as much as a course of unknown cause explains?"""
         course = self.description
         if score <= (LEVELS.strong if self.linear.series else 0.0):
             return False
@@ -426,8 +427,10 @@ def _near(refits: Sequence[Refit[F]]) -> list[Evidence]:
 
 
 def _torn_between(refits: Sequence[Refit[F]], ranking: Ranking) -> list[Evidence]:
-    """Causes of which each, were it the wrong one, would leave the declared parameters further off than
-    none of them: what is added hangs on which it is."""
+    """Causes of which each, were it the wrong one, would do more harm than none of them.
+
+    That is, leave the declared parameters further off: what is added hangs on which it is.
+    """
     near = _near(refits)
     if len(near) < 2:
         return []
@@ -534,7 +537,8 @@ def _describes(
 ) -> bool:
     """Is a description so much better than causes with a name, wherever it is held out?
 
-    Than the best cause, and what has a name beside that one: terms of a formula may be several causes.
+    Than the best cause, and what has a name beside that one: terms of a formula may be several
+    causes.
     """
     best = max((r.evidence.score for r in names), default=0.0)
     if formula.score < best + LEVELS.described:
@@ -653,7 +657,7 @@ def _rivals(subject: Subject[F], state: State[F], kept: Kept) -> tuple[Rival, ..
         return ()
     stretches = linear.parts.stretches
     without, best = (squares(linear, c, stretches) for c in ([], [_in_time(ranking, mine[0])]))
-    rivals = []
+    rivals = list[Evidence]()
     for e in ranking.causes:
         if e is mine[0] or e.score < LEVELS.strong or len(rivals) == LEVELS.contenders:
             continue

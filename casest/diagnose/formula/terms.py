@@ -137,7 +137,7 @@ class Term:
 
 
 def library(variables: Sequence[Variable]) -> list[Shape]:
-    """Powers 1 to 3, size, exponentials and saturation of each; multiples of an angle; products of two."""
+    """Powers 1 to 3, size, exponentials, saturation of each; sines of angles; products of two."""
     straight = [v for v in variables if not v.angle]
     found = [Shape(kind, (v,), k) for v in straight for kind, k in SHAPES]
     found += [
