@@ -138,13 +138,9 @@ class Ranking:
 
 @dataclass(frozen=True)
 class Rival:
-    """A cause that is not told apart from one that was added: how the score differs, the t of the
-    difference of held-out squares, and the fit with it instead."""
+    """A cause that is not told apart from one that was added, and the fit with it instead."""
 
     what: Any
-    score: float
-    t: float
-    evidence: Evidence = field(repr=False)
     fit: Any = field(repr=False)
 
 
@@ -164,7 +160,6 @@ class Refused:
 
     what: Any
     why: str
-    evidence: Evidence | None = None
 
 
 @dataclass(frozen=True)
@@ -181,11 +176,11 @@ class State(Generic[F]):
     first: Ranking | None = None
     last: Ranking | None = None
 
-    def refusing(self, what: Any, why: str, evidence: Evidence | None = None) -> State[F]:
+    def refusing(self, what: Any, why: str) -> State[F]:
         """The state with a refusal, which is said once."""
         if any(r.what == what and r.why == why for r in self.refused):
             return self
-        return replace(self, refused=(*self.refused, Refused(what, why, evidence)))
+        return replace(self, refused=(*self.refused, Refused(what, why)))
 
 
 def search(
@@ -346,7 +341,7 @@ def _with_the_best(
             break
         asked, left = [], left or options
     for evidence in [e for e in options if e not in tried][:2]:
-        state = state.refusing(evidence.trials[0].what, NOT_HELD_OUT, evidence)
+        state = state.refusing(evidence.trials[0].what, NOT_HELD_OUT)
     return replace(state, open=tuple(options[: LEVELS.contenders]))
 
 
@@ -362,7 +357,7 @@ def _first_certified(
         fit = subject.certified(refit.fit)
         if not isinstance(fit, str):
             return _kept(subject, state, ranking, replace(refit, fit=fit), say), True
-        state = state.refusing(refit.evidence.trials[0].what, fit, refit.evidence)
+        state = state.refusing(refit.evidence.trials[0].what, fit)
         later = refits[k + 1].evidence.score if k + 1 < len(refits) else 0.0
         if len(refit.evidence.trials) == 1 and refit.evidence.score > later + LEVELS.strong:
             return state, True  # what explains clearly less is not the cause
@@ -379,7 +374,7 @@ def _hypotheses(
         alone = again(evidence, ranking.likelihood, ranking.none, len(asked), 1)
         if alone.p_value >= LEVELS.chance:
             why = f"no more of it than noise would have (p = {alone.p_value:.2g})"
-            state = state.refusing(evidence.trials[0].what, why, alone)
+            state = state.refusing(evidence.trials[0].what, why)
         elif falls(ranking, alone)["pieces"].ratio < 1:
             found.append(alone)
     return state, sorted(found, key=lambda e: -e.score)
@@ -678,7 +673,7 @@ def _rivals(subject: Subject[F], state: State[F], kept: Kept) -> tuple[Rival, ..
             own_, its = (squares(x, [], stretches) for x in (after, other))
             lost, best = its - own_, own_
         if _as_well(behind, lost, without - best):
-            found.append(Rival(e.trials[0].what, behind, standard_errors(lost), e, fit))
+            found.append(Rival(e.trials[0].what, fit))
     return tuple(found)
 
 

@@ -74,11 +74,6 @@ class Shape:
     variables: tuple[Variable, ...]
     order: int = 1
 
-    @property
-    def reads(self) -> frozenset[str]:
-        """Labels of what it reads."""
-        return frozenset(v.label for v in self.variables)
-
     def values(self, values: Sequence[Any], m: Any = np) -> Any:
         """Of the variables' values, with the functions of `m`."""
         v, x = self.variables, list(values)
