@@ -525,9 +525,7 @@ def test_a_saved_result_with_a_lag_and_a_memory_is_read_and_applied_again(tmp_pa
     assert values["signal_lag(attitude).delay"] == pytest.approx(0.05, abs=1e-3)
     corrected = tmp_path / "corrected.csv"
     assert command(["apply", str(tmp_path / "o"), str(record), "-o", str(corrected)]) == 0
-    assert "carry the course of one record to another: creep" in (
-        capsys.readouterr().err
-    )
+    assert "carry the course of one record to another: creep" in (capsys.readouterr().err)
     field = np.genfromtxt(corrected, delimiter=",", names=True)
     hard = np.array(saved["estimate"]["parameters"]["hard"]["value"])
     expected = table[:, 1:4] - hard

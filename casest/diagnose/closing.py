@@ -22,8 +22,8 @@ from casest.leastsquares.problem import Problem
 class Closing:
     """What the loop leaves: the estimate before and after, what was added, what was refused.
 
-    `visible`: what these data could show of each effect that was tried; `undecided`: causes that are
-    there, of which none was added.
+    `visible`: what these data could show of each effect that was tried; `undecided`: causes that
+    are there, of which none was added.
     """
 
     before: Estimate

@@ -17,9 +17,8 @@ HELD_OUT_DATA = "held-out data"
 class Found:
     """An effect that was added, with the evidence.
 
-    `gain`: fall of the held-out mean square; `ratios` of the held-out squares after over before, on
-    interleaved pieces, whole stretches and whole regions. `rivals`: what the data do not tell apart
-    from it, nearest first, each with how far the declared parameters would move were it the cause.
+    `gain`: fall of the held-out mean square; `rivals`: what the data do not tell apart from it,
+    nearest first, each with how far the declared parameters would move were it the cause.
     """
 
     candidate: Candidate
@@ -27,7 +26,6 @@ class Found:
     gain: float
     names: tuple[str, ...] = ()
     rivals: Mapping[str, Mapping[str, Array]] = field(default_factory=dict)
-    ratios: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def of_noise(self) -> bool:

@@ -109,20 +109,18 @@ def _closed(sensor: Sensor, before: Estimate, folds: Folds, say: Callable[[str],
     effects = [] if outliers is None else [outliers]
     effects += [_found(sensor, state, k, after) for k in state.kept]
     effects += [Found(Candidate(e), 0.0, 0.0) for e in _declared_walks(sensor)]
-    found, skipped = sensor.found(declared)
-    del found
     return Closing(
         before,
         after,
         held_out(sensor, declared, folds),
         held_out(sensor, state.fit, folds),
         tuple(effects),
-        tuple(skipped),
+        tuple(sensor.found(declared)[1]),
         _refused(sensor, state, declared),
         folds,
         _visible(sensor, declared),
         sensor.runs,
-        _undecided(sensor, state),
+        _undecided(state),
     )
 
 
@@ -174,15 +172,15 @@ def _found(sensor: Sensor, state: State[Fit], kept: Kept, after: Estimate) -> Fo
     """An added effect with its evidence, and what would have been in its place."""
     candidate: Candidate = sensor.final(state.fit, kept.what)
     names = tuple(p.name for p in candidate.parameters(after.model))
-    ratios = {k: f.ratio for k, f in kept.falls.items()}
-    fall = (1 - ratios["pieces"]) / max(ratios["pieces"], 1e-300) * state.fit.noise**2
+    ratio = kept.falls["pieces"].ratio
+    fall = (1 - ratio) / max(ratio, 1e-300) * state.fit.noise**2
     added = {k.what.label for k in state.kept}
     rivals = {
         r.what.label: sensor.moved_by(state.fit, r)
         for r in kept.rivals
         if r.what.label not in added
     }
-    return Found(candidate, kept.evidence.p_value, float(fall), names, rivals, ratios)
+    return Found(candidate, kept.evidence.p_value, float(fall), names, rivals)
 
 
 def _refused(sensor: Sensor, state: State[Fit], declared: Fit) -> tuple[Skipped, ...]:
@@ -203,7 +201,7 @@ def _visible(sensor: Sensor, declared: Fit) -> tuple[Visible, ...]:
     return visible(sensor.linear(declared), plain)
 
 
-def _undecided(sensor: Sensor, state: State[Fit]) -> Undecided | None:
+def _undecided(state: State[Fit]) -> Undecided | None:
     """Strong evidence for causes that were not added."""
     if not state.open:
         return None

@@ -1,8 +1,9 @@
 """The loop, for residuals and for innovations: rank, refit, confirm, eliminate.
 
-A `Subject` knows its model: what could be missing there, in which columns it shows, how to refit. The loop
-knows nothing of models: it asks which cause explains most, whether what was held out confirms it, and
-what cannot be told apart. A state of the search is a value: what is tried and dropped leaves no trace.
+A `Subject` knows its model: what could be missing there, in which columns it shows, how to refit.
+The loop knows nothing of models: it asks which cause explains most, whether what was held out
+confirms it, and what cannot be told apart. A state of the search is a value: what is tried and
+dropped leaves no trace.
 """
 
 from __future__ import annotations
@@ -122,7 +123,7 @@ class Ranking:
         return tuple(e for e in self.found if not e.trials[0].describes)
 
     def enough(self, score: float, gain: float) -> bool:
-        """Is it strong evidence, and as much as a course of unknown cause explains, but for little?"""
+        """Is it strong evidence, and nearly as much as a course of unknown cause explains?"""
         course = self.description
         if score <= (LEVELS.strong if self.linear.series else 0.0):
             return False
@@ -137,13 +138,9 @@ class Ranking:
 
 @dataclass(frozen=True)
 class Rival:
-    """A cause that is not told apart from one that was added: how the score differs, the t of the
-    difference of held-out squares, and the fit with it instead."""
+    """A cause that is not told apart from one that was added, and the fit with it instead."""
 
     what: Any
-    score: float
-    t: float
-    evidence: Evidence = field(repr=False)
     fit: Any = field(repr=False)
 
 
@@ -163,7 +160,6 @@ class Refused:
 
     what: Any
     why: str
-    evidence: Evidence | None = None
 
 
 @dataclass(frozen=True)
@@ -180,11 +176,11 @@ class State(Generic[F]):
     first: Ranking | None = None
     last: Ranking | None = None
 
-    def refusing(self, what: Any, why: str, evidence: Evidence | None = None) -> State[F]:
+    def refusing(self, what: Any, why: str) -> State[F]:
         """The state with a refusal, which is said once."""
         if any(r.what == what and r.why == why for r in self.refused):
             return self
-        return replace(self, refused=(*self.refused, Refused(what, why, evidence)))
+        return replace(self, refused=(*self.refused, Refused(what, why)))
 
 
 def search(
@@ -345,7 +341,7 @@ def _with_the_best(
             break
         asked, left = [], left or options
     for evidence in [e for e in options if e not in tried][:2]:
-        state = state.refusing(evidence.trials[0].what, NOT_HELD_OUT, evidence)
+        state = state.refusing(evidence.trials[0].what, NOT_HELD_OUT)
     return replace(state, open=tuple(options[: LEVELS.contenders]))
 
 
@@ -361,7 +357,7 @@ def _first_certified(
         fit = subject.certified(refit.fit)
         if not isinstance(fit, str):
             return _kept(subject, state, ranking, replace(refit, fit=fit), say), True
-        state = state.refusing(refit.evidence.trials[0].what, fit, refit.evidence)
+        state = state.refusing(refit.evidence.trials[0].what, fit)
         later = refits[k + 1].evidence.score if k + 1 < len(refits) else 0.0
         if len(refit.evidence.trials) == 1 and refit.evidence.score > later + LEVELS.strong:
             return state, True  # what explains clearly less is not the cause
@@ -378,7 +374,7 @@ def _hypotheses(
         alone = again(evidence, ranking.likelihood, ranking.none, len(asked), 1)
         if alone.p_value >= LEVELS.chance:
             why = f"no more of it than noise would have (p = {alone.p_value:.2g})"
-            state = state.refusing(evidence.trials[0].what, why, alone)
+            state = state.refusing(evidence.trials[0].what, why)
         elif falls(ranking, alone)["pieces"].ratio < 1:
             found.append(alone)
     return state, sorted(found, key=lambda e: -e.score)
@@ -426,8 +422,10 @@ def _near(refits: Sequence[Refit[F]]) -> list[Evidence]:
 
 
 def _torn_between(refits: Sequence[Refit[F]], ranking: Ranking) -> list[Evidence]:
-    """Causes of which each, were it the wrong one, would leave the declared parameters further off than
-    none of them: what is added hangs on which it is."""
+    """Causes of which each, were it the wrong one, would do more harm than none of them.
+
+    That is, leave the declared parameters further off: what is added hangs on which it is.
+    """
     near = _near(refits)
     if len(near) < 2:
         return []
@@ -534,7 +532,8 @@ def _describes(
 ) -> bool:
     """Is a description so much better than causes with a name, wherever it is held out?
 
-    Than the best cause, and what has a name beside that one: terms of a formula may be several causes.
+    Than the best cause, and what has a name beside that one: terms of a formula may be several
+    causes.
     """
     best = max((r.evidence.score for r in names), default=0.0)
     if formula.score < best + LEVELS.described:
@@ -653,7 +652,7 @@ def _rivals(subject: Subject[F], state: State[F], kept: Kept) -> tuple[Rival, ..
         return ()
     stretches = linear.parts.stretches
     without, best = (squares(linear, c, stretches) for c in ([], [_in_time(ranking, mine[0])]))
-    rivals = []
+    rivals = list[Evidence]()
     for e in ranking.causes:
         if e is mine[0] or e.score < LEVELS.strong or len(rivals) == LEVELS.contenders:
             continue
@@ -674,7 +673,7 @@ def _rivals(subject: Subject[F], state: State[F], kept: Kept) -> tuple[Rival, ..
             own_, its = (squares(x, [], stretches) for x in (after, other))
             lost, best = its - own_, own_
         if _as_well(behind, lost, without - best):
-            found.append(Rival(e.trials[0].what, behind, standard_errors(lost), e, fit))
+            found.append(Rival(e.trials[0].what, fit))
     return tuple(found)
 
 

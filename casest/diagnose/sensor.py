@@ -20,7 +20,7 @@ from casest.diagnose.candidates.grid import Seen, nearer, on_grid
 from casest.diagnose.candidates.slopes import rows_of, slopes
 from casest.diagnose.cross_validation import undetermined
 from casest.diagnose.evidence.likelihood import Likelihood
-from casest.diagnose.evidence.linear import Linear, Parts, parts_of, spans_of
+from casest.diagnose.evidence.linear import Index, Linear, Parts, parts_of, spans_of
 from casest.diagnose.evidence.score import Evidence, Trial
 from casest.diagnose.formula.search import NAME, described, readable, with_sizes
 from casest.diagnose.levels import LEVELS
@@ -142,7 +142,7 @@ class Sensor:
         return problem, problem.point(fit.values)
 
     @cached_property
-    def rows(self) -> list[np.ndarray]:
+    def rows(self) -> list[Index]:
         """Rows of each run that are looked at."""
         return rows_of(self.runs, LEVELS.rows)
 
@@ -155,15 +155,15 @@ class Sensor:
             inside = (rows >= block.span.start) & (rows < block.span.stop)
             here, chosen = offsets[block.run] + np.flatnonzero(inside), rows[inside]
             local = chosen - block.span.start
-            root = 1.0 if block.weights is None else np.sqrt(block.weights[local])
+            root = np.ones((1, 1)) if block.weights is None else np.sqrt(block.weights[local])
             r[here] = block.residual[local] * root
             own = np.zeros((len(here), axes, problem.unknowns))
             own[:, :, block.x] = block.jacobian[local]
-            J[here] = own * (root if block.weights is None else root[:, :, None])
+            J[here] = own * root[:, :, None]
         return r, np.nan_to_num(J)
 
     @cached_property
-    def _numbers(self) -> tuple[np.ndarray, np.ndarray]:
+    def _numbers(self) -> tuple[Index, Index]:
         """Block and run of each row."""
         blocks = [run.block[rows] for run, rows in zip(self.runs, self.rows, strict=True)]
         runs = [np.full(len(rows), k) for k, rows in enumerate(self.rows)]
@@ -193,7 +193,7 @@ class Sensor:
         parts = [
             f[0].reshape(len(f[0]), -1)[rows] for f, rows in zip(found, self.rows, strict=True)
         ]
-        return np.nan_to_num(np.concatenate(parts))
+        return np.asarray(np.nan_to_num(np.concatenate(parts)))
 
     def _instant(self, fit: Fit) -> Fit:
         """The fit without what looks at other samples."""
@@ -213,10 +213,10 @@ class Sensor:
 
     def _seen(self, fit: Fit, linear: Linear) -> Seen:
         problem, point = self._problem(fit)
-        found = self._shift(fit)
+        shift = self._shift(fit)
         push = -linear.residual
-        if found is not None:
-            push = np.einsum("nmq,nm->nq", found[1], linear.residual)
+        if shift is not None:
+            push = np.einsum("nmq,nm->nq", shift[1], linear.residual)
         reading = None
         if fit.model.traced.predicted is not None and not problem.sequential:
             found = problem.evaluate(point, {"p": fit.model.traced.predicted})
@@ -280,6 +280,7 @@ class Sensor:
         return self.trials_of(fit, found)
 
     def trials_of(self, fit: Fit, several: Sequence[Candidate]) -> list[Trial]:
+        """These candidates in their columns, without those that have none here."""
         problem, point = self._problem(fit)
         found = []
         for candidate, columns in slopes(problem, point, several, self.rows):
@@ -291,7 +292,7 @@ class Sensor:
             found.append(Trial(candidate, family, columns, trials, axes, describes))
         return found
 
-    def _axes(self, fit: Fit, candidate: Candidate, count: int) -> Array | None:
+    def _axes(self, fit: Fit, candidate: Candidate, count: int) -> Index | None:
         own = candidate.parameters(candidate.traced_on(fit.model))
         size = axes_of(own)
         return np.tile(np.arange(size), len(own)) if size > 1 and size * len(own) == count else None
@@ -306,7 +307,8 @@ class Sensor:
     def on_axes(self, fit: Fit, trial: Trial, axes: Sequence[int]) -> Trial:
         """The trial on some of its axes."""
         candidate: Candidate = trial.what
-        assert candidate.effect is not None and trial.axes is not None
+        assert candidate.effect is not None
+        assert trial.axes is not None
         less = replace(candidate, effect=restricted(candidate.effect, axes, fit.model), traced=None)
         own = np.isin(trial.axes, list(axes))
         return replace(trial, what=less, columns=trial.columns[:, :, own], axes=None)
@@ -358,7 +360,8 @@ class Sensor:
         why = undetermined(problem, values)
         normal = problem.normal(found.point)
         step = np.linalg.lstsq(normal.matrix, normal.gradient, rcond=1e-12)[0]
-        if not why and np.sqrt(max(step @ normal.gradient, 0)) > RESTLESS * fit.noise:
+        length = float(np.sqrt(max(float(step @ normal.gradient), 0.0)))
+        if not why and length > RESTLESS * fit.noise:
             why = "not a stationary point"
         return f"its fit is refused: {why}" if why else replace(fit, values=values)
 

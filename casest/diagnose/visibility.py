@@ -1,4 +1,4 @@
-"""What data can show of an effect: what of it the declared parameters leave, and would move by it."""
+"""What data can show of an effect: what the declared parameters leave of it, and how they move."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from casest.diagnose.evidence.score import Trial
 class Visible:
     """Of one candidate with q unknowns beside n declared ones.
 
-    survives (q,): share of each that the declared ones leave; bias (n, q): their shift by one unit of
-    it; information (q, q) under the noise as it is.
+    survives (q,): share of each that the declared ones leave; bias (n, q): their shift by one unit
+    of it; information (q, q) under the noise as it is.
     """
 
     candidate: Candidate

@@ -209,7 +209,7 @@ def _channels(model: Model, runs: Sequence[Run]) -> tuple[dict[str, bool], list[
             skipped.append(Skipped(name, "column is not numeric in every file"))
             continue
         x = np.concatenate([run.signals[name][:, 0] for run in runs])
-        why = _useless(name, x, values)
+        why = _useless(x, values)
         if why:
             skipped.append(Skipped(name, why))
             continue
@@ -219,7 +219,7 @@ def _channels(model: Model, runs: Sequence[Run]) -> tuple[dict[str, bool], list[
     return found, skipped
 
 
-def _useless(name: str, x: Array, others: Mapping[str, Array]) -> str:
+def _useless(x: Array, others: Mapping[str, Array]) -> str:
     """Why a column can explain nothing, in words; else empty."""
     if not np.all(np.isfinite(x)):
         return f"column has {int(np.sum(~np.isfinite(x)))} values that are not finite"

@@ -1,7 +1,7 @@
 """Where to look for what has a moment, a level, a frequency or a time constant.
 
-The residual itself says where: its cumulative sum, its periodogram, the largest readings. How much was
-looked through is counted, and paid for.
+The residual itself says where: its cumulative sum, its periodogram, the largest readings. How much
+was looked through is counted, and paid for.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 
 from casest.declaration.shapes import Array
 from casest.diagnose.candidates.candidates import Candidate
-from casest.diagnose.evidence.linear import Linear
+from casest.diagnose.evidence.linear import Index, Linear
 
 #: Values on each grid: moments beside the best one, edges of pulses, levels, time constants, lines.
 MOMENTS, EDGES, PULSES, LEVELS_TRIED, CONSTANTS, LINES = 15, 60, 10, 24, 8, 3
@@ -86,9 +86,9 @@ def _levels(seen: Seen) -> Values:
     if most <= least:
         return [], 1
     beyond = np.unique(np.geomspace(len(size) - least, FEWEST, LEVELS_TRIED).astype(int))
-    levels = np.unique([float(f"{size[-b]:.6g}") for b in beyond])
+    several = np.unique([float(f"{size[-b]:.6g}") for b in beyond])
     # Rows of one pose are predicted alike: what nothing exceeds but by rounding is no level.
-    levels = [v for v in levels if np.count_nonzero(size > v * (1 + 1e-6)) >= FEWEST]
+    levels = [float(v) for v in several if np.count_nonzero(size > v * (1 + 1e-6)) >= FEWEST]
     return [(v,) for v in levels], max(len(levels), 1)
 
 
@@ -130,10 +130,10 @@ def _pulses(seen: Seen) -> Values:
         return [], 1
     sums = _bends(seen.push)[0]
 
-    def gain(a: Array | int, b: Array | int) -> Array:
-        inside = np.maximum(np.asarray(b) - np.asarray(a), 1)
+    def gain(a: Index, b: Index) -> Array:
+        inside = np.maximum(b - a, 1)
         moved = ((sums[b] - sums[a]) ** 2).sum(axis=-1) / (inside * (1 - inside / n) + 1e-9)
-        return np.asarray(np.where(np.asarray(b) - np.asarray(a) >= edge, moved, 0.0))
+        return np.asarray(np.where(b - a >= edge, moved, 0.0))
 
     grid = np.unique(np.linspace(edge, n - edge, EDGES).astype(int))
     a, b = (g.ravel() for g in np.meshgrid(grid, grid, indexing="ij"))
@@ -149,8 +149,7 @@ def _pulses(seen: Seen) -> Values:
             last = int(near[np.argmax(gain(np.full_like(near, first), near))])
     even = np.linspace(0, n, PULSES + 1).astype(int)[1:-1]
     pairs = {(first, last)} | {(int(i), int(j)) for i in even for j in even if i < j}
-    found = [(_between(time, i), _between(time, j)) for i, j in sorted(pairs)]
-    return found, n * n / 2
+    return [(_between(time, i), _between(time, j)) for i, j in sorted(pairs)], n * n / 2
 
 
 def _constants(seen: Seen) -> Values:
@@ -203,8 +202,7 @@ def _lines(seen: Seen) -> Values:
             break
         if all(abs(int(k) - b) > 2 for b in best):
             best.append(int(k))
-    found = [(2 * np.pi * _refined(power, k) / (length * step),) for k in best]
-    return found, length // 2
+    return [(2 * np.pi * _refined(power, k) / (length * step),) for k in best], length // 2
 
 
 def _refined(power: Array, k: int) -> float:

@@ -1,7 +1,7 @@
 """Slopes of the residual in what a candidate would add, at its null value: no refit.
 
-All candidates share the symbols of the model as it is, so that one evaluation serves many. What acts
-on the sequence of samples is differentiated through its recursion.
+All candidates share the symbols of the model as it is, so that one evaluation serves many. What
+acts on the sequence of samples is differentiated through its recursion.
 """
 
 from __future__ import annotations
@@ -66,19 +66,20 @@ def _sequential(candidate: Candidate, model: Model) -> bool:
 def _direct(
     problem: Problem, point: Point, found: Sequence[Candidate], rows: Sequence[Index]
 ) -> Iterator[tuple[Candidate, Array | CasestError]]:
-    model, kept, slopes, scopes = problem.model, [], [], []
+    model, kept = problem.model, list[Candidate]()
+    slopes, scopes = list[Any](), list[NDArray[np.bool_]]()
     signals = list(model.signals)
     symbols = {s.name: model.traced.symbols[s.name] for s in signals}
     for candidate in found:
         try:
-            slope, per_run, more = slope_of(candidate, model, symbols)
+            slope, scope, more = slope_of(candidate, model, symbols)
         except CasestError as error:
             yield candidate, error
             continue
         signals += more
         kept.append(candidate)
         slopes.append(slope)
-        scopes.append(np.array(per_run, bool))
+        scopes.append(np.array(scope, bool))
     if not kept:
         return
     base = model.traced
@@ -148,7 +149,7 @@ def _secant(
     candidate: Candidate,
     rows: Sequence[Index],
 ) -> Array:
-    """What a lag that is held changes, per second of it: it may be longer than any slope reaches."""
+    """What a held lag changes, per second of it: it may be longer than any slope reaches."""
     ((_, size),) = candidate.held
     pairs = zip(wide.residuals(at), problem.residuals(point), strict=True)
     parts = [(a - b)[chosen] / size for (a, b), chosen in zip(pairs, rows, strict=True)]

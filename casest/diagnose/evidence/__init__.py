@@ -1,1 +1,1 @@
-"""What columns beside a fit are worth: likelihood with its own noise, held-out error. Imports levels."""
+"""What columns beside a fit are worth: likelihood, price, held-out error. Imports levels."""

@@ -1,4 +1,4 @@
-"""Held-out squares: each part of a record foretold by the rest, with columns beside the fit or not."""
+"""Held-out squares: each part of a record foretold by the rest, with columns or without."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ OPEN = 0.2
 
 @dataclass(frozen=True)
 class Fall:
-    """What columns do to held-out squares: ratio after over before; t of the fall, from part to part."""
+    """Of held-out squares by columns: ratio after over before, and t from part to part."""
 
     ratio: float
     t: float
@@ -28,11 +28,14 @@ class Fall:
 def squares(linear: Linear, columns: Sequence[Array], parts: Index) -> Array:
     """Held-out squares of every part (parts,), each by a fit to the others; columns (N, m, k)."""
     e = _near(linear, foretold(linear, columns, parts))
-    return np.bincount(parts, np.sum(e**2, axis=1))
+    return np.asarray(np.bincount(parts, np.sum(e**2, axis=1)), float)
 
 
 def foretold(linear: Linear, columns: Sequence[Array], parts: Index) -> Array:
-    """Held-out residuals (N, m). What the rest of the record leaves open of the columns is nothing."""
+    """Held-out residuals (N, m).
+
+    What the rest of the record leaves open of the columns is taken to be nothing.
+    """
     flat = [_flat(c, linear) for c in columns]
     E = np.concatenate(flat, axis=1) if flat else np.zeros((linear.residual.size, 0))
     X, p = np.concatenate([linear.basis, E], axis=1), linear.basis.shape[1]

@@ -2,9 +2,10 @@
 
 The cosine transform of coloured noise is nearly independent from frequency to frequency, with the
 spectrum as its variance, and −2 log L = Σ log S + R²/S (P. Whittle, 1953). The spectrum is a smooth
-curve, fitted to what these very columns leave, with the power given back that the fit takes from each
-frequency: estimated from a residual that still holds the cause, it would count the cause as noise; without
-the leverage, smooth columns would win in noise of any colour. Poses and tables have white noise.
+curve, fitted to what these very columns leave, with the power given back that the fit takes from
+each frequency: estimated from a residual that still holds the cause, it would count the cause as
+noise; without the leverage, smooth columns would win in noise of any colour. Poses and tables have
+white noise.
 """
 
 from __future__ import annotations

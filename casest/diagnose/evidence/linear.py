@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,8 +28,8 @@ class Parts:
     """Three ways to hold a record out, the fold of each row (N,) in each.
 
     pieces: interleaved, which know their neighbours; stretches: whole parts of the record; regions:
-    whole parts of what the sensor met, wherever in the record. `batches` are parts of the record whose
-    noises are taken to be independent.
+    whole parts of what the sensor met, wherever in the record. `batches` are parts of the record
+    whose noises are taken to be independent.
     """
 
     pieces: Index
@@ -146,4 +147,4 @@ def spans_of(blocks: Index, runs: Index) -> tuple[slice, ...]:
     """Stretches of rows of one block of one run."""
     change = np.flatnonzero((np.diff(blocks) != 0) | (np.diff(runs) != 0)) + 1
     edges: Sequence[int] = [0, *change.tolist(), len(blocks)]
-    return tuple(slice(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True))
+    return tuple(slice(a, b) for a, b in pairwise(edges))

@@ -1,8 +1,9 @@
 """What a cause is worth: twice the log of its likelihood over none, less what its unknowns cost.
 
-The price is Schwarz's (1978), with its extension for what was looked through (J. Chen, Z. Chen, 2008):
-2 log of the number of variants of one cause, and of families of causes. With few rows the likelihood
-ratio with Zellner's prior of the weight of one observation stands in its place, which is exact there.
+The price is Schwarz's (1978), with its extension for what was looked through (J. Chen, Z. Chen,
+2008): 2 log of the number of variants of one cause, and of families of causes. With few rows the
+likelihood ratio with Zellner's prior of the weight of one observation stands in its place, which is
+exact there.
 """
 
 from __future__ import annotations
@@ -16,22 +17,23 @@ import numpy as np
 
 from casest.declaration.shapes import Array
 from casest.diagnose.evidence.likelihood import Explained, Likelihood
+from casest.diagnose.evidence.linear import Index
 
 
 @dataclass(frozen=True)
 class Trial:
     """A cause in its columns (N, m, k): slopes of the residual in its unknowns.
 
-    `what` it is to whom asks; `family` its name for all that is a variant of it; `variants`: how many were
-    looked through; `axes` (k,): the axis that each column belongs to, where that is a matter of axes;
-    `describes`: it is no cause, but what a cause must explain more than.
+    `what` it is to whom asks; `family` its name for all that is a variant of it; `variants`: how
+    many were looked through; `axes` (k,): the axis that each column belongs to, where that is a
+    matter of axes; `describes`: it is no cause, but what a cause must explain more than.
     """
 
     what: Any
     family: str
     columns: Array
     variants: float = 1.0
-    axes: Array | None = None
+    axes: Index | None = None
     describes: bool = False
 
 
@@ -39,8 +41,8 @@ class Trial:
 class Evidence:
     """A trial (several, if they come together) with what it is worth.
 
-    gain: 2 log L over none; freedom: unknowns; score: gain less the price; `basis` orthonormal columns
-    (N·m, k) by frequency.
+    gain: 2 log L over none; freedom: unknowns; score: gain less the price; `basis` orthonormal
+    columns (N·m, k) by frequency.
     """
 
     trials: tuple[Trial, ...]
@@ -86,9 +88,10 @@ def p_value(gain: float, freedom: int, searched: float, likelihood: Likelihood) 
 
 
 def screened(trial: Trial, likelihood: Likelihood, white: tuple[Array, Array, Array]) -> float:
-    """The gain of a trial under the noise beside none, less its price: cheap, to choose among variants.
+    """The gain of a trial under the noise beside none, less its price.
 
-    `white`: 1/√S of none, orthonormal whitened unknowns and the whitened residual beyond them.
+    Cheap, to choose among variants. `white`: 1/√S of none, orthonormal whitened unknowns and the
+    whitened residual beyond them.
     """
     root, Q, r = white
     flat = trial.columns.reshape(len(root), -1)
@@ -161,7 +164,7 @@ def _searched(trials: Sequence[Trial], families: int) -> float:
 
 def _leaves_enough(freedom: int, likelihood: Likelihood) -> bool:
     rest = len(likelihood.residual) - likelihood.declared.shape[1]
-    return rest - freedom >= max(4, rest / 4)
+    return bool(rest - freedom >= max(4, rest / 4))
 
 
 def on_fewer_axes(evidence: Evidence, likelihood: Likelihood) -> list[int] | None:
@@ -211,8 +214,9 @@ def shift(evidence: Evidence, likelihood: Likelihood) -> Array:
 
 
 def expected_loss(found: Sequence[Evidence], likelihood: Likelihood) -> tuple[Array, float]:
-    """Of each choice, were each of the others the truth: how far off the declared parameters would be,
-    by what they predict; and that of choosing none. Weights are those of the evidence.
+    """How far off each choice would leave the declared parameters, were each of the others true.
+
+    By what they predict; and that of choosing none. Weights are those of the evidence.
     """
     moved = np.array([shift(e, likelihood) for e in found] + [0 * shift(found[0], likelihood)])
     scores = np.array([e.score for e in found] + [0.0])

@@ -1,7 +1,7 @@
 """Outside the catalogue: a description of at most a few terms in what is recorded.
 
-Terms may read columns, time, the quantities of the model, and products of two. A description names no
-cause: it is tried beside the names, and stands only where it leads them by far.
+Terms may read columns, time, the quantities of the model, and products of two. A description names
+no cause: it is tried beside the names, and stands only where it leads them by far.
 """
 
 from __future__ import annotations

@@ -74,11 +74,6 @@ class Shape:
     variables: tuple[Variable, ...]
     order: int = 1
 
-    @property
-    def reads(self) -> frozenset[str]:
-        """Labels of what it reads."""
-        return frozenset(v.label for v in self.variables)
-
     def values(self, values: Sequence[Any], m: Any = np) -> Any:
         """Of the variables' values, with the functions of `m`."""
         v, x = self.variables, list(values)
@@ -137,7 +132,7 @@ class Term:
 
 
 def library(variables: Sequence[Variable]) -> list[Shape]:
-    """Powers 1 to 3, size, exponentials and saturation of each; multiples of an angle; products of two."""
+    """Powers 1 to 3, size, exponentials, saturation of each; sines of angles; products of two."""
     straight = [v for v in variables if not v.angle]
     found = [Shape(kind, (v,), k) for v in straight for kind, k in SHAPES]
     found += [

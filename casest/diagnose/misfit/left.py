@@ -1,7 +1,8 @@
 """Is what is left noise? As large as an independent estimate of it says, and flat.
 
-`calibrate` and `close` ask the same of a fit, and so agree. A colour that reaches over a few samples is
-noise; a slow course is none, whatever it is: its share is said, and that its cause is not known.
+`calibrate` and `close` ask the same of a fit, and so agree. A colour that reaches over a few
+samples is noise; a slow course is none, whatever it is: its share is said, and that its cause is
+not known.
 """
 
 from __future__ import annotations
@@ -50,8 +51,10 @@ class Finding:
 
 
 def doubts(estimate: Estimate) -> list[Finding] | None:
-    """What of a calibration's residual is no noise. None where nothing is asked: a refused estimate, or
-    one of more than LONGEST samples."""
+    """What of a calibration's residual is no noise.
+
+    None where nothing is asked: a refused estimate, or one of more than LONGEST samples.
+    """
     runs = estimate.problem.runs
     if not estimate.certificate.trusted or sum(map(len, runs)) > LONGEST:
         return None

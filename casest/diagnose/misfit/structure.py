@@ -1,7 +1,8 @@
 """Is a residual a function of something? Neighbours in its order are alike then.
 
-Rows are put in the order of a variable and averaged over blocks; the squared differences of neighbouring
-means against their variance (J. von Neumann, 1941) are 1 on average for what follows nothing.
+Rows are put in the order of a variable and averaged over blocks; the squared differences of
+neighbouring means against their variance (J. von Neumann, 1941) are 1 on average for what follows
+nothing.
 """
 
 from __future__ import annotations

@@ -55,16 +55,6 @@ class Fit:
         """Is it the most likely one, as far as its scoring says?"""
         return bool(np.isfinite(self.likelihood)) and self.last_step < 1.0
 
-    @property
-    def unknowns(self) -> int:
-        """Numbers that were estimated beside the states and intensities."""
-        return sum(c.size for c, _ in self.added) + (2 if self.colour else 0)
-
-    def evidence(self, other: Fit) -> float:
-        """Rise of log-likelihood less what as many numbers gain from noise alone (Schwarz 1978)."""
-        readings = np.isfinite(self.found.innovations).sum()
-        return rise(self, other) - 0.5 * self.unknowns * float(np.log(readings))
-
     def by_reading(self, values: Array) -> Array:
         """Values of readings (N, m) in the rows that these have in the file."""
         return by_reading(self.base, self.shifts, values)

@@ -1,4 +1,4 @@
-"""A filter's innovations as what the loop searches: effects on its signals, refitted with the noise."""
+"""A filter's innovations as what the loop searches: effects on signals, refitted with the noise."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The loop in motion: filter, look at the innovations, add what is missing, judged on held-out time."""
+"""The loop in motion: filter, look at innovations, add what is missing, judge on held-out time."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from casest.effects.moving import Candidate
 
 @dataclass(frozen=True)
 class Visible:
-    """`information` (p, p) of an effect's numbers; `moves` (n, p): rms effect of each on the states."""
+    """`information` (p, p) of an effect's numbers; `moves` (n, p): rms of each on the states."""
 
     candidate: Candidate
     information: Array

@@ -33,8 +33,8 @@ class NoiseModel:
     """What is known of the noise, from residuals.
 
     sigma: robust standard deviation of each axis, residual unit. lag1: correlation of neighbours
-    (None: the samples are no series), with its p-value under white noise; correlated_over: samples
-    per independent one; colour: "white", "AR(1)" (it decays as lag1 to the k-th) or "coloured".
+    (None: the samples are no series), with its p-value under white noise. colour: "white", "AR(1)"
+    (it decays as lag1 to the k-th) or "coloured".
     wander: random walk in residual units per root second (per root sample without time), 0 where
     none shows at `wander_p`. freedom: ν of Student's t, inf where tails are normal. outliers: share
     of samples. step: quantisation of the reading, 0 without. unequal: largest over smallest σ
@@ -45,7 +45,6 @@ class NoiseModel:
     lag1: float | None
     colour: str
     colour_p: float
-    correlated_over: float
     wander: float
     wander_p: float
     freedom: float
@@ -97,7 +96,6 @@ def noise_model(
         lag1=lag1,
         colour=_colour(lag1, colour_p, correlated_over),
         colour_p=colour_p,
-        correlated_over=correlated_over,
         wander=wander if wander_p < ALARM else 0.0,
         wander_p=wander_p,
         freedom=np.inf if outliers else found.freedom,

@@ -33,17 +33,14 @@ FREEDOMS, NORMAL = 1 / np.linspace(1 / 200, 1 / 1.5, 28), 50.0
 class Tails:
     """Log-likelihoods of three models of the tails, with what they found.
 
-    `freedom` is ν of Student's t (inf where tails are no heavier than normal), `share` and `away`
-    the share of outliers and how far out they lie, in σ, under the contaminated normal; `far`
-    (n,) the probability of each residual to be one.
+    `freedom` is ν of Student's t (inf where tails are no heavier than normal), `far` (n,) the
+    probability of each residual to be an outlier under the contaminated normal.
     """
 
     normal: float
     student: float
     contaminated: float
     freedom: float
-    share: float
-    away: float
     far: Array
 
     @property
@@ -57,12 +54,10 @@ def tails(z: Array) -> Tails:
     z = z / max(robust_scale([z]), 1e-300)
     normal = -0.5 * len(z) * (np.log(2 * np.pi * np.mean(z**2)) + 1)
     student, freedom = _student(z**2)
-    contaminated, share, away, far = _contaminated(z**2, normal)
+    contaminated, far = _contaminated(z**2, normal)
     # χ² with one degree of freedom for ν, at 1 in 1000.
     heavy = student - normal > 5.4 and freedom < NORMAL
-    return Tails(
-        normal, student, contaminated, freedom if heavy else np.inf, share, away, far
-    )  # fmt: skip
+    return Tails(normal, student, contaminated, freedom if heavy else np.inf, far)
 
 
 def _student(q: Array) -> tuple[float, float]:
@@ -88,11 +83,11 @@ def _between(x: Array, y: Array, best: int) -> float:
     return float(1 / (x[best] + shift * (x[1] - x[0])))
 
 
-def _contaminated(q: Array, normal: float) -> tuple[float, float, float, Array]:
-    """Largest log-likelihood of the contaminated normal; share, distance, probabilities (EM)."""
+def _contaminated(q: Array, normal: float) -> tuple[float, Array]:
+    """Largest log-likelihood of the contaminated normal; probabilities of outliers (EM)."""
     variance, far = 1.0, (q > (FAR + 1) ** 2).astype(float)
     if not far.any():
-        return normal, 0.0, 1.0, far
+        return normal, far
     for _ in range(60):
         share = min(max(float(far.mean()), 1e-9), FEW)
         variance = float(np.sum((1 - far) * q) / max(np.sum(1 - far), 1e-300))
@@ -101,7 +96,7 @@ def _contaminated(q: Array, normal: float) -> tuple[float, float, float, Array]:
         out = np.log(share) - 0.5 * np.log(wide) - q / (2 * wide)
         far = 1 / (1 + np.exp(np.clip(near - out, -700, 700)))
     likelihood = float(np.sum(np.logaddexp(near, out))) - 0.5 * len(q) * np.log(2 * np.pi)
-    return likelihood, share, float(np.sqrt(wide / variance)), far
+    return likelihood, far
 
 
 def even_scale(
