@@ -412,7 +412,30 @@ def _refitted(
         usual = [min(ranking.order.get(f, 0) for f in e.families) for e in near]
         best = found[min(range(len(near)), key=lambda k: (float(f"{loss[k]:.3g}"), usual[k]))]
         found = [best, *[r for r in found if r is not best]]
+        found = _plainest_first(found)
     return found
+
+
+def _plainest_first(refits: list[Refit[F]]) -> list[Refit[F]]:
+    """What the first one contains, and explains as much, comes before it."""
+    first = refits[0].evidence
+    inside = [
+        r
+        for r in refits[1:]
+        if r.evidence.score > first.score - LEVELS.strong
+        and r.evidence.freedom < first.freedom
+        and _contains(first, r.evidence)
+    ]
+    if not inside:
+        return refits
+    best = max(inside, key=lambda r: r.evidence.score)
+    return [best, *[r for r in refits if r is not best]]
+
+
+def _contains(wide: Evidence, narrow: Evidence) -> bool:
+    """Are the columns of one a combination of those of the other?"""
+    beyond = narrow.basis - wide.basis @ (wide.basis.T @ narrow.basis)
+    return bool(np.sum(beyond**2) < NESTED * narrow.freedom)
 
 
 def _near(refits: Sequence[Refit[F]]) -> list[Evidence]:
@@ -430,7 +453,9 @@ def _torn_between(refits: Sequence[Refit[F]], ranking: Ranking) -> list[Evidence
     if len(near) < 2:
         return []
     loss, none = expected_loss(near, ranking.likelihood)
-    return near if none < loss.min() else []
+    noise = float(np.mean(ranking.likelihood.residual**2 * np.exp(-near[0].gain / len(
+        ranking.likelihood.residual))))  # fmt: skip
+    return near if none < loss.min() and loss.min() > noise else []
 
 
 def _best_refits(refits: Sequence[Refit[F]]) -> list[Refit[F]]:
@@ -484,6 +509,8 @@ def _kept(
     return replace(state, fit=refit.fit, kept=kept)
 
 
+#: Share of its length by which a column may lie outside a span that contains it.
+NESTED = 1e-4
 #: Parts that are held out whole.
 FAR_AWAY = ("stretches", "regions")
 NOT_HELD_OUT = "held-out data do not confirm it"
@@ -522,7 +549,7 @@ def _better_than_its_parts(both: Evidence, seen: dict[str, Fall], ranking: Ranki
         if one.score > both.score - LEVELS.strong:
             return False
         alone = falls(ranking, one)
-        if any(1 - alone[k].ratio > (1 - LEVELS.alike) * (1 - seen[k].ratio) for k in names):
+        if any(seen[k].ratio > (1 - LEVELS.alike) * alone[k].ratio for k in names):
             return False
     return True
 

@@ -202,6 +202,7 @@ def _follows(
     if any(run.spread for run in problem.runs):
         return []
     read = variables(problem, point, usable_columns(problem.model, problem.runs))
+    read = [v for v in read if v.name in times or v.name not in TIMES]
     found = [
         s for s in structures(clipped, read) if s.p_value < LEVELS.misfit and s.share > LEVELS.share
     ]
