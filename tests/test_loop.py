@@ -98,11 +98,13 @@ def test_a_dead_zone_is_named_and_its_width_found(seed):
     assert np.all(np.abs(width - 0.12 * np.abs(worlds.SHARES)) < 5 * std)
 
 
-def test_a_bent_course_over_temperature_is_a_formula_and_no_step():
+def test_a_bent_course_over_temperature_follows_it_and_is_no_step():
+    """An exponential: the curve over temperature, or a formula in it."""
     closing, world = closed("table", 5, {"warm_exp": 0.03})
-    assert "formula" in labels(closing)
-    assert "bias_step" not in labels(closing)
-    assert "temperature" in closing.effects[-1].candidate.effect.formula
+    assert labels(closing) in (["temperature_curve(temperature)"], ["formula"])
+    assert "channel" in dict(closing.effects[-1].candidate.effect.columns) or (
+        "temperature" in closing.effects[-1].candidate.effect.formula
+    )
     assert rms(closing.after_held_out) < 1.1 * world.sigma
 
 
@@ -176,7 +178,6 @@ def test_an_offset_that_walks_at_random_is_unexplained_and_neither_drift_nor_ste
         assert "slow course" in closing.misfit.where
 
 
-@pytest.mark.xfail(strict=True, reason="what is asked for and acts on the noise is passed over")
 def test_of_an_offset_that_is_said_to_wander_something_is_said():
     closing = close(constant_bias, [wandering(2e-3, 0)], known=["bias_wander"])
     assert "bias_wander" in {*labels(closing), *(r.name for r in closing.refused)}

@@ -549,9 +549,15 @@ def _better_than_its_parts(both: Evidence, seen: dict[str, Fall], ranking: Ranki
         if one.score > both.score - LEVELS.strong:
             return False
         alone = falls(ranking, one)
-        if any(seen[k].ratio > (1 - LEVELS.alike) * alone[k].ratio for k in names):
+        if any(_as_much(alone[k].ratio, seen[k].ratio) for k in names):
             return False
     return True
+
+
+def _as_much(alone: float, both: float) -> bool:
+    """Does one alone gain nine tenths of what both gain, and do both leave as much but a tenth?"""
+    gains = 1 - alone > (1 - LEVELS.alike) * (1 - both)
+    return gains and both > (1 - LEVELS.alike) * alone
 
 
 def _describes(
