@@ -127,20 +127,12 @@ def test_a_wave_in_a_column_is_a_misfit():
         assert judged(record(white, seed, n=1200, positions=0, misfit=wave)).significant
 
 
-@pytest.mark.xfail(
-    strict=True, reason="a slow course in time is said, and columns are not asked beside it"
-)
 def test_a_wave_in_a_column_names_the_column():
     """It follows the column exactly, and time only nearly."""
     found = judged(record(white, 0, n=1200, positions=0, misfit=wave))
     assert "temp" in found.where
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="0.011 in the second, whose words say 13 %: σ of the middle against the mean square, "
-    "which differ by 7 % in 2400 normal numbers",
-)
 def test_the_share_of_a_wave_is_the_one_that_it_has():
     """Its variance, 0.5²/2 less its mean, over that of everything."""
     for seed in range(3):

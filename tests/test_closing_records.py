@@ -103,14 +103,7 @@ def test_the_accelerometer_beside_it_has_nothing_but_samples_far_out(closed, cou
     assert set(labels(closed(counting, *ACCELEROMETER))) <= {"outliers"}
 
 
-SLOW = pytest.mark.xfail(
-    strict=True,
-    reason="signed_cubic is claimed (p below 1e-300, held-out squares 1.5 % less) and eight rivals "
-    "named, in a residual of which a third is a slow course",
-)
-
-
-@pytest.mark.parametrize("which", ["noisy", pytest.param("filtered", marks=SLOW)])
+@pytest.mark.parametrize("which", ["noisy", "filtered"])
 def test_a_magnetometer_turned_by_hand_asks_for_no_cubic(shared_data, which):
     """Of its misfit of 6 % of the radius no effect explains a good part."""
     model = find_model("norm-triangular").having(norm=1.0)

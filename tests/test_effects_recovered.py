@@ -24,6 +24,7 @@ from casest import (
 )
 from casest.correction.inverse import Correction, invertible
 from casest.declaration.dimensions import check_units
+from casest.declaration.effect import OVER_TIME, RECORDED
 from casest.effects.on_axes import restricted
 from casest.effects.placing import angles, placed_in, prepared, told
 from casest.errors import CasestError
@@ -372,8 +373,11 @@ def swing(t=signal("s"), v=signal("V"), *, gain=param("V", start=1.0), pace=para
 OWN = {"compass": compass, "cell": cell, "swing": swing}
 
 
-@pytest.mark.parametrize("effect", [e for e in effects.CATALOGUE if e.on != "noise"],
-                         ids=lambda e: e.name)  # fmt: skip
+#: Those that act on a signal as another instrument has recorded it are tested in test_memory.py.
+ON_SAMPLES = [e for e in effects.CATALOGUE if e.on not in ("noise", RECORDED)]
+
+
+@pytest.mark.parametrize("effect", ON_SAMPLES, ids=lambda e: e.name)
 @pytest.mark.parametrize("name", [*OWN, "wheel", "rate-table", "norm-triangular"])
 def test_each_unknown_of_an_effect_changes_the_residual_from_null_on(effect, name):
     """By differences: finite, and not zero, wherever the effect is attached."""
@@ -384,6 +388,8 @@ def test_each_unknown_of_an_effect_changes_the_residual_from_null_on(effect, nam
         changed = declared.with_effect(placed_in(held, declared), columns=columns)
     except CasestError:
         return  # tests/test_effects.py says where and why
+    if changed.effects[-1].kind in OVER_TIME:
+        return  # it acts along a record, not on samples one by one: tests/test_memory.py
     rng = np.random.default_rng(4)
     samples = {s.name: rng.uniform(0.2, 2, (12, s.size)) for s in changed.signals}
     at = SOMEWHERE.get(name, {})
@@ -415,4 +421,5 @@ def test_effects_of_time_and_of_single_inputs_fit_a_model_of_one_axis():
             continue
     three = {"cross_axis", "soft_iron", "cross_quadratic"}
     wheels = {"imbalance", "speed_polynomial", "table_angle", "lever_arm"}
-    assert {e.name for e in effects.CATALOGUE} - fits == three | wheels
+    recorded = {"signal_lag"}  # of a signal besides the time and what is measured: there is none
+    assert {e.name for e in effects.CATALOGUE} - fits == three | wheels | recorded

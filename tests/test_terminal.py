@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import simulators as sim
+from scipy.spatial.transform import Rotation
 
 from casest.cli import commands, run
 from casest.cli.waiting import Waiting
@@ -54,7 +55,7 @@ def said(tmp_path_factory):
     shutil.copy(ROOT / "casest" / "demo" / "wheel.csv", folder)
     t = np.arange(0, 10, 0.02)
     omega = np.column_stack([0.3 * np.sin(0.2 * t), 0.3 * np.cos(0.3 * t), 0.2 + 0 * t])
-    a = np.array([0, 0, -9.81]) + 0.02 * rng.standard_normal((len(t), 3))
+    a = turned_back([0, 0, -9.81], t, omega) + 0.02 * rng.standard_normal((len(t), 3))
     table = np.column_stack([t, a, omega, 0.01 * rng.standard_normal((len(t), 3))])
     names = [f"{s}{axis} [{u}]" for s, u in (("a", "m/s^2"), ("omega", "rad/s"), ("v", "m/s"))
              for axis in "xyz"]  # fmt: skip
@@ -63,6 +64,14 @@ def said(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         yield {name: printed(words, patch) for name, words in WORDS.items()}
+
+
+def turned_back(vector, t, omega):
+    """What stands still outside (3,), as a body sees it that turns by `omega` (N, 3): (N, 3)."""
+    seen = [np.array(vector)]
+    for dt, rate in zip(np.diff(t), (omega[1:] + omega[:-1]) / 2, strict=True):
+        seen.append(Rotation.from_rotvec(-dt * rate).apply(seen[-1]))
+    return np.array(seen)
 
 
 def printed(words: str, patch: pytest.MonkeyPatch) -> str:

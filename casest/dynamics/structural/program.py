@@ -13,8 +13,6 @@ from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import Any
 
-import casadi as ca
-
 from casest.engine.graph import Graph
 from casest.engine.operations import operation_of
 
@@ -213,37 +211,34 @@ def program_of(function: Any) -> Program:
 
 
 def _rewritten(p: Program, code: int, operands: Sequence[int]) -> int:
-    a, b = operands[0], operands[-1]
+    a, b, name = operands[0], operands[-1], operation_of(code, "a model").name
     one = p.constant(1)
-    for name in ("add", "sub", "mul", "div"):
-        if code == getattr(ca, f"OP_{name.upper()}"):
-            return p.step(name, a, b)
-    if code in (ca.OP_POW, ca.OP_CONSTPOW):
-        return _power(p, a, b)
+    if name in ("add", "sub", "mul", "div"):
+        return p.step(name, a, b)
     found = {
-        ca.OP_NEG: lambda: p.step("sub", p.constant(0), a),
-        ca.OP_TWICE: lambda: p.step("add", a, a),
-        ca.OP_SQ: lambda: p.step("mul", a, a),
-        ca.OP_INV: lambda: p.step("div", one, a),
-        ca.OP_SQRT: lambda: p.root(a, Fraction(1, 2)),
-        ca.OP_EXP: lambda: p.exp(a),
-        ca.OP_EXPM1: lambda: p.step("sub", p.exp(a), one),
-        ca.OP_LOG: lambda: p.log(a),
-        ca.OP_LOG1P: lambda: p.log(p.step("add", one, a)),
-        ca.OP_COS: lambda: p.circle(a)[0],
-        ca.OP_SIN: lambda: p.circle(a)[1],
-        ca.OP_TAN: lambda: p.step("div", *p.circle(a)[::-1]),
-        ca.OP_ATAN: lambda: p.angle(one, a),
-        ca.OP_ATAN2: lambda: p.angle(b, a),
-        ca.OP_ASIN: lambda: p.angle(_other_leg(p, a), a),
-        ca.OP_ACOS: lambda: p.angle(a, _other_leg(p, a)),
-        ca.OP_HYPOT: lambda: _hypotenuse(p, a, b),
-        ca.OP_SINH: lambda: p.step("div", _odd(p, a), p.constant(2)),
-        ca.OP_COSH: lambda: p.step("div", _even(p, a), p.constant(2)),
-        ca.OP_TANH: lambda: p.step("div", _odd(p, a), _even(p, a)),
-    }.get(code)
+        "pow": lambda: _power(p, a, b),
+        "neg": lambda: p.step("sub", p.constant(0), a),
+        "twice": lambda: p.step("add", a, a),
+        "square": lambda: p.step("mul", a, a),
+        "inverse": lambda: p.step("div", one, a),
+        "sqrt": lambda: p.root(a, Fraction(1, 2)),
+        "exp": lambda: p.exp(a),
+        "expm1": lambda: p.step("sub", p.exp(a), one),
+        "log": lambda: p.log(a),
+        "log1p": lambda: p.log(p.step("add", one, a)),
+        "cos": lambda: p.circle(a)[0],
+        "sin": lambda: p.circle(a)[1],
+        "tan": lambda: p.step("div", *p.circle(a)[::-1]),
+        "atan": lambda: p.angle(one, a),
+        "atan2": lambda: p.angle(b, a),
+        "asin": lambda: p.angle(_other_leg(p, a), a),
+        "acos": lambda: p.angle(a, _other_leg(p, a)),
+        "hypot": lambda: _hypotenuse(p, a, b),
+        "sinh": lambda: p.step("div", _odd(p, a), p.constant(2)),
+        "cosh": lambda: p.step("div", _even(p, a), p.constant(2)),
+        "tanh": lambda: p.step("div", _odd(p, a), _even(p, a)),
+    }.get(name)
     if found is None:
-        name = operation_of(code, "a model").name
         raise Inexact(f"{name} has no power series that arithmetic modulo a prime can follow")
     return found()
 
