@@ -70,7 +70,7 @@ SIGN = pytest.mark.xfail(
 
 LATER = pytest.mark.xfail(
     strict=True,
-    reason="added on x alone, channel_bias is not given y later: channel_curve(supply) stands there",
+    reason="added on x alone, channel_bias is not given y later: channel_curve(supply) is there",
 )
 
 
@@ -168,7 +168,7 @@ def test_what_hangs_on_which_of_two_causes_it_is_said():
 @pytest.mark.xfail(
     strict=True,
     reason="a walk is named in 22 of 30 records (bias_drift 17, warm_up 4, a step 1): the spectrum "
-    "is flat below its first 24 frequencies, so that smooth causes win, and stretches confirm them",
+    "is flat over its first frequencies, so that smooth causes win, and stretches confirm them",
 )
 def test_an_offset_that_walks_at_random_is_unexplained_and_neither_drift_nor_step():
     """Most of it is a slow course, and its cause is not known."""

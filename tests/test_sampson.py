@@ -227,8 +227,8 @@ def z_values(estimate, sensor, per_ampere, current):
             norm_triangular,
             marks=pytest.mark.xfail(
                 strict=True,
-                reason="one record of three: the refit with a bend is worth 2.5 more (twice the log "
-                "of the likelihood, priced) than without, and the line stands as its rival",
+                reason="one record of three: the refit with a bend is worth 2.5 more (twice the "
+                "log of the likelihood, priced) than without, and the line stands as its rival",
             ),
         ),
     ],
