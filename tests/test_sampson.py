@@ -219,21 +219,7 @@ def z_values(estimate, sensor, per_ampere, current):
     return np.concatenate([(found[n] - truth[n]) / std[n] for n in truth])
 
 
-@pytest.mark.parametrize(
-    "declared",
-    [
-        norm_diagonal,
-        pytest.param(
-            norm_triangular,
-            marks=pytest.mark.xfail(
-                strict=True,
-                reason="one record of three: the refit with a bend is worth 2.5 more (twice the "
-                "log of the likelihood, priced) than without, and the line stands as its rival",
-            ),
-        ),
-    ],
-    ids=lambda m: m.name,
-)
+@pytest.mark.parametrize("declared", [norm_diagonal, norm_triangular], ids=lambda m: m.name)
 def test_a_motors_current_beside_a_magnetometer_is_found_and_what_is_left_is_noise(declared):
     z = []
     for seed in range(3):

@@ -509,8 +509,8 @@ def _kept(
     return replace(state, fit=refit.fit, kept=kept)
 
 
-#: Share of its length by which a column may lie outside a span that contains it.
-NESTED = 1e-4
+#: Share of their length by which columns may lie outside a span that holds the most of them.
+NESTED = 0.5
 #: Parts that are held out whole.
 FAR_AWAY = ("stretches", "regions")
 NOT_HELD_OUT = "held-out data do not confirm it"
