@@ -285,8 +285,8 @@ def by_normal_equations(model, run):
 
 @pytest.mark.parametrize("work", [filtered, least_squares])
 def test_the_engine_evaluates_rates_outputs_and_their_slopes(work, monkeypatch):
-    """Over all samples at once, from the replayed instructions; of a nonlinear model also the
-    motion between samples and its Jacobian."""
+    """Over all samples at once, from the replayed instructions; and the motion between samples, of
+    a nonlinear model with its Jacobian."""
     run, seen = flight(2.0)[0], []
     replayed = Replay.__call__
 
@@ -295,11 +295,10 @@ def test_the_engine_evaluates_rates_outputs_and_their_slopes(work, monkeypatch):
         return replayed(self, parameters, samples)
 
     monkeypatch.setattr(Replay, "__call__", counted)
-    work(bias_gravity, run)
-    assert set(seen) == {len(run)}
-    seen.clear()
-    work(turning_gravity, run)
-    assert set(seen) == {len(run), len(run) - 1}
+    for model in (bias_gravity, turning_gravity):
+        seen.clear()
+        work(model, run)
+        assert set(seen) == {len(run), len(run) - 1}
 
 
 @dynamics

@@ -23,7 +23,6 @@ from casest.dynamics.transition import (
     Linearised,
     linearised,
     process_along,
-    process_noise,
     steps_to,
     with_lost,
 )
@@ -151,8 +150,9 @@ def trajectory(model: Dynamics, run: Run, along: Array) -> tuple[Array, Array, b
 
 def discretised(model: Dynamics, system: Linearised) -> Steps:
     """The record in discrete time: exact transitions, readings as averages over their period."""
-    Phi, forced = system.moved
-    Q = with_lost(model, system.steps, Phi, process_noise(system, system.process))
+    moved = system.sampled
+    Phi, forced = moved.Phi, moved.forced
+    Q = with_lost(model, system.steps, Phi, moved.Q.copy())
     R = np.diag(model.noise)[None] / steps_to(system)[:, None]
     t = model.traced
     return Steps(Phi, forced, Q, system.C, system.d, R, system.y, reach(t.A), entries(t.C))

@@ -1,8 +1,8 @@
-"""From samples of the signals to transition matrices: fourth-order Magnus steps.
+"""From samples of the signals to transition matrices and process noise.
 
-Between two samples every signal is a straight line, so that A(t) is one too for the models at hand;
-Ω = h·(A₀ + A₁)/2 + h²/12·[A₁, A₀] is then right to fourth order (Magnus 1954; Blanes et al. 2009),
-where holding A is right to second order only. A known input is one more, constant state.
+Between two samples every signal is a straight line, so that A(t) is one too for the models at hand.
+Where only a part of a step or another equation's is asked for: fourth-order Magnus steps with
+Ω = h·(A₀ + A₁)/2 + h²/12·[A₁, A₀] (Magnus 1954; Blanes et al. 2009).
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from casest.data.run import Run
 from casest.data.timing import GAP, UNUSED
 from casest.declaration.shapes import Array
 from casest.declaration.tracing import flat
+from casest.dynamics.between import Motions, motions
 from casest.dynamics.declare import Dynamics
 from casest.dynamics.stepping import reach
 from casest.engine import Columns, Replay
@@ -60,6 +61,13 @@ class Linearised:
     def moved(self) -> tuple[Array, Array]:
         """Φ (N − 1, n, n) and forced step u (N − 1, n) of every step."""
         return transitions(self)
+
+    @cached_property
+    def sampled(self) -> Motions:
+        """Φ, forced step and covariance of the noise of every step."""
+        found = stepped(self, self.process)
+        self.__dict__.setdefault("moved", (found.Phi, found.forced))
+        return found
 
     @cached_property
     def later_half(self) -> Array:
@@ -159,14 +167,28 @@ def _refuse_missing_inputs(model: Dynamics, run: Run) -> None:
             )
 
 
-def transitions(system: Linearised, part: tuple[float, float] = (0.0, 1.0)) -> tuple[Array, Array]:
-    """Φ (N − 1, n, n) and forced step u (N − 1, n): x(t₁) = Φ x(t₀) + u.
+def transitions(system: Linearised) -> tuple[Array, Array]:
+    """Φ (N − 1, n, n) and forced step u (N − 1, n): x(t₁) = Φ x(t₀) + u."""
+    found = stepped(system, np.zeros_like(system.A[0]))
+    return found.Phi, found.forced
 
-    `part`: from which share of every step to which (for rules that need the middle).
+
+def stepped(system: Linearised, intensity: Array) -> Motions:
+    """Every step between two samples; Ξ constant (n, n), or at every sample (N, n, n).
+
+    Raises DataError where a step leads beyond what numbers hold.
     """
-    n = system.A.shape[1]
-    both = magnus_steps(lambda where: _augmented(system.A[where], system.c[where]), system, part)
-    return both[:, :n, :n], both[:, :n, n]
+    found = motions(system.A, system.c, intensity, system.steps)
+    whole = np.isfinite(found.forced).all(axis=1) & np.isfinite(found.Q).all(axis=(1, 2))
+    bad = np.flatnonzero(~(whole & np.isfinite(found.Phi).all(axis=(1, 2))))
+    if bad.size:
+        k = int(bad[0])
+        raise DataError(
+            f"from t = {system.time[k]:.9g} s to {system.time[k + 1]:.9g} s the motion grows beyond "
+            f"what numbers hold: its fastest rate is {np.abs(system.A[k]).max():.3g}/s; sample "
+            "faster, or leave the fast state out"
+        )
+    return found
 
 
 def half_transitions(system: Linearised, part: tuple[float, float]) -> Array:
@@ -202,13 +224,6 @@ def magnus_blocks(
         yield exponential(0.5 * h * (first + last) + h**2 / 12 * bend)
 
 
-def _augmented(A: Array, c: Array) -> Array:
-    count, n = c.shape
-    both = np.zeros((count, n + 1, n + 1))
-    both[:, :n, :n], both[:, :n, n] = A, c
-    return both
-
-
 def exponential(matrices: Array) -> Array:
     """exp of every matrix, (N, n, n): scaling, Taylor series, squaring.
 
@@ -236,24 +251,8 @@ def exponential(matrices: Array) -> Array:
 
 
 def process_noise(system: Linearised, intensity: Array) -> Array:
-    """∫Φ(t₁, s)ΞΦ(t₁, s)ᵀ ds of every step, (N − 1, n, n): Simpson's rule.
-
-    Ξ constant and diagonal (n, n), or any at every sample (N, n, n).
-    """
-    h = system.steps[:, None, None]
-    Phi, middle = system.moved[0], system.later_half
-    if intensity.ndim == 3:
-        last = intensity[1:]
-        between = 0.5 * (intensity[:-1] + last)
-        ends = Phi @ intensity[:-1] @ Phi.transpose(0, 2, 1) + last
-        inner = middle @ between @ middle.transpose(0, 2, 1)
-    else:
-        # A diagonal one: a product with its roots, half the work.
-        root = np.sqrt(np.diag(intensity))
-        first, middle = Phi * root, middle * root
-        ends = first @ first.transpose(0, 2, 1) + intensity
-        inner = middle @ middle.transpose(0, 2, 1)
-    return np.asarray(h / 6 * (ends + 4 * inner))
+    """∫Φ(t₁, s)ΞΦ(t₁, s)ᵀ ds of every step, (N − 1, n, n); Ξ (n, n), or at every sample."""
+    return stepped(system, intensity).Q
 
 
 def lost(model: Dynamics, steps: Array) -> Array:
