@@ -10,6 +10,7 @@ fast in a piece is doubled with A held: exact where A is constant.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -47,12 +48,12 @@ def motions(A: Array, c: Array, Xi: Array, h: Array) -> Motions:
     ends = A[:-1], A[1:], c[:-1], c[1:], *((Xi[:-1], Xi[1:]) if Xi.ndim == 3 else (Xi, Xi))
     fast = _balanced(np.abs(A).max(axis=0)) * h
     if fast.max(initial=0.0) <= _SLOW[-1]:
-        return _slow(*ends, h, float(fast.max(initial=0.0)))
+        return _slow(ends, h, float(fast.max(initial=0.0)))
     with np.errstate(all="ignore"):
         return _any(ends, h, fast)
 
 
-def _any(ends: tuple[Array, ...], h: Array, fast: Array) -> Motions:
+def _any(ends: Sequence[Array], h: Array, fast: Array) -> Motions:
     """Slow steps at once, faster ones in as many pieces as they need."""
     n = ends[0].shape[1]
     found = Motions(*(np.empty((len(h), *s)) for s in ((n, n), (n,), (n, n))))
@@ -69,7 +70,7 @@ def _rows(end: Array, rows: NDArray[np.bool_], n: int) -> Array:
     return end[rows] if len(end) == len(rows) and end.shape != (n, n) else end
 
 
-def _cut(ends: list[Array], h: Array, count: int, fast: Array) -> Motions:
+def _cut(ends: Sequence[Array], h: Array, count: int, fast: Array) -> Motions:
     whole: Motions | None = None
     A0, A1, c0, c1, X0, X1 = ends
     for k in range(count):
@@ -88,7 +89,7 @@ def _doubled(piece: list[Array], h: Array, times: int) -> Motions:
         piece = [
             M for s, e in zip(piece[::2], piece[1::2], strict=True) for M in 2 * [0.5 * (s + e)]
         ]
-    own = _slow(*piece, h / 2.0**times, _SLOW[-1])
+    own = _slow(piece, h / 2.0**times, _SLOW[-1])
     for _ in range(min(times, DOUBLINGS)):
         own = _after(own, own)
     return own
@@ -111,13 +112,13 @@ def _balanced(size: Array) -> float:
     return float(matrix_balance(size, permute=False)[0].sum(axis=1).max())
 
 
-def _slow(A0: Array, A1: Array, c0: Array, c1: Array, X0: Array, X1: Array, h: Array, fast: float
-          ) -> Motions:  # fmt: skip
+def _slow(ends: Sequence[Array], h: Array, fast: float) -> Motions:
+    A0, A1, c0, c1, X0, X1 = ends
     n, count = A0.shape[1], len(h)
     D = A1 - A0
     of_A, of_D = (_pattern(M.any(axis=0)) for M in (A1, D))
     even = X0.ndim == 2
-    there = (X0 != 0) | (X1 != 0)
+    there = np.asarray((X0 != 0) | (X1 != 0))
     of_X = _pattern(np.triu(there if even else there.any(axis=0)))
     columns = [_picked(A1, of_A), _picked(D, of_D), c0, c1]
     if not even:

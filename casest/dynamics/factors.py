@@ -8,7 +8,6 @@ in time: weighted Gram-Schmidt (C. Thornton, 1976).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import casadi as ca
@@ -43,8 +42,8 @@ def factored(P: Any) -> Factors:
     return U, D
 
 
-def orthogonal(rows: Any, weights: Any) -> tuple[Factors, Any]:
-    """U and D of rows·diag(weights)·rowsᵀ, and V with rows = U·V whose rows are orthogonal."""
+def orthogonal(rows: Any, weights: Any) -> Factors:
+    """U and D of rows·diag(weights)·rowsᵀ."""
     n = rows.size1()
     U, D = ca.SX.eye(n), ca.SX.zeros(n)
     left = [rows[i, :] for i in range(n)]
@@ -54,15 +53,24 @@ def orthogonal(rows: Any, weights: Any) -> tuple[Factors, Any]:
         for i in range(j):
             U[i, j] = over(ca.dot(left[i].T, heavy), D[j])
             left[i] = left[i] - U[i, j] * left[j]
-    return (U, D), ca.vertcat(*left)
+    return U, D
 
 
-def read(factors: Factors, c: Any, variance: Any) -> tuple[Factors, Any, Any]:
-    """After one scalar reading with gradient c: U and D, P·c, and the innovation's variance."""
+def moved(factors: Factors, Phi: Any, noise: Factors) -> Factors:
+    """After a step: U and D of ΦPΦᵀ + Q."""
+    (U, D), (Uq, Dq) = factors, noise
+    return orthogonal(ca.horzcat(Phi @ U, Uq), ca.vertcat(D, Dq))
+
+
+def read(factors: Factors, c: Any, variance: Any, weight: Any = 1) -> tuple[Factors, Any]:
+    """After one scalar reading with gradient c: U and D, and the gain.
+
+    Its variance is `variance`/`weight`: of no weight it says nothing.
+    """
     U, D = factors
     n = D.numel()
     f = U.T @ c
-    g = D * f
+    g, f = D * f, weight * f
     after_U, after_D, gain, before = ca.SX(U), ca.SX.zeros(n), ca.SX.zeros(n), variance
     for j in range(n):
         s = before + f[j] * g[j]
@@ -73,7 +81,7 @@ def read(factors: Factors, c: Any, variance: Any) -> tuple[Factors, Any, Any]:
             gain[i] += U[i, j] * g[j]
         gain[j] = g[j]
         before = s
-    return (after_U, after_D), gain, before
+    return (after_U, after_D), gain * (weight / before)
 
 
 def packed(x: Any, factors: Factors) -> Any:
@@ -95,8 +103,3 @@ def unpacked(both: Any, n: int) -> tuple[Any, Factors]:
 def size(n: int) -> int:
     """How many numbers `packed` makes of n states."""
     return 2 * n + n * (n - 1) // 2
-
-
-def beside(parts: Sequence[Any]) -> Any:
-    """Matrices side by side."""
-    return ca.horzcat(*parts)
