@@ -1,7 +1,7 @@
 """What happens between two samples: Φ, forced step and process noise, for A(t) a straight line.
 
-Seen back from the step's end, Φ(t₁, t₁ − τh) = ΣFₖτᵏ with (k + 1)Fₖ₊₁ = h(FₖA₁ − Fₖ₋₁(A₁ − A₀)): one
-series gives the transition over any part of the step, where A(t) need not commute with itself. The
+From a step's end backwards, Φ(t₁, t₁ − τh) = ΣFₖτᵏ with (k + 1)Fₖ₊₁ = h(FₖA₁ − Fₖ₋₁(A₁ − A₀)):
+one series gives the transition over any part of the step; A(t) need not commute with itself. The
 integrals of input and noise are Gauss's sums over those parts, so that a covariance is a sum of
 squares, and right in its leading power of h in every entry: a position's, driven through three
 integrators, too (by Simpson's rule it is not). Fast motion is cut into pieces, and what is still
@@ -10,7 +10,7 @@ fast in a piece is doubled with A held: exact where A is constant.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casest.declaration.shapes import Array
+from casest.dynamics.stepping import Pattern, entries
 from casest.engine import Columns, Replay
 
 #: How much of a motion, ‖A‖h, a series of so many terms follows to rounding.
@@ -32,7 +33,7 @@ DOUBLINGS = 60
 
 @dataclass(frozen=True)
 class Motions:
-    """Steps x(t₁) = Φ x(t₀) + u + w: Phi (K, n, n), forced u (K, n), covariance Q of w (K, n, n)."""
+    """Steps x(t₁) = Φ x(t₀) + u + w: Phi (K, n, n), forced u (K, n), Q (K, n, n) of w."""
 
     Phi: Array
     forced: Array
@@ -46,7 +47,7 @@ def motions(A: Array, c: Array, Xi: Array, h: Array) -> Motions:
     grows beyond what numbers hold, what is not finite is returned.
     """
     ends = A[:-1], A[1:], c[:-1], c[1:], *((Xi[:-1], Xi[1:]) if Xi.ndim == 3 else (Xi, Xi))
-    fast = _balanced(np.abs(A).max(axis=0)) * h
+    fast = balanced(np.abs(A).max(axis=0)) * h
     if fast.max(initial=0.0) <= _SLOW[-1]:
         return _slow(ends, h, float(fast.max(initial=0.0)))
     with np.errstate(all="ignore"):
@@ -57,17 +58,14 @@ def _any(ends: Sequence[Array], h: Array, fast: Array) -> Motions:
     """Slow steps at once, faster ones in as many pieces as they need."""
     n = ends[0].shape[1]
     found = Motions(*(np.empty((len(h), *s)) for s in ((n, n), (n,), (n, n))))
+    held = ends[4] if ends[4].ndim == 2 else None
     pieces = np.exp2(np.ceil(np.log2(np.maximum(fast / _SLOW[-1], 1.0))))
     for count in np.unique(np.minimum(pieces, _PIECES)):
         rows = np.minimum(pieces, _PIECES) == count
-        own = _cut([_rows(e, rows, n) for e in ends], h[rows], int(count), fast[rows])
+        own = _cut([e if e is held else e[rows] for e in ends], h[rows], int(count), fast[rows])
         for name in ("Phi", "forced", "Q"):
             getattr(found, name)[rows] = getattr(own, name)
     return found
-
-
-def _rows(end: Array, rows: NDArray[np.bool_], n: int) -> Array:
-    return end[rows] if len(end) == len(rows) and end.shape != (n, n) else end
 
 
 def _cut(ends: Sequence[Array], h: Array, count: int, fast: Array) -> Motions:
@@ -103,7 +101,7 @@ def _after(first: Motions, then: Motions) -> Motions:
     return Motions(Phi @ first.Phi, moved + then.forced, 0.5 * (Q + Q.transpose(0, 2, 1)))
 
 
-def _balanced(size: Array) -> float:
+def balanced(size: Array) -> float:
     """‖A‖ of entries no larger than these, in the units of the states that make it smallest."""
     from scipy.linalg import matrix_balance
 
@@ -118,8 +116,8 @@ def _slow(ends: Sequence[Array], h: Array, fast: float) -> Motions:
     D = A1 - A0
     of_A, of_D = (_pattern(M.any(axis=0)) for M in (A1, D))
     even = X0.ndim == 2
-    there = np.asarray((X0 != 0) | (X1 != 0))
-    of_X = _pattern(np.triu(there if even else there.any(axis=0)))
+    there = np.asarray(X0 != 0 if even else ((X0 != 0) | (X1 != 0)).any(axis=0))
+    of_X = _pattern(np.triu(there))
     columns = [_picked(A1, of_A), _picked(D, of_D), c0, c1]
     if not even:
         columns += [_picked(X0, of_X), _picked(X1, of_X)]
@@ -130,10 +128,7 @@ def _slow(ends: Sequence[Array], h: Array, fast: float) -> Motions:
     return Motions(np.asarray(Phi), np.asarray(forced).reshape(count, n), np.asarray(Q))
 
 
-Pattern = tuple[tuple[int, int], ...]
-
-
-def _pattern(there: NDArray[np.bool_]) -> Pattern:
+def _pattern(there: Any) -> Pattern:
     return tuple((int(i), int(j)) for i, j in np.argwhere(there))
 
 
@@ -147,19 +142,47 @@ def _replay(n: int, of_A: Pattern, of_D: Pattern, of_X: Pattern, even: bool, ord
     (a, A), (d, D) = (_symbols(name, n, p) for name, p in (("A", of_A), ("D", of_D)))
     c0, c1, h = ca.SX.sym("c0", n), ca.SX.sym("c1", n), ca.SX.sym("h")
     (x0, X0), (x1, X1) = (_symbols(name, n, of_X, True) for name in ("X0", "X1"))
-    series = _series(h * A, h * D, order)
-    forced, Q = ca.SX(n, 1), ca.SX(n, n)
-    for tau, weight in _nodes(of_A, n):
-        Phi = sum((tau**k * F for k, F in enumerate(series[1:], 1)), series[0])
-        forced += weight * h * (Phi @ (c1 - tau * (c1 - c0)))
-        Xi = X0 if even else X1 - tau * (X1 - X0)
-        Q += weight * h * ca.triu(Phi @ Xi @ Phi.T)
-    Phi = sum(series[1:], series[0])
+
+    def at(tau: float) -> tuple[Any, Any]:
+        return c1 - tau * (c1 - c0), X0 if even else X1 - tau * (X1 - X0)
+
+    Phi, forced, Q = expressions(A, D, at, h, order)
     sample = [a, d, c0, c1, *(() if even else (x0, x1)), h]
-    outputs = [ca.densify(e) for e in (Phi, forced, Q + ca.triu(Q, False).T)]
+    outputs = [ca.densify(e) for e in (Phi, forced, Q)]
     names = ["parameters", "sample"], ["Phi", "forced", "Q"]
     known = x0 if even else ca.SX.sym("none", 0)
     return Replay(ca.Function("between", [known, ca.vertcat(*sample)], outputs, *names))
+
+
+def expressions(
+    A: Any, D: Any, at: Callable[[float], tuple[Any, Any]], h: Any, order: int
+) -> tuple[Any, Any, Any]:
+    """Φ, forced step and Q of one step in CasADi's symbols: A at its end, D what A has changed by,
+    c and Ξ at τ, which runs from the end, 0, back to the beginning, 1."""
+    n = A.size1()
+    forced, Q = ca.SX(n, 1), ca.SX(n, n)
+    *parts, (whole, _, _) = _parts(A, D, h, order)
+    for Phi, tau, weight in parts:
+        c, Xi = at(tau)
+        forced += weight * (Phi @ c)
+        Q += weight * ca.triu(Phi @ Xi @ Phi.T)
+    return whole, forced, Q + ca.triu(Q, False).T
+
+
+def noise_of(A: Any, D: Any, Xi: Callable[[float], Any], h: Any) -> Any:
+    """Q alone of a step with ‖A‖h up to a half."""
+    none = ca.SX(A.size1(), 1)
+    return expressions(A, D, lambda tau: (none, Xi(tau)), h, _SERIES[-1])[2]
+
+
+def _parts(A: Any, D: Any, h: Any, order: int) -> list[tuple[Any, float, Any]]:
+    """Φ(t₁, t₁ − τh), τ and weight at Gauss's places, and of the whole step."""
+    series = _series(h * A, h * D, order)
+    places = [(tau, weight * h) for tau, weight in _nodes(entries(A), A.size1())] + [(1.0, 0 * h)]
+    return [
+        (sum((tau**k * F for k, F in enumerate(series[1:], 1)), series[0]), tau, weight)
+        for tau, weight in places
+    ]
 
 
 def _series(A: Any, D: Any, order: int) -> list[Any]:

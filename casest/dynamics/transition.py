@@ -184,9 +184,9 @@ def stepped(system: Linearised, intensity: Array) -> Motions:
     if bad.size:
         k = int(bad[0])
         raise DataError(
-            f"from t = {system.time[k]:.9g} s to {system.time[k + 1]:.9g} s the motion grows beyond "
-            f"what numbers hold: its fastest rate is {np.abs(system.A[k]).max():.3g}/s; sample "
-            "faster, or leave the fast state out"
+            f"from t = {system.time[k]:.9g} s to {system.time[k + 1]:.9g} s the motion grows "
+            f"beyond what numbers hold: its fastest rate is {np.abs(system.A[k]).max():.3g}/s; "
+            "sample faster, or leave the fast state out"
         )
     return found
 
