@@ -17,7 +17,6 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from casest.declaration.shapes import Array
 from casest.dynamics.stepping import Pattern, entries
@@ -47,7 +46,7 @@ def motions(A: Array, c: Array, Xi: Array, h: Array) -> Motions:
     grows beyond what numbers hold, what is not finite is returned.
     """
     ends = A[:-1], A[1:], c[:-1], c[1:], *((Xi[:-1], Xi[1:]) if Xi.ndim == 3 else (Xi, Xi))
-    fast = balanced(np.abs(A).max(axis=0)) * h
+    fast = balance(np.abs(A).max(axis=0))[1] * h
     if fast.max(initial=0.0) <= _SLOW[-1]:
         return _slow(ends, h, float(fast.max(initial=0.0)))
     with np.errstate(all="ignore"):
@@ -101,13 +100,14 @@ def _after(first: Motions, then: Motions) -> Motions:
     return Motions(Phi @ first.Phi, moved + then.forced, 0.5 * (Q + Q.transpose(0, 2, 1)))
 
 
-def balanced(size: Array) -> float:
-    """‖A‖ of entries no larger than these, in the units of the states that make it smallest."""
+def balance(size: Array) -> tuple[Array, float]:
+    """Units (n,) in which a matrix of such entries is smallest, and its norm there."""
     from scipy.linalg import matrix_balance
 
     if not np.isfinite(size).all():
-        return np.inf
-    return float(matrix_balance(size, permute=False)[0].sum(axis=1).max())
+        return np.ones(len(size)), np.inf
+    even, (units, _) = matrix_balance(size, permute=False, separate=True)
+    return np.asarray(units, float), float(even.sum(axis=1).max())
 
 
 def _slow(ends: Sequence[Array], h: Array, fast: float) -> Motions:

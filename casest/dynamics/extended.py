@@ -20,7 +20,7 @@ from casest.declaration.physics import SX
 from casest.declaration.shapes import Array
 from casest.declaration.tracing import flat
 from casest.dynamics import factors
-from casest.dynamics.between import balanced, noise_of
+from casest.dynamics.between import balance, noise_of
 from casest.dynamics.declare import Dynamics
 from casest.dynamics.discrete import Steps
 from casest.dynamics.stepping import entries, packed, run_steps, unpacked
@@ -189,7 +189,7 @@ def pieces(model: Dynamics, run: Run) -> int:
     """
     A = linearised(model, run).A
     h = float(counted(np.diff(checked_time(run))).max())
-    fast = h * balanced(np.abs(A).max(axis=0))
+    fast = h * balance(np.abs(A).max(axis=0))[1]
     count = int(2 ** np.clip(np.ceil(np.log2(max(fast, 1e-300) / PIECE)), 1, np.log2(MOST)))
     if not fast / count < UNSTABLE:
         raise DataError(

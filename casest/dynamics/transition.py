@@ -7,7 +7,6 @@ Where only a part of a step or another equation's is asked for: fourth-order Mag
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import factorial
@@ -193,35 +192,23 @@ def stepped(system: Linearised, intensity: Array) -> Motions:
 
 def half_transitions(system: Linearised, part: tuple[float, float]) -> Array:
     """Φ alone over a part of every step, for rules that need the middle."""
-    return magnus_steps(lambda where: system.A[where], system, part)
+    found = np.empty((len(system.time) - 1, *system.A.shape[1:]))
+    for k in range(0, len(found), _BLOCK):
+        where = slice(k, k + _BLOCK)
+        M = system.A[k : k + _BLOCK + 1]
+        found[where] = exponential(magnus(M, system.steps[where], part))
+    return found
 
 
-def magnus_steps(
-    coefficients: Callable[[slice], Array],
-    system: Linearised,
-    part: tuple[float, float] = (0.0, 1.0),
-) -> Array:
-    """Transition of ż = M(t) z over (a part of) every step, by fourth-order Magnus steps.
-
-    `coefficients(where)` gives M at those samples; between samples it is a straight line.
-    """
-    return np.concatenate(list(magnus_blocks(coefficients, system, part)))
-
-
-def magnus_blocks(
-    coefficients: Callable[[slice], Array],
-    system: Linearised,
-    part: tuple[float, float] = (0.0, 1.0),
-) -> Iterator[Array]:
-    """The same, some steps at a time: they stay in the processor's cache."""
-    steps, (begin, end) = system.steps, part
-    for k in range(0, len(steps), _BLOCK):
-        M = coefficients(slice(k, k + _BLOCK + 1))
-        slope = M[1:] - M[:-1]
-        first, last = (M[:-1] + share * slope if share else M[:-1] for share in part)
-        h = (end - begin) * steps[k : k + _BLOCK, None, None]
-        bend = last @ first - first @ last
-        yield exponential(0.5 * h * (first + last) + h**2 / 12 * bend)
+def magnus(M: Array, steps: Array, part: tuple[float, float] = (0.0, 1.0)) -> Array:
+    """Ω of ż = M(t) z over (a part of) every step, M (K + 1, n, n) being straight lines between
+    samples: exp Ω is the transition, to fourth order."""
+    begin, end = part
+    slope = M[1:] - M[:-1]
+    first, last = (M[:-1] + share * slope if share else M[:-1] for share in part)
+    h = (end - begin) * steps[:, None, None]
+    bend = last @ first - first @ last
+    return np.asarray(0.5 * h * (first + last) + h**2 / 12 * bend)
 
 
 def exponential(matrices: Array) -> Array:
