@@ -30,7 +30,8 @@ from casest.dynamics.transition import (
     counted,
     linearised,
     lost,
-    steps_to,
+    shares,
+    variances,
     with_lost,
 )
 from casest.engine import Columns, Recursion, Replay
@@ -49,11 +50,12 @@ def relinearised(model: Dynamics, run: Run, along: Array) -> Steps:
         *(run.signals[n][:-1] for n in inputs),
         *(run.signals[n][1:] for n in inputs),
         np.diff(time)[:, None],
+        _stood_for(np.diff(time)),
     ]
     Phi, forced, Q = over_samples(_step(model, pieces(model, run)), columns)
     Q = with_lost(model, np.diff(time), Phi, Q)
     C, d, y = _rows(model, run, along)
-    R = np.diag(model.noise)[None] / steps_to(np.diff(time))[:, None]
+    R = variances(model, np.diff(time))
     return Steps(Phi, forced[:, :, 0], Q, C, d, R, y, of_C=entries(model.traced.C))
 
 
@@ -66,9 +68,9 @@ def _rows(model: Dynamics, run: Run, along: Array) -> tuple[Array, Array, Array]
 
 @lru_cache(maxsize=8)
 def _step(model: Dynamics, count: int) -> Replay:
-    x, u, v, h = model.traced.x, *_two_samples(model), ca.SX.sym("h")
-    end, Phi, Q = _motion(model, count)(x, u, v, h)
-    return replay(ca.vertcat(x, u, v, h), [Phi, end - Phi @ x, Q])
+    x, (u, v, h, share) = model.traced.x, _two_samples(model)
+    end, Phi, Q = _motion(model, count)(x, u, v, h, share)
+    return replay(ca.vertcat(x, u, v, h, share), [Phi, end - Phi @ x, Q])
 
 
 @lru_cache(maxsize=8)
@@ -105,9 +107,10 @@ def extended(model: Dynamics, run: Run) -> tuple[Array, Array, Array, Array, Arr
         np.concatenate([u[:1], u[:-1]]),
         u,
         np.concatenate([[0.0], step])[:, None],
+        np.concatenate([[[1.0]], _stood_for(step)]),
         np.concatenate([np.zeros((1, n)), lost(model, step)]),
         np.nan_to_num(at),
-        np.diag(model.noise)[None] / steps_to(step)[:, None],
+        variances(model, step),
         np.nan_to_num(y),
         present.astype(float),
     ]
@@ -126,10 +129,10 @@ def _extended_step(model: Dynamics, count: int) -> Recursion:
     """(x and factors of P, numbers of one sample) -> (the same; x and P; and before the reading;
     innovation and S)."""
     t, n = model.traced, model.size
-    u, v, h = *_two_samples(model), ca.SX.sym("h")
+    u, v, h, share = _two_samples(model)
     both = ca.SX.sym("both", factors.size(n))
     x, P = factors.unpacked(both, n)
-    end, Phi, Q = _motion(model, count)(x, u, v, h)
+    end, Phi, Q = _motion(model, count)(x, u, v, h, share)
     gap = ca.diag(ca.SX.sym("gap", n))
     before = factors.moved(P, Phi, factors.factored(Phi @ gap @ Phi.T + Q + gap))
     before_x, before_P = end, factors.multiplied(before)
@@ -143,7 +146,7 @@ def _extended_step(model: Dynamics, count: int) -> Recursion:
         left = (y[i] - said[i]) * there[i] - ca.dot(c, after_x - before_x)
         after, gain = factors.read(after, c, R[i])
         after_x = after_x + gain * left
-    numbers = ca.vertcat(u, v, h, ca.diag(gap), signals, R, y, there)
+    numbers = ca.vertcat(u, v, h, share, ca.diag(gap), signals, R, y, there)
     told = ca.vertcat(y - said, ca.vec(ca.densify(C @ before_P @ C.T + ca.diag(R))))
     outputs = [
         factors.packed(after_x, after),
@@ -156,30 +159,29 @@ def _extended_step(model: Dynamics, count: int) -> Recursion:
 
 @lru_cache(maxsize=8)
 def _motion(model: Dynamics, count: int) -> Any:
-    """(x, inputs at both ends, h) -> (x after it, Φ, Q), as a function of symbols, in `count`
-    pieces."""
+    """(x, inputs at both ends, h, share of the usual step) -> (x after it, Φ, Q), as a function of
+    symbols, in `count` pieces."""
     t, n = model.traced, model.size
-    x, h = ca.SX.sym("x", n), ca.SX.sym("h")
-    u, v = _two_samples(model)
+    x, (u, v, h, share) = ca.SX.sym("x", n), _two_samples(model)
     own = ca.vertcat(*[flat(t.symbols[name]) for name in _input_names(model)])
     rate = ca.Function("rate", [t.x, own], [t.f])
     noise = ca.SX(ca.DM(model.process))
-    noise = noise if model.input_noise is None else noise + model.input_noise
-    slope, driven = (ca.Function("of", [t.x, own], [e]) for e in (t.A, noise))
+    noise = noise if model.input_noise is None else noise + share * model.input_noise
+    slope, driven = (ca.Function("of", [t.x, own, share], [e]) for e in (t.A, noise))
     piece = ca.Function("piece", [x, u, v, h], _with_jacobian(_runge_kutta(rate, x, u, v, h), x))
     end, Phi, Q, h_piece = x, ca.SX.eye(n), ca.SX(n, n), h / count
     for k in range(count):
         ends = [u + share / count * (v - u) for share in (k, k + 1)]
         before, (end, later) = end, piece(end, *ends, h_piece)
-        A0, A1 = slope(before, ends[0]), slope(end, ends[1])
+        A0, A1 = slope(before, ends[0], share), slope(end, ends[1], share)
         path = _path(before, end, rate(before, ends[0]), rate(end, ends[1]), h_piece)
 
-        def intensity(tau: float, ends: Any = ends, path: Any = path) -> Any:
-            return driven(path(tau), ends[1] - tau * (ends[1] - ends[0]))
+        def intensity(tau: float, ends: Any = ends, path: Any = path, share: SX = share) -> Any:
+            return driven(path(tau), ends[1] - tau * (ends[1] - ends[0]), share)
 
         Q = later @ Q @ later.T + noise_of(A1, A1 - A0, intensity, h_piece)
         Phi = later @ Phi
-    return ca.Function("motion", [x, u, v, h], [end, Phi, Q], {"cse": True})
+    return ca.Function("motion", [x, u, v, h, share], [end, Phi, Q], {"cse": True})
 
 
 def pieces(model: Dynamics, run: Run) -> int:
@@ -229,6 +231,13 @@ def _input_names(model: Dynamics) -> list[str]:
     return [s.name for s in model.signals if ca.depends_on(t.f, flat(t.symbols[s.name]))]
 
 
-def _two_samples(model: Dynamics) -> tuple[SX, SX]:
+def _stood_for(steps: Array) -> Array:
+    """What part of the usual step the readings at both ends of each stand for, (N − 1, 1)."""
+    own = shares(steps)
+    return 0.5 * (own[1:] + own[:-1])[:, None]
+
+
+def _two_samples(model: Dynamics) -> tuple[SX, SX, SX, SX]:
+    """Inputs at both ends of a step, its length, and what share of the usual one they stand for."""
     size = sum(int(model.traced.symbols[n].numel()) for n in _input_names(model))
-    return ca.SX.sym("u", size), ca.SX.sym("v", size)
+    return ca.SX.sym("u", size), ca.SX.sym("v", size), ca.SX.sym("h"), ca.SX.sym("share")

@@ -1,8 +1,8 @@
 """Kalman filter and fixed-interval smoother on a sampled record with A(t), gaps, missing readings.
 
-Between samples the exact transition of the (straight-line) signals; readings are taken as averages
-over their sampling period, so that their variance is Θ/Δt. A reading that is missing in part is
-used in part.
+Between samples the exact transition of the (straight-line) signals; a reading's variance is its
+noise's intensity over the usual time between two, however they lie. A reading that is missing in
+part is used in part.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from casest.dynamics.transition import (
     Linearised,
     linearised,
     process_along,
-    steps_to,
+    variances,
     with_lost,
 )
 from casest.errors import DataError
@@ -149,11 +149,11 @@ def trajectory(model: Dynamics, run: Run, along: Array) -> tuple[Array, Array, b
 
 
 def discretised(model: Dynamics, system: Linearised) -> Steps:
-    """The record in discrete time: exact transitions, readings as averages over their period."""
+    """The record in discrete time: exact transitions, and every reading with its variance."""
     moved = system.sampled
     Phi, forced = moved.Phi, moved.forced
     Q = with_lost(model, system.steps, Phi, moved.Q.copy())
-    R = np.diag(model.noise)[None] / steps_to(system)[:, None]
+    R = variances(model, system.steps)
     t = model.traced
     return Steps(Phi, forced, Q, system.C, system.d, R, system.y, reach(t.A), entries(t.C))
 

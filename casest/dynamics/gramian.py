@@ -15,7 +15,7 @@ import numpy as np
 
 from casest.declaration.shapes import Array
 from casest.dynamics.declare import Dynamics
-from casest.dynamics.transition import Linearised, counted, half_transitions
+from casest.dynamics.transition import Linearised, counted, half_transitions, usual
 from casest.leastsquares.null_space import sparsest
 
 #: A direction counts as observable from this share of the largest scaled eigenvalue on. Rounding
@@ -49,7 +49,7 @@ def gramian(model: Dynamics, system: Linearised) -> Array:
 
 def _of_steps(model: Dynamics, system: Linearised, Phi: Array) -> Array:
     """W of every single step at its own beginning, (N − 1, n, n): Simpson's rule."""
-    weight = np.linalg.inv(model.noise)
+    weight = np.linalg.inv(model.noise_at(usual(system.steps)))
     half = half_transitions(system, (0.0, 0.5))
     middle = 0.5 * (system.C[1:] + system.C[:-1]) @ half
     first, last = system.C[:-1], system.C[1:] @ Phi
@@ -84,8 +84,8 @@ def gramian_by_ode(model: Dynamics, system: Linearised, tolerance: float = 1e-12
     Signals are straight lines between samples, as in the other form; the integrator stops at every
     sample, so that it never steps over a corner.
     """
-    t, n = model.traced, model.size
-    W, weight = ca.SX.sym("W", n, n), ca.SX(ca.DM(np.linalg.inv(model.noise)))
+    t, n, noise = model.traced, model.size, model.noise_at(usual(system.steps))
+    W, weight = ca.SX.sym("W", n, n), ca.SX(ca.DM(np.linalg.inv(noise)))
     # Time runs backwards from the end; `since` is when the step began, at its later sample.
     s, since, h = (ca.SX.sym(name) for name in ("s", "since", "h"))
     share, ends = (s - since) / h, list[ca.SX]()

@@ -27,7 +27,7 @@ from casest.dynamics.transition import (
     lost,
     process_along,
     process_noise,
-    steps_to,
+    usual,
 )
 from casest.engine import Recursion
 
@@ -97,7 +97,7 @@ def prepared(model: Dynamics, run: Run, along: Array) -> Prepared:
     parts.append(_after(lost(model, system.steps), count))
     parts.append(_picked(np.where(present[:, :, None], system.C, 0.0), entries(t.C)))
     parts.append(np.where(present, system.y - system.d, 0.0))
-    period = steps_to(system)
+    period = np.full(count, usual(system.steps))
     readings, place = {}, 0
     for name, o in zip(t.measured, t.outputs, strict=True):
         readings[name] = slice(place, place + o.predicted.numel())

@@ -19,7 +19,7 @@ from casest.dynamics import factors
 from casest.dynamics.between import DOUBLINGS, balance
 from casest.dynamics.declare import Dynamics
 from casest.dynamics.stepping import run_steps
-from casest.dynamics.transition import Linearised, exponential, magnus
+from casest.dynamics.transition import Linearised, exponential, magnus, usual
 from casest.engine import Recursion
 from casest.errors import DataError
 
@@ -71,7 +71,7 @@ def _riccati_step(n: int) -> Recursion:
 
 def _over_steps(model: Dynamics, system: Linearised, where: slice) -> tuple[Array, Array, Array]:
     """Φ, Q and W of these steps, (…, n, n) each."""
-    weight: Array = np.asarray(np.linalg.inv(model.noise), float)
+    weight: Array = np.asarray(np.linalg.inv(model.noise_at(usual(system.steps))), float)
     ends = slice(where.start, where.stop + 1)
     n = model.size
     generator = magnus(_hamiltonian(model, system, ends, weight), system.steps[where])

@@ -13,10 +13,9 @@ from math import factorial
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from casest.data.run import Run
-from casest.data.timing import GAP, UNUSED
+from casest.data.timing import UNUSED, gaps
 from casest.declaration.shapes import Array
 from casest.declaration.tracing import flat
 from casest.dynamics.between import Motions, motions
@@ -134,7 +133,7 @@ def linearised(model: Dynamics, run: Run, along: Array | None = None) -> Lineari
     )
     columns = Columns([np.ascontiguousarray(along), *(run.signals[s.name] for s in model.signals)])
     A, c_, C, d_, y, *more = Replay(function)(np.zeros(0), columns)
-    process = model.process + more[0] if more else model.process
+    process = model.process + _stood_for(time) * more[0] if more else model.process
     readings = y[:, :, 0]
     if not np.isfinite(readings).all():
         C = np.where(np.isfinite(readings)[:, :, None], C, 0.0)
@@ -151,7 +150,12 @@ def process_along(model: Dynamics, run: Run, along: Array) -> Array:
     function = ca.Function("noise", [ca.SX.sym("none", 0), sample], [ca.densify(added)],
                            ["parameters", "sample"], ["Q"])  # fmt: skip
     columns = Columns([np.ascontiguousarray(along), *(run.signals[s.name] for s in model.signals)])
-    return np.asarray(model.process + Replay(function)(np.zeros(0), columns)[0])
+    noise = Replay(function)(np.zeros(0), columns)[0]
+    return np.asarray(model.process + _stood_for(checked_time(run)) * noise)
+
+
+def _stood_for(time: Array) -> Array:
+    return shares(np.diff(time))[:, None, None]
 
 
 def _refuse_missing_inputs(model: Dynamics, run: Run) -> None:
@@ -250,35 +254,48 @@ def lost(model: Dynamics, steps: Array) -> Array:
     """
     t, n = model.traced, model.size
     found = np.zeros((len(steps), n))
-    gaps = steps > GAP * np.median(steps)
-    if gaps.any():
+    wide = gaps(steps)
+    if wide.any():
         u = [flat(t.symbols[s.name]) for s in model.signals if s.name not in t.measured]
         driven = np.zeros(n, dtype=bool)
         if u:
             driven[list(set(ca.jacobian(t.f, ca.vertcat(*u)).sparsity().get_triplet()[0]))] = True
         moved = np.zeros((n, n), dtype=bool)
         moved[tuple(np.array(reach(t.A)).T)] = True
-        found[gaps] = np.where(moved @ driven, np.diag(model.start_covariance), 0.0)
+        found[wide] = np.where(moved @ driven, np.diag(model.start_covariance), 0.0)
     return found
 
 
 def with_lost(model: Dynamics, steps: Array, Phi: Array, Q: Array) -> Array:
     """The noise Q (N − 1, n, n) of steps, gaps included."""
     added, i = lost(model, steps), np.arange(model.size)
-    gaps = np.flatnonzero(added.any(axis=1))
-    own = np.zeros((len(gaps), model.size, model.size))
-    own[:, i, i] = added[gaps]
-    Q[gaps] += Phi[gaps] @ own @ Phi[gaps].transpose(0, 2, 1) + own
+    wide = np.flatnonzero(added.any(axis=1))
+    own = np.zeros((len(wide), model.size, model.size))
+    own[:, i, i] = added[wide]
+    Q[wide] += Phi[wide] @ own @ Phi[wide].transpose(0, 2, 1) + own
     return Q
 
 
+def usual(steps: Array) -> float:
+    """Time between two readings, s: the mean of the steps (N − 1,) that are no gaps."""
+    return float(np.mean(steps[~gaps(steps)]))
+
+
 def counted(steps: Array) -> Array:
-    """Steps (N − 1,) as far as readings stand for them: in a gap nothing was read."""
-    usual = float(np.median(steps))
-    return np.where(steps > GAP * usual, usual, steps)
+    """Steps (N − 1,) as far as readings stand for them: each for the usual one.
+
+    A sensor's noise knows nothing of when it was read before, and in a gap nothing was read.
+    """
+    return np.full(len(steps), usual(steps))
 
 
-def steps_to(steps: Array | Linearised) -> NDArray[np.float64]:
-    """Time that each sample stands for, (N,): half of the steps (N − 1,) on both sides of it."""
-    step = counted(steps.steps if isinstance(steps, Linearised) else steps)
-    return np.concatenate([[step[0]], 0.5 * (step[1:] + step[:-1]), [step[-1]]])
+def variances(model: Dynamics, steps: Array) -> Array:
+    """Variance of every reading, (N, m): the noise's intensity over the time between two."""
+    return np.repeat(np.diag(model.noise_at(usual(steps)))[None] / usual(steps), len(steps) + 1, 0)
+
+
+def shares(steps: Array) -> Array:
+    """What part of the usual step each reading of an input stands for, (N,): what lies between it
+    and its neighbours follows it, noise included. In a gap nothing does."""
+    step = np.where(gaps(steps), usual(steps), steps) / usual(steps)
+    return np.concatenate([step[:1], 0.5 * (step[1:] + step[:-1]), step[-1:]])

@@ -8,7 +8,7 @@ import numpy as np
 from msgspec import UNSET, Struct, UnsetType
 
 from casest.data.run import Run
-from casest.data.timing import GAP
+from casest.data.timing import gaps
 from casest.declaration.model import Model
 from casest.dynamics import Dynamics
 from casest.dynamics.filter import filtered
@@ -217,11 +217,11 @@ def assumed(run: Run) -> list[str]:
     notes = list(run.notes)
     time = np.asarray(run.time, float)
     step = np.diff(time)
-    gaps = np.flatnonzero(step > GAP * np.median(step))
-    if gaps.size:
-        worst = int(gaps[np.argmax(step[gaps])])
+    wide = np.flatnonzero(gaps(step))
+    if wide.size:
+        worst = int(wide[np.argmax(step[wide])])
         notes.append(
-            f"{gaps.size} {'gap' if gaps.size == 1 else 'gaps'} in time, the longest of "
+            f"{wide.size} {'gap' if wide.size == 1 else 'gaps'} in time, the longest of "
             f"{step[worst]:.3g} s after row {int(run.rows[worst])} (t = {time[worst]:.6g} s): "
             "inputs were taken as straight lines across; the states that they drive are known "
             "after it no better than at the beginning"

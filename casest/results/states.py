@@ -14,7 +14,7 @@ from msgspec import UNSET, Struct, UnsetType
 from casest.data.run import Run
 from casest.dynamics import Dynamics
 from casest.dynamics.filter import Filtered, filtered
-from casest.dynamics.intensities import Tuned, intensities, units
+from casest.dynamics.intensities import Tuned, intensities, period, units
 from casest.results.file import plain
 from casest.results.observability import assumed, too_short
 from casest.results.result import Number, Reproduced, Result, reproduced
@@ -94,8 +94,8 @@ def follow(
         states=_final(found),
         intensities=UsedIntensities(
             tuned.how if tuned else "as declared",
-            _plain_values(intensities(model)),
-            _plain_values(intensities(found.model)),
+            _plain_values(intensities(model, period(run))),
+            _plain_values(intensities(found.model, period(run))),
             _plain_values(tuned.spread) if tuned else {},
             units(found.model),
             plain(_normalised_mean(declared)),
