@@ -119,9 +119,7 @@ def test_an_output_may_state_the_noise_of_one_reading():
 def test_the_intensity_of_a_stated_reading_needs_its_period():
     assert resting.noise_at(0.1)[0, 0] == pytest.approx(0.3**2 * 0.1)
     assert resting.sensing(y=2.0).noise[0, 0] == 2.0
-    with pytest.raises(
-        UsageError, match=r"y has the noise of one reading \(std=0.3\)"
-    ):
+    with pytest.raises(UsageError, match=r"y has the noise of one reading \(std=0.3\)"):
         _ = resting.noise
 
 

@@ -177,12 +177,12 @@ def _after_scaling(
     return spelled
 
 
-def gaps(steps: Array) -> NDArray[np.bool_]:
-    """Which steps are gaps: far longer than the one that four of five do not exceed.
+def longest(steps: Array) -> float:
+    """The longest step that is no gap, s: some times the one that four of five do not exceed.
 
-    The median would call every second step a gap where short ones and long ones take turns.
+    By the median every second step would be a gap where short ones and long ones take turns.
     """
-    return np.asarray(steps > GAP * np.quantile(steps, USUAL, method="lower"))
+    return GAP * float(np.quantile(steps, USUAL, method="lower"))
 
 
 def interruptions(name: str, time: Array, rows: NDArray[np.int_]) -> list[str]:
@@ -193,7 +193,7 @@ def interruptions(name: str, time: Array, rows: NDArray[np.int_]) -> list[str]:
     median = float(np.median(steps))
     even = float(np.mean(np.abs(steps - median) < 0.1 * median)) >= 0.5
     said = []
-    wide = gaps(steps)
+    wide = steps > longest(steps)
     lost = np.flatnonzero((steps > 1.5 * median) & ~wide)
     if even and lost.size:
         count = int((np.rint(steps[lost] / median) - 1).sum())
@@ -204,11 +204,11 @@ def interruptions(name: str, time: Array, rows: NDArray[np.int_]) -> list[str]:
         )
     found = np.flatnonzero(wide)
     if found.size:
-        longest = found[np.argmax(steps[found])]
-        samples = f" ({round(steps[longest] / median) - 1} samples)" if even else ""
+        worst = found[np.argmax(steps[found])]
+        samples = f" ({round(steps[worst] / median) - 1} samples)" if even else ""
         said.append(
-            f"{_counted(found.size, 'gap')}, the longest {steps[longest]:.4g} s{samples} behind "
-            f"row {rows[longest]} (t = {time[longest]:.6g} s)"
+            f"{_counted(found.size, 'gap')}, the longest {steps[worst]:.4g} s{samples} behind "
+            f"row {rows[worst]} (t = {time[worst]:.6g} s)"
         )
     return [f"{name}: {'; '.join(said)}; the median step is {median:.3g} s"] if said else []
 

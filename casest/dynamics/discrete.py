@@ -6,7 +6,8 @@ that is discrete from the beginning.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -81,15 +82,26 @@ class Estimates:
 
 def kalman(steps: Steps, start: Array, covariance: Array) -> Estimates:
     """Kalman filter; `start` (n,) and `covariance` (n, n) hold before the first reading."""
-    m, n = steps.C.shape[1:]
-    C, R, y = steps.seen, steps.R, steps.read
+    n = steps.C.shape[2]
     # No step leads to the first sample: Φ = 0 from an empty state, and what is known beforehand.
-    forced, Q = np.concatenate([start[None], steps.forced]), np.empty((len(y), n, n))
+    forced, Q = np.concatenate([start[None], steps.forced]), np.empty((len(steps.y), n, n))
     Q[0], Q[1:] = covariance, steps.Q
-    step = kalman_step(n, m, *steps.patterns)
-    factored, *both = run_steps(step, np.zeros(size(n)), [steps.Phi, forced, Q, C, R, y])
+    return _followed(steps, [steps.Phi, forced, Q], np.zeros(size(n)))
+
+
+def continued(steps: Steps, state: Array) -> Estimates:
+    """The same at every sample but the first, where the filter has come to `state`, as factored."""
+    parts = {name: getattr(steps, name)[1:] for name in ("C", "d", "R", "y")}
+    return _followed(replace(steps, **parts), [steps.Phi, steps.forced, steps.Q], state)
+
+
+def _followed(samples: Steps, motion: Sequence[Array], state: Array) -> Estimates:
+    m, n = samples.C.shape[1:]
+    step = kalman_step(n, m, *samples.patterns)
+    readings = [samples.seen, samples.R, samples.read]
+    factored, *both = run_steps(step, state, [*motion, *readings])
     (x, P), before = (unpacked(part, n) for part in both)
-    return Estimates(x, P, *before, *_innovations(steps, *before), factored)
+    return Estimates(x, P, *before, *_innovations(samples, *before), factored)
 
 
 def _innovations(steps: Steps, x: Array, P: Array) -> tuple[Array, Array]:
@@ -104,13 +116,22 @@ def _innovations(steps: Steps, x: Array, P: Array) -> tuple[Array, Array]:
 
 def smoothed(steps: Steps, found: Estimates) -> tuple[Array, Array]:
     """Fixed-interval smoother: states (N, n) and covariances (N, n, n) by the whole record."""
+    n = steps.C.shape[2]
+    x, P, _ = smoothed_before(steps, found.factored[:-1], np.zeros(n * n + 2 * n))
+    return np.concatenate([x, found.x[-1:]]), np.concatenate([P, found.P[-1:]])
+
+
+def smoothed_before(steps: Steps, factored: Array, told: Array) -> tuple[Array, Array, Array]:
+    """The same at every sample but the last, of which what is `told` by readings after it is known.
+
+    `factored` (N − 1, …) by the filter; also returned: what is told of the first sample.
+    """
     m, n = steps.C.shape[1:]
     step, later = smoother_step(n, m, *steps.patterns), slice(None, 0, -1)
     parts = [p[::-1] for p in (steps.Phi, steps.forced, steps.Q)]
-    parts += [p[later] for p in (steps.seen, steps.R, steps.read)] + [found.factored[-2::-1]]
-    _, both = run_steps(step, np.zeros(n * n + 2 * n), parts, keep=False)
-    x, P = unpacked(both[::-1], n)
-    return np.concatenate([x, found.x[-1:]]), np.concatenate([P, found.P[-1:]])
+    parts += [p[later] for p in (steps.seen, steps.R, steps.read)] + [factored[::-1]]
+    back, both = run_steps(step, told, parts)
+    return *unpacked(both[::-1], n), back[-1]
 
 
 def linear_recursion(M: Array, b: Array, first: Array) -> Array:

@@ -8,14 +8,15 @@ Where only a part of a step or another equation's is asked for: fourth-order Mag
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from math import factorial
+from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from casest.data.run import Run
-from casest.data.timing import UNUSED, gaps
+from casest.data.timing import UNUSED, longest
 from casest.declaration.shapes import Array
 from casest.declaration.tracing import flat
 from casest.dynamics.between import Motions, motions
@@ -39,7 +40,8 @@ class Linearised:
 
     time (N,); A (N, n, n), c (N, n), C (N, m, n), d (N, m); y (N, m) with NaN where it is missing
     and no row in C;
-    process noise intensity Ξ (n, n), or (N, n, n) where inputs have noise of their own.
+    process noise intensity Ξ (n, n), or (N, n, n) where inputs have noise of their own;
+    `pace` of the whole record where this is a part of it.
     """
 
     time: Array
@@ -49,6 +51,7 @@ class Linearised:
     d: Array
     y: Array
     process: Array
+    pace: Pace | None = None
 
     @property
     def steps(self) -> Array:
@@ -114,48 +117,58 @@ def checked_record(model: Dynamics, run: Run) -> Array:
     return time
 
 
-def linearised(model: Dynamics, run: Run, along: Array | None = None) -> Linearised:
+def linearised(
+    model: Dynamics, run: Run, along: Array | None = None, pace: Pace | None = None
+) -> Linearised:
     """The model along a record; a nonlinear one along states `along` (N, n).
 
     Signals that only outputs use may be missing (NaN); inputs may not.
     """
-    time, t = checked_record(model, run), model.traced
+    time = checked_record(model, run)
     if along is None:
         along = np.broadcast_to(model.start, (len(time), model.size))
-    sample = ca.vertcat(t.x, *[flat(t.symbols[s.name]) for s in model.signals])
-    c, d = t.f - t.A @ t.x, t.h - t.C @ t.x
-    added = model.input_noise
-    expressions = [t.A, c, t.C, d, t.reading] + ([] if added is None else [added])
-    outputs = [ca.densify(e) for e in expressions]
-    none = ca.SX.sym("none", 0)
-    function = ca.Function(
-        "along", [none, sample], outputs, ["parameters", "sample"], list("AcCdyQ")[: len(outputs)]
-    )
     columns = Columns([np.ascontiguousarray(along), *(run.signals[s.name] for s in model.signals)])
-    A, c_, C, d_, y, *more = Replay(function)(np.zeros(0), columns)
-    process = model.process + _stood_for(time) * more[0] if more else model.process
+    A, c_, C, d_, y, *more = _along(model)(np.zeros(0), columns)
+    process = model.process + _stood_for(time, pace) * more[0] if more else model.process
     readings = y[:, :, 0]
     if not np.isfinite(readings).all():
         C = np.where(np.isfinite(readings)[:, :, None], C, 0.0)
-    return Linearised(time, A, c_[:, :, 0], C, d_[:, :, 0], readings, process)
+    return Linearised(time, A, c_[:, :, 0], C, d_[:, :, 0], readings, process, pace)
 
 
-def process_along(model: Dynamics, run: Run, along: Array) -> Array:
-    """Process noise Ξ alone, (n, n), or along states (N, n) where inputs have noise: (N, n, n)."""
-    added = model.input_noise
-    if added is None:
-        return model.process
+@lru_cache(maxsize=8)
+def _along(model: Dynamics) -> Replay:
+    """A, c, C, d and readings at a sample; what noise of inputs adds to Ξ, where they have any."""
+    t, added = model.traced, model.input_noise
+    c, d = t.f - t.A @ t.x, t.h - t.C @ t.x
+    expressions = [t.A, c, t.C, d, t.reading] + ([] if added is None else [added])
+    return _replay(model, expressions)
+
+
+@lru_cache(maxsize=8)
+def _noise_along(model: Dynamics) -> Replay:
+    return _replay(model, [model.input_noise])
+
+
+def _replay(model: Dynamics, expressions: list[Any]) -> Replay:
     t = model.traced
     sample = ca.vertcat(t.x, *[flat(t.symbols[s.name]) for s in model.signals])
-    function = ca.Function("noise", [ca.SX.sym("none", 0), sample], [ca.densify(added)],
-                           ["parameters", "sample"], ["Q"])  # fmt: skip
+    outputs = [ca.densify(e) for e in expressions]
+    names = ["parameters", "sample"], [f"o{k}" for k in range(len(outputs))]
+    return Replay(ca.Function("along", [ca.SX.sym("none", 0), sample], outputs, *names))
+
+
+def process_along(model: Dynamics, run: Run, along: Array, pace: Pace | None = None) -> Array:
+    """Process noise Ξ alone, (n, n), or along states (N, n) where inputs have noise: (N, n, n)."""
+    if model.input_noise is None:
+        return model.process
     columns = Columns([np.ascontiguousarray(along), *(run.signals[s.name] for s in model.signals)])
-    noise = Replay(function)(np.zeros(0), columns)[0]
-    return np.asarray(model.process + _stood_for(checked_time(run)) * noise)
+    noise = _noise_along(model)(np.zeros(0), columns)[0]
+    return np.asarray(model.process + _stood_for(checked_time(run), pace) * noise)
 
 
-def _stood_for(time: Array) -> Array:
-    return shares(np.diff(time))[:, None, None]
+def _stood_for(time: Array, pace: Pace | None) -> Array:
+    return shares(np.diff(time), pace)[:, None, None]
 
 
 def _refuse_missing_inputs(model: Dynamics, run: Run) -> None:
@@ -246,7 +259,7 @@ def process_noise(system: Linearised, intensity: Array) -> Array:
     return stepped(system, intensity).Q
 
 
-def lost(model: Dynamics, steps: Array) -> Array:
+def lost(model: Dynamics, steps: Array, pace: Pace | None = None) -> Array:
     """Variances (N − 1, n) that are added before and after each step: nothing but in gaps.
 
     What inputs did in a gap is unknown: states that they drive, through others too, are known in it
@@ -254,7 +267,7 @@ def lost(model: Dynamics, steps: Array) -> Array:
     """
     t, n = model.traced, model.size
     found = np.zeros((len(steps), n))
-    wide = gaps(steps)
+    wide = steps > (pace or pace_of(steps)).gap
     if wide.any():
         u = [flat(t.symbols[s.name]) for s in model.signals if s.name not in t.measured]
         driven = np.zeros(n, dtype=bool)
@@ -266,9 +279,11 @@ def lost(model: Dynamics, steps: Array) -> Array:
     return found
 
 
-def with_lost(model: Dynamics, steps: Array, Phi: Array, Q: Array) -> Array:
+def with_lost(
+    model: Dynamics, steps: Array, Phi: Array, Q: Array, pace: Pace | None = None
+) -> Array:
     """The noise Q (N − 1, n, n) of steps, gaps included."""
-    added, i = lost(model, steps), np.arange(model.size)
+    added, i = lost(model, steps, pace), np.arange(model.size)
     wide = np.flatnonzero(added.any(axis=1))
     own = np.zeros((len(wide), model.size, model.size))
     own[:, i, i] = added[wide]
@@ -276,9 +291,27 @@ def with_lost(model: Dynamics, steps: Array, Phi: Array, Q: Array) -> Array:
     return Q
 
 
+@dataclass(frozen=True)
+class Pace:
+    """How a record is read: the usual time between two readings, and what is a gap, s.
+
+    `share`: what part of the usual step each reading stands for (see `shares`), where it is known.
+    """
+
+    usual: float
+    gap: float
+    share: Array | None = None
+
+
+def pace_of(steps: Array) -> Pace:
+    """Of steps (N − 1,): the usual one is the mean of those that are no gaps."""
+    gap = longest(steps)
+    return Pace(float(np.mean(steps[steps <= gap])), gap)
+
+
 def usual(steps: Array) -> float:
     """Time between two readings, s: the mean of the steps (N − 1,) that are no gaps."""
-    return float(np.mean(steps[~gaps(steps)]))
+    return pace_of(steps).usual
 
 
 def counted(steps: Array) -> Array:
@@ -289,13 +322,17 @@ def counted(steps: Array) -> Array:
     return np.full(len(steps), usual(steps))
 
 
-def variances(model: Dynamics, steps: Array) -> Array:
+def variances(model: Dynamics, steps: Array, pace: Pace | None = None) -> Array:
     """Variance of every reading, (N, m): the noise's intensity over the time between two."""
-    return np.repeat(np.diag(model.noise_at(usual(steps)))[None] / usual(steps), len(steps) + 1, 0)
+    period = (pace or pace_of(steps)).usual
+    return np.repeat(np.diag(model.noise_at(period))[None] / period, len(steps) + 1, 0)
 
 
-def shares(steps: Array) -> Array:
+def shares(steps: Array, pace: Pace | None = None) -> Array:
     """What part of the usual step each reading of an input stands for, (N,): what lies between it
     and its neighbours follows it, noise included. In a gap nothing does."""
-    step = np.where(gaps(steps), usual(steps), steps) / usual(steps)
+    pace = pace or pace_of(steps)
+    if pace.share is not None:
+        return pace.share
+    step = np.where(steps > pace.gap, pace.usual, steps) / pace.usual
     return np.concatenate([step[:1], 0.5 * (step[1:] + step[:-1]), step[-1:]])

@@ -8,7 +8,7 @@ import numpy as np
 from msgspec import UNSET, Struct, UnsetType
 
 from casest.data.run import Run
-from casest.data.timing import gaps
+from casest.data.timing import longest
 from casest.declaration.model import Model
 from casest.dynamics import Dynamics
 from casest.dynamics.filter import filtered
@@ -217,7 +217,7 @@ def assumed(run: Run) -> list[str]:
     notes = list(run.notes)
     time = np.asarray(run.time, float)
     step = np.diff(time)
-    wide = np.flatnonzero(gaps(step))
+    wide = np.flatnonzero(step > longest(step))
     if wide.size:
         worst = int(wide[np.argmax(step[wide])])
         notes.append(
