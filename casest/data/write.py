@@ -38,7 +38,8 @@ Content = str | bytes | Iterable[str]
 def write_atomically(path: str | os.PathLike[str], text: Content) -> None:
     """Write text (in UTF-8) or bytes to `path`: it holds the old content or all of the new.
 
-    The text, whole or in pieces, goes to a temporary name in the same folder, reaches the disk, and is then renamed.
+    The text, whole or in pieces, goes to a temporary name in the same folder, reaches the disk, and
+    is then renamed.
     What is no character, as in the name of a file that is not UTF-8, becomes a question mark.
     Raises DataError where the folder is missing or cannot be written.
     """

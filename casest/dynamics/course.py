@@ -118,7 +118,7 @@ class _Pieces:
             )
         steps = discretised(model, system)
         found = self._through(steps, begun[1])
-        # Copies: a view would keep the whole piece.
+        # Copied: a view would keep the whole piece.
         return steps, found, (first, found.factored[-1].copy())
 
     def _through(self, steps: Steps, begun: Array | None) -> Estimates:

@@ -295,12 +295,14 @@ def with_lost(
 class Pace:
     """How a record is read: the usual time between two readings, and what is a gap, s.
 
-    `share`: what part of the usual step each reading stands for (see `shares`), where it is known.
+    `share`: what part of the usual step each reading stands for (see `shares`), where it is known;
+    `holed`: are readings missing somewhere in the record?
     """
 
     usual: float
     gap: float
     share: Array | None = None
+    holed: bool = False
 
 
 def pace_of(steps: Array) -> Pace:

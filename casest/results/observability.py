@@ -13,9 +13,8 @@ from casest.declaration.model import Model
 from casest.dynamics import Dynamics
 from casest.dynamics.filter import filtered
 from casest.dynamics.gramian import Observed as Seen
-from casest.dynamics.gramian import gramian, observed, window_eigenvalues
+from casest.dynamics.gramian import Products, observed, window_eigenvalues
 from casest.dynamics.structural import Structure, structure
-from casest.dynamics.transition import linearised
 from casest.errors import DeclarationError, UsageError
 from casest.estimate.calibrate import attempt
 from casest.results.file import plain
@@ -176,16 +175,17 @@ def observe_motion(
     model is linearised along its smoothed states.
     """
     along = None if model.linear else filtered(model, run).smoothed
-    system = linearised(model, run, along)
-    seen = observed(model, gramian(model, system))
-    duration = float(system.time[-1] - system.time[0])
-    if window is not None and not 2 * float(np.median(system.steps)) <= window < np.inf:
+    products = Products.of(model, run, along)
+    seen = observed(model, products.gramian())
+    time = np.asarray(run.time, float)
+    duration, step = float(time[-1] - time[0]), float(np.median(np.diff(time)))
+    if window is not None and not 2 * step <= window < np.inf:
         raise UsageError(
             f"--window {window:g} s: a window must hold two steps of "
-            f"{float(np.median(system.steps)):.3g} s at least; the record lasts {duration:.3g} s"
+            f"{step:.3g} s at least; the record lasts {duration:.3g} s"
         )
     length = min(window or WINDOW * duration, duration)
-    ends, eigenvalues = window_eigenvalues(model, system, length)
+    ends, eigenvalues = window_eigenvalues(products, length)
     telling = np.flatnonzero(eigenvalues[:, 0] > 1)
     std = {name: plain(seen.std[where]) for name, where in model.slices().items()}
     return ObservedMotion(
