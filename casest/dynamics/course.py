@@ -66,7 +66,7 @@ def followed(model: Dynamics, run: Run, *, smooth: bool = True) -> Course:
     check_covariance(model.start_covariance, "the covariance at the beginning")
     if not model.linear:
         return _of(filtered(model, run, smooth=smooth))
-    pieces = _Pieces.of(model, run)
+    pieces = Pieces.of(model, run)
     found, states = _empty(pieces, smooth), [pieces.start]
     for where in pieces.every:
         _, own, after = pieces.filtered(where, states[-1])
@@ -79,11 +79,11 @@ def followed(model: Dynamics, run: Run, *, smooth: bool = True) -> Course:
 
 
 #: Where the filter has come to, as factored: with noise along the start, and along its own states.
-_States = tuple[Array | None, Array | None]
+States = tuple[Array | None, Array | None]
 
 
 @dataclass(frozen=True)
-class _Pieces:
+class Pieces:
     """A record and the model along it, in pieces that share their ends."""
 
     model: Dynamics
@@ -92,19 +92,24 @@ class _Pieces:
     time: Array
     share: Array
     every: tuple[slice, ...]
-    start: _States = (None, None)
+    start: States = (None, None)
 
     @staticmethod
-    def of(model: Dynamics, run: Run) -> _Pieces:
+    def of(model: Dynamics, run: Run, pace: Pace | None = None) -> Pieces:
+        """A whole record, or a part of one that is read at a known pace."""
         time = checked_record(model, run)
         step, last = np.diff(time), len(time) - 1
         cuts = [slice(k, min(k + PIECE, last) + 1) for k in range(0, last, PIECE)]
-        return _Pieces(model, run, pace_of(step), time, shares(step), tuple(cuts))
+        pace = pace or pace_of(step)
+        return Pieces(model, run, pace, time, shares(step, pace), tuple(cuts))
 
-    def filtered(self, where: slice, begun: _States) -> tuple[Steps, Estimates, _States]:
+    def filtered(
+        self, where: slice, begun: States, last: int = -1
+    ) -> tuple[Steps, Estimates, States]:
         """The steps of a piece, the filter at every sample after its first, and where it came to.
 
-        At the beginning of the record: at its first sample too.
+        At the beginning of the record: at its first sample too. `last`: which of these counts as
+        the end.
         """
         model, own = self.model, self.run.take(where)
         pace = replace(self.pace, share=self.share[where])
@@ -114,12 +119,12 @@ class _Pieces:
             x = early.x if begun[0] is None else np.vstack([begun[0][: model.size], early.x])
             system, first = (
                 system.driven(process_along(model, own, x, pace)),
-                early.factored[-1].copy(),
+                early.factored[last].copy(),
             )
         steps = discretised(model, system)
         found = self._through(steps, begun[1])
         # Copied: a view would keep the whole piece.
-        return steps, found, (first, found.factored[-1].copy())
+        return steps, found, (first, found.factored[last].copy())
 
     def _through(self, steps: Steps, begun: Array | None) -> Estimates:
         if begun is None:
@@ -132,7 +137,7 @@ class _Pieces:
         return x, std_of(P)
 
 
-def _back(found: Course, pieces: _Pieces, states: list[_States]) -> None:
+def _back(found: Course, pieces: Pieces, states: list[States]) -> None:
     n = pieces.model.size
     told = np.zeros(n * n + 2 * n)
     for where, begun in zip(pieces.every[::-1], states[-2::-1], strict=True):
@@ -145,14 +150,14 @@ def _back(found: Course, pieces: _Pieces, states: list[_States]) -> None:
     found.smoothed[-1], found.smoothed_std[-1] = found.x[-1], found.std[-1]
 
 
-def _put(found: Course, pieces: _Pieces, where: slice, own: Estimates) -> None:
+def _put(found: Course, pieces: Pieces, where: slice, own: Estimates) -> None:
     where = slice(where.stop - len(own.x), where.stop)
     found.x[where], found.std[where] = pieces.known(where, own.x, own.P)
     found.innovations[where], found.expected_std[where] = own.innovations, std_of(own.S)
     found.normalised_innovations[where] = normalised(own.innovations, own.S)
 
 
-def _empty(pieces: _Pieces, smooth: bool) -> Course:
+def _empty(pieces: Pieces, smooth: bool) -> Course:
     N, n, m = len(pieces.time), pieces.model.size, pieces.model.traced.h.numel()
     sizes = (n, n, n, n, m, m)
     x, std, own, own_std, innovations, expected = (np.empty((N, size)) for size in sizes)

@@ -14,6 +14,7 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from casest.data.run import Run
 from casest.declaration.physics import SX
@@ -25,11 +26,12 @@ from casest.dynamics.declare import Dynamics
 from casest.dynamics.discrete import Steps
 from casest.dynamics.stepping import entries, packed, run_steps, unpacked
 from casest.dynamics.transition import (
+    Pace,
     checked_record,
     checked_time,
-    counted,
     linearised,
     lost,
+    pace_of,
     shares,
     variances,
     with_lost,
@@ -95,10 +97,28 @@ def over_samples(expressions: Replay, columns: list[Array]) -> list[Array]:
 
 def extended(model: Dynamics, run: Run) -> tuple[Array, Array, Array, Array, Array, Array]:
     """Extended Kalman filter: x, P after each reading and before it, innovations, their S."""
+    n, m, (parts, present) = model.size, model.traced.h.numel(), given(model, run)
+    root = np.zeros(n * (n - 1) // 2)
+    state = np.concatenate([model.start, np.diag(model.start_covariance), root])
+    steps = extended_step(model, pieces(model, run))
+    _, after, before, told = run_steps(steps, state, parts, keep=False)
+    return *unpacked(after, n), *unpacked(before, n), *_told(told, present, m)
+
+
+def _told(told: Array, present: NDArray[np.bool_], m: int) -> tuple[Array, Array]:
+    """Innovations and their S, NaN where a reading is missing."""
+    S = told[:, m:].reshape(-1, m, m).transpose(0, 2, 1)
+    S = np.where(present[:, :, None] & present[:, None, :], S, np.nan)
+    return np.where(present, told[:, :m], np.nan), S
+
+
+def given(
+    model: Dynamics, run: Run, pace: Pace | None = None
+) -> tuple[list[Array], NDArray[np.bool_]]:
+    """What every step of the extended filter is given, (N, …) each; which readings there are."""
     time = checked_record(model, run)
-    t, inputs = model.traced, _input_names(model)
-    n, m = model.size, t.h.numel()
-    step = np.diff(time)
+    inputs, step = _input_names(model), np.diff(time)
+    n, m = model.size, model.traced.h.numel()
     u = np.concatenate([run.signals[name] for name in inputs] or [np.zeros((len(time), 0))], axis=1)
     at = np.concatenate([run.signals[s.name] for s in model.signals], axis=1)
     y = _rows(model, run, np.broadcast_to(model.start, (len(time), n)))[2][:, :m]
@@ -107,25 +127,18 @@ def extended(model: Dynamics, run: Run) -> tuple[Array, Array, Array, Array, Arr
         np.concatenate([u[:1], u[:-1]]),
         u,
         np.concatenate([[0.0], step])[:, None],
-        np.concatenate([[[1.0]], _stood_for(step)]),
-        np.concatenate([np.zeros((1, n)), lost(model, step)]),
+        np.concatenate([[[1.0]], _stood_for(step, pace)]),
+        np.concatenate([np.zeros((1, n)), lost(model, step, pace)]),
         np.nan_to_num(at),
-        variances(model, step),
+        variances(model, step, pace),
         np.nan_to_num(y),
         present.astype(float),
     ]
-    root = np.zeros(n * (n - 1) // 2)
-    state = np.concatenate([model.start, np.diag(model.start_covariance), root])
-    steps = _extended_step(model, pieces(model, run))
-    _, after, before, told = run_steps(steps, state, parts, keep=False)
-    ours = np.where(present, told[:, :m], np.nan)
-    S = told[:, m:].reshape(-1, m, m).transpose(0, 2, 1)
-    S = np.where(present[:, :, None] & present[:, None, :], S, np.nan)
-    return *unpacked(after, n), *unpacked(before, n), ours, S
+    return parts, present
 
 
 @lru_cache(maxsize=8)
-def _extended_step(model: Dynamics, count: int) -> Recursion:
+def extended_step(model: Dynamics, count: int) -> Recursion:
     """(x and factors of P, numbers of one sample) -> (the same; x and P; and before the reading;
     innovation and S)."""
     t, n = model.traced, model.size
@@ -184,13 +197,13 @@ def _motion(model: Dynamics, count: int) -> Any:
     return ca.Function("motion", [x, u, v, h, share], [end, Phi, Q], {"cse": True})
 
 
-def pieces(model: Dynamics, run: Run) -> int:
+def pieces(model: Dynamics, run: Run, pace: Pace | None = None) -> int:
     """Into how many pieces a usual step is cut: as many as the motion at the start asks for.
 
     Raises DataError where that is more than can be followed.
     """
     A = linearised(model, run).A
-    h = float(counted(np.diff(checked_time(run))).max())
+    h = (pace or pace_of(np.diff(checked_time(run)))).usual
     fast = h * balance(np.abs(A).max(axis=0))[1]
     count = int(2 ** np.clip(np.ceil(np.log2(max(fast, 1e-300) / PIECE)), 1, np.log2(MOST)))
     if not fast / count < UNSTABLE:
@@ -231,9 +244,9 @@ def _input_names(model: Dynamics) -> list[str]:
     return [s.name for s in model.signals if ca.depends_on(t.f, flat(t.symbols[s.name]))]
 
 
-def _stood_for(steps: Array) -> Array:
+def _stood_for(steps: Array, pace: Pace | None = None) -> Array:
     """What part of the usual step the readings at both ends of each stand for, (N − 1, 1)."""
-    own = shares(steps)
+    own = shares(steps, pace)
     return 0.5 * (own[1:] + own[:-1])[:, None]
 
 
