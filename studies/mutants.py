@@ -40,7 +40,7 @@ TESTS: dict[str, tuple[str, ...]] = {
     "dynamics/factors": ("digits",),
     "dynamics/course": ("course",),
     "dynamics/record": ("gaps", "dynamics"),
-    "dynamics/transition": ("gaps", "discrete", "dynamics"),
+    "dynamics/transition": ("gaps", "discrete", "dynamics", "intensities"),
     "correction/": ("two_roots", "apply"),
     "data/timing": ("time_units", "bind"),
     "data/bind": ("time_units", "bind"),

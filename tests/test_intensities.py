@@ -31,6 +31,11 @@ def resting(y=signal("m"), *, place=state("m", std=1e9)):
     return Motion(rates={}, outputs=(measured(y, place, std=0.3),))
 
 
+@dynamics
+def walked(speed=signal("m/s"), y=signal("m"), *, place=state("m", std=1e-3)):
+    return Motion(rates={"place": speed}, outputs=(measured(y, place, std=1.0),))
+
+
 @pytest.fixture(scope="module")
 def flight():
     return flights.record(flights.in_the_air(), T, np.random.default_rng(0))
@@ -102,6 +107,18 @@ def test_steps_that_take_turns_are_no_gaps():
     record = flights.record(flights.in_the_air(), t, np.random.default_rng(0))
     assert np.median(np.diff(t)) < 0.002
     assert assumed(record) == list(record.notes)
+
+
+def test_noise_of_an_input_lasts_as_long_as_its_reading_is_held():
+    """A distance by trapezoids of a noisy speed at uneven times: σ²Σ(half of both steps)²."""
+    rng = np.random.default_rng(3)
+    t = np.cumsum(rng.choice([0.01, 0.02, 0.04], 2000))
+    none = np.full((2000, 1), np.nan)
+    run = Run.raw("r", {"speed": np.ones((2000, 1)), "y": none}, units={}, time=t)
+    found = filtered(from_stated(walked, run, {"speed": 0.1}).model, run, smooth=False)
+    weights = 0.5 * (t[2:] - t[:-2])
+    expected = 0.1**2 * np.sum(weights**2)
+    assert found.P[-1, 0, 0] - found.P[0, 0, 0] == pytest.approx(expected, rel=1e-3)
 
 
 def test_an_output_may_state_the_noise_of_one_reading():
