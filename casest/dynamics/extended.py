@@ -184,7 +184,7 @@ def _motion(model: Dynamics, count: int) -> Any:
     piece = ca.Function("piece", [x, u, v, h], _with_jacobian(_runge_kutta(rate, x, u, v, h), x))
     end, Phi, Q, h_piece = x, ca.SX.eye(n), ca.SX(n, n), h / count
     for k in range(count):
-        ends = [u + share / count * (v - u) for share in (k, k + 1)]
+        ends = [u + part / count * (v - u) for part in (k, k + 1)]
         before, (end, later) = end, piece(end, *ends, h_piece)
         A0, A1 = slope(before, ends[0], share), slope(end, ends[1], share)
         path = _path(before, end, rate(before, ends[0]), rate(end, ends[1]), h_piece)
