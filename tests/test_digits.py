@@ -23,6 +23,7 @@ from casest.dynamics import (
     state,
 )
 from casest.dynamics.filter import discretised
+from casest.dynamics.likelihood import likelihood, prepared
 from casest.dynamics.riccati import riccati
 from casest.dynamics.transition import Linearised, linearised, process_noise, transitions
 
@@ -181,6 +182,17 @@ def test_a_pendulum_of_which_nothing_is_known_is_followed():
     assert (np.diagonal(found.P, axis1=1, axis2=2) > 0).all()
     known = filtered(pendulum.known_to(angle=1, rate=1), run)
     np.testing.assert_allclose(found.std[-1], known.std[-1], rtol=5e-3)
+
+
+def test_the_likelihood_forgets_what_was_known_before_as_that_grows():
+    """Of two states that the readings determine it falls by 2·log of their std."""
+    run = recorded(y=1e-3 * np.random.default_rng(0).standard_normal(len(T)))
+    found = []
+    for std in (1e5, 1e6, 1e8):
+        model = integrated.known_to(place=std, speed=std)
+        ready = prepared(model, run, filtered(model, run).smoothed)
+        found.append(likelihood(ready, {"speed": 1e-3, "y": 1e-8}) + 2 * np.log(std))
+    np.testing.assert_allclose(found, found[0], atol=1e-6)
 
 
 # -- the noise of a step ---------------------------------------------------------------------------

@@ -67,6 +67,12 @@ def read(factors: Factors, c: Any, variance: Any, weight: Any = 1) -> tuple[Fact
 
     Its variance is `variance`/`weight`: of no weight it says nothing.
     """
+    found, gain, _ = read_with(factors, c, variance, weight)
+    return found, gain
+
+
+def read_with(factors: Factors, c: Any, variance: Any, weight: Any = 1) -> tuple[Factors, Any, Any]:
+    """The same with the innovation's variance, times `weight`."""
     U, D = factors
     n = D.numel()
     f = U.T @ c
@@ -81,7 +87,7 @@ def read(factors: Factors, c: Any, variance: Any, weight: Any = 1) -> tuple[Fact
             gain[i] += U[i, j] * g[j]
         gain[j] = g[j]
         before = s
-    return (after_U, after_D), gain * (weight / before)
+    return (after_U, after_D), gain * (weight / before), before
 
 
 def packed(x: Any, factors: Factors) -> Any:

@@ -19,12 +19,6 @@ from casest.engine import Recursion
 Pattern = tuple[tuple[int, int], ...]
 
 
-def symmetric(matrix: Any) -> Any:
-    """The matrix of its upper half: half the operations, and no drift."""
-    upper = ca.triu(matrix)
-    return ca.densify(upper + ca.triu(matrix, False).T)
-
-
 def reach(A: Any) -> Pattern:
     """Which entries of Φ can differ from zero, given the pattern of A: (row, column)."""
     n = A.size1()
@@ -48,13 +42,6 @@ def _matrix(name: str, shape: tuple[int, int], pattern: Pattern) -> tuple[Any, A
     for i, j in pattern:
         used[i, j] = full[i, j]
     return full, used
-
-
-def taken(x: Any, P: Any, c: Any, innovation: Any, s: Any) -> tuple[Any, Any]:
-    """State and covariance after one scalar reading with gradient c and variance s."""
-    PC = P @ c
-    # One component at a time this form is as safe as Joseph's: s is a sum of positive terms.
-    return x + PC * (innovation / s), symmetric(P - PC @ (PC / s).T)
 
 
 @lru_cache(maxsize=16)
