@@ -36,6 +36,7 @@ bench: $(READY)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/many.py
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/long.py
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/motion.py
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/motion_long.py
 
 study: $(READY)
 	$(BIN)/python studies/bound.py

@@ -74,7 +74,6 @@ def textbook(run, x, P):
     """Continuous-discrete extended Kalman filter: moments by solve_ivp between readings."""
     t, u, y = run.time, run.signals["torque"][:, 0], run.signals["y"][:, 0]
     step = np.diff(t)
-    period = np.r_[step[0], 0.5 * (step[1:] + step[:-1]), step[-1]]
 
     def rate(time, z):
         angle, speed = z[:2]
@@ -90,7 +89,7 @@ def textbook(run, x, P):
             z = solve_ivp(rate, span, np.r_[x, P.ravel()], "DOP853", rtol=1e-11, atol=1e-14).y
             x, P = z[:2, -1], z[2:, -1].reshape(2, 2)
         if np.isfinite(y[k]):
-            K = P[:, 0] / (P[0, 0] + THETA / period[k])
+            K = P[:, 0] / (P[0, 0] + THETA / step.mean())
             x, P = x + K * (y[k] - x[0]), P - np.outer(K, P[0])
         found.append((x, P))
     return np.array([x for x, _ in found]), np.array([P for _, P in found])

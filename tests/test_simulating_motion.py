@@ -90,9 +90,7 @@ def test_driven_states_and_readings_scatter_as_their_intensities_say():
     for own, variance in ((end[:, :count], q * span), (end[:, count:], forgets)):
         assert band[0] < np.mean(own**2) / variance < band[1]
     left = np.array([e.run.signals["y"] - e.states[:, :count] for e in each])
-    period = np.diff(t, prepend=2 * t[0] - t[1], append=2 * t[-1] - t[-2])
-    period = 0.5 * (period[1:] + period[:-1])
-    squares = np.mean(left**2, axis=(0, 2)) * period / theta
+    squares = np.mean(left**2, axis=(0, 2)) * np.diff(t).mean() / theta
     assert band[0] < squares.min()
     assert squares.max() < band[1]
 

@@ -6,6 +6,7 @@ from casest.dynamics.continuous import Continuous, kalman_bucy
 from casest.dynamics.declare import Dynamics, Motion, State, constraint, dynamics, measured, state
 from casest.dynamics.discrete import Estimates, Steps, kalman, smoothed
 from casest.dynamics.filter import Filtered, filtered
+from casest.dynamics.online import Estimator
 from casest.dynamics.record import Record, least_squares
 from casest.dynamics.statespace import to_statespace
 from casest.dynamics.structural import Structure, structure
@@ -14,6 +15,7 @@ __all__ = [
     "Continuous",
     "Dynamics",
     "Estimates",
+    "Estimator",
     "Filtered",
     "Motion",
     "Record",

@@ -77,12 +77,14 @@ def _wrong(field: str, number: Any) -> str | None:
 class Measured:
     """An output: the signal that measures it, what it should be, and its noise intensity.
 
-    `intensity` in unit²·s: variance of one reading times the time between two.
+    `intensity` in unit²·s: variance of one reading times the time between two; or `std`, the
+    standard deviation of one reading, in its unit.
     """
 
     signal: SX
     predicted: SX
-    intensity: float
+    intensity: float | None
+    std: float | None = None
 
 
 @dataclass(frozen=True)
@@ -104,14 +106,29 @@ class Motion:
     constraints: tuple[Constraint, ...] = ()
 
 
-def measured(signal: SX, predicted: SX, *, intensity: float) -> Measured:
-    """An output: `measured(v, velocity, intensity=0.1)`, intensity in unit²·s."""
-    if not intensity > 0:
+def measured(
+    signal: SX, predicted: SX, *, intensity: float | None = None, std: float | None = None
+) -> Measured:
+    """An output: `measured(v, velocity, std=0.01)`, the standard deviation of one reading; or its
+    noise's intensity in unit²·s, the variance of one reading times the time between two."""
+    if (intensity is None) == (std is None):
+        given = "neither" if std is None else "both"
+        raise DeclarationError(
+            f"measured: {given} of std= and intensity= given: say how large the noise of one "
+            "reading is (std=), or its variance times the time between two (intensity=)"
+        )
+    if std is not None and not 0 < std < np.inf:
+        raise DeclarationError(
+            f"measured: std={std:g} must be positive and finite: the standard deviation of one "
+            "reading"
+        )
+    if intensity is not None and not intensity > 0:
         raise DeclarationError(
             f"measured: the noise intensity must be positive, not {intensity}: a reading without "
             "noise makes the Riccati equation singular; give the sensor's variance times its period"
         )
-    return Measured(signal, predicted, float(intensity))
+    numbers = (None if v is None else float(v) for v in (intensity, std))
+    return Measured(signal, predicted, *numbers)
 
 
 def constraint(expression: SX, value: float | SX) -> Constraint:
@@ -247,15 +264,38 @@ class Dynamics:
         """Intensity Ξ of the driving noise, (n, n)."""
         return np.diag(np.concatenate([np.full(s.size, s.intensity) for s in self.states]))
 
-    @cached_property
+    @property
     def noise(self) -> Array:
-        """Intensity Θ of the measurement noise, (m, m)."""
+        """Intensity Θ of the measurement noise, (m, m), if intensities are what is declared."""
+        return self.noise_at(None)
+
+    def noise_at(self, period: float | None) -> Array:
+        """Intensity Θ of the measurement noise, (m, m), of readings every `period` s."""
         t = self.traced
         parts = [
-            np.full(o.predicted.numel(), self.sensors.get(name, o.intensity))
+            np.full(o.predicted.numel(), self.intensity_of(name, period))
             for name, o in zip(t.measured, t.outputs, strict=True)
         ]
         return np.diag(np.concatenate(parts))
+
+    def intensity_of(self, name: str, period: float | None = None) -> float:
+        """Noise intensity of an output signal, unit²·s, read every `period` s.
+
+        Raises UsageError where a standard deviation is declared and the period is not known.
+        """
+        if name in self.sensors:
+            return self.sensors[name]
+        t = self.traced
+        own = next(o for n, o in zip(t.measured, t.outputs, strict=True) if n == name)
+        if own.intensity is not None:
+            return own.intensity
+        if period is None:
+            raise UsageError(
+                f"{self.name}: {name} has the noise of one reading (std={own.std:g}): its "
+                f"intensity needs the time between two; sensing({name}=…) says it"
+            )
+        assert own.std is not None
+        return own.std**2 * period
 
     @cached_property
     def input_noise(self) -> SX | None:

@@ -1,8 +1,8 @@
 """Kalman filter and fixed-interval smoother on a sampled record with A(t), gaps, missing readings.
 
-Between samples the exact transition of the (straight-line) signals; readings are taken as averages
-over their sampling period, so that their variance is Θ/Δt. A reading that is missing in part is
-used in part.
+Between samples the exact transition of the (straight-line) signals; a reading's variance is its
+noise's intensity over the usual time between two, however they lie. A reading that is missing in
+part is used in part.
 """
 
 from __future__ import annotations
@@ -23,8 +23,7 @@ from casest.dynamics.transition import (
     Linearised,
     linearised,
     process_along,
-    process_noise,
-    steps_to,
+    variances,
     with_lost,
 )
 from casest.errors import DataError
@@ -64,16 +63,35 @@ class Filtered:
     @property
     def std(self) -> Array:
         """Standard deviation of every state after each reading, (N, n)."""
-        return np.sqrt(np.diagonal(self.P, axis1=1, axis2=2))
+        return std_of(self.P)
+
+    @property
+    def smoothed_std(self) -> Array:
+        """Standard deviation of every state by the whole record, (N, n)."""
+        return std_of(self.smoothed_P)
+
+    @property
+    def expected_std(self) -> Array:
+        """Standard deviation that the filter expects of its innovations, (N, m)."""
+        return std_of(self.S)
 
     @property
     def normalised_innovations(self) -> Array:
         """νᵀS⁻¹ν of every complete reading, (N,): χ² with m degrees of freedom if all is right."""
-        whole = np.isfinite(self.innovations).all(axis=1)
-        found = np.full(len(self.innovations), np.nan)
-        solved = np.linalg.solve(self.S[whole], self.innovations[whole][:, :, None])[:, :, 0]
-        found[whole] = np.sum(self.innovations[whole] * solved, axis=1)
-        return found
+        return normalised(self.innovations, self.S)
+
+
+def std_of(covariances: Array) -> Array:
+    """Standard deviations, (N, n), of covariances (N, n, n)."""
+    return np.asarray(np.sqrt(np.diagonal(covariances, axis1=1, axis2=2)))
+
+
+def normalised(innovations: Array, S: Array) -> Array:
+    """νᵀS⁻¹ν of innovations (N, m), NaN where one is missing in part."""
+    whole = np.isfinite(innovations).all(axis=1)
+    found, own = np.full(len(innovations), np.nan), innovations[whole]
+    found[whole] = np.sum(own * np.linalg.solve(S[whole], own[:, :, None])[:, :, 0], axis=1)
+    return found
 
 
 def filtered(
@@ -150,10 +168,11 @@ def trajectory(model: Dynamics, run: Run, along: Array) -> tuple[Array, Array, b
 
 
 def discretised(model: Dynamics, system: Linearised) -> Steps:
-    """The record in discrete time: exact transitions, readings as averages over their period."""
-    Phi, forced = system.moved
-    Q = with_lost(model, system.steps, Phi, process_noise(system, system.process))
-    R = np.diag(model.noise)[None] / steps_to(system)[:, None]
+    """The record in discrete time: exact transitions, and every reading with its variance."""
+    moved = system.sampled
+    Phi, forced = moved.Phi, moved.forced
+    Q = with_lost(model, system.steps, Phi, moved.Q.copy(), system.pace)
+    R = variances(model, system.steps, system.pace)
     t = model.traced
     return Steps(Phi, forced, Q, system.C, system.d, R, system.y, reach(t.A), entries(t.C))
 

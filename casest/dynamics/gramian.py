@@ -8,19 +8,31 @@ products of transition matrices, and the ODE −Ẇ = AᵀW + WA + CᵀΘ⁻¹C,
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
 
+from casest.data.run import Run
 from casest.declaration.shapes import Array
+from casest.dynamics.between import motions
 from casest.dynamics.declare import Dynamics
-from casest.dynamics.transition import Linearised, counted, half_transitions
+from casest.dynamics.transition import (
+    Linearised,
+    Pace,
+    checked_record,
+    counted,
+    linearised,
+    pace_of,
+    usual,
+)
 from casest.leastsquares.null_space import sparsest
 
 #: A direction counts as observable from this share of the largest scaled eigenvalue on. Rounding
 #: and the error of a fourth-order step stay below 1e-13.
 NULL = 1e-11
+#: Steps whose product is kept, and samples that are worked on at once.
+CHUNK, PIECE = 256, 4096
 
 
 @dataclass(frozen=True)
@@ -43,27 +55,26 @@ class Observed:
 
 def gramian(model: Dynamics, system: Linearised) -> Array:
     """W of the whole record at its first sample, (n, n), from transition matrices."""
-    Phi, _ = system.moved
-    return _reduced(Phi, _of_steps(model, system, Phi))[1]
+    return _reduced(*_of_steps(model, system))[1]
 
 
-def _of_steps(model: Dynamics, system: Linearised, Phi: Array) -> Array:
-    """W of every single step at its own beginning, (N − 1, n, n): Simpson's rule."""
-    weight = np.linalg.inv(model.noise)
-    half = half_transitions(system, (0.0, 0.5))
-    middle = 0.5 * (system.C[1:] + system.C[:-1]) @ half
-    first, last = system.C[:-1], system.C[1:] @ Phi
-    h = counted(system.steps)[:, None, None]
-    if not np.isfinite(system.y).all():  # single readings are no curve: each for its own time
-        return np.asarray(0.5 * h * sum(M.transpose(0, 2, 1) @ weight @ M for M in (first, last)))
-    return np.asarray(
-        h
-        / 6
-        * sum(
-            share * (M.transpose(0, 2, 1) @ weight @ M)
-            for share, M in ((1, first), (4, middle), (1, last))
-        )
-    )
+def _of_steps(model: Dynamics, system: Linearised) -> tuple[Array, Array]:
+    """Φ and W of every single step at its own beginning, (N − 1, n, n) each.
+
+    W is what driving noise CᵀΘ⁻¹C makes of the motion with Aᵀ that runs back from the step's end,
+    and Φᵀ its transition.
+    """
+    pace = system.pace or pace_of(system.steps)
+    weight = np.linalg.inv(model.noise_at(pace.usual))
+    told = np.asarray(system.C.transpose(0, 2, 1) @ weight @ system.C, float)
+    none, back = np.zeros_like(system.c), system.A.transpose(0, 2, 1)[::-1]
+    if np.isfinite(system.y).all() and not pace.holed:
+        found = motions(back, none, told[::-1], system.steps[::-1])
+        Phi, W = found.Phi[::-1].transpose(0, 2, 1), found.Q[::-1]
+        return Phi, W * (pace.usual / system.steps)[:, None, None]
+    # Single readings are no curve: each for its own time.
+    Phi = system.moved[0]
+    return Phi, 0.5 * pace.usual * (told[:-1] + Phi.transpose(0, 2, 1) @ told[1:] @ Phi)
 
 
 def _reduced(Phi: Array, W: Array) -> tuple[Array, Array]:
@@ -78,14 +89,60 @@ def _reduced(Phi: Array, W: Array) -> tuple[Array, Array]:
     return Phi[0], 0.5 * (W[0] + W[0].T)
 
 
+@dataclass(frozen=True)
+class Products:
+    """A model along a record of any length, chunk by chunk: Φ and W of each, (K, n, n)."""
+
+    model: Dynamics
+    run: Run
+    along: Array | None
+    pace: Pace
+    Phi: Array
+    W: Array
+
+    @staticmethod
+    def of(model: Dynamics, run: Run, along: Array | None = None) -> Products:
+        """`along`: states (N, n) along which a nonlinear model is linearised."""
+        step, n = np.diff(checked_record(model, run)), model.size
+        holed = any(not np.isfinite(run.signals[name]).all() for name in model.measured_signals)
+        none = np.zeros((-(-len(step) // CHUNK), n, n))
+        found = Products(model, run, along, replace(pace_of(step), holed=holed), none, none.copy())
+        for k in range(0, len(step), PIECE):
+            Phi, W = found._steps(k, min(k + PIECE, len(step)))
+            for i in range(0, len(Phi), CHUNK):
+                own = _reduced(Phi[i : i + CHUNK], W[i : i + CHUNK])
+                found.Phi[(k + i) // CHUNK], found.W[(k + i) // CHUNK] = own
+        return found
+
+    def _steps(self, first: int, last: int) -> tuple[Array, Array]:
+        where = slice(first, last + 1)
+        along = None if self.along is None else self.along[where]
+        system = linearised(self.model, self.run.take(where), along, self.pace)
+        return _of_steps(self.model, system)
+
+    def gramian(self, first: int = 0, last: int | None = None) -> Array:
+        """W (n, n) of the samples from `first` to `last`, at the first; of all unless told."""
+        last = len(self.run) - 1 if last is None else last
+        begin, end = -(-first // CHUNK), last // CHUNK
+        if begin >= end:
+            return _reduced(*self._steps(first, last))[1]
+        parts = [(self.Phi[begin:end], self.W[begin:end])]
+        if first < begin * CHUNK:
+            parts.insert(0, self._steps(first, begin * CHUNK))
+        if end * CHUNK < last:
+            parts.append(self._steps(end * CHUNK, last))
+        Phi, W = zip(*parts, strict=True)
+        return _reduced(np.concatenate(Phi), np.concatenate(W))[1]
+
+
 def gramian_by_ode(model: Dynamics, system: Linearised, tolerance: float = 1e-12) -> Array:
     """The same by integrating −Ẇ = AᵀW + WA + CᵀΘ⁻¹C backwards with CVODES (SUNDIALS, Adams).
 
     Signals are straight lines between samples, as in the other form; the integrator stops at every
     sample, so that it never steps over a corner.
     """
-    t, n = model.traced, model.size
-    W, weight = ca.SX.sym("W", n, n), ca.SX(ca.DM(np.linalg.inv(model.noise)))
+    t, n, noise = model.traced, model.size, model.noise_at(usual(system.steps))
+    W, weight = ca.SX.sym("W", n, n), ca.SX(ca.DM(np.linalg.inv(noise)))
     # Time runs backwards from the end; `since` is when the step began, at its later sample.
     s, since, h = (ca.SX.sym(name) for name in ("s", "since", "h"))
     share, ends = (s - since) / h, list[ca.SX]()
@@ -181,7 +238,7 @@ def sentence(model: Dynamics, direction: Array) -> str:
 
 
 def smallest_eigenvalue(
-    model: Dynamics, system: Linearised, window: float, count: int = 60
+    model: Dynamics, run: Run, window: float, count: int = 60
 ) -> tuple[Array, Array]:
     """Smallest eigenvalue of the Gramian over windows of that length (s) along the record.
 
@@ -189,18 +246,14 @@ def smallest_eigenvalue(
     deviations, so that they are squared signal over noise: above 1 a window alone teaches more
     than was known.
     """
-    ends, values = window_eigenvalues(model, system, window, count)
+    ends, values = window_eigenvalues(Products.of(model, run), window, count)
     return ends, values[:, 0]
 
 
-def window_eigenvalues(
-    model: Dynamics, system: Linearised, window: float, count: int = 60
-) -> tuple[Array, Array]:
+def window_eigenvalues(products: Products, window: float, count: int = 60) -> tuple[Array, Array]:
     """All of them, ascending: the windows' ends (K,) and eigenvalues (K, n), scaled alike."""
-    Phi, _ = system.moved
-    W = _of_steps(model, system, Phi)
-    prior = np.sqrt(np.diag(model.start_covariance))
-    time = system.time
+    prior = np.sqrt(np.diag(products.model.start_covariance))
+    time = np.asarray(products.run.time, float)
     ends = (
         np.linspace(time[0] + window, time[-1], count)
         if time[-1] - time[0] > window
@@ -210,6 +263,5 @@ def window_eigenvalues(
     for end in ends:
         first = min(int(np.searchsorted(time, end - window - 1e-12)), len(time) - 2)
         last = max(int(np.searchsorted(time, end + 1e-12)) - 1, first + 1)
-        own = _reduced(Phi[first:last], W[first:last])[1]
-        found.append(np.linalg.eigvalsh(own * np.outer(prior, prior)))
+        found.append(np.linalg.eigvalsh(products.gramian(first, last) * np.outer(prior, prior)))
     return np.asarray(ends, float), np.array(found)

@@ -19,15 +19,16 @@ from numpy.typing import NDArray
 from casest.data.run import Run
 from casest.declaration.shapes import Array
 from casest.declaration.tracing import flat
+from casest.dynamics import factors
 from casest.dynamics.declare import Dynamics
-from casest.dynamics.stepping import Pattern, entries, packed, reach, symmetric, taken
+from casest.dynamics.stepping import Pattern, entries, reach
 from casest.dynamics.transition import (
     Linearised,
     linearised,
     lost,
     process_along,
     process_noise,
-    steps_to,
+    usual,
 )
 from casest.engine import Recursion
 
@@ -97,7 +98,7 @@ def prepared(model: Dynamics, run: Run, along: Array) -> Prepared:
     parts.append(_after(lost(model, system.steps), count))
     parts.append(_picked(np.where(present[:, :, None], system.C, 0.0), entries(t.C)))
     parts.append(np.where(present, system.y - system.d, 0.0))
-    period = steps_to(system)
+    period = np.full(count, usual(system.steps))
     readings, place = {}, 0
     for name, o in zip(t.measured, t.outputs, strict=True):
         readings[name] = slice(place, place + o.predicted.numel())
@@ -137,7 +138,9 @@ def whitened(ready: Prepared, intensities: Mapping[str, float]) -> tuple[Array, 
     patterns = reach(t.A), tuple(ready.units.values()), entries(t.C)
     step = _likelihood_step(ready.model.size, rows, *patterns)
     given = np.array([intensities[name] for name in ready.names])
-    state = np.concatenate([ready.model.start, ready.model.start_covariance.T.ravel(), given])
+    n = ready.model.size
+    first = [ready.model.start, np.diag(ready.model.start_covariance), np.zeros(n * (n - 1) // 2)]
+    state = np.concatenate([*first, given])
     _, e, s = step(state, ready.numbers, keep=False)
     return e, s
 
@@ -232,29 +235,32 @@ def _likelihood_step(
     units: tuple[Pattern, ...],
     of_C: Pattern,
 ) -> Recursion:
-    """(x, P and intensities; numbers of one sample) -> (the same later; innovations; variances)."""
+    """(x, factors of P, intensities; numbers of one sample) -> (the same later; innovations;
+    variances)."""
     m = rows[-1][1]
-    x, P, q = ca.SX.sym("x", n), ca.SX.sym("P", n, n), ca.SX.sym("q", len(units) + len(rows))
+    both, q = ca.SX.sym("both", factors.size(n)), ca.SX.sym("q", len(units) + len(rows))
+    x, P = factors.unpacked(both, n)
     moved, Phi = _sparse("Phi", (n, n), of_Phi)
     u, y, period = ca.SX.sym("u", n), ca.SX.sym("y", m), ca.SX.sym("period")
     own = [_sparse(f"Q{k}", (n, n), pattern) for k, pattern in enumerate(units)]
     seen, C = _sparse("C", (m, n), of_C)
     gap = ca.SX.sym("gap", n)
-    Q = ca.diag(gap)
+    Q = ca.diag(gap) + Phi @ ca.diag(gap) @ Phi.T
     for k, (_, unit) in enumerate(own):
         Q += q[k] * unit
     R = ca.vertcat(*[ca.repmat(q[len(units) + k] / period, last - first)
                      for k, (first, last) in enumerate(rows)])  # fmt: skip
-    later_x, later_P = Phi @ x + u, symmetric(ca.triu(Phi @ (P + ca.diag(gap)) @ Phi.T) + Q)
+    later_x, later = Phi @ x + u, factors.moved(P, Phi, factors.factored(Q))
     e, s = [], []
     for i in range(m):
         c = C[i, :].T
         e.append(y[i] - ca.dot(c, later_x))
-        s.append(ca.dot(c, later_P @ c) + R[i])
-        later_x, later_P = taken(later_x, later_P, c, e[-1], s[-1])
+        later, gain, expected = factors.read_with(later, c, R[i])
+        s.append(expected)
+        later_x = later_x + gain * e[-1]
     numbers = ca.vertcat(moved, u, *[k for k, _ in own], gap, seen, y, period)
-    outputs = [ca.vertcat(packed(later_x, later_P), q), ca.vertcat(*e), ca.vertcat(*s)]
-    state = ca.vertcat(packed(x, P), q)
+    outputs = [ca.vertcat(factors.packed(later_x, later), q), ca.vertcat(*e), ca.vertcat(*s)]
+    state = ca.vertcat(both, q)
     return Recursion(ca.Function("step", [state, numbers], outputs, {"cse": True}))
 
 

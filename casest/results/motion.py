@@ -15,6 +15,7 @@ from casest.declaration.shapes import Array
 from casest.diagnose.motion.fit import Fit, forgotten, rise
 from casest.diagnose.motion.loop import Added, MotionClosing
 from casest.diagnose.motion.visibility import Visible
+from casest.dynamics.transition import usual
 from casest.effects.moving import Candidate
 from casest.results.closing import Detectable
 from casest.results.file import plain
@@ -137,7 +138,7 @@ def motion_result(
 ) -> MotionClosed:
     """What `close` leaves of an estimator in motion."""
     declared, after, left = closing.declared, closing.after, closing.left
-    period = float(np.median(np.diff(after.found.time)))
+    period = usual(after.found.system.steps)
     complete = np.isfinite(after.found.innovations).all(axis=1)
     between = float(np.median(np.diff(after.found.time[complete])))
     where = f"innovations foretell those within {left.lag * between:.3g} s after them"
@@ -149,7 +150,7 @@ def motion_result(
         verdict=closing.verdict,
         trusted=after.trusted,
         noise=MotionNoise(
-            plain(np.sqrt(np.diag(after.model.noise) / period)),
+            plain(np.sqrt(np.diag(after.model.noise_at(period)) / period)),
             _unit(closing),
             Intensities(plain_all(closing.before.intensities), plain_all(after.intensities)),
             _declared(closing),
@@ -226,9 +227,8 @@ def _unit(closing: MotionClosing) -> str:
 
 
 def _declared(closing: MotionClosing) -> dict[str, float]:
-    model = closing.declared
-    outputs = zip(model.traced.measured, model.traced.outputs, strict=True)
-    readings = {name: model.sensors.get(name, o.intensity) for name, o in outputs}
+    model, period = closing.declared, usual(closing.after.found.system.steps)
+    readings = {name: model.intensity_of(name, period) for name in model.measured_signals}
     return plain_all({**{s.name: s.intensity for s in model.states}, **model.sensors, **readings})
 
 

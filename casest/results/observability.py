@@ -8,14 +8,13 @@ import numpy as np
 from msgspec import UNSET, Struct, UnsetType
 
 from casest.data.run import Run
-from casest.data.timing import GAP
+from casest.data.timing import longest
 from casest.declaration.model import Model
 from casest.dynamics import Dynamics
 from casest.dynamics.filter import filtered
 from casest.dynamics.gramian import Observed as Seen
-from casest.dynamics.gramian import gramian, observed, window_eigenvalues
+from casest.dynamics.gramian import Products, observed, window_eigenvalues
 from casest.dynamics.structural import Structure, structure
-from casest.dynamics.transition import linearised
 from casest.errors import DeclarationError, UsageError
 from casest.estimate.calibrate import attempt
 from casest.results.file import plain
@@ -209,16 +208,17 @@ def observe_motion(
     model is linearised along its smoothed states.
     """
     along = None if model.linear else filtered(model, run).smoothed
-    system = linearised(model, run, along)
-    seen = observed(model, gramian(model, system))
-    duration = float(system.time[-1] - system.time[0])
-    if window is not None and not 2 * float(np.median(system.steps)) <= window < np.inf:
+    products = Products.of(model, run, along)
+    seen = observed(model, products.gramian())
+    time = np.asarray(run.time, float)
+    duration, step = float(time[-1] - time[0]), float(np.median(np.diff(time)))
+    if window is not None and not 2 * step <= window < np.inf:
         raise UsageError(
             f"--window {window:g} s: a window must hold two steps of "
-            f"{float(np.median(system.steps)):.3g} s at least; the record lasts {duration:.3g} s"
+            f"{step:.3g} s at least; the record lasts {duration:.3g} s"
         )
     length = min(window or WINDOW * duration, duration)
-    ends, eigenvalues = window_eigenvalues(model, system, length)
+    ends, eigenvalues = window_eigenvalues(products, length)
     telling = np.flatnonzero(eigenvalues[:, 0] > 1)
     std = {name: plain(seen.std[where]) for name, where in model.slices().items()}
     return ObservedMotion(
@@ -250,11 +250,11 @@ def assumed(run: Run) -> list[str]:
     notes = list(run.notes)
     time = np.asarray(run.time, float)
     step = np.diff(time)
-    gaps = np.flatnonzero(step > GAP * np.median(step))
-    if gaps.size:
-        worst = int(gaps[np.argmax(step[gaps])])
+    wide = np.flatnonzero(step > longest(step))
+    if wide.size:
+        worst = int(wide[np.argmax(step[wide])])
         notes.append(
-            f"{gaps.size} {'gap' if gaps.size == 1 else 'gaps'} in time, the longest of "
+            f"{wide.size} {'gap' if wide.size == 1 else 'gaps'} in time, the longest of "
             f"{step[worst]:.3g} s after row {int(run.rows[worst])} (t = {time[worst]:.6g} s): "
             "inputs were taken as straight lines across; the states that they drive are known "
             "after it no better than at the beginning"
