@@ -16,6 +16,7 @@ from casest.declaration.shapes import Array
 from casest.dynamics.declare import Dynamics
 from casest.dynamics.discrete import Steps, kalman, smoothed, smoothed_states
 from casest.dynamics.extended import extended, relinearised
+from casest.dynamics.inputs import uncertain
 from casest.dynamics.known import known
 from casest.dynamics.riccati import check_covariance
 from casest.dynamics.stepping import entries, reach
@@ -107,6 +108,8 @@ def coefficients(model: Dynamics, run: Run) -> Linearised:
     if model.input_noise is None:
         return system
     first = _once(model, run, system, smooth=False)
+    if uncertain(model):
+        return linearised(model, run, first.x)
     return system.driven(process_along(model, run, first.x))
 
 

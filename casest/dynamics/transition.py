@@ -21,6 +21,7 @@ from casest.data.timing import GAP, UNUSED
 from casest.declaration.shapes import Array
 from casest.declaration.tracing import flat
 from casest.dynamics.declare import Dynamics
+from casest.dynamics.inputs import estimates
 from casest.dynamics.stepping import reach
 from casest.engine import Columns, Replay
 from casest.errors import DataError
@@ -111,21 +112,27 @@ def checked_record(model: Dynamics, run: Run) -> Array:
 def linearised(model: Dynamics, run: Run, along: Array | None = None) -> Linearised:
     """The model along a record; a nonlinear one along states `along` (N, n).
 
-    Signals that only outputs use may be missing (NaN); inputs may not.
+    Signals that only outputs use may be missing (NaN); inputs may not. Of inputs with noise A and C
+    are taken at the estimate (`inputs`), also of a linear model then along states.
     """
     time, t = checked_record(model, run), model.traced
     if along is None:
         along = np.broadcast_to(model.start, (len(time), model.size))
-    sample = ca.vertcat(t.x, *[flat(t.symbols[s.name]) for s in model.signals])
-    c, d = t.f - t.A @ t.x, t.h - t.C @ t.x
+    calm = estimates(model, run)
+    read = [flat(t.symbols[name]) for name in calm]
+    as_was = [ca.SX.sym(name, e.numel()) for name, e in zip(calm, read, strict=True)]
+    A, C = ca.substitute([t.A, t.C], read, as_was) if calm else (t.A, t.C)
+    sample = ca.vertcat(t.x, *[flat(t.symbols[s.name]) for s in model.signals], *as_was)
+    c, d = t.f - A @ t.x, t.h - C @ t.x
     added = model.input_noise
-    expressions = [t.A, c, t.C, d, t.reading] + ([] if added is None else [added])
+    expressions = [A, c, C, d, t.reading] + ([] if added is None else [added])
     outputs = [ca.densify(e) for e in expressions]
     none = ca.SX.sym("none", 0)
     function = ca.Function(
         "along", [none, sample], outputs, ["parameters", "sample"], list("AcCdyQ")[: len(outputs)]
     )
-    columns = Columns([np.ascontiguousarray(along), *(run.signals[s.name] for s in model.signals)])
+    signals = [*(run.signals[s.name] for s in model.signals), *calm.values()]
+    columns = Columns([np.ascontiguousarray(along), *signals])
     A, c_, C, d_, y, *more = Replay(function)(np.zeros(0), columns)
     process = model.process + more[0] if more else model.process
     readings = y[:, :, 0]
