@@ -16,7 +16,7 @@ from casest.declaration.shapes import Array
 from casest.dynamics.declare import Dynamics
 from casest.dynamics.discrete import Steps, kalman, smoothed, smoothed_states
 from casest.dynamics.extended import extended, relinearised
-from casest.dynamics.inputs import uncertain
+from casest.dynamics.inputs import on_errors, uncertain
 from casest.dynamics.known import known
 from casest.dynamics.riccati import check_covariance
 from casest.dynamics.stepping import entries, reach
@@ -33,6 +33,9 @@ from casest.errors import DataError
 #: Rounds of an extended smoother, linearised along its own states; a change of this share of a
 #: standard deviation ends them.
 ROUNDS, SETTLED = 30, 1e-5
+#: Passes of a filter with noisy coefficients; a change of this share of every standard deviation
+#: ends them.
+PASSES, ALIKE = 8, 0.01
 
 
 @dataclass(frozen=True)
@@ -103,14 +106,23 @@ def filtered(
 
 
 def coefficients(model: Dynamics, run: Run) -> Linearised:
-    """A linear model along a record; noise that depends on the states, along a first estimate."""
+    """A linear model along a record; noise that depends on the states, along a first estimate.
+
+    Where the noise of inputs acts on the errors of the states too, as large as they are with it.
+    """
     system = linearised(model, run)
     if model.input_noise is None:
         return system
     first = _once(model, run, system, smooth=False)
-    if uncertain(model):
-        return linearised(model, run, first.x)
-    return system.driven(process_along(model, run, first.x))
+    if not uncertain(model):
+        return system.driven(process_along(model, run, first.x))
+    for _ in range(PASSES):
+        system = linearised(model, run, first.x)
+        system = system.driven(system.process + on_errors(model, run, first.x, first.P))
+        before, first = first, _once(model, run, system, smooth=False)
+        if np.max(np.abs(first.std / before.std - 1)) < ALIKE:
+            break
+    return system
 
 
 def _extended(model: Dynamics, run: Run, smooth: bool) -> Filtered:

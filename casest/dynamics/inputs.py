@@ -2,24 +2,27 @@
 
 Where an input enters A(t) or C(t), its noise would be counted as motion, and motion is what tells
 states apart: an errors-in-variables problem, in which the input is an unknown with a reading of its
-own. Its Gauss-Newton step linearises at an estimate of the input, not at its reading,
-f(x, u) ≈ f(x̄, u) + A(x̄, û)(x − x̄) − G(x̄)·noise, and is consistent with any x̄ that does not know
-the noise to come. The estimate û keeps what stands out of the noise: in the directions in which the
-input moves at all, octave by octave of its frequencies, shrunk by what noise adds to it (James &
-Stein 1961; Cai 1999, blockwise). What does not stand out is zero.
+own. Its Gauss-Newton step linearises at an estimate û of the input, not at its reading u,
+f(x) ≈ f(x̄, u) + A(x̄, û)(x − x̄) − G(x̄)·noise: exact where û is the truth, for any x̄ that does not
+know the noise to come. What û is wrong by acts on the error of the state, as the noise of a
+bilinear system does (Wonham 1968).
+
+û keeps what stands out of the noise: in the directions in which the input moves at all, octave by
+octave of its frequencies, shrunk by what noise adds to it (James & Stein 1961; blockwise: Cai
+1999). What does not stand out is zero.
 """
 
 from __future__ import annotations
-
-from collections.abc import Mapping
 
 import casadi as ca
 import numpy as np
 
 from casest.data.run import Run
+from casest.data.timing import GAP
 from casest.declaration.shapes import Array
 from casest.declaration.tracing import flat
 from casest.dynamics.declare import Dynamics
+from casest.engine import Columns, Replay
 
 #: Chance that noise alone stands out, for each octave of each direction.
 FALSE_ALARM = 1e-4
@@ -45,10 +48,17 @@ def uncertain(model: Dynamics) -> tuple[str, ...]:
     return tuple(n for n in coefficients_of(model) if model.sensors.get(n))
 
 
-def estimates(model: Dynamics, run: Run) -> Mapping[str, Array]:
-    """Every uncertain input as it most likely was, (N, k), by name."""
-    step = float(np.median(np.diff(np.asarray(run.time, float))))
-    return {n: estimate(run.signals[n], model.sensors[n] / step) for n in uncertain(model)}
+def estimates(model: Dynamics, run: Run) -> dict[str, Array]:
+    """Every uncertain input as it most likely was, (N, k), by name; on each side of a gap apart."""
+    step = np.diff(np.asarray(run.time, float))
+    usual = float(np.median(step))
+    gaps = np.flatnonzero(step > GAP * usual) + 1
+    found = {}
+    for name in uncertain(model):
+        variance = model.sensors[name] / usual
+        parts = np.split(run.signals[name], gaps)
+        found[name] = np.concatenate([estimate(part, variance) for part in parts])
+    return found
 
 
 def estimate(values: Array, variance: float = 0.0) -> Array:
@@ -59,12 +69,12 @@ def estimate(values: Array, variance: float = 0.0) -> Array:
     size = max(variance, scatter(values) ** 2)
     if not size > 0:
         return values
-    kept = np.zeros(len(c), dtype=bool)
-    for where in _octaves(len(c)):
-        kept[where] = bool(_shares(c[where].reshape(-1, 1), size)[0] > 0)
+    octaves, kept = _octaves(len(c)), np.zeros(len(c), dtype=bool)
+    for where in octaves:
+        kept[where] = _shares(c[where].reshape(-1, 1), size)[0] > 0
     _, axes = np.linalg.eigh(c[kept].T @ c[kept])
     turned = c @ axes
-    for where in _octaves(len(c)):
+    for where in octaves:
         turned[where] *= _shares(turned[where], size)
     return np.asarray(idct(turned @ axes.T, axis=0, norm="ortho"), float)
 
@@ -90,3 +100,30 @@ def _shares(c: Array, variance: float) -> Array:
     squares = np.sum(c**2, axis=0) / variance
     left = 1 - len(c) / np.maximum(squares, 1e-300)
     return np.where(squares > chdtri(len(c), FALSE_ALARM), left, 0.0)
+
+
+def on_errors(model: Dynamics, run: Run, along: Array, P: Array) -> Array:
+    """What the noise of uncertain inputs adds to Ξ by acting on the errors of states, (N, n, n).
+
+    Σq·N·P·Nᵀ with N = ∂A/∂u; `along` (N, n), P (N, n, n) of these errors.
+    """
+    found, t, n = np.zeros_like(P), model.traced, model.size
+    for name in uncertain(model):
+        u = flat(t.symbols[name])
+        moved = _along(model, run, along, ca.jacobian(ca.vec(t.A), u))
+        for k in range(u.numel()):
+            N = moved[..., k].reshape(-1, n, n).transpose(0, 2, 1)
+            found += model.sensors[name] * (N @ P @ N.transpose(0, 2, 1))
+    return found
+
+
+def _along(model: Dynamics, run: Run, along: Array, expression: ca.SX) -> Array:
+    """An expression at every sample (N, …), or at one where it is the same at all."""
+    t = model.traced
+    sample = ca.vertcat(t.x, *[flat(t.symbols[s.name]) for s in model.signals])
+    columns = [np.ascontiguousarray(along), *(run.signals[s.name] for s in model.signals)]
+    if not ca.depends_on(expression, sample):
+        columns = [c[:1] for c in columns]
+    function = ca.Function("slopes", [ca.SX.sym("none", 0), sample], [ca.densify(expression)],
+                           ["parameters", "sample"], ["N"])  # fmt: skip
+    return np.asarray(Replay(function)(np.zeros(0), Columns(columns))[0])
