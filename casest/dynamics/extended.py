@@ -19,22 +19,24 @@ from casest.declaration.shapes import Array
 from casest.declaration.tracing import flat
 from casest.dynamics.declare import Dynamics
 from casest.dynamics.discrete import Steps
+from casest.dynamics.inputs import at_estimates, estimates, on_errors, slopes, uncertain
 from casest.dynamics.stepping import entries, packed, run_steps, symmetric, taken, unpacked
 from casest.dynamics.transition import checked_record, lost, steps_to, with_lost
 from casest.engine import Columns, Recursion, Replay
 
 
-def relinearised(model: Dynamics, run: Run, along: Array) -> Steps:
-    """The record in discrete time, linearised along states (N, n)."""
+def relinearised(model: Dynamics, run: Run, along: Array, errors: Array | None = None) -> Steps:
+    """The record in discrete time, linearised along states (N, n).
+
+    `errors` (N, n, n): covariances of what these are wrong by, on which noise of inputs acts.
+    """
     time = checked_record(model, run)
-    inputs = _input_names(model)
-    columns = [
-        np.ascontiguousarray(along[:-1]),
-        *(run.signals[n][:-1] for n in inputs),
-        *(run.signals[n][1:] for n in inputs),
-        np.diff(time)[:, None],
-    ]
+    inputs = _inputs(model, run)
+    columns = [np.ascontiguousarray(along[:-1]), inputs[:-1], inputs[1:], np.diff(time)[:, None]]
     Phi, forced, Q = over_samples(_step(model), columns)
+    if errors is not None and uncertain(model):
+        acting = on_errors(model, run, along, errors)
+        Q += 0.5 * np.diff(time)[:, None, None] * (acting[1:] + acting[:-1])
     Q = with_lost(model, np.diff(time), Phi, Q)
     C, d, y = _rows(model, run, along)
     R = np.diag(model.noise)[None] / steps_to(np.diff(time))[:, None]
@@ -44,6 +46,7 @@ def relinearised(model: Dynamics, run: Run, along: Array) -> Steps:
 def _rows(model: Dynamics, run: Run, along: Array) -> tuple[Array, Array, Array]:
     """Readings as rows: C, d and y."""
     columns = [np.ascontiguousarray(along), *(run.signals[s.name] for s in model.signals)]
+    columns += estimates(model, run).values()
     C, d, y = over_samples(_outputs(model), columns)
     return C, d[:, :, 0], y[:, :, 0]
 
@@ -58,8 +61,9 @@ def _step(model: Dynamics) -> Replay:
 @lru_cache(maxsize=8)
 def _outputs(model: Dynamics) -> Replay:
     t = model.traced
-    sample = ca.vertcat(t.x, *[flat(t.symbols[s.name]) for s in model.signals])
-    return replay(sample, [t.C, t.h - t.C @ t.x, t.reading])
+    signals = [flat(t.symbols[s.name]) for s in model.signals]
+    (C,), as_was = at_estimates(model, [t.C])
+    return replay(ca.vertcat(t.x, *signals, *as_was), [C, t.h - C @ t.x, t.reading])
 
 
 def replay(sample: SX, outputs: list[SX]) -> Replay:
@@ -78,11 +82,10 @@ def over_samples(expressions: Replay, columns: list[Array]) -> list[Array]:
 def extended(model: Dynamics, run: Run) -> tuple[Array, Array, Array, Array, Array, Array]:
     """Extended Kalman filter: x, P after each reading and before it, innovations, their S."""
     time = checked_record(model, run)
-    t, inputs = model.traced, _input_names(model)
+    t, u = model.traced, _inputs(model, run)
     n, m = model.size, t.h.numel()
     step = np.diff(time)
-    u = np.concatenate([run.signals[name] for name in inputs] or [np.zeros((len(time), 0))], axis=1)
-    at = np.concatenate([run.signals[s.name] for s in model.signals], axis=1)
+    at = [*(run.signals[s.name] for s in model.signals), *estimates(model, run).values()]
     y = _rows(model, run, np.broadcast_to(model.start, (len(time), n)))[2][:, :m]
     present = np.isfinite(y)
     parts = [
@@ -90,7 +93,7 @@ def extended(model: Dynamics, run: Run) -> tuple[Array, Array, Array, Array, Arr
         u,
         np.concatenate([[0.0], step])[:, None],
         np.concatenate([np.zeros((1, n)), lost(model, step)]),
-        np.nan_to_num(at),
+        np.nan_to_num(np.concatenate(at, axis=1)),
         np.diag(model.noise)[None] / steps_to(step)[:, None],
         np.nan_to_num(y),
         present.astype(float),
@@ -111,10 +114,12 @@ def _extended_step(model: Dynamics) -> Recursion:
     x, P = ca.SX.sym("x", n), ca.SX.sym("P", n, n)
     end, Phi, Q = _motion(model)(x, u, v, h)
     gap = ca.SX.sym("gap", n)
+    Q += h * _acting(model, x, u, P)
     before_x, before_P = end, symmetric(Phi @ (P + ca.diag(gap)) @ Phi.T + Q + ca.diag(gap))
-    signals = ca.vertcat(*[flat(t.symbols[s.name]) for s in model.signals])
+    (of_h,), as_was = at_estimates(model, [t.C])
+    signals = ca.vertcat(*[flat(t.symbols[s.name]) for s in model.signals], *as_was)
     R, y, there = (ca.SX.sym(name, t.h.numel()) for name in ("R", "y", "there"))
-    predict = ca.Function("predict", [t.x, signals], [t.h, t.C])
+    predict = ca.Function("predict", [t.x, signals], [t.h, of_h])
     said, C = predict(before_x, signals)
     after_x, after_P = before_x, before_P
     for i in range(t.h.numel()):
@@ -129,24 +134,43 @@ def _extended_step(model: Dynamics) -> Recursion:
 
 @lru_cache(maxsize=8)
 def _motion(model: Dynamics) -> Any:
-    """(x, inputs at both ends, h) -> (x after it, Φ, Q), as a function of symbols."""
+    """(x, inputs at both ends, h) -> (x after it, Φ, Q), as a function of symbols.
+
+    Inputs as they were read, then the uncertain ones as estimated: Φ is taken at these.
+    """
     t, inputs = model.traced, _input_names(model)
     x, h = ca.SX.sym("x", model.size), ca.SX.sym("h")
     u, v = _two_samples(model)
     own = ca.vertcat(*[flat(t.symbols[n]) for n in inputs])
+    read, estimated = _both_of(model)
     rate = ca.Function("rate", [t.x, own], [t.f])
     noise = ca.SX(ca.DM(model.process))
     noise = noise if model.input_noise is None else noise + model.input_noise
     intensity = ca.Function("intensity", [t.x, own], [noise])
-    half = ca.Function("half", [x, u, v, h], _with_jacobian(_runge_kutta(rate, x, u, v, h), x))
-    middle_u = 0.5 * (u + v)
-    middle, first = half(x, u, middle_u, 0.5 * h)
-    end, second = half(middle, middle_u, v, 0.5 * h)
+    a, b = (ca.SX.sym(name, own.numel()) for name in "ab")
+    half = ca.Function("half", [x, a, b, h], _with_jacobian(_runge_kutta(rate, x, a, b, h), x))
+    between = 0.5 * (u + v)
+    middle, first = half(x, u[read], between[read], 0.5 * h)
+    end, second = half(middle, between[read], v[read], 0.5 * h)
     Phi = second @ first
-    ends = Phi @ intensity(x, u) @ Phi.T + intensity(end, v)
-    between = second @ intensity(middle, middle_u) @ second.T
-    Q = h / 6 * (ends + 4 * between)
+    ends = Phi @ intensity(x, u[read]) @ Phi.T + intensity(end, v[read])
+    inner = second @ intensity(middle, between[read]) @ second.T
+    Q = h / 6 * (ends + 4 * inner)
+    if read != estimated:
+        first = half(x, u[estimated], between[estimated], 0.5 * h)[1]
+        Phi = half(middle, between[estimated], v[estimated], 0.5 * h)[1] @ first
     return ca.Function("motion", [x, u, v, h], [end, Phi, Q], {"cse": True})
+
+
+def _acting(model: Dynamics, x: SX, u: SX, P: SX) -> Any:
+    """What noise of uncertain inputs adds to Ξ by acting on errors with covariance P."""
+    t, n = model.traced, model.size
+    own = ca.vertcat(*[flat(t.symbols[name]) for name in _input_names(model)])
+    found = ca.SX(n, n)
+    for name, slope in slopes(model):
+        N = ca.Function("slope", [t.x, own], [slope])(x, u[_both_of(model)[0]])
+        found += model.sensors[name] * (N @ P @ N.T)
+    return found
 
 
 def _with_jacobian(expression: SX, x: SX) -> list[SX]:
@@ -168,6 +192,29 @@ def _input_names(model: Dynamics) -> list[str]:
     return [s.name for s in model.signals if ca.depends_on(t.f, flat(t.symbols[s.name]))]
 
 
+def _inputs(model: Dynamics, run: Run) -> Array:
+    """Inputs of the rates as they were read, and after them the uncertain ones as estimated."""
+    calm = estimates(model, run)
+    parts = [run.signals[n] for n in _input_names(model)]
+    parts += [calm[n] for n in _input_names(model) if n in calm]
+    return np.concatenate([np.zeros((len(run), 0)), *parts], axis=1)
+
+
+def _both_of(model: Dynamics) -> tuple[list[int], list[int]]:
+    """Where the inputs as they were read are in `_inputs`, and those to be linearised at."""
+    noisy, names = uncertain(model), _input_names(model)
+    sizes = [int(model.traced.symbols[name].numel()) for name in names]
+    read = list(range(sum(sizes)))
+    estimated, later = list[int](), len(read)
+    for name, size in zip(names, sizes, strict=True):
+        if name in noisy:
+            estimated += range(later, later + size)
+            later += size
+        else:
+            estimated += range(len(estimated), len(estimated) + size)
+    return read, estimated
+
+
 def _two_samples(model: Dynamics) -> tuple[SX, SX]:
-    size = sum(int(model.traced.symbols[n].numel()) for n in _input_names(model))
+    size = len({i for part in _both_of(model) for i in part})
     return ca.SX.sym("u", size), ca.SX.sym("v", size)

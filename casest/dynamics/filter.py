@@ -137,20 +137,23 @@ def _extended(model: Dynamics, run: Run, smooth: bool) -> Filtered:
     after = known(model, run, x, P)
     if not smooth:
         return Filtered(model, linearised(model, run, x), *after, *before, *after)
-    along, smooth_P, settled = trajectory(model, run, x)
+    along, smooth_P, settled = trajectory(model, run, x, P)
     both = known(model, run, along, smooth_P)
     return Filtered(model, linearised(model, run, along), *after, *before, *both, settled)
 
 
-def trajectory(model: Dynamics, run: Run, along: Array) -> tuple[Array, Array, bool]:
+def trajectory(
+    model: Dynamics, run: Run, along: Array, errors: Array | None = None
+) -> tuple[Array, Array, bool]:
     """The most probable states (N, n), their covariances, and whether they settled.
 
-    Gauss-Newton on all states of the record, from states `along`, by smoothing again and again.
+    Gauss-Newton on all states of the record, from states `along` of a filter with covariances
+    `errors`, by smoothing again and again.
     Where the rounds do not settle, the first one's states.
     """
     first: tuple[Array, Array] | None = None
     for _ in range(ROUNDS):
-        steps = relinearised(model, run, along)
+        steps = relinearised(model, run, along, errors)
         before = along
         along, P = smoothed(steps, kalman(steps, model.start, model.start_covariance))
         first = first or (along, P)

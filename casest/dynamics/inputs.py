@@ -14,11 +14,15 @@ octave of its frequencies, shrunk by what noise adds to it (James & Stein 1961; 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from itertools import pairwise
+
 import casadi as ca
 import numpy as np
 
 from casest.data.run import Run
 from casest.data.timing import GAP
+from casest.declaration.physics import SX
 from casest.declaration.shapes import Array
 from casest.declaration.tracing import flat
 from casest.dynamics.declare import Dynamics
@@ -26,12 +30,16 @@ from casest.engine import Columns, Replay
 
 #: Chance that noise alone stands out, for each octave of each direction.
 FALSE_ALARM = 1e-4
+#: Samples below which noise is not told from motion; share of an input that may be rounding.
+SHORTEST, ROUNDING = 16, 1e-6
+#: Sum of the squared coefficients of a fourth difference.
+_FOURTH = 70.0
 #: Median of χ² with one degree of freedom: noise is told by a median, which no line moves.
 _MEDIAN = 0.4549
 
 
 def coefficients_of(model: Dynamics) -> tuple[str, ...]:
-    """Inputs that A or C depend on, rotations apart: those whose noise could be taken for motion."""
+    """Inputs that A or C depend on, but for rotations: their noise could be taken for motion."""
     t = model.traced
     slopes = ca.vertcat(ca.vec(t.A), ca.vec(t.C))
     return tuple(
@@ -62,7 +70,7 @@ def estimates(model: Dynamics, run: Run) -> dict[str, Array]:
 
 
 def estimate(values: Array, variance: float = 0.0) -> Array:
-    """Readings (N, k) without their white noise of that `variance`, or more where they show more."""
+    """Readings (N, k) without their white noise: of that `variance`, or what they show if more."""
     from scipy.fft import dct, idct
 
     c = np.asarray(dct(values, axis=0, norm="ortho"), float)
@@ -80,17 +88,45 @@ def estimate(values: Array, variance: float = 0.0) -> Array:
 
 
 def scatter(values: Array) -> float:
-    """Standard deviation of white noise in readings (N, k), from the upper half of their spectrum."""
+    """Standard deviation of white noise in readings (N, k).
+
+    The smaller one of two: by the upper half of their spectrum, which the ends of a smooth curve
+    reach, and by their fourth differences, which a fast line reaches.
+    """
     from scipy.fft import dct
 
     upper = dct(values, axis=0, norm="ortho")[len(values) // 2 :]
-    return float(np.sqrt(np.median(upper**2) / _MEDIAN)) if upper.size else 0.0
+    if len(values) < SHORTEST:
+        return 0.0
+    spectral = float(np.sqrt(np.median(upper**2) / _MEDIAN))
+    differences = float(np.sqrt(np.median(np.diff(values, 4, axis=0) ** 2) / _MEDIAN / _FOURTH))
+    return differences if differences < 0.5 * spectral else spectral
+
+
+def unstated(model: Dynamics, run: Run) -> dict[str, float]:
+    """Standard deviation of the noise, by the record itself, of inputs of which nobody stated it.
+
+    Of those alone that A or C depend on; nothing where it is no more than rounding.
+    """
+    found = {n: scatter(run.signals[n]) for n in coefficients_of(model) if n not in model.sensors}
+    return {
+        name: std
+        for name, std in found.items()
+        if std > ROUNDING * float(np.sqrt(np.mean(run.signals[name] ** 2)))
+    }
+
+
+def smallest(std: float, count: int) -> float:
+    """The least constant value that stands out of `count` readings with noise `std`."""
+    from scipy.special import chdtri
+
+    return std * float(np.sqrt(chdtri(1, FALSE_ALARM) / count))
 
 
 def _octaves(count: int) -> list[slice]:
     """The mean, then twice as many frequencies each."""
     edges = [0, *(2**k for k in range(count.bit_length()) if 2**k < count), count]
-    return [slice(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+    return [slice(a, b) for a, b in pairwise(edges)]
 
 
 def _shares(c: Array, variance: float) -> Array:
@@ -102,22 +138,35 @@ def _shares(c: Array, variance: float) -> Array:
     return np.where(squares > chdtri(len(c), FALSE_ALARM), left, 0.0)
 
 
+def at_estimates(model: Dynamics, expressions: list[SX]) -> tuple[list[SX], list[SX]]:
+    """Expressions at the estimates of the uncertain inputs, and the symbols of these."""
+    read = {name: flat(model.traced.symbols[name]) for name in uncertain(model)}
+    as_was = [ca.SX.sym(name, e.numel()) for name, e in read.items()]
+    return ca.substitute(expressions, list(read.values()), as_was), as_was
+
+
+def slopes(model: Dynamics) -> Iterator[tuple[str, SX]]:
+    """∂A/∂u (n, n) of every number of every uncertain input."""
+    t, n = model.traced, model.size
+    for name in uncertain(model):
+        u = flat(t.symbols[name])
+        for k in range(u.numel()):
+            yield name, ca.reshape(ca.jacobian(ca.vec(t.A), u[k]), n, n)
+
+
 def on_errors(model: Dynamics, run: Run, along: Array, P: Array) -> Array:
     """What the noise of uncertain inputs adds to Ξ by acting on the errors of states, (N, n, n).
 
     Σq·N·P·Nᵀ with N = ∂A/∂u; `along` (N, n), P (N, n, n) of these errors.
     """
-    found, t, n = np.zeros_like(P), model.traced, model.size
-    for name in uncertain(model):
-        u = flat(t.symbols[name])
-        moved = _along(model, run, along, ca.jacobian(ca.vec(t.A), u))
-        for k in range(u.numel()):
-            N = moved[..., k].reshape(-1, n, n).transpose(0, 2, 1)
-            found += model.sensors[name] * (N @ P @ N.transpose(0, 2, 1))
+    found = np.zeros_like(P)
+    for name, slope in slopes(model):
+        N = _along(model, run, along, slope)
+        found += model.sensors[name] * (N @ P @ N.transpose(0, 2, 1))
     return found
 
 
-def _along(model: Dynamics, run: Run, along: Array, expression: ca.SX) -> Array:
+def _along(model: Dynamics, run: Run, along: Array, expression: SX) -> Array:
     """An expression at every sample (N, …), or at one where it is the same at all."""
     t = model.traced
     sample = ca.vertcat(t.x, *[flat(t.symbols[s.name]) for s in model.signals])

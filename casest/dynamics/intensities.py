@@ -55,6 +55,11 @@ def from_stated(model: Dynamics, run: Run, stds: Mapping[str, float]) -> Tuned:
     return Tuned(_driven_by(model, said), "from the sensors' stated noise")
 
 
+def with_stated(model: Dynamics, run: Run, stds: Mapping[str, float]) -> Dynamics:
+    """The model with those noises of its sensors, or as it is where none is stated."""
+    return from_stated(model, run, stds).model if stds else model
+
+
 def period(run: Run) -> float:
     """Median time between two samples, s."""
     if run.time is None or len(run) < 2:

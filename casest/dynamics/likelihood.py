@@ -20,6 +20,7 @@ from casest.data.run import Run
 from casest.declaration.shapes import Array
 from casest.declaration.tracing import flat
 from casest.dynamics.declare import Dynamics
+from casest.dynamics.inputs import unstated
 from casest.dynamics.stepping import Pattern, entries, packed, reach, symmetric, taken
 from casest.dynamics.transition import (
     Linearised,
@@ -82,7 +83,9 @@ def prepared(model: Dynamics, run: Run, along: Array) -> Prepared:
     """Along states (N, n), where the model or its noise depends on them."""
     inputs, own = reached(model)
     silent = model.driven(**{s.name: 0.0 for s in model.states})
-    system = linearised(model, run, along)
+    step = float(np.median(np.diff(np.asarray(run.time, float))))
+    shown = {name: std**2 * step for name, std in unstated(model, run).items()}
+    system = linearised(model.sensing(**shown), run, along)
     Phi, forced = system.moved
     present = np.isfinite(system.y)
     t, count = model.traced, len(present)
@@ -200,13 +203,16 @@ def _scoring(
 
 
 def first_guess(ready: Prepared, run: Run) -> dict[str, float]:
-    """Of a signal: its fourth differences, where little but noise is left. Of a state: little."""
+    """Of a signal: what was stated of its noise, else its fourth differences, where little but
+    noise is left. Of a state: little."""
     model, guess = ready.model, {}
     stds = {s.name: s.std for s in model.states}
     intensities = {s.name: s.intensity for s in model.states}
     duration = float(np.sum(ready.period))
     for name in ready.names:
-        if name in run.signals:
+        if name in model.sensors:
+            guess[name] = model.sensors[name]
+        elif name in run.signals:
             values = run.signals[name]
             fourth = np.diff(values[np.isfinite(values).all(axis=1)], 4, axis=0)
             variance = float(np.median(fourth**2)) / 0.4549 / _FOURTH if len(fourth) else 0.0

@@ -39,9 +39,9 @@ def least_squares(model: Dynamics, run: Run) -> Record:
     check_covariance(model.start_covariance, "the covariance at the beginning")
     if model.linear:
         return _solved(model, discretised(model, coefficients(model, run)))
-    x = extended(model, run)[0]
+    x, P = extended(model, run)[:2]
     for _ in range(ROUNDS):
-        found = _solved(model, relinearised(model, run, x))
+        found = _solved(model, relinearised(model, run, x, P))
         change = np.abs(found.x - x) / np.sqrt(np.diag(found.P_end))
         x = found.x
         if np.max(change) < SETTLED:

@@ -21,7 +21,7 @@ from casest.data.timing import GAP, UNUSED
 from casest.declaration.shapes import Array
 from casest.declaration.tracing import flat
 from casest.dynamics.declare import Dynamics
-from casest.dynamics.inputs import estimates
+from casest.dynamics.inputs import at_estimates, estimates
 from casest.dynamics.stepping import reach
 from casest.engine import Columns, Replay
 from casest.errors import DataError
@@ -119,9 +119,7 @@ def linearised(model: Dynamics, run: Run, along: Array | None = None) -> Lineari
     if along is None:
         along = np.broadcast_to(model.start, (len(time), model.size))
     calm = estimates(model, run)
-    read = [flat(t.symbols[name]) for name in calm]
-    as_was = [ca.SX.sym(name, e.numel()) for name, e in zip(calm, read, strict=True)]
-    A, C = ca.substitute([t.A, t.C], read, as_was) if calm else (t.A, t.C)
+    (A, C), as_was = at_estimates(model, [t.A, t.C])
     sample = ca.vertcat(t.x, *[flat(t.symbols[s.name]) for s in model.signals], *as_was)
     c, d = t.f - A @ t.x, t.h - C @ t.x
     added = model.input_noise

@@ -20,6 +20,7 @@ from casest.results.observability import (
     ObservedParameters,
     ObservedStructure,
     could_reach,
+    weak_directions,
     window_words,
 )
 from casest.results.states import States, intensity_spread, verdict_words
@@ -62,6 +63,7 @@ def _directions(result: Observability) -> str:
         f"{w.direction}: {number(w.inflation)} times less certain than each alone."
         for w in combinations
     ]
+    weak += [_sentence(words) for words in weak_directions(result)]
     if not result.unobservable and not weak:
         return section("hidden", "What is hidden", paragraph("Nothing: no combination is lost."))
     tolerance = "" if isinstance(result, ObservedParameters) else result.tolerance
