@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
 .PHONY: demo test lint types format wheel bench study study-starts study-nist study-loop \
-	study-motion study-records study-asked study-slow study-coverage study-deceptive study-mutation \
+	study-motion study-inputs study-records study-asked study-slow study-coverage study-deceptive study-mutation \
 	figures docs clean
 
 demo: $(READY)
@@ -55,6 +55,9 @@ study-loop: $(READY)
 study-motion: $(READY)
 	$(BIN)/python studies/flight.py
 	$(BIN)/python studies/flight_loop.py
+
+study-inputs: $(READY)
+	$(BIN)/python studies/inputs.py
 
 study-asked: $(READY)
 	$(BIN)/python studies/asked.py
