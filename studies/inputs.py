@@ -134,12 +134,12 @@ from a start drawn from what the filter is told: 0.01 m/s, 10 m/s² and 1 m/s² 
 * **claimed**: the largest that the filter claims at the end, median. The prior is 10; where gravity
   and bias move together the prior of the bias, 1, is what remains.
 * **NEES**: squared errors over what is claimed, mean of {runs} runs, nine expected; 99 % of such
-  means lie within {low:.2f} to {high:.2f}, (!) marks those that do not. Filter at half time and at the
-  end, smoother at the beginning and at half time.
+  means lie within {low:.2f} to {high:.2f}, (!) marks those that do not. Filter at half time and
+  at the end, smoother at the beginning and at half time.
 * **NIS**: squared innovations over what is expected, one expected.
 
-| motion | gyro °/s | rank | said | bound | claimed | filter, half | filter, end | smoother, start | \
-smoother, half | NIS |
+| motion | gyro °/s | rank | said | bound | claimed | filter, half | filter, end | \
+smoother, start | smoother, half | NIS |
 | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |
 {rows}
 

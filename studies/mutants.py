@@ -190,7 +190,7 @@ MUTANTS = tuple(
         (TRANSITION, "h**2 / 12 * bend", "h**2 / 6 * bend"),
         (TRANSITION, "0.5 * (step[1:] + step[:-1])", "step[1:]"),
         (EXTENDED, "P + ca.diag(gap)) @ Phi.T + Q + ca.diag(gap)", "P) @ Phi.T + Q"),
-        (EXTENDED, "intensity(middle, middle_u)", "intensity(x, u)"),
+        (EXTENDED, "intensity(middle, between[read])", "intensity(x, u[read])"),
         (EXTENDED, "Q = with_lost(model, np.diff(time), Phi, Q)", "pass"),
         (EXTENDED, "- ca.dot(c, after_x - before_x)", ""),
         ("dynamics/filter.py", "first = first or (along, P)", "first = (along, P)"),
