@@ -29,7 +29,7 @@ from casest.dynamics.declare import Dynamics
 from casest.engine import Columns, Replay
 
 #: Chance that noise alone stands out, for each octave of each direction.
-FALSE_ALARM = 1e-4
+FALSE_ALARM = 1e-5
 #: Samples below which noise is not told from motion; share of an input that may be rounding.
 SHORTEST, ROUNDING = 16, 1e-6
 #: Sum of the squared coefficients of a fourth difference.

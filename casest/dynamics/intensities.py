@@ -90,7 +90,7 @@ def most_likely(model: Dynamics, run: Run) -> Tuned:
     start = None
     for _ in range(ROUNDS):
         ready = prepared(model, run, filtered(model, run).smoothed)
-        start, _ = matched(ready, run, start)
+        start, _ = matched(ready, run, start, exactly=True)
         model = applied(model, start)
     assert start is not None
     names, logs = ready.names, np.log([start[n] for n in ready.names])
