@@ -192,7 +192,7 @@ MUTANTS = tuple(
         (EXTENDED, "P + ca.diag(gap)) @ Phi.T + Q + ca.diag(gap)", "P) @ Phi.T + Q"),
         (EXTENDED, "intensity(middle, between[read])", "intensity(x, u[read])"),
         (EXTENDED, "Q = with_lost(model, np.diff(time), Phi, Q)", "pass"),
-        (EXTENDED, "- ca.dot(c, after_x - before_x)", ""),
+        (EXTENDED, "- ca.dot(c, found - along)", ""),
         ("dynamics/filter.py", "first = first or (along, P)", "first = (along, P)"),
         (
             "dynamics/filter.py",

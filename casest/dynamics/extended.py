@@ -2,11 +2,13 @@
 
 Between samples the state follows two fourth-order Runge-Kutta steps, inputs being straight lines;
 Φ is the Jacobian of that very map, so that filter, smoother and least squares speak of one problem.
-Readings are linearised at the prediction (Jazwinski 1970, 8.3).
+Readings are linearised at the prediction and again where they lead to (Jazwinski 1970, 8.3).
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -23,6 +25,9 @@ from casest.dynamics.inputs import at_estimates, estimates, on_errors, slopes, u
 from casest.dynamics.stepping import entries, packed, run_steps, symmetric, taken, unpacked
 from casest.dynamics.transition import checked_record, lost, steps_to, with_lost
 from casest.engine import Columns, Recursion, Replay
+
+#: Rounds of the filter's update where a reading is no linear function of the state.
+ITERATIONS = 4
 
 
 def relinearised(model: Dynamics, run: Run, along: Array, errors: Array | None = None) -> Steps:
@@ -121,15 +126,53 @@ def _extended_step(model: Dynamics) -> Recursion:
     R, y, there = (ca.SX.sym(name, t.h.numel()) for name in ("R", "y", "there"))
     predict = ca.Function("predict", [t.x, signals], [t.h, of_h])
     said, C = predict(before_x, signals)
-    after_x, after_P = before_x, before_P
-    for i in range(t.h.numel()):
-        c = C[i, :].T * there[i]
-        left = (y[i] - said[i]) * there[i] - ca.dot(c, after_x - before_x)
-        after_x, after_P = taken(after_x, after_P, c, left, ca.dot(c, after_P @ c) + R[i])
+    reading = _Reading(lambda at: predict(at, signals), y, R, there)
+    rounds = ITERATIONS if ca.depends_on(t.C, t.x) else 1
+    after_x, after_P = reading.taken(before_x, before_P, rounds)
     numbers = ca.vertcat(u, v, h, gap, signals, R, y, there)
     told = ca.vertcat(y - said, ca.vec(ca.densify(C @ before_P @ C.T + ca.diag(R))))
     outputs = [packed(after_x, after_P), packed(before_x, before_P), told]
     return Recursion(ca.Function("step", [packed(x, P), numbers], outputs, {"cse": True}))
+
+
+@dataclass(frozen=True)
+class _Reading:
+    """Readings y with variances R, as far as they are there; `predict(x)` says h(x) and C(x)."""
+
+    predict: Callable[[Any], tuple[Any, Any]]
+    y: Any
+    R: Any
+    there: Any
+
+    def taken(self, x: Any, P: Any, rounds: int) -> tuple[Any, Any]:
+        """State and covariance after them, linearised where they lead to, round after round.
+
+        Gauss-Newton on what the prediction and the readings say together (Bell & Cathey 1993); of
+        all rounds the most probable state.
+        """
+        best = found, after_P, cost = self._once(x, P, x)
+        for _ in range(rounds - 1):
+            found, after_P, cost = self._once(x, P, found)
+            better = cost < best[2]
+            best = tuple(
+                ca.if_else(better, a, b) for a, b in zip((found, after_P, cost), best, strict=True)
+            )
+        return best[0], best[1]
+
+    def _once(self, x: Any, P: Any, along: Any) -> tuple[Any, Any, Any]:
+        """The same linearised at `along`, and twice the negative log-density of the state."""
+        said, C = self.predict(along)
+        found, after, explained = x, P, ca.SX(0)
+        for i in range(self.y.numel()):
+            c = C[i, :].T * self.there[i]
+            left = (self.y[i] - said[i]) * self.there[i] - ca.dot(c, found - along)
+            s = ca.dot(c, after @ c) + self.R[i]
+            found, after = taken(found, after, c, left, s)
+            explained += left**2 / s
+        linear = said + C @ (found - along)
+        there = self.there / self.R
+        bent = (self.y - self.predict(found)[0]) ** 2 - (self.y - linear) ** 2
+        return found, after, explained + ca.dot(there, bent)
 
 
 @lru_cache(maxsize=8)

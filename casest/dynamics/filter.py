@@ -71,6 +71,17 @@ class Filtered:
         return np.sqrt(np.diagonal(self.P, axis1=1, axis2=2))
 
     @property
+    def end(self) -> tuple[Array, Array]:
+        """State (n,) and covariance (n, n) at the end of the record, as all of it says.
+
+        The smoother's, which linearises along the whole record; the filter's, which of a nonlinear
+        model linearised at what it knew at the time, where that did not settle.
+        """
+        if self.settled:
+            return self.smoothed[-1], self.smoothed_P[-1]
+        return self.x[-1], self.P[-1]
+
+    @property
     def normalised_innovations(self) -> Array:
         """νᵀS⁻¹ν of every complete reading, (N,): χ² with m degrees of freedom if all is right."""
         whole = np.isfinite(self.innovations).all(axis=1)

@@ -254,9 +254,10 @@ def _section(fit: Fit, closing: MotionClosing, side: int) -> MotionSection:
 
 def _states(fit: Fit, closing: MotionClosing) -> dict[str, Parameter]:
     """The declared states at the end of the record."""
-    model, found = closing.declared, fit.found
+    model, (x, P) = closing.declared, fit.found.end
+    std = np.sqrt(np.diag(P))
     return {
-        name: _number(found.x[-1][where], found.std[-1][where], model[name].unit)
+        name: _number(x[where], std[where], model[name].unit)
         for name, where in model.slices().items()
     }
 

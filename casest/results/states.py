@@ -22,10 +22,13 @@ from casest.results.trajectory import Innovations, Trajectory, trajectory_of
 
 #: Between these shares of what is expected innovations are called as large as expected.
 SMALLEST, LARGEST = 0.8, 1.25
+#: Filter and smoother disagree at the end by more than so many standard deviations: it is said.
+PARTED = 1.0
 
 
 class FinalState(Struct, frozen=True):
-    """A state at the end of the record, and how well the smoother knows it along the way."""
+    """A state at the end of the record, as all of it says, and how well the smoother knows it along
+    the way."""
 
     value: list[Number]
     std: list[Number]
@@ -89,7 +92,12 @@ def follow(
     mean, m = _normalised_mean(found), found.innovations.shape[1]
     return States(
         model=found.model.name,
-        notes=[*assumed(run), *_unsettled(found), *_too_short(run, found.model.size)],
+        notes=[
+            *assumed(run),
+            *_unsettled(found),
+            *_parted(found),
+            *_too_short(run, found.model.size),
+        ],
         samples=len(found.time),
         states=_final(found),
         intensities=UsedIntensities(
@@ -116,10 +124,12 @@ def follow(
 
 
 def _final(found: Filtered) -> dict[str, FinalState]:
+    x, P = found.end
+    std = np.sqrt(np.diag(P))
     return {
         name: FinalState(
-            plain(found.x[-1][where]),
-            plain(found.std[-1][where]),
+            plain(x[where]),
+            plain(std[where]),
             plain(_median_std(found, where)),
             found.model[name].unit,
         )
@@ -137,6 +147,21 @@ def _unsettled(found: Filtered) -> list[str]:
     return [
         "the smoother's rounds did not settle: its states are those of one pass; nearer start "
         "values or a smaller std at the beginning may help"
+    ]
+
+
+def _parted(found: Filtered) -> list[str]:
+    """Where the filter ends elsewhere than the smoother, which has the same readings there."""
+    x, P = found.end
+    off = np.abs(found.x[-1] - x) / np.sqrt(np.maximum(np.diag(P), 1e-300))
+    worst = int(np.argmax(off))
+    if not off[worst] > PARTED:
+        return []
+    return [
+        f"the filter ends {off[worst]:.2g} standard deviations of {found.model.names[worst]} away "
+        "from what the whole record says, since it linearised at what it knew at the time: the "
+        "states above and smoothed_* in states.csv are the record's, its innovations are the "
+        "filter's; a nearer start, or a smaller std at the beginning, brings both together"
     ]
 
 
