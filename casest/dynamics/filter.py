@@ -106,12 +106,13 @@ def filtered(
     noise of inputs reaches a linear model through its states, it is taken along the estimates of a
     first pass. What is known exactly (`constraint`) is put into every estimate and not fed back.
 
-    Of a linear model: `system`, the model along the record, where it is known already; `spread`
-    False: smoothed states without their covariances (the filter's in their place): half the time.
+    `system`: the model along the record, where it is known already; a nonlinear one is then linear
+    along it, and the filter too is linearised where all readings lead. `spread` False: smoothed
+    states of a linear one without their covariances (the filter's in their place): half the time.
     Raises DataError where time or inputs are not usable, or a covariance is none.
     """
     check_covariance(model.start_covariance, "the covariance at the beginning")
-    if not model.linear:
+    if not model.linear and system is None:
         return _extended(model, run, smooth)
     return _once(model, run, system or coefficients(model, run), smooth, spread)
 

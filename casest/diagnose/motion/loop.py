@@ -18,6 +18,7 @@ from casest.diagnose.motion.whiteness import Whiteness, whiteness
 from casest.dynamics.declare import Dynamics
 from casest.dynamics.filter import filtered
 from casest.dynamics.likelihood import applied, first_guess, likelihood
+from casest.dynamics.transition import process_along
 from casest.effects.moving import Candidate, Colour, candidates
 from casest.errors import DataError
 
@@ -183,7 +184,11 @@ class _Loop:
         if not self._noise_is_odd(current):
             return []
         model = applied(current.model, self._of_sensors(current))
-        found = filtered(model, current.run, spread=False)
+        system = None
+        if not model.linear:
+            process = process_along(model, current.run, current.found.smoothed)
+            system = current.ready.system.driven(process)
+        found = filtered(model, current.run, system=system, spread=False)
         rest = [c for c in self.tried if all(c is not a for a, _ in current.added)]
         return scores(sensitivity(current.base, current.added, rest, current.run, found), rest)
 
