@@ -158,7 +158,7 @@ def motion_result(
         after=_section(after, closing, 1),
         effects=[_effect(a, closing) for a in closing.effects],
         invisible=[i for s in closing.first for i in _invisible(s, closing)],
-        unexplained=Left(plain(left.share), where) if closing.misfit else Left(0.0, ""),
+        unexplained=Left(plain(left.share), where) if closing.coloured else Left(0.0, ""),
         moved=_moved(closing),
         smallest_detectable=[_detectable(s) for s in closing.first if np.any(s.information)],
         refused=[Explained(name, why) for name, why in closing.refused],
@@ -182,6 +182,12 @@ def sentence(result: MotionClosed) -> str:
         verb = "was" if len(names) == 1 else "were"
         return f"extended: {', '.join(names)} {verb} missing; what is left is noise"
     beside = f" beside {', '.join(names)}" if names else ""
+    if not result.closing.coloured:
+        loud = " and ".join(
+            f"{name} is {np.sqrt(times):.2g} times as noisy as it was stated to be or shows from "
+            "sample to sample" for name, times in result.closing.loud.items()
+        )  # fmt: skip
+        return f"unexplained: the innovations are white only if {loud}{beside}"
     return f"unexplained: the innovations are not white{beside}, and no candidate says why"
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,7 +17,7 @@ from casest.diagnose.motion.sensitivity import sensitivity
 from casest.diagnose.motion.whiteness import Whiteness, whiteness
 from casest.dynamics.declare import Dynamics
 from casest.dynamics.filter import filtered
-from casest.dynamics.likelihood import applied, first_guess, likelihood
+from casest.dynamics.likelihood import applied, first_guess, likelihood, reached
 from casest.dynamics.transition import process_along
 from casest.effects.moving import Candidate, Colour, candidates
 from casest.errors import DataError
@@ -32,6 +32,8 @@ ALIKE = 3.0
 CONTENDERS, ROUNDS, BLOCKS, FOLDS = 3, 6, 40, 4
 #: Whiteness below which noise with a colour is tried; gain of likelihood that asks for it too.
 SUSPECT, ASKS = 0.05, 10.0
+#: An input's matched intensity that is so many times what its own readings show is no noise.
+LOUD = 4.0
 #: Significance of what is left.
 UNEXPLAINED = 1e-4
 #: Samples below which nothing can be held out.
@@ -65,11 +67,18 @@ class MotionClosing:
     first: tuple[Score, ...]
     left: Whiteness
     held_out: tuple[Array, Array]
+    #: Inputs whose noise had to be matched far above their own, and how many times.
+    loud: Mapping[str, float]
+
+    @property
+    def coloured(self) -> bool:
+        """Are the innovations not white after the loop?"""
+        return self.left.p_value < UNEXPLAINED
 
     @property
     def misfit(self) -> bool:
-        """Are the innovations not white after the loop?"""
-        return self.left.p_value < UNEXPLAINED
+        """Are they not, or white only because an input was called noisier than it is?"""
+        return self.coloured or bool(self.loud)
 
     @property
     def verdict(self) -> str | None:
@@ -139,6 +148,7 @@ class _Loop:
             tuple(first),
             left,
             (one, two),
+            self._loud(current),
         )
 
     def _judged(self, fit: Fit) -> tuple[list[Score], Whiteness]:
@@ -226,6 +236,18 @@ class _Loop:
     def _noise_is_odd(self, fit: Fit) -> bool:
         """Are the intensities far from what the signals themselves show from sample to sample?"""
         return fit.likelihood - likelihood(fit.ready, self._of_sensors(fit)) > ASKS
+
+    def _loud(self, fit: Fit) -> dict[str, float]:
+        """Inputs whose matched intensity is many times what was stated or their readings show, and
+        how many, where the likelihood insists on it."""
+        guess, inputs = first_guess(fit.ready, self.run), reached(self.model)[0]
+        times = {n: fit.intensities[n] / guess[n] for n in inputs if n in fit.intensities}
+        found = {}
+        for name, ratio in times.items():
+            own = {**fit.intensities, name: guess[name]}
+            if ratio > LOUD and fit.likelihood - likelihood(fit.ready, own) > ASKS:
+                found[name] = ratio
+        return found
 
     def _of_sensors(self, fit: Fit) -> dict[str, float]:
         """Intensities of inputs and states no larger than the signals' noise from sample to sample
