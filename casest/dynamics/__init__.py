@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from casest.dynamics.continuous import Continuous, kalman_bucy
 from casest.dynamics.declare import Dynamics, Motion, State, constraint, dynamics, measured, state
+from casest.dynamics.dimensions import check_units
 from casest.dynamics.discrete import Estimates, Steps, kalman, smoothed
 from casest.dynamics.filter import Filtered, filtered
 from casest.dynamics.record import Record, least_squares
@@ -20,6 +21,7 @@ __all__ = [
     "State",
     "Steps",
     "Structure",
+    "check_units",
     "constraint",
     "dynamics",
     "filtered",

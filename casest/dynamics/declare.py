@@ -101,6 +101,19 @@ class Motion:
     outputs: tuple[Measured, ...]
     constraints: tuple[Constraint, ...] = ()
 
+    def __post_init__(self) -> None:
+        """One alone, its comma forgotten, is a tuple of one."""
+        for name, kind in (("outputs", Measured), ("constraints", Constraint)):
+            given = getattr(self, name)
+            several = (given,) if isinstance(given, kind) else given
+            if not isinstance(several, tuple | list) or not all(
+                isinstance(one, kind) for one in several
+            ):
+                raise DeclarationError(
+                    f"Motion: {name}= takes {kind.__name__.lower()}(…), …, not {several!r}"
+                )
+            object.__setattr__(self, name, tuple(several))
+
 
 def measured(signal: SX, predicted: SX, *, intensity: float) -> Measured:
     """An output: `measured(v, velocity, intensity=0.1)`, intensity in unit²·s."""
@@ -270,7 +283,7 @@ class Dynamics:
     @cached_property
     def traced(self) -> Traced:
         """The body on CasADi symbols."""
-        return _trace(self)
+        return traced_with(self, {c.name: float(c.array) for c in self.constants})
 
     @property
     def measured_signals(self) -> tuple[str, ...]:
@@ -334,15 +347,15 @@ def dynamics(function: Callable[..., Motion]) -> Dynamics:
     return Dynamics(name, function, tuple(signals), tuple(states), tuple(constants))
 
 
-def _trace(declared: Dynamics) -> Traced:
+def traced_with(declared: Dynamics, constants: Mapping[str, SX | float]) -> Traced:
+    """The body on CasADi symbols, its constants numbers or symbols too."""
     symbols: dict[str, SX] = {}
     for s in declared.signals:
         plain = ca.SX.sym(s.name, s.size)
         symbols[s.name] = ca.reshape(plain, 3, 3).T if s.kind == "rotation" else plain
     xs = {s.name: ca.SX.sym(s.name, s.size) for s in declared.states}
-    numbers = {c.name: float(c.array) for c in declared.constants}
     try:
-        motion = declared.function(**symbols, **xs, **numbers)
+        motion = declared.function(**symbols, **xs, **constants)
     except CasestError:
         raise
     except (Exception, SystemExit) as error:
