@@ -75,12 +75,30 @@ def _wrong(field: str, number: Any) -> str | None:
 class Measured:
     """An output: the signal that measures it, what it should be, and its noise intensity.
 
-    `intensity` in unit²·s: variance of one reading times the time between two.
+    `intensity` in unit²·s: variance of one reading times the time between two. `wraps`: both are
+    angles, which are alike a full turn apart.
     """
 
     signal: SX
     predicted: SX
     intensity: float
+    wraps: bool = False
+
+
+@dataclass(frozen=True)
+class Angle:
+    """What an output should be, up to full turns."""
+
+    expression: SX
+
+
+def angle(expression: SX) -> Angle:
+    """An angle as an output: `measured(bearing, angle(atan2(y, x)), intensity=1e-4)`.
+
+    Reading and prediction may differ by full turns, 2π or 360 by the unit of the signal (rad where
+    it has none): 179° and −179° are 2° apart.
+    """
+    return Angle(expression)
 
 
 @dataclass(frozen=True)
@@ -115,13 +133,15 @@ class Motion:
             object.__setattr__(self, name, tuple(several))
 
 
-def measured(signal: SX, predicted: SX, *, intensity: float) -> Measured:
-    """An output: `measured(v, velocity, intensity=0.1)`, intensity in unit²·s."""
+def measured(signal: SX, predicted: SX | Angle, *, intensity: float) -> Measured:
+    """An output: `measured(v, velocity, intensity=0.1)`, intensity in unit²·s; see `angle` too."""
     if not intensity > 0:
         raise DeclarationError(
             f"measured: the noise intensity must be positive, not {intensity}: a reading without "
             "noise makes the Riccati equation singular; give the sensor's variance times its period"
         )
+    if isinstance(predicted, Angle):
+        return Measured(signal, predicted.expression, float(intensity), wraps=True)
     return Measured(signal, predicted, float(intensity))
 
 
@@ -299,8 +319,10 @@ class Dynamics:
 
     @cached_property
     def linear(self) -> bool:
-        """Are rates and outputs linear in the state?"""
+        """Are rates and outputs linear in the state? An angle that wraps is not."""
         t = self.traced
+        if any(o.wraps for o in t.outputs):
+            return False
         slopes = ca.vertcat(ca.vec(t.A), ca.vec(t.C))
         return not ca.depends_on(slopes, t.x)
 
@@ -308,7 +330,7 @@ class Dynamics:
 @dataclass(frozen=True)
 class Traced:
     """Symbols and expressions: x, signals, f(x, u), h(x, u), A = ∂f/∂x, C = ∂h/∂x, readings;
-    constraints g(x, u) = 0 and G = ∂g/∂x."""
+    constraints g(x, u) = 0 and G = ∂g/∂x; `turn` (m,): a full turn of readings that are angles."""
 
     x: SX
     symbols: Mapping[str, SX]
@@ -321,6 +343,23 @@ class Traced:
     G: SX
     outputs: tuple[Measured, ...]
     measured: tuple[str, ...]
+    turn: Array
+
+    def wrapped(self, difference: Any) -> Any:
+        """Readings less predictions (m) or (N, m), angles within half a turn of zero."""
+        if not self.turn.any():
+            return difference
+        full = np.where(self.turn > 0, self.turn, 1.0)
+        if isinstance(difference, np.ndarray):
+            return difference - self.turn * np.floor(difference / full + 0.5)
+        return difference - ca.DM(self.turn) * ca.floor(difference / full + 0.5)
+
+    def nearest(self, y: Array, C: Array, d: Array, x: Array) -> Array:
+        """Readings (N, m), angles by full turns as near to C·x + d as they come."""
+        if not self.turn.any():
+            return y
+        said = (C @ x[:, :, None])[:, :, 0] + d
+        return np.asarray(said + self.wrapped(y - said))
 
 
 def dynamics(function: Callable[..., Motion]) -> Dynamics:
@@ -386,5 +425,23 @@ def traced_with(declared: Dynamics, constants: Mapping[str, SX | float]) -> Trac
     if reading.numel() != h.numel():
         raise DeclarationError(f"dynamics {declared.name}: outputs and signals differ in shape")
     g = ca.vertcat(*[ca.vec(c.expression) for c in motion.constraints])
+    of = {s.name: s.unit for s in declared.signals}
+    turn = [
+        np.full(o.predicted.numel(), 2 * np.pi / units.size(of[n] or "rad")[0] if o.wraps else 0.0)
+        for n, o in zip(names, motion.outputs, strict=True)
+    ]
     A, C, G = ca.jacobian(f, x), ca.jacobian(h, x), ca.jacobian(g, x)
-    return Traced(x, symbols, f, h, A, C, reading, g, G, motion.outputs, tuple(names))
+    return Traced(
+        x,
+        symbols,
+        f,
+        h,
+        A,
+        C,
+        reading,
+        g,
+        G,
+        motion.outputs,
+        tuple(names),
+        np.concatenate([np.zeros(0), *turn]),
+    )

@@ -28,7 +28,8 @@ def check_units(model: Dynamics) -> None:
 
     A declaration that has no unit at all has none to check: its time has none either.
     """
-    if not {s.unit for s in (*model.states, *model.signals, *model.constants)} - {None, "", "1"}:
+    given: list[str | None] = [x.unit for part in (model.states, model.constants) for x in part]
+    if not {*given, *(s.unit for s in model.signals)} - {None, "", "1"}:
         return
     symbols = {c.name: ca.SX.sym(c.name) for c in model.constants}
     t = traced_with(model, symbols)

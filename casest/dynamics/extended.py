@@ -52,8 +52,9 @@ def _rows(model: Dynamics, run: Run, along: Array) -> tuple[Array, Array, Array]
     """Readings as rows: C, d and y."""
     columns = [np.ascontiguousarray(along), *(run.signals[s.name] for s in model.signals)]
     columns += estimates(model, run).values()
-    C, d, y = over_samples(_outputs(model), columns)
-    return C, d[:, :, 0], y[:, :, 0]
+    C, d, y = (part[:, :, 0] if k else part
+               for k, part in enumerate(over_samples(_outputs(model), columns)))  # fmt: skip
+    return C, d, model.traced.nearest(y, C, d, along)
 
 
 @lru_cache(maxsize=8)
@@ -126,20 +127,22 @@ def _extended_step(model: Dynamics) -> Recursion:
     R, y, there = (ca.SX.sym(name, t.h.numel()) for name in ("R", "y", "there"))
     predict = ca.Function("predict", [t.x, signals], [t.h, of_h])
     said, C = predict(before_x, signals)
-    reading = _Reading(lambda at: predict(at, signals), y, R, there)
+    reading = _Reading(lambda at: predict(at, signals), t.wrapped, y, R, there)
     rounds = ITERATIONS if ca.depends_on(t.C, t.x) else 1
     after_x, after_P = reading.taken(before_x, before_P, rounds)
     numbers = ca.vertcat(u, v, h, gap, signals, R, y, there)
-    told = ca.vertcat(y - said, ca.vec(ca.densify(C @ before_P @ C.T + ca.diag(R))))
+    told = ca.vertcat(t.wrapped(y - said), ca.vec(ca.densify(C @ before_P @ C.T + ca.diag(R))))
     outputs = [packed(after_x, after_P), packed(before_x, before_P), told]
     return Recursion(ca.Function("step", [packed(x, P), numbers], outputs, {"cse": True}))
 
 
 @dataclass(frozen=True)
 class _Reading:
-    """Readings y with variances R, as far as they are there; `predict(x)` says h(x) and C(x)."""
+    """Readings y with variances R, as far as they are there; `predict(x)` says h(x) and C(x), and
+    `wrapped` what of a difference is no full turn."""
 
     predict: Callable[[Any], tuple[Any, Any]]
+    wrapped: Callable[[Any], Any]
     y: Any
     R: Any
     there: Any
@@ -162,16 +165,17 @@ class _Reading:
     def _once(self, x: Any, P: Any, along: Any) -> tuple[Any, Any, Any]:
         """The same linearised at `along`, and twice the negative log-density of the state."""
         said, C = self.predict(along)
+        difference = self.wrapped(self.y - said)
         found, after, explained = x, P, ca.SX(0)
         for i in range(self.y.numel()):
             c = C[i, :].T * self.there[i]
-            left = (self.y[i] - said[i]) * self.there[i] - ca.dot(c, found - along)
+            left = difference[i] * self.there[i] - ca.dot(c, found - along)
             s = ca.dot(c, after @ c) + self.R[i]
             found, after = taken(found, after, c, left, s)
             explained += left**2 / s
-        linear = said + C @ (found - along)
+        linear = difference - C @ (found - along)
         there = self.there / self.R
-        bent = (self.y - self.predict(found)[0]) ** 2 - (self.y - linear) ** 2
+        bent = self.wrapped(self.y - self.predict(found)[0]) ** 2 - linear**2
         return found, after, explained + ca.dot(there, bent)
 
 

@@ -133,7 +133,7 @@ def linearised(model: Dynamics, run: Run, along: Array | None = None) -> Lineari
     columns = Columns([np.ascontiguousarray(along), *signals])
     A, c_, C, d_, y, *more = Replay(function)(np.zeros(0), columns)
     process = model.process + more[0] if more else model.process
-    readings = y[:, :, 0]
+    readings = t.nearest(y[:, :, 0], C, d_[:, :, 0], along)
     if not np.isfinite(readings).all():
         C = np.where(np.isfinite(readings)[:, :, None], C, 0.0)
     return Linearised(time, A, c_[:, :, 0], C, d_[:, :, 0], readings, process)
