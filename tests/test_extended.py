@@ -352,6 +352,37 @@ def test_a_nonlinear_model_keeps_to_what_is_known_too():
     assert np.std(angle - truth[:, 0]) < 1.2 * np.std(plain.smoothed[:, 0] - truth[:, 0])
 
 
+def test_the_states_printed_are_those_of_the_whole_record():
+    """A pendulum whose length is found from a start far away: the filter ends elsewhere."""
+
+    @dynamics
+    def pendulum(
+        y=signal("rad"),
+        *,
+        angle=state("rad", start=0.3, std=0.3),
+        rate=state("rad/s", std=1.0),
+        length=state("m", start=1.5, std=1.0),
+    ):
+        rates = {"angle": rate, "rate": -G_OVER_L * 0.8 / length * sin(angle)}
+        return Motion(rates=rates, outputs=(measured(y, angle, intensity=2e-8),))
+
+    t, parted = np.arange(0, 20, 0.02), 0
+    for seed in range(4):
+        rng = np.random.default_rng(300 + seed)
+        start = [rng.uniform(0.3, 1.2), rng.uniform(-0.5, 0.5)]
+        path = solve_ivp(lambda _, x: [x[1], -G_OVER_L * np.sin(x[0])], (0, 20), start,
+                         t_eval=t, rtol=1e-11, atol=1e-12)  # fmt: skip
+        y = path.y[0] + 0.001 * rng.standard_normal(len(t))
+        result = follow(pendulum, Run.raw("p", {"y": y[:, None]}, units={}, time=t))
+        length = result.states["length"]
+        assert abs(length.value[0] - 0.8) < 4 * length.std[0]
+        off = abs(result.filtered.x[-1] - result.filtered.smoothed[-1]) / result.filtered.std[-1]
+        said = "standard deviations of" in " ".join(result.notes)
+        assert said == bool(off.max() > 1) or abs(off.max() - 1) < 0.1
+        parted += said
+    assert parted
+
+
 def test_a_smoother_that_does_not_settle_says_so(monkeypatch):
     monkeypatch.setattr("casest.dynamics.filter.ROUNDS", 1)
     result = follow(pendulum_of(), swing()[0])

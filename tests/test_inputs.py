@@ -16,6 +16,7 @@ from casest.dynamics import Motion, dynamics, measured, state
 from casest.dynamics.filter import coefficients, filtered
 from casest.dynamics.gramian import gramian, observed
 from casest.dynamics.inputs import estimate, scatter, unstated
+from casest.dynamics.record import least_squares
 from casest.results.observability import observe_motion
 from casest_problems.bias_gravity import bias_gravity
 
@@ -161,6 +162,18 @@ def test_errors_are_no_larger_than_they_are_said_to_be(declared, spin, degrees):
     assert np.mean(squares[::2]) < chi2.ppf(0.9995, 9 * 10) / 10
     assert np.mean(squares[1::2]) < chi2.ppf(0.9995, 9 * 10) / 10
     assert np.mean(squares) > 5.5  # and not much smaller either
+
+
+@pytest.mark.parametrize("declared", [bias_gravity, hidden()], ids=["linear", "nonlinear"])
+def test_smoother_and_least_squares_agree(declared):
+    run, _ = record("all axes, 30 °/s", 0.2)
+    model = estimator(0.2, declared)
+    found, at_once = filtered(model, run), least_squares(model, run)
+    std = np.sqrt(np.diagonal(found.smoothed_P, axis1=1, axis2=2))
+    assert np.max(np.abs(found.smoothed - at_once.x) / std) < 1e-3
+    np.testing.assert_allclose(
+        np.sqrt(np.diag(at_once.P_start)), np.sqrt(np.diag(found.smoothed_P[0])), rtol=1e-3
+    )
 
 
 def test_at_rest_nothing_is_told_of_gravity_and_bias_apart():

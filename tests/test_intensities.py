@@ -9,8 +9,9 @@ import flights
 import numpy as np
 import pytest
 
-from casest import DataError, UsageError
+from casest import DataError, Run, UsageError, signal
 from casest.cli import run
+from casest.dynamics import Motion, dynamics, measured, state
 from casest.dynamics.allan import allan
 from casest.dynamics.filter import filtered
 from casest.dynamics.intensities import from_rest, from_stated, intensities, most_likely
@@ -83,6 +84,20 @@ def test_the_most_likely_intensities_are_the_true_ones(flight):
     assert found.spread["v"] < 0.05
     assert found.spread["omega"] < 1.0
     assert not found.spread["bias"] < 1.0  # it does not drift at all
+
+
+def test_the_niles_intensities_are_the_certified_ones(shared_data):
+    """A local level: Durbin and Koopman's maximum, 15 098.5 and 1469.2."""
+
+    @dynamics
+    def nile(flow=signal(), *, level=state(intensity=1e3, start=1000.0, std=1e4)):
+        return Motion(rates={}, outputs=measured(flow, level, intensity=1e4))
+
+    t, flow = np.loadtxt(shared_data / "certified" / "nile.csv", delimiter=",", skiprows=1).T
+    run = Run.raw("nile", {"flow": flow[:, None]}, units={}, time=t)
+    used = intensities(most_likely(nile, run).model)
+    assert used["flow"] == pytest.approx(15_098.5, rel=2e-4)
+    assert used["level"] == pytest.approx(1469.2, rel=2e-4)
 
 
 # -- at rest ---------------------------------------------------------------------------------------

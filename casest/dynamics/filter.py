@@ -7,7 +7,7 @@ used in part.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -114,7 +114,11 @@ def filtered(
     check_covariance(model.start_covariance, "the covariance at the beginning")
     if not model.linear and system is None:
         return _extended(model, run, smooth)
-    return _once(model, run, system or coefficients(model, run), smooth, spread)
+    found = _once(model, run, system or coefficients(model, run), smooth, spread)
+    if smooth and system is None and uncertain(model):
+        later = _once(model, run, in_hindsight(model, run, found), smooth, spread)
+        return replace(found, smoothed=later.smoothed, smoothed_P=later.smoothed_P)
+    return found
 
 
 def coefficients(model: Dynamics, run: Run) -> Linearised:
@@ -135,6 +139,13 @@ def coefficients(model: Dynamics, run: Run) -> Linearised:
         if np.max(np.abs(first.std / before.std - 1)) < ALIKE:
             break
     return system
+
+
+def in_hindsight(model: Dynamics, run: Run, found: Filtered) -> Linearised:
+    """A linear model with uncertain coefficients along smoothed states: the noise of inputs acts on
+    these, which early in the record are nearer than what the filter knew."""
+    system = linearised(model, run, found.smoothed)
+    return system.driven(system.process + on_errors(model, run, found.smoothed, found.P))
 
 
 def _extended(model: Dynamics, run: Run, smooth: bool) -> Filtered:
