@@ -243,6 +243,15 @@ def test_observe_takes_the_sensors_noise_and_says_what_it_leaves_out(file, capsy
     assert louder["notes"] != stated["notes"]
 
 
+def test_filter_says_where_noise_is_taken_for_motion(file, capsys):
+    assert cli(["filter", "bias-gravity", file, "--json"]) == 0
+    notes = " ".join(json.loads(capsys.readouterr().out)["notes"])
+    assert "it is taken for motion" in notes
+    assert "--sensor-noise omega=0.000" in notes
+    assert cli(["filter", "bias-gravity", file, "--json", *STATED]) == 0
+    assert "taken for motion" not in " ".join(json.loads(capsys.readouterr().out)["notes"])
+
+
 def test_close_does_not_tell_gravity_from_bias_by_noise(file, capsys):
     for words in ([], STATED):
         assert cli(["close", "bias-gravity", file, "--json", *words]) == 0

@@ -14,6 +14,7 @@ from msgspec import UNSET, Struct, UnsetType
 from casest.data.run import Run
 from casest.dynamics import Dynamics
 from casest.dynamics.filter import Filtered, filtered
+from casest.dynamics.inputs import unstated
 from casest.dynamics.intensities import Tuned, intensities, units
 from casest.results.file import plain
 from casest.results.observability import assumed, too_short
@@ -147,6 +148,16 @@ def _unsettled(found: Filtered) -> list[str]:
     return [
         "the smoother's rounds did not settle: its states are those of one pass; nearer start "
         "values or a smaller std at the beginning may help"
+    ]
+
+
+def _taken_for_motion(model: Dynamics, run: Run) -> list[str]:
+    """Noise of inputs that nobody stated, which a filter counts as motion."""
+    units = {s.name: s.unit or "1" for s in model.signals}
+    return [
+        f"{name} shows noise of {std:.3g} {units[name]} that is not stated: it is taken for "
+        f"motion, and what the filter is sure of may be too much (--sensor-noise {name}={std:.2g})"
+        for name, std in unstated(model, run).items()
     ]
 
 

@@ -79,6 +79,11 @@ class Fit:
 
     def with_spread(self) -> Fit:
         """The same with the covariances of the smoothed states, which the loop has no use for."""
+        if not self.model.linear:  # by its own steps, which straight lines of A(t) only follow
+            found = filtered(self.model, self.run)
+            x, P, settled = found.smoothed, found.smoothed_P, found.settled
+            own = replace(self.found, smoothed=x, smoothed_P=P, settled=settled)
+            return replace(self, found=own)
         process = process_along(self.model, self.run, self.found.smoothed)
         found = filtered(self.model, self.run, system=self.ready.system.driven(process))
         return replace(self, found=replace(self.found, smoothed_P=found.smoothed_P))
