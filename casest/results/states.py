@@ -95,6 +95,7 @@ def follow(
         model=found.model.name,
         notes=[
             *assumed(run),
+            *_taken_for_motion(found.model, run),
             *_unsettled(found),
             *_parted(found),
             *_too_short(run, found.model.size),
