@@ -197,8 +197,8 @@ def _weak(model: Dynamics, W: Array, rank: int) -> Iterator[str]:
     """Directions that are observable, and told less than was known of them beforehand."""
     prior = np.sqrt(np.diag(model.start_covariance))
     values, vectors = np.linalg.eigh(W * np.outer(prior, prior))
-    for value, v in zip(values, vectors.T, strict=True):
-        if model.size - rank <= np.searchsorted(values, value) and 0 < value < 1:
+    for k, (value, v) in enumerate(zip(values, vectors.T, strict=True)):
+        if k >= model.size - rank and 0 < value < 1:
             most = int(np.argmax(np.abs(v)))
             std, unit = prior[most] * abs(v[most]) / np.sqrt(value), model.state_units[most]
             yield (
