@@ -150,11 +150,12 @@ SAID = """Before inputs were estimated, the same filter counted the noise as mot
 0.05 °/s it claimed 0.78 m/s² for what nothing shows, and its NEES was 37 after a minute; with 1 °/s
 0.13 m/s² and 48 000, with NIS at 1.0 in both, so that nothing warned (20 runs).
 
-Not within the band: at rest and on one axis the filter claims up to a tenth more than its errors are
-(NEES 7 to 8.2), since an input that shows no motion might have moved by the mean of its noise, and
-the prior of what stays hidden is as large as gravity itself. Where the noise of one reading is as
-large as the rate, 1 °/s of both on all axes, it claims too little at half time (NEES 10.8 in 200
-runs): the estimate of the motion is then itself too rough, and this is not guaranteed."""
+Not within the band: at rest and on one axis the filter claims up to a tenth more than its
+errors are (NEES 7 to 8.2), since an input that shows no motion might have moved by the mean of
+its noise, and the prior of what stays hidden is as large as gravity itself. Where the noise of
+one reading is as large as the rate, 1 °/s of both on all axes, it claims too little at half
+time (NEES 10.8): the estimate of the motion is then itself too rough, and this is not
+guaranteed."""
 
 
 def main() -> None:
