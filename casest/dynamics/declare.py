@@ -78,13 +78,31 @@ class Measured:
     """An output: the signal that measures it, what it should be, and its noise intensity.
 
     `intensity` in unit²·s: variance of one reading times the time between two; or `std`, the
-    standard deviation of one reading, in its unit.
+    standard deviation of one reading, in its unit. `wraps`: both are angles, which are alike a full
+    turn apart.
     """
 
     signal: SX
     predicted: SX
     intensity: float | None
     std: float | None = None
+    wraps: bool = False
+
+
+@dataclass(frozen=True)
+class Angle:
+    """What an output should be, up to full turns."""
+
+    expression: SX
+
+
+def angle(expression: SX) -> Angle:
+    """An angle as an output: `measured(bearing, angle(atan2(y, x)), intensity=1e-4)`.
+
+    Reading and prediction may differ by full turns, 2π or 360 by the unit of the signal (rad where
+    it has none): 179° and −179° are 2° apart.
+    """
+    return Angle(expression)
 
 
 @dataclass(frozen=True)
@@ -105,12 +123,30 @@ class Motion:
     outputs: tuple[Measured, ...]
     constraints: tuple[Constraint, ...] = ()
 
+    def __post_init__(self) -> None:
+        """One alone, its comma forgotten, is a tuple of one."""
+        for name, kind in (("outputs", Measured), ("constraints", Constraint)):
+            given = getattr(self, name)
+            several = (given,) if isinstance(given, kind) else given
+            if not isinstance(several, tuple | list) or not all(
+                isinstance(one, kind) for one in several
+            ):
+                raise DeclarationError(
+                    f"Motion: {name}= takes {kind.__name__.lower()}(…), …, not {several!r}"
+                )
+            object.__setattr__(self, name, tuple(several))
+
 
 def measured(
-    signal: SX, predicted: SX, *, intensity: float | None = None, std: float | None = None
+    signal: SX,
+    predicted: SX | Angle,
+    *,
+    intensity: float | None = None,
+    std: float | None = None,
 ) -> Measured:
     """An output: `measured(v, velocity, std=0.01)`, the standard deviation of one reading; or its
-    noise's intensity in unit²·s, the variance of one reading times the time between two."""
+    noise's intensity in unit²·s, the variance of one reading times the time between two; see
+    `angle` too."""
     if (intensity is None) == (std is None):
         given = "neither" if std is None else "both"
         raise DeclarationError(
@@ -127,8 +163,10 @@ def measured(
             f"measured: the noise intensity must be positive, not {intensity}: a reading without "
             "noise makes the Riccati equation singular; give the sensor's variance times its period"
         )
-    numbers = (None if v is None else float(v) for v in (intensity, std))
-    return Measured(signal, predicted, *numbers)
+    intensity, std = (None if v is None else float(v) for v in (intensity, std))
+    if isinstance(predicted, Angle):
+        return Measured(signal, predicted.expression, intensity, std, wraps=True)
+    return Measured(signal, predicted, intensity, std)
 
 
 def constraint(expression: SX, value: float | SX) -> Constraint:
@@ -312,7 +350,7 @@ class Dynamics:
     @cached_property
     def traced(self) -> Traced:
         """The body on CasADi symbols."""
-        return _trace(self)
+        return traced_with(self, {c.name: float(c.array) for c in self.constants})
 
     @property
     def measured_signals(self) -> tuple[str, ...]:
@@ -328,8 +366,10 @@ class Dynamics:
 
     @cached_property
     def linear(self) -> bool:
-        """Are rates and outputs linear in the state?"""
+        """Are rates and outputs linear in the state? An angle that wraps is not."""
         t = self.traced
+        if any(o.wraps for o in t.outputs):
+            return False
         slopes = ca.vertcat(ca.vec(t.A), ca.vec(t.C))
         return not ca.depends_on(slopes, t.x)
 
@@ -337,7 +377,7 @@ class Dynamics:
 @dataclass(frozen=True)
 class Traced:
     """Symbols and expressions: x, signals, f(x, u), h(x, u), A = ∂f/∂x, C = ∂h/∂x, readings;
-    constraints g(x, u) = 0 and G = ∂g/∂x."""
+    constraints g(x, u) = 0 and G = ∂g/∂x; `turn` (m,): a full turn of readings that are angles."""
 
     x: SX
     symbols: Mapping[str, SX]
@@ -350,6 +390,23 @@ class Traced:
     G: SX
     outputs: tuple[Measured, ...]
     measured: tuple[str, ...]
+    turn: Array
+
+    def wrapped(self, difference: Any) -> Any:
+        """Readings less predictions (m) or (N, m), angles within half a turn of zero."""
+        if not self.turn.any():
+            return difference
+        full = np.where(self.turn > 0, self.turn, 1.0)
+        if isinstance(difference, np.ndarray):
+            return difference - self.turn * np.floor(difference / full + 0.5)
+        return difference - ca.DM(self.turn) * ca.floor(difference / full + 0.5)
+
+    def nearest(self, y: Array, C: Array, d: Array, x: Array) -> Array:
+        """Readings (N, m), angles by full turns as near to C·x + d as they come."""
+        if not self.turn.any():
+            return y
+        said = (C @ x[:, :, None])[:, :, 0] + d
+        return np.asarray(said + self.wrapped(y - said))
 
 
 def dynamics(function: Callable[..., Motion]) -> Dynamics:
@@ -376,15 +433,15 @@ def dynamics(function: Callable[..., Motion]) -> Dynamics:
     return Dynamics(name, function, tuple(signals), tuple(states), tuple(constants))
 
 
-def _trace(declared: Dynamics) -> Traced:
+def traced_with(declared: Dynamics, constants: Mapping[str, SX | float]) -> Traced:
+    """The body on CasADi symbols, its constants numbers or symbols too."""
     symbols: dict[str, SX] = {}
     for s in declared.signals:
         plain = ca.SX.sym(s.name, s.size)
         symbols[s.name] = ca.reshape(plain, 3, 3).T if s.kind == "rotation" else plain
     xs = {s.name: ca.SX.sym(s.name, s.size) for s in declared.states}
-    numbers = {c.name: float(c.array) for c in declared.constants}
     try:
-        motion = declared.function(**symbols, **xs, **numbers)
+        motion = declared.function(**symbols, **xs, **constants)
     except CasestError:
         raise
     except (Exception, SystemExit) as error:
@@ -415,5 +472,23 @@ def _trace(declared: Dynamics) -> Traced:
     if reading.numel() != h.numel():
         raise DeclarationError(f"dynamics {declared.name}: outputs and signals differ in shape")
     g = ca.vertcat(*[ca.vec(c.expression) for c in motion.constraints])
+    of = {s.name: s.unit for s in declared.signals}
+    turn = [
+        np.full(o.predicted.numel(), 2 * np.pi / units.size(of[n] or "rad")[0] if o.wraps else 0.0)
+        for n, o in zip(names, motion.outputs, strict=True)
+    ]
     A, C, G = ca.jacobian(f, x), ca.jacobian(h, x), ca.jacobian(g, x)
-    return Traced(x, symbols, f, h, A, C, reading, g, G, motion.outputs, tuple(names))
+    return Traced(
+        x,
+        symbols,
+        f,
+        h,
+        A,
+        C,
+        reading,
+        g,
+        G,
+        motion.outputs,
+        tuple(names),
+        np.concatenate([np.zeros(0), *turn]),
+    )

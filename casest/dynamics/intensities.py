@@ -56,6 +56,11 @@ def from_stated(model: Dynamics, run: Run, stds: Mapping[str, float]) -> Tuned:
     return Tuned(_driven_by(model, said), "from the sensors' stated noise")
 
 
+def with_stated(model: Dynamics, run: Run, stds: Mapping[str, float]) -> Dynamics:
+    """The model with those noises of its sensors, or as it is where none is stated."""
+    return from_stated(model, run, stds).model if stds else model
+
+
 def period(run: Run) -> float:
     """Time between two samples, s: the mean of the steps that are no gaps."""
     if run.time is None or len(run) < 2:
@@ -86,7 +91,7 @@ def most_likely(model: Dynamics, run: Run) -> Tuned:
     start = None
     for _ in range(ROUNDS):
         ready = prepared(model, run, filtered(model, run).smoothed)
-        start, _ = matched(ready, run, start)
+        start, _ = matched(ready, run, start, exactly=True)
         model = applied(model, start)
     assert start is not None
     names, logs = ready.names, np.log([start[n] for n in ready.names])

@@ -14,6 +14,7 @@ from casest.declaration.shapes import Array
 from casest.dynamics.course import Pieces
 from casest.dynamics.declare import Dynamics
 from casest.dynamics.extended import extended_step, given, pieces
+from casest.dynamics.inputs import as_read
 from casest.dynamics.known import known
 from casest.dynamics.riccati import check_covariance
 from casest.dynamics.stepping import run_steps, unpacked
@@ -44,7 +45,8 @@ class Estimator:
     """A filter that is given one sample after the other, every `period` s as a rule.
 
     Evenly sampled, it says what `filtered` says of the whole record, to rounding. A step of more
-    than five periods is a gap.
+    than five periods is a gap. Inputs with noise that enter A or C are taken as they are read:
+    what is their motion and what is noise only the whole record tells.
     """
 
     def __init__(self, model: Dynamics, period: float) -> None:
@@ -105,7 +107,7 @@ class Estimator:
 
     def _extended(self, run: Run, first: bool) -> tuple[Array, Array]:
         model, n = self.model, self.model.size
-        parts, _ = given(model, run, self._pace)
+        parts, _ = given(model, run, self._pace, as_read(model, run))
         begun = self._states[1]
         if begun is None:
             root = np.zeros(n * (n - 1) // 2)

@@ -7,6 +7,7 @@ Where only a part of a step or another equation's is asked for: fourth-order Mag
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from math import factorial
@@ -21,6 +22,7 @@ from casest.declaration.shapes import Array
 from casest.declaration.tracing import flat
 from casest.dynamics.between import Motions, motions
 from casest.dynamics.declare import Dynamics
+from casest.dynamics.inputs import at_estimates, estimates, on_errors
 from casest.dynamics.stepping import reach
 from casest.engine import Columns, Replay
 from casest.errors import DataError
@@ -75,6 +77,14 @@ class Linearised:
         """Φ over the second half of every step, (N − 1, n, n)."""
         return half_transitions(self, (0.5, 1.0))
 
+    def part(self, where: slice, pace: Pace) -> Linearised:
+        """Some samples of it, which are read at the pace of the whole."""
+        process = self.process[where] if self.process.ndim == 3 else self.process
+        time, A, c, C, d, y = (
+            x[where] for x in (self.time, self.A, self.c, self.C, self.d, self.y)
+        )
+        return Linearised(time, A, c, C, d, y, process, pace)
+
     def driven(self, process: Array) -> Linearised:
         """The same motion with other process noise; what is known of its steps is kept."""
         other = replace(self, process=process)
@@ -118,19 +128,27 @@ def checked_record(model: Dynamics, run: Run) -> Array:
 
 
 def linearised(
-    model: Dynamics, run: Run, along: Array | None = None, pace: Pace | None = None
+    model: Dynamics,
+    run: Run,
+    along: Array | None = None,
+    pace: Pace | None = None,
+    calm: Mapping[str, Array] | None = None,
 ) -> Linearised:
     """The model along a record; a nonlinear one along states `along` (N, n).
 
-    Signals that only outputs use may be missing (NaN); inputs may not.
+    Signals that only outputs use may be missing (NaN); inputs may not. Of inputs with noise A and C
+    are taken at the estimate (`inputs`), also of a linear model then along states; `calm`: these
+    estimates (N, k) by name, where they are known already.
     """
     time = checked_record(model, run)
     if along is None:
         along = np.broadcast_to(model.start, (len(time), model.size))
-    columns = Columns([np.ascontiguousarray(along), *(run.signals[s.name] for s in model.signals)])
+    calm = estimates(model, run) if calm is None else calm
+    signals = [*(run.signals[s.name] for s in model.signals), *calm.values()]
+    columns = Columns([np.ascontiguousarray(along), *signals])
     A, c_, C, d_, y, *more = _along(model)(np.zeros(0), columns)
     process = model.process + _stood_for(time, pace) * more[0] if more else model.process
-    readings = y[:, :, 0]
+    readings = model.traced.nearest(y[:, :, 0], C, d_[:, :, 0], along)
     if not np.isfinite(readings).all():
         C = np.where(np.isfinite(readings)[:, :, None], C, 0.0)
     return Linearised(time, A, c_[:, :, 0], C, d_[:, :, 0], readings, process, pace)
@@ -140,9 +158,10 @@ def linearised(
 def _along(model: Dynamics) -> Replay:
     """A, c, C, d and readings at a sample; what noise of inputs adds to Ξ, where they have any."""
     t, added = model.traced, model.input_noise
-    c, d = t.f - t.A @ t.x, t.h - t.C @ t.x
-    expressions = [t.A, c, t.C, d, t.reading] + ([] if added is None else [added])
-    return _replay(model, expressions)
+    (A, C), as_was = at_estimates(model, [t.A, t.C])
+    c, d = t.f - A @ t.x, t.h - C @ t.x
+    expressions = [A, c, C, d, t.reading] + ([] if added is None else [added])
+    return _replay(model, expressions, as_was)
 
 
 @lru_cache(maxsize=8)
@@ -150,9 +169,9 @@ def _noise_along(model: Dynamics) -> Replay:
     return _replay(model, [model.input_noise])
 
 
-def _replay(model: Dynamics, expressions: list[Any]) -> Replay:
+def _replay(model: Dynamics, expressions: list[Any], as_was: Sequence[Any] = ()) -> Replay:
     t = model.traced
-    sample = ca.vertcat(t.x, *[flat(t.symbols[s.name]) for s in model.signals])
+    sample = ca.vertcat(t.x, *[flat(t.symbols[s.name]) for s in model.signals], *as_was)
     outputs = [ca.densify(e) for e in expressions]
     names = ["parameters", "sample"], [f"o{k}" for k in range(len(outputs))]
     return Replay(ca.Function("along", [ca.SX.sym("none", 0), sample], outputs, *names))
@@ -165,6 +184,12 @@ def process_along(model: Dynamics, run: Run, along: Array, pace: Pace | None = N
     columns = Columns([np.ascontiguousarray(along), *(run.signals[s.name] for s in model.signals)])
     noise = _noise_along(model)(np.zeros(0), columns)[0]
     return np.asarray(model.process + _stood_for(checked_time(run), pace) * noise)
+
+
+def acting(model: Dynamics, run: Run, along: Array, P: Array) -> Array:
+    """What noise of uncertain inputs adds to Ξ by acting on errors of states with covariances P
+    (N, n, n), as long as each reading of them is held."""
+    return _stood_for(checked_time(run), None) * on_errors(model, run, along, P)
 
 
 def _stood_for(time: Array, pace: Pace | None) -> Array:

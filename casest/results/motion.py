@@ -159,7 +159,7 @@ def motion_result(
         after=_section(after, closing, 1),
         effects=[_effect(a, closing) for a in closing.effects],
         invisible=[i for s in closing.first for i in _invisible(s, closing)],
-        unexplained=Left(plain(left.share), where) if closing.misfit else Left(0.0, ""),
+        unexplained=Left(plain(left.share), where) if closing.coloured else Left(0.0, ""),
         moved=_moved(closing),
         smallest_detectable=[_detectable(s) for s in closing.first if np.any(s.information)],
         refused=[Explained(name, why) for name, why in closing.refused],
@@ -183,6 +183,12 @@ def sentence(result: MotionClosed) -> str:
         verb = "was" if len(names) == 1 else "were"
         return f"extended: {', '.join(names)} {verb} missing; what is left is noise"
     beside = f" beside {', '.join(names)}" if names else ""
+    if not result.closing.coloured:
+        loud = " and ".join(
+            f"{name} is {np.sqrt(times):.2g} times as noisy as it was stated to be or shows from "
+            "sample to sample" for name, times in result.closing.loud.items()
+        )  # fmt: skip
+        return f"unexplained: the innovations are white only if {loud}{beside}"
     return f"unexplained: the innovations are not white{beside}, and no candidate says why"
 
 
@@ -254,9 +260,10 @@ def _section(fit: Fit, closing: MotionClosing, side: int) -> MotionSection:
 
 def _states(fit: Fit, closing: MotionClosing) -> dict[str, Parameter]:
     """The declared states at the end of the record."""
-    model, found = closing.declared, fit.found
+    model, (x, P) = closing.declared, fit.found.end
+    std = np.sqrt(np.diag(P))
     return {
-        name: _number(found.x[-1][where], found.std[-1][where], model[name].unit)
+        name: _number(x[where], std[where], model[name].unit)
         for name, where in model.slices().items()
     }
 

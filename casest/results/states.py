@@ -14,6 +14,7 @@ from msgspec import UNSET, Struct, UnsetType
 from casest.data.run import Run
 from casest.dynamics import Dynamics
 from casest.dynamics.course import Course, followed
+from casest.dynamics.inputs import unstated
 from casest.dynamics.intensities import Tuned, intensities, period, units
 from casest.results.file import plain
 from casest.results.observability import assumed, too_short
@@ -24,10 +25,13 @@ from casest.results.trajectory import Innovations, Trajectory, trajectory_of
 ROWS = 8192
 #: Between these shares of what is expected innovations are called as large as expected.
 SMALLEST, LARGEST = 0.8, 1.25
+#: Filter and smoother disagree at the end by more than so many standard deviations: it is said.
+PARTED = 1.0
 
 
 class FinalState(Struct, frozen=True):
-    """A state at the end of the record, and how well the smoother knows it along the way."""
+    """A state at the end of the record, as all of it says, and how well the smoother knows it along
+    the way."""
 
     value: list[Number]
     std: list[Number]
@@ -91,7 +95,13 @@ def follow(
     mean, m = _normalised_mean(found), found.innovations.shape[1]
     return States(
         model=found.model.name,
-        notes=[*assumed(run), *_unsettled(found), *_too_short(run, found.model.size)],
+        notes=[
+            *assumed(run),
+            *_taken_for_motion(found.model, run),
+            *_unsettled(found),
+            *_parted(found),
+            *_too_short(run, found.model.size),
+        ],
         samples=len(found.time),
         states=_final(found),
         intensities=UsedIntensities(
@@ -118,10 +128,11 @@ def follow(
 
 
 def _final(found: Course) -> dict[str, FinalState]:
+    x, std = found.end
     return {
         name: FinalState(
-            plain(found.x[-1][where]),
-            plain(found.std[-1][where]),
+            plain(x[where]),
+            plain(std[where]),
             plain(_median_std(found, where)),
             found.model[name].unit,
         )
@@ -139,6 +150,31 @@ def _unsettled(found: Course) -> list[str]:
     return [
         "the smoother's rounds did not settle: its states are those of one pass; nearer start "
         "values or a smaller std at the beginning may help"
+    ]
+
+
+def _taken_for_motion(model: Dynamics, run: Run) -> list[str]:
+    """Noise of inputs that nobody stated, which a filter counts as motion."""
+    units = {s.name: s.unit or "1" for s in model.signals}
+    return [
+        f"{name} shows noise of {std:.3g} {units[name]} that is not stated: it is taken for "
+        f"motion, and what the filter is sure of may be too much (--sensor-noise {name}={std:.2g})"
+        for name, std in unstated(model, run).items()
+    ]
+
+
+def _parted(found: Course) -> list[str]:
+    """Where the filter ends elsewhere than the smoother, which has the same readings there."""
+    x, std = found.end
+    off = np.abs(found.x[-1] - x) / np.maximum(std, 1e-150)
+    worst = int(np.argmax(off))
+    if not off[worst] > PARTED:
+        return []
+    return [
+        f"the filter ends {off[worst]:.2g} standard deviations of {found.model.names[worst]} away "
+        "from what the whole record says, since it linearised at what it knew at the time: the "
+        "states above and smoothed_* in states.csv are the record's, its innovations are the "
+        "filter's; a nearer start, or a smaller std at the beginning, brings both together"
     ]
 
 
