@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
 .PHONY: demo test lint types format wheel bench study study-starts study-nist study-loop \
-	study-motion study-records study-asked study-slow study-coverage study-deceptive \
+	study-motion study-inputs study-records study-asked study-slow study-coverage study-deceptive \
 	study-deceptive-many study-mutation study-worlds study-noises study-structural \
 	figures docs clean
 
@@ -36,6 +36,7 @@ bench: $(READY)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/many.py
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/long.py
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/motion.py
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/motion_long.py
 
 study: $(READY)
 	$(BIN)/python studies/bound.py
@@ -62,6 +63,9 @@ study-noises: $(READY)
 study-motion: $(READY)
 	$(BIN)/python studies/flight.py
 	$(BIN)/python studies/flight_loop.py
+
+study-inputs: $(READY)
+	$(BIN)/python studies/inputs.py
 
 study-asked: $(READY)
 	$(BIN)/python studies/asked.py

@@ -38,8 +38,11 @@ TESTS: dict[str, tuple[str, ...]] = {
     "dynamics/stepping": ("gaps", "dynamics"),
     "dynamics/gramian": ("gaps", "dynamics"),
     "dynamics/known": ("extended",),
+    "dynamics/between": ("digits", "gaps"),
+    "dynamics/factors": ("digits",),
+    "dynamics/course": ("course",),
     "dynamics/record": ("gaps", "dynamics"),
-    "dynamics/transition": ("gaps", "discrete", "dynamics"),
+    "dynamics/transition": ("gaps", "discrete", "dynamics", "intensities"),
     "correction/": ("two_roots", "apply"),
     "data/timing": ("time_units", "bind"),
     "data/bind": ("time_units", "bind"),
@@ -210,40 +213,29 @@ MUTANTS = tuple(
         ("diagnose/misfit/structure.py", "(1 - steps / variance)", "(1 - 0.9 * steps / variance)"),
         ("diagnose/misfit/structure.py", "* len(z) * tried", "* tried"),
         # -- filters -------------------------------------------------------------------------------
-        (TRANSITION, "0.5 * (intensity[:-1] + last)", "intensity[:-1]"),
+        ("dynamics/between.py", "X1 - tau * (X1 - X0)", "X1"),
         (TRANSITION, "np.where(moved @ driven,", "np.where(driven,"),
-        (TRANSITION, "Phi[gaps].transpose(0, 2, 1) + own", "Phi[gaps].transpose(0, 2, 1)"),
-        (TRANSITION, "np.where(steps > GAP * usual, usual, steps)", "steps"),
+        (TRANSITION, "Phi[wide].transpose(0, 2, 1) + own", "Phi[wide].transpose(0, 2, 1)"),
+        (TRANSITION, "np.full(len(steps), usual(steps))", "steps"),
         (TRANSITION, "h**2 / 12 * bend", "h**2 / 6 * bend"),
         (TRANSITION, "0.5 * (step[1:] + step[:-1])", "step[1:]"),
-        (EXTENDED, "P + ca.diag(gap)) @ Phi.T + Q + ca.diag(gap)", "P) @ Phi.T + Q"),
-        (EXTENDED, "intensity(middle, middle_u)", "intensity(x, u)"),
+        (EXTENDED, "Phi @ gap @ Phi.T + Q + gap", "Q"),
+        (EXTENDED, "driven(path(tau),", "driven(path(0),"),
         (EXTENDED, "Q = with_lost(model, np.diff(time), Phi, Q)", "pass"),
-        (EXTENDED, "- ca.dot(c, after_x - before_x)", ""),
+        (EXTENDED, "- ca.dot(c, found - along)", ""),
         ("dynamics/filter.py", "first = first or (along, P)", "first = (along, P)"),
         (
             "dynamics/filter.py",
-            "np.diag(model.noise)[None] / steps_to(system)",
-            "np.diag(model.noise)[None] * steps_to(system)",
+            "variances(model, system.steps, system.pace)",
+            "variances(model, system.steps) * system.steps.mean()",
         ),
-        ("dynamics/discrete.py", "+ G @ steps.Q @ G.transpose(0, 2, 1)", ""),
+        ("dynamics/factors.py", "D[j] * (before / s)", "D[j]"),
         ("dynamics/discrete.py", "np.where(self.present[:, :, None], self.C, 0.0)", "self.C"),
         ("dynamics/riccati.py", "both[:, n:, n:] = -A", "both[:, n:, n:] = A"),
-        (
-            "dynamics/riccati.py",
-            "P = np.add(half, half.T, out=later)",
-            "P = np.add(half, half, out=later)",
-        ),
-        (
-            "dynamics/stepping.py",
-            "symmetric(P - PC @ (PC / s).T)",
-            "symmetric(P + PC @ (PC / s).T)",
-        ),
-        (
-            "dynamics/gramian.py",
-            "h = counted(system.steps)[:, None, None]",
-            "h = system.steps[:, None, None]",
-        ),
+        ("dynamics/riccati.py", "W = _even(W + back @ W", "W = _even(back @ W"),
+        ("dynamics/stepping.py", "ca.vertcat(weight, 1 / R)", "ca.vertcat(weight, R)"),
+        ("dynamics/course.py", "_back(found, pieces, states)", "pass"),
+        ("dynamics/gramian.py", "pace.usual / system.steps)", "0 * system.steps + 1)"),
         ("dynamics/known.py", "S[:, np.arange(count), np.arange(count)] += hidden", "pass"),
         # -- corrections and readers ---------------------------------------------------------------
         (
@@ -284,8 +276,5 @@ JUDGED: dict[tuple[str, str], str] = {
     ),
     ("data/splits.py", "(run.count > 1e9).any()"): (
         "equivalent: a mean of a rest interval is one sample, which is not cut"
-    ),
-    ("dynamics/riccati.py", "P = np.add(half, half, out=later)"): (
-        "equivalent but for rounding: the fraction is symmetric by itself"
     ),
 }

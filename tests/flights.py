@@ -168,3 +168,34 @@ def in_the_air():
 def somewhere(rng):
     """A small vehicle on a random way."""
     return Flight(sines(rng, 0.6, 0.2, 1.0), sines(rng, 4.0, 0.2, 0.9))
+
+
+#: An axis that is none of the body's.
+AXIS = np.array([0.27, 0.53, 0.80]) / np.linalg.norm([0.27, 0.53, 0.80])
+#: Angular velocities of a body that stays where it is, rad/s (N, 3), and what a velocity sensor
+#: can tell of the six numbers of gravity and bias (Batista, theorem 2).
+SPINS = {
+    "at rest": (lambda t: np.zeros((len(t), 3)), 3),
+    "one axis, 1 °/s": (lambda t: np.tile(np.radians(1.0) * AXIS, (len(t), 1)), 5),
+    "one axis, 17 °/s": (lambda t: (0.1 + 0.3 * np.sin(0.4 * t))[:, None] * AXIS, 5),
+    "all axes, 1 °/s": (
+        lambda t: np.radians(1.0) * np.c_[np.cos(0.1 * t), np.sin(0.1 * t), 0.5 + 0 * t], 6,
+    ),
+    "all axes, 30 °/s": (
+        lambda t: np.c_[0.5 * np.sin(0.6 * t), 0.4 * np.cos(0.42 * t), 0.3 * np.sin(0.2 * t + 1)],
+        6,
+    ),
+}  # fmt: skip
+
+
+def spun(omega, t, parts=8):
+    """Gravity in body axes (N, 3) of a body that turns with omega(t), by small rotations."""
+    step = (t[1] - t[0]) / parts
+    middle = t[0] + step * (np.arange((len(t) - 1) * parts) + 0.5)
+    turns = Rotation.from_rotvec(-step * omega(middle))
+    body, found = Rotation.from_euler("ZYX", [0.2, 0.1, -0.3]).inv(), []
+    for k, turn in enumerate(turns):
+        if k % parts == 0:
+            found.append(body.apply(GRAVITY))
+        body = turn * body
+    return np.array([*found, body.apply(GRAVITY)])

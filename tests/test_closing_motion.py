@@ -9,8 +9,9 @@ import flights
 import numpy as np
 import pytest
 from flights import Sensors
+from scipy.integrate import solve_ivp
 
-from casest import DataError, Run, cli, cross, norm_2, signal
+from casest import DataError, Run, cli, cross, norm_2, signal, sin
 from casest.diagnose.motion.delays import by_reading, shifted
 from casest.diagnose.motion.fit import fitted, rise
 from casest.diagnose.motion.innovations import Innovations
@@ -22,7 +23,7 @@ from casest.dynamics import Motion, constraint, dynamics, measured, state
 from casest.dynamics.filter import filtered
 from casest.dynamics.likelihood import first_guess, likelihood, matched, prepared
 from casest.effects.moving import Colour, candidates, extended
-from casest.results.motion import motion_result, rms_settled
+from casest.results.motion import motion_result, rms_settled, sentence
 from casest_problems.bias_gravity import bias_gravity, bias_gravity_position
 
 RATE = 25.0
@@ -85,6 +86,47 @@ def test_coloured_noise_becomes_a_state_and_nothing_else_is_named():
     (effect,) = motion_result(closing, model_name="bias-gravity", data=[]).effects
     assert 0.2 < effect.parameters["correlation_time"].value < 1.2
     assert 0.015 < effect.parameters["std"].value < 0.06
+
+
+def test_innovations_that_are_white_only_by_a_noise_that_is_absurd_are_not_adequate():
+    """What the accelerometer lacks is slow: from sample to sample it shows no such noise."""
+    run, still = flight(seed=2), bias_gravity.driven(bias=0.0)
+    slow = flights.coloured(run.time, 0.5, 0.1, np.random.default_rng(12))
+    run = Run.raw("slow", {**run.signals, "a": run.signals["a"] + slow}, units=flights.UNITS,
+                  time=run.time)  # fmt: skip
+    closing = close_motion(still, run)
+    result = motion_result(closing, model_name="bias-gravity", data=[])
+    assert result.verdict == "unexplained"
+    assert "a" in closing.loud or closing.coloured
+    if not closing.coloured:
+        assert "only if a is" in sentence(result)
+
+
+def test_a_right_nonlinear_model_is_adequate():
+    """A pendulum whose length is found: the filter that steps forward is far off at first."""
+
+    @dynamics
+    def pendulum(
+        y=signal("rad"),
+        *,
+        angle=state("rad", start=0.3, std=0.3),
+        rate=state("rad/s", std=1.0),
+        length=state("m", start=1.5, std=1.0),
+    ):
+        rates = {"angle": rate, "rate": -9.81 / length * sin(angle)}
+        return Motion(rates=rates, outputs=(measured(y, angle, intensity=2e-8),))
+
+    t = np.arange(0, 20, 0.02)
+    for seed in range(3):
+        rng = np.random.default_rng(300 + seed)
+        start = [rng.uniform(0.3, 1.2), rng.uniform(-0.5, 0.5)]
+        swing = solve_ivp(lambda _, x: [x[1], -9.81 / 0.8 * np.sin(x[0])], (0, 20), start,
+                          t_eval=t, rtol=1e-11, atol=1e-12)  # fmt: skip
+        y = swing.y[0] + 0.001 * rng.standard_normal(len(t))
+        closing = close_motion(pendulum, Run.raw("p", {"y": y[:, None]}, units={}, time=t))
+        assert closing.verdict == "adequate"
+        end, P = closing.after.found.end
+        assert abs(end[2] - 0.8) < 4 * np.sqrt(P[2, 2])
 
 
 @pytest.mark.parametrize(

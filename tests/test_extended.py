@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import least_squares
+from scipy.stats import chi2
 
 from casest import DataError, Run, atan2, log, norm_2, signal, sin, vertcat
 from casest.cli import run as cli
-from casest.dynamics import Motion, constraint, dynamics, measured, state
+from casest.dynamics import Motion, angle, constraint, dynamics, measured, state
 from casest.dynamics.filter import filtered
 from casest.dynamics.record import least_squares as at_once_of
 from casest.results.observability import observe_motion
@@ -74,7 +75,6 @@ def textbook(run, x, P):
     """Continuous-discrete extended Kalman filter: moments by solve_ivp between readings."""
     t, u, y = run.time, run.signals["torque"][:, 0], run.signals["y"][:, 0]
     step = np.diff(t)
-    period = np.r_[step[0], 0.5 * (step[1:] + step[:-1]), step[-1]]
 
     def rate(time, z):
         angle, speed = z[:2]
@@ -90,7 +90,7 @@ def textbook(run, x, P):
             z = solve_ivp(rate, span, np.r_[x, P.ravel()], "DOP853", rtol=1e-11, atol=1e-14).y
             x, P = z[:2, -1], z[2:, -1].reshape(2, 2)
         if np.isfinite(y[k]):
-            K = P[:, 0] / (P[0, 0] + THETA / period[k])
+            K = P[:, 0] / (P[0, 0] + THETA / step.mean())
             x, P = x + K * (y[k] - x[0]), P - np.outer(K, P[0])
         found.append((x, P))
     return np.array([x for x, _ in found]), np.array([P for _, P in found])
@@ -169,6 +169,71 @@ def test_range_and_bearing_find_a_moving_body():
     error = (found.smoothed - truth)[len(t) // 2]
     assert error @ np.linalg.solve(found.smoothed_P[len(t) // 2], error) < 18.5  # χ², 99.9 %
     assert abs(found.normalised_innovations[20:].mean() - 2) < 0.3
+
+
+@pytest.mark.parametrize(("unit", "turn"), [("rad", 2 * np.pi), ("deg", 360.0)])
+def test_a_bearing_goes_on_across_half_a_turn(unit, turn):
+    """A body passes behind the radar, where its bearing jumps from one end to the other."""
+
+    @dynamics
+    def radar(
+        distance=signal("m"),
+        bearing=signal(unit),
+        *,
+        place=state(2, "m", start=(-50.0, 30.0), std=10.0),
+        speed=state(2, "m/s", std=5.0),
+    ):
+        seen = angle(turn / (2 * np.pi) * atan2(place[1], place[0]))
+        outputs = (
+            measured(distance, norm_2(place), intensity=0.001),
+            measured(bearing, seen, intensity=1e-6 * (turn / (2 * np.pi)) ** 2),
+        )
+        return Motion(rates={"place": speed}, outputs=outputs)
+
+    t, squares = np.arange(0, 30, 0.1), []
+    true = np.c_[-45 + 0.3 * t, 25 - 2.0 * t]
+    truth = np.c_[true, np.tile([0.3, -2.0], (len(t), 1))]
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        distance = np.hypot(*true.T) + 0.1 * rng.standard_normal(len(t))
+        read = np.arctan2(true[:, 1], true[:, 0]) + np.sqrt(1e-5) * rng.standard_normal(len(t))
+        read = (read + np.pi) % (2 * np.pi) - np.pi
+        assert np.abs(np.diff(read)).max() > 6  # it does jump
+        signals = {"distance": distance[:, None], "bearing": turn / (2 * np.pi) * read[:, None]}
+        found = filtered(radar, Run.raw("radar", signals, units={}, time=t))
+        assert found.settled
+        assert abs(found.normalised_innovations.mean() - 2) < 0.6
+        for x, P in ((found.x, found.P), (found.smoothed, found.smoothed_P)):
+            error = x[150] - truth[150]
+            squares.append(error @ np.linalg.solve(P[150], error))
+    low, high = chi2.ppf([0.0005, 0.9995], 4 * 10)
+    for of_all in (squares[::2], squares[1::2]):
+        assert low < np.sum(of_all) < high
+
+
+def test_ranges_alone_find_a_body_from_a_start_far_away():
+    """Readings are linearised where they lead to: an update at the prediction alone ends eight
+    standard deviations off, and says that it is sure."""
+
+    @dynamics
+    def ranging(
+        r=signal(2, "m"),
+        *,
+        place=state(2, "m", start=(10.0, 10.0), std=20.0),
+        speed=state(2, "m/s", std=2.0),
+    ):
+        both = vertcat(norm_2(place), norm_2(place - vertcat(30.0, 0.0)))
+        return Motion(rates={"place": speed}, outputs=(measured(r, both, intensity=1e-3),))
+
+    t, squares = np.arange(0, 20, 0.1), []
+    true = np.c_[25 - 1.0 * t, 20 + 0.5 * t]
+    ranges = np.c_[np.hypot(*true.T), np.hypot(true[:, 0] - 30, true[:, 1])]
+    for seed in range(20):
+        r = ranges + 0.1 * np.random.default_rng(seed).standard_normal(ranges.shape)
+        found = filtered(ranging, Run.raw("r", {"r": r}, units={}, time=t))
+        error = found.x[-1] - [*true[-1], -1.0, 0.5]
+        squares.append(error @ np.linalg.solve(found.P[-1], error))
+    assert chi2.ppf(0.0005, 80) < np.sum(squares) < chi2.ppf(0.9995, 80)
 
 
 def linear_and_not():
@@ -284,6 +349,37 @@ def test_a_nonlinear_model_keeps_to_what_is_known_too():
     angle = np.arctan2(*found.smoothed[:, :2].T)
     plain = filtered(pendulum_of(), run)
     assert np.std(angle - truth[:, 0]) < 1.2 * np.std(plain.smoothed[:, 0] - truth[:, 0])
+
+
+def test_the_states_printed_are_those_of_the_whole_record():
+    """A pendulum whose length is found from a start far away: the filter ends elsewhere."""
+
+    @dynamics
+    def pendulum(
+        y=signal("rad"),
+        *,
+        angle=state("rad", start=0.3, std=0.3),
+        rate=state("rad/s", std=1.0),
+        length=state("m", start=1.5, std=1.0),
+    ):
+        rates = {"angle": rate, "rate": -G_OVER_L * 0.8 / length * sin(angle)}
+        return Motion(rates=rates, outputs=(measured(y, angle, intensity=2e-8),))
+
+    t, parted = np.arange(0, 20, 0.02), 0
+    for seed in range(4):
+        rng = np.random.default_rng(300 + seed)
+        start = [rng.uniform(0.3, 1.2), rng.uniform(-0.5, 0.5)]
+        path = solve_ivp(lambda _, x: [x[1], -G_OVER_L * np.sin(x[0])], (0, 20), start,
+                         t_eval=t, rtol=1e-11, atol=1e-12)  # fmt: skip
+        y = path.y[0] + 0.001 * rng.standard_normal(len(t))
+        result = follow(pendulum, Run.raw("p", {"y": y[:, None]}, units={}, time=t))
+        length = result.states["length"]
+        assert abs(length.value[0] - 0.8) < 4 * length.std[0]
+        off = abs(result.filtered.x[-1] - result.filtered.smoothed[-1]) / result.filtered.std[-1]
+        said = "standard deviations of" in " ".join(result.notes)
+        assert said == bool(off.max() > 1) or abs(off.max() - 1) < 0.1
+        parted += said
+    assert parted
 
 
 def test_a_smoother_that_does_not_settle_says_so(monkeypatch):

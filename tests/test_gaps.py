@@ -216,7 +216,7 @@ def test_noise_that_changes_along_a_step_is_integrated_along_it():
             return Phi @ (Xi[k] + s / STEP * (Xi[k + 1] - Xi[k])) @ Phi.T
 
         expected = quad_vec(integrand, 0, STEP, epsrel=1e-12)[0]
-        np.testing.assert_allclose(Q[k], expected, atol=1e-5 * np.abs(expected).max())
+        np.testing.assert_allclose(Q[k], expected, atol=1e-12 * np.abs(expected).max())
 
 
 @dynamics

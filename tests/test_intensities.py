@@ -8,12 +8,15 @@ import sys
 import flights
 import numpy as np
 import pytest
+import scipy.stats
 
-from casest import DataError, UsageError
+from casest import DataError, DeclarationError, Run, UsageError, signal
 from casest.cli import run
+from casest.dynamics import Motion, dynamics, measured, state
 from casest.dynamics.allan import allan
 from casest.dynamics.filter import filtered
 from casest.dynamics.intensities import from_rest, from_stated, intensities, most_likely
+from casest.results.observability import assumed
 from casest_problems.bias_gravity import bias_gravity
 
 DT = 0.02
@@ -21,6 +24,16 @@ T = np.arange(0, 30, DT)
 TRUE = {name: sigma**2 * DT for name, sigma in flights.SIGMA.items()}
 NAMES = ["t [s]", *(f"a{c} [m/s^2]" for c in "xyz"), *(f"omega_{c} [rad/s]" for c in "xyz"),
          *(f"v{c} [m/s]" for c in "xyz")]  # fmt: skip
+
+
+@dynamics
+def resting(y=signal("m"), *, place=state("m", std=1e9)):
+    return Motion(rates={}, outputs=(measured(y, place, std=0.3),))
+
+
+@dynamics
+def walked(speed=signal("m/s"), y=signal("m"), *, place=state("m", std=1e-3)):
+    return Motion(rates={"place": speed}, outputs=(measured(y, place, std=1.0),))
 
 
 @pytest.fixture(scope="module")
@@ -62,6 +75,81 @@ def test_matched_innovations_are_as_large_as_expected(flight):
     assert abs(filtered(matched, flight).normalised_innovations[150:].mean() - 3) < 0.3
 
 
+def uneven(kind, rng):
+    """Times of about 50 Hz: a fifth of them dropped, or 1 and 39 ms in turn."""
+    if kind == "dropped":
+        return T[np.sort(rng.choice(len(T), len(T) * 4 // 5, replace=False))]
+    return np.cumsum(np.tile([0.001, 0.039], len(T) // 2))[1:-1]
+
+
+@pytest.mark.parametrize("kind", ["dropped", "in turn"])
+def test_stated_noise_is_that_of_one_reading_however_the_rows_lie(kind):
+    """Errors and innovations of 100 flights are χ² of 9 and of 3 a reading; 99.9 % bands."""
+    errors, innovations, air = [], [], flights.in_the_air()
+    for seed in range(100):
+        rng = np.random.default_rng(seed)
+        t = uneven(kind, rng)
+        record = flights.record(air, t, rng)
+        model = from_stated(bias_gravity, record, flights.SIGMA).model.driven(bias=0.0)
+        found = filtered(model, record, smooth=False)
+        truth = np.r_[air.velocity(t[-1:])[0], air.gravity(t[-1:])[0], flights.BIAS]
+        left = found.x[-1] - truth
+        errors.append(left @ np.linalg.solve(found.P[-1], left))
+        innovations.append(found.normalised_innovations[150:].mean())
+    low, high = scipy.stats.chi2.ppf([0.0005, 0.9995], 900) / 100
+    assert low < np.mean(errors) < high
+    assert abs(np.mean(innovations) - 3) < 0.05
+
+
+def test_steps_that_take_turns_are_no_gaps():
+    """An odd number of them has a median of 1 ms."""
+    t = uneven("in turn", None)
+    record = flights.record(flights.in_the_air(), t, np.random.default_rng(0))
+    assert np.median(np.diff(t)) < 0.002
+    assert assumed(record) == list(record.notes)
+
+
+def test_noise_of_an_input_lasts_as_long_as_its_reading_is_held():
+    """A distance by trapezoids of a noisy speed at uneven times: σ²Σ(half of both steps)²."""
+    rng = np.random.default_rng(3)
+    t = np.cumsum(rng.choice([0.01, 0.02, 0.04], 2000))
+    none = np.full((2000, 1), np.nan)
+    run = Run.raw("r", {"speed": np.ones((2000, 1)), "y": none}, units={}, time=t)
+    found = filtered(from_stated(walked, run, {"speed": 0.1}).model, run, smooth=False)
+    weights = 0.5 * (t[2:] - t[:-2])
+    expected = 0.1**2 * np.sum(weights**2)
+    assert found.P[-1, 0, 0] - found.P[0, 0, 0] == pytest.approx(expected, rel=1e-3)
+
+
+def test_an_output_may_state_the_noise_of_one_reading():
+    """Rows of a table at any times weigh alike: the mean, and σ²/N."""
+    t, y = np.array([0.0, 1, 2, 5, 10, 20, 60]), np.arange(7.0)[:, None] ** 2
+    table = Run.raw("table", {"y": y}, units={}, time=t)
+    found = filtered(resting, table)
+    assert found.x[-1, 0] == pytest.approx(y.mean(), rel=1e-9)
+    assert found.P[-1, 0, 0] == pytest.approx(0.3**2 / 7, rel=1e-9)
+    for step in (0.1, 10.0):
+        again = filtered(resting, Run.raw("table", {"y": y}, units={}, time=step * t))
+        np.testing.assert_allclose(again.x[-1], found.x[-1], rtol=1e-12)
+
+
+def test_the_intensity_of_a_stated_reading_needs_its_period():
+    assert resting.noise_at(0.1)[0, 0] == pytest.approx(0.3**2 * 0.1)
+    assert resting.sensing(y=2.0).noise[0, 0] == 2.0
+    with pytest.raises(UsageError, match=r"y has the noise of one reading \(std=0.3\)"):
+        _ = resting.noise
+
+
+@pytest.mark.parametrize(("given", "words"), [
+    ({}, "neither of std= and intensity= given"),
+    ({"std": 1.0, "intensity": 1.0}, "both of std= and intensity= given"),
+    ({"std": 0.0}, "std=0 must be positive and finite"),
+])  # fmt: skip
+def test_an_output_states_its_noise_once(given, words):
+    with pytest.raises(DeclarationError, match=words):
+        measured(None, None, **given)
+
+
 @pytest.mark.parametrize(("stds", "words"), [
     ({"w": 1.0}, "has no signal 'w'; it has a, omega, v"),
     ({"v": 0.0}, "v: the noise 0 must be positive"),
@@ -83,6 +171,20 @@ def test_the_most_likely_intensities_are_the_true_ones(flight):
     assert found.spread["v"] < 0.05
     assert found.spread["omega"] < 1.0
     assert not found.spread["bias"] < 1.0  # it does not drift at all
+
+
+def test_the_niles_intensities_are_the_certified_ones(shared_data):
+    """A local level: Durbin and Koopman's maximum, 15 098.5 and 1469.2."""
+
+    @dynamics
+    def nile(flow=signal(), *, level=state(intensity=1e3, start=1000.0, std=1e4)):
+        return Motion(rates={}, outputs=measured(flow, level, intensity=1e4))
+
+    t, flow = np.loadtxt(shared_data / "certified" / "nile.csv", delimiter=",", skiprows=1).T
+    run = Run.raw("nile", {"flow": flow[:, None]}, units={}, time=t)
+    used = intensities(most_likely(nile, run).model)
+    assert used["flow"] == pytest.approx(15_098.5, rel=2e-4)
+    assert used["level"] == pytest.approx(1469.2, rel=2e-4)
 
 
 # -- at rest ---------------------------------------------------------------------------------------

@@ -90,9 +90,7 @@ def test_driven_states_and_readings_scatter_as_their_intensities_say():
     for own, variance in ((end[:, :count], q * span), (end[:, count:], forgets)):
         assert band[0] < np.mean(own**2) / variance < band[1]
     left = np.array([e.run.signals["y"] - e.states[:, :count] for e in each])
-    period = np.diff(t, prepend=2 * t[0] - t[1], append=2 * t[-1] - t[-2])
-    period = 0.5 * (period[1:] + period[:-1])
-    squares = np.mean(left**2, axis=(0, 2)) * period / theta
+    squares = np.mean(left**2, axis=(0, 2)) * np.diff(t).mean() / theta
     assert band[0] < squares.min()
     assert squares.max() < band[1]
 
@@ -203,13 +201,14 @@ def test_inputs_of_a_record_are_the_true_ones(tmp_path):
 def test_a_users_own_estimator_is_simulated_and_followed(tmp_path, capsys):
     """A swinging pendulum: the torque leads the rate; the angle alone is measured."""
     (tmp_path / "swing.py").write_text(
-        "from casest import sin, signal\n"
+        "from casest import constant, sin, signal\n"
         "from casest.dynamics import Motion, dynamics, measured, state\n\n\n"
         "@dynamics\n"
-        "def swing(torque=signal('N*m'), angle=signal('rad'), *,\n"
+        "def swing(torque=signal('1/s^2'), angle=signal('rad'), *,\n"
+        "          stiffness=constant(4.0, '1/s^2'), damping=constant(0.1, '1/s'),\n"
         "          phi=state('rad', start=0.2, std=0.2),\n"
         "          rate=state('rad/s', intensity=1e-4, std=0.5)):\n"
-        "    rates = {'phi': rate, 'rate': torque - 4 * sin(phi) - 0.1 * rate}\n"
+        "    rates = {'phi': rate, 'rate': torque - stiffness * sin(phi) - damping * rate}\n"
         "    return Motion(rates=rates, outputs=(measured(angle, phi, intensity=1e-5),))\n",
         encoding="utf-8",
     )

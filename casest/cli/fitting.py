@@ -18,7 +18,14 @@ from casest.cli.loading import (
     records,
     trajectory,
 )
-from casest.cli.options import DATA, RESULTS, FitOptions, MotionOptions, model_argument
+from casest.cli.options import (
+    DATA,
+    RESULTS,
+    CloseOptions,
+    FitOptions,
+    MotionOptions,
+    model_argument,
+)
 from casest.cli.shared import commands, echo, progress, reported, typed, write
 from casest.errors import NotTrusted
 
@@ -96,8 +103,8 @@ def calibration(model_name: str, data: Sequence[str], options: FitOptions, comma
 @commands.command()
 @model_argument(Kind.FITTED, Kind.MOVING)
 @DATA
-@taking(FitOptions)
-def close(model_name: str, data: tuple[str, ...], options: FitOptions) -> int:
+@taking(CloseOptions)
+def close(model_name: str, data: tuple[str, ...], options: CloseOptions) -> int:
     """Fit, trace the residual to missing effects, add them, judge by held-out data.
 
     Verdict `adequate`: nothing that these data can show is missing; `extended`: effects were added
@@ -109,6 +116,7 @@ def close(model_name: str, data: tuple[str, ...], options: FitOptions) -> int:
 
     if isinstance(find_any(model_name), Dynamics):
         return closing_in_motion(model_name, data, options, typed())
+    refuse(options, Kind.MOVING, f"is for estimators in motion; {model_name} is a calibration")
     return closing(model_name, data, options, typed())
 
 
@@ -185,10 +193,11 @@ def asked_effects(
 
 
 def closing_in_motion(
-    model_name: str, data: Sequence[str], options: FitOptions, command: str
+    model_name: str, data: Sequence[str], options: CloseOptions, command: str
 ) -> int:
     """Filter, diagnose the innovations, add what is missing, save, print."""
     from casest.diagnose.motion import loop
+    from casest.dynamics.intensities import with_stated
     from casest.report.html import closing_motion_page
     from casest.report.text.motion import motion_text
     from casest.results.file import as_json, save
@@ -201,6 +210,7 @@ def closing_in_motion(
     refuse(options, Kind.FITTED, why)
     moving = moving_model(model_name, options.model.constants, MotionOptions())
     run = trajectory(moving, model_name, data, options.reading)
+    moving = with_stated(moving, run, options.sensors.stds())
     progress(f"filtering {model_name}, looking for effects")
     found = loop.close_motion(moving, run, say=progress)
     result = motion_result(found, model_name=model_name, data=data, command=command)

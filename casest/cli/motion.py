@@ -73,6 +73,7 @@ class ObserveOptions:
     reading: ReadingOptions = field(default_factory=ReadingOptions)
     motion: MotionOptions = field(default_factory=MotionOptions)
     structural: StructuralOptions = field(default_factory=StructuralOptions)
+    sensors: SensorOptions = field(default_factory=SensorOptions)
     result: OutputOptions = field(default_factory=OutputOptions)
     window: float | None = flag(
         None, "--window", type=float, metavar="SECONDS", help="Of the sliding eigenvalue."
@@ -90,6 +91,7 @@ def observe(model_name: str, data: tuple[str, ...], options: ObserveOptions) -> 
     code 0 even where something is not observable.
     """
     from casest.declaration.model import Model
+    from casest.dynamics.intensities import with_stated
     from casest.report.text.observability import observe_text
     from casest.results.file import as_json
     from casest.results.find import find_any
@@ -107,6 +109,7 @@ def observe(model_name: str, data: tuple[str, ...], options: ObserveOptions) -> 
     if fits:
         if not data:
             raise UsageError(f"{model_name}: what can be seen depends on the record: give DATA")
+        refuse(options, Kind.MOVING, f"is for estimators in motion; {model_name} is a calibration")
         model, runs = model_and_records(model_name, data, options.model, options.reading)
         progress(f"fitting {model_name}")
         result: Observability = observe_parameters(model, runs, data=data, command=typed())
@@ -114,6 +117,7 @@ def observe(model_name: str, data: tuple[str, ...], options: ObserveOptions) -> 
         moving = moving_model(model_name, options.model.constants, options.motion)
         if data:
             run = trajectory(moving, model_name, data, options.reading)
+            moving = with_stated(moving, run, options.sensors.stds())
             progress("what the trajectory shows")
             result = observe_motion(moving, run, options.window, data=data, command=typed())
         else:

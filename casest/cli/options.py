@@ -210,3 +210,10 @@ class FitOptions:
     seed: int = flag(0, "--seed", show_default=True, help="For random restarts.")
     output: Path | None = flag(None, "-o", "--output", **RESULTS)
     as_json: bool = flag(False, "--json", help="Print result.json instead of a table.")
+
+
+@dataclass(frozen=True, slots=True)
+class CloseOptions(FitOptions):
+    """Options of `close`."""
+
+    sensors: SensorOptions = field(default_factory=SensorOptions)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -97,7 +98,7 @@ def reported(folder: Path, page: str) -> None:
     write(folder / REPORT, page)
 
 
-def write(path: Path, text: str) -> None:
+def write(path: Path, text: str | Iterable[str]) -> None:
     """A file in a folder that is made if it is missing."""
     from casest.data.write import make_folder, write_atomically
 

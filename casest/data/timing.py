@@ -17,7 +17,8 @@ from casest.errors import DataError, UnitError, UsageError
 
 Array = NDArray[np.float64]
 
-GAP = 5.0  # times the median step
+GAP = 5.0  # times the usual step
+USUAL = 0.8  # share of the steps that do not exceed it
 _EVEN = 20  # steps that show whether a record is evenly sampled
 
 #: How the note begins that tells why a time column was left aside.
@@ -176,6 +177,14 @@ def _after_scaling(
     return spelled
 
 
+def longest(steps: Array) -> float:
+    """The longest step that is no gap, s: some times the one that four of five do not exceed.
+
+    By the median every second step would be a gap where short ones and long ones take turns.
+    """
+    return GAP * float(np.quantile(steps, USUAL, method="lower"))
+
+
 def interruptions(name: str, time: Array, rows: NDArray[np.int_]) -> list[str]:
     """A note on samples that an evenly sampled record lacks, and on gaps: how many, and where."""
     steps = np.diff(time)
@@ -184,7 +193,8 @@ def interruptions(name: str, time: Array, rows: NDArray[np.int_]) -> list[str]:
     median = float(np.median(steps))
     even = float(np.mean(np.abs(steps - median) < 0.1 * median)) >= 0.5
     said = []
-    lost = np.flatnonzero((steps > 1.5 * median) & (steps <= GAP * median))
+    wide = steps > longest(steps)
+    lost = np.flatnonzero((steps > 1.5 * median) & ~wide)
     if even and lost.size:
         count = int((np.rint(steps[lost] / median) - 1).sum())
         coarse = ", or the time stamps are coarse" if lost.size > 0.1 * len(steps) else ""
@@ -192,13 +202,13 @@ def interruptions(name: str, time: Array, rows: NDArray[np.int_]) -> list[str]:
             f"{_counted(count, 'sample')} missing in {_counted(lost.size, 'place')}, the first "
             f"behind row {rows[lost[0]]} (t = {time[lost[0]]:.6g} s){coarse}"
         )
-    gaps = np.flatnonzero(steps > GAP * median)
-    if gaps.size:
-        longest = gaps[np.argmax(steps[gaps])]
-        samples = f" ({round(steps[longest] / median) - 1} samples)" if even else ""
+    found = np.flatnonzero(wide)
+    if found.size:
+        worst = found[np.argmax(steps[found])]
+        samples = f" ({round(steps[worst] / median) - 1} samples)" if even else ""
         said.append(
-            f"{_counted(gaps.size, 'gap')}, the longest {steps[longest]:.4g} s{samples} behind row "
-            f"{rows[longest]} (t = {time[longest]:.6g} s)"
+            f"{_counted(found.size, 'gap')}, the longest {steps[worst]:.4g} s{samples} behind "
+            f"row {rows[worst]} (t = {time[worst]:.6g} s)"
         )
     return [f"{name}: {'; '.join(said)}; the median step is {median:.3g} s"] if said else []
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -62,10 +62,15 @@ def make_folder(folder: Path) -> None:
         raise DataError(f"{folder}: cannot be made ({error.strerror}); give another -o") from None
 
 
-def write_atomically(path: str | os.PathLike[str], text: str | bytes) -> None:
+#: What a file holds: text, bytes, or text in pieces that need not be in memory together.
+Content = str | bytes | Iterable[str]
+
+
+def write_atomically(path: str | os.PathLike[str], text: Content) -> None:
     """Write text (in UTF-8) or bytes to `path`: it holds the old content or all of the new.
 
-    The text goes to a temporary name in the same folder, reaches the disk, and is then renamed.
+    The text, whole or in pieces, goes to a temporary name in the same folder, reaches the disk, and
+    is then renamed.
     What is no character, as in the name of a file that is not UTF-8, becomes a question mark.
     Raises DataError where the folder is missing or cannot be written.
     """
@@ -77,7 +82,7 @@ def write_atomically(path: str | os.PathLike[str], text: str | bytes) -> None:
         write_atomically(path, text)
 
 
-def _write(target: Path, text: str | bytes, pending: dict[str, Path]) -> None:
+def _write(target: Path, text: Content, pending: dict[str, Path]) -> None:
     """The text under a temporary name, which `pending` lists from the moment it exists."""
     try:
         with held_back():
@@ -90,7 +95,8 @@ def _write(target: Path, text: str | bytes, pending: dict[str, Path]) -> None:
         ) from error
     try:
         with os.fdopen(handle, "wb") as file:
-            file.write(text.encode(errors="replace") if isinstance(text, str) else text)
+            for piece in [text] if isinstance(text, str | bytes) else text:
+                file.write(piece.encode(errors="replace") if isinstance(piece, str) else piece)
             file.flush()
             os.fsync(file.fileno())
         os.chmod(temporary, _usual_mode())  # mkstemp makes files that only the owner can read

@@ -72,7 +72,7 @@ def check_units(model: Model) -> None:
         outputs["prediction"] = traced.predicted
     f = function_of(open_model, outputs, traced)
     numbers = {c.name: float(c.array) for c in model.constants if not c.dims}
-    sizes = _outputs(f, _input_sizes(open_model, numbers), model.name)
+    sizes = followed_through(f, _input_sizes(open_model, numbers), f"model {model.name}")
     if traced.predicted is None:
         for found in sizes[-1]:
             _refuse_counted_residual(found, model.name)
@@ -81,17 +81,17 @@ def check_units(model: Model) -> None:
             for found in sizes[k]:
                 where = f"model {model.name}: quantity {q.name} is declared in {q.unit}"
                 try:
-                    declared = _size(q.unit, open_model)
+                    declared = size_of(q.unit, _references(open_model))
                 except UnitError as error:
                     raise UnitError(f"{where}: {error}") from None
-                _fits(found, declared, where)
+                refuse_unless_fits(found, declared, where)
                 _same_zero(found, q.unit, declared, where)
     if traced.measured is not None:
         unit = model.residual_unit
         for found in sizes[-1]:
             where = f"model {model.name}: the prediction of {traced.measured} [{unit}]"
-            declared = _size(unit, open_model)
-            _fits(found, declared, where)
+            declared = size_of(unit, _references(open_model))
+            refuse_unless_fits(found, declared, where)
             _same_zero(found, unit, declared, where)
 
 
@@ -116,27 +116,32 @@ def _input_sizes(model: Model, numbers: Mapping[str, float]) -> dict[tuple[int, 
         for i in range(p.shape.coordinates):
             curved = p.shape.curved
             unit = "" if curved else p.units[i]
-            size = Size({}, 1.0, frozenset()) if curved else _size(unit, model)
+            size = Size({}, 1.0, frozenset()) if curved else size_of(unit, _references(model))
             number = numbers.get(p.name)
             zero = of_symbol(unit, signal=False, free=p.name not in numbers, number=number)
-            sizes[0, k] = replace(_named(size, p.name, unit), zero=zero)
+            sizes[0, k] = replace(named(size, p.name, unit), zero=zero)
             k += 1
     k = 0
     for s in model.signals:
         for _ in range(s.size):
             unit = "" if s.kind == "rotation" else f"[{s.name}]"
-            own = _size(s.unit if s.unit is not None else unit, model)
+            own = size_of(s.unit if s.unit is not None else unit, _references(model))
             zero = of_symbol(s.unit or "", signal=True, free=False, number=None)
-            sizes[1, k] = replace(_named(own, s.name, s.unit or ""), zero=zero)
+            sizes[1, k] = replace(named(own, s.name, s.unit or ""), zero=zero)
             k += 1
     return sizes
 
 
-def _size(unit: str, model: Model) -> Size:
+def _references(model: Model) -> Mapping[str, Any]:
+    """What a unit may refer to: symbols, and quantities."""
+    return {**model.quantities, **model.symbols}
+
+
+def size_of(unit: str, symbols: Mapping[str, Any]) -> Size:
     """Size of a declared unit; `[v]` is that of the symbol v, a base of its own if v has none."""
     text = unit
-    for _ in model.symbols:  # a unit may refer to one that refers to another
-        text = _PLACEHOLDER.sub(lambda m: _replacement(m[1], model), text)
+    for _ in symbols:  # a unit may refer to one that refers to another
+        text = _PLACEHOLDER.sub(lambda m: _replacement(m[1], symbols), text)
     own: dict[str, Fraction] = {}
     for match in _PLACEHOLDER.finditer(text):
         power = -_ONE if text[: match.start()].rstrip("( ").endswith("/") else _ONE
@@ -153,16 +158,17 @@ _PLACEHOLDER = re.compile(r"\[([^\]]+)\]")
 _POWER = re.compile(r"[) ]*(?:\^|\*\*) *(\d+)")
 
 
-def _replacement(name: str, model: Model) -> str:
+def _replacement(name: str, symbols: Mapping[str, Any]) -> str:
     """The unit of a symbol or quantity in brackets, or the placeholder where it has none."""
-    symbol = model.symbols.get(name) or model.quantities.get(name)
+    symbol = symbols.get(name)
     unit = symbol.unit if symbol is not None else None
     if not unit or "," in unit or unit == f"[{name}]":
         return f"[{name}]"
     return f"({unit})"
 
 
-def _named(size: Size, name: str, unit: str) -> Size:
+def named(size: Size, name: str, unit: str) -> Size:
+    """The size, that of a symbol which messages can name."""
     return Size(size.powers, size.factor, frozenset({f"{name} [{unit}]" if unit else name}))
 
 
@@ -180,8 +186,10 @@ def _open(attached: Attached) -> Attached:
     return replace(attached, effect=effect, parameters=(*attached.parameters, *more))
 
 
-def _outputs(f: Any, inputs: Mapping[tuple[int, int], Size], name: str) -> list[list[Size]]:
-    """Sizes of every output entry, by walking the instruction list."""
+def followed_through(
+    f: Any, inputs: Mapping[tuple[int, int], Size], place: str
+) -> list[list[Size]]:
+    """Sizes of every output entry, by walking the instruction list; errors begin with `place`."""
     work: dict[int, Size] = {}
     outputs: list[list[Size]] = [[] for _ in range(f.n_out())]
     for k in range(f.n_instructions()):
@@ -195,8 +203,8 @@ def _outputs(f: Any, inputs: Mapping[tuple[int, int], Size], name: str) -> list[
         elif op == ca.OP_OUTPUT:
             outputs[to[0]].append(work[where[0]])
         else:
-            operation = operation_of(op, f"model {name}")
-            work[to[0]] = _operated(operation, [work[i] for i in where], name)
+            operation = operation_of(op, place)
+            work[to[0]] = _operated(operation, [work[i] for i in where], place)
     return outputs
 
 
@@ -207,19 +215,19 @@ def _is_mathematical(number: float) -> bool:
     return any(abs(x - round(x)) < 1e-12 for x in candidates if x < 12.5)
 
 
-def _operated(operation: Operation, operands: list[Size], name: str) -> Size:
+def _operated(operation: Operation, operands: list[Size], place: str) -> Size:
     """Size of an operation's result, and from where it counts if it is a temperature."""
-    found = _result(operation, operands, name)
+    found = _result(operation, operands, place)
     alike = [o.powers == _KELVIN for o in operands]
     temperature = found.powers == _KELVIN or not found.powers
-    where = f"model {name}"
+    where = place
     if marked := sorted(frozenset().union(*(o.names for o in operands if o.zero.affine))):
         where += f", {', '.join(marked)}"
     zeros = [replace(o.zero, plain=o.powers is None) for o in operands]
     return replace(found, zero=followed(operation.code, zeros, alike, temperature, where))
 
 
-def _result(operation: Operation, operands: list[Size], name: str) -> Size:
+def _result(operation: Operation, operands: list[Size], place: str) -> Size:
     """What comes out of an operation on operands of these sizes."""
     names = frozenset().union(*(o.names for o in operands))
     first, pure = operands[0], Size({}, 1.0, names)
@@ -233,7 +241,7 @@ def _result(operation: Operation, operands: list[Size], name: str) -> Size:
         case Units.LAST:
             return operands[-1]
         case Units.SAME | Units.COMPARED:
-            _fits(first, operands[1], f"model {name}")
+            refuse_unless_fits(first, operands[1], place)
             if operation.units is Units.COMPARED:
                 return pure
             chosen = first if first.powers is not None else operands[1]
@@ -241,8 +249,8 @@ def _result(operation: Operation, operands: list[Size], name: str) -> Size:
         case Units.PURE | Units.ANGLE:
             factor = 1.0 if operation.units is Units.ANGLE else None
             for operand in operands:
-                where = f"model {name}: the argument of {operation.name}"
-                _fits(operand, Size({}, factor, frozenset()), where)
+                where = f"{place}: the argument of {operation.name}"
+                refuse_unless_fits(operand, Size({}, factor, frozenset()), where)
             return pure
 
 
@@ -261,7 +269,8 @@ def _product(powers: Powers, operands: list[Size], names: frozenset[str]) -> Siz
     return Size({b: p for b, p in total.items() if p}, factor, names)
 
 
-def _fits(a: Size, b: Size, where: str) -> None:
+def refuse_unless_fits(a: Size, b: Size, where: str) -> None:
+    """UnitError where two sizes are not one, unless one of them fits anything."""
     if a.powers is None or b.powers is None:
         return
     same_factor = a.factor is None or b.factor is None or abs(a.factor / b.factor - 1) < 1e-9

@@ -3,9 +3,20 @@
 from __future__ import annotations
 
 from casest.dynamics.continuous import Continuous, kalman_bucy
-from casest.dynamics.declare import Dynamics, Motion, State, constraint, dynamics, measured, state
+from casest.dynamics.declare import (
+    Dynamics,
+    Motion,
+    State,
+    angle,
+    constraint,
+    dynamics,
+    measured,
+    state,
+)
+from casest.dynamics.dimensions import check_units
 from casest.dynamics.discrete import Estimates, Steps, kalman, smoothed
 from casest.dynamics.filter import Filtered, filtered
+from casest.dynamics.online import Estimator
 from casest.dynamics.record import Record, least_squares
 from casest.dynamics.statespace import to_statespace
 from casest.dynamics.structural import Structure, structure
@@ -14,12 +25,15 @@ __all__ = [
     "Continuous",
     "Dynamics",
     "Estimates",
+    "Estimator",
     "Filtered",
     "Motion",
     "Record",
     "State",
     "Steps",
     "Structure",
+    "angle",
+    "check_units",
     "constraint",
     "dynamics",
     "filtered",

@@ -15,7 +15,7 @@ from casest.declaration.shapes import Array
 from casest.dynamics.declare import Dynamics
 from casest.dynamics.filter import coefficients
 from casest.dynamics.riccati import riccati
-from casest.dynamics.transition import Linearised, transitions
+from casest.dynamics.transition import Linearised, transitions, usual
 from casest.errors import UsageError
 
 
@@ -38,7 +38,7 @@ def kalman_bucy(model: Dynamics, run: Run) -> Continuous:
         raise UsageError(f"{model.name} is nonlinear: the Kalman-Bucy filter is for linear models")
     system = coefficients(model, run)
     P = riccati(model, system)
-    K = P @ system.C.transpose(0, 2, 1) @ np.linalg.inv(model.noise)
+    K = P @ system.C.transpose(0, 2, 1) @ np.linalg.inv(model.noise_at(usual(system.steps)))
     reading = np.nan_to_num(system.y - system.d)[:, :, None]
     closed = system.A - K @ system.C
     driven = system.c + (K @ reading)[:, :, 0]

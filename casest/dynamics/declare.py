@@ -77,12 +77,32 @@ def _wrong(field: str, number: Any) -> str | None:
 class Measured:
     """An output: the signal that measures it, what it should be, and its noise intensity.
 
-    `intensity` in unit²·s: variance of one reading times the time between two.
+    `intensity` in unit²·s: variance of one reading times the time between two; or `std`, the
+    standard deviation of one reading, in its unit. `wraps`: both are angles, which are alike a full
+    turn apart.
     """
 
     signal: SX
     predicted: SX
-    intensity: float
+    intensity: float | None
+    std: float | None = None
+    wraps: bool = False
+
+
+@dataclass(frozen=True)
+class Angle:
+    """What an output should be, up to full turns."""
+
+    expression: SX
+
+
+def angle(expression: SX) -> Angle:
+    """An angle as an output: `measured(bearing, angle(atan2(y, x)), intensity=1e-4)`.
+
+    Reading and prediction may differ by full turns, 2π or 360 by the unit of the signal (rad where
+    it has none): 179° and −179° are 2° apart.
+    """
+    return Angle(expression)
 
 
 @dataclass(frozen=True)
@@ -103,15 +123,50 @@ class Motion:
     outputs: tuple[Measured, ...]
     constraints: tuple[Constraint, ...] = ()
 
+    def __post_init__(self) -> None:
+        """One alone, its comma forgotten, is a tuple of one."""
+        for name, kind in (("outputs", Measured), ("constraints", Constraint)):
+            given = getattr(self, name)
+            several = (given,) if isinstance(given, kind) else given
+            if not isinstance(several, tuple | list) or not all(
+                isinstance(one, kind) for one in several
+            ):
+                raise DeclarationError(
+                    f"Motion: {name}= takes {kind.__name__.lower()}(…), …, not {several!r}"
+                )
+            object.__setattr__(self, name, tuple(several))
 
-def measured(signal: SX, predicted: SX, *, intensity: float) -> Measured:
-    """An output: `measured(v, velocity, intensity=0.1)`, intensity in unit²·s."""
-    if not intensity > 0:
+
+def measured(
+    signal: SX,
+    predicted: SX | Angle,
+    *,
+    intensity: float | None = None,
+    std: float | None = None,
+) -> Measured:
+    """An output: `measured(v, velocity, std=0.01)`, the standard deviation of one reading; or its
+    noise's intensity in unit²·s, the variance of one reading times the time between two; see
+    `angle` too."""
+    if (intensity is None) == (std is None):
+        given = "neither" if std is None else "both"
+        raise DeclarationError(
+            f"measured: {given} of std= and intensity= given: say how large the noise of one "
+            "reading is (std=), or its variance times the time between two (intensity=)"
+        )
+    if std is not None and not 0 < std < np.inf:
+        raise DeclarationError(
+            f"measured: std={std:g} must be positive and finite: the standard deviation of one "
+            "reading"
+        )
+    if intensity is not None and not intensity > 0:
         raise DeclarationError(
             f"measured: the noise intensity must be positive, not {intensity}: a reading without "
             "noise makes the Riccati equation singular; give the sensor's variance times its period"
         )
-    return Measured(signal, predicted, float(intensity))
+    intensity, std = (None if v is None else float(v) for v in (intensity, std))
+    if isinstance(predicted, Angle):
+        return Measured(signal, predicted.expression, intensity, std, wraps=True)
+    return Measured(signal, predicted, intensity, std)
 
 
 def constraint(expression: SX, value: float | SX) -> Constraint:
@@ -247,15 +302,38 @@ class Dynamics:
         """Intensity Ξ of the driving noise, (n, n)."""
         return np.diag(np.concatenate([np.full(s.size, s.intensity) for s in self.states]))
 
-    @cached_property
+    @property
     def noise(self) -> Array:
-        """Intensity Θ of the measurement noise, (m, m)."""
+        """Intensity Θ of the measurement noise, (m, m), if intensities are what is declared."""
+        return self.noise_at(None)
+
+    def noise_at(self, period: float | None) -> Array:
+        """Intensity Θ of the measurement noise, (m, m), of readings every `period` s."""
         t = self.traced
         parts = [
-            np.full(o.predicted.numel(), self.sensors.get(name, o.intensity))
+            np.full(o.predicted.numel(), self.intensity_of(name, period))
             for name, o in zip(t.measured, t.outputs, strict=True)
         ]
         return np.diag(np.concatenate(parts))
+
+    def intensity_of(self, name: str, period: float | None = None) -> float:
+        """Noise intensity of an output signal, unit²·s, read every `period` s.
+
+        Raises UsageError where a standard deviation is declared and the period is not known.
+        """
+        if name in self.sensors:
+            return self.sensors[name]
+        t = self.traced
+        own = next(o for n, o in zip(t.measured, t.outputs, strict=True) if n == name)
+        if own.intensity is not None:
+            return own.intensity
+        if period is None:
+            raise UsageError(
+                f"{self.name}: {name} has the noise of one reading (std={own.std:g}): its "
+                f"intensity needs the time between two; sensing({name}=…) says it"
+            )
+        assert own.std is not None
+        return own.std**2 * period
 
     @cached_property
     def input_noise(self) -> SX | None:
@@ -272,7 +350,7 @@ class Dynamics:
     @cached_property
     def traced(self) -> Traced:
         """The body on CasADi symbols."""
-        return _trace(self)
+        return traced_with(self, {c.name: float(c.array) for c in self.constants})
 
     @property
     def measured_signals(self) -> tuple[str, ...]:
@@ -288,8 +366,10 @@ class Dynamics:
 
     @cached_property
     def linear(self) -> bool:
-        """Are rates and outputs linear in the state?"""
+        """Are rates and outputs linear in the state? An angle that wraps is not."""
         t = self.traced
+        if any(o.wraps for o in t.outputs):
+            return False
         slopes = ca.vertcat(ca.vec(t.A), ca.vec(t.C))
         return not ca.depends_on(slopes, t.x)
 
@@ -297,7 +377,7 @@ class Dynamics:
 @dataclass(frozen=True)
 class Traced:
     """Symbols and expressions: x, signals, f(x, u), h(x, u), A = ∂f/∂x, C = ∂h/∂x, readings;
-    constraints g(x, u) = 0 and G = ∂g/∂x."""
+    constraints g(x, u) = 0 and G = ∂g/∂x; `turn` (m,): a full turn of readings that are angles."""
 
     x: SX
     symbols: Mapping[str, SX]
@@ -310,6 +390,23 @@ class Traced:
     G: SX
     outputs: tuple[Measured, ...]
     measured: tuple[str, ...]
+    turn: Array
+
+    def wrapped(self, difference: Any) -> Any:
+        """Readings less predictions (m) or (N, m), angles within half a turn of zero."""
+        if not self.turn.any():
+            return difference
+        full = np.where(self.turn > 0, self.turn, 1.0)
+        if isinstance(difference, np.ndarray):
+            return difference - self.turn * np.floor(difference / full + 0.5)
+        return difference - ca.DM(self.turn) * ca.floor(difference / full + 0.5)
+
+    def nearest(self, y: Array, C: Array, d: Array, x: Array) -> Array:
+        """Readings (N, m), angles by full turns as near to C·x + d as they come."""
+        if not self.turn.any():
+            return y
+        said = (C @ x[:, :, None])[:, :, 0] + d
+        return np.asarray(said + self.wrapped(y - said))
 
 
 def dynamics(function: Callable[..., Motion]) -> Dynamics:
@@ -336,15 +433,15 @@ def dynamics(function: Callable[..., Motion]) -> Dynamics:
     return Dynamics(name, function, tuple(signals), tuple(states), tuple(constants))
 
 
-def _trace(declared: Dynamics) -> Traced:
+def traced_with(declared: Dynamics, constants: Mapping[str, SX | float]) -> Traced:
+    """The body on CasADi symbols, its constants numbers or symbols too."""
     symbols: dict[str, SX] = {}
     for s in declared.signals:
         plain = ca.SX.sym(s.name, s.size)
         symbols[s.name] = ca.reshape(plain, 3, 3).T if s.kind == "rotation" else plain
     xs = {s.name: ca.SX.sym(s.name, s.size) for s in declared.states}
-    numbers = {c.name: float(c.array) for c in declared.constants}
     try:
-        motion = declared.function(**symbols, **xs, **numbers)
+        motion = declared.function(**symbols, **xs, **constants)
     except CasestError:
         raise
     except (Exception, SystemExit) as error:
@@ -375,5 +472,23 @@ def _trace(declared: Dynamics) -> Traced:
     if reading.numel() != h.numel():
         raise DeclarationError(f"dynamics {declared.name}: outputs and signals differ in shape")
     g = ca.vertcat(*[ca.vec(c.expression) for c in motion.constraints])
+    of = {s.name: s.unit for s in declared.signals}
+    turn = [
+        np.full(o.predicted.numel(), 2 * np.pi / units.size(of[n] or "rad")[0] if o.wraps else 0.0)
+        for n, o in zip(names, motion.outputs, strict=True)
+    ]
     A, C, G = ca.jacobian(f, x), ca.jacobian(h, x), ca.jacobian(g, x)
-    return Traced(x, symbols, f, h, A, C, reading, g, G, motion.outputs, tuple(names))
+    return Traced(
+        x,
+        symbols,
+        f,
+        h,
+        A,
+        C,
+        reading,
+        g,
+        G,
+        motion.outputs,
+        tuple(names),
+        np.concatenate([np.zeros(0), *turn]),
+    )

@@ -6,14 +6,16 @@ that is discrete from the beginning.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from casest.declaration.shapes import Array
-from casest.dynamics.stepping import Pattern, kalman_step, run_steps, unpacked
+from casest.dynamics.factors import size
+from casest.dynamics.stepping import Pattern, kalman_step, run_steps, smoother_step, unpacked
 
 
 @dataclass(frozen=True)
@@ -47,6 +49,11 @@ class Steps:
             return self.C
         return np.where(self.present[:, :, None], self.C, 0.0)
 
+    @cached_property
+    def read(self) -> Array:
+        """y − d, and nothing where a reading is missing."""
+        return np.where(self.present, self.y - self.d, 0.0)
+
     @property
     def patterns(self) -> tuple[Pattern, Pattern]:
         """Entries of Φ and of C that can differ from zero."""
@@ -61,6 +68,7 @@ class Estimates:
     """States x (N, n) and covariances P (N, n, n) after each reading and before it.
 
     innovations y − Cx − d (N, m) and their covariance S (N, m, m), NaN where a reading is missing.
+    `factored`: x and the factors of P after each reading, as the smoother takes them.
     """
 
     x: Array
@@ -69,24 +77,31 @@ class Estimates:
     predicted_P: Array  # noqa: N815
     innovations: Array
     S: Array
+    factored: Array
 
 
 def kalman(steps: Steps, start: Array, covariance: Array) -> Estimates:
     """Kalman filter; `start` (n,) and `covariance` (n, n) hold before the first reading."""
-    m, n = steps.C.shape[1:]
-    C, R = steps.seen, steps.R
-    y = np.where(steps.present, steps.y - steps.d, 0.0)
+    n = steps.C.shape[2]
     # No step leads to the first sample: Φ = 0 from an empty state, and what is known beforehand.
-    Phi, forced, Q = (
-        steps.Phi,
-        np.concatenate([start[None], steps.forced]),
-        np.empty((len(y), n, n)),
-    )
+    forced, Q = np.concatenate([start[None], steps.forced]), np.empty((len(steps.y), n, n))
     Q[0], Q[1:] = covariance, steps.Q
-    step = kalman_step(n, m, *steps.patterns)
-    after, before = run_steps(step, np.zeros(n + n * n), [Phi, forced, Q, C, R, y])
-    (x, P), (before_x, before_P) = unpacked(after, n), unpacked(before, n)
-    return Estimates(x, P, before_x, before_P, *_innovations(steps, before_x, before_P))
+    return _followed(steps, [steps.Phi, forced, Q], np.zeros(size(n)))
+
+
+def continued(steps: Steps, state: Array) -> Estimates:
+    """The same at every sample but the first, where the filter has come to `state`, as factored."""
+    parts = {name: getattr(steps, name)[1:] for name in ("C", "d", "R", "y")}
+    return _followed(replace(steps, **parts), [steps.Phi, steps.forced, steps.Q], state)
+
+
+def _followed(samples: Steps, motion: Sequence[Array], state: Array) -> Estimates:
+    m, n = samples.C.shape[1:]
+    step = kalman_step(n, m, *samples.patterns)
+    readings = [samples.seen, samples.R, samples.read]
+    factored, *both = run_steps(step, state, [*motion, *readings])
+    (x, P), before = (unpacked(part, n) for part in both)
+    return Estimates(x, P, *before, *_innovations(samples, *before), factored)
 
 
 def _innovations(steps: Steps, x: Array, P: Array) -> tuple[Array, Array]:
@@ -100,55 +115,30 @@ def _innovations(steps: Steps, x: Array, P: Array) -> tuple[Array, Array]:
 
 
 def smoothed(steps: Steps, found: Estimates) -> tuple[Array, Array]:
-    """Fixed-interval smoother (Rauch, Tung & Striebel 1965): states (N, n), covariances (N, n, n).
+    """Fixed-interval smoother: states (N, n) and covariances (N, n, n) by the whole record."""
+    n = steps.C.shape[2]
+    x, P, _ = smoothed_before(steps, found.factored[:-1], np.zeros(n * n + 2 * n))
+    return np.concatenate([x, found.x[-1:]]), np.concatenate([P, found.P[-1:]])
 
-    The covariance left of a step is in Joseph's form, so that it stays positive however much later
-    readings add.
+
+def smoothed_before(steps: Steps, factored: Array, told: Array) -> tuple[Array, Array, Array]:
+    """The same at every sample but the last, of which what is `told` by readings after it is known.
+
+    `factored` (N − 1, …) by the filter; also returned: what is told of the first sample.
     """
-    x, P = found.x, found.P
-    G = np.linalg.solve(found.predicted_P[1:], steps.Phi @ P[:-1]).transpose(0, 2, 1)
-    left = np.eye(x.shape[1]) - G @ steps.Phi
-    own_x = x[:-1] - (G @ found.predicted_x[1:, :, None])[:, :, 0]
-    own_P = left @ P[:-1] @ left.transpose(0, 2, 1) + G @ steps.Q @ G.transpose(0, 2, 1)
-    earlier = gathered(np.asarray(G, float), own_x, np.asarray(own_P, float), x[-1], P[-1])
-    return np.concatenate([earlier[0], x[-1:]]), np.concatenate([earlier[1], P[-1:]])
-
-
-def gathered(G: Array, w: Array, W: Array, x: Array, P: Array) -> tuple[Array, Array]:
-    """Backwards x(k) = G(k)x(k+1) + w(k), P(k) = G(k)P(k+1)G(k)ᵀ + W(k), from x and P at the end.
-
-    G, W (K, n, n) and w (K, n); x (K, n) and P (K, n, n). About √K stretches of √K steps go side by
-    side: first what each does to any end, then, the ends known, every step.
-    """
-    count, n = w.shape
-    length = max(1, int(np.sqrt(count)))
-    stretches = -(-count // length)
-    lead = stretches * length - count  # at the beginning, where nothing comes after
-
-    def cut(parts: Array) -> Array:
-        padded = np.concatenate([np.zeros((lead, *parts.shape[1:])), parts])
-        return padded.reshape(stretches, length, *parts.shape[1:])
-
-    # x rides along as one more column of P, which Gᵀ does not multiply from the right.
-    G, both = cut(G), cut(np.concatenate([W, w[:, :, None]], axis=2))
-    whole, ends = np.broadcast_to(np.eye(n), (stretches, n, n)), np.zeros((stretches, n, n + 1))
-    for k in range(length - 1, -1, -1):
-        whole, ends = G[:, k] @ whole, _earlier(G[:, k], ends, both[:, k])
-    after = np.empty((stretches, n, n + 1))
-    after[-1] = np.concatenate([P, x[:, None]], axis=1)
-    for j in range(stretches - 1, 0, -1):
-        after[j - 1] = _earlier(whole[j], after[j], ends[j])
-    found = np.empty((stretches, length, n, n + 1))
-    for k in range(length - 1, -1, -1):
-        found[:, k] = after = _earlier(G[:, k], after, both[:, k])
-    found = found.reshape(-1, n, n + 1)[lead:]
-    return found[:, :, n], found[:, :, :n]
+    m, n = steps.C.shape[1:]
+    step, later = smoother_step(n, m, *steps.patterns), slice(None, 0, -1)
+    parts = [p[::-1] for p in (steps.Phi, steps.forced, steps.Q)]
+    parts += [p[later] for p in (steps.seen, steps.R, steps.read)] + [factored[::-1]]
+    back, both = run_steps(step, told, parts)
+    return *unpacked(both[::-1], n), back[-1]
 
 
 def linear_recursion(M: Array, b: Array, first: Array) -> Array:
     """x(k+1) = M(k)x(k) + b(k) from x(0) = first (n, p): all x, (K + 1, n, p).
 
-    M (K, n, n) and b (K, n, p); about √K stretches go side by side, as above.
+    M (K, n, n) and b (K, n, p); about √K stretches of √K steps go side by
+    side: first what each does to any beginning, then, the beginnings known, every step.
     """
     count, n, p = b.shape
     length = max(1, int(np.sqrt(count)))
@@ -186,10 +176,3 @@ def smoothed_states(steps: Steps, found: Estimates) -> Array:
     M = left[:-1] @ steps.Phi.transpose(0, 2, 1)
     back = linear_recursion(M[::-1], -told[-2::-1, :, :1], -told[-1, :, :1])[::-1]
     return np.asarray(found.predicted_x - (found.predicted_P @ back)[:, :, 0])
-
-
-def _earlier(G: Array, after: Array, added: Array) -> Array:
-    n = G.shape[-1]
-    moved = G @ after
-    moved[..., :n] = moved[..., :n] @ np.swapaxes(G, -1, -2)
-    return np.asarray(moved + added)

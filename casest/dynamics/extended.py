@@ -1,65 +1,97 @@
 """Nonlinear models step by step: the motion between two samples, and the extended Kalman filter.
 
-Between samples the state follows two fourth-order Runge-Kutta steps, inputs being straight lines;
-Φ is the Jacobian of that very map, so that filter, smoother and least squares speak of one problem.
-Readings are linearised at the prediction (Jazwinski 1970, 8.3).
+Between samples the state follows two fourth-order Runge-Kutta steps, more where the motion is fast,
+inputs being straight lines; Φ is the Jacobian of that very map, so that filter, smoother and least
+squares speak of one problem.
+Readings are linearised at the prediction and again where they lead to (Jazwinski 1970, 8.3).
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from casest.data.run import Run
 from casest.declaration.physics import SX
 from casest.declaration.shapes import Array
 from casest.declaration.tracing import flat
+from casest.dynamics import factors
+from casest.dynamics.between import balance, noise_of
 from casest.dynamics.declare import Dynamics
 from casest.dynamics.discrete import Steps
-from casest.dynamics.stepping import entries, packed, run_steps, symmetric, taken, unpacked
-from casest.dynamics.transition import checked_record, lost, steps_to, with_lost
+from casest.dynamics.factors import Factors
+from casest.dynamics.inputs import as_read, at_estimates, estimates, slopes, uncertain
+from casest.dynamics.stepping import entries, packed, run_steps, unpacked
+from casest.dynamics.transition import (
+    Pace,
+    acting,
+    checked_record,
+    checked_time,
+    linearised,
+    lost,
+    pace_of,
+    shares,
+    variances,
+    with_lost,
+)
 from casest.engine import Columns, Recursion, Replay
+from casest.errors import DataError
+
+#: ‖A‖h of a piece that Runge-Kutta follows well, pieces at most, and ‖A‖h that it cannot follow.
+PIECE, MOST, UNSTABLE = 0.5, 16, 2.5
+
+#: Rounds of the filter's update where a reading is no linear function of the state.
+ITERATIONS = 4
 
 
-def relinearised(model: Dynamics, run: Run, along: Array) -> Steps:
-    """The record in discrete time, linearised along states (N, n)."""
+def relinearised(model: Dynamics, run: Run, along: Array, errors: Array | None = None) -> Steps:
+    """The record in discrete time, linearised along states (N, n).
+
+    `errors` (N, n, n): covariances of what these are wrong by, on which noise of inputs acts.
+    """
     time = checked_record(model, run)
-    inputs = _input_names(model)
-    columns = [
-        np.ascontiguousarray(along[:-1]),
-        *(run.signals[n][:-1] for n in inputs),
-        *(run.signals[n][1:] for n in inputs),
-        np.diff(time)[:, None],
-    ]
-    Phi, forced, Q = over_samples(_step(model), columns)
+    u, step = _inputs(model, run), np.diff(time)
+    columns = [np.ascontiguousarray(along[:-1]), u[:-1], u[1:], step[:, None], _stood_for(step)]
+    Phi, forced, Q = over_samples(_step(model, pieces(model, run)), columns)
+    if errors is not None and uncertain(model):
+        added = acting(model, run, along, errors)
+        Q += 0.5 * step[:, None, None] * (added[1:] + added[:-1])
     Q = with_lost(model, np.diff(time), Phi, Q)
     C, d, y = _rows(model, run, along)
-    R = np.diag(model.noise)[None] / steps_to(np.diff(time))[:, None]
+    R = variances(model, np.diff(time))
     return Steps(Phi, forced[:, :, 0], Q, C, d, R, y, of_C=entries(model.traced.C))
 
 
-def _rows(model: Dynamics, run: Run, along: Array) -> tuple[Array, Array, Array]:
+def _rows(
+    model: Dynamics, run: Run, along: Array, calm: Mapping[str, Array] | None = None
+) -> tuple[Array, Array, Array]:
     """Readings as rows: C, d and y."""
     columns = [np.ascontiguousarray(along), *(run.signals[s.name] for s in model.signals)]
-    C, d, y = over_samples(_outputs(model), columns)
-    return C, d[:, :, 0], y[:, :, 0]
+    columns += (estimates(model, run) if calm is None else calm).values()
+    C, d, y = (part[:, :, 0] if k else part
+               for k, part in enumerate(over_samples(_outputs(model), columns)))  # fmt: skip
+    return C, d, model.traced.nearest(y, C, d, along)
 
 
 @lru_cache(maxsize=8)
-def _step(model: Dynamics) -> Replay:
-    x, u, v, h = model.traced.x, *_two_samples(model), ca.SX.sym("h")
-    end, Phi, Q = _motion(model)(x, u, v, h)
-    return replay(ca.vertcat(x, u, v, h), [Phi, end - Phi @ x, Q])
+def _step(model: Dynamics, count: int) -> Replay:
+    x, (u, v, h, share) = model.traced.x, _two_samples(model)
+    end, Phi, Q = _motion(model, count)(x, u, v, h, share)
+    return replay(ca.vertcat(x, u, v, h, share), [Phi, end - Phi @ x, Q])
 
 
 @lru_cache(maxsize=8)
 def _outputs(model: Dynamics) -> Replay:
     t = model.traced
-    sample = ca.vertcat(t.x, *[flat(t.symbols[s.name]) for s in model.signals])
-    return replay(sample, [t.C, t.h - t.C @ t.x, t.reading])
+    signals = [flat(t.symbols[s.name]) for s in model.signals]
+    (C,), as_was = at_estimates(model, [t.C])
+    return replay(ca.vertcat(t.x, *signals, *as_was), [C, t.h - C @ t.x, t.reading])
 
 
 def replay(sample: SX, outputs: list[SX]) -> Replay:
@@ -77,76 +109,195 @@ def over_samples(expressions: Replay, columns: list[Array]) -> list[Array]:
 
 def extended(model: Dynamics, run: Run) -> tuple[Array, Array, Array, Array, Array, Array]:
     """Extended Kalman filter: x, P after each reading and before it, innovations, their S."""
+    n, m, (parts, present) = model.size, model.traced.h.numel(), given(model, run)
+    root = np.zeros(n * (n - 1) // 2)
+    state = np.concatenate([model.start, np.diag(model.start_covariance), root])
+    steps = extended_step(model, pieces(model, run))
+    _, after, before, told = run_steps(steps, state, parts, keep=False)
+    return *unpacked(after, n), *unpacked(before, n), *_told(told, present, m)
+
+
+def _told(told: Array, present: NDArray[np.bool_], m: int) -> tuple[Array, Array]:
+    """Innovations and their S, NaN where a reading is missing."""
+    S = told[:, m:].reshape(-1, m, m).transpose(0, 2, 1)
+    S = np.where(present[:, :, None] & present[:, None, :], S, np.nan)
+    return np.where(present, told[:, :m], np.nan), S
+
+
+def given(
+    model: Dynamics, run: Run, pace: Pace | None = None, calm: Mapping[str, Array] | None = None
+) -> tuple[list[Array], NDArray[np.bool_]]:
+    """What every step of the extended filter is given, (N, …) each; which readings there are.
+
+    `calm`: uncertain inputs (N, k) as they are estimated, by name, where that is known already.
+    """
     time = checked_record(model, run)
-    t, inputs = model.traced, _input_names(model)
-    n, m = model.size, t.h.numel()
-    step = np.diff(time)
-    u = np.concatenate([run.signals[name] for name in inputs] or [np.zeros((len(time), 0))], axis=1)
-    at = np.concatenate([run.signals[s.name] for s in model.signals], axis=1)
-    y = _rows(model, run, np.broadcast_to(model.start, (len(time), n)))[2][:, :m]
+    calm = estimates(model, run) if calm is None else calm
+    u, step = _inputs(model, run, calm), np.diff(time)
+    n, m = model.size, model.traced.h.numel()
+    at = np.concatenate([*(run.signals[s.name] for s in model.signals), *calm.values()], axis=1)
+    y = _rows(model, run, np.broadcast_to(model.start, (len(time), n)), calm)[2][:, :m]
     present = np.isfinite(y)
     parts = [
         np.concatenate([u[:1], u[:-1]]),
         u,
         np.concatenate([[0.0], step])[:, None],
-        np.concatenate([np.zeros((1, n)), lost(model, step)]),
+        np.concatenate([[[1.0]], _stood_for(step, pace)]),
+        np.concatenate([np.zeros((1, n)), lost(model, step, pace)]),
         np.nan_to_num(at),
-        np.diag(model.noise)[None] / steps_to(step)[:, None],
+        variances(model, step, pace),
         np.nan_to_num(y),
         present.astype(float),
     ]
-    state = np.concatenate([model.start, model.start_covariance.T.ravel()])
-    after, before, told = run_steps(_extended_step(model), state, parts)
-    ours = np.where(present, told[:, :m], np.nan)
-    S = told[:, m:].reshape(-1, m, m).transpose(0, 2, 1)
-    S = np.where(present[:, :, None] & present[:, None, :], S, np.nan)
-    return *unpacked(after, n), *unpacked(before, n), ours, S
+    return parts, present
 
 
 @lru_cache(maxsize=8)
-def _extended_step(model: Dynamics) -> Recursion:
-    """(x and P, numbers of one sample) -> (x and P, also before the reading, innovation and S)."""
+def extended_step(model: Dynamics, count: int) -> Recursion:
+    """(x and factors of P, numbers of one sample) -> (the same; x and P; and before the reading;
+    innovation and S)."""
     t, n = model.traced, model.size
-    u, v, h = *_two_samples(model), ca.SX.sym("h")
-    x, P = ca.SX.sym("x", n), ca.SX.sym("P", n, n)
-    end, Phi, Q = _motion(model)(x, u, v, h)
-    gap = ca.SX.sym("gap", n)
-    before_x, before_P = end, symmetric(Phi @ (P + ca.diag(gap)) @ Phi.T + Q + ca.diag(gap))
-    signals = ca.vertcat(*[flat(t.symbols[s.name]) for s in model.signals])
+    u, v, h, share = _two_samples(model)
+    both = ca.SX.sym("both", factors.size(n))
+    x, P = factors.unpacked(both, n)
+    end, Phi, Q = _motion(model, count)(x, u, v, h, share)
+    Q += h * share * _acting(model, x, u, factors.multiplied(P))
+    gap = ca.diag(ca.SX.sym("gap", n))
+    before = factors.moved(P, Phi, factors.factored(Phi @ gap @ Phi.T + Q + gap))
+    before_x, before_P = end, factors.multiplied(before)
+    (of_h,), as_was = at_estimates(model, [t.C])
+    signals = ca.vertcat(*[flat(t.symbols[s.name]) for s in model.signals], *as_was)
     R, y, there = (ca.SX.sym(name, t.h.numel()) for name in ("R", "y", "there"))
-    predict = ca.Function("predict", [t.x, signals], [t.h, t.C])
+    predict = ca.Function("predict", [t.x, signals], [t.h, of_h])
     said, C = predict(before_x, signals)
-    after_x, after_P = before_x, before_P
-    for i in range(t.h.numel()):
-        c = C[i, :].T * there[i]
-        left = (y[i] - said[i]) * there[i] - ca.dot(c, after_x - before_x)
-        after_x, after_P = taken(after_x, after_P, c, left, ca.dot(c, after_P @ c) + R[i])
-    numbers = ca.vertcat(u, v, h, gap, signals, R, y, there)
-    told = ca.vertcat(y - said, ca.vec(ca.densify(C @ before_P @ C.T + ca.diag(R))))
-    outputs = [packed(after_x, after_P), packed(before_x, before_P), told]
-    return Recursion(ca.Function("step", [packed(x, P), numbers], outputs, {"cse": True}))
+    reading = _Reading(lambda at: predict(at, signals), t.wrapped, y, R, there)
+    rounds = ITERATIONS if ca.depends_on(t.C, t.x) else 1
+    after_x, after = reading.taken(before_x, before, rounds)
+    numbers = ca.vertcat(u, v, h, share, ca.diag(gap), signals, R, y, there)
+    told = ca.vertcat(t.wrapped(y - said), ca.vec(ca.densify(C @ before_P @ C.T + ca.diag(R))))
+    outputs = [
+        factors.packed(after_x, after),
+        packed(after_x, factors.multiplied(after)),
+        packed(before_x, before_P),
+        told,
+    ]
+    return Recursion(ca.Function("step", [both, numbers], outputs, {"cse": True}))
+
+
+@dataclass(frozen=True)
+class _Reading:
+    """Readings y with variances R, as far as they are there; `predict(x)` says h(x) and C(x), and
+    `wrapped` what of a difference is no full turn."""
+
+    predict: Callable[[Any], tuple[Any, Any]]
+    wrapped: Callable[[Any], Any]
+    y: Any
+    R: Any
+    there: Any
+
+    def taken(self, x: Any, P: Factors, rounds: int) -> tuple[Any, Factors]:
+        """State and factors of its covariance after them, linearised where they lead to,
+        round after round.
+
+        Gauss-Newton on what the prediction and the readings say together (Bell & Cathey 1993); of
+        all rounds the most probable state.
+        """
+        found, after, least = self._once(x, P, x)
+        best = factors.packed(found, after)
+        for _ in range(rounds - 1):
+            found, after, cost = self._once(x, P, found)
+            best = ca.if_else(cost < least, factors.packed(found, after), best)
+            least = ca.if_else(cost < least, cost, least)
+        return factors.unpacked(best, x.numel())
+
+    def _once(self, x: Any, P: Factors, along: Any) -> tuple[Any, Factors, Any]:
+        """The same linearised at `along`, and twice the negative log-density of the state."""
+        said, C = self.predict(along)
+        difference = self.wrapped(self.y - said)
+        found, after, explained = x, P, ca.SX(0)
+        for i in range(self.y.numel()):
+            c = C[i, :].T * self.there[i]
+            left = difference[i] * self.there[i] - ca.dot(c, found - along)
+            after, gain, s = factors.read_with(after, c, self.R[i])
+            found = found + gain * left
+            explained += left**2 / s
+        linear = difference - C @ (found - along)
+        there = self.there / self.R
+        bent = self.wrapped(self.y - self.predict(found)[0]) ** 2 - linear**2
+        return found, after, explained + ca.dot(there, bent)
 
 
 @lru_cache(maxsize=8)
-def _motion(model: Dynamics) -> Any:
-    """(x, inputs at both ends, h) -> (x after it, Φ, Q), as a function of symbols."""
-    t, inputs = model.traced, _input_names(model)
-    x, h = ca.SX.sym("x", model.size), ca.SX.sym("h")
-    u, v = _two_samples(model)
-    own = ca.vertcat(*[flat(t.symbols[n]) for n in inputs])
+def _motion(model: Dynamics, count: int) -> Any:
+    """(x, inputs at both ends, h, share of the usual step) -> (x after it, Φ, Q), as a function of
+    symbols, in `count` pieces.
+
+    Inputs as they were read, then the uncertain ones as estimated: Φ is taken at these,
+    and noise moves along the inputs as they were read.
+    """
+    t, n = model.traced, model.size
+    x, (u, v, h, share) = ca.SX.sym("x", n), _two_samples(model)
+    own = ca.vertcat(*[flat(t.symbols[name]) for name in _input_names(model)])
     rate = ca.Function("rate", [t.x, own], [t.f])
     noise = ca.SX(ca.DM(model.process))
-    noise = noise if model.input_noise is None else noise + model.input_noise
-    intensity = ca.Function("intensity", [t.x, own], [noise])
-    half = ca.Function("half", [x, u, v, h], _with_jacobian(_runge_kutta(rate, x, u, v, h), x))
-    middle_u = 0.5 * (u + v)
-    middle, first = half(x, u, middle_u, 0.5 * h)
-    end, second = half(middle, middle_u, v, 0.5 * h)
-    Phi = second @ first
-    ends = Phi @ intensity(x, u) @ Phi.T + intensity(end, v)
-    between = second @ intensity(middle, middle_u) @ second.T
-    Q = h / 6 * (ends + 4 * between)
-    return ca.Function("motion", [x, u, v, h], [end, Phi, Q], {"cse": True})
+    noise = noise if model.input_noise is None else noise + share * model.input_noise
+    slope, driven = (ca.Function("of", [t.x, own, share], [e]) for e in (t.A, noise))
+    read, estimated = _both_of(model)
+    a, b = (ca.SX.sym(name, own.numel()) for name in "ab")
+    piece = ca.Function("piece", [x, a, b, h], _with_jacobian(_runge_kutta(rate, x, a, b, h), x))
+    end, Phi, Q, h_piece = x, ca.SX.eye(n), ca.SX(n, n), h / count
+    for k in range(count):
+        ends = [u + part / count * (v - u) for part in (k, k + 1)]
+        calm, ends = ([both[where] for both in ends] for where in (estimated, read))
+        Phi = piece(end, *calm, h_piece)[1] @ Phi
+        before, (end, later) = end, piece(end, *ends, h_piece)
+        A0, A1 = slope(before, ends[0], share), slope(end, ends[1], share)
+        path = _path(before, end, rate(before, ends[0]), rate(end, ends[1]), h_piece)
+
+        def intensity(tau: float, ends: Any = ends, path: Any = path, share: SX = share) -> Any:
+            return driven(path(tau), ends[1] - tau * (ends[1] - ends[0]), share)
+
+        Q = later @ Q @ later.T + noise_of(A1, A1 - A0, intensity, h_piece)
+    return ca.Function("motion", [x, u, v, h, share], [end, Phi, Q], {"cse": True})
+
+
+def pieces(model: Dynamics, run: Run, pace: Pace | None = None) -> int:
+    """Into how many pieces a usual step is cut: as many as the motion at the start asks for.
+
+    Raises DataError where that is more than can be followed.
+    """
+    A = linearised(model, run, calm=as_read(model, run)).A
+    h = (pace or pace_of(np.diff(checked_time(run)))).usual
+    fast = h * balance(np.abs(A).max(axis=0))[1]
+    count = int(2 ** np.clip(np.ceil(np.log2(max(fast, 1e-300) / PIECE)), 1, np.log2(MOST)))
+    if not fast / count < UNSTABLE:
+        raise DataError(
+            f"{run.file or run.name}: {model.name} moves {fast:.3g} times faster than a step of "
+            f"{h:.3g} s, more than a nonlinear model is followed ({UNSTABLE * MOST:g} times): "
+            "sample faster, or leave its fast state out"
+        )
+    return count
+
+
+def _path(x: SX, later: SX, rate: SX, later_rate: SX, h: SX) -> Callable[[float], SX]:
+    """The state at τ, from the end back: the cubic through both ends with their rates."""
+
+    def at(tau: float) -> SX:
+        near = (1 - tau) ** 2 * ((1 + 2 * tau) * later - tau * h * later_rate)
+        return near + tau**2 * ((3 - 2 * tau) * x + (1 - tau) * h * rate)
+
+    return at
+
+
+def _acting(model: Dynamics, x: SX, u: SX, P: SX) -> Any:
+    """What noise of uncertain inputs adds to Ξ by acting on errors with covariance P."""
+    t, n = model.traced, model.size
+    own = ca.vertcat(*[flat(t.symbols[name]) for name in _input_names(model)])
+    found = ca.SX(n, n)
+    for name, slope in slopes(model):
+        N = ca.Function("slope", [t.x, own], [slope])(x, u[_both_of(model)[0]])
+        found += model.sensors[name] * (N @ P @ N.T)
+    return found
 
 
 def _with_jacobian(expression: SX, x: SX) -> list[SX]:
@@ -168,6 +319,36 @@ def _input_names(model: Dynamics) -> list[str]:
     return [s.name for s in model.signals if ca.depends_on(t.f, flat(t.symbols[s.name]))]
 
 
-def _two_samples(model: Dynamics) -> tuple[SX, SX]:
-    size = sum(int(model.traced.symbols[n].numel()) for n in _input_names(model))
-    return ca.SX.sym("u", size), ca.SX.sym("v", size)
+def _stood_for(steps: Array, pace: Pace | None = None) -> Array:
+    """What part of the usual step the readings at both ends of each stand for, (N − 1, 1)."""
+    own = shares(steps, pace)
+    return 0.5 * (own[1:] + own[:-1])[:, None]
+
+
+def _inputs(model: Dynamics, run: Run, calm: Mapping[str, Array] | None = None) -> Array:
+    """Inputs of the rates as they were read, and after them the uncertain ones as estimated."""
+    calm = estimates(model, run) if calm is None else calm
+    parts = [run.signals[n] for n in _input_names(model)]
+    parts += [calm[n] for n in _input_names(model) if n in calm]
+    return np.concatenate([np.zeros((len(run), 0)), *parts], axis=1)
+
+
+def _both_of(model: Dynamics) -> tuple[list[int], list[int]]:
+    """Where the inputs as they were read are in `_inputs`, and those to be linearised at."""
+    noisy, names = uncertain(model), _input_names(model)
+    sizes = [int(model.traced.symbols[name].numel()) for name in names]
+    read = list(range(sum(sizes)))
+    estimated, later = list[int](), len(read)
+    for name, size in zip(names, sizes, strict=True):
+        if name in noisy:
+            estimated += range(later, later + size)
+            later += size
+        else:
+            estimated += range(len(estimated), len(estimated) + size)
+    return read, estimated
+
+
+def _two_samples(model: Dynamics) -> tuple[SX, SX, SX, SX]:
+    """Inputs at both ends of a step, its length, and what share of the usual one they stand for."""
+    size = len({i for part in _both_of(model) for i in part})
+    return ca.SX.sym("u", size), ca.SX.sym("v", size), ca.SX.sym("h"), ca.SX.sym("share")

@@ -1,13 +1,13 @@
 """Kalman filter and fixed-interval smoother on a sampled record with A(t), gaps, missing readings.
 
-Between samples the exact transition of the (straight-line) signals; readings are taken as averages
-over their sampling period, so that their variance is Θ/Δt. A reading that is missing in part is
-used in part.
+Between samples the exact transition of the (straight-line) signals; a reading's variance is its
+noise's intensity over the usual time between two, however they lie. A reading that is missing in
+part is used in part.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,15 +16,16 @@ from casest.declaration.shapes import Array
 from casest.dynamics.declare import Dynamics
 from casest.dynamics.discrete import Steps, kalman, smoothed, smoothed_states
 from casest.dynamics.extended import extended, relinearised
+from casest.dynamics.inputs import uncertain
 from casest.dynamics.known import known
 from casest.dynamics.riccati import check_covariance
 from casest.dynamics.stepping import entries, reach
 from casest.dynamics.transition import (
     Linearised,
+    acting,
     linearised,
     process_along,
-    process_noise,
-    steps_to,
+    variances,
     with_lost,
 )
 from casest.errors import DataError
@@ -32,6 +33,9 @@ from casest.errors import DataError
 #: Rounds of an extended smoother, linearised along its own states; a change of this share of a
 #: standard deviation ends them.
 ROUNDS, SETTLED = 30, 1e-5
+#: Passes of a filter with noisy coefficients; a change of this share of every standard deviation
+#: ends them.
+PASSES, ALIKE = 8, 0.01
 
 
 @dataclass(frozen=True)
@@ -64,16 +68,46 @@ class Filtered:
     @property
     def std(self) -> Array:
         """Standard deviation of every state after each reading, (N, n)."""
-        return np.sqrt(np.diagonal(self.P, axis1=1, axis2=2))
+        return std_of(self.P)
+
+    @property
+    def smoothed_std(self) -> Array:
+        """Standard deviation of every state by the whole record, (N, n)."""
+        return std_of(self.smoothed_P)
+
+    @property
+    def expected_std(self) -> Array:
+        """Standard deviation that the filter expects of its innovations, (N, m)."""
+        return std_of(self.S)
+
+    @property
+    def end(self) -> tuple[Array, Array]:
+        """State (n,) and covariance (n, n) at the end of the record, as all of it says.
+
+        The smoother's, which linearises along the whole record; the filter's, which of a nonlinear
+        model linearised at what it knew at the time, where that did not settle.
+        """
+        if self.settled:
+            return self.smoothed[-1], self.smoothed_P[-1]
+        return self.x[-1], self.P[-1]
 
     @property
     def normalised_innovations(self) -> Array:
         """νᵀS⁻¹ν of every complete reading, (N,): χ² with m degrees of freedom if all is right."""
-        whole = np.isfinite(self.innovations).all(axis=1)
-        found = np.full(len(self.innovations), np.nan)
-        solved = np.linalg.solve(self.S[whole], self.innovations[whole][:, :, None])[:, :, 0]
-        found[whole] = np.sum(self.innovations[whole] * solved, axis=1)
-        return found
+        return normalised(self.innovations, self.S)
+
+
+def std_of(covariances: Array) -> Array:
+    """Standard deviations, (N, n), of covariances (N, n, n)."""
+    return np.asarray(np.sqrt(np.diagonal(covariances, axis1=1, axis2=2)))
+
+
+def normalised(innovations: Array, S: Array) -> Array:
+    """νᵀS⁻¹ν of innovations (N, m), NaN where one is missing in part."""
+    whole = np.isfinite(innovations).all(axis=1)
+    found, own = np.full(len(innovations), np.nan), innovations[whole]
+    found[whole] = np.sum(own * np.linalg.solve(S[whole], own[:, :, None])[:, :, 0], axis=1)
+    return found
 
 
 def filtered(
@@ -91,23 +125,46 @@ def filtered(
     noise of inputs reaches a linear model through its states, it is taken along the estimates of a
     first pass. What is known exactly (`constraint`) is put into every estimate and not fed back.
 
-    Of a linear model: `system`, the model along the record, where it is known already; `spread`
-    False: smoothed states without their covariances (the filter's in their place): half the time.
+    `system`: the model along the record, where it is known already; a nonlinear one is then linear
+    along it, and the filter too is linearised where all readings lead. `spread` False: smoothed
+    states of a linear one without their covariances (the filter's in their place): half the time.
     Raises DataError where time or inputs are not usable, or a covariance is none.
     """
     check_covariance(model.start_covariance, "the covariance at the beginning")
-    if not model.linear:
+    if not model.linear and system is None:
         return _extended(model, run, smooth)
-    return _once(model, run, system or coefficients(model, run), smooth, spread)
+    found = _once(model, run, system or coefficients(model, run), smooth, spread)
+    if smooth and system is None and uncertain(model):
+        later = _once(model, run, in_hindsight(model, run, found), smooth, spread)
+        return replace(found, smoothed=later.smoothed, smoothed_P=later.smoothed_P)
+    return found
 
 
 def coefficients(model: Dynamics, run: Run) -> Linearised:
-    """A linear model along a record; noise that depends on the states, along a first estimate."""
+    """A linear model along a record; noise that depends on the states, along a first estimate.
+
+    Where the noise of inputs acts on the errors of the states too, as large as they are with it.
+    """
     system = linearised(model, run)
     if model.input_noise is None:
         return system
     first = _once(model, run, system, smooth=False)
-    return system.driven(process_along(model, run, first.x))
+    if not uncertain(model):
+        return system.driven(process_along(model, run, first.x))
+    for _ in range(PASSES):
+        system = linearised(model, run, first.x)
+        system = system.driven(system.process + acting(model, run, first.x, first.P))
+        before, first = first, _once(model, run, system, smooth=False)
+        if np.max(np.abs(first.std / before.std - 1)) < ALIKE:
+            break
+    return system
+
+
+def in_hindsight(model: Dynamics, run: Run, found: Filtered) -> Linearised:
+    """A linear model with uncertain coefficients along smoothed states: the noise of inputs acts on
+    these, which early in the record are nearer than what the filter knew."""
+    system = linearised(model, run, found.smoothed)
+    return system.driven(system.process + acting(model, run, found.smoothed, found.P))
 
 
 def _extended(model: Dynamics, run: Run, smooth: bool) -> Filtered:
@@ -122,20 +179,23 @@ def _extended(model: Dynamics, run: Run, smooth: bool) -> Filtered:
     after = known(model, run, x, P)
     if not smooth:
         return Filtered(model, linearised(model, run, x), *after, *before, *after)
-    along, smooth_P, settled = trajectory(model, run, x)
+    along, smooth_P, settled = trajectory(model, run, x, P)
     both = known(model, run, along, smooth_P)
     return Filtered(model, linearised(model, run, along), *after, *before, *both, settled)
 
 
-def trajectory(model: Dynamics, run: Run, along: Array) -> tuple[Array, Array, bool]:
+def trajectory(
+    model: Dynamics, run: Run, along: Array, errors: Array | None = None
+) -> tuple[Array, Array, bool]:
     """The most probable states (N, n), their covariances, and whether they settled.
 
-    Gauss-Newton on all states of the record, from states `along`, by smoothing again and again.
+    Gauss-Newton on all states of the record, from states `along` of a filter with covariances
+    `errors`, by smoothing again and again.
     Where the rounds do not settle, the first one's states.
     """
     first: tuple[Array, Array] | None = None
     for _ in range(ROUNDS):
-        steps = relinearised(model, run, along)
+        steps = relinearised(model, run, along, errors)
         before = along
         along, P = smoothed(steps, kalman(steps, model.start, model.start_covariance))
         first = first or (along, P)
@@ -150,10 +210,11 @@ def trajectory(model: Dynamics, run: Run, along: Array) -> tuple[Array, Array, b
 
 
 def discretised(model: Dynamics, system: Linearised) -> Steps:
-    """The record in discrete time: exact transitions, readings as averages over their period."""
-    Phi, forced = system.moved
-    Q = with_lost(model, system.steps, Phi, process_noise(system, system.process))
-    R = np.diag(model.noise)[None] / steps_to(system)[:, None]
+    """The record in discrete time: exact transitions, and every reading with its variance."""
+    moved = system.sampled
+    Phi, forced = moved.Phi, moved.forced
+    Q = with_lost(model, system.steps, Phi, moved.Q.copy(), system.pace)
+    R = variances(model, system.steps, system.pace)
     t = model.traced
     return Steps(Phi, forced, Q, system.C, system.d, R, system.y, reach(t.A), entries(t.C))
 

@@ -7,20 +7,36 @@ products of transition matrices, and the ODE −Ẇ = AᵀW + WA + CᵀΘ⁻¹C,
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
 
+from casest.data.run import Run
 from casest.declaration.shapes import Array
+from casest.dynamics.between import motions
 from casest.dynamics.declare import Dynamics
-from casest.dynamics.transition import Linearised, counted, half_transitions
+from casest.dynamics.transition import (
+    Linearised,
+    Pace,
+    checked_record,
+    counted,
+    linearised,
+    pace_of,
+    process_noise,
+    usual,
+)
 from casest.leastsquares.null_space import sparsest
 
+#: Below this share of the largest, in standard deviations known beforehand, a part of a direction
+#: is no part of it: what two printed digits do not show.
+RESIDUE = 5e-3
 #: A direction counts as observable from this share of the largest scaled eigenvalue on. Rounding
 #: and the error of a fourth-order step stay below 1e-13.
 NULL = 1e-11
+#: Steps whose product is kept, and samples that are worked on at once.
+CHUNK, PIECE = 256, 4096
 
 
 @dataclass(frozen=True)
@@ -28,54 +44,162 @@ class Observed:
     """Rank of the Gramian among n states, scaled so that units do not count.
 
     `eigenvalues` (n,) of the scaled Gramian, largest first; `unobservable` in words, with their
-    `directions` (n, k) in the states' units; `std` (n,) what the data alone allow at the start of
-    the record (NaN where they do not determine it).
+    `directions` (n, k) in the states' units; `weak` in words: directions of which the data tell
+    less than was known beforehand; `std` (n,) what the data alone allow at the start of the record
+    (NaN where they do not determine it).
     """
 
     rank: int
     unknowns: int
     eigenvalues: Array
     unobservable: tuple[str, ...]
+    weak: tuple[str, ...]
     directions: Array
     std: Array
     gramian: Array
 
 
 def gramian(model: Dynamics, system: Linearised) -> Array:
-    """W of the whole record at its first sample, (n, n), from transition matrices."""
-    Phi, _ = system.moved
-    return _reduced(Phi, _of_steps(model, system, Phi))[1]
+    """W of the whole record at its first sample, (n, n), from transition matrices.
+
+    The noise of inputs, where it is known, is a motion that nobody knows: what it hides of the
+    state at the first sample is not counted. Other driving noise is no matter of the trajectory.
+    """
+    return _reduced(*_of_steps(model, system))[1]
 
 
-def _of_steps(model: Dynamics, system: Linearised, Phi: Array) -> Array:
-    """W of every single step at its own beginning, (N − 1, n, n): Simpson's rule."""
-    weight = np.linalg.inv(model.noise)
-    half = half_transitions(system, (0.0, 0.5))
-    middle = 0.5 * (system.C[1:] + system.C[:-1]) @ half
-    first, last = system.C[:-1], system.C[1:] @ Phi
-    h = counted(system.steps)[:, None, None]
-    if not np.isfinite(system.y).all():  # single readings are no curve: each for its own time
-        return np.asarray(0.5 * h * sum(M.transpose(0, 2, 1) @ weight @ M for M in (first, last)))
-    return np.asarray(
-        h
-        / 6
-        * sum(
-            share * (M.transpose(0, 2, 1) @ weight @ M)
-            for share, M in ((1, first), (4, middle), (1, last))
-        )
-    )
+#: Φ and W of steps, and the covariance of the motion that nobody knows, where there is one.
+Parts = tuple[Array, Array, Array | None]
 
 
-def _reduced(Phi: Array, W: Array) -> tuple[Array, Array]:
-    """Neighbours joined pair by pair: (Φ₂, W₂)∘(Φ₁, W₁) = (Φ₂Φ₁, W₁ + Φ₁ᵀW₂Φ₁)."""
+def _unknown_motion(model: Dynamics, system: Linearised) -> Array | None:
+    """Covariance that the noise of inputs adds in every step, (N − 1, n, n)."""
+    if system.process.ndim == 2:
+        return None
+    return process_noise(system, np.asarray(system.process - model.process, float))
+
+
+def _of_steps(model: Dynamics, system: Linearised) -> Parts:
+    """Φ and W of every single step at its own beginning, (N − 1, n, n) each; and Q.
+
+    W is what driving noise CᵀΘ⁻¹C makes of the motion with Aᵀ that runs back from the step's end,
+    and Φᵀ its transition.
+    """
+    pace, Q = system.pace or pace_of(system.steps), _unknown_motion(model, system)
+    weight = np.linalg.inv(model.noise_at(pace.usual))
+    told = np.asarray(system.C.transpose(0, 2, 1) @ weight @ system.C, float)
+    none, back = np.zeros_like(system.c), system.A.transpose(0, 2, 1)[::-1]
+    if np.isfinite(system.y).all() and not pace.holed:
+        found = motions(back, none, told[::-1], system.steps[::-1])
+        Phi, W = found.Phi[::-1].transpose(0, 2, 1), found.Q[::-1]
+        return Phi, W * (pace.usual / system.steps)[:, None, None], Q
+    # Single readings are no curve: each for its own time.
+    Phi = system.moved[0]
+    return Phi, 0.5 * pace.usual * (told[:-1] + Phi.transpose(0, 2, 1) @ told[1:] @ Phi), Q
+
+
+def _reduced(Phi: Array, W: Array, Q: Array | None = None) -> Parts:
+    """Neighbours joined pair by pair: (Φ₂, W₂)∘(Φ₁, W₁) = (Φ₂Φ₁, W₁ + Φ₁ᵀW₂Φ₁).
+
+    With noise Q of every step W₂ says less: (W₂⁻¹ + Q₁)⁻¹, in a form that needs no inverse of W₂,
+    and Φ and Q are those given the readings in between (Särkkä & García-Fernández 2021).
+    """
     while len(Phi) > 1:
         even = len(Phi) // 2 * 2
         first, second = slice(0, even, 2), slice(1, even, 2)
-        joined = W[first] + Phi[first].transpose(0, 2, 1) @ W[second] @ Phi[first]
-        products = Phi[second] @ Phi[first]
-        W = np.concatenate([joined, W[even:]])
+        later, told = Phi[second], W[second]
+        if Q is not None:
+            both = _over_noise(Q[first], np.concatenate([Phi[first], Q[first]], axis=2), told)
+            n = Phi.shape[1]
+            W1 = W[first] + Phi[first].transpose(0, 2, 1) @ told @ both[:, :, :n]
+            noise = later @ both[:, :, n:] @ later.transpose(0, 2, 1) + Q[second]
+            Q = np.concatenate([_even(noise), Q[even:]])
+            products = later @ both[:, :, :n]
+        else:
+            W1 = W[first] + Phi[first].transpose(0, 2, 1) @ told @ Phi[first]
+            products = later @ Phi[first]
+        W = np.concatenate([_even(W1), W[even:]])
         Phi = np.concatenate([products, Phi[even:]])
-    return Phi[0], 0.5 * (W[0] + W[0].T)
+    return Phi[0], _even(W)[0], None if Q is None else Q[0]
+
+
+def _over_noise(Q: Array, right: Array, W: Array) -> Array:
+    """(1 + QW)⁻¹·right, with states brought to one size: their units differ by powers of ten."""
+    size = np.sqrt(np.maximum(np.diagonal(Q, axis1=1, axis2=2).max(axis=0), 1e-300))
+    scale, n = np.where(size > 1e-150, size, 1.0), Q.shape[1]
+    own, told = Q / np.outer(scale, scale), W * np.outer(scale, scale)
+    return np.asarray(
+        np.linalg.solve(np.eye(n) + own @ told, right / scale[:, None]) * scale[:, None]
+    )
+
+
+def _even(M: Array) -> Array:
+    return np.asarray(0.5 * (M + np.swapaxes(M, -1, -2)))
+
+
+@dataclass(frozen=True)
+class Products:
+    """A model along a record of any length, chunk by chunk: Φ and W of each, (K, n, n); and Q.
+
+    `system`: the model along all of it, where it is known already.
+    """
+
+    model: Dynamics
+    run: Run
+    along: Array | None
+    pace: Pace
+    system: Linearised | None
+    Phi: Array
+    W: Array
+    Q: Array | None
+
+    @staticmethod
+    def of(
+        model: Dynamics, run: Run, along: Array | None = None, system: Linearised | None = None
+    ) -> Products:
+        """`along`: states (N, n) along which a nonlinear model is linearised."""
+        step, n = np.diff(checked_record(model, run)), model.size
+        holed = any(not np.isfinite(run.signals[name]).all() for name in model.measured_signals)
+        none = np.zeros((-(-len(step) // CHUNK), n, n))
+        pace = replace(pace_of(step), holed=holed)
+        Q = none.copy() if system is not None and system.process.ndim == 3 else None
+        found = Products(model, run, along, pace, system, none, none.copy(), Q)
+        for k in range(0, len(step), PIECE):
+            Phi, W, noise = found._steps(k, min(k + PIECE, len(step)))
+            for i in range(0, len(Phi), CHUNK):
+                own = slice(i, i + CHUNK)
+                chunk = _reduced(Phi[own], W[own], None if noise is None else noise[own])
+                found._put((k + i) // CHUNK, *chunk)
+        return found
+
+    def _put(self, k: int, Phi: Array, W: Array, Q: Array | None) -> None:
+        self.Phi[k], self.W[k] = Phi, W
+        if self.Q is not None and Q is not None:
+            self.Q[k] = Q
+
+    def _steps(self, first: int, last: int) -> Parts:
+        where = slice(first, last + 1)
+        if self.system is not None:
+            return _of_steps(self.model, self.system.part(where, self.pace))
+        along = None if self.along is None else self.along[where]
+        system = linearised(self.model, self.run.take(where), along, self.pace)
+        return _of_steps(self.model, system)
+
+    def gramian(self, first: int = 0, last: int | None = None) -> Array:
+        """W (n, n) of the samples from `first` to `last`, at the first; of all unless told."""
+        last = len(self.run) - 1 if last is None else last
+        begin, end = -(-first // CHUNK), last // CHUNK
+        if begin >= end:
+            return _reduced(*self._steps(first, last))[1]
+        inner = None if self.Q is None else self.Q[begin:end]
+        parts: list[Parts] = [(self.Phi[begin:end], self.W[begin:end], inner)]
+        if first < begin * CHUNK:
+            parts.insert(0, self._steps(first, begin * CHUNK))
+        if end * CHUNK < last:
+            parts.append(self._steps(end * CHUNK, last))
+        Phi, W, Q = zip(*parts, strict=True)
+        noise = None if self.Q is None else np.concatenate(Q)
+        return _reduced(np.concatenate(Phi), np.concatenate(W), noise)[1]
 
 
 def gramian_by_ode(model: Dynamics, system: Linearised, tolerance: float = 1e-12) -> Array:
@@ -84,8 +208,8 @@ def gramian_by_ode(model: Dynamics, system: Linearised, tolerance: float = 1e-12
     Signals are straight lines between samples, as in the other form; the integrator stops at every
     sample, so that it never steps over a corner.
     """
-    t, n = model.traced, model.size
-    W, weight = ca.SX.sym("W", n, n), ca.SX(ca.DM(np.linalg.inv(model.noise)))
+    t, n, noise = model.traced, model.size, model.noise_at(usual(system.steps))
+    W, weight = ca.SX.sym("W", n, n), ca.SX(ca.DM(np.linalg.inv(noise)))
     # Time runs backwards from the end; `since` is when the step began, at its later sample.
     s, since, h = (ca.SX.sym(name) for name in ("s", "since", "h"))
     share, ends = (s - since) / h, list[ca.SX]()
@@ -137,9 +261,10 @@ def observed(model: Dynamics, W: Array) -> Observed:
     null = null / np.maximum(np.linalg.norm(null, axis=0), 1e-300)
     kept = vectors[:, :rank] / np.sqrt(np.maximum(values[:rank], 1e-300))
     std = np.sqrt(np.sum(kept**2, axis=1)) / scale
-    touched = np.linalg.norm(vectors[:, rank:], axis=1) > 1e-5
-    words = tuple(_words(model, null))
-    return Observed(rank, model.size, values, words, null, np.where(touched, np.nan, std), W)
+    hidden = np.abs(null / prior[:, None])
+    touched = (hidden > RESIDUE * hidden.max(axis=0, initial=0.0)).any(axis=1)
+    words, weak = tuple(_words(model, null)), tuple(_weak(model, W, rank))
+    return Observed(rank, model.size, values, words, weak, null, np.where(touched, np.nan, std), W)
 
 
 def _words(model: Dynamics, null: Array) -> Sequence[str]:
@@ -148,40 +273,55 @@ def _words(model: Dynamics, null: Array) -> Sequence[str]:
     return [sentence(model, basis[:, k]) for k in range(basis.shape[1])]
 
 
+def _weak(model: Dynamics, W: Array, rank: int) -> Iterator[str]:
+    """Directions that are observable, and told less than was known of them beforehand."""
+    prior = np.sqrt(np.diag(model.start_covariance))
+    values, vectors = np.linalg.eigh(W * np.outer(prior, prior))
+    for k, (value, v) in enumerate(zip(values, vectors.T, strict=True)):
+        if k >= model.size - rank and 0 < value < 1:
+            most = int(np.argmax(np.abs(v)))
+            std, unit = prior[most] * abs(v[most]) / np.sqrt(value), model.state_units[most]
+            yield (
+                f"{_subject(model, v * prior)[0]}: {model.names[most]} is told to {std:.3g} {unit} "
+                f"only; {prior[most]:.3g} was known beforehand"
+            )
+
+
 def sentence(model: Dynamics, direction: Array) -> str:
-    """ "gravity and bias along (0.27, 0.53, 0.80) move together" """
-    largest = np.abs(direction).max()
-    parts: list[tuple[str, Array]] = []
-    for name, where in model.slices().items():
-        own = direction[where]
-        if np.abs(own).max(initial=0.0) > 1e-6 * largest:
-            parts.append((name, own))
-    vectors = [v for _, v in parts if len(v) == 3]
-    if len(parts) > 1 and len(vectors) == len(parts):
-        unit = vectors[0] / np.linalg.norm(vectors[0])
+    """ "gravity and bias along (0.27, 0.53, 0.80) move together: no reading changes" """
+    subject, alone = _subject(model, direction)
+    if " along the body axis " in subject:
+        return f"{subject}: no reading changes"
+    return f"{subject} changes no reading" if alone else f"{subject} together change no reading"
+
+
+def _subject(model: Dynamics, direction: Array) -> tuple[str, bool]:
+    """What moves in a direction, in words; is it a single number?"""
+    prior = np.sqrt(np.diag(model.start_covariance))
+    share = np.abs(direction / prior)
+    direction = np.where(share > RESIDUE * share.max(), direction, 0.0)
+    parts = [(name, direction[where]) for name, where in model.slices().items()
+             if np.any(direction[where])]  # fmt: skip
+    if len(parts) > 1 and all(len(v) == 3 for _, v in parts):
+        unit = parts[0][1] / np.linalg.norm(parts[0][1])
         unit = unit * np.sign(unit[np.argmax(np.abs(unit))])
-        along = [float(v @ unit) for v in vectors]
-        if all(np.linalg.norm(v - a * unit) < 1e-5 * np.linalg.norm(v)
-               for v, a in zip(vectors, along, strict=True)):  # fmt: skip
+        along = [float(v @ unit) for _, v in parts]
+        if all(np.linalg.norm(v - a * unit) < RESIDUE * np.linalg.norm(v)
+               for (_, v), a in zip(parts, along, strict=True)):  # fmt: skip
             axis = ", ".join(f"{u if abs(u) >= 5e-3 else 0.0:.2f}" for u in unit)
             names = " and ".join(name for name, _ in parts)
-            same = all(abs(a - along[0]) < 1e-4 * abs(along[0]) for a in along)
+            same = all(abs(a - along[0]) < RESIDUE * abs(along[0]) for a in along)
             how = "move together" if same else "move in proportion"
-            return f"{names} along the body axis ({axis}) {how}: no reading changes"
-    words: list[str] = []
-    label = ""
-    for name, own in parts:
-        for i, value in enumerate(own):
-            if abs(value) > 1e-6 * largest:
-                label = name if len(own) == 1 else f"{name}[{i}]"
-                words.append(f"{label} {value / largest:+.3g}")
-    if len(words) == 1:
-        return f"{label} changes no reading"
-    return f"{', '.join(words)} together change no reading"
+            return f"{names} along the body axis ({axis}) {how}", False
+    largest = np.abs(direction).max()
+    moved = [(model.names[i], value / largest) for i, value in enumerate(direction) if value]
+    if len(moved) == 1:
+        return moved[0][0], True
+    return ", ".join(f"{label} {value:+.3g}" for label, value in moved), False
 
 
 def smallest_eigenvalue(
-    model: Dynamics, system: Linearised, window: float, count: int = 60
+    model: Dynamics, run: Run, window: float, count: int = 60
 ) -> tuple[Array, Array]:
     """Smallest eigenvalue of the Gramian over windows of that length (s) along the record.
 
@@ -189,18 +329,14 @@ def smallest_eigenvalue(
     deviations, so that they are squared signal over noise: above 1 a window alone teaches more
     than was known.
     """
-    ends, values = window_eigenvalues(model, system, window, count)
+    ends, values = window_eigenvalues(Products.of(model, run), window, count)
     return ends, values[:, 0]
 
 
-def window_eigenvalues(
-    model: Dynamics, system: Linearised, window: float, count: int = 60
-) -> tuple[Array, Array]:
+def window_eigenvalues(products: Products, window: float, count: int = 60) -> tuple[Array, Array]:
     """All of them, ascending: the windows' ends (K,) and eigenvalues (K, n), scaled alike."""
-    Phi, _ = system.moved
-    W = _of_steps(model, system, Phi)
-    prior = np.sqrt(np.diag(model.start_covariance))
-    time = system.time
+    prior = np.sqrt(np.diag(products.model.start_covariance))
+    time = np.asarray(products.run.time, float)
     ends = (
         np.linspace(time[0] + window, time[-1], count)
         if time[-1] - time[0] > window
@@ -210,6 +346,5 @@ def window_eigenvalues(
     for end in ends:
         first = min(int(np.searchsorted(time, end - window - 1e-12)), len(time) - 2)
         last = max(int(np.searchsorted(time, end + 1e-12)) - 1, first + 1)
-        own = _reduced(Phi[first:last], W[first:last])[1]
-        found.append(np.linalg.eigvalsh(own * np.outer(prior, prior)))
+        found.append(np.linalg.eigvalsh(products.gramian(first, last) * np.outer(prior, prior)))
     return np.asarray(ends, float), np.array(found)

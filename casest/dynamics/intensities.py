@@ -18,6 +18,7 @@ from casest.declaration.tracing import flat
 from casest.dynamics import Dynamics, filtered
 from casest.dynamics.allan import Allan, allan
 from casest.dynamics.likelihood import STEP, applied, matched, prepared, reached, whitened
+from casest.dynamics.transition import usual
 from casest.errors import DataError, UsageError
 
 #: Rounds of maximum likelihood: the states along which noise acts move a little with it.
@@ -55,11 +56,16 @@ def from_stated(model: Dynamics, run: Run, stds: Mapping[str, float]) -> Tuned:
     return Tuned(_driven_by(model, said), "from the sensors' stated noise")
 
 
+def with_stated(model: Dynamics, run: Run, stds: Mapping[str, float]) -> Dynamics:
+    """The model with those noises of its sensors, or as it is where none is stated."""
+    return from_stated(model, run, stds).model if stds else model
+
+
 def period(run: Run) -> float:
-    """Median time between two samples, s."""
+    """Time between two samples, s: the mean of the steps that are no gaps."""
     if run.time is None or len(run) < 2:
         raise DataError(f"{run.file or run.name}: no rate: it needs a time column, or --rate")
-    return float(np.median(np.diff(run.time)))
+    return usual(np.diff(run.time))
 
 
 def from_rest(model: Dynamics, rest: Run) -> tuple[Tuned, dict[str, Allan]]:
@@ -85,7 +91,7 @@ def most_likely(model: Dynamics, run: Run) -> Tuned:
     start = None
     for _ in range(ROUNDS):
         ready = prepared(model, run, filtered(model, run).smoothed)
-        start, _ = matched(ready, run, start)
+        start, _ = matched(ready, run, start, exactly=True)
         model = applied(model, start)
     assert start is not None
     names, logs = ready.names, np.log([start[n] for n in ready.names])
@@ -118,11 +124,10 @@ def told(found: Mapping[str, Allan]) -> dict[str, Any]:
     }
 
 
-def intensities(model: Dynamics) -> dict[str, float]:
-    """Of every state (unit²/s) and signal (unit²·s) that has one."""
+def intensities(model: Dynamics, period: float | None = None) -> dict[str, float]:
+    """Of every state (unit²/s) and signal (unit²·s) that has one, read every `period` s."""
     found = {s.name: s.intensity for s in model.states if s.intensity}
-    outputs = zip(model.traced.measured, model.traced.outputs, strict=True)
-    found |= {name: o.intensity for name, o in outputs}
+    found |= {name: model.intensity_of(name, period) for name in model.measured_signals}
     return found | dict(model.sensors)
 
 

@@ -19,15 +19,18 @@ from numpy.typing import NDArray
 from casest.data.run import Run
 from casest.declaration.shapes import Array
 from casest.declaration.tracing import flat
+from casest.dynamics import factors
 from casest.dynamics.declare import Dynamics
-from casest.dynamics.stepping import Pattern, entries, packed, reach, symmetric, taken
+from casest.dynamics.inputs import unstated
+from casest.dynamics.stepping import Pattern, entries, reach
 from casest.dynamics.transition import (
     Linearised,
+    checked_time,
     linearised,
     lost,
     process_along,
     process_noise,
-    steps_to,
+    usual,
 )
 from casest.engine import Recursion
 
@@ -39,6 +42,8 @@ _FOURTH = 70.0
 RANGE = 14.0
 #: Scoring: rounds, difference and largest step of a logarithm, gain in log-likelihood that ends it.
 ROUNDS, STEP, LARGEST, ENOUGH = 30, 1e-3, 5.0, 0.1
+#: The gain that ends it where the maximum itself is asked for, and rounds until then.
+NOTHING, MANY = 1e-9, 200
 
 
 @dataclass(frozen=True)
@@ -82,7 +87,9 @@ def prepared(model: Dynamics, run: Run, along: Array) -> Prepared:
     """Along states (N, n), where the model or its noise depends on them."""
     inputs, own = reached(model)
     silent = model.driven(**{s.name: 0.0 for s in model.states})
-    system = linearised(model, run, along)
+    step = usual(np.diff(checked_time(run)))
+    shown = {name: std**2 * step for name, std in unstated(model, run).items()}
+    system = linearised(model.sensing(**shown), run, along)
     Phi, forced = system.moved
     present = np.isfinite(system.y)
     t, count = model.traced, len(present)
@@ -97,7 +104,7 @@ def prepared(model: Dynamics, run: Run, along: Array) -> Prepared:
     parts.append(_after(lost(model, system.steps), count))
     parts.append(_picked(np.where(present[:, :, None], system.C, 0.0), entries(t.C)))
     parts.append(np.where(present, system.y - system.d, 0.0))
-    period = steps_to(system)
+    period = np.full(count, usual(system.steps))
     readings, place = {}, 0
     for name, o in zip(t.measured, t.outputs, strict=True):
         readings[name] = slice(place, place + o.predicted.numel())
@@ -137,7 +144,9 @@ def whitened(ready: Prepared, intensities: Mapping[str, float]) -> tuple[Array, 
     patterns = reach(t.A), tuple(ready.units.values()), entries(t.C)
     step = _likelihood_step(ready.model.size, rows, *patterns)
     given = np.array([intensities[name] for name in ready.names])
-    state = np.concatenate([ready.model.start, ready.model.start_covariance.T.ravel(), given])
+    n = ready.model.size
+    first = [ready.model.start, np.diag(ready.model.start_covariance), np.zeros(n * (n - 1) // 2)]
+    state = np.concatenate([*first, given])
     _, e, s = step(state, ready.numbers, keep=False)
     return e, s
 
@@ -152,9 +161,13 @@ def _log_density(ready: Prepared, e: Array, s: Array) -> float:
 
 
 def matched(
-    ready: Prepared, run: Run, start: Mapping[str, float] | None = None
+    ready: Prepared, run: Run, start: Mapping[str, float] | None = None, *, exactly: bool = False
 ) -> tuple[dict[str, float], float]:
-    """The most likely intensities, and their log-likelihood: Fisher scoring of their logarithms."""
+    """The most likely intensities, and their log-likelihood: Fisher scoring of their logarithms.
+
+    Within a tenth of the maximum, which for a comparison is enough; `exactly`: the maximum.
+    """
+    enough, rounds = (NOTHING, MANY) if exactly else (ENOUGH, ROUNDS)
     names, guess = ready.names, first_guess(ready, run)
     middle = np.log([guess[name] for name in names])
     starts = [middle] + ([np.log([{**guess, **start}[n] for n in names])] if start else [])
@@ -165,22 +178,25 @@ def matched(
 
     logs, found = max(((x, at(x)) for x in starts), key=lambda pair: pair[1][2])
     damping = 1e-3
-    for _ in range(ROUNDS):
+    for _ in range(rounds):
         moved = [at(logs + STEP * unit) for unit in np.eye(len(names))]
         gradient, information = _scoring(ready.present, found, moved)
+        if exactly:
+            back = [at(logs - STEP * unit)[2] for unit in np.eye(len(names))]
+            gradient = (np.array([m[2] for m in moved]) - back) / (2 * STEP)
         while damping < 1e9:
             curved = information + damping * np.diag(np.diag(information) + 1.0)
             step = np.clip(np.linalg.solve(curved, gradient), -LARGEST, LARGEST)
             tried = np.clip(logs + step, middle - RANGE, middle + RANGE)
             promised = gradient @ (tried - logs)
-            better = at(tried) if promised > ENOUGH else found
-            if better[2] > found[2] or promised <= ENOUGH:
+            better = at(tried) if promised > enough else found
+            if better[2] > found[2] or promised <= enough:
                 break
             damping = max(10 * damping, 0.1)
         gained, damping = better[2] - found[2], damping / 10
         if gained > 0:
             logs, found = tried, better
-        if gained < ENOUGH:
+        if gained < enough:
             break
     return dict(zip(names, np.exp(logs).tolist(), strict=True)), found[2]
 
@@ -200,12 +216,14 @@ def _scoring(
 
 
 def first_guess(ready: Prepared, run: Run) -> dict[str, float]:
-    """Of a signal: its fourth differences, where little but noise is left. Of a state: little, or
-    what was taken from these data before."""
+    """Of a signal: what was stated of its noise, else its fourth differences, where little but
+    noise is left. Of a state: little, or what was taken from these data before."""
     model, guess = ready.model, {}
     duration = float(np.sum(ready.period))
     for name in ready.names:
-        if name in run.signals:
+        if name in model.sensors:
+            guess[name] = model.sensors[name]
+        elif name in run.signals:
             values = run.signals[name]
             fourth = np.diff(values[np.isfinite(values).all(axis=1)], 4, axis=0)
             variance = float(np.median(fourth**2)) / 0.4549 / _FOURTH if len(fourth) else 0.0
@@ -232,29 +250,32 @@ def _likelihood_step(
     units: tuple[Pattern, ...],
     of_C: Pattern,
 ) -> Recursion:
-    """(x, P and intensities; numbers of one sample) -> (the same later; innovations; variances)."""
+    """(x, factors of P, intensities; numbers of one sample) -> (the same later; innovations;
+    variances)."""
     m = rows[-1][1]
-    x, P, q = ca.SX.sym("x", n), ca.SX.sym("P", n, n), ca.SX.sym("q", len(units) + len(rows))
+    both, q = ca.SX.sym("both", factors.size(n)), ca.SX.sym("q", len(units) + len(rows))
+    x, P = factors.unpacked(both, n)
     moved, Phi = _sparse("Phi", (n, n), of_Phi)
     u, y, period = ca.SX.sym("u", n), ca.SX.sym("y", m), ca.SX.sym("period")
     own = [_sparse(f"Q{k}", (n, n), pattern) for k, pattern in enumerate(units)]
     seen, C = _sparse("C", (m, n), of_C)
     gap = ca.SX.sym("gap", n)
-    Q = ca.diag(gap)
+    Q = ca.diag(gap) + Phi @ ca.diag(gap) @ Phi.T
     for k, (_, unit) in enumerate(own):
         Q += q[k] * unit
     R = ca.vertcat(*[ca.repmat(q[len(units) + k] / period, last - first)
                      for k, (first, last) in enumerate(rows)])  # fmt: skip
-    later_x, later_P = Phi @ x + u, symmetric(ca.triu(Phi @ (P + ca.diag(gap)) @ Phi.T) + Q)
+    later_x, later = Phi @ x + u, factors.moved(P, Phi, factors.factored(Q))
     e, s = [], []
     for i in range(m):
         c = C[i, :].T
         e.append(y[i] - ca.dot(c, later_x))
-        s.append(ca.dot(c, later_P @ c) + R[i])
-        later_x, later_P = taken(later_x, later_P, c, e[-1], s[-1])
+        later, gain, expected = factors.read_with(later, c, R[i])
+        s.append(expected)
+        later_x = later_x + gain * e[-1]
     numbers = ca.vertcat(moved, u, *[k for k, _ in own], gap, seen, y, period)
-    outputs = [ca.vertcat(packed(later_x, later_P), q), ca.vertcat(*e), ca.vertcat(*s)]
-    state = ca.vertcat(packed(x, P), q)
+    outputs = [ca.vertcat(factors.packed(later_x, later), q), ca.vertcat(*e), ca.vertcat(*s)]
+    state = ca.vertcat(both, q)
     return Recursion(ca.Function("step", [state, numbers], outputs, {"cse": True}))
 
 

@@ -17,7 +17,15 @@ from casest.declaration.shapes import Array
 from casest.dynamics.declare import Dynamics
 from casest.dynamics.discrete import Steps
 from casest.dynamics.extended import extended, relinearised
-from casest.dynamics.filter import ROUNDS, SETTLED, coefficients, discretised
+from casest.dynamics.filter import (
+    ROUNDS,
+    SETTLED,
+    coefficients,
+    discretised,
+    filtered,
+    in_hindsight,
+)
+from casest.dynamics.inputs import uncertain
 from casest.dynamics.riccati import check_covariance
 
 
@@ -38,10 +46,13 @@ def least_squares(model: Dynamics, run: Run) -> Record:
     """
     check_covariance(model.start_covariance, "the covariance at the beginning")
     if model.linear:
-        return _solved(model, discretised(model, coefficients(model, run)))
-    x = extended(model, run)[0]
+        system = coefficients(model, run)
+        if uncertain(model):
+            system = in_hindsight(model, run, filtered(model, run, system=system))
+        return _solved(model, discretised(model, system))
+    x, P = extended(model, run)[:2]
     for _ in range(ROUNDS):
-        found = _solved(model, relinearised(model, run, x))
+        found = _solved(model, relinearised(model, run, x, P))
         change = np.abs(found.x - x) / np.sqrt(np.diag(found.P_end))
         x = found.x
         if np.max(change) < SETTLED:

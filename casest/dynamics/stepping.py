@@ -13,15 +13,10 @@ import casadi as ca
 import numpy as np
 
 from casest.declaration.shapes import Array
+from casest.dynamics import factors
 from casest.engine import Recursion
 
 Pattern = tuple[tuple[int, int], ...]
-
-
-def symmetric(matrix: Any) -> Any:
-    """The matrix of its upper half: half the operations, and no drift."""
-    upper = ca.triu(matrix)
-    return ca.densify(upper + ca.triu(matrix, False).T)
 
 
 def reach(A: Any) -> Pattern:
@@ -49,35 +44,66 @@ def _matrix(name: str, shape: tuple[int, int], pattern: Pattern) -> tuple[Any, A
     return full, used
 
 
-def taken(x: Any, P: Any, c: Any, innovation: Any, s: Any) -> tuple[Any, Any]:
-    """State and covariance after one scalar reading with gradient c and variance s."""
-    PC = P @ c
-    # One component at a time this form is as safe as Joseph's: s is a sum of positive terms.
-    return x + PC * (innovation / s), symmetric(P - PC @ (PC / s).T)
-
-
 @lru_cache(maxsize=16)
 def kalman_step(n: int, m: int, of_Phi: Pattern, of_C: Pattern) -> Recursion:
-    """(state, numbers of one sample) -> (state, also before the reading).
+    """(state, numbers of one sample) -> (state; x and P after the reading; and before it).
 
-    state: x and P column by column; numbers: Φ, forced step, Q, C, diagonal of R, y. Readings are
+    state: x with the factors of P; numbers: Φ, forced step, Q, C, diagonal of R, y. Readings are
     taken one component after the other, which needs no inverse (their noise is independent).
     """
-    x, P = ca.SX.sym("x", n), ca.SX.sym("P", n, n)
+    both = ca.SX.sym("both", factors.size(n))
+    x, (U, D) = factors.unpacked(both, n)
     full, Phi = _matrix("Phi", (n, n), of_Phi)
     whole, C = _matrix("C", (m, n), of_C)
     u, Q = ca.SX.sym("u", n), ca.SX.sym("Q", n, n)
     R, y = ca.SX.sym("R", m), ca.SX.sym("y", m)
-    before_x = Phi @ x + u
-    before_P = symmetric(Phi @ P @ Phi.T + Q)
-    after_x, after_P = before_x, before_P
+    before_x, before = Phi @ x + u, factors.moved((U, D), Phi, factors.factored(Q))
+    after_x, after = before_x, before
     for i in range(m):
         c = C[i, :].T
-        s = ca.dot(c, after_P @ c) + R[i]
-        after_x, after_P = taken(after_x, after_P, c, y[i] - ca.dot(c, after_x), s)
+        innovation = y[i] - ca.dot(c, after_x)
+        after, gain = factors.read(after, c, R[i])
+        after_x = after_x + gain * innovation
     numbers = ca.vertcat(*[ca.vec(e) for e in (full, u, Q, whole, R, y)])
-    outputs = [packed(after_x, after_P), packed(before_x, before_P)]
-    return Recursion(ca.Function("step", [packed(x, P), numbers], outputs, {"cse": True}))
+    outputs = [
+        factors.packed(after_x, after),
+        packed(after_x, factors.multiplied(after)),
+        packed(before_x, factors.multiplied(before)),
+    ]
+    return Recursion(ca.Function("step", [both, numbers], outputs, {"cse": True}))
+
+
+@lru_cache(maxsize=16)
+def smoother_step(n: int, m: int, of_Phi: Pattern, of_C: Pattern) -> Recursion:
+    """(what is read after a sample; numbers) -> (what is read after the sample before it; x and P).
+
+    What later readings say of a sample are n readings of it, with gradients B, weights and values,
+    which the filter's state there takes like its own (two filters: Mayne 1966; Fraser & Potter
+    1969). A step back is the filter's with Φᵀ, readings and noise having changed their parts; the
+    values go along as one more row. numbers: Φ, forced step and Q of the step; C, R and y of the
+    sample after it; x and the factors of P of the filter before it.
+    """
+    later, own = ca.SX.sym("later", n * n + 2 * n), ca.SX.sym("own", factors.size(n))
+    B, weight, value = ca.reshape(later[: n * n], n, n), later[-2 * n : -n], later[-n:]
+    full, Phi = _matrix("Phi", (n, n), of_Phi)
+    whole, C = _matrix("C", (m, n), of_C)
+    u, Q = ca.SX.sym("u", n), ca.SX.sym("Q", n, n)
+    R, y = ca.SX.sym("R", m), ca.SX.sym("y", m)
+    rows = ca.vertcat(ca.horzcat(value.T, y.T), ca.horzcat(B, C.T))
+    told = factors.orthogonal(rows, ca.vertcat(weight, 1 / R))
+    Uq, Dq = factors.factored(Q)
+    for j in range(n):
+        told, _ = factors.read(told, ca.vertcat(0, Uq[:, j]), 1, Dq[j])
+    U, weight = told[0][1:, 1:], told[1][1:]
+    B, value = Phi.T @ U, told[0][0, 1:].T - U.T @ u
+    x, found = factors.unpacked(own, n)
+    for j in range(n):
+        found, gain = factors.read(found, B[:, j], 1, weight[j])
+        x = x + gain * (value[j] - ca.dot(B[:, j], x))
+    numbers = ca.vertcat(*[ca.vec(e) for e in (full, u, Q, whole, R, y, own)])
+    back = ca.vertcat(*[ca.vec(ca.densify(e)) for e in (B, weight, value)])
+    outputs = [back, packed(x, factors.multiplied(found))]
+    return Recursion(ca.Function("step", [later, numbers], outputs, {"cse": True}))
 
 
 def packed(x: Any, P: Any) -> Any:
@@ -85,11 +111,14 @@ def packed(x: Any, P: Any) -> Any:
     return ca.vertcat(ca.densify(x), ca.vec(ca.densify(P)))
 
 
-def run_steps(steps: Recursion, state: Array, parts: Sequence[Array]) -> list[Array]:
+def run_steps(
+    steps: Recursion, state: Array, parts: Sequence[Array], *, keep: bool = True
+) -> list[Array]:
     """Every output of the steps, (N, …) each.
 
     `state`: what the first step begins from; `parts`: arrays (N, …) of what each step is given,
     matrices included, in the order of its numbers; (N − 1, …) where the first is given zeros.
+    Without `keep` of the first output nothing of use.
     """
     N = max(map(len, parts))
     numbers = np.empty((N, sum(p[0].size for p in parts)))
@@ -101,7 +130,7 @@ def run_steps(steps: Recursion, state: Array, parts: Sequence[Array]) -> list[Ar
             own, p = own.reshape(N, *p.shape[:0:-1]), p.transpose(0, 2, 1)
         own[N - len(p) :] = p
         own[: N - len(p)] = 0.0
-    return steps(state, numbers)
+    return steps(state, numbers, keep=keep)
 
 
 def unpacked(both: Array, n: int) -> tuple[Array, Array]:

@@ -1,26 +1,28 @@
-"""From samples of the signals to transition matrices: fourth-order Magnus steps.
+"""From samples of the signals to transition matrices and process noise.
 
-Between two samples every signal is a straight line, so that A(t) is one too for the models at hand;
-Ω = h·(A₀ + A₁)/2 + h²/12·[A₁, A₀] is then right to fourth order (Magnus 1954; Blanes et al. 2009),
-where holding A is right to second order only. A known input is one more, constant state.
+Between two samples every signal is a straight line, so that A(t) is one too for the models at hand.
+Where only a part of a step or another equation's is asked for: fourth-order Magnus steps with
+Ω = h·(A₀ + A₁)/2 + h²/12·[A₁, A₀] (Magnus 1954; Blanes et al. 2009).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from math import factorial
+from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from casest.data.run import Run
-from casest.data.timing import GAP, UNUSED
+from casest.data.timing import UNUSED, longest
 from casest.declaration.shapes import Array
 from casest.declaration.tracing import flat
+from casest.dynamics.between import Motions, motions
 from casest.dynamics.declare import Dynamics
+from casest.dynamics.inputs import at_estimates, estimates, on_errors
 from casest.dynamics.stepping import reach
 from casest.engine import Columns, Replay
 from casest.errors import DataError
@@ -40,7 +42,8 @@ class Linearised:
 
     time (N,); A (N, n, n), c (N, n), C (N, m, n), d (N, m); y (N, m) with NaN where it is missing
     and no row in C;
-    process noise intensity Ξ (n, n), or (N, n, n) where inputs have noise of their own.
+    process noise intensity Ξ (n, n), or (N, n, n) where inputs have noise of their own;
+    `pace` of the whole record where this is a part of it.
     """
 
     time: Array
@@ -50,6 +53,7 @@ class Linearised:
     d: Array
     y: Array
     process: Array
+    pace: Pace | None = None
 
     @property
     def steps(self) -> Array:
@@ -62,9 +66,24 @@ class Linearised:
         return transitions(self)
 
     @cached_property
+    def sampled(self) -> Motions:
+        """Φ, forced step and covariance of the noise of every step."""
+        found = stepped(self, self.process)
+        self.__dict__.setdefault("moved", (found.Phi, found.forced))
+        return found
+
+    @cached_property
     def later_half(self) -> Array:
         """Φ over the second half of every step, (N − 1, n, n)."""
         return half_transitions(self, (0.5, 1.0))
+
+    def part(self, where: slice, pace: Pace) -> Linearised:
+        """Some samples of it, which are read at the pace of the whole."""
+        process = self.process[where] if self.process.ndim == 3 else self.process
+        time, A, c, C, d, y = (
+            x[where] for x in (self.time, self.A, self.c, self.C, self.d, self.y)
+        )
+        return Linearised(time, A, c, C, d, y, process, pace)
 
     def driven(self, process: Array) -> Linearised:
         """The same motion with other process noise; what is known of its steps is kept."""
@@ -108,43 +127,73 @@ def checked_record(model: Dynamics, run: Run) -> Array:
     return time
 
 
-def linearised(model: Dynamics, run: Run, along: Array | None = None) -> Linearised:
+def linearised(
+    model: Dynamics,
+    run: Run,
+    along: Array | None = None,
+    pace: Pace | None = None,
+    calm: Mapping[str, Array] | None = None,
+) -> Linearised:
     """The model along a record; a nonlinear one along states `along` (N, n).
 
-    Signals that only outputs use may be missing (NaN); inputs may not.
+    Signals that only outputs use may be missing (NaN); inputs may not. Of inputs with noise A and C
+    are taken at the estimate (`inputs`), also of a linear model then along states; `calm`: these
+    estimates (N, k) by name, where they are known already.
     """
-    time, t = checked_record(model, run), model.traced
+    time = checked_record(model, run)
     if along is None:
         along = np.broadcast_to(model.start, (len(time), model.size))
-    sample = ca.vertcat(t.x, *[flat(t.symbols[s.name]) for s in model.signals])
-    c, d = t.f - t.A @ t.x, t.h - t.C @ t.x
-    added = model.input_noise
-    expressions = [t.A, c, t.C, d, t.reading] + ([] if added is None else [added])
-    outputs = [ca.densify(e) for e in expressions]
-    none = ca.SX.sym("none", 0)
-    function = ca.Function(
-        "along", [none, sample], outputs, ["parameters", "sample"], list("AcCdyQ")[: len(outputs)]
-    )
-    columns = Columns([np.ascontiguousarray(along), *(run.signals[s.name] for s in model.signals)])
-    A, c_, C, d_, y, *more = Replay(function)(np.zeros(0), columns)
-    process = model.process + more[0] if more else model.process
-    readings = y[:, :, 0]
+    calm = estimates(model, run) if calm is None else calm
+    signals = [*(run.signals[s.name] for s in model.signals), *calm.values()]
+    columns = Columns([np.ascontiguousarray(along), *signals])
+    A, c_, C, d_, y, *more = _along(model)(np.zeros(0), columns)
+    process = model.process + _stood_for(time, pace) * more[0] if more else model.process
+    readings = model.traced.nearest(y[:, :, 0], C, d_[:, :, 0], along)
     if not np.isfinite(readings).all():
         C = np.where(np.isfinite(readings)[:, :, None], C, 0.0)
-    return Linearised(time, A, c_[:, :, 0], C, d_[:, :, 0], readings, process)
+    return Linearised(time, A, c_[:, :, 0], C, d_[:, :, 0], readings, process, pace)
 
 
-def process_along(model: Dynamics, run: Run, along: Array) -> Array:
-    """Process noise Ξ alone, (n, n), or along states (N, n) where inputs have noise: (N, n, n)."""
-    added = model.input_noise
-    if added is None:
-        return model.process
+@lru_cache(maxsize=8)
+def _along(model: Dynamics) -> Replay:
+    """A, c, C, d and readings at a sample; what noise of inputs adds to Ξ, where they have any."""
+    t, added = model.traced, model.input_noise
+    (A, C), as_was = at_estimates(model, [t.A, t.C])
+    c, d = t.f - A @ t.x, t.h - C @ t.x
+    expressions = [A, c, C, d, t.reading] + ([] if added is None else [added])
+    return _replay(model, expressions, as_was)
+
+
+@lru_cache(maxsize=8)
+def _noise_along(model: Dynamics) -> Replay:
+    return _replay(model, [model.input_noise])
+
+
+def _replay(model: Dynamics, expressions: list[Any], as_was: Sequence[Any] = ()) -> Replay:
     t = model.traced
-    sample = ca.vertcat(t.x, *[flat(t.symbols[s.name]) for s in model.signals])
-    function = ca.Function("noise", [ca.SX.sym("none", 0), sample], [ca.densify(added)],
-                           ["parameters", "sample"], ["Q"])  # fmt: skip
+    sample = ca.vertcat(t.x, *[flat(t.symbols[s.name]) for s in model.signals], *as_was)
+    outputs = [ca.densify(e) for e in expressions]
+    names = ["parameters", "sample"], [f"o{k}" for k in range(len(outputs))]
+    return Replay(ca.Function("along", [ca.SX.sym("none", 0), sample], outputs, *names))
+
+
+def process_along(model: Dynamics, run: Run, along: Array, pace: Pace | None = None) -> Array:
+    """Process noise Ξ alone, (n, n), or along states (N, n) where inputs have noise: (N, n, n)."""
+    if model.input_noise is None:
+        return model.process
     columns = Columns([np.ascontiguousarray(along), *(run.signals[s.name] for s in model.signals)])
-    return np.asarray(model.process + Replay(function)(np.zeros(0), columns)[0])
+    noise = _noise_along(model)(np.zeros(0), columns)[0]
+    return np.asarray(model.process + _stood_for(checked_time(run), pace) * noise)
+
+
+def acting(model: Dynamics, run: Run, along: Array, P: Array) -> Array:
+    """What noise of uncertain inputs adds to Ξ by acting on errors of states with covariances P
+    (N, n, n), as long as each reading of them is held."""
+    return _stood_for(checked_time(run), None) * on_errors(model, run, along, P)
+
+
+def _stood_for(time: Array, pace: Pace | None) -> Array:
+    return shares(np.diff(time), pace)[:, None, None]
 
 
 def _refuse_missing_inputs(model: Dynamics, run: Run) -> None:
@@ -159,54 +208,49 @@ def _refuse_missing_inputs(model: Dynamics, run: Run) -> None:
             )
 
 
-def transitions(system: Linearised, part: tuple[float, float] = (0.0, 1.0)) -> tuple[Array, Array]:
-    """Φ (N − 1, n, n) and forced step u (N − 1, n): x(t₁) = Φ x(t₀) + u.
+def transitions(system: Linearised) -> tuple[Array, Array]:
+    """Φ (N − 1, n, n) and forced step u (N − 1, n): x(t₁) = Φ x(t₀) + u."""
+    found = stepped(system, np.zeros_like(system.A[0]))
+    return found.Phi, found.forced
 
-    `part`: from which share of every step to which (for rules that need the middle).
+
+def stepped(system: Linearised, intensity: Array) -> Motions:
+    """Every step between two samples; Ξ constant (n, n), or at every sample (N, n, n).
+
+    Raises DataError where a step leads beyond what numbers hold.
     """
-    n = system.A.shape[1]
-    both = magnus_steps(lambda where: _augmented(system.A[where], system.c[where]), system, part)
-    return both[:, :n, :n], both[:, :n, n]
+    found = motions(system.A, system.c, intensity, system.steps)
+    whole = np.isfinite(found.forced).all(axis=1) & np.isfinite(found.Q).all(axis=(1, 2))
+    bad = np.flatnonzero(~(whole & np.isfinite(found.Phi).all(axis=(1, 2))))
+    if bad.size:
+        k = int(bad[0])
+        raise DataError(
+            f"from t = {system.time[k]:.9g} s to {system.time[k + 1]:.9g} s the motion grows "
+            f"beyond what numbers hold: its fastest rate is {np.abs(system.A[k]).max():.3g}/s; "
+            "sample faster, or leave the fast state out"
+        )
+    return found
 
 
 def half_transitions(system: Linearised, part: tuple[float, float]) -> Array:
     """Φ alone over a part of every step, for rules that need the middle."""
-    return magnus_steps(lambda where: system.A[where], system, part)
+    found = np.empty((len(system.time) - 1, *system.A.shape[1:]))
+    for k in range(0, len(found), _BLOCK):
+        where = slice(k, k + _BLOCK)
+        M = system.A[k : k + _BLOCK + 1]
+        found[where] = exponential(magnus(M, system.steps[where], part))
+    return found
 
 
-def magnus_steps(
-    coefficients: Callable[[slice], Array],
-    system: Linearised,
-    part: tuple[float, float] = (0.0, 1.0),
-) -> Array:
-    """Transition of ż = M(t) z over (a part of) every step, by fourth-order Magnus steps.
-
-    `coefficients(where)` gives M at those samples; between samples it is a straight line.
-    """
-    return np.concatenate(list(magnus_blocks(coefficients, system, part)))
-
-
-def magnus_blocks(
-    coefficients: Callable[[slice], Array],
-    system: Linearised,
-    part: tuple[float, float] = (0.0, 1.0),
-) -> Iterator[Array]:
-    """The same, some steps at a time: they stay in the processor's cache."""
-    steps, (begin, end) = system.steps, part
-    for k in range(0, len(steps), _BLOCK):
-        M = coefficients(slice(k, k + _BLOCK + 1))
-        slope = M[1:] - M[:-1]
-        first, last = (M[:-1] + share * slope if share else M[:-1] for share in part)
-        h = (end - begin) * steps[k : k + _BLOCK, None, None]
-        bend = last @ first - first @ last
-        yield exponential(0.5 * h * (first + last) + h**2 / 12 * bend)
-
-
-def _augmented(A: Array, c: Array) -> Array:
-    count, n = c.shape
-    both = np.zeros((count, n + 1, n + 1))
-    both[:, :n, :n], both[:, :n, n] = A, c
-    return both
+def magnus(M: Array, steps: Array, part: tuple[float, float] = (0.0, 1.0)) -> Array:
+    """Ω of ż = M(t) z over (a part of) every step, M (K + 1, n, n) being straight lines between
+    samples: exp Ω is the transition, to fourth order."""
+    begin, end = part
+    slope = M[1:] - M[:-1]
+    first, last = (M[:-1] + share * slope if share else M[:-1] for share in part)
+    h = (end - begin) * steps[:, None, None]
+    bend = last @ first - first @ last
+    return np.asarray(0.5 * h * (first + last) + h**2 / 12 * bend)
 
 
 def exponential(matrices: Array) -> Array:
@@ -236,27 +280,11 @@ def exponential(matrices: Array) -> Array:
 
 
 def process_noise(system: Linearised, intensity: Array) -> Array:
-    """∫Φ(t₁, s)ΞΦ(t₁, s)ᵀ ds of every step, (N − 1, n, n): Simpson's rule.
-
-    Ξ constant and diagonal (n, n), or any at every sample (N, n, n).
-    """
-    h = system.steps[:, None, None]
-    Phi, middle = system.moved[0], system.later_half
-    if intensity.ndim == 3:
-        last = intensity[1:]
-        between = 0.5 * (intensity[:-1] + last)
-        ends = Phi @ intensity[:-1] @ Phi.transpose(0, 2, 1) + last
-        inner = middle @ between @ middle.transpose(0, 2, 1)
-    else:
-        # A diagonal one: a product with its roots, half the work.
-        root = np.sqrt(np.diag(intensity))
-        first, middle = Phi * root, middle * root
-        ends = first @ first.transpose(0, 2, 1) + intensity
-        inner = middle @ middle.transpose(0, 2, 1)
-    return np.asarray(h / 6 * (ends + 4 * inner))
+    """∫Φ(t₁, s)ΞΦ(t₁, s)ᵀ ds of every step, (N − 1, n, n); Ξ (n, n), or at every sample."""
+    return stepped(system, intensity).Q
 
 
-def lost(model: Dynamics, steps: Array) -> Array:
+def lost(model: Dynamics, steps: Array, pace: Pace | None = None) -> Array:
     """Variances (N − 1, n) that are added before and after each step: nothing but in gaps.
 
     What inputs did in a gap is unknown: states that they drive, through others too, are known in it
@@ -264,35 +292,74 @@ def lost(model: Dynamics, steps: Array) -> Array:
     """
     t, n = model.traced, model.size
     found = np.zeros((len(steps), n))
-    gaps = steps > GAP * np.median(steps)
-    if gaps.any():
+    wide = steps > (pace or pace_of(steps)).gap
+    if wide.any():
         u = [flat(t.symbols[s.name]) for s in model.signals if s.name not in t.measured]
         driven = np.zeros(n, dtype=bool)
         if u:
             driven[list(set(ca.jacobian(t.f, ca.vertcat(*u)).sparsity().get_triplet()[0]))] = True
         moved = np.zeros((n, n), dtype=bool)
         moved[tuple(np.array(reach(t.A)).T)] = True
-        found[gaps] = np.where(moved @ driven, np.diag(model.start_covariance), 0.0)
+        found[wide] = np.where(moved @ driven, np.diag(model.start_covariance), 0.0)
     return found
 
 
-def with_lost(model: Dynamics, steps: Array, Phi: Array, Q: Array) -> Array:
+def with_lost(
+    model: Dynamics, steps: Array, Phi: Array, Q: Array, pace: Pace | None = None
+) -> Array:
     """The noise Q (N − 1, n, n) of steps, gaps included."""
-    added, i = lost(model, steps), np.arange(model.size)
-    gaps = np.flatnonzero(added.any(axis=1))
-    own = np.zeros((len(gaps), model.size, model.size))
-    own[:, i, i] = added[gaps]
-    Q[gaps] += Phi[gaps] @ own @ Phi[gaps].transpose(0, 2, 1) + own
+    added, i = lost(model, steps, pace), np.arange(model.size)
+    wide = np.flatnonzero(added.any(axis=1))
+    own = np.zeros((len(wide), model.size, model.size))
+    own[:, i, i] = added[wide]
+    Q[wide] += Phi[wide] @ own @ Phi[wide].transpose(0, 2, 1) + own
     return Q
 
 
+@dataclass(frozen=True)
+class Pace:
+    """How a record is read: the usual time between two readings, and what is a gap, s.
+
+    `share`: what part of the usual step each reading stands for (see `shares`), where it is known;
+    `holed`: are readings missing somewhere in the record?
+    """
+
+    usual: float
+    gap: float
+    share: Array | None = None
+    holed: bool = False
+
+
+def pace_of(steps: Array) -> Pace:
+    """Of steps (N − 1,): the usual one is the mean of those that are no gaps."""
+    gap = longest(steps)
+    return Pace(float(np.mean(steps[steps <= gap])), gap)
+
+
+def usual(steps: Array) -> float:
+    """Time between two readings, s: the mean of the steps (N − 1,) that are no gaps."""
+    return pace_of(steps).usual
+
+
 def counted(steps: Array) -> Array:
-    """Steps (N − 1,) as far as readings stand for them: in a gap nothing was read."""
-    usual = float(np.median(steps))
-    return np.where(steps > GAP * usual, usual, steps)
+    """Steps (N − 1,) as far as readings stand for them: each for the usual one.
+
+    A sensor's noise knows nothing of when it was read before, and in a gap nothing was read.
+    """
+    return np.full(len(steps), usual(steps))
 
 
-def steps_to(steps: Array | Linearised) -> NDArray[np.float64]:
-    """Time that each sample stands for, (N,): half of the steps (N − 1,) on both sides of it."""
-    step = counted(steps.steps if isinstance(steps, Linearised) else steps)
-    return np.concatenate([[step[0]], 0.5 * (step[1:] + step[:-1]), [step[-1]]])
+def variances(model: Dynamics, steps: Array, pace: Pace | None = None) -> Array:
+    """Variance of every reading, (N, m): the noise's intensity over the time between two."""
+    period = (pace or pace_of(steps)).usual
+    return np.repeat(np.diag(model.noise_at(period))[None] / period, len(steps) + 1, 0)
+
+
+def shares(steps: Array, pace: Pace | None = None) -> Array:
+    """What part of the usual step each reading of an input stands for, (N,): what lies between it
+    and its neighbours follows it, noise included. In a gap nothing does."""
+    pace = pace or pace_of(steps)
+    if pace.share is not None:
+        return pace.share
+    step = np.where(steps > pace.gap, pace.usual, steps) / pace.usual
+    return np.concatenate([step[:1], 0.5 * (step[1:] + step[:-1]), step[-1:]])

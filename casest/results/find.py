@@ -19,6 +19,7 @@ from casest.declaration.dimensions import check_units
 from casest.declaration.effect import RECORDED, Effect
 from casest.declaration.model import Model
 from casest.dynamics import Dynamics
+from casest.dynamics import check_units as check_units_in_motion
 from casest.effects import CATALOGUE
 from casest.errors import CasestError, DeclarationError, UsageError
 
@@ -58,6 +59,7 @@ def find_any(name: str) -> Model | Dynamics:
             still = [v for v in declared.values() if isinstance(v, Model)]
             chosen = None if still else next(iter(moving.values()))
         if chosen is not None:
+            check_units_in_motion(chosen)
             return chosen
     return find_model(name)
 

@@ -15,6 +15,7 @@ from casest.declaration.shapes import Array
 from casest.diagnose.motion.fit import Fit, forgotten, rise
 from casest.diagnose.motion.loop import Added, MotionClosing
 from casest.diagnose.motion.visibility import Visible
+from casest.dynamics.transition import usual
 from casest.effects.moving import Candidate
 from casest.results.closing import Detectable
 from casest.results.file import plain
@@ -137,7 +138,7 @@ def motion_result(
 ) -> MotionClosed:
     """What `close` leaves of an estimator in motion."""
     declared, after, left = closing.declared, closing.after, closing.left
-    period = float(np.median(np.diff(after.found.time)))
+    period = usual(after.found.system.steps)
     complete = np.isfinite(after.found.innovations).all(axis=1)
     between = float(np.median(np.diff(after.found.time[complete])))
     where = f"innovations foretell those within {left.lag * between:.3g} s after them"
@@ -149,7 +150,7 @@ def motion_result(
         verdict=closing.verdict,
         trusted=after.trusted,
         noise=MotionNoise(
-            plain(np.sqrt(np.diag(after.model.noise) / period)),
+            plain(np.sqrt(np.diag(after.model.noise_at(period)) / period)),
             _unit(closing),
             Intensities(plain_all(closing.before.intensities), plain_all(after.intensities)),
             _declared(closing),
@@ -158,7 +159,7 @@ def motion_result(
         after=_section(after, closing, 1),
         effects=[_effect(a, closing) for a in closing.effects],
         invisible=[i for s in closing.first for i in _invisible(s, closing)],
-        unexplained=Left(plain(left.share), where) if closing.misfit else Left(0.0, ""),
+        unexplained=Left(plain(left.share), where) if closing.coloured else Left(0.0, ""),
         moved=_moved(closing),
         smallest_detectable=[_detectable(s) for s in closing.first if np.any(s.information)],
         refused=[Explained(name, why) for name, why in closing.refused],
@@ -182,6 +183,12 @@ def sentence(result: MotionClosed) -> str:
         verb = "was" if len(names) == 1 else "were"
         return f"extended: {', '.join(names)} {verb} missing; what is left is noise"
     beside = f" beside {', '.join(names)}" if names else ""
+    if not result.closing.coloured:
+        loud = " and ".join(
+            f"{name} is {np.sqrt(times):.2g} times as noisy as it was stated to be or shows from "
+            "sample to sample" for name, times in result.closing.loud.items()
+        )  # fmt: skip
+        return f"unexplained: the innovations are white only if {loud}{beside}"
     return f"unexplained: the innovations are not white{beside}, and no candidate says why"
 
 
@@ -226,9 +233,8 @@ def _unit(closing: MotionClosing) -> str:
 
 
 def _declared(closing: MotionClosing) -> dict[str, float]:
-    model = closing.declared
-    outputs = zip(model.traced.measured, model.traced.outputs, strict=True)
-    readings = {name: model.sensors.get(name, o.intensity) for name, o in outputs}
+    model, period = closing.declared, usual(closing.after.found.system.steps)
+    readings = {name: model.intensity_of(name, period) for name in model.measured_signals}
     return plain_all({**{s.name: s.intensity for s in model.states}, **model.sensors, **readings})
 
 
@@ -254,9 +260,10 @@ def _section(fit: Fit, closing: MotionClosing, side: int) -> MotionSection:
 
 def _states(fit: Fit, closing: MotionClosing) -> dict[str, Parameter]:
     """The declared states at the end of the record."""
-    model, found = closing.declared, fit.found
+    model, (x, P) = closing.declared, fit.found.end
+    std = np.sqrt(np.diag(P))
     return {
-        name: _number(found.x[-1][where], found.std[-1][where], model[name].unit)
+        name: _number(x[where], std[where], model[name].unit)
         for name, where in model.slices().items()
     }
 

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from msgspec import UNSET, Struct, UnsetType
 
 from casest.data.run import Run
-from casest.data.timing import GAP
+from casest.data.timing import longest
 from casest.declaration.model import Model
 from casest.dynamics import Dynamics
-from casest.dynamics.filter import filtered
+from casest.dynamics.filter import coefficients, filtered
 from casest.dynamics.gramian import Observed as Seen
-from casest.dynamics.gramian import gramian, observed, window_eigenvalues
+from casest.dynamics.gramian import Products, observed, window_eigenvalues
+from casest.dynamics.inputs import smallest, uncertain, unstated
+from casest.dynamics.intensities import period, with_stated
 from casest.dynamics.structural import Structure, structure
 from casest.dynamics.transition import linearised
 from casest.errors import DeclarationError, UsageError
@@ -90,10 +92,12 @@ class Windows(Struct, frozen=True):
 
 
 class ObservedMotion(Observed, frozen=True, kw_only=True, dict=True):
-    """The content of `observe.json` for a trajectory. `std`: what the readings alone allow."""
+    """The content of `observe.json` for a trajectory. `std`: what the readings alone allow;
+    `weak`: directions of which they tell less than was known beforehand."""
 
     notes: list[str]
     structural_rank: int | None
+    weak: list[str]
     std: dict[str, Numbers]
     units: dict[str, str]
     eigenvalues: list[Number]
@@ -208,26 +212,34 @@ def observe_motion(
     `std` is what the readings alone allow at the beginning of the record, per state. A nonlinear
     model is linearised along its smoothed states.
     """
-    along = None if model.linear else filtered(model, run).smoothed
-    system = linearised(model, run, along)
-    seen = observed(model, gramian(model, system))
-    duration = float(system.time[-1] - system.time[0])
-    if window is not None and not 2 * float(np.median(system.steps)) <= window < np.inf:
+    noisy = unstated(model, run)
+    model = with_stated(model, run, noisy)
+    products = _products(model, run)
+    seen = observed(model, products.gramian())
+    time = np.asarray(run.time, float)
+    duration, step = float(time[-1] - time[0]), float(np.median(np.diff(time)))
+    if window is not None and not 2 * step <= window < np.inf:
         raise UsageError(
             f"--window {window:g} s: a window must hold two steps of "
-            f"{float(np.median(system.steps)):.3g} s at least; the record lasts {duration:.3g} s"
+            f"{step:.3g} s at least; the record lasts {duration:.3g} s"
         )
     length = min(window or WINDOW * duration, duration)
-    ends, eigenvalues = window_eigenvalues(model, system, length)
+    ends, eigenvalues = window_eigenvalues(products, length)
     telling = np.flatnonzero(eigenvalues[:, 0] > 1)
     std = {name: plain(seen.std[where]) for name, where in model.slices().items()}
     return ObservedMotion(
         model=model.name,
-        notes=[*assumed(run), *_readings_alone(model), *_too_short(seen, run)],
+        notes=[
+            *assumed(run),
+            *noise_of_inputs(model, run, noisy),
+            *_readings_alone(model),
+            *_too_short(seen, run),
+        ],
         rank=seen.rank,
         unknowns=seen.unknowns,
         structural_rank=_structural_rank(model),
         unobservable=list(seen.unobservable),
+        weak=list(seen.weak),
         std=std,
         units={s.name: s.unit for s in model.states},
         eigenvalues=plain(seen.eigenvalues / max(float(seen.eigenvalues[0]), 1e-300)),
@@ -250,14 +262,39 @@ def assumed(run: Run) -> list[str]:
     notes = list(run.notes)
     time = np.asarray(run.time, float)
     step = np.diff(time)
-    gaps = np.flatnonzero(step > GAP * np.median(step))
-    if gaps.size:
-        worst = int(gaps[np.argmax(step[gaps])])
+    wide = np.flatnonzero(step > longest(step))
+    if wide.size:
+        worst = int(wide[np.argmax(step[wide])])
         notes.append(
-            f"{gaps.size} {'gap' if gaps.size == 1 else 'gaps'} in time, the longest of "
+            f"{wide.size} {'gap' if wide.size == 1 else 'gaps'} in time, the longest of "
             f"{step[worst]:.3g} s after row {int(run.rows[worst])} (t = {time[worst]:.6g} s): "
             "inputs were taken as straight lines across; the states that they drive are known "
             "after it no better than at the beginning"
+        )
+    return notes
+
+
+def _products(model: Dynamics, run: Run) -> Products:
+    """In pieces; at once where the noise of inputs is known, as its estimates are of the whole."""
+    along = None if model.linear else filtered(model, run).smoothed
+    if model.input_noise is None:
+        return Products.of(model, run, along)
+    system = coefficients(model, run) if model.linear else linearised(model, run, along)
+    return Products.of(model, run, system=system)
+
+
+def noise_of_inputs(model: Dynamics, run: Run, noisy: Mapping[str, float]) -> list[str]:
+    """What noise was taken out of a motion, and how slow a turn would be taken for none."""
+    notes = []
+    for name in uncertain(model):
+        unit = next(s.unit for s in model.signals if s.name == name)
+        std = float(np.sqrt(model.sensors[name] / period(run)))
+        how = "shows noise" if name in noisy else "has noise"
+        state = f" (--sensor-noise {name}=… states it)" if name in noisy else ""
+        notes.append(
+            f"{name} {how} of {std:.3g} {unit}{state}; what that makes of the motion is not "
+            f"counted, and {name} below {smallest(std, len(run)):.2g} {unit} all the time cannot "
+            "be told from none"
         )
     return notes
 
@@ -304,6 +341,17 @@ def combination_words(found: Structural) -> str:
         parts.append(f"{found.more} more {what} without a short formula" if parts else
                      f"{found.more} {what} without a short formula")  # fmt: skip
     return f"determined all the same: {', '.join(parts)}" if parts else ""
+
+
+def weak_directions(result: Observability) -> list[str]:
+    """What a trajectory tells less well than it was known beforehand, in words."""
+    return result.weak if isinstance(result, ObservedMotion) else []
+
+
+def weak_words(result: Observability) -> str:
+    """How much of the rank says nothing: `, 1 of them weak`."""
+    count = len(weak_directions(result))
+    return f", {count} of them weak" if count else ""
 
 
 def could_reach(result: Observability) -> str:

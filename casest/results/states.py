@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -13,19 +13,25 @@ from msgspec import UNSET, Struct, UnsetType
 
 from casest.data.run import Run
 from casest.dynamics import Dynamics
-from casest.dynamics.filter import Filtered, filtered
-from casest.dynamics.intensities import Tuned, intensities, units
+from casest.dynamics.course import Course, followed
+from casest.dynamics.inputs import unstated
+from casest.dynamics.intensities import Tuned, intensities, period, units
 from casest.results.file import plain
 from casest.results.observability import assumed, too_short
 from casest.results.result import Number, Reproduced, Result, reproduced
 from casest.results.trajectory import Innovations, Trajectory, trajectory_of
 
+#: Rows of states.csv that are written at once.
+ROWS = 8192
 #: Between these shares of what is expected innovations are called as large as expected.
 SMALLEST, LARGEST = 0.8, 1.25
+#: Filter and smoother disagree at the end by more than so many standard deviations: it is said.
+PARTED = 1.0
 
 
 class FinalState(Struct, frozen=True):
-    """A state at the end of the record, and how well the smoother knows it along the way."""
+    """A state at the end of the record, as all of it says, and how well the smoother knows it along
+    the way."""
 
     value: list[Number]
     std: list[Number]
@@ -62,7 +68,7 @@ class States(Result, frozen=True, kw_only=True, dict=True):
     data: list[str]
     reproduce: Reproduced
     as_expected: bool
-    filtered: Filtered
+    filtered: Course
 
     @cached_property
     def trajectory(self) -> Trajectory:
@@ -84,18 +90,24 @@ def follow(
     `tuned`: the same model with other noise intensities, used in place of the declared ones, which
     are shown beside them; `allan`: what a record at rest said of them.
     """
-    declared = filtered(model, run, smooth=tuned is None)
-    found = filtered(tuned.model, run) if tuned else declared
+    declared = followed(model, run, smooth=tuned is None)
+    found = followed(tuned.model, run) if tuned else declared
     mean, m = _normalised_mean(found), found.innovations.shape[1]
     return States(
         model=found.model.name,
-        notes=[*assumed(run), *_unsettled(found), *_too_short(run, found.model.size)],
+        notes=[
+            *assumed(run),
+            *_taken_for_motion(found.model, run),
+            *_unsettled(found),
+            *_parted(found),
+            *_too_short(run, found.model.size),
+        ],
         samples=len(found.time),
         states=_final(found),
         intensities=UsedIntensities(
             tuned.how if tuned else "as declared",
-            _plain_values(intensities(model)),
-            _plain_values(intensities(found.model)),
+            _plain_values(intensities(model, period(run))),
+            _plain_values(intensities(found.model, period(run))),
             _plain_values(tuned.spread) if tuned else {},
             units(found.model),
             plain(_normalised_mean(declared)),
@@ -115,11 +127,12 @@ def follow(
     )
 
 
-def _final(found: Filtered) -> dict[str, FinalState]:
+def _final(found: Course) -> dict[str, FinalState]:
+    x, std = found.end
     return {
         name: FinalState(
-            plain(found.x[-1][where]),
-            plain(found.std[-1][where]),
+            plain(x[where]),
+            plain(std[where]),
             plain(_median_std(found, where)),
             found.model[name].unit,
         )
@@ -131,7 +144,7 @@ def _plain_values(values: Mapping[str, float]) -> dict[str, Number]:
     return {name: plain(value) for name, value in values.items()}
 
 
-def _unsettled(found: Filtered) -> list[str]:
+def _unsettled(found: Course) -> list[str]:
     if found.settled:
         return []
     return [
@@ -140,12 +153,37 @@ def _unsettled(found: Filtered) -> list[str]:
     ]
 
 
+def _taken_for_motion(model: Dynamics, run: Run) -> list[str]:
+    """Noise of inputs that nobody stated, which a filter counts as motion."""
+    units = {s.name: s.unit or "1" for s in model.signals}
+    return [
+        f"{name} shows noise of {std:.3g} {units[name]} that is not stated: it is taken for "
+        f"motion, and what the filter is sure of may be too much (--sensor-noise {name}={std:.2g})"
+        for name, std in unstated(model, run).items()
+    ]
+
+
+def _parted(found: Course) -> list[str]:
+    """Where the filter ends elsewhere than the smoother, which has the same readings there."""
+    x, std = found.end
+    off = np.abs(found.x[-1] - x) / np.maximum(std, 1e-150)
+    worst = int(np.argmax(off))
+    if not off[worst] > PARTED:
+        return []
+    return [
+        f"the filter ends {off[worst]:.2g} standard deviations of {found.model.names[worst]} away "
+        "from what the whole record says, since it linearised at what it knew at the time: the "
+        "states above and smoothed_* in states.csv are the record's, its innovations are the "
+        "filter's; a nearer start, or a smaller std at the beginning, brings both together"
+    ]
+
+
 def _too_short(run: Run, unknowns: int) -> list[str]:
     words = too_short(run, unknowns)
     return [f"{w}; the states are mostly what was declared of the start" for w in words]
 
 
-def _normalised_mean(found: Filtered) -> float:
+def _normalised_mean(found: Course) -> float:
     """Mean of νᵀS⁻¹ν after the first tenth, which belongs to the start values."""
     normalised = found.normalised_innovations
     whole = normalised[np.isfinite(normalised)]
@@ -153,9 +191,8 @@ def _normalised_mean(found: Filtered) -> float:
     return float(np.mean(later)) if len(later) else float("nan")
 
 
-def _median_std(found: Filtered, where: slice) -> Any:
-    std = np.sqrt(np.diagonal(found.smoothed_P, axis1=1, axis2=2))[:, where]
-    return np.median(std, axis=0)
+def _median_std(found: Course, where: slice) -> Any:
+    return np.median(found.smoothed_std[:, where], axis=0)
 
 
 def _lag1(innovations: Any) -> Any:
@@ -164,8 +201,8 @@ def _lag1(innovations: Any) -> Any:
     return np.sum(r[1:] * r[:-1], axis=0) / np.maximum(np.sum(r**2, axis=0), 1e-300)
 
 
-def states_csv(found: Filtered) -> str:
-    """Filtered and smoothed states with standard deviations, a row per sample."""
+def states_csv(found: Course) -> Iterator[str]:
+    """Filtered and smoothed states with standard deviations, a row per sample, in pieces."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     names, own_units = found.model.names, found.model.state_units
@@ -173,10 +210,13 @@ def states_csv(found: Filtered) -> str:
     for kind in ("", "std_", "smoothed_", "smoothed_std_"):
         head += [f"{kind}{n} [{u}]" for n, u in zip(names, own_units, strict=True)]
     writer.writerow(head)
-    smooth_std = np.sqrt(np.diagonal(found.smoothed_P, axis1=1, axis2=2))
-    table = np.hstack([found.time[:, None], found.x, found.std, found.smoothed, smooth_std])
-    writer.writerows([[repr(float(v)) for v in row] for row in table])
-    return text.getvalue()
+    columns = found.time[:, None], found.x, found.std, found.smoothed, found.smoothed_std
+    for k in range(0, len(found.time), ROWS):
+        table = np.hstack([own[k : k + ROWS] for own in columns])
+        writer.writerows([[repr(v) for v in row] for row in table.tolist()])
+        yield text.getvalue()
+        text.seek(0)
+        text.truncate()
 
 
 def intensity_spread(spread: Mapping[str, Number], name: str) -> str:

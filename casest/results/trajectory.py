@@ -6,12 +6,12 @@ import inspect
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
 from msgspec import Struct
 
 from casest.data.run import Run
 from casest.declaration.shapes import Array
 from casest.dynamics import Dynamics
+from casest.dynamics.course import Course
 from casest.dynamics.filter import Filtered
 from casest.results.result import Number
 
@@ -65,7 +65,7 @@ class Trajectory:
     convention: str
 
 
-def trajectory_of(found: Filtered) -> Trajectory:
+def trajectory_of(found: Filtered | Course) -> Trajectory:
     """What a filter and smoother said along a record."""
     model, slices = found.model, found.model.slices()
     units: dict[str, str | None] = {"y": None}
@@ -76,10 +76,10 @@ def trajectory_of(found: Filtered) -> Trajectory:
         found.x,
         found.std,
         found.smoothed,
-        np.sqrt(np.diagonal(found.smoothed_P, axis1=1, axis2=2)),
+        found.smoothed_std,
         tuple(State(s.name, slices[s.name], s.unit, s.std, s.intensity) for s in model.states),
         found.innovations,
-        np.sqrt(np.diagonal(found.S, axis1=1, axis2=2)),
+        found.expected_std,
         tuple(_readings(model)),
         Run.raw("innovations", {"y": found.innovations}, units=units, time=found.time),
         inspect.getdoc(model.function) or "",

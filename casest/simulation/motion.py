@@ -24,7 +24,7 @@ from casest.declaration.shapes import Array
 from casest.declaration.tracing import flat
 from casest.dynamics.declare import Dynamics
 from casest.dynamics.extended import over_samples, replay
-from casest.dynamics.transition import checked_time, steps_to
+from casest.dynamics.transition import checked_time, usual
 from casest.effects.moving import (
     CATALOGUE,
     COLOURED,
@@ -117,11 +117,10 @@ def _run(model: Dynamics, t: Array, signals: Mapping[str, Array]) -> Run:
 
 def _stds(model: Dynamics, t: Array, noise: float | None) -> dict[str, Array]:
     """Standard deviation of each reading of each signal, (N,)."""
-    period = steps_to(np.diff(t))
+    period = usual(np.diff(t))
     intensities = {n: q for n, q in model.sensors.items() if q}
-    outputs = zip(model.traced.measured, model.traced.outputs, strict=True)
-    intensities |= {n: model.sensors.get(n, o.intensity) for n, o in outputs}
-    found = {name: np.sqrt(q / period) for name, q in intensities.items()}
+    intensities |= {n: model.intensity_of(n, period) for n in model.measured_signals}
+    found = {name: np.full(len(t), np.sqrt(q / period)) for name, q in intensities.items()}
     if noise is not None:
         found |= {name: np.full(len(t), noise) for name in model.measured_signals}
     return found

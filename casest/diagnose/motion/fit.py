@@ -69,8 +69,11 @@ class Fit:
 
     def with_spread(self) -> Fit:
         """The same with the covariances of the smoothed states, which the loop has no use for."""
-        if not self.model.linear:
-            return self
+        if not self.model.linear:  # by its own steps, which straight lines of A(t) only follow
+            found = filtered(self.model, self.run)
+            x, P, settled = found.smoothed, found.smoothed_P, found.settled
+            own = replace(self.found, smoothed=x, smoothed_P=P, settled=settled)
+            return replace(self, found=own)
         process = process_along(self.model, self.run, self.found.smoothed)
         found = filtered(self.model, self.run, system=self.ready.system.driven(process))
         return replace(self, found=replace(self.found, smoothed_P=found.smoothed_P))
@@ -124,8 +127,9 @@ def fitted(
     last = 0.0
     for k in range(ROUNDS if added else 1):
         fit = _tuned(base, run, along, added, colour, start)
-        if not added:
-            return fit
+        if not added:  # a nonlinear model: once more, along what these intensities lead to
+            again = (base, run, fit.found.smoothed, added, colour, fit.intensities)
+            return fit if base.linear else _tuned(*again)
         assert fit.answers is not None
         H, z = fit.answers.H, fit.answers.z
         information = np.einsum("kij,kil->jl", H, H)
@@ -161,9 +165,7 @@ def _tuned(
     known = {name: value for name, value in (start or {}).items() if name in ready.names}
     intensities, likelihood = matched(ready, run, known)
     model = applied(grown, intensities)
-    system = None
-    if model.linear:
-        system = ready.system.driven(process_along(model, run, along))
+    system = ready.system.driven(process_along(model, run, along))
     found = filtered(model, run, system=system, spread=False)
     tried = [c for c, _ in added]
     answers = sensitivity(base, added, tried, run, found) if added else None

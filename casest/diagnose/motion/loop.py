@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,7 +20,7 @@ from casest.diagnose.motion.whiteness import Whiteness, whiteness
 from casest.diagnose.protocol import Kept, State, search
 from casest.dynamics.declare import Dynamics
 from casest.dynamics.filter import filtered
-from casest.dynamics.likelihood import first_guess, likelihood
+from casest.dynamics.likelihood import first_guess, likelihood, reached
 from casest.effects.moving import Candidate, Colour, candidates
 from casest.errors import DataError
 
@@ -28,6 +28,8 @@ from casest.errors import DataError
 SUSPECT, ASKS = 0.05, 10.0
 #: Blocks and folds of held-out time.
 BLOCKS, FOLDS = 40, 4
+#: An input's matched intensity that is so many times what its own readings show is no noise.
+LOUD = 4.0
 #: Significance of what is left.
 UNEXPLAINED = 1e-4
 #: Samples below which nothing can be held out.
@@ -63,11 +65,18 @@ class MotionClosing:
     first: tuple[Visible, ...]
     left: Whiteness
     held_out: tuple[Array, Array]
+    #: Inputs whose noise had to be matched far above their own, and how many times.
+    loud: Mapping[str, float]
+
+    @property
+    def coloured(self) -> bool:
+        """Are the innovations not white after the loop?"""
+        return self.left.p_value < UNEXPLAINED
 
     @property
     def misfit(self) -> bool:
-        """Are the innovations not white after the loop?"""
-        return self.left.p_value < UNEXPLAINED
+        """Are they not, or white only because an input was called noisier than it is?"""
+        return self.coloured or bool(self.loud)
 
     @property
     def verdict(self) -> str | None:
@@ -114,6 +123,7 @@ def close_motion(
         visible(found, subject.tried),
         _left(state.fit),
         (one, two),
+        _loud(model, run, state.fit),
     )
 
 
@@ -160,6 +170,19 @@ def _noise_is_odd(fit: Fit, run: Run) -> bool:
         for name, value in fit.intensities.items()
     }
     return bool(fit.likelihood - likelihood(fit.ready, own) > ASKS)
+
+
+def _loud(model: Dynamics, run: Run, fit: Fit) -> dict[str, float]:
+    """Inputs whose matched intensity is many times what was stated or their readings show, and how
+    many, where the likelihood insists on it."""
+    guess, inputs = first_guess(fit.ready, run), reached(model)[0]
+    times = {n: fit.intensities[n] / guess[n] for n in inputs if n in fit.intensities}
+    found = {}
+    for name, ratio in times.items():
+        own = {**fit.intensities, name: guess[name]}
+        if ratio > LOUD and fit.likelihood - likelihood(fit.ready, own) > ASKS:
+            found[name] = ratio
+    return found
 
 
 def _confirmed(current: Fit, better: Fit, folds: NDArray[np.int_]) -> float | None:

@@ -20,7 +20,7 @@ from casest.declaration.tracing import flat
 from casest.dynamics.declare import Dynamics
 from casest.dynamics.discrete import linear_recursion
 from casest.dynamics.filter import Filtered
-from casest.dynamics.transition import Linearised, steps_to
+from casest.dynamics.transition import Linearised, variances
 from casest.effects.moving import Candidate, extended
 from casest.engine import Columns, Replay
 
@@ -54,7 +54,7 @@ def sensitivity(
     present = np.isfinite(system.y)
     C = np.where(present[:, :, None], system.C, 0.0)
     m = C.shape[1]
-    R = np.diag(found.model.noise)[None] / steps_to(system)[:, None]
+    R = variances(found.model, system.steps)
     PC = found.predicted_P @ C.transpose(0, 2, 1)
     S = C @ PC
     S[:, np.arange(m), np.arange(m)] += R

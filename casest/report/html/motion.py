@@ -22,6 +22,7 @@ from casest.results.observability import (
     Structural,
     combination_words,
     could_reach,
+    weak_directions,
     window_words,
 )
 from casest.results.states import States, intensity_spread, verdict_words
@@ -64,6 +65,7 @@ def _directions(result: Observability) -> str:
         f"{w.direction}: {number(w.inflation)} times less certain than each alone."
         for w in combinations
     ]
+    weak += [_sentence(words) for words in weak_directions(result)]
     if not result.unobservable and not weak:
         return section("hidden", "What is hidden", paragraph("Nothing: no combination is lost."))
     tolerance = "" if isinstance(result, ObservedParameters) else result.tolerance

@@ -83,7 +83,7 @@ def _intensities(result: MotionClosed) -> Iterator[str]:
 
 def _left(result: MotionClosed) -> Iterator[str]:
     left = result.unexplained
-    if result.verdict == "unexplained":
+    if result.verdict == "unexplained" and left.where:
         yield item(f"Unexplained: {left.fraction:.1%} of the variance, {left.where}")
     if result.invisible:
         yield "Could be wrong without showing (shift by a typical size):"

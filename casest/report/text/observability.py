@@ -13,6 +13,8 @@ from casest.results.observability import (
     combination_words,
     could_reach,
     number_or_not,
+    weak_directions,
+    weak_words,
     window_words,
 )
 
@@ -21,10 +23,11 @@ def observe_text(result: Observability) -> str:
     """Rank, what is hidden in words, and the standard deviations that the data allow."""
     if isinstance(result, ObservedStructure):
         return structure_text(result)
-    lines = [f"{result.model}: rank {result.rank} of {result.unknowns}"]
+    lines = [f"{result.model}: rank {result.rank} of {result.unknowns}{weak_words(result)}"]
     lines += [f"  - {words}" for words in result.unobservable]
+    lines += [f"  - weak: {words}" for words in weak_directions(result)]
     lines += [f"  {could}" for could in [could_reach(result)] if could]
-    if not result.unobservable:
+    if not result.unobservable and not weak_directions(result):
         lines.append("  every unknown is determined by these data")
     lines += ["", "  standard deviation that these data allow:", *_deviations(result)]
     if isinstance(result, ObservedMotion):

@@ -1,0 +1,190 @@
+"""States along a record of any length: the filter and smoother in pieces, with what is to be shown.
+
+The filter runs over the record once and keeps where it was at the beginning of every piece; from
+the last piece to the first it runs again, and the smoother back over it. What readings after a
+piece tell of its end is all that goes from one to the next. Numbers are those of the whole at once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from casest.data.run import Run
+from casest.declaration.shapes import Array
+from casest.dynamics.declare import Dynamics
+from casest.dynamics.discrete import (
+    Estimates,
+    Steps,
+    continued,
+    kalman,
+    smoothed_before,
+)
+from casest.dynamics.filter import Filtered, discretised, filtered, normalised, std_of
+from casest.dynamics.inputs import as_read, uncertain
+from casest.dynamics.known import known
+from casest.dynamics.riccati import check_covariance
+from casest.dynamics.transition import (
+    Pace,
+    checked_record,
+    linearised,
+    pace_of,
+    process_along,
+    shares,
+)
+
+#: Samples of a piece.
+PIECE = 4096
+
+
+@dataclass(frozen=True)
+class Course:
+    """States x (N, n) with their std, by the readings so far and by all of them, and innovations
+    (N, m) with the std that is expected of them, NaN where a reading is missing.
+
+    `normalised_innovations` (N,): νᵀS⁻¹ν of every complete reading; `settled`: did the rounds of a
+    nonlinear model's smoother settle?
+    """
+
+    model: Dynamics
+    time: Array
+    x: Array
+    std: Array
+    smoothed: Array
+    smoothed_std: Array
+    innovations: Array
+    expected_std: Array
+    normalised_innovations: Array
+    settled: bool = True
+
+    @property
+    def end(self) -> tuple[Array, Array]:
+        """State (n,) and its std at the end of the record, as all of it says (see `Filtered`)."""
+        if self.settled:
+            return self.smoothed[-1], self.smoothed_std[-1]
+        return self.x[-1], self.std[-1]
+
+
+def followed(model: Dynamics, run: Run, *, smooth: bool = True) -> Course:
+    """Filter and smoother over a record; of a linear model memory beyond the result is constant,
+    unless inputs with noise enter its coefficients: their estimates are of the whole record.
+
+    Raises DataError as `filtered` does.
+    """
+    check_covariance(model.start_covariance, "the covariance at the beginning")
+    if not model.linear or uncertain(model):
+        return _of(filtered(model, run, smooth=smooth))
+    pieces = Pieces.of(model, run)
+    found, states = _empty(pieces, smooth), [pieces.start]
+    for where in pieces.every:
+        _, own, after = pieces.filtered(where, states[-1])
+        states.append(after)
+        if not smooth:
+            _put(found, pieces, where, own)
+    if smooth:
+        _back(found, pieces, states)
+    return found
+
+
+#: Where the filter has come to, as factored: with noise along the start, and along its own states.
+States = tuple[Array | None, Array | None]
+
+
+@dataclass(frozen=True)
+class Pieces:
+    """A record and the model along it, in pieces that share their ends."""
+
+    model: Dynamics
+    run: Run
+    pace: Pace
+    time: Array
+    share: Array
+    every: tuple[slice, ...]
+    start: States = (None, None)
+
+    @staticmethod
+    def of(model: Dynamics, run: Run, pace: Pace | None = None) -> Pieces:
+        """A whole record, or a part of one that is read at a known pace."""
+        time = checked_record(model, run)
+        step, last = np.diff(time), len(time) - 1
+        cuts = [slice(k, min(k + PIECE, last) + 1) for k in range(0, last, PIECE)]
+        pace = pace or pace_of(step)
+        return Pieces(model, run, pace, time, shares(step, pace), tuple(cuts))
+
+    def filtered(
+        self, where: slice, begun: States, last: int = -1
+    ) -> tuple[Steps, Estimates, States]:
+        """The steps of a piece, the filter at every sample after its first, and where it came to.
+
+        At the beginning of the record: at its first sample too. `last`: which of these counts as
+        the end.
+        """
+        model, own = self.model, self.run.take(where)
+        pace = replace(self.pace, share=self.share[where])
+        system, first = linearised(model, own, pace=pace, calm=as_read(model, own)), None
+        if model.input_noise is not None:
+            early = self._through(discretised(model, system), begun[0])
+            x = early.x if begun[0] is None else np.vstack([begun[0][: model.size], early.x])
+            system, first = (
+                system.driven(process_along(model, own, x, pace)),
+                early.factored[last].copy(),
+            )
+        steps = discretised(model, system)
+        found = self._through(steps, begun[1])
+        # Copied: a view would keep the whole piece.
+        return steps, found, (first, found.factored[last].copy())
+
+    def _through(self, steps: Steps, begun: Array | None) -> Estimates:
+        if begun is None:
+            return kalman(steps, self.model.start, self.model.start_covariance)
+        return continued(steps, begun)
+
+    def known(self, where: slice, x: Array, P: Array) -> tuple[Array, Array]:
+        """With what is known exactly put in: states and their standard deviations."""
+        x, P = known(self.model, self.run.take(where), x, P)
+        return x, std_of(P)
+
+
+def _back(found: Course, pieces: Pieces, states: list[States]) -> None:
+    n = pieces.model.size
+    told = np.zeros(n * n + 2 * n)
+    for where, begun in zip(pieces.every[::-1], states[-2::-1], strict=True):
+        steps, own, _ = pieces.filtered(where, begun)
+        _put(found, pieces, where, own)
+        factored = own.factored if begun[1] is None else np.vstack([begun[1], own.factored])
+        x, P, told = smoothed_before(steps, factored[:-1], told)
+        before = slice(where.start, where.stop - 1)
+        found.smoothed[before], found.smoothed_std[before] = pieces.known(before, x, P)
+    found.smoothed[-1], found.smoothed_std[-1] = found.x[-1], found.std[-1]
+
+
+def _put(found: Course, pieces: Pieces, where: slice, own: Estimates) -> None:
+    where = slice(where.stop - len(own.x), where.stop)
+    found.x[where], found.std[where] = pieces.known(where, own.x, own.P)
+    found.innovations[where], found.expected_std[where] = own.innovations, std_of(own.S)
+    found.normalised_innovations[where] = normalised(own.innovations, own.S)
+
+
+def _empty(pieces: Pieces, smooth: bool) -> Course:
+    N, n, m = len(pieces.time), pieces.model.size, pieces.model.traced.h.numel()
+    sizes = (n, n, n, n, m, m)
+    x, std, own, own_std, innovations, expected = (np.empty((N, size)) for size in sizes)
+    both = (own, own_std) if smooth else (x, std)
+    readings = innovations, expected, np.empty(N)
+    return Course(pieces.model, pieces.time, x, std, *both, *readings)
+
+
+def _of(found: Filtered) -> Course:
+    return Course(
+        found.model,
+        found.time,
+        found.x,
+        found.std,
+        found.smoothed,
+        found.smoothed_std,
+        found.innovations,
+        std_of(found.S),
+        found.normalised_innovations,
+        found.settled,
+    )

@@ -1,0 +1,110 @@
+"""Records of any length: piece by piece the numbers of the whole at once, in constant memory."""
+
+from __future__ import annotations
+
+import tracemalloc
+
+import flights
+import numpy as np
+import pytest
+
+from casest import Run
+from casest.dynamics import course, filtered, gramian
+from casest.dynamics.course import followed
+from casest.dynamics.gramian import Products
+from casest.dynamics.transition import linearised
+from casest.results.states import follow, states_csv
+from casest_problems.bias_gravity import bias_gravity, bias_gravity_magnitude
+
+NAMES = ("x", "std", "smoothed", "smoothed_std", "innovations", "expected_std",
+         "normalised_innovations")  # fmt: skip
+
+
+def record(count, kind="even"):
+    """A flight at 50 Hz; `uneven`: rows dropped, a gap, readings missing, some in part."""
+    rng = np.random.default_rng(0)
+    t = 0.02 * np.arange(count)
+    if kind == "uneven":
+        t = t[np.sort(rng.choice(count, count * 9 // 10, replace=False))]
+        t[count // 3 :] += 5.0
+    run = flights.record(flights.in_the_air(), t, rng)
+    if kind == "uneven":
+        run.signals["v"][100:140] = np.nan
+        run.signals["v"][200, 1] = np.nan
+    return run
+
+
+@pytest.mark.parametrize("kind", ["even", "uneven"])
+@pytest.mark.parametrize("model", [
+    bias_gravity, bias_gravity.sensing(omega=1e-8, a=1e-8), bias_gravity_magnitude,
+], ids=["linear", "noisy inputs", "known"])  # fmt: skip
+def test_in_pieces_every_number_is_the_wholes_to_rounding(model, kind, monkeypatch):
+    monkeypatch.setattr(course, "PIECE", 137)
+    run = record(1000, kind)
+    whole, pieces = filtered(model, run), followed(model, run)
+    for name in NAMES:
+        np.testing.assert_allclose(getattr(pieces, name), getattr(whole, name), 1e-9, 1e-9)
+
+
+@pytest.mark.parametrize("count", [2, 137, 138, 139])
+def test_a_piece_may_end_anywhere(count, monkeypatch):
+    monkeypatch.setattr(course, "PIECE", 137)
+    run = record(count)
+    np.testing.assert_array_equal(followed(bias_gravity, run).smoothed,
+                                  filtered(bias_gravity, run).smoothed)  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", ["even", "uneven"])
+def test_the_gramian_of_any_window_is_that_of_its_record(kind, monkeypatch):
+    monkeypatch.setattr(gramian, "PIECE", 512)
+    run = record(2000, kind)
+    products = Products.of(bias_gravity, run)
+    for first, last in ((0, len(run) - 1), (0, 700), (250, 262), (300, 1200), (256, 768)):
+        part = linearised(bias_gravity, run.take(slice(first, last + 1)), pace=products.pace)
+        expected = gramian.gramian(bias_gravity, part)
+        scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+        assert np.abs((products.gramian(first, last) - expected) / scale).max() < 1e-12
+
+
+def peak(work, run):
+    """Bytes at the worst moment beyond the record and what is returned."""
+    tracemalloc.start()
+    try:
+        found = work(bias_gravity, run)
+        left, most = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert found is not None
+    return most - left
+
+
+@pytest.mark.parametrize("work", [followed, Products.of])
+def test_memory_beyond_the_record_and_the_result_is_constant(work, monkeypatch):
+    """A byte for every sixteen that a record of nine numbers in a row has."""
+    monkeypatch.setattr(course, "PIECE", 512)
+    monkeypatch.setattr(gramian, "PIECE", 512)
+    runs = [record(n) for n in (2000, 10_000)]
+    work(bias_gravity, runs[0])  # what is made once
+    few, many = (peak(work, run) for run in runs)
+    assert many - few < 8000 * 100
+
+
+def test_the_file_of_states_is_written_in_pieces_and_holds_every_digit(monkeypatch):
+    monkeypatch.setattr("casest.results.states.ROWS", 64)
+    found = follow(bias_gravity, record(300)).filtered
+    pieces = list(states_csv(found))
+    assert len(pieces) == 5
+    rows = [[float(v) for v in line.split(",")] for line in "".join(pieces).splitlines()[1:]]
+    expected = (found.time[:, None], found.x, found.std, found.smoothed, found.smoothed_std)
+    np.testing.assert_array_equal(rows, np.hstack(expected))
+
+
+def test_a_motion_that_is_not_linear_is_followed_as_before():
+    from test_dynamics import turning_gravity
+
+    run = record(200)
+    signals = {name: run.signals[name] for name in ("omega", "a")}
+    run = Run.raw("r", signals, units={}, time=run.time)
+    np.testing.assert_array_equal(
+        followed(turning_gravity, run).smoothed, filtered(turning_gravity, run).smoothed
+    )
