@@ -413,3 +413,12 @@ def test_what_a_fit_to_the_rest_cannot_foretell_is_refused():
     even = positions(rng)
     assert check_folds(attempt(line, [even]), (even,), folded((even,))) is None
     assert Problem(line, (even,)).residual_count == 24
+
+
+def test_what_nothing_foretells_is_no_part_of_an_error_and_a_dash_on_the_page():
+    from casest.diagnose.cross_validation import rms
+    from casest.report.html.numbers import alike
+
+    assert rms([np.array([[3.0, np.nan], [np.nan, 4.0]])]) == pytest.approx(np.sqrt(12.5))
+    assert np.isnan(rms([np.full((2, 1), np.nan)]))
+    assert alike([1.5, None]) == ["1.5000", "–"]

@@ -111,9 +111,10 @@ def _left_open(rest: Problem, fitted: Point, hidden: Problem, point: Point) -> b
 
 
 def rms(residuals: Sequence[Array]) -> float:
-    """Root mean square of all residuals."""
-    count = sum(r.size for r in residuals)
-    return float(np.sqrt(sum(float(np.sum(r**2)) for r in residuals) / count))
+    """Root mean square of all residuals that there are; NaN stands for what nothing foretells."""
+    everything = np.concatenate([r.ravel() for r in residuals])
+    there = everything[np.isfinite(everything)]
+    return float(np.sqrt(np.mean(there**2))) if there.size else float("nan")
 
 
 def check_folds(before: Estimate, runs: Sequence[Run], folds: Folds) -> None:

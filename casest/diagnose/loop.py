@@ -109,11 +109,11 @@ def _closed(sensor: Sensor, before: Estimate, folds: Folds, say: Callable[[str],
     effects = [] if outliers is None else [outliers]
     effects += [_found(sensor, state, k, after) for k in state.kept]
     effects += [Found(Candidate(e), 0.0, 0.0) for e in _declared_walks(sensor)]
+    hidden = [held_out(sensor, fit, folds) for fit in (declared, state.fit)]
     return Closing(
         before,
         after,
-        held_out(sensor, declared, folds),
-        held_out(sensor, state.fit, folds),
+        *_on_the_same_samples(*hidden),
         tuple(effects),
         tuple(sensor.found(declared)[1]),
         _refused(sensor, state, declared),
@@ -132,6 +132,18 @@ def _declared_walks(sensor: Sensor) -> list[Effect]:
 def held_out(sensor: Sensor, fit: Fit, folds: Folds) -> tuple[Array, ...]:
     """Residuals (N, m) of each run, each from a fit that did not see its part."""
     return cross_fitted(fit.model, sensor.runs, fit.values, folds)
+
+
+def _on_the_same_samples(
+    before: tuple[Array, ...], after: tuple[Array, ...]
+) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
+    """NaN in both where one of them foretells nothing."""
+    there = [np.isfinite(b + a) for b, a in zip(before, after, strict=True)]
+    one, other = (
+        tuple(np.where(k, r, np.nan) for k, r in zip(there, several, strict=True))
+        for several in (before, after)
+    )
+    return one, other
 
 
 def without_outliers(sensor: Sensor, fit: Fit, folds: Folds) -> tuple[Fit, Found | None]:

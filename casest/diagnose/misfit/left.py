@@ -97,7 +97,9 @@ def left_over(
     )
     found = findings(problem, point, correlated_over, wanders=wanders)
     everything = np.concatenate([r.ravel() for r in held_out])
-    everything = everything[np.abs(everything) <= FAR * robust_scale(held_out)]
+    everything = everything[np.isfinite(everything)]  # the rest nothing foretells
+    if everything.size:
+        everything = everything[np.abs(everything) <= FAR * robust_scale([everything])]
     variance = float(np.mean(everything**2)) if everything.size else np.nan
     sigma = min((f.sigma for f in found), default=np.sqrt(variance))
     fraction = max(0.0, 1 - sigma**2 / variance) if variance > 0 else 0.0

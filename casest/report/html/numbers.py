@@ -38,10 +38,11 @@ def with_unit(value: float | None, unit: str, digits: int = 3) -> str:
     return f"{number(value, digits)} {printed_unit(unit)}".removesuffix(" 1").strip()
 
 
-def alike(values: Sequence[float], digits: int = 5) -> list[str]:
+def alike(values: Sequence[float | None], digits: int = 5) -> list[str]:
     """Numbers of one column with as many decimals each: the largest has so many digits."""
-    largest = max((abs(v) for v in values if math.isfinite(v)), default=0.0)
+    there = [v for v in values if v is not None and math.isfinite(v)]
+    largest = max(map(abs, there), default=0.0)
     if not largest or not 1e-6 < largest < 1e9:
         return [number(v, digits) for v in values]
     places = max(digits - 1 - math.floor(math.log10(largest)), 0)
-    return [printed(f"{v:.{places}f}") if math.isfinite(v) else "–" for v in values]
+    return [printed(f"{v:.{places}f}") if v in there else "–" for v in values]
