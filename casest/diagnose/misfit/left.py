@@ -34,8 +34,6 @@ from casest.leastsquares.weights import robust_scale, weighted
 LONGEST = 200_000
 #: Residual over a step of the reading below which rounding alone, 1/√12 = 0.29, may be all of it.
 ROUNDED = 0.45
-#: What stands for the time among variables.
-TIMES = ("time", "place in the record")
 #: Held-out residuals beyond so many robust standard deviations do not count in a share.
 FAR = 6.0
 
@@ -134,7 +132,7 @@ def findings(
     clipped = _clipped(problem, residuals, sigma)
     found = _repeats(problem, point, clipped)
     slow = [] if wanders else _slow(problem, clipped, sigma)
-    follows = _follows(problem, point, clipped, sigma, [] if slow or wanders else TIMES)
+    follows = _follows(problem, point, clipped, sigma, in_time=not (slow or wanders))
     found += follows + slow
     line = strongest_line(problem.runs, clipped)
     if line is not None and line.p_value < LEVELS.misfit:
@@ -198,13 +196,14 @@ def _follows(
     point: Point,
     clipped: Sequence[Array],
     sigma: float,
-    times: Sequence[str],
+    *,
+    in_time: bool,
 ) -> list[Finding]:
-    """What it follows: a column, a quantity; of the `times` only where no slow course says so."""
+    """What it follows: a column, a quantity; the time only where no slow course says so."""
     if any(run.spread for run in problem.runs):
         return []
     read = variables(problem, point, usable_columns(problem.model, problem.runs))
-    read = [v for v in read if v.name in times or v.name not in TIMES]
+    read = [v for v in read if in_time or not v.clock]
     found = [
         s for s in structures(clipped, read) if s.p_value < LEVELS.misfit and s.share > LEVELS.share
     ]

@@ -20,12 +20,13 @@ from casest.leastsquares.problem import Point, Problem
 class Variable:
     """Something that a residual may depend on: its values (N,) for each run.
 
-    `turns`: an angle that goes round more than once.
+    `turns`: an angle that goes round more than once; `clock`: it says when, and nothing else.
     """
 
     name: str
     values: tuple[Array, ...]
     turns: bool = False
+    clock: bool = False
 
 
 def variables(problem: Problem, point: Point, columns: Sequence[str]) -> list[Variable]:
@@ -33,7 +34,7 @@ def variables(problem: Problem, point: Point, columns: Sequence[str]) -> list[Va
     runs = problem.runs
     timed = all("t" in run.signals for run in runs)
     name = "time" if timed else "place in the record"
-    found = [Variable(name, tuple(_when(run, timed) for run in runs))]
+    found = [Variable(name, tuple(_when(run, timed) for run in runs), clock=True)]
     found += [Variable(n, tuple(run.signals[n][:, 0] for run in runs)) for n in columns]
     if not problem.sequential:
         found += _quantities(problem, point)
