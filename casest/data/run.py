@@ -63,6 +63,8 @@ class Run:
     elsewhere: Mapping[str, Series] = field(default_factory=dict)
     whole: Run | None = None
     places: Index | None = None
+    #: Signals between their samples, once they were asked for; of a changed run they are others.
+    curves: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         """Refuse parts of unequal length: they would be matched wrongly without a sign."""

@@ -8,9 +8,11 @@ white, autoregressive, pink and wandering noise.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from casest.declaration.shapes import Array
 
@@ -73,33 +75,56 @@ class Bands:
         edges = np.unique(np.round(np.geomspace(FIRST, max(len(log), FIRST), BANDS)).astype(int))
         self._edges = np.concatenate([[0], edges[edges < len(log)]])
         self._size = np.diff(np.append(self._edges, len(log)))
-        self._middle = np.add.reduceat(log, self._edges) / self._size
         self._log = np.log(frequency)
-        self._edge = float(log[min(FIRST, len(log)) - 1])
+        middle = np.add.reduceat(log, self._edges) / self._size
+        # Flat to the first band's end: nothing holds a curve between its middle and there.
+        middle[0] = max(float(log[min(FIRST, len(log)) - 1]), middle[0])
+        self._middle = middle
 
-    def curve(self, power: Array, left: Array) -> Array:
-        """The most likely smooth spectrum (N,) of powers (N,), of which a fit left a share each."""
-        return self.smooth(power, left)(self._log)
+    def curves(self, power: Array, left: Array) -> Array:
+        """The most likely smooth spectra (N, m) of powers (N, m), of which a fit left a share."""
+        mean, count, told = self._banded(power, left)
+        if told.all():
+            shapes, there = self._shapes
+            return np.asarray(np.exp(there @ _most_likely(shapes, mean, count)))
+        each = [self.smooth(power[:, k], left[:, k])(self._log) for k in range(power.shape[1])]
+        return np.stack(each, axis=1)
 
     def smooth(self, power: Array, left: Array) -> Callable[[Array], Array]:
-        """The same as a function of the logarithm of the frequency."""
-        count = np.add.reduceat(left[self._order], self._edges)
-        mean = np.add.reduceat(power[self._order], self._edges) / np.maximum(count, 1e-300)
-        told = (count > LEFT * self._size) & (mean > 0)
+        """That of powers (N,) of one axis, as a function of the logarithm of the frequency."""
+        mean, count, told = self._banded(power[:, None], left[:, None])
+        told = told[:, 0]
         if not told.any():
             return lambda log: np.full(np.shape(log), 1e-300)
-        middle = self._middle[told]
-        # Flat to the first band's end: nothing holds a curve between its middle and there.
-        middle = np.where(middle == self._middle[0], max(self._edge, middle[0]), middle)
-        low, high = float(middle.min()), float(middle.max())
-        order = min(ORDER, int(told.sum()) - 1)
-
-        def shapes(log: Array) -> Array:
-            place = np.clip(2 * (log - low) / max(high - low, 1e-300) - 1, -1, 1)
-            return np.asarray(np.polynomial.legendre.legvander(place, order))
-
-        curve = _most_likely(shapes(middle), mean[told], count[told])
+        shapes = Shapes(self._middle[told])
+        (curve,) = _most_likely(shapes(self._middle[told]), mean[told], count[told]).T
         return lambda log: np.exp(shapes(log) @ curve)
+
+    def _banded(self, power: Array, left: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
+        """Mean power and number of frequencies of each band (B, m), and what tells something."""
+        count = np.add.reduceat(left[self._order], self._edges, axis=0)
+        sums = np.add.reduceat(power[self._order], self._edges, axis=0)
+        mean = sums / np.maximum(count, 1e-300)
+        return mean, count, (count > LEFT * self._size[:, None]) & (mean > 0)
+
+    @cached_property
+    def _shapes(self) -> tuple[Array, Array]:
+        """Those of all bands, there and at all frequencies."""
+        shapes = Shapes(self._middle)
+        return shapes(self._middle), shapes(self._log)
+
+
+class Shapes:
+    """Legendre's polynomials over the range of some logarithms of frequencies."""
+
+    def __init__(self, middle: Array) -> None:
+        self._low, self._high = float(middle.min()), float(middle.max())
+        self._order = min(ORDER, len(middle) - 1)
+
+    def __call__(self, log: Array) -> Array:
+        """(N, k) at these logarithms (N,); beyond the range as at its end."""
+        place = 2 * (log - self._low) / max(self._high - self._low, 1e-300) - 1
+        return np.asarray(np.polynomial.legendre.legvander(np.clip(place, -1, 1), self._order))
 
 
 def noise_spectrum(parts: Sequence[Powers]) -> Callable[[Array], Array]:
@@ -110,23 +135,31 @@ def noise_spectrum(parts: Sequence[Powers]) -> Callable[[Array], Array]:
 
 
 def _most_likely(shapes: Array, mean: Array, count: Array) -> Array:
-    """Least Σ count·(log S + mean/S), log S = shapes·b: Newton's method on a convex function."""
-    root = np.sqrt(count)
-    b = np.linalg.lstsq(shapes * root[:, None], np.log(mean) * root, rcond=None)[0]
+    """Least Σ count·(log S + mean/S), log S = shapes·b: Newton's method on a convex function.
 
-    def cost(b: Array) -> float:
-        z = np.clip(shapes @ b, -700, 700)
-        return float(np.sum(count * (z + mean * np.exp(-z))))
+    For several means and counts (B, m) at once, each by itself: b is (k, m).
+    """
+    root = np.sqrt(count).T
+    A = shapes * root[:, :, None]
+    small = 1e-9 * np.eye(shapes.shape[1])
+    b = np.linalg.pinv(A) @ (np.log(mean.T) * root)[:, :, None]
+    mean, count = mean.T, count.T
 
-    here = cost(b)
+    def cost(b: Array) -> Array:
+        z = np.clip(b[:, :, 0] @ shapes.T, -700, 700)
+        return np.asarray(np.sum(count * (z + mean * np.exp(-z)), axis=1))
+
+    here, length = cost(b), np.ones(len(b))
     for _ in range(50):
-        share = mean * np.exp(-np.clip(shapes @ b, -700, 700))
-        gradient = shapes.T @ (count * (1 - share))
-        hessian = (shapes.T * (count * share)) @ shapes + 1e-9 * np.eye(len(b))
-        step, length = np.linalg.solve(hessian, gradient), 1.0
-        while length > 1e-6 and not cost(b - length * step) <= here:
-            length /= 2
-        b, before, here = b - length * step, here, cost(b - length * step)
-        if before - here < 1e-6:
+        share = mean * np.exp(-np.clip(b[:, :, 0] @ shapes.T, -700, 700))
+        gradient = (count * (1 - share)) @ shapes
+        hessian = shapes.T @ ((count * share)[:, :, None] * shapes) + small
+        step, length[:] = np.linalg.solve(hessian, gradient[:, :, None]), 1.0
+        after = cost(b - step)
+        while (longer := ~(after <= here) & (length > 1e-6)).any():
+            length[longer] /= 2
+            after = cost(b - length[:, None, None] * step)
+        b, before, here = b - length[:, None, None] * step, here, after
+        if np.all(before - here < 1e-6):
             break
-    return np.asarray(b)
+    return np.asarray(b[:, :, 0].T)

@@ -362,6 +362,12 @@ class Problem:
         parameters = self.parameters(point, r)
         return self._staged.rows(parameters, self.samples[r].dense, r, tuple(own))[1]
 
+    def given(self, point: Point, r: int) -> Array:
+        """What the effects that look at other samples give at the samples of one run (N, k)."""
+        if self._staged is None:
+            return np.zeros((len(self.runs[r]), 0))
+        return self._staged.given(self.parameters(point, r), r, ())[0]
+
     def blocks(self, point: Point) -> Iterator[Block]:
         """Residuals and Jacobians of all samples, piece by piece, unweighted."""
         for r, samples in enumerate(self.samples):

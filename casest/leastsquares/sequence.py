@@ -7,7 +7,7 @@ through sample by sample; a signal at another time is taken from its record by s
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 import casadi as ca
@@ -36,7 +36,6 @@ class Record:
     samples: Array
     time: Array
     places: Index | slice
-    curves: dict[str, Curve] = field(default_factory=dict)
 
     @classmethod
     def of(cls, model: Model, run: Run) -> Record:
@@ -52,12 +51,13 @@ class Record:
 
     def at(self, name: str, wanted: Array, *, rotation: bool) -> tuple[Array, Array]:
         """A signal and its rate (N, k) at a time for each sample of the record."""
-        if name not in self.curves:
+        curves = self.run.curves
+        if name not in curves:
             own = Series("", self.time, self.run.signals[name], self.run.block)
             one = self.run.elsewhere.get(name, own)
             made = Curve.through(one.time, one.values, one.block, rotation=rotation)
-            self.curves[name] = made
-        curve = self.curves[name]
+            curves[name] = made
+        curve: Curve = curves[name]
         # Within its own record a signal crosses no gap; another file's has gaps of its own.
         apart = name in self.run.elsewhere
         return curve.at(wanted, curve.nearest(wanted) if apart else curve.stretch)
@@ -97,7 +97,14 @@ class Staged:
         Effects follow the record that the samples were taken from, block by block. `own`: the
         coordinates that slopes are taken in, where not in all.
         """
-        *stages, last = _programs(self.model, own)
+        last = _programs(self.model, own)[-1]
+        return _chained(last.taken, parameters, samples, *self.given(parameters, r, own))
+
+    def given(
+        self, parameters: Array, r: int, own: tuple[int, ...] | None = None
+    ) -> tuple[Array, Array]:
+        """What the stages give at the samples of run r (N, k), side by side, and its slopes."""
+        *stages, _ = _programs(self.model, own)
         record = self._records[r]
         given = np.zeros((len(record.samples), 0))
         count = self.model.staged.coordinates.numel() if own is None else len(own)
@@ -110,8 +117,7 @@ class Staged:
                 more = stage.memory.along(parameters, *taken, record.time, record.run.block)
             given = np.concatenate([given, more[0]], axis=1)
             slopes = np.concatenate([slopes, more[1]], axis=1)
-        here = given[record.places], slopes[record.places]
-        return _chained(last.taken, parameters, samples, *here)
+        return given[record.places], slopes[record.places]
 
     def _late(self, stage: Program, parameters: Array, record: Record) -> tuple[Array, Array]:
         """A signal at the times at which the effect says that it is taken, and its slopes."""

@@ -163,7 +163,7 @@ def with_record(model: Model, file: str, arguments: Mapping[str, Any]) -> Run:
     signals = {**run.signals, size.name: np.zeros((len(run), size.size))}
     units = {**run.units, size.name: size.unit}
     made = Run.raw("simulated", signals, units=units, time=run.time)
-    return Run(**{**made.__dict__, "columns": run.columns, "column_units": run.column_units})
+    return replace(made, columns=run.columns, column_units=run.column_units)
 
 
 def _rotations(count: int, rng: np.random.Generator) -> Array:
@@ -211,7 +211,7 @@ def _predicted(model: Model, run: Run, name: str, values: Mapping[str, Array]) -
 
 def _with(run: Run, signals: Mapping[str, Array]) -> Run:
     made = Run.raw(run.name, dict(signals), units=run.units, time=run.time)
-    return Run(**{**made.__dict__, "columns": run.columns, "column_units": run.column_units})
+    return replace(made, columns=run.columns, column_units=run.column_units)
 
 
 def _of_directions(

@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 from casest.data.run import Run
 from casest.declaration.effect import OVER_TIME
 from casest.declaration.model import Model
+from casest.declaration.physics import SX
 from casest.declaration.shapes import Array
 from casest.declaration.symbols import Signal
-from casest.declaration.tracing import flat
+from casest.declaration.tracing import Traced, flat
 from casest.diagnose.candidates.candidates import Candidate
 from casest.engine import Columns, Replay
 from casest.errors import CasestError
@@ -43,10 +44,11 @@ def slopes(
     Per-run unknowns have columns of their own for each run.
     """
     axes = len(problem.model.axes)
-    direct = [c for c in found if not _sequential(c, problem.model)]
+    direct = [c for c in found if not _sequential(c, problem)]
     size = max(1, WIDEST // (3 * axes))
+    given = [problem.given(point, r) for r in range(len(problem.runs))] if direct else []
     for k in range(0, len(direct), size):
-        yield from _direct(problem, point, direct[k : k + size], rows)
+        yield from _direct(problem, point, direct[k : k + size], rows, given)
     for candidate in found:
         if candidate not in direct:
             try:
@@ -55,21 +57,51 @@ def slopes(
                 yield candidate, error
 
 
-def _sequential(candidate: Candidate, model: Model) -> bool:
-    """Does a sample's residual depend on those before it?"""
-    kinds = {a.kind for a in model.effects}
-    if candidate.effect is not None:
-        kinds.add(candidate.effect.kind)
-    return bool(kinds & set(OVER_TIME))
+def _sequential(candidate: Candidate, problem: Problem) -> bool:
+    """Does what it adds act on other samples than its own?
+
+    It does if it looks at them itself, or changes what an effect of the model that does so takes.
+    """
+    if candidate.effect is not None and candidate.effect.kind in OVER_TIME:
+        return True
+    if not problem.sequential:
+        return False
+    try:
+        extended = candidate.traced_on(problem.model)
+    except CasestError:
+        return False  # it is said why where its slope is asked for
+    taken = ca.vertcat(*(stage.taken for stage in extended.staged.stages))
+    places = _coordinates(extended)
+    own = ca.vertcat(*(places[p.name] for p in candidate.parameters(extended)))
+    return bool(ca.jacobian(taken, own).nnz())
+
+
+def _coordinates(model: Model) -> dict[str, SX]:
+    """The coordinates of each parameter among those of the traced body."""
+    place, found = 0, {}
+    for p in model.parameters:
+        found[p.name] = _traced(model).coordinates[place : place + p.shape.coordinates]
+        place += p.shape.coordinates
+    return found
+
+
+def _traced(model: Model) -> Traced:
+    """The body, with a symbol in the place of what effects on other samples give."""
+    return model.staged if any(a.kind in OVER_TIME for a in model.effects) else model.traced
 
 
 def _direct(
-    problem: Problem, point: Point, found: Sequence[Candidate], rows: Sequence[Index]
+    problem: Problem,
+    point: Point,
+    found: Sequence[Candidate],
+    rows: Sequence[Index],
+    given: Sequence[Array],
 ) -> Iterator[tuple[Candidate, Array | CasestError]]:
+    """All at once; `given` (N, k) of each run: what the model's effects on other samples give."""
     model, kept = problem.model, list[Candidate]()
     slopes, scopes = list[Any](), list[NDArray[np.bool_]]()
     signals = list(model.signals)
-    symbols = {s.name: model.traced.symbols[s.name] for s in signals}
+    symbols = {s.name: _traced(model).symbols[s.name] for s in signals}
     for candidate in found:
         try:
             slope, scope, more = slope_of(candidate, model, symbols)
@@ -82,16 +114,16 @@ def _direct(
         scopes.append(np.array(scope, bool))
     if not kept:
         return
-    base = model.traced
+    base = _traced(model)
     inputs = [
         ca.vertcat(base.coordinates, base.references),
-        ca.vertcat(*[flat(symbols[s.name]) for s in signals]),
+        ca.vertcat(*[flat(symbols[s.name]) for s in signals], *(s.given for s in base.stages)),
     ]
     together = ca.densify(ca.horzcat(*slopes))
     replay = Replay(ca.Function("slopes", inputs, [together], ["parameters", "sample"], ["G"]))
     values = []
     for r, run in enumerate(problem.runs):
-        samples = Columns([run.signals[s.name] for s in signals])
+        samples = Columns([*(run.signals[s.name] for s in signals), given[r]])
         every = slice(None, None, rows[r][1] - rows[r][0]) if len(rows[r]) > 1 else slice(None)
         (G,) = replay(problem.parameters(point, r), samples[every])
         weight = None if problem.weights is None else problem.weights[r][rows[r]]
@@ -164,30 +196,24 @@ def slope_of(
 ) -> tuple[Any, list[bool], list[Signal]]:
     """∂r/∂(its unknowns) at null in the model's symbols; which are per run; signals it adds."""
     extended = candidate.traced_on(model)
-    traced, base = extended.traced, model.traced
+    traced, base = _traced(extended), _traced(model)
     held = {f"{candidate.label}.{name}": value for name, value in candidate.held}
     own = {p.name for p in candidate.parameters(extended)}
     more = [s for s in extended.signals if s.name not in symbols]
     for s in more:
         symbols[s.name] = ca.SX.sym(s.name, s.size)
-    place, mine, scopes, old, new, k = 0, [], [], [], [], 0
+    here, there = _coordinates(extended), _coordinates(model)
+    mine, scopes, new = [], [], []
     for p in extended.parameters:
-        width = p.shape.coordinates
-        here = traced.coordinates[place : place + width]
-        if p.name in held:
-            old.append(here)
-            new.append(ca.DM(held[p.name]))
-        elif p.name in own:
-            mine.append(here)
-            scopes += [p.scope == "run"] * width
-            old.append(here)
-            new.append(ca.DM(p.start_value()))
-        else:
-            old.append(here)
-            new.append(base.coordinates[k : k + width])
-            k += width
-        place += width
+        if p.name in own:
+            mine.append(here[p.name])
+            scopes += [p.scope == "run"] * p.shape.coordinates
+        start = p.start_value() if p.name in own else held.get(p.name)
+        new.append(there[p.name] if start is None else ca.DM(start))
     slope = ca.jacobian(traced.expression, ca.vertcat(*mine))
-    old += [traced.references, *(flat(traced.symbols[s.name]) for s in extended.signals)]
-    new += [base.references, *(flat(symbols[s.name]) for s in extended.signals)]
+    old = [traced.coordinates, traced.references]
+    old += [stage.given for stage in traced.stages]
+    old += [flat(traced.symbols[s.name]) for s in extended.signals]
+    new += [base.references, *(stage.given for stage in base.stages)]
+    new += [flat(symbols[s.name]) for s in extended.signals]
     return ca.substitute(slope, ca.vertcat(*old), ca.vertcat(*new)), scopes, more

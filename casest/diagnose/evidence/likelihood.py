@@ -132,8 +132,7 @@ class Likelihood:
     def _spectrum(self, left: Array, free: Array) -> Array:
         """Of every axis, from what is left and the share that the fit leaves free."""
         power, free = (left**2).reshape(self.shape), np.clip(free, LEFT, 1).reshape(self.shape)
-        curves = [self._bands.curve(power[:, a], free[:, a]) for a in range(self.shape[1])]
-        return np.stack(curves, axis=1).ravel()
+        return self._bands.curves(power, free).ravel()
 
     def course(self, explained: Explained, columns: Sequence[Array]) -> Array:
         """What unknowns and columns explain, (N, m) in time."""
