@@ -87,7 +87,7 @@ CERTIFICATE, JUDGE = "estimate/certificate.py", "fleet/judge.py"
 REASONS = "estimate/reasons.py"
 SCORE, LIKELIHOOD = "diagnose/evidence/score.py", "diagnose/evidence/likelihood.py"
 PARTS, LINEAR = "diagnose/evidence/held_out.py", "diagnose/evidence/linear.py"
-CROSS, PROTOCOL = "diagnose/cross_validation.py", "diagnose/protocol.py"
+CROSS, CONFIRMING = "diagnose/cross_validation.py", "diagnose/protocol/confirming.py"
 LEVELS = "diagnose/levels.py"
 TRANSITION, EXTENDED = "dynamics/transition.py", "dynamics/extended.py"
 
@@ -177,8 +177,8 @@ MUTANTS = tuple(
             "stretches = batches % LEVELS.folds",
         ),
         (LINEAR, "regions = _regions(inputs, LEVELS.regions)", "regions = batches % LEVELS.folds"),
-        (PROTOCOL, "all(f.ratio < 1 for f in found.values())", "True"),
-        (PROTOCOL, "if not holds_out(seen, ranking.linear):", "if False:"),
+        (CONFIRMING, "all(f.ratio < 1 for f in found.values())", "True"),
+        (CONFIRMING, "if not holds_out(seen, ranking.linear):", "if False:"),
         (LEVELS, "confirmed: float = 1.64", "confirmed: float = 0.0"),
         (
             "estimate/held_out.py",

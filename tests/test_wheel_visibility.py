@@ -83,8 +83,8 @@ def test_one_mounting_at_one_tilt_hides_both(name):
     ready = prepared(wheel, [run])
     sensor = Sensor(wheel, ready, (cross_axis,))
     fit = sensor.fitted(wheel, calibrate(wheel, [run]).values)
-    listed = sensor.found(fit)[0]
-    seen = {v.candidate.name: v for v in visible(sensor.linear(fit), sensor.trials_of(fit, listed))}
+    listed = sensor.tried.found(fit)[0]
+    seen = {v.candidate.name: v for v in visible(sensor.linear(fit), sensor.tried.of(fit, listed))}
     assert np.all(seen[name].survives < LEVELS.survives)
     # Nothing is "found" although both are wrong.
     ranking = ranked(sensor, fit)

@@ -115,7 +115,7 @@ def _closed(sensor: Sensor, before: Estimate, folds: Folds, say: Callable[[str],
         after,
         *_on_the_same_samples(*hidden),
         tuple(effects),
-        tuple(sensor.found(declared)[1]),
+        tuple(sensor.tried.found(declared)[1]),
         _refused(sensor, state, declared),
         folds,
         _visible(sensor, declared),
@@ -188,7 +188,7 @@ def _found(sensor: Sensor, state: State[Fit], kept: Kept, after: Estimate) -> Fo
     fall = (1 - ratio) / max(ratio, 1e-300) * state.fit.noise**2
     added = {k.what.label for k in state.kept}
     rivals = {
-        r.what.label: sensor.moved_by(state.fit, r)
+        r.what.label: sensor.moved_by(state.fit, r.fit)
         for r in kept.rivals
         if r.what.label not in added
     }
@@ -200,7 +200,7 @@ def _refused(sensor: Sensor, state: State[Fit], declared: Fit) -> tuple[Skipped,
     said = {r.what.label: r.why for r in reversed(state.refused) if r.what.label not in added}
     ranked = state.first.found if state.first else ()
     shown = {e.trials[0].family for e in ranked}
-    asked, skipped = sensor.unseen(declared, shown)
+    asked, skipped = sensor.tried.unseen(declared, shown)
     return (
         *(Skipped(name, why) for name, why in said.items()),
         *asked,

@@ -1,0 +1,121 @@
+"""One step of the search: the best cause that held-out parts confirm, or none."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+from casest.diagnose.evidence.score import Evidence, again
+from casest.diagnose.levels import LEVELS
+from casest.diagnose.protocol.confirming import FAR_AWAY, falls, passing, significant
+from casest.diagnose.protocol.ranking import pairs, ranked
+from casest.diagnose.protocol.refits import best_refits, refitted, shown, torn_between
+from casest.diagnose.protocol.state import F, Kept, Ranking, Refit, State
+from casest.diagnose.protocol.subject import Subject
+
+#: Why a cause with strong evidence is not added.
+NOT_HELD_OUT = "held-out data do not confirm it"
+
+
+def with_the_best(
+    subject: Subject[F], state: State[F], ranking: Ranking, say: Callable[[str], None]
+) -> State[F]:
+    """The state with the best cause that held-out parts confirm; as it is if none is."""
+    state, asked = _hypotheses(subject, state, ranking)
+    every = (*ranking.causes, *pairs(ranking))
+    options = [e for e in every if significant(e, ranking.linear)]
+    options.sort(key=lambda e: -e.score)
+    described = None if asked else subject.formula(state.fit, ranking)
+    left, tried = options, list[Evidence]()
+    while True:
+        held = asked or passing(ranking, left)
+        refits = refitted(subject, state.fit, ranking, held)
+        if not asked and not tried:
+            refits = best_refits([*refits, *shown(subject, state.fit, ranking)])
+        torn = [] if asked else torn_between(refits, ranking)
+        if torn:
+            return replace(state, open=tuple(torn))
+        if described is not None and _describes(subject, described, refits, ranking):
+            refits = [*refitted(subject, state.fit, ranking, [described]), *refits]
+        bigger, over = _first_certified(subject, state, ranking, refits, say)
+        if len(bigger.kept) > len(state.kept):
+            return bigger
+        state, tried = bigger, [*tried, *held]
+        # A linear promise that no refit keeps: what comes after it.
+        left = [] if asked else [e for e in left if e not in held]
+        if over or not held or not (left or asked):
+            break
+        asked, left = [], left or options
+    for evidence in [e for e in options if e not in tried][:2]:
+        state = state.refusing(evidence.trials[0].what, NOT_HELD_OUT)
+    return replace(state, open=tuple(options[: LEVELS.contenders]))
+
+
+def _first_certified(
+    subject: Subject[F],
+    state: State[F],
+    ranking: Ranking,
+    refits: Sequence[Refit[F]],
+    say: Callable[[str], None],
+) -> tuple[State[F], bool]:
+    """The state with the first refit that is proved, if there is one; and is the search over?"""
+    for k, refit in enumerate(refits):
+        fit = subject.certified(refit.fit)
+        if not isinstance(fit, str):
+            return _with_kept(subject, state, ranking, replace(refit, fit=fit), say), True
+        state = state.refusing(refit.evidence.trials[0].what, fit)
+        later = refits[k + 1].evidence.score if k + 1 < len(refits) else 0.0
+        if len(refit.evidence.trials) == 1 and refit.evidence.score > later + LEVELS.strong:
+            return state, True  # what explains clearly less is not the cause
+    return state, False
+
+
+def _hypotheses(
+    subject: Subject[F], state: State[F], ranking: Ranking
+) -> tuple[State[F], list[Evidence]]:
+    """What the user says is there: a hypothesis that was there before the data, by its F test."""
+    asked = [e for e in ranking.found if subject.asked(e.trials[0].what)]
+    found = []
+    for evidence in asked:
+        alone = again(evidence, ranking.likelihood, ranking.none, len(asked), 1)
+        if alone.p_value >= LEVELS.chance:
+            why = f"no more of it than noise would have (p = {alone.p_value:.2g})"
+            state = state.refusing(evidence.trials[0].what, why)
+        elif falls(ranking, alone)["pieces"].ratio < 1:
+            found.append(alone)
+    return state, sorted(found, key=lambda e: -e.score)
+
+
+def _describes(
+    subject: Subject[F], formula: Evidence, names: Sequence[Refit[F]], ranking: Ranking
+) -> bool:
+    """Is a description so much better than causes with a name, wherever it is held out?
+
+    Than the best cause, and what has a name beside that one: terms of a formula may be several
+    causes.
+    """
+    best = max((r.evidence.score for r in names), default=0.0)
+    if formula.score < best + LEVELS.described:
+        return False
+    seen = falls(ranking, formula)
+    if any(f.ratio >= 1 or f.t < LEVELS.confirmed for f in seen.values()):
+        return False
+    if not names:
+        return True
+    named = falls(ranking, names[0].evidence)
+    if any(1 - named[k].ratio > (1 - LEVELS.alike) * (1 - seen[k].ratio) for k in FAR_AWAY):
+        return False  # what has a name explains as much
+    beside = ranked(subject, names[0].fit).found
+    second = max((e.score for e in beside[:1]), default=0.0)
+    return formula.score >= best + max(second, 0.0) + LEVELS.described
+
+
+def _with_kept(
+    subject: Subject[F], state: State[F], ranking: Ranking, refit: Refit[F],
+    say: Callable[[str], None],
+) -> State[F]:  # fmt: skip
+    seen, kept = refit.falls or falls(ranking, refit.evidence), state.kept
+    for trial in refit.evidence.trials:
+        say(f"{subject.label(trial.what)}: held-out error falls")
+        kept = (*kept, Kept(trial.what, refit.evidence, seen))
+    return replace(state, fit=refit.fit, kept=kept)

@@ -1,0 +1,85 @@
+"""Is a cause strong evidence, and are parts that were held out foretold better with it?"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from casest.diagnose.evidence.held_out import Fall, fall, fall_between
+from casest.diagnose.evidence.linear import Linear
+from casest.diagnose.evidence.score import Evidence
+from casest.diagnose.levels import LEVELS
+from casest.diagnose.protocol.state import Ranking
+
+#: Parts that are held out whole.
+FAR_AWAY = ("stretches", "regions")
+
+
+def significant(evidence: Evidence, linear: Linear) -> bool:
+    """Strong evidence in a series; in poses the F test, shared among all that was tried."""
+    return evidence.score > LEVELS.strong if linear.series else evidence.p_value < LEVELS.chance
+
+
+def falls(ranking: Ranking, evidence: Evidence) -> dict[str, Fall]:
+    """What the columns of a cause do to each kind of held-out squares."""
+    columns = [ranking.likelihood.in_time(evidence.basis)]
+    return {k: fall(ranking.linear, columns, p) for k, p in ranking.linear.parts.each.items()}
+
+
+def falls_of_refit(before: Linear, after: Linear) -> dict[str, Fall]:
+    """Held-out squares of two fits, each near its own optimum."""
+    return {k: fall_between(before, after, parts) for k, parts in before.parts.each.items()}
+
+
+def holds_out(found: dict[str, Fall], linear: Linear) -> bool:
+    """Are pieces, whole stretches and whole regions foretold better?
+
+    From part to part where there are parts enough; a region may be foretold worse by chance alone.
+    """
+    if not linear.series:
+        return found["pieces"].ratio < 1
+    steady = min(found["pieces"].t, found["stretches"].t) > LEVELS.confirmed
+    return steady and all(f.ratio < 1 for f in found.values())
+
+
+def passing(ranking: Ranking, options: Sequence[Evidence]) -> list[Evidence]:
+    """Those that hold out, down to where none has any weight beside the best of them.
+
+    A linear promise may be far from a refit's: of causes alone the first few count in any case.
+    """
+    found: list[Evidence] = []
+    alone = 0
+    for evidence in options:
+        far = bool(found) and evidence.score < found[0].score - 2 * LEVELS.strong
+        several = len(evidence.trials) > 1
+        if far and (several or alone >= LEVELS.contenders):
+            continue
+        alone += not several
+        seen = falls(ranking, evidence)
+        if not holds_out(seen, ranking.linear):
+            continue
+        if several and not _better_than_its_parts(evidence, seen, ranking):
+            continue
+        found.append(evidence)
+    return found
+
+
+def _better_than_its_parts(both: Evidence, seen: dict[str, Fall], ranking: Ranking) -> bool:
+    """Does a pair foretell much more of whole parts than each of the two alone?
+
+    Else the better one comes first, and the other one beside it, if it is there.
+    """
+    names = FAR_AWAY if ranking.linear.series else ("pieces",)
+    for trial in both.trials:
+        (one,) = [e for e in ranking.found if e.trials[0] is trial]
+        if one.score > both.score - LEVELS.strong:
+            return False
+        alone = falls(ranking, one)
+        if any(_as_much(alone[k].ratio, seen[k].ratio) for k in names):
+            return False
+    return True
+
+
+def _as_much(alone: float, both: float) -> bool:
+    """Does one alone gain nine tenths of what both gain, and do both leave as much but a tenth?"""
+    gains = 1 - alone > (1 - LEVELS.alike) * (1 - both)
+    return gains and both > (1 - LEVELS.alike) * alone

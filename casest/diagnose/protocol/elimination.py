@@ -1,0 +1,74 @@
+"""Each cause must earn its place again beside those that came later."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from casest.diagnose.evidence.likelihood import Likelihood
+from casest.diagnose.evidence.score import p_value, worth
+from casest.diagnose.levels import LEVELS
+from casest.diagnose.protocol.confirming import falls_of_refit, holds_out
+from casest.diagnose.protocol.state import F, Kept, State
+from casest.diagnose.protocol.subject import Subject
+
+
+def on_all_axes(subject: Subject[F], state: State[F]) -> State[F]:
+    """Axes that were nothing beside what was still missing may be something now."""
+    for k, kept in enumerate(state.kept):
+        found = subject.wider(state.fit, kept.what)
+        if found is None:
+            continue
+        what, fit = found
+        none, all_ = Likelihood(subject.linear(state.fit)), subject.linear(fit)
+        more = all_.basis.shape[1] - none.declared.shape[1]
+        if more < 1 or isinstance(subject.certified(fit), str):
+            continue
+        if worth(subject.rise(state.fit, fit), more, 0.0, none) > LEVELS.strong:
+            trials = tuple(replace(t, what=what) if t.what == kept.what else t
+                           for t in kept.evidence.trials)  # fmt: skip
+            evidence = replace(kept.evidence, trials=trials)
+            several = list(state.kept)
+            several[k] = replace(kept, what=what, evidence=evidence)
+            state = replace(state, fit=fit, kept=tuple(several))
+    return state
+
+
+def eliminated(subject: Subject[F], state: State[F]) -> State[F]:
+    """Each cause must earn its place again beside the others; the weakest goes first."""
+    while len(state.kept) > 1:
+        weak = []
+        for kept in state.kept:
+            base = subject.without(state.fit, kept.what)
+            score = None if base is None else _beside_the_others(subject, state, kept, base)
+            if score is not None:
+                weak.append((score, kept, base))
+        if not weak:
+            return state
+        _, gone, fit = min(weak, key=lambda w: w[0])
+        assert fit is not None
+        state = replace(state, fit=fit, kept=tuple(k for k in state.kept if k is not gone))
+        state = state.refusing(gone.what, "no longer needed beside what came later")
+    return state
+
+
+def _beside_the_others(subject: Subject[F], state: State[F], kept: Kept, base: F) -> float | None:
+    """What a cause is worth that does not earn its place as the last one; None if it does.
+
+    `base` is the fit without it.
+    """
+    linear, whole = subject.linear(base), subject.linear(state.fit)
+    none, gain = Likelihood(linear), subject.rise(base, state.fit)
+    freedom = max(whole.basis.shape[1] - linear.basis.shape[1], 1)
+    families = state.first.families if state.first else 1
+    searched = float(np.log(kept.evidence.trials[0].variants * families))
+    score = worth(gain, freedom, searched, none)
+    strong = (
+        score > LEVELS.strong
+        if linear.series
+        else (p_value(gain, freedom, searched, none) < LEVELS.chance)
+    )
+    if strong and (subject.asked(kept.what) or linear.residual.shape != whole.residual.shape):
+        return None  # rows that moved in time are others
+    return None if strong and holds_out(falls_of_refit(linear, whole), linear) else score

@@ -1,0 +1,114 @@
+"""Causes by what they are worth beside one fit."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+
+from casest.diagnose.evidence.likelihood import Likelihood
+from casest.diagnose.evidence.linear import Linear
+from casest.diagnose.evidence.score import (
+    Evidence,
+    Trial,
+    again,
+    judged,
+    on_fewer_axes,
+    screened,
+    whitened,
+)
+from casest.diagnose.levels import LEVELS
+from casest.diagnose.protocol.state import F, Ranking
+from casest.diagnose.protocol.subject import Subject
+
+
+def ranked(subject: Subject[F], fit: F) -> Ranking:
+    """Every cause beside a fit: the best variants of each family, each with a noise of its own."""
+    ranking = ranked_of(subject.linear(fit), list(subject.trials(fit)))
+    found = _best_first([_on_its_axes(subject, fit, e, ranking) for e in ranking.found])
+    ranking = _about_the_best(replace(ranking, found=found))
+    near = [e for e in ranking.causes[: LEVELS.contenders] if e.score > -LEVELS.clear]
+    finer = {e.trials[0].family: sharpened(subject, fit, ranking, e) for e in near}
+    found = tuple(finer.get(e.trials[0].family, e) for e in ranking.found)
+    return replace(ranking, found=_best_first(found))
+
+
+def ranked_of(linear: Linear, trials: Sequence[Trial]) -> Ranking:
+    """The best variant of each family, with a noise of its own."""
+    likelihood = Likelihood(linear)
+    none = likelihood.beside()
+    families = max(len({t.family for t in trials}), 1)
+    white = whitened(likelihood, none)
+    best: dict[str, tuple[float, Trial]] = {}
+    for trial in trials:
+        promise = screened(trial, likelihood, white)
+        if promise > best.get(trial.family, (-np.inf, trial))[0]:
+            best[trial.family] = (promise, trial)
+    found = [judged([trial], likelihood, none, families=families) for _, trial in best.values()]
+    several = _best_first([e for e in found if e is not None])
+    order = {family: k for k, family in enumerate(dict.fromkeys(t.family for t in trials))}
+    return Ranking(linear, likelihood, none, several, families, order)
+
+
+def _best_first(found: Sequence[Evidence]) -> tuple[Evidence, ...]:
+    return tuple(sorted(found, key=lambda e: -e.score))
+
+
+def _on_its_axes(subject: Subject[F], fit: F, evidence: Evidence, ranking: Ranking) -> Evidence:
+    """Without the axes that are not worth their price."""
+    axes = on_fewer_axes(evidence, ranking.likelihood)
+    if axes is None:
+        return evidence
+    trial = subject.on_axes(fit, evidence.trials[0], axes)
+    less = judged([trial], ranking.likelihood, ranking.none, start=evidence.explained,
+                  families=ranking.families)  # fmt: skip
+    whole = evidence.freedom == evidence.trials[0].columns.shape[2]  # else no size of its own
+    return less if less is not None and (less.score > evidence.score or not whole) else evidence
+
+
+def _about_the_best(ranking: Ranking) -> Ranking:
+    """The same with what is far out told from the best course: far from none may be the cause."""
+    if not ranking.found or not ranking.linear.series:
+        return ranking
+    best, families = ranking.found[0], ranking.families
+    if best.score < 0:
+        return ranking
+    course = ranking.likelihood.course(best.explained, [best.basis])
+    likelihood = Likelihood(ranking.linear, course)
+    likelihood.__dict__["declared"] = ranking.likelihood.declared
+    none = likelihood.beside(start=ranking.none.spectrum)
+    found = _best_first([again(e, likelihood, none, families, 1) for e in ranking.found])
+    return replace(ranking, likelihood=likelihood, none=none, found=found)
+
+
+def sharpened(subject: Subject[F], fit: F, ranking: Ranking, evidence: Evidence) -> Evidence:
+    """At the best value near the one that a grid had: the grid is coarse."""
+    for k, trial in enumerate(evidence.trials):
+        others = [t for t in evidence.trials if t is not trial]
+        for scale in (1.0, 0.3, 0.1):
+            for moved in subject.nearer(fit, evidence.trials[k], scale):
+                both = [*others[:k], moved, *others[k:]]
+                found = judged(both, ranking.likelihood, ranking.none, start=evidence.explained,
+                               families=ranking.families, rounds=1)  # fmt: skip
+                if found is not None and found.score > evidence.score:
+                    evidence = found
+    return evidence
+
+
+def pairs(ranking: Ranking) -> list[Evidence]:
+    """The best causes two by two: what neither shows alone."""
+    best = ranking.causes[: LEVELS.contenders]
+    found = []
+    for one, other in combinations(best, 2):
+        both = judged(
+            [*one.trials, *other.trials],
+            ranking.likelihood,
+            ranking.none,
+            start=one.explained,
+            families=ranking.families,
+        )
+        if both is not None and both.freedom > max(one.freedom, other.freedom):
+            found.append(both)
+    return sorted(found, key=lambda e: -e.score)

@@ -1,0 +1,121 @@
+"""Causes refitted, and which of several that explain alike comes first, or none."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from casest.diagnose.evidence.score import Evidence, expected_loss, judged
+from casest.diagnose.levels import LEVELS
+from casest.diagnose.protocol.confirming import falls_of_refit, holds_out, significant
+from casest.diagnose.protocol.ranking import sharpened
+from casest.diagnose.protocol.state import F, Ranking, Refit
+from casest.diagnose.protocol.subject import Subject
+
+#: Share of their length by which columns may lie outside a span that holds the most of them.
+NESTED = 0.5
+
+
+def refitted(
+    subject: Subject[F], fit: F, ranking: Ranking, options: Sequence[Evidence]
+) -> list[Refit[F]]:
+    """Causes by what their refits are worth; of equal ones first what would do the least harm."""
+    found: list[Refit[F]] = []
+    for evidence in _with_parts(options[: LEVELS.contenders], ranking):
+        evidence = sharpened(subject, fit, ranking, evidence)
+        better = subject.refit(fit, evidence.trials)
+        if isinstance(better, str):
+            continue
+        gain = subject.gain(fit, better, evidence)
+        score = evidence.score - evidence.gain + gain
+        if ranking.enough(score, gain) or subject.asked(evidence.trials[0].what):
+            found.append(Refit(better, replace(evidence, gain=gain, score=score)))
+    found.sort(key=lambda r: -r.evidence.score)
+    near = _near(found)
+    if len(near) > 1:
+        loss, _ = expected_loss(near, ranking.likelihood)
+        # Of equal ones the first of the catalogue: what is met more often.
+        usual = [min(ranking.order.get(f, 0) for f in e.families) for e in near]
+        best = found[min(range(len(near)), key=lambda k: (float(f"{loss[k]:.3g}"), usual[k]))]
+        found = [best, *[r for r in found if r is not best]]
+        found = _plainest_first(found)
+    return found
+
+
+def _with_parts(options: Sequence[Evidence], ranking: Ranking) -> list[Evidence]:
+    """What comes in pairs alone as well: a refit may need one of them only."""
+    alone = {e.trials[0].family: e for e in ranking.found}
+    parts = [alone[t.family] for e in options if len(e.trials) > 1 for t in e.trials[:1]]
+    parts += [alone[t.family] for e in options if len(e.trials) > 1 for t in e.trials[1:]]
+    several = {id(e): e for e in (*options, *parts) if significant(e, ranking.linear)}
+    return list(several.values())
+
+
+def _plainest_first(refits: list[Refit[F]]) -> list[Refit[F]]:
+    """What the first one contains, and explains as much, comes before it."""
+    first = refits[0].evidence
+    inside = [
+        r
+        for r in refits[1:]
+        if r.evidence.score > first.score - LEVELS.strong
+        and r.evidence.freedom < first.freedom
+        and _contains(first, r.evidence)
+    ]
+    if not inside:
+        return refits
+    best = max(inside, key=lambda r: r.evidence.score)
+    return [best, *[r for r in refits if r is not best]]
+
+
+def _contains(wide: Evidence, narrow: Evidence) -> bool:
+    """Are the columns of one a combination of those of the other?"""
+    beyond = narrow.basis - wide.basis @ (wide.basis.T @ narrow.basis)
+    return bool(np.sum(beyond**2) < NESTED * narrow.freedom)
+
+
+def _near(refits: Sequence[Refit[F]]) -> list[Evidence]:
+    """Those that the evidence does not tell from the best."""
+    best = max((r.evidence.score for r in refits), default=0.0)
+    return [r.evidence for r in refits if r.evidence.score > best - LEVELS.clear]
+
+
+def torn_between(refits: Sequence[Refit[F]], ranking: Ranking) -> list[Evidence]:
+    """Causes of which each, were it the wrong one, would do more harm than none of them.
+
+    That is, leave the declared parameters further off: what is added hangs on which it is.
+    """
+    near = _near(refits)
+    if len(near) < 2:
+        return []
+    loss, none = expected_loss(near, ranking.likelihood)
+    noise = float(np.mean(ranking.likelihood.residual**2 * np.exp(-near[0].gain / len(
+        ranking.likelihood.residual))))  # fmt: skip
+    return near if none < loss.min() and loss.min() > noise else []
+
+
+def best_refits(refits: Sequence[Refit[F]]) -> list[Refit[F]]:
+    """The first stays, unless another one is clearly worth more."""
+    if not refits:
+        return []
+    best = max(refits, key=lambda r: r.evidence.score)
+    clear = best.evidence.score > refits[0].evidence.score + LEVELS.clear
+    first = best if clear else refits[0]
+    return [first, *[r for r in refits if r is not first]]
+
+
+def shown(subject: Subject[F], fit: F, ranking: Ranking) -> list[Refit[F]]:
+    """What the records show by themselves, refitted: held-out parts by the refit itself."""
+    found = []
+    for trial in subject.shown(fit):
+        evidence = judged([trial], ranking.likelihood, ranking.none, families=ranking.families)
+        better = subject.refit(fit, [trial])
+        if evidence is None or isinstance(better, str):
+            continue
+        gain = subject.gain(fit, better, evidence)
+        score = evidence.score - evidence.gain + gain
+        seen = falls_of_refit(ranking.linear, subject.linear(better))
+        if ranking.enough(score, gain) and holds_out(seen, ranking.linear):
+            found.append(Refit(better, replace(evidence, gain=gain, score=score), seen))
+    return found

@@ -1,0 +1,72 @@
+"""What explains as much in the place of a cause that was added."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from casest.declaration.shapes import Array
+from casest.diagnose.evidence.held_out import squares, standard_errors
+from casest.diagnose.evidence.score import Evidence
+from casest.diagnose.levels import LEVELS
+from casest.diagnose.protocol.ranking import ranked_of
+from casest.diagnose.protocol.state import F, Kept, Ranking, Rival, State
+from casest.diagnose.protocol.subject import Subject
+
+
+def with_rivals(subject: Subject[F], state: State[F]) -> State[F]:
+    """Each cause beside those that explain as much in its place, the others kept."""
+    kept = tuple(replace(k, rivals=_rivals(subject, state, k)) for k in state.kept)
+    return replace(state, kept=kept)
+
+
+def _rivals(subject: Subject[F], state: State[F], kept: Kept) -> tuple[Rival, ...]:
+    """By evidence, or by held-out stretches (Vuong 1989): a score alone does not say so."""
+    apart, base = subject.apart(state.fit, kept), subject.without(state.fit, kept.what)
+    if apart is None or base is None:
+        return ()
+    linear, own, others = subject.linear(base), apart[1], list(subject.trials(base))
+    if own.columns.shape[:2] != linear.residual.shape:  # rows that moved in time are others
+        (own, *_) = [t for t in others if t.family == own.family]
+    # Slopes and grids are those of the fit without it: in its own, others follow it.
+    ranking = ranked_of(linear, [own, *(t for t in others if t.family != own.family)])
+    mine = [e for e in ranking.found if e.trials[0] is own]
+    if not mine:
+        return ()
+    stretches = linear.parts.stretches
+    without, best = (squares(linear, c, stretches) for c in ([], [_in_time(ranking, mine[0])]))
+    rivals = list[Evidence]()
+    for e in ranking.causes:
+        if e is mine[0] or e.score < LEVELS.strong or len(rivals) == LEVELS.contenders:
+            continue
+        lost = squares(linear, [_in_time(ranking, e)], stretches) - best
+        if _as_well(mine[0].score - e.score, lost, without - best):
+            rivals.append(e)
+    after = subject.linear(state.fit)
+    target = mine[0].score - mine[0].gain + subject.rise(base, state.fit)
+    found = []
+    for e in rivals:  # what the columns promise, a refit must keep
+        fit = subject.refit(base, e.trials)
+        if isinstance(fit, str):
+            continue
+        behind = target - (e.score - e.gain + subject.rise(base, fit))
+        other = subject.linear(fit)
+        lost = np.zeros(1)
+        if {x.residual.shape for x in (linear, after, other)} == {linear.residual.shape}:
+            own_, its = (squares(x, [], stretches) for x in (after, other))
+            lost, best = its - own_, own_
+        if _as_well(behind, lost, without - best):
+            found.append(Rival(e.trials[0].what, fit))
+    return tuple(found)
+
+
+def _in_time(ranking: Ranking, evidence: Evidence) -> Array:
+    return ranking.likelihood.in_time(evidence.basis)
+
+
+def _as_well(behind: float, lost: Array, gained: Array) -> bool:
+    """Not clearly less evidence, or what was held out is foretold as well."""
+    little = float(lost.sum()) < LEVELS.alike * float(gained.sum())
+    alike = len(lost) > 1 and standard_errors(lost) < LEVELS.apart and little
+    return behind < LEVELS.clear or alike

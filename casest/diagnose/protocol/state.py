@@ -1,0 +1,102 @@
+"""What a search is made of: causes ranked, refitted, kept, refused; a state of it is a value."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Generic, TypeVar
+
+from casest.diagnose.evidence.held_out import Fall
+from casest.diagnose.evidence.likelihood import Explained, Likelihood
+from casest.diagnose.evidence.linear import Linear
+from casest.diagnose.evidence.score import Evidence
+from casest.diagnose.levels import LEVELS
+
+F = TypeVar("F")
+
+
+@dataclass(frozen=True)
+class Ranking:
+    """Causes by what they are worth, beside one fit; the best of each family, best first."""
+
+    linear: Linear
+    likelihood: Likelihood = field(repr=False)
+    none: Explained = field(repr=False)
+    found: tuple[Evidence, ...]
+    families: int
+    order: Mapping[str, int] = field(default_factory=dict, repr=False)
+
+    @property
+    def causes(self) -> tuple[Evidence, ...]:
+        """Those that have a name of their own."""
+        return tuple(e for e in self.found if not e.trials[0].describes)
+
+    def enough(self, score: float, gain: float) -> bool:
+        """Is it strong evidence, and nearly as much as a course of unknown cause explains?"""
+        course = self.description
+        if score <= (LEVELS.strong if self.linear.series else 0.0):
+            return False
+        return course is None or score > course.score or gain > (1 - LEVELS.alike) * course.gain
+
+    @property
+    def description(self) -> Evidence | None:
+        """The best course of unknown cause, if there is evidence for one."""
+        found = [e for e in self.found if e.trials[0].describes and e.score > LEVELS.strong]
+        return found[0] if found else None
+
+
+@dataclass(frozen=True)
+class Refit(Generic[F]):
+    """A cause in the model, fitted: `evidence` with the score of this fit; `falls` if they are not
+    those of its columns."""
+
+    fit: F
+    evidence: Evidence
+    falls: dict[str, Fall] | None = None
+
+
+@dataclass(frozen=True)
+class Rival:
+    """A cause that is not told apart from one that was added, and the fit with it instead."""
+
+    what: Any
+    fit: Any = field(repr=False)
+
+
+@dataclass(frozen=True)
+class Kept:
+    """A cause that was added, its evidence when it was, what held-out parts said, its rivals."""
+
+    what: Any
+    evidence: Evidence
+    falls: dict[str, Fall]
+    rivals: tuple[Rival, ...] = ()
+
+
+@dataclass(frozen=True)
+class Refused:
+    """What explained much but was not added, and why."""
+
+    what: Any
+    why: str
+
+
+@dataclass(frozen=True)
+class State(Generic[F]):
+    """A search as it stands: the fit, what it has been given, what was refused.
+
+    `open`: causes of which one is there, but not one to add.
+    """
+
+    fit: F
+    kept: tuple[Kept, ...] = ()
+    refused: tuple[Refused, ...] = ()
+    open: tuple[Evidence, ...] = ()
+    first: Ranking | None = None
+    last: Ranking | None = None
+
+    def refusing(self, what: Any, why: str) -> State[F]:
+        """The state with a refusal, which is said once."""
+        if any(r.what == what and r.why == why for r in self.refused):
+            return self
+        return replace(self, refused=(*self.refused, Refused(what, why)))

@@ -1,0 +1,74 @@
+"""What is searched: it knows its model, what could be missing there, and how to refit."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+from casest.diagnose.evidence.linear import Linear
+from casest.diagnose.evidence.score import Evidence, Trial
+from casest.diagnose.protocol.state import F, Kept, Ranking
+
+
+class Subject(Protocol[F]):
+    """What is searched. Fits are values; `what` of a trial is the subject's own."""
+
+    def linear(self, fit: F) -> Linear:
+        """The fit as a linear problem."""
+        ...
+
+    def trials(self, fit: F) -> Sequence[Trial]:
+        """All that could be missing, in its columns; of what has a grid, one for each value."""
+        ...
+
+    def shown(self, fit: F) -> Sequence[Trial]:
+        """What is refitted whatever its columns promise."""
+        ...
+
+    def nearer(self, fit: F, trial: Trial, scale: float) -> Sequence[Trial]:
+        """Variants of a trial around its value on a grid."""
+        ...
+
+    def on_axes(self, fit: F, trial: Trial, axes: Sequence[int]) -> Trial:
+        """The trial on some of its axes only."""
+        ...
+
+    def refit(self, fit: F, added: Sequence[Trial]) -> F | str:
+        """The fit with these in the model; or why there is none."""
+        ...
+
+    def gain(self, fit: F, better: F, evidence: Evidence) -> float:
+        """2 log of the likelihood of a refit over that of the fit, each with a noise of its own."""
+        ...
+
+    def rise(self, less: F, fit: F) -> float:
+        """2 log of the likelihood of a fit over that of one with less in it."""
+        ...
+
+    def certified(self, fit: F) -> F | str:
+        """The fit, proved; or why it is refused."""
+        ...
+
+    def without(self, fit: F, what: Any) -> F | None:
+        """The fit without something that was added."""
+        ...
+
+    def wider(self, fit: F, what: Any) -> tuple[Any, F] | None:
+        """Something that was added on some axes only, and the fit with it on all of them."""
+        ...
+
+    def apart(self, fit: F, kept: Kept) -> tuple[Linear, Trial] | None:
+        """The linear problem as if a cause were not there, and the cause as a trial of it."""
+        ...
+
+    def asked(self, what: Any) -> bool:
+        """Did the user say that it is there?"""
+        ...
+
+    def label(self, what: Any) -> str:
+        """What it is called."""
+        ...
+
+    def formula(self, fit: F, ranking: Ranking) -> Evidence | None:
+        """The best description outside the catalogue."""
+        ...

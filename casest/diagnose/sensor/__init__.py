@@ -1,0 +1,6 @@
+"""Residuals of a sensor as what the loop searches. Imports candidates, formula, protocol."""
+
+from casest.diagnose.sensor.fits import Fit
+from casest.diagnose.sensor.sensor import Sensor
+
+__all__ = ["Fit", "Sensor"]

@@ -1,0 +1,114 @@
+"""Rows that are looked at: residuals and slopes there, what is held out, what the sensor met."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+
+from casest.data.run import Run
+from casest.declaration.effect import OVER_TIME
+from casest.declaration.shapes import Array
+from casest.diagnose.candidates.slopes import rows_of
+from casest.diagnose.evidence.linear import Index, Linear, parts_of, spans_of
+from casest.diagnose.levels import LEVELS
+from casest.diagnose.sensor.fits import Fit, problem_of
+from casest.diagnose.sensor.recent import Recent
+from casest.leastsquares.problem import Point, Problem
+
+#: What survives of an implicit residual's slopes, in noise over reading, at least.
+BEYOND = 5.0
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Rows of runs (prepared), chosen evenly, and fits as linear problems in them."""
+
+    runs: tuple[Run, ...]
+    _linears: Recent[Fit, Linear] = field(default_factory=Recent, repr=False)
+
+    def linear(self, fit: Fit) -> Linear:
+        """Residuals and slopes in the rows that are looked at."""
+        return self._linears.of(fit, lambda: self._linear(fit))
+
+    def _linear(self, fit: Fit) -> Linear:
+        residual, J = self._slopes(*problem_of(fit, self.runs))
+        parts = parts_of(*self._numbers, self._met(fit))
+        return Linear(residual, J, self._spans, parts, self._least(fit))
+
+    def of(self, values: Sequence[Array]) -> Array:
+        """Values of each run (N, …) in the rows that are looked at, one run after the other."""
+        return np.concatenate([np.asarray(v)[k] for v, k in zip(values, self.index, strict=True)])
+
+    @cached_property
+    def index(self) -> list[Index]:
+        """Rows of each run that are looked at."""
+        return rows_of(self.runs, LEVELS.rows)
+
+    def _slopes(self, problem: Problem, point: Point) -> tuple[Array, Array]:
+        axes = len(problem.model.axes)
+        offsets = np.cumsum([0, *map(len, self.index)])
+        r, J = np.zeros((offsets[-1], axes)), np.zeros((offsets[-1], axes, problem.unknowns))
+        for block in problem.blocks(point):
+            rows = self.index[block.run]
+            inside = (rows >= block.span.start) & (rows < block.span.stop)
+            here, chosen = offsets[block.run] + np.flatnonzero(inside), rows[inside]
+            local = chosen - block.span.start
+            root = np.ones((1, 1)) if block.weights is None else np.sqrt(block.weights[local])
+            r[here] = block.residual[local] * root
+            own = np.zeros((len(here), axes, problem.unknowns))
+            own[:, :, block.x] = block.jacobian[local]
+            J[here] = own * root[:, :, None]
+        return r, np.nan_to_num(J)
+
+    @cached_property
+    def _numbers(self) -> tuple[Index, Index]:
+        """Block and run of each row."""
+        blocks = [run.block[rows] for run, rows in zip(self.runs, self.index, strict=True)]
+        runs = [np.full(len(rows), k) for k, rows in enumerate(self.index)]
+        return np.concatenate(blocks), np.concatenate(runs)
+
+    @cached_property
+    def _spans(self) -> tuple[slice, ...]:
+        """Where the noise may have a colour: in single readings with a time."""
+        total = sum(map(len, self.index))
+        in_time = all(run.time is not None and not run.spread for run in self.runs)
+        return spans_of(*self._numbers) if in_time and total >= LEVELS.series else ()
+
+    def _least(self, fit: Fit) -> float:
+        """Slopes of an implicit residual contain the residual: what survives must be more."""
+        if not fit.model.implicit:
+            return LEVELS.survives
+        names = [
+            s.name
+            for s in fit.model.signals
+            if s.name != "t" and s.kind == "plain" and s.name not in self.runs[0].columns
+        ]
+        sizes = [
+            float(np.sqrt(np.mean(np.concatenate([r.signals[n] for r in self.runs]) ** 2)))
+            for n in names
+        ]
+        return max(LEVELS.survives, BEYOND * fit.noise / max(min(sizes, default=np.inf), 1e-300))
+
+    def _met(self, fit: Fit) -> Array:
+        """What the sensor met in each row (N, q): the corrected quantity, or the prediction."""
+        traced = fit.model.traced
+        name = traced.corrected
+        value = fit.model.quantities[name].value if name else traced.predicted
+        if value is None:
+            return np.zeros((len(self._numbers[0]), 1))
+        problem, point = problem_of(fit, self.runs)
+        if problem.sequential:  # what it met is what it met without a memory as well
+            return self._met(_instant(fit))
+        found = problem.evaluate(point, {"q": value})
+        return np.nan_to_num(self.of([f[0].reshape(len(f[0]), -1) for f in found]))
+
+
+def _instant(fit: Fit) -> Fit:
+    """The fit without what looks at other samples."""
+    kept = tuple(a for a in fit.model.effects if a.kind not in OVER_TIME)
+    model = replace(fit.model, effects=kept)
+    own = {p.name for p in model.parameters}
+    return replace(fit, model=model, values={n: v for n, v in fit.values.items() if n in own})

@@ -1,0 +1,226 @@
+"""A sensor's residuals as what the loop searches: models with effects, refitted and proved."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from casest.data.run import Run
+from casest.declaration.effect import Effect
+from casest.declaration.model import Model
+from casest.declaration.shapes import Array
+from casest.diagnose.candidates.candidates import Candidate
+from casest.diagnose.evidence.likelihood import Likelihood
+from casest.diagnose.evidence.linear import Linear
+from casest.diagnose.evidence.score import Evidence, Trial
+from casest.diagnose.formula.search import NAME, described, readable, with_sizes
+from casest.diagnose.protocol import Kept, Ranking
+from casest.diagnose.sensor.fits import Fit, certified, fitted, problem_of, simpler, starts
+from casest.diagnose.sensor.rows import Rows
+from casest.diagnose.sensor.tried import Tried, on_axes
+from casest.engine.kernel import only_tried
+from casest.errors import CasestError
+from casest.estimate.calibrate import attempt
+from casest.estimate.estimate import Estimate
+from casest.leastsquares.problem import Problem
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """A model, its runs (prepared) and what may be missing: the loop's subject."""
+
+    model: Model
+    runs: tuple[Run, ...]
+    catalogue: tuple[Effect, ...]
+    known: frozenset[str] = frozenset()
+    seed: int = 0
+
+    @cached_property
+    def rows(self) -> Rows:
+        """What is looked at."""
+        return Rows(self.runs)
+
+    @cached_property
+    def tried(self) -> Tried:
+        """What may be missing."""
+        return Tried(self.rows, self.catalogue, self.known)
+
+    def fitted(self, model: Model, values: Mapping[str, Array]) -> Fit | None:
+        """Fit to everything from these values; None where it goes astray."""
+        return fitted(model, self.runs, values)
+
+    def proved(self, fit: Fit) -> Estimate:
+        """An estimate whose trust is known; its intervals are left for the end."""
+        with only_tried(False):
+            return attempt(fit.model, self.runs, start=fit.values, seed=self.seed, intervals=False)
+
+    def linear(self, fit: Fit) -> Linear:
+        """Residuals and slopes in the rows that are looked at."""
+        return self.rows.linear(fit)
+
+    def trials(self, fit: Fit) -> list[Trial]:
+        """Every candidate in its columns, over its grid."""
+        return self.tried.trials(fit)
+
+    def shown(self, fit: Fit) -> list[Trial]:
+        """Long lags that the records show by themselves: a slope does not reach as far."""
+        return self.tried.shown(fit)
+
+    def nearer(self, fit: Fit, trial: Trial, scale: float) -> list[Trial]:
+        """Values of a grid around the trial's."""
+        return self.tried.nearer(fit, trial, scale)
+
+    def on_axes(self, fit: Fit, trial: Trial, axes: Sequence[int]) -> Trial:
+        """The trial on some of its axes."""
+        return on_axes(fit, trial, axes)
+
+    def asked(self, what: Candidate) -> bool:
+        """Is it the user's own, or named as there?"""
+        return self.tried.asked(what)
+
+    def label(self, what: Candidate) -> str:
+        """Name and column."""
+        return what.label
+
+    def refit(self, fit: Fit, added: Sequence[Trial]) -> Fit | str:
+        """The fit with these effects, from their first-order sizes, if it can be trusted."""
+        try:
+            first = [t.what.free() if _is_lag(t.what) else t.what for t in added]
+            found = self._with(fit, first, fit.values)
+            if found is not None and any(t.what.free() is not t.what for t in added):
+                # From the sizes at the value of the grid: at nothing, no slope tells a frequency.
+                found = self._with(fit, [t.what.free() for t in added], found.values)
+            plain = [_plain(t.what) for t in added]
+            if found is not None and any(p is not None for p in plain):
+                simple = [p or t.what.free() for p, t in zip(plain, added, strict=True)]
+                found = simpler(found, self._with(fit, simple, fit.values))
+        except (CasestError, np.linalg.LinAlgError) as error:
+            return f"its refit fails: {error}"
+        return "its refit fails: the residual is not finite" if found is None else found
+
+    def _with(
+        self, fit: Fit, added: Sequence[Candidate], values: Mapping[str, Array]
+    ) -> Fit | None:
+        model = fit.model
+        for candidate in added:
+            model = candidate.added_to(model)
+        return self.fitted(model, starts(model, self.runs, values))
+
+    def gain(self, fit: Fit, better: Fit, evidence: Evidence) -> float:
+        """2 log of the likelihood of a refit over that of the fit, each with a noise of its own."""
+        refit = Likelihood(self.linear(better)).beside(start=evidence.explained.spectrum)
+        return evidence.gain + evidence.explained.cost - refit.cost
+
+    def rise(self, less: Fit, fit: Fit) -> float:
+        """2 log of the likelihood of a fit over that of one with less in it."""
+        costs = [Likelihood(self.linear(f)).beside().cost for f in (less, fit)]
+        return costs[0] - costs[1]
+
+    def certified(self, fit: Fit) -> Fit | str:
+        """The fit, if the data determine it and it is at rest; or why it is refused."""
+        return certified(fit, self.runs)
+
+    def without(self, fit: Fit, what: Candidate) -> Fit | None:
+        """The fit without an effect that was added."""
+        if what.freed:
+            return None
+        own = fit.model.unknowns_of(what.label)
+        left = tuple(a for a in fit.model.effects if a.label != what.label)
+        values = {n: v for n, v in fit.values.items() if n not in own}
+        return self.fitted(replace(fit.model, effects=left), values)
+
+    def wider(self, fit: Fit, what: Candidate) -> tuple[Candidate, Fit] | None:
+        """An effect that was added on some axes only, and the fit with it on all of them."""
+        base = self.without(fit, what)
+        if base is None or what.effect is None:
+            return None
+        whole = next((c for c in self.tried.found(base)[0] if c.label == what.label), None)
+        if whole is None or what.parameters(fit.model) == whole.parameters(
+            whole.traced_on(base.model)
+        ):
+            return None
+        whole = replace(whole, held=what.held, trials=what.trials)
+        found = self.refit(base, [Trial(whole, whole.label, np.zeros((0, 0, 0)))])
+        return None if isinstance(found, str) else (whole, found)
+
+    def apart(self, fit: Fit, kept: Kept) -> tuple[Linear, Trial] | None:
+        """The linear problem as if an effect were not there, and the effect as a trial of it."""
+        what: Candidate = kept.what
+        problem, _ = problem_of(fit, self.runs)
+        names = {p.name for p in what.parameters(fit.model)}
+        own = [(s.x, s.parameter.name) for s in problem.slots if s.parameter.name in names]
+        if not own:
+            return None
+        linear = self.linear(fit)
+        everything = np.concatenate([np.arange(x.start, x.stop) for x, _ in own])
+        profile = dict(what.effect.profile) if what.effect else {}
+        sizes = [x for x, name in own if name.rpartition(".")[2] not in profile] or [
+            x for x, _ in own
+        ]
+        columns = linear.slopes[:, :, np.concatenate([np.arange(x.start, x.stop) for x in sizes])]
+        part = self._residual_without(fit, what) - linear.residual
+        variants = max(t.variants for t in kept.evidence.trials if t.family == what.label)
+        trial = Trial(what, what.label, columns, variants)
+        return linear.without(np.delete(linear.slopes, everything, axis=2), part), trial
+
+    def _residual_without(self, fit: Fit, what: Candidate) -> Array:
+        """Residuals (N, m) of the model without an effect, at the values of the fit."""
+        own = fit.model.unknowns_of(what.label)
+        if what.freed:
+            model = fit.model.having(**{what.freed: float(self.model[what.freed].array)})
+            own = {what.freed}
+        else:
+            left = tuple(a for a in fit.model.effects if a.label != what.label)
+            model = replace(fit.model, effects=left)
+        values = {n: v for n, v in fit.values.items() if n not in own}
+        problem = Problem(model, self.runs)
+        residuals = problem.residuals(problem.point(values))
+        weights = problem_of(fit, self.runs)[0].weights
+        if weights is not None:
+            residuals = tuple(r * np.sqrt(w) for r, w in zip(residuals, weights, strict=True))
+        return self.rows.of(residuals)
+
+    def final(self, fit: Fit, what: Candidate) -> Candidate:
+        """The candidate as it stands in the model."""
+        attached = next((a for a in fit.model.effects if a.label == what.label), None)
+        if attached is None:
+            return what
+        made = attached.effect
+        if what.label == NAME:
+            own = {p.name.rpartition(".")[2]: p.name for p in attached.parameters}
+            made = with_sizes(made, {k: float(fit.values[n]) for k, n in own.items()})
+        return replace(what, effect=made, held=(), traced=None)
+
+    def moved_by(self, fit: Fit, other: Fit) -> dict[str, Array]:
+        """How far the declared parameters would move, were this the fit."""
+        return {n: other.values[n] - v for n, v in fit.values.items() if n in other.values}
+
+    def formula(self, fit: Fit, ranking: Ranking) -> Evidence | None:
+        """The best description; None where there is one, or nothing to be added to."""
+        problem, point = problem_of(fit, self.runs)
+        found = self.tried.shift(fit)
+        if found is None or problem.sequential or any(a.label == NAME for a in fit.model.effects):
+            return None
+        on, slope = found
+        read = readable(problem, point, slope, on, self.rows.index)
+        return described(read, ranking.likelihood, ranking.none, ranking.families)
+
+
+def _is_lag(candidate: Candidate) -> bool:
+    """Is it nothing but a time, which cannot be held?"""
+    return candidate.effect is not None and candidate.effect.kind == "time"
+
+
+def _plain(candidate: Candidate) -> Candidate | None:
+    """What it mostly is in practice: with fewer unknowns, nothing held."""
+    effect = candidate.effect
+    if effect is None or not effect.plain:
+        return None
+    names = {n for n, _ in effect.declarations}
+    if not set(dict(effect.plain)) <= names:
+        return None
+    begun = effect.starting(**dict(candidate.held)).holding(**dict(effect.plain))
+    return replace(candidate, effect=begun, held=(), traced=None)

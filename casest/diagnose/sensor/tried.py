@@ -1,0 +1,181 @@
+"""What may be missing, in its columns beside a fit, over the grids of what is searched."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+
+from casest.declaration.effect import NOISE, OVER_TIME, Effect, effect
+from casest.declaration.model import Model
+from casest.declaration.physics import SX
+from casest.declaration.shapes import Array, each
+from casest.declaration.symbols import param
+from casest.diagnose.candidates.axes import axes_of
+from casest.diagnose.candidates.candidates import Candidate, Skipped, candidates
+from casest.diagnose.candidates.grid import Seen, nearer, on_grid
+from casest.diagnose.candidates.slopes import slopes
+from casest.diagnose.evidence.linear import Index
+from casest.diagnose.evidence.score import Trial
+from casest.diagnose.sensor.fits import Fit, problem_of
+from casest.diagnose.sensor.recent import Recent
+from casest.diagnose.sensor.rows import Rows
+from casest.effects import shipped
+from casest.effects.lateness import likely_lag
+from casest.effects.on_axes import restricted
+from casest.effects.placing import placed_in
+from casest.errors import CasestError
+
+#: Samples of a block up to which it is a pose.
+LONGEST_POSE = 32
+
+
+@effect(on="output")
+def _shift(y: SX, *, k: SX = param(each, "[y]")) -> SX:
+    """An offset: its slope is that of the residual in what the sensor gives."""
+    return y + k
+
+
+@dataclass(frozen=True)
+class Tried:
+    """The catalogue on the rows that are looked at; `known`: what the user says is there."""
+
+    rows: Rows
+    catalogue: tuple[Effect, ...]
+    known: frozenset[str]
+    _found: Recent[Model, tuple[list[Candidate], list[Skipped]]] = field(
+        default_factory=Recent, repr=False
+    )
+    _looked: Recent[Fit, Seen] = field(default_factory=Recent, repr=False)
+    _trials: Recent[Fit, list[Trial]] = field(default_factory=lambda: Recent(1), repr=False)
+
+    def found(self, fit: Fit) -> tuple[list[Candidate], list[Skipped]]:
+        """What could be missing, and what does not apply here."""
+        catalogue = [e for e in self.catalogue if self._in_time or e.kind not in OVER_TIME]
+        return self._found.of(fit.model, lambda: candidates(fit.model, self.rows.runs, catalogue))
+
+    def trials(self, fit: Fit) -> list[Trial]:
+        """Every candidate in its columns, over its grid."""
+        return self._trials.of(fit, lambda: self.of(fit, self._expanded(fit)))
+
+    def _expanded(self, fit: Fit) -> list[Candidate]:
+        seen = self.seen(fit)
+        return [c for one in self.found(fit)[0] for c in on_grid(one, seen, self._likely(fit, one))]
+
+    def shown(self, fit: Fit) -> list[Trial]:
+        """Long lags that the records show by themselves: a slope does not reach as far."""
+        times = [run.time for run in self.rows.runs if run.time is not None and len(run) > 1]
+        step = float(np.median(np.diff(times[0]))) if times else np.inf
+        found = []
+        for candidate in self.found(fit)[0]:
+            lag = self._likely(fit, candidate)
+            if abs(lag) > 2 * step:
+                found.append(replace(candidate, held=(("delay", lag),), trials=len(times[0])))
+        return self.of(fit, found)
+
+    def of(self, fit: Fit, several: Sequence[Candidate]) -> list[Trial]:
+        """These candidates in their columns, without those that have none here."""
+        problem, point = problem_of(fit, self.rows.runs)
+        found = []
+        for candidate, columns in slopes(problem, point, several, self.rows.index):
+            if isinstance(columns, CasestError):
+                continue
+            axes = _axes(fit, candidate, columns.shape[2])
+            effect = candidate.effect
+            describes = effect is not None and effect.describes and not self.asked(candidate)
+            family, trials = candidate.label, candidate.trials
+            found.append(Trial(candidate, family, columns, trials, axes, describes))
+        return found
+
+    def nearer(self, fit: Fit, trial: Trial, scale: float) -> list[Trial]:
+        """Values of a grid around the trial's."""
+        if not trial.what.held:
+            return []
+        around = nearer(trial.what, self.seen(fit), scale)
+        return self.of(fit, around)
+
+    def seen(self, fit: Fit) -> Seen:
+        """What grids are laid over."""
+        return self._looked.of(fit, lambda: self._seen(fit))
+
+    def _seen(self, fit: Fit) -> Seen:
+        problem, point = problem_of(fit, self.rows.runs)
+        shift, linear = self.shift(fit), self.rows.linear(fit)
+        push = -linear.residual
+        if shift is not None:
+            push = np.einsum("nmq,nm->nq", shift[1], linear.residual)
+        reading = time = None
+        if fit.model.traced.predicted is not None and not problem.sequential:
+            found = problem.evaluate(point, {"p": fit.model.traced.predicted})
+            reading = self.rows.of([f[0][:, :, 0] for f in found])
+        times = [run.time for run in self.rows.runs if run.time is not None]
+        if len(times) == len(self.rows.runs):
+            time = self.rows.of(times)
+        return Seen(push, reading, time, linear)
+
+    def shift(self, fit: Fit) -> tuple[str, Array] | None:
+        """What the sensor gives, and the residual's slope (N, m, axes) in a shift of it."""
+        problem, point = problem_of(fit, self.rows.runs)
+        try:
+            probe = Candidate(placed_in(_shift, fit.model))
+        except CasestError:
+            return None
+        ((_, slope),) = slopes(problem, point, [probe], self.rows.index)
+        return None if isinstance(slope, CasestError) else (probe.on, slope)
+
+    @cached_property
+    def _in_time(self) -> bool:
+        """Do samples follow each other? In poses each begins anew, and nothing comes late."""
+        blocks = sum(len(np.unique(run.block)) for run in self.rows.runs)
+        return sum(map(len, self.rows.runs)) >= LONGEST_POSE * blocks
+
+    def _likely(self, fit: Fit, candidate: Candidate) -> float:
+        """A lag that two records show by how lively each of them is."""
+        if candidate.effect is None or candidate.effect.kind != "time":
+            return 0.0
+        name, measured = candidate.on, fit.model.traced.measured
+        rotation = any(s.name == name and s.kind == "rotation" for s in fit.model.signals)
+        return likely_lag(self.rows.runs, measured or "", name, within=True, rotation=rotation)
+
+    def asked(self, what: Candidate) -> bool:
+        """Is it the user's own, or named as there?"""
+        if what.effect is None:
+            return what.freed in self.known
+        return what.among(self.known) or what.name in self._own
+
+    @cached_property
+    def _own(self) -> frozenset[str]:
+        """Names of effects that are the user's."""
+        return frozenset(e.name for e in self.catalogue if not shipped(e))
+
+    def unseen(self, fit: Fit, shown: Collection[str]) -> tuple[list[Skipped], list[Skipped]]:
+        """What is asked for and these data cannot show; and what of it does not apply to them."""
+        found, skipped = self.found(fit)
+        hidden = [c for c in found if self.asked(c) and c.label not in shown]
+        silent = [Skipped(c.label, "these data cannot show it") for c in hidden]
+        of_noise = {e.name for e in self.catalogue if e.on == NOISE}
+        tried = {name for c in found for name in (c.name, c.label)}
+        absent = []
+        for name in sorted(self.known - of_noise - tried):
+            reasons = [s.reason for s in skipped if name in (s.name, s.name.partition("(")[0])]
+            why = reasons[0] if reasons else "the data have no column that it could follow"
+            absent.append(Skipped(name, why))
+        return silent, absent
+
+
+def _axes(fit: Fit, candidate: Candidate, count: int) -> Index | None:
+    own = candidate.parameters(candidate.traced_on(fit.model))
+    size = axes_of(own)
+    return np.tile(np.arange(size), len(own)) if size > 1 and size * len(own) == count else None
+
+
+def on_axes(fit: Fit, trial: Trial, axes: Sequence[int]) -> Trial:
+    """The trial on some of its axes."""
+    candidate: Candidate = trial.what
+    assert candidate.effect is not None
+    assert trial.axes is not None
+    less = replace(candidate, effect=restricted(candidate.effect, axes, fit.model), traced=None)
+    own = np.isin(trial.axes, list(axes))
+    return replace(trial, what=less, columns=trial.columns[:, :, own], axes=None)
