@@ -9,13 +9,17 @@ import numpy as np
 from casest.diagnose.evidence.likelihood import Likelihood
 from casest.diagnose.evidence.score import p_value, worth
 from casest.diagnose.levels import LEVELS
-from casest.diagnose.protocol.confirming import falls_of_refit, holds_out
+from casest.diagnose.protocol.confirming import falls_of_refit
 from casest.diagnose.protocol.state import F, Kept, State
 from casest.diagnose.protocol.subject import Subject
 
 
-def on_all_axes(subject: Subject[F], state: State[F]) -> State[F]:
-    """Axes that were nothing beside what was still missing may be something now."""
+def on_all_axes(subject: Subject[F], state: State[F], *, needed: bool) -> State[F]:
+    """Axes that were nothing beside what was still missing may be something now.
+
+    Where they are not `needed`, what is found on some axes is on all that the data determine: an
+    axis set to nothing because it is not seen would leave the other unknowns off, and too sure.
+    """
     for k, kept in enumerate(state.kept):
         found = subject.wider(state.fit, kept.what)
         if found is None:
@@ -25,7 +29,8 @@ def on_all_axes(subject: Subject[F], state: State[F]) -> State[F]:
         more = all_.basis.shape[1] - none.declared.shape[1]
         if more < 1 or isinstance(subject.certified(fit), str):
             continue
-        if worth(subject.rise(state.fit, fit), more, 0.0, none) > LEVELS.strong:
+        rise = worth(subject.rise(state.fit, fit), more, 0.0, none) if needed else np.inf
+        if rise > LEVELS.strong:
             trials = tuple(replace(t, what=what) if t.what == kept.what else t
                            for t in kept.evidence.trials)  # fmt: skip
             evidence = replace(kept.evidence, trials=trials)
@@ -71,4 +76,7 @@ def _beside_the_others(subject: Subject[F], state: State[F], kept: Kept, base: F
     )
     if strong and (subject.asked(kept.what) or linear.residual.shape != whole.residual.shape):
         return None  # rows that moved in time are others
-    return None if strong and holds_out(falls_of_refit(linear, whole), linear) else score
+    # What was confirmed once stays, unless some held-out part is clearly worse with it.
+    seen = falls_of_refit(linear, whole)
+    worse = any(f.t < -LEVELS.confirmed for f in seen.values()) if linear.series else False
+    return None if strong and seen["pieces"].ratio < 1 and not worse else score

@@ -30,7 +30,7 @@ def refitted(
             continue
         gain = subject.gain(fit, better, evidence)
         score = evidence.score - evidence.gain + gain
-        if ranking.enough(score, gain) or subject.asked(evidence.trials[0].what):
+        if _enough(ranking, evidence, score) or subject.asked(evidence.trials[0].what):
             found.append(Refit(better, replace(evidence, gain=gain, score=score)))
     found.sort(key=lambda r: -r.evidence.score)
     near = _near(found)
@@ -42,6 +42,18 @@ def refitted(
         found = [best, *[r for r in found if r is not best]]
         found = _plainest_first(found)
     return found
+
+
+def _enough(ranking: Ranking, evidence: Evidence, score: float) -> bool:
+    """Is it strong evidence, clearly more than a course of unknown cause has, or beside one?"""
+    if score <= (LEVELS.strong if ranking.linear.series else 0.0):
+        return False
+    course = ranking.description
+    if course is None or score > course.score + LEVELS.clear:
+        return True
+    both = judged([*course.trials, *evidence.trials], ranking.likelihood, ranking.none,
+                  start=course.explained, families=ranking.families)  # fmt: skip
+    return both is not None and both.score > course.score + LEVELS.strong
 
 
 def _with_parts(options: Sequence[Evidence], ranking: Ranking) -> list[Evidence]:
@@ -116,6 +128,6 @@ def shown(subject: Subject[F], fit: F, ranking: Ranking) -> list[Refit[F]]:
         gain = subject.gain(fit, better, evidence)
         score = evidence.score - evidence.gain + gain
         seen = falls_of_refit(ranking.linear, subject.linear(better))
-        if ranking.enough(score, gain) and holds_out(seen, ranking.linear):
+        if _enough(ranking, evidence, score) and holds_out(seen, ranking.linear):
             found.append(Refit(better, replace(evidence, gain=gain, score=score), seen))
     return found

@@ -32,7 +32,9 @@ def search(
         state = bigger
     else:
         state = replace(state, last=ranked(subject, state.fit))
-    smaller = eliminated(subject, on_all_axes(subject, state))
-    if len(smaller.kept) < len(state.kept):
-        smaller = replace(smaller, last=ranked(subject, smaller.fit))
-    return with_rivals(subject, smaller)
+    left = eliminated(subject, on_all_axes(subject, state, needed=True))
+    if subject.linear(left.fit).series:  # poses are few: each unknown costs
+        left = on_all_axes(subject, left, needed=False)
+    if len(left.kept) < len(state.kept):
+        left = replace(left, last=ranked(subject, left.fit))
+    return with_rivals(subject, left)

@@ -31,13 +31,6 @@ class Ranking:
         """Those that have a name of their own."""
         return tuple(e for e in self.found if not e.trials[0].describes)
 
-    def enough(self, score: float, gain: float) -> bool:
-        """Is it strong evidence, and nearly as much as a course of unknown cause explains?"""
-        course = self.description
-        if score <= (LEVELS.strong if self.linear.series else 0.0):
-            return False
-        return course is None or score > course.score or gain > (1 - LEVELS.alike) * course.gain
-
     @property
     def description(self) -> Evidence | None:
         """The best course of unknown cause, if there is evidence for one."""

@@ -19,6 +19,7 @@ from casest.diagnose.evidence.score import Evidence, Trial
 from casest.diagnose.formula.search import NAME, described, readable, with_sizes
 from casest.diagnose.protocol import Kept, Ranking
 from casest.diagnose.sensor.fits import Fit, certified, fitted, problem_of, simpler, starts
+from casest.diagnose.sensor.recent import Recent
 from casest.diagnose.sensor.rows import Rows
 from casest.diagnose.sensor.tried import Tried, on_axes
 from casest.engine.kernel import only_tried
@@ -26,6 +27,9 @@ from casest.errors import CasestError
 from casest.estimate.calibrate import attempt
 from casest.estimate.estimate import Estimate
 from casest.leastsquares.problem import Problem
+
+#: Time constants that a record must span for a memory to be seen in it.
+SEEN = 2
 
 
 @dataclass(frozen=True)
@@ -47,6 +51,10 @@ class Sensor:
     def tried(self) -> Tried:
         """What may be missing."""
         return Tried(self.rows, self.catalogue, self.known)
+
+    @cached_property
+    def _without(self) -> Recent[Fit, dict[str, Fit | None]]:
+        return Recent()
 
     def fitted(self, model: Model, values: Mapping[str, Array]) -> Fit | None:
         """Fit to everything from these values; None where it goes astray."""
@@ -99,7 +107,20 @@ class Sensor:
                 found = simpler(found, self._with(fit, simple, fit.values))
         except (CasestError, np.linalg.LinAlgError) as error:
             return f"its refit fails: {error}"
-        return "its refit fails: the residual is not finite" if found is None else found
+        if found is None:
+            return "its refit fails: the residual is not finite"
+        return self._too_slow(found, added) or found
+
+    def _too_slow(self, fit: Fit, added: Sequence[Trial]) -> str:
+        """Why the records are too short for a memory: nobody saw it fade; else empty."""
+        spans = [float(np.ptp(run.time)) for run in self.runs if run.time is not None]
+        for what in (t.what for t in added if t.what.effect is not None):
+            slow = [n for n, kind in what.effect.profile if kind == "timescale"]
+            for name in slow:
+                value = float(np.max(fit.values.get(f"{what.label}.{name}", 0.0)))
+                if value > max(spans, default=np.inf) / SEEN:
+                    return f"{name} = {value:.3g} s is more than half of the record"
+        return ""
 
     def _with(
         self, fit: Fit, added: Sequence[Candidate], values: Mapping[str, Array]
@@ -125,8 +146,12 @@ class Sensor:
 
     def without(self, fit: Fit, what: Candidate) -> Fit | None:
         """The fit without an effect that was added."""
-        if what.freed:
-            return None
+        known = self._without.of(fit, dict)
+        if what.label not in known:
+            known[what.label] = None if what.freed else self._fitted_without(fit, what)
+        return known[what.label]
+
+    def _fitted_without(self, fit: Fit, what: Candidate) -> Fit | None:
         own = fit.model.unknowns_of(what.label)
         left = tuple(a for a in fit.model.effects if a.label != what.label)
         values = {n: v for n, v in fit.values.items() if n not in own}
