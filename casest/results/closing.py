@@ -82,13 +82,17 @@ class Hidden(Struct, frozen=True):
 
 
 class Unexplained(Struct, frozen=True):
-    """What is left: share of the held-out variance, where; causes of which none was added."""
+    """What is left: share of the held-out variance, where; causes of which none was added.
+
+    `described_by`: effects that a slow course looks like, and that name no cause.
+    """
 
     fraction: Number
     where: str
     one_of: list[str]
     would_move: dict[str, Shifts]
     would_separate: list[str]
+    described_by: list[str] = []
 
 
 class Detectable(Struct, frozen=True):
@@ -232,6 +236,7 @@ def _unexplained(closing: Closing) -> Unexplained:
         list(names),
         {label: _shifts(moves[label], closing) for label in names if label in moves},
         _measurements(names, closing) if len(names) > 1 else [],
+        list(closing.misfit.described),
     )
 
 
@@ -296,8 +301,10 @@ def formula_source(closing: Closing) -> str:
 def with_formula_in(result: Closed, path: Path, source: str) -> Closed:
     """The result that says where the formula's source will be, with the digest of its text."""
     file, sha256 = str(path.resolve()), hashlib.sha256(source.encode()).hexdigest()
+    written = [bool(getattr(f.candidate.effect, "source", "")) for f in result.closing.effects]
     effects = [
-        replace(e, file=file, sha256=sha256) if e.name == "formula" else e for e in result.effects
+        replace(e, file=file, sha256=sha256) if own else e
+        for e, own in zip(result.effects, written, strict=True)
     ]
     return replace(result, effects=effects)
 

@@ -119,7 +119,7 @@ def close_motion(
         before,
         state.fit.with_spread(),
         (*added, *([colour] if colour is not None else [])),
-        tuple((r.what.label, r.why) for r in state.refused),
+        _refused(state),
         visible(found, subject.tried),
         _left(state.fit),
         (one, two),
@@ -133,6 +133,13 @@ def _added(kept: Kept, state: State[Fit]) -> Added:
     count = int(np.isfinite(state.fit.found.innovations).sum())
     gained = 0.5 * kept.evidence.gain / count
     return Added(kept.what, kept.evidence.p_value, gained, tuple(alike[:NEAREST]))
+
+
+def _refused(state: State[Fit]) -> tuple[tuple[str, str], ...]:
+    """What was not added, each once, with the first reason."""
+    added = {k.what.label for k in state.kept}
+    said = {r.what.label: r.why for r in reversed(state.refused) if r.what.label not in added}
+    return tuple(said.items())
 
 
 def _left(fit: Fit) -> Whiteness:

@@ -29,14 +29,16 @@ def with_the_best(
     left, tried = options, list[Evidence]()
     while True:
         held = asked or passing(ranking, left)
-        refits = refitted(subject, state.fit, ranking, held)
+        state, refits = refitted(subject, state, ranking, held)
         if not asked and not tried:
-            refits = best_refits([*refits, *shown(subject, state.fit, ranking)])
+            state, more = shown(subject, state, ranking)
+            refits = best_refits([*refits, *more])
         torn = [] if asked else torn_between(refits, ranking)
         if torn:
-            return replace(state, open=tuple(torn))
+            return replace(state, open=tuple(r.evidence for r in torn), torn=tuple(torn))
         if described is not None and _describes(subject, described, refits, ranking):
-            refits = [*refitted(subject, state.fit, ranking, [described]), *refits]
+            state, more = refitted(subject, state, ranking, [described])
+            refits = [*more, *refits]
         bigger, over = _first_certified(subject, state, ranking, refits, say)
         if len(bigger.kept) > len(state.kept):
             return bigger

@@ -27,6 +27,9 @@ from casest.estimate.calibrate import attempt
 from casest.estimate.estimate import Estimate
 from casest.leastsquares.problem import Problem
 
+#: Why there is no refit.
+NOT_FINITE = "its refit fails: the residual is not finite"
+
 
 @dataclass(frozen=True)
 class Sensor:
@@ -99,7 +102,7 @@ class Sensor:
                 found = simpler(found, self._with(fit, simple, fit.values))
         except (CasestError, np.linalg.LinAlgError) as error:
             return f"its refit fails: {error}"
-        return "its refit fails: the residual is not finite" if found is None else found
+        return NOT_FINITE if found is None else found
 
     def _with(
         self, fit: Fit, added: Sequence[Candidate], values: Mapping[str, Array]
@@ -189,7 +192,7 @@ class Sensor:
         if attached is None:
             return what
         made = attached.effect
-        if what.label == NAME:
+        if made.source:
             own = {p.name.rpartition(".")[2]: p.name for p in attached.parameters}
             made = with_sizes(made, {k: float(fit.values[n]) for k, n in own.items()})
         return replace(what, effect=made, held=(), traced=None)
@@ -201,8 +204,8 @@ class Sensor:
     def formula(self, fit: Fit, ranking: Ranking) -> Evidence | None:
         """The best description; None where there is one, or nothing to be added to."""
         problem, point = problem_of(fit, self.runs)
-        found = self.tried.shift(fit)
-        if found is None or problem.sequential or any(a.label == NAME for a in fit.model.effects):
+        found, there = self.tried.shift(fit), {a.label for a in fit.model.effects}
+        if found is None or problem.sequential or NAME in there:
             return None
         on, slope = found
         read = readable(problem, point, slope, on, self.rows.index)
