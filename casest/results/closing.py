@@ -21,6 +21,7 @@ from casest.diagnose.cross_validation import rms
 from casest.diagnose.detectability import detectable, invisible
 from casest.diagnose.formula.terms import source
 from casest.diagnose.found import Found
+from casest.diagnose.levels import LEVELS
 from casest.estimate.estimate import Estimate
 from casest.leastsquares.problem import Problem
 from casest.results.application import formula_of
@@ -38,9 +39,6 @@ from casest.results.residuals import Residuals, residuals_of, side_of
 from casest.results.result import Certificate, Explained, Number, Numbers, Parameter
 from casest.results.units import resolved, unit_table
 from casest.results.values import parameter_table
-
-#: How many of those that are not told apart from an effect are named beside it; others come after.
-NEAREST = 2
 
 #: Largest shift of each declared parameter.
 Shifts = dict[str, float]
@@ -215,11 +213,11 @@ def _effect(found: Found, closing: Closing) -> Effect:
         p_value=plain(found.p_value),
         holdout_gain=plain(found.gain),
         formula=_formula(found, attached),
-        indistinguishable_from=alike[:NEAREST],
-        less_likely=alike[NEAREST:],
-        would_separate=_measurements(alike[:NEAREST], closing),
+        indistinguishable_from=alike[: LEVELS.nearest],
+        less_likely=alike[LEVELS.nearest :],
+        would_separate=_measurements(alike[: LEVELS.nearest], closing),
         instead_would_move={
-            label: _shifts(found.rivals[label], closing) for label in alike[:NEAREST]
+            label: _shifts(found.rivals[label], closing) for label in alike[: LEVELS.nearest]
         },
     )
     return effect if attached is None else replace(effect, **asdict(attachment(attached)))

@@ -32,10 +32,6 @@ from casest.leastsquares.weights import robust_scale, weighted
 
 #: Longer records are not asked by `calibrate`: all residuals are looked at at once.
 LONGEST = 200_000
-#: Residual over a step of the reading below which rounding alone, 1/√12 = 0.29, may be all of it.
-ROUNDED = 0.45
-#: Held-out residuals beyond so many robust standard deviations do not count in a share.
-FAR = 6.0
 
 
 @dataclass(frozen=True)
@@ -102,7 +98,7 @@ def left_over(
     everything = np.concatenate([r.ravel() for r in held_out])
     everything = everything[np.isfinite(everything)]  # the rest nothing foretells
     if everything.size:
-        everything = everything[np.abs(everything) <= FAR * robust_scale([everything])]
+        everything = everything[np.abs(everything) <= LEVELS.beyond * robust_scale([everything])]
     variance = float(np.mean(everything**2)) if everything.size else np.nan
     sigma = min((f.sigma for f in found), default=np.sqrt(variance))
     fraction = max(0.0, 1 - sigma**2 / variance) if variance > 0 else 0.0
@@ -182,7 +178,7 @@ def _slow(problem: Problem, clipped: Sequence[Array], sigma: float) -> list[Find
     found = slow_course(problem.runs, clipped)
     if found is None or found.p_value >= LEVELS.misfit or found.share < LEVELS.share:
         return []
-    if sigma < ROUNDED * step_of(problem.runs, problem.model.traced.measured):
+    if sigma < LEVELS.rounded * step_of(problem.runs, problem.model.traced.measured):
         return []
     where = (
         f"{100 * found.share:.0f} % of it is a slow course over about {found.samples} samples"

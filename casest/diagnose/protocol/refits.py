@@ -14,9 +14,6 @@ from casest.diagnose.protocol.ranking import sharpened
 from casest.diagnose.protocol.state import F, Ranking, Refit, State
 from casest.diagnose.protocol.subject import Subject
 
-#: Share of their length by which columns may lie outside a span that holds the most of them.
-NESTED = 0.5
-
 
 def refitted(
     subject: Subject[F], state: State[F], ranking: Ranking, options: Sequence[Evidence]
@@ -76,7 +73,7 @@ def _plainest_first(refits: list[Refit[F]]) -> list[Refit[F]]:
 def _contains(wide: Evidence, narrow: Evidence) -> bool:
     """Are the columns of one a combination of those of the other?"""
     beyond = narrow.basis - wide.basis @ (wide.basis.T @ narrow.basis)
-    return bool(np.sum(beyond**2) < NESTED * narrow.freedom)
+    return bool(np.sum(beyond**2) < LEVELS.nested * narrow.freedom)
 
 
 def _near(refits: Sequence[Refit[F]]) -> list[Refit[F]]:

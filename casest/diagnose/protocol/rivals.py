@@ -52,7 +52,7 @@ def _rivals(subject: Subject[F], state: State[F], kept: Kept) -> tuple[State[F],
     for e in rivals:  # what the columns promise, a refit must keep
         fit = subject.refit(base, e.trials)
         if isinstance(fit, str):
-            state = state.failing(e, f"in the place of {subject.label(kept.what)} {fit}")
+            state = state.failing(e, f"in the place of {own.family} {fit}")
             continue
         behind = target - (e.score - e.gain + subject.rise(base, fit))
         other = subject.linear(fit)

@@ -17,7 +17,7 @@ from casest.diagnose.evidence.likelihood import Likelihood
 from casest.diagnose.evidence.linear import Linear
 from casest.diagnose.evidence.score import Evidence, Trial
 from casest.diagnose.formula.search import NAME, described, readable, with_sizes
-from casest.diagnose.protocol import Kept, Ranking
+from casest.diagnose.protocol import Kept, Ranking, Subject
 from casest.diagnose.sensor.fits import Fit, certified, fitted, problem_of, simpler, starts
 from casest.diagnose.sensor.rows import Rows
 from casest.diagnose.sensor.tried import Tried, on_axes
@@ -32,7 +32,7 @@ NOT_FINITE = "its refit fails: the residual is not finite"
 
 
 @dataclass(frozen=True)
-class Sensor:
+class Sensor(Subject[Fit]):
     """A model, its runs (prepared) and what may be missing: the loop's subject."""
 
     model: Model
@@ -83,10 +83,6 @@ class Sensor:
     def asked(self, what: Candidate) -> bool:
         """Is it the user's own, or named as there?"""
         return self.tried.asked(what)
-
-    def label(self, what: Candidate) -> str:
-        """Name and column."""
-        return what.label
 
     def refit(self, fit: Fit, added: Sequence[Trial]) -> Fit | str:
         """The fit with these effects, from their first-order sizes, if it can be trusted."""
