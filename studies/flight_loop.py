@@ -31,7 +31,8 @@ import flights  # noqa: E402
 from flights import Sensors  # noqa: E402
 from scipy.stats import beta  # noqa: E402
 
-from casest.diagnose.motion.loop import UNEXPLAINED, close_motion  # noqa: E402
+from casest.diagnose.levels import LEVELS  # noqa: E402
+from casest.diagnose.motion.loop import close_motion  # noqa: E402
 from casest.results.motion import rms_settled  # noqa: E402
 from casest_problems.bias_gravity import bias_gravity  # noqa: E402
 
@@ -104,7 +105,7 @@ def world(name: str, seed: int, sensors: Sensors, rate: float) -> dict[str, Any]
         "seconds": perf_counter() - begin,
         "found": [a.candidate.label for a in found.effects],
         "alike": [list(a.indistinguishable_from) for a in found.effects],
-        "unexplained": found.left.p_value < UNEXPLAINED,
+        "unexplained": found.left.p_value < LEVELS.coloured,
         "numbers": {c.label: v.tolist() for c, v in found.after.added},
         "stds": found.after.std.tolist(),
         "p_value": min(s.p_value for s in found.first),

@@ -164,7 +164,7 @@ MUTANTS = tuple(
             "weighted(Problem(model, tuple(runs)), values)",
         ),
         (CROSS, "10 * correlated_over", "0.1 * correlated_over"),
-        (CROSS, "spread < UNCERTAIN * part", "spread < 1e9 * UNCERTAIN * part"),
+        (CROSS, "spread < LEVELS.uncertain * part", "spread < 1e9 * part"),
         (PARTS, "rest = A - X[own].T @ X[own]", "rest = A"),
         (PARTS, "b - X[own].T @ seen[own]", "b"),
         (PARTS, "np.sum(b**2) - np.sum(a**2)", "np.sum(b**2) + np.sum(a**2)"),

@@ -272,7 +272,6 @@ def test_where_the_refit_of_a_candidate_fails_the_loop_goes_on(bench, failing_re
     assert result["effects"][0]["name"] == "formula"
 
 
-@pytest.mark.xfail(strict=True, reason="of refits that fail nothing is said: they are passed over")
 def test_a_candidate_whose_refit_fails_is_named(bench, failing_refit):
     _, result = closed()
     reasons = {s["name"]: s["reason"] for s in result["refused"]}

@@ -76,6 +76,8 @@ class Effect:
     describes: bool = False
     memory: tuple[tuple[str, str | float], ...] = ()
     otherwise: Effect | None = None
+    #: Python text of one that the loop wrote, to be given again.
+    source: str = ""
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         """Evaluate the effect's own function."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from casest.data.run import Run
 from casest.declaration.shapes import Array
-from casest.diagnose.candidates.candidates import Skipped
+from casest.diagnose.candidates.candidates import Candidate, Skipped
 from casest.diagnose.cross_validation import Folds
 from casest.diagnose.found import Found, Undecided
 from casest.diagnose.misfit.left import Misfit, left_over
@@ -37,6 +37,8 @@ class Closing:
     visible: tuple[Visible, ...]
     runs: tuple[Run, ...]
     undecided: Undecided | None = None
+    #: What a slow course in the residual looks like, though its cause is not known.
+    described: tuple[Candidate, ...] = ()
 
     @cached_property
     def misfit(self) -> Misfit:
@@ -50,6 +52,7 @@ class Closing:
                 self.after_held_out,
                 self.after.correlated_over,
                 self.undecided,
+                self.described,
                 wanders=any(f.wanders for f in self.effects),
             )
 

@@ -12,7 +12,7 @@ from casest.data.run import Run
 from casest.data.splits import interleaved_blocks
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
-from casest.diagnose.levels import STRETCHES
+from casest.diagnose.levels import LEVELS
 from casest.errors import DataError
 from casest.estimate.estimate import Estimate
 from casest.estimate.reasons import PRACTICALLY_NULL
@@ -21,10 +21,6 @@ from casest.leastsquares.problem import Point, Problem
 from casest.leastsquares.weights import weighted
 from casest.solve.trust_region import trust_region
 
-#: Fits of a cross-fit: each sees all blocks but one in FOLDS.
-FOLDS = 4
-#: Variance of what a fit to the rest foretells of a part, in those of the noise, at most.
-UNCERTAIN = 10.0
 #: Share of the squares of its unknowns, each alone, by which a direction moves a prediction at all.
 OPEN = 1e-10
 #: Iterations of a fit that begins at the fit to everything, and gain (in σ²) that ends it.
@@ -48,13 +44,14 @@ def folded(runs: Sequence[Run], correlated_over: float = 1.0, seed: int = 0) -> 
     """
     of, batches = [], []
     for run in runs:
-        stretches = STRETCHES
+        stretches = LEVELS.pieces
         if correlated_over > 1:
-            stretches = int(np.clip(len(run) / (10 * correlated_over), 2 * FOLDS, STRETCHES))
-        of.append(interleaved_blocks(run, stretches, FOLDS, seed))
+            most = len(run) / (10 * correlated_over)
+            stretches = int(np.clip(most, 2 * LEVELS.refits, LEVELS.pieces))
+        of.append(interleaved_blocks(run, stretches, LEVELS.refits, seed))
         change = np.flatnonzero(_changes(run, of[-1]))
         batches.append(change)
-    return Folds(tuple(of), tuple(batches), FOLDS)
+    return Folds(tuple(of), tuple(batches), LEVELS.refits)
 
 
 def _changes(run: Run, fold: NDArray[np.int_]) -> NDArray[np.bool_]:
@@ -138,7 +135,7 @@ def check_folds(before: Estimate, runs: Sequence[Run], folds: Folds) -> None:
             point = rest.point(before.values)
             own = part.normal(part.point(before.values)).matrix
             spread = float(np.trace(np.linalg.solve(rest.normal(point).matrix, own)))
-            if spread < UNCERTAIN * part.residual_count:
+            if spread < LEVELS.uncertain * part.residual_count:
                 continue
             deviations = np.sqrt(spread / part.residual_count)
             words = f"the part is foretold to {deviations:.2g} standard deviations of the noise"

@@ -15,11 +15,6 @@ from casest.diagnose.closing import Closing
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.visibility import Visible
 
-#: Noncentrality of the score from which on an effect is found nearly always.
-SEEN = 45.0
-#: Noncentrality below which nobody could find it: three standard deviations.
-UNSEEN = 9.0
-
 
 @dataclass(frozen=True)
 class Invisible:
@@ -61,7 +56,7 @@ def invisible(closing: Closing) -> list[Invisible]:
         if typical is None or len(typical) > len(score.survives):
             continue
         seen = np.diag(score.information)[: len(typical)] * typical**2
-        hidden = (seen < UNSEEN) | (score.survives[: len(typical)] < LEVELS.survives)
+        hidden = (seen < LEVELS.unseen) | (score.survives[: len(typical)] < LEVELS.survives)
         moves = _moves(closing, score, typical, hidden)
         if hidden.any() and moves:
             names = [p.name.rpartition(".")[2] for p in parameters]
@@ -129,9 +124,9 @@ def detectable(closing: Closing) -> list[Detectable]:
         for p in _own(candidate, model):
             width = p.shape.coordinates
             information = np.diag(score.information)[place : place + width]
-            alive = score.survives[place : place + width] > 1e-4
+            alive = score.survives[place : place + width] >= LEVELS.survives
             place += width
             if np.any(alive):
-                size = float(np.sqrt(SEEN / information[alive]).max())
+                size = float(np.sqrt(LEVELS.seen / information[alive]).max())
                 found.append(Detectable(candidate.label, p.name, size, p.units[0]))
     return found

@@ -48,7 +48,7 @@ class Undecided:
     """Something is missing, and what it is hangs on more than the data say.
 
     `share` of the mean square that the first would take away; `moves`: how far each would move the
-    declared parameters, where that is known.
+    declared parameters, of those that were refitted.
     """
 
     names: tuple[str, ...]

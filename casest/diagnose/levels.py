@@ -22,14 +22,36 @@ class Levels:
     alike: share of what a cause gains that another may lose and still explain the same.
     described: lead of a formula over the best name. True causes without a name lead by 95 and more,
         formulas over causes that have one by at most 21.
-    terms: of a formula. contenders: causes that are tried in pairs.
-    rounds: of the loop at most.
+    nested: share of a cause's squares that may lie outside the columns of one that contains it.
+    terms: of a formula. contenders: causes that are tried in pairs. nearest: rivals that are named
+        first. rounds: of the loop at most.
     stretches, regions, pieces, folds: parts that are held out whole; interleaved pieces and the
-        folds that they make.
-    survives: share of a cause's length that the declared unknowns must leave.
-    misfit: chance of each kind of misfit where there is none; share: of the variance, from which
-        on one counts. blocks, block: means that are compared, and the rows in each at least.
+        folds that they make. few_regions: those of poses. refits: folds of which each is foretold
+        by a fit of its own to the others.
+    far: robust standard deviations that a held-out residual counts as at most. beyond: those from
+        which on it does not count in a share of the variance.
+    told: share of what the record says of a direction that the rest of it must say.
+    uncertain: variance that a fit to the rest may leave of a part, in those of the noise.
+    fades: time constants that a record must span for a memory to be seen to fade.
+    survives: share of a cause's length that the declared unknowns must leave; over_noise: an
+        implicit residual's slopes contain its noise, of which so many must survive.
+    seen, unseen: noncentrality of the score from which on an effect is found nearly always, and
+        below which (three standard deviations) nobody could.
+    misfit: chance of each kind of misfit, or of a colour of noise, where there is none; share: of
+        the variance, from which on one counts. blocks, block: means that are compared, and the rows
+        in each at least.
+    lacks: residual over the scatter within rest intervals from which on rests lack something: what
+        is slower than a rest (bias instability) is not in that scatter, and no misfit of its own.
+    rounded: residual over a step of the reading below which rounding alone (1/√12 = 0.29) may be
+        all of it.
+    outliers: log-likelihood over that of Student's t from which on samples are outliers: t noise of
+        3 to 6 degrees of freedom gets there in less than one of a hundred records.
     rows: of a longer record so many, evenly chosen, are looked at.
+
+    In motion: suspect: whiteness below which noise with a colour is tried, and insists: gain of
+    log-likelihood that asks for it too; coloured: whiteness below which it is a misfit; loud: an
+    input's matched intensity in that of its own readings, from which on it is no noise; shortest:
+    samples below which nothing can be held out.
     """
 
     clip: float = 3.5
@@ -41,22 +63,39 @@ class Levels:
     apart: float = 2.0
     alike: float = 0.1
     described: float = 30.0
+    nested: float = 0.5
     terms: int = 3
     contenders: int = 6
+    nearest: int = 2
     rounds: int = 6
     stretches: int = 10
     regions: int = 10
     pieces: int = 40
     folds: int = 5
+    few_regions: int = 6
+    refits: int = 4
+    far: float = 4.0
+    beyond: float = 6.0
+    told: float = 0.2
+    uncertain: float = 10.0
+    fades: float = 2.0
     survives: float = 1e-3
+    over_noise: float = 5.0
+    seen: float = 45.0
+    unseen: float = 9.0
     share: float = 0.02
     misfit: float = 0.001
     blocks: int = 60
     block: int = 20
+    lacks: float = 1.5
+    rounded: float = 0.45
+    outliers: float = 4.0
     rows: int = 12_000
+    suspect: float = 0.05
+    insists: float = 10.0
+    coloured: float = 1e-4
+    loud: float = 4.0
+    shortest: int = 400
 
 
 LEVELS = Levels()
-
-#: Stretches that a continuous record is cut into, for folds and batches.
-STRETCHES = 40

@@ -19,7 +19,7 @@ from casest.diagnose.found import HELD_OUT_DATA, Found, Undecided
 from casest.diagnose.misfit.left import predictions
 from casest.diagnose.noise.tails import outliers_p_value
 from casest.diagnose.protocol import Kept, State, search
-from casest.diagnose.sensor import Fit, Sensor
+from casest.diagnose.sensor import NOT_FINITE, Fit, Sensor
 from casest.diagnose.visibility import Visible, visible
 from casest.effects import CATALOGUE
 from casest.effects.placing import prepared
@@ -100,9 +100,9 @@ def _closed(sensor: Sensor, before: Estimate, folds: Folds, say: Callable[[str],
         raise NotTrusted("the residual is not finite at the optimum")
     state = search(sensor, declared, say)
     # What is missing may look like outliers, not they like it: far residuals count as less.
-    fit, outliers = without_outliers(sensor, state.fit, folds)
+    state, outliers = without_outliers(sensor, state, folds)
     if outliers is not None:
-        state = search(sensor, fit, say, state)
+        state = search(sensor, state.fit, say, state)
     after = before
     if state.fit is not declared:
         state, after = certified(sensor, state, before)
@@ -120,7 +120,8 @@ def _closed(sensor: Sensor, before: Estimate, folds: Folds, say: Callable[[str],
         folds,
         _visible(sensor, declared),
         sensor.runs,
-        _undecided(state),
+        _undecided(sensor, state),
+        tuple(e.trials[0].what for e in state.last.descriptions) if state.last else (),
     )
 
 
@@ -146,20 +147,26 @@ def _on_the_same_samples(
     return one, other
 
 
-def without_outliers(sensor: Sensor, fit: Fit, folds: Folds) -> tuple[Fit, Found | None]:
+def without_outliers(
+    sensor: Sensor, state: State[Fit], folds: Folds
+) -> tuple[State[Fit], Found | None]:
     """With the effect `outliers` where there are some: they would pull what follows."""
-    effect = next((e for e in sensor.catalogue if e.seen_in == TAILS), None)
+    fit, effect = state.fit, next((e for e in sensor.catalogue if e.seen_in == TAILS), None)
     if effect is None or any(a.label == effect.name for a in fit.model.effects):
-        return fit, None
+        return state, None
     problem = Problem(fit.model, sensor.runs)
     levels = predictions(problem, problem.point(fit.values))
     p_value = outliers_p_value(fit.residuals, folds.batches, levels)
     if p_value is None:
-        return fit, None
+        return state, None
+    candidate = Candidate(effect)
     better = sensor.fitted(fit.model.with_effect(effect), fit.values)
-    if better is None or not sensor.proved(better).certificate.trusted:
-        return fit, None
-    return better, Found(Candidate(effect), p_value, 0.0)
+    if better is None:
+        return state.refusing(candidate, NOT_FINITE), None
+    certificate = sensor.proved(better).certificate
+    if not certificate.trusted:
+        return state.refusing(candidate, f"its fit is refused: {certificate.reasons[0]}"), None
+    return replace(state, fit=better), Found(candidate, p_value, 0.0)
 
 
 def certified(sensor: Sensor, state: State[Fit], before: Estimate) -> tuple[State[Fit], Estimate]:
@@ -213,7 +220,7 @@ def _visible(sensor: Sensor, declared: Fit) -> tuple[Visible, ...]:
     return visible(sensor.linear(declared), plain)
 
 
-def _undecided(state: State[Fit]) -> Undecided | None:
+def _undecided(sensor: Sensor, state: State[Fit]) -> Undecided | None:
     """Strong evidence for causes that were not added."""
     if not state.open:
         return None
@@ -221,7 +228,12 @@ def _undecided(state: State[Fit]) -> Undecided | None:
     names = tuple(dict.fromkeys(label for e in state.open for label in e.families))
     ranking = state.last
     count = len(ranking.likelihood.residual) if ranking else 1
-    return Undecided(names, float(-np.expm1(-best.gain / count)))
+    moves = {
+        r.evidence.families[0]: sensor.moved_by(r.before, r.fit)
+        for r in state.torn
+        if len(r.evidence.families) == 1  # of a pair none moves them alone
+    }
+    return Undecided(names, float(-np.expm1(-best.gain / count)), moves)
 
 
 __all__ = ["Closing", "Found", "close", "rms"]

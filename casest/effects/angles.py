@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from casest.declaration.effect import effect
 from casest.declaration.physics import SX, cos, sin
 from casest.declaration.shapes import each
 from casest.declaration.symbols import constant, param
 
+_OF_AN_ANGLE: dict[str, Any] = {
+    "on": "output",
+    "typical": {"cosine": 0.02, "sine": 0.02},
+    "shown_by": "readings all round, at a speed that changes: what is not the angle's does not "
+    "follow",
+    "columns": {"channel": "angle"},
+    "numbers": {"radian": "radian"},
+}
 
-@effect(
-    on="output",
-    typical={"cosine": 0.02, "sine": 0.02},
-    shown_by="readings all round, at a speed that changes: what is not the angle's does not follow",
-    formula="y + cosine·cos(radian·channel) + sine·sin(radian·channel)",
-    columns={"channel": "angle"},
-    numbers={"radian": "radian"},
-)
+
+@effect(**_OF_AN_ANGLE, formula="y + cosine·cos(radian·channel) + sine·sin(radian·channel)")
 def harmonic(
     y: SX,
     channel: SX,
@@ -29,14 +33,7 @@ def harmonic(
     return y + cosine * cos(turned) + sine * sin(turned)
 
 
-@effect(
-    on="output",
-    typical={"cosine": 0.02, "sine": 0.02},
-    shown_by="readings all round, at a speed that changes: what is not the angle's does not follow",
-    formula="y + cosine·cos(2·radian·channel) + sine·sin(2·radian·channel)",
-    columns={"channel": "angle"},
-    numbers={"radian": "radian"},
-)
+@effect(**_OF_AN_ANGLE, formula="y + cosine·cos(2·radian·channel) + sine·sin(2·radian·channel)")
 def second_harmonic(
     y: SX,
     channel: SX,

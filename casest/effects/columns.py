@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from casest.declaration.effect import effect
+from dataclasses import replace
+
+from casest.declaration.effect import Effect, effect
 from casest.declaration.physics import SX
 from casest.declaration.shapes import each
 from casest.declaration.symbols import constant, param
@@ -80,69 +82,20 @@ def temperature_gain_curve(
     return u * (1 + k * x + bend * x**2)
 
 
-@effect(
-    on="output",
-    shown_by="the same input at two values of the channel",
-    formula="y + k·(channel − at)",
-    columns={"channel": "other"},
-    numbers={"at": "mean"},
+def _of_another(of_temperature: Effect, name: str, shown_by: str) -> Effect:
+    """The same of a channel that is no temperature, for which no size is typical."""
+    doc = of_temperature.doc.replace("temperature", "another recorded channel")
+    return replace(of_temperature, name=name, doc=doc, columns=(("channel", "other"),), typical=(),
+                   shown_by=shown_by)  # fmt: skip
+
+
+channel_bias = _of_another(
+    temperature_bias, "channel_bias", "the same input at two values of the channel"
 )
-def channel_bias(
-    y: SX, channel: SX, *, k: SX = param(each, "[y]/[channel]"), at: SX = constant(0.0)
-) -> SX:
-    """An offset that follows another recorded channel, about its mean `at`."""
-    return y + k * (channel - at)
-
-
-@effect(
-    on="input",
-    shown_by="large inputs at two values of the channel",
-    formula="u·(1 + k·(channel − at))",
-    columns={"channel": "other"},
-    numbers={"at": "mean"},
+channel_gain = _of_another(
+    temperature_gain, "channel_gain", "large inputs at two values of the channel"
 )
-def channel_gain(
-    u: SX, channel: SX, *, k: SX = param(each, "1/[channel]"), at: SX = constant(0.0)
-) -> SX:
-    """A gain that follows another recorded channel, about its mean `at`."""
-    return u * (1 + k * (channel - at))
-
-
-@effect(
-    on="output",
-    shown_by="the same input at three values of the channel or more",
-    formula="y + k·(channel − at) + bend·(channel − at)²",
-    columns={"channel": "other"},
-    numbers={"at": "mean"},
+channel_curve = _of_another(temperature_curve, "channel_curve", temperature_curve.shown_by)
+channel_gain_curve = _of_another(
+    temperature_gain_curve, "channel_gain_curve", temperature_gain_curve.shown_by
 )
-def channel_curve(
-    y: SX,
-    channel: SX,
-    *,
-    k: SX = param(each, "[y]/[channel]"),
-    bend: SX = param(each, "[y]/[channel]^2"),
-    at: SX = constant(0.0),
-) -> SX:
-    """An offset that follows another recorded channel in a bent line, about its mean `at`."""
-    x = channel - at
-    return y + k * x + bend * x**2
-
-
-@effect(
-    on="input",
-    shown_by="large inputs at three values of the channel or more",
-    formula="u·(1 + k·(channel − at) + bend·(channel − at)²)",
-    columns={"channel": "other"},
-    numbers={"at": "mean"},
-)
-def channel_gain_curve(
-    u: SX,
-    channel: SX,
-    *,
-    k: SX = param(each, "1/[channel]"),
-    bend: SX = param(each, "1/[channel]^2"),
-    at: SX = constant(0.0),
-) -> SX:
-    """A gain that follows another recorded channel in a bent line, about its mean `at`."""
-    x = channel - at
-    return u * (1 + k * x + bend * x**2)

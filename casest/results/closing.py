@@ -21,6 +21,7 @@ from casest.diagnose.cross_validation import rms
 from casest.diagnose.detectability import detectable, invisible
 from casest.diagnose.formula.terms import source
 from casest.diagnose.found import Found
+from casest.diagnose.levels import LEVELS
 from casest.estimate.estimate import Estimate
 from casest.leastsquares.problem import Problem
 from casest.results.application import formula_of
@@ -38,9 +39,6 @@ from casest.results.residuals import Residuals, residuals_of, side_of
 from casest.results.result import Certificate, Explained, Number, Numbers, Parameter
 from casest.results.units import resolved, unit_table
 from casest.results.values import parameter_table
-
-#: How many of those that are not told apart from an effect are named beside it; others come after.
-NEAREST = 2
 
 #: Largest shift of each declared parameter.
 Shifts = dict[str, float]
@@ -82,13 +80,17 @@ class Hidden(Struct, frozen=True):
 
 
 class Unexplained(Struct, frozen=True):
-    """What is left: share of the held-out variance, where; causes of which none was added."""
+    """What is left: share of the held-out variance, where; causes of which none was added.
+
+    `described_by`: effects that a slow course looks like, and that name no cause.
+    """
 
     fraction: Number
     where: str
     one_of: list[str]
     would_move: dict[str, Shifts]
     would_separate: list[str]
+    described_by: list[str] = []
 
 
 class Detectable(Struct, frozen=True):
@@ -211,11 +213,11 @@ def _effect(found: Found, closing: Closing) -> Effect:
         p_value=plain(found.p_value),
         holdout_gain=plain(found.gain),
         formula=_formula(found, attached),
-        indistinguishable_from=alike[:NEAREST],
-        less_likely=alike[NEAREST:],
-        would_separate=_measurements(alike[:NEAREST], closing),
+        indistinguishable_from=alike[: LEVELS.nearest],
+        less_likely=alike[LEVELS.nearest :],
+        would_separate=_measurements(alike[: LEVELS.nearest], closing),
         instead_would_move={
-            label: _shifts(found.rivals[label], closing) for label in alike[:NEAREST]
+            label: _shifts(found.rivals[label], closing) for label in alike[: LEVELS.nearest]
         },
     )
     return effect if attached is None else replace(effect, **asdict(attachment(attached)))
@@ -232,6 +234,7 @@ def _unexplained(closing: Closing) -> Unexplained:
         list(names),
         {label: _shifts(moves[label], closing) for label in names if label in moves},
         _measurements(names, closing) if len(names) > 1 else [],
+        list(closing.misfit.described),
     )
 
 
@@ -296,8 +299,10 @@ def formula_source(closing: Closing) -> str:
 def with_formula_in(result: Closed, path: Path, source: str) -> Closed:
     """The result that says where the formula's source will be, with the digest of its text."""
     file, sha256 = str(path.resolve()), hashlib.sha256(source.encode()).hexdigest()
+    written = [bool(getattr(f.candidate.effect, "source", "")) for f in result.closing.effects]
     effects = [
-        replace(e, file=file, sha256=sha256) if e.name == "formula" else e for e in result.effects
+        replace(e, file=file, sha256=sha256) if own else e
+        for e, own in zip(result.effects, written, strict=True)
     ]
     return replace(result, effects=effects)
 

@@ -12,6 +12,7 @@ import numpy as np
 from msgspec import Struct
 
 from casest.declaration.shapes import Array
+from casest.diagnose.levels import LEVELS
 from casest.diagnose.motion.fit import Fit, forgotten, rise
 from casest.diagnose.motion.loop import Added, MotionClosing
 from casest.diagnose.motion.visibility import Visible
@@ -33,9 +34,6 @@ from casest.results.result import (
 )
 from casest.results.rounding import rounded
 from casest.results.trajectory import Innovations, Trajectory, trajectory_of
-
-#: Noncentrality from which an effect is found nearly always, and below which nobody could find it.
-SEEN, UNSEEN = 45.0, 9.0
 
 
 class Intensities(Struct, frozen=True):
@@ -318,7 +316,7 @@ def _invisible(score: Visible, closing: MotionClosing) -> list[MotionHidden]:
     candidate = score.candidate
     if any(a.candidate is candidate for a in closing.effects):
         return []
-    hidden = np.diag(score.information) * candidate.typical**2 < UNSEEN
+    hidden = np.diag(score.information) * candidate.typical**2 < LEVELS.unseen
     moves = (score.moves[:, hidden] * candidate.typical).max(axis=1, initial=0.0)
     std = np.median(closing.before.found.std, axis=0)
     would = {
@@ -336,7 +334,7 @@ def _invisible(score: Visible, closing: MotionClosing) -> list[MotionHidden]:
 def _detectable(score: Visible) -> Detectable:
     information = np.diag(score.information)
     alive = information * score.candidate.typical**2 > 1e-4
-    size = float(np.sqrt(SEEN / information[alive]).max()) if alive.any() else np.nan
+    size = float(np.sqrt(LEVELS.seen / information[alive]).max()) if alive.any() else np.nan
     candidate = score.candidate
     return Detectable(candidate.label, candidate.state, plain(size), candidate.unit)
 

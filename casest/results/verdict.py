@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Protocol, TypeVar
 
-from casest.diagnose.evidence.held_out import FAR
 from casest.diagnose.found import HELD_OUT_DATA
+from casest.diagnose.levels import LEVELS
 from casest.effects import CATALOGUE
 from casest.results.closing import Closed, Effect, Shifts, Unexplained
 from casest.results.result import Number, Parameter
@@ -82,7 +82,7 @@ def judged(gain: str) -> str:
     """By how much an effect makes held-out data better predicted, and how that is counted."""
     return (
         f"The mean square error on held-out data falls by {gain}, residuals "
-        f"beyond {FAR:g} standard deviations of the noise counted as {FAR:g}."
+        f"beyond {LEVELS.far:g} standard deviations of the noise counted as {LEVELS.far:g}."
     )
 
 

@@ -11,11 +11,6 @@ from casest.declaration.shapes import Array
 from casest.diagnose.evidence.linear import Index, Linear, robust_sd
 from casest.diagnose.levels import LEVELS
 
-#: Robust standard deviations (before) that a held-out residual counts as at most.
-FAR = 4.0
-#: Share of what the whole record says of a direction that the rest of it must say.
-OPEN = 0.2
-
 
 @dataclass(frozen=True)
 class Fall:
@@ -60,7 +55,7 @@ def _determined(whole: Array, rest: Array, p: int) -> Array:
     kept = values > 1e-9 * values.max(initial=1e-300)
     root = vectors[:, kept] / np.sqrt(values[kept])
     share, turned = np.linalg.eigh(root.T @ there @ root)
-    ways = (root @ turned)[:, share > OPEN]
+    ways = (root @ turned)[:, share > LEVELS.told]
     found = np.zeros((len(whole), p + ways.shape[1]))
     found[:p, :p] = np.eye(p)
     found[p:, p:] = ways
@@ -110,7 +105,7 @@ def standard_errors(gained: Array) -> float:
 
 def _near(linear: Linear, e: Array) -> Array:
     """Errors (N, m), those far out counted as less: by what is far before."""
-    far = FAR * robust_sd(linear.residual)
+    far = LEVELS.far * robust_sd(linear.residual)
     return np.clip(e, -far, far) if linear.series else e
 
 
@@ -118,7 +113,7 @@ def clipped(linear: Linear) -> Array:
     """Residuals that fits are made to: those far out brought near."""
     if not linear.series:
         return linear.residual
-    far = FAR * LEVELS.clip * robust_sd(linear.residual)
+    far = LEVELS.far * LEVELS.clip * robust_sd(linear.residual)
     return np.clip(linear.residual, -far, far)
 
 

@@ -19,9 +19,6 @@ from casest.diagnose.levels import LEVELS
 
 Index = NDArray[np.int_]
 
-#: Regions of poses.
-FEW_REGIONS = 6
-
 
 @dataclass(frozen=True)
 class Parts:
@@ -107,7 +104,7 @@ def parts_of(blocks: Index, runs: Index, inputs: Array) -> Parts:
     if count < LEVELS.series:
         single = np.unique(np.stack([runs, place]), axis=1, return_inverse=True)[1].ravel()
         stretches = place * min(LEVELS.stretches, max(count // 3, 2)) // size
-        return Parts(single, stretches, _regions(inputs, FEW_REGIONS), single)
+        return Parts(single, stretches, _regions(inputs, LEVELS.few_regions), single)
     batches = place * LEVELS.pieces // size
     stretches = place * LEVELS.stretches // size
     regions = _regions(inputs, LEVELS.regions)

@@ -163,9 +163,7 @@ def formula_effect(terms: Sequence[Term], size: int, on: str, unit: str) -> Effe
     made: Effect = scope["formula"]
     by_argument = {argument: name for name, argument in names.items()}
     extras = tuple(replace(s, name=by_argument[s.name]) for s in made.extras)
-    made.function.source = text  # type: ignore[attr-defined]
-    made.function.terms = tuple(terms)  # type: ignore[attr-defined]
-    return replace(made, extras=extras, formula=formula_text(terms, on, unit))
+    return replace(made, extras=extras, formula=formula_text(terms, on, unit), source=text)
 
 
 def formula_text(
@@ -187,10 +185,9 @@ def source(effect: Effect) -> str:
 
     Empty for an effect that is no formula.
     """
-    text: str = getattr(effect.function, "source", "")
-    if not text:
+    if not effect.source:
         return ""
-    head, tail = text.split('formula=""', 1)
+    head, tail = effect.source.split('formula=""', 1)
     return f"{head}formula={effect.formula!r}{tail}"
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casest.declaration.shapes import Array
-from casest.diagnose.candidates.candidates import usable_columns
+from casest.diagnose.candidates.candidates import Candidate, usable_columns
 from casest.diagnose.found import Undecided
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.misfit.pure_error import pure_error
@@ -32,20 +32,18 @@ from casest.leastsquares.weights import robust_scale, weighted
 
 #: Longer records are not asked by `calibrate`: all residuals are looked at at once.
 LONGEST = 200_000
-#: Residual over a step of the reading below which rounding alone, 1/√12 = 0.29, may be all of it.
-ROUNDED = 0.45
-#: Held-out residuals beyond so many robust standard deviations do not count in a share.
-FAR = 6.0
 
 
 @dataclass(frozen=True)
 class Finding:
-    """Evidence of a misfit: where, in words, σ of the noise beside it, and its share if known."""
+    """Evidence of a misfit: where, in words, σ of the noise beside it, its share if known; `slow`:
+    it is a course of unknown cause."""
 
     where: str
     p_value: float
     sigma: float
     share: float = 0.0
+    slow: bool = False
 
 
 def doubts(estimate: Estimate) -> list[Finding] | None:
@@ -65,13 +63,15 @@ def doubts(estimate: Estimate) -> list[Finding] | None:
 class Misfit:
     """What is left beyond noise: share of the held-out variance, and where it lives.
 
-    `noise` holds what is known of the noise itself.
+    `noise` holds what is known of the noise itself; `described` names what a slow
+    course in it looks like.
     """
 
     significant: bool
     fraction: float
     where: str
     noise: Mapping[str, Any]
+    described: tuple[str, ...] = ()
 
 
 def left_over(
@@ -81,6 +81,7 @@ def left_over(
     held_out: Sequence[Array],
     correlated_over: float = 1.0,
     undecided: Undecided | None = None,
+    described: Sequence[Candidate] = (),
     *,
     wanders: bool = False,
 ) -> Misfit:
@@ -97,7 +98,7 @@ def left_over(
     everything = np.concatenate([r.ravel() for r in held_out])
     everything = everything[np.isfinite(everything)]  # the rest nothing foretells
     if everything.size:
-        everything = everything[np.abs(everything) <= FAR * robust_scale([everything])]
+        everything = everything[np.abs(everything) <= LEVELS.beyond * robust_scale([everything])]
     variance = float(np.mean(everything**2)) if everything.size else np.nan
     sigma = min((f.sigma for f in found), default=np.sqrt(variance))
     fraction = max(0.0, 1 - sigma**2 / variance) if variance > 0 else 0.0
@@ -107,7 +108,19 @@ def left_over(
         fraction = max(fraction, undecided.share)
         several = " and other shapes" if len(undecided.names) == 1 else ""
         where = [f"which {' or '.join(undecided.names[:3])}{several} explain alike", *where]
-    return Misfit(bool(where), float(fraction), "; ".join(where), noise.content)
+    said = described if where and not wanders else ()
+    if said:
+        looks = " or ".join(_looks_like(c) for c in said)
+        where.append(f"its slow course is best described by {looks}")
+    names = tuple(c.label for c in said)
+    return Misfit(bool(where), float(fraction), "; ".join(where), noise.content, names)
+
+
+def _looks_like(candidate: Candidate) -> str:
+    """A description with the first sentence that it says of itself."""
+    doc = getattr(candidate.effect, "doc", "").partition("\n\n")[0]
+    words = " ".join(doc.split()).removesuffix(".")
+    return f"{candidate.label} ({words[:1].lower()}{words[1:]})"
 
 
 def predictions(problem: Problem, point: Point) -> list[Array] | None:
@@ -137,7 +150,7 @@ def findings(
     line = strongest_line(problem.runs, clipped)
     if line is not None and line.p_value < LEVELS.misfit:
         found.append(Finding(f"a line at {line.frequency:.4g} {line.unit}", line.p_value, sigma))
-    if not any("course" in f.where for f in found):
+    if not any(f.slow for f in found):
         found += _runs(problem, point, correlated_over, sigma)
     return found
 
@@ -165,14 +178,14 @@ def _slow(problem: Problem, clipped: Sequence[Array], sigma: float) -> list[Find
     found = slow_course(problem.runs, clipped)
     if found is None or found.p_value >= LEVELS.misfit or found.share < LEVELS.share:
         return []
-    if sigma < ROUNDED * step_of(problem.runs, problem.model.traced.measured):
+    if sigma < LEVELS.rounded * step_of(problem.runs, problem.model.traced.measured):
         return []
     where = (
         f"{100 * found.share:.0f} % of it is a slow course over about {found.samples} samples"
         f"{_when(problem, clipped, found.samples)}, of unknown cause"
     )
     left = sigma * float(np.sqrt(1 - min(found.share, 1)))
-    return [Finding(where, found.p_value, left, found.share)]
+    return [Finding(where, found.p_value, left, found.share, slow=True)]
 
 
 def _when(problem: Problem, clipped: Sequence[Array], samples: int) -> str:

@@ -15,13 +15,11 @@ import numpy as np
 
 from casest.data.run import Run
 from casest.declaration.shapes import Array
+from casest.diagnose.levels import LEVELS
 from casest.diagnose.noise.noise_model import likelihood_of_walk, likelihood_of_white, power
 from casest.leastsquares.per_sample import slope_in_sample
 from casest.leastsquares.problem import Point, Problem
 
-#: Residual over the scatter within rest intervals from which on rests lack something: what is
-#: slower than a rest (bias instability) is not in that scatter, and is no misfit of its own.
-LACKS = 1.5
 #: Independent samples that a rest interval's own scatter is known by, at most.
 WITHIN = 10
 #: Neighbours that are looked at for correlation among repeats, at most.
@@ -65,7 +63,7 @@ def _between_rests(
     first = dof / len(expected) * _equivalent(expected)
     second = WITHIN * _equivalent(expected)
     sigma = float(np.sqrt(expected.mean()))
-    return PureError(F, _tail(F / LACKS**2, first, second), sigma, "rest intervals")
+    return PureError(F, _tail(F / LEVELS.lacks**2, first, second), sigma, "rest intervals")
 
 
 def _rest_variances(problem: Problem, point: Point) -> Iterator[Array]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +14,7 @@ from casest.diagnose.evidence.linear import Linear, Parts, parts_of, spans_of
 from casest.diagnose.evidence.score import Evidence, Trial
 from casest.diagnose.motion.fit import Fit, fitted, rise
 from casest.diagnose.motion.sensitivity import sensitivity
-from casest.diagnose.protocol import Kept, Ranking
+from casest.diagnose.protocol import Kept, Subject
 from casest.effects.moving import Candidate
 
 #: Times that a refit goes on where its scoring has not come to an end.
@@ -23,7 +22,7 @@ AGAIN = 3
 
 
 @dataclass(frozen=True)
-class Innovations:
+class Innovations(Subject[Fit]):
     """A record of an estimator in motion, and what may be missing: the loop's subject.
 
     Whitened innovations are linear in constants that the model lacks, the states already marginal
@@ -61,18 +60,6 @@ class Innovations:
             for c, where in zip(rest, found.columns, strict=True)
         ]
 
-    def shown(self, fit: Fit) -> list[Trial]:
-        """Nothing."""
-        return []
-
-    def nearer(self, fit: Fit, trial: Trial, scale: float) -> list[Trial]:
-        """Nothing has a grid."""
-        return []
-
-    def on_axes(self, fit: Fit, trial: Trial, axes: Sequence[int]) -> Trial:
-        """The trial: its numbers come together."""
-        return trial
-
     def refit(self, fit: Fit, added: Sequence[Trial]) -> Fit | str:
         """Numbers and intensities in turn, from the first-order step."""
         more = tuple((t.what, _step(self.linear(fit), t)) for t in added)
@@ -99,19 +86,11 @@ class Innovations:
         """The same of two fits."""
         return 2 * rise(fit, less)
 
-    def certified(self, fit: Fit) -> Fit | str:
-        """The fit: its scoring has come to an end."""
-        return fit
-
     def without(self, fit: Fit, what: Candidate) -> Fit | None:
         """The fit without an effect that was added."""
         kept = [(c, v) for c, v in fit.added if c is not what]
         return fitted(fit.base, self.run, fit.found.smoothed, added=kept, colour=fit.colour,
                       start=fit.intensities)  # fmt: skip
-
-    def wider(self, fit: Fit, what: Candidate) -> tuple[Candidate, Fit] | None:
-        """Numbers come together."""
-        return None
 
     def apart(self, fit: Fit, kept: Kept) -> tuple[Linear, Trial] | None:
         """The innovations as if an effect were not there, and the effect as a trial of them."""
@@ -124,18 +103,6 @@ class Innovations:
         return linear.without(others, -(columns @ value)), Trial(
             kept.what, kept.what.label, columns
         )
-
-    def asked(self, what: Any) -> bool:
-        """Nothing is."""
-        return False
-
-    def label(self, what: Candidate) -> str:
-        """`bias of omega`."""
-        return what.label
-
-    def formula(self, fit: Fit, ranking: Ranking) -> Evidence | None:
-        """None: innovations are not described."""
-        return None
 
 
 def _rows(fit: Fit) -> NDArray[np.int_]:

@@ -24,19 +24,6 @@ from casest.dynamics.likelihood import first_guess, likelihood, reached
 from casest.effects.moving import Candidate, Colour, candidates
 from casest.errors import DataError
 
-#: Whiteness below which noise with a colour is tried; gain of likelihood that asks for it too.
-SUSPECT, ASKS = 0.05, 10.0
-#: Blocks and folds of held-out time.
-BLOCKS, FOLDS = 40, 4
-#: An input's matched intensity that is so many times what its own readings show is no noise.
-LOUD = 4.0
-#: Significance of what is left.
-UNEXPLAINED = 1e-4
-#: Samples below which nothing can be held out.
-SHORTEST = 400
-#: Rivals that are named.
-NEAREST = 2
-
 
 @dataclass(frozen=True)
 class Added:
@@ -71,7 +58,7 @@ class MotionClosing:
     @property
     def coloured(self) -> bool:
         """Are the innovations not white after the loop?"""
-        return self.left.p_value < UNEXPLAINED
+        return self.left.p_value < LEVELS.coloured
 
     @property
     def misfit(self) -> bool:
@@ -97,12 +84,12 @@ def close_motion(
     has innovations that are not white, for no physical reason. Raises DataError where the record
     is too short to hold any of it out.
     """
-    if len(run) < SHORTEST:
+    if len(run) < LEVELS.shortest:
         raise DataError(
             f"{run.file or run.name}: {len(run)} samples are too few to hold some of them out; "
-            f"closing the loop needs {SHORTEST} at least"
+            f"closing the loop needs {LEVELS.shortest} at least"
         )
-    folds = interleaved_blocks(run, BLOCKS, FOLDS)
+    folds = interleaved_blocks(run, LEVELS.pieces, LEVELS.refits)
     before = fitted(model, run, filtered(model, run).smoothed)
     subject = Innovations(run, tuple(candidates(model, run)))
     with np.errstate(all="ignore"):
@@ -119,7 +106,7 @@ def close_motion(
         before,
         state.fit.with_spread(),
         (*added, *([colour] if colour is not None else [])),
-        tuple((r.what.label, r.why) for r in state.refused),
+        _refused(state),
         visible(found, subject.tried),
         _left(state.fit),
         (one, two),
@@ -132,7 +119,14 @@ def _added(kept: Kept, state: State[Fit]) -> Added:
     alike = [r.what.label for r in kept.rivals if r.what.label not in there]
     count = int(np.isfinite(state.fit.found.innovations).sum())
     gained = 0.5 * kept.evidence.gain / count
-    return Added(kept.what, kept.evidence.p_value, gained, tuple(alike[:NEAREST]))
+    return Added(kept.what, kept.evidence.p_value, gained, tuple(alike[: LEVELS.nearest]))
+
+
+def _refused(state: State[Fit]) -> tuple[tuple[str, str], ...]:
+    """What was not added, each once, with the first reason."""
+    added = {k.what.label for k in state.kept}
+    said = {r.what.label: r.why for r in reversed(state.refused) if r.what.label not in added}
+    return tuple(said.items())
 
 
 def _left(fit: Fit) -> Whiteness:
@@ -145,7 +139,7 @@ def _coloured(
     fit: Fit, run: Run, folds: NDArray[np.int_], say: Callable[[str], None]
 ) -> tuple[Fit, Added | None]:
     """The fit with correlated noise on an output, if the innovations ask for it."""
-    if not (_left(fit).p_value < SUSPECT or _noise_is_odd(fit, run)):
+    if not (_left(fit).p_value < LEVELS.suspect or _noise_is_odd(fit, run)):
         return fit, None
     from scipy.special import chdtrc
 
@@ -169,7 +163,7 @@ def _noise_is_odd(fit: Fit, run: Run) -> bool:
         name: value if name in kept else min(guess[name], value)
         for name, value in fit.intensities.items()
     }
-    return bool(fit.likelihood - likelihood(fit.ready, own) > ASKS)
+    return bool(fit.likelihood - likelihood(fit.ready, own) > LEVELS.insists)
 
 
 def _loud(model: Dynamics, run: Run, fit: Fit) -> dict[str, float]:
@@ -180,7 +174,7 @@ def _loud(model: Dynamics, run: Run, fit: Fit) -> dict[str, float]:
     found = {}
     for name, ratio in times.items():
         own = {**fit.intensities, name: guess[name]}
-        if ratio > LOUD and fit.likelihood - likelihood(fit.ready, own) > ASKS:
+        if ratio > LEVELS.loud and fit.likelihood - likelihood(fit.ready, own) > LEVELS.insists:
             found[name] = ratio
     return found
 
@@ -191,7 +185,7 @@ def _confirmed(current: Fit, better: Fit, folds: NDArray[np.int_]) -> float | No
     if current.shifts != better.shifts:  # the first readings are of one of them alone
         lost = ~(forgotten(current) & forgotten(better))
         before[lost] = after[lost] = np.nan
-    part = np.arange(len(before)) * BLOCKS // len(before)
+    part = np.arange(len(before)) * LEVELS.pieces // len(before)
     gains = np.bincount(part, np.nan_to_num(after - before))
     error = float(np.sqrt(len(gains)) * np.std(gains, ddof=1))
     total = float(gains.sum())

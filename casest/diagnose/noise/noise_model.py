@@ -19,8 +19,6 @@ from casest.diagnose.noise.tails import even_scale, outlier_share, tails
 from casest.estimate.correlation import is_series
 from casest.leastsquares.weights import robust_scale
 
-#: Chance under white, equal, normal noise of being called anything else, each.
-ALARM = 1e-3
 #: Batches of a record that its slow wander is judged by, and the fewest.
 SLICES, FEWEST = 64, 24
 #: Slow shapes, half a period to two and a half over the record, that a misfit might have too;
@@ -85,7 +83,7 @@ def noise_model(
     sigma = _sigma(residuals)
     clipped = [np.clip(r / sigma, -LEVELS.clip, LEVELS.clip) for r in residuals]
     unequal_p = equal_noise(clipped, batches)
-    unequal = unequal_p < ALARM
+    unequal = unequal_p < LEVELS.misfit
     even = even_scale(residuals, batches, unequal)
     lag1, colour_p = lag_one(runs, clipped)
     wander, wander_p = _wander(runs, clipped, sigma)
@@ -96,7 +94,7 @@ def noise_model(
         lag1=lag1,
         colour=_colour(lag1, colour_p, correlated_over),
         colour_p=colour_p,
-        wander=wander if wander_p < ALARM else 0.0,
+        wander=wander if wander_p < LEVELS.misfit else 0.0,
         wander_p=wander_p,
         freedom=np.inf if outliers else found.freedom,
         outliers=outliers,
@@ -144,7 +142,7 @@ def _two_sided(z: float) -> float:
 
 
 def _colour(lag1: float | None, p: float, correlated_over: float) -> str:
-    if lag1 is None or p >= ALARM:
+    if lag1 is None or p >= LEVELS.misfit:
         return "white"
     expected = (1 + lag1) / (1 - lag1) if abs(lag1) < 1 else np.inf
     return "AR(1)" if 2 / 3 < correlated_over / max(expected, 1.0) < 1.5 else "coloured"

@@ -15,6 +15,7 @@ import numpy as np
 
 from casest.data.run import Run
 from casest.declaration.shapes import Array
+from casest.diagnose.levels import LEVELS
 from casest.estimate.correlation import is_series
 
 #: Periods in samples from which on a course is slow, and that it is compared with.
@@ -25,8 +26,6 @@ MEMORY = 5
 #: ω is 2π·MEMORY/period, and the power 1/(1 + ω²).
 _EDGES = 2 * np.pi * MEMORY / np.array([SLOW, FAST])
 COLOUR = float(np.diff(_EDGES)[0] / np.diff(np.arctan(_EDGES))[0])
-#: A smaller share of the variance is no matter.
-LEAST = 0.02
 #: What is less likely nobody can tell from zero.
 LEAST_CHANCE = 1e-16
 
@@ -56,7 +55,7 @@ def slow_course(runs: Sequence[Run], residuals: Sequence[Array]) -> SlowCourse |
     frequency = np.concatenate([np.arange(1, len(r)) / (2 * len(r)) for r in series])
     power = np.concatenate([_power(r) for r in series])
     found = [_of_axis(frequency, power[:, a], power.shape[1]) for a in range(power.shape[1])]
-    large = [f for f in found if f.share >= LEAST]
+    large = [f for f in found if f.share >= LEVELS.share]
     return min(large or found, key=lambda f: (f.p_value, -f.share))
 
 

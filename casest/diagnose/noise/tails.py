@@ -14,13 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casest.declaration.shapes import Array
+from casest.diagnose.levels import LEVELS
 from casest.leastsquares.weights import robust_scale
 
 #: Outliers are few, and so many times further out than the noise.
 FEW, FAR = 0.05, 5.0
-#: Log-likelihood over that of Student's t from which on samples are outliers: t noise of 3 to 6
-#: degrees of freedom gets there in less than one of a hundred records (tests/test_adequacy.py).
-DECIDES = 4.0
 #: Residuals of a batch from which on it has a scale of its own.
 OWN_SCALE = 8
 #: Outliers within the record's length over twice this are near to each other.
@@ -46,7 +44,7 @@ class Tails:
     @property
     def outliers(self) -> bool:
         """Do outliers explain the tails better than any heavy-tailed noise?"""
-        return self.contaminated - max(self.student, self.normal) > DECIDES
+        return self.contaminated - max(self.student, self.normal) > LEVELS.outliers
 
 
 def tails(z: Array) -> Tails:

@@ -29,14 +29,16 @@ def with_the_best(
     left, tried = options, list[Evidence]()
     while True:
         held = asked or passing(ranking, left)
-        refits = refitted(subject, state.fit, ranking, held)
+        state, refits = refitted(subject, state, ranking, held)
         if not asked and not tried:
-            refits = best_refits([*refits, *shown(subject, state.fit, ranking)])
+            state, more = shown(subject, state, ranking)
+            refits = best_refits([*refits, *more])
         torn = [] if asked else torn_between(refits, ranking)
         if torn:
-            return replace(state, open=tuple(torn))
+            return replace(state, open=tuple(r.evidence for r in torn), torn=tuple(torn))
         if described is not None and _describes(subject, described, refits, ranking):
-            refits = [*refitted(subject, state.fit, ranking, [described]), *refits]
+            state, more = refitted(subject, state, ranking, [described])
+            refits = [*more, *refits]
         bigger, over = _first_certified(subject, state, ranking, refits, say)
         if len(bigger.kept) > len(state.kept):
             return bigger
@@ -62,7 +64,7 @@ def _first_certified(
     for k, refit in enumerate(refits):
         fit = subject.certified(refit.fit)
         if not isinstance(fit, str):
-            return _with_kept(subject, state, ranking, replace(refit, fit=fit), say), True
+            return _with_kept(state, ranking, replace(refit, fit=fit), say), True
         state = state.refusing(refit.evidence.trials[0].what, fit)
         later = refits[k + 1].evidence.score if k + 1 < len(refits) else 0.0
         if len(refit.evidence.trials) == 1 and refit.evidence.score > later + LEVELS.strong:
@@ -111,11 +113,10 @@ def _describes(
 
 
 def _with_kept(
-    subject: Subject[F], state: State[F], ranking: Ranking, refit: Refit[F],
-    say: Callable[[str], None],
-) -> State[F]:  # fmt: skip
+    state: State[F], ranking: Ranking, refit: Refit[F], say: Callable[[str], None]
+) -> State[F]:
     seen, kept = refit.falls or falls(ranking, refit.evidence), state.kept
     for trial in refit.evidence.trials:
-        say(f"{subject.label(trial.what)}: held-out error falls")
+        say(f"{trial.family}: held-out error falls")
         kept = (*kept, Kept(trial.what, refit.evidence, seen))
     return replace(state, fit=refit.fit, kept=kept)

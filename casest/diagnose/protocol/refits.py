@@ -11,29 +11,30 @@ from casest.diagnose.evidence.score import Evidence, expected_loss, judged
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.protocol.confirming import falls_of_refit, holds_out, significant
 from casest.diagnose.protocol.ranking import sharpened
-from casest.diagnose.protocol.state import F, Ranking, Refit
+from casest.diagnose.protocol.state import F, Ranking, Refit, State
 from casest.diagnose.protocol.subject import Subject
-
-#: Share of their length by which columns may lie outside a span that holds the most of them.
-NESTED = 0.5
 
 
 def refitted(
-    subject: Subject[F], fit: F, ranking: Ranking, options: Sequence[Evidence]
-) -> list[Refit[F]]:
-    """Causes by what their refits are worth; of equal ones first what would do the least harm."""
+    subject: Subject[F], state: State[F], ranking: Ranking, options: Sequence[Evidence]
+) -> tuple[State[F], list[Refit[F]]]:
+    """Causes by what their refits are worth; of equal ones first what would do the least harm.
+
+    The state says which refits fail.
+    """
     found: list[Refit[F]] = []
     for evidence in _with_parts(options[: LEVELS.contenders], ranking):
-        evidence = sharpened(subject, fit, ranking, evidence)
-        better = subject.refit(fit, evidence.trials)
+        evidence = sharpened(subject, state.fit, ranking, evidence)
+        better = subject.refit(state.fit, evidence.trials)
         if isinstance(better, str):
+            state = state.failing(evidence, better)
             continue
-        gain = subject.gain(fit, better, evidence)
+        gain = subject.gain(state.fit, better, evidence)
         score = evidence.score - evidence.gain + gain
         if _enough(ranking, evidence, score) or subject.asked(evidence.trials[0].what):
-            found.append(Refit(better, replace(evidence, gain=gain, score=score)))
+            found.append(Refit(state.fit, better, replace(evidence, gain=gain, score=score)))
     found.sort(key=lambda r: -r.evidence.score)
-    near = _near(found)
+    near = [r.evidence for r in _near(found)]
     if len(near) > 1:
         loss, _ = expected_loss(near, ranking.likelihood)
         # Of equal ones the first of the catalogue: what is met more often.
@@ -41,14 +42,14 @@ def refitted(
         best = found[min(range(len(near)), key=lambda k: (float(f"{loss[k]:.3g}"), usual[k]))]
         found = [best, *[r for r in found if r is not best]]
         found = _plainest_first(found)
-    return found
+    return state, found
 
 
 def _enough(ranking: Ranking, evidence: Evidence, score: float) -> bool:
     """Is it strong evidence, clearly more than a course of unknown cause has, or beside one?"""
     if score <= (LEVELS.strong if ranking.linear.series else 0.0):
         return False
-    course = ranking.description
+    course = next(iter(ranking.descriptions), None)
     if course is None or score > course.score + LEVELS.clear:
         return True
     both = judged([*course.trials, *evidence.trials], ranking.likelihood, ranking.none,
@@ -84,16 +85,16 @@ def _plainest_first(refits: list[Refit[F]]) -> list[Refit[F]]:
 def _contains(wide: Evidence, narrow: Evidence) -> bool:
     """Are the columns of one a combination of those of the other?"""
     beyond = narrow.basis - wide.basis @ (wide.basis.T @ narrow.basis)
-    return bool(np.sum(beyond**2) < NESTED * narrow.freedom)
+    return bool(np.sum(beyond**2) < LEVELS.nested * narrow.freedom)
 
 
-def _near(refits: Sequence[Refit[F]]) -> list[Evidence]:
+def _near(refits: Sequence[Refit[F]]) -> list[Refit[F]]:
     """Those that the evidence does not tell from the best."""
     best = max((r.evidence.score for r in refits), default=0.0)
-    return [r.evidence for r in refits if r.evidence.score > best - LEVELS.clear]
+    return [r for r in refits if r.evidence.score > best - LEVELS.clear]
 
 
-def torn_between(refits: Sequence[Refit[F]], ranking: Ranking) -> list[Evidence]:
+def torn_between(refits: Sequence[Refit[F]], ranking: Ranking) -> list[Refit[F]]:
     """Causes of which each, were it the wrong one, would do more harm than none of them.
 
     That is, leave the declared parameters further off: what is added hangs on which it is.
@@ -101,9 +102,9 @@ def torn_between(refits: Sequence[Refit[F]], ranking: Ranking) -> list[Evidence]
     near = _near(refits)
     if len(near) < 2:
         return []
-    loss, none = expected_loss(near, ranking.likelihood)
-    noise = float(np.mean(ranking.likelihood.residual**2 * np.exp(-near[0].gain / len(
-        ranking.likelihood.residual))))  # fmt: skip
+    loss, none = expected_loss([r.evidence for r in near], ranking.likelihood)
+    left = np.exp(-near[0].evidence.gain / len(ranking.likelihood.residual))
+    noise = float(np.mean(ranking.likelihood.residual**2 * left))
     return near if none < loss.min() and loss.min() > noise else []
 
 
@@ -117,17 +118,20 @@ def best_refits(refits: Sequence[Refit[F]]) -> list[Refit[F]]:
     return [first, *[r for r in refits if r is not first]]
 
 
-def shown(subject: Subject[F], fit: F, ranking: Ranking) -> list[Refit[F]]:
+def shown(
+    subject: Subject[F], state: State[F], ranking: Ranking
+) -> tuple[State[F], list[Refit[F]]]:
     """What the records show by themselves, refitted: held-out parts by the refit itself."""
     found = []
-    for trial in subject.shown(fit):
+    for trial in subject.shown(state.fit):
         evidence = judged([trial], ranking.likelihood, ranking.none, families=ranking.families)
-        better = subject.refit(fit, [trial])
+        better = subject.refit(state.fit, [trial])
         if evidence is None or isinstance(better, str):
+            state = state if evidence is None else state.failing(evidence, str(better))
             continue
-        gain = subject.gain(fit, better, evidence)
+        gain = subject.gain(state.fit, better, evidence)
         score = evidence.score - evidence.gain + gain
         seen = falls_of_refit(ranking.linear, subject.linear(better))
         if _enough(ranking, evidence, score) and holds_out(seen, ranking.linear):
-            found.append(Refit(better, replace(evidence, gain=gain, score=score), seen))
-    return found
+            found.append(Refit(state.fit, better, replace(evidence, gain=gain, score=score), seen))
+    return state, found

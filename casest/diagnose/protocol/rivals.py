@@ -17,15 +17,18 @@ from casest.diagnose.protocol.subject import Subject
 
 def with_rivals(subject: Subject[F], state: State[F]) -> State[F]:
     """Each cause beside those that explain as much in its place, the others kept."""
-    kept = tuple(replace(k, rivals=_rivals(subject, state, k)) for k in state.kept)
-    return replace(state, kept=kept)
+    several = []
+    for kept in state.kept:
+        state, rivals = _rivals(subject, state, kept)
+        several.append(replace(kept, rivals=tuple(rivals)))
+    return replace(state, kept=tuple(several))
 
 
-def _rivals(subject: Subject[F], state: State[F], kept: Kept) -> tuple[Rival, ...]:
+def _rivals(subject: Subject[F], state: State[F], kept: Kept) -> tuple[State[F], list[Rival]]:
     """By evidence, or by held-out stretches (Vuong 1989): a score alone does not say so."""
     apart, base = subject.apart(state.fit, kept), subject.without(state.fit, kept.what)
     if apart is None or base is None:
-        return ()
+        return state, []
     linear, own, others = subject.linear(base), apart[1], list(subject.trials(base))
     if own.columns.shape[:2] != linear.residual.shape:  # rows that moved in time are others
         (own, *_) = [t for t in others if t.family == own.family]
@@ -33,7 +36,7 @@ def _rivals(subject: Subject[F], state: State[F], kept: Kept) -> tuple[Rival, ..
     ranking = ranked_of(linear, [own, *(t for t in others if t.family != own.family)])
     mine = [e for e in ranking.found if e.trials[0] is own]
     if not mine:
-        return ()
+        return state, []
     stretches = linear.parts.stretches
     without, best = (squares(linear, c, stretches) for c in ([], [_in_time(ranking, mine[0])]))
     rivals = list[Evidence]()
@@ -45,10 +48,11 @@ def _rivals(subject: Subject[F], state: State[F], kept: Kept) -> tuple[Rival, ..
             rivals.append(e)
     after = subject.linear(state.fit)
     target = mine[0].score - mine[0].gain + subject.rise(base, state.fit)
-    found = []
+    found = list[Rival]()
     for e in rivals:  # what the columns promise, a refit must keep
         fit = subject.refit(base, e.trials)
         if isinstance(fit, str):
+            state = state.failing(e, f"in the place of {own.family} {fit}")
             continue
         behind = target - (e.score - e.gain + subject.rise(base, fit))
         other = subject.linear(fit)
@@ -58,7 +62,7 @@ def _rivals(subject: Subject[F], state: State[F], kept: Kept) -> tuple[Rival, ..
             lost, best = its - own_, own_
         if _as_well(behind, lost, without - best):
             found.append(Rival(e.trials[0].what, fit))
-    return tuple(found)
+    return state, found
 
 
 def _in_time(ranking: Ranking, evidence: Evidence) -> Array:

@@ -24,7 +24,7 @@ def search(
     state = State(fit) if begun is None else replace(begun, fit=fit)
     for _ in range(LEVELS.rounds):
         ranking = ranked(subject, state.fit)
-        state = replace(state, first=state.first or ranking, last=ranking, open=())
+        state = replace(state, first=state.first or ranking, last=ranking, open=(), torn=())
         bigger = with_the_best(subject, state, ranking, say)
         if len(bigger.kept) == len(state.kept):
             state = bigger

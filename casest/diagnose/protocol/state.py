@@ -32,17 +32,18 @@ class Ranking:
         return tuple(e for e in self.found if not e.trials[0].describes)
 
     @property
-    def description(self) -> Evidence | None:
-        """The best course of unknown cause, if there is evidence for one."""
+    def descriptions(self) -> tuple[Evidence, ...]:
+        """Courses of unknown cause that there is evidence for, and none for a better one."""
         found = [e for e in self.found if e.trials[0].describes and e.score > LEVELS.strong]
-        return found[0] if found else None
+        return tuple(e for e in found if e.score > found[0].score - LEVELS.clear)
 
 
 @dataclass(frozen=True)
 class Refit(Generic[F]):
-    """A cause in the model, fitted: `evidence` with the score of this fit; `falls` if they are not
-    those of its columns."""
+    """A cause in the model, fitted, and the fit `before` it: `evidence` with the score of this fit;
+    `falls` if they are not those of its columns."""
 
+    before: F
     fit: F
     evidence: Evidence
     falls: dict[str, Fall] | None = None
@@ -78,13 +79,15 @@ class Refused:
 class State(Generic[F]):
     """A search as it stands: the fit, what it has been given, what was refused.
 
-    `open`: causes of which one is there, but not one to add.
+    `open`: causes of which one is there, but not one to add; `torn`: their refits, where each would
+    do more harm than none if it is the wrong one.
     """
 
     fit: F
     kept: tuple[Kept, ...] = ()
     refused: tuple[Refused, ...] = ()
     open: tuple[Evidence, ...] = ()
+    torn: tuple[Refit[F], ...] = ()
     first: Ranking | None = None
     last: Ranking | None = None
 
@@ -93,3 +96,12 @@ class State(Generic[F]):
         if any(r.what == what and r.why == why for r in self.refused):
             return self
         return replace(self, refused=(*self.refused, Refused(what, why)))
+
+    def failing(self, evidence: Evidence, why: str) -> State[F]:
+        """The state that says of each of these causes why there is no refit with them."""
+        state = self
+        for trial in evidence.trials:
+            others = [f for f in evidence.families if f != trial.family]
+            beside = f" (beside {', '.join(others)})" if others else ""
+            state = state.refusing(trial.what, why + beside)
+        return state

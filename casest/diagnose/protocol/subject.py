@@ -11,7 +11,10 @@ from casest.diagnose.protocol.state import F, Kept, Ranking
 
 
 class Subject(Protocol[F]):
-    """What is searched. Fits are values; `what` of a trial is the subject's own."""
+    """What is searched. Fits are values; `what` of a trial is the subject's own.
+
+    One that knows no grids, axes, descriptions or wishes of the user leaves those questions be.
+    """
 
     def linear(self, fit: F) -> Linear:
         """The fit as a linear problem."""
@@ -23,15 +26,15 @@ class Subject(Protocol[F]):
 
     def shown(self, fit: F) -> Sequence[Trial]:
         """What is refitted whatever its columns promise."""
-        ...
+        return ()
 
     def nearer(self, fit: F, trial: Trial, scale: float) -> Sequence[Trial]:
         """Variants of a trial around its value on a grid."""
-        ...
+        return ()
 
     def on_axes(self, fit: F, trial: Trial, axes: Sequence[int]) -> Trial:
         """The trial on some of its axes only."""
-        ...
+        return trial
 
     def refit(self, fit: F, added: Sequence[Trial]) -> F | str:
         """The fit with these in the model; or why there is none."""
@@ -47,7 +50,7 @@ class Subject(Protocol[F]):
 
     def certified(self, fit: F) -> F | str:
         """The fit, proved; or why it is refused."""
-        ...
+        return fit
 
     def without(self, fit: F, what: Any) -> F | None:
         """The fit without something that was added."""
@@ -55,7 +58,7 @@ class Subject(Protocol[F]):
 
     def wider(self, fit: F, what: Any) -> tuple[Any, F] | None:
         """Something that was added on some axes only, and the fit with it on all of them."""
-        ...
+        return None
 
     def apart(self, fit: F, kept: Kept) -> tuple[Linear, Trial] | None:
         """The linear problem as if a cause were not there, and the cause as a trial of it."""
@@ -63,12 +66,8 @@ class Subject(Protocol[F]):
 
     def asked(self, what: Any) -> bool:
         """Did the user say that it is there?"""
-        ...
-
-    def label(self, what: Any) -> str:
-        """What it is called."""
-        ...
+        return False
 
     def formula(self, fit: F, ranking: Ranking) -> Evidence | None:
         """The best description outside the catalogue."""
-        ...
+        return None

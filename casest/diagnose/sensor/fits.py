@@ -10,13 +10,11 @@ import numpy as np
 from casest.data.run import Run
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
-from casest.diagnose.cross_validation import undetermined
+from casest.diagnose.cross_validation import ENOUGH, ITERATIONS, undetermined
 from casest.leastsquares.problem import Point, Problem
 from casest.leastsquares.weights import robust_scale, weighted
 from casest.solve.trust_region import trust_region
 
-#: Iterations of a fit that begins at the fit to everything, and gain (in σ²) that ends it.
-ITERATIONS, ENOUGH = 30, 1e-3
 #: Iterations of a fit that is to stay, and standard deviations that a step may be long there.
 LONG, RESTLESS = 100, 1e-2
 

@@ -18,9 +18,6 @@ from casest.diagnose.sensor.fits import Fit, problem_of
 from casest.diagnose.sensor.recent import Recent
 from casest.leastsquares.problem import Point, Problem
 
-#: What survives of an implicit residual's slopes, in noise over reading, at least.
-BEYOND = 5.0
-
 
 @dataclass(frozen=True)
 class Rows:
@@ -90,7 +87,8 @@ class Rows:
             float(np.sqrt(np.mean(np.concatenate([r.signals[n] for r in self.runs]) ** 2)))
             for n in names
         ]
-        return max(LEVELS.survives, BEYOND * fit.noise / max(min(sizes, default=np.inf), 1e-300))
+        noise = fit.noise / max(min(sizes, default=np.inf), 1e-300)
+        return max(LEVELS.survives, LEVELS.over_noise * noise)
 
     def _met(self, fit: Fit) -> Array:
         """What the sensor met in each row (N, q): the corrected quantity, or the prediction."""

@@ -17,7 +17,7 @@ from casest.diagnose.evidence.likelihood import Likelihood
 from casest.diagnose.evidence.linear import Linear
 from casest.diagnose.evidence.score import Evidence, Trial
 from casest.diagnose.formula.search import NAME, described, readable, with_sizes
-from casest.diagnose.protocol import Kept, Ranking
+from casest.diagnose.protocol import Kept, Ranking, Subject
 from casest.diagnose.sensor.fits import Fit, certified, fitted, problem_of, simpler, starts
 from casest.diagnose.sensor.recent import Recent
 from casest.diagnose.sensor.rows import Rows
@@ -28,12 +28,12 @@ from casest.estimate.calibrate import attempt
 from casest.estimate.estimate import Estimate
 from casest.leastsquares.problem import Problem
 
-#: Time constants that a record must span for a memory to be seen in it.
-SEEN = 2
+#: Why there is no refit.
+NOT_FINITE = "its refit fails: the residual is not finite"
 
 
 @dataclass(frozen=True)
-class Sensor:
+class Sensor(Subject[Fit]):
     """A model, its runs (prepared) and what may be missing: the loop's subject."""
 
     model: Model
@@ -89,10 +89,6 @@ class Sensor:
         """Is it the user's own, or named as there?"""
         return self.tried.asked(what)
 
-    def label(self, what: Candidate) -> str:
-        """Name and column."""
-        return what.label
-
     def refit(self, fit: Fit, added: Sequence[Trial]) -> Fit | str:
         """The fit with these effects, from their first-order sizes, if it can be trusted."""
         try:
@@ -108,7 +104,7 @@ class Sensor:
         except (CasestError, np.linalg.LinAlgError) as error:
             return f"its refit fails: {error}"
         if found is None:
-            return "its refit fails: the residual is not finite"
+            return NOT_FINITE
         return self._too_slow(found, added) or found
 
     def _too_slow(self, fit: Fit, added: Sequence[Trial]) -> str:
@@ -118,8 +114,8 @@ class Sensor:
             slow = [n for n, kind in what.effect.profile if kind == "timescale"]
             for name in slow:
                 value = float(np.max(fit.values.get(f"{what.label}.{name}", 0.0)))
-                if value > max(spans, default=np.inf) / SEEN:
-                    return f"{name} = {value:.3g} s is more than half of the record"
+                if value > max(spans, default=np.inf) / LEVELS.fades:
+                    return f"its refit fails: {name} = {value:.3g} s is over half of the record"
         return ""
 
     def _with(
@@ -214,7 +210,7 @@ class Sensor:
         if attached is None:
             return what
         made = attached.effect
-        if what.label == NAME:
+        if made.source:
             own = {p.name.rpartition(".")[2]: p.name for p in attached.parameters}
             made = with_sizes(made, {k: float(fit.values[n]) for k, n in own.items()})
         return replace(what, effect=made, held=(), traced=None)
@@ -226,8 +222,8 @@ class Sensor:
     def formula(self, fit: Fit, ranking: Ranking) -> Evidence | None:
         """The best description; None where there is one, or nothing to be added to."""
         problem, point = problem_of(fit, self.runs)
-        found = self.tried.shift(fit)
-        if found is None or problem.sequential or any(a.label == NAME for a in fit.model.effects):
+        found, there = self.tried.shift(fit), {a.label for a in fit.model.effects}
+        if found is None or problem.sequential or NAME in there:
             return None
         on, slope = found
         read = readable(problem, point, slope, on, self.rows.index)

@@ -1,0 +1,85 @@
+"""What `close` says of a misfit that it adds no cause for: through the command line."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from casest.cli import run
+
+REST = """
+import casest as c
+
+
+@c.model
+def rest(v=c.signal(3, "m/s^2"), *, bias=c.param(3, "m/s^2")):
+    return c.Residual(measured=v, predicted=c.quantity("reading", bias, "m/s^2"))
+"""
+COMPASS = """
+import casest as c
+
+
+@c.model
+def compass(b=c.signal(3, "uT"), m=c.signal(3, "uT"), *, hard=c.param(3, "uT")):
+    field = c.quantity("field", b, "uT")
+    reading = c.quantity("reading", field + hard, "uT")
+    return c.Residual(measured=m, predicted=reading, corrected=field)
+"""
+
+
+def closed(folder, model, columns, *values):
+    """result.json of the model on these columns."""
+    (folder / "model.py").write_text(model)
+    table = np.column_stack(values)
+    np.savetxt(folder / "record.csv", table, delimiter=",", header=columns, comments="")
+    files = str(folder / "model.py"), str(folder / "record.csv")
+    assert run(["close", *files, "-o", str(folder / "out")]) == 0
+    return json.loads((folder / "out" / "result.json").read_text())
+
+
+def test_of_causes_of_which_none_is_added_it_is_said_how_far_each_moves_the_parameters(
+    tmp_path, capsys
+):
+    """A drift: the offset that it begins from is that of NumPy's straight line."""
+    rng = np.random.default_rng(0)
+    t = np.arange(6000) / 10
+    v = 0.3 + 0.02 * rng.standard_normal((6000, 3))
+    v[:, 0] += 0.007 * (t / t[-1] - 0.5)
+    names = "t [s],v_x [m/s^2],v_y [m/s^2],v_z [m/s^2]"
+    left = closed(tmp_path, REST, names, t, v)["unexplained"]
+    assert left["one_of"] == ["bias_drift", "warm_up"]
+    assert set(left["would_move"]) == {"bias_drift", "warm_up"}
+    begins = np.polyfit(t, v[:, 0], 1)[1] - v[:, 0].mean()
+    np.testing.assert_allclose(left["would_move"]["bias_drift"]["bias"], -begins, rtol=1e-3)
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "bias_drift would move the parameters: bias by 0.0047 m/s^2" in printed
+    assert "who knows which of them is there says so, as --effects bias_drift" in printed
+
+
+@pytest.mark.parametrize(
+    ("of_field", "of_offset", "name", "words"),
+    [
+        (0.006, 0.0, "reference_wander", "the known reference sways: its size follows a smooth"),
+        (0.0, 0.2, "bias_course", "the offset of each axis follows a smooth course of its own"),
+    ],
+)
+def test_a_slow_course_is_said_to_be_of_the_reference_or_of_the_offset(
+    tmp_path, of_field, of_offset, name, words
+):
+    rng = np.random.default_rng(3)
+    t = 0.1 * np.arange(600)
+    x = 2 * t / t[-1] - 1
+    course = np.sin(2.5 * x) + 0.4 * np.cos(5 * x)
+    b = rng.standard_normal((600, 3))
+    b *= 48 / np.linalg.norm(b, axis=1)[:, None]
+    m = b * (1 + of_field * course)[:, None] + np.outer(
+        course, of_offset * np.array([1, -0.5, 0.8])
+    )
+    m += [5, -8, 2] + 0.02 * rng.standard_normal((600, 3))
+    names = "t [s]," + ",".join(f"{n}_{a} [uT]" for n in "bm" for a in "xyz")
+    result = closed(tmp_path, COMPASS, names, t, b, m)
+    assert result["verdict"] == "unexplained"
+    assert result["unexplained"]["described_by"] == [name]
+    assert f"its slow course is best described by {name} ({words}" in result["unexplained"]["where"]
