@@ -17,6 +17,7 @@ from casest.diagnose.evidence.likelihood import Likelihood
 from casest.diagnose.evidence.linear import Linear
 from casest.diagnose.evidence.score import Evidence, Trial
 from casest.diagnose.formula.search import NAME, described, readable, with_sizes
+from casest.diagnose.levels import LEVELS
 from casest.diagnose.protocol import Kept, Ranking, Subject
 from casest.diagnose.sensor.fits import Fit, certified, fitted, problem_of, simpler, starts
 from casest.diagnose.sensor.recent import Recent
