@@ -43,12 +43,16 @@ class Explained:
 
 
 class Likelihood:
-    """A linear problem by frequency; residuals far out count as less, about a given course."""
+    """A linear problem by frequency; `cut` (N, m) is taken from its residual: what is far out.
 
-    def __init__(self, linear: Linear, about: Array | None = None) -> None:
+    Of two fits the same must be cut: what one explains and the other does not is far out of the
+    other alone.
+    """
+
+    def __init__(self, linear: Linear, cut: Array | None = None) -> None:
         self.linear = linear
         self.shape = linear.residual.shape
-        self.about = about
+        self.cut = far_out(linear.residual) if cut is None and linear.series else cut
 
     @cached_property
     def _bands(self) -> Bands:
@@ -65,13 +69,9 @@ class Likelihood:
 
     @cached_property
     def residual(self) -> Array:
-        """(N·m,), what is far from `about` (N, m) brought near to it."""
+        """(N·m,), without what is cut."""
         r = self.linear.residual
-        if self.linear.series:
-            course = np.zeros_like(r) if self.about is None else self.about
-            far = LEVELS.clip * robust_sd(r - course)
-            r = course + np.clip(r - course, -far, far)
-        return self.by_frequency(r[:, :, None])[:, 0]
+        return self.by_frequency((r if self.cut is None else r - self.cut)[:, :, None])[:, 0]
 
     def by_frequency(self, columns: Array) -> Array:
         """(N, m, k) as (N·m, k): each stretch by its cosines."""
@@ -138,6 +138,28 @@ class Likelihood:
         """What unknowns and columns explain, (N, m) in time."""
         X = np.concatenate([self.declared, *columns], axis=1)
         return self.in_time((X @ explained.values)[:, None])[:, :, 0]
+
+
+def far_out(residual: Array) -> Array:
+    """(N, m): what residuals have beyond some robust standard deviations."""
+    far = LEVELS.clip * robust_sd(residual)
+    return np.asarray(residual - np.clip(residual, -far, far))
+
+
+def rises(less: Linear, fits: Sequence[Linear]) -> list[float]:
+    """2 log of the likelihood of each fit over that of one with less in it; each has its own noise.
+
+    What the fit with the least squares leaves far out is cut from all of them.
+    """
+    best = min(fits, key=lambda x: float(np.sum(np.log(np.mean(x.residual**2, axis=0) + 1e-300))))
+
+    def cost(linear: Linear) -> float:
+        alike = linear.residual.shape == best.residual.shape  # rows that moved in time are others
+        cut = far_out(best.residual) if alike and linear.series else None
+        return Likelihood(linear, cut).beside().cost
+
+    none = cost(less)
+    return [none - cost(fit) for fit in fits]
 
 
 def _solved(X: Array, y: Array) -> tuple[Array, NDArray[Any]]:

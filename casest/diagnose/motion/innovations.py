@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from casest.data.run import Run
 from casest.declaration.shapes import Array
 from casest.diagnose.evidence.linear import Linear, Parts, parts_of, spans_of
-from casest.diagnose.evidence.score import Evidence, Trial
+from casest.diagnose.evidence.score import Trial
 from casest.diagnose.motion.fit import Fit, fitted, rise
 from casest.diagnose.motion.sensitivity import sensitivity
 from casest.diagnose.protocol import Kept, Subject
@@ -78,13 +78,9 @@ class Innovations(Subject[Fit]):
             numbers, along, start = found.added, found.found.smoothed, found.intensities
         return "its refit does not come to an end"
 
-    def gain(self, fit: Fit, better: Fit, evidence: Evidence) -> float:
-        """2 log of the likelihood over that of the fit, on the readings of both."""
-        return 2 * rise(better, fit)
-
-    def rise(self, less: Fit, fit: Fit) -> float:
-        """The same of two fits."""
-        return 2 * rise(fit, less)
+    def rises(self, less: Fit, fits: Sequence[Fit]) -> list[float]:
+        """2 log of the likelihood of each over that of the fit, on the readings of both."""
+        return [2 * rise(fit, less) for fit in fits]
 
     def without(self, fit: Fit, what: Candidate) -> Fit | None:
         """The fit without an effect that was added."""

@@ -31,7 +31,7 @@ def with_the_best(
         held = asked or passing(ranking, left)
         state, refits = refitted(subject, state, ranking, held)
         if not asked and not tried:
-            state, more = shown(subject, state, ranking)
+            state, more = shown(subject, state, ranking, refits)
             refits = best_refits([*refits, *more])
         torn = [] if asked else torn_between(refits, ranking)
         if torn:

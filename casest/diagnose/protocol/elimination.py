@@ -29,7 +29,7 @@ def on_all_axes(subject: Subject[F], state: State[F], *, needed: bool) -> State[
         more = all_.basis.shape[1] - none.declared.shape[1]
         if more < 1 or isinstance(subject.certified(fit), str):
             continue
-        rise = worth(subject.rise(state.fit, fit), more, 0.0, none) if needed else np.inf
+        rise = worth(subject.rises(state.fit, [fit])[0], more, 0.0, none) if needed else np.inf
         if rise > LEVELS.strong:
             trials = tuple(replace(t, what=what) if t.what == kept.what else t
                            for t in kept.evidence.trials)  # fmt: skip
@@ -64,7 +64,7 @@ def _beside_the_others(subject: Subject[F], state: State[F], kept: Kept, base: F
     `base` is the fit without it.
     """
     linear, whole = subject.linear(base), subject.linear(state.fit)
-    none, gain = Likelihood(linear), subject.rise(base, state.fit)
+    none, gain = Likelihood(linear), subject.rises(base, [state.fit])[0]
     freedom = max(whole.basis.shape[1] - linear.basis.shape[1], 1)
     families = state.first.families if state.first else 1
     searched = float(np.log(kept.evidence.trials[0].variants * families))

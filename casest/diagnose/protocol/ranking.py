@@ -8,7 +8,7 @@ from itertools import combinations
 
 import numpy as np
 
-from casest.diagnose.evidence.likelihood import Likelihood
+from casest.diagnose.evidence.likelihood import Likelihood, far_out
 from casest.diagnose.evidence.linear import Linear
 from casest.diagnose.evidence.score import (
     Evidence,
@@ -76,7 +76,7 @@ def _about_the_best(ranking: Ranking) -> Ranking:
     if best.score < 0:
         return ranking
     course = ranking.likelihood.course(best.explained, [best.basis])
-    likelihood = Likelihood(ranking.linear, course)
+    likelihood = Likelihood(ranking.linear, far_out(ranking.linear.residual - course))
     likelihood.__dict__["declared"] = ranking.likelihood.declared
     none = likelihood.beside(start=ranking.none.spectrum)
     found = _best_first([again(e, likelihood, none, families, 1) for e in ranking.found])

@@ -22,17 +22,20 @@ def refitted(
 
     The state says which refits fail.
     """
-    found: list[Refit[F]] = []
+    fits: list[tuple[Evidence, F]] = []
     for evidence in _with_parts(options[: LEVELS.contenders], ranking):
         evidence = sharpened(subject, state.fit, ranking, evidence)
         better = subject.refit(state.fit, evidence.trials)
         if isinstance(better, str):
             state = state.failing(evidence, better)
-            continue
-        gain = subject.gain(state.fit, better, evidence)
-        score = evidence.score - evidence.gain + gain
-        if _enough(ranking, evidence, score) or subject.asked(evidence.trials[0].what):
-            found.append(Refit(state.fit, better, replace(evidence, gain=gain, score=score)))
+        else:
+            fits.append((evidence, better))
+    gains = subject.rises(state.fit, [fit for _, fit in fits]) if fits else []
+    found: list[Refit[F]] = []
+    for (evidence, better), gain in zip(fits, gains, strict=True):
+        kept = _gaining(evidence, gain)
+        if _enough(ranking, kept) or subject.asked(evidence.trials[0].what):
+            found.append(Refit(state.fit, better, kept))
     found.sort(key=lambda r: -r.evidence.score)
     near = [r.evidence for r in _near(found)]
     if len(near) > 1:
@@ -45,12 +48,17 @@ def refitted(
     return state, found
 
 
-def _enough(ranking: Ranking, evidence: Evidence, score: float) -> bool:
+def _gaining(evidence: Evidence, gain: float) -> Evidence:
+    """With what its refit gains."""
+    return replace(evidence, gain=gain, score=evidence.score - evidence.gain + gain)
+
+
+def _enough(ranking: Ranking, evidence: Evidence) -> bool:
     """Is it strong evidence, clearly more than a course of unknown cause has, or beside one?"""
-    if score <= (LEVELS.strong if ranking.linear.series else 0.0):
+    if evidence.score <= (LEVELS.strong if ranking.linear.series else 0.0):
         return False
     course = next(iter(ranking.descriptions), None)
-    if course is None or score > course.score + LEVELS.clear:
+    if course is None or evidence.score > course.score + LEVELS.clear:
         return True
     both = judged([*course.trials, *evidence.trials], ranking.likelihood, ranking.none,
                   start=course.explained, families=ranking.families)  # fmt: skip
@@ -119,7 +127,7 @@ def best_refits(refits: Sequence[Refit[F]]) -> list[Refit[F]]:
 
 
 def shown(
-    subject: Subject[F], state: State[F], ranking: Ranking
+    subject: Subject[F], state: State[F], ranking: Ranking, beside: Sequence[Refit[F]]
 ) -> tuple[State[F], list[Refit[F]]]:
     """What the records show by themselves, refitted: held-out parts by the refit itself."""
     found = []
@@ -129,9 +137,9 @@ def shown(
         if evidence is None or isinstance(better, str):
             state = state if evidence is None else state.failing(evidence, str(better))
             continue
-        gain = subject.gain(state.fit, better, evidence)
-        score = evidence.score - evidence.gain + gain
+        gain, *_ = subject.rises(state.fit, [better, *(r.fit for r in beside)])
+        kept = _gaining(evidence, gain)
         seen = falls_of_refit(ranking.linear, subject.linear(better))
-        if _enough(ranking, evidence, score) and holds_out(seen, ranking.linear):
-            found.append(Refit(state.fit, better, replace(evidence, gain=gain, score=score), seen))
+        if _enough(ranking, kept) and holds_out(seen, ranking.linear):
+            found.append(Refit(state.fit, better, kept, seen))
     return state, found

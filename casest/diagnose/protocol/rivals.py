@@ -47,19 +47,19 @@ def _rivals(subject: Subject[F], state: State[F], kept: Kept) -> tuple[State[F],
         if _as_well(mine[0].score - e.score, lost, without - best):
             rivals.append(e)
     after = subject.linear(state.fit)
-    target = mine[0].score - mine[0].gain + subject.rise(base, state.fit)
     found = list[Rival]()
     for e in rivals:  # what the columns promise, a refit must keep
         fit = subject.refit(base, e.trials)
         if isinstance(fit, str):
             state = state.failing(e, f"in the place of {own.family} {fit}")
             continue
-        behind = target - (e.score - e.gain + subject.rise(base, fit))
+        ours, its = subject.rises(base, [state.fit, fit])
+        behind = (mine[0].score - mine[0].gain + ours) - (e.score - e.gain + its)
         other = subject.linear(fit)
         lost = np.zeros(1)
         if {x.residual.shape for x in (linear, after, other)} == {linear.residual.shape}:
-            own_, its = (squares(x, [], stretches) for x in (after, other))
-            lost, best = its - own_, own_
+            best, worse = (squares(x, [], stretches) for x in (after, other))
+            lost = worse - best
         if _as_well(behind, lost, without - best):
             found.append(Rival(e.trials[0].what, fit))
     return state, found

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
+from casest.diagnose.evidence.score import Evidence
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.protocol.choosing import with_the_best
+from casest.diagnose.protocol.confirming import significant
 from casest.diagnose.protocol.elimination import eliminated, on_all_axes
 from casest.diagnose.protocol.ranking import ranked
 from casest.diagnose.protocol.rivals import with_rivals
-from casest.diagnose.protocol.state import F, State
+from casest.diagnose.protocol.state import F, Ranking, State
 from casest.diagnose.protocol.subject import Subject
 
 
@@ -22,14 +24,16 @@ def search(
 ) -> State[F]:
     """Add what is missing, one cause or a pair at a time, until nothing is confirmed any more."""
     state = State(fit) if begun is None else replace(begun, fit=fit)
+    before: State[F] | None = None
     for _ in range(LEVELS.rounds):
         ranking = ranked(subject, state.fit)
-        state = replace(state, first=state.first or ranking, last=ranking, open=(), torn=())
-        bigger = with_the_best(subject, state, ranking, say)
-        if len(bigger.kept) == len(state.kept):
-            state = bigger
+        if before is not None and _small(subject, before, state) and _left(ranking):
+            state = _as_before(before, state)
             break
-        state = bigger
+        state = replace(state, first=state.first or ranking, last=ranking, open=())
+        before, state = state, with_the_best(subject, state, ranking, say)
+        if len(state.kept) == len(before.kept):
+            break
     else:
         state = replace(state, last=ranked(subject, state.fit))
     left = eliminated(subject, on_all_axes(subject, state, needed=True))
@@ -38,3 +42,28 @@ def search(
     if len(left.kept) < len(state.kept):
         left = replace(left, last=ranked(subject, left.fit))
     return with_rivals(subject, left)
+
+
+def _small(subject: Subject[F], before: State[F], state: State[F]) -> bool:
+    """Does what came last explain less of the variance than a misfit that counts?"""
+    last = state.kept[len(before.kept) :]
+    if not subject.linear(before.fit).series or any(subject.asked(k.what) for k in last):
+        return False
+    return all(k.falls["pieces"].ratio > 1 - LEVELS.share for k in last)
+
+
+def _left(ranking: Ranking) -> bool:
+    """Is there strong evidence for something still?"""
+    return any(significant(e, ranking.linear) for e in ranking.found)
+
+
+def _as_before(before: State[F], state: State[F]) -> State[F]:
+    """Without what came last: a small part of a misfit may be anything that goes with it."""
+    open_: dict[int, Evidence] = {}
+    for kept in state.kept[len(before.kept) :]:
+        before = before.refusing(kept.what, "a small part of what is missing: it may be another's")
+        open_[id(kept.evidence)] = kept.evidence
+    assert before.last is not None
+    others = [e for e in before.last.causes if significant(e, before.last.linear)]
+    torn = (*open_.values(), *(e for e in others if id(e) not in open_))
+    return replace(before, open=torn[: LEVELS.contenders])

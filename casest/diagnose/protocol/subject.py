@@ -40,12 +40,8 @@ class Subject(Protocol[F]):
         """The fit with these in the model; or why there is none."""
         ...
 
-    def gain(self, fit: F, better: F, evidence: Evidence) -> float:
-        """2 log of the likelihood of a refit over that of the fit, each with a noise of its own."""
-        ...
-
-    def rise(self, less: F, fit: F) -> float:
-        """2 log of the likelihood of a fit over that of one with less in it."""
+    def rises(self, less: F, fits: Sequence[F]) -> list[float]:
+        """2 log of the likelihood of each fit over that of one with less in it."""
         ...
 
     def certified(self, fit: F) -> F | str:

@@ -13,7 +13,7 @@ from casest.declaration.effect import Effect
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
 from casest.diagnose.candidates.candidates import Candidate
-from casest.diagnose.evidence.likelihood import Likelihood
+from casest.diagnose.evidence.likelihood import rises
 from casest.diagnose.evidence.linear import Linear
 from casest.diagnose.evidence.score import Evidence, Trial
 from casest.diagnose.formula.search import NAME, described, readable, with_sizes
@@ -127,15 +127,9 @@ class Sensor(Subject[Fit]):
             model = candidate.added_to(model)
         return self.fitted(model, starts(model, self.runs, values))
 
-    def gain(self, fit: Fit, better: Fit, evidence: Evidence) -> float:
-        """2 log of the likelihood of a refit over that of the fit, each with a noise of its own."""
-        refit = Likelihood(self.linear(better)).beside(start=evidence.explained.spectrum)
-        return evidence.gain + evidence.explained.cost - refit.cost
-
-    def rise(self, less: Fit, fit: Fit) -> float:
-        """2 log of the likelihood of a fit over that of one with less in it."""
-        costs = [Likelihood(self.linear(f)).beside().cost for f in (less, fit)]
-        return costs[0] - costs[1]
+    def rises(self, less: Fit, fits: Sequence[Fit]) -> list[float]:
+        """2 log of the likelihood of each fit over that of one with less in it."""
+        return rises(self.linear(less), [self.linear(fit) for fit in fits])
 
     def certified(self, fit: Fit) -> Fit | str:
         """The fit, if the data determine it and it is at rest; or why it is refused."""
