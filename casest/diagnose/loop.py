@@ -15,7 +15,9 @@ from casest.declaration.shapes import Array
 from casest.diagnose.candidates.candidates import Candidate, Skipped
 from casest.diagnose.closing import Closing
 from casest.diagnose.cross_validation import Folds, check_folds, cross_fitted, folded, rms
+from casest.diagnose.evidence.linear import robust_sd
 from casest.diagnose.found import HELD_OUT_DATA, Found, Undecided
+from casest.diagnose.levels import LEVELS
 from casest.diagnose.misfit.left import predictions
 from casest.diagnose.noise.tails import outliers_p_value
 from casest.diagnose.protocol import Kept, State, search
@@ -98,10 +100,14 @@ def _closed(sensor: Sensor, before: Estimate, folds: Folds, say: Callable[[str],
     declared = sensor.fitted(before.model, before.values)
     if declared is None:
         raise NotTrusted("the residual is not finite at the optimum")
-    state = search(sensor, declared, say)
+    state, outliers = State(declared), None
+    if spoilt(declared.residuals):
+        state, outliers = without_outliers(sensor, state, folds)
+    first = state = search(sensor, state.fit, say, state)
     # What is missing may look like outliers, not they like it: far residuals count as less.
-    state, outliers = without_outliers(sensor, state, folds)
-    if outliers is not None:
+    if outliers is None:
+        state, outliers = without_outliers(sensor, state, folds)
+    if state is not first:
         state = search(sensor, state.fit, say, state)
     after = before
     if state.fit is not declared:
@@ -145,6 +151,19 @@ def _on_the_same_samples(
         for several in (before, after)
     )
     return one, other
+
+
+def spoilt(residuals: Sequence[Array]) -> bool:
+    """Are most of the squares those of single samples, each far out between two that are not?"""
+    total = alone = 0.0
+    for r in residuals:
+        far = np.abs(r - np.median(r, axis=0)) > LEVELS.clip * robust_sd(r)
+        beside = np.zeros_like(far)
+        beside[1:] |= far[:-1]
+        beside[:-1] |= far[1:]
+        total += float(np.sum(r**2))
+        alone += float(np.sum(r[far & ~beside] ** 2))
+    return alone > 0.5 * total
 
 
 def without_outliers(

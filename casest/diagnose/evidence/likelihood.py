@@ -149,9 +149,9 @@ def far_out(residual: Array) -> Array:
 def rises(less: Linear, fits: Sequence[Linear]) -> list[float]:
     """2 log of the likelihood of each fit over that of one with less in it; each has its own noise.
 
-    What the fit with the least squares leaves far out is cut from all of them.
+    What the fit with the least noise leaves far out is cut from all of them.
     """
-    best = min(fits, key=lambda x: float(np.sum(np.log(np.mean(x.residual**2, axis=0) + 1e-300))))
+    best = min(fits, key=lambda x: float(np.sum(np.log(robust_sd(x.residual)))))
 
     def cost(linear: Linear) -> float:
         alike = linear.residual.shape == best.residual.shape  # rows that moved in time are others

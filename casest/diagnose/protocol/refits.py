@@ -9,7 +9,7 @@ import numpy as np
 
 from casest.diagnose.evidence.score import Evidence, expected_loss, judged
 from casest.diagnose.levels import LEVELS
-from casest.diagnose.protocol.confirming import falls_of_refit, holds_out, significant
+from casest.diagnose.protocol.confirming import falls, falls_of_refit, holds_out, significant
 from casest.diagnose.protocol.ranking import sharpened
 from casest.diagnose.protocol.state import F, Ranking, Refit, State
 from casest.diagnose.protocol.subject import Subject
@@ -66,12 +66,19 @@ def _enough(ranking: Ranking, evidence: Evidence) -> bool:
 
 
 def _with_parts(options: Sequence[Evidence], ranking: Ranking) -> list[Evidence]:
-    """What comes in pairs alone as well: a refit may need one of them only."""
+    """What comes in pairs alone as well, if it holds out: a refit may need one of them only."""
     alone = {e.trials[0].family: e for e in ranking.found}
-    parts = [alone[t.family] for e in options if len(e.trials) > 1 for t in e.trials[:1]]
-    parts += [alone[t.family] for e in options if len(e.trials) > 1 for t in e.trials[1:]]
-    several = {id(e): e for e in (*options, *parts) if significant(e, ranking.linear)}
-    return list(several.values())
+    pairs = [e for e in options if len(e.trials) > 1]
+    parts = {id(e): e for pair in pairs for e in (alone[t.family] for t in pair.trials)}
+    own = {id(e) for e in options}
+    more = [
+        e
+        for e in parts.values()
+        if id(e) not in own
+        and significant(e, ranking.linear)
+        and holds_out(falls(ranking, e), ranking.linear)
+    ]
+    return [*options, *more]
 
 
 def _plainest_first(refits: list[Refit[F]]) -> list[Refit[F]]:
