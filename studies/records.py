@@ -183,9 +183,11 @@ def _wrong(record: Record, row: Row) -> Iterator[str]:
         beside = {_bare(name) for name in e["rivals"]} | {o["name"] for o in claims if o is not e}
         if e["name"] in right.rivals and not beside & right.rivals:
             yield f"{e['label']} alone, where others explain the record alike"
+    # What is slow comes later by a delay and a low pass's time constant together.
+    besides = sum(e["values"].get("tau", 0.0) for e in claims if e["name"] == "low_pass")
     for e in claims:
         for name, (low, high) in right.values.items():
-            sizes = np.abs(np.atleast_1d(e["values"].get(name, [])))
+            sizes = np.abs(np.atleast_1d(e["values"].get(name, []))) + besides
             if sizes.size and not ((low <= sizes) & (sizes <= high)).all():
                 yield f"{e['label']}: {name} = {', '.join(f'{s:.4g}' for s in sizes)}"
 
