@@ -75,7 +75,7 @@ def reached(model: Dynamics) -> tuple[list[str], list[str]]:
     inputs, touched = [], np.zeros(model.size, dtype=bool)
     for s in model.signals:
         slope = ca.jacobian(t.f, flat(t.symbols[s.name]))
-        if slope.nnz() and s.name not in t.measured:
+        if slope.nnz() and s.name not in t.measured and s.name not in model.exact:
             inputs.append(s.name)
             touched[list(set(slope.sparsity().get_triplet()[0]))] = True
     where = model.slices()

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from casest.declaration.effect import effect
-from casest.declaration.physics import SX
+from casest.declaration.physics import SX, dot, vertcat
 from casest.declaration.shapes import each
-from casest.declaration.symbols import constant, param
+from casest.declaration.symbols import constant, param, signal
+from casest.effects.response import three_axes
 
 
 @effect(
@@ -146,3 +147,16 @@ def channel_gain_curve(
     """A gain that follows another recorded channel in a bent line, about its mean `at`."""
     x = channel - at
     return u * (1 + k * x + bend * x**2)
+
+
+@effect(
+    on="output",
+    typical={"k": 1e-4},
+    shown_by="the gyro at rest, turned to several sides: gravity turns with it",
+    formula="y + K·force, K of three rows: k[0] k[1] k[2]; k[3] k[4] k[5]; k[6] k[7] k[8]",
+    columns={"force": "acceleration"},
+)
+def g_sensitivity(y: SX, force: SX = signal(3), *, k: SX = param(9, "[y]/[force]")) -> SX:
+    """A gyro answers to specific force as well (IEEE Std 528, acceleration-sensitive drift rate)."""
+    three_axes(y)
+    return y + vertcat(*(dot(k[row : row + 3], force) for row in (0, 3, 6)))

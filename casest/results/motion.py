@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import inspect
 import io
+import re
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 
@@ -60,7 +61,7 @@ class MotionEffect(Struct, frozen=True):
     name: str
     on: str
     parameters: dict[str, Parameter]
-    column: None
+    column: str | None
     p_value: Number
     holdout_gain: Number
     formula: str
@@ -73,7 +74,7 @@ class MotionHidden(Struct, frozen=True):
 
     name: str
     on: str
-    column: None
+    column: str | None
     typical: dict[str, float]
     would_move: dict[str, float]
     shown_by: str
@@ -174,7 +175,7 @@ def motion_result(
 
 def sentence(result: MotionClosed) -> str:
     """The verdict in one sentence."""
-    names = [f"{e.name} of {e.on}" for e in result.effects]
+    names = [called(e) for e in result.effects]
     if result.verdict is None:
         return "no trustworthy estimate"
     if result.verdict == "adequate":
@@ -192,13 +193,19 @@ def sentence(result: MotionClosed) -> str:
     return f"unexplained: the innovations are not white{beside}, and no candidate says why"
 
 
+def called(effect: MotionEffect | MotionHidden) -> str:
+    """`bias of omega`, `temperature_bias(temp) of a`."""
+    column = f"({effect.column})" if effect.column else ""
+    return f"{effect.name}{column} of {effect.on}"
+
+
 def numbers_of(effect: MotionEffect) -> str:
     """`; k = 0.1996 ± 0.0004 s`: the numbers of an effect."""
     said = []
     for name, p in effect.parameters.items():
         values, stds = (np.atleast_1d(np.array(v, float)) for v in (p.value, p.std))
         pairs = zip(values, np.broadcast_to(stds, values.shape), strict=True)
-        shown = [" ± ".join(rounded(v, s)) if np.isfinite(s) else f"{v:.3g}" for v, s in pairs]
+        shown = [" ± ".join(rounded(v, s)) if np.isfinite(s) else f"{v:.4g}" for v, s in pairs]
         text = ", ".join(shown)
         unit = "" if p.unit == "1" else f" {p.unit}"
         said.append(f"{name} = {text}{unit}")
@@ -273,12 +280,24 @@ def _number(value: Numbers, std: Numbers, unit: str) -> Parameter:
 
 
 def _numbers(fit: Fit) -> dict[str, Parameter]:
+    """Of every effect: `omega_bias` where it has one sort of numbers, `v_vibration.sine` else."""
     if fit.answers is None:
         return {}
-    return {
-        candidate.state: _number(value, fit.std[where], candidate.unit)
-        for (candidate, value), where in zip(fit.added, fit.answers.columns, strict=True)
-    }
+    found = {}
+    for (candidate, value), where in zip(fit.added, fit.answers.columns, strict=True):
+        own = _by_name(candidate, value, fit.std[where])
+        several = len(own) > 1
+        found |= {f"{candidate.state}.{n}" if several else candidate.state: p
+                  for n, p in own.items()}  # fmt: skip
+    return found
+
+
+def _by_name(candidate: Candidate, value: Array, std: Array) -> dict[str, Parameter]:
+    """Numbers of an effect, and what it was searched over."""
+    values, stds = candidate.named(value), candidate.named(std)
+    found = {n.name: _number(values[n.name], stds[n.name], n.unit) for n in candidate.numbers}
+    units = {p.name.rpartition(".")[2]: p.unit for p in candidate.parameters}
+    return found | {n: _number(v, None, units[n]) for n, v in candidate.held}
 
 
 def _effect(added: Added, closing: MotionClosing) -> MotionEffect:
@@ -294,14 +313,19 @@ def _effect(added: Added, closing: MotionClosing) -> MotionEffect:
         }
         said = f"{on} holds noise whose correlation falls by e over correlation_time"
         return MotionEffect(name, on, parameters, *evidence, said, [], [])
-    by_label = {s.candidate.label: s.candidate for s in closing.first}
+    assert fit.answers is not None
+    labels = [c.label for c, _ in fit.added]
+    k = labels.index(candidate.label)
+    there, value = fit.added[k]
+    by_label = {c.label: c for c in closing.tried}
     alike = list(added.indistinguishable_from)
     return MotionEffect(
-        candidate.effect.name,
-        candidate.on,
-        {"k": _numbers(fit)[candidate.state]},
-        *evidence,
-        formula(candidate),
+        there.effect.name,
+        there.on,
+        _by_name(there, value, fit.std[fit.answers.columns[k]]),
+        there.column,
+        *evidence[1:],
+        formula(there),
         alike,
         [f"{label}: {by_label[label].effect.shown_by}" for label in alike],
     )
@@ -309,17 +333,25 @@ def _effect(added: Added, closing: MotionClosing) -> MotionEffect:
 
 def formula(candidate: Candidate) -> str:
     """What the effect does, with the names of its signals."""
-    said = candidate.effect.formula.replace("prediction", f"predicted {candidate.on}")
-    return said.replace("reading", candidate.on).replace("omega", candidate.turn or "omega")
+    said = candidate.effect.formula
+    if candidate.attached is None:
+        said = said.replace("prediction", f"predicted {candidate.on}")
+        return said.replace("reading", candidate.on).replace("omega", candidate.turn or "omega")
+    value = "predicted " + candidate.on if candidate.place == "output" else "true " + candidate.on
+    for name, own in candidate.attached.columns:
+        said = re.sub(rf"\b{name}\b", own, said)
+    first = "u" if candidate.effect.on == "input" else "y"
+    return re.sub(rf"\b{first}\b", value, said) + f" is read as {candidate.on}"
 
 
 def _invisible(score: Visible, closing: MotionClosing) -> list[MotionHidden]:
     """An effect whose typical size the data could not have shown, if it would move a state."""
     candidate = score.candidate
-    if any(a.candidate is candidate for a in closing.effects):
+    if any(a.candidate.label == candidate.label for a in closing.effects):
         return []
-    hidden = np.diag(score.information) * candidate.typical**2 < UNSEEN
-    moves = (score.moves[:, hidden] * candidate.typical).max(axis=1, initial=0.0)
+    typical = candidate.typical
+    hidden = np.diag(score.information) * typical**2 < UNSEEN
+    moves = (score.moves * typical)[:, hidden].max(axis=1, initial=0.0)
     std = np.median(closing.before.found.std, axis=0)
     would = {
         name: plain(moves[where].max())
@@ -328,17 +360,18 @@ def _invisible(score: Visible, closing: MotionClosing) -> list[MotionHidden]:
     }
     if not would:
         return []
-    typical = {"k": plain(candidate.typical)}
+    sizes = {n.name: plain(n.typical) for n in candidate.numbers}
     name, shown_by = candidate.effect.name, candidate.effect.shown_by
-    return [MotionHidden(name, candidate.on, None, typical, would, shown_by)]
+    return [MotionHidden(name, candidate.on, candidate.column, sizes, would, shown_by)]
 
 
 def _detectable(score: Visible) -> Detectable:
-    information = np.diag(score.information)
-    alive = information * score.candidate.typical**2 > 1e-4
+    """The size of an effect's first numbers that is found nearly always."""
+    candidate, own = score.candidate, score.candidate.numbers[0]
+    information = np.diag(score.information)[: own.size]
+    alive = information * own.typical**2 > 1e-4
     size = float(np.sqrt(SEEN / information[alive]).max()) if alive.any() else np.nan
-    candidate = score.candidate
-    return Detectable(candidate.label, candidate.state, plain(size), candidate.unit)
+    return Detectable(candidate.label, candidate.state, plain(size), own.unit)
 
 
 def _moved(closing: MotionClosing) -> dict[str, Numbers]:

@@ -12,6 +12,7 @@ from casest.data.run import Run
 from casest.data.splits import interleaved_blocks
 from casest.declaration.shapes import Array
 from casest.diagnose.levels import LEVELS
+from casest.diagnose.motion.candidates import candidates, prepared
 from casest.diagnose.motion.fit import Fit, coloured, fitted, forgotten, rise
 from casest.diagnose.motion.innovations import Innovations
 from casest.diagnose.motion.sensitivity import sensitivity
@@ -21,7 +22,7 @@ from casest.diagnose.protocol import Kept, State, search
 from casest.dynamics.declare import Dynamics
 from casest.dynamics.filter import filtered
 from casest.dynamics.likelihood import first_guess, likelihood, reached
-from casest.effects.moving import Candidate, Colour, candidates
+from casest.effects.moving import Candidate, Colour
 from casest.errors import DataError
 
 #: Whiteness below which noise with a colour is tried; gain of likelihood that asks for it too.
@@ -62,6 +63,7 @@ class MotionClosing:
     after: Fit
     effects: tuple[Added, ...]
     refused: tuple[tuple[str, str], ...]
+    tried: tuple[Candidate, ...]
     first: tuple[Visible, ...]
     left: Whiteness
     held_out: tuple[Array, Array]
@@ -103,6 +105,7 @@ def close_motion(
             f"closing the loop needs {SHORTEST} at least"
         )
     folds = interleaved_blocks(run, BLOCKS, FOLDS)
+    run = prepared(model, run)
     before = fitted(model, run, filtered(model, run).smoothed)
     subject = Innovations(run, tuple(candidates(model, run)))
     with np.errstate(all="ignore"):
@@ -110,7 +113,8 @@ def close_motion(
         current, colour = _coloured(state.fit, run, folds, say)
         if colour is not None:
             state = search(subject, current, say, state)
-    found = sensitivity(model, [], subject.tried, before.run, before.found)
+    plain = [c for c in subject.tried if not c.held]
+    found = sensitivity(model, [], plain, before.run, before.found)
     added = tuple(_added(k, state) for k in state.kept)
     one, two = (f.by_reading(held_out(f, folds)) for f in (before, state.fit))
     return MotionClosing(
@@ -120,7 +124,8 @@ def close_motion(
         state.fit.with_spread(),
         (*added, *([colour] if colour is not None else [])),
         tuple((r.what.label, r.why) for r in state.refused),
-        visible(found, subject.tried),
+        subject.tried,
+        visible(found, plain),
         _left(state.fit),
         (one, two),
         _loud(model, run, state.fit),
