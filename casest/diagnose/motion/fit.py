@@ -14,7 +14,14 @@ from casest.diagnose.motion.delays import by_reading, shifted, shifts_of
 from casest.diagnose.motion.sensitivity import Sensitivity, sensitivity
 from casest.dynamics.declare import Dynamics
 from casest.dynamics.filter import Filtered, filtered
-from casest.dynamics.likelihood import Prepared, applied, matched, prepared, whitened
+from casest.dynamics.likelihood import (
+    Prepared,
+    applied,
+    first_guess,
+    matched,
+    prepared,
+    whitened,
+)
 from casest.dynamics.transition import process_along
 from casest.effects.moving import Candidate, Colour, extended
 
@@ -23,6 +30,8 @@ ROUNDS, ENOUGH = 4, 0.1
 #: Correlation times of noise that are tried, logarithms of samples: the shortest, where the search
 #: begins, the longest, and the steps.
 FIRST, MIDDLE, LAST, WIDE = np.log([2.5, 9.0, 350.0, 3.2]).tolist()
+#: An intensity that is so many times what was stated of it or its readings show is no noise.
+LOUD = 4.0
 #: A start is forgotten where a reading's variance is below so many times its usual one.
 FORGOTTEN = 2.0
 
@@ -163,7 +172,7 @@ def _tuned(
     along = np.pad(along[:, : grown.size], ((0, 0), (0, max(0, grown.size - along.shape[1]))))
     ready = prepared(grown, run, along)
     known = {name: value for name, value in (start or {}).items() if name in ready.names}
-    intensities, likelihood = matched(ready, run, known)
+    intensities, likelihood = matched(ready, run, known, most=plausible(base, ready, run))
     model = applied(grown, intensities)
     system = ready.system.driven(process_along(model, run, along))
     found = filtered(model, run, system=system, spread=False)
@@ -172,6 +181,24 @@ def _tuned(
     return Fit(
         base, model, added, colour, intensities, likelihood, run, shifts, ready, found, answers
     )
+
+
+def plausible(base: Dynamics, ready: Prepared, run: Run) -> dict[str, float]:
+    """The largest intensities that are noise: beyond them something is missing.
+
+    Of inputs, and of readings of which it was stated, by what was stated or the signal shows from
+    sample to sample; of a state's own by what was declared.
+    """
+    guess = first_guess(ready, run)
+    states = {s.name: s.intensity for s in base.states if s.intensity}
+    signals = {n: q for n, q in guess.items() if n in run.signals and n not in ready.readings}
+    stated = {n: q for n, q in base.sensors.items() if n in ready.names}
+    return {n: LOUD * q for n, q in {**states, **signals, **stated}.items() if n in ready.names}
+
+
+def unbounded(fit: Fit, run: Run) -> tuple[dict[str, float], float]:
+    """The intensities that the record asks for where none is too large, and their likelihood."""
+    return matched(fit.ready, run, fit.intensities)
 
 
 def coloured(fit: Fit, run: Run) -> Fit:

@@ -13,7 +13,16 @@ from casest.data.splits import interleaved_blocks
 from casest.declaration.shapes import Array
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.motion.candidates import candidates, prepared
-from casest.diagnose.motion.fit import Fit, coloured, fitted, forgotten, rise
+from casest.diagnose.motion.fit import (
+    LOUD,
+    Fit,
+    coloured,
+    fitted,
+    forgotten,
+    plausible,
+    rise,
+    unbounded,
+)
 from casest.diagnose.motion.innovations import Innovations
 from casest.diagnose.motion.sensitivity import sensitivity
 from casest.diagnose.motion.visibility import Visible, visible
@@ -21,7 +30,7 @@ from casest.diagnose.motion.whiteness import Whiteness, whiteness
 from casest.diagnose.protocol import Kept, State, search
 from casest.dynamics.declare import Dynamics
 from casest.dynamics.filter import filtered
-from casest.dynamics.likelihood import first_guess, likelihood, reached
+from casest.dynamics.likelihood import first_guess, likelihood
 from casest.effects.moving import Candidate, Colour
 from casest.errors import DataError
 
@@ -29,8 +38,6 @@ from casest.errors import DataError
 SUSPECT, ASKS = 0.05, 10.0
 #: Blocks and folds of held-out time.
 BLOCKS, FOLDS = 40, 4
-#: An input's matched intensity that is so many times what its own readings show is no noise.
-LOUD = 4.0
 #: Significance of what is left.
 UNEXPLAINED = 1e-4
 #: Samples below which nothing can be held out.
@@ -67,7 +74,7 @@ class MotionClosing:
     first: tuple[Visible, ...]
     left: Whiteness
     held_out: tuple[Array, Array]
-    #: Inputs whose noise had to be matched far above their own, and how many times.
+    #: Whose noise would have to be far above what is plausible, and how many times.
     loud: Mapping[str, float]
 
     @property
@@ -128,7 +135,7 @@ def close_motion(
         visible(found, plain),
         _left(state.fit),
         (one, two),
-        _loud(model, run, state.fit),
+        _loud(state.fit),
     )
 
 
@@ -177,17 +184,17 @@ def _noise_is_odd(fit: Fit, run: Run) -> bool:
     return bool(fit.likelihood - likelihood(fit.ready, own) > ASKS)
 
 
-def _loud(model: Dynamics, run: Run, fit: Fit) -> dict[str, float]:
-    """Inputs whose matched intensity is many times what was stated or their readings show, and how
-    many, where the likelihood insists on it."""
-    guess, inputs = first_guess(fit.ready, run), reached(model)[0]
-    times = {n: fit.intensities[n] / guess[n] for n in inputs if n in fit.intensities}
-    found = {}
-    for name, ratio in times.items():
-        own = {**fit.intensities, name: guess[name]}
-        if ratio > LOUD and fit.likelihood - likelihood(fit.ready, own) > ASKS:
-            found[name] = ratio
-    return found
+def _loud(fit: Fit) -> dict[str, float]:
+    """What would have to be many times as noisy as is plausible, and how many, where the likelihood
+    insists on it."""
+    most = plausible(fit.base, fit.ready, fit.run)
+    at_the_end = [n for n, q in most.items() if fit.intensities[n] > 0.99 * q]
+    if not at_the_end:
+        return {}
+    asked, risen = unbounded(fit, fit.run)
+    if risen - fit.likelihood < ASKS:
+        return {}
+    return {n: LOUD * asked[n] / most[n] for n in at_the_end if asked[n] > most[n]}
 
 
 def _confirmed(current: Fit, better: Fit, folds: NDArray[np.int_]) -> float | None:
