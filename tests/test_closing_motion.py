@@ -22,7 +22,8 @@ from casest.diagnose.protocol import ranked
 from casest.dynamics import Motion, constraint, dynamics, measured, state
 from casest.dynamics.filter import filtered
 from casest.dynamics.likelihood import first_guess, likelihood, matched, prepared
-from casest.effects.moving import Colour, candidates, extended
+from casest.diagnose.motion.candidates import candidates
+from casest.effects.moving import Colour, extended
 from casest.results.motion import motion_result, rms_settled, sentence
 from casest_problems.bias_gravity import bias_gravity, bias_gravity_position
 

@@ -27,8 +27,8 @@ PREVIOUS, STEP, SPAN = "previous", "dt", "span"
 #: What an effect on the noise acts on, instead of a quantity.
 NOISE = "noise"
 #: What an effect may say of a column that is looked for among those recorded: a temperature, any
-#: other, or both, or an angle, or another sensor's acceleration on three axes; of a number that data
-#: tell; of what is searched over a grid; and of where one on the noise shows itself.
+#: other, or both, or an angle, or another sensor's acceleration on three axes; of a number that
+#: data tell; of what is searched over a grid; and of where one on the noise shows itself.
 COLUMNS = ("temperature", "other", "any", "angle", "acceleration")
 NUMBERS = ("mean", "duration", "radian")
 PROFILES = ("frequency", "time", "timescale", "level", "share", "lag")

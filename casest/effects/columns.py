@@ -157,6 +157,6 @@ def channel_gain_curve(
     columns={"force": "acceleration"},
 )
 def g_sensitivity(y: SX, force: SX = signal(3), *, k: SX = param(9, "[y]/[force]")) -> SX:
-    """A gyro answers to specific force as well (IEEE Std 528, acceleration-sensitive drift rate)."""
+    """A gyro answers to specific force as well (IEEE Std 528: acceleration-sensitive drift)."""
     three_axes(y)
     return y + vertcat(*(dot(k[row : row + 3], force) for row in (0, 3, 6)))

@@ -122,7 +122,7 @@ CATALOGUE = (
 #: Name of what belongs to the noise of a signal rather than to its mean.
 COLOURED = "coloured_noise"
 #: What an effect of a sensor may be searched over here.
-SEARCHED = (set(), {"time"}, {"frequency"})
+SEARCHED: tuple[set[str], ...] = (set(), {"time"}, {"frequency"})
 #: Rounds that find the true input from its reading: each leaves the square of the effect's size.
 ROUNDS = 3
 

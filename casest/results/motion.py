@@ -184,13 +184,26 @@ def sentence(result: MotionClosed) -> str:
         verb = "was" if len(names) == 1 else "were"
         return f"extended: {', '.join(names)} {verb} missing; what is left is noise"
     beside = f" beside {', '.join(names)}" if names else ""
-    if not result.closing.coloured:
-        loud = " and ".join(
-            f"{name} is {np.sqrt(times):.2g} times as noisy as it was stated to be or shows from "
-            "sample to sample" for name, times in result.closing.loud.items()
-        )  # fmt: skip
-        return f"unexplained: the innovations are white only if {loud}{beside}"
-    return f"unexplained: the innovations are not white{beside}, and no candidate says why"
+    return f"unexplained: {_unexplained(result.closing)}{beside}"
+
+
+def _unexplained(closing: MotionClosing) -> str:
+    """Why what is left is no noise, or not all that is missing is known."""
+    if closing.loud:
+        loud = " and ".join(_louder(closing, name, times) for name, times in closing.loud.items())
+        return f"the innovations are white only if {loud}"
+    if closing.undecided:
+        several = " or ".join(closing.undecided)
+        return f"{several} explains much of the innovations, and held-out time does not confirm it"
+    return "the innovations are not white, and no candidate says why"
+
+
+def _louder(closing: MotionClosing, name: str, times: float) -> str:
+    """`a is 160 times as noisy …`: of a signal in standard deviations, of a state as declared."""
+    if name in closing.run.signals:
+        said = "it was stated to be or shows from sample to sample"
+        return f"{name} is {np.sqrt(times):.2g} times as noisy as {said}"
+    return f"{name} is driven by {times:.2g} times the intensity that was declared"
 
 
 def called(effect: MotionEffect | MotionHidden) -> str:
@@ -283,7 +296,7 @@ def _numbers(fit: Fit) -> dict[str, Parameter]:
     """Of every effect: `omega_bias` where it has one sort of numbers, `v_vibration.sine` else."""
     if fit.answers is None:
         return {}
-    found = {}
+    found: dict[str, Parameter] = {}
     for (candidate, value), where in zip(fit.added, fit.answers.columns, strict=True):
         own = _by_name(candidate, value, fit.std[where])
         several = len(own) > 1

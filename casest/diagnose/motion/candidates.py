@@ -44,8 +44,11 @@ def prepared(model: Dynamics, run: Run) -> Run:
 
 def candidates(model: Dynamics, run: Run) -> list[Candidate]:
     """All that can be tried on a run that is `prepared`, what is met more often first."""
-    found = [c for e in CATALOGUE for s in model.signals for c in _of_motion(model, run, e, s)]
-    used = {s.name for s in (*model.signals, *model.states)} | {"t"}
+    found = list[Candidate]()
+    for own in CATALOGUE:
+        for s in model.signals:
+            found += _of_motion(model, run, own, s)
+    used = {s.name for s in model.signals} | {s.name for s in model.states} | {"t"}
     warm, _ = channels(used, [run])
     for effect in of_sensors():
         for s in model.signals:

@@ -19,7 +19,9 @@ from casest.dynamics.likelihood import (
     applied,
     first_guess,
     matched,
+    noiseless,
     prepared,
+    reached,
     whitened,
 )
 from casest.dynamics.transition import process_along
@@ -202,17 +204,17 @@ def unbounded(fit: Fit, run: Run) -> tuple[dict[str, float], float]:
 
 
 def coloured(fit: Fit, run: Run) -> Fit:
-    """The same with correlated noise on the output that it helps most, over the best time."""
-    trials = [_best_colour(fit, run, name, where) for name, where in _outputs(fit.base).items()]
+    """The same with correlated noise on the signal that it helps most, over the best time."""
+    inputs, _ = reached(fit.base, noiseless(fit.base, fit.run))
+    trials = [_best_colour(fit, run, name) for name in (*fit.base.measured_signals, *inputs)]
     return max(trials, key=lambda f: f.likelihood)
 
 
-def _best_colour(fit: Fit, run: Run, name: str, where: slice) -> Fit:
+def _best_colour(fit: Fit, run: Run, name: str) -> Fit:
     """From the middle of the correlation times towards where the likelihood rises; between those
     that enclose the best by a parabola over their logarithms."""
     step = float(np.median(np.diff(fit.found.time)))
     signal = next(s for s in fit.base.signals if s.name == name)
-    std = float(np.nanmedian(np.abs(fit.found.innovations[:, where]))) / 2
     done: dict[float, Fit] = {}
 
     def at(logarithm: float) -> float:
@@ -220,6 +222,7 @@ def _best_colour(fit: Fit, run: Run, name: str, where: slice) -> Fit:
             return -np.inf
         if logarithm not in done:
             tau = float(np.exp(logarithm)) * step
+            std = _size_of_colour(fit, name, tau)
             colour = Colour(name, signal.size, signal.unit or "1", tau, std)
             found = fitted(fit.base, run, fit.found.smoothed, added=fit.added, colour=colour,
                            start=fit.intensities)  # fmt: skip
@@ -237,10 +240,8 @@ def _best_colour(fit: Fit, run: Run, name: str, where: slice) -> Fit:
     return max(done.values(), key=lambda f: f.likelihood)
 
 
-def _outputs(model: Dynamics) -> dict[str, slice]:
-    """Rows of every output signal."""
-    t, rows, place = model.traced, {}, 0
-    for name, o in zip(t.measured, t.outputs, strict=True):
-        rows[name] = slice(place, place + o.predicted.numel())
-        place += o.predicted.numel()
-    return rows
+def _size_of_colour(fit: Fit, name: str, tau: float) -> float:
+    """About how large it is: half of an output's innovations, or as intense as an input's noise."""
+    if name not in fit.ready.readings:
+        return float(np.sqrt(fit.intensities[name] / (2 * tau)))
+    return float(np.nanmedian(np.abs(fit.found.innovations[:, fit.ready.readings[name]]))) / 2

@@ -14,7 +14,7 @@ import numpy as np
 from casest.declaration.effect import Effect
 from casest.declaration.shapes import Array
 from casest.diagnose.candidates.grid import Seen, searched
-from casest.diagnose.evidence.linear import Linear
+from casest.diagnose.evidence.linear import Index, Linear
 from casest.diagnose.motion.fit import Fit
 from casest.diagnose.motion.sensitivity import gains, pushes
 from casest.effects.moving import Candidate
@@ -32,7 +32,7 @@ def profile(candidate: Candidate) -> dict[str, str]:
     return dict(candidate.effect.profile) if isinstance(candidate.effect, Effect) else {}
 
 
-def on_grid(fit: Fit, candidate: Candidate, linear: Linear, rows: Array) -> list[Candidate]:
+def on_grid(fit: Fit, candidate: Candidate, linear: Linear, rows: Index) -> list[Candidate]:
     """The candidate at values of what it is searched over; alone where that is nothing."""
     searching = profile(candidate)
     if not searching:

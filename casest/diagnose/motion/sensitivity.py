@@ -46,9 +46,9 @@ class Sensitivity:
 class Gains:
     """A filter along its record, as numbers that its model lacks meet it.
 
-    `left` = I − KC (N, n, n) with the gain K (N, n, m); `later` what a step and the reading after it
-    leave of a state (N − 1, n, n); `back` = L⁻¹ of the innovations' covariance LLᵀ (N, m, m); z their
-    whitened values (N, m); C (N, m, n) and `present` (N, m) of the readings that there are.
+    `left` = I − KC (N, n, n) with the gain K (N, n, m); `later` what a step and the reading after
+    it leave of a state (N − 1, n, n); `back` = L⁻¹ of the innovations' covariance LLᵀ (N, m, m); z
+    their whitened values (N, m); C (N, m, n) and `present` (N, m) of the readings there are.
     """
 
     system: Linearised
@@ -75,7 +75,7 @@ def gains(found: Filtered) -> Gains:
     K: Array = np.linalg.solve(S, PC.transpose(0, 2, 1)).transpose(0, 2, 1).astype(float)
     L: Array = np.asarray(np.linalg.cholesky(S), float)
     nu = np.where(present, found.innovations, 0.0)
-    back = np.linalg.inv(L)
+    back = np.asarray(np.linalg.inv(L), float)
     z = np.asarray((back @ nu[:, :, None])[:, :, 0], float)
     left = np.eye(C.shape[2]) - K @ C
     return Gains(system, C, K, L, left, left[1:] @ system.moved[0], back, z, present)
