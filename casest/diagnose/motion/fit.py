@@ -45,7 +45,8 @@ class Fit:
     `run`: the record, readings that come late moved by `shifts` samples; `ready`: it made ready
     for its likelihoods; `answers`: how the innovations answer to the numbers of `added`; None where
     there are none.
-    `last_step`: of the scoring, in standard deviations.
+    `last_step`: of the scoring, in standard deviations; `bounded`: are the intensities plausible
+    ones, or whatever the record asks for?
     """
 
     base: Dynamics
@@ -60,6 +61,7 @@ class Fit:
     found: Filtered
     answers: Sensitivity | None
     last_step: float = 0.0
+    bounded: bool = True
 
     @property
     def trusted(self) -> bool:
@@ -132,14 +134,15 @@ def fitted(
     added: Sequence[tuple[Candidate, Array]] = (),
     colour: Colour | None = None,
     start: Mapping[str, float] | None = None,
+    bounded: bool = True,
 ) -> Fit:
     """Numbers and intensities in turn, from given ones. `along`: states (N, n) to begin with."""
     added = tuple(added)
     last = 0.0
     for k in range(ROUNDS if added else 1):
-        fit = _tuned(base, run, along, added, colour, start)
+        fit = _tuned(base, run, along, added, colour, start, bounded)
         if not added:  # a nonlinear model: once more, along what these intensities lead to
-            again = (base, run, fit.found.smoothed, added, colour, fit.intensities)
+            again = (base, run, fit.found.smoothed, added, colour, fit.intensities, bounded)
             return fit if base.linear else _tuned(*again)
         assert fit.answers is not None
         H, z = fit.answers.H, fit.answers.z
@@ -167,6 +170,7 @@ def _tuned(
     added: tuple[tuple[Candidate, Array], ...],
     colour: Colour | None,
     start: Mapping[str, float] | None,
+    bounded: bool,
 ) -> Fit:
     shifts = shifts_of(base, run, added)
     run = shifted(base, run, shifts)
@@ -174,15 +178,17 @@ def _tuned(
     along = np.pad(along[:, : grown.size], ((0, 0), (0, max(0, grown.size - along.shape[1]))))
     ready = prepared(grown, run, along)
     known = {name: value for name, value in (start or {}).items() if name in ready.names}
-    intensities, likelihood = matched(ready, run, known, most=plausible(base, ready, run))
+    most = plausible(base, ready, run) if bounded else None
+    intensities, likelihood = matched(ready, run, known, most=most)
     model = applied(grown, intensities)
     system = ready.system.driven(process_along(model, run, along))
     found = filtered(model, run, system=system, spread=False)
     tried = [c for c, _ in added]
     answers = sensitivity(base, added, tried, run, found) if added else None
-    return Fit(
+    fit = Fit(
         base, model, added, colour, intensities, likelihood, run, shifts, ready, found, answers
     )
+    return replace(fit, bounded=bounded)
 
 
 def plausible(base: Dynamics, ready: Prepared, run: Run) -> dict[str, float]:

@@ -23,6 +23,8 @@ from casest.effects.moving import Candidate
 SURROGATES = 8
 #: Moments that are looked at, and the share of a record within which two are one.
 MOMENTS, APART = 3, 0.02
+#: Share of a record at its ends in which no step is looked for: it would be an offset.
+EDGE = 0.05
 #: What is found on a grid first and is fitted then: an effect is smooth in it.
 SMOOTH = ("frequency",)
 
@@ -75,7 +77,7 @@ def _moments(time: Array, said: Array) -> tuple[list[float], float]:
     for own, size in zip(after[:, :, 0].T, information.T, strict=True):
         smooth = np.convolve(size, np.ones(2 * wide + 1) / (2 * wide + 1), "same")
         gain += own**2 / np.maximum(smooth, 1e-12 * smooth.max(initial=1e-300))
-    edge, found = max(4, count // 50), list[int]()
+    edge, found = max(4, int(EDGE * count)), list[int]()
     gain[:edge] = gain[count - edge :] = 0.0
     for k in np.argsort(-gain):
         if len(found) == MOMENTS or not gain[k] > 0:

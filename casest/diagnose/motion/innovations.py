@@ -86,8 +86,9 @@ class Innovations:
         for _ in range(AGAIN):
             try:
                 found = fitted(
-                    fit.base, self.run, along, added=numbers, colour=fit.colour, start=start
-                )
+                    fit.base, self.run, along, added=numbers, colour=fit.colour, start=start,
+                    bounded=fit.bounded,
+                )  # fmt: skip
             except np.linalg.LinAlgError as error:
                 return f"its refit fails: {error}"
             if not np.isfinite(found.likelihood):
@@ -113,7 +114,7 @@ class Innovations:
         """The fit without an effect that was added."""
         kept = [(c, v) for c, v in fit.added if c.label != what.label]
         return fitted(fit.base, self.run, fit.found.smoothed, added=kept, colour=fit.colour,
-                      start=fit.intensities)  # fmt: skip
+                      start=fit.intensities, bounded=fit.bounded)  # fmt: skip
 
     def wider(self, fit: Fit, what: Candidate) -> tuple[Candidate, Fit] | None:
         """Numbers come together."""

@@ -38,6 +38,8 @@ from casest.errors import DataError
 SUSPECT, ASKS = 0.05, 10.0
 #: Blocks and folds of held-out time.
 BLOCKS, FOLDS = 40, 4
+#: Innovations that are so many times those of a filter that follows the readings: it is lost.
+LOST = 10.0
 #: Significance of what is left.
 UNEXPLAINED = 1e-4
 #: Samples below which nothing can be held out.
@@ -118,7 +120,8 @@ def close_motion(
     before = fitted(model, run, filtered(model, run).smoothed)
     subject = Innovations(run, tuple(candidates(model, run)))
     with np.errstate(all="ignore"):
-        state, undecided = _searched(subject, search(subject, before, say), folds, say)
+        state = _begun(subject, before, say)
+        state, undecided = _searched(subject, state, folds, say)
         current, colour = _coloured(state.fit, run, folds, say)
         if colour is not None:
             state = search(subject, current, say, state)
@@ -181,6 +184,24 @@ def _where(candidate: Candidate) -> str:
     """`bias_step of a (when = 17.3)`."""
     held = ", ".join(f"{name} = {value:.4g}" for name, value in candidate.held)
     return candidate.label + (f" ({held})" if held else "")
+
+
+def _begun(subject: Innovations, before: Fit, say: Callable[[str], None]) -> State[Fit]:
+    """The search from the declared model. Where that is lost by what it lacks, its noise may first
+    be as large as it takes to follow the readings: far from them no straight line leads back."""
+    run = before.run
+    if _loud(before):
+        free = fitted(before.base, run, filtered(before.base, run).smoothed, bounded=False)
+        if _rms(before) > LOST * _rms(free):
+            state = search(subject, free, say)
+            fit = state.fit
+            fit = fitted(fit.base, subject.run, fit.found.smoothed, added=fit.added)
+            return search(subject, fit, say, state)
+    return search(subject, before, say)
+
+
+def _rms(fit: Fit) -> float:
+    return float(np.sqrt(np.nanmean(fit.found.innovations[forgotten(fit)] ** 2)))
 
 
 def _added(kept: Kept, state: State[Fit]) -> Added:
