@@ -202,7 +202,7 @@ def table(kept: dict[tuple[str, int], dict[str, Any]]) -> str:
                     name, share, [k for k in kept.values() if k["name"] == f"{name} x{share:g}"]
                 )
             )
-        ),  # fmt: skip
+        ),
         pair=f"Gyro bias and lever arm of the table's sizes: exactly both named in {named} of "
         f"{len(both)} flights.",
     )
