@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
 .PHONY: demo test lint types format wheel bench study study-starts study-nist study-loop \
-	study-motion study-inputs study-records study-asked study-slow study-coverage study-deceptive \
+	study-motion study-flights study-inputs study-records study-asked study-slow study-coverage study-deceptive \
 	study-deceptive-many study-mutation study-worlds study-noises study-structural \
 	figures docs clean
 
@@ -62,6 +62,9 @@ study-noises: $(READY)
 
 study-motion: $(READY)
 	$(BIN)/python studies/flight.py
+	$(BIN)/python studies/flight_loop.py
+
+study-flights: $(READY)
 	$(BIN)/python studies/flight_loop.py
 
 study-inputs: $(READY)

@@ -25,7 +25,7 @@ from motion import RATE, record
 
 from casest import Run
 from casest.dynamics.course import followed
-from casest.dynamics.gramian import Products, window_eigenvalues
+from casest.dynamics.gramian import Products, over_windows
 from casest_problems.bias_gravity import bias_gravity
 
 #: Gyro and accelerometer noise as it may be stated: it reaches the states along their estimates.
@@ -36,7 +36,7 @@ def gramian(run: Run) -> object:
     """Of the whole record and of 60 windows of a tenth of it."""
     products = Products.of(bias_gravity, run)
     products.gramian()
-    return window_eigenvalues(products, 0.1 * len(run) / RATE)
+    return over_windows(products, 0.1 * len(run) / RATE)
 
 
 JOBS: dict[str, Callable[[Run], object]] = {

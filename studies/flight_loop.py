@@ -87,6 +87,9 @@ def tasks() -> Iterator[tuple[str, int, Sensors, float]]:
             for share in SHARES:
                 yield f"{name} x{share:g}", 1000 + seed, smaller(sensors, share), 50.0
         yield "gyro bias and lever arm", 1000 + seed, PAIR, 50.0
+        for name in flights.CHANGES:
+            for share in SHARES:
+                yield f"{name} x{share:g}", 3000 + seed, Sensors(), 50.0
 
 
 def world(name: str, seed: int, sensors: Sensors, rate: float) -> dict[str, Any]:
@@ -95,7 +98,11 @@ def world(name: str, seed: int, sensors: Sensors, rate: float) -> dict[str, Any]
     flight = flights.somewhere(rng)
     worse = rng.uniform(1, 3, 3) if name == "null" else np.ones(3)
     sigma = {k: s * w for (k, s), w in zip(flights.SIGMA.items(), worse, strict=True)}
-    run = flights.record(flight, np.arange(0, 60, 1 / rate), rng, sensors, sigma)
+    t = np.arange(0, 60, 1 / rate)
+    run = flights.record(flight, t, rng, sensors, sigma)
+    kind, _, share = name.partition(" x")
+    if kind in flights.CHANGES:
+        run = flights.CHANGES[kind][0](run, flight, t, float(share))
     begin = perf_counter()
     found = close_motion(bias_gravity, run)
     before, after = rms_settled(found)
@@ -108,7 +115,7 @@ def world(name: str, seed: int, sensors: Sensors, rate: float) -> dict[str, Any]
         "unexplained": found.left.p_value < LEVELS.coloured,
         "numbers": {c.label: v.tolist() for c, v in found.after.added},
         "stds": found.after.std.tolist(),
-        "p_value": min(s.p_value for s in found.first),
+        "verdict": found.verdict,
         "before": before,
         "after": after,
         "gain": found.after.likelihood - found.before.likelihood,
@@ -145,6 +152,15 @@ distance of the found number from the planted one, in its own standard deviation
 | --- | --- | --- | --- | --- | --- | --- | --- | --- |
 {rows}
 
+## Effects of the sensors' catalogue
+
+As above. A constant wind changes nothing of gravity and bias that a speed through air shows, and
+nothing should be found.
+
+| planted | size | named | anything else | unexplained | before | after |
+| --- | --- | --- | --- | --- | --- | --- |
+{others}
+
 ## Two at once
 
 {pair}
@@ -178,6 +194,16 @@ def table(kept: dict[tuple[str, int], dict[str, Any]]) -> str:
         kinds="\n".join(kinds),
         seeds=SEEDS,
         rows="\n".join(r for r in rows if r),
+        others="\n".join(
+            line
+            for name in flights.CHANGES
+            for share in SHARES
+            if (
+                line := _other(
+                    name, share, [k for k in kept.values() if k["name"] == f"{name} x{share:g}"]
+                )
+            )
+        ),
         pair=f"Gyro bias and lever arm of the table's sizes: exactly both named in {named} of "
         f"{len(both)} flights.",
     )
@@ -215,6 +241,24 @@ def _row(name: str, share: float, kept: list[dict[str, Any]]) -> str:
     )
 
 
+def _other(name: str, share: float, kept: list[dict[str, Any]]) -> str:
+    """A line of what changes readings beyond `Sensors`."""
+    if not kept:
+        return ""
+    _, label, size = flights.CHANGES[name]
+    named = other = 0
+    for k in kept:
+        right = [label == f or label in a for f, a in zip(k["found"], k["alike"], strict=True)]
+        named, other = named + any(right), other + (len(right) - sum(right) > 0)
+    before, after = (np.median([k[w] for k in kept]) for w in ("before", "after"))
+    unexplained = sum(k["verdict"] == "unexplained" for k in kept)
+    planted = size if share == 1 else f"{share:g} times that"
+    return (
+        f"| {name} | {planted} | {f'{named} of {len(kept)}' if label else '–'} | {other} | "
+        f"{unexplained} | {before:.5f} | {after:.5f} |"
+    )
+
+
 def _planted(sensors: Sensors, label: str) -> Any:
     return {
         "bias of omega": np.array(sensors.gyro_bias),
@@ -227,15 +271,20 @@ def _planted(sensors: Sensors, label: str) -> Any:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--only", default="")
+    parser.add_argument("--seconds", type=float, default=np.inf, help="of work, then stop")
     options = parser.parse_args()
     KEPT.parent.mkdir(exist_ok=True)
-    done = read()
-    for name, seed, sensors, rate in tasks():
-        if (name, seed) in done or not re.search(options.only, name):
-            continue
+    done, begin = read(), perf_counter()
+    left = [x for x in tasks() if x[:2] not in done and re.search(options.only, x[0])]
+    for k, (name, seed, sensors, rate) in enumerate(left):
+        if perf_counter() - begin > options.seconds:
+            break
+        made = world(name, seed, sensors, rate)
         with KEPT.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(world(name, seed, sensors, rate)) + "\n")
-    TABLE.write_text(table(read()), encoding="utf-8")
+            file.write(json.dumps(made) + "\n")
+        print(f"{k + 1}/{len(left)} {name}, {seed}: {made['verdict']} {made['found']}", flush=True)
+    else:
+        TABLE.write_text(table(read()), encoding="utf-8")
 
 
 if __name__ == "__main__":

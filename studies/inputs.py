@@ -11,9 +11,9 @@ the smoother begin from a start drawn from what they are told of it. Written to 
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import sys
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
@@ -27,6 +27,7 @@ sys.path.insert(0, str(ROOT / "tests"))
 
 import flights  # noqa: E402
 from numpy.typing import NDArray  # noqa: E402
+from resumed import kept  # noqa: E402
 from scipy.stats import chi2  # noqa: E402
 
 from casest import Run  # noqa: E402
@@ -38,6 +39,8 @@ from casest_problems.bias_gravity import bias_gravity  # noqa: E402
 Array = NDArray[np.float64]
 
 TABLE = ROOT / "studies" / "inputs.md"
+#: Each line of the table as it is made: an interrupted study goes on where it stopped.
+KEPT = ROOT / "out" / "inputs.jsonl"
 DT, SECONDS = 0.02, 60.0
 NOISES = (0.0, 0.05, 0.2, 1.0)
 SIGMA = {"a": 0.02, "v": 0.01}
@@ -114,12 +117,6 @@ def bound(stds: list[list[float]]) -> str:
     return "not determined" if np.isnan(most).mean() > 0.5 else f"{np.nanmedian(most):.3g}"
 
 
-def rows(runs: int) -> Iterator[str]:
-    for spin in flights.SPINS:
-        for degrees in NOISES:
-            yield row(spin, degrees, runs)
-
-
 PAGE = """# Noise of a gyro is no rotation
 
 Made by `make study-inputs` (`python studies/inputs.py`, {minutes:.0f} minutes on one core).
@@ -164,14 +161,23 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=200)
     options = parser.parse_args()
     runs = 4 if options.quick else options.runs
-    begin, lines = perf_counter(), []
-    for line in rows(runs):
-        print(line, flush=True)
-        lines.append(line)
+    lines = []
+    KEPT.parent.mkdir(exist_ok=True)
+    done = {tuple(r["key"]): r for r in kept(KEPT)}
+    cases = [(spin, degrees, runs) for spin in flights.SPINS for degrees in NOISES]
+    for number, case in enumerate(cases, 1):
+        if case not in done:
+            at = perf_counter()
+            line = row(*case)
+            done[case] = {"key": case, "line": line, "seconds": perf_counter() - at}
+            with KEPT.open("a", encoding="utf-8") as file:
+                file.write(json.dumps(done[case]) + "\n")
+        print(f"{number}/{len(cases)} {done[case]['line']}", flush=True)
+        lines.append(done[case]["line"])
     low, high = chi2.ppf([0.005, 0.995], 9 * runs) / runs
     page = PAGE.format(
         rows="\n".join(lines), said=SAID, runs=runs, few=FEW, seconds=SECONDS, low=low, high=high,
-        minutes=(perf_counter() - begin) / 60,
+        minutes=sum(done[case]["seconds"] for case in cases) / 60,
     )  # fmt: skip
     if not options.quick:
         TABLE.write_text(page, encoding="utf-8")

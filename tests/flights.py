@@ -199,3 +199,69 @@ def spun(omega, t, parts=8):
             found.append(body.apply(GRAVITY))
         body = turn * body
     return np.array([*found, body.apply(GRAVITY)])
+
+
+# -- what a sensor does beside noise: the same motion, other readings ------------------------------
+
+
+def with_signals(run, columns=None, units=None, **changed):
+    """The run with other signals, and with columns beside them."""
+    made = Run.raw("flight", {**run.signals, **changed}, units=UNITS, time=run.time)
+    return replace(made, columns=columns or {}, column_units=units or {})
+
+
+def quadratic(run, motion, t, share=1.0):
+    return with_signals(
+        run, a=run.signals["a"] + share * np.array([1e-3, -7e-4, 5e-4]) * motion.force(t) ** 2
+    )
+
+
+def answers_to_force(run, motion, t, share=1.0):
+    K = share * np.radians([[0.03, 0, 0.01], [0, -0.02, 0], [0.01, 0, 0.02]])
+    return with_signals(run, omega=run.signals["omega"] + motion.force(t) @ K.T)
+
+
+def knocked(run, motion, t, share=1.0):
+    late = (t > 17.3)[:, None]
+    return with_signals(run, a=run.signals["a"] + share * np.array([0.1, -0.05, 0.08]) * late)
+
+
+def shaken(run, motion, t, share=1.0):
+    line = np.sin(2 * np.pi * 3.7 * t + 0.3)[:, None]
+    return with_signals(run, a=run.signals["a"] + share * np.array([0.1, -0.05, 0.08]) * line)
+
+
+def warmed(run, motion, t, share=1.0):
+    warm = 20 + 10 * (1 - np.exp(-t / 15)) + 2 * np.sin(0.3 * t)
+    drift = share * np.array([0.01, -0.005, 0.008]) * (warm - 20)[:, None]
+    return with_signals(run, {"temp": warm}, {"temp": "degC"}, a=run.signals["a"] + drift)
+
+
+def beside_a_motor(run, motion, t, share=1.0):
+    current = 5 + 2 * np.sign(np.sin(0.9 * t)) + 0.1 * np.cos(7 * t)
+    pulled = share * np.array([0.03, -0.015, 0.02]) * current[:, None]
+    return with_signals(run, {"motor": current}, {"motor": "A"}, a=run.signals["a"] + pulled)
+
+
+def in_gusts(run, motion, t, share=1.0):
+    gusts = coloured(t, 4.0, 0.3 * share, np.random.default_rng(9))
+    return with_signals(run, v=run.signals["v"] - motion.body(t).apply(gusts))
+
+
+def in_wind(run, motion, t, share=1.0):
+    """A constant one: what a speed through air shows of gravity and bias is the same in it."""
+    wind = np.tile(share * np.array([0.25, 0.15, 0.05]), (len(t), 1))
+    return with_signals(run, v=run.signals["v"] - motion.body(t).apply(wind))
+
+
+#: Kind -> how readings change, what should be found, the size in words.
+CHANGES = {
+    "g²": (quadratic, "quadratic of a", "1e-3 (m/s²)⁻¹"),
+    "g-sensitivity": (answers_to_force, "g_sensitivity(a) of omega", "0.03 °/s per m/s²"),
+    "knock": (knocked, "bias_step of a", "0.14 m/s² from 17.3 s on"),
+    "vibration": (shaken, "vibration of a", "0.14 m/s² at 3.7 Hz"),
+    "temperature": (warmed, "temperature_bias(temp) of a", "0.014 m/s² per K"),
+    "motor": (beside_a_motor, "channel_bias(motor) of a", "0.04 m/s² per A"),
+    "gusts": (in_gusts, "coloured_noise of v", "0.3 m/s over 4 s"),
+    "constant wind": (in_wind, "", "0.3 m/s"),
+}

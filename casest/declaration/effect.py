@@ -27,9 +27,9 @@ PREVIOUS, STEP, SPAN = "previous", "dt", "span"
 #: What an effect on the noise acts on, instead of a quantity.
 NOISE = "noise"
 #: What an effect may say of a column that is looked for among those recorded: a temperature, any
-#: other, or both, or an angle; of a number that data tell; of what is searched over a grid; and of
-#: where one on the noise shows itself.
-COLUMNS = ("temperature", "other", "any", "angle")
+#: other, or both, or an angle, or another sensor's acceleration on three axes; of a number that
+#: data tell; of what is searched over a grid; and of where one on the noise shows itself.
+COLUMNS = ("temperature", "other", "any", "angle", "acceleration")
 NUMBERS = ("mean", "duration", "radian")
 PROFILES = ("frequency", "time", "timescale", "level", "share", "lag")
 TAILS, RANDOM_WALK = "tails", "random walk"
@@ -45,8 +45,9 @@ class Effect:
     parameters that are searched over a grid (name -> "frequency", "time", "timescale", "level",
     "share" or "lag"), because the effect is not smooth in them or has many valleys; `shown_by` the
     measurement that shows it; `plain` the form that it is tried in once it was found; `columns` the
-    argument for which a recorded column is looked for (name -> "temperature", "other", "any" or
-    "angle", which is also a scalar signal or quantity of the model in rad or deg); `numbers` those
+    argument for which a recorded column is looked for (name -> "temperature", "other", "any",
+    "angle", which is also a scalar signal or quantity of the model in rad or deg, or
+    "acceleration", another measured signal of three axes); `numbers` those
     that data tell (name -> "mean" of that column, "radian": rad for each of its unit, or "duration"
     of the record); `seen_in` where an effect on the noise shows itself: the "tails" of the
     residuals, or a "random walk" in them; `describes`: it says what a course looks like, and names

@@ -185,6 +185,8 @@ class Dynamics:
     constants: tuple[Constant, ...]
     #: Intensity of the white noise of signals, unit²·s, where `sensing` has said it.
     sensors: Mapping[str, float] = field(default_factory=dict, hash=False)
+    #: Signals that are taken as they are, without noise: what an effect reads.
+    exact: frozenset[str] = frozenset()
 
     # -- new ones from this one ----------------------------------------------------------------
 

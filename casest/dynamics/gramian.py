@@ -329,12 +329,25 @@ def smallest_eigenvalue(
     deviations, so that they are squared signal over noise: above 1 a window alone teaches more
     than was known.
     """
-    ends, values = window_eigenvalues(Products.of(model, run), window, count)
-    return ends, values[:, 0]
+    found = over_windows(Products.of(model, run), window, count)
+    return found.ends, found.eigenvalues[:, 0]
 
 
-def window_eigenvalues(products: Products, window: float, count: int = 60) -> tuple[Array, Array]:
-    """All of them, ascending: the windows' ends (K,) and eigenvalues (K, n), scaled alike."""
+@dataclass(frozen=True)
+class Windows:
+    """What windows that end at `ends` (K,), s, tell of the state at their beginning.
+
+    `eigenvalues` (K, n) of the Gramian, ascending, in units of what was known beforehand; `std`
+    (K, n) of every number of the state by that and the window's readings.
+    """
+
+    ends: Array
+    eigenvalues: Array
+    std: Array
+
+
+def over_windows(products: Products, window: float, count: int = 60) -> Windows:
+    """One window of so many seconds, moved along the record to `count` places."""
     prior = np.sqrt(np.diag(products.model.start_covariance))
     time = np.asarray(products.run.time, float)
     ends = (
@@ -342,9 +355,11 @@ def window_eigenvalues(products: Products, window: float, count: int = 60) -> tu
         if time[-1] - time[0] > window
         else (time[-1:])
     )
-    found = []
+    found, stds = [], []
     for end in ends:
         first = min(int(np.searchsorted(time, end - window - 1e-12)), len(time) - 2)
         last = max(int(np.searchsorted(time, end + 1e-12)) - 1, first + 1)
-        found.append(np.linalg.eigvalsh(products.gramian(first, last) * np.outer(prior, prior)))
-    return np.asarray(ends, float), np.array(found)
+        values, axes = np.linalg.eigh(products.gramian(first, last) * np.outer(prior, prior))
+        found.append(values)
+        stds.append(prior * np.sqrt(axes**2 @ (1 / (1 + np.maximum(values, 0.0)))))
+    return Windows(np.asarray(ends, float), np.array(found), np.array(stds))

@@ -46,6 +46,7 @@ def coefficients_of(model: Dynamics) -> tuple[str, ...]:
         s.name
         for s in model.signals
         if s.kind != "rotation"
+        and s.name not in model.exact
         and s.name not in t.measured
         and ca.depends_on(slopes, flat(t.symbols[s.name]))
     )

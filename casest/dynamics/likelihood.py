@@ -7,7 +7,7 @@ and nothing could be traced.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -21,7 +21,7 @@ from casest.declaration.shapes import Array
 from casest.declaration.tracing import flat
 from casest.dynamics import factors
 from casest.dynamics.declare import Dynamics
-from casest.dynamics.inputs import unstated
+from casest.dynamics.inputs import scatter, unstated
 from casest.dynamics.stepping import Pattern, entries, reach
 from casest.dynamics.transition import (
     Linearised,
@@ -42,6 +42,8 @@ _FOURTH = 70.0
 RANGE = 14.0
 #: Scoring: rounds, difference and largest step of a logarithm, gain in log-likelihood that ends it.
 ROUNDS, STEP, LARGEST, ENOUGH = 30, 1e-3, 5.0, 0.1
+#: Share of an input's size below which it shows no noise: no sensor is so good.
+SILENT = 1e-5
 #: The gain that ends it where the maximum itself is asked for, and rounds until then.
 NOTHING, MANY = 1e-9, 200
 
@@ -69,13 +71,25 @@ class Prepared:
         return (*self.units, *self.readings)
 
 
-def reached(model: Dynamics) -> tuple[list[str], list[str]]:
-    """Inputs whose noise drives states, and driven states that no such noise reaches."""
+def noiseless(model: Dynamics, run: Run) -> set[str]:
+    """Inputs of which nobody stated a noise, and that show none: simulated, or known exactly."""
+    names = {s.name for s in model.signals} - {*model.sensors, *model.measured_signals}
+    return {
+        name
+        for name in names
+        if scatter(run.signals[name]) < SILENT * float(np.sqrt(np.nanmean(run.signals[name] ** 2)))
+    }
+
+
+def reached(model: Dynamics, silent: Collection[str] = ()) -> tuple[list[str], list[str]]:
+    """Inputs whose noise drives states, and driven states that no such noise reaches; `silent`
+    ones have none."""
     t = model.traced
     inputs, touched = [], np.zeros(model.size, dtype=bool)
-    for s in model.signals:
+    noisy = [s for s in model.signals if s.name not in (*t.measured, *model.exact, *silent)]
+    for s in noisy:
         slope = ca.jacobian(t.f, flat(t.symbols[s.name]))
-        if slope.nnz() and s.name not in t.measured:
+        if slope.nnz():
             inputs.append(s.name)
             touched[list(set(slope.sparsity().get_triplet()[0]))] = True
     where = model.slices()
@@ -85,7 +99,7 @@ def reached(model: Dynamics) -> tuple[list[str], list[str]]:
 
 def prepared(model: Dynamics, run: Run, along: Array) -> Prepared:
     """Along states (N, n), where the model or its noise depends on them."""
-    inputs, own = reached(model)
+    inputs, own = reached(model, noiseless(model, run))
     silent = model.driven(**{s.name: 0.0 for s in model.states})
     step = usual(np.diff(checked_time(run)))
     shown = {name: std**2 * step for name, std in unstated(model, run).items()}
@@ -161,22 +175,31 @@ def _log_density(ready: Prepared, e: Array, s: Array) -> float:
 
 
 def matched(
-    ready: Prepared, run: Run, start: Mapping[str, float] | None = None, *, exactly: bool = False
+    ready: Prepared,
+    run: Run,
+    start: Mapping[str, float] | None = None,
+    *,
+    most: Mapping[str, float] | None = None,
+    exactly: bool = False,
 ) -> tuple[dict[str, float], float]:
     """The most likely intensities, and their log-likelihood: Fisher scoring of their logarithms.
 
-    Within a tenth of the maximum, which for a comparison is enough; `exactly`: the maximum.
+    None above the `most` that is plausible. Within a tenth of the maximum, which for a comparison
+    is enough; `exactly`: the maximum.
     """
     enough, rounds = (NOTHING, MANY) if exactly else (ENOUGH, ROUNDS)
     names, guess = ready.names, first_guess(ready, run)
     middle = np.log([guess[name] for name in names])
     starts = [middle] + ([np.log([{**guess, **start}[n] for n in names])] if start else [])
+    top = np.minimum(middle + RANGE, np.log([(most or {}).get(n, np.inf) for n in names]))
+    bottom = np.minimum(middle, top) - RANGE
 
     def at(where: Array) -> tuple[Array, Array, float]:
         e, s = whitened(ready, dict(zip(names, np.exp(where).tolist(), strict=True)))
         return e, s, _log_density(ready, e, s)
 
-    logs, found = max(((x, at(x)) for x in starts), key=lambda pair: pair[1][2])
+    tries = ((x, at(x)) for x in np.clip(starts, bottom, top))
+    logs, found = max(tries, key=lambda pair: pair[1][2])
     damping = 1e-3
     for _ in range(rounds):
         moved = [at(logs + STEP * unit) for unit in np.eye(len(names))]
@@ -184,10 +207,14 @@ def matched(
         if exactly:
             back = [at(logs - STEP * unit)[2] for unit in np.eye(len(names))]
             gradient = (np.array([m[2] for m in moved]) - back) / (2 * STEP)
+        held = ((logs >= top) & (gradient > 0)) | ((logs <= bottom) & (gradient < 0))
+        gradient = np.where(held, 0.0, gradient)
+        information[held] = information[:, held] = 0.0
         while damping < 1e9:
             curved = information + damping * np.diag(np.diag(information) + 1.0)
+            curved += np.diag(held.astype(float))
             step = np.clip(np.linalg.solve(curved, gradient), -LARGEST, LARGEST)
-            tried = np.clip(logs + step, middle - RANGE, middle + RANGE)
+            tried = np.clip(logs + step, bottom, top)
             promised = gradient @ (tried - logs)
             better = at(tried) if promised > enough else found
             if better[2] > found[2] or promised <= enough:

@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 from casest.declaration.effect import Effect, effect
-from casest.declaration.physics import SX
+from casest.declaration.physics import SX, dot, vertcat
 from casest.declaration.shapes import each
-from casest.declaration.symbols import constant, param
+from casest.declaration.symbols import constant, param, signal
+from casest.effects.response import three_axes
 
 
 @effect(
@@ -99,3 +100,16 @@ channel_curve = _of_another(temperature_curve, "channel_curve", temperature_curv
 channel_gain_curve = _of_another(
     temperature_gain_curve, "channel_gain_curve", temperature_gain_curve.shown_by
 )
+
+
+@effect(
+    on="output",
+    typical={"k": 1e-4},
+    shown_by="the gyro at rest, turned to several sides: gravity turns with it",
+    formula="y + K·force, K of three rows: k[0] k[1] k[2]; k[3] k[4] k[5]; k[6] k[7] k[8]",
+    columns={"force": "acceleration"},
+)
+def g_sensitivity(y: SX, force: SX = signal(3), *, k: SX = param(9, "[y]/[force]")) -> SX:
+    """A gyro answers to specific force as well (IEEE Std 528: acceleration-sensitive drift)."""
+    three_axes(y)
+    return y + vertcat(*(dot(k[row : row + 3], force) for row in (0, 3, 6)))

@@ -1,4 +1,4 @@
-"""What a moving estimator may lack, each a few lines of physics: the catalogue of motion.
+"""What a moving estimator may lack: the sensors' catalogue, and what only motion shows.
 
 An effect acts on a signal: on an input it says what the sensor should have read, on an output what
 the sensor reads instead of what the model predicts. All are null at zero. They apply to any
@@ -8,18 +8,21 @@ estimator that has the signal, a user's own included.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import wraps
 from typing import Any, Literal
 
 import casadi as ca
 import numpy as np
 
-from casest.data.run import Run
+from casest.declaration.effect import Attached, Effect
 from casest.declaration.physics import SX
 from casest.declaration.shapes import Array
-from casest.declaration.symbols import Signal
+from casest.declaration.symbols import Parameter, Signal
 from casest.dynamics.declare import Dynamics, Measured, Motion, state
+from casest.effects import CATALOGUE as SENSORS
+
+Place = Literal["input", "output"]
 
 
 @dataclass(frozen=True)
@@ -34,7 +37,7 @@ class MotionEffect:
     """
 
     name: str
-    on: Literal["input", "output"]
+    on: Place
     formula: str
     size: Callable[[int], int]
     unit: Callable[[str], str]
@@ -44,20 +47,19 @@ class MotionEffect:
     vector: bool = False
     turning: bool = False
     in_time: bool = False
-
-    def state_of(self, signal: str) -> str:
-        """Name of its numbers on that signal, as a state: `omega_bias`."""
-        return f"{signal}_{self.name}"
+    reads_time: bool = False
 
 
 @dataclass(frozen=True)
 class Body:
-    """What an effect may read beside its signal: its rate of change, the rate of turn, and by how
-    much the reading was moved in time (s) before the model saw it."""
+    """What an effect may read beside its signal: its rate of change, the rate of turn, by how much
+    the reading was moved in time (s) before the model saw it; and, by name, time, columns and other
+    signals."""
 
     rate: SX | None = None
     turn: SX | None = None
     moved: SX | float = 0.0
+    read: Mapping[str, SX] = field(default_factory=dict)
 
 
 def _same(n: int) -> int:
@@ -105,99 +107,167 @@ LEVER_ARM = MotionEffect(
     "the place of the sensor in the body, by a ruler", vector=True, turning=True,
 )  # fmt: skip
 
+CLOCK_DRIFT = MotionEffect(
+    "clock_drift", "output", "prediction, k·t earlier", lambda _: 1, lambda _: "1",
+    lambda _: 1e-4, lambda y, k, body: y - k * body.read["t"] * body.rate,
+    "the first and the last of several events that all sensors see", reads_time=True,
+)  # fmt: skip
+
 #: Where two explain the data alike, the one that comes first is the one that is met more often.
 CATALOGUE = (
     BIAS, GAIN, LEVER_ARM, TIME_DELAY, MISALIGNMENT, OUTPUT_GAIN, OUTPUT_MISALIGNMENT, OUTPUT_BIAS,
+    CLOCK_DRIFT,
 )  # fmt: skip
 
-#: Name of what belongs to the noise of an output rather than to its mean.
+#: Name of what belongs to the noise of a signal rather than to its mean.
 COLOURED = "coloured_noise"
+#: What an effect of a sensor may be searched over here.
+SEARCHED: tuple[set[str], ...] = (set(), {"time"}, {"frequency"})
+#: Rounds that find the true input from its reading: each leaves the square of the effect's size.
+ROUNDS = 3
+
+
+def of_sensors() -> list[Effect]:
+    """Effects of the sensors' catalogue that tell what a sensor reads instead of a quantity.
+
+    Not those without a size of their own, which gain and misalignment are already; nor those that
+    describe a course; nor those on a model's own quantities or on the sequence of samples.
+    """
+    return [
+        e
+        for e in SENSORS
+        if e.kind == "quantity"
+        and e.on in ("input", "output")
+        and (e.typical or e.columns)
+        and not e.describes
+        and {kind for _, kind in e.profile} in SEARCHED
+        and len(e.profile) < 2
+        and {s.name for s in e.extras} <= {"t", *(name for name, _ in e.columns)}
+    ]
 
 
 def listed() -> list[tuple[str, str, str]]:
     """Name, what it is on and formula of everything that may be missing in motion."""
     found = [(e.name, f"an {e.on}", e.formula) for e in CATALOGUE]
-    return [*found, (COLOURED, "an output", "noise that is correlated in time, as a state")]
+    found += [(e.name, "any signal", e.formula) for e in of_sensors()]
+    return [*found, (COLOURED, "any signal", "noise that is correlated in time, as a state")]
+
+
+@dataclass(frozen=True)
+class Numbers:
+    """Numbers of an effect that come together: `typical` in practice, NaN where nobody knows."""
+
+    name: str
+    size: int
+    unit: str
+    typical: float
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """An effect on one signal of one estimator: its numbers' count, unit and typical size."""
+    """An effect on one signal of one estimator: its numbers and what it reads beside the signal.
 
-    effect: MotionEffect
+    `attached`: an effect of the sensors' catalogue on that signal, which is an `input` or an
+    `output`; `held`: what it is searched over, at a value; `trials`: among so many.
+    """
+
+    effect: MotionEffect | Effect
     on: str
-    size: int
-    unit: str
-    typical: float
+    place: Place
+    numbers: tuple[Numbers, ...]
     turn: str = ""
+    reads: tuple[Signal, ...] = ()
+    attached: Attached | None = field(default=None, compare=False)
+    held: tuple[tuple[str, float], ...] = ()
+    trials: float = 1.0
+
+    @property
+    def column(self) -> str | None:
+        """The column or signal that it reads beside the time."""
+        pairs = self.attached.columns if self.attached is not None else ()
+        return pairs[0][1] if pairs else None
+
+    @property
+    def name(self) -> str:
+        """With its column: `temperature_bias(temp)`."""
+        return self.effect.name + (f"({self.column})" if self.column else "")
 
     @property
     def label(self) -> str:
         """`bias of omega`."""
-        return f"{self.effect.name} of {self.on}"
+        return f"{self.name} of {self.on}"
+
+    @property
+    def size(self) -> int:
+        """How many numbers it has."""
+        return sum(n.size for n in self.numbers)
+
+    @property
+    def typical(self) -> Array:
+        """Typical sizes (size,), NaN where nobody knows one."""
+        return np.concatenate([np.full(n.size, n.typical) for n in self.numbers])
 
     @property
     def state(self) -> str:
         """Name of its numbers as a state: `omega_bias`."""
-        return self.effect.state_of(self.on)
+        return f"{self.on}_{self.name}"
 
     @property
     def moved(self) -> str:
         """Name of the column that says by how much readings were moved in time: `v_moved`."""
         return f"{self.on}_moved"
 
+    @property
+    def in_time(self) -> bool:
+        """Is its one number how late the reading is?"""
+        return isinstance(self.effect, MotionEffect) and self.effect.in_time
 
-def candidates(model: Dynamics, run: Run) -> list[Candidate]:
-    """Every effect of the catalogue on every signal that it can act on."""
-    t = model.traced
-    turn = next((s.name for s in model.signals if s.unit == "rad/s" and s.size == 3), "")
-    found = []
-    for effect in CATALOGUE:
-        for s in model.signals:
-            outputs = s.name in t.measured
-            used = ca.depends_on(t.f, t.symbols[s.name])
-            if (effect.on == "output") != outputs or (effect.on == "input" and not used):
-                continue
-            if (effect.vector and s.size != 3) or s.kind == "rotation":
-                continue
-            if effect.turning and not (turn and s.unit == "m/s"):
-                continue
-            if effect.on == "input" and _estimated(model, effect, s):
-                continue
-            unit, size = effect.unit(s.unit or "1"), effect.size(s.size)
-            typical = effect.typical(_rms(run.signals[s.name]))
-            found.append(
-                Candidate(effect, s.name, size, unit, typical, turn if effect.turning else "")
-            )
-    return found
+    def named(self, k: Any) -> dict[str, Any]:
+        """Numbers k (size, …) by their names."""
+        found, place = {}, 0
+        for n in self.numbers:
+            found[n.name] = k[place : place + n.size]
+            place += n.size
+        return found
 
+    def changed(self, value: SX, k: SX, body: Body) -> SX:
+        """On an output the reading for a prediction; on an input the true one for a reading."""
+        if isinstance(self.effect, MotionEffect):
+            return self.effect.changed(value, k, body)
+        if self.place == "output":
+            return self.sensed(value, k, body)
+        true = value
+        for _ in range(ROUNDS):
+            true = value - (self.sensed(true, k, body) - true)
+        return true
 
-def _estimated(model: Dynamics, effect: MotionEffect, signal: Signal) -> bool:
-    """Are the effect's numbers on that input a state already: a constant that acts as they do?"""
-    t, where = model.traced, model.slices()
-    reading, k = t.symbols[signal.name], ca.SX.sym("k", effect.size(signal.size))
-    moved = ca.substitute(ca.jacobian(effect.changed(reading, k, Body()), k), k, 0)
-    slope = ca.jacobian(t.f, reading) @ moved
-    for s in model.states:
-        own = where[s.name]
-        if s.size != slope.size2() or not t.f[own].is_zero():
-            continue
-        pair = ca.horzcat(ca.vec(slope), ca.vec(t.A[:, own]))
-        sample = ca.vertcat(t.x, *[ca.vec(symbol) for symbol in t.symbols.values()])
-        point = np.random.default_rng(0).standard_normal(sample.numel())
-        found = ca.Function("pair", [sample], [ca.densify(pair)])(point).full().T
-        if np.allclose(found[0], found[1]):
-            return True
-    return False
+    def sensed(self, value: SX, k: SX, body: Body) -> SX:
+        """What a sensor with an effect of the sensors' catalogue reads."""
+        assert self.attached is not None
+        own = {
+            f"{self.attached.label}.{n}": v for n, v in {**self.named(k), **dict(self.held)}.items()
+        }
+        symbols = {**body.read, **{n: ca.SX(v) for n, v in own.items()}}
+        return self.attached.apply(value, symbols)
 
+    def free(self, names: Sequence[str]) -> tuple[Candidate, Array]:
+        """With what it is held at unknown again, as far as it is named; and where those begin."""
+        freed = [(n, v) for n, v in self.held if n in names]
+        units = {p.name.rpartition(".")[2]: p.unit for p in self.parameters}
+        more = tuple(Numbers(n, 1, units[n], np.nan) for n, _ in freed)
+        left = tuple((n, v) for n, v in self.held if n not in names)
+        found = replace(self, held=left, numbers=(*self.numbers, *more))
+        return found, np.array([v for _, v in freed])
 
-def _rms(values: Array) -> float:
-    return float(np.sqrt(np.nanmean(values**2))) or 1.0
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Of an effect of the sensors' catalogue."""
+        return self.attached.parameters if self.attached is not None else ()
 
 
 @dataclass(frozen=True)
 class Colour:
-    """Noise of an output that is correlated over `tau` seconds, as states of their own."""
+    """Noise of a signal that is correlated over `tau` seconds, as states of their own."""
 
     on: str
     size: int
@@ -221,44 +291,48 @@ def extended(
 ) -> Dynamics:
     """The model with effects at given numbers; with None, as constant states to estimate."""
     # Inputs are corrected before anything, outputs among them, reads them.
-    for candidate, value in sorted(added, key=lambda pair: pair[0].effect.on, reverse=True):
+    for candidate, value in sorted(added, key=lambda pair: pair[0].place, reverse=True):
         model = _with(model, candidate, value)
     return model if colour is None else _coloured(model, colour)
 
 
 def _with(model: Dynamics, candidate: Candidate, value: Array | None) -> Dynamics:
-    inner, effect, name = model.function, candidate.effect, candidate.state
+    inner, name, there = model.function, candidate.state, {s.name for s in model.signals}
+    more = [s for s in candidate.reads if s.name not in there]
+    more += [Signal(candidate.moved, 1, "s")] if candidate.in_time else []
+    own = {s.name for s in more}
 
     @wraps(inner)
     def function(**given: Any) -> Motion:
         k = given.pop(name) if value is None else ca.SX(ca.DM(value))
-        moved = given.pop(candidate.moved) if effect.in_time else 0.0
-        if effect.on == "input":
-            corrected = effect.changed(given[candidate.on], k, Body())
-            return inner(**{**given, candidate.on: corrected})
-        motion = inner(**given)
-        return _reading(motion, given, candidate, k, moved)
+        moved = given[candidate.moved] if candidate.in_time else 0.0
+        left = {n: v for n, v in given.items() if n not in own}
+        body = Body(turn=given.get(candidate.turn), moved=moved, read=given)
+        if candidate.place == "input":
+            corrected = candidate.changed(given[candidate.on], k, body)
+            return inner(**{**left, candidate.on: corrected})
+        return _reading(inner(**left), given, candidate, k, body)
 
-    grown = replace(model, function=function)
-    if effect.in_time:
-        grown = replace(grown, signals=(*model.signals, Signal(candidate.moved, 1, "s")))
+    grown = replace(model, function=function, signals=(*model.signals, *more))
+    grown = replace(grown, exact=model.exact | own)
     if value is not None:
         return grown
-    own = state(candidate.size, candidate.unit, std=candidate.typical)
-    return replace(grown, states=(*model.states, replace(own, name=name)))
+    # A constant is not driven: what is known of it at the beginning matters to no slope.
+    constant = state(candidate.size, candidate.numbers[0].unit)
+    return replace(grown, states=(*model.states, replace(constant, name=name)))
 
 
 def _reading(
-    motion: Motion, given: Mapping[str, SX], candidate: Candidate, k: SX, moved: SX | float
+    motion: Motion, given: Mapping[str, SX], candidate: Candidate, k: SX, body: Body
 ) -> Motion:
     """The motion with another prediction of one output."""
-    turn = given.get(candidate.turn)
-    outputs = tuple(
-        replace(o, predicted=candidate.effect.changed(
-            o.predicted, k, Body(_rate(o, motion, given), turn, moved)))
-        if o.signal is given[candidate.on] else o
-        for o in motion.outputs
-    )  # fmt: skip
+
+    def changed(o: Measured) -> Measured:
+        predicted = ca.SX(o.predicted)
+        beside = replace(body, rate=_rate(o, motion, given))
+        return replace(o, predicted=candidate.changed(predicted, k, beside))
+
+    outputs = tuple(changed(o) if o.signal is given[candidate.on] else o for o in motion.outputs)
     return replace(motion, outputs=outputs)
 
 
@@ -271,16 +345,21 @@ def _rate(output: Measured, motion: Motion, given: Mapping[str, SX]) -> SX:
 
 def _coloured(model: Dynamics, colour: Colour) -> Dynamics:
     inner, name = model.function, colour.state
+    measured = colour.on in model.measured_signals
 
     @wraps(inner)
     def function(**given: Any) -> Motion:
         own = given.pop(name)
-        motion = inner(**given)
-        outputs = tuple(
-            replace(o, predicted=o.predicted + own) if o.signal is given[colour.on] else o
-            for o in motion.outputs
-        )
-        return replace(motion, rates={**motion.rates, name: -own / colour.tau}, outputs=outputs)
+        if measured:
+            motion = inner(**given)
+            outputs = tuple(
+                replace(o, predicted=o.predicted + own) if o.signal is given[colour.on] else o
+                for o in motion.outputs
+            )
+            motion = replace(motion, outputs=outputs)
+        else:
+            motion = inner(**{**given, colour.on: given[colour.on] - own})
+        return replace(motion, rates={**motion.rates, name: -own / colour.tau})
 
     own = state(colour.size, colour.unit, std=colour.std,
                 intensity=2 * colour.std**2 / colour.tau)  # fmt: skip

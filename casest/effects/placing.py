@@ -23,6 +23,11 @@ _ENDING = re.compile(r"[_ ](rad|deg)$", re.IGNORECASE)
 
 def prepared(model: Model, runs: Sequence[Run]) -> tuple[Run, ...]:
     """Runs whose time and usable columns can be read like signals."""
+    return with_columns(runs)
+
+
+def with_columns(runs: Sequence[Run]) -> tuple[Run, ...]:
+    """The same, whatever the model."""
     names = set.intersection(*[set(_usable(run)) for run in runs]) if runs else set()
     found = []
     for run in runs:

@@ -9,7 +9,8 @@ from casest.declaration.symbols import param
 from casest.errors import UsageError
 
 
-def _three_axes(u: SX) -> None:
+def three_axes(u: SX) -> None:
+    """Refuse a quantity of another number of axes."""
     if u.numel() != 3:
         raise UsageError(f"not applicable: it needs three axes, and there are {u.numel()}")
 
@@ -25,7 +26,7 @@ def cross_axis(u: SX, *, k: SX = param(3)) -> SX:
 
     Three terms, because a rotation is the mounting's (Burkhard et al., eq. 1: M lower triangular).
     """
-    _three_axes(u)
+    three_axes(u)
     return vertcat(u[0], u[1] + k[0] * u[0], u[2] + k[1] * u[0] + k[2] * u[1])
 
 
@@ -51,7 +52,7 @@ def soft_iron(u: SX, *, k: SX = param(9)) -> SX:
     K row by row (Vasconcelos et al. 2011, C_SI − 1), gains on its diagonal. As much of it is
     determined as the declared gains, axes and mounting leave.
     """
-    _three_axes(u)
+    three_axes(u)
     return u + vertcat(*(dot(k[row : row + 3], u) for row in (0, 3, 6)))
 
 
@@ -118,7 +119,7 @@ def signed_cubic(u: SX, *, k: SX = param(each, "1/([u])^2")) -> SX:
 )
 def cross_quadratic(u: SX, *, k: SX = param(3, "1/[u]")) -> SX:
     """Products of the two other axes in each axis (IEEE Std 1293, cross-coupling)."""
-    _three_axes(u)
+    three_axes(u)
     return u + vertcat(k[0] * u[1] * u[2], k[1] * u[0] * u[2], k[2] * u[0] * u[1])
 
 

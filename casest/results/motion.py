@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import inspect
 import io
+import re
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 
@@ -58,7 +59,7 @@ class MotionEffect(Struct, frozen=True):
     name: str
     on: str
     parameters: dict[str, Parameter]
-    column: None
+    column: str | None
     p_value: Number
     holdout_gain: Number
     formula: str
@@ -71,7 +72,7 @@ class MotionHidden(Struct, frozen=True):
 
     name: str
     on: str
-    column: None
+    column: str | None
     typical: dict[str, float]
     would_move: dict[str, float]
     shown_by: str
@@ -172,7 +173,7 @@ def motion_result(
 
 def sentence(result: MotionClosed) -> str:
     """The verdict in one sentence."""
-    names = [f"{e.name} of {e.on}" for e in result.effects]
+    names = [called(e) for e in result.effects]
     if result.verdict is None:
         return "no trustworthy estimate"
     if result.verdict == "adequate":
@@ -181,13 +182,32 @@ def sentence(result: MotionClosed) -> str:
         verb = "was" if len(names) == 1 else "were"
         return f"extended: {', '.join(names)} {verb} missing; what is left is noise"
     beside = f" beside {', '.join(names)}" if names else ""
-    if not result.closing.coloured:
-        loud = " and ".join(
-            f"{name} is {np.sqrt(times):.2g} times as noisy as it was stated to be or shows from "
-            "sample to sample" for name, times in result.closing.loud.items()
-        )  # fmt: skip
-        return f"unexplained: the innovations are white only if {loud}{beside}"
-    return f"unexplained: the innovations are not white{beside}, and no candidate says why"
+    return f"unexplained: {_unexplained(result.closing)}{beside}"
+
+
+def _unexplained(closing: MotionClosing) -> str:
+    """Why what is left is no noise, or not all that is missing is known."""
+    if closing.loud:
+        loud = " and ".join(_louder(closing, name, times) for name, times in closing.loud.items())
+        return f"the innovations are white only if {loud}"
+    if closing.undecided:
+        several = " or ".join(closing.undecided)
+        return f"{several} explains much of the innovations, and held-out time does not confirm it"
+    return "the innovations are not white, and no candidate says why"
+
+
+def _louder(closing: MotionClosing, name: str, times: float) -> str:
+    """`a is 160 times as noisy …`: of a signal in standard deviations, of a state as declared."""
+    if name in closing.run.signals:
+        said = "it was stated to be or shows from sample to sample"
+        return f"{name} is {np.sqrt(times):.2g} times as noisy as {said}"
+    return f"{name} is driven by {times:.2g} times the intensity that was declared"
+
+
+def called(effect: MotionEffect | MotionHidden) -> str:
+    """`bias of omega`, `temperature_bias(temp) of a`."""
+    column = f"({effect.column})" if effect.column else ""
+    return f"{effect.name}{column} of {effect.on}"
 
 
 def numbers_of(effect: MotionEffect) -> str:
@@ -196,7 +216,7 @@ def numbers_of(effect: MotionEffect) -> str:
     for name, p in effect.parameters.items():
         values, stds = (np.atleast_1d(np.array(v, float)) for v in (p.value, p.std))
         pairs = zip(values, np.broadcast_to(stds, values.shape), strict=True)
-        shown = [" ± ".join(rounded(v, s)) if np.isfinite(s) else f"{v:.3g}" for v, s in pairs]
+        shown = [" ± ".join(rounded(v, s)) if np.isfinite(s) else f"{v:.4g}" for v, s in pairs]
         text = ", ".join(shown)
         unit = "" if p.unit == "1" else f" {p.unit}"
         said.append(f"{name} = {text}{unit}")
@@ -271,12 +291,24 @@ def _number(value: Numbers, std: Numbers, unit: str) -> Parameter:
 
 
 def _numbers(fit: Fit) -> dict[str, Parameter]:
+    """Of every effect: `omega_bias` where it has one sort of numbers, `v_vibration.sine` else."""
     if fit.answers is None:
         return {}
-    return {
-        candidate.state: _number(value, fit.std[where], candidate.unit)
-        for (candidate, value), where in zip(fit.added, fit.answers.columns, strict=True)
-    }
+    found: dict[str, Parameter] = {}
+    for (candidate, value), where in zip(fit.added, fit.answers.columns, strict=True):
+        own = _by_name(candidate, value, fit.std[where])
+        several = len(own) > 1
+        found |= {f"{candidate.state}.{n}" if several else candidate.state: p
+                  for n, p in own.items()}  # fmt: skip
+    return found
+
+
+def _by_name(candidate: Candidate, value: Array, std: Array) -> dict[str, Parameter]:
+    """Numbers of an effect, and what it was searched over."""
+    values, stds = candidate.named(value), candidate.named(std)
+    found = {n.name: _number(values[n.name], stds[n.name], n.unit) for n in candidate.numbers}
+    units = {p.name.rpartition(".")[2]: p.unit for p in candidate.parameters}
+    return found | {n: _number(v, None, units[n]) for n, v in candidate.held}
 
 
 def _effect(added: Added, closing: MotionClosing) -> MotionEffect:
@@ -292,14 +324,19 @@ def _effect(added: Added, closing: MotionClosing) -> MotionEffect:
         }
         said = f"{on} holds noise whose correlation falls by e over correlation_time"
         return MotionEffect(name, on, parameters, *evidence, said, [], [])
-    by_label = {s.candidate.label: s.candidate for s in closing.first}
+    assert fit.answers is not None
+    labels = [c.label for c, _ in fit.added]
+    k = labels.index(candidate.label)
+    there, value = fit.added[k]
+    by_label = {c.label: c for c in closing.tried}
     alike = list(added.indistinguishable_from)
     return MotionEffect(
-        candidate.effect.name,
-        candidate.on,
-        {"k": _numbers(fit)[candidate.state]},
-        *evidence,
-        formula(candidate),
+        there.effect.name,
+        there.on,
+        _by_name(there, value, fit.std[fit.answers.columns[k]]),
+        there.column,
+        *evidence[1:],
+        formula(there),
         alike,
         [f"{label}: {by_label[label].effect.shown_by}" for label in alike],
     )
@@ -307,17 +344,25 @@ def _effect(added: Added, closing: MotionClosing) -> MotionEffect:
 
 def formula(candidate: Candidate) -> str:
     """What the effect does, with the names of its signals."""
-    said = candidate.effect.formula.replace("prediction", f"predicted {candidate.on}")
-    return said.replace("reading", candidate.on).replace("omega", candidate.turn or "omega")
+    said = candidate.effect.formula
+    if candidate.attached is None:
+        said = said.replace("prediction", f"predicted {candidate.on}")
+        return said.replace("reading", candidate.on).replace("omega", candidate.turn or "omega")
+    value = "predicted " + candidate.on if candidate.place == "output" else "true " + candidate.on
+    for name, own in candidate.attached.columns:
+        said = re.sub(rf"\b{name}\b", own, said)
+    first = "u" if candidate.effect.on == "input" else "y"
+    return re.sub(rf"\b{first}\b", value, said) + f" is read as {candidate.on}"
 
 
 def _invisible(score: Visible, closing: MotionClosing) -> list[MotionHidden]:
     """An effect whose typical size the data could not have shown, if it would move a state."""
     candidate = score.candidate
-    if any(a.candidate is candidate for a in closing.effects):
+    if any(a.candidate.label == candidate.label for a in closing.effects):
         return []
-    hidden = np.diag(score.information) * candidate.typical**2 < LEVELS.unseen
-    moves = (score.moves[:, hidden] * candidate.typical).max(axis=1, initial=0.0)
+    typical = candidate.typical
+    hidden = np.diag(score.information) * typical**2 < LEVELS.unseen
+    moves = (score.moves * typical)[:, hidden].max(axis=1, initial=0.0)
     std = np.median(closing.before.found.std, axis=0)
     would = {
         name: plain(moves[where].max())
@@ -326,17 +371,18 @@ def _invisible(score: Visible, closing: MotionClosing) -> list[MotionHidden]:
     }
     if not would:
         return []
-    typical = {"k": plain(candidate.typical)}
+    sizes = {n.name: plain(n.typical) for n in candidate.numbers}
     name, shown_by = candidate.effect.name, candidate.effect.shown_by
-    return [MotionHidden(name, candidate.on, None, typical, would, shown_by)]
+    return [MotionHidden(name, candidate.on, candidate.column, sizes, would, shown_by)]
 
 
 def _detectable(score: Visible) -> Detectable:
-    information = np.diag(score.information)
-    alive = information * score.candidate.typical**2 > 1e-4
+    """The size of an effect's first numbers that is found nearly always."""
+    candidate, own = score.candidate, score.candidate.numbers[0]
+    information = np.diag(score.information)[: own.size]
+    alive = information * own.typical**2 > 1e-4
     size = float(np.sqrt(LEVELS.seen / information[alive]).max()) if alive.any() else np.nan
-    candidate = score.candidate
-    return Detectable(candidate.label, candidate.state, plain(size), candidate.unit)
+    return Detectable(candidate.label, candidate.state, plain(size), own.unit)
 
 
 def _moved(closing: MotionClosing) -> dict[str, Numbers]:

@@ -13,7 +13,8 @@ from casest.declaration.model import Model
 from casest.dynamics import Dynamics
 from casest.dynamics.filter import coefficients, filtered
 from casest.dynamics.gramian import Observed as Seen
-from casest.dynamics.gramian import Products, observed, window_eigenvalues
+from casest.dynamics.gramian import Products, observed, over_windows
+from casest.dynamics.gramian import Windows as Over
 from casest.dynamics.inputs import smallest, uncertain, unstated
 from casest.dynamics.intensities import period, with_stated
 from casest.dynamics.structural import Structure, structure
@@ -26,6 +27,8 @@ from casest.results.result import Number, Numbers, Reproduced, Result, reproduce
 
 #: Windows over which the smallest eigenvalue is followed: this share of the record unless told.
 WINDOW = 0.1
+#: Share of what was known beforehand from which on a window has taught something of a number.
+HALF = 0.5
 
 
 class Observed(Result, frozen=True, kw_only=True, dict=True):
@@ -82,13 +85,21 @@ class ObservedStructure(Observed, frozen=True, kw_only=True, dict=True):
 
 
 class Windows(Struct, frozen=True):
-    """Eigenvalues of the Gramian over windows, in units of what was known beforehand."""
+    """Eigenvalues of the Gramian over windows, in units of what was known beforehand.
+
+    `std` of every number of the state (`gravity[2]`) at each window's beginning, by its readings
+    and what was known, which is `known`; `better_from_s`: the end of the first window that makes it
+    half of that.
+    """
 
     length_s: Number
     end_s: list[float]
     smallest_eigenvalue: list[float]
     informative_from_s: Number
     eigenvalues: list[list[float]]
+    std: dict[str, list[float]]
+    known: dict[str, float]
+    better_from_s: dict[str, Number]
 
 
 class ObservedMotion(Observed, frozen=True, kw_only=True, dict=True):
@@ -224,8 +235,7 @@ def observe_motion(
             f"{step:.3g} s at least; the record lasts {duration:.3g} s"
         )
     length = min(window or WINDOW * duration, duration)
-    ends, eigenvalues = window_eigenvalues(products, length)
-    telling = np.flatnonzero(eigenvalues[:, 0] > 1)
+    windows = _windows(model, over_windows(products, length), length)
     std = {name: plain(seen.std[where]) for name, where in model.slices().items()}
     return ObservedMotion(
         model=model.name,
@@ -245,15 +255,28 @@ def observe_motion(
         eigenvalues=plain(seen.eigenvalues / max(float(seen.eigenvalues[0]), 1e-300)),
         tolerance="eigenvalues of the Gramian scaled to a unit diagonal, below 1e-11 of the "
         "largest, count as zero",
-        windows=Windows(
-            plain(length),
-            plain(ends),
-            plain(eigenvalues[:, 0]),
-            plain(ends[telling[0]]) if telling.size else None,
-            plain(eigenvalues),
-        ),
+        windows=windows,
         data=list(data),
         reproduce=reproduced(command, data),
+    )
+
+
+def _windows(model: Dynamics, found: Over, length: float) -> Windows:
+    telling = np.flatnonzero(found.eigenvalues[:, 0] > 1)
+    known = np.sqrt(np.diag(model.start_covariance))
+    better = {}
+    for name, column, before in zip(model.names, found.std.T, known, strict=True):
+        since = np.flatnonzero(column < HALF * before)
+        better[name] = plain(found.ends[since[0]]) if since.size else None
+    return Windows(
+        plain(length),
+        plain(found.ends),
+        plain(found.eigenvalues[:, 0]),
+        plain(found.ends[telling[0]]) if telling.size else None,
+        plain(found.eigenvalues),
+        {name: plain(column) for name, column in zip(model.names, found.std.T, strict=True)},
+        {name: plain(value) for name, value in zip(model.names, known, strict=True)},
+        better,
     )
 
 

@@ -22,18 +22,11 @@ from casest.data.run import Run
 from casest.data.write import make_folder, write_atomically
 from casest.declaration.shapes import Array
 from casest.declaration.tracing import flat
+from casest.diagnose.motion.candidates import candidates, prepared
 from casest.dynamics.declare import Dynamics
 from casest.dynamics.extended import over_samples, replay
 from casest.dynamics.transition import checked_time, usual
-from casest.effects.moving import (
-    CATALOGUE,
-    COLOURED,
-    Body,
-    Candidate,
-    Colour,
-    candidates,
-    extended,
-)
+from casest.effects.moving import COLOURED, TIME_DELAY, Body, Candidate, Colour, Numbers, extended
 from casest.errors import UsageError
 from casest.results.file import plain
 from casest.simulation.record import record_text
@@ -97,7 +90,7 @@ def simulated_motion(
     std = _stds(model, t, noise)
     clean = _run(model, t, course.inputs(t) | _outputs(model, course, t))
     chosen = [_chosen(model, clean, text, std) for text in effects]
-    placed = _placed(chosen, values)
+    placed = _placed(chosen, values, clean)
     signals = _sensed(model, course, t, placed)
     for name, own in std.items():
         signals[name] = signals[name] + own[:, None] * rng.standard_normal(signals[name].shape)
@@ -134,7 +127,8 @@ _Kind = Candidate | Colour
 def _chosen(model: Dynamics, run: Run, text: str, std: Mapping[str, Array]) -> _Kind:
     """The effect that `lever_arm(v)` names; the signal may be left out where there is one."""
     colours = [_colour(model, name, run, std) for name in model.measured_signals]
-    every: list[_Kind] = [*candidates(model, run), *colours]
+    ready = prepared(model, run)
+    every: list[_Kind] = [*map(_freed, candidates(model, ready)), *colours]
     said = re.fullmatch(r"(\w+)(?:\((\w+)\))?", text)
     found = [c for c in every if said and _name(c) == said[1] and said[2] in (None, c.on)]
     if len(found) == 1:
@@ -142,6 +136,24 @@ def _chosen(model: Dynamics, run: Run, text: str, std: Mapping[str, Array]) -> _
     names = ", ".join(f"{_name(c)}({c.on})" for c in (found or every))
     what = "which of" if found else "no such effect; there are"
     raise UsageError(f"--effect {text}: {what} {names}{'?' if found else ''}")
+
+
+def _freed(candidate: Candidate) -> Candidate:
+    """With what it is searched over among its numbers."""
+    return candidate.free([name for name, _ in candidate.held])[0]
+
+
+def _usual(numbers: Numbers, run: Run) -> Array:
+    """A typical size; of a moment the middle of the record, of a frequency a twentieth of its
+    rate."""
+    assert run.time is not None
+    if numbers.name == "when":
+        value = float(np.mean(run.time[[0, -1]]) - run.time[0])
+    elif numbers.name == "frequency":
+        value = float(2 * np.pi * 0.05 / np.median(np.diff(run.time)))
+    else:
+        value = numbers.typical if np.isfinite(numbers.typical) else 0.01
+    return np.full(numbers.size, value)
 
 
 def _colour(model: Dynamics, name: str, run: Run, std: Mapping[str, Array]) -> Colour:
@@ -156,7 +168,9 @@ def _name(kind: _Kind) -> str:
     return COLOURED if isinstance(kind, Colour) else kind.effect.name
 
 
-def _placed(chosen: Sequence[_Kind], values: Mapping[str, Any]) -> list[tuple[_Kind, Array]]:
+def _placed(
+    chosen: Sequence[_Kind], values: Mapping[str, Any], run: Run
+) -> list[tuple[_Kind, Array]]:
     """Each effect with its numbers; of noise with a colour (correlation time, std)."""
     rest, placed = dict(values), list[tuple[_Kind, Array]]()
     for kind in chosen:
@@ -167,12 +181,8 @@ def _placed(chosen: Sequence[_Kind], values: Mapping[str, Any]) -> list[tuple[_K
             if len(placed[-1][1]) != 2 or not (placed[-1][1] > 0).all():
                 raise UsageError(f"--value {kind.state}: correlation time and std are positive")
             continue
-        value = np.asarray(rest.pop(kind.state, np.full(kind.size, kind.typical)), float)
-        if value.size not in (1, kind.size):
-            raise UsageError(
-                f"--value {kind.state}: {value.size} numbers, {kind.label} has {kind.size}"
-            )
-        placed.append((kind, np.broadcast_to(value.ravel(), (kind.size,))))
+        parts = [_given(kind, n, rest, run) for n in kind.numbers]
+        placed.append((kind, np.concatenate(parts)))
     if rest:
         known = [w for kind, _ in placed for w in _value_names(kind)]
         more = f" and {', '.join(known)}" if known else ""
@@ -180,21 +190,40 @@ def _placed(chosen: Sequence[_Kind], values: Mapping[str, Any]) -> list[tuple[_K
     return placed
 
 
+def _given(kind: Candidate, numbers: Numbers, rest: dict[str, Any], run: Run) -> Array:
+    """What --value says of some numbers of an effect, which it takes out of the rest."""
+    name = _named(kind, numbers)
+    value = np.asarray(rest.pop(name, _usual(numbers, run)), float)
+    if value.size not in (1, numbers.size):
+        raise UsageError(f"--value {name}: {value.size} numbers, {kind.label} has {numbers.size}")
+    return np.array(np.broadcast_to(value.ravel(), (numbers.size,)))
+
+
+def _named(kind: Candidate, numbers: Numbers) -> str:
+    """`omega_bias`; `v_bias_step.when` where there are several sorts of numbers."""
+    return kind.state if len(kind.numbers) == 1 else f"{kind.state}.{numbers.name}"
+
+
 def _value_names(kind: _Kind) -> list[str]:
     if isinstance(kind, Candidate):
-        return [kind.state]
+        return [_named(kind, n) for n in kind.numbers]
     return [f"{kind.state}.correlation_time", f"{kind.state}.std"]
 
 
 def _numbers(kind: _Kind, value: Array) -> Any:
-    if isinstance(kind, Candidate):
-        return {"k": plain(value), "unit": kind.unit}
-    return {"correlation_time": plain(value[0]), "std": plain(value[1]), "unit": kind.unit}
+    if not isinstance(kind, Candidate):
+        pair = {"correlation_time": plain(value[0]), "std": plain(value[1])}
+        return {**pair, "unit": kind.unit}
+    own = kind.named(value)
+    if len(own) == 1:
+        (numbers,) = kind.numbers
+        return {numbers.name: plain(value), "unit": numbers.unit}
+    return {n.name: {"value": plain(own[n.name]), "unit": n.unit} for n in kind.numbers}
 
 
 def _longest_delay(model: Dynamics, values: Mapping[str, Any]) -> float:
     """How long before the record the truth must be known, s."""
-    late = {e.state_of(s.name) for e in CATALOGUE if e.in_time for s in model.signals}
+    late = {f"{s.name}_{TIME_DELAY.name}" for s in model.signals}
     given = [np.max(np.asarray(v, float), initial=0.0) for n, v in values.items() if n in late]
     return float(max([1.0, *given]))
 
@@ -204,13 +233,13 @@ def _sensed(
 ) -> dict[str, Array]:
     """What sensors read without noise, (N, size) each."""
     of_mean = [(kind, value) for kind, value in placed if isinstance(kind, Candidate)]
-    delays = {k: float(v[0]) for k, v in of_mean if k.effect.in_time}
-    changed = [(k, v) for k, v in of_mean if k.effect.on == "output" and k not in delays]
+    delays = {k: float(v[0]) for k, v in of_mean if k.in_time}
+    changed = [(k, v) for k, v in of_mean if k.place == "output" and k not in delays]
     there = extended(model, changed)
     signals = course.inputs(t)
     for kind, value in of_mean:
-        if kind.effect.on == "input":
-            signals[kind.on] = _misread(kind, value, signals[kind.on])
+        if kind.place == "input":
+            signals[kind.on] = _misread(kind, value, {**signals, "t": (t - t[0])[:, None]})
     signals |= _outputs(there, course, t)
     for kind, late in delays.items():
         if not -(t[1] - t[0]) <= late < t[-1] - t[0]:
@@ -222,7 +251,7 @@ def _sensed(
 def _outputs(model: Dynamics, course: Course, t: Array) -> dict[str, Array]:
     """Every output at any times of the course."""
     traced = model.traced
-    given = course.inputs(t)
+    given = {"t": (t - t[0])[:, None], **course.inputs(t)}
     zeros = {s.name: np.zeros((len(t), s.size)) for s in model.signals}
     sample = ca.vertcat(traced.x, *[flat(traced.symbols[s.name]) for s in model.signals])
     columns = [(zeros | given)[s.name] for s in model.signals]
@@ -235,12 +264,19 @@ def _outputs(model: Dynamics, course: Course, t: Array) -> dict[str, Array]:
     return found
 
 
-def _misread(kind: Candidate, value: Array, true: Array) -> Array:
-    """What an input reads (N, size) so that the effect gives the true one back: it is linear."""
-    y = ca.SX.sym("y", kind.size if kind.effect.vector else true.shape[1])
-    back = kind.effect.changed(y, ca.SX(ca.DM(value)), Body())
-    zero, slope = ca.Function("back", [y], [ca.densify(back), ca.jacobian(back, y)])(0)
-    return np.linalg.solve(slope.full(), (true - zero.full().T).T).T
+def _misread(kind: Candidate, value: Array, true: Mapping[str, Array]) -> Array:
+    """What an input reads (N, size) so that the effect gives the true one back."""
+    read = {s.name: ca.SX.sym(s.name, s.size) for s in kind.reads}
+    own = true[kind.on]
+    y, k = ca.SX.sym("y", own.shape[1]), ca.SX(ca.DM(value))
+    if kind.attached is None:  # linear in the reading
+        back = kind.changed(y, k, Body())
+        zero, slope = ca.Function("back", [y], [ca.densify(back), ca.jacobian(back, y)])(0)
+        return np.linalg.solve(slope.full(), (own - zero.full().T).T).T
+    sensed = ca.densify(kind.sensed(y, k, Body(read={**read, kind.on: y})))
+    columns = [true[name] for name in read]
+    function = ca.Function("sensed", [y, *read.values()], [sensed]).map(len(own))
+    return np.asarray(function(own.T, *[c.T for c in columns]).full().T)
 
 
 def _coloured(t: Array, size: int, tau: float, std: float, rng: np.random.Generator) -> Array:

@@ -24,6 +24,8 @@ _TEMPERATURE = re.compile(r"temp|(^|_)t_?(deg)?c$|celsius|kelvin", re.IGNORECASE
 _DEGREES = {"degC", "K", "kelvin", "degree_Celsius", "°C"}
 #: What is searched over first and fitted then: an effect is smooth in it.
 SMOOTH = ("frequency", "timescale", "lag")
+#: Which columns an effect asks for: temperatures, others, both.
+WARM = {"temperature": (True,), "other": (False,), "any": (True, False)}
 #: Columns that number things instead of measuring them.
 _LABELS = re.compile(
     r"^(run|pose|index|(first_|last_)?row|count|sample|seq|id|nr|no)$", re.IGNORECASE
@@ -130,7 +132,7 @@ def candidates(
     """
     found: list[Candidate] = []
     skipped: list[Skipped] = []
-    channels, unusable = _channels(model, runs)
+    measured, unusable = _channels(model, runs)
     unfit = {s.name for s in unusable}
     turning = [n for n in angles(model, runs) if n not in unfit]
     skipped += unusable
@@ -142,7 +144,7 @@ def candidates(
         except CasestError as error:
             skipped.append(Skipped(effect.name, str(error)))
             continue
-        for columns in _columns_for(placed, channels, turning):
+        for columns in _columns_for(placed, measured, turning):
             candidate = Candidate(placed, columns)
             try:
                 told = with_numbers(placed, columns, runs, model)
@@ -185,7 +187,7 @@ def _columns_for(
         return [((argument, name),) for name in every if kind == "=" + name]
     if kind == "angle":
         return [((argument, name),) for name in turning if name != effect.on]
-    fits = {"temperature": (True,), "other": (False,), "any": (True, False)}[kind]
+    fits = WARM.get(kind, ())
     return [((argument, name),) for name, is_warm in channels.items() if is_warm in fits]
 
 
@@ -198,7 +200,11 @@ def _channels(model: Model, runs: Sequence[Run]) -> tuple[dict[str, bool], list[
     """Columns that measure something (is it a temperature?), and those that cannot be used."""
     # A column that an effect reads already may be the cause of another one as well.
     read = {column for attached in model.effects for _, column in dict(attached.columns).items()}
-    used = {s.name for s in model.signals} - read | {"t"}
+    return channels({s.name for s in model.signals} - read | {"t"}, runs)
+
+
+def channels(used: Collection[str], runs: Sequence[Run]) -> tuple[dict[str, bool], list[Skipped]]:
+    """The same of columns that are not `used`."""
     found: dict[str, bool] = {}
     skipped: list[Skipped] = []
     values: dict[str, Array] = {}

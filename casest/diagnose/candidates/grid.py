@@ -46,7 +46,7 @@ def on_grid(candidate: Candidate, seen: Seen, likely: float = 0.0) -> list[Candi
     profile = dict(candidate.effect.profile) if candidate.effect else {}
     if not profile:
         return [candidate]
-    values, trials = _values(tuple(profile.values()), seen, likely)
+    values, trials = searched(tuple(profile.values()), seen, likely)
     return [
         replace(candidate, held=_held(dict(zip(profile, v, strict=True))), trials=int(trials))
         for v in values
@@ -60,7 +60,8 @@ def _held(values: Mapping[str, float]) -> tuple[tuple[str, float], ...]:
 Values = tuple[list[tuple[float, ...]], float]
 
 
-def _values(kinds: tuple[str, ...], seen: Seen, likely: float = 0.0) -> Values:
+def searched(kinds: tuple[str, ...], seen: Seen, likely: float = 0.0) -> Values:
+    """Values to look at for what is searched over, and among how many they were chosen."""
     if kinds == ("level",):
         return _levels(seen)
     if seen.time is None:

@@ -25,7 +25,7 @@ def shifts_of(
     """By how many samples the readings of each output are moved to earlier ones."""
     step, found = float(np.median(np.diff(np.asarray(run.time)))), dict[str, int]()
     for candidate, value in added:
-        if candidate.effect.in_time and candidate.on in model.may_be_missing:
+        if candidate.in_time and candidate.on in model.may_be_missing:
             limit = len(run) // 4
             found[candidate.on] = int(np.clip(np.round(float(value[0]) / step), -limit, limit))
     return {name: shift for name, shift in found.items() if shift}

@@ -10,11 +10,21 @@ from numpy.typing import NDArray
 
 from casest.data.run import Run
 from casest.declaration.shapes import Array
+from casest.diagnose.levels import LEVELS
 from casest.diagnose.motion.delays import by_reading, shifted, shifts_of
 from casest.diagnose.motion.sensitivity import Sensitivity, sensitivity
 from casest.dynamics.declare import Dynamics
 from casest.dynamics.filter import Filtered, filtered
-from casest.dynamics.likelihood import Prepared, applied, matched, prepared, whitened
+from casest.dynamics.likelihood import (
+    Prepared,
+    applied,
+    first_guess,
+    matched,
+    noiseless,
+    prepared,
+    reached,
+    whitened,
+)
 from casest.dynamics.transition import process_along
 from casest.effects.moving import Candidate, Colour, extended
 
@@ -34,7 +44,8 @@ class Fit:
     `run`: the record, readings that come late moved by `shifts` samples; `ready`: it made ready
     for its likelihoods; `answers`: how the innovations answer to the numbers of `added`; None where
     there are none.
-    `last_step`: of the scoring, in standard deviations.
+    `last_step`: of the scoring, in standard deviations; `bounded`: are the intensities plausible
+    ones, or whatever the record asks for?
     """
 
     base: Dynamics
@@ -49,6 +60,7 @@ class Fit:
     found: Filtered
     answers: Sensitivity | None
     last_step: float = 0.0
+    bounded: bool = True
 
     @property
     def trusted(self) -> bool:
@@ -121,14 +133,15 @@ def fitted(
     added: Sequence[tuple[Candidate, Array]] = (),
     colour: Colour | None = None,
     start: Mapping[str, float] | None = None,
+    bounded: bool = True,
 ) -> Fit:
     """Numbers and intensities in turn, from given ones. `along`: states (N, n) to begin with."""
     added = tuple(added)
     last = 0.0
     for k in range(ROUNDS if added else 1):
-        fit = _tuned(base, run, along, added, colour, start)
+        fit = _tuned(base, run, along, added, colour, start, bounded)
         if not added:  # a nonlinear model: once more, along what these intensities lead to
-            again = (base, run, fit.found.smoothed, added, colour, fit.intensities)
+            again = (base, run, fit.found.smoothed, added, colour, fit.intensities, bounded)
             return fit if base.linear else _tuned(*again)
         assert fit.answers is not None
         H, z = fit.answers.H, fit.answers.z
@@ -156,6 +169,7 @@ def _tuned(
     added: tuple[tuple[Candidate, Array], ...],
     colour: Colour | None,
     start: Mapping[str, float] | None,
+    bounded: bool,
 ) -> Fit:
     shifts = shifts_of(base, run, added)
     run = shifted(base, run, shifts)
@@ -163,29 +177,50 @@ def _tuned(
     along = np.pad(along[:, : grown.size], ((0, 0), (0, max(0, grown.size - along.shape[1]))))
     ready = prepared(grown, run, along)
     known = {name: value for name, value in (start or {}).items() if name in ready.names}
-    intensities, likelihood = matched(ready, run, known)
+    most = plausible(base, ready, run) if bounded else None
+    intensities, likelihood = matched(ready, run, known, most=most)
     model = applied(grown, intensities)
     system = ready.system.driven(process_along(model, run, along))
     found = filtered(model, run, system=system, spread=False)
     tried = [c for c, _ in added]
     answers = sensitivity(base, added, tried, run, found) if added else None
-    return Fit(
+    fit = Fit(
         base, model, added, colour, intensities, likelihood, run, shifts, ready, found, answers
     )
+    return replace(fit, bounded=bounded)
+
+
+def plausible(base: Dynamics, ready: Prepared, run: Run) -> dict[str, float]:
+    """The largest intensities that are noise: beyond them something is missing.
+
+    Of inputs, and of readings of which it was stated, by what was stated or the signal shows from
+    sample to sample; of a state's own by what was declared.
+    """
+    guess = first_guess(ready, run)
+    states = {s.name: s.intensity for s in base.states if s.intensity}
+    signals = {n: q for n, q in guess.items() if n in run.signals and n not in ready.readings}
+    stated = {n: q for n, q in base.sensors.items() if n in ready.names}
+    known = {**states, **signals, **stated}
+    return {n: LEVELS.loud * q for n, q in known.items() if n in ready.names}
+
+
+def unbounded(fit: Fit, run: Run) -> tuple[dict[str, float], float]:
+    """The intensities that the record asks for where none is too large, and their likelihood."""
+    return matched(fit.ready, run, fit.intensities)
 
 
 def coloured(fit: Fit, run: Run) -> Fit:
-    """The same with correlated noise on the output that it helps most, over the best time."""
-    trials = [_best_colour(fit, run, name, where) for name, where in _outputs(fit.base).items()]
+    """The same with correlated noise on the signal that it helps most, over the best time."""
+    inputs, _ = reached(fit.base, noiseless(fit.base, fit.run))
+    trials = [_best_colour(fit, run, name) for name in (*fit.base.measured_signals, *inputs)]
     return max(trials, key=lambda f: f.likelihood)
 
 
-def _best_colour(fit: Fit, run: Run, name: str, where: slice) -> Fit:
+def _best_colour(fit: Fit, run: Run, name: str) -> Fit:
     """From the middle of the correlation times towards where the likelihood rises; between those
     that enclose the best by a parabola over their logarithms."""
     step = float(np.median(np.diff(fit.found.time)))
     signal = next(s for s in fit.base.signals if s.name == name)
-    std = float(np.nanmedian(np.abs(fit.found.innovations[:, where]))) / 2
     done: dict[float, Fit] = {}
 
     def at(logarithm: float) -> float:
@@ -193,6 +228,7 @@ def _best_colour(fit: Fit, run: Run, name: str, where: slice) -> Fit:
             return -np.inf
         if logarithm not in done:
             tau = float(np.exp(logarithm)) * step
+            std = _size_of_colour(fit, name, tau)
             colour = Colour(name, signal.size, signal.unit or "1", tau, std)
             found = fitted(fit.base, run, fit.found.smoothed, added=fit.added, colour=colour,
                            start=fit.intensities)  # fmt: skip
@@ -210,10 +246,8 @@ def _best_colour(fit: Fit, run: Run, name: str, where: slice) -> Fit:
     return max(done.values(), key=lambda f: f.likelihood)
 
 
-def _outputs(model: Dynamics) -> dict[str, slice]:
-    """Rows of every output signal."""
-    t, rows, place = model.traced, {}, 0
-    for name, o in zip(t.measured, t.outputs, strict=True):
-        rows[name] = slice(place, place + o.predicted.numel())
-        place += o.predicted.numel()
-    return rows
+def _size_of_colour(fit: Fit, name: str, tau: float) -> float:
+    """About how large it is: half of an output's innovations, or as intense as an input's noise."""
+    if name not in fit.ready.readings:
+        return float(np.sqrt(fit.intensities[name] / (2 * tau)))
+    return float(np.nanmedian(np.abs(fit.found.innovations[:, fit.ready.readings[name]]))) / 2

@@ -12,6 +12,7 @@ from casest.data.run import Run
 from casest.declaration.shapes import Array
 from casest.diagnose.evidence.linear import Linear, Parts, parts_of, spans_of
 from casest.diagnose.evidence.score import Trial
+from casest.diagnose.motion import grid
 from casest.diagnose.motion.fit import Fit, fitted, rise
 from casest.diagnose.motion.sensitivity import sensitivity
 from casest.diagnose.protocol import Kept, Subject
@@ -52,23 +53,33 @@ class Innovations(Subject[Fit]):
 
     def trials(self, fit: Fit) -> list[Trial]:
         """Every effect that is not there, in what the innovations answer to it."""
-        there = [c for c, _ in fit.added]
-        rest = [c for c in self.tried if c not in there]
-        found = sensitivity(fit.base, fit.added, rest, fit.run, fit.found)
+        there = {c.label for c, _ in fit.added}
+        rest = [c for c in self.tried if c.label not in there]
+        rows = _rows(fit)
+        linear = self.linear(fit)
+        return self._trials(fit, [c for r in rest for c in grid.on_grid(fit, r, linear, rows)])
+
+    def _trials(self, fit: Fit, several: Sequence[Candidate]) -> list[Trial]:
+        found, rows = sensitivity(fit.base, fit.added, several, fit.run, fit.found), _rows(fit)
         return [
-            Trial(c, c.label, -found.H[_rows(fit)][:, :, where])
-            for c, where in zip(rest, found.columns, strict=True)
+            Trial(c, c.label, -found.H[rows][:, :, where], variants=c.trials)
+            for c, where in zip(several, found.columns, strict=True)
         ]
+
+    def nearer(self, fit: Fit, trial: Trial, scale: float) -> list[Trial]:
+        """Moments around its own."""
+        return self._trials(fit, grid.nearer(fit, trial.what, scale))
 
     def refit(self, fit: Fit, added: Sequence[Trial]) -> Fit | str:
         """Numbers and intensities in turn, from the first-order step."""
-        more = tuple((t.what, _step(self.linear(fit), t)) for t in added)
+        more = tuple(_begun(self.linear(fit), t) for t in added)
         numbers, along, start = (*fit.added, *more), fit.found.smoothed, fit.intensities
         for _ in range(AGAIN):
             try:
                 found = fitted(
-                    fit.base, self.run, along, added=numbers, colour=fit.colour, start=start
-                )
+                    fit.base, self.run, along, added=numbers, colour=fit.colour, start=start,
+                    bounded=fit.bounded,
+                )  # fmt: skip
             except np.linalg.LinAlgError as error:
                 return f"its refit fails: {error}"
             if not np.isfinite(found.likelihood):
@@ -84,16 +95,16 @@ class Innovations(Subject[Fit]):
 
     def without(self, fit: Fit, what: Candidate) -> Fit | None:
         """The fit without an effect that was added."""
-        kept = [(c, v) for c, v in fit.added if c is not what]
+        kept = [(c, v) for c, v in fit.added if c.label != what.label]
         return fitted(fit.base, self.run, fit.found.smoothed, added=kept, colour=fit.colour,
-                      start=fit.intensities)  # fmt: skip
+                      start=fit.intensities, bounded=fit.bounded)  # fmt: skip
 
     def apart(self, fit: Fit, kept: Kept) -> tuple[Linear, Trial] | None:
         """The innovations as if an effect were not there, and the effect as a trial of them."""
         if fit.answers is None:
             return None
         linear, pairs = self.linear(fit), zip(fit.added, fit.answers.columns, strict=True)
-        ((value, where),) = [(v, w) for (c, v), w in pairs if c is kept.what]
+        ((value, where),) = [(v, w) for (c, v), w in pairs if c.label == kept.what.label]
         columns = linear.slopes[:, :, where]
         others = np.delete(linear.slopes, np.arange(where.start, where.stop), axis=2)
         return linear.without(others, -(columns @ value)), Trial(
@@ -104,6 +115,12 @@ class Innovations(Subject[Fit]):
 def _rows(fit: Fit) -> NDArray[np.int_]:
     """Rows in which anything was read."""
     return np.flatnonzero(np.isfinite(fit.found.innovations).any(axis=1))
+
+
+def _begun(linear: Linear, trial: Trial) -> tuple[Candidate, Array]:
+    """An effect at its first-order numbers; what it was searched over is one of them now."""
+    candidate, more = grid.free(trial.what)
+    return candidate, np.concatenate([_step(linear, trial), more])
 
 
 def _step(linear: Linear, trial: Trial) -> Array:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,16 @@ from casest.data.run import Run
 from casest.data.splits import interleaved_blocks
 from casest.declaration.shapes import Array
 from casest.diagnose.levels import LEVELS
-from casest.diagnose.motion.fit import Fit, coloured, fitted, forgotten, rise
+from casest.diagnose.motion.candidates import candidates, prepared
+from casest.diagnose.motion.fit import (
+    Fit,
+    coloured,
+    fitted,
+    forgotten,
+    plausible,
+    rise,
+    unbounded,
+)
 from casest.diagnose.motion.innovations import Innovations
 from casest.diagnose.motion.sensitivity import sensitivity
 from casest.diagnose.motion.visibility import Visible, visible
@@ -20,9 +29,12 @@ from casest.diagnose.motion.whiteness import Whiteness, whiteness
 from casest.diagnose.protocol import Kept, State, search
 from casest.dynamics.declare import Dynamics
 from casest.dynamics.filter import filtered
-from casest.dynamics.likelihood import first_guess, likelihood, reached
-from casest.effects.moving import Candidate, Colour, candidates
+from casest.dynamics.likelihood import first_guess, likelihood
+from casest.effects.moving import Candidate, Colour
 from casest.errors import DataError
+
+#: Innovations that are so many times those of a filter that follows the readings: it is lost.
+LOST = 10.0
 
 
 @dataclass(frozen=True)
@@ -49,10 +61,13 @@ class MotionClosing:
     after: Fit
     effects: tuple[Added, ...]
     refused: tuple[tuple[str, str], ...]
+    tried: tuple[Candidate, ...]
     first: tuple[Visible, ...]
     left: Whiteness
     held_out: tuple[Array, Array]
-    #: Inputs whose noise had to be matched far above their own, and how many times.
+    #: Causes of which one is there, and none was confirmed on held-out time.
+    undecided: tuple[str, ...]
+    #: Whose noise would have to be far above what is plausible, and how many times.
     loud: Mapping[str, float]
 
     @property
@@ -62,8 +77,8 @@ class MotionClosing:
 
     @property
     def misfit(self) -> bool:
-        """Are they not, or white only because an input was called noisier than it is?"""
-        return self.coloured or bool(self.loud)
+        """Are they not, or white only by noise that is not plausible, or is a cause open?"""
+        return self.coloured or bool(self.loud) or bool(self.undecided)
 
     @property
     def verdict(self) -> str | None:
@@ -90,14 +105,18 @@ def close_motion(
             f"closing the loop needs {LEVELS.shortest} at least"
         )
     folds = interleaved_blocks(run, LEVELS.pieces, LEVELS.refits)
+    run = prepared(model, run)
     before = fitted(model, run, filtered(model, run).smoothed)
     subject = Innovations(run, tuple(candidates(model, run)))
     with np.errstate(all="ignore"):
-        state = search(subject, before, say)
+        state = _begun(subject, before, say)
+        state, undecided = _searched(subject, state, folds, say)
         current, colour = _coloured(state.fit, run, folds, say)
         if colour is not None:
             state = search(subject, current, say, state)
-    found = sensitivity(model, [], subject.tried, before.run, before.found)
+            state, undecided = _searched(subject, state, folds, say)
+    plain = [c for c in subject.tried if not c.held]
+    found = sensitivity(model, [], plain, before.run, before.found)
     added = tuple(_added(k, state) for k in state.kept)
     one, two = (f.by_reading(held_out(f, folds)) for f in (before, state.fit))
     return MotionClosing(
@@ -107,11 +126,71 @@ def close_motion(
         state.fit.with_spread(),
         (*added, *([colour] if colour is not None else [])),
         _refused(state),
-        visible(found, subject.tried),
+        subject.tried,
+        visible(found, plain),
         _left(state.fit),
         (one, two),
-        _loud(model, run, state.fit),
+        undecided,
+        _loud(state.fit),
     )
+
+
+def _searched(
+    subject: Innovations,
+    state: State[Fit],
+    folds: NDArray[np.int_],
+    say: Callable[[str], None],
+) -> tuple[State[Fit], tuple[str, ...]]:
+    """With causes that shrink the innovations nowhere but where they begin, as a step does that a
+    state soon follows: what they are worth is that the noise need not allow for them any more.
+
+    Confirmed by the density of held-out time; else by name, if a refit keeps what they promise.
+    """
+    for _ in range(LEVELS.rounds):
+        strong = [e for e in state.open if e.p_value < LEVELS.coloured and len(e.trials) == 1]
+        names = []
+        for evidence in strong[: LEVELS.nearest]:
+            what, better = evidence.trials[0].what, subject.refit(state.fit, evidence.trials)
+            if isinstance(better, str):
+                continue
+            gain = 2 * rise(better, state.fit)
+            score = evidence.score - evidence.gain + gain
+            if score < LEVELS.strong:
+                continue
+            if _confirmed(state.fit, better, folds) is not None:
+                say(f"{what.label}: held-out time is more likely")
+                kept = Kept(what, replace(evidence, gain=gain, score=score), {})
+                state = replace(state, fit=better, kept=(*state.kept, kept))
+                state = search(subject, better, say, state)
+                break
+            names.append(_where(what))
+        else:
+            return state, tuple(dict.fromkeys(names))
+    return state, ()
+
+
+def _where(candidate: Candidate) -> str:
+    """`bias_step of a (when = 17.3)`."""
+    held = ", ".join(f"{name} = {value:.4g}" for name, value in candidate.held)
+    return candidate.label + (f" ({held})" if held else "")
+
+
+def _begun(subject: Innovations, before: Fit, say: Callable[[str], None]) -> State[Fit]:
+    """The search from the declared model. Where that is lost by what it lacks, its noise may first
+    be as large as it takes to follow the readings: far from them no straight line leads back."""
+    run = before.run
+    if _loud(before):
+        free = fitted(before.base, run, filtered(before.base, run).smoothed, bounded=False)
+        if _rms(before) > LOST * _rms(free):
+            state = search(subject, free, say)
+            fit = state.fit
+            fit = fitted(fit.base, subject.run, fit.found.smoothed, added=fit.added)
+            return search(subject, fit, say, state)
+    return search(subject, before, say)
+
+
+def _rms(fit: Fit) -> float:
+    return float(np.sqrt(np.nanmean(fit.found.innovations[forgotten(fit)] ** 2)))
 
 
 def _added(kept: Kept, state: State[Fit]) -> Added:
@@ -166,17 +245,17 @@ def _noise_is_odd(fit: Fit, run: Run) -> bool:
     return bool(fit.likelihood - likelihood(fit.ready, own) > LEVELS.insists)
 
 
-def _loud(model: Dynamics, run: Run, fit: Fit) -> dict[str, float]:
-    """Inputs whose matched intensity is many times what was stated or their readings show, and how
-    many, where the likelihood insists on it."""
-    guess, inputs = first_guess(fit.ready, run), reached(model)[0]
-    times = {n: fit.intensities[n] / guess[n] for n in inputs if n in fit.intensities}
-    found = {}
-    for name, ratio in times.items():
-        own = {**fit.intensities, name: guess[name]}
-        if ratio > LEVELS.loud and fit.likelihood - likelihood(fit.ready, own) > LEVELS.insists:
-            found[name] = ratio
-    return found
+def _loud(fit: Fit) -> dict[str, float]:
+    """What would have to be many times as noisy as is plausible, and how many, where the likelihood
+    insists on it."""
+    most = plausible(fit.base, fit.ready, fit.run)
+    at_the_end = [n for n, q in most.items() if fit.intensities[n] > 0.99 * q]
+    if not at_the_end:
+        return {}
+    asked, risen = unbounded(fit, fit.run)
+    if risen - fit.likelihood < LEVELS.insists:
+        return {}
+    return {n: LEVELS.loud * asked[n] / most[n] for n in at_the_end if asked[n] > most[n]}
 
 
 def _confirmed(current: Fit, better: Fit, folds: NDArray[np.int_]) -> float | None:

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from casest.data.run import Run
 from casest.declaration.shapes import Array
@@ -41,15 +42,28 @@ class Sensitivity:
     columns: tuple[slice, ...]
 
 
-def sensitivity(
-    model: Dynamics,
-    added: Sequence[tuple[Candidate, Array]],
-    tried: Sequence[Candidate],
-    run: Run,
-    found: Filtered,
-) -> Sensitivity:
-    """Answers of the innovations of `found`, the filter of a model with effects `added`, to the
-    numbers of `tried`: further candidates at zero, or those that are added at their values."""
+@dataclass(frozen=True)
+class Gains:
+    """A filter along its record, as numbers that its model lacks meet it.
+
+    `left` = I − KC (N, n, n) with the gain K (N, n, m); `later` what a step and the reading after
+    it leave of a state (N − 1, n, n); `back` = L⁻¹ of the innovations' covariance LLᵀ (N, m, m); z
+    their whitened values (N, m); C (N, m, n) and `present` (N, m) of the readings there are.
+    """
+
+    system: Linearised
+    C: Array
+    K: Array
+    L: Array
+    left: Array
+    later: Array
+    back: Array
+    z: Array
+    present: NDArray[np.bool_]
+
+
+def gains(found: Filtered) -> Gains:
+    """Of a filter."""
     system = found.system
     present = np.isfinite(system.y)
     C = np.where(present[:, :, None], system.C, 0.0)
@@ -61,26 +75,70 @@ def sensitivity(
     K: Array = np.linalg.solve(S, PC.transpose(0, 2, 1)).transpose(0, 2, 1).astype(float)
     L: Array = np.asarray(np.linalg.cholesky(S), float)
     nu = np.where(present, found.innovations, 0.0)
-    back = np.linalg.inv(L)
+    back = np.asarray(np.linalg.inv(L), float)
     z = np.asarray((back @ nu[:, :, None])[:, :, 0], float)
     left = np.eye(C.shape[2]) - K @ C
-    later = left[1:] @ system.moved[0]
-    count = sum(c.size for c in tried)
-    H, moves = np.empty((len(z), m, count)), np.empty((C.shape[2], count))
+    return Gains(system, C, K, L, left, left[1:] @ system.moved[0], back, z, present)
+
+
+def sensitivity(
+    model: Dynamics,
+    added: Sequence[tuple[Candidate, Array]],
+    tried: Sequence[Candidate],
+    run: Run,
+    found: Filtered,
+) -> Sensitivity:
+    """Answers of the innovations of `found`, the filter of a model with effects `added`, to the
+    numbers of `tried`: further candidates at zero, or those that are added at their values."""
+    g, count = gains(found), sum(c.size for c in tried)
+    H, moves = np.empty((*g.z.shape, count)), np.empty((g.C.shape[2], count))
     columns, place = [], 0
     for candidate in tried:  # one after the other: all at once would need much memory
         where = slice(place, place + candidate.size)
         F, G = _slopes(model, added, tried, candidate, run, found.smoothed)
-        G = np.where(present[:, :, None], G, 0.0)
-        pushed = _over_steps(system, F)
+        G = np.where(g.present[:, :, None], G, 0.0)
+        pushed = _over_steps(g.system, F)
         # After each reading, and before it.
-        X = linear_recursion(later, left[1:] @ pushed - K[1:] @ G[1:], -K[0] @ G[0])
-        G[1:] += C[1:] @ (system.moved[0] @ X[:-1] + pushed)
-        H[:, :, where] = back @ G
+        X = linear_recursion(g.later, g.left[1:] @ pushed - g.K[1:] @ G[1:], -g.K[0] @ G[0])
+        G[1:] += g.C[1:] @ (g.system.moved[0] @ X[:-1] + pushed)
+        H[:, :, where] = g.back @ G
         moves[:, where] = np.sqrt(np.mean(X[len(X) // 5 :] ** 2, axis=0))
         columns.append(where)
         place = where.stop
-    return Sensitivity(z, H, L, moves, tuple(columns))
+    return Sensitivity(g.z, H, g.L, moves, tuple(columns))
+
+
+def pushes(
+    model: Dynamics,
+    added: Sequence[tuple[Candidate, Array]],
+    candidate: Candidate,
+    run: Run,
+    found: Filtered,
+    z: Array,
+) -> Array:
+    """What whitened innovations z (N, m, q) say of each sample's share in a candidate's numbers.
+
+    (N, p, q): Hᵀz of numbers that act at that sample alone, for all samples by one pass backwards
+    (the filter's adjoint). Of a step the sum from its sample on, of a line its transform.
+    """
+    g = gains(found)
+    F, G = _slopes(model, added, [], candidate, run, found.smoothed)
+    G = np.where(g.present[:, :, None], G, 0.0)
+    said = g.back.transpose(0, 2, 1) @ z
+    through = (g.C[1:] @ g.system.moved[0]).transpose(0, 2, 1) @ said[1:]
+    # λ: of the state after a reading; what comes after the last one is nothing.
+    after = np.zeros((len(z), F.shape[1], z.shape[2]))
+    after[:-1] = linear_recursion(g.later[-2::-1].transpose(0, 2, 1), through[-2::-1], through[-1])[
+        ::-1
+    ]
+    on_step = g.C[1:].transpose(0, 2, 1) @ said[1:] + g.left[1:].transpose(0, 2, 1) @ after[1:]
+    own = G.transpose(0, 2, 1) @ (said - g.K.transpose(0, 2, 1) @ after)
+    h = g.system.steps[:, None, None]
+    first = h / 6 * (g.system.moved[0] + 2 * g.system.later_half)
+    last = h / 6 * (2 * g.system.later_half + np.eye(F.shape[1]))
+    own[:-1] += F[:-1].transpose(0, 2, 1) @ (first.transpose(0, 2, 1) @ on_step)
+    own[1:] += F[1:].transpose(0, 2, 1) @ (last.transpose(0, 2, 1) @ on_step)
+    return np.asarray(own)
 
 
 def _slopes(

@@ -119,36 +119,63 @@ def _deviations(result: Observability) -> str:
 
 
 def _windows(result: ObservedMotion, figures: Figures) -> str:
-    windows = result.windows
-    end = np.array(windows.end_s, dtype=float)
-    values = np.array(windows.eigenvalues, dtype=float)
-    positive = values[values > 0]
-    least = max(float(positive.min(initial=np.inf)), float(positive.max(initial=1.0)) * 1e-16)
-    most = float(positive.max(initial=1.0))
-    lines = [
-        figures.series(
-            "line", "before" if k else "after", end, exact=True, y=np.maximum(column, least)
-        )
-        for k, column in reversed(list(enumerate(values.T)))
-    ]
-    drawn = panel(
-        "eigenvalues" if values.shape[1] > 1 else "smallest eigenvalue",
-        axis("end of the window", "s", float(end.min()), float(end.max()), room=0.02),
-        axis("information over prior", "1", least, most, log=True, room=0.05),
-        lines,
-        bands=[{"low": 1.0, "high": 1.0}] if least < 1 <= most else [],
-        height=240,
-    )
-    caption = (
-        "Observability along the record:",
-        f"eigenvalues of the Gramian over windows of {number(windows.length_s)} s, the smallest "
-        "in its own colour, in units of what was known beforehand. Above 1 (dashed) one window "
-        f"alone teaches more than that. {_sentence(window_words(windows))}",
-    )
-    picture = figures.add("windows", caption, [drawn])
     rows = [[str(k + 1), number(v)] for k, v in enumerate(result.eigenvalues)]
     shown = table(["direction", "eigenvalue over the largest"], rows, [1])
-    return section("eigenvalues", "Where along the record", picture, shown)
+    pictures = [_stds_along(result, figures), _eigenvalue_along(result, figures)]
+    return section("eigenvalues", "Where along the record", *pictures, shown)
+
+
+def _stds_along(result: ObservedMotion, figures: Figures) -> str:
+    """One small panel for every number of the state; those of one state on one scale."""
+    windows = result.windows
+    end, panels = np.array(windows.end_s, dtype=float), []
+    across = axis("end of the window", "s", float(end.min()), float(end.max()), room=0.02)
+    for state, unit in result.units.items():
+        names = [n for n in windows.std if n == state or n.startswith(f"{state}[")]
+        every = np.array([[*windows.std[n], windows.known[n]] for n in names], dtype=float)
+        low, high = float(every.min()), float(every.max())
+        for name in names:
+            line = figures.series("line", "after", end, exact=True, y=np.array(windows.std[name]))
+            known = windows.known[name]
+            since = windows.better_from_s[name]
+            told = "not halved" if since is None else f"halved at {number(since)} s"
+            upright = axis(f"± {name}", unit, low, high, log=True, room=0.08)
+            panels.append(
+                panel(f"{name}: {told}", across, upright, [line],
+                      bands=[{"low": known, "high": known}], height=140)
+            )  # fmt: skip
+    caption = (
+        "Standard deviations along the record:",
+        f"of each number of the state by one window of {number(windows.length_s)} s alone and what "
+        "was known beforehand (dashed), which stays where the motion shows nothing of it. Those of "
+        "one state have one scale.",
+    )
+    return figures.add("windows-std", caption, panels, two=True)
+
+
+def _eigenvalue_along(result: ObservedMotion, figures: Figures) -> str:
+    """The direction that a window tells least of."""
+    windows = result.windows
+    end = np.array(windows.end_s, dtype=float)
+    values = np.array(windows.smallest_eigenvalue, dtype=float)
+    most = max(float(values.max(initial=0.0)), 1.0)
+    positive = values[values > most * 1e-16]
+    least = float(positive.min(initial=most))
+    drawn = panel(
+        "smallest eigenvalue",
+        axis("end of the window", "s", float(end.min()), float(end.max()), room=0.02),
+        axis("information over prior", "1", least, most, log=True, room=0.05),
+        [figures.series("line", "after", end, exact=True, y=np.maximum(values, least))],
+        bands=[{"low": 1.0, "high": 1.0}] if least < 1 <= most else [],
+        height=200,
+    )
+    caption = (
+        "The least observable direction:",
+        f"smallest eigenvalue of the Gramian over windows of {number(windows.length_s)} s, in "
+        "units of what was known beforehand. Above 1 (dashed) one window alone teaches more than "
+        f"that of every direction. {_sentence(window_words(windows))}",
+    )
+    return figures.add("windows", caption, [drawn])
 
 
 # -- filter ----------------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ from casest.report.html.frame import whole
 from casest.report.html.motion import conventions, innovation_figures, state_figures
 from casest.report.html.numbers import alike, number, printed_unit, with_unit
 from casest.report.html.page import paragraph, points, section, table
-from casest.results.motion import MotionClosed, numbers_of, sentence
+from casest.results.motion import MotionClosed, called, numbers_of, sentence
 
 
 def closing_motion_page(result: MotionClosed) -> str:
@@ -65,7 +65,7 @@ def _effects(result: MotionClosed) -> str:
         return section("effects", "Effects", said)
     texts = []
     for e in result.effects:
-        text = f"{e.name} of {e.on}: {e.formula}{numbers_of(e)} (p = {number(e.p_value, 1)})"
+        text = f"{called(e)}: {e.formula}{numbers_of(e)} (p = {number(e.p_value, 1)})"
         if e.indistinguishable_from:
             text += f"; not told apart from {', '.join(e.indistinguishable_from)}"
         texts.append(text + ".")
@@ -95,5 +95,5 @@ def _invisible(result: MotionClosed) -> str:
     texts = []
     for i in result.invisible:
         moves = ", ".join(f"{n} by {v:.2g}" for n, v in i.would_move.items())
-        texts.append(f"{i.name} of {i.on} would move {moves}; shown by {i.shown_by}.")
+        texts.append(f"{called(i)} would move {moves}; shown by {i.shown_by}.")
     return section("invisible", "What could be wrong without showing", points(texts))

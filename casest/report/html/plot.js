@@ -65,7 +65,9 @@
     const a = Math.ceil(low - 1e-9), b = Math.floor(high + 1e-9), found = [];
     const every = Math.max(1, Math.ceil((b - a + 1) / count));
     for (let k = a; k <= b; k += every) found.push(k);
-    if (found.length > 2) return { at: found, text: (v) => "10" + raised(v) };
+    // Three decades or more, or no room for what lies between: powers of ten alone.
+    const crowded = found.length > 1 && 3 * (high - low) > 2 * count;
+    if (found.length > 2 || crowded) return { at: found, text: (v) => "10" + raised(v) };
     const between = []; // less than two decades: 1, 2 and 5 of each
     for (let k = Math.floor(low); k <= high; k++)
       for (const m of [1, 2, 5]) {

@@ -9,7 +9,7 @@ from pathlib import Path
 from casest.data.logs import file_name
 from casest.report.next_command import following
 from casest.report.text.layout import WIDTH, item
-from casest.results.motion import MotionClosed, numbers_of, sentence
+from casest.results.motion import MotionClosed, called, numbers_of, sentence
 from casest.results.rounding import rounded
 
 #: Lists longer than this are left to result.json.
@@ -52,7 +52,7 @@ def _effects(result: MotionClosed) -> Iterator[str]:
     if result.effects:
         yield "Added:"
     for e in result.effects:
-        yield item(f"{e.name} of {e.on} (p = {e.p_value:.1g}): {e.formula}{numbers_of(e)}")
+        yield item(f"{called(e)} (p = {e.p_value:.1g}): {e.formula}{numbers_of(e)}")
         if e.indistinguishable_from:
             yield item(f"not told apart from {', '.join(e.indistinguishable_from)}")
             yield from (item(words) for words in e.would_separate)
@@ -89,7 +89,7 @@ def _left(result: MotionClosed) -> Iterator[str]:
         yield "Could be wrong without showing (shift by a typical size):"
     for i in result.invisible[:SHOWN]:
         moves = ", ".join(f"{n} by {v:.2g}" for n, v in i.would_move.items())
-        size = i.typical["k"]
-        yield item(f"{i.name} of {i.on} ({size:.2g}): {moves}; shown by {i.shown_by}")
+        sizes = ", ".join(f"{size:.2g}" for size in i.typical.values())
+        yield item(f"{called(i)} ({sizes}): {moves}; shown by {i.shown_by}")
     yield from (item(f"{r.name} was not added: {r.reason}") for r in result.refused)
     yield from (item(note) for note in result.notes)
