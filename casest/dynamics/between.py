@@ -41,13 +41,17 @@ class Motions:
     Q: Array
 
 
-def motions(A: Array, c: Array, Xi: Array, h: Array) -> Motions:
+def motions(
+    A: Array, c: Array, Xi: Array, h: Array, ending: tuple[Array, Array] | None = None
+) -> Motions:
     """Of every step between samples: A (N, n, n), c (N, n), intensity Ξ, h (N − 1,).
 
-    Ξ (n, n), or (N, n, n) where it changes; between samples all are straight lines. Where a motion
-    grows beyond what numbers hold, what is not finite is returned.
+    Ξ (n, n), or (N, n, n) where it changes; between samples all are straight lines. `ending`: A and
+    c at the end of every step, where they jump there. Where a motion grows beyond what numbers
+    hold, what is not finite is returned.
     """
-    ends = A[:-1], A[1:], c[:-1], c[1:], *((Xi[:-1], Xi[1:]) if Xi.ndim == 3 else (Xi, Xi))
+    A1, c1 = ending or (A[1:], c[1:])
+    ends = A[:-1], A1, c[:-1], c1, *((Xi[:-1], Xi[1:]) if Xi.ndim == 3 else (Xi, Xi))
     fast = balance(np.abs(A).max(axis=0))[1] * h
     if fast.max(initial=0.0) <= _SLOW[-1]:
         return _slow(ends, h, float(fast.max(initial=0.0)))

@@ -29,7 +29,6 @@ from casest.dynamics.transition import (
     Pace,
     checked_record,
     linearised,
-    pace_of,
     process_along,
     shares,
 )
@@ -99,7 +98,6 @@ class Pieces:
     run: Run
     pace: Pace
     time: Array
-    share: Array
     every: tuple[slice, ...]
     start: States = (None, None)
 
@@ -107,10 +105,11 @@ class Pieces:
     def of(model: Dynamics, run: Run, pace: Pace | None = None) -> Pieces:
         """A whole record, or a part of one that is read at a known pace."""
         time = checked_record(model, run)
-        step, last = np.diff(time), len(time) - 1
+        last = len(time) - 1
         cuts = [slice(k, min(k + PIECE, last) + 1) for k in range(0, last, PIECE)]
-        pace = pace or pace_of(step)
-        return Pieces(model, run, pace, time, shares(step, pace), tuple(cuts))
+        pace = pace or Pace.of(model, run)
+        pace = replace(pace, share=shares(np.diff(time), pace))
+        return Pieces(model, run, pace, time, tuple(cuts))
 
     def filtered(
         self, where: slice, begun: States, last: int = -1
@@ -121,7 +120,7 @@ class Pieces:
         the end.
         """
         model, own = self.model, self.run.take(where)
-        pace = replace(self.pace, share=self.share[where])
+        pace = self.pace.part(where)
         system, first = linearised(model, own, pace=pace, calm=as_read(model, own)), None
         if model.input_noise is not None:
             early = self._through(discretised(model, system), begun[0])

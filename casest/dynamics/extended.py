@@ -35,7 +35,6 @@ from casest.dynamics.transition import (
     checked_time,
     linearised,
     lost,
-    pace_of,
     shares,
     variances,
     with_lost,
@@ -57,14 +56,15 @@ def relinearised(model: Dynamics, run: Run, along: Array, errors: Array | None =
     """
     time = checked_record(model, run)
     u, step = _inputs(model, run), np.diff(time)
-    columns = [np.ascontiguousarray(along[:-1]), u[:-1], u[1:], step[:, None], _stood_for(step)]
+    pace, ends = Pace.of(model, run), (u[:-1], _at_ends(model, u))
+    columns = [np.ascontiguousarray(along[:-1]), *ends, step[:, None], _stood_for(step, pace)]
     Phi, forced, Q = over_samples(_step(model, pieces(model, run)), columns)
     if errors is not None and uncertain(model):
         added = acting(model, run, along, errors)
         Q += 0.5 * step[:, None, None] * (added[1:] + added[:-1])
-    Q = with_lost(model, np.diff(time), Phi, Q)
+    Q = with_lost(model, step, Phi, Q, pace)
     C, d, y = _rows(model, run, along)
-    R = variances(model, np.diff(time))
+    R = variances(model, step, pace)
     return Steps(Phi, forced[:, :, 0], Q, C, d, R, y, of_C=entries(model.traced.C))
 
 
@@ -133,14 +133,14 @@ def given(
     """
     time = checked_record(model, run)
     calm = estimates(model, run) if calm is None else calm
-    u, step = _inputs(model, run, calm), np.diff(time)
+    u, step, pace = _inputs(model, run, calm), np.diff(time), pace or Pace.of(model, run)
     n, m = model.size, model.traced.h.numel()
     at = np.concatenate([*(run.signals[s.name] for s in model.signals), *calm.values()], axis=1)
     y = _rows(model, run, np.broadcast_to(model.start, (len(time), n)), calm)[2][:, :m]
     present = np.isfinite(y)
     parts = [
         np.concatenate([u[:1], u[:-1]]),
-        u,
+        np.concatenate([u[:1], _at_ends(model, u)]),
         np.concatenate([[0.0], step])[:, None],
         np.concatenate([[[1.0]], _stood_for(step, pace)]),
         np.concatenate([np.zeros((1, n)), lost(model, step, pace)]),
@@ -267,7 +267,8 @@ def pieces(model: Dynamics, run: Run, pace: Pace | None = None) -> int:
     Raises DataError where that is more than can be followed.
     """
     A = linearised(model, run, calm=as_read(model, run)).A
-    h = (pace or pace_of(np.diff(checked_time(run)))).usual
+    checked_time(run)
+    h = (pace or Pace.of(model, run)).usual
     fast = h * balance(np.abs(A).max(axis=0))[1]
     count = int(2 ** np.clip(np.ceil(np.log2(max(fast, 1e-300) / PIECE)), 1, np.log2(MOST)))
     if not fast / count < UNSTABLE:
@@ -331,6 +332,15 @@ def _inputs(model: Dynamics, run: Run, calm: Mapping[str, Array] | None = None) 
     parts = [run.signals[n] for n in _input_names(model)]
     parts += [calm[n] for n in _input_names(model) if n in calm]
     return np.concatenate([np.zeros((len(run), 0)), *parts], axis=1)
+
+
+def _at_ends(model: Dynamics, u: Array) -> Array:
+    """`_inputs` u (N, k) at the end of every step, (N − 1, k): what is held has not changed yet."""
+    names, noisy = _input_names(model), uncertain(model)
+    signals = {s.name: s for s in model.signals}
+    held = [signals[n].held for n in (*names, *(n for n in names if n in noisy))
+            for _ in range(signals[n].size)]  # fmt: skip
+    return np.where(held, u[:-1], u[1:]) if any(held) else u[1:]
 
 
 def _both_of(model: Dynamics) -> tuple[list[int], list[int]]:

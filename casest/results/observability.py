@@ -288,13 +288,13 @@ def noise_of_inputs(model: Dynamics, run: Run, noisy: Mapping[str, float]) -> li
     notes = []
     for name in uncertain(model):
         unit = next(s.unit for s in model.signals if s.name == name)
-        std = float(np.sqrt(model.sensors[name] / period(run)))
+        std = float(np.sqrt(model.sensors[name] / period(run, name)))
+        least = smallest(std, len(run.recorded(name)))
         how = "shows noise" if name in noisy else "has noise"
         state = f" (--sensor-noise {name}=… states it)" if name in noisy else ""
         notes.append(
             f"{name} {how} of {std:.3g} {unit}{state}; what that makes of the motion is not "
-            f"counted, and {name} below {smallest(std, len(run)):.2g} {unit} all the time cannot "
-            "be told from none"
+            f"counted, and {name} below {least:.2g} {unit} all the time cannot be told from none"
         )
     return notes
 
