@@ -11,7 +11,7 @@ from casest import DataError, load_runs, signal
 from casest.cli import run as command
 from casest.dynamics import Estimator, Motion, dynamics, filtered, measured, state
 from casest.dynamics.course import followed
-from casest.dynamics.intensities import from_stated
+from casest.dynamics.intensities import from_stated, most_likely
 
 Q_BIAS, SIGMA = 1e-5, 0.3
 
@@ -289,7 +289,7 @@ def test_a_column_in_both_files_is_asked_for(tmp_path):
     ta, a, tx, x = logs(np.random.default_rng(8))
     path = pair(tmp_path, ta, a, tx, x)
     written(tmp_path / "gps.csv", "t [s],x [m],a [m/s^2]", tx, x, x)
-    with pytest.raises(DataError, match="both have signal a: say --columns a=imu.a or"):
+    with pytest.raises(DataError, match=r"both have signal a: say --columns a=imu\.a or"):
         read(path, sledge)
 
 
@@ -337,3 +337,18 @@ def test_the_command_line_takes_both_files(tmp_path, capsys):
     np.testing.assert_allclose(table[:, 7:10], [m for m, _ in smooth], atol=1e-9)
     assert command(["observe", str(tmp_path / "sledge.py"), path]) == 0
     assert "rank 3 of 3" in capsys.readouterr().out
+    assert command(["close", str(tmp_path / "sledge.py"), path]) == 1
+    assert "close looks for its causes sample by sample" in capsys.readouterr().err
+
+
+def test_likely_intensities_are_those_of_each_clock(tmp_path):
+    """The reading's is its variance times the time between two of them."""
+    rng = np.random.default_rng(11)
+    tx = np.arange(0.005, 300, 0.2)
+    ta = np.arange(0, 300.5, 0.05)
+    x = -0.8 / 0.49 * np.sin(0.7 * tx) + SIGMA * rng.standard_normal(len(tx))
+    run = read(pair(tmp_path, ta, 0.8 * np.sin(0.7 * ta), tx, x), sledge)
+    tuned = most_likely(sledge, run)
+    share = tuned.spread["x"]
+    assert share < 0.1
+    assert abs(np.log(tuned.model.sensors["x"] / (SIGMA**2 * 0.2))) < 3 * share

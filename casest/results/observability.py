@@ -260,7 +260,7 @@ def observe_motion(
 
 def assumed(run: Run) -> list[str]:
     """What was assumed of a record, gaps included, one sentence each."""
-    clocks: dict[str, list[str]] = {}  # the samples, and the signals that have them
+    clocks: dict[bytes, list[str]] = {}  # the samples, and the signals that have them
     for name in run.read:
         clocks.setdefault(run.read[name].tobytes(), []).append(name)
     if not run.read:
