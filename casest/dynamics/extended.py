@@ -42,8 +42,9 @@ from casest.dynamics.transition import (
 from casest.engine import Columns, Recursion, Replay
 from casest.errors import DataError
 
-#: ‖A‖h of a piece that Runge-Kutta follows well, pieces at most, and ‖A‖h that it cannot follow.
-PIECE, MOST, UNSTABLE = 0.5, 16, 2.5
+#: ‖A‖h of a piece that Runge-Kutta follows well, pieces at least and at most, and ‖A‖h that it
+#: cannot follow.
+PIECE, FEWEST, MOST, UNSTABLE = 0.5, 2, 16, 2.5
 
 #: Rounds of the filter's update where a reading is no linear function of the state.
 ITERATIONS = 4
@@ -158,30 +159,59 @@ def extended_step(model: Dynamics, count: int) -> Recursion:
     innovation and S)."""
     t, n = model.traced, model.size
     u, v, h, share = _two_samples(model)
-    both = ca.SX.sym("both", factors.size(n))
-    x, P = factors.unpacked(both, n)
-    end, Phi, Q = _motion(model, count)(x, u, v, h, share)
-    Q += h * share * _acting(model, x, u, factors.multiplied(P))
-    gap = ca.diag(ca.SX.sym("gap", n))
-    before = factors.moved(P, Phi, factors.factored(Phi @ gap @ Phi.T + Q + gap))
-    before_x, before_P = end, factors.multiplied(before)
-    (of_h,), as_was = at_estimates(model, [t.C])
-    signals = ca.vertcat(*[flat(t.symbols[s.name]) for s in model.signals], *as_was)
+    both, gap = ca.SX.sym("both", factors.size(n)), ca.SX.sym("gap", n)
+    signals = ca.SX.sym("signals", _extended_outputs(model).numel_in(1))
     R, y, there = (ca.SX.sym(name, t.h.numel()) for name in ("R", "y", "there"))
-    predict = ca.Function("predict", [t.x, signals], [t.h, of_h])
-    said, C = predict(before_x, signals)
-    reading = _Reading(lambda at: predict(at, signals), t.wrapped, y, R, there)
-    rounds = ITERATIONS if ca.depends_on(t.C, t.x) else 1
-    after_x, after = reading.taken(before_x, before, rounds)
-    numbers = ca.vertcat(u, v, h, share, ca.diag(gap), signals, R, y, there)
+    moved = extended_move(model, count)(both, u, v, h, share, gap)
+    before_x, before = factors.unpacked(moved, n)
+    before_P = factors.multiplied(before)
+    found = extended_read(model)(moved, signals, R, y, there)
+    after_x, after = factors.unpacked(found, n)
+    said, C = _extended_outputs(model)(before_x, signals)
     told = ca.vertcat(t.wrapped(y - said), ca.vec(ca.densify(C @ before_P @ C.T + ca.diag(R))))
+    numbers = ca.vertcat(u, v, h, share, gap, signals, R, y, there)
     outputs = [
-        factors.packed(after_x, after),
+        found,
         packed(after_x, factors.multiplied(after)),
         packed(before_x, before_P),
         told,
     ]
     return Recursion(ca.Function("step", [both, numbers], outputs, {"cse": True}))
+
+
+@lru_cache(maxsize=8)
+def extended_move(model: Dynamics, count: int) -> Any:
+    """(x and factors of P, inputs at both ends, h, share, variances of a gap) -> (the same)."""
+    n, (u, v, h, share) = model.size, _two_samples(model)
+    both, gap = ca.SX.sym("both", factors.size(n)), ca.SX.sym("gap", n)
+    x, P = factors.unpacked(both, n)
+    end, Phi, Q = _motion(model, count)(x, u, v, h, share)
+    Q += h * share * _acting(model, x, u, factors.multiplied(P))
+    lost = ca.diag(gap)
+    before = factors.moved(P, Phi, factors.factored(Phi @ lost @ Phi.T + Q + lost))
+    return ca.Function("move", [both, u, v, h, share, gap], [factors.packed(end, before)])
+
+
+@lru_cache(maxsize=8)
+def extended_read(model: Dynamics) -> Any:
+    """(x and factors of P, signals, R, y, which readings there are) -> (x and factors of P)."""
+    t, n, predict = model.traced, model.size, _extended_outputs(model)
+    both, signals = ca.SX.sym("both", factors.size(n)), ca.SX.sym("signals", predict.numel_in(1))
+    R, y, there = (ca.SX.sym(name, t.h.numel()) for name in ("R", "y", "there"))
+    x, P = factors.unpacked(both, n)
+    reading = _Reading(lambda at: predict(at, signals), t.wrapped, y, R, there)
+    rounds = ITERATIONS if ca.depends_on(t.C, t.x) else 1
+    found = factors.packed(*reading.taken(x, P, rounds))
+    return ca.Function("read", [both, signals, R, y, there], [found])
+
+
+@lru_cache(maxsize=8)
+def _extended_outputs(model: Dynamics) -> Any:
+    """(x, signals and after them the uncertain ones as estimated) -> (h, C)."""
+    t = model.traced
+    (of_h,), as_was = at_estimates(model, [t.C])
+    signals = ca.vertcat(*[flat(t.symbols[s.name]) for s in model.signals], *as_was)
+    return ca.Function("predict", [t.x, signals], [t.h, of_h])
 
 
 @dataclass(frozen=True)
@@ -237,7 +267,7 @@ def _motion(model: Dynamics, count: int) -> Any:
     """
     t, n = model.traced, model.size
     x, (u, v, h, share) = ca.SX.sym("x", n), _two_samples(model)
-    own = ca.vertcat(*[flat(t.symbols[name]) for name in _input_names(model)])
+    own = ca.vertcat(*[flat(t.symbols[name]) for name in input_names(model)])
     rate = ca.Function("rate", [t.x, own], [t.f])
     noise = ca.SX(ca.DM(model.process))
     noise = noise if model.input_noise is None else noise + share * model.input_noise
@@ -270,7 +300,9 @@ def pieces(model: Dynamics, run: Run, pace: Pace | None = None) -> int:
     checked_time(run)
     h = (pace or Pace.of(model, run)).usual
     fast = h * balance(np.abs(A).max(axis=0))[1]
-    count = int(2 ** np.clip(np.ceil(np.log2(max(fast, 1e-300) / PIECE)), 1, np.log2(MOST)))
+    count = int(
+        2 ** np.clip(np.ceil(np.log2(max(fast, 1e-300) / PIECE)), np.log2(FEWEST), np.log2(MOST))
+    )
     if not fast / count < UNSTABLE:
         raise DataError(
             f"{run.file or run.name}: {model.name} moves {fast:.3g} times faster than a step of "
@@ -293,7 +325,7 @@ def _path(x: SX, later: SX, rate: SX, later_rate: SX, h: SX) -> Callable[[float]
 def _acting(model: Dynamics, x: SX, u: SX, P: SX) -> Any:
     """What noise of uncertain inputs adds to Ξ by acting on errors with covariance P."""
     t, n = model.traced, model.size
-    own = ca.vertcat(*[flat(t.symbols[name]) for name in _input_names(model)])
+    own = ca.vertcat(*[flat(t.symbols[name]) for name in input_names(model)])
     found = ca.SX(n, n)
     for name, slope in slopes(model):
         N = ca.Function("slope", [t.x, own], [slope])(x, u[_both_of(model)[0]])
@@ -314,7 +346,7 @@ def _runge_kutta(rate: Any, x: SX, u: SX, v: SX, h: SX) -> SX:
     return x + h / 6 * (a + 2 * b + 2 * c + d)
 
 
-def _input_names(model: Dynamics) -> list[str]:
+def input_names(model: Dynamics) -> list[str]:
     """Signals that drive the rates."""
     t = model.traced
     return [s.name for s in model.signals if ca.depends_on(t.f, flat(t.symbols[s.name]))]
@@ -329,14 +361,14 @@ def _stood_for(steps: Array, pace: Pace | None = None) -> Array:
 def _inputs(model: Dynamics, run: Run, calm: Mapping[str, Array] | None = None) -> Array:
     """Inputs of the rates as they were read, and after them the uncertain ones as estimated."""
     calm = estimates(model, run) if calm is None else calm
-    parts = [run.signals[n] for n in _input_names(model)]
-    parts += [calm[n] for n in _input_names(model) if n in calm]
+    parts = [run.signals[n] for n in input_names(model)]
+    parts += [calm[n] for n in input_names(model) if n in calm]
     return np.concatenate([np.zeros((len(run), 0)), *parts], axis=1)
 
 
 def _at_ends(model: Dynamics, u: Array) -> Array:
     """`_inputs` u (N, k) at the end of every step, (N − 1, k): what is held has not changed yet."""
-    names, noisy = _input_names(model), uncertain(model)
+    names, noisy = input_names(model), uncertain(model)
     signals = {s.name: s for s in model.signals}
     held = [signals[n].held for n in (*names, *(n for n in names if n in noisy))
             for _ in range(signals[n].size)]  # fmt: skip
@@ -345,7 +377,7 @@ def _at_ends(model: Dynamics, u: Array) -> Array:
 
 def _both_of(model: Dynamics) -> tuple[list[int], list[int]]:
     """Where the inputs as they were read are in `_inputs`, and those to be linearised at."""
-    noisy, names = uncertain(model), _input_names(model)
+    noisy, names = uncertain(model), input_names(model)
     sizes = [int(model.traced.symbols[name].numel()) for name in names]
     read = list(range(sum(sizes)))
     estimated, later = list[int](), len(read)
