@@ -18,6 +18,7 @@ from casest.dynamics.inputs import as_read
 from casest.dynamics.known import known
 from casest.dynamics.riccati import check_covariance
 from casest.dynamics.stepping import run_steps, unpacked
+from casest.dynamics.stepwise import checked_period
 from casest.dynamics.transition import Pace
 from casest.errors import UsageError
 
@@ -52,8 +53,7 @@ class Estimator:
     def __init__(self, model: Dynamics, period: float) -> None:
         """Raises UsageError where the period is none, DataError where the start is no
         covariance."""
-        if not 0 < period < np.inf:
-            raise UsageError(f"{model.name}: the period {period:g} s must be positive and finite")
+        checked_period(model, period)
         check_covariance(model.start_covariance, "the covariance at the beginning")
         self.model = model
         self._pace = Pace(float(period), GAP * period)

@@ -69,8 +69,7 @@ class Stepwise:
 
 def stepwise(model: Dynamics, period: float) -> Stepwise:
     """Raises UsageError where the model knows something exactly, or the period is none."""
-    if not 0 < period < np.inf:
-        raise UsageError(f"{model.name}: the period {period:g} s must be positive and finite")
+    checked_period(model, period)
     if model.traced.g.numel():
         raise UsageError(
             f"{model.name}: what it knows exactly (constraint) is found by rounds that are not "
@@ -89,6 +88,13 @@ def stepwise(model: Dynamics, period: float) -> Stepwise:
         model, period, pace.gap, move, _read(model, R), told, fast, slow, begin,
         lost(model, step, pace)[0], _readings(model), _needed(model), leads,
     )  # fmt: skip
+
+
+def checked_period(model: Dynamics, period: float) -> float:
+    """The usual time between two samples, s; UsageError where that is none."""
+    if not 0 < period < np.inf:
+        raise UsageError(f"{model.name}: the period {period:g} s must be positive and finite")
+    return float(period)
 
 
 def _samples(model: Dynamics) -> tuple[Any, Any, dict[str, Any], dict[str, Any]]:
