@@ -172,7 +172,7 @@ def test_in_float_it_says_nearly_the_same(compiled):
 
 def test_what_is_known_exactly_is_not_exported():
     with pytest.raises(UsageError, match="what it knows exactly"):
-        stepwise(bias_gravity_magnitude, STEP)
+        filter_source(stepwise(bias_gravity_magnitude, STEP))
 
 
 def test_the_command_line_writes_it(tmp_path, capsys):

@@ -8,11 +8,10 @@ from typing import Any
 from casest import __version__
 from casest.correction.c import function, number
 from casest.correction.program import steps_of
-from casest.dynamics.stepwise import Stepwise
+from casest.dynamics.stepwise import PARTS, Stepwise
+from casest.errors import UsageError
 from casest.escaping import c_comment, c_identifier
 
-#: Parts at most into which a step is cut.
-_MOST = 4096
 _BEGIN = """
 void {name}_begin({name} *f) {{
   for (int i = 0; i < S; ++i) f->state[i] = {begin}[i];
@@ -96,7 +95,15 @@ _FIRST = """\
 
 
 def filter_source(step: Stepwise, single: bool = False) -> str:
-    """The source file; `single` computes with `float` instead of `double`."""
+    """The source file; `single` computes with `float` instead of `double`.
+
+    Raises UsageError where the model knows something exactly.
+    """
+    if step.model.traced.g.numel():
+        raise UsageError(
+            f"{step.model.name}: what it knows exactly (constraint) is found by rounds that are "
+            "not exported: export the model without it; Estimator in Python puts it in"
+        )
     name = f"filter_{c_identifier(step.model.name)}"
     parts = [*_head(step, name, single), _values("begin", step.begin)]
     parts.append(_values("forgotten", step.forgotten))
@@ -159,7 +166,7 @@ def _head(step: Stepwise, name: str, single: bool) -> Iterator[str]:
     yield f"enum {{ {', '.join(f'{k} = {v}' for k, v in sizes.items())} }};"
     yield f"#define GAP {number(step.gap)}"
     if step.fast is not None:
-        yield f"#define SLOW {number(step.slow)}\n#define MOST {_MOST}"
+        yield f"#define SLOW {number(step.slow)}\n#define MOST {PARTS}"
     lead = " real lead[S];" if step.leads else ""
     yield f"typedef struct {{ real state[S];{lead} real last[W]; double time; int begun; }} {name};"
     yield f"void {name}_begin({name} *f);"

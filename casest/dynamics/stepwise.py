@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import casadi as ca
@@ -33,6 +34,8 @@ from casest.errors import UsageError
 
 #: Terms of the series over one part of a step of a linear model, and ‖A‖h that they follow.
 _TERMS, _SLOW = 12, 0.25
+#: Parts at most into which a step is cut.
+PARTS = 4096
 
 
 @dataclass(frozen=True)
@@ -67,14 +70,10 @@ class Stepwise:
     leads: bool
 
 
+@lru_cache(maxsize=8)
 def stepwise(model: Dynamics, period: float) -> Stepwise:
-    """Raises UsageError where the model knows something exactly, or the period is none."""
+    """Raises UsageError where the period is none. What the model knows exactly is left out."""
     checked_period(model, period)
-    if model.traced.g.numel():
-        raise UsageError(
-            f"{model.name}: what it knows exactly (constraint) is found by rounds that are not "
-            "exported: export the model without it; Estimator in Python puts it in"
-        )
     n, pace = model.size, Pace(period, GAP * period)
     both = ca.SX.sym("both", factors.size(n))
     x, P = factors.unpacked(both, n)
