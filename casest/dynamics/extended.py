@@ -46,20 +46,30 @@ from casest.errors import DataError
 #: cannot follow.
 PIECE, FEWEST, MOST, UNSTABLE = 0.5, 2, 16, 2.5
 
+#: Samples that are linearised at once.
+_BLOCK = 4096
+
 #: Rounds of the filter's update where a reading is no linear function of the state.
 ITERATIONS = 4
 
 
-def relinearised(model: Dynamics, run: Run, along: Array, errors: Array | None = None) -> Steps:
+def relinearised(
+    model: Dynamics,
+    run: Run,
+    along: Array,
+    errors: Array | None = None,
+    pace: Pace | None = None,
+) -> Steps:
     """The record in discrete time, linearised along states (N, n).
 
-    `errors` (N, n, n): covariances of what these are wrong by, on which noise of inputs acts.
+    `errors` (N, n, n): covariances of what these are wrong by, on which noise of inputs acts;
+    `pace`: how the whole record is read where this is a part of it.
     """
     time = checked_record(model, run)
     u, step = _inputs(model, run), np.diff(time)
-    pace, ends = Pace.of(model, run), (u[:-1], _at_ends(model, u))
+    pace, ends = pace or Pace.of(model, run), (u[:-1], _at_ends(model, u))
     columns = [np.ascontiguousarray(along[:-1]), *ends, step[:, None], _stood_for(step, pace)]
-    Phi, forced, Q = over_samples(_step(model, pieces(model, run)), columns)
+    Phi, forced, Q = over_samples(_step(model, pieces(model, run, pace)), columns)
     if errors is not None and uncertain(model):
         added = acting(model, run, along, errors)
         Q += 0.5 * step[:, None, None] * (added[1:] + added[:-1])
@@ -111,29 +121,33 @@ def over_samples(expressions: Replay, columns: list[Array]) -> list[Array]:
 def extended(model: Dynamics, run: Run) -> tuple[Array, Array, Array, Array, Array, Array]:
     """Extended Kalman filter: x, P after each reading and before it, innovations, their S."""
     n, m, (parts, present) = model.size, model.traced.h.numel(), given(model, run)
-    root = np.zeros(n * (n - 1) // 2)
-    state = np.concatenate([model.start, np.diag(model.start_covariance), root])
+    state = beginning(model)
     steps = extended_step(model, pieces(model, run))
-    _, after, before, told = run_steps(steps, state, parts, keep=False)
-    return *unpacked(after, n), *unpacked(before, n), *_told(told, present, m)
+    _, after, before, said = run_steps(steps, state, parts, keep=False)
+    return *unpacked(after, n), *unpacked(before, n), *told(said, present, m)
 
 
-def _told(told: Array, present: NDArray[np.bool_], m: int) -> tuple[Array, Array]:
+def beginning(model: Dynamics) -> Array:
+    """What is known before the first sample: x and the factors of P."""
+    root = np.zeros(model.size * (model.size - 1) // 2)
+    return np.concatenate([model.start, np.diag(model.start_covariance), root])
+
+
+def told(said: Array, present: NDArray[np.bool_], m: int) -> tuple[Array, Array]:
     """Innovations and their S, NaN where a reading is missing."""
-    S = told[:, m:].reshape(-1, m, m).transpose(0, 2, 1)
+    S = said[:, m:].reshape(-1, m, m).transpose(0, 2, 1)
     S = np.where(present[:, :, None] & present[:, None, :], S, np.nan)
-    return np.where(present, told[:, :m], np.nan), S
+    return np.where(present, said[:, :m], np.nan), S
 
 
 def given(
-    model: Dynamics, run: Run, pace: Pace | None = None, calm: Mapping[str, Array] | None = None
+    model: Dynamics, run: Run, pace: Pace | None = None
 ) -> tuple[list[Array], NDArray[np.bool_]]:
     """What every step of the extended filter is given, (N, …) each; which readings there are.
 
-    `calm`: uncertain inputs (N, k) as they are estimated, by name, where that is known already.
+    `pace`: how the whole record is read where this is a part of it.
     """
-    time = checked_record(model, run)
-    calm = estimates(model, run) if calm is None else calm
+    time, calm = checked_record(model, run), estimates(model, run)
     u, step, pace = _inputs(model, run, calm), np.diff(time), pace or Pace.of(model, run)
     n, m = model.size, model.traced.h.numel()
     at = np.concatenate([*(run.signals[s.name] for s in model.signals), *calm.values()], axis=1)
@@ -296,10 +310,13 @@ def pieces(model: Dynamics, run: Run, pace: Pace | None = None) -> int:
 
     Raises DataError where that is more than can be followed.
     """
-    A = linearised(model, run, calm=as_read(model, run)).A
-    checked_time(run)
-    h = (pace or Pace.of(model, run)).usual
-    fast = h * balance(np.abs(A).max(axis=0))[1]
+    time = checked_time(run)
+    h, largest = (pace or Pace.of(model, run)).usual, np.zeros((model.size, model.size))
+    for k in range(0, len(time) - 1, _BLOCK):
+        own = run.take(slice(k, k + _BLOCK + 1))
+        A = linearised(model, own, calm=as_read(model, own)).A
+        largest = np.maximum(largest, np.abs(A).max(axis=0))
+    fast = h * balance(largest)[1]
     count = int(
         2 ** np.clip(np.ceil(np.log2(max(fast, 1e-300) / PIECE)), np.log2(FEWEST), np.log2(MOST))
     )
