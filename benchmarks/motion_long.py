@@ -1,4 +1,5 @@
 """A million samples of a turning body, 9 states: filter, smoother and Gramian, time and memory.
+A nonlinear model of 3 states too.
 
 Run `python benchmarks/motion_long.py` (`--samples 100000` for fewer). Each job runs in a process of
 its own: processor time, and the most memory that was held at any moment beyond the record; of the
@@ -23,13 +24,23 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 from motion import RATE, record
 
-from casest import Run
+from casest import Run, cross, norm_2, signal
+from casest.dynamics import Motion, dynamics, measured, state
 from casest.dynamics.course import followed
 from casest.dynamics.gramian import Products, window_eigenvalues
 from casest_problems.bias_gravity import bias_gravity
 
 #: Gyro and accelerometer noise as it may be stated: it reaches the states along their estimates.
 NOISY = bias_gravity.sensing(omega=7.6e-9, a=1.7e-8)
+
+
+@dynamics
+def leveller(
+    omega=signal(3, "rad/s"), v=signal(3, "m/s"), *, g=state(3, "m/s^2", start=(0, 0, 9.8))
+):
+    """Its direction alone is read, so that it is nonlinear; what is read is of no matter here."""
+    outputs = (measured(v, g / norm_2(g), intensity=0.1),)
+    return Motion(rates={"g": -cross(omega, g)}, outputs=outputs)
 
 
 def gramian(run: Run) -> object:
@@ -43,6 +54,8 @@ JOBS: dict[str, Callable[[Run], object]] = {
     "filter": lambda run: followed(bias_gravity, run, smooth=False),
     "filter and smoother": lambda run: followed(bias_gravity, run),
     "filter, noisy inputs": lambda run: followed(NOISY, run, smooth=False),
+    "nonlinear filter": lambda run: followed(leveller, run, smooth=False),
+    "and its smoother": lambda run: followed(leveller, run),
     "Gramian, whole": lambda run: Products.of(bias_gravity, run).gramian(),
     "Gramian and windows": gramian,
 }

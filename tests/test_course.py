@@ -55,6 +55,7 @@ def record(count, kind="even"):
 ])  # fmt: skip
 def test_in_pieces_every_number_is_the_wholes_to_rounding(model, kind, monkeypatch):
     monkeypatch.setattr(course, "PIECE", 137)
+    monkeypatch.setattr(course, "LARGEST", 0)
     run = record(1000, kind)
     whole, pieces = filtered(model, run), followed(model, run)
     assert pieces.settled == whole.settled

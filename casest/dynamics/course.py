@@ -45,6 +45,8 @@ from casest.dynamics.transition import (
 
 #: Samples of a piece.
 PIECE = 4096
+#: Numbers of a nonlinear model's piece: all but the last are linearised twice a round.
+LARGEST = 2**24
 
 
 @dataclass(frozen=True)
@@ -101,6 +103,8 @@ def followed(model: Dynamics, run: Run, *, smooth: bool = True) -> Course:
 
 def _nonlinear(pieces: Pieces, smooth: bool) -> Course:
     model, run, pace, every = pieces.model, pieces.run, pieces.pace, pieces.every
+    each = LARGEST // (10 * model.size**2 + 4 * model.size * model.traced.h.numel())
+    longer = cuts(len(run), max(PIECE, each))
     found = _empty(pieces, smooth)
     along = np.empty_like(found.x) if smooth else found.x
     for where, x, P, innovations, S in rounds.filtered(model, run, pace, every):
@@ -113,7 +117,7 @@ def _nonlinear(pieces: Pieces, smooth: bool) -> Course:
     first: tuple[Array, Array] | None = None
     for _ in range(ROUNDS):
         change, later = 0.0, np.empty_like(along)
-        for where, x, P in rounds.smoothed(model, run, pace, every, along):
+        for where, x, P in rounds.smoothed(model, run, pace, longer, along):
             std = np.sqrt(np.maximum(np.diagonal(P, axis1=1, axis2=2), 1e-300))
             change = max(change, float(np.max(np.abs(x - along[where]) / std)))
             later[where] = x
@@ -131,6 +135,12 @@ def _nonlinear(pieces: Pieces, smooth: bool) -> Course:
 States = tuple[Array | None, Array | None]
 
 
+def cuts(count: int, length: int) -> tuple[slice, ...]:
+    """Pieces of so many samples of a record, which share their ends."""
+    last = count - 1
+    return tuple(slice(k, min(k + length, last) + 1) for k in range(0, last, length))
+
+
 @dataclass(frozen=True)
 class Pieces:
     """A record and the model along it, in pieces that share their ends."""
@@ -146,11 +156,9 @@ class Pieces:
     def of(model: Dynamics, run: Run) -> Pieces:
         """A whole record."""
         time = checked_record(model, run)
-        last = len(time) - 1
-        cuts = [slice(k, min(k + PIECE, last) + 1) for k in range(0, last, PIECE)]
         pace = Pace.of(model, run)
         pace = replace(pace, share=shares(np.diff(time), pace))
-        return Pieces(model, run, pace, time, tuple(cuts))
+        return Pieces(model, run, pace, time, cuts(len(time), PIECE))
 
     def filtered(self, where: slice, begun: States) -> tuple[Steps, Estimates, States]:
         """The steps of a piece, the filter at every sample after its first, and where it came to.
