@@ -20,7 +20,7 @@ import numpy as np
 
 from casest.declaration.shapes import Array
 from casest.dynamics.stepping import Pattern, entries
-from casest.engine import Columns, Replay
+from casest.engine import Columns, Replay, evaluated
 
 #: Share of the largest entry below which one is nothing that units need to make even.
 NOTHING = 1e-60
@@ -132,7 +132,7 @@ def _slow(ends: Sequence[Array], h: Array, fast: float) -> Motions:
     order = _SERIES[int(fast > _SLOW[0])]
     replay = _replay(n, of_A, of_D, of_X, even, order)
     given = X0[tuple(np.array(of_X, int).reshape(-1, 2).T)] if even else np.zeros(0)
-    Phi, forced, Q = replay(given, Columns([*columns, h[:, None]]))
+    Phi, forced, Q = evaluated(replay, given, Columns([*columns, h[:, None]]))
     return Motions(np.asarray(Phi), np.asarray(forced).reshape(count, n), np.asarray(Q))
 
 

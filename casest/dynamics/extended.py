@@ -39,7 +39,7 @@ from casest.dynamics.transition import (
     variances,
     with_lost,
 )
-from casest.engine import Columns, Recursion, Replay
+from casest.engine import Columns, Recursion, Replay, evaluated
 from casest.errors import DataError
 
 #: ‖A‖h of a piece that Runge-Kutta follows well, pieces at least and at most, and ‖A‖h that it
@@ -115,7 +115,7 @@ def replay(sample: SX, outputs: list[SX]) -> Replay:
 
 def over_samples(expressions: Replay, columns: list[Array]) -> list[Array]:
     """Each expression at every sample, (N, …)."""
-    return list(expressions(np.zeros(0), Columns(columns)))
+    return evaluated(expressions, np.zeros(0), Columns(columns))
 
 
 def extended(model: Dynamics, run: Run) -> tuple[Array, Array, Array, Array, Array, Array]:

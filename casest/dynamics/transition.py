@@ -25,7 +25,7 @@ from casest.dynamics.between import Motions, motions
 from casest.dynamics.declare import Dynamics
 from casest.dynamics.inputs import at_estimates, estimates, on_errors
 from casest.dynamics.stepping import reach
-from casest.engine import Columns, Replay
+from casest.engine import Columns, Replay, evaluated
 from casest.errors import DataError
 
 #: Coefficients of the exponential's series to degree 11, three at a time; and the norms below which
@@ -153,7 +153,7 @@ def linearised(
     pace = pace or Pace.of(model, run)
     signals = [*(run.signals[s.name] for s in model.signals), *calm.values()]
     columns = Columns([np.ascontiguousarray(along), *signals])
-    A, c_, C, d_, y, *more = _along(model)(np.zeros(0), columns)
+    A, c_, C, d_, y, *more = evaluated(_along(model), np.zeros(0), columns)
     process = model.process + _stood_for(time, pace) * more[0] if more else model.process
     readings = model.traced.nearest(y[:, :, 0], C, d_[:, :, 0], along)
     if not np.isfinite(readings).all():
@@ -203,7 +203,7 @@ def process_along(model: Dynamics, run: Run, along: Array, pace: Pace | None = N
     if model.input_noise is None:
         return model.process
     columns = Columns([np.ascontiguousarray(along), *(run.signals[s.name] for s in model.signals)])
-    noise = _noise_along(model)(np.zeros(0), columns)[0]
+    noise = evaluated(_noise_along(model), np.zeros(0), columns)[0]
     time = checked_time(run)
     return np.asarray(model.process + _stood_for(time, pace or Pace.of(model, run)) * noise)
 
