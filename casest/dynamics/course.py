@@ -19,6 +19,7 @@ from casest.dynamics.discrete import (
     Estimates,
     Steps,
     continued,
+    ended,
     kalman,
     smoothed_before,
 )
@@ -91,13 +92,15 @@ def followed(model: Dynamics, run: Run, *, smooth: bool = True) -> Course:
     if not model.linear:
         return _nonlinear(pieces, smooth)
     found, states = _empty(pieces, smooth), [pieces.start]
-    for where in pieces.every:
-        _, own, after = pieces.filtered(where, states[-1])
-        states.append(after)
-        if not smooth:
-            _put(found, pieces, where, own)
     if smooth:
+        for where in pieces.every[:-1]:
+            states.append(pieces.ahead(where, states[-1]))
         _back(found, pieces, states)
+        return found
+    state = pieces.start
+    for where in pieces.every:
+        _, own, state = pieces.filtered(where, state)
+        _put(found, pieces, where, own)
     return found
 
 
@@ -165,6 +168,17 @@ class Pieces:
 
         At the beginning of the record: at its first sample too.
         """
+        steps, first = self._steps(where, begun)
+        found = self._through(steps, begun[1])
+        # Copied: a view would keep the whole piece.
+        return steps, found, (first, found.factored[-1].copy())
+
+    def ahead(self, where: slice, begun: States) -> States:
+        """Where the filter comes to alone, for half of the work."""
+        (steps, first), model = self._steps(where, begun), self.model
+        return first, ended(steps, begun[1], model.start, model.start_covariance)
+
+    def _steps(self, where: slice, begun: States) -> tuple[Steps, Array | None]:
         model, own = self.model, self.run.take(where)
         pace = self.pace.part(where)
         system, first = linearised(model, own, pace=pace, calm=as_read(model, own)), None
@@ -175,10 +189,7 @@ class Pieces:
                 system.driven(process_along(model, own, x, pace)),
                 early.factored[-1].copy(),
             )
-        steps = discretised(model, system)
-        found = self._through(steps, begun[1])
-        # Copied: a view would keep the whole piece.
-        return steps, found, (first, found.factored[-1].copy())
+        return discretised(model, system), first
 
     def _through(self, steps: Steps, begun: Array | None) -> Estimates:
         if begun is None:
@@ -194,7 +205,7 @@ class Pieces:
 def _back(found: Course, pieces: Pieces, states: list[States]) -> None:
     n = pieces.model.size
     told = np.zeros(n * n + 2 * n)
-    for where, begun in zip(pieces.every[::-1], states[-2::-1], strict=True):
+    for where, begun in zip(pieces.every[::-1], states[::-1], strict=True):
         steps, own, _ = pieces.filtered(where, begun)
         _put(found, pieces, where, own)
         factored = own.factored if begun[1] is None else np.vstack([begun[1], own.factored])

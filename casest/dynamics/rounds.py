@@ -13,7 +13,7 @@ import numpy as np
 from casest.data.run import Run
 from casest.declaration.shapes import Array
 from casest.dynamics.declare import Dynamics
-from casest.dynamics.discrete import Estimates, Steps, continued, kalman, smoothed_before
+from casest.dynamics.discrete import continued, ended, kalman, smoothed_before
 from casest.dynamics.extended import beginning, extended_step, given, pieces, relinearised, told
 from casest.dynamics.stepping import run_steps, unpacked
 from casest.dynamics.transition import Pace
@@ -43,23 +43,18 @@ def smoothed(
     last piece to the first."""
     begun: list[Array | None] = [None]
     for where in cuts[:-1]:
-        _, own = _piece(model, run, pace, where, along, begun[-1])
-        begun.append(own.factored[-1].copy())
+        steps = relinearised(model, run.take(where), along[where], pace=pace.part(where))
+        begun.append(ended(steps, begun[-1], model.start, model.start_covariance))
     n = model.size
     later = np.zeros(n * n + 2 * n)
     for where, state in zip(cuts[::-1], begun[::-1], strict=True):
-        steps, own = _piece(model, run, pace, where, along, state)
+        steps = relinearised(model, run.take(where), along[where], pace=pace.part(where))
+        if state is None:
+            own = kalman(steps, model.start, model.start_covariance)
+        else:
+            own = continued(steps, state)
         if where is cuts[-1]:
             yield slice(where.stop - 1, where.stop), own.x[-1:], own.P[-1:]
         factored = own.factored if state is None else np.vstack([state, own.factored])
         x, P, later = smoothed_before(steps, factored[:-1], later)
         yield slice(where.start, where.stop - 1), x, P
-
-
-def _piece(
-    model: Dynamics, run: Run, pace: Pace, where: slice, along: Array, begun: Array | None
-) -> tuple[Steps, Estimates]:
-    steps = relinearised(model, run.take(where), along[where], pace=pace.part(where))
-    if begun is None:
-        return steps, kalman(steps, model.start, model.start_covariance)
-    return steps, continued(steps, begun)
