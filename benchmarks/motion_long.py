@@ -22,6 +22,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
+import numpy as np
 from motion import RATE, record
 
 from casest import Run, cross, norm_2, signal
@@ -43,6 +44,16 @@ def leveller(
     return Motion(rates={"g": -cross(omega, g)}, outputs=outputs)
 
 
+def level(run: Run) -> Run:
+    """Rocking about one axis by closed form, with readings of it."""
+    t = np.asarray(run.time)
+    angle, none = 0.6 * np.sin(0.5 * t), 0 * t
+    omega = np.column_stack([0.3 * np.cos(0.5 * t), none, none])
+    v = np.column_stack([none, np.sin(angle), np.cos(angle)])
+    v += 0.1 * np.random.default_rng(0).standard_normal(v.shape)
+    return Run.raw("rocking", {"omega": omega, "v": v}, units={}, time=t)
+
+
 def gramian(run: Run) -> object:
     """Of the whole record and of 60 windows of a tenth of it."""
     products = Products.of(bias_gravity, run)
@@ -54,8 +65,8 @@ JOBS: dict[str, Callable[[Run], object]] = {
     "filter": lambda run: followed(bias_gravity, run, smooth=False),
     "filter and smoother": lambda run: followed(bias_gravity, run),
     "filter, noisy inputs": lambda run: followed(NOISY, run, smooth=False),
-    "nonlinear filter": lambda run: followed(leveller, run, smooth=False),
-    "and its smoother": lambda run: followed(leveller, run),
+    "nonlinear filter": lambda run: followed(leveller, level(run), smooth=False),
+    "and its smoother": lambda run: followed(leveller, level(run)),
     "Gramian, whole": lambda run: Products.of(bias_gravity, run).gramian(),
     "Gramian and windows": gramian,
 }

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from casest.data.logs import parts_of
 from casest.results.written import apart
 
 WIDTH = 80
@@ -173,7 +174,8 @@ def _after_look(typed: Typed, output: str | Path | None, trusted: bool, applies:
             noise = ("--noise", "--sensor-noise", "--rest")
             yield "keep the states", typed.keeping("filter", (*motion, *noise)).into("out").lines()
         yield "what can this trajectory see?", typed.keeping("observe", motion).lines()
-        yield "is something missing?", typed.keeping("close", motion[:-2]).into("out").lines()
+        if len(parts_of(typed.arguments[-1])) == 1:  # the loop wants one clock
+            yield "is something missing?", typed.keeping("close", motion[:-2]).into("out").lines()
     elif len(typed.arguments) < 2:
         return
     elif not applies:
