@@ -272,6 +272,20 @@ def test_clocks_in_different_units(tmp_path, scale, head, words):
     assert np.count_nonzero(np.isfinite(run.signals["x"])) == len(tx)
 
 
+def test_two_files_of_one_name_are_told_apart(tmp_path):
+    ta, a, tx, x = logs(np.random.default_rng(6))
+    for name in ("one", "two"):
+        (tmp_path / name).mkdir()
+    imu = written(tmp_path / "one" / "log.csv", "t [s],a [m/s^2]", ta, a)
+    path = f"{imu}+{written(tmp_path / 'two' / 'log.csv', 't,x [m]', 1000 * tx, x)}"
+    with pytest.raises(DataError, match=r"--unit log#2\.t=ms"):
+        read(path, sledge)
+    (run,) = load_runs(
+        [path], sledge.signals, gaps=["x"], between=["a"], units={"log#2.t": "ms"}
+    )  # fmt: skip
+    assert np.isfinite(run.signals["x"]).sum() == len(tx)
+
+
 def test_clocks_with_no_time_in_common(tmp_path):
     ta, a, tx, x = logs(np.random.default_rng(7))
     path = pair(tmp_path, ta, a, tx + 1.7e9, x)

@@ -30,7 +30,7 @@ T = TypeVar("T")
 _FEWEST = 2
 
 
-def stems(tables: Sequence[Table]) -> list[str]:
+def stems(tables: Sequence[Table | Run]) -> list[str]:
     """What each file is called before the dot of a column: `phone.gyro_x`."""
     names = [file_and_topics(table.file)[0].stem for table in tables]
     total, seen, found = Counter(names), Counter[str](), list[str]()

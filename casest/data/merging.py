@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casest.data.curves import quaternions, turned
-from casest.data.joining import times_of
-from casest.data.logs import file_and_topics, file_name
+from casest.data.joining import stems, times_of
+from casest.data.logs import file_name
 from casest.data.options import Options
 from casest.data.run import Array, Run
 from casest.data.timing import ASSUMED
@@ -83,7 +83,7 @@ def _refuse_units(runs: Sequence[Run], times: Sequence[Array]) -> None:
     power = np.log10(lasting[k] / lasting[shortest])
     for thousands, unit in _UNITS.items():
         if abs(power - thousands) < _NEAR:
-            stem = file_and_topics(runs[k].file)[0].stem
+            stem = stems(runs)[k]
             raise DataError(
                 f"{runs[k].file} lasts {lasting[k]:.6g} s and {runs[shortest].file} "
                 f"{lasting[shortest]:.6g} s: its clock, which states no unit, seems to count "
@@ -178,7 +178,7 @@ def _refuse_apart(runs: Sequence[Run], begin: float, end: float) -> None:
     apart = max(s.first for s in spans) > min(s.last for s in spans)
     if begin < end and not apart:
         return
-    stem = file_and_topics(runs[-1].file)[0].stem
+    stem = stems(runs)[-1]
     raise DataError(
         f"no time that all files recorded: {', '.join(map(str, spans))}: a filter needs them on "
         f"one clock; move one with --scale {stem}.t=+SECONDS, or say its unit with --unit "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -59,7 +60,8 @@ def refuse_unknown_names(
         ("scale", options.scales, [*names, "t", *headers, *apart]),
     ):
         for name in given:
-            if name in allowed:
+            # Two files of one name are told apart: gps#2.t.
+            if name in allowed or re.sub(r"#\d+(?=\.)", "", name) in allowed:
                 continue
             if option != "columns" and any(find_by_name(table, name) for table in tables):
                 continue
