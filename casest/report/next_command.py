@@ -7,7 +7,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from casest.data.logs import parts_of
 from casest.results.written import apart
 
 WIDTH = 80
@@ -168,6 +167,8 @@ def _after_motion(typed: Typed, output: str | Path | None, complete: bool) -> _S
 
 def _after_look(typed: Typed, output: str | Path | None, trusted: bool, applies: bool) -> _Steps:
     """After observe, filter and compare; only estimators in motion have nothing to apply."""
+    from casest.data.logs import parts_of  # imported late: it brings NumPy, which --help is without
+
     motion = (*_READING, "--set", "--std", "--intensity")
     if typed.name == "filter":
         if output is None:
