@@ -127,10 +127,11 @@ def told(found: Mapping[str, Allan]) -> dict[str, Any]:
     }
 
 
-def intensities(model: Dynamics, run: Run) -> dict[str, float]:
+def intensities(model: Dynamics, run: Run | None = None) -> dict[str, float]:
     """Of every state (unit²/s) and signal (unit²·s) that has one, read as in a record."""
     found = {s.name: s.intensity for s in model.states if s.intensity}
-    found |= {name: model.intensity_of(name, period(run, name)) for name in model.measured_signals}
+    for name in model.measured_signals:
+        found[name] = model.intensity_of(name, None if run is None else period(run, name))
     return found | dict(model.sensors)
 
 
