@@ -1,4 +1,5 @@
 """A million samples of a turning body, 9 states: filter, smoother and Gramian, time and memory.
+A nonlinear model of 3 states too.
 
 Run `python benchmarks/motion_long.py` (`--samples 100000` for fewer). Each job runs in a process of
 its own: processor time, and the most memory that was held at any moment beyond the record; of the
@@ -21,15 +22,36 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
+import numpy as np
 from motion import RATE, record
 
-from casest import Run
+from casest import Run, cross, norm_2, signal
+from casest.dynamics import Motion, dynamics, measured, state
 from casest.dynamics.course import followed
 from casest.dynamics.gramian import Products, over_windows
 from casest_problems.bias_gravity import bias_gravity
 
 #: Gyro and accelerometer noise as it may be stated: it reaches the states along their estimates.
 NOISY = bias_gravity.sensing(omega=7.6e-9, a=1.7e-8)
+
+
+@dynamics
+def leveller(
+    omega=signal(3, "rad/s"), v=signal(3, "m/s"), *, g=state(3, "m/s^2", start=(0, 0, 9.8))
+):
+    """Its direction alone is read, so that it is nonlinear; what is read is of no matter here."""
+    outputs = (measured(v, g / norm_2(g), intensity=0.1),)
+    return Motion(rates={"g": -cross(omega, g)}, outputs=outputs)
+
+
+def level(run: Run) -> Run:
+    """Rocking about one axis by closed form, with readings of it."""
+    t = np.asarray(run.time)
+    angle, none = 0.6 * np.sin(0.5 * t), 0 * t
+    omega = np.column_stack([0.3 * np.cos(0.5 * t), none, none])
+    v = np.column_stack([none, np.sin(angle), np.cos(angle)])
+    v += 0.1 * np.random.default_rng(0).standard_normal(v.shape)
+    return Run.raw("rocking", {"omega": omega, "v": v}, units={}, time=t)
 
 
 def gramian(run: Run) -> object:
@@ -43,6 +65,8 @@ JOBS: dict[str, Callable[[Run], object]] = {
     "filter": lambda run: followed(bias_gravity, run, smooth=False),
     "filter and smoother": lambda run: followed(bias_gravity, run),
     "filter, noisy inputs": lambda run: followed(NOISY, run, smooth=False),
+    "nonlinear filter": lambda run: followed(leveller, level(run), smooth=False),
+    "and its smoother": lambda run: followed(leveller, level(run)),
     "Gramian, whole": lambda run: Products.of(bias_gravity, run).gramian(),
     "Gramian and windows": gramian,
 }

@@ -86,9 +86,11 @@ def test_rates_without_a_unit_are_said(told, tmp_path):
     assert "rad/s" in notes
 
 
-def test_a_rate_that_is_missing_for_a_while(refused, tmp_path):
-    said = refused("filter", record(tmp_path / "r.csv", hole=range(100, 150)))
-    assert "omega_x row 100 is empty (and 49 more such rows)" in said
+def test_a_rate_that_is_missing_for_a_while_is_a_gap(told, tmp_path):
+    content = told("filter", record(tmp_path / "r.csv", hole=range(100, 150)))
+    notes = " ".join(content["notes"])
+    assert "omega: 50 of 500 readings are missing" in notes
+    assert "1 gap in omega, the longest of 1.02 s after row 99" in notes
 
 
 def test_empty_velocity_cells_are_readings_that_are_missing(told, tmp_path):

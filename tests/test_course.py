@@ -7,9 +7,10 @@ import tracemalloc
 import flights
 import numpy as np
 import pytest
+from test_dynamics import turning_gravity
 
-from casest import Run
-from casest.dynamics import course, filtered, gramian
+from casest import Run, cross, norm_2, signal
+from casest.dynamics import Motion, constraint, course, dynamics, filtered, gramian, measured, state
 from casest.dynamics.course import followed
 from casest.dynamics.gramian import Products
 from casest.dynamics.transition import linearised
@@ -18,6 +19,17 @@ from casest_problems.bias_gravity import bias_gravity, bias_gravity_magnitude
 
 NAMES = ("x", "std", "smoothed", "smoothed_std", "innovations", "expected_std",
          "normalised_innovations")  # fmt: skip
+
+
+@dynamics
+def near_the_ground(
+    omega=signal(3, "rad/s"), a=signal(3, "m/s^2"), *, g=state(3, "m/s^2", start=(0.0, 0.0, 9.8))
+):
+    """Gravity from its direction, its length known."""
+    g_of = -9.8 * g / norm_2(g)
+    rates = {"g": -cross(omega, g)}
+    known = (constraint(norm_2(g), 9.8),)
+    return Motion(rates=rates, outputs=(measured(a, g_of, intensity=0.1),), constraints=known)
 
 
 def record(count, kind="even"):
@@ -37,11 +49,16 @@ def record(count, kind="even"):
 @pytest.mark.parametrize("kind", ["even", "uneven"])
 @pytest.mark.parametrize("model", [
     bias_gravity, bias_gravity.sensing(omega=1e-8, a=1e-8), bias_gravity_magnitude,
-], ids=["linear", "noisy inputs", "known"])  # fmt: skip
+    turning_gravity, turning_gravity.sensing(omega=1e-8), near_the_ground,
+], ids=[
+    "linear", "noisy inputs", "known", "nonlinear", "nonlinear and noisy", "nonlinear and known",
+])  # fmt: skip
 def test_in_pieces_every_number_is_the_wholes_to_rounding(model, kind, monkeypatch):
     monkeypatch.setattr(course, "PIECE", 137)
+    monkeypatch.setattr(course, "LARGEST", 0)
     run = record(1000, kind)
     whole, pieces = filtered(model, run), followed(model, run)
+    assert pieces.settled == whole.settled
     for name in NAMES:
         np.testing.assert_allclose(getattr(pieces, name), getattr(whole, name), 1e-9, 1e-9)
 

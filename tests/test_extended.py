@@ -383,7 +383,7 @@ def test_the_states_printed_are_those_of_the_whole_record():
 
 
 def test_a_smoother_that_does_not_settle_says_so(monkeypatch):
-    monkeypatch.setattr("casest.dynamics.filter.ROUNDS", 1)
+    monkeypatch.setattr("casest.dynamics.course.ROUNDS", 1)
     result = follow(pendulum_of(), swing()[0])
     assert not result.filtered.settled
     assert "the smoother's rounds did not settle" in " ".join(result.notes)

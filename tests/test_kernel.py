@@ -29,7 +29,17 @@ from test_replay import (
 )
 
 from casest.demo import WHEEL
-from casest.engine import Replay, cost, kernel, normal_equations, residuals, rows, summed
+from casest.engine import (
+    Columns,
+    Replay,
+    cost,
+    evaluated,
+    kernel,
+    normal_equations,
+    residuals,
+    rows,
+    summed,
+)
 from casest.engine.operations import OPERATIONS
 from casest.leastsquares.per_sample import residual_and_jacobian
 from casest.results.find import SHIPPED, find_model
@@ -494,3 +504,21 @@ def test_a_result_says_which_kernel_it_is_of_and_they_differ_in_the_last_digits(
         value, std = np.array(p["value"]), np.array(p["std"])
         other = np.array(compiled["parameters"][name]["value"])
         assert (np.abs(value - other) <= 1e-9 * std).all()
+
+
+def test_values_of_single_samples_have_the_digits_of_the_replay(monkeypatch):
+    """Sums, products and quotients alone: nothing is contracted. Sparse outputs are made dense."""
+    p, x = ca.SX.sym("p", 2), ca.SX.sym("x", 3)
+    matrix = ca.SX(2, 3)
+    matrix[0, 1], matrix[1, 2] = p[0] * x[0] + x[1], x[2] / (1 + x[0] ** 2) - p[1]
+    function = ca.Function("f", [p, x], [matrix, ca.vertcat(3 * p[0], x[1])],
+                           ["parameters", "sample"], ["a", "b"])  # fmt: skip
+    samples = Columns([np.random.default_rng(0).standard_normal((1001, 3))])
+    known = np.array([0.7, -1.3])
+    monkeypatch.setenv("CASEST_KERNEL", "always")
+    compiled = evaluated(Replay(function), known, samples)
+    for found, expected in zip(compiled, Replay(function)(known, samples), strict=True):
+        np.testing.assert_array_equal(found, expected)
+    np.testing.assert_allclose(
+        compiled[0][5, 0, 1], 0.7 * samples.dense[5, 0] + samples.dense[5, 1]
+    )

@@ -8,8 +8,10 @@ from typing import Literal
 
 import click
 
-from casest.cli.flags import flag, taking
-from casest.cli.options import RESULT, ReadingOptions
+from casest.cli.assignments import Assignment, Assignments
+from casest.cli.flags import Kind, flag, refuse, taking
+from casest.cli.loading import moving_model
+from casest.cli.options import RESULT, MotionOptions, ReadingOptions, SensorOptions
 from casest.cli.shared import commands, echo, progress, shown, typed, write
 from casest.errors import UsageError
 
@@ -66,8 +68,32 @@ def apply(result_path: Path, data: str, options: ApplyOptions) -> None:
     echo(f"\n{following(typed(), file=path)}")
 
 
+@dataclass(frozen=True, slots=True)
+class StepOptions:
+    """Options of `export` of an estimator in motion."""
+
+    period: float | None = flag(
+        None,
+        "--period",
+        only=Kind.MOVING,
+        type=float,
+        metavar="SECONDS",
+        help="Of an estimator in motion: the usual time between two samples.",
+    )
+    constants: Assignments = flag(
+        (),
+        "--set",
+        only=Kind.MOVING,
+        of=Assignment,
+        metavar="NAME=VALUE",
+        help="Set a constant of the estimator.",
+    )
+    motion: MotionOptions = field(default_factory=MotionOptions)
+    sensors: SensorOptions = field(default_factory=SensorOptions)
+
+
 @commands.command()
-@RESULT
+@click.argument("result_path", metavar="RESULT|MODEL", type=click.Path(path_type=Path))
 @click.option(
     "--to",
     required=True,
@@ -84,6 +110,7 @@ def apply(result_path: Path, data: str, options: ApplyOptions) -> None:
     help="Without it, standard output.",
 )
 @click.option("--force", is_flag=True, help="Export a result that was refused.")
+@taking(StepOptions)
 def export(
     result_path: Path,
     to: Literal["c", "python", "json"],
@@ -91,8 +118,12 @@ def export(
     run: int,
     output: Path | None,
     force: bool,
+    options: StepOptions,
 ) -> None:
-    """The correction of a saved RESULT, ready to run on the device."""
+    """The correction of a saved RESULT, or a filter's step, ready to run on the device.
+
+    Of an estimator in motion, MODEL is its name or file, and --to c writes one step of its filter.
+    """
     from casest.correction.inverse import TIMED
     from casest.report.next_command import following
     from casest.results.saved import saved_result
@@ -102,12 +133,55 @@ def export(
     if single and to != "c":
         raise UsageError("--float is for --to c")
     progress(f"exporting {result_path}")
+    if names_a_model(result_path):
+        if run or force or to != "c":
+            raise UsageError(
+                "of an estimator in motion --to c alone is written, without --run and --force: in "
+                "Python the step is casest.dynamics.Estimator"
+            )
+        saved(step_of(str(result_path), options, single), output)
+        return
+    refuse(options, Kind.MOVING, f"is for estimators in motion; {result_path} is a saved result")
     text = exported(result_path, to, single=single, run=run, force=force)
     if timed := correcting.of_another_time(result_path):
         echo(f"casest: {TIMED}{', '.join(timed)}", err=True)
+    saved(text, output)
+    if output is not None:
+        fitted = saved_result(result_path).reproduce.command
+        echo(f"\n{following(typed(), file=output, fitted=fitted)}")
+
+
+def saved(text: str, output: Path | None) -> None:
+    """Write to a file, or to standard output."""
     if output is None:
         echo(text, nl=False)
         return
     write(output, text)
     echo(f"Written: {output}")
-    echo(f"\n{following(typed(), file=output, fitted=saved_result(result_path).reproduce.command)}")
+
+
+def names_a_model(given: Path) -> bool:
+    """Is this a model, shipped or in a Python file, and no saved result?"""
+    from casest.results.find import MOVING, SHIPPED
+
+    own = str(given).partition(":")[0]
+    return not given.is_dir() and (own.endswith(".py") or own in {*MOVING, *SHIPPED})
+
+
+def step_of(name: str, options: StepOptions, single: bool) -> str:
+    """C source of the filter's step of the estimator in motion called `name`."""
+    import numpy as np
+
+    from casest.correction.filter_c import filter_source
+    from casest.data.run import Run
+    from casest.dynamics.intensities import with_stated
+    from casest.dynamics.stepwise import checked_period, stepwise
+
+    moving = moving_model(name, options.constants, options.motion)
+    if options.period is None:
+        raise UsageError(f"{name}: give the usual time between two samples: --period SECONDS")
+    time = np.array([0.0, checked_period(moving, options.period)])
+    blank = Run.raw("two samples", {"t": time[:, None]}, units={}, time=time)
+    return filter_source(
+        stepwise(with_stated(moving, blank, options.sensors.stds()), options.period), single
+    )

@@ -27,7 +27,7 @@ from casest.cli.options import (
     model_argument,
 )
 from casest.cli.shared import commands, echo, progress, reported, typed, write
-from casest.errors import NotTrusted
+from casest.errors import NotTrusted, UsageError
 
 if TYPE_CHECKING:
     from casest.declaration.effect import Effect
@@ -210,6 +210,12 @@ def closing_in_motion(
     refuse(options, Kind.FITTED, why)
     moving = moving_model(model_name, options.model.constants, MotionOptions())
     run = trajectory(moving, model_name, data, options.reading)
+    if run.read:
+        raise UsageError(
+            f"close looks for its causes sample by sample, and the signals of {data[0]} have "
+            "clocks of their own: filter it (--noise ml matches the noise), or close a record in "
+            "which every row has all inputs"
+        )
     moving = with_stated(moving, run, options.sensors.stds())
     progress(f"filtering {model_name}, looking for effects")
     found = loop.close_motion(moving, run, say=progress)

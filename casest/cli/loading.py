@@ -129,7 +129,8 @@ def trajectory(moving: Dynamics, name: str, data: Sequence[str], options: Readin
         raise UsageError(f"{name}: a trajectory is one file, not {len(data)}")
     progress(f"reading {data[0]}")
     gaps = moving.may_be_missing
-    runs = load_runs(list(data), moving.signals, gaps=gaps, **options.keywords())
+    own = options.keywords()
+    runs = load_runs(list(data), moving.signals, gaps=gaps, between=moving.input_signals, **own)
     if len(runs) != 1:
         raise UsageError(f"{data[0]} holds {len(runs)} runs; a trajectory is one")
     return runs[0]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 from casest import __version__
 from casest.correction.inverse import LEFT
@@ -110,12 +111,12 @@ def c_source(program: Program, name: str, single: bool, test: tuple[Array, Array
     """
     n, width = program.output.size, program.width
     lines = [_head(program, name, single)]
-    lines += ["static void run(const real *in, real *out) {", *_body(program), "}"]
+    lines += [*function("run", program.steps, program.registers)]
     if program.kind == "direct":
         lines.append(_DIRECT.format(name=name, n=n))
     else:
         assert program.measured is not None
-        starts = [_number(s) for s in program.starts]
+        starts = [number(s) for s in program.starts]
         starts += ["FROM_READING"] * (program.measured[1] == n)
         lines.append(
             _NEWTON.format(
@@ -124,7 +125,7 @@ def c_source(program: Program, name: str, single: bool, test: tuple[Array, Array
                 width=width,
                 at=program.measured[0],
                 starts=", ".join(starts),
-                largest=_number(program.largest),
+                largest=number(program.largest),
             )
         )
     inputs, outputs = (_rows(part) for part in test)
@@ -168,31 +169,34 @@ def _head(program: Program, name: str, single: bool) -> str:
         lines += [
             f"#define CLOSE {close}",
             f"#define EXACT {exact}",
-            f"#define MIDDLE {_number(program.middle)}",
+            f"#define MIDDLE {number(program.middle)}",
             "#define FROM_READING (real)1e30",
         ]
     return "\n".join([*lines, ""])
 
 
-def _body(program: Program) -> Iterator[str]:
-    yield f"  real w[{max(program.registers, 1)}];"
-    for operation, place, *rest in program.steps:
+def function(name: str, steps: Sequence[tuple[Any, ...]], registers: int) -> Iterator[str]:
+    """`static void NAME(const real *in, real *out)`: a list of operations (see `Program`)."""
+    yield f"static void {name}(const real *in, real *out) {{"
+    yield f"  real w[{max(registers, 1)}];"
+    for operation, place, *rest in steps:
         if operation == "input":
             yield f"  w[{place}] = in[{rest[0]}];"
         elif operation == "constant":
-            yield f"  w[{place}] = {_number(rest[0])};"
+            yield f"  w[{place}] = {number(rest[0])};"
         elif operation == "output":
             yield f"  out[{place}] = w[{rest[0]}];"
         else:
             operands = [f"w[{r}]" for r in rest]
             yield f"  w[{place}] = {_C[operation].format(*operands)};"
+    yield "}"
 
 
-def _number(value: float) -> str:
+def number(value: float) -> str:
     """A literal of the right type, to the last digit."""
     return f"(real){float(value)!r}"
 
 
 def _rows(values: Array) -> str:
-    rows: Sequence[str] = ["    {" + ", ".join(_number(x) for x in row) + "}," for row in values]
+    rows: Sequence[str] = ["    {" + ", ".join(number(x) for x in row) + "}," for row in values]
     return "\n".join(rows)

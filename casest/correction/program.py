@@ -99,7 +99,7 @@ def program(
             "to correct"
         )
     bound = _bound(function, parameters, correction, differing, trial=kind == "newton")
-    steps, registers = _steps(bound)
+    steps, registers = steps_of(bound, "the correction")
     output = Input(correction.name, correction.size, units.get(correction.name, ""))
     built = Program(model.name, kind, inputs, output, registers, steps, own=len(differing))
     if kind == "direct":
@@ -135,8 +135,9 @@ def _bound(
     return ca.Function("correction", [x], [ca.densify(out)])
 
 
-def _steps(function: Any) -> tuple[tuple[tuple[Any, ...], ...], int]:
-    """The instruction list of a CasADi function of one input and one output."""
+def steps_of(function: Any, what: str) -> tuple[tuple[tuple[Any, ...], ...], int]:
+    """The instruction list of a CasADi function of one input and one output, and its registers;
+    `what` it is, in an error about an operation that there is not."""
     found: list[tuple[Any, ...]] = []
     for k in range(function.n_instructions()):
         op = function.instruction_id(k)
@@ -148,7 +149,7 @@ def _steps(function: Any) -> tuple[tuple[tuple[Any, ...], ...], int]:
         elif op == ca.OP_OUTPUT:
             found.append(("output", outs[1], ins[0]))
         else:
-            operation = operation_of(op, "the correction")
+            operation = operation_of(op, what)
             found.append((operation.name, outs[0], *ins[: operation.arity]))
     return tuple(found), int(function.sz_w())
 

@@ -18,6 +18,7 @@ from casest.data.finding import Choice, as_names, find_column, find_columns
 from casest.data.joining import joined, shared_out
 from casest.data.logs import file_and_topics, parts_of
 from casest.data.matching import find_by_name
+from casest.data.merging import merged, one_clock_each
 from casest.data.options import Options, refuse_unknown_names, stated_unit
 from casest.data.rest import at_rest as averaged_at_rest
 from casest.data.run import Array, Labels, Run
@@ -53,6 +54,7 @@ def load_runs(
     extra: Sequence[str] = (),
     time_zero: Literal["first", "column"] = "first",
     gaps: Sequence[str] = (),
+    between: Sequence[str] | None = None,
 ) -> tuple[Run, ...]:
     """Read files and bind their columns to `signals`: one run per file and `run` label.
 
@@ -68,6 +70,9 @@ def load_runs(
     * extra: columns that must be there; like a signal's, their empty cells cost the row, and the
       run calls them as they are called here.
     * gaps: signals whose cells may be empty; a reading that is missing is NaN in the run.
+    * between: inputs of an estimator in motion, whose signals may have clocks of their own: where
+      one has no sample it is a straight line, or held. The samples of a.csv+b.csv are then those of
+      all files, every reading at the time when it was made.
     * time_zero: "first" makes each run's first sample t = 0, "column" keeps the column's own zero.
 
     A row in which a signal, the time of a model that needs it or an extra column has no number
@@ -87,7 +92,8 @@ def load_runs(
         None if rate is None else timing.checked_rate(rate),
         time_zero,
         tuple(extra),
-        frozenset(gaps),
+        frozenset(gaps) | frozenset(between or ()),
+        None if between is None else frozenset(between),
     )
     groups = [[read_table(part) for part in parts_of(path)] for path in listed]
     refuse_unknown_names([table for tables in groups for table in tables], wanted, options)
@@ -102,7 +108,8 @@ def load_runs(
 def _group_runs(tables: Sequence[Table], signals: Sequence[Signal], options: Options) -> list[Run]:
     """The runs of one file, or the one run of several files."""
     if len(tables) == 1:
-        return _runs(tables[0], signals, options)
+        runs = _runs(tables[0], signals, options)
+        return [one_clock_each(run, signals, options) for run in runs]
     apart = replace(options, time_zero="column")
     parts = []
     for table, own, chosen in shared_out(tables, signals, apart):
@@ -113,6 +120,8 @@ def _group_runs(tables: Sequence[Table], signals: Sequence[Signal], options: Opt
                 "runs in files of their own"
             )
         parts += runs
+    if options.between is not None:
+        return [merged(parts, signals, options)]
     return [joined(parts, signals, options.time_zero)]
 
 

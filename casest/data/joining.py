@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 
@@ -24,11 +24,13 @@ from casest.declaration.symbols import Signal
 from casest.errors import DataError, UsageError
 from casest.units import conversion
 
+T = TypeVar("T")
+
 #: Samples of the first file that the others must cover.
 _FEWEST = 2
 
 
-def stems(tables: Sequence[Table]) -> list[str]:
+def stems(tables: Sequence[Table | Run]) -> list[str]:
     """What each file is called before the dot of a column: `phone.gyro_x`."""
     names = [file_and_topics(table.file)[0].stem for table in tables]
     total, seen, found = Counter(names), Counter[str](), list[str]()
@@ -58,9 +60,27 @@ def shared_out(
     extra = [[n for n in options.extra if find_by_name(table, n)] for table in tables]
     extra[0] += [n for n in options.extra if not any(n in names for names in extra)]
     return [
-        (table, tuple(mine), replace(options, columns=columns, extra=tuple(more)))
-        for table, mine, columns, more in zip(tables, own, said, extra, strict=True)
+        (
+            table,
+            tuple(mine),
+            replace(
+                options,
+                columns=columns,
+                extra=tuple(more),
+                units=_of_file(options.units, stem),
+                scales=_of_file(options.scales, stem),
+            ),
+        )
+        for (table, stem), mine, columns, more in zip(
+            _called(tables), own, said, extra, strict=True
+        )
     ]
+
+
+def _of_file(given: Mapping[str, T], stem: str) -> dict[str, T]:
+    """What is said of one of the files: phone.t=ms is of phone.csv alone, and goes before t=s."""
+    own = {n.removeprefix(f"{stem}."): v for n, v in given.items() if n.startswith(f"{stem}.")}
+    return {**given, **own}
 
 
 def _called(tables: Sequence[Table]) -> list[tuple[Table, str]]:
@@ -127,7 +147,7 @@ def joined(
     Raises DataError where a file has no time, or the first has no sample that all others cover.
     """
     first, *others = runs
-    time, *clocks = _times(runs)
+    time, *clocks = times_of(runs)
     time, clocks, notes = _common(runs, time, clocks)
     covered = np.ones(len(first), dtype=np.bool_)
     for run, clock in zip(others, clocks, strict=True):
@@ -146,7 +166,7 @@ def joined(
     return replace(whole, file=names, notes=(*whole.notes, *notes))
 
 
-def _times(runs: Sequence[Run]) -> list[Array]:
+def times_of(runs: Sequence[Run]) -> list[Array]:
     """The time of each file. Raises DataError where one has none."""
     for run in runs:
         if run.time is None:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 from casest import units as unit_names
 from casest.data.finding import Choice
+from casest.data.logs import file_and_topics
 from casest.data.matching import find_by_name
 from casest.data.scaling import Scale
 from casest.data.table import Table
@@ -28,6 +30,8 @@ class Options:
     extra: tuple[str, ...]
     #: Signals of which readings may be missing (empty cells).
     gaps: frozenset[str] = frozenset()
+    #: Inputs that are interpolated, or held, where they have no sample; None of a sensor model.
+    between: frozenset[str] | None = None
 
 
 def stated_unit(name: str, unit: str) -> str:
@@ -44,13 +48,20 @@ def refuse_unknown_names(
     """Refuse an option for a signal or column that exists nowhere: a typing error."""
     names = [s.name for s in signals]
     headers = [name for table in tables for name in table.columns]
+    apart = [
+        f"{file_and_topics(table.file)[0].stem}.{name}"
+        for table in tables
+        for name in (*names, "t", *table.columns)
+        if len(tables) > 1
+    ]
     for option, given, allowed in (
         ("columns", options.columns, [*names, "t", "run", "pose"]),
-        ("unit", options.units, [*names, "t", *headers]),
-        ("scale", options.scales, [*names, "t", *headers]),
+        ("unit", options.units, [*names, "t", *headers, *apart]),
+        ("scale", options.scales, [*names, "t", *headers, *apart]),
     ):
         for name in given:
-            if name in allowed:
+            # Two files of one name are told apart: gps#2.t.
+            if name in allowed or re.sub(r"#\d+(?=\.)", "", name) in allowed:
                 continue
             if option != "columns" and any(find_by_name(table, name) for table in tables):
                 continue

@@ -43,6 +43,8 @@ class Run:
     spread: per signal (N, size), standard error of each mean; empty for a raw record.
     correlation: per signal (N, size, size), of the errors of one mean's components; may be missing.
     notes: what was assumed, skipped or looks wrong, one sentence each.
+    read: per signal (N,), in which samples it was read, where signals have clocks of their own:
+    between its own samples an input is interpolated or held; empty where all have one clock.
     elsewhere: signals and columns that come from another file than the first, as they are there.
     whole: the record that these samples were taken from, where `places` (N,) says; None of a whole.
     """
@@ -61,6 +63,7 @@ class Run:
     notes: tuple[str, ...] = ()
     correlation: Mapping[str, Array] = field(default_factory=dict)
     elsewhere: Mapping[str, Series] = field(default_factory=dict)
+    read: Mapping[str, NDArray[np.bool_]] = field(default_factory=dict)
     whole: Run | None = None
     places: Index | None = None
     #: Signals between their samples, once they were asked for; of a changed run they are others.
@@ -70,6 +73,7 @@ class Run:
         """Refuse parts of unequal length: they would be matched wrongly without a sign."""
         n = len(self.rows)
         parts: dict[str, NDArray[Any]] = {**self.signals, **self.columns, **self.spread}
+        parts |= {f"read {name}": mask for name, mask in self.read.items()}
         parts |= {"block": self.block, "count": self.count}
         if self.time is not None:
             parts["time"] = self.time
@@ -118,9 +122,18 @@ class Run:
             count=self.count[chosen],
             spread={name: values[chosen] for name, values in self.spread.items()},
             correlation={name: values[chosen] for name, values in self.correlation.items()},
+            read={name: mask[chosen] for name, mask in self.read.items()},
             whole=self if self.whole is None else self.whole,
             places=places[chosen],
         )
+
+    def recorded(self, name: str) -> Array:
+        """Return the values (M, size) of a signal in the samples where it was read."""
+        return self.signals[name][self.read.get(name, slice(None))]
+
+    def clock(self, name: str) -> Array:
+        """Return the times (M,) in s at which a signal was read, of a record that has times."""
+        return np.asarray(self.time, float)[self.read.get(name, slice(None))]
 
     def covariance(self, name: str) -> Array:
         """Return the covariance of a signal's means, (N, size, size)."""

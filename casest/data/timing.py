@@ -21,6 +21,8 @@ GAP = 5.0  # times the usual step
 USUAL = 0.8  # share of the steps that do not exceed it
 _EVEN = 20  # steps that show whether a record is evenly sampled
 
+#: What a note says of a time without a unit.
+ASSUMED = "no unit stated, taken as s"
 #: How the note begins that tells why a time column was left aside.
 UNUSED = "time not used: "
 
@@ -154,7 +156,7 @@ def seconds(
     if unit is None:
         there = values[np.isfinite(values)]
         step = f"{np.median(np.diff(there)):g}" if len(there) > 1 else "unknown"
-        note = f"{column.name}: no unit stated, taken as s (median step {step} s); "
+        note = f"{column.name}: {ASSUMED} (median step {step} s); "
         return values, [note + "if that is wrong say --unit t=ms"]
     factor, _ = units.conversion(unit, "s")
     return values * factor, []

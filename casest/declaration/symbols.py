@@ -19,19 +19,26 @@ class Signal:
 
     `size` is the number of numbers per sample (9 for a rotation matrix, row by row);
     `unit` is None where any unit will do (the data's own is then kept).
+    `held`: of an estimator in motion, it keeps its value until the next sample, as a command does;
+    else it is a straight line between two.
     """
 
     name: str
     size: int
     unit: str | None
     kind: Literal["plain", "rotation"] = "plain"
+    held: bool = False
 
 
-def signal(shape: int | str = 1, unit: str | None = None) -> Any:
-    """Declare a measured input: `signal("s")`, `signal(3, "m/s^2")`, `signal(3)` (any unit)."""
+def signal(shape: int | str = 1, unit: str | None = None, *, held: bool = False) -> Any:
+    """Declare a measured input: `signal("s")`, `signal(3, "m/s^2")`, `signal(3)` (any unit).
+
+    `held`: an input of an estimator in motion that keeps its value between samples (a command to a
+    motor) in place of a straight line.
+    """
     if isinstance(shape, str):
-        return Signal("", 1, shape)
-    return Signal("", shape, unit)
+        return Signal("", 1, shape, held=held)
+    return Signal("", shape, unit, held=held)
 
 
 def attitude() -> Any:

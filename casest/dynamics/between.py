@@ -20,7 +20,7 @@ import numpy as np
 
 from casest.declaration.shapes import Array
 from casest.dynamics.stepping import Pattern, entries
-from casest.engine import Columns, Replay
+from casest.engine import Columns, Replay, evaluated
 
 #: Share of the largest entry below which one is nothing that units need to make even.
 NOTHING = 1e-60
@@ -41,13 +41,17 @@ class Motions:
     Q: Array
 
 
-def motions(A: Array, c: Array, Xi: Array, h: Array) -> Motions:
+def motions(
+    A: Array, c: Array, Xi: Array, h: Array, ending: tuple[Array, Array] | None = None
+) -> Motions:
     """Of every step between samples: A (N, n, n), c (N, n), intensity Ξ, h (N − 1,).
 
-    Ξ (n, n), or (N, n, n) where it changes; between samples all are straight lines. Where a motion
-    grows beyond what numbers hold, what is not finite is returned.
+    Ξ (n, n), or (N, n, n) where it changes; between samples all are straight lines. `ending`: A and
+    c at the end of every step, where they jump there. Where a motion grows beyond what numbers
+    hold, what is not finite is returned.
     """
-    ends = A[:-1], A[1:], c[:-1], c[1:], *((Xi[:-1], Xi[1:]) if Xi.ndim == 3 else (Xi, Xi))
+    A1, c1 = ending or (A[1:], c[1:])
+    ends = A[:-1], A1, c[:-1], c1, *((Xi[:-1], Xi[1:]) if Xi.ndim == 3 else (Xi, Xi))
     fast = balance(np.abs(A).max(axis=0))[1] * h
     if fast.max(initial=0.0) <= _SLOW[-1]:
         return _slow(ends, h, float(fast.max(initial=0.0)))
@@ -128,7 +132,7 @@ def _slow(ends: Sequence[Array], h: Array, fast: float) -> Motions:
     order = _SERIES[int(fast > _SLOW[0])]
     replay = _replay(n, of_A, of_D, of_X, even, order)
     given = X0[tuple(np.array(of_X, int).reshape(-1, 2).T)] if even else np.zeros(0)
-    Phi, forced, Q = replay(given, Columns([*columns, h[:, None]]))
+    Phi, forced, Q = evaluated(replay, given, Columns([*columns, h[:, None]]))
     return Motions(np.asarray(Phi), np.asarray(forced).reshape(count, n), np.asarray(Q))
 
 

@@ -13,15 +13,26 @@ import numpy as np
 
 from casest.data.run import Run
 from casest.declaration.shapes import Array
+from casest.dynamics import rounds
 from casest.dynamics.declare import Dynamics
 from casest.dynamics.discrete import (
     Estimates,
     Steps,
     continued,
+    ended,
     kalman,
     smoothed_before,
 )
-from casest.dynamics.filter import Filtered, discretised, filtered, normalised, std_of
+from casest.dynamics.filter import (
+    ROUNDS,
+    SETTLED,
+    Filtered,
+    discretised,
+    filtered,
+    normalised,
+    refuse_divergence,
+    std_of,
+)
 from casest.dynamics.inputs import as_read, uncertain
 from casest.dynamics.known import known
 from casest.dynamics.riccati import check_covariance
@@ -29,13 +40,14 @@ from casest.dynamics.transition import (
     Pace,
     checked_record,
     linearised,
-    pace_of,
     process_along,
     shares,
 )
 
 #: Samples of a piece.
 PIECE = 4096
+#: Numbers of a nonlinear model's piece: all but the last are linearised twice a round.
+LARGEST = 2**24
 
 
 @dataclass(frozen=True)
@@ -67,28 +79,69 @@ class Course:
 
 
 def followed(model: Dynamics, run: Run, *, smooth: bool = True) -> Course:
-    """Filter and smoother over a record; of a linear model memory beyond the result is constant,
-    unless inputs with noise enter its coefficients: their estimates are of the whole record.
+    """Filter and smoother over a record in constant memory beyond the result, a nonlinear model's
+    states once more; unless inputs with noise enter its coefficients: their estimates are of the
+    whole record.
 
     Raises DataError as `filtered` does.
     """
     check_covariance(model.start_covariance, "the covariance at the beginning")
-    if not model.linear or uncertain(model):
+    if uncertain(model):
         return _of(filtered(model, run, smooth=smooth))
     pieces = Pieces.of(model, run)
+    if not model.linear:
+        return _nonlinear(pieces, smooth)
     found, states = _empty(pieces, smooth), [pieces.start]
-    for where in pieces.every:
-        _, own, after = pieces.filtered(where, states[-1])
-        states.append(after)
-        if not smooth:
-            _put(found, pieces, where, own)
     if smooth:
+        for where in pieces.every[:-1]:
+            states.append(pieces.ahead(where, states[-1]))
         _back(found, pieces, states)
+        return found
+    state = pieces.start
+    for where in pieces.every:
+        _, own, state = pieces.filtered(where, state)
+        _put(found, pieces, where, own)
     return found
+
+
+def _nonlinear(pieces: Pieces, smooth: bool) -> Course:
+    model, run, pace, every = pieces.model, pieces.run, pieces.pace, pieces.every
+    each = LARGEST // (10 * model.size**2 + 4 * model.size * model.traced.h.numel())
+    longer = cuts(len(run), max(PIECE, each))
+    found = _empty(pieces, smooth)
+    along = np.empty_like(found.x) if smooth else found.x
+    for where, x, P, innovations, S in rounds.filtered(model, run, pace, every):
+        refuse_divergence(model, run.take(where), x)
+        along[where] = x
+        found.x[where], found.std[where] = pieces.known(where, x, P)
+        _read(found, where, innovations, S)
+    if not smooth:
+        return found
+    first: tuple[Array, Array] | None = None
+    for _ in range(ROUNDS):
+        change, later = 0.0, np.empty_like(along)
+        for where, x, P in rounds.smoothed(model, run, pace, longer, along):
+            std = np.sqrt(np.maximum(np.diagonal(P, axis1=1, axis2=2), 1e-300))
+            change = max(change, float(np.max(np.abs(x - along[where]) / std)))
+            later[where] = x
+            found.smoothed[where], found.smoothed_std[where] = pieces.known(where, x, P)
+        along, first = later, first or (found.smoothed.copy(), found.smoothed_std.copy())
+        if change < SETTLED:
+            return found
+        if not np.isfinite(change):
+            break
+    assert first is not None
+    return replace(found, smoothed=first[0], smoothed_std=first[1], settled=False)
 
 
 #: Where the filter has come to, as factored: with noise along the start, and along its own states.
 States = tuple[Array | None, Array | None]
+
+
+def cuts(count: int, length: int) -> tuple[slice, ...]:
+    """Pieces of so many samples of a record, which share their ends."""
+    last = count - 1
+    return tuple(slice(k, min(k + length, last) + 1) for k in range(0, last, length))
 
 
 @dataclass(frozen=True)
@@ -99,41 +152,44 @@ class Pieces:
     run: Run
     pace: Pace
     time: Array
-    share: Array
     every: tuple[slice, ...]
     start: States = (None, None)
 
     @staticmethod
-    def of(model: Dynamics, run: Run, pace: Pace | None = None) -> Pieces:
-        """A whole record, or a part of one that is read at a known pace."""
+    def of(model: Dynamics, run: Run) -> Pieces:
+        """A whole record."""
         time = checked_record(model, run)
-        step, last = np.diff(time), len(time) - 1
-        cuts = [slice(k, min(k + PIECE, last) + 1) for k in range(0, last, PIECE)]
-        pace = pace or pace_of(step)
-        return Pieces(model, run, pace, time, shares(step, pace), tuple(cuts))
+        pace = Pace.of(model, run)
+        pace = replace(pace, share=shares(np.diff(time), pace))
+        return Pieces(model, run, pace, time, cuts(len(time), PIECE))
 
-    def filtered(
-        self, where: slice, begun: States, last: int = -1
-    ) -> tuple[Steps, Estimates, States]:
+    def filtered(self, where: slice, begun: States) -> tuple[Steps, Estimates, States]:
         """The steps of a piece, the filter at every sample after its first, and where it came to.
 
-        At the beginning of the record: at its first sample too. `last`: which of these counts as
-        the end.
+        At the beginning of the record: at its first sample too.
         """
+        steps, first = self._steps(where, begun)
+        found = self._through(steps, begun[1])
+        # Copied: a view would keep the whole piece.
+        return steps, found, (first, found.factored[-1].copy())
+
+    def ahead(self, where: slice, begun: States) -> States:
+        """Where the filter comes to alone, for half of the work."""
+        (steps, first), model = self._steps(where, begun), self.model
+        return first, ended(steps, begun[1], model.start, model.start_covariance)
+
+    def _steps(self, where: slice, begun: States) -> tuple[Steps, Array | None]:
         model, own = self.model, self.run.take(where)
-        pace = replace(self.pace, share=self.share[where])
+        pace = self.pace.part(where)
         system, first = linearised(model, own, pace=pace, calm=as_read(model, own)), None
         if model.input_noise is not None:
             early = self._through(discretised(model, system), begun[0])
             x = early.x if begun[0] is None else np.vstack([begun[0][: model.size], early.x])
             system, first = (
                 system.driven(process_along(model, own, x, pace)),
-                early.factored[last].copy(),
+                early.factored[-1].copy(),
             )
-        steps = discretised(model, system)
-        found = self._through(steps, begun[1])
-        # Copied: a view would keep the whole piece.
-        return steps, found, (first, found.factored[last].copy())
+        return discretised(model, system), first
 
     def _through(self, steps: Steps, begun: Array | None) -> Estimates:
         if begun is None:
@@ -149,7 +205,7 @@ class Pieces:
 def _back(found: Course, pieces: Pieces, states: list[States]) -> None:
     n = pieces.model.size
     told = np.zeros(n * n + 2 * n)
-    for where, begun in zip(pieces.every[::-1], states[-2::-1], strict=True):
+    for where, begun in zip(pieces.every[::-1], states[::-1], strict=True):
         steps, own, _ = pieces.filtered(where, begun)
         _put(found, pieces, where, own)
         factored = own.factored if begun[1] is None else np.vstack([begun[1], own.factored])
@@ -162,8 +218,12 @@ def _back(found: Course, pieces: Pieces, states: list[States]) -> None:
 def _put(found: Course, pieces: Pieces, where: slice, own: Estimates) -> None:
     where = slice(where.stop - len(own.x), where.stop)
     found.x[where], found.std[where] = pieces.known(where, own.x, own.P)
-    found.innovations[where], found.expected_std[where] = own.innovations, std_of(own.S)
-    found.normalised_innovations[where] = normalised(own.innovations, own.S)
+    _read(found, where, own.innovations, own.S)
+
+
+def _read(found: Course, where: slice, innovations: Array, S: Array) -> None:
+    found.innovations[where], found.expected_std[where] = innovations, std_of(S)
+    found.normalised_innovations[where] = normalised(innovations, S)
 
 
 def _empty(pieces: Pieces, smooth: bool) -> Course:

@@ -309,11 +309,21 @@ class Dynamics:
         """Intensity Θ of the measurement noise, (m, m), if intensities are what is declared."""
         return self.noise_at(None)
 
-    def noise_at(self, period: float | None) -> Array:
-        """Intensity Θ of the measurement noise, (m, m), of readings every `period` s."""
-        t = self.traced
+    def noise_at(self, period: float | None, own: Mapping[str, float] | None = None) -> Array:
+        """Intensity Θ of the measurement noise, (m, m), of readings every `period` s.
+
+        `own`: the time between two readings of signals with clocks of their own; of these Θ is that
+        which makes the variance of one reading right if it is divided by `period`.
+        """
+        t, own = self.traced, own or {}
+
+        def intensity(name: str) -> float:
+            if period is None or name not in own:
+                return self.intensity_of(name, period)
+            return self.intensity_of(name, own[name]) * (period / own[name])
+
         parts = [
-            np.full(o.predicted.numel(), self.intensity_of(name, period))
+            np.full(o.predicted.numel(), intensity(name))
             for name, o in zip(t.measured, t.outputs, strict=True)
         ]
         return np.diag(np.concatenate(parts))
@@ -353,6 +363,11 @@ class Dynamics:
     def traced(self) -> Traced:
         """The body on CasADi symbols."""
         return traced_with(self, {c.name: float(c.array) for c in self.constants})
+
+    @property
+    def input_signals(self) -> tuple[str, ...]:
+        """Names of the signals that drive the motion or tell the outputs, but for the time."""
+        return tuple(s.name for s in self.signals if s.name not in (*self.measured_signals, "t"))
 
     @property
     def measured_signals(self) -> tuple[str, ...]:

@@ -82,24 +82,48 @@ class Estimates:
 
 def kalman(steps: Steps, start: Array, covariance: Array) -> Estimates:
     """Kalman filter; `start` (n,) and `covariance` (n, n) hold before the first reading."""
-    n = steps.C.shape[2]
-    # No step leads to the first sample: Φ = 0 from an empty state, and what is known beforehand.
-    forced, Q = np.concatenate([start[None], steps.forced]), np.empty((len(steps.y), n, n))
-    Q[0], Q[1:] = covariance, steps.Q
-    return _followed(steps, [steps.Phi, forced, Q], np.zeros(size(n)))
+    return _followed(*_from_start(steps, start, covariance))
 
 
 def continued(steps: Steps, state: Array) -> Estimates:
     """The same at every sample but the first, where the filter has come to `state`, as factored."""
-    parts = {name: getattr(steps, name)[1:] for name in ("C", "d", "R", "y")}
-    return _followed(replace(steps, **parts), [steps.Phi, steps.forced, steps.Q], state)
+    return _followed(*_from_state(steps, state))
 
 
-def _followed(samples: Steps, motion: Sequence[Array], state: Array) -> Estimates:
+def ended(steps: Steps, state: Array | None, start: Array, covariance: Array) -> Array:
+    """Where the filter comes to, as factored, from `state`, or from the start where it is None."""
+    if state is None:
+        samples, parts, begun = _from_start(steps, start, covariance)
+    else:
+        samples, parts, begun = _from_state(steps, state)
     m, n = samples.C.shape[1:]
-    step = kalman_step(n, m, *samples.patterns)
-    readings = [samples.seen, samples.R, samples.read]
-    factored, *both = run_steps(step, state, [*motion, *readings])
+    step = kalman_step(n, m, *samples.patterns, alone=True)
+    (found,) = run_steps(step, begun, parts)
+    return np.array(found[-1])
+
+
+#: Samples, what is given of each, and the state before the first.
+Given = tuple[Steps, Sequence[Array], Array]
+
+
+def _from_start(steps: Steps, start: Array, covariance: Array) -> Given:
+    n = steps.C.shape[2]
+    # No step leads to the first sample: Φ = 0 from an empty state, and what is known beforehand.
+    forced, Q = np.concatenate([start[None], steps.forced]), np.empty((len(steps.y), n, n))
+    Q[0], Q[1:] = covariance, steps.Q
+    return steps, [steps.Phi, forced, Q, steps.seen, steps.R, steps.read], np.zeros(size(n))
+
+
+def _from_state(steps: Steps, state: Array) -> Given:
+    parts = {name: getattr(steps, name)[1:] for name in ("C", "d", "R", "y")}
+    samples = replace(steps, **parts)
+    motion = [steps.Phi, steps.forced, steps.Q]
+    return samples, [*motion, samples.seen, samples.R, samples.read], state
+
+
+def _followed(samples: Steps, parts: Sequence[Array], state: Array) -> Estimates:
+    m, n = samples.C.shape[1:]
+    factored, *both = run_steps(kalman_step(n, m, *samples.patterns), state, parts)
     (x, P), before = (unpacked(part, n) for part in both)
     return Estimates(x, P, *before, *_innovations(samples, *before), factored)
 

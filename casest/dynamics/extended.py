@@ -35,36 +35,47 @@ from casest.dynamics.transition import (
     checked_time,
     linearised,
     lost,
-    pace_of,
     shares,
     variances,
     with_lost,
 )
-from casest.engine import Columns, Recursion, Replay
+from casest.engine import Columns, Recursion, Replay, evaluated
 from casest.errors import DataError
 
-#: ‖A‖h of a piece that Runge-Kutta follows well, pieces at most, and ‖A‖h that it cannot follow.
-PIECE, MOST, UNSTABLE = 0.5, 16, 2.5
+#: ‖A‖h of a piece that Runge-Kutta follows well, pieces at least and at most, and ‖A‖h that it
+#: cannot follow.
+PIECE, FEWEST, MOST, UNSTABLE = 0.5, 2, 16, 2.5
+
+#: Samples that are linearised at once.
+_BLOCK = 4096
 
 #: Rounds of the filter's update where a reading is no linear function of the state.
 ITERATIONS = 4
 
 
-def relinearised(model: Dynamics, run: Run, along: Array, errors: Array | None = None) -> Steps:
+def relinearised(
+    model: Dynamics,
+    run: Run,
+    along: Array,
+    errors: Array | None = None,
+    pace: Pace | None = None,
+) -> Steps:
     """The record in discrete time, linearised along states (N, n).
 
-    `errors` (N, n, n): covariances of what these are wrong by, on which noise of inputs acts.
+    `errors` (N, n, n): covariances of what these are wrong by, on which noise of inputs acts;
+    `pace`: how the whole record is read where this is a part of it.
     """
     time = checked_record(model, run)
     u, step = _inputs(model, run), np.diff(time)
-    columns = [np.ascontiguousarray(along[:-1]), u[:-1], u[1:], step[:, None], _stood_for(step)]
-    Phi, forced, Q = over_samples(_step(model, pieces(model, run)), columns)
+    pace, ends = pace or Pace.of(model, run), (u[:-1], _at_ends(model, u))
+    columns = [np.ascontiguousarray(along[:-1]), *ends, step[:, None], _stood_for(step, pace)]
+    Phi, forced, Q = over_samples(_step(model, pieces(model, run, pace)), columns)
     if errors is not None and uncertain(model):
         added = acting(model, run, along, errors)
         Q += 0.5 * step[:, None, None] * (added[1:] + added[:-1])
-    Q = with_lost(model, np.diff(time), Phi, Q)
+    Q = with_lost(model, step, Phi, Q, pace)
     C, d, y = _rows(model, run, along)
-    R = variances(model, np.diff(time))
+    R = variances(model, step, pace)
     return Steps(Phi, forced[:, :, 0], Q, C, d, R, y, of_C=entries(model.traced.C))
 
 
@@ -104,43 +115,47 @@ def replay(sample: SX, outputs: list[SX]) -> Replay:
 
 def over_samples(expressions: Replay, columns: list[Array]) -> list[Array]:
     """Each expression at every sample, (N, …)."""
-    return list(expressions(np.zeros(0), Columns(columns)))
+    return evaluated(expressions, np.zeros(0), Columns(columns))
 
 
 def extended(model: Dynamics, run: Run) -> tuple[Array, Array, Array, Array, Array, Array]:
     """Extended Kalman filter: x, P after each reading and before it, innovations, their S."""
     n, m, (parts, present) = model.size, model.traced.h.numel(), given(model, run)
-    root = np.zeros(n * (n - 1) // 2)
-    state = np.concatenate([model.start, np.diag(model.start_covariance), root])
+    state = beginning(model)
     steps = extended_step(model, pieces(model, run))
-    _, after, before, told = run_steps(steps, state, parts, keep=False)
-    return *unpacked(after, n), *unpacked(before, n), *_told(told, present, m)
+    _, after, before, said = run_steps(steps, state, parts, keep=False)
+    return *unpacked(after, n), *unpacked(before, n), *told(said, present, m)
 
 
-def _told(told: Array, present: NDArray[np.bool_], m: int) -> tuple[Array, Array]:
+def beginning(model: Dynamics) -> Array:
+    """What is known before the first sample: x and the factors of P."""
+    root = np.zeros(model.size * (model.size - 1) // 2)
+    return np.concatenate([model.start, np.diag(model.start_covariance), root])
+
+
+def told(said: Array, present: NDArray[np.bool_], m: int) -> tuple[Array, Array]:
     """Innovations and their S, NaN where a reading is missing."""
-    S = told[:, m:].reshape(-1, m, m).transpose(0, 2, 1)
+    S = said[:, m:].reshape(-1, m, m).transpose(0, 2, 1)
     S = np.where(present[:, :, None] & present[:, None, :], S, np.nan)
-    return np.where(present, told[:, :m], np.nan), S
+    return np.where(present, said[:, :m], np.nan), S
 
 
 def given(
-    model: Dynamics, run: Run, pace: Pace | None = None, calm: Mapping[str, Array] | None = None
+    model: Dynamics, run: Run, pace: Pace | None = None
 ) -> tuple[list[Array], NDArray[np.bool_]]:
     """What every step of the extended filter is given, (N, …) each; which readings there are.
 
-    `calm`: uncertain inputs (N, k) as they are estimated, by name, where that is known already.
+    `pace`: how the whole record is read where this is a part of it.
     """
-    time = checked_record(model, run)
-    calm = estimates(model, run) if calm is None else calm
-    u, step = _inputs(model, run, calm), np.diff(time)
+    time, calm = checked_record(model, run), estimates(model, run)
+    u, step, pace = _inputs(model, run, calm), np.diff(time), pace or Pace.of(model, run)
     n, m = model.size, model.traced.h.numel()
     at = np.concatenate([*(run.signals[s.name] for s in model.signals), *calm.values()], axis=1)
     y = _rows(model, run, np.broadcast_to(model.start, (len(time), n)), calm)[2][:, :m]
     present = np.isfinite(y)
     parts = [
         np.concatenate([u[:1], u[:-1]]),
-        u,
+        np.concatenate([u[:1], _at_ends(model, u)]),
         np.concatenate([[0.0], step])[:, None],
         np.concatenate([[[1.0]], _stood_for(step, pace)]),
         np.concatenate([np.zeros((1, n)), lost(model, step, pace)]),
@@ -158,30 +173,59 @@ def extended_step(model: Dynamics, count: int) -> Recursion:
     innovation and S)."""
     t, n = model.traced, model.size
     u, v, h, share = _two_samples(model)
-    both = ca.SX.sym("both", factors.size(n))
-    x, P = factors.unpacked(both, n)
-    end, Phi, Q = _motion(model, count)(x, u, v, h, share)
-    Q += h * share * _acting(model, x, u, factors.multiplied(P))
-    gap = ca.diag(ca.SX.sym("gap", n))
-    before = factors.moved(P, Phi, factors.factored(Phi @ gap @ Phi.T + Q + gap))
-    before_x, before_P = end, factors.multiplied(before)
-    (of_h,), as_was = at_estimates(model, [t.C])
-    signals = ca.vertcat(*[flat(t.symbols[s.name]) for s in model.signals], *as_was)
+    both, gap = ca.SX.sym("both", factors.size(n)), ca.SX.sym("gap", n)
+    signals = ca.SX.sym("signals", _extended_outputs(model).numel_in(1))
     R, y, there = (ca.SX.sym(name, t.h.numel()) for name in ("R", "y", "there"))
-    predict = ca.Function("predict", [t.x, signals], [t.h, of_h])
-    said, C = predict(before_x, signals)
-    reading = _Reading(lambda at: predict(at, signals), t.wrapped, y, R, there)
-    rounds = ITERATIONS if ca.depends_on(t.C, t.x) else 1
-    after_x, after = reading.taken(before_x, before, rounds)
-    numbers = ca.vertcat(u, v, h, share, ca.diag(gap), signals, R, y, there)
+    moved = extended_move(model, count)(both, u, v, h, share, gap)
+    before_x, before = factors.unpacked(moved, n)
+    before_P = factors.multiplied(before)
+    found = extended_read(model)(moved, signals, R, y, there)
+    after_x, after = factors.unpacked(found, n)
+    said, C = _extended_outputs(model)(before_x, signals)
     told = ca.vertcat(t.wrapped(y - said), ca.vec(ca.densify(C @ before_P @ C.T + ca.diag(R))))
+    numbers = ca.vertcat(u, v, h, share, gap, signals, R, y, there)
     outputs = [
-        factors.packed(after_x, after),
+        found,
         packed(after_x, factors.multiplied(after)),
         packed(before_x, before_P),
         told,
     ]
     return Recursion(ca.Function("step", [both, numbers], outputs, {"cse": True}))
+
+
+@lru_cache(maxsize=8)
+def extended_move(model: Dynamics, count: int) -> Any:
+    """(x and factors of P, inputs at both ends, h, share, variances of a gap) -> (the same)."""
+    n, (u, v, h, share) = model.size, _two_samples(model)
+    both, gap = ca.SX.sym("both", factors.size(n)), ca.SX.sym("gap", n)
+    x, P = factors.unpacked(both, n)
+    end, Phi, Q = _motion(model, count)(x, u, v, h, share)
+    Q += h * share * _acting(model, x, u, factors.multiplied(P))
+    lost = ca.diag(gap)
+    before = factors.moved(P, Phi, factors.factored(Phi @ lost @ Phi.T + Q + lost))
+    return ca.Function("move", [both, u, v, h, share, gap], [factors.packed(end, before)])
+
+
+@lru_cache(maxsize=8)
+def extended_read(model: Dynamics) -> Any:
+    """(x and factors of P, signals, R, y, which readings there are) -> (x and factors of P)."""
+    t, n, predict = model.traced, model.size, _extended_outputs(model)
+    both, signals = ca.SX.sym("both", factors.size(n)), ca.SX.sym("signals", predict.numel_in(1))
+    R, y, there = (ca.SX.sym(name, t.h.numel()) for name in ("R", "y", "there"))
+    x, P = factors.unpacked(both, n)
+    reading = _Reading(lambda at: predict(at, signals), t.wrapped, y, R, there)
+    rounds = ITERATIONS if ca.depends_on(t.C, t.x) else 1
+    found = factors.packed(*reading.taken(x, P, rounds))
+    return ca.Function("read", [both, signals, R, y, there], [found])
+
+
+@lru_cache(maxsize=8)
+def _extended_outputs(model: Dynamics) -> Any:
+    """(x, signals and after them the uncertain ones as estimated) -> (h, C)."""
+    t = model.traced
+    (of_h,), as_was = at_estimates(model, [t.C])
+    signals = ca.vertcat(*[flat(t.symbols[s.name]) for s in model.signals], *as_was)
+    return ca.Function("predict", [t.x, signals], [t.h, of_h])
 
 
 @dataclass(frozen=True)
@@ -237,7 +281,7 @@ def _motion(model: Dynamics, count: int) -> Any:
     """
     t, n = model.traced, model.size
     x, (u, v, h, share) = ca.SX.sym("x", n), _two_samples(model)
-    own = ca.vertcat(*[flat(t.symbols[name]) for name in _input_names(model)])
+    own = ca.vertcat(*[flat(t.symbols[name]) for name in input_names(model)])
     rate = ca.Function("rate", [t.x, own], [t.f])
     noise = ca.SX(ca.DM(model.process))
     noise = noise if model.input_noise is None else noise + share * model.input_noise
@@ -266,10 +310,16 @@ def pieces(model: Dynamics, run: Run, pace: Pace | None = None) -> int:
 
     Raises DataError where that is more than can be followed.
     """
-    A = linearised(model, run, calm=as_read(model, run)).A
-    h = (pace or pace_of(np.diff(checked_time(run)))).usual
-    fast = h * balance(np.abs(A).max(axis=0))[1]
-    count = int(2 ** np.clip(np.ceil(np.log2(max(fast, 1e-300) / PIECE)), 1, np.log2(MOST)))
+    time = checked_time(run)
+    h, largest = (pace or Pace.of(model, run)).usual, np.zeros((model.size, model.size))
+    for k in range(0, len(time) - 1, _BLOCK):
+        own = run.take(slice(k, k + _BLOCK + 1))
+        A = linearised(model, own, calm=as_read(model, own)).A
+        largest = np.maximum(largest, np.abs(A).max(axis=0))
+    fast = h * balance(largest)[1]
+    count = int(
+        2 ** np.clip(np.ceil(np.log2(max(fast, 1e-300) / PIECE)), np.log2(FEWEST), np.log2(MOST))
+    )
     if not fast / count < UNSTABLE:
         raise DataError(
             f"{run.file or run.name}: {model.name} moves {fast:.3g} times faster than a step of "
@@ -292,7 +342,7 @@ def _path(x: SX, later: SX, rate: SX, later_rate: SX, h: SX) -> Callable[[float]
 def _acting(model: Dynamics, x: SX, u: SX, P: SX) -> Any:
     """What noise of uncertain inputs adds to Ξ by acting on errors with covariance P."""
     t, n = model.traced, model.size
-    own = ca.vertcat(*[flat(t.symbols[name]) for name in _input_names(model)])
+    own = ca.vertcat(*[flat(t.symbols[name]) for name in input_names(model)])
     found = ca.SX(n, n)
     for name, slope in slopes(model):
         N = ca.Function("slope", [t.x, own], [slope])(x, u[_both_of(model)[0]])
@@ -313,7 +363,7 @@ def _runge_kutta(rate: Any, x: SX, u: SX, v: SX, h: SX) -> SX:
     return x + h / 6 * (a + 2 * b + 2 * c + d)
 
 
-def _input_names(model: Dynamics) -> list[str]:
+def input_names(model: Dynamics) -> list[str]:
     """Signals that drive the rates."""
     t = model.traced
     return [s.name for s in model.signals if ca.depends_on(t.f, flat(t.symbols[s.name]))]
@@ -328,14 +378,23 @@ def _stood_for(steps: Array, pace: Pace | None = None) -> Array:
 def _inputs(model: Dynamics, run: Run, calm: Mapping[str, Array] | None = None) -> Array:
     """Inputs of the rates as they were read, and after them the uncertain ones as estimated."""
     calm = estimates(model, run) if calm is None else calm
-    parts = [run.signals[n] for n in _input_names(model)]
-    parts += [calm[n] for n in _input_names(model) if n in calm]
+    parts = [run.signals[n] for n in input_names(model)]
+    parts += [calm[n] for n in input_names(model) if n in calm]
     return np.concatenate([np.zeros((len(run), 0)), *parts], axis=1)
+
+
+def _at_ends(model: Dynamics, u: Array) -> Array:
+    """`_inputs` u (N, k) at the end of every step, (N − 1, k): what is held has not changed yet."""
+    names, noisy = input_names(model), uncertain(model)
+    signals = {s.name: s for s in model.signals}
+    held = [signals[n].held for n in (*names, *(n for n in names if n in noisy))
+            for _ in range(signals[n].size)]  # fmt: skip
+    return np.where(held, u[:-1], u[1:]) if any(held) else u[1:]
 
 
 def _both_of(model: Dynamics) -> tuple[list[int], list[int]]:
     """Where the inputs as they were read are in `_inputs`, and those to be linearised at."""
-    noisy, names = uncertain(model), _input_names(model)
+    noisy, names = uncertain(model), input_names(model)
     sizes = [int(model.traced.symbols[name].numel()) for name in names]
     read = list(range(sum(sizes)))
     estimated, later = list[int](), len(read)

@@ -169,12 +169,7 @@ def in_hindsight(model: Dynamics, run: Run, found: Filtered) -> Linearised:
 
 def _extended(model: Dynamics, run: Run, smooth: bool) -> Filtered:
     x, P, before_x, before_P, innovations, S = extended(model, run)
-    if not np.all(np.isfinite(x)):
-        row = int(run.rows[np.flatnonzero(~np.isfinite(x).all(axis=1))[0]])
-        raise DataError(
-            f"{run.file or run.name}: the extended filter of {model.name} diverges at row {row}: "
-            "start= and std= must lie where the model holds"
-        )
+    refuse_divergence(model, run, x)
     before = before_x, before_P, innovations, S
     after = known(model, run, x, P)
     if not smooth:
@@ -182,6 +177,17 @@ def _extended(model: Dynamics, run: Run, smooth: bool) -> Filtered:
     along, smooth_P, settled = trajectory(model, run, x, P)
     both = known(model, run, along, smooth_P)
     return Filtered(model, linearised(model, run, along), *after, *before, *both, settled)
+
+
+def refuse_divergence(model: Dynamics, run: Run, x: Array) -> None:
+    """DataError where states (N, n) of the extended filter are not finite."""
+    if np.all(np.isfinite(x)):
+        return
+    row = int(run.rows[np.flatnonzero(~np.isfinite(x).all(axis=1))[0]])
+    raise DataError(
+        f"{run.file or run.name}: the extended filter of {model.name} diverges at row {row}: "
+        "start= and std= must lie where the model holds"
+    )
 
 
 def trajectory(

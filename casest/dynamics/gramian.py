@@ -86,7 +86,7 @@ def _of_steps(model: Dynamics, system: Linearised) -> Parts:
     and Φᵀ its transition.
     """
     pace, Q = system.pace or pace_of(system.steps), _unknown_motion(model, system)
-    weight = np.linalg.inv(model.noise_at(pace.usual))
+    weight = np.linalg.inv(model.noise_at(pace.usual, pace.periods))
     told = np.asarray(system.C.transpose(0, 2, 1) @ weight @ system.C, float)
     none, back = np.zeros_like(system.c), system.A.transpose(0, 2, 1)[::-1]
     if np.isfinite(system.y).all() and not pace.holed:
@@ -161,7 +161,7 @@ class Products:
         step, n = np.diff(checked_record(model, run)), model.size
         holed = any(not np.isfinite(run.signals[name]).all() for name in model.measured_signals)
         none = np.zeros((-(-len(step) // CHUNK), n, n))
-        pace = replace(pace_of(step), holed=holed)
+        pace = replace(Pace.of(model, run), holed=holed)
         Q = none.copy() if system is not None and system.process.ndim == 3 else None
         found = Products(model, run, along, pace, system, none, none.copy(), Q)
         for k in range(0, len(step), PIECE):
@@ -180,9 +180,9 @@ class Products:
     def _steps(self, first: int, last: int) -> Parts:
         where = slice(first, last + 1)
         if self.system is not None:
-            return _of_steps(self.model, self.system.part(where, self.pace))
+            return _of_steps(self.model, self.system.part(where, self.pace.part(where)))
         along = None if self.along is None else self.along[where]
-        system = linearised(self.model, self.run.take(where), along, self.pace)
+        system = linearised(self.model, self.run.take(where), along, self.pace.part(where))
         return _of_steps(self.model, system)
 
     def gramian(self, first: int = 0, last: int | None = None) -> Array:

@@ -59,15 +59,24 @@ def uncertain(model: Dynamics) -> tuple[str, ...]:
 
 def estimates(model: Dynamics, run: Run) -> dict[str, Array]:
     """Every uncertain input as it most likely was, (N, k), by name; on each side of a gap apart."""
-    step = np.diff(np.asarray(run.time, float))
-    gap = longest(step)
-    usual, gaps = float(np.mean(step[step <= gap])), np.flatnonzero(step > gap) + 1
     found = {}
     for name in uncertain(model):
+        time, values = run.clock(name), run.recorded(name)
+        step = np.diff(time)
+        gap = longest(step)
+        usual, gaps = float(np.mean(step[step <= gap])), np.flatnonzero(step > gap) + 1
         variance = model.sensors[name] / usual
-        parts = np.split(run.signals[name], gaps)
-        found[name] = np.concatenate([estimate(part, variance) for part in parts])
+        own = np.concatenate([estimate(part, variance) for part in np.split(values, gaps)])
+        found[name] = own if len(own) == len(run) else _between(model, name, run, time, own)
     return found
+
+
+def _between(model: Dynamics, name: str, run: Run, time: Array, values: Array) -> Array:
+    """What an input was at its own samples, at all of the run's: a straight line, or held."""
+    every = np.asarray(run.time, float)
+    if next(s.held for s in model.signals if s.name == name):
+        return np.asarray(values[np.clip(np.searchsorted(time, every, "right") - 1, 0, None)])
+    return np.column_stack([np.interp(every, time, part) for part in values.T])
 
 
 def as_read(model: Dynamics, run: Run) -> dict[str, Array]:
@@ -114,7 +123,7 @@ def unstated(model: Dynamics, run: Run) -> dict[str, float]:
 
     Of those alone that A or C depend on; nothing where it is no more than rounding.
     """
-    found = {n: scatter(run.signals[n]) for n in coefficients_of(model) if n not in model.sensors}
+    found = {n: scatter(run.recorded(n)) for n in coefficients_of(model) if n not in model.sensors}
     return {
         name: std
         for name, std in found.items()

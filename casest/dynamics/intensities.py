@@ -42,7 +42,8 @@ def from_stated(model: Dynamics, run: Run, stds: Mapping[str, float]) -> Tuned:
     """From standard deviations of single readings, in the signals' units: σ²/rate.
 
     The rate is the record's, also of a signal that is read less often: the filter takes a reading's
-    variance to be intensity × rate. Raises UsageError for a name that is no signal.
+    variance to be intensity × rate. Signals with clocks of their own have rates of their own.
+    Raises UsageError for a name that is no signal.
     """
     known = {s.name for s in model.signals}
     for name, std in stds.items():
@@ -52,7 +53,7 @@ def from_stated(model: Dynamics, run: Run, stds: Mapping[str, float]) -> Tuned:
             )
         if not 0 < std < np.inf:
             raise UsageError(f"{name}: the noise {std:g} must be positive: one standard deviation")
-    said = {name: std**2 * period(run) for name, std in stds.items()}
+    said = {name: std**2 * period(run, name) for name, std in stds.items()}
     return Tuned(_driven_by(model, said), "from the sensors' stated noise")
 
 
@@ -61,11 +62,13 @@ def with_stated(model: Dynamics, run: Run, stds: Mapping[str, float]) -> Dynamic
     return from_stated(model, run, stds).model if stds else model
 
 
-def period(run: Run) -> float:
-    """Time between two samples, s: the mean of the steps that are no gaps."""
+def period(run: Run, name: str | None = None) -> float:
+    """Time between two samples, of a signal where it has a clock of its own, s: the mean of the
+    steps that are no gaps."""
     if run.time is None or len(run) < 2:
         raise DataError(f"{run.file or run.name}: no rate: it needs a time column, or --rate")
-    return usual(np.diff(run.time))
+    own = run.time if name is None else run.clock(name)
+    return usual(np.diff(own)) if len(own) > 1 else float(np.ptp(run.time))
 
 
 def from_rest(model: Dynamics, rest: Run) -> tuple[Tuned, dict[str, Allan]]:
@@ -124,10 +127,11 @@ def told(found: Mapping[str, Allan]) -> dict[str, Any]:
     }
 
 
-def intensities(model: Dynamics, period: float | None = None) -> dict[str, float]:
-    """Of every state (unit²/s) and signal (unit²·s) that has one, read every `period` s."""
+def intensities(model: Dynamics, run: Run | None = None) -> dict[str, float]:
+    """Of every state (unit²/s) and signal (unit²·s) that has one, read as in a record."""
     found = {s.name: s.intensity for s in model.states if s.intensity}
-    found |= {name: model.intensity_of(name, period) for name in model.measured_signals}
+    for name in model.measured_signals:
+        found[name] = model.intensity_of(name, None if run is None else period(run, name))
     return found | dict(model.sensors)
 
 

@@ -25,6 +25,7 @@ from casest.dynamics.inputs import scatter, unstated
 from casest.dynamics.stepping import Pattern, entries, reach
 from casest.dynamics.transition import (
     Linearised,
+    Pace,
     checked_time,
     linearised,
     lost,
@@ -101,8 +102,12 @@ def prepared(model: Dynamics, run: Run, along: Array) -> Prepared:
     """Along states (N, n), where the model or its noise depends on them."""
     inputs, own = reached(model, noiseless(model, run))
     silent = model.driven(**{s.name: 0.0 for s in model.states})
-    step = usual(np.diff(checked_time(run)))
-    shown = {name: std**2 * step for name, std in unstated(model, run).items()}
+    checked_time(run)
+    pace = Pace.of(model, run)
+    shown = {
+        name: std**2 * pace.periods.get(name, pace.usual)
+        for name, std in unstated(model, run).items()
+    }
     system = linearised(model.sensing(**shown), run, along)
     Phi, forced = system.moved
     present = np.isfinite(system.y)
@@ -115,15 +120,16 @@ def prepared(model: Dynamics, run: Run, along: Array) -> Prepared:
     for one, pattern in zip(alone, units.values(), strict=True):
         Q = process_noise(system, process_along(one, run, along))
         parts.append(_after(_picked(Q, pattern), count))
-    parts.append(_after(lost(model, system.steps), count))
+    parts.append(_after(lost(model, system.steps, pace), count))
     parts.append(_picked(np.where(present[:, :, None], system.C, 0.0), entries(t.C)))
     parts.append(np.where(present, system.y - system.d, 0.0))
-    period = np.full(count, usual(system.steps))
     readings, place = {}, 0
     for name, o in zip(t.measured, t.outputs, strict=True):
         readings[name] = slice(place, place + o.predicted.numel())
         place += o.predicted.numel()
-    numbers = np.concatenate([*parts, period[:, None]], axis=1)
+    period = np.full(count, pace.usual)
+    each = np.array([pace.periods.get(name, pace.usual) for name in readings])
+    numbers = np.concatenate([*parts, np.broadcast_to(each, (count, len(each)))], axis=1)
     return Prepared(model, system, present, period, units, readings, numbers)
 
 
@@ -251,15 +257,21 @@ def first_guess(ready: Prepared, run: Run) -> dict[str, float]:
         if name in model.sensors:
             guess[name] = model.sensors[name]
         elif name in run.signals:
-            values = run.signals[name]
+            values = run.recorded(name)
             fourth = np.diff(values[np.isfinite(values).all(axis=1)], 4, axis=0)
             variance = float(np.median(fourth**2)) / 0.4549 / _FOURTH if len(fourth) else 0.0
             scale = 1e-12 * float(np.nanmean(values**2)) or 1e-12
-            guess[name] = max(variance, scale) * float(np.median(ready.period))
+            guess[name] = max(variance, scale) * _period(run, name, float(np.median(ready.period)))
         else:
             own = model[name]
             guess[name] = own.intensity if own.of_data else 1e-6 * own.std**2 / duration
     return guess
+
+
+def _period(run: Run, name: str, period: float) -> float:
+    """Time between two samples of a signal with a clock of its own, else `period`, s."""
+    own = run.clock(name) if name in run.read else np.zeros(0)
+    return usual(np.diff(own)) if len(own) > 1 else period
 
 
 def applied(model: Dynamics, intensities: Mapping[str, float]) -> Dynamics:
@@ -283,14 +295,14 @@ def _likelihood_step(
     both, q = ca.SX.sym("both", factors.size(n)), ca.SX.sym("q", len(units) + len(rows))
     x, P = factors.unpacked(both, n)
     moved, Phi = _sparse("Phi", (n, n), of_Phi)
-    u, y, period = ca.SX.sym("u", n), ca.SX.sym("y", m), ca.SX.sym("period")
+    u, y, period = ca.SX.sym("u", n), ca.SX.sym("y", m), ca.SX.sym("period", len(rows))
     own = [_sparse(f"Q{k}", (n, n), pattern) for k, pattern in enumerate(units)]
     seen, C = _sparse("C", (m, n), of_C)
     gap = ca.SX.sym("gap", n)
     Q = ca.diag(gap) + Phi @ ca.diag(gap) @ Phi.T
     for k, (_, unit) in enumerate(own):
         Q += q[k] * unit
-    R = ca.vertcat(*[ca.repmat(q[len(units) + k] / period, last - first)
+    R = ca.vertcat(*[ca.repmat(q[len(units) + k] / period[k], last - first)
                      for k, (first, last) in enumerate(rows)])  # fmt: skip
     later_x, later = Phi @ x + u, factors.moved(P, Phi, factors.factored(Q))
     e, s = [], []

@@ -9,16 +9,13 @@ from typing import Any
 import numpy as np
 
 from casest.data.run import Run
-from casest.data.timing import GAP
 from casest.declaration.shapes import Array
-from casest.dynamics.course import Pieces
 from casest.dynamics.declare import Dynamics
-from casest.dynamics.extended import extended_step, given, pieces
-from casest.dynamics.inputs import as_read
 from casest.dynamics.known import known
 from casest.dynamics.riccati import check_covariance
-from casest.dynamics.stepping import run_steps, unpacked
-from casest.dynamics.transition import Pace
+from casest.dynamics.stepping import unpacked
+from casest.dynamics.stepwise import PARTS, checked_period, stepwise
+from casest.dynamics.transition import checked_record
 from casest.errors import UsageError
 
 
@@ -52,13 +49,12 @@ class Estimator:
     def __init__(self, model: Dynamics, period: float) -> None:
         """Raises UsageError where the period is none, DataError where the start is no
         covariance."""
-        if not 0 < period < np.inf:
-            raise UsageError(f"{model.name}: the period {period:g} s must be positive and finite")
+        checked_period(model, period)
         check_covariance(model.start_covariance, "the covariance at the beginning")
         self.model = model
-        self._pace = Pace(float(period), GAP * period)
+        self._own = stepwise(model, float(period))
         self._last: tuple[float, dict[str, Array]] | None = None
-        self._states: Any = (None, None)
+        self._state = self._lead = self._own.begin
 
     def step(self, reading: Mapping[str, Any], t: float) -> Now:
         """What is known after a sample at time t, s: every signal by name, in the model's units.
@@ -70,12 +66,43 @@ class Estimator:
         own = self._signals(reading)
         # To the first sample nothing leads: it is the first of a record of two.
         first = self._last is None
-        before = (t - self._pace.usual, own) if self._last is None else self._last
+        before = (t - self._own.period, own) if self._last is None else self._last
         run = self._record(before, (t, own))
-        x, P = self._linear(run, first) if self.model.linear else self._extended(run, first)
+        checked_record(self.model, run)
+        self._taken(
+            np.hstack([run.signals[s.name] for s in self.model.signals]), t - before[0], first
+        )
         self._last = t, own
-        x, P = known(self.model, run.take(slice(1, 2)), x[None], P[None])
+        x, P = unpacked(_of(self._own.told, self._state)[None], self.model.size)
+        x, P = known(self.model, run.take(slice(1, 2)), x, P)
         return Now(self.model, float(t), x[0], P[0])
+
+    def _taken(self, samples: Array, h: float, first: bool) -> None:
+        """The state after the samples (2, W) before and now, the second's readings included."""
+        n, lead, own = self.model.size, self._lead, self._own
+        if own.leads:  # the noise of inputs acts along the states of this one
+            start = own.begin[:n]
+            moved = lead if first else self._moved(lead, samples, h, start, start)
+            self._lead = self._read(moved, samples[1])
+        if not first:
+            self._state = self._moved(self._state, samples, h, lead[:n], self._lead[:n])
+        self._state = self._read(self._state, samples[1])
+
+    def _moved(self, state: Array, samples: Array, h: float, *along: Array) -> Array:
+        own, ends = self._own, samples.ravel()
+        fast = 0.0 if own.fast is None else float(own.fast([*ends, h]))
+        parts = int(np.clip(np.ceil(fast / own.slow), 1, PARTS)) if np.isfinite(fast) else 1
+        lost, none = own.forgotten * (h > own.gap), np.zeros(self.model.size)
+        for k in range(parts):
+            gap = lost if k == 0 else none, lost if k == parts - 1 else none
+            ab = [k / parts, (k + 1) / parts]
+            state = _of(own.move, state, ends, [h], *gap, ab, *(along if own.leads else ()))
+        return state
+
+    def _read(self, state: Array, sample: Array) -> Array:
+        y = sample[list(self._own.readings)]
+        there = np.isfinite(y)
+        return _of(self._own.read, state, sample, np.where(there, y, 0.0), there)
 
     def _signals(self, reading: Mapping[str, Any]) -> dict[str, Array]:
         sizes = {s.name: s.size for s in self.model.signals}
@@ -99,22 +126,7 @@ class Estimator:
         time = np.array([t for t, _ in samples], float)
         return Run.raw("online", signals, units={}, time=time)
 
-    def _linear(self, run: Run, first: bool) -> tuple[Array, Array]:
-        both = Pieces.of(self.model, run, self._pace)
-        _, found, states = both.filtered(slice(0, 2), self._states, 0 if first else -1)
-        self._states = states
-        return found.x[0], found.P[0]
 
-    def _extended(self, run: Run, first: bool) -> tuple[Array, Array]:
-        model, n = self.model, self.model.size
-        parts, _ = given(model, run, self._pace, as_read(model, run))
-        begun = self._states[1]
-        if begun is None:
-            root = np.zeros(n * (n - 1) // 2)
-            begun = np.concatenate([model.start, np.diag(model.start_covariance), root])
-        step = extended_step(model, pieces(model, run, self._pace))
-        row = slice(0, 1) if first else slice(1, 2)
-        state, after, *_ = run_steps(step, begun, [p[row] for p in parts])
-        self._states = None, state[0]
-        x, P = unpacked(after, n)
-        return x[0], P[0]
+def _of(function: Any, *parts: Any) -> Array:
+    """A function of one vector, of its parts."""
+    return np.asarray(function(np.concatenate(parts)), float).ravel()

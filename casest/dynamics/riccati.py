@@ -18,7 +18,7 @@ from casest.declaration.shapes import Array
 from casest.dynamics import factors
 from casest.dynamics.between import DOUBLINGS, balance
 from casest.dynamics.declare import Dynamics
-from casest.dynamics.stepping import run_steps
+from casest.dynamics.stepping import by_rows, run_steps
 from casest.dynamics.transition import Linearised, exponential, magnus, usual
 from casest.engine import Recursion
 from casest.errors import DataError
@@ -64,7 +64,7 @@ def _riccati_step(n: int) -> Recursion:
     for j in range(n):
         P, _ = factors.read(P, U[:, j], 1, D[j])
     P = factors.moved(P, Phi, factors.factored(Q))
-    numbers = ca.vertcat(*[ca.vec(e) for e in (Phi, Q, W)])
+    numbers = ca.vertcat(*[by_rows(e) for e in (Phi, Q, W)])
     outputs = [factors.packed(x, P), ca.vec(factors.multiplied(P))]
     return Recursion(ca.Function("step", [both, numbers], outputs, {"cse": True}))
 

@@ -45,8 +45,9 @@ def _matrix(name: str, shape: tuple[int, int], pattern: Pattern) -> tuple[Any, A
 
 
 @lru_cache(maxsize=16)
-def kalman_step(n: int, m: int, of_Phi: Pattern, of_C: Pattern) -> Recursion:
-    """(state, numbers of one sample) -> (state; x and P after the reading; and before it).
+def kalman_step(n: int, m: int, of_Phi: Pattern, of_C: Pattern, alone: bool = False) -> Recursion:
+    """(state, numbers of one sample) -> (state; x and P after the reading; and before it), or the
+    state `alone`.
 
     state: x with the factors of P; numbers: Φ, forced step, Q, C, diagonal of R, y. Readings are
     taken one component after the other, which needs no inverse (their noise is independent).
@@ -64,12 +65,13 @@ def kalman_step(n: int, m: int, of_Phi: Pattern, of_C: Pattern) -> Recursion:
         innovation = y[i] - ca.dot(c, after_x)
         after, gain = factors.read(after, c, R[i])
         after_x = after_x + gain * innovation
-    numbers = ca.vertcat(*[ca.vec(e) for e in (full, u, Q, whole, R, y)])
+    numbers = ca.vertcat(*[by_rows(e) for e in (full, u, Q, whole, R, y)])
     outputs = [
         factors.packed(after_x, after),
         packed(after_x, factors.multiplied(after)),
         packed(before_x, factors.multiplied(before)),
     ]
+    outputs = outputs[:1] if alone else outputs
     return Recursion(ca.Function("step", [both, numbers], outputs, {"cse": True}))
 
 
@@ -100,10 +102,15 @@ def smoother_step(n: int, m: int, of_Phi: Pattern, of_C: Pattern) -> Recursion:
     for j in range(n):
         found, gain = factors.read(found, B[:, j], 1, weight[j])
         x = x + gain * (value[j] - ca.dot(B[:, j], x))
-    numbers = ca.vertcat(*[ca.vec(e) for e in (full, u, Q, whole, R, y, own)])
+    numbers = ca.vertcat(*[by_rows(e) for e in (full, u, Q, whole, R, y, own)])
     back = ca.vertcat(*[ca.vec(ca.densify(e)) for e in (B, weight, value)])
     outputs = [back, packed(x, factors.multiplied(found))]
     return Recursion(ca.Function("step", [later, numbers], outputs, {"cse": True}))
+
+
+def by_rows(matrix: Any) -> Any:
+    """The entries of a matrix row by row, as they lie in an array."""
+    return ca.vec(ca.densify(matrix).T)
 
 
 def packed(x: Any, P: Any) -> Any:
@@ -126,9 +133,7 @@ def run_steps(
     for p in parts:
         own = numbers[:, place : place + p[0].size]
         place += p[0].size
-        if p.ndim == 3:
-            own, p = own.reshape(N, *p.shape[:0:-1]), p.transpose(0, 2, 1)
-        own[N - len(p) :] = p
+        own[N - len(p) :] = p.reshape(len(p), -1)
         own[: N - len(p)] = 0.0
     return steps(state, numbers, keep=keep)
 

@@ -8,13 +8,14 @@ Where only a part of a step or another equation's is asked for: fourth-order Mag
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from math import factorial
 from typing import Any
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from casest.data.run import Run
 from casest.data.timing import UNUSED, longest
@@ -24,7 +25,7 @@ from casest.dynamics.between import Motions, motions
 from casest.dynamics.declare import Dynamics
 from casest.dynamics.inputs import at_estimates, estimates, on_errors
 from casest.dynamics.stepping import reach
-from casest.engine import Columns, Replay
+from casest.engine import Columns, Replay, evaluated
 from casest.errors import DataError
 
 #: Coefficients of the exponential's series to degree 11, three at a time; and the norms below which
@@ -43,7 +44,9 @@ class Linearised:
     time (N,); A (N, n, n), c (N, n), C (N, m, n), d (N, m); y (N, m) with NaN where it is missing
     and no row in C;
     process noise intensity Ξ (n, n), or (N, n, n) where inputs have noise of their own;
-    `pace` of the whole record where this is a part of it.
+    `pace` of the whole record where this is a part of it;
+    `held`: A (N − 1, n, n) and c (N − 1, n) at the end of each step, where inputs that are held
+    have not changed yet.
     """
 
     time: Array
@@ -54,6 +57,7 @@ class Linearised:
     y: Array
     process: Array
     pace: Pace | None = None
+    held: tuple[Array, Array] | None = None
 
     @property
     def steps(self) -> Array:
@@ -83,7 +87,9 @@ class Linearised:
         time, A, c, C, d, y = (
             x[where] for x in (self.time, self.A, self.c, self.C, self.d, self.y)
         )
-        return Linearised(time, A, c, C, d, y, process, pace)
+        inner = slice(where.start, where.stop - 1)
+        held = None if self.held is None else (self.held[0][inner], self.held[1][inner])
+        return Linearised(time, A, c, C, d, y, process, pace, held)
 
     def driven(self, process: Array) -> Linearised:
         """The same motion with other process noise; what is known of its steps is kept."""
@@ -144,14 +150,29 @@ def linearised(
     if along is None:
         along = np.broadcast_to(model.start, (len(time), model.size))
     calm = estimates(model, run) if calm is None else calm
+    pace = pace or Pace.of(model, run)
     signals = [*(run.signals[s.name] for s in model.signals), *calm.values()]
     columns = Columns([np.ascontiguousarray(along), *signals])
-    A, c_, C, d_, y, *more = _along(model)(np.zeros(0), columns)
+    A, c_, C, d_, y, *more = evaluated(_along(model), np.zeros(0), columns)
     process = model.process + _stood_for(time, pace) * more[0] if more else model.process
     readings = model.traced.nearest(y[:, :, 0], C, d_[:, :, 0], along)
     if not np.isfinite(readings).all():
         C = np.where(np.isfinite(readings)[:, :, None], C, 0.0)
-    return Linearised(time, A, c_[:, :, 0], C, d_[:, :, 0], readings, process, pace)
+    held = _held(model, run, along, calm)
+    return Linearised(time, A, c_[:, :, 0], C, d_[:, :, 0], readings, process, pace, held)
+
+
+def _held(
+    model: Dynamics, run: Run, along: Array, calm: Mapping[str, Array]
+) -> tuple[Array, Array] | None:
+    """A and c at the end of each step, held inputs as they were at its beginning; None of none."""
+    if not any(s.held for s in model.signals):
+        return None
+    held = {s.name for s in model.signals if s.held}
+    parts = [(s.name, run.signals[s.name]) for s in model.signals] + list(calm.items())
+    signals = [own[:-1] if name in held else own[1:] for name, own in parts]
+    found = _along(model)(np.zeros(0), Columns([np.ascontiguousarray(along[1:]), *signals]))
+    return found[0], found[1][:, :, 0]
 
 
 @lru_cache(maxsize=8)
@@ -182,14 +203,16 @@ def process_along(model: Dynamics, run: Run, along: Array, pace: Pace | None = N
     if model.input_noise is None:
         return model.process
     columns = Columns([np.ascontiguousarray(along), *(run.signals[s.name] for s in model.signals)])
-    noise = _noise_along(model)(np.zeros(0), columns)[0]
-    return np.asarray(model.process + _stood_for(checked_time(run), pace) * noise)
+    noise = evaluated(_noise_along(model), np.zeros(0), columns)[0]
+    time = checked_time(run)
+    return np.asarray(model.process + _stood_for(time, pace or Pace.of(model, run)) * noise)
 
 
 def acting(model: Dynamics, run: Run, along: Array, P: Array) -> Array:
     """What noise of uncertain inputs adds to Ξ by acting on errors of states with covariances P
     (N, n, n), as long as each reading of them is held."""
-    return _stood_for(checked_time(run), None) * on_errors(model, run, along, P)
+    time = checked_time(run)
+    return _stood_for(time, Pace.of(model, run)) * on_errors(model, run, along, P)
 
 
 def _stood_for(time: Array, pace: Pace | None) -> Array:
@@ -219,7 +242,7 @@ def stepped(system: Linearised, intensity: Array) -> Motions:
 
     Raises DataError where a step leads beyond what numbers hold.
     """
-    found = motions(system.A, system.c, intensity, system.steps)
+    found = motions(system.A, system.c, intensity, system.steps, system.held)
     whole = np.isfinite(found.forced).all(axis=1) & np.isfinite(found.Q).all(axis=(1, 2))
     bad = np.flatnonzero(~(whole & np.isfinite(found.Phi).all(axis=(1, 2))))
     if bad.size:
@@ -292,7 +315,8 @@ def lost(model: Dynamics, steps: Array, pace: Pace | None = None) -> Array:
     """
     t, n = model.traced, model.size
     found = np.zeros((len(steps), n))
-    wide = steps > (pace or pace_of(steps)).gap
+    pace = pace or pace_of(steps)
+    wide = steps > pace.gap if pace.wide is None else pace.wide
     if wide.any():
         u = [flat(t.symbols[s.name]) for s in model.signals if s.name not in t.measured]
         driven = np.zeros(n, dtype=bool)
@@ -322,12 +346,49 @@ class Pace:
 
     `share`: what part of the usual step each reading stands for (see `shares`), where it is known;
     `holed`: are readings missing somewhere in the record?
+    Where signals have clocks of their own, `periods`: the time between two samples of each, s;
+    `wide` (N − 1,): which steps lie in a gap of the inputs.
     """
 
     usual: float
     gap: float
     share: Array | None = None
     holed: bool = False
+    periods: Mapping[str, float] = field(default_factory=dict)
+    wide: NDArray[np.bool_] | None = None
+
+    @staticmethod
+    def of(model: Dynamics, run: Run) -> Pace:
+        """How a record is read, signal by signal where they have clocks of their own."""
+        time = np.asarray(run.time, float)
+        pace = pace_of(np.diff(time))
+        if not run.read:
+            return pace
+        clocks = {name: run.clock(name) for name in run.read}
+        periods = {n: usual(np.diff(t)) if len(t) > 1 else float(np.ptp(time))
+                   for n, t in clocks.items()}  # fmt: skip
+        inputs = [clocks[name] for name in model.input_signals if name in clocks]
+        wide = np.zeros(len(time) - 1, dtype=bool)
+        share = np.ones(len(time))
+        for t in inputs:
+            wide |= _within_gaps(time, t)
+        if inputs:
+            share = np.mean([np.interp(time, t, shares(np.diff(t))) for t in inputs], axis=0)
+        return replace(pace, share=share, periods=periods, wide=wide)
+
+    def part(self, where: slice) -> Pace:
+        """The same of some samples of the record."""
+        share = None if self.share is None else self.share[where]
+        wide = None if self.wide is None else self.wide[where.start : where.stop - 1]
+        return replace(self, share=share, wide=wide)
+
+
+def _within_gaps(time: Array, own: Array) -> NDArray[np.bool_]:
+    """Which steps (N − 1,) of a record lie in a gap of a clock of samples at `own` (M,)."""
+    steps = np.diff(own)
+    gap = steps > longest(steps)
+    before = np.searchsorted(own, time[:-1], side="right") - 1
+    return np.asarray(gap[np.clip(before, 0, len(gap) - 1)])
 
 
 def pace_of(steps: Array) -> Pace:
@@ -351,8 +412,9 @@ def counted(steps: Array) -> Array:
 
 def variances(model: Dynamics, steps: Array, pace: Pace | None = None) -> Array:
     """Variance of every reading, (N, m): the noise's intensity over the time between two."""
-    period = (pace or pace_of(steps)).usual
-    return np.repeat(np.diag(model.noise_at(period))[None] / period, len(steps) + 1, 0)
+    pace = pace or pace_of(steps)
+    own = np.diag(model.noise_at(pace.usual, pace.periods)) / pace.usual
+    return np.repeat(own[None], len(steps) + 1, 0)
 
 
 def shares(steps: Array, pace: Pace | None = None) -> Array:

@@ -6,6 +6,7 @@ operations (`operations`): NumPy, C and exported programs read the same rows.
 
 from __future__ import annotations
 
+from casest.engine.kernel import evaluated
 from casest.engine.normal import (
     Normal,
     cost,
@@ -26,6 +27,7 @@ __all__ = [
     "Replay",
     "Samples",
     "cost",
+    "evaluated",
     "normal_equations",
     "residuals",
     "rows",

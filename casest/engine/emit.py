@@ -87,6 +87,41 @@ def source_of_sum(replay: Replay, output: int) -> str:
     return "\n".join(parts)
 
 
+def source_of_values(replay: Replay) -> str:
+    """C source with `casest_records`: all outputs of every sample, one dense after the other."""
+    outputs = range(len(replay.shapes))
+    entries = [entry for i in outputs for entry in replay.entries(i)]
+    chunk = max(16, min(128, _CACHE // (8 * max(len(entries), 1)) // 8 * 8))
+    parts = [_HEAD.replace("{chunk}", str(chunk))]
+    parts += _block("all", replay.plan(entries), len(entries))
+    parts.append(_records(replay, len(entries)))
+    return "\n".join(parts)
+
+
+def _records(replay: Replay, count: int) -> str:
+    """Every entry of every sample, where it is in dense outputs: result[sample][place]."""
+    places, width = list[int](), 0
+    for (rows, columns), (row, column) in zip(replay.shapes, replay.sparsity, strict=True):
+        places += (width + row * columns + column).tolist()
+        width += rows * columns
+    return "\n".join(
+        [
+            "const int casest_normal_count = 0;",
+            f"static const int place[] = {{{', '.join(map(str, places)) or '0'}}};",
+            f"void casest_records{_SIGNATURE} {{",
+            _BUFFERS.format(name="all"),
+            "  (void)w;",
+            "  for (ptrdiff_t first = 0; first < n; first += B) {",
+            _READ.format(name="all"),
+            "    for (int l = 0; l < length; ++l)",
+            f"      for (int k = 0; k < {count}; ++k)",
+            f"        result[(first + l) * {width} + place[k]] = v[k][l];",
+            "  }",
+            "}",
+        ]
+    )
+
+
 def _block(name: str, plan: Plan, wanted: int) -> Iterator[str]:
     """A function for what depends on parameters only, and one for the entries of a chunk."""
     values = plan.graph.values

@@ -22,13 +22,15 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from contextvars import ContextVar
+from dataclasses import dataclass
 from functools import lru_cache
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
 from casest.engine.cache import kernel_folder, own_file
-from casest.engine.emit import source, source_of_sum
+from casest.engine.emit import source, source_of_sum, source_of_values
 from casest.engine.operations import Floats
 from casest.engine.replay import Columns, Entry, Replay
 
@@ -51,6 +53,15 @@ _FLAGS = (
     ["-O2"],
 )  # fmt: skip
 
+
+#: Values of single samples: no contraction, so that the digits are those of NumPy.
+_SAME_DIGITS = (
+    ["-O2", "-ftree-loop-vectorize", "-fvect-cost-model=unlimited", "-march=native",
+     "-mprefer-vector-width=512", "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=off"],
+    ["-O2", "-ffp-contract=off"],
+)  # fmt: skip
+#: Samples, in all calls together, from which on values of single samples are compiled.
+OFTEN = 100_000
 
 #: Samples from which on a kernel is built for a model that is only tried.
 TRIED = 100_000
@@ -92,6 +103,12 @@ class Kernel:
     def residuals(self, parameters: Floats, samples: Columns, count: int) -> Floats:
         """Every residual of every sample, (count, N)."""
         return self._each("casest_values_residual", parameters, samples, count)
+
+    def records(self, parameters: Floats, samples: Columns, width: int) -> Floats:
+        """All outputs of every sample, (N, width), as dense ones one after the other."""
+        result = np.zeros((len(samples), width))
+        self._call("casest_records", parameters, samples, slice(0, len(samples)), None, result)
+        return result
 
     def sums(self, parameters: Floats, samples: Columns) -> Floats:
         """Each entry of an output, added over all samples."""
@@ -198,6 +215,46 @@ def _kernel(
         replay.kernels[which] = _made(text())
     found: Kernel | None = replay.kernels[which]
     return found
+
+
+def evaluated(replay: Replay, parameters: Floats, samples: Columns) -> list[Floats]:
+    """Each output of every sample, dense: (N, rows, columns), with the digits of the replay but for
+    the last of a sine and its like.
+
+    Compiled where so many samples were asked for, in all calls together, that it is worthwhile.
+    """
+    kernel = _values_kernel(replay, len(samples))
+    if kernel is None or not len(samples):
+        return replay(parameters, samples)
+    parameters, samples = replay.check(parameters, samples)
+    ends = np.cumsum([0, *(rows * columns for rows, columns in replay.shapes)]).tolist()
+    whole = kernel.records(parameters, samples, ends[-1])
+    places = zip(pairwise(ends), replay.shapes, strict=True)
+    return [whole[:, a:b].reshape(-1, *shape) for (a, b), shape in places]
+
+
+@dataclass
+class _Values:
+    """How many samples were asked for, what was tried, and what came of it."""
+
+    seen: int = 0
+    looked: bool = False
+    built: bool = False
+    kernel: Kernel | None = None
+
+
+def _values_kernel(replay: Replay, samples: int) -> Kernel | None:
+    own: _Values = replay.made.setdefault(evaluated, _Values())
+    own.seen += samples
+    wish = os.environ.get("CASEST_KERNEL", "auto")
+    if wish == "off":
+        return None
+    due = wish == "always" or own.seen > (10 * TRIED if _tried.get() else OFTEN)
+    if own.kernel is None and (due > own.built or (own.seen > WORTHWHILE and not own.looked)):
+        own.looked, own.built = True, due
+        found = library(source_of_values(replay), _SAME_DIGITS, build=due)
+        own.kernel = None if found is None else Kernel(found)
+    return own.kernel
 
 
 def _made(text: str) -> Kernel | None:

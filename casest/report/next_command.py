@@ -167,13 +167,16 @@ def _after_motion(typed: Typed, output: str | Path | None, complete: bool) -> _S
 
 def _after_look(typed: Typed, output: str | Path | None, trusted: bool, applies: bool) -> _Steps:
     """After observe, filter and compare; only estimators in motion have nothing to apply."""
+    from casest.data.logs import parts_of  # imported late: it brings NumPy, which --help is without
+
     motion = (*_READING, "--set", "--std", "--intensity")
     if typed.name == "filter":
         if output is None:
             noise = ("--noise", "--sensor-noise", "--rest")
             yield "keep the states", typed.keeping("filter", (*motion, *noise)).into("out").lines()
         yield "what can this trajectory see?", typed.keeping("observe", motion).lines()
-        yield "is something missing?", typed.keeping("close", motion[:-2]).into("out").lines()
+        if len(parts_of(typed.arguments[-1])) == 1:  # the loop wants one clock
+            yield "is something missing?", typed.keeping("close", motion[:-2]).into("out").lines()
     elif len(typed.arguments) < 2:
         return
     elif not applies:

@@ -10,6 +10,7 @@ from msgspec import UNSET, Struct, UnsetType
 from casest.data.run import Run
 from casest.data.timing import longest
 from casest.declaration.model import Model
+from casest.declaration.shapes import Array
 from casest.dynamics import Dynamics
 from casest.dynamics.filter import coefficients, filtered
 from casest.dynamics.gramian import Observed as Seen
@@ -282,19 +283,30 @@ def _windows(model: Dynamics, found: Over, length: float) -> Windows:
 
 def assumed(run: Run) -> list[str]:
     """What was assumed of a record, gaps included, one sentence each."""
-    notes = list(run.notes)
-    time = np.asarray(run.time, float)
+    clocks: dict[bytes, list[str]] = {}  # the samples, and the signals that have them
+    for name in run.read:
+        clocks.setdefault(run.read[name].tobytes(), []).append(name)
+    if not run.read:
+        return [*run.notes, *_gaps(np.asarray(run.time, float), np.asarray(run.rows), "time")]
+    notes = [note for names in clocks.values()
+             for note in _gaps(run.clock(names[0]), np.asarray(run.rows)[run.read[names[0]]],
+                               " and ".join(names))]  # fmt: skip
+    return [*run.notes, *notes]
+
+
+def _gaps(time: Array, rows: Array, where: str) -> list[str]:
+    """What was assumed in gaps of a clock with samples at `time` (M,), s."""
     step = np.diff(time)
-    wide = np.flatnonzero(step > longest(step))
-    if wide.size:
-        worst = int(wide[np.argmax(step[wide])])
-        notes.append(
-            f"{wide.size} {'gap' if wide.size == 1 else 'gaps'} in time, the longest of "
-            f"{step[worst]:.3g} s after row {int(run.rows[worst])} (t = {time[worst]:.6g} s): "
-            "inputs were taken as straight lines across; the states that they drive are known "
-            "after it no better than at the beginning"
-        )
-    return notes
+    wide = np.flatnonzero(step > longest(step)) if len(step) else np.zeros(0, int)
+    if not wide.size:
+        return []
+    worst = int(wide[np.argmax(step[wide])])
+    return [
+        f"{wide.size} {'gap' if wide.size == 1 else 'gaps'} in {where}, the longest of "
+        f"{step[worst]:.3g} s after row {int(rows[worst])} (t = {time[worst]:.6g} s): "
+        "inputs were taken as straight lines across; the states that they drive are known "
+        "after it no better than at the beginning"
+    ]
 
 
 def _products(model: Dynamics, run: Run) -> Products:
@@ -311,13 +323,13 @@ def noise_of_inputs(model: Dynamics, run: Run, noisy: Mapping[str, float]) -> li
     notes = []
     for name in uncertain(model):
         unit = next(s.unit for s in model.signals if s.name == name)
-        std = float(np.sqrt(model.sensors[name] / period(run)))
+        std = float(np.sqrt(model.sensors[name] / period(run, name)))
+        least = smallest(std, len(run.recorded(name)))
         how = "shows noise" if name in noisy else "has noise"
         state = f" (--sensor-noise {name}=… states it)" if name in noisy else ""
         notes.append(
             f"{name} {how} of {std:.3g} {unit}{state}; what that makes of the motion is not "
-            f"counted, and {name} below {smallest(std, len(run)):.2g} {unit} all the time cannot "
-            "be told from none"
+            f"counted, and {name} below {least:.2g} {unit} all the time cannot be told from none"
         )
     return notes
 

@@ -15,7 +15,7 @@ from casest.data.run import Run
 from casest.dynamics import Dynamics
 from casest.dynamics.course import Course, followed
 from casest.dynamics.inputs import unstated
-from casest.dynamics.intensities import Tuned, intensities, period, units
+from casest.dynamics.intensities import Tuned, intensities, units
 from casest.results.file import plain
 from casest.results.observability import assumed, too_short
 from casest.results.result import Number, Reproduced, Result, reproduced
@@ -106,8 +106,8 @@ def follow(
         states=_final(found),
         intensities=UsedIntensities(
             tuned.how if tuned else "as declared",
-            _plain_values(intensities(model, period(run))),
-            _plain_values(intensities(found.model, period(run))),
+            _plain_values(intensities(model, run)),
+            _plain_values(intensities(found.model, run)),
             _plain_values(tuned.spread) if tuned else {},
             units(found.model),
             plain(_normalised_mean(declared)),
