@@ -12,6 +12,7 @@ import numpy as np
 
 from casest.declaration.physics import SX
 from casest.declaration.symbols import Constant, Parameter, Signal, Undecided, named
+from casest.declaration.travelling import reduced
 from casest.errors import DeclarationError, UnitError, last_line
 from casest.units import known
 
@@ -76,6 +77,10 @@ class Effect:
     describes: bool = False
     memory: tuple[tuple[str, str | float], ...] = ()
     otherwise: Effect | None = None
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """To pickle: its function by name."""
+        return reduced(self)
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         """Evaluate the effect's own function."""
