@@ -179,6 +179,23 @@ def _call(plan: Plan, i: int, place: dict[int, Array]) -> tuple[Kernel, tuple[Ar
     return BY_CODE[value.code].kernel, (*(place[j] for j in value.operands), place[i])
 
 
+def _left(L: Array, J: Array, columns: list[int]) -> Array:
+    """1 − h, what is left of each residual, (P, w); rows J (k, P, w) have only these columns.
+
+    h = ‖L⁻¹Jᵀ‖², by substitution in the place of J.
+    """
+    left, part = np.ones(J.shape[1:]), np.empty(J.shape[1:])
+    done: dict[int, Array] = {}
+    for i in range(columns[0] if columns else len(L), len(L)):
+        own = J[columns.index(i)] if i in columns else np.zeros_like(left)
+        for k, before in done.items():
+            own -= np.multiply(L[i, k], before, out=part)
+        own /= L[i, i]
+        left -= np.square(own, out=part)
+        done[i] = own
+    return np.maximum(left, 1e-12, out=left)
+
+
 def _adjacent(places: list[int]) -> slice | list[int]:
     """The same places, as a slice where they follow each other: that makes views."""
     first, last = places[0], places[-1]
@@ -259,6 +276,19 @@ class Squares:
                 first += len(columns)
                 total[columns, s] += np.einsum("ps,jps->js", own, part)
         return total[: self.n]
+
+    def studentised(self, x: Array, sensors: Sensors, factor: Array) -> Array:
+        """Largest r²/(1 − h) of every sensor, (W,), h the leverage; factor L (n, n, W) of JᵀJ."""
+        largest = np.zeros(x.shape[1])
+        for _, s, values in self._all.chunks(x, sensors):
+            first, L = 0, factor[..., s]
+            for columns in self._columns:
+                own = values[first : first + len(columns)]
+                first += len(columns)
+                square = np.square(own[-1])
+                square /= _left(L, own[:-1], columns[:-1])
+                np.maximum(largest[s], square.max(axis=0), out=largest[s])
+        return largest
 
     def residuals(self, x: Array, sensors: Sensors) -> Array:
         """Every residual, (m, N, W)."""

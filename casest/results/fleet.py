@@ -1,0 +1,85 @@
+"""What `casest fleet` leaves beside the rows: `fleet.json`, which text and page read too."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from msgspec import Struct
+
+from casest.declaration.travelling import fingerprint
+from casest.results.result import Result
+from casest.tasks.job import Job
+from casest.tasks.tally import Moments, Total
+
+FLEET = "fleet.json"
+
+
+class Spread(Struct, frozen=True, kw_only=True):
+    """An unknown over the trusted sensors: mean and standard deviation, least and largest.
+
+    `typical_std` is the mean of the sensors' own standard deviations.
+    """
+
+    mean: float | None
+    std: float | None
+    least: float | None
+    largest: float | None
+    typical_std: float | None
+    unit: str
+
+
+class FleetResult(Result, frozen=True, kw_only=True):
+    """The content of `fleet.json`: nothing in it depends on who computed, nor when."""
+
+    model_hash: str
+    constants: dict[str, Any]
+    dataset: str
+    partitions: int
+    sensors: int
+    trusted: int
+    rejected: dict[str, int]
+    reasons: dict[str, int]
+    parameters: dict[str, Spread]
+    rms: Spread
+    options: str
+    versions: dict[str, str]
+
+
+def fleet_result(
+    job: Job, total: Total, *, dataset: str, partitions: int, unreadable: Sequence[Any]
+) -> FleetResult:
+    """All partitions of a data set in numbers."""
+    rejected = dict(total.rejected)
+    if unreadable:
+        rejected["file"] = rejected.get("file", 0) + len(unreadable)
+    names = [name for p in job.model.parameters for name in p.entry_names]
+    constants = {c.name: c.array.tolist() for c in job.model.constants}
+    return FleetResult(
+        model=job.model.name,
+        model_hash=fingerprint(job.model),
+        constants=constants,
+        dataset=dataset,
+        partitions=partitions,
+        sensors=total.sensors,
+        trusted=total.trusted,
+        rejected=dict(sorted(rejected.items())),
+        reasons=total.codes,
+        parameters={name: _spread(name, total.moments, job.units.get(name, "")) for name in names},
+        rms=_spread("rms", total.moments, ""),
+        options=job.identity["options"],
+        versions={name: v for name, v in job.identity.items() if name in job.versions},
+    )
+
+
+def _spread(name: str, moments: Mapping[str, Moments], unit: str) -> Spread:
+    own, std = moments.get(name, Moments()), moments.get(f"{name}_std", Moments())
+    some = own.count > 0
+    return Spread(
+        mean=own.mean if some else None,
+        std=own.std if own.count > 1 else None,
+        least=own.least if some else None,
+        largest=own.largest if some else None,
+        typical_std=std.mean if std.count else None,
+        unit=unit,
+    )
