@@ -31,8 +31,10 @@ def names(count, first=0):
 
 def wide(v, sensors):
     """One row for each sensor, a list for each axis."""
-    columns = {f"v{axis} [m/s^2]": list(v[:, :, k]) for k, axis in enumerate("xyz")}
-    return pa.table({"sensor": sensors, **columns})
+    ends = pa.array(np.arange(len(v) + 1) * v.shape[1], pa.int32())
+    flat = {f"v{axis} [m/s^2]": np.ascontiguousarray(v[:, :, k]) for k, axis in enumerate("xyz")}
+    lists = {n: pa.ListArray.from_arrays(ends, pa.array(x.ravel())) for n, x in flat.items()}
+    return pa.table({"sensor": sensors, **lists})
 
 
 def vectors(v, sensors):
@@ -54,9 +56,7 @@ def dataset(folder: Path, files=2, each=40, form=wide, seed=0, **how):
     v = readings(files * each, seed)
     for k in range(files):
         own = slice(k * each, (k + 1) * each)
-        pq.write_table(
-            form(v[own], names(each, k * each)), folder / f"part-{k}.parquet", **how
-        )
+        pq.write_table(form(v[own], names(each, k * each)), folder / f"part-{k}.parquet", **how)
     return v
 
 

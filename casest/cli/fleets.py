@@ -15,7 +15,7 @@ import click
 from casest.cli.flags import Kind, flag, taking
 from casest.cli.loading import declared_model
 from casest.cli.options import FOLDER, ModelOptions, ReadingOptions, Words, model_argument
-from casest.cli.shared import commands, echo, progress, reported
+from casest.cli.shared import commands, echo, progress, write
 from casest.errors import INTERRUPTED, CasestError, NotTrusted, UsageError
 
 if TYPE_CHECKING:
@@ -106,8 +106,6 @@ def fleet(model_name: str, dataset: str, options: FleetOptions) -> int:
     )
     swept(job, plan.partitions)
     write_rejected(job, plan.partitions, plan.unreadable)
-    from casest.cli.shared import write
-
     write(options.output / FLEET, as_json(result.content()))
     if options.as_json:
         echo(as_json(result.content()), nl=False)
@@ -127,7 +125,7 @@ def planned(model: Model, dataset: str, options: FleetOptions) -> tuple[Plan, Jo
     from casest.tasks.job import Job
 
     assert options.output is not None
-    if options.scheduler and options.workers or options.processes and options.workers:
+    if options.workers and (options.scheduler or options.processes):
         raise UsageError("--workers starts workers here: leave out --scheduler and --processes")
     check_model(model)
     reading = read_options(options.reading)
@@ -182,15 +180,16 @@ def read_options(options: ReadingOptions) -> Options:
 def computed(job: Job, plan: Plan, options: FleetOptions) -> None:
     """Run what is not done yet; whatever ends it early says what is."""
     from casest.tasks.executors import Stopped
-    from casest.tasks.folder import missing, prepared
+    from casest.tasks.folder import missing, prepared, refuse_others
 
-    prepared(job)
+    refuse_others(job)
     left = missing(job, plan.partitions)
     done = len(plan.partitions) - len(left)
     if not left:
         return
     try:
         with executor(options, len(left)) as run:
+            prepared(job)
             for k, _ in enumerate(_watched(run(job, left), left, done, len(plan.partitions))):
                 done = len(plan.partitions) - len(left) + k + 1
     except KeyboardInterrupt:

@@ -1,1 +1,1 @@
-"""Parquet data sets of many sensors: files, layout, partitions, readings. Imports data and below."""
+"""Parquet data sets of many sensors: files, layout, partitions, readings."""

@@ -123,12 +123,14 @@ def layout_of(
         fields = [*names, *(r.field for r in used), *kept]
         kinds = tuple((name, _kind(schema.field(name))) for name in fields)
         types = (_name_type(schema, names), *(schema.field(name).type for name in kept))
-        return Layout(
-            sensor, wide, tuple(used), bound, time, kept, by_folder, kinds, units, types
+        return Layout(sensor, wide, tuple(used), bound, time, kept, by_folder, kinds, units, types)
+    raise (
+        errors[0]
+        if errors
+        else DataError(
+            f"{file.name}: holds no columns of numbers, nor of lists of numbers; it has "
+            f"{listed(schema.names)}"
         )
-    raise errors[0] if errors else DataError(
-        f"{file.name}: holds no columns of numbers, nor of lists of numbers; it has "
-        f"{listed(schema.names)}"
     )
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -94,16 +95,16 @@ def plan(
         if layout is None:
             first = file
             layout = layout_of(file, table, signals, options, sensor=sensor, kept=kept)
-        elif (error := differing(layout, first or file, file, table)) is not None:
-            raise error
+        elif (other := differing(layout, first or file, file, table)) is not None:
+            raise other
         found.append(_looked_at(file, table, layout))
     if layout is None:
         raise DataError(f"{dataset}: none of its {len(bad)} files can be read: {bad[0][1]}")
     found, damaged, sensors, places = _named(found, layout)
+    if not sensors:
+        raise DataError(f"{dataset}: holds no row that names a sensor; check the export")
     cut = _cut(found, layout)
-    parts = tuple(
-        replace(p, twice=tuple(_said(p, places, found))) if places else p for p in cut
-    )
+    parts = tuple(replace(p, twice=tuple(_said(p, places, found))) if places else p for p in cut)
     return Plan(layout, parts, (*bad, *damaged), sensors)
 
 
@@ -244,6 +245,6 @@ def _pieces(own: _Open, layout: Layout) -> Iterator[tuple[Piece, int]]:
         cuts = [0, *starts[at[1:-1]].tolist(), own.groups[-1]] if len(cuts) > 2 else cuts
     cuts = sorted(set(cuts))
     each = sum(own.numbers) / max(own.groups[-1], 1)
-    for first, stop in zip(cuts, cuts[1:], strict=False):
+    for first, stop in pairwise(cuts):
         piece = Piece(own.file, int(first), int(stop), own.digest, name)
         yield piece, round(each * (stop - first))

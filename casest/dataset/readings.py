@@ -1,4 +1,4 @@
-"""Readings of a partition, some sensors at a time: columns as they stand, then a model's signals."""
+"""Readings of a partition, some sensors at a time: columns as they stand, then signals."""
 
 from __future__ import annotations
 
@@ -144,7 +144,7 @@ def _wide_block(layout: Layout, piece: Piece, row: int, batch: Any) -> Block:
         whole, batch = batch, batch.filter(pyarrow.array(good))
     else:
         whole = batch
-    columns = {}
+    columns: dict[str, Array] = {}
     for r in layout.readings:
         values = _flat(batch.column(r.field), r)
         columns.update(zip(r.headers, values.reshape(-1, max(r.size, 1)).T, strict=True))
@@ -234,7 +234,7 @@ def _long_block(layout: Layout, piece: Piece, parts: Sequence[tuple[int, Any]]) 
     begins = np.concatenate([[0], np.flatnonzero(code[1:] != code[:-1]) + 1])
     counts = np.diff(np.append(begins, len(batch)))
     rows = np.concatenate([row + np.arange(len(p)) for row, p in parts])[begins]
-    columns = {}
+    columns: dict[str, Array] = {}
     for r in layout.readings:
         values = _flat(batch.column(r.field), r)
         if len(values) != len(batch) * max(r.size, 1):
@@ -258,18 +258,17 @@ class _Binding:
 
     def __call__(self, table: Table, counts: NDArray[np.int64]) -> dict[str, Any]:
         """Columns of each signal, from those of some sensors; DataError where one is unusable."""
-        bound_to, found = dict(self.layout.signals), {}
+        bound_to = dict(self.layout.signals)
+        found: dict[str, Any] = {}
         for signal in self.signals:
             if is_time(signal):
                 found[signal.name] = (self._time(table, counts, signal),)
-            elif signal.kind == "rotation":
-                found[signal.name] = rotation(table, signal, bound_to[signal.name], self.options)[
-                    0
-                ].T
+                continue
+            names = bound_to[signal.name]
+            if signal.kind == "rotation":
+                found[signal.name] = rotation(table, signal, names, self.options)[0].T
             else:
-                found[signal.name] = columns_of(
-                    table, signal, bound_to[signal.name], self.options
-                )
+                found[signal.name] = columns_of(table, signal, names, self.options)
         return found
 
     def _time(self, table: Table, counts: NDArray[np.int64], signal: Signal) -> Array:

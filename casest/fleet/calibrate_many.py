@@ -107,8 +107,8 @@ def calibrate_many(
 
     `noise` is the standard deviation of one residual that a sound sensor has: one with
     significantly more is refused. Up to `retry` refused sensors are calibrated once more one by
-    one, with IPOPT and second opinions. `misfit` asks of each whether its largest residual is larger
-    than noise makes it (`fleet.outlying`), which costs a fifth of the time.
+    one, with IPOPT and second opinions. `misfit` asks of each whether its largest residual is
+    larger than noise makes it (`fleet.outlying`), which costs a fifth of the time.
 
     The samples of a sensor are taken as independent of each other (poses, not a time series); from
     a hundred of them on a sensor whose neighbouring residuals are alike is refused.

@@ -6,6 +6,7 @@ order. What it is told twice, it may do twice: a task writes the same bytes each
 
 from __future__ import annotations
 
+import logging
 import os
 import pickle
 import signal
@@ -88,7 +89,8 @@ class Dask:
         def submitted(partition: Partition) -> Any:
             return self.client.submit(remote, sent, partition, key=f"casest-{job.key(partition)}")
 
-        going = as_completed([submitted(p) for p in islice(rest, workers * WAITING)])
+        first = [submitted(p) for p in islice(rest, workers * WAITING)]
+        going = as_completed(first, loop=self.client.loop)
         for future in going:
             try:
                 yield future.result()
@@ -122,7 +124,11 @@ def dask(scheduler: str | None, workers: int | None) -> Iterator[Any]:
         return
     with (
         distributed.LocalCluster(
-            n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=":0"
+            n_workers=workers,
+            threads_per_worker=1,
+            processes=True,
+            dashboard_address=":0",
+            silence_logs=logging.ERROR,
         ) as cluster,
         distributed.Client(cluster, set_as_default=False) as client,
     ):

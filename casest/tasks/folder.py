@@ -19,17 +19,22 @@ JOB, REJECTED = "job.json", "rejected.parquet"
 PIECE = 1 << 16
 
 
+def refuse_others(job: Job) -> None:
+    """UsageError where the folder holds results of something else."""
+    file = job.folder / TASKS / JOB
+    if file.exists():
+        _refuse_others(job, _read(file))
+    elif (job.folder / RESULTS).exists():
+        raise UsageError(
+            f"-o {job.folder}: holds a folder {RESULTS} that casest fleet did not begin; give "
+            "another -o"
+        )
+
+
 def prepared(job: Job) -> None:
-    """Make the folder, or go on in it; UsageError where it holds results of something else."""
+    """Make the folder, and say in it whose it is."""
     file = job.folder / TASKS / JOB
     with written_at_once():
-        if file.exists():
-            _refuse_others(job, _read(file))
-        elif (job.folder / RESULTS).exists():
-            raise UsageError(
-                f"-o {job.folder}: holds a folder {RESULTS} that casest fleet did not begin; give "
-                "another -o"
-            )
         for name in (RESULTS, TASKS):
             make_folder(job.folder / name)
         write_atomically(file, json.dumps(job.identity, indent=2) + "\n")

@@ -31,14 +31,15 @@ class Rows:
     def put(self, places: Any, batch: Batch) -> None:
         """Take over what was found of the sensors at these places."""
         for k, (name, index) in enumerate(self._entries):
-            self.x[k, places] = batch.values[name][(slice(None), *index)]
-            self.std[k, places] = batch.std[name][(slice(None), *index)]
+            entry: Any = (slice(None), *index)
+            self.x[k, places] = batch.values[name][entry]
+            self.std[k, places] = batch.std[name][entry]
         self.covariance[:, places] = batch.covariance[:, self._lower[0], self._lower[1]].T
         self.rms[places] = batch.rmse
         self.misfit[places] = np.nan if batch.misfit is None else batch.misfit
         self.trusted[places] = batch.trusted
         for i in np.flatnonzero(~batch.trusted):
-            self.reasons[int(places[i])] = batch.reasons[i][0]
+            self.reasons[int(places[i])] = batch.reasons[int(i)][0]
             self.codes[int(places[i])] = _first(batch.reasons, int(i))
 
 

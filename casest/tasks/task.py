@@ -8,7 +8,6 @@ import uuid
 from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -76,9 +75,7 @@ def _calibrated(
     usable = np.array([k for k in chosen if k not in block.bad], dtype=int)
     for places in _alike(block.counts, usable):
         given, counts = _side_by_side(signals, block.counts, ends, places)
-        found = calibrate_many(
-            job.model, given, counts=counts, noise=job.noise, misfit=True
-        )
+        found = calibrate_many(job.model, given, counts=counts, noise=job.noise, misfit=True)
         rows.put(places, found)
     for k in chosen:
         if not rows.trusted[k]:
@@ -143,9 +140,9 @@ def _side_by_side(
     rows = ends[places][:, None] + np.arange(longest)
     own = counts[places]
     if longest <= ALIKE:
-        whole = len(rows) and np.array_equal(ends[places], ends[places[0]] + longest * np.arange(len(places)))
         first = int(ends[places[0]])
         stop = first + longest * len(places)
+        whole = np.array_equal(ends[places], np.arange(first, stop, longest))
         cut = slice(first, stop) if whole else rows.ravel()
         return {n: v[cut].reshape(len(places), longest, -1) for n, v in signals.items()}, None
     rows = np.minimum(rows, (ends[places] + own - 1)[:, None])
@@ -178,7 +175,8 @@ def _written(job: Job, target: Path) -> Iterator[Write]:
             os.fsync(file.fileno())
         os.replace(beside, target)
     except OSError as error:
-        raise DataError(f"{target}: cannot be written ({error.strerror or error})") from None
+        why = os.strerror(error.errno) if error.errno else error  # Arrow's own words are longer
+        raise DataError(f"{target}: cannot be written ({why})") from None
     finally:
         with contextlib.suppress(OSError):
             beside.unlink()
