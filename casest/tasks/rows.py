@@ -96,12 +96,26 @@ def record_batch(job: Job, block: Block, rows: Rows, chosen: Any, form: Any) -> 
         flat = pyarrow.array(np.ascontiguousarray(rows.covariance[:, chosen].T).ravel())
         gone, size = pyarrow.array(~trusted), len(rows.covariance)
         columns.append(pyarrow.FixedSizeListArray.from_arrays(flat, size, mask=gone))
-    reasons = pyarrow.array([rows.reasons.get(int(k)) for k in chosen], pyarrow.string())
     columns += [
         pyarrow.array(trusted),
-        reasons.dictionary_encode(),
+        _reasons(rows, chosen),
         numbers(rows.rms),
         numbers(rows.misfit),
     ]
     columns += [block.kept[name].take(pyarrow.array(chosen)) for name in job.layout.kept]
     return pyarrow.RecordBatch.from_arrays(columns, schema=form)
+
+
+def _reasons(rows: Rows, chosen: Any) -> Any:
+    """Why sensors are refused, dictionary-encoded; null of the trusted."""
+    import pyarrow
+
+    said = sorted({*rows.reasons.values()})
+    place = {reason: k for k, reason in enumerate(said)}
+    indices = np.full(len(rows.trusted), -1, np.int32)
+    for k, reason in rows.reasons.items():
+        indices[k] = place[reason]
+    own = indices[chosen]
+    return pyarrow.DictionaryArray.from_arrays(
+        pyarrow.array(own, mask=own < 0), pyarrow.array(said, pyarrow.string())
+    )

@@ -72,18 +72,17 @@ def _calibrated(
     rows = Rows(job.model, len(block.counts))
     chosen = _named(block, twice, tally)
     ends = np.concatenate([[0], np.cumsum(block.counts)])
-    usable = np.array([k for k in chosen if k not in block.bad], dtype=int)
+    usable = np.setdiff1d(chosen, np.array([*block.bad], dtype=int))
     for places in _alike(block.counts, usable):
         given, counts = _side_by_side(signals, block.counts, ends, places)
         found = calibrate_many(job.model, given, counts=counts, noise=job.noise, misfit=True)
         rows.put(places, found)
-    for k in chosen:
-        if not rows.trusted[k]:
-            kind = READINGS if k in block.bad else REFUSED
-            reason = block.bad[k] if k in block.bad else rows.reasons[int(k)]
-            rows.reasons[int(k)] = reason
-            made[READINGS if k in block.bad else rows.codes[int(k)]] += 1
-            tally.reject(Rejected(block.file, int(block.rows[k]), name_of(block, k), kind, reason))
+    for k in map(int, chosen[~rows.trusted[chosen]]):
+        bad = k in block.bad
+        reason = rows.reasons[k] = block.bad[k] if bad else rows.reasons[k]
+        made[READINGS if bad else rows.codes[k]] += 1
+        kind = READINGS if bad else REFUSED
+        tally.reject(Rejected(block.file, int(block.rows[k]), name_of(block, k), kind, reason))
     tally.sensors += len(chosen)
     tally.trusted += int(rows.trusted.sum())
     _measure(job, rows, tally)
@@ -115,10 +114,12 @@ def _named(block: Block, twice: dict[str, str], tally: Tally) -> NDArray[np.int_
 
 def _alike(counts: NDArray[np.int64], places: NDArray[np.int_]) -> Iterator[NDArray[np.int_]]:
     """Groups of sensors that are calibrated together, by the number of their readings alone."""
-    if len(places):
-        padded = np.array([_padded(int(n)) for n in counts[places]])
-        for n in np.unique(padded):
-            yield places[padded == n]
+    if not len(places):
+        return
+    found, which = np.unique(counts[places], return_inverse=True)
+    padded = np.array([_padded(int(n)) for n in found])
+    for n in np.unique(padded):
+        yield places if len(found) == 1 else places[(padded == n)[which]]
 
 
 def _padded(count: int) -> int:
