@@ -366,3 +366,25 @@ def test_misfit_is_the_chance_of_the_prediction_of_a_reading_left_out():
             least.append(2 * 12 * student.sf(abs(off), 9))
         assert found.misfit[i] == pytest.approx(min(1.0, min(least)), rel=1e-6)
     assert found.misfit[3] < 1e-3
+
+
+def test_the_page_shows_yield_outlying_sensors_and_drift_over_the_date(tmp_path):
+    v = fleets.readings(300)
+    v[:, :, 2] += np.linspace(0, 3, 300)[:, None]  # an offset that drifts over the days
+    v[123, :, 0] += 40.0
+    v[7, 5, 1] = np.nan
+    days = np.datetime64("2026-03-01T00:00:00") + np.arange(300) * np.timedelta64(3600, "s")
+    table = fleets.wide(v, fleets.names(300)).append_column("made", pa.array(days))
+    order = np.random.default_rng(0).permutation(300)
+    pq.write_table(table.take(order), tmp_path / "a.parquet")
+    assert fleet(tmp_path / "a.parquet", tmp_path / "out", "--keep", "made") == 0
+    page = (tmp_path / "out" / "fleet.html").read_text()
+    assert "299 of 300 sensors trusted." in page
+    assert "<td>S000123</td>" in page
+    assert "made since 2026-03-01T00:00:00" in page
+    data = json.loads(page.partition('id="data">')[2].partition("</script>")[0])
+    drift = next(f for f in data["figures"] if f["id"] == "drift-figure")["panels"]
+    third = next(p for p in drift if p["title"] == "offset[2]")
+    assert third["x"]["unit"] == "d"
+    means = data["arrays"][third["series"][1]["y"]]
+    assert means[-1] - means[0] == pytest.approx(3 * (len(means) - 1) / len(means), abs=0.5)

@@ -85,9 +85,11 @@ def fleet(model_name: str, dataset: str, options: FleetOptions) -> int:
     killed, the same command goes on where it was. Exit code 0: every partition is done, whatever
     was rejected; 1: bad input; 2: no sensor is trusted; 130: Ctrl-C, and what is done stays.
     """
+    from casest.report.html.fleet import PAGE, fleet_page
     from casest.report.text.fleet import fleet_text
     from casest.results.file import as_json
     from casest.results.fleet import FLEET, fleet_result
+    from casest.results.fleet_rows import drawn
     from casest.tasks.folder import swept, tallies, write_rejected
     from casest.tasks.tally import added
 
@@ -107,6 +109,8 @@ def fleet(model_name: str, dataset: str, options: FleetOptions) -> int:
     swept(job, plan.partitions)
     write_rejected(job, plan.partitions, plan.unreadable)
     write(options.output / FLEET, as_json(result.content()))
+    progress("drawing")
+    write(options.output / PAGE, fleet_page(result, drawn(job, plan.partitions, total.sensors)))
     if options.as_json:
         echo(as_json(result.content()), nl=False)
     else:
