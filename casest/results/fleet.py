@@ -9,10 +9,11 @@ from msgspec import Struct
 
 from casest.declaration.travelling import fingerprint
 from casest.results.result import Result
+from casest.tasks.common import Common, Told
 from casest.tasks.job import Job
 from casest.tasks.tally import Moments, Total
 
-FLEET = "fleet.json"
+FLEET, COMMON = "fleet.json", "common.json"
 
 
 class Spread(Struct, frozen=True, kw_only=True):
@@ -82,4 +83,57 @@ def _spread(name: str, moments: Mapping[str, Moments], unit: str) -> Spread:
         largest=own.largest if some else None,
         typical_std=std.mean if std.count else None,
         unit=unit,
+    )
+
+
+class CommonEffect(Struct, frozen=True, kw_only=True):
+    """An effect that the fleet has: unknowns with their common size, and what it changes."""
+
+    name: str
+    parameters: dict[str, list[float]]
+    chance: float
+    indistinguishable_from: list[str]
+    follows: dict[str, float]
+    sigma_before: float
+    sigma_after: float
+    moved: dict[str, float]
+
+
+class FleetClosed(Result, frozen=True, kw_only=True):
+    """The content of `common.json`.
+
+    `parameters` of an effect hold value and standard deviation; `moved` the mean move of each
+    declared unknown in its own standard deviations.
+    """
+
+    dataset: str
+    sensors: int
+    effects: list[CommonEffect]
+    tried: dict[str, float]
+    invisible: list[str]
+
+
+def common_result(job: Job, told: Told, dataset: str) -> FleetClosed:
+    """What was asked of a fleet, and what it said."""
+    return FleetClosed(
+        model=job.model.name,
+        dataset=dataset,
+        sensors=told.sensors,
+        effects=[_effect(e) for e in told.effects],
+        tried={name: chance for name, chance, visible in told.tried if visible},
+        invisible=[name for name, _, visible in told.tried if not visible],
+    )
+
+
+def _effect(e: Common) -> CommonEffect:
+    pairs = zip(e.names, e.size, e.std, strict=True)
+    return CommonEffect(
+        name=e.effect.name,
+        parameters={name: [float(v), float(s)] for name, v, s in pairs},
+        chance=e.chance,
+        indistinguishable_from=list(e.rivals),
+        follows=e.follows,
+        sigma_before=e.before,
+        sigma_after=e.after,
+        moved=e.moved,
     )

@@ -25,7 +25,7 @@ from casest.tasks.tally import FILE, NAMELESS, READINGS, REFUSED, TWICE, Moments
 
 #: Up to so many readings sensors of one number are calibrated together; beyond, numbers that are
 #: at most an eighth apart are, the short ones filled up.
-ALIKE = 32
+FEW = 32
 #: Writes the chosen rows of a block.
 Write = Callable[[Block, Rows, NDArray[np.int_]], None]
 
@@ -73,8 +73,8 @@ def _calibrated(
     chosen = _named(block, twice, tally)
     ends = np.concatenate([[0], np.cumsum(block.counts)])
     usable = np.setdiff1d(chosen, np.array([*block.bad], dtype=int))
-    for places in _alike(block.counts, usable):
-        given, counts = _side_by_side(signals, block.counts, ends, places)
+    for places in alike(block.counts, usable):
+        given, counts = side_by_side(signals, block.counts, ends, places)
         found = calibrate_many(job.model, given, counts=counts, noise=job.noise, misfit=True)
         rows.put(places, found)
     for k in map(int, chosen[~rows.trusted[chosen]]):
@@ -112,7 +112,7 @@ def _named(block: Block, twice: dict[str, str], tally: Tally) -> NDArray[np.int_
     return np.array(kept, dtype=int)
 
 
-def _alike(counts: NDArray[np.int64], places: NDArray[np.int_]) -> Iterator[NDArray[np.int_]]:
+def alike(counts: NDArray[np.int64], places: NDArray[np.int_]) -> Iterator[NDArray[np.int_]]:
     """Groups of sensors that are calibrated together, by the number of their readings alone."""
     if not len(places):
         return
@@ -123,13 +123,13 @@ def _alike(counts: NDArray[np.int64], places: NDArray[np.int_]) -> Iterator[NDAr
 
 
 def _padded(count: int) -> int:
-    if count <= ALIKE:
+    if count <= FEW:
         return count
     step = 1 << (count.bit_length() - 4)
     return -(-count // step) * step
 
 
-def _side_by_side(
+def side_by_side(
     signals: dict[str, Array],
     counts: NDArray[np.int64],
     ends: NDArray[np.int64],
@@ -140,7 +140,7 @@ def _side_by_side(
     # Rows beyond a sensor's own are never looked at: any will do.
     rows = ends[places][:, None] + np.arange(longest)
     own = counts[places]
-    if longest <= ALIKE:
+    if longest <= FEW:
         first = int(ends[places[0]])
         stop = first + longest * len(places)
         whole = np.array_equal(ends[places], np.arange(first, stop, longest))

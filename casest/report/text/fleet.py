@@ -6,8 +6,9 @@ import textwrap
 from collections.abc import Iterator
 from pathlib import Path
 
-from casest.report.text.layout import WIDTH
-from casest.results.fleet import FleetResult
+from casest.report.text.layout import WIDTH, item
+from casest.results.fleet import COMMON, CommonEffect, FleetClosed, FleetResult
+from casest.results.rounding import rounded
 
 #: Kinds of what is rejected, in words for one and for several.
 KINDS = {
@@ -51,3 +52,37 @@ def _table(result: FleetResult) -> Iterator[str]:
         first = f"  {row[0]:<{widths[0]}}"
         middle = "".join(f"  {cell:>{w}}" for cell, w in zip(row[1:6], widths[1:6], strict=True))
         yield f"{first}{middle}  {row[6]}".rstrip()
+
+
+def common_text(result: FleetClosed, folder: Path | None) -> str:
+    """What the sensors have in common: each effect with its size, before and after."""
+    names = ", ".join(e.name for e in result.effects)
+    said = f"{names} in common" if names else "nothing in common that their model lacks"
+    head = f"{result.model} on {result.dataset}: {result.sensors} sensors have {said}"
+    lines = [textwrap.fill(head, WIDTH)]
+    for e in result.effects:
+        lines += ["", *_common_lines(e)]
+    if result.invisible:
+        lines += ["", item(f"no pose could show: {', '.join(result.invisible)}")]
+    if folder is not None:
+        lines += ["", f"Written: {folder}/{COMMON}"]
+    return "\n".join(lines)
+
+
+def _common_lines(e: CommonEffect) -> Iterator[str]:
+    yield f"  {e.name} (chance {e.chance:.2g} where there is none):"
+    for name, (value, std) in e.parameters.items():
+        yield "    {}  {} ± {}".format(name, *rounded(value, std))
+    fallen = 100 * (1 - e.sigma_after / e.sigma_before)
+    yield item(
+        f"sigma of sensors that had no part in that size: {e.sigma_before:.5g} before, "
+        f"{e.sigma_after:.5g} after ({fallen:.2g} % less)"
+    )
+    far = sorted(e.moved.items(), key=lambda pair: -abs(pair[1]))[:3]
+    moves = ", ".join(f"{name} by {by:.2g}" for name, by in far)
+    yield item(f"declared unknowns move on average, in their own standard deviations: {moves}")
+    if e.indistinguishable_from:
+        yield item(f"explains as much: {', '.join(e.indistinguishable_from)}")
+    for column, chance in e.follows.items():
+        differs = "differs with" if chance < 0.001 else "does not differ with"
+        yield item(f"its size {differs} {column} (chance {chance:.2g})")
