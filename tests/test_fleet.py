@@ -300,6 +300,12 @@ def test_rows_of_a_sensor_that_do_not_stand_together_are_named(tmp_path):
     assert said == {("S000001", "twice"), ("S000002", "twice")}
 
 
+def test_a_folder_within_the_data_set_is_refused(tmp_path, capsys):
+    fleets.dataset(tmp_path / "in", files=1, each=3)
+    said = refused(capsys, *fleets.WORDS, tmp_path / "in", "-o", tmp_path / "in" / "out")
+    assert said.endswith("which it would become a part of; give a folder beside it")
+
+
 def test_a_model_that_many_cannot_have_is_refused_before_the_data(tmp_path, capsys):
     said = refused(capsys, "fleet", "rate-table", tmp_path / "none", "-o", tmp_path / "out")
     assert "direction or rotation" in said

@@ -1,4 +1,4 @@
-"""What sensors have in common: named in ten thousand where none shows it, and not where it is not."""
+"""What sensors have in common: named by ten thousand of which none shows it, else not named."""
 
 from __future__ import annotations
 

@@ -44,6 +44,13 @@ class FleetOptions:
         metavar="STD",
         help="Of one residual of a sound sensor: one with significantly more is refused.",
     )
+    prior: Path | None = flag(
+        None,
+        "--prior",
+        type=click.Path(path_type=Path),
+        metavar="DIR",
+        help="Take sensors as ones of the fleet in this folder: few poses are enough.",
+    )
     covariance: bool = flag(False, "--covariance", help="Write each sensor's covariance too.")
     processes: int | None = flag(
         None,
@@ -89,7 +96,7 @@ def fleet(model_name: str, dataset: str, options: FleetOptions) -> int:
     from casest.report.text.fleet import fleet_text
     from casest.results.file import as_json
     from casest.results.fleet import FLEET, fleet_result
-    from casest.results.fleet_rows import drawn
+    from casest.results.fleet_rows import drawn, estimated
     from casest.tasks.folder import swept, tallies, write_rejected
     from casest.tasks.tally import added
 
@@ -105,6 +112,7 @@ def fleet(model_name: str, dataset: str, options: FleetOptions) -> int:
         dataset=dataset,
         partitions=len(plan.partitions),
         unreadable=plan.unreadable,
+        found=estimated(job, plan.partitions, total),
     )
     swept(job, plan.partitions)
     write_rejected(job, plan.partitions, plan.unreadable)
@@ -126,16 +134,25 @@ def planned(model: Model, dataset: str, options: FleetOptions) -> tuple[Plan, Jo
     from casest.dataset.partitions import plan
     from casest.fleet.calibrate_many import check_model
     from casest.results.file import versions
+    from casest.results.fleet import known
     from casest.tasks.job import Job
 
     assert options.output is not None
     if options.workers and (options.scheduler or options.processes):
         raise UsageError("--workers starts workers here: leave out --scheduler and --processes")
+    if options.prior and options.noise:
+        raise UsageError("--noise: with --prior the noise is that of the fleet; leave it out")
+    if Path(dataset).resolve() in options.output.resolve().parents:
+        raise UsageError(
+            f"-o {options.output}: lies in the data set {dataset}, which it would become a part "
+            "of; give a folder beside it"
+        )
     check_model(model)
     reading = read_options(options.reading)
     progress(f"looking through {dataset}")
     found = plan(dataset, model.signals, reading, sensor=options.sensor, kept=options.keep)
     computing = {name: v for name, v in versions().items() if name != "python"}
+    units = units_of(model, found)
     job = Job(
         model,
         found.layout,
@@ -143,7 +160,8 @@ def planned(model: Model, dataset: str, options: FleetOptions) -> tuple[Plan, Jo
         options.output,
         options.noise,
         options.covariance,
-        units_of(model, found),
+        known(options.prior, model, units) if options.prior else None,
+        units,
         computing,
     )
     return found, job

@@ -116,7 +116,7 @@ def calibrate_many(
     samples, and directions or rotations among the unknowns; DataError for arrays of wrong shape.
     """
     check_model(model)
-    readings, lengths = _checked(model, signals, counts)
+    readings, lengths = checked(model, signals, counts)
     size, samples = readings[0].shape[:2]
     job = _Job(model, readings, lengths, start or model.starter_of_many, noise)
     result = _Result.empty(model, size, misfit)
@@ -165,7 +165,7 @@ def check_model(model: Model) -> None:
         )
 
 
-def _checked(
+def checked(
     model: Model, signals: Mapping[str, Any], counts: Any
 ) -> tuple[list[Array], Array | None]:
     """Readings (S, N, size) in the model's order, and how many of each sensor count, (S,)."""
@@ -234,7 +234,7 @@ class _Result:
     @classmethod
     def empty(cls, model: Model, size: int, misfit: bool) -> _Result:
         n = sum(p.shape.size for p in model.parameters)
-        verdicts = Verdicts.empty(_names(model), size)
+        verdicts = Verdicts.empty(entry_names(model), size)
         # In memory the sensors lie side by side, as in the blocks that come in.
         x, std = np.empty((2, n, size)).transpose(0, 2, 1)
         covariance = np.empty((n, n, size)).transpose(2, 0, 1)
@@ -246,12 +246,12 @@ class _Result:
         for array in (self.covariance, self.sigma, self.rmse, self.misfit):
             if array is not None:
                 array[~trusted] = np.nan
-        values, std = _unpacked(model, self.x), _unpacked(model, self.std)
+        values, std = unpacked(model, self.x), unpacked(model, self.std)
         for array in (*values.values(), *std.values()):  # zeros of triangular matrices too
             array[~trusted] = np.nan
         return Batch(
             model,
-            _names(model),
+            entry_names(model),
             values,
             std,
             self.covariance,
@@ -406,7 +406,7 @@ class _Job:
             if self.start is None:
                 self.retry(i, result)
                 continue
-            values = {n: v[0] for n, v in _unpacked(self.model, x[None]).items()}
+            values = {n: v[0] for n, v in unpacked(self.model, x[None]).items()}
             self.retry(i, result, self._within(ended.bounds, int(k)), values)
         trusted = places[result.verdicts.trusted[span.start + places]]
         if not trusted.size:
@@ -423,7 +423,7 @@ class _Job:
         declared = [np.concatenate([getattr(p, n) for p in self.model.parameters]) for n in SIDES]
         if np.array_equal(lower, declared[0]) and np.array_equal(upper, declared[1]):
             return self.model
-        own = [_unpacked(self.model, side[None]) for side in (lower, upper)]
+        own = [unpacked(self.model, side[None]) for side in (lower, upper)]
         limits = {n: (own[0][n][0], own[1][n][0]) for n in own[0]}
         return self.model.bounded(lambda model, runs: limits)
 
@@ -483,11 +483,12 @@ def _entry(array: Array, index: tuple[int, ...]) -> Array:
     return np.asarray(array[place])
 
 
-def _names(model: Model) -> tuple[str, ...]:
+def entry_names(model: Model) -> tuple[str, ...]:
+    """Names of all unknowns, entry by entry."""
     return tuple(name for p in model.parameters for name in p.entry_names)
 
 
-def _unpacked(model: Model, x: Array) -> dict[str, Array]:
+def unpacked(model: Model, x: Array) -> dict[str, Array]:
     """Values by parameter, (S, …), from the unknowns (S, n)."""
     found, first = {}, 0
     for p in model.parameters:

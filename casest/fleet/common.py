@@ -26,7 +26,7 @@ from casest.declaration.shapes import Array
 from casest.effects.placing import placed_in
 from casest.engine.threads import one_thread
 from casest.errors import CasestError
-from casest.fleet.sums import NARROWEST, Sensors, Squares, widest
+from casest.fleet.sums import Squares, side_by_side, widest
 from casest.leastsquares.per_sample import residual_and_jacobian
 
 #: Share of an effect's slopes that the declared unknowns must leave, for it to be told from them.
@@ -159,11 +159,11 @@ def _projected(
     squares: Squares, values: Array, signals: Sequence[Array], null: Array, n: int
 ) -> tuple[Array, Array, Array]:
     """The same of a block."""
-    total = len(values)
-    places = np.minimum(np.arange(-(-total // NARROWEST) * NARROWEST), total - 1)
-    samples = np.concatenate([v[places].transpose(2, 1, 0) for v in signals])
-    x = np.concatenate([values[places].T, np.repeat(null[:, None], len(places), axis=1)])
-    rows = squares.normals(x, Sensors(np.ascontiguousarray(samples), None)).rows[..., :total]
+    total, sensors = len(values), side_by_side(signals)
+    width = sensors.samples.shape[2]
+    x = np.repeat(null[:, None], width, axis=1)
+    x = np.concatenate([values[np.minimum(np.arange(width), total - 1)].T, x])
+    rows = squares.normals(x, sensors).rows[..., :total]
     rows = rows.transpose(2, 0, 1)
     A = rows[:, :-1] + np.tril(rows[:, :-1], -1).swapaxes(1, 2)
     pull = rows[:, -1]

@@ -9,7 +9,7 @@ act on every column, and the sums run over samples in their order.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -55,6 +55,17 @@ class Sensors(NamedTuple):
         mask = None if self.mask is None else self.mask[:, chosen]
         hold = None if self.hold is None else Hold(*(part[:, chosen] for part in self.hold))
         return Sensors(self.samples[:, :, chosen], mask, hold)
+
+
+def side_by_side(readings: Sequence[Array], counts: Array | None = None) -> Sensors:
+    """Readings (S, N, size) as a block of sensors, the last repeated up to its width."""
+    total, samples = readings[0].shape[:2]
+    places = np.minimum(np.arange(-(-total // NARROWEST) * NARROWEST), total - 1)
+    found = np.concatenate([r[places].transpose(2, 1, 0) for r in readings])
+    if counts is None:
+        return Sensors(np.ascontiguousarray(found), None)
+    mask = (np.arange(samples)[:, None] < counts[places]).astype(float)
+    return Sensors(np.where(mask > 0, found, found[:, :1]), mask)
 
 
 class Normals(NamedTuple):

@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 from msgspec import Struct
 
+from casest.declaration.model import Model
 from casest.declaration.travelling import fingerprint
+from casest.errors import UsageError
+from casest.fleet.population import Population
+from casest.results.file import load_json
 from casest.results.result import Result
 from casest.tasks.common import Common, Told
 from casest.tasks.job import Job
@@ -30,6 +36,23 @@ class Spread(Struct, frozen=True, kw_only=True):
     unit: str
 
 
+class PopulationFound(Struct, frozen=True, kw_only=True):
+    """Mean and covariance of the unknowns over the fleet, without the noise of the estimates.
+
+    `sigma` of one residual; `mean_std` and `spread_std` are uncertainties of `mean` and `spread`;
+    from `sensors` of them, outlying ones left out. There where covariances were asked for.
+    """
+
+    names: list[str]
+    mean: list[float]
+    mean_std: list[float]
+    spread: list[float]
+    spread_std: list[float]
+    covariance: list[list[float]]
+    sigma: float
+    sensors: int
+
+
 class FleetResult(Result, frozen=True, kw_only=True):
     """The content of `fleet.json`: nothing in it depends on who computed, nor when."""
 
@@ -43,14 +66,21 @@ class FleetResult(Result, frozen=True, kw_only=True):
     reasons: dict[str, int]
     parameters: dict[str, Spread]
     rms: Spread
+    population: PopulationFound | None
     options: str
     versions: dict[str, str]
 
 
 def fleet_result(
-    job: Job, total: Total, *, dataset: str, partitions: int, unreadable: Sequence[Any]
+    job: Job,
+    total: Total,
+    *,
+    dataset: str,
+    partitions: int,
+    unreadable: Sequence[Any],
+    found: Population | None = None,
 ) -> FleetResult:
-    """All partitions of a data set in numbers."""
+    """All partitions of a data set in numbers; `found` of their sensors."""
     rejected = dict(total.rejected)
     if unreadable:
         rejected["file"] = rejected.get("file", 0) + len(unreadable)
@@ -68,8 +98,53 @@ def fleet_result(
         reasons=total.codes,
         parameters={name: _spread(name, total.moments, job.units.get(name, "")) for name in names},
         rms=_spread("rms", total.moments, ""),
+        population=None if found is None else _population(found),
         options=job.identity["options"],
         versions={name: v for name, v in job.identity.items() if name in job.versions},
+    )
+
+
+def known(folder: Path, model: Model, units: Mapping[str, str]) -> Population:
+    """The fleet in a folder, as a prior for sensors of the same model in the same units.
+
+    Raises UsageError where there is none, or it is another model's.
+    """
+    option, file = f"--prior {folder}", folder / FLEET
+    try:
+        content = load_json(file)
+        found, parameters = content["population"], content["parameters"]
+    except (OSError, ValueError, KeyError, TypeError):
+        raise UsageError(f"{option}: no {FLEET} of casest fleet there that can be read") from None
+    if found is None:
+        raise UsageError(
+            f"{option}: holds no population of sensors; calibrate that fleet with --covariance"
+        )
+    names = [name for p in model.parameters for name in p.entry_names]
+    if content["model"] != model.name or found["names"] != names:
+        raise UsageError(
+            f"{option}: is a fleet of {content['model']} with the unknowns "
+            f"{', '.join(found['names'])}, and this is {model.name} with {', '.join(names)}"
+        )
+    for name in names:
+        before, now = parameters[name]["unit"], units.get(name, "")
+        if before != now:
+            raise UsageError(f"{option}: {name} is in {before or 'no unit'} there, here in {now}")
+    arrays = (np.array(found[n]) for n in ("mean", "covariance"))
+    mean, covariance = arrays
+    spreads = (np.array(found[n]) for n in ("mean_std", "spread_std"))
+    return Population(tuple(names), mean, covariance, found["sigma"], *spreads, found["sensors"])
+
+
+def _population(found: Population) -> PopulationFound:
+    return PopulationFound(
+        names=list(found.names),
+        mean=found.mean.tolist(),
+        mean_std=found.mean_std.tolist(),
+        spread=found.spread.tolist(),
+        spread_std=found.spread_std.tolist(),
+        covariance=found.covariance.tolist(),
+        sigma=found.sigma,
+        sensors=found.count,
     )
 
 

@@ -11,10 +11,14 @@ from numpy.typing import NDArray
 
 from casest.dataset.partitions import Partition
 from casest.declaration.shapes import Array
+from casest.fleet.population import Population, population
 from casest.tasks.job import Job
+from casest.tasks.tally import Total
 
 #: Sensors that are drawn; and among how many the outlying ones are looked for.
 DRAWN, LOOKED_AT = 200_000, 20_000_000
+#: Sensors of which the fleet's distribution is estimated; fewest, for each unknown.
+ESTIMATED, FEWEST = 5_000, 5
 #: Outlying sensors that are named, and from how many standard deviations of the fleet on.
 NAMED, OUTLYING = 20, 5.0
 #: Standard deviations of a normal distribution between its quartiles.
@@ -91,6 +95,45 @@ def drawn(job: Job, partitions: Sequence[Partition], sensors: int) -> Drawn:
         outlying,
         sensors if few else 0,
     )
+
+
+def estimated(job: Job, partitions: Sequence[Partition], total: Total) -> Population | None:
+    """The fleet's distribution from some of its sensors; None without their covariances.
+
+    Outlying sensors are no part of it.
+    """
+    names = tuple(name for p in job.model.parameters for name in p.entry_names)
+    if not job.covariance or job.prior is not None or total.trusted < FEWEST * len(names):
+        return None
+    step, first = max(1, -(-total.sensors // ESTIMATED)), 0
+    parts = []
+    for batch in _batches(job, partitions, [*names, "covariance", "trusted"]):
+        chosen = np.arange(-first % step, len(batch), step)
+        first += len(batch)
+        chosen = chosen[_numbers(batch.column("trusted"))[chosen] > 0]
+        x = np.array([_numbers(batch.column(n))[chosen] for n in names])
+        lower = batch.column("covariance").take(pyarrow_array(chosen)).flatten()
+        parts.append((x, _numbers(lower).reshape(len(chosen), -1)))
+    x = np.concatenate([own for own, _ in parts], axis=1)
+    lower = np.concatenate([own for _, own in parts])
+    quartiles = np.array([_quartiles(own) for own in x])
+    scale = (quartiles[:, 2] - quartiles[:, 0]) / QUARTILES
+    near = (np.abs(x - quartiles[:, 1:2]) <= OUTLYING * scale[:, None]).all(axis=0)
+    near &= np.isfinite(lower).all(axis=1)
+    if near.sum() < FEWEST * len(names):
+        return None
+    V = np.zeros((len(lower), len(names), len(names)))
+    rows, columns = np.tril_indices(len(names))
+    V[:, rows, columns] = V[:, columns, rows] = lower
+    variance = np.full(1, total.moments["variance"].mean)
+    return population(names, x[:, near].T, V[near], np.sqrt(variance))
+
+
+def pyarrow_array(values: Any) -> Any:
+    """Places in an Arrow array."""
+    import pyarrow
+
+    return pyarrow.array(values)
 
 
 def _is_time(kind: Any) -> bool:

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 from casest import __version__
 from casest.data.options import Options
@@ -14,6 +15,7 @@ from casest.dataset.layout import Layout
 from casest.dataset.partitions import Partition
 from casest.declaration.model import Model
 from casest.declaration.travelling import fingerprint
+from casest.fleet.population import Population
 
 RESULTS, TASKS = "results", ".tasks"
 
@@ -28,6 +30,8 @@ class Job:
     folder: Path
     noise: float | None = None
     covariance: bool = False
+    #: What is known of a sensor before it is measured: the fleet that it is one of.
+    prior: Population | None = None
     #: Unit of every entry of a parameter, by its name.
     units: Mapping[str, str] = field(default_factory=dict)
     #: Versions of what computes, by name.
@@ -38,7 +42,7 @@ class Job:
         """What decides the numbers, by what it is called."""
         options = [sorted(self.options.columns.items()), sorted(self.options.units.items())]
         scales = sorted((name, repr(scale)) for name, scale in self.options.scales.items())
-        own = [*options, scales, self.options.rate, self.options.time_zero]
+        own = [*options, scales, self.options.rate, self.options.time_zero, *self._known()]
         return {
             "model": f"{self.model.name} {fingerprint(self.model)[:16]}",
             "options": _digest(repr([own, self.noise, self.covariance, self.layout.kept]))[:16],
@@ -46,6 +50,10 @@ class Job:
             "casest": __version__,
             **self.versions,
         }
+
+    def _known(self) -> list[Any]:
+        known = self.prior
+        return [known.mean.tolist(), known.covariance.tolist(), known.sigma] if known else []
 
     def key(self, partition: Partition) -> str:
         """Hash of the model, the options and the input: what is alike has one result."""

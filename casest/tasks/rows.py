@@ -21,7 +21,7 @@ class Rows:
         n = sum(p.shape.size for p in model.parameters)
         self.x, self.std = np.full((2, n, size), np.nan)
         self.covariance = np.full((n * (n + 1) // 2, size), np.nan)
-        self.rms, self.misfit = np.full((2, size), np.nan)
+        self.rms, self.misfit, self.variance = np.full((3, size), np.nan)
         self.trusted = np.zeros(size, bool)
         self.reasons: dict[int, str] = {}
         self.codes: dict[int, str] = {}
@@ -35,7 +35,7 @@ class Rows:
             self.x[k, places] = batch.values[name][entry]
             self.std[k, places] = batch.std[name][entry]
         self.covariance[:, places] = batch.covariance[:, self._lower[0], self._lower[1]].T
-        self.rms[places] = batch.rmse
+        self.rms[places], self.variance[places] = batch.rmse, batch.sigma**2
         self.misfit[places] = np.nan if batch.misfit is None else batch.misfit
         self.trusted[places] = batch.trusted
         for i in np.flatnonzero(~batch.trusted):

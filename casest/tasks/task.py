@@ -19,6 +19,7 @@ from casest.dataset.readings import Block, blocks, bound, name_of, together
 from casest.declaration.shapes import Array
 from casest.errors import DataError
 from casest.fleet.calibrate_many import calibrate_many
+from casest.fleet.population import calibrate_with
 from casest.tasks.job import Job
 from casest.tasks.rows import Rows, record_batch, schema
 from casest.tasks.tally import FILE, NAMELESS, READINGS, REFUSED, TWICE, Moments, Rejected, Tally
@@ -75,7 +76,10 @@ def _calibrated(
     usable = np.setdiff1d(chosen, np.array([*block.bad], dtype=int))
     for places in alike(block.counts, usable):
         given, counts = side_by_side(signals, block.counts, ends, places)
-        found = calibrate_many(job.model, given, counts=counts, noise=job.noise, misfit=True)
+        if job.prior is None:
+            found = calibrate_many(job.model, given, counts=counts, noise=job.noise, misfit=True)
+        else:
+            found = calibrate_with(job.model, given, job.prior, counts)
         rows.put(places, found)
     for k in map(int, chosen[~rows.trusted[chosen]]):
         bad = k in block.bad
@@ -153,7 +157,7 @@ def side_by_side(
 def _measure(job: Job, rows: Rows, tally: Tally) -> None:
     """Moments of every unknown and of the residual, of trusted sensors."""
     names = [name for p in job.model.parameters for name in p.entry_names]
-    measured = dict(zip(names, rows.x, strict=True)) | {"rms": rows.rms}
+    measured = dict(zip(names, rows.x, strict=True)) | {"rms": rows.rms, "variance": rows.variance}
     measured |= {f"{n}_std": v for n, v in zip(names, rows.std, strict=True)}
     for name, values in measured.items():
         if (own := Moments.of(values[rows.trusted])).count:
