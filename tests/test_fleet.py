@@ -246,7 +246,7 @@ def refused(capsys, *words):
 
 
 def test_a_folder_without_parquet_is_refused(tmp_path, capsys):
-    said = refused(capsys, *fleets.WORDS, tmp_path, "-o", tmp_path / "out")
+    said = refused(capsys, *fleets.WORDS, tmp_path, "-o", tmp_path.with_name("out"))
     assert said == (
         f"{tmp_path}: no Parquet files there (….parquet, ….pq, ….parq); name a file, a folder, or "
         "a pattern in quotes"
@@ -268,7 +268,7 @@ def test_files_with_different_schemas_are_refused(tmp_path, capsys):
     v = fleets.readings(3)
     pq.write_table(fleets.wide(v, fleets.names(3)), tmp_path / "a.parquet")
     pq.write_table(fleets.long(v, fleets.names(3)), tmp_path / "b.parquet")
-    said = refused(capsys, *fleets.WORDS, tmp_path, "-o", tmp_path / "out")
+    said = refused(capsys, *fleets.WORDS, tmp_path, "-o", tmp_path.with_name("out"))
     assert said == (
         f"{tmp_path}/b.parquet: column vx [m/s^2] is double, and in {tmp_path}/a.parquet "
         "list<double>; a data set has one schema: convert it, or calibrate these files apart"

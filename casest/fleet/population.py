@@ -158,7 +158,7 @@ def _fitted(squares: Squares, sensors: Sensors, fleet: Population) -> _Fitted:
     found.low[:], found.high[:], found.smallest[:], found.weakest[:] = 1.0, 1.0, 1.0, 0.0
     bad = ~np.isfinite(sensors.samples).all(axis=0)
     found.where[:] = np.argmax(bad, axis=0)
-    found.add(Code.READING, bad.any(axis=0))
+    found.add(Code.READING, np.asarray(bad.any(axis=0)))
     found.add(Code.NOT_FINITE, ~np.isfinite(squared))
     found.add(Code.NOT_SETTLED, ~(left <= STEP**2))
     found.add(Code.LOUD, ~(chance >= TOO_LARGE))

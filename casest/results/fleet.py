@@ -129,10 +129,11 @@ def known(folder: Path, model: Model, units: Mapping[str, str]) -> Population:
         before, now = parameters[name]["unit"], units.get(name, "")
         if before != now:
             raise UsageError(f"{option}: {name} is in {before or 'no unit'} there, here in {now}")
-    arrays = (np.array(found[n]) for n in ("mean", "covariance"))
-    mean, covariance = arrays
-    spreads = (np.array(found[n]) for n in ("mean_std", "spread_std"))
-    return Population(tuple(names), mean, covariance, found["sigma"], *spreads, found["sensors"])
+    mean, covariance, mean_std, spread_std = (
+        np.array(found[n]) for n in ("mean", "covariance", "mean_std", "spread_std")
+    )
+    sigma, count = found["sigma"], found["sensors"]
+    return Population(tuple(names), mean, covariance, sigma, mean_std, spread_std, count)
 
 
 def _population(found: Population) -> PopulationFound:
