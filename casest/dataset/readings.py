@@ -119,10 +119,11 @@ def _wide(layout: Layout, piece: Piece) -> Iterator[Block]:
     size = max(1, max(r.size for r in layout.readings))
     rows = max(FEWEST, round(HELD / max(each / size * width, 1.0)) // FEWEST * FEWEST)
     for row, batch in _batches(layout, piece, min(rows, 1 << 16)):
-        yield _wide_block(layout, piece, row, batch)
+        yield wide_block(layout, piece, row, batch)
 
 
-def _wide_block(layout: Layout, piece: Piece, row: int, batch: Any) -> Block:
+def wide_block(layout: Layout, piece: Piece, row: int, batch: Any) -> Block:
+    """The sensors of a record batch with one row for each, which begins at a row of its file."""
     import pyarrow
 
     if piece.name is None:

@@ -41,7 +41,7 @@ def run(job: Job, partition: Partition) -> int:
     tally, made = Tally(), Counter[str]()
     with written_at_once(), _written(job, job.results(partition)) as write:
         for block in _readable(job, partition, tally):
-            _calibrated(job, block, dict(partition.twice), tally, made, write)
+            calibrated(job, block, dict(partition.twice), tally, made, write)
         tally.codes = dict(sorted(made.items()))
         write_atomically(job.tally(partition), msgspec.json.encode(tally) + b"\n")
     return partition.number
@@ -60,7 +60,7 @@ def _readable(job: Job, partition: Partition, tally: Tally) -> Iterator[Block]:
             tally.reject(Rejected(pieces[0].file.name, row, None, FILE, f"{error}{said}"))
 
 
-def _calibrated(
+def calibrated(
     job: Job,
     block: Block,
     twice: dict[str, str],
