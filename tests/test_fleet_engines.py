@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import importlib.util
+from pathlib import Path
+
 import fleets
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from casest import DataError, UsageError, calibrate_arrow, calibrate_many
 from casest.results.find import find_model
 
+EXAMPLES = Path(__file__).parents[1] / "examples"
 NORM = find_model("norm-triangular").having(norm=fleets.GRAVITY)
 
 
@@ -41,30 +46,36 @@ def test_long_form_and_a_missing_column_are_refused():
         calibrate_arrow(NORM, fleets.wide(v, fleets.names(3)), sensor="unit")
 
 
-def test_spark_calls_it(tmp_path):
-    pyspark = pytest.importorskip("pyspark.sql", reason="Spark is not installed")
-    from pyspark.sql.pandas.types import from_arrow_schema
+def example(name):
+    spec = importlib.util.spec_from_file_location(name, EXAMPLES / f"{name}.py")
+    made = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(made)
+    return made
 
-    v = fleets.readings(40)
-    table = fleets.wide(v, fleets.names(40))
-    spark = pyspark.SparkSession.builder.master("local[1]").getOrCreate()
-    made = calibrate_arrow(NORM, table.slice(0, 1)).schema
-    frame = spark.createDataFrame(table.to_pylist()).mapInArrow(rows, from_arrow_schema(made))
-    found = {row["sensor"]: row["offset[0]"] for row in frame.collect()}
+
+def same_as_in_memory(v, found):
+    offsets = {row["sensor"]: row["offset[0]"] for row in found}
     direct = calibrate_many(NORM, {"v": v}).values["offset"][:, 0]
-    assert [found[name] for name in fleets.names(40)] == direct.tolist()
+    assert [offsets[name] for name in fleets.names(len(v))] == direct.tolist()
+
+
+def test_spark_calls_it(tmp_path):
+    sql = pytest.importorskip("pyspark.sql", reason="Spark is not installed")
+    v = fleets.readings(40)
+    pq.write_table(fleets.wide(v, fleets.names(40)), tmp_path / "line.parquet")
+    spark = sql.SparkSession.builder.master("local[1]").getOrCreate()
+    frame = spark.read.parquet(str(tmp_path / "line.parquet"))
+    found = example("fleet_spark").calibrated(frame).collect()
+    same_as_in_memory(v, [row.asDict() for row in found])
     spark.stop()
 
 
-def test_ray_calls_it():
+def test_ray_calls_it(tmp_path):
     ray = pytest.importorskip("ray", reason="Ray is not installed")
     data = pytest.importorskip("ray.data", reason="Ray is not installed")
     v = fleets.readings(40)
+    pq.write_table(fleets.wide(v, fleets.names(40)), tmp_path / "line.parquet")
     ray.init(num_cpus=1, include_dashboard=False)
-    made = data.from_arrow(fleets.wide(v, fleets.names(40))).map_batches(
-        lambda table: calibrate_arrow(NORM, table), batch_format="pyarrow"
-    )
-    found = {row["sensor"]: row["offset[0]"] for row in made.take_all()}
-    direct = calibrate_many(NORM, {"v": v}).values["offset"][:, 0]
-    assert [found[name] for name in fleets.names(40)] == direct.tolist()
+    line = data.read_parquet(str(tmp_path / "line.parquet"))
+    same_as_in_memory(v, example("fleet_ray").calibrated(line).take_all())
     ray.shutdown()

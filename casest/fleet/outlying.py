@@ -2,9 +2,8 @@
 
 The largest of M externally studentised residuals tᵢ = rᵢ/(σ₍ᵢ₎·√(1 − hᵢ)), hᵢ the leverage, with
 Bonferroni's bound on its chance (Cook & Weisberg, Residuals and Influence in Regression, 1982,
-2.2.2): one pose that was knocked, a glitch, a level that was misread. Leverages are computed where
-residuals are largest, in LOOKED_AT samples of each sensor: the chance that is told is never too
-small.
+2.2.2): one pose that was knocked, a glitch, a level that was misread. Leverages are computed of
+the two samples with the largest residuals alone: the chance that is told is never too small.
 """
 
 from __future__ import annotations
@@ -17,8 +16,6 @@ from casest.fleet.fit import Fits, residual_counts
 from casest.fleet.linear import cholesky
 from casest.fleet.sums import Sensors, Squares
 
-#: Samples of each sensor whose leverage is computed: those with the largest residuals.
-LOOKED_AT = 4
 #: Share of a residual that must be left beside its leverage: below, the fit follows the reading.
 LEFT = 1e-6
 
@@ -31,11 +28,10 @@ def outlying(squares: Squares, sensors: Sensors, fits: Fits) -> Array:
     count = residual_counts(squares, sensors)
     freedom = count - len(fits.x)
     with np.errstate(all="ignore"):
-        square = np.square(squares.residuals(fits.x, sensors)).sum(axis=0)
-        places = np.argpartition(-square, min(LOOKED_AT, len(square)) - 1, axis=0)[:LOOKED_AT]
-        few = Sensors(np.take_along_axis(sensors.samples, places[None], axis=1), None)
-        largest = squares.studentised(fits.x, few, cholesky(fits.matrix))
-        own = np.minimum(largest * freedom / square.sum(axis=0), freedom * (1 - LEFT))
+        squared, places = squares.largest(fits.x, sensors)
+        few = sensors.samples[:, places, np.arange(len(squared))]
+        largest = squares.studentised(fits.x, Sensors(few, None), cholesky(fits.matrix))
+        own = np.minimum(largest * freedom / squared, freedom * (1 - LEFT))
         t = np.sqrt(own * (freedom - 1) / (freedom - own))
         chance = np.minimum(1.0, 2 * count * stdtr(freedom - 1, -t))
     return np.asarray(np.where(freedom > 1, chance, np.nan))

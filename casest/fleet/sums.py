@@ -301,6 +301,24 @@ class Squares:
                 np.maximum(largest[s], square.max(axis=0), out=largest[s])
         return largest
 
+    def largest(self, x: Array, sensors: Sensors) -> tuple[Array, NDArray[np.intp]]:
+        """Σr² (W,), and the two samples of every sensor whose residuals are largest, (2, W)."""
+        total, best = np.zeros(x.shape[1]), np.full((2, x.shape[1]), -1.0)
+        places = np.zeros((2, x.shape[1]), dtype=np.intp)
+        for span, s, values in self._residual.chunks(x, sensors):
+            square, own = np.einsum("mps,mps->ps", values, values), np.arange(values.shape[2])
+            total[s] += square.sum(axis=0)
+            sizes, samples = [*best[:, s]], [*places[:, s]]
+            for _ in range(min(2, len(square))):
+                k = square.argmax(axis=0)
+                sizes.append(square[k, own])
+                samples.append(k + span.start)
+                square[k, own] = -1.0
+            order = np.argsort(sizes, axis=0, kind="stable")[-1:-3:-1]
+            best[:, s] = np.take_along_axis(np.array(sizes), order, axis=0)
+            places[:, s] = np.take_along_axis(np.array(samples), order, axis=0)
+        return total, places
+
     def residuals(self, x: Array, sensors: Sensors) -> Array:
         """Every residual, (m, N, W)."""
         found = np.empty((self.residual_count, *sensors.samples.shape[1:]))
