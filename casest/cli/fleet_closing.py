@@ -20,6 +20,7 @@ def fleet_closing(model_name: str, data: Sequence[str], options: CloseOptions) -
     from casest.cli.fleets import FleetOptions, planned
     from casest.diagnose.levels import LEVELS
     from casest.effects import CATALOGUE
+    from casest.fleet.common import CHANCE
     from casest.report.text.fleet import common_text
     from casest.results.file import as_json
     from casest.results.fleet import COMMON, common_result
@@ -43,7 +44,7 @@ def fleet_closing(model_name: str, data: Sequence[str], options: CloseOptions) -
         job,
         plan.partitions,
         (*CATALOGUE, *own),
-        chance=LEVELS.chance,
+        chance=CHANCE,
         clear=LEVELS.clear,
         say=progress,
     )

@@ -31,6 +31,9 @@ from casest.leastsquares.per_sample import residual_and_jacobian
 
 #: Share of an effect's slopes that the declared unknowns must leave, for it to be told from them.
 SURVIVES = 1e-3
+#: Chance of naming any effect where a fleet has none in common: it has power to spare, an effect of
+#: 0.2 standard deviations in each of 10 000 sensors has a T² of 400.
+CHANCE = 1e-4
 #: Scores are clipped here, in robust standard deviations: one bad sensor is no common effect.
 CLIP = 8.0
 
