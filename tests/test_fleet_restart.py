@@ -168,6 +168,8 @@ def test_no_scheduler_at_an_address_is_said_before_any_work(line, tmp_path, caps
     said = capsys.readouterr().err
     assert "--scheduler tcp://127.0.0.1:9: no scheduler answers there within 0.5 s" in said
     assert not out.exists()
+    assert run(words("line", out, "--scheduler", "tcp://127.0.0.1:9")) == 1
+    assert "its workers may be in another folder; give line as /" in capsys.readouterr().err
 
 
 def test_a_dask_worker_killed_in_the_middle_costs_nothing_but_time(line, tmp_path):

@@ -140,6 +140,12 @@ def planned(model: Model, dataset: str, options: FleetOptions) -> tuple[Plan, Jo
     assert options.output is not None
     if options.workers and (options.scheduler or options.processes):
         raise UsageError("--workers starts workers here: leave out --scheduler and --processes")
+    for word in (dataset, str(options.output)) if options.scheduler else ():
+        if "://" not in word and not Path(word).is_absolute():
+            raise UsageError(
+                f"--scheduler: its workers may be in another folder; give {word} as "
+                f"{Path(word).resolve()}"
+            )
     if options.prior and options.noise:
         raise UsageError("--noise: with --prior the noise is that of the fleet; leave it out")
     if Path(dataset).resolve() in options.output.resolve().parents:

@@ -111,8 +111,7 @@ def layout_of(
     errors: list[DataError] = []
     for wide in (True, False):
         readings = [r for r in (_readings(table, entry, wide) for entry in others) if r]
-        if wide and not any(_VECTOR.match(str(schema.field(r.field).type)) or r.size
-                            for r in readings):  # fmt: skip
+        if not readings:
             continue
         try:
             bound, units, time, used = _bound(file, readings, signals, options)

@@ -60,6 +60,7 @@ class Drawn:
 def drawn(job: Job, partitions: Sequence[Partition], sensors: int) -> Drawn:
     """What the page draws of results that are all there."""
     names = tuple(name for p in job.model.parameters for name in p.entry_names)
+    few, partitions, sensors = sensors <= LOOKED_AT, *_some(partitions, sensors)
     step = max(1, -(-sensors // DRAWN))
     over = next((n for n, t in zip(job.layout.kept, job.layout.types[1:], strict=True)
                  if _is_time(t)), "")  # fmt: skip
@@ -79,7 +80,6 @@ def drawn(job: Job, partitions: Sequence[Partition], sensors: int) -> Drawn:
     order = np.argsort(at, kind="stable")
     quartiles = np.array([_quartiles(own[trusted]) for own in values])
     centre, scale = quartiles[:, 1], (quartiles[:, 2] - quartiles[:, 0]) / QUARTILES
-    few = sensors <= LOOKED_AT
     outlying = _outlying(job, partitions, names, centre, scale) if few else ()
     return Drawn(
         names,
@@ -105,7 +105,8 @@ def estimated(job: Job, partitions: Sequence[Partition], total: Total) -> Popula
     names = tuple(name for p in job.model.parameters for name in p.entry_names)
     if not job.covariance or job.prior is not None or total.trusted < FEWEST * len(names):
         return None
-    step, first = max(1, -(-total.sensors // ESTIMATED)), 0
+    partitions, sensors = _some(partitions, total.sensors)
+    step, first = max(1, -(-sensors // ESTIMATED)), 0
     parts = []
     for batch in _batches(job, partitions, [*names, "covariance", "trusted"]):
         chosen = np.arange(-first % step, len(batch), step)
@@ -127,6 +128,12 @@ def estimated(job: Job, partitions: Sequence[Partition], total: Total) -> Popula
     V[:, rows, columns] = V[:, columns, rows] = lower
     variance = np.full(1, total.moments["variance"].mean)
     return population(names, x[:, near].T, V[near], np.sqrt(variance))
+
+
+def _some(partitions: Sequence[Partition], sensors: int) -> tuple[Sequence[Partition], int]:
+    """Evenly chosen partitions with no more than LOOKED_AT sensors, about, and how many those."""
+    step = max(1, -(-sensors // LOOKED_AT))
+    return partitions[::step], sensors // step
 
 
 def pyarrow_array(values: Any) -> Any:
