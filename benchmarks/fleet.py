@@ -17,7 +17,7 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
-from time import perf_counter, process_time
+from time import perf_counter, process_time, sleep
 from typing import Any
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -64,11 +64,27 @@ def command(dataset: Path, out: Path, processes: int) -> tuple[float, float, flo
     before, began = resource.getrusage(resource.RUSAGE_CHILDREN), perf_counter()
     argv = [sys.executable, "-c", CODE, *map(str, words), "--processes", str(processes)]
     going = subprocess.Popen(argv, stdout=subprocess.DEVNULL)
-    _, status, used = os.wait4(going.pid, 0)
-    assert status == 0
+    most = 0.0
+    while going.poll() is None:
+        most = max(most, largest_of(going.pid))
+        sleep(0.05)
+    assert going.returncode == 0
     after, took = resource.getrusage(resource.RUSAGE_CHILDREN), perf_counter() - began
     spent = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    return spent, took, used.ru_maxrss / 1024
+    return spent, took, most
+
+
+def largest_of(command: int) -> float:
+    """Most memory that a process, or one that it started, has held so far, MB."""
+    found = [0.0]
+    for status in Path("/proc").glob("[0-9]*/status"):
+        try:
+            said = dict(line.split(":", 1) for line in status.read_text().splitlines())
+        except (OSError, ValueError):  # it has ended
+            continue
+        if "VmHWM" in said and command in (int(said["Pid"]), int(said["PPid"])):
+            found.append(int(said["VmHWM"].split()[0]) / 1024)
+    return max(found)
 
 
 def in_memory(v: Any, misfit: bool) -> float:
@@ -126,7 +142,7 @@ def main() -> None:
                 spent, took, memory = command(dataset, out, 2)
                 print(
                     f"  two processes: {took:.1f} s, {spent:.1f} s of the processor, "
-                    f"{one / spent:.2f} of the rate per core of one; driver {memory:.0f} MB",
+                    f"{one / spent:.2f} of the rate per core of one; at most {memory:.0f} MB",
                     flush=True,
                 )
             shutil.rmtree(dataset)

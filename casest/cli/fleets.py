@@ -212,24 +212,27 @@ def computed(job: Job, plan: Plan, options: FleetOptions) -> None:
 
     refuse_others(job)
     left = missing(job, plan.partitions)
-    done = len(plan.partitions) - len(left)
     if not left:
         return
     try:
         with executor(options, len(left)) as run:
             prepared(job)
-            for k, _ in enumerate(_watched(run(job, left), left, done, len(plan.partitions))):
-                done = len(plan.partitions) - len(left) + k + 1
+            for _ in _watched(run(job, left), left, len(plan.partitions)):
+                pass
     except KeyboardInterrupt:
-        raise _unfinished("interrupted", job, done, plan, INTERRUPTED) from None
+        raise _unfinished("interrupted", job, plan, INTERRUPTED) from None
     except Stopped as error:
-        raise _unfinished(str(error), job, done, plan, 1) from None
+        raise _unfinished(str(error), job, plan, 1) from None
 
 
-def _unfinished(why: str, job: Job, done: int, plan: Plan, code: int) -> CasestError:
+def _unfinished(why: str, job: Job, plan: Plan, code: int) -> CasestError:
+    from casest.tasks.folder import missing
+
+    total = len(plan.partitions)
+    done = total - len(missing(job, plan.partitions))
     error = CasestError(
-        f"{why}; {done} of {len(plan.partitions)} partitions are done and stay in {job.folder}: "
-        "the same command goes on from there"
+        f"{why}; {done} of {total} partitions are done and stay in {job.folder}: the same command "
+        "goes on from there"
     )
     error.exit_code = code
     return error
@@ -250,11 +253,9 @@ def executor(options: FleetOptions, tasks: int) -> Iterator[Any]:
     yield here if count == 1 else Processes(count)
 
 
-def _watched(
-    done: Iterator[int], left: Sequence[Partition], before: int, total: int
-) -> Iterator[int]:
+def _watched(done: Iterator[int], left: Sequence[Partition], total: int) -> Iterator[int]:
     """The same, with how far it is, how fast, and how long it will take."""
-    began = time.monotonic()
+    began, before = time.monotonic(), total - len(left)
     progress(f"partition {before + 1} of {total}")
     for k, number in enumerate(done, 1):
         each = (time.monotonic() - began) / k
