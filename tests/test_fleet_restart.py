@@ -193,3 +193,20 @@ def test_what_a_worker_is_sent_pickles(line, tmp_path):
     again = pickle.loads(pickle.dumps((job, plan)))
     assert again == (job, plan)
     assert again[0].key(plan.partitions[0]) == job.key(plan.partitions[0])
+
+
+def test_a_model_of_ones_own_file_reaches_every_worker(tmp_path):
+    file = tmp_path / "own_triad.py"
+    file.write_text(
+        "from casest import Residual, model, norm_2, param, quantity, signal\n\n\n@model\n"
+        'def own_triad(v=signal(3, "m/s^2"), *, offset=param(3, "m/s^2")):\n'
+        '    """Three axes with an offset each."""\n'
+        '    length = quantity("length", norm_2(v - offset), "m/s^2")\n'
+        '    return Residual(implicit=length - 9.80665, unit="m/s^2", axes=("norm",))\n'
+    )
+    fleets.dataset(tmp_path / "in", files=2, each=EACH)
+    told = ["fleet", file, tmp_path / "in", "-o", tmp_path / "out", "--processes", 2]
+    subprocess.run(fleets.command(*told, numbers=SMALL), check=True, capture_output=True)
+    found = fleets.results(tmp_path / "out")
+    assert len(found) == 2 * EACH
+    assert {"offset[0]", "offset[2]_std"} <= set(found.column_names)
