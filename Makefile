@@ -5,8 +5,9 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
 .PHONY: demo test lint types format wheel bench study study-starts study-nist study-loop \
-	study-motion study-flights study-inputs study-records study-asked study-slow study-coverage study-deceptive \
-	study-deceptive-many study-mutation study-worlds study-noises study-structural \
+	study-motion study-flights study-inputs study-records study-asked study-slow study-coverage \
+	study-deceptive study-deceptive-many study-fleet study-mutation study-worlds study-noises \
+	study-structural \
 	figures docs clean
 
 demo: $(READY)
@@ -34,6 +35,7 @@ bench: $(READY)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/evaluate.py
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/wheel_solve.py
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/many.py
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/fleet.py
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/long.py
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/motion.py
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/motion_long.py
@@ -86,6 +88,9 @@ study-records: $(READY)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python studies/records.py
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python studies/agreement.py
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python studies/subsets.py
+
+study-fleet: $(READY)
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python studies/fleet_common.py
 
 study-structural: $(READY)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python studies/structural.py

@@ -80,6 +80,10 @@ if TYPE_CHECKING:
     from casest.estimate.estimate import Estimate as Estimate
     from casest.fleet.calibrate_many import Batch as Batch
     from casest.fleet.calibrate_many import calibrate_many as calibrate_many
+    from casest.fleet.population import Population as Population
+    from casest.fleet.population import calibrate_with as calibrate_with
+    from casest.fleet.population import population as population
+    from casest.tasks.arrow import calibrate_arrow as calibrate_arrow
 
 
 def _homes() -> dict[str, str]:

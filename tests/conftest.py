@@ -11,7 +11,8 @@ import pytest
 
 #: The files that take longest come first: a long one at the end would leave a core idle.
 LONGEST = (
-    "norm_limits", "nist", "norm_statistics", "closing_records", "pages", "readme", "loop",
+    "norm_limits", "nist", "norm_statistics", "closing_records", "fleet_restart", "pages",
+    "fleet_common", "readme", "loop",
     "adequacy", "examples", "cli", "solvers", "pair", "formula", "closing_motion", "kernel",
     "false_alarms", "spread", "export", "profile", "batch", "report", "compare", "replay", "wheel",
     "certificate",

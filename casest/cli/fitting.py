@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from casest.cli.flags import Kind, refuse, taking
+from casest.cli.fleet_closing import fleet_closing
 from casest.cli.loading import (
+    asked_effects,
     declared_model,
     held_out,
     model_and_records,
@@ -30,7 +32,7 @@ from casest.cli.shared import commands, echo, progress, reported, typed, write
 from casest.errors import NotTrusted, UsageError
 
 if TYPE_CHECKING:
-    from casest.declaration.effect import Effect
+    pass
 
 
 @commands.command("list")
@@ -109,7 +111,8 @@ def close(model_name: str, data: tuple[str, ...], options: CloseOptions) -> int:
 
     Verdict `adequate`: nothing that these data can show is missing; `extended`: effects were added
     and what is left is noise; `unexplained`: a misfit remains. Exit code 0 whatever the verdict.
-    Of an estimator in motion the one-step innovations are diagnosed.
+    Of an estimator in motion the one-step innovations are diagnosed; with --sensor the effects
+    that many sensors have in common.
     """
     from casest.dynamics import Dynamics
     from casest.results.find import find_any
@@ -117,6 +120,10 @@ def close(model_name: str, data: tuple[str, ...], options: CloseOptions) -> int:
     if isinstance(find_any(model_name), Dynamics):
         return closing_in_motion(model_name, data, options, typed())
     refuse(options, Kind.MOVING, f"is for estimators in motion; {model_name} is a calibration")
+    if options.sensor:
+        return fleet_closing(model_name, data, options)
+    if options.keep:
+        raise UsageError("--keep is for a data set of many sensors: say --sensor COLUMN too")
     return closing(model_name, data, options, typed())
 
 
@@ -170,26 +177,6 @@ def closing(model_name: str, data: Sequence[str], options: FitOptions, command: 
     else:
         echo(closing_text(result, options.output), verdict=True)
     return 0
-
-
-def asked_effects(
-    asked: Sequence[str],
-) -> tuple[set[str], tuple[Effect, ...], tuple[str, ...]]:
-    """Names of shipped effects that --effects says are there; those to try beside the catalogue;
-    columns that they are said to follow."""
-    from casest.effects import CATALOGUE
-    from casest.results.find import find_asked
-
-    catalogue = {e.name for e in CATALOGUE}
-    known, own, followed = catalogue & {*asked}, [], dict[str, None]()
-    for text in asked:
-        for effect, column in find_asked(text) if text not in known else ():
-            if column and effect.name in catalogue:
-                known.add(text)
-            followed |= {column: None} if column else {}
-            columns = tuple((name, f"={column}") for name, _ in effect.columns)
-            own.append(replace(effect, columns=columns) if column else effect)
-    return known, tuple(own), tuple(followed)
 
 
 def closing_in_motion(

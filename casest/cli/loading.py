@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,6 +14,7 @@ from casest.errors import UsageError
 
 if TYPE_CHECKING:
     from casest.data.run import Run
+    from casest.declaration.effect import Effect
     from casest.declaration.model import Model
     from casest.dynamics import Dynamics
 
@@ -134,3 +136,23 @@ def trajectory(moving: Dynamics, name: str, data: Sequence[str], options: Readin
     if len(runs) != 1:
         raise UsageError(f"{data[0]} holds {len(runs)} runs; a trajectory is one")
     return runs[0]
+
+
+def asked_effects(
+    asked: Sequence[str],
+) -> tuple[set[str], tuple[Effect, ...], tuple[str, ...]]:
+    """Names of shipped effects that --effects says are there; those to try beside the catalogue;
+    columns that they are said to follow."""
+    from casest.effects import CATALOGUE
+    from casest.results.find import find_asked
+
+    catalogue = {e.name for e in CATALOGUE}
+    known, own, followed = catalogue & {*asked}, [], dict[str, None]()
+    for text in asked:
+        for effect, column in find_asked(text) if text not in known else ():
+            if column and effect.name in catalogue:
+                known.add(text)
+            followed |= {column: None} if column else {}
+            columns = tuple((name, f"={column}") for name, _ in effect.columns)
+            own.append(replace(effect, columns=columns) if column else effect)
+    return known, tuple(own), tuple(followed)

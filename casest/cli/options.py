@@ -216,4 +216,18 @@ class FitOptions:
 class CloseOptions(FitOptions):
     """Options of `close`."""
 
+    sensor: str | None = flag(
+        None,
+        "--sensor",
+        only=Kind.FITTED,
+        metavar="COLUMN",
+        help="DATA is a Parquet data set of many sensors, named there: what have they in common?",
+    )
+    keep: Words = flag(
+        (),
+        "--keep",
+        only=Kind.FITTED,
+        metavar="COLUMN",
+        help="With --sensor: does it follow this column (line, supplier, fixture)?",
+    )
     sensors: SensorOptions = field(default_factory=SensorOptions)

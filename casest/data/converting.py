@@ -21,14 +21,8 @@ def vector(
     table: Table, signal: Signal, names: tuple[str, ...], options: Options
 ) -> tuple[Array, str | None, list[str]]:
     """Return a plain signal (N, size), its unit, and notes on what was assumed."""
-    stated = [_unit_of(table, table.columns[name], signal.name, options) for name in names]
-    target = unit_names.canonical(signal.unit) if signal.unit else next(filter(None, stated), None)
-    parts = []
-    for name, unit in zip(names, stated, strict=True):
-        values = _scaled(table, table.columns[name], signal.name, options)
-        if unit is not None and target is not None:
-            values = _converted(table, name, signal, values, unit, target, stated)
-        parts.append(values)
+    target, stated = units_of(table, signal, names, options)
+    parts = columns_of(table, signal, names, options)
     values = np.stack(parts, axis=1)
     checks.refuse_too_small(table.file, signal.name, values, names)
     notes = [*_overruled(table, signal, names, options), *_missing(table, signal, values, options)]
@@ -43,6 +37,29 @@ def vector(
             f"if that is wrong say --unit {signal.name}=…"
         )
     return values, target, notes
+
+
+def units_of(
+    table: Table, signal: Signal, names: tuple[str, ...], options: Options
+) -> tuple[str | None, list[str | None]]:
+    """The unit of a plain signal, and what is stated of each column; None where nobody says."""
+    stated = [_unit_of(table, table.columns[name], signal.name, options) for name in names]
+    target = unit_names.canonical(signal.unit) if signal.unit else next(filter(None, stated), None)
+    return target, stated
+
+
+def columns_of(
+    table: Table, signal: Signal, names: tuple[str, ...], options: Options
+) -> tuple[Array, ...]:
+    """The columns of a plain signal in its unit, (N,) each; nothing is noted on them."""
+    target, stated = units_of(table, signal, names, options)
+    parts = []
+    for name, unit in zip(names, stated, strict=True):
+        values = _scaled(table, table.columns[name], signal.name, options)
+        if unit is not None and target is not None:
+            values = _converted(table, name, signal, values, unit, target, stated)
+        parts.append(values)
+    return tuple(parts)
 
 
 def _missing(table: Table, signal: Signal, values: Array, options: Options) -> list[str]:

@@ -47,6 +47,16 @@ def written_together() -> Iterator[None]:
                 folder.rmdir()
 
 
+@contextlib.contextmanager
+def written_at_once() -> Iterator[None]:
+    """Within it each file gets its name as soon as it is whole, also within `written_together`."""
+    token = _together.set(None)
+    try:
+        yield
+    finally:
+        _together.reset(token)
+
+
 def make_folder(folder: Path) -> None:
     """Make a folder to write into, and those above it, where there is none.
 

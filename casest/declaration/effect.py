@@ -12,6 +12,7 @@ import numpy as np
 
 from casest.declaration.physics import SX
 from casest.declaration.symbols import Constant, Parameter, Signal, Undecided, named
+from casest.declaration.travelling import reduced
 from casest.errors import DeclarationError, UnitError, last_line
 from casest.units import known
 
@@ -79,6 +80,10 @@ class Effect:
     otherwise: Effect | None = None
     #: Python text of one that the loop wrote, to be given again.
     source: str = ""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """To pickle: its function by name."""
+        return reduced(self)
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         """Evaluate the effect's own function."""

@@ -33,6 +33,7 @@ from casest.declaration.sampson import sampson
 from casest.declaration.shapes import Array
 from casest.declaration.symbols import Constant, Parameter, Scope, Signal, Symbol, constant, named
 from casest.declaration.tracing import Traced, describe, function_of, reached_parameters, trace
+from casest.declaration.travelling import reduced
 from casest.errors import DeclarationError, UnitError, UsageError
 from casest.units import known, size
 
@@ -56,6 +57,10 @@ class Model:
     inverter: Callable[..., Any] | None = None
     canonicaliser: Callable[..., Any] | None = None
     estimators: tuple[tuple[str, Callable[..., Any]], ...] = ()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """To pickle: the declaration alone; it is traced anew where it arrives."""
+        return reduced(self)
 
     # -- the symbol table ----------------------------------------------------------------------
 

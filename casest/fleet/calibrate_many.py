@@ -27,6 +27,7 @@ from casest.estimate.reasons import Code
 from casest.estimate.valley import searchable
 from casest.fleet.fit import Bounds, Places, minimise, padded
 from casest.fleet.judge import Judge
+from casest.fleet.outlying import outlying
 from casest.fleet.sums import NARROWEST, Sensors, Squares, widest
 from casest.fleet.valley import Doubt, Ended
 from casest.fleet.verdicts import Verdicts
@@ -47,7 +48,8 @@ class Batch:
     `values` and `std` by parameter, (S, …); `covariance` (S, n, n) of the unknowns `names`;
     `sigma` (S,) the standard deviation of one residual and `rmse` (S,), in the residual's unit;
     `trusted` (S,). Of a refused sensor every number is NaN, and `reasons[i]` says why; of a trusted
-    one it says why it is believed.
+    one it says why it is believed. `misfit` (S,), if asked for: how probable a largest residual of
+    that size is where nothing is wrong with the sensor.
     """
 
     model: Model
@@ -59,6 +61,7 @@ class Batch:
     rmse: Array
     trusted: NDArray[np.bool_]
     reasons: Sequence[tuple[str, ...]]
+    misfit: Array | None = None
 
     def __len__(self) -> int:
         """Return the number of sensors."""
@@ -80,6 +83,7 @@ def calibrate_many(
     counts: Any = None,
     noise: float | None = None,
     retry: int = 0,
+    misfit: bool = False,
 ) -> Batch:
     """Fit the model to each of S sensors, N samples each; every sensor has its own certificate.
 
@@ -103,18 +107,19 @@ def calibrate_many(
 
     `noise` is the standard deviation of one residual that a sound sensor has: one with
     significantly more is refused. Up to `retry` refused sensors are calibrated once more one by
-    one, with IPOPT and second opinions.
+    one, with IPOPT and second opinions. `misfit` asks of each whether its largest residual is
+    larger than noise makes it (`fleet.outlying`), which costs a fifth of the time.
 
     The samples of a sensor are taken as independent of each other (poses, not a time series); from
     a hundred of them on a sensor whose neighbouring residuals are alike is refused.
     Raises UsageError for models with parameters per run, effects on the noise or on the sequence of
     samples, and directions or rotations among the unknowns; DataError for arrays of wrong shape.
     """
-    _check_model(model)
-    readings, lengths = _checked(model, signals, counts)
+    check_model(model)
+    readings, lengths = checked(model, signals, counts)
     size, samples = readings[0].shape[:2]
     job = _Job(model, readings, lengths, start or model.starter_of_many, noise)
-    result = _Result.empty(model, size)
+    result = _Result.empty(model, size, misfit)
     width = widest(samples)
     with np.errstate(all="ignore"), one_thread():
         for first in range(0, size, width):
@@ -127,7 +132,8 @@ def calibrate_many(
 # -- what is asked for ---------------------------------------------------------------------------
 
 
-def _check_model(model: Model) -> None:
+def check_model(model: Model) -> None:
+    """UsageError where many sensors of this model cannot be calibrated together."""
     per_run = [p.name for p in model.parameters if p.scope == "run"]
     curved = [p.name for p in model.parameters if p.shape.curved]
     if not model.parameters:
@@ -159,7 +165,7 @@ def _check_model(model: Model) -> None:
         )
 
 
-def _checked(
+def checked(
     model: Model, signals: Mapping[str, Any], counts: Any
 ) -> tuple[list[Array], Array | None]:
     """Readings (S, N, size) in the model's order, and how many of each sensor count, (S,)."""
@@ -223,26 +229,29 @@ class _Result:
     sigma: Array
     rmse: Array
     verdicts: Verdicts
+    misfit: Array | None
 
     @classmethod
-    def empty(cls, model: Model, size: int) -> _Result:
+    def empty(cls, model: Model, size: int, misfit: bool) -> _Result:
         n = sum(p.shape.size for p in model.parameters)
-        verdicts = Verdicts.empty(_names(model), size)
+        verdicts = Verdicts.empty(entry_names(model), size)
         # In memory the sensors lie side by side, as in the blocks that come in.
         x, std = np.empty((2, n, size)).transpose(0, 2, 1)
         covariance = np.empty((n, n, size)).transpose(2, 0, 1)
-        return cls(x, std, covariance, np.empty(size), np.empty(size), verdicts)
+        asked = np.empty(size) if misfit else None
+        return cls(x, std, covariance, np.empty(size), np.empty(size), verdicts, asked)
 
     def batch(self, model: Model) -> Batch:
         trusted = self.verdicts.trusted
-        for array in (self.covariance, self.sigma, self.rmse):
-            array[~trusted] = np.nan
-        values, std = _unpacked(model, self.x), _unpacked(model, self.std)
+        for array in (self.covariance, self.sigma, self.rmse, self.misfit):
+            if array is not None:
+                array[~trusted] = np.nan
+        values, std = unpacked(model, self.x), unpacked(model, self.std)
         for array in (*values.values(), *std.values()):  # zeros of triangular matrices too
             array[~trusted] = np.nan
         return Batch(
             model,
-            _names(model),
+            entry_names(model),
             values,
             std,
             self.covariance,
@@ -250,6 +259,7 @@ class _Result:
             self.rmse,
             trusted,
             self.verdicts,
+            self.misfit,
         )
 
 
@@ -286,6 +296,8 @@ class _Job:
         result.sigma[span] = judged.sigma[:size]
         result.rmse[span] = judged.rmse[:size]
         result.verdicts.put(span, judged)
+        if result.misfit is not None:
+            result.misfit[span] = outlying(self.squares, sensors, fits)[:size]
         if self.doubt is not None:
             ended = Ended(sensors, x, fits, bounds)
             doubtful = self.doubt(ended, judged, lambda k: self._as_run(span.start + k), size)
@@ -394,7 +406,7 @@ class _Job:
             if self.start is None:
                 self.retry(i, result)
                 continue
-            values = {n: v[0] for n, v in _unpacked(self.model, x[None]).items()}
+            values = {n: v[0] for n, v in unpacked(self.model, x[None]).items()}
             self.retry(i, result, self._within(ended.bounds, int(k)), values)
         trusted = places[result.verdicts.trusted[span.start + places]]
         if not trusted.size:
@@ -411,7 +423,7 @@ class _Job:
         declared = [np.concatenate([getattr(p, n) for p in self.model.parameters]) for n in SIDES]
         if np.array_equal(lower, declared[0]) and np.array_equal(upper, declared[1]):
             return self.model
-        own = [_unpacked(self.model, side[None]) for side in (lower, upper)]
+        own = [unpacked(self.model, side[None]) for side in (lower, upper)]
         limits = {n: (own[0][n][0], own[1][n][0]) for n in own[0]}
         return self.model.bounded(lambda model, runs: limits)
 
@@ -471,11 +483,12 @@ def _entry(array: Array, index: tuple[int, ...]) -> Array:
     return np.asarray(array[place])
 
 
-def _names(model: Model) -> tuple[str, ...]:
+def entry_names(model: Model) -> tuple[str, ...]:
+    """Names of all unknowns, entry by entry."""
     return tuple(name for p in model.parameters for name in p.entry_names)
 
 
-def _unpacked(model: Model, x: Array) -> dict[str, Array]:
+def unpacked(model: Model, x: Array) -> dict[str, Array]:
     """Values by parameter, (S, …), from the unknowns (S, n)."""
     found, first = {}, 0
     for p in model.parameters:

@@ -9,7 +9,7 @@ act on every column, and the sums run over samples in their order.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -55,6 +55,17 @@ class Sensors(NamedTuple):
         mask = None if self.mask is None else self.mask[:, chosen]
         hold = None if self.hold is None else Hold(*(part[:, chosen] for part in self.hold))
         return Sensors(self.samples[:, :, chosen], mask, hold)
+
+
+def side_by_side(readings: Sequence[Array], counts: Array | None = None) -> Sensors:
+    """Readings (S, N, size) as a block of sensors, the last repeated up to its width."""
+    total, samples = readings[0].shape[:2]
+    places = np.minimum(np.arange(-(-total // NARROWEST) * NARROWEST), total - 1)
+    found = np.concatenate([r[places].transpose(2, 1, 0) for r in readings])
+    if counts is None:
+        return Sensors(np.ascontiguousarray(found), None)
+    mask = (np.arange(samples)[:, None] < counts[places]).astype(float)
+    return Sensors(np.where(mask > 0, found, found[:, :1]), mask)
 
 
 class Normals(NamedTuple):
@@ -179,6 +190,23 @@ def _call(plan: Plan, i: int, place: dict[int, Array]) -> tuple[Kernel, tuple[Ar
     return BY_CODE[value.code].kernel, (*(place[j] for j in value.operands), place[i])
 
 
+def _left(L: Array, J: Array, columns: list[int]) -> Array:
+    """1 − h, what is left of each residual, (P, w); rows J (k, P, w) have only these columns.
+
+    h = ‖L⁻¹Jᵀ‖², by substitution in the place of J.
+    """
+    left, part = np.ones(J.shape[1:]), np.empty(J.shape[1:])
+    done: dict[int, Array] = {}
+    for i in range(columns[0] if columns else len(L), len(L)):
+        own = J[columns.index(i)] if i in columns else np.zeros_like(left)
+        for k, before in done.items():
+            own -= np.multiply(L[i, k], before, out=part)
+        own /= L[i, i]
+        left -= np.square(own, out=part)
+        done[i] = own
+    return np.maximum(left, 1e-12, out=left)
+
+
 def _adjacent(places: list[int]) -> slice | list[int]:
     """The same places, as a slice where they follow each other: that makes views."""
     first, last = places[0], places[-1]
@@ -259,6 +287,37 @@ class Squares:
                 first += len(columns)
                 total[columns, s] += np.einsum("ps,jps->js", own, part)
         return total[: self.n]
+
+    def studentised(self, x: Array, sensors: Sensors, factor: Array) -> Array:
+        """Largest r²/(1 − h) of every sensor, (W,), h the leverage; factor L (n, n, W) of JᵀJ."""
+        largest = np.zeros(x.shape[1])
+        for _, s, values in self._all.chunks(x, sensors):
+            first, L = 0, factor[..., s]
+            for columns in self._columns:
+                own = values[first : first + len(columns)]
+                first += len(columns)
+                square = np.square(own[-1])
+                square /= _left(L, own[:-1], columns[:-1])
+                np.maximum(largest[s], square.max(axis=0), out=largest[s])
+        return largest
+
+    def largest(self, x: Array, sensors: Sensors) -> tuple[Array, NDArray[np.intp]]:
+        """Σr² (W,), and the two samples of every sensor whose residuals are largest, (2, W)."""
+        total, best = np.zeros(x.shape[1]), np.full((2, x.shape[1]), -1.0)
+        places = np.zeros((2, x.shape[1]), dtype=np.intp)
+        for span, s, values in self._residual.chunks(x, sensors):
+            square, own = np.einsum("mps,mps->ps", values, values), np.arange(values.shape[2])
+            total[s] += square.sum(axis=0)
+            sizes, samples = [*best[:, s]], [*places[:, s]]
+            for _ in range(min(2, len(square))):
+                k = square.argmax(axis=0)
+                sizes.append(square[k, own])
+                samples.append(k + span.start)
+                square[k, own] = -1.0
+            order = np.argsort(sizes, axis=0, kind="stable")[-1:-3:-1]
+            best[:, s] = np.take_along_axis(np.array(sizes), order, axis=0)
+            places[:, s] = np.take_along_axis(np.array(samples), order, axis=0)
+        return total, places
 
     def residuals(self, x: Array, sensors: Sensors) -> Array:
         """Every residual, (m, N, W)."""

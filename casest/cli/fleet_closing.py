@@ -1,0 +1,58 @@
+"""`close MODEL DATASET --sensor COLUMN`: what the sensors of a data set have in common."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from casest.cli.loading import asked_effects, declared_model
+from casest.cli.shared import echo, progress, write
+from casest.errors import UsageError
+
+if TYPE_CHECKING:
+    from casest.cli.options import CloseOptions
+
+
+def fleet_closing(model_name: str, data: Sequence[str], options: CloseOptions) -> int:
+    """Ask all sensors of a data set for effects that their model lacks; save, print."""
+    from casest.cli.fleets import FleetOptions, planned
+    from casest.diagnose.levels import LEVELS
+    from casest.effects import CATALOGUE
+    from casest.fleet.common import CHANCE
+    from casest.report.text.fleet import common_text
+    from casest.results.file import as_json
+    from casest.results.fleet import COMMON, common_result
+    from casest.tasks.common import common
+
+    if len(data) != 1 or options.holdout or options.starts:
+        raise UsageError(
+            "--sensor: a fleet is one data set, whose halves are held out in turn: leave out "
+            "further files, --holdout and --start"
+        )
+    _, own, _ = asked_effects(options.model.effects)
+    model = declared_model(model_name, replace(options.model, effects=()))
+    asked = FleetOptions(
+        reading=options.reading,
+        sensor=options.sensor or "sensor",
+        keep=options.keep,
+        output=options.output or Path("out"),
+    )
+    plan, job = planned(model, data[0], asked)
+    told = common(
+        job,
+        plan.partitions,
+        (*CATALOGUE, *own),
+        chance=CHANCE,
+        clear=LEVELS.clear,
+        say=progress,
+    )
+    result = common_result(job, told, data[0])
+    if options.output:
+        write(options.output / COMMON, as_json(result.content()))
+    if options.as_json:
+        echo(as_json(result.content()), nl=False)
+    else:
+        echo(common_text(result, options.output), verdict=True)
+    return 0

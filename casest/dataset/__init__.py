@@ -1,0 +1,1 @@
+"""Parquet data sets of many sensors: files, layout, partitions, readings."""

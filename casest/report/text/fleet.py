@@ -1,0 +1,88 @@
+"""What `casest fleet` prints."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Iterator
+from pathlib import Path
+
+from casest.report.text.layout import WIDTH, item
+from casest.results.fleet import COMMON, CommonEffect, FleetClosed, FleetResult
+from casest.results.rounding import rounded
+
+#: Kinds of what is rejected, in words for one and for several.
+KINDS = {
+    "file": ("file cannot be read", "files cannot be read"),
+    "nameless": ("row without a name", "rows without a name"),
+    "twice": ("row of a sensor that is there twice", "rows of sensors that are there twice"),
+    "readings": ("sensor with unusable readings", "sensors with unusable readings"),
+    "refused": ("sensor refused", "sensors refused"),
+}
+
+
+def fleet_text(result: FleetResult, folder: Path) -> str:
+    """Head, parameters over the fleet, why sensors are refused, what was written."""
+    lines = [textwrap.fill(_head(result), WIDTH), "", *_table(result)]
+    if result.reasons:
+        lines += ["", "Refused for:"]
+        lines += [f"  {n:>8} {code.replace('_', ' ')}" for code, n in result.reasons.items()]
+    where = f"Written: {folder}/fleet.json, fleet.html, results/, rejected.parquet"
+    return "\n".join([*lines, "", textwrap.fill(where, WIDTH)])
+
+
+def _head(result: FleetResult) -> str:
+    rejected = ", ".join(f"{n} {KINDS[kind][n > 1]}" for kind, n in result.rejected.items() if n)
+    return (
+        f"{result.model} on {result.dataset}: {result.trusted} of {result.sensors} sensors trusted"
+        + (f"; {rejected}: rejected.parquet names them" if rejected else "")
+    )
+
+
+def _table(result: FleetResult) -> Iterator[str]:
+    """One line per unknown: mean and spread over the fleet, and what one sensor's is worth."""
+    if not result.trusted:
+        return
+    rows = [("parameter", "mean", "spread", "least", "largest", "std of one", "unit")]
+    for name, p in result.parameters.items():
+        numbers = (p.mean, p.std, p.least, p.largest, p.typical_std)
+        said = ["-" if v is None else f"{v:.4g}" for v in numbers]
+        rows.append((name, *said, "" if p.unit == "1" else p.unit))  # type: ignore[arg-type]
+    widths = [max(len(row[k]) for row in rows) for k in range(7)]
+    for row in rows:
+        first = f"  {row[0]:<{widths[0]}}"
+        middle = "".join(f"  {cell:>{w}}" for cell, w in zip(row[1:6], widths[1:6], strict=True))
+        yield f"{first}{middle}  {row[6]}".rstrip()
+
+
+def common_text(result: FleetClosed, folder: Path | None) -> str:
+    """What the sensors have in common: each effect with its size, before and after."""
+    names = ", ".join(e.name for e in result.effects)
+    said = f"{names} in common" if names else "nothing in common that their model lacks"
+    head = f"{result.model} on {result.dataset}: {result.sensors} sensors have {said}"
+    lines = [textwrap.fill(head, WIDTH)]
+    for e in result.effects:
+        lines += ["", *_common_lines(e)]
+    if result.invisible:
+        lines += ["", item(f"no pose could show: {', '.join(result.invisible)}")]
+    if folder is not None:
+        lines += ["", f"Written: {folder}/{COMMON}"]
+    return "\n".join(lines)
+
+
+def _common_lines(e: CommonEffect) -> Iterator[str]:
+    yield f"  {e.name} (chance {e.chance:.2g} where there is none):"
+    for name, (value, std) in e.parameters.items():
+        yield "    {}  {} ± {}".format(name, *rounded(value, std))
+    fallen = 100 * (1 - e.sigma_after / e.sigma_before)
+    yield item(
+        f"sigma of sensors that had no part in that size: {e.sigma_before:.5g} before, "
+        f"{e.sigma_after:.5g} after ({fallen:.2g} % less)"
+    )
+    far = sorted(e.moved.items(), key=lambda pair: -abs(pair[1]))[:3]
+    moves = ", ".join(f"{name} by {by:.2g}" for name, by in far)
+    yield item(f"declared unknowns move on average, in their own standard deviations: {moves}")
+    if e.indistinguishable_from:
+        yield item(f"explains as much: {', '.join(e.indistinguishable_from)}")
+    for column, chance in e.follows.items():
+        differs = "differs with" if chance < 0.001 else "does not differ with"
+        yield item(f"its size {differs} {column} (chance {chance:.2g})")

@@ -1,0 +1,196 @@
+"""Rows of a fleet's results as the page draws them: some of many, and the outlying of all."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from casest.dataset.partitions import Partition
+from casest.declaration.shapes import Array
+from casest.fleet.population import Population, population
+from casest.tasks.job import Job
+from casest.tasks.tally import Total
+
+#: Sensors that are drawn; and among how many the outlying ones are looked for.
+DRAWN, LOOKED_AT = 200_000, 20_000_000
+#: Sensors of which the fleet's distribution is estimated; fewest, for each unknown.
+ESTIMATED, FEWEST = 5_000, 5
+#: Outlying sensors that are named, and from how many standard deviations of the fleet on.
+NAMED, OUTLYING = 20, 5.0
+#: Standard deviations of a normal distribution between its quartiles.
+QUARTILES = 1.349
+
+
+@dataclass(frozen=True)
+class Outlier:
+    """A trusted sensor that is unlike the others: in which unknown, how far."""
+
+    sensor: str
+    unknown: str
+    value: float
+    away: float
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """S sensors of the fleet in the order of `at`: unknowns (n, S), NaN where refused.
+
+    `at` is the place in the data set, or what `over` names, in s since `since`. `centre` and
+    `scale` (n,) are median and standard deviation by the quartiles. `outlying` are of `looked_at`.
+    """
+
+    names: tuple[str, ...]
+    values: Array
+    rms: Array
+    misfit: Array
+    trusted: NDArray[np.bool_]
+    at: Array
+    over: str
+    since: str
+    centre: Array
+    scale: Array
+    outlying: tuple[Outlier, ...]
+    looked_at: int
+
+
+def drawn(job: Job, partitions: Sequence[Partition], sensors: int) -> Drawn:
+    """What the page draws of results that are all there."""
+    names = tuple(name for p in job.model.parameters for name in p.entry_names)
+    few, partitions, sensors = sensors <= LOOKED_AT, *_some(partitions, sensors)
+    step = max(1, -(-sensors // DRAWN))
+    over = next((n for n, t in zip(job.layout.kept, job.layout.types[1:], strict=True)
+                 if _is_time(t)), "")  # fmt: skip
+    columns = [*names, "rms", "misfit", "trusted", *([over] if over else [])]
+    parts, first = [], 0
+    for batch in _batches(job, partitions, columns):
+        chosen = np.arange(-first % step, len(batch), step)
+        parts.append([_numbers(batch.column(c))[chosen] for c in columns] + [first + chosen])
+        first += len(batch)
+    whole = [np.concatenate(own) for own in zip(*parts, strict=True)]
+    values, trusted = np.array(whole[: len(names)]), whole[len(names) + 2].astype(bool)
+    at = whole[len(names) + 3].astype(float)
+    since = ""
+    if over:
+        least = np.nanmin(at)
+        since, at = str(np.datetime64(int(least), "s")), at - least
+    order = np.argsort(at, kind="stable")
+    quartiles = np.array([_quartiles(own[trusted]) for own in values])
+    centre, scale = quartiles[:, 1], (quartiles[:, 2] - quartiles[:, 0]) / QUARTILES
+    outlying = _outlying(job, partitions, names, centre, scale) if few else ()
+    return Drawn(
+        names,
+        values[:, order],
+        whole[len(names)][order],
+        whole[len(names) + 1][order],
+        trusted[order],
+        at[order],
+        over,
+        since,
+        centre,
+        scale,
+        outlying,
+        sensors if few else 0,
+    )
+
+
+def estimated(job: Job, partitions: Sequence[Partition], total: Total) -> Population | None:
+    """The fleet's distribution from some of its sensors; None without their covariances.
+
+    Outlying sensors are no part of it.
+    """
+    names = tuple(name for p in job.model.parameters for name in p.entry_names)
+    if not job.covariance or job.prior is not None or total.trusted < FEWEST * len(names):
+        return None
+    partitions, sensors = _some(partitions, total.sensors)
+    step, first = max(1, -(-sensors // ESTIMATED)), 0
+    parts = []
+    for batch in _batches(job, partitions, [*names, "covariance", "trusted"]):
+        chosen = np.arange(-first % step, len(batch), step)
+        first += len(batch)
+        chosen = chosen[_numbers(batch.column("trusted"))[chosen] > 0]
+        x = np.array([_numbers(batch.column(n))[chosen] for n in names])
+        lower = batch.column("covariance").take(pyarrow_array(chosen)).flatten()
+        parts.append((x, _numbers(lower).reshape(len(chosen), -1)))
+    x = np.concatenate([own for own, _ in parts], axis=1)
+    lower = np.concatenate([own for _, own in parts])
+    quartiles = np.array([_quartiles(own) for own in x])
+    scale = (quartiles[:, 2] - quartiles[:, 0]) / QUARTILES
+    near = (np.abs(x - quartiles[:, 1:2]) <= OUTLYING * scale[:, None]).all(axis=0)
+    near &= np.isfinite(lower).all(axis=1)
+    if near.sum() < FEWEST * len(names):
+        return None
+    V = np.zeros((len(lower), len(names), len(names)))
+    rows, columns = np.tril_indices(len(names))
+    V[:, rows, columns] = V[:, columns, rows] = lower
+    variance = np.full(1, total.moments["variance"].mean)
+    return population(names, x[:, near].T, V[near], np.sqrt(variance))
+
+
+def _some(partitions: Sequence[Partition], sensors: int) -> tuple[Sequence[Partition], int]:
+    """Evenly chosen partitions with no more than LOOKED_AT sensors, about, and how many those."""
+    step = max(1, -(-sensors // LOOKED_AT))
+    return partitions[::step], sensors // step
+
+
+def pyarrow_array(values: Any) -> Any:
+    """Places in an Arrow array."""
+    import pyarrow
+
+    return pyarrow.array(values)
+
+
+def _is_time(kind: Any) -> bool:
+    import pyarrow
+
+    return bool(pyarrow.types.is_timestamp(kind) or pyarrow.types.is_date(kind))
+
+
+def _batches(job: Job, partitions: Sequence[Partition], columns: list[str]) -> Iterator[Any]:
+    import pyarrow.parquet
+
+    for partition in partitions:
+        with pyarrow.parquet.ParquetFile(job.results(partition), pre_buffer=False) as table:
+            yield from table.iter_batches(columns=columns, use_threads=False)
+
+
+def _numbers(column: Any) -> Array:
+    """A column as numbers; times in s."""
+    import pyarrow
+
+    if _is_time(column.type):
+        column = column.cast(pyarrow.timestamp("s"), safe=False).cast(pyarrow.int64())
+    return np.asarray(column.cast(pyarrow.float64()).to_numpy(zero_copy_only=False))
+
+
+def _quartiles(values: Array) -> Array:
+    if not len(values):
+        return np.full(3, np.nan)
+    return np.asarray(np.quantile(values, (0.25, 0.5, 0.75)))
+
+
+def _outlying(
+    job: Job,
+    partitions: Sequence[Partition],
+    names: tuple[str, ...],
+    centre: Array,
+    scale: Array,
+) -> tuple[Outlier, ...]:
+    """The most outlying of all trusted sensors, the furthest first."""
+    found: list[Outlier] = []
+    for batch in _batches(job, partitions, ["sensor", *names]):
+        values = np.array([_numbers(batch.column(n)) for n in names])
+        with np.errstate(all="ignore"):
+            away = np.nan_to_num((values - centre[:, None]) / scale[:, None], posinf=0, neginf=0)
+        worst = np.abs(away).argmax(axis=0)
+        far = np.abs(away[worst, np.arange(len(worst))])
+        for k in np.argsort(-far, kind="stable")[:NAMED]:
+            if far[k] >= OUTLYING:
+                i = int(worst[k])
+                sensor = str(batch.column("sensor")[int(k)].as_py())
+                found.append(Outlier(sensor, names[i], float(values[i, k]), float(away[i, k])))
+        found = sorted(found, key=lambda o: -abs(o.away))[:NAMED]
+    return tuple(found)
