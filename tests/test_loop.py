@@ -185,7 +185,7 @@ def test_a_steady_offset_does_not_wander():
 
 
 def test_of_a_cause_too_small_to_be_told_from_others_all_are_named():
-    """Shapes of response explain the same half of a percent, and put offset and gain apart: with the
+    """Shapes of response explain the same half of a percent and put offset and gain apart: with the
     one that is added they are nearer to the truth than without. Few readings are at the ends."""
     seed = [10000, *b"one", *b"wheel", *b"cubic", *b"small"]
     closing, world = closed("wheel", seed, {"cubic": 2.4e-6})
