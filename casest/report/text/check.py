@@ -1,0 +1,120 @@
+"""What `casest check` prints."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Iterator
+from pathlib import Path
+
+from casest.data.logs import file_name
+from casest.report.text.layout import WIDTH, item
+from casest.results.check import Changed, Checked, Dated, changes_of
+from casest.results.rounding import rounded
+
+
+def check_text(result: Checked, output: Path | None) -> str:
+    """Verdict, the test, what changed and what repairs it; all dates where there are several."""
+    last = result.dates[-1]
+    blocks = [
+        textwrap.fill(sentence(result), WIDTH),
+        "\n".join(item(note) for note in result.notes),
+        "\n".join(_changed(result.changed)),
+        "\n".join(item(line) for line in reasons(last)),
+        "\n".join(_dates(result)),
+        "\n".join(item(line) for line in drift(result)),
+        "\n".join(item(line) for line in repair(last)),
+        f"Next: the smallest recalibration that repairs it\n  {last.recalibrate.command}"
+        if last.recalibrate and last.recalibrate.command
+        else "",
+        f"Written: {output}/report.html, check.json" if output else "",
+    ]
+    return "\n\n".join(b for b in blocks if b)
+
+
+def sentence(result: Checked) -> str:
+    """The verdict in one sentence."""
+    files = ", ".join(file_name(name) for name in result.data)
+    verdict = "valid" if result.valid else f"NOT VALID: {' and '.join(result.what)} changed"
+    return f"{result.model} by {result.result} on {files}: {verdict}"
+
+
+def reasons(date: Dated) -> Iterator[str]:
+    """What was asked of a date, and the answers."""
+    test, noise = date.test, date.noise
+    yield (
+        f"the parameters, as far as the record sees them ({test.rank} combinations): "
+        f"p = {test.p_value:.2g}; an alarm below {test.level:.2g}"
+    )
+    unit = "" if noise.unit == "1" else f" {noise.unit}"
+    yield (
+        f"the noise: {noise.now:.3g}{unit}, {noise.ratio:.2f} times that of the calibration: "
+        f"p = {noise.p_value:.2g}; an alarm below {noise.level:.2g}"
+    )
+    if noise.another_colour:
+        yield "the noise has another colour than in the calibration; the record's own is used"
+    for place in date.conditions:
+        yield (
+            f"{place.column} is {place.now[0]:.4g} to {place.now[1]:.4g}; in the calibration it "
+            f"was {place.before[0]:.4g} to {place.before[1]:.4g}"
+        )
+
+
+def repair(date: Dated) -> Iterator[str]:
+    """What explains a record that the old parameters do not, and how it is repaired."""
+    cause, again = date.explained_by, date.recalibrate
+    if cause is None or again is None:
+        return
+    yield f"{cause.what} alone explains the record: with it p = {cause.p_value:.2g}"
+    if cause.or_else:
+        yield f"nearly as well: {', '.join(cause.or_else)}"
+    hold = f", with {' and '.join(again.hold)} held" if again.hold else ""
+    yield (
+        f"{' and '.join(again.fit)} anew{hold}: {again.samples} {again.kind} like these make it as "
+        "sharp as it was"
+    )
+
+
+def drift(result: Checked) -> Iterator[str]:
+    """What the chart over several dates says."""
+    if len(result.dates) < 2:
+        return
+    p, level = result.chart.p_values[-1], result.chart.level
+    yield f"the weighted means over the dates together: p = {p:.2g}; an alarm below {level:.2g}"
+    last = len(result.dates) - 1
+    for line in result.chart.lines:
+        if last in line.out:
+            since = result.dates[line.out[0]].data
+            yield (
+                f"{line.name}: the weighted mean of its shifts, {line.mean[-1]:.3g} {line.unit}, "
+                f"is beyond ±{line.limit[-1]:.3g}, first on {file_name(since)}"
+            )
+
+
+def _changed(changed: list[Changed]) -> Iterator[str]:
+    if not changed:
+        return
+    rows = [(c.name, *_numbers(c), "" if c.unit == "1" else c.unit) for c in changed]
+    widths = [max(len(r[k]) for r in (*rows, _HEAD)) for k in range(3)]
+    for row in (_HEAD, *rows):
+        name, before, now, unit = row
+        yield f"  {name:<{widths[0]}}  {before:<{widths[1]}}  {now:<{widths[2]}}  {unit}".rstrip()
+
+
+_HEAD = ("parameter", "before", "now", "unit")
+
+
+def _numbers(c: Changed) -> tuple[str, str]:
+    before = rounded(_number(c.before), _number(c.std_before))
+    return f"{before[0]} ± {before[1]}", " ± ".join(rounded(_number(c.now), _number(c.std)))
+
+
+def _number(value: float | None) -> float:
+    return float("nan") if value is None else value
+
+
+def _dates(result: Checked) -> Iterator[str]:
+    if len(result.dates) < 2:
+        return
+    for date in result.dates:
+        what = "valid" if date.valid else f"not valid: {' and '.join(changes_of(date))}"
+        yield f"  {file_name(date.data)}: {what} (p = {date.p_value:.2g})"
