@@ -19,7 +19,7 @@ from casest.validity.judged import Subject, Test, repaired_variance, tested
 from casest.validity.whitened import Factor
 
 #: A cause explains a record whose test beside it has at least this chance.
-EXPLAINS = 0.01
+EXPLAINS = 0.001
 #: Causes that cost no more than this beyond the best one are named with it: a likelihood of one in
 #: twenty.
 ALIKE = 6.0

@@ -39,13 +39,16 @@ SEEN = 1e-8
 @dataclass(frozen=True)
 class Noise:
     """The new record's noise: standard deviation, its ratio to the old one, and the chance of a
-    ratio as large while nothing changed; `freedom` of what judges the parameters."""
+    ratio as large while nothing changed; `freedom` of what judges the parameters. `known_by` is
+    what the old covariance grows by, where both records together say how large the noise is.
+    """
 
     sigma: float
     ratio: float
     p_value: float
     coloured: bool
     freedom: float
+    known_by: float | None = None
 
 
 @dataclass(frozen=True)
@@ -109,7 +112,7 @@ def subject_of(old: Old, runs: tuple[Run, ...]) -> Subject:
         own_colour = spectrum_of(problem, everything, bread)
         rows = replace(rows, colour=own_colour) if own_colour else rows
     point, _ = rows.fitted(problem.point(values), free)
-    return Subject(old, rows, point, free, covariance, noise)
+    return Subject(old, rows, point, free, (noise.known_by or 1.0) * covariance, noise)
 
 
 def _noise(old: Old, rows: Whitened, point: Point, there: Factor) -> Noise:
@@ -131,7 +134,8 @@ def _noise(old: Old, rows: Whitened, point: Point, there: Factor) -> Noise:
         return Noise(sigma, ratio, p, coloured, float(left))
     together = left + old.freedom
     pooled = np.sqrt((left * sigma**2 + old.freedom * old.sigma**2) / together)
-    return Noise(float(pooled), ratio, p, coloured, float(together))
+    known_by = float(pooled / old.sigma) ** 2
+    return Noise(float(pooled), ratio, p, coloured, float(together), known_by)
 
 
 def _tails(problem: Problem, point: Point) -> float:
@@ -169,8 +173,18 @@ def tested(subject: Subject, factor: Factor, free: Array) -> Test:
     V = sigma**2 * np.eye(len(y)) + A @ subject.covariance @ A.T
     size = np.sqrt(np.diag(V))
     statistic = float((y / size) @ np.linalg.solve(V / np.outer(size, size), y / size))
-    k, freedom = len(y), max(subject.noise.freedom, 1.0)
+    k = len(y)
+    freedom = _freedom(subject, 1 - sigma**2 * float(np.trace(np.linalg.inv(V))) / k)
     return Test(statistic, k, freedom, float(fdtrc(k, freedom, statistic / k)))
+
+
+def _freedom(subject: Subject, share: float) -> float:
+    """Degrees of freedom of V, of which so large a share is of the old errors (Satterthwaite)."""
+    noise, old = subject.noise, max(subject.old.freedom, 1.0)
+    if noise.known_by is not None:
+        return max(noise.freedom, 1.0)
+    share = min(max(share, 0.0), 1.0)
+    return 1 / (share**2 / old + (1 - share) ** 2 / max(noise.freedom, 1.0))
 
 
 def beside(R: Array, free: Array) -> Array:

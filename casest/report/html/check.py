@@ -10,8 +10,8 @@ from casest.report.html.figures import Figures, axis, panel
 from casest.report.html.frame import whole
 from casest.report.html.numbers import number, printed_unit
 from casest.report.html.page import escaped, paragraph, points, section, table, tag
-from casest.report.text.check import drift, reasons, repair
 from casest.results.check import Charted, Checked, changes_of
+from casest.results.check_words import drift, reasons, repair
 
 
 def check_page(result: Checked) -> str:
