@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 from casest.data.run import Run
 from casest.validity.changes import Change, changed
@@ -14,14 +15,18 @@ from casest.validity.old import Old
 
 @dataclass(frozen=True)
 class Date:
-    """One new record under the old calibration; `change` only where its parameters moved."""
+    """One new record under the old calibration: did its parameters move, is it louder?"""
 
     runs: tuple[Run, ...]
     subject: Subject
     test: Test
     moved: bool
     louder: bool
-    change: Change | None
+
+    @cached_property
+    def change(self) -> Change | None:
+        """What changed, where the parameters moved; looked for when asked."""
+        return changed(self.subject) if self.moved else None
 
     @property
     def valid(self) -> bool:
@@ -79,4 +84,4 @@ def _date(old: Old, runs: tuple[Run, ...], level: float) -> Date:
     test = judged(subject)
     moved = test.p_value < level / 2
     louder = subject.noise.p_value < level / 2
-    return Date(runs, subject, test, moved, louder, changed(subject) if moved else None)
+    return Date(runs, subject, test, moved, louder)
