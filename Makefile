@@ -7,7 +7,7 @@ READY := $(VENV)/.ready
 .PHONY: demo test lint types format wheel bench study study-starts study-nist study-loop \
 	study-motion study-flights study-inputs study-records study-asked study-slow study-coverage \
 	study-deceptive study-deceptive-many study-fleet study-mutation study-worlds study-noises \
-	study-structural \
+	study-structural study-check \
 	figures docs clean
 
 demo: $(READY)
@@ -88,6 +88,9 @@ study-records: $(READY)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python studies/records.py
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python studies/agreement.py
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python studies/subsets.py
+
+study-check: $(READY)
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python studies/check.py
 
 study-fleet: $(READY)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python studies/fleet_common.py

@@ -1,6 +1,7 @@
 """`report.html`: what was found, why it is believed, how it is used, on one self-contained page."""
 
 from casest.report.html.calibration import calibration_page
+from casest.report.html.check import check_page
 from casest.report.html.closed import closing_page
 from casest.report.html.motion import filter_page, observe_page
 from casest.report.html.motion_closed import closing_motion_page
@@ -10,6 +11,7 @@ REPORT = "report.html"
 __all__ = [
     "REPORT",
     "calibration_page",
+    "check_page",
     "closing_motion_page",
     "closing_page",
     "filter_page",
