@@ -65,10 +65,14 @@ class NoiseModel(Noise, frozen=True):
 
 
 class Correlation(Struct, frozen=True):
-    """Correlation of the unknowns: null where the data do not determine one."""
+    """Correlation of the unknowns: null where the data do not determine one.
+
+    `information` is the inverse of their covariance, from which a plan goes on.
+    """
 
     names: list[str]
     matrix: list[list[Number]]
+    information: list[list[Number]]
 
 
 class Section(Struct, frozen=True, kw_only=True):
@@ -286,7 +290,7 @@ def correlation_of(estimate: Estimate) -> Correlation:
     std = np.sqrt(np.diag(estimate.covariance))
     with np.errstate(invalid="ignore", divide="ignore"):
         matrix = np.asarray(estimate.covariance / np.outer(std, std))
-    return Correlation(list(estimate.names), plain(matrix))
+    return Correlation(list(estimate.names), plain(matrix), plain(estimate.information))
 
 
 def _noise(estimate: Estimate, unit: str) -> Noise:
