@@ -14,7 +14,7 @@ from casest.cli.correcting import names_a_model
 from casest.cli.flags import flag, taking
 from casest.cli.loading import declared_model
 from casest.cli.options import FOLDER, ModelOptions, ReadingOptions, Words
-from casest.cli.shared import commands, echo, last_words, progress, typed, write
+from casest.cli.shared import commands, echo, progress, typed, write
 from casest.errors import UsageError
 
 if TYPE_CHECKING:
@@ -70,6 +70,9 @@ class PlanOptions:
     )
     possible: PossibleOptions = field(default_factory=PossibleOptions)
     reading: ReadingOptions = field(default_factory=ReadingOptions)
+    separate: bool = flag(
+        False, "--separate", help="After close: what tells the causes apart that it left open."
+    )
     count: int | None = flag(None, "--count", type=int, metavar="N", help="How many to plan.")
     until: Words = flag(
         (),
@@ -129,7 +132,8 @@ def plan(given: Path, options: PlanOptions) -> int:
     situation = (
         _of_model(str(given), options) if names_a_model(given) else _of_result(given, options)
     )
-    result = planned_result(situation, options)
+    make = separating if options.separate else planned_result
+    result = make(situation, options)
     if options.output:
         from casest.report.html import plan_page
 
@@ -140,7 +144,8 @@ def plan(given: Path, options: PlanOptions) -> int:
         echo(as_json(result.content()), nl=False)
         return 0
     echo(plan_text(result))
-    last_words(options.output, "plan.html, plan.json, plan.csv")
+    if options.output:
+        echo(f"\nWritten: {options.output}/plan.html, plan.json, plan.csv")
     return 0
 
 
@@ -253,6 +258,76 @@ def planned_result(situation: Situation, options: PlanOptions) -> Plan:
     )
 
 
+def separating(situation: Situation, options: PlanOptions) -> Plan:
+    """Candidates as each cause has them, and the plan that tells the causes apart."""
+    from casest.plan.candidates.finding import candidates
+    from casest.plan.rivals.rivals import Rival, open_causes, refitted
+    from casest.plan.rivals.separating import separated, separation
+    from casest.results.plan import separation_result
+
+    if options.until or options.criterion != "D":
+        raise UsageError("--separate has a goal of its own: leave --until and --criterion out")
+    if situation.after is None:
+        raise UsageError(f"--separate: {situation.name} is a model; give a result of close")
+    base, labels = open_causes(situation.content, situation.model)
+    if len(labels) < 2:
+        raise UsageError(
+            f"{situation.after}: its record left no two causes open; plan for precision instead "
+            "(without --separate)"
+        )
+    runs = _records(situation)
+    if runs is None:
+        raise UsageError(
+            f"{situation.after}: the record that it was made from is not where it was, and the "
+            "causes are fitted to it again"
+        )
+    progress(f"fitting {', '.join(labels)}")
+    rivals = refitted(base, situation.values, runs, labels, situation.noise.residual)
+    possible = _with_columns(_possible(situation, options), situation, rivals, runs)
+
+    def make(rival: Rival) -> Candidates:
+        return candidates(rival.model, rival.values, situation.noise, possible)
+
+    found = separation(rivals, situation.noise, make, situation.name, possible.rate)
+    planned = separated(found, options.count, options.most, situation.name)
+    named = {r.label for r in rivals}
+    left = [label for label in labels if label not in named]
+    return separation_result(
+        situation.model,
+        found,
+        planned,
+        model_name=situation.name,
+        after=situation.after,
+        noise=situation.noise,
+        units=situation.units,
+        notes=[f"not planned for: {', '.join(left)}"] if left else [],
+        covered=_covered(situation) if found.candidates.up is not None else None,
+        command=typed(),
+    )
+
+
+def _with_columns(possible: Any, situation: Situation, rivals: Any, runs: Any) -> Any:
+    """Values of the columns that a rival reads: as typed, else as the record has them."""
+    from dataclasses import replace
+
+    import numpy as np
+
+    from casest.effects.placing import prepared
+    from casest.plan.candidates.varied import values_of
+
+    own = {s.name for s in situation.model.signals}
+    extras = {s.name: s.unit for r in rivals for s in r.model.signals if s.name not in own}
+    typed_ones = dict(possible.varied)
+    also = {}
+    for name, unit in extras.items():
+        if name in typed_ones:
+            also[name] = values_of(name, typed_ones.pop(name), unit)
+            continue
+        seen = np.concatenate([run.signals[name][:, 0] for run in prepared(situation.model, runs)])
+        also[name] = np.unique(np.quantile(seen, [0.0, 0.5, 1.0]))[:, None]
+    return replace(possible, varied=typed_ones, also=also)
+
+
 def _possible(situation: Situation, options: PlanOptions) -> Any:
     from casest.plan.candidates.finding import Possible
 
@@ -332,9 +407,20 @@ def _count(given: Task) -> int:
 
 def _covered(situation: Situation) -> Any:
     """Directions of up (N, 3) in the records that the result was made from, if they are there."""
-    from casest.data import load_runs
     from casest.errors import CasestError
     from casest.plan.candidates.poses import upward
+
+    runs = _records(situation)
+    try:
+        return None if runs is None else upward(situation.model, situation.values, runs)
+    except CasestError:  # a reading that has no pose: nothing is drawn
+        return None
+
+
+def _records(situation: Situation) -> tuple[Run, ...] | None:
+    """The records that a result was made from, read as they were; None where they are gone."""
+    from casest.data import load_runs
+    from casest.errors import CasestError
     from casest.report.next_command import typed_words
 
     words = typed_words(situation.content.get("reproduce", {}).get("command", ""))
@@ -351,7 +437,6 @@ def _covered(situation: Situation) -> Any:
     )
     try:
         data = list(situation.content["data"])
-        runs = load_runs(data, situation.model.signals, **reading.keywords())
-        return upward(situation.model, situation.values, runs)
-    except (CasestError, OSError, ValueError):  # moved or changed since: nothing is drawn
+        return load_runs(data, situation.model.signals, **reading.keywords())
+    except (CasestError, OSError, ValueError):  # moved or changed since
         return None

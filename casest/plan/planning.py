@@ -23,6 +23,8 @@ from casest.plan.goals import Goal
 
 #: Candidates that whole measurements are chosen from: those of the largest slopes.
 POOL = 400
+#: Measurements from which on their weights need no exchange.
+MANY = 60
 #: Information of one candidate, as a share of their mean, that stands in for what is not known yet:
 #: standard deviations 10⁴ times those of one measurement.
 VAGUE = 1e-8
@@ -121,12 +123,15 @@ def criterion_of(given: Task, name: str, columns: Array | None = None) -> Criter
 #: Size of an unknown that a goal does not name, beside what the goal asks for: its standard
 #: deviation may be larger by this factor, in units of what one candidate says of it.
 LOOSE = 30.0
+#: Variance of a scaled unknown from which on nothing is known of it.
+UNKNOWN = 1e4
 
 
 def _with_all(columns: Array, given: Task) -> Array:
-    """The combinations and, with little weight, every unknown: none is to stay undetermined."""
-    sizes = np.linalg.norm(columns, axis=0)
-    return np.hstack([columns, np.eye(len(given.scale)) * sizes.min() / LOOSE])
+    """The combinations and, with little weight, what is unknown yet: nothing is to stay so."""
+    size = np.linalg.norm(columns, axis=0).min() / LOOSE
+    unknown = np.diag(inverse(given.start)) > UNKNOWN
+    return np.hstack([columns, np.eye(len(given.scale))[:, unknown] * size])
 
 
 def planned(given: Task, criterion: Criterion, count: int) -> Planned:
@@ -155,6 +160,8 @@ def _whole(given: Task, criterion: Criterion, weights: Array, count: int) -> lis
     C = inverse(M)
     worth = slopes(C, criterion.weight(C), given.factors)
     first = rounded(weights, count)
+    if count > MANY:  # rounded to whole numbers, little is lost
+        return first
     pool = np.union1d(np.argsort(-worth)[:POOL], first)
     places = [int(np.searchsorted(pool, i)) for i in first]
     found = exchanged(criterion, given.start, given.factors[pool], places)

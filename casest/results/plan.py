@@ -5,17 +5,21 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from msgspec import UNSET, Struct, UnsetType
+from msgspec.structs import replace as replaced
 
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
+from casest.diagnose.levels import LEVELS
 from casest.plan.candidates.attitudes import words
 from casest.plan.candidates.candidates import Candidates, Noise
 from casest.plan.goals import Goal
 from casest.plan.planning import Planned
+from casest.plan.rivals.separating import Separation
 from casest.results.file import plain
 from casest.results.result import Number, Reproduced, Result, reproduced
 
@@ -34,7 +38,8 @@ class Measurement(Struct, frozen=True):
     signals: the expected values, in the model's units. settings: of a run. up: direction of up in
     the sensor's frame. determined: unknowns that are, with all before it. std_ratio: the geometric
     mean of the unknowns' standard deviations, as a share of what it was before this one; null while
-    something is undetermined. std: of each unknown after it.
+    something is undetermined. std: of each unknown after it. told_apart: the chance, with all
+    before it, that the two causes that are hardest to tell apart are.
     """
 
     number: int
@@ -45,6 +50,7 @@ class Measurement(Struct, frozen=True):
     cost: float
     std_ratio: Number
     std: dict[str, Number]
+    told_apart: Number | UnsetType = UNSET
 
 
 class Unknown(Struct, frozen=True):
@@ -63,6 +69,21 @@ class Reached(Struct, frozen=True):
     unit: str
     before: Number
     after: Number
+
+
+class ToldApart(Struct, frozen=True):
+    """Were `true` the cause: the chance that the plan refutes `against`, refitted to it all.
+
+    growth: expected, of 2 log of their likelihoods' ratio; lead: that of the record; limit: from
+    which on they are told apart.
+    """
+
+    true: str
+    against: str
+    chance: float
+    growth: float
+    lead: float
+    limit: float
 
 
 class BestPossible(Struct, frozen=True):
@@ -101,6 +122,7 @@ class Plan(Result, frozen=True, kw_only=True, dict=True):
     candidates: int
     measurements: list[Measurement]
     unknowns: dict[str, Unknown]
+    separates: list[ToldApart] | UnsetType = UNSET
     best_possible: BestPossible
     noise: PlanNoise
     units: dict[str, str]
@@ -166,6 +188,48 @@ def plan_result(
     )
 
 
+def separation_result(
+    model: Model,
+    found: Separation,
+    planned: Planned,
+    *,
+    model_name: str,
+    after: str,
+    noise: Noise,
+    units: Mapping[str, str],
+    notes: Sequence[str] = (),
+    covered: Array | None = None,
+    command: str = "",
+) -> Plan:
+    """What `plan --separate` leaves."""
+    candidates, chosen = found.candidates, planned.chosen
+    blank = Planned(chosen, (None,) * (len(chosen) + 1), planned.share, planned.at_least)
+    made = plan_result(
+        model,
+        replace(candidates, names=()),
+        blank,
+        model_name=model_name,
+        after=after,
+        criterion="causes told apart",
+        goals=[],
+        noise=noise,
+        units=units,
+        notes=notes,
+        covered=covered,
+        command=command,
+    )
+    powers = [min(found.powers(chosen[: k + 1])) for k in range(len(chosen))]
+    growths, last = found.growths(chosen), found.powers(chosen)
+    told = [
+        ToldApart(p.true, p.against, chance, float(growth), p.lead, LEVELS.clear)
+        for p, chance, growth in zip(found.pairs, last, growths, strict=True)
+    ]
+    measured = [
+        replaced(m, told_apart=power) for m, power in zip(made.measurements, powers, strict=True)
+    ]
+    return replaced(made, measurements=measured, separates=told)
+
+
 def _emptiest(found: Candidates, planned: Planned, covered: Array | None) -> str:
     """The possible direction furthest from all that is covered or planned."""
     if found.up is None or not planned.chosen:
@@ -214,18 +278,34 @@ def headline(result: Plan) -> str:
     if not result.count:
         return f"{result.declared}{after}: nothing to measure: every goal is reached already"
     one = result.things[:-1] if result.count == 1 else result.things
+    if result.separates:
+        causes = " from ".join(dict.fromkeys(t.true for t in result.separates))
+        chance = min(t.chance for t in result.separates)
+        told = f"that tell {causes} in {100 * chance:.0f} %"
+        return f"{result.declared}{after}: {result.count} {one} next {told}"
     return f"{result.declared}{after}: {result.count} {one} next, those first that bring most"
 
 
 def plan_words(result: Plan) -> Iterator[str]:
     """Goals, the certificate, notes: a sentence each."""
+    for told in result.separates or ():
+        yield (
+            f"were {told.true} the cause, {told.against} would be refuted in "
+            f"{100 * told.chance:.0f} %"
+        )
     for goal in result.goals:
         unit = "" if goal.unit == "1" else f" {goal.unit}"
         before = "undetermined" if goal.before is None else f"{goal.before:.3g}"
         after = f"{goal.after:.3g}" if goal.after is not None else "undetermined"
         yield f"goal {goal.name} < {goal.limit:g}{unit}: {before} before, {after}{unit} after"
     best = result.best_possible
-    if result.count:
+    if result.count and result.separates:
+        yield (
+            f"certified: for no {result.count} {result.things} of these {result.candidates} does "
+            "2 log of the likelihoods' ratio grow by more than "
+            f"{best.share_of_std**-2:.4g} times as much"
+        )
+    elif result.count:
         yield (
             f"certified: no {result.count} {result.things} of these {result.candidates} have "
             f"standard deviations below {100 * best.share_of_std:.4g} % of these "

@@ -15,6 +15,7 @@ from casest.data.run import Run
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
 from casest.errors import DataError, UsageError
+from casest.plan.candidates.candidates import marginal, of_last_run
 from casest.results.file import load_result, result_file
 from casest.results.saved import numbers
 from casest.results.units import unit_table
@@ -80,7 +81,7 @@ def started(path: Path) -> Start:
     if information.shape != (n, n):
         raise DataError(f"{where}: its information is not {n} by {n}; calibrate again")
     shared = sum(p.shape.coordinates for p in model.parameters if p.scope == "all")
-    last = {name: _of_last_run(model, name, value) for name, value in values.items()}
+    last = {name: of_last_run(model, name, value) for name, value in values.items()}
     sigma = numbers(result.noise.sigma, f"{where}: its noise")
     if not (sigma > 0).all():
         raise DataError(f"{where}: its noise is 0: say what it is, --sensor-noise SIGNAL=STD")
@@ -96,15 +97,6 @@ def started(path: Path) -> Start:
     )
 
 
-def marginal(information: Array, kept: int) -> Array:
-    """Information of the first unknowns, the others being unknown along with them."""
-    if kept == len(information):
-        return information
-    own = information[kept:, kept:]
-    across = information[:kept, kept:]
-    return np.asarray(information[:kept, :kept] - across @ np.linalg.pinv(own) @ across.T)
-
-
 def _units(model: Model, known: Mapping[str, str]) -> dict[str, str]:
     """Units of signals as the data had them, and of everything that follows from these."""
     signals = {s.name: np.zeros((0, s.size)) for s in model.signals}
@@ -114,8 +106,3 @@ def _units(model: Model, known: Mapping[str, str]) -> dict[str, str]:
 
 def _readable(unit: str | None) -> str | None:
     return unit if unit and "[" not in unit else None
-
-
-def _of_last_run(model: Model, name: str, value: Array) -> Array:
-    dims: tuple[int, ...] = model[name].shape.dims
-    return value[-1] if value.ndim > len(dims) else value

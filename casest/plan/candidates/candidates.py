@@ -57,9 +57,17 @@ class Candidates:
 
 def factors_of(model: Model, values: Mapping[str, Any], run: Run, noise: Noise) -> Array:
     """Whitened slopes (N, m, n) of the residuals of a run's samples in the unknowns."""
+    return whitened(model, values, run, noise)[1]
+
+
+def whitened(
+    model: Model, values: Mapping[str, Any], run: Run, noise: Noise
+) -> tuple[Array, Array]:
+    """Residuals (N, m) of a run's samples and their slopes (N, m, n), over the noise."""
     problem = Problem(model, (run,))
     point = problem.point(values)
     slopes = problem.jacobian(point).reshape(len(run), len(model.axes), problem.unknowns)
+    residuals = problem.residuals(point)[0]
     if not np.isfinite(slopes).all():
         bad = int(np.argmax(~np.isfinite(slopes).all(axis=(1, 2))))
         raise UsageError(
@@ -67,7 +75,7 @@ def factors_of(model: Model, values: Mapping[str, Any], run: Run, noise: Noise) 
             "it out"
         )
     if not noise.readings:
-        return np.asarray(slopes / noise.residual[:, None])
+        return residuals / noise.residual, np.asarray(slopes / noise.residual[:, None])
     G = slope_in_sample(model)(problem.parameters(point, 0), problem.samples[0])[0]
     std = np.concatenate([np.full(s.size, noise.readings.get(s.name, 0.0)) for s in model.signals])
     covariance = np.einsum("nik,k,njk->nij", G, std**2, G)
@@ -79,13 +87,15 @@ def factors_of(model: Model, values: Mapping[str, Any], run: Run, noise: Noise) 
             f"{model.name}: the noise of {' and '.join(noise.readings)} alone leaves a residual "
             f"without noise; give that of {' and '.join(silent) or 'others'} too: --sensor-noise"
         ) from None
-    return np.asarray(np.linalg.solve(root, slopes))
+    both = np.linalg.solve(root, np.concatenate([slopes, residuals[:, :, None]], axis=2))
+    return np.asarray(both[:, :, -1]), np.asarray(both[:, :, :-1])
 
 
 def blank(model: Model, count: int, given: Mapping[str, Array]) -> Run:
-    """A run of so many samples with the given signals; others, and readings, are zero."""
+    """A run of so many samples with what is given; other signals, and readings, are zero."""
     signals = {s.name: given.get(s.name, np.zeros((count, s.size))) for s in model.signals}
-    return Run.raw("planned", signals, units={s.name: s.unit for s in model.signals})
+    units = {s.name: s.unit for s in model.signals}
+    return Run.raw("planned", {**given, **signals}, units=units)
 
 
 def predicted(model: Model, values: Mapping[str, Any], run: Run) -> Run:
@@ -104,3 +114,18 @@ def others(model: Model) -> tuple[Signal, ...]:
     return tuple(
         s for s in model.signals if s.name not in own and s.name != "t" and s.kind == "plain"
     )
+
+
+def marginal(information: Array, kept: int) -> Array:
+    """Information of the first unknowns, the others being unknown along with them."""
+    if kept == len(information):
+        return information
+    own = information[kept:, kept:]
+    across = information[:kept, kept:]
+    return np.asarray(information[:kept, :kept] - across @ np.linalg.pinv(own) @ across.T)
+
+
+def of_last_run(model: Model, name: str, value: Array) -> Array:
+    """A parameter's value (of the last run, where it has a leading axis of runs)."""
+    dims: tuple[int, ...] = model[name].shape.dims
+    return np.asarray(value[-1] if value.ndim > len(dims) else value)

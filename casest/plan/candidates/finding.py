@@ -8,6 +8,7 @@ from typing import Any
 
 from casest.data.run import Run
 from casest.declaration.model import Model
+from casest.declaration.shapes import Array
 from casest.errors import UsageError
 from casest.plan.candidates import poses, rows, runs
 from casest.plan.candidates.attitudes import STEP
@@ -20,7 +21,8 @@ class Possible:
     """What can be set, as a person says it.
 
     varied: values by name, as typed. step, reach: of poses, degrees. duration, rate: of runs, s and
-    1/s. table: rows of a file, in place of all that.
+    1/s. table: rows of a file, in place of all that. also: values (N, 1) of columns that an effect
+    reads.
     """
 
     varied: Mapping[str, str] = field(default_factory=dict)
@@ -29,6 +31,7 @@ class Possible:
     duration: float | None = None
     rate: float | None = None
     table: Sequence[Run] | None = None
+    also: Mapping[str, Array] = field(default_factory=dict)
 
 
 def candidates(
@@ -55,6 +58,7 @@ def candidates(
             name: values_of(name, text, sizes[name][1], sizes[name][0])
             for name, text in possible.varied.items()
         }
+        | dict(possible.also)
     )
     turned = poses.rotation_signal(model) is not None
     if turned or poses.at_rest(model):

@@ -113,7 +113,7 @@ def _number(value: Array) -> str:
 
 
 def _unit(model: Model, name: str) -> str:
-    unit = model[name].unit
+    unit = model[name].unit if name in model.symbols else ""
     return f" {unit}" if unit and unit != "1" else ""
 
 

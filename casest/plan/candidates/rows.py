@@ -43,7 +43,7 @@ def settings(
 
 
 def _said(model: Model, name: str, row: Array) -> str:
-    unit = model[name].unit
+    unit = model[name].unit if name in model.symbols else ""
     number = ", ".join(f"{x:g}" for x in row)
     return f"{name} {number}{f' {unit}' if unit and unit != '1' else ''}"
 

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
 from itertools import product
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -16,7 +15,13 @@ from casest.declaration.symbols import Parameter
 from casest.errors import UsageError
 from casest.leastsquares.problem import Problem
 from casest.plan.candidates.attitudes import about
-from casest.plan.candidates.candidates import Candidates, Noise, factors_of, predicted
+from casest.plan.candidates.candidates import (
+    Candidates,
+    Noise,
+    factors_of,
+    predicted,
+    whitened,
+)
 from casest.plan.candidates.varied import combined
 
 #: Values of an angle that are tried between its bounds; quarter turns of a mounting.
@@ -27,6 +32,18 @@ STEEP = 0.1
 THINNED = 2000
 #: Settings of a run that are no symbol of the model.
 DURATION = "duration"
+
+
+class Rivalled(Protocol):
+    """A model and its values."""
+
+    @property
+    def model(self) -> Model:
+        """The model."""
+
+    @property
+    def values(self) -> Mapping[str, Array]:
+        """Values of its unknowns."""
 
 
 def runs(
@@ -160,12 +177,34 @@ def _shared(
     rows = slopes.reshape(-1, slopes.shape[2])
     shared = sum(p.shape.coordinates for p in model.parameters if p.scope == "all")
     turned = np.hstack([rows[:, shared:], rows[:, :shared]])
-    norms = np.linalg.norm(turned, axis=0)
-    R = np.linalg.qr(turned / np.where(norms > 0, norms, 1.0), mode="r") * norms
-    own = rows.shape[1] - shared
-    return np.asarray(R[own:, own:])
+    return np.asarray(_lower(turned, rows.shape[1] - shared))
 
 
-def replaced(noise: Noise, over: float) -> Noise:
-    """The noise of a residual where neighbours are alike over some samples."""
-    return replace(noise, residual=noise.residual * np.sqrt(max(over, 1.0)))
+def off_by(
+    truth: Rivalled, other: Rivalled, noise: Noise, settings: Mapping[str, Array], rate: float
+) -> Array:
+    """Factor (n + 1, n + 1) of a run as the truth has it, seen by another model.
+
+    Its columns: the unknowns that all runs share of the other model, and by how much that is off.
+    """
+    own = {n: row for n, row in settings.items() if n != DURATION}
+    duration = float(settings[DURATION][0])
+    every = max(1.0, duration * rate / THINNED)
+    shaped = {n: truth.model[n].shape.unpack(row) for n, row in own.items()}
+    run = _run(truth.model, {**truth.values, **shaped}, duration, rate / every)
+    mine = {p.name for p in truth.model.parameters if p.scope == "run"}
+    same = {n: v for n, v in {**truth.values, **shaped}.items() if n in mine}
+    off, slopes = whitened(other.model, {**other.values, **same}, run, noise)
+    both = np.concatenate([slopes, off[:, :, None]], axis=2) * np.sqrt(every)
+    rows = both.reshape(-1, both.shape[2])
+    shared = sum(p.shape.coordinates for p in other.model.parameters if p.scope == "all")
+    last = rows.shape[1] - 1
+    turned = np.hstack([rows[:, shared:last], rows[:, :shared], rows[:, last:]])
+    return _lower(turned, last - shared)
+
+
+def _lower(columns: Array, first: int) -> Array:
+    """What the columns after the `first` say beside those: triangular."""
+    norms = np.linalg.norm(columns, axis=0)
+    R = np.linalg.qr(columns / np.where(norms > 0, norms, 1.0), mode="r") * norms
+    return np.asarray(R[first:, first:])

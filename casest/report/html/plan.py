@@ -38,14 +38,15 @@ def _sheet(result: Plan) -> str:
             str(m.number),
             m.words,
             _expected(m.signals),
-            number(m.std_ratio) if m.std_ratio is not None else "–",
+            f"{100 * m.told_apart:.0f} %" if m.told_apart else number(m.std_ratio),
         ]
         for m in result.measurements
     ]
+    brings = "told apart" if result.separates else "std becomes ×"
     units = ", ".join(
         f"{n} in {printed_unit(u)}" for n, u in result.units.items() if u and u != "1"
     )
-    head = ["", "no.", result.things[:-1], "expected", "std becomes ×"]
+    head = ["", "no.", result.things[:-1], "expected", brings]
     said = f"Expected readings: {units}." if units else ""
     return section(
         "sheet", "What to measure", paragraph(said) if said else "", table(head, rows, [1, 4])
@@ -81,6 +82,8 @@ def _sphere(result: Plan) -> str:
 
 
 def _unknowns(result: Plan) -> str:
+    if not result.unknowns:
+        return ""
     rows = [
         [f"`{n}`", number(u.before), number(u.after), printed_unit(u.unit)]
         for n, u in result.unknowns.items()

@@ -5,8 +5,10 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Iterator
 
+from msgspec import UNSET
+
 from casest.report.text.layout import WIDTH, item
-from casest.results.plan import Plan, headline, plan_words
+from casest.results.plan import Measurement, Plan, headline, plan_words
 
 
 def plan_text(result: Plan) -> str:
@@ -24,16 +26,24 @@ def _measurements(result: Plan) -> Iterator[str]:
     if not result.count:
         return
     costs = len({m.cost for m in result.measurements}) > 1
-    yield f"    #  {'std':>5}  {'cost  ' if costs else ''}{result.things[:-1]}"
+    said = "told apart" if result.separates else "std"
+    yield f"    #  {said:>5}  {'cost  ' if costs else ''}{result.things[:-1]}"
     for m in result.measurements:
-        ratio = f"×{m.std_ratio:.2f}" if m.std_ratio is not None else "–"
+        ratio = _brings(m)
         cost = f"{m.cost:>4.3g}  " if costs else ""
         line = f"  {m.number:>3}  {ratio:>5}  {cost}{m.words}"
         yield textwrap.fill(line, WIDTH, subsequent_indent=" " * 15)
 
 
+def _brings(m: Measurement) -> str:
+    """The factor of the standard deviations, or the chance to tell the causes apart."""
+    if m.told_apart is not UNSET and m.told_apart is not None:
+        return f"{100 * m.told_apart:>8.0f} %"
+    return f"×{m.std_ratio:.2f}" if m.std_ratio is not None else "–"
+
+
 def _unknowns(result: Plan) -> Iterator[str]:
-    if not result.count:
+    if not result.count or not result.unknowns:
         return
     width = max(map(len, result.unknowns))
     times = "" if result.noise.stated else " (in units of the noise)"
