@@ -18,6 +18,7 @@ from casest.cli import (
     fitting,
     fleets,
     motion,
+    planning,
     simulating,
 )
 from casest.cli.shared import commands, echo, shown
@@ -27,7 +28,7 @@ from casest.interruption import remember
 __all__ = ["commands", "main", "run"]
 
 #: Every room adds its commands to the group as it is imported.
-ROOMS = (fitting, checking, motion, comparing, correcting, simulating, fleets, completing)
+ROOMS = (fitting, checking, motion, comparing, correcting, simulating, planning, fleets, completing)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -92,6 +92,14 @@ class Estimate:
         R = self.problem.factor(at)[0]
         return self._spread(sandwich(self.problem, at, R, self.correlated_over, self.free))
 
+    @cached_property
+    def information(self) -> Array:
+        """The inverse of the covariance (n, n); JᵀJ/σ² where that has none."""
+        if self.identifiability.rank == self.problem.unknowns and self.free.all():
+            return np.asarray(np.linalg.inv(self.covariance))
+        R = self.problem.factor(self.optimum or self.point)[0]
+        return np.asarray(R.T @ R / self.noise.sigma**2)
+
     @property
     def free(self) -> NDArray[np.bool_]:
         """Which unknowns are on no bound, (n,)."""

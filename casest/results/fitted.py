@@ -76,11 +76,15 @@ class NoiseModel(Noise, frozen=True):
 
 class Correlation(Struct, frozen=True):
     """Correlation of the unknowns, and the standard deviation of each: null where the data do not
-    determine one."""
+    determine one.
+
+    `information` is the inverse of their covariance, from which a plan goes on.
+    """
 
     names: list[str]
     matrix: list[list[Number]]
     std: list[Number]
+    information: list[list[Number]]
 
 
 class Section(Struct, frozen=True, kw_only=True):
@@ -302,7 +306,8 @@ def correlation_of(estimate: Estimate) -> Correlation:
     std = np.sqrt(np.diag(estimate.covariance))
     with np.errstate(invalid="ignore", divide="ignore"):
         matrix = np.asarray(estimate.covariance / np.outer(std, std))
-    return Correlation(list(estimate.names), plain(matrix), plain(std))
+    names, information = list(estimate.names), plain(estimate.information)
+    return Correlation(names, plain(matrix), plain(std), information)
 
 
 def _noise(estimate: Estimate, unit: str) -> Noise:

@@ -5,6 +5,7 @@ from casest.report.html.check import check_page
 from casest.report.html.closed import closing_page
 from casest.report.html.motion import filter_page, observe_page
 from casest.report.html.motion_closed import closing_motion_page
+from casest.report.html.plan import plan_page
 
 REPORT = "report.html"
 
@@ -16,4 +17,5 @@ __all__ = [
     "closing_page",
     "filter_page",
     "observe_page",
+    "plan_page",
 ]
