@@ -16,6 +16,7 @@ from casest.declaration.changing import (
     check_units_known,
     converted_constant,
     converted_parameter,
+    uncertainty_of_coordinates,
 )
 from casest.declaration.effect import (
     NOISE,
@@ -179,7 +180,8 @@ class Model:
             except DeclarationError as error:
                 raise UsageError(f"{name} of model {self.name}: {error}") from None
             fixed: Constant = constant(value, new.unit)
-            return replace(fixed, name=name, frozen=old)
+            known = uncertainty_of_coordinates(name, new, old)
+            return replace(fixed, name=name, frozen=old, uncertainty=known)
         if new.array.shape != old.array.shape:
             raise UsageError(f"{name} has shape {old.array.shape}, not {new.array.shape}")
         like = old.like or (old.unit if "[" in old.unit and new.unit != old.unit else "")

@@ -22,6 +22,7 @@ from casest.estimate.estimate import Estimate as Estimate
 from casest.estimate.estimate import Noise
 from casest.estimate.evidence import judged
 from casest.estimate.on_bounds import free_of, on_bounds
+from casest.estimate.propagation import propagated
 from casest.estimate.reasons import POOR, STARTS, WORTH, Code
 from casest.estimate.remarks import NOTABLE_BIAS
 from casest.estimate.valley import looked_for
@@ -196,6 +197,8 @@ def _estimate(
     bias = second_order_bias(problem, point, noise.sigma, inverse_normal(R, free))
     relative = float(np.max(np.abs(bias[free]) / np.sqrt(np.diag(covariance)[free]), initial=0.0))
     shift = np.outer(bias, bias) if relative > NOTABLE_BIAS else 0.0
+    inputs = propagated(problem, point, free)
+    shift = shift if inputs is None else shift + inputs.carried
     covariance = covariance + shift
     factored = (R, factor[1], rest)
     certificate = certify(
@@ -226,6 +229,7 @@ def _estimate(
         correlated,
         relative,
         shift,
+        inputs=inputs,
     )
 
 

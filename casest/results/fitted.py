@@ -33,6 +33,7 @@ from casest.results.result import (
     Result,
     reproduced,
 )
+from casest.results.uncertainty import Covariance, Input
 from casest.results.units import unit_table
 from casest.results.values import Entry, Held, entries, held
 
@@ -81,6 +82,8 @@ class Section(Struct, frozen=True, kw_only=True):
     certificate: Certificate
     parameters: dict[str, Parameter]
     correlation: Correlation | UnsetType = UNSET
+    covariance: Covariance | UnsetType = UNSET
+    inputs: list[Input] | UnsetType = UNSET
 
 
 class JudgedSection(Section, frozen=True, kw_only=True):
@@ -271,7 +274,7 @@ def fitted_content(
         "kind": "rest intervals" if problem.runs[0].spread else "samples",
         "entries": entries(estimate),
         "unknown_units": dict(zip(estimate.names, problem.units, strict=True)),
-        "held": held(problem.model, units),
+        "held": held(estimate, units),
         "found": estimate,
     }
 
