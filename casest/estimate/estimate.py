@@ -19,9 +19,10 @@ from casest.estimate.evidence import Evidence, remarks
 from casest.estimate.on_bounds import free_of
 from casest.estimate.profile_likelihood import half_width
 from casest.estimate.propagation import Inputs
-from casest.estimate.remarks import notes
+from casest.estimate.remarks import notes, of_stated_noise
 from casest.leastsquares.identifiability import Identifiability, Weak
 from casest.leastsquares.problem import Point, Problem
+from casest.leastsquares.stated import UNLIKELY, ChiSquare
 from casest.solve.outcome import Outcome
 
 #: Degrees of freedom from which on a standard deviation is as good as known.
@@ -33,13 +34,23 @@ class Noise:
     """Standard deviation of one residual, with where it comes from.
 
     `sigma` is what the covariance uses; `residual` the root of RSS over degrees of freedom;
-    `repeats` the scatter that rest intervals show by themselves (None without any).
+    `repeats` the scatter that rest intervals show by themselves (None without any). `stated` is
+    what it should be by the noise that was stated (None without), and `chi_square` compares.
     """
 
     sigma: float
     residual: float
     repeats: float | None
     degrees_of_freedom: int
+    stated: float | None = None
+    chi_square: ChiSquare | None = None
+
+    @property
+    def known(self) -> bool:
+        """Was it stated, and is the residual not larger than that by more than chance?"""
+        if self.stated is None:
+            return False
+        return self.chi_square is None or self.chi_square.larger >= UNLIKELY
 
 
 @dataclass(frozen=True)
@@ -121,7 +132,8 @@ class Estimate:
         dof = problem.residual_count - self.identifiability.rank
         with np.errstate(all="ignore"):
             found = notes(problem, at, dof, self.correlated_over, self.bias)
-            return (*remarks(problem, self.evidence), *found, *_of_tables(problem, at))
+            stated = of_stated_noise(self.noise.chi_square)
+            return (*stated, *remarks(problem, self.evidence), *found, *_of_tables(problem, at))
 
     @cached_property
     def interval_reach(self) -> tuple[Mapping[str, Array], Mapping[str, Array]]:
@@ -162,6 +174,8 @@ class Estimate:
         What comes of references counts as known exactly: their standard uncertainties are.
         """
         freedom = int(self.noise.degrees_of_freedom / self.correlated_over)
+        if self.noise.known and self.correlated_over <= 1:
+            freedom = UNLIMITED
         if self.inputs is None:
             return (freedom,) * self.problem.unknowns
         variance, known = np.diag(self.covariance), np.diag(self.inputs.carried)

@@ -303,10 +303,10 @@ class Problem:
         """Signals of each run side by side, by column."""
         stacked = []
         for run in self.runs:
-            missing = [s.name for s in self.model.signals if s.name not in run.signals]
+            missing = [s.name for s in self.model.columns if s.name not in run.signals]
             if missing:
                 raise DataError(f"{run.file}: no data for signal {missing[0]!r}; add --columns")
-            parts = [np.asanyarray(run.signals[s.name]) for s in self.model.signals]
+            parts = [np.asanyarray(run.signals[s.name]) for s in self.model.columns]
             if sum(part.size for part in parts) <= COPIED:
                 # Columns first: the kernel reads them in order.
                 parts = [np.ascontiguousarray(part.T, dtype=float).T for part in parts]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import inspect
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -39,7 +40,11 @@ from casest.results.values import Entry, Held, entries, held
 
 
 class Noise(Struct, frozen=True):
-    """Standard deviation of one residual on each axis, and where it comes from."""
+    """Standard deviation of one residual on each axis, and where it comes from.
+
+    `stated` is that of a usual residual by the noise that was stated; `chi_square` compares what
+    is left with it, and `chi_square_p_value` is the chance of as much or more.
+    """
 
     sigma: list[float]
     unit: str
@@ -47,6 +52,9 @@ class Noise(Struct, frozen=True):
     from_repeats: Number
     degrees_of_freedom: int
     correlated_over_samples: Number
+    stated: Number
+    chi_square: Number
+    chi_square_p_value: Number
 
 
 class NoiseModel(Noise, frozen=True):
@@ -293,7 +301,7 @@ def correlation_of(estimate: Estimate) -> Correlation:
 
 
 def _noise(estimate: Estimate, unit: str) -> Noise:
-    noise = estimate.noise
+    noise, chi = estimate.noise, estimate.noise.chi_square
     return Noise(
         [float(noise.sigma)] * len(estimate.model.axes),
         unit,
@@ -301,6 +309,9 @@ def _noise(estimate: Estimate, unit: str) -> Noise:
         plain(noise.repeats),
         noise.degrees_of_freedom,
         plain(estimate.correlated_over),
+        plain(noise.stated),
+        None if chi is None else plain(chi.value),
+        None if chi is None else plain(chi.larger),
     )
 
 
@@ -356,7 +367,8 @@ def _correction(
     around = None
     if corrected and corrected.low is not UNSET and corrected.high is not UNSET:
         around = (corrected.low, corrected.high)
-    found = carried(estimate.model, estimate.values, estimate.problem.runs, units, around)
+    model = replace(estimate.model, noise=None)  # readings are corrected without their noise
+    found = carried(model, estimate.values, estimate.problem.runs, units, around)
     if isinstance(found, str):
         return {"reason": found}
     values = {name: plain(value) for name, value in estimate.values.items()}
