@@ -167,10 +167,9 @@ class SensorOptions:
     stated: Assignments = flag(
         (),
         "--sensor-noise",
-        only=Kind.MOVING,
         of=Assignment,
-        metavar="SIGNAL=STD",
-        help="In motion: std of one reading, in the model's unit; its rate is the record's.",
+        metavar="SIGNAL=STD|%|COLUMN",
+        help="Std of one reading: v=0.02 (model's unit), 'v=0.02 g', v=2%, v=u_x.",
     )
 
     def stds(self) -> dict[str, float]:
@@ -184,6 +183,7 @@ class FitOptions:
 
     model: ModelOptions = field(default_factory=ModelOptions)
     reading: ReadingOptions = field(default_factory=ReadingOptions)
+    sensors: SensorOptions = field(default_factory=SensorOptions)
     holdout: Words = flag(
         (),
         "--holdout",
@@ -230,4 +230,3 @@ class CloseOptions(FitOptions):
         metavar="COLUMN",
         help="With --sensor: does it follow this column (line, supplier, fixture)?",
     )
-    sensors: SensorOptions = field(default_factory=SensorOptions)

@@ -16,6 +16,7 @@ from casest.declaration.changing import (
     check_units_known,
     converted_constant,
     converted_parameter,
+    uncertainty_of_coordinates,
 )
 from casest.declaration.effect import (
     NOISE,
@@ -28,6 +29,7 @@ from casest.declaration.effect import (
     check_null,
     label_of,
 )
+from casest.declaration.noise import Stated, in_units_of_noise
 from casest.declaration.physics import Quantity, Residual
 from casest.declaration.sampson import sampson
 from casest.declaration.shapes import Array
@@ -57,6 +59,7 @@ class Model:
     inverter: Callable[..., Any] | None = None
     canonicaliser: Callable[..., Any] | None = None
     estimators: tuple[tuple[str, Callable[..., Any]], ...] = ()
+    noise: Stated | None = None
 
     def __reduce__(self) -> tuple[Any, ...]:
         """To pickle: the declaration alone; it is traced anew where it arrives."""
@@ -71,6 +74,13 @@ class Model:
         for attached in self.effects:
             own += [s for s in attached.signals if s.name not in {o.name for o in own}]
         return tuple(own)
+
+    @cached_property
+    def columns(self) -> tuple[Signal, ...]:
+        """What a sample holds: the signals, then what is stated of their noise."""
+        if self.noise is None:
+            return self.signals
+        return self.signals + self.noise.columns({s.name: s for s in self.signals})
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -179,7 +189,8 @@ class Model:
             except DeclarationError as error:
                 raise UsageError(f"{name} of model {self.name}: {error}") from None
             fixed: Constant = constant(value, new.unit)
-            return replace(fixed, name=name, frozen=old)
+            known = uncertainty_of_coordinates(name, new, old)
+            return replace(fixed, name=name, frozen=old, uncertainty=known)
         if new.array.shape != old.array.shape:
             raise UsageError(f"{name} has shape {old.array.shape}, not {new.array.shape}")
         like = old.like or (old.unit if "[" in old.unit and new.unit != old.unit else "")
@@ -404,6 +415,8 @@ class Model:
     def traced(self) -> Traced:
         """The body in CasADi symbols, with every effect in place."""
         found = trace(self)
+        if self.noise is not None:
+            return in_units_of_noise(found, self.noise)
         acting = any(a.kind in ("quantity", "signal") for a in self.effects)
         if found.residual.implicit is None or not acting:
             return found
@@ -412,7 +425,8 @@ class Model:
     @cached_property
     def staged(self) -> Traced:
         """The body with a symbol in the place of what each effect gives that looks at others."""
-        return trace(self, staged=True)
+        found = trace(self, staged=True)
+        return found if self.noise is None else in_units_of_noise(found, self.noise)
 
     # -- numbers -------------------------------------------------------------------------------
 

@@ -279,7 +279,7 @@ class Problem:
         for s in self.slots:
             shape, block = s.parameter.shape, covariance[s.x, s.x]
             if shape.curved:
-                jacobian = self._chart_jacobian(s, point)
+                jacobian = self.chart_slope(s, point)
                 std = _root(np.diag(jacobian @ block @ jacobian.T)).reshape(shape.dims)
             else:
                 std = shape.unpack(_root(np.diag(block)))
@@ -288,7 +288,10 @@ class Problem:
         per_run = {p.name for p in self.model.parameters if p.scope == "run"}
         return {n: np.stack(v) if several and n in per_run else v[0] for n, v in found.items()}
 
-    def _chart_jacobian(self, slot: Slot, point: Point) -> Array:
+    def chart_slope(self, slot: Slot, point: Point) -> Array:
+        """Slope (entries, coordinates) of a parameter's entries in its unknowns."""
+        if not slot.parameter.shape.curved:
+            return np.eye(slot.parameter.shape.size)
         x, reference = point.x[slot.x], point.references[slot.ref]
         _, slope = _chart(slot.parameter.shape.kind, len(x), len(reference))
         return np.array(slope(x, reference))
@@ -300,10 +303,10 @@ class Problem:
         """Signals of each run side by side, by column."""
         stacked = []
         for run in self.runs:
-            missing = [s.name for s in self.model.signals if s.name not in run.signals]
+            missing = [s.name for s in self.model.columns if s.name not in run.signals]
             if missing:
                 raise DataError(f"{run.file}: no data for signal {missing[0]!r}; add --columns")
-            parts = [np.asanyarray(run.signals[s.name]) for s in self.model.signals]
+            parts = [np.asanyarray(run.signals[s.name]) for s in self.model.columns]
             if sum(part.size for part in parts) <= COPIED:
                 # Columns first: the kernel reads them in order.
                 parts = [np.ascontiguousarray(part.T, dtype=float).T for part in parts]

@@ -46,7 +46,7 @@ class Record:
                 f"{run.file or run.name}: an effect that looks at other samples needs time: give a "
                 "time column or --rate"
             )
-        samples = np.hstack([np.asarray(whole.signals[s.name], float) for s in model.signals])
+        samples = np.hstack([np.asarray(whole.signals[s.name], float) for s in model.columns])
         return cls(whole, samples, np.asarray(whole.time, float), places)
 
     def at(self, name: str, wanted: Array, *, rotation: bool) -> tuple[Array, Array]:

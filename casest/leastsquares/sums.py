@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from casest.declaration.shapes import Array
 from casest.leastsquares.per_sample import laplacian, slope_in_sample
 from casest.leastsquares.problem import Block, Point, Problem
+from casest.leastsquares.stated import settles, shifts_of_curvature
 
 #: Residuals that are looked at where a median or a correlation is wanted of a longer record.
 SAMPLED = 1_000_000
@@ -96,9 +97,13 @@ def rounding(problem: Problem, point: Point) -> float:
 def second_order(problem: Problem, point: Point, sigma: float) -> float:
     """Root mean square over σ of ½Σσ_s²·∂²r/∂s²: what an implicit residual neglects of the noise.
 
-    Zero for explicit models, whose residual is linear in the noise of the reading.
+    Zero for explicit models, whose residual is linear in the noise of the reading, unless noise of
+    their inputs was stated.
     """
-    if not problem.model.implicit:
+    if settles(problem.model):
+        shifts = np.concatenate([shift.ravel() for shift in shifts_of_curvature(problem, point)])
+        return float(np.sqrt(np.mean(shifts**2)) / sigma)
+    if not problem.model.implicit or problem.model.noise is not None:
         return 0.0
     squares, count, noise = 0.0, 0, _signal_noise(problem, point, sigma)
     for r, samples in enumerate(problem.samples):
@@ -113,7 +118,13 @@ def second_order_bias(problem: Problem, point: Point, sigma: float, bread: Array
     Noise of σ_s in every component of signal s shifts each residual by ½Σσ_s²·∂²r/∂s² on average.
     """
     slope = np.zeros(problem.unknowns)
-    if not problem.model.implicit:
+    if settles(problem.model) and not problem.model.implicit:
+        shifts = tuple(shifts_of_curvature(problem, point))
+        for block in problem.blocks(point):
+            own = shifts[block.run][block.span]
+            np.add.at(slope, block.x, np.einsum("nm,nmk->k", own, block.jacobian))
+        return np.asarray(-bread @ slope)
+    if not problem.model.implicit or problem.model.noise is not None:
         return slope
     noise = _signal_noise(problem, point, sigma)
     for block in problem.blocks(point):

@@ -15,7 +15,7 @@ _OUTPUT = ("-o", "--output")
 _FLAGS = ("--at-rest", "--json", "--force", "--float")
 _READING = ("--columns", "--unit", "--scale", "--rate", "--time-zero")
 _MODEL = ("--set", "--free", "--fix", "--shared", "--per-run", "--effects", "--at-rest")
-_FIT = ("--start", "--solver", "--seed", "--holdout")
+_FIT = ("--start", "--solver", "--seed", "--holdout", "--sensor-noise", "--prior")
 
 
 @dataclass(frozen=True)

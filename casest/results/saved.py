@@ -29,8 +29,14 @@ class SavedParameter(Struct, frozen=True):
         return self.unit if isinstance(self.unit, str) else next(iter(self.unit), "")
 
 
+class _SavedCovariance(Struct, frozen=True):
+    names: list[str]
+    matrix: list[list[float | None]]
+
+
 class _Section(Struct, frozen=True):
     parameters: dict[str, SavedParameter]
+    covariance: _SavedCovariance | UnsetType = UNSET
 
 
 class _Reproduced(Struct, frozen=True):

@@ -28,6 +28,7 @@ from casest.effects.placing import prepared
 from casest.estimate.estimate import Estimate
 from casest.leastsquares.agreement import between_runs
 from casest.leastsquares.problem import Point, Problem
+from casest.leastsquares.stated import chi_square
 from casest.leastsquares.weights import robust_scale, weighted
 
 #: Longer records are not asked by `calibrate`: all residuals are looked at at once.
@@ -143,7 +144,7 @@ def findings(
     freedom = max(problem.residual_count - problem.unknowns, 1)
     sigma = robust_scale(residuals) * float(np.sqrt(problem.residual_count / freedom))
     clipped = _clipped(problem, residuals, sigma)
-    found = _repeats(problem, point, clipped)
+    found = _repeats(problem, point, clipped) + _stated(problem, point)
     slow = [] if wanders else _slow(problem, clipped, sigma)
     follows = _follows(problem, point, clipped, sigma, in_time=not (slow or wanders))
     found += follows + slow
@@ -171,6 +172,18 @@ def _repeats(problem: Problem, point: Point, clipped: Sequence[Array]) -> list[F
         "within them explains"
     )
     return [Finding(where, tested.p_value, tested.sigma)]
+
+
+def _stated(problem: Problem, point: Point) -> list[Finding]:
+    """A residual that is larger than the noise that was stated, by χ²."""
+    found, noise = chi_square(problem, point, problem.unknowns), problem.model.noise
+    if found is None or noise is None or found.larger >= LEVELS.misfit:
+        return []
+    where = (
+        f"chi-square is {found.value:.4g} with {found.degrees_of_freedom} degrees of freedom: the "
+        f"residual is {found.times:.2g} times the stated noise"
+    )
+    return [Finding(where, found.larger, noise.scale)]
 
 
 def _slow(problem: Problem, clipped: Sequence[Array], sigma: float) -> list[Finding]:
