@@ -22,6 +22,7 @@ class SavedParameter(Struct, frozen=True):
     value: Any
     std: Any
     unit: str | list[str]
+    interval95: Any = None
 
     @property
     def first_unit(self) -> str:
@@ -42,6 +43,7 @@ class SavedResult(Struct, frozen=True, kw_only=True):
 
     model: str
     trusted: bool
+    verdict: str | None = None
     data: list[str] = []
     runs: list[str] = []
     constants: dict[str, Any] = {}
@@ -71,28 +73,33 @@ def saved_correction(path: Path, *, force: bool = False, what: str) -> tuple[Sav
 
     `what` is to be done to a refused result only with `force`.
     """
-    result = saved_result(path)
+    return correction_of(saved_result(path), str(result_file(path)), force=force, what=what)
+
+
+def correction_of(
+    result: SavedResult, name: str, *, force: bool = False, what: str
+) -> tuple[SavedResult, Carried]:
+    """The result and the correction that it carries, checked; errors call the result `name`."""
     if result.innovations is not None:
         raise UsageError(
             f"the result is of {result.model}, an estimator in motion: it has states over time "
             f"(casest filter {result.model} DATA) and no correction"
         )
     if not result.trusted and not force:
-        raise UsageError(f"{path}: this estimate was refused; --force {what} it all the same")
+        raise UsageError(f"{name}: this estimate was refused; --force {what} it all the same")
     if result.correction is None:
         raise DataError(
-            f"{path}: was made by an older casest, and carries no correction: calibrate again"
+            f"{name}: was made by an older casest, and carries no correction: calibrate again"
         )
     if "reason" in result.correction:
         raise UsageError(str(result.correction["reason"]))
     values = {name: p.value for name, p in result.parameters.items()}
     if result.correction.get("of") != digest_of_values(values, result.trusted):
         raise DataError(
-            f"{result_file(path)}: its parameters are not those that its correction was made from; "
+            f"{name}: its parameters are not those that its correction was made from; "
             "a result is not edited by hand: calibrate again, with --fix what is to be held"
         )
-    where = f"{result_file(path)}: correction"
-    return result, carried_read(result.correction, where, len(result.runs))
+    return result, carried_read(result.correction, f"{name}: correction", len(result.runs))
 
 
 def numbers(value: Any, where: str) -> Array:
