@@ -18,6 +18,7 @@ from casest.cli import (
     fitting,
     fleets,
     motion,
+    reporting,
     simulating,
 )
 from casest.cli.project import expanded
@@ -28,7 +29,9 @@ from casest.interruption import remember
 __all__ = ["commands", "main", "run"]
 
 #: Every room adds its commands to the group as it is imported.
-ROOMS = (fitting, motion, comparing, correcting, simulating, fleets, beginning, completing)
+ROOMS = (
+    fitting, motion, comparing, correcting, simulating, fleets, reporting, beginning, completing,
+)  # fmt: skip
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

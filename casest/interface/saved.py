@@ -9,8 +9,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from casest.correction.carried import Carried
 from casest.data.finding import Choice
 from casest.declaration.shapes import Array
@@ -20,7 +18,7 @@ from casest.interface.tables import Library, as_frame
 from casest.interface.told import table_columns
 from casest.interface.words import as_python_says
 from casest.report.text.layout import value_table
-from casest.results.saved import SavedParameter, SavedResult, correction_of, saved_result
+from casest.results.saved import SavedResult, correction_of, floats, saved_result
 from casest.results.values import Entry
 
 
@@ -59,12 +57,12 @@ class Saved:
     @cached_property
     def values(self) -> Mapping[str, Array]:
         """Values by parameter, in its shape; of `close`, after the loop."""
-        return {n: _numbers(p.value) for n, p in self.content.parameters.items()}
+        return {n: floats(p.value) for n, p in self.content.parameters.items()}
 
     @cached_property
     def std(self) -> Mapping[str, Array]:
         """Standard deviations by parameter; NaN where there is none."""
-        return {n: _numbers(p.std) for n, p in self.content.parameters.items()}
+        return {n: floats(p.std) for n, p in self.content.parameters.items()}
 
     @property
     def units(self) -> Mapping[str, str | list[str]]:
@@ -84,9 +82,9 @@ class Saved:
         """A data frame with a row for each number: value, std, 95 % interval, unit."""
         return as_frame(table_columns(self._entries), to)
 
-    @cached_property
+    @property
     def _entries(self) -> tuple[Entry, ...]:
-        return tuple(e for n, p in self.content.parameters.items() for e in _entries(n, p))
+        return self.content.entries
 
     def __call__(
         self,
@@ -110,23 +108,3 @@ class Saved:
 
     def _correction(self, force: bool) -> tuple[SavedResult, Carried]:
         return correction_of(self.content, str(self.path), force=force, what="uses")
-
-
-def _numbers(value: Any) -> Array:
-    return np.array(value, dtype=np.float64)
-
-
-def _entries(name: str, p: SavedParameter) -> list[Entry]:
-    """Every number but those that the shape holds at zero."""
-    value, std = _numbers(p.value), _numbers(p.std)
-    ends = _numbers(p.interval95) if p.interval95 is not None else np.stack([value, value])
-    found = []
-    for k, place in enumerate(np.ndindex(value.shape)):
-        if value[place] == 0 == std[place]:
-            continue
-        unit = p.unit if isinstance(p.unit, str) else p.unit[k % len(p.unit)]
-        label = f"{name}[{','.join(map(str, place))}]" if place else name
-        below, above = value[place] - ends[0][place], ends[1][place] - value[place]
-        shown = "" if unit == "1" else unit
-        found.append(Entry(label, shown, *map(float, (value[place], std[place], below, above))))
-    return found

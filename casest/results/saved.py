@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from casest.correction.reading import carried_read, typed
 from casest.declaration.shapes import Array
 from casest.errors import DataError, UsageError
 from casest.results.file import digest_of_values, load_result, result_file
+from casest.results.values import Entry
 
 
 class SavedParameter(Struct, frozen=True):
@@ -61,6 +62,11 @@ class SavedResult(Struct, frozen=True, kw_only=True):
         """After the loop was closed, if it was."""
         found = self.after or self.estimate
         return found.parameters if found else {}
+
+    @property
+    def entries(self) -> tuple[Entry, ...]:
+        """Every number of every parameter, but those that its shape holds at zero."""
+        return tuple(e for n, p in self.parameters.items() for e in _entries(n, p))
 
 
 def saved_result(path: Path) -> SavedResult:
@@ -111,3 +117,21 @@ def numbers(value: Any, where: str) -> Array:
     if not np.isfinite(found).all():
         raise DataError(f"{where}: has no value; calibrate again")
     return found
+
+
+def floats(value: Any) -> Array:
+    """A saved value as it stands, of any shape; NaN where there is none."""
+    return np.array(value, dtype=np.float64)
+
+
+def _entries(name: str, p: SavedParameter) -> Iterator[Entry]:
+    value, std = floats(p.value), floats(p.std)
+    ends = np.stack([value, value]) if p.interval95 is None else floats(p.interval95)
+    for k, place in enumerate(np.ndindex(value.shape)):
+        if value[place] == 0 == std[place]:
+            continue
+        unit = p.unit if isinstance(p.unit, str) else p.unit[k % len(p.unit)]
+        label = f"{name}[{','.join(map(str, place))}]" if place else name
+        reach = value[place] - ends[0][place], ends[1][place] - value[place]
+        shown = "" if unit == "1" else unit
+        yield Entry(label, shown, *(float(x) for x in (value[place], std[place], *reach)))

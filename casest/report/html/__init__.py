@@ -4,6 +4,7 @@ from casest.report.html.calibration import calibration_page
 from casest.report.html.closed import closing_page
 from casest.report.html.motion import filter_page, observe_page
 from casest.report.html.motion_closed import closing_motion_page
+from casest.report.html.side_by_side import side_by_side_page
 
 REPORT = "report.html"
 
@@ -14,4 +15,5 @@ __all__ = [
     "closing_page",
     "filter_page",
     "observe_page",
+    "side_by_side_page",
 ]
