@@ -36,8 +36,8 @@ from casest.declaration.shapes import Array
 from casest.declaration.symbols import Constant, Parameter, Scope, Signal, Symbol, constant, named
 from casest.declaration.tracing import Traced, describe, function_of, reached_parameters, trace
 from casest.declaration.travelling import reduced
-from casest.errors import DeclarationError, UnitError, UsageError
-from casest.units import known, size
+from casest.errors import CasestError, DeclarationError, UnitError, UsageError
+from casest.units import known, parse_quantity, size
 
 
 @dataclass(frozen=True)
@@ -167,8 +167,8 @@ class Model:
     def having(self, **changes: Any) -> Model:
         """A model with constants set, parameters redeclared, or either turned into the other.
 
-        A number fixes (`radius=0.3`), a `param(…)` frees (`radius=param("m", start=0.28)`), a
-        `constant(…)` sets value and unit.
+        A number fixes (`radius=0.3`), also with its unit (`norm="48 uT"`), a `param(…)` frees
+        (`radius=param("m", start=0.28)`), a `constant(…)` sets value and unit.
         """
         model = self
         for name, change in changes.items():
@@ -181,7 +181,7 @@ class Model:
             raise UsageError(f"{name} is a signal of model {self.name}: data give it, not having()")
         if isinstance(change, Parameter):
             return replace(converted_parameter(name, change, old), name=name)
-        new = change if isinstance(change, Constant) else constant(change, old.unit)
+        new = change if isinstance(change, Constant) else _stated(name, change, old.unit)
         new = converted_constant(name, new, old.unit)
         if isinstance(old, Parameter):
             try:
@@ -526,3 +526,15 @@ def _reaches_residual(made: Model, attached: Attached) -> bool:
 
 def _rows(value: Any, declared: Signal) -> Array:
     return np.asarray(value, dtype=float).reshape(-1, declared.size)
+
+
+def _stated(name: str, value: Any, unit: str) -> Constant:
+    """A constant from a number, or from text with its unit."""
+    if isinstance(value, str):
+        try:
+            value, stated = parse_quantity(value)
+        except CasestError as error:
+            raise type(error)(f"{name}: {error}") from None
+        unit = stated or unit
+    found: Constant = constant(value, unit)
+    return found

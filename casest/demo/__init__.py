@@ -37,3 +37,11 @@ def _error(part: Mapping[str, Any], name: str, k: int, true: float) -> str:
     found = part["parameters"][name]
     value, std = np.atleast_1d(found["value"])[k], np.atleast_1d(found["std"])[k]
     return f"{value - true:+.4f} ({(value - true) / std:+.1f})"
+
+
+def furthest(values: Mapping[str, Any], std: Mapping[str, Any]) -> float:
+    """How far an estimate of `RECORD` is from the truth at most, in standard deviations."""
+    truth = json.loads((FOLDER / "truth.json").read_text(encoding="utf-8"))["parameters"]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        z = [np.abs(values[n] - np.array(true)) / std[n] for n, true in truth.items()]
+    return float(max(np.nanmax(one) for one in z))

@@ -6,6 +6,7 @@ from casest.report.html.closed import closing_page
 from casest.report.html.motion import filter_page, observe_page
 from casest.report.html.motion_closed import closing_motion_page
 from casest.report.html.plan import plan_page
+from casest.report.html.side_by_side import side_by_side_page
 
 REPORT = "report.html"
 
@@ -18,4 +19,5 @@ __all__ = [
     "filter_page",
     "observe_page",
     "plan_page",
+    "side_by_side_page",
 ]
