@@ -96,9 +96,10 @@ def rounding(problem: Problem, point: Point) -> float:
 def second_order(problem: Problem, point: Point, sigma: float) -> float:
     """Root mean square over σ of ½Σσ_s²·∂²r/∂s²: what an implicit residual neglects of the noise.
 
-    Zero for explicit models, whose residual is linear in the noise of the reading.
+    Zero for explicit models, whose residual is linear in the noise of the reading, and taken for
+    none where rests are compared: their means have little.
     """
-    if not problem.model.implicit:
+    if not problem.model.implicit or problem.model.resting:
         return 0.0
     squares, count, noise = 0.0, 0, _signal_noise(problem, point, sigma)
     for r, samples in enumerate(problem.samples):
@@ -113,7 +114,7 @@ def second_order_bias(problem: Problem, point: Point, sigma: float, bread: Array
     Noise of σ_s in every component of signal s shifts each residual by ½Σσ_s²·∂²r/∂s² on average.
     """
     slope = np.zeros(problem.unknowns)
-    if not problem.model.implicit:
+    if not problem.model.implicit or problem.model.resting:
         return slope
     noise = _signal_noise(problem, point, sigma)
     for block in problem.blocks(point):
@@ -145,9 +146,10 @@ def _signal_noise(problem: Problem, point: Point, sigma: float) -> Array:
 def repeat_noise(problem: Problem, point: Point) -> float | None:
     """Root mean square of the residual's noise that the scatter within rest intervals implies.
 
-    None where no signal carries a spread of its own. What only effects read is exact.
+    None where no signal carries a spread of its own, and where rests are compared. What only
+    effects read is exact.
     """
-    if not any(run.spread for run in problem.runs):
+    if not any(run.spread for run in problem.runs) or problem.model.resting:
         return None
     squares, count = 0.0, 0
     declared = {s.name for s in problem.model.declared}

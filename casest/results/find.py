@@ -33,6 +33,7 @@ SHIPPED = {
     "norm-triangular": ("norm", "norm_triangular"),
     "norm-full": ("norm", "norm_full"),
     "norm-pair": ("pair", "norm_pair"),
+    "gyro-rests": ("imu", "gyro_rests"),
 }
 
 
