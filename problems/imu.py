@@ -21,11 +21,12 @@ from numpy.typing import NDArray
 from casest import (
     DataError,
     Model,
-    NotTrusted,
     Residual,
     Run,
+    atan2,
     before,
     constant,
+    cos,
     cross,
     dot,
     if_else,
@@ -36,11 +37,12 @@ from casest import (
     pi,
     quantity,
     signal,
+    sin,
     turned,
     vertcat,
 )
 
-from .norm import burkhard_bias, burkhard_full
+from .pair import alone, closed_form, held_values, right_handed
 
 Array = NDArray[np.float64]
 
@@ -66,6 +68,12 @@ def _apart(seen: Any, foretold: Any) -> Any:
     second = vertcat(x * y * a, side + y * y * a, -y)
     away = cross(foretold, seen) * (2 / (1 + dot(seen, foretold)))
     return DEGREE * vertcat(dot(first, away), dot(second, away))
+
+
+def _heading(up: Any, north: Any, foretold: Any) -> Any:
+    """The angle about the vertical from where a direction was foretold to where it is seen, deg."""
+    seen, foretold = north - dot(north, up) * up, foretold - dot(foretold, up) * up
+    return DEGREE * atan2(dot(up, cross(foretold, seen)), dot(foretold, seen))
 
 
 @model
@@ -106,83 +114,161 @@ def gyro_rests(
     )
 
 
+@model
+def imu(
+    a=signal(3),
+    w=signal(3),
+    m=signal(3),
+    *,
+    accelerometer_scale=param(lower(3), "[gravity]/[a]"),
+    accelerometer_offset=param(3, "[a]"),
+    gyroscope_scale=param((3, 3), "rad/s/[w]"),
+    gyroscope_offset=param(3, "[w]"),
+    magnetometer_scale=param((3, 3), "[field]/[m]"),
+    magnetometer_offset=param(3, "[m]"),
+    dip=param("rad", bounds=(-pi / 2, pi / 2)),
+    g_sensitivity=constant(np.zeros((3, 3)), "[w]/[gravity]"),
+    gravity=constant(9.80665, "m/s^2"),
+    field=constant(1.0, "[m]"),
+    accelerometer_noise=constant(0.0, "[a]"),
+    magnetometer_noise=constant(0.0, "[m]"),
+    dip_noise=constant(0.0, "deg"),
+    gyroscope_noise=constant(0.0, "[w]"),
+    turn_noise=constant(0.0, "deg"),
+    heading_noise=constant(0.0, "deg"),
+):
+    """Accelerometer, gyroscope and magnetometer of one body together: 34 unknowns.
+
+    force = accelerometer_scale·(a − accelerometer_offset) has the length `gravity` at rest, flux =
+    magnetometer_scale·(m − magnetometer_offset) the length `field`, `dip` below the horizontal;
+    rate = gyroscope_scale·(w − gyroscope_offset − g_sensitivity·force) in rad/s is zero at rest, and
+    turns both from one rest to the next. All are in the accelerometer's frame; corrected is force,
+    rate, flux. A noise of 0 is found from the data.
+    """
+    force = quantity("force", accelerometer_scale @ (a - accelerometer_offset), "[gravity]")
+    bias = gyroscope_offset + g_sensitivity @ force
+    rate = quantity("rate", gyroscope_scale @ (w - bias), "rad/s")
+    flux = quantity("flux", magnetometer_scale @ (m - magnetometer_offset), "[field]")
+    up, north = force / norm_2(force), flux / norm_2(flux)
+    back = turned(rate).T
+    return Residual(
+        implicit=vertcat(
+            _length(force, accelerometer_scale, gravity),
+            _length(flux, magnetometer_scale, field),
+            DEGREE * (dot(up, north) + sin(dip)) / cos(dip),
+            w - bias,
+            _apart(up, back @ before(up)),
+            _heading(up, north, back @ before(north)),
+        ),
+        axes=(
+            "gravity",
+            "field",
+            "dip",
+            "rest_x",
+            "rest_y",
+            "rest_z",
+            "turn_x",
+            "turn_y",
+            "heading",
+        ),
+        noise=(
+            "accelerometer_noise",
+            "magnetometer_noise",
+            "dip_noise",
+            *3 * ("gyroscope_noise",),
+            *2 * ("turn_noise",),
+            "heading_noise",
+        ),
+        corrected=quantity("corrected", vertcat(force, rate, flux)),
+    )
+
+
 # -- start values ---------------------------------------------------------------------------------
 
 
-def _held(declared: Model) -> dict[str, Array]:
-    """Values of what is held: constants, and parameters that were fixed."""
-    return {c.name: c.array for c in declared.constants}
-
-
-def _means(runs: Sequence[Run], name: str) -> Array:
-    """Mean readings at rest of all runs, (N, 3)."""
-    return np.vstack([run.signals[name] for run in runs])
-
-
-def ellipsoid(v: Array, length: float) -> tuple[Array, Array]:
-    """(scale, offset) of one sensor: Burkhard's closed form, else a sphere through the readings."""
-    try:
-        return burkhard_full(v, length)
-    except NotTrusted:
-        b, radius = burkhard_bias(v)
-        return np.eye(3) * length / radius, b
-
-
-def _sensor(declared: Model, runs: Sequence[Run], name: str, sensor: str, length: str) -> Any:
-    """(scale, offset) of a sensor by its lengths at rest, with what is held as it is."""
-    held = _held(declared)
-    scale, offset = ellipsoid(_means(runs, name), float(held[length]))
-    return held.get(f"{sensor}_scale", scale), held.get(f"{sensor}_offset", offset)
-
-
-def turning_scale(runs: Sequence[Run], up: Sequence[Array], bias: Sequence[Array]) -> Array:
+def turning_scale(runs: Sequence[Run], up: Sequence[Array], bias: Array) -> Array:
     """The gyroscope's scale (3, 3) by linear least squares, from directions on the way.
 
     u′ = u × S(w - b) of the direction u that the accelerometer shows while it is turned: summed
     from rest to rest that is linear in S. Hands shake, so it is a start, and no more: right to some
     percent, whatever the unit and the mounting.
     """
-    rows, right = [], []
-    for run, u, b in zip(runs, up, bias, strict=True):
+    rows, right = [np.zeros((0, 9))], [np.zeros(0)]
+    for run, u in zip(runs, up, strict=True):
         assert run.averaged is not None
         raw = run.averaged.run
-        time, w = np.asarray(raw.time), raw.signals["w"] - b
+        time, w = np.asarray(raw.time), raw.signals["w"] - bias
         for i, j in zip(run.averaged.last[:-1], run.averaged.first[1:], strict=True):
             angle = 0.5 * (w[i:j] + w[i + 1 : j + 1]) * np.diff(time[i : j + 1])[:, None]
-            middle = 0.5 * (u[i:j] + u[i + 1 : j + 1])
-            sums = middle.T @ angle  # Σ u_p d_q; u × e_r has the components ε_spr u_p
-            block = np.einsum("spr,pq->srq", _LEVI_CIVITA, sums)
-            rows.append(block.reshape(3, 9))
+            sums = (0.5 * (u[i:j] + u[i + 1 : j + 1])).T @ angle
+            # u × e_r has the components ε_spr u_p.
+            rows.append(np.einsum("spr,pq->srq", _CROSS, sums).reshape(3, 9))
             right.append(u[j] - u[i])
     found = np.linalg.lstsq(np.vstack(rows), np.concatenate(right), rcond=None)[0]
     return np.asarray(found.reshape(3, 3))
 
 
-_LEVI_CIVITA = np.zeros((3, 3, 3))
-for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-    _LEVI_CIVITA[_i, _j, _k], _LEVI_CIVITA[_i, _k, _j] = 1.0, -1.0
+#: ε: +1 for (0, 1, 2) and what follows by turning it round, −1 for the others.
+_CROSS = np.array([np.cross(np.eye(3), axis) for axis in np.eye(3)]).T
 
 
-def linear_start(declared: Model, runs: Sequence[Run]) -> dict[str, Array]:
-    """Accelerometer in closed form, gyroscope's offset at rest, its scale by `turning_scale`."""
-    held = _held(declared)
-    scale, offset = _sensor(declared, runs, "a", "accelerometer", "gravity")
-    found = {"accelerometer_scale": scale, "accelerometer_offset": offset}
+def start(declared: Model, runs: Sequence[Run]) -> dict[str, Array]:
+    """Closed forms of the accelerometer (and magnetometer) at rest, then the gyroscope's: its
+    offset at rest, its scale by `turning_scale`."""
+    _refuse_no_record(declared, runs)
+    held = held_values(declared)
+    if "m" in {s.name for s in declared.signals}:
+        found = dict(closed_form(declared, runs))
+    else:
+        scale, offset = alone(declared, runs, "accelerometer")
+        found = {"accelerometer_scale": scale, "accelerometer_offset": offset}
     counts = np.concatenate([run.count for run in runs]).astype(float)
-    bias = held.get("gyroscope_offset", np.average(_means(runs, "w"), axis=0, weights=counts))
+    at_rest = np.vstack([run.signals["w"] for run in runs])
+    bias = held.get("gyroscope_offset", np.average(at_rest, axis=0, weights=counts))
     found["gyroscope_offset"] = bias
     if "gyroscope_scale" not in held:
+        scale, offset = found["accelerometer_scale"], found["accelerometer_offset"]
         up = [_directions(run, scale, offset) for run in runs]
-        found["gyroscope_scale"] = turning_scale(runs, up, [bias] * len(runs))
+        found["gyroscope_scale"] = turning_scale(runs, up, bias)
     return found
+
+
+def _refuse_no_record(declared: Model, runs: Sequence[Run]) -> None:
+    for run in runs:
+        if run.averaged is None:
+            raise DataError(
+                f"{run.file or run.name}: {declared.name} looks at what lies between rests: give "
+                "the raw record with --at-rest (load_runs(…, at_rest=True))"
+            )
+        if run.averaged.run.time is None:
+            raise DataError(
+                f"{run.file or run.name}: {declared.name} needs time: give a time column or --rate "
+                "(--columns t=NAME, --rate HZ)"
+            )
 
 
 def _directions(run: Run, scale: Array, offset: Array) -> Array:
     """Directions (N, 3) of the force in every sample of the raw record."""
-    if run.averaged is None:
-        raise DataError(f"{run.file or run.name}: give the raw record with --at-rest")
+    assert run.averaged is not None
     force = (run.averaged.run.signals["a"] - offset) @ scale.T
     return np.asarray(force / np.linalg.norm(force, axis=1, keepdims=True))
 
 
-gyro_rests = gyro_rests.starting(linear_start)
+def limits(declared: Model, runs: Sequence[Run]) -> dict[str, tuple[Any, Any]]:
+    """Offsets lie inside the balls that the readings span; the dip is a degree off the vertical."""
+    found: dict[str, tuple[Any, Any]] = {}
+    for name, sensor in (("a", "accelerometer"), ("m", "magnetometer")):
+        if name in {s.name for s in declared.signals}:
+            v = np.vstack([run.signals[name] for run in runs])
+            radius = float(np.max(np.linalg.norm(v, axis=1)))
+            found[f"{sensor}_offset"] = (-radius, radius)
+    steepest = np.radians(89.0)
+    return (
+        {**found, "dip": (-steepest, steepest)}
+        if "m" in {s.name for s in declared.signals}
+        else found
+    )
+
+
+gyro_rests = gyro_rests.starting(start).bounded(limits)
+imu = imu.starting(start).bounded(limits).canonical(right_handed)

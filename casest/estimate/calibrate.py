@@ -95,7 +95,7 @@ def _attempt(
     nowhere = _not_finite(problem, first)
     if nowhere:
         return _refused(problem, first, Code.NOT_FINITE, nowhere, began)
-    problem, first = in_deviations(problem, first, _fitted)
+    problem = in_deviations(problem, first, _fitted)
     problem, outcomes = solve(
         problem,
         first,

@@ -32,14 +32,14 @@ def unknown_noises(model: Model) -> tuple[str, ...]:
 
 def in_deviations(
     problem: Problem, first: Point, fit: Callable[[Problem, Point], Point]
-) -> tuple[Problem, Point]:
+) -> Problem:
     """The problem with the noise of each kind that is not known as these data show it.
 
     `fit` solves a problem from a point. As it is where nothing is unknown.
     """
     names = unknown_noises(problem.model)
     if not names:
-        return problem, first
+        return problem
     kinds = np.array([names.index(n) if n in names else -1
                       for n in problem.model.traced.residual.noise])  # fmt: skip
     repeats = np.array([_rests_show(problem, name) for name in names])
@@ -55,7 +55,7 @@ def in_deviations(
             break
     found = {n: float(f"{s:.5g}") for n, s in zip(names, sizes, strict=True)}
     model = problem.model.having(**found)
-    return Problem(model, problem.runs, problem.weights), point
+    return Problem(model, problem.runs, problem.weights)
 
 
 def _rests_show(problem: Problem, name: str) -> float:

@@ -34,6 +34,7 @@ SHIPPED = {
     "norm-full": ("norm", "norm_full"),
     "norm-pair": ("pair", "norm_pair"),
     "gyro-rests": ("imu", "gyro_rests"),
+    "imu": ("imu", "imu"),
 }
 
 
