@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from casest.data.run import Array, Labels, Run
+from casest.data.run import Array, Averaged, Labels, Run
 from casest.data.stillness import WINDOW, Interval, Rests, find_rests, resolution
 from casest.errors import UsageError
 
@@ -94,6 +94,9 @@ def _averaged(run: Run, found: Rests, names: list[str], channels: Array) -> Run:
         spread={k: _spreads(v, spans) for k, v in run.signals.items() if k != "t"},
         notes=(*run.notes, *_notes(run, found, names, channels)),
         correlation={k: _correlations(v, spans) for k, v in run.signals.items() if k != "t"},
+        averaged=Averaged(
+            run, np.array([s.first for s in spans]), np.array([s.last for s in spans])
+        ),
     )
 
 

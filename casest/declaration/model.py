@@ -140,6 +140,8 @@ class Model:
     def residual_unit(self) -> str:
         """Unit of the residual; `[v]` stands for the unit of signal v."""
         traced = self.traced
+        if traced.residual.noise:
+            return "1"
         if traced.measured is not None and not traced.residual.unit:
             return self[traced.measured].unit or f"[{traced.measured}]"
         return traced.residual.unit
@@ -428,6 +430,16 @@ class Model:
         found = trace(self, staged=True)
         return found if self.noise is None else in_units_of_noise(found, self.noise)
 
+    @cached_property
+    def resting(self) -> bool:
+        """Does the body look back to the rest before (`before`, `turned`)?"""
+        return any(stage.word for stage in self.staged.stages)
+
+    @property
+    def sequential(self) -> bool:
+        """Does a sample's residual depend on other samples?"""
+        return self.resting or any(a.kind in OVER_TIME for a in self.effects)
+
     # -- numbers -------------------------------------------------------------------------------
 
     def __call__(self, **values: Any) -> dict[str, Array]:
@@ -442,10 +454,11 @@ class Model:
         missing = [s.name for s in self.signals if s.name not in values]
         if missing:
             raise UsageError(f"model {self.name} needs the signal {missing[0]!r}")
-        if any(a.kind in OVER_TIME for a in self.effects):
+        if self.sequential:
             raise UsageError(
-                f"model {self.name} has an effect on the sequence of samples: single samples have "
-                "no prediction of their own; evaluate it on a run (leastsquares.problem)"
+                f"model {self.name} has an effect on the sequence of samples, or looks at the rest "
+                "before: single samples have no prediction of their own; evaluate it on a run "
+                "(leastsquares.problem)"
             )
         traced = self.traced
         outputs = {q.name: q.value for q in traced.quantities.values()}

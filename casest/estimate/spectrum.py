@@ -100,7 +100,7 @@ class Bands:
         line = np.stack([np.ones(len(self._beyond)), self._middle[self._beyond]], axis=1)
         mean = np.maximum(mean[self._beyond], 1e-300)
         slope = _most_likely(line, mean, count[self._beyond])[1]
-        return np.clip(-slope, 0.0, STEEPEST)
+        return np.asarray(np.clip(-slope, 0.0, STEEPEST))
 
     def _flat(self, power: Array, left: Array) -> Array:
         """Those that are flat in the first band."""

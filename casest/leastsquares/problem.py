@@ -16,7 +16,6 @@ import casadi as ca
 import numpy as np
 
 from casest.data.run import Run
-from casest.declaration.effect import OVER_TIME
 from casest.declaration.model import Model
 from casest.declaration.physics import chart
 from casest.declaration.shapes import Array
@@ -117,7 +116,14 @@ class Problem:
     @property
     def residual_count(self) -> int:
         """Number of scalar residuals."""
-        return sum(len(run) for run in self.runs) * len(self.model.axes)
+        every = sum(len(run) for run in self.runs) * len(self.model.axes)
+        return every - sum(int(np.sum(~p)) for p in self.present if p is not None)
+
+    @cached_property
+    def present(self) -> tuple[Any, ...]:
+        """Which residuals (N, m) of each run there are; None where all are."""
+        staged = self._staged
+        return tuple(None if staged is None else staged.present(r) for r in range(len(self.runs)))
 
     @cached_property
     def _selections(self) -> tuple[tuple[Any, Any], ...]:
@@ -342,8 +348,7 @@ class Problem:
     @cached_property
     def _staged(self) -> Staged | None:
         """Where an effect looks at other samples, rows come from the record as a whole."""
-        sequential = any(a.kind in OVER_TIME for a in self.model.effects)
-        return Staged(self.model, self.runs) if sequential else None
+        return Staged(self.model, self.runs) if self.model.sequential else None
 
     def _rows(self, point: Point, r: int, span: slice = slice(None)) -> tuple[Array, Array]:
         """Residuals (N, m) and Jacobians (N, m, n of the run) of one run, unweighted."""
@@ -394,7 +399,8 @@ class Problem:
 
     def _run_cost(self, point: Point, r: int) -> float:
         if self._staged is not None:
-            return 0.5 * float(np.sum(self._weighted_rows(point, r)[:, -1] ** 2))
+            residual, weights = self._residuals(point, r), self._weight(r)
+            return 0.5 * float(np.sum(residual**2 if weights is None else weights * residual**2))
         parameters = self.parameters(point, r)
         return cost(self._with_jacobian, parameters, self.samples[r], self._weight(r))
 
@@ -501,9 +507,9 @@ class Problem:
         return tuple(self._residuals(point, r) for r in range(len(self.runs)))
 
     def _residuals(self, point: Point, r: int, span: slice = slice(None)) -> Array:
-        if self.sequential:
-            return self._rows(point, r, span)[0]
         parameters = self.parameters(point, r)
+        if self._staged is not None:  # without slopes
+            return self._staged.rows(parameters, self.samples[r].dense, r, ())[0][span]
         return residuals(self._with_jacobian, parameters, self.samples[r][span])
 
     def residual_blocks(self, point: Point) -> Iterator[tuple[int, slice, Array]]:
