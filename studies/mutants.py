@@ -182,8 +182,8 @@ MUTANTS = tuple(
         (LEVELS, "confirmed: float = 1.64", "confirmed: float = 0.0"),
         (
             "estimate/held_out.py",
-            "_with_own(model, values, fitted)",
-            "_with_own(model, values, scored)",
+            "with_own(model, values, (fitted,))",
+            "with_own(model, values, (scored,))",
         ),
         ("diagnose/motion/loop.py", "H[~hidden], z[~hidden]", "H, z"),
         ("data/splits.py", "(run.count > 1).any()", "(run.count > 1e9).any()"),

@@ -129,7 +129,7 @@ def second_order_bias(problem: Problem, point: Point, sigma: float, bread: Array
         for block in problem.blocks(point):
             own = shifts[block.run][block.span]
             np.add.at(slope, block.x, np.einsum("nm,nmk->k", own, block.jacobian))
-        return np.asarray(-bread @ slope)
+        return -np.asarray(bread @ slope)
     if not _implicit_in_noise(problem):
         return slope
     noise = _signal_noise(problem, point, sigma)

@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import norm
+from scipy.special import ndtr, ndtri
 
 from casest.declaration.shapes import Array
 from casest.diagnose.levels import LEVELS
@@ -41,7 +41,7 @@ class Pair:
     @property
     def needed(self) -> float:
         """λ with which 2 log of the likelihood ratio is beyond the limit with chance POWER."""
-        missing, z = LEVELS.clear - self.lead, float(norm.ppf(POWER))
+        missing, z = LEVELS.clear - self.lead, float(ndtri(POWER))
         if missing <= -z * z:
             return 0.0
         return float((z + np.sqrt(max(z * z + missing, 0.0))) ** 2)
@@ -50,7 +50,7 @@ class Pair:
         """The chance with which the pair is told apart after this growth."""
         if growth <= 0:
             return float(self.lead >= LEVELS.clear)
-        return float(norm.cdf((growth + self.lead - LEVELS.clear) / (2 * np.sqrt(growth))))
+        return float(ndtr((growth + self.lead - LEVELS.clear) / (2 * np.sqrt(growth))))
 
 
 @dataclass(frozen=True)
