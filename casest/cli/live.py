@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import tempfile
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from casest.cli.options import ReadingOptions
+from casest.cli.plan_options import PlanOptions
 from casest.cli.shared import echo
+from casest.cli.situation import Situation, measures_of, possible_of
 from casest.errors import CasestError, NotTrusted, UsageError
 
 if TYPE_CHECKING:
     from casest.data.run import Run
+    from casest.declaration.model import Model
     from casest.plan.candidates.candidates import Candidates, Noise
-    from casest.plan.goals import Goal, Measures
+    from casest.plan.goals import Goal
     from casest.plan.planning import Task
 
 #: Equations for each unknown from which on a fit moves the values that slopes are taken at.
@@ -31,11 +35,11 @@ class Session:
     known: Any
     possible: Any
     reading: ReadingOptions
+    units: Mapping[str, str]
     goals: tuple[str, ...]
     fits: bool
     taken: int = 0
     text: str = ""
-    said: list[str] = field(default_factory=list)
 
     def arrived(self, text: str) -> bool:
         """Take in what has come; is the goal reached?"""
@@ -89,7 +93,7 @@ class Session:
         if run is not None:
             known = known + self._brought(run)
         given = task(found.factors, known, found.names, self.model.name)
-        measures = self.measures(found)
+        measures = measures_of(self, found)
         goals = [measures.goal(text) for text in self.goals]
         now = given.covariance(())
         done = bool(goals) and now is not None and all(g.std(now) <= g.limit for g in goals)
@@ -116,9 +120,19 @@ class Session:
         rows = own.reshape(-1, own.shape[2])
         return rows.T @ rows
 
-    def measures(self, found: Candidates) -> Measures:
-        """What goals can be about."""
-        raise NotImplementedError
+
+def follow(session: Session, source: str, idle: float, baud: int) -> bool:
+    """Tell which pose is next each time one has been taken; is the goal reached at the end?"""
+    from casest.plan.live import arriving
+
+    if session.tell(None):
+        return True
+    for text in arriving(source, idle, baud):
+        if text and session.arrived(text):
+            echo("reached: stop here")
+            return True
+    echo(f"nothing more came; {session.taken} poses were taken")
+    return False
 
 
 def _zeros(n: int) -> Any:
@@ -155,3 +169,35 @@ def _reached(goal: Goal, covariance: Any) -> str:
     unit = f" {goal.unit}" if goal.unit not in ("", "1") else ""
     now = "undetermined" if covariance is None else f"{goal.std(covariance):.2g}{unit}"
     return f"{goal.name} {now} (goal {goal.limit:g}{unit})"
+
+
+def living(situation: Situation, options: PlanOptions, source: str) -> int:
+    """Which pose is next while one measures; exit code 0 where it ends, reached or not."""
+    if options.separate or options.count is not None or options.output or options.as_json:
+        raise UsageError("--live says what is next as it comes: leave --count, -o and --json out")
+    if options.until and not situation.noise.known:
+        name = situation.model.readings[0].name
+        raise UsageError(f"--until: how well depends on the noise: --sensor-noise {name}=STD")
+    known = situation.information
+    if known is not None and len(known) != _unknowns(situation.model):
+        raise UsageError(
+            f"{situation.after}: what each run has for itself is unknown in a new one: give the "
+            "MODEL to --live"
+        )
+    session = Session(
+        situation.model,
+        situation.values,
+        situation.noise,
+        known,
+        possible_of(situation, options),
+        options.reading,
+        situation.units,
+        options.until,
+        fits=known is None,
+    )
+    follow(session, source, options.live.idle, options.live.baud)
+    return 0
+
+
+def _unknowns(model: Model) -> int:
+    return sum(p.shape.coordinates for p in model.parameters)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import select
 import sys
 import time
@@ -41,17 +42,20 @@ def _stream(stream: Any, idle: float) -> Iterator[str]:
     except (OSError, ValueError, AttributeError):  # no file behind it: all of it is there
         yield stream.read()
         return
-    quiet = 0.0
+    quiet, part = 0.0, b""
     while quiet < idle:
         if not select.select([number], [], [], LOOK)[0]:
             quiet += LOOK
             yield ""
             continue
-        line = stream.readline()
-        if not line:
-            return
-        quiet = 0.0
-        yield line
+        come = os.read(number, 1 << 20)
+        if not come:
+            break
+        quiet, whole = 0.0, part + come
+        lines, _, part = whole.rpartition(b"\n")
+        if lines:
+            yield lines.decode("utf-8", errors="replace") + "\n"
+    yield part.decode("utf-8", errors="replace")
 
 
 def _file(path: Path, idle: float) -> Iterator[str]:
@@ -80,6 +84,8 @@ def _port(source: str, idle: float, baud: int) -> Iterator[str]:
     with port:
         quiet = 0.0
         while quiet < idle:
-            line = port.readline().decode("utf-8", errors="replace")
-            quiet = 0.0 if line else quiet + LOOK
-            yield line
+            until, lines = time.monotonic() + LOOK, ""
+            while time.monotonic() < until:
+                lines += port.readline().decode("utf-8", errors="replace")
+            quiet = 0.0 if lines else quiet + LOOK
+            yield lines
