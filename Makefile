@@ -7,7 +7,7 @@ READY := $(VENV)/.ready
 .PHONY: demo test lint types format wheel bench study study-starts study-nist study-loop \
 	study-motion study-flights study-inputs study-records study-asked study-slow study-coverage \
 	study-deceptive study-deceptive-many study-fleet study-mutation study-worlds study-noises \
-	study-structural study-check \
+	study-structural study-check study-plans \
 	figures docs clean
 
 demo: $(READY)
@@ -97,6 +97,9 @@ study-fleet: $(READY)
 
 study-structural: $(READY)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python studies/structural.py
+
+study-plans: $(READY)
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python studies/plans.py
 
 study-mutation: $(READY)
 	$(BIN)/python studies/mutation.py

@@ -104,8 +104,8 @@ def _converted(value: float, unit: str, into: str) -> float:
     """A standard deviation in another unit: a zero point does not matter."""
     if "[" in into:
         raise UsageError(
-            f"nobody stated the unit that {unit} is to be compared with: leave it out, or "
-            "calibrate with --unit"
+            f"nobody stated the unit that {unit} is to be compared with: leave it out, or say "
+            "--unit SIGNAL=UNIT"
         )
     factor, _ = units.conversion(unit, into or "1")
     return value * factor

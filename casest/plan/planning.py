@@ -123,6 +123,8 @@ def criterion_of(given: Task, name: str, columns: Array | None = None) -> Criter
 #: Size of an unknown that a goal does not name, beside what the goal asks for: its standard
 #: deviation may be larger by this factor, in units of what one candidate says of it.
 LOOSE = 30.0
+#: Share of standard deviations to which a number of measurements is looked for.
+ROUGHLY = 0.01
 #: Variance of a scaled unknown from which on nothing is known of it.
 UNKNOWN = 1e4
 
@@ -177,10 +179,10 @@ def until(given: Task, goals: Sequence[Goal], most: int) -> Planned:
     if criterion.value(inverse(given.start)) <= 1:
         return Planned((), (given.covariance(()),), 1.0, 0)
     steady = Largest(_with_all(criterion.K, given))
-    floor = continuous(criterion, given.start, given.factors, most).floor
+    floor = continuous(criterion, given.start, given.factors, most, ROUGHLY).floor
     if floor > 1:
         raise UsageError(_unreachable(given, goals, planned(given, steady, most), most))
-    low = _fewest(given, criterion, most)
+    low = _fewest(given, criterion, most, floor)
     found, at_least = None, low
     high = low
     while found is None:
@@ -199,15 +201,19 @@ def until(given: Task, goals: Sequence[Goal], most: int) -> Planned:
     return Planned(found.chosen, found.covariances, found.share, at_least)
 
 
-def _fewest(given: Task, criterion: Criterion, most: int) -> int:
-    """A number below which even a continuous design does not reach the goals."""
+def _fewest(given: Task, criterion: Criterion, most: int, floor: float) -> int:
+    """A number below which even a continuous design does not reach the goals.
+
+    `floor` is that of `most`; a variance falls about as one over the number.
+    """
     low, high = 1, most
     while low < high:
-        middle = (low + high) // 2
-        if continuous(criterion, given.start, given.factors, middle, close=0.005).floor > 1:
-            low = middle + 1
+        guess = min(max(int(high * floor), low, (3 * low + high) // 4), high - 1)
+        there = continuous(criterion, given.start, given.factors, guess, ROUGHLY).floor
+        if there > 1:
+            low = guess + 1
         else:
-            high = middle
+            high, floor = guess, there
     return low
 
 

@@ -6,7 +6,7 @@ import csv
 import io
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from msgspec import UNSET, Struct, UnsetType
@@ -19,9 +19,11 @@ from casest.plan.candidates.attitudes import words
 from casest.plan.candidates.candidates import Candidates, Noise
 from casest.plan.goals import Goal
 from casest.plan.planning import Planned
-from casest.plan.rivals.separating import Separation
 from casest.results.file import plain
 from casest.results.result import Number, Reproduced, Result, reproduced
+
+if TYPE_CHECKING:
+    from casest.plan.rivals.separating import Separation
 
 #: What the criteria mean.
 CRITERIA = {

@@ -82,6 +82,7 @@ def continuous(
         s = total * slopes(C, L, factors)
         value, mean = criterion.value(C), float(weights @ s)
         floor = max(floor, criterion.base(C, L) - float(s.max() - mean))
+        best = Continuous(weights, value, floor)
         if criterion.ratio(floor, value, n) > 1 - close:
             break
         kept = weights > DROPPED * weights.max()
@@ -92,7 +93,7 @@ def continuous(
         weights[better] = share
         weights /= weights.sum()
         active = np.flatnonzero(weights).astype(np.int_)
-    return Continuous(weights, value, floor)
+    return best
 
 
 def _steps(

@@ -11,9 +11,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from statistics import NormalDist
 
 import numpy as np
-from scipy.special import ndtr, ndtri
 
 from casest.declaration.shapes import Array
 from casest.diagnose.levels import LEVELS
@@ -41,7 +41,7 @@ class Pair:
     @property
     def needed(self) -> float:
         """λ with which 2 log of the likelihood ratio is beyond the limit with chance POWER."""
-        missing, z = LEVELS.clear - self.lead, float(ndtri(POWER))
+        missing, z = LEVELS.clear - self.lead, NormalDist().inv_cdf(POWER)
         if missing <= -z * z:
             return 0.0
         return float((z + np.sqrt(max(z * z + missing, 0.0))) ** 2)
@@ -50,7 +50,7 @@ class Pair:
         """The chance with which the pair is told apart after this growth."""
         if growth <= 0:
             return float(self.lead >= LEVELS.clear)
-        return float(ndtr((growth + self.lead - LEVELS.clear) / (2 * np.sqrt(growth))))
+        return NormalDist().cdf((growth + self.lead - LEVELS.clear) / (2 * float(np.sqrt(growth))))
 
 
 @dataclass(frozen=True)
