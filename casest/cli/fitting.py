@@ -20,6 +20,7 @@ from casest.cli.loading import (
     noisy,
     records,
     trajectory,
+    with_prior,
 )
 from casest.cli.options import (
     DATA,
@@ -149,7 +150,7 @@ def closing(model_name: str, data: Sequence[str], options: FitOptions, command: 
     model = declared_model(model_name, replace(options.model, effects=()))
     runs = records(model, data, options.reading, followed)
     apart = held_out(model, options.holdout, data, options.reading, followed)
-    model, runs = noisy(model, runs, options.sensors)
+    model, runs = noisy(with_prior(model, runs, options.model.prior), runs, options.sensors)
     apart = noisy(model, apart, options.sensors)[1] if apart else apart
     start = dict(given.start(model) for given in options.starts) or None
     progress(f"fitting {model_name}, looking for effects")

@@ -66,9 +66,23 @@ def model_and_records(
 
     model = declared_model(name, options)
     runs = records(model, data, reading)
+    model = with_prior(model, runs, options.prior)
     if sensors is not None:
         model, runs = noisy(model, runs, sensors)
     return told(model, runs), runs
+
+
+def with_prior(model: Model, runs: Sequence[Run], prior: str | None) -> Model:
+    """The model with --prior applied."""
+    if prior is None:
+        return model
+    from casest.results.earlier import earlier_result
+    from casest.results.units import unit_table
+
+    if not prior.startswith("@"):
+        raise UsageError(f"--prior {prior}: write it as --prior @old/result.json")
+    earlier = earlier_result(prior[1:], model)
+    return replace(model, prior=earlier.prior(model, unit_table(model, runs)))
 
 
 def noisy(

@@ -59,6 +59,13 @@ class ModelOptions:
         metavar="NAME=VALUE|@RESULT",
         help="Hold a parameter: a number, 1,2,3, rows a,b;c,d, or @result.json.",
     )
+    prior: str | None = flag(
+        None,
+        "--prior",
+        only=Kind.FITTED,
+        metavar="@RESULT",
+        help="What an earlier result knows, with its whole covariance: update it by these data.",
+    )
     shared: Words = flag(
         (), "--shared", only=Kind.FITTED, metavar="NAME", help="One value for all runs."
     )

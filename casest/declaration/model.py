@@ -31,6 +31,7 @@ from casest.declaration.effect import (
 )
 from casest.declaration.noise import Stated, in_units_of_noise
 from casest.declaration.physics import Quantity, Residual
+from casest.declaration.prior import Prior
 from casest.declaration.sampson import sampson
 from casest.declaration.shapes import Array
 from casest.declaration.symbols import Constant, Parameter, Scope, Signal, Symbol, constant, named
@@ -60,6 +61,7 @@ class Model:
     canonicaliser: Callable[..., Any] | None = None
     estimators: tuple[tuple[str, Callable[..., Any]], ...] = ()
     noise: Stated | None = None
+    prior: Prior | None = None
 
     def __reduce__(self) -> tuple[Any, ...]:
         """To pickle: the declaration alone; it is traced anew where it arrives."""

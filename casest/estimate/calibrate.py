@@ -203,7 +203,8 @@ def _estimate(
     noise = _noise(problem, point, float(np.sqrt(2 * best.cost)), dof, identified.rank)
     correlated = correlation_time(problem, point)
     free = free_of(problem.unknowns, on_bounds(problem, point, factor, noise.sigma))
-    by = covariance_of if not (noise.known and correlated <= 1) else as_stated
+    normal = problem.model.prior is not None or (noise.known and correlated <= 1)
+    by = as_stated if normal else covariance_of
     covariance = by(problem, point, R, noise.sigma, correlated, free)
     bias = second_order_bias(problem, point, noise.sigma, inverse_normal(R, free))
     relative = float(np.max(np.abs(bias[free]) / np.sqrt(np.diag(covariance)[free]), initial=0.0))
@@ -298,8 +299,8 @@ def _noise(problem: Problem, point: Point, length: float, dof: int, rank: int) -
     residual = length / np.sqrt(dof) if dof > 0 else float("nan")
     repeats = repeat_noise(problem, point)
     chi = chi_square(problem, point, rank)
-    if problem.model.noise is not None and problem.weights is None:
-        scale = problem.model.noise.scale
+    scale = problem.noise_scale
+    if scale is not None and problem.weights is None:
         stated = Noise(scale, residual, repeats, dof, scale, chi)
         return stated if stated.known else replace(stated, sigma=residual)
     if dof >= ENOUGH_FREEDOM:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
+from casest.estimate.before import against_prior
 from casest.estimate.certificate import Certificate, one_sided
 from casest.estimate.correlation import ENOUGH, TABLE, correlation_time
 from casest.estimate.covariance import inverse_normal, sandwich
@@ -141,7 +142,15 @@ class Estimate:
         with np.errstate(all="ignore"):
             found = notes(problem, at, dof, self.correlated_over, self.bias)
             stated = of_stated_noise(self.noise.chi_square)
-            return (*stated, *remarks(problem, self.evidence), *found, *_of_tables(problem, at))
+            before = against_prior(problem, at)
+            first = [] if before is None or before.agrees else [before.words]
+            return (
+                *first,
+                *stated,
+                *remarks(problem, self.evidence),
+                *found,
+                *_of_tables(problem, at),
+            )
 
     @cached_property
     def interval_reach(self) -> tuple[Mapping[str, Array], Mapping[str, Array]]:

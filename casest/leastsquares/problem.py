@@ -115,15 +115,23 @@ class Problem:
 
     @property
     def residual_count(self) -> int:
-        """Number of scalar residuals."""
+        """Number of scalar residuals; what is known before counts as one for each number."""
         every = sum(len(run) for run in self.runs) * len(self.model.axes)
-        return every - sum(int(np.sum(~p)) for p in self.present if p is not None)
+        every -= sum(int(np.sum(~p)) for p in self.present if p is not None)
+        return every if self.model.prior is None else every + len(self.model.prior.covariance)
 
     @cached_property
     def present(self) -> tuple[Any, ...]:
         """Which residuals (N, m) of each run there are; None where all are."""
         staged = self._staged
         return tuple(None if staged is None else staged.present(r) for r in range(len(self.runs)))
+
+    @property
+    def noise_scale(self) -> float | None:
+        """Standard deviation of a usual residual that was stated, or that a prior had."""
+        if self.model.noise is not None:
+            return self.model.noise.scale
+        return None if self.model.prior is None else self.model.prior.sigma
 
     @cached_property
     def _selections(self) -> tuple[tuple[Any, Any], ...]:
@@ -228,6 +236,9 @@ class Problem:
 
     @cached_property
     def _start(self) -> Point:
+        known_before = {} if self.model.prior is None else self.model.prior.by_name
+        if {p.name for p in self.model.parameters} <= set(known_before):
+            return self.point(known_before)
         try:
             values = self.model.starter(self.model, self.runs) if self.model.starter else {}
         except np.linalg.LinAlgError as error:
@@ -236,7 +247,7 @@ class Problem:
                 "they all alike?"
             ) from error
         known = {p.name for p in self.model.parameters}
-        return self.point({k: v for k, v in values.items() if k in known})
+        return self.point({k: v for k, v in {**values, **known_before}.items() if k in known})
 
     def moved(self, point: Point, step: Array) -> Point:
         """The point after a step, with directions and rotations in a chart around themselves."""
@@ -432,7 +443,10 @@ class Problem:
 
     def cost(self, point: Point) -> float:
         """½ Σ w r²."""
-        return sum(self._run_cost(point, r) for r in range(len(self.runs)))
+        own = sum(self._run_cost(point, r) for r in range(len(self.runs)))
+        if self.model.prior is None:
+            return own
+        return own + 0.5 * float(np.sum(prior_rows(self, point)[:, -1] ** 2))
 
     def normal(self, point: Point) -> Normal:
         """Cost, gradient (n,) and Gauss-Newton matrix (n, n); those of the last points are kept."""
@@ -448,7 +462,7 @@ class Problem:
         return deque(maxlen=LATEST)
 
     def _normal(self, point: Point) -> Normal:
-        if self._alone:
+        if self._alone and self.model.prior is None:
             return self._run_normal(point, 0)
         total, gradient = 0.0, np.zeros(self.unknowns)
         matrix = np.zeros((self.unknowns, self.unknowns))
@@ -458,6 +472,12 @@ class Problem:
             total += own.cost
             gradient[x] += own.gradient
             matrix[np.ix_(x, x)] += own.matrix
+        if self.model.prior is not None:
+            rows_before = prior_rows(self, point)
+            product = rows_before.T @ rows_before
+            total += 0.5 * float(product[-1, -1])
+            gradient += product[:-1, -1]
+            matrix += product[:-1, :-1]
         return Normal(total, gradient, matrix)
 
     def run_normals(self, point: Point) -> list[tuple[Any, Normal]]:
@@ -480,8 +500,10 @@ class Problem:
             block = np.zeros((len(own), n + 1))
             block[:, [*x, n]] = own
             blocks.append(block)
+        if self.model.prior is not None:
+            blocks.append(prior_rows(self, point))
         whole = np.vstack(blocks)
-        if len(self.runs) > 1:
+        if len(blocks) > 1:
             whole = np.asarray(np.linalg.qr(whole, mode="r"))
         full = np.zeros((n + 1, n + 1))
         full[: len(whole)] = whole[: n + 1]
@@ -538,6 +560,27 @@ class Problem:
     def with_weights(self, weights: Sequence[Array] | None) -> Problem:
         """The same problem with other weights on the squares."""
         return replace(self, weights=None if weights is None else tuple(weights))
+
+
+def prior_rows(problem: Problem, point: Point) -> Array:
+    """[J r] (k, n + 1) of what is known before: coordinates off the prior's, in residual units."""
+    prior, scale = problem.model.prior, problem.noise_scale
+    assert prior is not None
+    assert scale is not None
+    parts, slots = [], {s.parameter.name: s for s in problem.slots}
+    for name, before in prior.by_name.items():
+        slot = slots[name]
+        shape, part = slot.parameter.shape, np.zeros((slot.x.stop - slot.x.start, problem.unknowns))
+        if shape.curved:
+            reference = shape.reference(before)
+            here = problem._charted(slot, point.x[slot.x], point.references[slot.ref])
+            off = shape.tangent(here, reference)
+            steps = problem.chart_slope(slot, point).T.reshape(-1, *shape.dims)
+            part[:, slot.x] = np.stack([shape.tangent(s, reference) for s in steps], axis=1)
+        else:
+            off, part[:, slot.x] = point.x[slot.x] - shape.pack(before), np.eye(len(part))
+        parts.append(np.column_stack([part, off]))
+    return np.asarray(scale * prior.root @ np.vstack(parts))
 
 
 @lru_cache(maxsize=8)

@@ -308,14 +308,14 @@ def _inverse(matrices: Array) -> Array:
 
 
 def chi_square(problem: Problem, point: Point, rank: int) -> ChiSquare | None:
-    """χ² of a fit of so many determined unknowns; None where no noise was stated.
+    """χ² of a fit of so many determined unknowns; None where no noise is known beforehand.
 
     Also where an effect on the noise counts what lies far out as less.
     """
-    noise = problem.model.noise
-    if noise is None or problem.weights is not None:
+    scale = problem.noise_scale
+    if scale is None or problem.weights is not None:
         return None
     freedom = problem.residual_count - rank
     if not freedom:
         return None
-    return ChiSquare(2 * problem.cost(point) / noise.scale**2, freedom)
+    return ChiSquare(2 * problem.cost(point) / scale**2, freedom)

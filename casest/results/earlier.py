@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,10 +11,11 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from casest.declaration.model import Model
+from casest.declaration.prior import Prior
 from casest.declaration.shapes import Array, Shape
 from casest.declaration.symbols import Constant, Parameter, constant
 from casest.declaration.uncertainty import Uncertainty, found_together
-from casest.errors import DataError, DeclarationError, UsageError
+from casest.errors import DataError, DeclarationError, UnitError, UsageError
 from casest.results.file import result_file
 from casest.results.saved import SavedResult, numbers, saved_result
 
@@ -41,6 +43,52 @@ class Earlier:
         if name not in self.places:
             return made
         return replace(made, uncertainty=self.known.only(self.places[name]))
+
+    def prior(self, model: Model, units: Mapping[str, str]) -> Prior:
+        """What it knows of the parameters that all runs of a model share.
+
+        `units` are those that the model's parameters have with the new data. Raises UsageError
+        where the result is of another model, UnitError where a parameter had another unit.
+        """
+        if self.result.model != model.name and not _same_file(self.result.model, model):
+            raise UsageError(
+                f"{self.path} is a result of {self.result.model}, and no prior for {model.name}"
+            )
+        names = [p.name for p in model.parameters if p.scope == "all" and p.name in self.places]
+        if not names:
+            raise UsageError(f"{self.path} knows none of the parameters of {model.name}")
+        for name in names:
+            _check_unit(self.path, name, self.result.parameters[name].first_unit, units)
+        known = self.known.only([i for name in names for i in self.places[name]]).covariance
+        if self.result.noise is None or not self.result.noise.sigma[0]:
+            raise UsageError(
+                f"{self.path} has no noise: calibrate again before using it as --prior"
+            )
+        return Prior(
+            tuple(names),
+            tuple(tuple(map(float, self.values[name].ravel())) for name in names),
+            tuple(self.values[name].shape for name in names),
+            tuple(tuple(map(float, row)) for row in known),
+            self.result.noise.sigma[0],
+            self.path,
+        )
+
+
+def _same_file(name: str, model: Model) -> bool:
+    """Is a result's model `path.py:name` declared in a file of the same name as this one?"""
+    path, _, own = name.partition(":")
+    file = Path(inspect.unwrap(model.function).__code__.co_filename).name
+    return Path(path).name == file and own.replace("_", "-") in ("", model.name)
+
+
+def _check_unit(path: str, name: str, before: str, units: Mapping[str, str]) -> None:
+    """Refuse a prior in another unit than the data lead to."""
+    now = units.get(name) or units.get(f"{name}[0]") or units.get(f"{name}[0,0]") or before
+    if now != before:
+        raise UnitError(
+            f"{path}: its {name} is in {before}, and with these data it is in {now}; give the data "
+            "in the unit of the earlier calibration (--unit)"
+        )
 
 
 def earlier_result(path: str, model: Model, what: str = "it") -> Earlier:
