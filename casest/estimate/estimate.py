@@ -20,6 +20,7 @@ from casest.estimate.on_bounds import free_of
 from casest.estimate.profile_likelihood import half_width
 from casest.estimate.remarks import notes
 from casest.leastsquares.identifiability import Identifiability, Weak
+from casest.leastsquares.kinds import freedom
 from casest.leastsquares.problem import Point, Problem
 from casest.solve.outcome import Outcome
 
@@ -141,14 +142,21 @@ class Estimate:
         """Squares of the reach below and above, (n, n) each as a covariance, as if unbounded."""
         profile = self.certificate.profile
         if profile is None:
-            half = half_width(int(self.noise.degrees_of_freedom / self.correlated_over))
-            linear = half**2 * self.covariance
+            half = self._quantiles()
+            linear = np.outer(half, half) * self.covariance
             return linear.copy(), linear.copy()
         R = self.problem.factor(self.optimum or self.point)[0]
         plain = self.noise.sigma**2 * np.diag(inverse_normal(R, self.free))
         with np.errstate(invalid="ignore", divide="ignore"):
             wider = np.sqrt(np.diag(self.covariance) / plain)
         return np.diag((wider * profile[:, 0]) ** 2), np.diag((wider * profile[:, 1]) ** 2)
+
+    def _quantiles(self) -> Array:
+        """Student's t of 95 % of each unknown, (n,)."""
+        at, most = self.optimum or self.point, self.noise.degrees_of_freedom
+        own = freedom(self.problem, at)
+        own = np.full(self.problem.unknowns, most) if own is None else np.minimum(own, most)
+        return np.array([half_width(int(f / self.correlated_over)) for f in own])
 
     @property
     def names(self) -> tuple[str, ...]:
