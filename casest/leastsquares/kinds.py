@@ -4,9 +4,9 @@ A model that ties lengths in m/s² and turns in degrees together says which cons
 each (`Residual(noise=…)`). One in the unit of a signal, `[a]`, is that of the signal's mean at a
 rest: it is in the residuals of that rest, and in those of the turns to it and from it. Any other is
 a noise of the axes that name it, from rest to rest anew. So the covariance of all residuals of a
-run is V = Σ σ_c² V_c. What is 0 is estimated with the fit, by the squares that each part leaves over
-and its share of the redundancy: Helmert's variance components in Förstner's form (Förstner, ZfV
-104, 1979; Teunissen & Amiri-Simkooei, J. Geodesy 82, 2008, sec. 6).
+run is V = Σ σ_c² V_c. What is 0 is estimated with the fit, by the squares that each part leaves
+over and its share of the redundancy: Helmert's variance components in Förstner's form (Förstner,
+ZfV 104, 1979; Teunissen & Amiri-Simkooei, J. Geodesy 82, 2008, sec. 6).
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ def freedom(problem: Problem, point: Point) -> Array | None:
 
 
 class _System:
-    """Residuals and slopes of all runs, with the covariance that each part of the noise gives them."""
+    """Residuals and slopes of all runs, with the covariance that each noise gives them."""
 
     def __init__(self, problem: Problem, point: Point) -> None:
         plain = replace(problem, whitening=None)
