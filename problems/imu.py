@@ -42,6 +42,7 @@ from casest import (
     vertcat,
 )
 
+from .imu_remarks import refusals, remarks
 from .pair import alone, closed_form, held_values, right_handed
 
 Array = NDArray[np.float64]
@@ -79,11 +80,11 @@ def _heading(up: Any, north: Any, foretold: Any) -> Any:
 @model
 def gyro_rests(
     a=signal(3),
-    w=signal(3),
+    w=signal(3, wanders=True),
     *,
     accelerometer_scale=param(lower(3), "[gravity]/[a]"),
     accelerometer_offset=param(3, "[a]"),
-    gyroscope_scale=param((3, 3), "rad/s/[w]"),
+    gyroscope_scale=param((3, 3), "(rad/s)/[w]"),
     gyroscope_offset=param(3, "[w]"),
     g_sensitivity=constant(np.zeros((3, 3)), "[w]/[gravity]"),
     gravity=constant(9.80665, "m/s^2"),
@@ -117,12 +118,12 @@ def gyro_rests(
 @model
 def imu(
     a=signal(3),
-    w=signal(3),
+    w=signal(3, wanders=True),
     m=signal(3),
     *,
     accelerometer_scale=param(lower(3), "[gravity]/[a]"),
     accelerometer_offset=param(3, "[a]"),
-    gyroscope_scale=param((3, 3), "rad/s/[w]"),
+    gyroscope_scale=param((3, 3), "(rad/s)/[w]"),
     gyroscope_offset=param(3, "[w]"),
     magnetometer_scale=param((3, 3), "[field]/[m]"),
     magnetometer_offset=param(3, "[m]"),
@@ -135,7 +136,6 @@ def imu(
     dip_noise=constant(0.0, "deg"),
     gyroscope_noise=constant(0.0, "[w]"),
     turn_noise=constant(0.0, "deg"),
-    heading_noise=constant(0.0, "deg"),
 ):
     """Accelerometer, gyroscope and magnetometer of one body together: 34 unknowns.
 
@@ -176,8 +176,7 @@ def imu(
             "magnetometer_noise",
             "dip_noise",
             *3 * ("gyroscope_noise",),
-            *2 * ("turn_noise",),
-            "heading_noise",
+            *3 * ("turn_noise",),
         ),
         corrected=quantity("corrected", vertcat(force, rate, flux)),
     )
@@ -270,5 +269,11 @@ def limits(declared: Model, runs: Sequence[Run]) -> dict[str, tuple[Any, Any]]:
     )
 
 
-gyro_rests = gyro_rests.starting(start).bounded(limits)
-imu = imu.starting(start).bounded(limits).canonical(right_handed)
+gyro_rests = gyro_rests.starting(start).bounded(limits).remarking(remarks).refusing(refusals)
+imu = (
+    imu.starting(start)
+    .bounded(limits)
+    .canonical(right_handed)
+    .remarking(remarks)
+    .refusing(refusals)
+)

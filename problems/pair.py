@@ -292,7 +292,7 @@ def weighed(declared: Model, runs: Sequence[Run]) -> Model:
 
 def remarks(declared: Model, runs: Sequence[Run], values: Mapping[str, Any]) -> Iterator[str]:
     """What an engineer would notice: wrong units, wrong noises, poses in a plane, a mirror."""
-    yield from coverage(declared, runs)
+    yield from _coverage(declared, runs)
     known = {**held_values(declared), **{name: np.asarray(value) for name, value in values.items()}}
     if any(known[f"{s}_{p}"].ndim != n for s in SENSORS for p, n in (("scale", 2), ("offset", 1))):
         return  # values differ from run to run: what follows is about one sensor
@@ -305,8 +305,7 @@ def remarks(declared: Model, runs: Sequence[Run], values: Mapping[str, Any]) -> 
     yield from _noise(declared, runs, known)
 
 
-def coverage(declared: Model, runs: Sequence[Run]) -> Iterator[str]:
-    """Units mixed up, and readings of a sensor that lie close to a plane."""
+def _coverage(declared: Model, runs: Sequence[Run]) -> Iterator[str]:
     for sensor, (name, length) in SENSORS.items():
         v, known = _readings(runs, sensor), _number(declared, length)
         away = v - v.mean(axis=0)
@@ -316,15 +315,23 @@ def coverage(declared: Model, runs: Sequence[Run]) -> Iterator[str]:
                 f"the readings {name} are {sizes[1]:.3g} times the {length} ({known:g}): is one of "
                 f"the two in another unit? (--unit {name}=…, --set '{length}=…')"
             )
-        spread = np.linalg.svd(away, compute_uv=False) / np.sqrt(len(v))
-        # Noise alone is as thick as it is wide: the extent is at least that of a whole sphere.
-        thickness = spread[2] / max(spread[0], known / np.sqrt(3))
-        if thickness < 0.15:
-            yield (
-                f"the readings of the {sensor} lie close to a plane, a line or a point (thickness "
-                f"{thickness:.1%} of their extent): turning about one axis, such as the vertical, "
-                "is not enough; tilt the sensors about others too"
-            )
+        yield from flat(away, known, sensor)
+
+
+def flat(away: Array, known: float, sensor: str) -> Iterator[str]:
+    """That readings (N, 3), from which their mean is taken, lie close to a plane or a line.
+
+    `known` is the length of what they measure in their own unit.
+    """
+    spread = np.linalg.svd(away, compute_uv=False) / np.sqrt(len(away))
+    # Noise alone is as thick as it is wide: the extent is at least that of a whole sphere.
+    thickness = spread[2] / max(spread[0], known / np.sqrt(3))
+    if thickness < 0.15:
+        yield (
+            f"the readings of the {sensor} lie close to a plane, a line or a point (thickness "
+            f"{thickness:.1%} of their extent): turning about one axis, such as the vertical, "
+            "is not enough; tilt the sensors about others too"
+        )
 
 
 def _noise(declared: Model, runs: Sequence[Run], known: Mapping[str, Array]) -> Iterator[str]:

@@ -57,6 +57,7 @@ class Model:
     starter_of_many: Callable[..., Any] | None = None
     limiter: Callable[..., Any] | None = None
     remarker: Callable[..., Any] | None = None
+    refuser: Callable[..., Any] | None = None
     inverter: Callable[..., Any] | None = None
     canonicaliser: Callable[..., Any] | None = None
     estimators: tuple[tuple[str, Callable[..., Any]], ...] = ()
@@ -393,6 +394,10 @@ class Model:
     def remarking(self, function: Callable[..., Any]) -> Model:
         """A model that comments on its fits: `function(model, runs, values) -> sentences`."""
         return replace(self, remarker=function)
+
+    def refusing(self, function: Callable[..., Any]) -> Model:
+        """A model that refuses fits: `function(model, runs, values) -> sentences`, or none."""
+        return replace(self, refuser=function)
 
     def canonical(self, function: Callable[..., Any]) -> Model:
         """A model that says which of equivalent values it means.

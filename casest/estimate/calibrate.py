@@ -117,6 +117,8 @@ def _attempt(
         found = _looked_at_for_a_better_one(found)
     if found.certificate.trusted:
         found = _no_random_walk(found)
+    if found.certificate.trusted and problem.model.refuser is not None:
+        found = _judged_by_the_model(found)
     return by_estimator(found, own[solver], solver) if solver in own else found
 
 
@@ -270,6 +272,15 @@ def _no_random_walk(found: Estimate) -> Estimate:
         return found
     reason = words.wandering(starts - 1, found.correlated_over, worth, unknowns)
     return replace(found, certificate=found.certificate.refused(Code.POOR_VALLEY, reason))
+
+
+def _judged_by_the_model(found: Estimate) -> Estimate:
+    """Refuse what the model itself says is no calibration."""
+    problem = found.problem
+    assert problem.model.refuser is not None
+    for reason in problem.model.refuser(problem.model, problem.runs, found.values):
+        return replace(found, certificate=found.certificate.refused(Code.MODEL, reason))
+    return found
 
 
 def _canonical(problem: Problem, best: Outcome) -> Outcome:

@@ -84,12 +84,14 @@ class Problem:
     """The sum of squares of a model's residuals over runs.
 
     `weights` (one (N, m) array per run, or None) multiply the squares. Residuals are in the
-    model's residual unit. Jacobians are with respect to the unknowns `x`.
+    model's residual unit. Jacobians are with respect to the unknowns `x`. `whitening` (one
+    (N·m, N·m) per run, or None) takes from residuals of rests what they share with those before.
     """
 
     model: Model
     runs: tuple[Run, ...]
     weights: tuple[Array, ...] | None = None
+    whitening: tuple[Array, ...] | None = None
 
     # -- layout --------------------------------------------------------------------------------
 
@@ -119,6 +121,10 @@ class Problem:
         every = sum(len(run) for run in self.runs) * len(self.model.axes)
         every -= sum(int(np.sum(~p)) for p in self.present if p is not None)
         return every if self.model.prior is None else every + len(self.model.prior.covariance)
+
+    def lost(self, r: int) -> Any:
+        """Rests of a run before which a sensor was beyond its range, by number."""
+        return np.zeros(0) if self._staged is None else self._staged.lost(r)
 
     @cached_property
     def present(self) -> tuple[Any, ...]:
@@ -351,6 +357,11 @@ class Problem:
     def _with_jacobian(self) -> Replay:
         return residual_and_jacobian(self.model)
 
+    def slopes_in_readings(self, point: Point, r: int) -> tuple[Array, Array]:
+        """∂r/∂s of one run's rests, (N, m, k) each: in their own means, and in those before."""
+        assert self._staged is not None
+        return self._staged.slopes_in_readings(self.parameters(point, r), r)
+
     @property
     def compiled(self) -> bool:
         """Have sums been computed by a compiled kernel? Else by NumPy, with other last digits."""
@@ -359,7 +370,7 @@ class Problem:
     @cached_property
     def _staged(self) -> Staged | None:
         """Where an effect looks at other samples, rows come from the record as a whole."""
-        return Staged(self.model, self.runs) if self.model.sequential else None
+        return Staged(self.model, self.runs, self.whitening) if self.model.sequential else None
 
     def _rows(self, point: Point, r: int, span: slice = slice(None)) -> tuple[Array, Array]:
         """Residuals (N, m) and Jacobians (N, m, n of the run) of one run, unweighted."""

@@ -9,9 +9,11 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from casest.data.clipping import at_full_scale
 from casest.data.run import Run
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
+from casest.declaration.tracing import reached_signals
 from casest.errors import DataError
 from casest.leastsquares.turns import rotations, skew
 
@@ -20,12 +22,14 @@ from casest.leastsquares.turns import rotations, skew
 class Rests:
     """The rests of a run, and the raw record between them.
 
-    `linked` (N,): is there a rest before, with no gap in between? `spans` (K, 2) are the first and
+    `linked` (N,): is there a rest before, with no gap in between? `lost` (N,): did the turn go
+    beyond the range of a sensor, so that it is left out? `spans` (K, 2) are the first and
     the last of the raw samples of each turn, as places in `samples` (M, k) and `time` (M,), which
     hold what lies between rests and nothing else.
     """
 
     linked: NDArray[np.bool_]
+    lost: NDArray[np.bool_]
     spans: NDArray[np.int_]
     samples: Array
     time: Array
@@ -41,6 +45,8 @@ class Rests:
         raw, first, last = run.averaged.run, run.averaged.first, run.averaged.last
         linked = np.zeros(len(first), dtype=np.bool_)
         linked[1:] = (raw.block[last[:-1]] == raw.block[first[1:]]) & (first[1:] > last[:-1])
+        lost = linked & _too_fast(model, raw, last, first)
+        linked &= ~lost
         begin, end = last[np.flatnonzero(linked) - 1], first[linked]
         lengths = end - begin + 1
         starts = np.concatenate([[0], np.cumsum(lengths)[:-1]]).astype(np.int_)
@@ -49,7 +55,20 @@ class Rests:
         )
         values = [_values(raw, s.name)[places] for s in model.signals]
         spans = np.column_stack([starts[: len(lengths)], starts[: len(lengths)] + lengths - 1])
-        return cls(linked, spans, np.hstack(values), np.asarray(raw.time, float)[places])
+        return cls(linked, lost, spans, np.hstack(values), np.asarray(raw.time, float)[places])
+
+
+def _too_fast(
+    model: Model, raw: Run, last: NDArray[np.int_], first: NDArray[np.int_]
+) -> NDArray[np.bool_]:
+    """Where (N,) what is turned by reached the end of its range since the rest before."""
+    turning = ca.vertcat(*(s.taken for s in model.staged.stages if s.word == "turned"))
+    names = reached_signals(model, model.staged, turning) & set(raw.signals) - {"t"}
+    found = np.zeros(len(first), dtype=np.bool_)
+    for name in names:
+        total = np.concatenate([[0], np.cumsum(at_full_scale(raw.signals[name]))])
+        found[1:] |= total[first[1:]] > total[last[:-1]]
+    return found
 
 
 def _values(raw: Run, name: str) -> Array:

@@ -93,6 +93,7 @@ class Staged:
 
     model: Model
     runs: tuple[Run, ...]
+    whitening: tuple[Array, ...] | None = None
 
     @cached_property
     def _records(self) -> tuple[Record, ...]:
@@ -112,7 +113,32 @@ class Staged:
         if present is not None:
             for part in found:
                 part[~present] = 0.0
+        if self.whitening is not None:
+            found = (
+                _multiplied(self.whitening[r], found[0]),
+                _multiplied(self.whitening[r], found[1]),
+            )
         return found
+
+    def slopes_in_readings(self, parameters: Array, r: int) -> tuple[Array, Array]:
+        """∂r/∂s (N, m, k) in the means of a rest, and in those of the rest before."""
+        record, last = self._records[r], _in_readings(self.model)
+        given = self._given(parameters, r, ())[0]
+        own, through = last.residual(parameters, np.hstack([record.samples, given]))
+        prior = np.zeros_like(own)
+        for first, taken in last.before:
+            slope = taken(parameters, np.hstack([record.samples, given]))[0]
+            prior[1:] += through[1:, :, first : first + slope.shape[1]] @ slope[:-1]
+        present = self.present(r)
+        for part in (own, prior):
+            if present is not None:
+                part[~present] = 0.0
+        return own, prior
+
+    def lost(self, r: int) -> NDArray[np.int_]:
+        """Rests that were reached too fast, by number."""
+        rests = self._records[r].rests
+        return np.zeros(0, np.int_) if rests is None else np.flatnonzero(rests.lost)
 
     def present(self, r: int) -> NDArray[np.bool_] | None:
         """Which residuals (N, m) there are; None where all are.
@@ -129,6 +155,11 @@ class Staged:
         self, parameters: Array, r: int, own: tuple[int, ...] | None = None
     ) -> tuple[Array, Array]:
         """What the stages give at the samples of run r (N, k), side by side, and its slopes."""
+        found = self._given(parameters, r, own)
+        return found[0][self._records[r].places], found[1][self._records[r].places]
+
+    def _given(self, parameters: Array, r: int, own: tuple[int, ...] | None) -> tuple[Array, Array]:
+        """The same at all samples of the record."""
         *stages, _ = _programs(self.model, own)
         record = self._records[r]
         given = np.zeros((len(record.samples), 0))
@@ -144,7 +175,7 @@ class Staged:
                 more = stage.memory.along(parameters, *taken, record.time, record.run.block)
             given = np.concatenate([given, more[0]], axis=1)
             slopes = np.concatenate([slopes, more[1]], axis=1)
-        return given[record.places], slopes[record.places]
+        return given, slopes
 
     def _of_word(
         self, stage: Program, parameters: Array, record: Record, given: Array, slopes: Array
@@ -224,6 +255,40 @@ def _programs(model: Model, own: tuple[int, ...] | None = None) -> tuple[Program
             found.append(Program(stage.attached, replay(stage.taken), memory=memory))
         given = ca.vertcat(given, stage.given)
     return (*found, Program(traced.stages[-1].attached, replay(traced.expression)))
+
+
+@dataclass(frozen=True)
+class Readings:
+    """Slopes in the readings of a rest: of the residual, also in what the stages give, and of what
+    each word `before` takes, with the place of what it gives."""
+
+    residual: Replay
+    before: tuple[tuple[int, Replay], ...]
+
+
+@lru_cache(maxsize=64)
+def _in_readings(model: Model) -> Readings:
+    traced = model.staged
+    parameters = ca.vertcat(traced.coordinates, traced.references)
+    reading, given = sample_symbol(model, traced), ca.vertcat(*(s.given for s in traced.stages))
+    sample = ca.vertcat(reading, given)
+
+    def slope(expression: SX, *of: SX) -> Replay:
+        outputs = [ca.densify(ca.jacobian(expression, x)) for x in of]
+        return _replay("slope", [parameters, sample], outputs)
+
+    found, place = [], 0
+    for stage in traced.stages:
+        if stage.word == "before":
+            found.append((place, slope(stage.taken, reading)))
+        place += stage.given.numel()
+    return Readings(slope(traced.expression, reading, given), tuple(found))
+
+
+def _multiplied(matrix: Array, values: Array) -> Array:
+    """Residuals (N, m) or slopes (N, m, n) of all samples of a run, combined."""
+    count = values.shape[0] * values.shape[1]
+    return np.asarray((matrix @ values.reshape(count, -1)).reshape(values.shape))
 
 
 def _replay(name: str, inputs: list[SX], outputs: list[SX]) -> Replay:
