@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from casest.data.column import Column, numeric_column, text_column
 from casest.data.delimited import Contents
-from casest.errors import DataError, last_line
+from casest.errors import DataError, last_line, library
 
 #: Rows of a Parquet file that are read at once.
 PIECE = 65_536
@@ -49,11 +49,9 @@ def read_parquet(file: Path) -> Contents:
 
     In pieces, so that no more than one of them is held beside the columns.
     """
-    import pyarrow
-    import pyarrow.parquet
-
+    parquet = library("pyarrow.parquet", "parquet", f"{file}: a Parquet file")
     try:
-        table = pyarrow.parquet.ParquetFile(str(file), pre_buffer=False)
+        table = parquet.ParquetFile(str(file), pre_buffer=False)
         wanted = _wanted(table.schema_arrow)
         pieces = table.iter_batches(batch_size=PIECE, columns=wanted) if wanted else ()
         columns, notes = from_batches(table.schema_arrow, table.metadata.num_rows, pieces)
