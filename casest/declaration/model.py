@@ -28,6 +28,7 @@ from casest.declaration.effect import (
     check_null,
     label_of,
 )
+from casest.declaration.flow import Flow
 from casest.declaration.physics import Quantity, Residual
 from casest.declaration.sampson import sampson
 from casest.declaration.shapes import Array
@@ -256,7 +257,7 @@ class Model:
     def _not_applicable(self, attached: Attached) -> str:
         """Why an effect of this model does nothing in it, or cannot be; else empty."""
         on = attached.on
-        if any(a.kind in OVER_TIME for a in self.effects):
+        if self.sequential:
             try:
                 traced = self.staged
             except DeclarationError as error:
@@ -321,7 +322,7 @@ class Model:
         """Signals that another instrument than the measured one may give, late: not t."""
         if self.implicit:
             return ()
-        return tuple(s.name for s in self.signals if s.name not in ("t", self.traced.measured))
+        return tuple(s.name for s in self.signals if s.name not in ("t", *self.traced.readings))
 
     def _checked_recorded(self, added: Effect, target: str) -> str:
         """The unit of a recorded signal that comes at another time."""
@@ -414,6 +415,11 @@ class Model:
         """The body with a symbol in the place of what each effect gives that looks at others."""
         return trace(self, staged=True)
 
+    @cached_property
+    def sequential(self) -> bool:
+        """Does a sample's residual depend on other samples: by an effect, or by equations?"""
+        return any(a.kind in OVER_TIME for a in self.effects) or self.traced.integrates
+
     # -- numbers -------------------------------------------------------------------------------
 
     def __call__(self, **values: Any) -> dict[str, Array]:
@@ -428,10 +434,11 @@ class Model:
         missing = [s.name for s in self.signals if s.name not in values]
         if missing:
             raise UsageError(f"model {self.name} needs the signal {missing[0]!r}")
-        if any(a.kind in OVER_TIME for a in self.effects):
+        if self.sequential:
             raise UsageError(
-                f"model {self.name} has an effect on the sequence of samples: single samples have "
-                "no prediction of their own; evaluate it on a run (leastsquares.problem)"
+                f"model {self.name} has an effect on the sequence of samples, or differential "
+                "equations: single samples have no prediction of their own; evaluate it on a run "
+                "(leastsquares.problem)"
             )
         traced = self.traced
         outputs = {q.name: q.value for q in traced.quantities.values()}
@@ -504,8 +511,10 @@ def _declared(model_name: str, argument: inspect.Parameter) -> Symbol:
 
 
 def _reaches_residual(made: Model, attached: Attached) -> bool:
-    """Does the residual depend on the effect's parameters at all?"""
-    reached = reached_parameters(made, made.traced, made.traced.expression)
+    """Does the residual depend on the effect's parameters at all, also by what it integrates?"""
+    traced = made.staged if made.traced.integrates else made.traced
+    flows = [ca.vertcat(s.rates, s.start) for s in traced.stages if isinstance(s, Flow)]
+    reached = reached_parameters(made, traced, ca.vertcat(traced.expression, *flows))
     own = {p.name for p in attached.parameters}
     return not own or bool(own & reached)
 

@@ -139,4 +139,5 @@ def searchable(model: Model) -> bool:
         or has_noise_effects(model)
         or linear(model)
         or any(a.kind == "sequence" for a in model.effects)
+        or model.traced.integrates
     )

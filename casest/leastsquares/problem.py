@@ -70,6 +70,8 @@ class Block(NamedTuple):
     weights: Array | None
 
 
+#: Step of a difference, in standard deviations of an unknown alone.
+NUDGE = 1e-3
 #: Points whose normal equations are kept: a solution is asked for again by who judges it.
 LATEST = 16
 #: Samples that are evaluated at once where every residual is looked at on its own.
@@ -116,8 +118,14 @@ class Problem:
 
     @property
     def residual_count(self) -> int:
-        """Number of scalar residuals."""
-        return sum(len(run) for run in self.runs) * len(self.model.axes)
+        """Number of scalar residuals, of readings that are there."""
+        return sum(len(run) for run in self.runs) * len(self.model.axes) - self._missing
+
+    @cached_property
+    def _missing(self) -> int:
+        """Number of readings that are not there."""
+        found = [] if self._staged is None else self._staged.missing
+        return sum(int(np.sum(gone)) for gone in found if gone is not None)
 
     @cached_property
     def _selections(self) -> tuple[tuple[Any, Any], ...]:
@@ -327,6 +335,12 @@ class Problem:
         """Does a sample's residual depend on the samples before?"""
         return self._staged is not None
 
+    @property
+    def smooth(self) -> bool:
+        """Are residuals smooth functions of the unknowns, as far as it is known? Not what effects
+        with a memory make of them: a hysteresis has corners."""
+        return not any(a.kind in OVER_TIME for a in self.model.effects)
+
     @cached_property
     def _with_jacobian(self) -> Replay:
         return residual_and_jacobian(self.model)
@@ -339,8 +353,7 @@ class Problem:
     @cached_property
     def _staged(self) -> Staged | None:
         """Where an effect looks at other samples, rows come from the record as a whole."""
-        sequential = any(a.kind in OVER_TIME for a in self.model.effects)
-        return Staged(self.model, self.runs) if sequential else None
+        return Staged(self.model, self.runs) if self.model.sequential else None
 
     def _rows(self, point: Point, r: int, span: slice = slice(None)) -> tuple[Array, Array]:
         """Residuals (N, m) and Jacobians (N, m, n of the run) of one run, unweighted."""
@@ -391,7 +404,8 @@ class Problem:
 
     def _run_cost(self, point: Point, r: int) -> float:
         if self._staged is not None:
-            return 0.5 * float(np.sum(self._weighted_rows(point, r)[:, -1] ** 2))
+            residual, weights = self._residuals(point, r), self._weight(r)
+            return 0.5 * float(np.sum(residual**2 * (1.0 if weights is None else weights)))
         parameters = self.parameters(point, r)
         return cost(self._with_jacobian, parameters, self.samples[r], self._weight(r))
 
@@ -479,10 +493,10 @@ class Problem:
         return full[:n, :n], full[:n, n], float(abs(full[n, n]))
 
     def hessian(self, point: Point) -> Array:
-        """Exact second derivative of the cost, (n, n); Gauss-Newton for sequences of samples."""
+        """Exact second derivative of the cost, (n, n); Gauss-Newton where effects have a memory."""
         matrix = self.normal(point).matrix.copy()
         if self._staged is not None:
-            return matrix
+            return self._differences(point, matrix) if self.smooth else matrix
         for r, samples in enumerate(self.samples):
             x = self._selections[r][0]
             weights = self._weight(r)
@@ -493,13 +507,33 @@ class Problem:
             matrix[np.ix_(x, x)] += own + np.triu(own, 1).T
         return matrix
 
+    def _differences(self, point: Point, matrix: Array) -> Array:
+        """The Hessian by central differences of the slope, which is exact.
+
+        Steps are a thousandth of a standard deviation of each unknown alone: small beside what the
+        cost is curved over, large beside rounding.
+        """
+        freedom = max(self.residual_count - self.unknowns, 1)
+        sigma = np.sqrt(2 * self.normal(point).cost / freedom)
+        column = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+        rounding = 1e-9 * np.maximum(np.abs(point.x), 1e-300)
+        found = np.zeros_like(matrix)
+        for j, size in enumerate(np.maximum(NUDGE * sigma / column, rounding)):
+            step = np.zeros(self.unknowns)
+            step[j] = size
+            ahead, behind = (self.normal(Point(point.x + s, point.references)).gradient
+                             for s in (step, -step))  # fmt: skip
+            found[:, j] = (ahead - behind) / (2 * size)
+        return 0.5 * (found + found.T)
+
     def residuals(self, point: Point) -> tuple[Array, ...]:
         """Residuals of each run, (N, m)."""
         return tuple(self._residuals(point, r) for r in range(len(self.runs)))
 
     def _residuals(self, point: Point, r: int, span: slice = slice(None)) -> Array:
-        if self.sequential:
-            return self._rows(point, r, span)[0]
+        if self._staged is not None:
+            dense = self.samples[r].dense
+            return self._staged.rows(self.parameters(point, r), dense, r, ())[0][span]
         parameters = self.parameters(point, r)
         return residuals(self._with_jacobian, parameters, self.samples[r][span])
 

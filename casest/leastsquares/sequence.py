@@ -2,7 +2,8 @@
 
 Each is a stage: what it takes at every sample is computed first, then what it gives, with its
 slopes in the parameters, and that takes the place of a symbol in what comes after. A memory is run
-through sample by sample; a signal at another time is taken from its record by splines.
+through sample by sample; a signal at another time is taken from its record by splines; differential
+equations are integrated from sample to sample.
 """
 
 from __future__ import annotations
@@ -12,16 +13,19 @@ from functools import cached_property, lru_cache
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from casest.data.curves import Curve
 from casest.data.run import Index, Run, Series
 from casest.declaration.effect import Attached
+from casest.declaration.flow import Flow
 from casest.declaration.model import Model
 from casest.declaration.physics import SX
 from casest.declaration.shapes import Array
 from casest.declaration.tracing import sample_symbol
 from casest.engine import Replay
 from casest.errors import DataError
+from casest.leastsquares.flow import Course, Integrator, Mesh
 from casest.leastsquares.memory import Memory
 
 
@@ -71,7 +75,7 @@ def _origin(model: Model, run: Run) -> tuple[Run, Index | slice]:
     whole, places = run.whole, run.places
     if whole is None or places is None or len(places) != len(run):
         return run, slice(None)
-    for name in (s.name for s in model.signals if s.name != model.traced.measured):
+    for name in (s.name for s in model.signals if s.name not in model.traced.readings):
         own, there = run.signals[name], whole.signals.get(name)
         if there is None or not np.array_equal(there[places], own, equal_nan=True):
             return run, slice(None)
@@ -98,7 +102,26 @@ class Staged:
         coordinates that slopes are taken in, where not in all.
         """
         last = _programs(self.model, own)[-1]
-        return _chained(last.taken, parameters, samples, *self.given(parameters, r, own))
+        residual, J = _chained(last.taken, parameters, samples, *self.given(parameters, r, own))
+        missing = self.missing[r]
+        if missing is not None:
+            residual[missing], J[missing] = 0.0, 0.0
+        return residual, J
+
+    @cached_property
+    def _meshes(self) -> dict[tuple[int, int], Mesh]:
+        """Steps of each run in each stage, kept from one evaluation to the next."""
+        return {}
+
+    @cached_property
+    def missing(self) -> tuple[NDArray[np.bool_] | None, ...]:
+        """Which readings (N, m) of each run are not there; None where all are."""
+        found = []
+        for run in self.runs:
+            readings = [run.signals[name] for name in self.model.traced.readings]
+            gone = np.isnan(np.hstack(readings)) if readings else np.zeros((len(run), 1), bool)
+            found.append(gone if gone.any() else None)
+        return tuple(found)
 
     def given(
         self, parameters: Array, r: int, own: tuple[int, ...] | None = None
@@ -109,8 +132,14 @@ class Staged:
         given = np.zeros((len(record.samples), 0))
         count = self.model.staged.coordinates.numel() if own is None else len(own)
         slopes = np.zeros((len(given), 0, count))
-        for stage in stages:
-            if stage.memory is None:
+        for k, stage in enumerate(stages):
+            if stage.flow is not None:
+                taken = given[:, :0], slopes[:, :0]
+                if stage.flow.sizes[1]:
+                    taken = _chained(stage.taken, parameters, record.samples, given, slopes)
+                mesh = self._meshes.setdefault((r, k), Mesh())
+                more = stage.flow.along(parameters, Course(record.time, *taken), mesh)
+            elif stage.memory is None:
                 more = self._late(stage, parameters, record)
             else:
                 taken = _chained(stage.taken, parameters, record.samples, given, slopes)
@@ -121,6 +150,7 @@ class Staged:
 
     def _late(self, stage: Program, parameters: Array, record: Record) -> tuple[Array, Array]:
         """A signal at the times at which the effect says that it is taken, and its slopes."""
+        assert stage.attached is not None
         name = stage.attached.on
         wanted, slope = stage.taken(parameters, record.time[:, None])
         rotation = self.model[name].kind == "rotation"
@@ -136,9 +166,10 @@ class Program:
     residual, with no effect behind it.
     """
 
-    attached: Attached
+    attached: Attached | None
     taken: Replay
     memory: Memory | None = None
+    flow: Integrator | None = None
 
 
 @lru_cache(maxsize=64)
@@ -156,7 +187,12 @@ def _programs(model: Model, own: tuple[int, ...] | None = None) -> tuple[Program
         return _replay("stage", [parameters, sample], outputs)
 
     for stage in traced.stages:
-        if stage.attached.kind == "time":
+        if isinstance(stage, Flow):
+            fed = ca.depends_on(stage.taken, ca.vertcat(coordinates, given))
+            found.append(
+                Program(None, replay(stage.taken), flow=Integrator(traced, stage, own, fed))
+            )
+        elif stage.attached.kind == "time":
             t = ca.SX.sym("t")
             moment = ca.SX(stage.attached.apply(t, traced.symbols))
             outputs = slopes(moment, coordinates)
