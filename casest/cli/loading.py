@@ -90,9 +90,7 @@ def records(
         seen.add(Path(name).resolve())
     known = {"t", *model.quantities, *(s.name for s in model.signals)}
     extra = [column for column in followed if column not in known]
-    # Equations are followed from reading to reading: one that is missing costs no row.
-    gaps = model.traced.readings if model.traced.integrates else ()
-    return load_runs(list(data), model.signals, extra=extra, gaps=gaps, **options.keywords())
+    return load_runs(list(data), model.signals, extra=extra, **model.reading, **options.keywords())
 
 
 def held_out(

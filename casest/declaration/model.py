@@ -33,7 +33,14 @@ from casest.declaration.physics import Quantity, Residual
 from casest.declaration.sampson import sampson
 from casest.declaration.shapes import Array
 from casest.declaration.symbols import Constant, Parameter, Scope, Signal, Symbol, constant, named
-from casest.declaration.tracing import Traced, describe, function_of, reached_parameters, trace
+from casest.declaration.tracing import (
+    Traced,
+    describe,
+    function_of,
+    reached_parameters,
+    reached_signals,
+    trace,
+)
 from casest.declaration.travelling import reduced
 from casest.errors import DeclarationError, UnitError, UsageError
 from casest.units import known, size
@@ -419,6 +426,25 @@ class Model:
     def sequential(self) -> bool:
         """Does a sample's residual depend on other samples: by an effect, or by equations?"""
         return any(a.kind in OVER_TIME for a in self.effects) or self.traced.integrates
+
+    @property
+    def reading(self) -> dict[str, Any]:
+        """What `load_runs` is told of its signals, as keyword arguments.
+
+        Of differential equations a reading may be missing, for the states go on; and inputs may be
+        constant, as settings of an experiment are.
+        """
+        if not self.traced.integrates:
+            return {}
+        traced = self.staged
+        needed = ca.vertcat(traced.predicted, *(s.entered for s in traced.stages))
+        reached = {"t", *reached_signals(self, traced, needed)}
+        gaps = tuple(s.name for s in self.signals if s.name not in reached)
+        measured = {*traced.readings}
+        return {
+            "gaps": gaps,
+            "steady": tuple(s.name for s in self.signals if s.name not in measured),
+        }
 
     # -- numbers -------------------------------------------------------------------------------
 
