@@ -7,7 +7,7 @@ READY := $(VENV)/.ready
 .PHONY: demo test lint types format wheel bench study study-starts study-nist study-loop \
 	study-motion study-flights study-inputs study-records study-asked study-slow study-coverage \
 	study-deceptive study-deceptive-many study-fleet study-mutation study-worlds study-noises \
-	study-structural \
+	study-structural study-equations \
 	figures docs clean
 
 demo: $(READY)
@@ -91,6 +91,9 @@ study-records: $(READY)
 
 study-fleet: $(READY)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python studies/fleet_common.py
+
+study-equations: $(READY)
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python studies/equations.py
 
 study-structural: $(READY)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python studies/structural.py

@@ -326,6 +326,14 @@ class Problem:
             self._thinned[every] = Problem(self.model, runs, weights)
         return self._thinned[every]
 
+    def beginning(self, rows: int) -> Problem:
+        """The same problem on so many first samples of each run: for a start, never for a result.
+
+        What follows is not even looked at: equations are integrated so far alone.
+        """
+        runs = (run.take(slice(0, rows)) for run in self.runs)
+        return Problem(self.model, tuple(replace(run, whole=None, places=None) for run in runs))
+
     @cached_property
     def _thinned(self) -> dict[int, Problem]:
         return {}
