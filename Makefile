@@ -9,7 +9,7 @@ USABLE := $(VENV)/.usable
 .PHONY: demo test lint types format wheel bench study study-starts study-nist study-loop \
 	study-motion study-flights study-inputs study-records study-asked study-slow study-coverage \
 	study-deceptive study-deceptive-many study-fleet study-mutation study-worlds study-noises \
-	study-structural study-check study-plans \
+	study-structural study-check study-plans study-equations \
 	figures docs clean
 
 demo: $(USABLE)
@@ -96,6 +96,9 @@ study-check: $(READY)
 
 study-fleet: $(READY)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python studies/fleet_common.py
+
+study-equations: $(READY)
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python studies/equations.py
 
 study-structural: $(READY)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python studies/structural.py

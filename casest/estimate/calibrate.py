@@ -77,6 +77,7 @@ def attempt(
     Without `intervals`, those that only the likelihood can give are left out: each takes fits. So
     is the search for a better valley: the start is taken to lie in the right one.
     """
+    model = getattr(model, "calibration", model)
     # What is not finite is found and named, not warned about.
     with np.errstate(all="ignore"), one_thread():
         return _attempt(Problem(model, tuple(runs)), start, solver, seed, intervals)

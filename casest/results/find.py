@@ -80,9 +80,14 @@ def find_model(name: str) -> Model:
         return found
     path, _, wanted = name.partition(":")
     if path.endswith(".py"):
-        own: Model = _one(load_file(Path(path)), Model, "model", path, wanted)
-        check_units(own)
-        return own
+        declared: Model | Dynamics = _one(
+            load_file(Path(path)), (Model, Dynamics), "model", path, wanted
+        )
+        if isinstance(declared, Dynamics):
+            check_units_in_motion(declared)
+            declared = declared.calibration
+        check_units(declared)
+        return declared
     if name in MOVING:
         raise UsageError(f"{name} is an estimator in motion: casest observe, filter or close it")
     hint = _meant(name, [*SHIPPED, *MOVING])
@@ -172,7 +177,7 @@ def without_grid(effect: Effect) -> Effect:
     return effect
 
 
-def _one(module: ModuleType, kind: type, word: str, path: str, wanted: str) -> Any:
+def _one(module: ModuleType, kind: Any, word: str, path: str, wanted: str) -> Any:
     own: dict[str, Any] = {n: v for n, v in vars(module).items() if isinstance(v, kind)}
     names = {n: v for n, v in own.items() if v.function.__module__ == module.__name__}
     names = names or own
