@@ -322,8 +322,8 @@ scales; that it is one shows in the column, which `check` names beside it.
 ## Over dates
 
 An accelerometer of 400 poses, then {dates} dates of 24 poses each. One offset is off from the first
-date on, by so many standard deviations of what one date says of it. Half of the 0.1 % is that of the
-dates, half that of the chart.
+date on, by so many standard deviations of what one date says of it. Half of the 0.1 % is that of
+the dates, half that of the chart.
 
 {courses}
 
@@ -334,15 +334,15 @@ dates, half that of the chart.
 def tasks(share: float) -> list[tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any]]]:
     """Every record to make: function, arguments, and what it is known by."""
     found: list[Any] = []
-    for kind in KINDS:
-        for seed in range(max(1, round(share * STILL))):
-            found.append((still, (kind, seed), {"what": "still", "kind": kind, "seed": seed}))
     for name in CHANGES:
         for seed in range(max(1, round(share * CHANGED))):
             found.append((changed, (name, seed), {"what": "changed", "name": name, "seed": seed}))
     for size in SIZES:
         for seed in range(max(1, round(share * COURSES))):
             found.append((course, (size, seed), {"what": "course", "size": size, "seed": seed}))
+    for kind in KINDS:
+        for seed in range(max(1, round(share * STILL))):
+            found.append((still, (kind, seed), {"what": "still", "kind": kind, "seed": seed}))
     return found
 
 
