@@ -321,9 +321,9 @@ scales; that it is one shows in the column, which `check` names beside it.
 
 ## Over dates
 
-An accelerometer of 400 poses, then {dates} dates of 24 poses each (fewer of larger shifts). One offset is off from the first
-date on, by so many standard deviations of what one date says of it. Half of the 0.1 % is that of
-the dates, half that of the chart.
+An accelerometer of 400 poses, then {dates} dates of 24 poses each (fewer of larger shifts). One
+offset is off from the first date on, by so many standard deviations of what one date says of it.
+Half of the 0.1 % is that of the dates, half that of the chart.
 
 {courses}
 

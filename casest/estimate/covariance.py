@@ -43,6 +43,18 @@ def covariance_of(
     return np.asarray(sigma**2 * inverse_normal(R, free))
 
 
+def as_stated(
+    problem: Problem,
+    point: Point,
+    R: Array,
+    sigma: float,
+    correlated_over: float,
+    free: NDArray[np.bool_] | None = None,
+) -> Array:
+    """The covariance (n, n) of independent noise that was stated of every reading."""
+    return np.asarray(sigma**2 * inverse_normal(R, free))
+
+
 def inverse_normal(R: Array, free: NDArray[np.bool_] | None = None) -> Array:
     """(JᵀJ)⁻¹ from the triangular factor, with unit columns inside; pseudo-inverse if singular.
 

@@ -16,6 +16,7 @@ from casest.declaration.model import Model
 from casest.declaration.shapes import Array
 from casest.errors import UsageError
 from casest.estimate.estimate import Estimate
+from casest.leastsquares.kinds import whitened
 from casest.leastsquares.problem import Problem
 from casest.solve.trust_region import trust_region
 
@@ -46,7 +47,8 @@ def residuals(model: Model, values: Mapping[str, Array], fitted: Run | None, sco
     if fitted is not None and per_run(model):
         values = with_own(model, values, (fitted,))
     problem = Problem(model, (scored,))
-    return problem.residuals(problem.point(values))[0]
+    point = problem.point(values)
+    return whitened(problem, point).residuals(point)[0]
 
 
 def per_run(model: Model) -> list[str]:

@@ -14,8 +14,8 @@ WIDTH = 80
 _OUTPUT = ("-o", "--output")
 _FLAGS = ("--at-rest", "--json", "--force", "--float")
 _READING = ("--columns", "--unit", "--scale", "--rate", "--time-zero")
-_MODEL = ("--set", "--free", "--fix", "--shared", "--per-run", "--effects", "--at-rest")
-_FIT = ("--start", "--solver", "--seed", "--holdout")
+_MODEL = ("--set", "--free", "--fix", "--shared", "--per-run", "--effects", "--at-rest", "--prior")
+_FIT = ("--start", "--solver", "--seed", "--holdout", "--sensor-noise")
 
 
 @dataclass(frozen=True)

@@ -39,6 +39,8 @@ SHIPPED = {
     "steinhart-hart": ("thermistor", "steinhart_hart"),
     "load-cell": ("one_channel", "load_cell"),
     "pressure": ("one_channel", "pressure"),
+    "gyro-rests": ("imu", "gyro_rests"),
+    "imu": ("imu", "imu"),
 }
 
 

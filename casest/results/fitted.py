@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import inspect
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -34,6 +35,7 @@ from casest.results.result import (
     Result,
     reproduced,
 )
+from casest.results.uncertainty import Covariance, Input
 from casest.results.units import unit_table
 from casest.results.values import Entry, Held, entries, held
 from casest.validity.colour import colour_of
@@ -48,7 +50,11 @@ class Spectrum(Struct, frozen=True):
 
 
 class Noise(Struct, frozen=True):
-    """Standard deviation of one residual on each axis, and where it comes from."""
+    """Standard deviation of one residual on each axis, and where it comes from.
+
+    `stated` is that of a usual residual by the noise that was stated; `chi_square` compares what
+    is left with it, and `chi_square_p_value` is the chance of as much or more.
+    """
 
     sigma: list[float]
     unit: str
@@ -56,6 +62,9 @@ class Noise(Struct, frozen=True):
     from_repeats: Number
     degrees_of_freedom: int
     correlated_over_samples: Number
+    stated: Number
+    chi_square: Number
+    chi_square_p_value: Number
 
 
 class NoiseModel(Noise, frozen=True):
@@ -76,11 +85,15 @@ class NoiseModel(Noise, frozen=True):
 
 class Correlation(Struct, frozen=True):
     """Correlation of the unknowns, and the standard deviation of each: null where the data do not
-    determine one."""
+    determine one.
+
+    `information` is the inverse of their covariance, from which a plan goes on.
+    """
 
     names: list[str]
     matrix: list[list[Number]]
     std: list[Number]
+    information: list[list[Number]]
 
 
 class Section(Struct, frozen=True, kw_only=True):
@@ -93,6 +106,8 @@ class Section(Struct, frozen=True, kw_only=True):
     certificate: Certificate
     parameters: dict[str, Parameter]
     correlation: Correlation | UnsetType = UNSET
+    covariance: Covariance | UnsetType = UNSET
+    inputs: list[Input] | UnsetType = UNSET
 
 
 class JudgedSection(Section, frozen=True, kw_only=True):
@@ -287,7 +302,7 @@ def fitted_content(
         "kind": "rest intervals" if problem.runs[0].spread else "samples",
         "entries": entries(estimate),
         "unknown_units": dict(zip(estimate.names, problem.units, strict=True)),
-        "held": held(problem.model, units),
+        "held": held(estimate, units),
         "found": estimate,
     }
 
@@ -302,11 +317,12 @@ def correlation_of(estimate: Estimate) -> Correlation:
     std = np.sqrt(np.diag(estimate.covariance))
     with np.errstate(invalid="ignore", divide="ignore"):
         matrix = np.asarray(estimate.covariance / np.outer(std, std))
-    return Correlation(list(estimate.names), plain(matrix), plain(std))
+    names, information = list(estimate.names), plain(estimate.information)
+    return Correlation(names, plain(matrix), plain(std), information)
 
 
 def _noise(estimate: Estimate, unit: str) -> Noise:
-    noise = estimate.noise
+    noise, chi = estimate.noise, estimate.noise.chi_square
     return Noise(
         [float(noise.sigma)] * len(estimate.model.axes),
         unit,
@@ -314,6 +330,9 @@ def _noise(estimate: Estimate, unit: str) -> Noise:
         plain(noise.repeats),
         noise.degrees_of_freedom,
         plain(estimate.correlated_over),
+        plain(noise.stated),
+        None if chi is None else plain(chi.value),
+        None if chi is None else plain(chi.larger),
     )
 
 
@@ -390,7 +409,8 @@ def _correction(
     around = None
     if corrected and corrected.low is not UNSET and corrected.high is not UNSET:
         around = (corrected.low, corrected.high)
-    found = carried(estimate.model, estimate.values, estimate.problem.runs, units, around)
+    model = replace(estimate.model, noise=None)  # readings are corrected without their noise
+    found = carried(model, estimate.values, estimate.problem.runs, units, around)
     if isinstance(found, str):
         return {"reason": found}
     values = {name: plain(value) for name, value in estimate.values.items()}

@@ -16,6 +16,7 @@ _NAMES = {
     "observe": ("observe.json", "report.html"),
     "filter": ("filter.json", "states.csv", "report.html"),
     "compare": ("compare.json", "compare.png", "compare.svg"),
+    "plan": ("plan.json", "plan.csv", "plan.html"),
     "simulate": ("record.csv", "truth.json", "truth.csv"),
 }
 #: Where a command writes that is not told.
@@ -33,7 +34,7 @@ def overwritten(command: str, output: str | Path | None, words: Sequence[str]) -
         return ""
     lost = {_entry(path) for path in _targets(command, Path(output))}
     for k, word in enumerate(words):
-        for path in _read(word, result=k == 0 and command in ("apply", "check", "export")):
+        for path in _read(word, result=k == 0 and command in ("apply", "check", "export", "plan")):
             # A link in the place of the output is replaced itself, not what it leads to.
             if lost & {_entry(path), os.path.realpath(path)}:
                 return word
