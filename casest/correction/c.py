@@ -128,6 +128,8 @@ def c_source(program: Program, name: str, single: bool, test: tuple[Array, Array
                 largest=number(program.largest),
             )
         )
+    if program.seen:
+        lines.append(_extrapolates(program, name))
     inputs, outputs = (_rows(part) for part in test)
     tolerance = "2e-4" if single else "1e-9"
     lines.append(
@@ -136,6 +138,22 @@ def c_source(program: Program, name: str, single: bool, test: tuple[Array, Array
         )
     )
     return "\n".join(lines)
+
+
+def _extrapolates(program: Program, name: str) -> str:
+    """A function that says whether a sample lies outside what the calibration saw."""
+    ends = [("-INFINITY", "INFINITY") if s is None else tuple(map(number, s)) for s in program.seen]
+    low, high = (", ".join(column) for column in zip(*ends, strict=True))
+    return (
+        "/* 1 where x lies outside what the calibration saw: the correction extrapolates. */\n"
+        f"int {name}_extrapolates(const real *x) {{\n"
+        f"  static const real low[] = {{{low}}};\n"
+        f"  static const real high[] = {{{high}}};\n"
+        f"  for (int i = 0; i < {program.width}; ++i)\n"
+        "    if (!(x[i] >= low[i] && x[i] <= high[i])) return 1;\n"
+        "  return 0;\n"
+        "}\n"
+    )
 
 
 def _head(program: Program, name: str, single: bool) -> str:
@@ -163,6 +181,7 @@ def _head(program: Program, name: str, single: bool) -> str:
         "",
         f"typedef {'float' if single else 'double'} real;",
         f"int {name}(const real *x, real *corrected);",
+        *([f"int {name}_extrapolates(const real *x);"] if program.seen else []),
     ]
     if program.kind == "newton":
         close, exact = ("1e-5f", "2e-7f") if single else ("1e-9", "1e-14")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import json
+import math
 from typing import Any
 
 from casest import __version__
@@ -55,6 +56,7 @@ def python_source(program: Program, test: tuple[Array, Array]) -> str:
         "def correct(x: Any) -> Any:\n"
         '    """Corrected values of every row of x."""\n'
         "    return corrected(PROGRAM, x)\n"
+        + (_extrapolates(program) if program.seen else "")
         + _TEST.format(inputs=_loaded(test[0].tolist()), outputs=_loaded(test[1].tolist()))
     )
     return (
@@ -72,6 +74,25 @@ def _loaded(data: Any, width: int = 88) -> str:
     text = json.dumps(data)
     pieces = [text[k : k + width] for k in range(0, len(text), width)]
     return "json.loads(\n" + "\n".join(f"    {piece!r}" for piece in pieces) + "\n)"
+
+
+def _extrapolates(program: Program) -> str:
+    low = [-math.inf if s is None else s[0] for s in program.seen]
+    high = [math.inf if s is None else s[1] for s in program.seen]
+    return (
+        "\n\nLOW, HIGH = (\n"
+        f"    np.array([{', '.join(map(_python_number, low))}]),\n"
+        f"    np.array([{', '.join(map(_python_number, high))}]),\n"
+        ")\n\n\n"
+        "def extrapolates(x: Any) -> Any:\n"
+        '    """Which rows of x lie outside what the calibration saw."""\n'
+        "    x = np.asarray(x, dtype=float)\n"
+        "    return ~((x >= LOW) & (x <= HIGH)).all(axis=1)\n"
+    )
+
+
+def _python_number(value: float) -> str:
+    return repr(value) if math.isfinite(value) else f"{'-' * (value < 0)}np.inf"
 
 
 def as_data(program: Program) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from casest.declaration.effect import RECORDED, Effect
 from casest.declaration.model import Model
 from casest.dynamics import Dynamics
 from casest.dynamics import check_units as check_units_in_motion
-from casest.effects import CATALOGUE
+from casest.effects import ASKED, CATALOGUE
 from casest.errors import CasestError, DeclarationError, UsageError
 
 #: Values of effects that a fit finds from where they start, without a grid.
@@ -107,7 +107,7 @@ def _meant(name: str, shipped: Sequence[str]) -> str:
 
 def find_effects(name: str) -> tuple[Effect, ...]:
     """All effects declared in `file.py`, the one of `file.py:name`, or a shipped one's name."""
-    shipped = {e.name: e for e in CATALOGUE}
+    shipped = {e.name: e for e in (*CATALOGUE, *ASKED)}
     if name in shipped:
         return (_whole(shipped[name]),)
     if not Path(name).suffix and ":" not in name:
@@ -135,7 +135,7 @@ def find_asked(text: str) -> tuple[tuple[Effect, str], ...]:
     if found is None:
         return tuple((effect, "") for effect in find_effects(text))
     name, column = found[1], found[2].strip()
-    shipped = {e.name: e for e in CATALOGUE}
+    shipped = {e.name: e for e in (*CATALOGUE, *ASKED)}
     if name not in shipped:
         several = find_effects(name)
         if len(several) > 1:

@@ -60,7 +60,7 @@ def corrected_csv(
     unit = result.units.get(program.output.name)
     text = table_of(runs, [s.name for s in needed], found, program.output.name, unit)
     notes = dict.fromkeys(note for run in runs for note in run.notes)
-    far = () if _was_fitted(result, data) else extrapolated(carried, runs)
+    far = () if _was_fitted(result, data) else beyond(program, with_margin(carried), runs)
     return Applied(text, program.left, (*notes, *_of_units(result, runs, data), *far))
 
 
@@ -80,24 +80,42 @@ def _of_units(result: SavedResult, runs: Sequence[Run], data: str) -> Iterator[s
             )
 
 
-def extrapolated(carried: Carried, runs: Sequence[Run]) -> Iterator[str]:
-    """How many samples lie outside what the calibration saw, and in which numbers."""
+def with_margin(carried: Carried) -> tuple[tuple[float, float] | None, ...]:
+    """Least and greatest of each number of a sample that need no remark; None of a time or a
+    rotation. Empty where an older result does not say."""
     if not carried.seen:
+        return ()
+    kinds = [i for i in carried.program.inputs for _ in range(i.size)]
+    found: list[tuple[float, float] | None] = []
+    for i, (low, high) in zip(kinds, carried.seen, strict=True):
+        margin = MARGIN * (high - low) + 1e-9 * max(abs(low), abs(high))
+        judged = i.kind != "rotation" and i.name != "t"  # of time, `of_another_time` speaks
+        found.append((low - margin, high + margin) if judged else None)
+    return tuple(found)
+
+
+def beyond(
+    program: Program, allowed: Sequence[tuple[float, float] | None], runs: Sequence[Run]
+) -> Iterator[str]:
+    """How many samples lie outside the ranges `allowed`, and in which numbers."""
+    if len(allowed) != program.width:
         return
     place, far, said = 0, [np.zeros(len(run), dtype=bool) for run in runs], []
-    for i in carried.program.inputs:
-        own = carried.seen[place : place + i.size]
+    for i in program.inputs:
+        own = allowed[place : place + i.size]
         place += i.size
-        if i.kind == "rotation" or i.name == "t":  # of time, `of_another_time` speaks
-            continue
-        for k, (axis, (low, high)) in enumerate(zip(axes(i.size), own, strict=True)):
-            margin = MARGIN * (high - low) + 1e-9 * max(abs(low), abs(high))
+        for k, (axis, ends) in enumerate(zip(axes(i.size), own, strict=True)):
+            if ends is None:
+                continue
+            low, high = ends
             parts = [run.signals[i.name][:, k] for run in runs]
-            beyond = [(x < low - margin) | (x > high + margin) for x in parts]
-            if any(b.any() for b in beyond):
-                far = [f | b for f, b in zip(far, beyond, strict=True)]
+            outside = [(x < low) | (x > high) for x in parts]
+            if any(o.any() for o in outside):
+                far = [f | o for f, o in zip(far, outside, strict=True)]
                 least, most = min(x.min() for x in parts), max(x.max() for x in parts)
-                said.append(f"{i.name}{axis} {least:.4g} to {most:.4g} ({low:.4g} to {high:.4g})")
+                inner = MARGIN / (1 + 2 * MARGIN) * (high - low)
+                seen = f"{low + inner:.4g} to {high - inner:.4g}"
+                said.append(f"{i.name}{axis} {least:.4g} to {most:.4g} ({seen})")
     if said:
         count, rows = sum(int(f.sum()) for f in far), sum(map(len, runs))
         more = f" and {len(said) - SAID} more" if len(said) > SAID else ""

@@ -29,7 +29,7 @@ from casest.errors import DataError, UsageError
 from casest.escaping import c_identifier
 from casest.results.file import load_json
 from casest.results.saved import SavedResult, saved_correction
-from casest.saved.apply import Applied, corrected, table_of, without
+from casest.saved.apply import Applied, beyond, corrected, table_of, with_margin, without
 
 #: What the JSON form calls itself; its schema is `casest/correction/correction.schema.json`.
 FORMAT = "casest-correction-1"
@@ -48,7 +48,7 @@ def exported(
     if carried.own and not 0 <= run < len(result.runs):
         raise UsageError(f"--run {run}: there are runs 0 to {len(result.runs) - 1}")
     bound, readings = carried.of_run(run if carried.own else 0)
-    built = replace(bound, model=carried.model)
+    built = replace(bound, model=carried.model, seen=with_margin(carried))
     refuse_unexported(built)
     test = _test(built, readings, path)
     if to == "json":
@@ -109,6 +109,7 @@ def _as_json(built: Program, carried: Carried, result: SavedResult, run: int) ->
         },
         "constants": result.constants,
         "program": as_data(built),
+        "range": [list(s) if s else None for s in built.seen],
     }
     return json.dumps(content, indent=1) + "\n"
 
@@ -135,6 +136,7 @@ class _Exported(Struct):
     program: dict[str, Any]
     signals: list[str] = []
     not_undone: list[str] = []
+    range: list[tuple[float, float] | None] = []
 
 
 def applied(path: Path, data: str, arguments: Mapping[str, Any]) -> Applied:
@@ -149,7 +151,7 @@ def applied(path: Path, data: str, arguments: Mapping[str, Any]) -> Applied:
     found, out = [corrected(built, run) for run in runs], built.output
     text = table_of(runs, [s.name for s in signals], found, out.name, out.unit)
     notes = dict.fromkeys(note for run in runs for note in run.notes)
-    return Applied(text, built.left, tuple(notes))
+    return Applied(text, built.left, (*notes, *beyond(built, content.range, runs)))
 
 
 def applied_foreign(path: Path, data: str, arguments: Mapping[str, Any]) -> Applied:
