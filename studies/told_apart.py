@@ -133,7 +133,7 @@ def main() -> None:
     lines = [
         "# Causes that a record left open, after the planned measurement",
         "",
-        f"Made by `make study-told-apart` ({wanted} wanted): {n} sensors of {seed} ended with several",
+        f"Made by `make study-told-apart`: {n} sensors of {seed} ended with several",
         "causes, the true one among the first three.",
         "",
         "| | the true cause is named | a wrong one | none |",
