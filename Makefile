@@ -9,7 +9,7 @@ USABLE := $(VENV)/.usable
 .PHONY: demo test lint types format wheel bench study study-starts study-nist study-loop \
 	study-motion study-flights study-inputs study-records study-asked study-slow study-coverage \
 	study-deceptive study-deceptive-many study-fleet study-mutation study-worlds study-noises \
-	study-structural study-check study-plans study-equations \
+	study-structural study-check study-plans study-equations study-told-apart \
 	figures docs clean
 
 demo: $(USABLE)
@@ -105,6 +105,9 @@ study-structural: $(READY)
 
 study-plans: $(READY)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python studies/plans.py
+
+study-told-apart: $(READY)
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python studies/told_apart.py
 
 study-mutation: $(READY)
 	$(BIN)/python studies/mutation.py
