@@ -258,6 +258,14 @@ class Fitted(Result, frozen=True, kw_only=True, dict=True):
         """What is drawn of the residuals: of one fit, or before and after."""
         raise NotImplementedError
 
+    @property
+    def refusals(self) -> tuple[str, ...]:
+        """Names of what speaks against the estimate: headings of docs/refusals.md."""
+        if self.trusted:
+            return ()
+        codes = self.found.certificate.code
+        return tuple((code.name or "").lower().replace("_", "-") for code in codes)
+
     @cached_property
     def application(self) -> Application:
         """How the result is applied."""

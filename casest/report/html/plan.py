@@ -9,7 +9,7 @@ from casest.report.html.fitted import reproduction
 from casest.report.html.frame import whole
 from casest.report.html.numbers import number, printed_unit
 from casest.report.html.page import escaped, paragraph, points, section, table, tag
-from casest.report.html.sphere import sphere
+from casest.report.html.directions import sphere
 from casest.results.plan import Plan, headline, plan_words
 
 #: Where the page is.
