@@ -10,7 +10,16 @@ from contextlib import suppress
 
 import click
 
-from casest.cli import comparing, completing, correcting, fitting, fleets, motion, simulating
+from casest.cli import (
+    budgeting,
+    comparing,
+    completing,
+    correcting,
+    fitting,
+    fleets,
+    motion,
+    simulating,
+)
 from casest.cli.shared import commands, echo, shown
 from casest.errors import INTERNAL, INTERRUPTED, CasestError
 from casest.interruption import remember
@@ -18,7 +27,7 @@ from casest.interruption import remember
 __all__ = ["commands", "main", "run"]
 
 #: Every room adds its commands to the group as it is imported.
-ROOMS = (fitting, motion, comparing, correcting, simulating, fleets, completing)
+ROOMS = (fitting, motion, comparing, correcting, budgeting, simulating, fleets, completing)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -14,6 +14,7 @@ _NAMES = {
     "close": (*_FITTED, "formula.py"),
     "observe": ("observe.json", "report.html"),
     "filter": ("filter.json", "states.csv", "report.html"),
+    "budget": ("budget.json", "budget.html"),
     "compare": ("compare.json", "compare.png", "compare.svg"),
     "simulate": ("record.csv", "truth.json", "truth.csv"),
 }
@@ -32,7 +33,7 @@ def overwritten(command: str, output: str | Path | None, words: Sequence[str]) -
         return ""
     lost = {_entry(path) for path in _targets(command, Path(output))}
     for k, word in enumerate(words):
-        for path in _read(word, result=k == 0 and command in ("apply", "export")):
+        for path in _read(word, result=k == 0 and command in ("apply", "export", "budget")):
             # A link in the place of the output is replaced itself, not what it leads to.
             if lost & {_entry(path), os.path.realpath(path)}:
                 return word
