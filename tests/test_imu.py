@@ -110,7 +110,7 @@ def test_rests_that_are_none_are_asked_for():
     rng = np.random.default_rng(9)
     record = recorded(waved(rng, rests=3), an_imu(rng), rng)
     raw = Run.raw("walk", {n: record[n] for n in "aw"}, units=UNITS, time=record["t"])
-    with pytest.raises(DataError, match="walk: .*at_rest=True"):
+    with pytest.raises(DataError, match=r"walk: .*at_rest=True"):
         attempt(GYRO, [raw])
 
 

@@ -93,6 +93,11 @@ class Model:
             return self.signals
         return self.signals + self.noise.columns({s.name: s for s in self.signals})
 
+    @property
+    def without_noise(self) -> Model:
+        """The same relation, its residual in its own unit; itself where no noise was stated."""
+        return self if self.noise is None else replace(self, noise=None)
+
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
         """Declared parameters, then those of the effects (`quadratic.k`)."""
