@@ -48,6 +48,10 @@ class Declared(Protocol):
         """What is measured, also by what the effects read."""
 
     @property
+    def columns(self) -> tuple[Signal, ...]:
+        """What a sample holds: the signals, then what is stated of their noise."""
+
+    @property
     def readings(self) -> tuple[Signal, ...]:
         """Those of the body's signals that carry noise."""
 
@@ -170,7 +174,7 @@ def trace(
 
 def _symbols(model: Declared) -> tuple[dict[str, SX], list[SX], list[SX]]:
     symbols: dict[str, SX] = {}
-    for s in model.signals:
+    for s in model.columns:
         flat = ca.SX.sym(s.name, s.size)
         symbols[s.name] = ca.reshape(flat, 3, 3).T if s.kind == "rotation" else flat
     coordinates, references = [], []
@@ -381,9 +385,9 @@ def function_of(model: Declared, outputs: Mapping[str, SX], traced: Traced | Non
 
 
 def sample_symbol(model: Declared, traced: Traced | None = None) -> SX:
-    """All signals of one sample as one column, in the order in which data hold them."""
+    """All that a sample holds as one column, in the order in which data hold it."""
     symbols = (traced or model.traced).symbols
-    return ca.vertcat(*[flat(symbols[s.name]) for s in model.signals])
+    return ca.vertcat(*[flat(symbols[s.name]) for s in model.columns])
 
 
 def reading_symbol(model: Declared, traced: Traced | None = None) -> SX:
@@ -409,7 +413,7 @@ def reached_signals(model: Declared, traced: Traced, expression: SX) -> set[str]
     sample = sample_symbol(model, traced)
     columns = ca.jacobian(ca.vec(expression), sample).sparsity().get_triplet()[1]
     reached, place = set(), 0
-    for s in model.signals:
+    for s in model.columns:
         if any(place <= c < place + s.size for c in columns):
             reached.add(s.name)
         place += s.size

@@ -117,9 +117,10 @@ class Problem:
 
     @property
     def residual_count(self) -> int:
-        """Number of scalar residuals."""
+        """Number of scalar residuals; what is known before counts as one for each number."""
         every = sum(len(run) for run in self.runs) * len(self.model.axes)
-        return every - sum(int(np.sum(~p)) for p in self.present if p is not None)
+        every -= sum(int(np.sum(~p)) for p in self.present if p is not None)
+        return every if self.model.prior is None else every + len(self.model.prior.covariance)
 
     def lost(self, r: int) -> Any:
         """Rests of a run before which a sensor was beyond its range, by number."""
@@ -130,6 +131,13 @@ class Problem:
         """Which residuals (N, m) of each run there are; None where all are."""
         staged = self._staged
         return tuple(None if staged is None else staged.present(r) for r in range(len(self.runs)))
+
+    @property
+    def noise_scale(self) -> float | None:
+        """Standard deviation of a usual residual that was stated, or that a prior had."""
+        if self.model.noise is not None:
+            return self.model.noise.scale
+        return None if self.model.prior is None else self.model.prior.sigma
 
     @cached_property
     def _selections(self) -> tuple[tuple[Any, Any], ...]:
@@ -234,6 +242,9 @@ class Problem:
 
     @cached_property
     def _start(self) -> Point:
+        known_before = {} if self.model.prior is None else self.model.prior.by_name
+        if {p.name for p in self.model.parameters} <= set(known_before):
+            return self.point(known_before)
         try:
             values = self.model.starter(self.model, self.runs) if self.model.starter else {}
         except np.linalg.LinAlgError as error:
@@ -242,7 +253,7 @@ class Problem:
                 "they all alike?"
             ) from error
         known = {p.name for p in self.model.parameters}
-        return self.point({k: v for k, v in values.items() if k in known})
+        return self.point({k: v for k, v in {**values, **known_before}.items() if k in known})
 
     def moved(self, point: Point, step: Array) -> Point:
         """The point after a step, with directions and rotations in a chart around themselves."""
@@ -291,7 +302,7 @@ class Problem:
         for s in self.slots:
             shape, block = s.parameter.shape, covariance[s.x, s.x]
             if shape.curved:
-                jacobian = self._chart_jacobian(s, point)
+                jacobian = self.chart_slope(s, point)
                 std = _root(np.diag(jacobian @ block @ jacobian.T)).reshape(shape.dims)
             else:
                 std = shape.unpack(_root(np.diag(block)))
@@ -300,7 +311,10 @@ class Problem:
         per_run = {p.name for p in self.model.parameters if p.scope == "run"}
         return {n: np.stack(v) if several and n in per_run else v[0] for n, v in found.items()}
 
-    def _chart_jacobian(self, slot: Slot, point: Point) -> Array:
+    def chart_slope(self, slot: Slot, point: Point) -> Array:
+        """Slope (entries, coordinates) of a parameter's entries in its unknowns."""
+        if not slot.parameter.shape.curved:
+            return np.eye(slot.parameter.shape.size)
         x, reference = point.x[slot.x], point.references[slot.ref]
         _, slope = _chart(slot.parameter.shape.kind, len(x), len(reference))
         return np.array(slope(x, reference))
@@ -312,10 +326,10 @@ class Problem:
         """Signals of each run side by side, by column."""
         stacked = []
         for run in self.runs:
-            missing = [s.name for s in self.model.signals if s.name not in run.signals]
+            missing = [s.name for s in self.model.columns if s.name not in run.signals]
             if missing:
                 raise DataError(f"{run.file}: no data for signal {missing[0]!r}; add --columns")
-            parts = [np.asanyarray(run.signals[s.name]) for s in self.model.signals]
+            parts = [np.asanyarray(run.signals[s.name]) for s in self.model.columns]
             if sum(part.size for part in parts) <= COPIED:
                 # Columns first: the kernel reads them in order.
                 parts = [np.ascontiguousarray(part.T, dtype=float).T for part in parts]
@@ -440,7 +454,10 @@ class Problem:
 
     def cost(self, point: Point) -> float:
         """½ Σ w r²."""
-        return sum(self._run_cost(point, r) for r in range(len(self.runs)))
+        own = sum(self._run_cost(point, r) for r in range(len(self.runs)))
+        if self.model.prior is None:
+            return own
+        return own + 0.5 * float(np.sum(prior_rows(self, point)[:, -1] ** 2))
 
     def normal(self, point: Point) -> Normal:
         """Cost, gradient (n,) and Gauss-Newton matrix (n, n); those of the last points are kept."""
@@ -456,7 +473,7 @@ class Problem:
         return deque(maxlen=LATEST)
 
     def _normal(self, point: Point) -> Normal:
-        if self._alone:
+        if self._alone and self.model.prior is None:
             return self._run_normal(point, 0)
         total, gradient = 0.0, np.zeros(self.unknowns)
         matrix = np.zeros((self.unknowns, self.unknowns))
@@ -466,6 +483,12 @@ class Problem:
             total += own.cost
             gradient[x] += own.gradient
             matrix[np.ix_(x, x)] += own.matrix
+        if self.model.prior is not None:
+            rows_before = prior_rows(self, point)
+            product = rows_before.T @ rows_before
+            total += 0.5 * float(product[-1, -1])
+            gradient += product[:-1, -1]
+            matrix += product[:-1, :-1]
         return Normal(total, gradient, matrix)
 
     def run_normals(self, point: Point) -> list[tuple[Any, Normal]]:
@@ -488,8 +511,10 @@ class Problem:
             block = np.zeros((len(own), n + 1))
             block[:, [*x, n]] = own
             blocks.append(block)
+        if self.model.prior is not None:
+            blocks.append(prior_rows(self, point))
         whole = np.vstack(blocks)
-        if len(self.runs) > 1:
+        if len(blocks) > 1:
             whole = np.asarray(np.linalg.qr(whole, mode="r"))
         full = np.zeros((n + 1, n + 1))
         full[: len(whole)] = whole[: n + 1]
@@ -546,6 +571,27 @@ class Problem:
     def with_weights(self, weights: Sequence[Array] | None) -> Problem:
         """The same problem with other weights on the squares."""
         return replace(self, weights=None if weights is None else tuple(weights))
+
+
+def prior_rows(problem: Problem, point: Point) -> Array:
+    """[J r] (k, n + 1) of what is known before: coordinates off the prior's, in residual units."""
+    prior, scale = problem.model.prior, problem.noise_scale
+    assert prior is not None
+    assert scale is not None
+    parts, slots = [], {s.parameter.name: s for s in problem.slots}
+    for name, before in prior.by_name.items():
+        slot = slots[name]
+        shape, part = slot.parameter.shape, np.zeros((slot.x.stop - slot.x.start, problem.unknowns))
+        if shape.curved:
+            reference = shape.reference(before)
+            here = problem._charted(slot, point.x[slot.x], point.references[slot.ref])
+            off = shape.tangent(here, reference)
+            steps = problem.chart_slope(slot, point).T.reshape(-1, *shape.dims)
+            part[:, slot.x] = np.stack([shape.tangent(s, reference) for s in steps], axis=1)
+        else:
+            off, part[:, slot.x] = point.x[slot.x] - shape.pack(before), np.eye(len(part))
+        parts.append(np.column_stack([part, off]))
+    return np.asarray(scale * prior.root @ np.vstack(parts))
 
 
 @lru_cache(maxsize=8)

@@ -50,7 +50,7 @@ class Record:
                 f"{run.file or run.name}: {_who(model)} needs time: give a time column or "
                 "--rate (--columns t=NAME, --rate HZ)"
             )
-        samples = np.hstack([np.asarray(whole.signals[s.name], float) for s in model.signals])
+        samples = np.hstack([np.asarray(whole.signals[s.name], float) for s in model.columns])
         rests = Rests.of(model, whole) if model.resting else None
         return cls(whole, samples, np.asarray(whole.time, float), places, rests)
 
