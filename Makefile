@@ -6,7 +6,7 @@ READY := $(VENV)/.ready
 # What a demo needs alone: a tenth of the developers' tools.
 USABLE := $(VENV)/.usable
 
-.PHONY: demo test lint types format wheel bench study study-starts study-nist study-loop \
+.PHONY: demo test lint types format wheel bench study study-imu study-starts study-nist study-loop \
 	study-motion study-flights study-inputs study-records study-asked study-slow study-coverage \
 	study-deceptive study-deceptive-many study-fleet study-mutation study-worlds study-noises \
 	study-structural study-check study-plans study-equations study-told-apart \
@@ -45,6 +45,9 @@ bench: $(READY)
 study: $(READY)
 	$(BIN)/python studies/bound.py
 	$(BIN)/python studies/wheel_bound.py
+
+study-imu: $(READY)
+	$(BIN)/python studies/imu.py
 
 study-starts: $(READY)
 	$(BIN)/python studies/random_starts.py
