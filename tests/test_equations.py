@@ -238,3 +238,116 @@ def test_a_constant_in_a_wrong_unit_is_refused(tmp_path, capsys):
     (tmp_path / "declared.py").write_text(source)
     assert casest_run(["calibrate", str(tmp_path / "declared.py"), "nothing.csv"]) == 1
     assert "units do not fit" in capsys.readouterr().err
+
+
+DECAY = (
+    HEAD
+    + """
+@dynamics
+def decay(
+    y1=signal(),
+    *,
+    y=state(start=1.0),
+    {more}
+    k=param(start={start}),
+):
+    return Motion(rates={{"y": {rate}}}, outputs=(measured(y1, y),))
+"""
+)
+
+
+@pytest.fixture
+def decaying(tmp_path):
+    """exp(−t/2) with noise of 0.01, every 0.1 s."""
+    rng = np.random.default_rng(0)
+    t = np.arange(30) / 10
+    file = tmp_path / "decay.csv"
+    rows = [f"{s:.1f},{np.exp(-s / 2) + 0.01 * rng.standard_normal():.5f}" for s in t]
+    file.write_text("\n".join(["t [s],y1", *rows]) + "\n")
+    return file
+
+
+def refused(tmp_path, capsys, file, code: int, rate="-k * y", start="0.4", more="") -> str:
+    """What is said against a fit, on one line."""
+    source = DECAY.format(rate=rate, start=start, more=more)
+    (tmp_path / "declared.py").write_text(source)
+    assert casest_run(["calibrate", str(tmp_path / "declared.py"), str(file)]) == code
+    return capsys.readouterr().err
+
+
+def test_a_rate_that_grows_without_bound_is_said_where_and_at_which_values(
+    tmp_path, capsys, decaying
+):
+    said = refused(tmp_path, capsys, decaying, 2, rate="k * y**2", start="5")
+    assert "cannot be followed beyond t = 0.1 s, where y = 2" in said
+    assert "k = 5, y_start = 1" in said
+
+
+def test_a_beginning_that_no_reading_tells_is_named(tmp_path, capsys, decaying):
+    said = refused(tmp_path, capsys, decaying, 2, more="z=state(start=1.0),")
+    assert "`z_start` changes no residual" in said
+
+
+def test_an_input_that_is_not_recorded_is_named(tmp_path, capsys, decaying):
+    source = DECAY.format(rate="-k * y + u", start="0.4", more="")
+    source = source.replace("    y1=signal(),\n", "    y1=signal(),\n    u=signal(held=True),\n")
+    (tmp_path / "declared.py").write_text(source)
+    assert casest_run(["calibrate", str(tmp_path / "declared.py"), str(decaying)]) == 1
+    assert "no columns u for signal u" in capsys.readouterr().err
+
+
+def test_times_out_of_order_are_named(tmp_path, capsys, decaying):
+    lines = decaying.read_text().splitlines()
+    lines[5], lines[6] = lines[6], lines[5]
+    decaying.write_text("\n".join(lines) + "\n")
+    said = refused(tmp_path, capsys, decaying, 1)
+    assert "time 0.4 s goes backward from 0.5 s" in said
+
+
+def test_driving_noise_makes_it_an_estimator_and_says_so(tmp_path, capsys, decaying):
+    more = "z=state(intensity=1.0),"
+    assert "has driving noise" in refused(tmp_path, capsys, decaying, 1, more=more)
+
+
+def test_missing_readings_cost_no_row_and_are_not_counted(tmp_path, capsys, decaying):
+    """A row at t = 0 without a reading, and some without one between: as if they were not there."""
+    lines = decaying.read_text().splitlines()
+    holes = [line if k % 7 else line.partition(",")[0] + "," for k, line in enumerate(lines[1:], 1)]
+    source = DECAY.format(rate="-k * y", start="0.4", more="")
+    fits = []
+    for rows in (holes, [line for line in holes if not line.endswith(",")]):
+        decaying.write_text("\n".join([lines[0], *rows]) + "\n")
+        fits.append(calibrated(tmp_path, capsys, source, str(decaying))[1])
+    assert value(fits[0], "k") == pytest.approx(value(fits[1], "k"), rel=1e-9)
+    for name in ("k", "y_start"):
+        stds = [f["estimate"]["parameters"][name]["plain_std"] for f in fits]
+        assert stds[0] == pytest.approx(stds[1], rel=1e-9)
+
+
+def test_a_growing_oscillation_is_found_from_a_start_where_it_has_lost_step(tmp_path, capsys):
+    """200 turns of a pendulum from a rate 20 % off: the cost from there has a hundred valleys."""
+
+    @dynamics
+    def swing(
+        a=signal("rad"),
+        *,
+        angle=state("rad", start=1.0),
+        rate=state("rad/s"),
+        w2=param("1/s^2", start=60, bounds=(0, None)),
+        friction=param("1/s", start=0.01),
+    ):
+        rates = {"angle": rate, "rate": -w2 * sin(angle) - friction * rate}
+        return Motion(rates=rates, outputs=(measured(a, angle),))
+
+    t = np.arange(0, 40, 0.02)
+    found = solve_ivp(
+        lambda s, y: [y[1], -39.0 * np.sin(y[0]) - 0.02 * y[1]], (0, t[-1]), [1.1, 0.3],
+        "DOP853", t, rtol=1e-11, atol=1e-11,
+    )  # fmt: skip
+    a = found.y[0] + 0.01 * np.random.default_rng(1).standard_normal(len(t))
+    run = Run.raw("swing", {"a": a[:, None]}, units={"a": "rad"}, time=t)
+    estimate = casest.attempt(swing.calibration, [run])
+    assert estimate.certificate.trusted
+    truth = {"w2": 39.0, "friction": 0.02, "angle_start": 1.1, "rate_start": 0.3}
+    for name, expected in truth.items():
+        assert abs(estimate.values[name] - expected) < 4 * estimate.std[name]

@@ -61,7 +61,7 @@ def _looked_for_in_equations(
     """The same of differential equations: unless readings vouch, ways from starts elsewhere."""
     best = best_of(outcomes)
     evidence = Evidence(scatter(problem, best.point))
-    if evidence.vouched:
+    if evidence.vouched or problem.model.starter is not None:
         return outcomes, evidence
     ends = from_elsewhere(problem, first, best, seed)
     lowest = best_of((best, *ends))

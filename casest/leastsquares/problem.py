@@ -409,6 +409,18 @@ class Problem:
         parameters = self.parameters(point, r)
         return self._staged.rows(parameters, self.samples[r].dense, r, tuple(own))[1]
 
+    def stopped(self, point: Point) -> str:
+        """Where equations could not be followed, at which parameters, in words; empty: nowhere."""
+        for r, run in enumerate(self.runs):
+            words = (
+                "" if self._staged is None else self._staged.stopped(self.parameters(point, r), r)
+            )
+            if words:
+                x = self._selections[r][0]
+                shown = ", ".join(f"{self.names[i]} = {point.x[i]:.4g}" for i in x)
+                return f"{run.file or run.name}: {words} (at {shown})"
+        return ""
+
     def given(self, point: Point, r: int) -> Array:
         """What the effects that look at other samples give at the samples of one run (N, k)."""
         if self._staged is None:

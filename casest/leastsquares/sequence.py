@@ -48,11 +48,19 @@ class Record:
     def of(cls, model: Model, run: Run) -> Record:
         """The whole record where the samples are its own still, else the samples alone."""
         whole, places = _origin(model, run)
+        if whole.time is None and model.traced.integrates:
+            why = next((n for n in whole.notes if n.startswith("time not used")), "")
+            raise DataError(
+                f"{whole.file or whole.name}: differential equations need a time for every row, in "
+                f"order: {why or 'give a time column (--columns t=NAME) or --rate'}"
+            )
         if whole.time is None:
             raise DataError(
                 f"{run.file or run.name}: {_who(model)} needs time: give a time column or "
                 "--rate (--columns t=NAME, --rate HZ)"
             )
+        if model.traced.integrates:
+            _refuse_going_back(whole)
         samples = np.hstack([np.asarray(whole.signals[s.name], float) for s in model.columns])
         rests = Rests.of(model, whole) if model.resting else None
         return cls(whole, samples, np.asarray(whole.time, float), places, rests)
@@ -73,6 +81,18 @@ class Record:
 
 def _who(model: Model) -> str:
     return model.name if model.resting else "an effect that looks at other samples"
+
+
+def _refuse_going_back(run: Run) -> None:
+    """Times of equations grow from row to row."""
+    time = np.asarray(run.time, float)
+    back = np.flatnonzero(~(np.diff(time) > 0))
+    if back.size:
+        k = int(back[0])
+        raise DataError(
+            f"{run.file or run.name}: the time goes from {time[k]:.6g} to {time[k + 1]:.6g} s in "
+            f"row {int(run.rows[k + 1])}: put the rows in order, one for each time"
+        )
 
 
 def _origin(model: Model, run: Run) -> tuple[Run, Index | slice]:
@@ -208,6 +228,25 @@ class Staged:
         wide = np.zeros((*moved.shape[:2], slopes.shape[2]))
         wide[:, :, list(stage.columns)] = moved
         return found, wide
+
+    def stopped(self, parameters: Array, r: int) -> str:
+        """What could not be followed from which time on, in words; empty where all was."""
+        given, place = self.given(parameters, r, ())[0], 0
+        time = self._records[r].time[self._records[r].places]
+        for stage in self.model.staged.stages:
+            own = given[:, place : place + stage.given.numel()]
+            place += stage.given.numel()
+            bad = np.flatnonzero(~np.isfinite(own).all(axis=1))
+            if isinstance(stage, Flow) and bad.size:
+                k = max(int(bad[0]) - 1, 0)
+                there = ", ".join(
+                    f"{n} = {v:.4g}" for n, v in zip(stage.names, own[k], strict=True)
+                )
+                return (
+                    f"the equations cannot be followed beyond t = {time[k]:.6g} s, where {there}: "
+                    "a rate is not finite there, grows without bound, or is too stiff"
+                )
+        return ""
 
     def _late(self, stage: Program, parameters: Array, record: Record) -> tuple[Array, Array]:
         """A signal at the times at which the effect says that it is taken, and its slopes."""

@@ -28,6 +28,7 @@ STARTED = ("timescale", "share", "lag")
 #: Shipped models: name on the command line -> module and attribute in `casest_problems`.
 SHIPPED = {
     "wheel": ("wheel", "wheel"),
+    "wheel-motion": ("wheel_motion", "wheel_motion"),
     "rate-table": ("rate_table", "rate_table"),
     "norm-diagonal": ("norm", "norm_diagonal"),
     "norm-triangular": ("norm", "norm_triangular"),
