@@ -9,7 +9,7 @@ USABLE := $(VENV)/.usable
 .PHONY: demo test lint types format wheel bench study study-starts study-nist study-loop \
 	study-motion study-flights study-inputs study-records study-asked study-slow study-coverage \
 	study-deceptive study-deceptive-many study-fleet study-mutation study-worlds study-noises \
-	study-structural \
+	study-structural study-check study-plans \
 	figures docs clean
 
 demo: $(USABLE)
@@ -91,11 +91,17 @@ study-records: $(READY)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python studies/agreement.py
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python studies/subsets.py
 
+study-check: $(READY)
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python studies/check.py
+
 study-fleet: $(READY)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python studies/fleet_common.py
 
 study-structural: $(READY)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python studies/structural.py
+
+study-plans: $(READY)
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python studies/plans.py
 
 study-mutation: $(READY)
 	$(BIN)/python studies/mutation.py

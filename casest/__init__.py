@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from casest.declaration.physics import asin as asin
     from casest.declaration.physics import atan as atan
     from casest.declaration.physics import atan2 as atan2
+    from casest.declaration.physics import before as before
     from casest.declaration.physics import cos as cos
     from casest.declaration.physics import cosh as cosh
     from casest.declaration.physics import cross as cross
@@ -54,6 +55,7 @@ if TYPE_CHECKING:
     from casest.declaration.physics import sum1 as sum1
     from casest.declaration.physics import tan as tan
     from casest.declaration.physics import tanh as tanh
+    from casest.declaration.physics import turned as turned
     from casest.declaration.physics import vertcat as vertcat
     from casest.declaration.shapes import diagonal as diagonal
     from casest.declaration.shapes import each as each

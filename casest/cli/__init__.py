@@ -12,12 +12,14 @@ import click
 
 from casest.cli import (
     beginning,
+    checking,
     comparing,
     completing,
     correcting,
     fitting,
     fleets,
     motion,
+    planning,
     reporting,
     simulating,
 )
@@ -30,7 +32,8 @@ __all__ = ["commands", "main", "run"]
 
 #: Every room adds its commands to the group as it is imported.
 ROOMS = (
-    fitting, motion, comparing, correcting, simulating, fleets, reporting, beginning, completing,
+    fitting, checking, motion, comparing, correcting, simulating, planning, fleets, reporting,
+    beginning, completing,
 )  # fmt: skip
 
 

@@ -17,8 +17,10 @@ from casest.cli.loading import (
     held_out,
     model_and_records,
     moving_model,
+    noisy,
     records,
     trajectory,
+    with_prior,
 )
 from casest.cli.options import (
     DATA,
@@ -69,8 +71,11 @@ def calibration(model_name: str, data: Sequence[str], options: FitOptions, comma
     from casest.results.calibration import calibration_result, residual_rows
     from casest.results.file import as_json, save
 
-    model, runs = model_and_records(model_name, data, options.model, options.reading)
+    model, runs = model_and_records(
+        model_name, data, options.model, options.reading, options.sensors
+    )
     hidden = held_out(model, options.holdout, data, options.reading)
+    hidden = noisy(model, hidden, options.sensors)[1] if hidden else hidden
     start = dict(given.start(model) for given in options.starts) or None
     progress(f"fitting {model_name}")
     found = attempt(model, runs, start=start, solver=options.solver, seed=options.seed)
@@ -116,7 +121,6 @@ def close(model_name: str, data: tuple[str, ...], options: CloseOptions) -> int:
 
     if isinstance(find_any(model_name), Dynamics):
         return closing_in_motion(model_name, data, options, typed())
-    refuse(options, Kind.MOVING, f"is for estimators in motion; {model_name} is a calibration")
     if options.sensor:
         return fleet_closing(model_name, data, options)
     if options.keep:
@@ -149,6 +153,8 @@ def closing(
     model = declared_model(model_name, replace(options.model, effects=()))
     runs = records(model, data, options.reading, followed)
     apart = held_out(model, options.holdout, data, options.reading, followed)
+    model, runs = noisy(with_prior(model, runs, options.model.prior), runs, options.sensors)
+    apart = noisy(model, apart, options.sensors)[1] if apart else apart
     start = dict(given.start(model) for given in options.starts) or None
     progress(f"fitting {model_name}, looking for effects")
     try:

@@ -107,7 +107,8 @@ def load_runs(
     runs = _named_apart(runs)
     if at_rest is not False:
         also = () if at_rest is True else tuple(at_rest)
-        runs = [averaged_at_rest(run, also=also) for run in runs]
+        wanders = [s.name for s in wanted if s.wanders]
+        runs = [averaged_at_rest(run, also=also, wanders=wanders) for run in runs]
     return tuple(runs)
 
 

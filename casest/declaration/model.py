@@ -16,6 +16,7 @@ from casest.declaration.changing import (
     check_units_known,
     converted_constant,
     converted_parameter,
+    uncertainty_of_coordinates,
 )
 from casest.declaration.effect import (
     NOISE,
@@ -28,7 +29,9 @@ from casest.declaration.effect import (
     check_null,
     label_of,
 )
+from casest.declaration.noise import Stated, in_units_of_noise
 from casest.declaration.physics import Quantity, Residual
+from casest.declaration.prior import Prior
 from casest.declaration.sampson import sampson
 from casest.declaration.shapes import Array
 from casest.declaration.symbols import Constant, Parameter, Scope, Signal, Symbol, constant, named
@@ -54,9 +57,12 @@ class Model:
     starter_of_many: Callable[..., Any] | None = None
     limiter: Callable[..., Any] | None = None
     remarker: Callable[..., Any] | None = None
+    refuser: Callable[..., Any] | None = None
     inverter: Callable[..., Any] | None = None
     canonicaliser: Callable[..., Any] | None = None
     estimators: tuple[tuple[str, Callable[..., Any]], ...] = ()
+    noise: Stated | None = None
+    prior: Prior | None = None
 
     def __reduce__(self) -> tuple[Any, ...]:
         """To pickle: the declaration alone; it is traced anew where it arrives."""
@@ -71,6 +77,13 @@ class Model:
         for attached in self.effects:
             own += [s for s in attached.signals if s.name not in {o.name for o in own}]
         return tuple(own)
+
+    @cached_property
+    def columns(self) -> tuple[Signal, ...]:
+        """What a sample holds: the signals, then what is stated of their noise."""
+        if self.noise is None:
+            return self.signals
+        return self.signals + self.noise.columns({s.name: s for s in self.signals})
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -130,6 +143,8 @@ class Model:
     def residual_unit(self) -> str:
         """Unit of the residual; `[v]` stands for the unit of signal v."""
         traced = self.traced
+        if traced.residual.noise:
+            return "1"
         if traced.measured is not None and not traced.residual.unit:
             return self[traced.measured].unit or f"[{traced.measured}]"
         return traced.residual.unit
@@ -179,7 +194,8 @@ class Model:
             except DeclarationError as error:
                 raise UsageError(f"{name} of model {self.name}: {error}") from None
             fixed: Constant = constant(value, new.unit)
-            return replace(fixed, name=name, frozen=old)
+            known = uncertainty_of_coordinates(name, new, old)
+            return replace(fixed, name=name, frozen=old, uncertainty=known)
         if new.array.shape != old.array.shape:
             raise UsageError(f"{name} has shape {old.array.shape}, not {new.array.shape}")
         like = old.like or (old.unit if "[" in old.unit and new.unit != old.unit else "")
@@ -379,6 +395,10 @@ class Model:
         """A model that comments on its fits: `function(model, runs, values) -> sentences`."""
         return replace(self, remarker=function)
 
+    def refusing(self, function: Callable[..., Any]) -> Model:
+        """A model that refuses fits: `function(model, runs, values) -> sentences`, or none."""
+        return replace(self, refuser=function)
+
     def canonical(self, function: Callable[..., Any]) -> Model:
         """A model that says which of equivalent values it means.
 
@@ -404,6 +424,8 @@ class Model:
     def traced(self) -> Traced:
         """The body in CasADi symbols, with every effect in place."""
         found = trace(self)
+        if self.noise is not None:
+            return in_units_of_noise(found, self.noise)
         acting = any(a.kind in ("quantity", "signal") for a in self.effects)
         if found.residual.implicit is None or not acting:
             return found
@@ -412,7 +434,18 @@ class Model:
     @cached_property
     def staged(self) -> Traced:
         """The body with a symbol in the place of what each effect gives that looks at others."""
-        return trace(self, staged=True)
+        found = trace(self, staged=True)
+        return found if self.noise is None else in_units_of_noise(found, self.noise)
+
+    @cached_property
+    def resting(self) -> bool:
+        """Does the body look back to the rest before (`before`, `turned`)?"""
+        return any(stage.word for stage in self.staged.stages)
+
+    @property
+    def sequential(self) -> bool:
+        """Does a sample's residual depend on other samples?"""
+        return self.resting or any(a.kind in OVER_TIME for a in self.effects)
 
     # -- numbers -------------------------------------------------------------------------------
 
@@ -428,10 +461,11 @@ class Model:
         missing = [s.name for s in self.signals if s.name not in values]
         if missing:
             raise UsageError(f"model {self.name} needs the signal {missing[0]!r}")
-        if any(a.kind in OVER_TIME for a in self.effects):
+        if self.sequential:
             raise UsageError(
-                f"model {self.name} has an effect on the sequence of samples: single samples have "
-                "no prediction of their own; evaluate it on a run (leastsquares.problem)"
+                f"model {self.name} has an effect on the sequence of samples, or looks at the rest "
+                "before: single samples have no prediction of their own; evaluate it on a run "
+                "(leastsquares.problem)"
             )
         traced = self.traced
         outputs = {q.name: q.value for q in traced.quantities.values()}

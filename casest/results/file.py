@@ -131,6 +131,7 @@ def load_result(path: Path) -> dict[str, Any]:
 
 #: What other commands leave in their folders.
 _WRITERS = {
+    "check.json": "check",
     "observe.json": "observe",
     "filter.json": "filter",
     "compare.json": "compare",

@@ -31,8 +31,18 @@ class SavedParameter(Struct, frozen=True):
         return self.unit if isinstance(self.unit, str) else next(iter(self.unit), "")
 
 
+class _SavedCovariance(Struct, frozen=True):
+    names: list[str]
+    matrix: list[list[float | None]]
+
+
+class _SavedNoise(Struct, frozen=True):
+    sigma: list[float]
+
+
 class _Section(Struct, frozen=True):
     parameters: dict[str, SavedParameter]
+    covariance: _SavedCovariance | UnsetType = UNSET
 
 
 class _Reproduced(Struct, frozen=True):
@@ -49,6 +59,7 @@ class SavedResult(Struct, frozen=True, kw_only=True):
     runs: list[str] = []
     constants: dict[str, Any] = {}
     scopes: dict[str, str] = {}
+    noise: _SavedNoise | None = None
     units: dict[str, str] = {}
     convention: str = ""
     estimate: _Section | UnsetType = UNSET

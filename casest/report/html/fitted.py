@@ -85,14 +85,29 @@ def _places(value: float, spread: str) -> str:
 
 def _held(held: Sequence[Held]) -> str:
     """Constants: as much a part of the answer as the unknowns."""
-    rows = []
+    rows, uncertain = [], any(c.std is not None for c in held)
     for c in held:
         value = ", ".join(f"{v:.9g}" for v in np.ravel(c.value))
-        rows.append([f"`{c.name}`", printed(value), printed_unit(c.unit) or "1"])
+        row = [f"`{c.name}`", printed(value), printed_unit(c.unit) or "1"]
+        rows.append([*row, *(_known(c) if uncertain else [])])
     if not rows:
         return ""
+    head = ["constant", "value", "unit", *(["± std", "largest share"] if uncertain else [])]
     said = "Held at these values; their own uncertainty is not in the standard deviations above."
-    return tag("h3", "Constants") + paragraph(said) + table(["constant", "value", "unit"], rows)
+    if uncertain:
+        said = (
+            "Held at these values. A standard uncertainty beside one is in the standard deviations "
+            "above; the share is the largest that it has of a variance there."
+        )
+    return tag("h3", "Constants") + paragraph(said) + table(head, rows)
+
+
+def _known(c: Held) -> list[str]:
+    """A constant's standard uncertainty, and the largest share that it has of a variance."""
+    if c.std is None:
+        return ["not stated" if c.frozen else "exact", ""]
+    std = ", ".join(f"{s:.2g}" for s in np.ravel(c.std))
+    return [printed(std), f"{printed(f'{100 * c.share:.2g}')} % of `{c.most}`"]
 
 
 # -- what is uncertain about them ------------------------------------------------------------------
