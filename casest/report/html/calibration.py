@@ -13,8 +13,8 @@ from casest.report.html.fitted import certified, parameters, reproduction, uncer
 from casest.report.html.frame import whole
 from casest.report.html.numbers import alike, printed_unit, with_unit
 from casest.report.html.page import paragraph, points, section, table
+from casest.report.html.poses import poses_seen
 from casest.report.html.residuals import convincing, residual_figures
-from casest.report.html.sphere import sphere
 from casest.results.calibration import Calibration, doubt_sentence
 from casest.results.fitted import Doubt
 from casest.results.residuals import Residuals
@@ -27,7 +27,7 @@ def calibration_page(result: Calibration, folder: str = "out") -> str:
     body = [
         _first(result.misfit) if result.misfit else "",
         parameters(result),
-        section("evidence", "The evidence", sphere(residuals.poses, figures),
+        section("evidence", "The evidence", poses_seen(residuals.poses, figures),
                 convincing(residuals, figures)) if finite else "",
         error_section(result, figures),
         section("residual", "Residual", residual_figures(residuals, figures)) if finite else "",

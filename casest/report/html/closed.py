@@ -13,8 +13,8 @@ from casest.report.html.fitted import certified, parameters, reproduction, uncer
 from casest.report.html.frame import whole
 from casest.report.html.numbers import alike, number, printed, printed_unit, with_unit
 from casest.report.html.page import details, escaped, paragraph, points, section, table, tag
+from casest.report.html.poses import poses_seen
 from casest.report.html.residuals import convincing, residual_figures
-from casest.report.html.sphere import sphere
 from casest.results.closing import Closed, Effect
 from casest.results.residuals import Residuals
 from casest.results.result import Parameter
@@ -31,7 +31,7 @@ def closing_page(result: Closed, folder: str = "out") -> str:
     changed = [_effects(result), parameters(result)]
     body = [
         *(changed if result.effects else reversed(changed)),
-        section("evidence", "The evidence", sphere(residuals.poses, figures),
+        section("evidence", "The evidence", poses_seen(residuals.poses, figures),
                 convincing(residuals, figures)),
         _errors(result, figures),
         section("residual", "Residual", residual_figures(residuals, figures)),

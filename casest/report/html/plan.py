@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from casest.report.html.directions import sphere
+from casest.report.html.sphere import sphere
 from casest.report.html.figures import Figures
 from casest.report.html.fitted import reproduction
 from casest.report.html.frame import whole

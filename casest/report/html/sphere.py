@@ -1,90 +1,71 @@
-"""The sphere of poses: which directions a record has seen, and lengths before and after."""
+"""Directions on a sphere, as two discs of equal area: the half around z up, and the half below."""
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 
 from casest.declaration.shapes import Array
-from casest.report.html.figures import Figures, axis, panel
-from casest.report.html.numbers import number
-from casest.results.poses import NEAR, Poses
+from casest.report.html.page import escaped, tag
 
-#: Poses that are drawn.
-DRAWN = 4000
-
-
-def sphere(poses: Poses | None, figures: Figures) -> str:
-    """Two halves of the sphere of equal area, and the length of each reading; nothing elsewhere."""
-    if poses is None:
-        return ""
-    halves = [_half(poses, figures, sign) for sign in (1, -1)]
-    where = ", ".join(number(v, 2) for v in poses.empty)
-    seen = figures.add(
-        "sphere",
-        (
-            "Directions of the poses.",
-            f"The sphere from above and below, equal areas as they are. "
-            f"{100 * poses.covered:.0f} % of all directions have a pose within {NEAR:g}°; the "
-            f"widest empty cap (outlined) has a half angle of {poses.radius:.0f}° around "
-            f"({where}).",
-        ),
-        halves,
-        two=True,
-    )
-    return seen + _lengths(poses, figures)
+#: Radius of a disc, and the room around it, in pixels.
+RADIUS, ROOM = 120, 22
+#: A number is shown beside its point, of as many points as can be told apart.
+NUMBERED = 60
 
 
-def _half(poses: Poses, figures: Figures, sign: int) -> dict[str, Any]:
-    turn = np.linspace(0, 2 * np.pi, 181)
-    edge = figures.series("line", "rim", np.cos(turn), y=np.sin(turn), exact=True)
-    chosen = poses.directions[:: max(1, len(poses.directions) // DRAWN)]
-    x, y = _flat(chosen[chosen[:, 2] * sign >= 0], sign)
-    dots = figures.series("points", "after", x, y=y, exact=True)
-    cap = _cap(poses.empty, np.radians(poses.radius))
-    cap_x, cap_y = _flat(np.where((cap[:, 2] * sign >= 0)[:, None], cap, np.nan), sign)
-    outline = figures.series("line", "before", cap_x, y=cap_y, exact=True)
-    drawn = [edge, dots] + ([outline] if np.isfinite(cap_x).any() else [])
-    title = "z up" if sign > 0 else "z down"
-    span = axis("direction [0]", "1", -1.04, 1.04), axis("direction [1]", "1", -1.04, 1.04)
-    return panel(title, *span, drawn, height=330, square=True)
+def sphere(planned: Sequence[Sequence[float]], covered: Sequence[Sequence[float]]) -> str:
+    """An SVG of planned directions with their numbers, and of those covered already."""
+    width, height = 4 * (RADIUS + ROOM), 2 * (RADIUS + ROOM)
+    parts = [_disc(k, sign) for k, sign in enumerate((1, -1))]
+    for direction in covered:
+        x, y = _place(np.asarray(direction))
+        parts.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="2.6" class="band edge"/>')
+    for (x, y), said in _numbered(planned):
+        parts.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="4" class="after" fill="none"/>')
+        if said:
+            parts.append(
+                f'<text x="{x + 6:.1f}" y="{y + 4:.1f}" class="label">{escaped(said)}</text>'
+            )
+    label = f"{len(planned)} planned directions and {len(covered)} covered ones on two half spheres"
+    return tag(
+        "svg", *parts, viewBox=f"0 0 {width} {height}", role="img", aria_label=label
+    ).replace("aria_label", "aria-label")
 
 
-def _flat(v: Array, sign: int) -> tuple[Array, Array]:
-    """Lambert's azimuthal projection of one half, its rim on the unit circle."""
-    with np.errstate(invalid="ignore"):
-        scale = 1 / np.sqrt(1 + np.abs(v[:, 2]))
-    return v[:, 0] * scale, v[:, 1] * scale
+def _numbered(planned: Sequence[Sequence[float]]) -> list[tuple[tuple[float, float], str]]:
+    """Places with the numbers of all that are there."""
+    places: dict[tuple[float, float], list[int]] = {}
+    for k, direction in enumerate(planned):
+        x, y = _place(np.asarray(direction))
+        places.setdefault((round(x, 1), round(y, 1)), []).append(k + 1)
+    few = len(planned) <= NUMBERED
+    return [(place, ",".join(map(str, ks)) if few else "") for place, ks in places.items()]
 
 
-def _cap(middle: Array, radius: float) -> Array:
-    """The circle at `radius` around a direction, (k, 3)."""
-    side = np.cross(middle, np.eye(3)[int(np.argmin(np.abs(middle)))])
-    side = side / np.linalg.norm(side)
-    other, turn = np.cross(middle, side), np.linspace(0, 2 * np.pi, 121)[:, None]
-    around = np.cos(turn) * side + np.sin(turn) * other
-    return np.asarray(np.cos(radius) * middle + np.sin(radius) * around)
-
-
-def _lengths(poses: Poses, figures: Figures) -> str:
-    step = max(1, len(poses.raw) // DRAWN)
-    x = np.arange(1, len(poses.raw) + 1, dtype=float)[::step]
-    raw, corrected = (100 * (v[::step] - 1) for v in (poses.raw, poses.corrected))
-    far = float(max(np.abs(raw).max(), np.abs(corrected).max())) or 1.0
-    drawn = [
-        figures.series("points", "before", x, y=raw) | {"name": "reading"},
-        figures.series("points", "after", x, y=corrected) | {"name": "corrected"},
+def _disc(k: int, sign: int) -> str:
+    x, y = (2 * k + 1) * (RADIUS + ROOM), RADIUS + ROOM
+    name = "z" if sign > 0 else "−z"
+    parts = [
+        f'<circle cx="{x}" cy="{y}" r="{RADIUS}" class="frame"/>',
+        f'<circle cx="{x}" cy="{y}" r="{RADIUS * np.sqrt(2) * np.sin(np.pi / 8):.1f}" class="grid" '
+        'fill="none"/>',
+        f'<path d="M{x - RADIUS} {y}H{x + RADIUS}M{x} {y - RADIUS}V{y + RADIUS}" class="grid"/>',
+        f'<text x="{x}" y="{y - 4}" text-anchor="middle" class="title">{name}</text>',
     ]
-    shown = panel(
-        "length",
-        axis("pose number", "1", 1.0, float(len(poses.raw)), room=0.02),
-        axis("off its median", "%", -far, far, room=0.06),
-        drawn,
-        height=190,
-    )
-    caption = (
-        "Length of every reading before and after.",
-        "It is one in every pose, if all is right.",
-    )
-    return figures.add("lengths", caption, [shown])
+    for dx, dy, text in ((1, 0, "x"), (-1, 0, "−x"), (0, -1, "y"), (0, 1, "−y")):
+        at = RADIUS + 11
+        parts.append(
+            f'<text x="{x + dx * at}" y="{y + dy * at + 4}" text-anchor="middle">{text}</text>'
+        )
+    return "".join(parts)
+
+
+def _place(direction: Array) -> tuple[float, float]:
+    """Equal-area projection (Lambert 1772) of a unit vector, from +z or −z, in pixels."""
+    x, y, z = direction / np.linalg.norm(direction)
+    half = 0 if z >= -1e-9 else 1
+    factor = RADIUS / np.sqrt(1 + abs(z))
+    middle = (2 * half + 1) * (RADIUS + ROOM)
+    return float(middle + factor * x), float(RADIUS + ROOM - factor * y)
