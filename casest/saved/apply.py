@@ -68,7 +68,7 @@ def corrected_csv(
     spreads = [stds(carried.spread, program, run, value) for run, value in pairs]
     text = table_of(runs, [s.name for s in needed], found, program.output.name, unit, spreads)
     notes = dict.fromkeys(note for run in runs for note in run.notes)
-    far = () if _was_fitted(result, data) else beyond(program, with_margin(carried), runs)
+    far = () if _was_fitted(result, data) else extrapolated(carried, runs)
     return Applied(text, program.left, (*notes, *_of_units(result, runs, data), *far))
 
 
@@ -86,6 +86,11 @@ def _of_units(result: SavedResult, runs: Sequence[Run], data: str) -> Iterator[s
                 f"{data}: {name} is in {unit}; nobody stated the unit of {name} when the result "
                 "was made, and it is taken to be the same: calibrate again with --unit to be sure"
             )
+
+
+def extrapolated(carried: Carried, runs: Sequence[Run]) -> Iterator[str]:
+    """How many samples lie outside what the calibration saw, and in which numbers."""
+    return beyond(carried.program, with_margin(carried), runs)
 
 
 def with_margin(carried: Carried) -> tuple[tuple[float, float] | None, ...]:
