@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: demo test lint types format wheel bench study study-starts study-nist study-loop \
+.PHONY: demo test lint types format wheel bench study study-metrology study-metrology-coverage study-starts study-nist study-loop \
 	study-motion study-flights study-inputs study-records study-asked study-slow study-coverage \
 	study-deceptive study-deceptive-many study-fleet study-mutation study-worlds study-noises \
 	study-structural \
@@ -49,6 +49,12 @@ study-starts: $(READY)
 
 study-nist: $(READY)
 	$(BIN)/python studies/nist.py
+
+study-metrology: $(READY)
+	$(BIN)/python studies/metrology.py
+
+study-metrology-coverage: $(READY)
+	$(BIN)/python studies/metrology_coverage.py
 
 study-coverage: $(READY)
 	$(BIN)/python studies/coverage.py

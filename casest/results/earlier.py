@@ -129,7 +129,8 @@ def _covariance(saved: SavedResult, where: str) -> tuple[list[str], Array]:
     if section and section.covariance:
         found = section.covariance
         owners = [name.partition("[")[0].partition(" (")[0] for name in found.names]
-        if any(len(row) != len(owners) for row in (found.matrix, *found.matrix)):
+        sizes = {len(found.matrix), *(len(row) for row in found.matrix)}
+        if sizes != {len(owners)}:
             raise DataError(f"{where}: its covariance is no square; calibrate again")
         return owners, np.array(found.matrix, dtype=float).reshape(len(owners), len(owners))
     owners, stds = [], list[float]()
