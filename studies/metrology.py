@@ -217,7 +217,8 @@ HEAD = """# Published calibrations with uncertainties
 Made by `make study-metrology` (`studies/metrology.py`). Every printed digit of values, standard
 uncertainties, covariance and χ² counts: what was published beside what casest gives. "χ² there"
 is that at the printed values over casest's least, less one (true values projected): of digits that
-were rounded it is a little more than zero; below zero casest's would be no minimum. ODRPACK's examples stop at half of the
+were rounded it is a little more than zero; below zero casest's would be no minimum. ODRPACK's
+examples stop at half of the
 digits that a double has. Of the ellipse casest takes off the mean that curvature gives a residual,
 which ODRPACK does not: hence other values, by fractions of their standard deviations.
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
@@ -32,9 +32,6 @@ from casest.cli.options import (
 )
 from casest.cli.shared import commands, echo, progress, reported, typed, write
 from casest.errors import NotTrusted, UsageError
-
-if TYPE_CHECKING:
-    pass
 
 
 @commands.command("list")
@@ -131,8 +128,14 @@ def close(model_name: str, data: tuple[str, ...], options: CloseOptions) -> int:
     return closing(model_name, data, options, typed())
 
 
-def closing(model_name: str, data: Sequence[str], options: FitOptions, command: str) -> int:
-    """Read, close the loop, save, print."""
+def closing(
+    model_name: str,
+    data: Sequence[str],
+    options: FitOptions,
+    command: str,
+    first: Callable[[Path], str] | None = None,
+) -> int:
+    """Read, close the loop, save, print; `first` is what is said of the folder before the rest."""
     from casest.diagnose import loop
     from casest.diagnose.held_out import scored
     from casest.effects import CATALOGUE
@@ -178,6 +181,8 @@ def closing(model_name: str, data: Sequence[str], options: FitOptions, command: 
             result = with_formula_in(result, options.output / "formula.py", formula)
         save(options.output, result.content(), residual_rows(found, hidden))
         reported(options.output, closing_page(result, str(options.output)))
+        if first is not None:
+            echo(first(options.output) + "\n")
     if options.as_json:
         echo(as_json(result.content()), nl=False)
     else:
@@ -252,12 +257,10 @@ def refused(
 @click.option("-o", "--output", default=Path("out"), **RESULTS)
 def demo(output: Path) -> int:
     """Close the loop on a shipped record with an effect that its model lacks."""
-    from casest.data.write import written_together
-    from casest.demo import WHEEL, comparison
+    from casest.data.write import written_at_once
+    from casest.demo import WHEEL, story
 
     words = f"casest close wheel {WHEEL} -o {output}"
     echo(f"$ {words}\n")
-    with written_together():  # `comparison` reads them
-        code = closing("wheel", (str(WHEEL),), FitOptions(output=output), words)
-    echo("\n" + comparison(output))
-    return code
+    with written_at_once():  # the story is read from them
+        return closing("wheel", (str(WHEEL),), FitOptions(output=output), words, first=story)

@@ -122,7 +122,9 @@ def records(
         seen.add(Path(name).resolve())
     known = {"t", *model.quantities, *(s.name for s in model.signals)}
     extra = [column for column in followed if column not in known]
-    return load_runs(list(data), model.signals, extra=extra, **options.keywords())
+    given = options.keywords()
+    given["at_rest"] = given["at_rest"] or model.resting
+    return load_runs(list(data), model.signals, extra=extra, **given)
 
 
 def held_out(

@@ -108,6 +108,13 @@ class ReadingOptions:
         type=click.Choice(["first", "column"]),
         help="t = 0 at each run's first sample, or where the column has it.",
     )
+    project: str | None = flag(
+        None,
+        "--project",
+        type=click.Path(),
+        metavar="FILE",
+        help="Options in a TOML file, written by `casest init`; what is typed overrides them.",
+    )
 
     def keywords(self) -> dict[str, Any]:
         """Keyword arguments of `load_runs`."""

@@ -37,8 +37,8 @@ from casest.declaration.shapes import Array
 from casest.declaration.symbols import Constant, Parameter, Scope, Signal, Symbol, constant, named
 from casest.declaration.tracing import Traced, describe, function_of, reached_parameters, trace
 from casest.declaration.travelling import reduced
-from casest.errors import DeclarationError, UnitError, UsageError
-from casest.units import known, size
+from casest.errors import CasestError, DeclarationError, UnitError, UsageError
+from casest.units import known, parse_quantity, size
 
 
 @dataclass(frozen=True)
@@ -57,6 +57,7 @@ class Model:
     starter_of_many: Callable[..., Any] | None = None
     limiter: Callable[..., Any] | None = None
     remarker: Callable[..., Any] | None = None
+    refuser: Callable[..., Any] | None = None
     inverter: Callable[..., Any] | None = None
     canonicaliser: Callable[..., Any] | None = None
     estimators: tuple[tuple[str, Callable[..., Any]], ...] = ()
@@ -147,6 +148,8 @@ class Model:
     def residual_unit(self) -> str:
         """Unit of the residual; `[v]` stands for the unit of signal v."""
         traced = self.traced
+        if traced.residual.noise:
+            return "1"
         if traced.measured is not None and not traced.residual.unit:
             return self[traced.measured].unit or f"[{traced.measured}]"
         return traced.residual.unit
@@ -174,8 +177,8 @@ class Model:
     def having(self, **changes: Any) -> Model:
         """A model with constants set, parameters redeclared, or either turned into the other.
 
-        A number fixes (`radius=0.3`), a `param(…)` frees (`radius=param("m", start=0.28)`), a
-        `constant(…)` sets value and unit.
+        A number fixes (`radius=0.3`), also with its unit (`norm="48 uT"`), a `param(…)` frees
+        (`radius=param("m", start=0.28)`), a `constant(…)` sets value and unit.
         """
         model = self
         for name, change in changes.items():
@@ -188,7 +191,7 @@ class Model:
             raise UsageError(f"{name} is a signal of model {self.name}: data give it, not having()")
         if isinstance(change, Parameter):
             return replace(converted_parameter(name, change, old), name=name)
-        new = change if isinstance(change, Constant) else constant(change, old.unit)
+        new = change if isinstance(change, Constant) else _stated(name, change, old.unit)
         new = converted_constant(name, new, old.unit)
         if isinstance(old, Parameter):
             try:
@@ -397,6 +400,10 @@ class Model:
         """A model that comments on its fits: `function(model, runs, values) -> sentences`."""
         return replace(self, remarker=function)
 
+    def refusing(self, function: Callable[..., Any]) -> Model:
+        """A model that refuses fits: `function(model, runs, values) -> sentences`, or none."""
+        return replace(self, refuser=function)
+
     def canonical(self, function: Callable[..., Any]) -> Model:
         """A model that says which of equivalent values it means.
 
@@ -435,6 +442,16 @@ class Model:
         found = trace(self, staged=True)
         return found if self.noise is None else in_units_of_noise(found, self.noise)
 
+    @cached_property
+    def resting(self) -> bool:
+        """Does the body look back to the rest before (`before`, `turned`)?"""
+        return any(stage.word for stage in self.staged.stages)
+
+    @property
+    def sequential(self) -> bool:
+        """Does a sample's residual depend on other samples?"""
+        return self.resting or any(a.kind in OVER_TIME for a in self.effects)
+
     # -- numbers -------------------------------------------------------------------------------
 
     def __call__(self, **values: Any) -> dict[str, Array]:
@@ -449,10 +466,11 @@ class Model:
         missing = [s.name for s in self.signals if s.name not in values]
         if missing:
             raise UsageError(f"model {self.name} needs the signal {missing[0]!r}")
-        if any(a.kind in OVER_TIME for a in self.effects):
+        if self.sequential:
             raise UsageError(
-                f"model {self.name} has an effect on the sequence of samples: single samples have "
-                "no prediction of their own; evaluate it on a run (leastsquares.problem)"
+                f"model {self.name} has an effect on the sequence of samples, or looks at the rest "
+                "before: single samples have no prediction of their own; evaluate it on a run "
+                "(leastsquares.problem)"
             )
         traced = self.traced
         outputs = {q.name: q.value for q in traced.quantities.values()}
@@ -533,3 +551,15 @@ def _reaches_residual(made: Model, attached: Attached) -> bool:
 
 def _rows(value: Any, declared: Signal) -> Array:
     return np.asarray(value, dtype=float).reshape(-1, declared.size)
+
+
+def _stated(name: str, value: Any, unit: str) -> Constant:
+    """A constant from a number, or from text with its unit."""
+    if isinstance(value, str):
+        try:
+            value, stated = parse_quantity(value)
+        except CasestError as error:
+            raise type(error)(f"{name}: {error}") from None
+        unit = stated or unit
+    found: Constant = constant(value, unit)
+    return found

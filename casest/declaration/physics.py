@@ -56,8 +56,10 @@ class Trace:
     quantities: dict[str, Quantity] = field(default_factory=dict)
     handed: dict[str, SX] = field(default_factory=dict)
     steps: list[tuple[SX, SX]] = field(default_factory=list)
-    #: Effects that look at other samples (tracing.Stage), in the order of the body.
+    #: What looks at other samples (tracing.Stage), in the order of the body.
     stages: list[Any] = field(default_factory=list)
+    #: How a word of the body that does so is handed on (tracing.reached).
+    reach: Any = None
 
     def enter(self, name: str, expression: Any, unit: str, *, implied: bool = False) -> SX:
         """Record a quantity and hand back what the rest of the body shall see."""
@@ -95,6 +97,27 @@ def quantity(name: str, expression: Any, unit: str = "") -> SX:
     return trace.enter(name, expression, unit)
 
 
+def before(expression: Any) -> SX:
+    """What an expression was at the rest before; of a record's first rest there is none."""
+    return _over_samples("before", expression)
+
+
+def turned(rate: Any) -> SX:
+    """How far the body has turned since the rest before: R (3, 3) of its angular rate in rad/s.
+
+    The rate, in the body's own frame, is integrated over the raw record between the two rests. A
+    direction that stands still, seen as x there, is now seen as R.T @ x.
+    """
+    return _over_samples("turned", rate)
+
+
+def _over_samples(word: str, expression: Any) -> SX:
+    trace = current_trace.get()
+    if trace is None or trace.reach is None:
+        raise DeclarationError(f"{word}(…) belongs in the body of a @model function")
+    return trace.reach(trace, word, ca.SX(expression))
+
+
 def polynomial(coefficients: Any, variable: SX) -> SX:
     """c[0] + c[1]·x + c[2]·x² + …, by Horner's rule."""
     coefficients = ca.SX(coefficients)
@@ -127,7 +150,7 @@ def der(expression: SX, variable: SX) -> SX:
     if trace is not None and trace.naming and expression.is_symbolic():
         return ca.SX.sym(f"der({expression})")
     for stage in [] if trace is None else trace.stages:
-        if ca.depends_on(ca.vec(ca.SX(expression)), stage.given):
+        if stage.attached is not None and ca.depends_on(ca.vec(ca.SX(expression)), stage.given):
             on, label = stage.attached.on, stage.attached.label
             raise DeclarationError(f"how fast {on} changes is unknown once {label} acts on it")
     return ca.jtimes(ca.SX(expression), variable, ca.SX.ones(*variable.shape))
@@ -151,6 +174,8 @@ class Residual:
     Explicit: `Residual(measured=v, predicted=reading)` with residual v − reading. Implicit:
     `Residual(implicit=expression, unit="m/s^2")`, an expression that is zero but for noise; its
     unit should be that of the reading. `corrected` is the quantity that `apply` gives back.
+    `noise` names for each axis the constant that is its standard deviation: a residual of several
+    kinds is then counted in standard deviations, and what is 0 is found from the data.
     """
 
     def __init__(
@@ -162,12 +187,13 @@ class Residual:
         corrected: SX = None,
         unit: str = "",
         axes: tuple[str, ...] = (),
+        noise: tuple[str, ...] = (),
     ) -> None:
         explicit = measured is not None and predicted is not None
         if explicit == (implicit is not None):
             raise DeclarationError("Residual takes measured= and predicted=, or implicit= alone")
         self.measured, self.predicted, self.implicit = measured, predicted, implicit
-        self.corrected, self.unit, self.axes = corrected, unit, axes
+        self.corrected, self.unit, self.axes, self.noise = corrected, unit, axes, noise
 
     @property
     def expression(self) -> SX:

@@ -29,17 +29,21 @@ class Signal:
     unit: str | None
     kind: Literal["plain", "rotation"] = "plain"
     held: bool = False
+    wanders: bool = False
 
 
-def signal(shape: int | str = 1, unit: str | None = None, *, held: bool = False) -> Any:
+def signal(
+    shape: int | str = 1, unit: str | None = None, *, held: bool = False, wanders: bool = False
+) -> Any:
     """Declare a measured input: `signal("s")`, `signal(3, "m/s^2")`, `signal(3)` (any unit).
 
     `held`: an input of an estimator in motion that keeps its value between samples (a command to a
-    motor) in place of a straight line.
+    motor) in place of a straight line. `wanders`: its mean may wander while the sensor lies still,
+    as a gyroscope's does; rest is looked for in its noise alone.
     """
     if isinstance(shape, str):
-        return Signal("", 1, shape, held=held)
-    return Signal("", shape, unit, held=held)
+        return Signal("", 1, shape, held=held, wanders=wanders)
+    return Signal("", shape, unit, held=held, wanders=wanders)
 
 
 def attitude() -> Any:

@@ -10,7 +10,7 @@ import textwrap
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import casadi as ca
 
@@ -95,20 +95,25 @@ class Traced:
     stages: tuple[Stage, ...] = ()
 
 
+#: Words of a body that look at the rest before.
+Word = Literal["", "before", "turned"]
+
+
 @dataclass(frozen=True)
 class Stage:
-    """An effect that looks at other samples, where it acts.
+    """What looks at other samples, where it acts: an effect, or a word of the body.
 
     `taken` is what it takes at a sample, one column: the value acted on, then what else it reads;
     `given` the symbol that stands for what it gives, a column as long as the value; `shape` is the
     value's, and `read` the names and shapes of what else it reads.
     """
 
-    attached: Attached
+    attached: Attached | None
     taken: SX
     given: SX
     shape: tuple[int, int] = (1, 1)
     read: tuple[tuple[str, tuple[int, int]], ...] = ()
+    word: Word = ""
 
 
 def trace(
@@ -128,6 +133,7 @@ def trace(
     """
     symbols, coordinates, references = _symbols(model)
     running = Trace(cut=cut, naming=naming, straight=straight, reserved=frozenset(symbols))
+    running.reach = _staged_word if staged else _as_if_at_rest
     for attached in model.effects:
         if attached.kind == "quantity":
             running.effects.setdefault(attached.on, []).append(_applied(attached, symbols, running))
@@ -145,7 +151,7 @@ def trace(
         ca.vertcat(*references),
         running.quantities,
         residual,
-        ca.densify(residual.expression),
+        ca.densify(_in_deviations(model, residual, symbols)),
         None if residual.predicted is None else ca.vec(ca.SX(residual.predicted)),
         None if residual.measured is None else ca.vec(residual.measured),
         measured,
@@ -208,6 +214,39 @@ def _staged(attached: Attached, symbols: Mapping[str, SX], running: Trace) -> Ca
         return ca.reshape(given, *value.shape)
 
     return apply
+
+
+def _staged_word(running: Trace, word: Word, value: SX) -> SX:
+    """A symbol in the place of what a word of the body gives."""
+    if word == "turned" and value.shape != (3, 1):
+        raise DeclarationError(f"turned(…) takes a rate about three axes, not {value.shape}")
+    shape = (3, 3) if word == "turned" else value.shape
+    given = ca.SX.sym(word, shape[0] * shape[1])
+    running.stages.append(Stage(None, ca.vec(value), given, shape, (), word))
+    return ca.reshape(given, *shape)
+
+
+def _as_if_at_rest(running: Trace, word: Word, value: SX) -> SX:
+    """Of a single sample: all was as it is, and the body has turned for a second."""
+    return value if word == "before" else ca.SX.eye(3) + ca.skew(value)
+
+
+def _in_deviations(model: Declared, residual: Residual, symbols: Mapping[str, SX]) -> SX:
+    """The residual, each axis over the constant that is its noise, where that is known."""
+    found = residual.expression
+    if not residual.noise:
+        return found
+    constants = {c.name for c in model.constants}
+    for name in residual.noise:
+        if name not in constants and not isinstance(symbols.get(name), ca.SX):
+            raise DeclarationError(f"model {model.name}: noise= names {name!r}, no constant of it")
+    if len(residual.noise) != found.numel():
+        raise DeclarationError(
+            f"model {model.name}: noise= has {len(residual.noise)} names for {found.numel()} axes"
+        )
+    sizes = [symbols[name] for name in residual.noise]
+    known = [1.0 if isinstance(size, float) and not size > 0 else size for size in sizes]
+    return found / ca.vertcat(*known)
 
 
 def _run_body(model: Declared, running: Trace, symbols: Mapping[str, SX]) -> Residual:

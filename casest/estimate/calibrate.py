@@ -28,11 +28,13 @@ from casest.estimate.reasons import POOR, STARTS, WORTH, Code
 from casest.estimate.remarks import NOTABLE_BIAS
 from casest.estimate.valley import looked_for
 from casest.leastsquares.identifiability import Identifiability, identify, weak_directions
+from casest.leastsquares.kinds import in_deviations
 from casest.leastsquares.problem import Point, Problem
 from casest.leastsquares.stated import chi_square
 from casest.leastsquares.sums import repeat_noise, second_order_bias
 from casest.solve.outcome import Outcome
 from casest.solve.strategy import SOLVERS, best_of, solve, valleys
+from casest.solve.trust_region import trust_region
 
 #: From this many degrees of freedom on the residual alone says how large the noise is.
 ENOUGH_FREEDOM = 10
@@ -96,6 +98,7 @@ def _attempt(
     nowhere = _not_finite(problem, first)
     if nowhere:
         return _refused(problem, first, Code.NOT_FINITE, nowhere, began)
+    problem = in_deviations(problem, first, _fitted)
     problem, outcomes = solve(
         problem,
         first,
@@ -114,7 +117,13 @@ def _attempt(
         found = _looked_at_for_a_better_one(found)
     if found.certificate.trusted:
         found = _no_random_walk(found)
+    if found.certificate.trusted and problem.model.refuser is not None:
+        found = _judged_by_the_model(found)
     return by_estimator(found, own[solver], solver) if solver in own else found
+
+
+def _fitted(problem: Problem, first: Point) -> Point:
+    return trust_region(problem, first).point
 
 
 def _enough(problem: Problem) -> None:
@@ -263,6 +272,15 @@ def _no_random_walk(found: Estimate) -> Estimate:
         return found
     reason = words.wandering(starts - 1, found.correlated_over, worth, unknowns)
     return replace(found, certificate=found.certificate.refused(Code.POOR_VALLEY, reason))
+
+
+def _judged_by_the_model(found: Estimate) -> Estimate:
+    """Refuse what the model itself says is no calibration."""
+    problem = found.problem
+    assert problem.model.refuser is not None
+    for reason in problem.model.refuser(problem.model, problem.runs, found.values):
+        return replace(found, certificate=found.certificate.refused(Code.MODEL, reason))
+    return found
 
 
 def _canonical(problem: Problem, best: Outcome) -> Outcome:

@@ -22,6 +22,7 @@ from casest.estimate.profile_likelihood import half_width
 from casest.estimate.propagation import Inputs
 from casest.estimate.remarks import notes, of_stated_noise
 from casest.leastsquares.identifiability import Identifiability, Weak
+from casest.leastsquares.kinds import freedom
 from casest.leastsquares.problem import Point, Problem
 from casest.leastsquares.stated import UNLIKELY, ChiSquare
 from casest.solve.outcome import Outcome
@@ -109,6 +110,14 @@ class Estimate:
         R = self.problem.factor(at)[0]
         return self._spread(sandwich(self.problem, at, R, self.correlated_over, self.free))
 
+    @cached_property
+    def information(self) -> Array:
+        """The inverse of the covariance (n, n); JᵀJ/σ² where that has none."""
+        if self.identifiability.rank == self.problem.unknowns and self.free.all():
+            return np.asarray(np.linalg.inv(self.covariance))
+        R = self.problem.factor(self.optimum or self.point)[0]
+        return np.asarray(R.T @ R / self.noise.sigma**2)
+
     @property
     def free(self) -> NDArray[np.bool_]:
         """Which unknowns are on no bound, (n,)."""
@@ -182,16 +191,17 @@ class Estimate:
 
         What comes of references counts as known exactly: their standard uncertainties are.
         """
-        freedom = int(self.noise.degrees_of_freedom / self.correlated_over)
+        most, own = self.noise.degrees_of_freedom, freedom(self.problem, self.optimum or self.point)
+        each = np.full(self.problem.unknowns, most) if own is None else np.minimum(own, most)
+        each = np.trunc(each / self.correlated_over)
         if self.noise.known and self.correlated_over <= 1:
-            freedom = UNLIMITED
-        if self.inputs is None:
-            return (freedom,) * self.problem.unknowns
-        variance, known = np.diag(self.covariance), np.diag(self.inputs.carried)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            larger = np.square(variance / np.maximum(variance - known, 1e-12 * variance))
-        larger = np.where(np.isfinite(larger), larger, 1.0)
-        return tuple(int(min(freedom * ratio, UNLIMITED)) for ratio in larger)
+            each[:] = UNLIMITED
+        if self.inputs is not None:
+            variance, known = np.diag(self.covariance), np.diag(self.inputs.carried)
+            with np.errstate(invalid="ignore", divide="ignore"):
+                larger = np.square(variance / np.maximum(variance - known, 1e-12 * variance))
+            each = each * np.where(np.isfinite(larger), larger, 1.0)
+        return tuple(int(min(f, UNLIMITED)) for f in each)
 
     @property
     def names(self) -> tuple[str, ...]:

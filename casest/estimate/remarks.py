@@ -44,6 +44,7 @@ def notes(
             "deviations (second order), which the printed ones contain: average readings at rest "
             "(--at-rest), or filter them"
         )
+    yield from _too_fast(problem)
     yield from _runs_that_disagree(problem, point, correlated)
     yield from _furthest_out(problem, point)
 
@@ -67,6 +68,18 @@ def of_stated_noise(found: ChiSquare | None) -> Iterator[str]:
         )
     else:
         yield f"{said} (p = {found.larger:.2g}): {larger}, as chance may have it"
+
+
+def _too_fast(problem: Problem) -> Iterator[str]:
+    """Turns between rests that a sensor could not follow."""
+    for r, run in enumerate(problem.runs):
+        lost = problem.lost(r)
+        if len(lost):
+            listed = ", ".join(str(int(k)) for k in lost[:5]) + ", …" * (len(lost) > 5)
+            yield (
+                f"{run.name}: {len(lost)} of {len(run) - 1} turns are left out, since a reading "
+                f"stays at its full scale on the way (to rest interval {listed}): turn more slowly"
+            )
 
 
 def _runs_that_disagree(problem: Problem, point: Point, correlated: float) -> Iterator[str]:

@@ -12,7 +12,6 @@ from itertools import pairwise
 import casadi as ca
 import numpy as np
 
-from casest.declaration.effect import OVER_TIME
 from casest.declaration.model import Model
 from casest.declaration.tracing import function_of, sample_symbol
 from casest.engine import Replay
@@ -32,7 +31,7 @@ def linear(model: Model) -> bool:
     t = model.traced
     if any(p.shape.curved for p in model.parameters):
         return False
-    if any(a.kind in OVER_TIME for a in model.effects):
+    if model.sequential:
         return False
     return not ca.depends_on(ca.jacobian(t.expression, t.coordinates), t.coordinates)
 

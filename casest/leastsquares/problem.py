@@ -16,7 +16,6 @@ import casadi as ca
 import numpy as np
 
 from casest.data.run import Run
-from casest.declaration.effect import OVER_TIME
 from casest.declaration.model import Model
 from casest.declaration.physics import chart
 from casest.declaration.shapes import Array
@@ -85,12 +84,14 @@ class Problem:
     """The sum of squares of a model's residuals over runs.
 
     `weights` (one (N, m) array per run, or None) multiply the squares. Residuals are in the
-    model's residual unit. Jacobians are with respect to the unknowns `x`.
+    model's residual unit. Jacobians are with respect to the unknowns `x`. `whitening` (one
+    (N·m, N·m) per run, or None) takes from residuals of rests what they share with those before.
     """
 
     model: Model
     runs: tuple[Run, ...]
     weights: tuple[Array, ...] | None = None
+    whitening: tuple[Array, ...] | None = None
 
     # -- layout --------------------------------------------------------------------------------
 
@@ -117,8 +118,19 @@ class Problem:
     @property
     def residual_count(self) -> int:
         """Number of scalar residuals; what is known before counts as one for each number."""
-        own = sum(len(run) for run in self.runs) * len(self.model.axes)
-        return own if self.model.prior is None else own + len(self.model.prior.covariance)
+        every = sum(len(run) for run in self.runs) * len(self.model.axes)
+        every -= sum(int(np.sum(~p)) for p in self.present if p is not None)
+        return every if self.model.prior is None else every + len(self.model.prior.covariance)
+
+    def lost(self, r: int) -> Any:
+        """Rests of a run before which a sensor was beyond its range, by number."""
+        return np.zeros(0) if self._staged is None else self._staged.lost(r)
+
+    @cached_property
+    def present(self) -> tuple[Any, ...]:
+        """Which residuals (N, m) of each run there are; None where all are."""
+        staged = self._staged
+        return tuple(None if staged is None else staged.present(r) for r in range(len(self.runs)))
 
     @property
     def noise_scale(self) -> float | None:
@@ -345,6 +357,11 @@ class Problem:
     def _with_jacobian(self) -> Replay:
         return residual_and_jacobian(self.model)
 
+    def slopes_in_readings(self, point: Point, r: int) -> tuple[Array, Array]:
+        """∂r/∂s of one run's rests, (N, m, k) each: in their own means, and in those before."""
+        assert self._staged is not None
+        return self._staged.slopes_in_readings(self.parameters(point, r), r)
+
     @property
     def compiled(self) -> bool:
         """Have sums been computed by a compiled kernel? Else by NumPy, with other last digits."""
@@ -353,8 +370,7 @@ class Problem:
     @cached_property
     def _staged(self) -> Staged | None:
         """Where an effect looks at other samples, rows come from the record as a whole."""
-        sequential = any(a.kind in OVER_TIME for a in self.model.effects)
-        return Staged(self.model, self.runs) if sequential else None
+        return Staged(self.model, self.runs, self.whitening) if self.model.sequential else None
 
     def _rows(self, point: Point, r: int, span: slice = slice(None)) -> tuple[Array, Array]:
         """Residuals (N, m) and Jacobians (N, m, n of the run) of one run, unweighted."""
@@ -405,7 +421,8 @@ class Problem:
 
     def _run_cost(self, point: Point, r: int) -> float:
         if self._staged is not None:
-            return 0.5 * float(np.sum(self._weighted_rows(point, r)[:, -1] ** 2))
+            residual, weights = self._residuals(point, r), self._weight(r)
+            return 0.5 * float(np.sum(residual**2 if weights is None else weights * residual**2))
         parameters = self.parameters(point, r)
         return cost(self._with_jacobian, parameters, self.samples[r], self._weight(r))
 
@@ -523,9 +540,9 @@ class Problem:
         return tuple(self._residuals(point, r) for r in range(len(self.runs)))
 
     def _residuals(self, point: Point, r: int, span: slice = slice(None)) -> Array:
-        if self.sequential:
-            return self._rows(point, r, span)[0]
         parameters = self.parameters(point, r)
+        if self._staged is not None:  # without slopes
+            return self._staged.rows(parameters, self.samples[r].dense, r, ())[0][span]
         return residuals(self._with_jacobian, parameters, self.samples[r][span])
 
     def residual_blocks(self, point: Point) -> Iterator[tuple[int, slice, Array]]:

@@ -17,6 +17,7 @@ from msgspec import UNSET, Struct, UnsetType
 from casest.correction.carried import Carried, carried
 from casest.correction.reading import carried_data
 from casest.correction.spread import spread_program
+from casest.data.run import Run
 from casest.declaration.effect import Attached
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
@@ -39,6 +40,15 @@ from casest.results.result import (
 from casest.results.uncertainty import CorrectedBudget, Covariance, Input, corrected_budget
 from casest.results.units import unit_table
 from casest.results.values import Entry, Held, entries, held
+from casest.validity.colour import colour_of
+
+
+class Spectrum(Struct, frozen=True):
+    """Noise that is not white: power of each axis, up to a factor, over cycles per sample."""
+
+    frequency: list[float]
+    power: list[list[float]]
+    samples_per_second: Number
 
 
 class Noise(Struct, frozen=True):
@@ -76,10 +86,16 @@ class NoiseModel(Noise, frozen=True):
 
 
 class Correlation(Struct, frozen=True):
-    """Correlation of the unknowns: null where the data do not determine one."""
+    """Correlation of the unknowns, and the standard deviation of each: null where the data do not
+    determine one.
+
+    `information` is the inverse of their covariance, from which a plan goes on.
+    """
 
     names: list[str]
     matrix: list[list[Number]]
+    std: list[Number]
+    information: list[list[Number]]
 
 
 class Section(Struct, frozen=True, kw_only=True):
@@ -214,6 +230,8 @@ class Fitted(Result, frozen=True, kw_only=True, dict=True):
     invisible: Sequence[Any] | None
     unexplained: Any
     misfit: list[Doubt] | None
+    spectrum: Spectrum | None
+    conditions: dict[str, list[float]]
     corrected: Corrected | None
     units: dict[str, str]
     solver: Solver
@@ -273,6 +291,8 @@ def fitted_content(
             weak_of(estimate),
         ),
         "scatter_between_runs": _scatter(estimate),
+        "spectrum": _spectrum(estimate),
+        "conditions": ranges(problem.runs),
         "corrected": corrected,
         "units": units,
         "solver": _solver(estimate),
@@ -301,7 +321,8 @@ def correlation_of(estimate: Estimate) -> Correlation:
     std = np.sqrt(np.diag(estimate.covariance))
     with np.errstate(invalid="ignore", divide="ignore"):
         matrix = np.asarray(estimate.covariance / np.outer(std, std))
-    return Correlation(list(estimate.names), plain(matrix))
+    names, information = list(estimate.names), plain(estimate.information)
+    return Correlation(names, plain(matrix), plain(std), information)
 
 
 def _noise(estimate: Estimate, unit: str) -> Noise:
@@ -317,6 +338,27 @@ def _noise(estimate: Estimate, unit: str) -> Noise:
         None if chi is None else plain(chi.value),
         None if chi is None else plain(chi.larger),
     )
+
+
+def _spectrum(estimate: Estimate) -> Spectrum | None:
+    """The noise's colour, for judging later records; null where it is white."""
+    found = colour_of(estimate) if estimate.certificate.trusted else None
+    if found is None:
+        return None
+    return Spectrum(found.frequency.tolist(), found.power.tolist(), plain(found.rate))
+
+
+def ranges(runs: Sequence[Run]) -> dict[str, list[float]]:
+    """Least and greatest of every other column of numbers: under what conditions it was fitted."""
+    found: dict[str, list[float]] = {}
+    for name in sorted({name for run in runs for name in run.columns}):
+        parts = [np.asarray(run.columns[name]) for run in runs if name in run.columns]
+        if all(p.dtype.kind in "fiu" for p in parts):
+            values = np.concatenate(parts).astype(float)
+            values = values[np.isfinite(values)]
+            if values.size:
+                found[name] = [float(values.min()), float(values.max())]
+    return found
 
 
 def noise_of(noise: Noise) -> tuple[Array, str]:

@@ -34,7 +34,7 @@ STRONG, SPOKEN = 0.9, 8
 def parameters(result: Fitted) -> str:
     """Values with uncertainty; beside each other and how far they moved, where there are two."""
     sides = result.residuals.sides
-    rows = [[f"`{e.name}`", *map(printed, _cells(e)), printed_unit(e.unit)] for e in result.entries]
+    rows = parameter_rows(result)
     head = ["parameter", "value", "± std", "95 % from", "to", "unit"]
     said = "± is one standard deviation; the interval holds 95 %."
     if len(sides) > 1:
@@ -43,6 +43,11 @@ def parameters(result: Fitted) -> str:
         said += " Moved: in the value's own standard deviation before."
     shown = table(head, rows, range(1, len(head) - 1))
     return section("parameters", "Parameters", paragraph(said), shown, _held(result.held))
+
+
+def parameter_rows(result: Fitted) -> list[list[str]]:
+    """Name, value, standard deviation, interval and unit of every number."""
+    return [[f"`{e.name}`", *map(printed, _cells(e)), printed_unit(e.unit)] for e in result.entries]
 
 
 def _cells(e: Entry) -> list[str]:
