@@ -6,7 +6,8 @@ READY := $(VENV)/.ready
 # What a demo needs alone: a tenth of the developers' tools.
 USABLE := $(VENV)/.usable
 
-.PHONY: demo test lint types format wheel bench study study-imu study-starts study-nist study-loop \
+.PHONY: demo test lint types format wheel bench study study-imu study-metrology \
+	study-metrology-coverage study-starts study-nist study-loop \
 	study-motion study-flights study-inputs study-records study-asked study-slow study-coverage \
 	study-deceptive study-deceptive-many study-fleet study-mutation study-worlds study-noises \
 	study-structural study-check study-plans study-equations study-told-apart \
@@ -54,6 +55,12 @@ study-starts: $(READY)
 
 study-nist: $(READY)
 	$(BIN)/python studies/nist.py
+
+study-metrology: $(READY)
+	$(BIN)/python studies/metrology.py
+
+study-metrology-coverage: $(READY)
+	$(BIN)/python studies/metrology_coverage.py
 
 study-coverage: $(READY)
 	$(BIN)/python studies/coverage.py

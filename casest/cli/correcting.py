@@ -54,7 +54,7 @@ def apply(result_path: Path, data: str, options: ApplyOptions) -> None:
     timed: tuple[str, ...] = ()
     if is_foreign(result_path):
         if options.std:
-            raise UsageError(f"{result_path} holds no uncertainty: leave --with-std away")
+            raise UsageError("--with-std is for a result, or a correction that casest exported")
         text, left, remarks = applied_foreign(result_path, data, arguments)
     elif is_exported(result_path):
         text, left, remarks = applied(result_path, data, arguments, std=options.std)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
-from casest.report.html.sphere import sphere
 from casest.report.html.figures import Figures
 from casest.report.html.fitted import reproduction
 from casest.report.html.frame import whole
 from casest.report.html.numbers import number, printed_unit
 from casest.report.html.page import escaped, paragraph, points, section, table, tag
+from casest.report.html.sphere import sphere
 from casest.results.plan import Plan, headline, plan_words
 
 #: Where the page is.
