@@ -42,7 +42,7 @@ from casest import (
     vertcat,
 )
 
-from .imu_remarks import refusals, remarks
+from .imu_remarks import refusals, refuse_few_axes, remarks
 from .pair import alone, closed_form, held_values, right_handed
 
 Array = NDArray[np.float64]
@@ -71,10 +71,16 @@ def _apart(seen: Any, foretold: Any) -> Any:
     return DEGREE * vertcat(dot(first, away), dot(second, away))
 
 
-def _heading(up: Any, north: Any, foretold: Any) -> Any:
-    """The angle about the vertical from where a direction was foretold to where it is seen, deg."""
-    seen, foretold = north - dot(north, up) * up, foretold - dot(foretold, up) * up
-    return DEGREE * atan2(dot(up, cross(foretold, seen)), dot(foretold, seen))
+def _heading(up: Any, north: Any, foretold_up: Any, foretold_north: Any) -> Any:
+    """The angle about the vertical from where the field was foretold to where it is seen, degrees.
+
+    What is foretold is first turned the shortest way into the vertical that is seen: how far that
+    was off is said by `_apart`, and a steep field would make much of it.
+    """
+    seen = north - dot(north, up) * up
+    level = foretold_north - dot(foretold_north, foretold_up) * foretold_up
+    level = level - dot(up, level) / (1 + dot(up, foretold_up)) * (up + foretold_up)
+    return DEGREE * atan2(dot(up, cross(level, seen)), dot(level, seen))
 
 
 @model
@@ -151,14 +157,15 @@ def imu(
     flux = quantity("flux", magnetometer_scale @ (m - magnetometer_offset), "[field]")
     up, north = force / norm_2(force), flux / norm_2(flux)
     back = turned(rate).T
+    foretold = back @ before(up)
     return Residual(
         implicit=vertcat(
             _length(force, accelerometer_scale, gravity),
             _length(flux, magnetometer_scale, field),
             DEGREE * (dot(up, north) + sin(dip)) / cos(dip),
             w - bias,
-            _apart(up, back @ before(up)),
-            _heading(up, north, back @ before(north)),
+            _apart(up, foretold),
+            _heading(up, north, foretold, back @ before(north)),
         ),
         axes=(
             "gravity",
@@ -226,6 +233,7 @@ def start(declared: Model, runs: Sequence[Run]) -> dict[str, Array]:
     bias = held.get("gyroscope_offset", np.average(at_rest, axis=0, weights=counts))
     found["gyroscope_offset"] = bias
     if "gyroscope_scale" not in held:
+        refuse_few_axes(runs, bias)
         scale, offset = found["accelerometer_scale"], found["accelerometer_offset"]
         up = [_directions(run, scale, offset) for run in runs]
         found["gyroscope_scale"] = turning_scale(runs, up, bias)

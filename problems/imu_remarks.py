@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from casest import Model, Run
+from casest import Model, NotTrusted, Run
 
 from .pair import flat, held_values
 
 Array = NDArray[np.float64]
 
-#: Angle (rad) about an axis, all turns together, below which nothing is said of that axis.
-LITTLE_TURNED = np.pi / 2
+#: Squares of the rate about one axis over those about another, below which it is left out.
+LITTLE_TURNED = 1e-3
 #: Share of the angle between one direction of gravity and the next that turns may miss it by.
 MISSED = 0.05
 #: Chance below which the offset at rest is said to follow the force.
@@ -23,7 +23,7 @@ FOLLOWS = 1e-3
 
 
 def remarks(declared: Model, runs: Sequence[Run], values: Mapping[str, Any]) -> Iterator[str]:
-    """Poses in a plane, turns about too few axes, an offset that follows the force."""
+    """Poses in a plane, an offset that follows the force."""
     known = {**held_values(declared), **{n: np.asarray(v) for n, v in values.items()}}
     sensors = {"accelerometer": ("a", "gravity"), "magnetometer": ("m", "field")}
     present = {s.name for s in declared.signals}
@@ -32,39 +32,30 @@ def remarks(declared: Model, runs: Sequence[Run], values: Mapping[str, Any]) -> 
             v = np.vstack([run.signals[name] for run in runs])
             gain = abs(np.linalg.det(known[f"{sensor}_scale"])) ** (1 / 3)
             yield from flat(v - v.mean(axis=0), float(known[length]) / gain, sensor)
-    yield from _axes(runs, known)
     if not known["g_sensitivity"].any() and "g_sensitivity" not in values:
         yield from _following(runs, known)
 
 
-def _rates(runs: Sequence[Run], known: Mapping[str, Array]) -> Iterator[tuple[Array, Array]]:
-    """Rate (N, 3) between rests and the time of each sample, run by run."""
+def refuse_few_axes(runs: Sequence[Run], bias: Array) -> None:
+    """Raise NotTrusted where the turns leave an axis of the gyroscope out, or there are none."""
+    turning, noise = np.zeros((3, 3)), []
     for run in runs:
         assert run.averaged is not None
-        raw = run.averaged.run
-        steps = np.gradient(np.asarray(raw.time))
-        moving = np.zeros(len(raw), dtype=bool)
+        w = run.averaged.run.signals["w"] - bias
         for i, j in zip(run.averaged.last[:-1], run.averaged.first[1:], strict=True):
-            moving[i:j] = True
-        rate = (raw.signals["w"] - known["gyroscope_offset"]) @ known["gyroscope_scale"].T
-        yield rate[moving], steps[moving]
-
-
-def _axes(runs: Sequence[Run], known: Mapping[str, Array]) -> Iterator[str]:
-    """An axis about which the unit is hardly turned."""
-    parts = list(_rates(runs, known))
-    rate, step = (np.concatenate(part) for part in zip(*parts, strict=True))
-    axes = np.linalg.eigh(rate.T @ (rate * step[:, None]))[1]
-    turned = [float(np.sum(np.abs(rate @ axis) * step)) for axis in axes.T]
-    left_out = [axis for axis, angle in zip(axes.T, turned, strict=True) if angle < LITTLE_TURNED]
-    if left_out:
-        axis = left_out[0] * np.sign(left_out[0][np.argmax(np.abs(left_out[0]))])
-        said = ", ".join(f"{x:.2f}" for x in axis)
-        yield (
-            f"the turns leave an axis out: about ({said}) the unit is turned by "
-            f"{np.degrees(min(turned)):.0f}° in all, which does not determine what the gyroscope "
-            "makes of it: turn about all three axes, a quarter turn or more each time"
-        )
+            turning += w[i:j].T @ w[i:j] / max(sum(map(len, runs)), 1)
+        for i, j in zip(run.averaged.first, run.averaged.last, strict=True):
+            noise.append(np.mean(np.var(w[i : j + 1], axis=0)))
+    squares, axes = np.linalg.eigh(turning)
+    if squares[0] > LITTLE_TURNED * squares[2] and squares[2] > np.mean(noise):
+        return
+    axis = axes[:, 0] * np.sign(axes[np.argmax(np.abs(axes[:, 0])), 0])
+    said = ", ".join(f"{x:.2f}" for x in axis)
+    raise NotTrusted(
+        f"the turns leave an axis of the gyroscope out: along ({said}) of w there is "
+        f"{np.sqrt(max(squares[0], 0) / max(squares[2], 1e-300)):.1%} of what there is along "
+        "another, which does not determine its scale: turn about all three axes"
+    )
 
 
 def _following(runs: Sequence[Run], known: Mapping[str, Array]) -> Iterator[str]:

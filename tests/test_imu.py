@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from imus import an_imu, recorded, waved
+from imus import an_imu, recorded, waved, written
 
 from casest import DataError, Run, attempt
 from casest.cli import run as casest_run
@@ -99,8 +100,6 @@ def test_across_a_gap_nothing_is_integrated():
     keep[middle - 10 : middle + 10] = False
     cut = Run.raw("imu", {n: record[n][keep] for n in "aw"}, units=UNITS, time=record["t"][keep])
     block = (record["t"][keep] > record["t"][middle]).astype(int)
-    from dataclasses import replace
-
     found = attempt(GYRO, [at_rest(replace(cut, block=block))])
     assert found.problem.residual_count == 6 * len(found.problem.runs[0]) - 4
     assert found.certificate.trusted
@@ -110,7 +109,7 @@ def test_rests_that_are_none_are_asked_for():
     rng = np.random.default_rng(9)
     record = recorded(waved(rng, rests=3), an_imu(rng), rng)
     raw = Run.raw("walk", {n: record[n] for n in "aw"}, units=UNITS, time=record["t"])
-    with pytest.raises(DataError, match=r"walk: .*--at-rest"):
+    with pytest.raises(DataError, match=r"walk: .*at_rest=True"):
         attempt(GYRO, [raw])
 
 
@@ -139,3 +138,115 @@ def test_the_xsens_record_is_that_of_its_factory_sheet(shared_data, tmp_path, ca
     gyroscope = 1 / np.diag(values["gyroscope_scale"])
     assert gyroscope == pytest.approx([4778, 4758, 4766], rel=0.002)
     assert result["constants"]["turn_noise"] < 0.2
+
+
+# -- accelerometer, gyroscope and magnetometer together --------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """A record of all three in one file, its result in a folder, and the truth."""
+    rng = np.random.default_rng(21)
+    imu, folder = an_imu(rng), tmp_path_factory.mktemp("whole")
+    record = recorded(waved(rng, rests=20), imu, rng)
+    file = written(folder / "imu.csv", record)
+    words = ["calibrate", "imu", file, "--set", "field=48 uT", "-o", str(folder / "out")]
+    assert casest_run(words) == 0
+    return folder, record, {**imu.truth, "dip": np.array(1.1)}
+
+
+def test_all_three_are_found_in_one_command(whole):
+    folder, _, truth = whole
+    result = json.loads((folder / "out" / "result.json").read_text())
+    assert result["trusted"]
+    away = []
+    for name, found in result["estimate"]["parameters"].items():
+        std = np.array(found["std"])
+        away.append(((np.array(found["value"]) - truth[name])[std > 0] / std[std > 0]).ravel())
+    z = np.concatenate(away)
+    assert len(z) == 34
+    assert np.sqrt(np.mean(z**2)) < 1.5
+    assert len(result["estimate"]["correlation"]["names"]) == 34
+
+
+def test_apply_corrects_all_three_into_one_frame(whole):
+    folder, _, _ = whole
+    out = folder / "corrected.csv"
+    assert casest_run(["apply", str(folder / "out"), str(folder / "imu.csv"), "-o", str(out)]) == 0
+    corrected = np.loadtxt(out, delimiter=",", skiprows=1)[:, -9:]
+    still = np.linalg.norm(corrected[:, 3:6], axis=1) < 0.02
+    assert still.mean() > 0.4
+    force, flux = corrected[still, :3], corrected[still, 6:]
+    assert np.linalg.norm(force, axis=1).mean() == pytest.approx(9.80665, abs=2e-3)
+    assert np.linalg.norm(flux, axis=1).mean() == pytest.approx(48, abs=0.02)
+    below = -np.sum(force * flux, axis=1) / 9.80665 / 48
+    assert np.arcsin(below.mean()) == pytest.approx(1.1, abs=2e-3)
+
+
+def test_the_export_is_one_function_of_nine_readings(whole):
+    folder, record, _ = whole
+    file = folder / "correction.py"
+    assert casest_run(["export", str(folder / "out"), "--to", "python", "-o", str(file)]) == 0
+    names: dict = {}
+    exec(file.read_text(), names)
+    rows = np.hstack([record[n] for n in "awm"])[:50]
+    apart = np.loadtxt(folder / "corrected.csv", delimiter=",", skiprows=1)[:50, -9:]
+    assert np.abs(names["correct"](rows) - apart).max() < 1e-6
+
+
+def test_three_files_with_clocks_of_their_own_are_one_record(whole, tmp_path, capsys):
+    _, record, truth = whole
+    late = {**record, "t": record["t"] + 0.0031}
+    files = [written(tmp_path / f"{n}.csv", record if n == "a" else late, n) for n in "awm"]
+    code, said = command(
+        ["calibrate", "imu", "+".join(files), "--set", "field=48 uT", "--json"], capsys
+    )
+    assert code == 0, said.err
+    found = json.loads(said.out)["estimate"]["parameters"]
+    for name in ("gyroscope_scale", "magnetometer_scale", "dip"):
+        std = np.array(found[name]["std"])
+        assert (np.abs(np.array(found[name]["value"]) - truth[name]) < 5 * std).all(), name
+
+
+# -- what cannot be --------------------------------------------------------------------------------
+
+
+def test_turns_about_one_axis_are_refused_with_the_axis_left_out():
+    rng = np.random.default_rng(31)
+    motion = waved(rng, rests=15, axes=np.array([[0.0, 0, 1]]), wobble=0.0)
+    found = attempt(GYRO, [rests(recorded(motion, an_imu(rng), rng))])
+    assert not found.certificate.trusted
+    assert "leave an axis of the gyroscope out" in found.certificate.reasons[0]
+
+
+def test_a_turn_at_full_scale_is_left_out_and_said():
+    rng = np.random.default_rng(32)
+    imu = an_imu(rng)
+    record = recorded(waved(rng, rests=24), imu, rng)
+    fast = np.sort(np.abs(record["w"]).max(axis=1))[-30]
+    record["w"] = np.clip(record["w"], -fast, fast)
+    found = attempt(GYRO, [rests(record)])
+    assert any("full scale" in note for note in found.notes)
+    assert found.certificate.trusted
+    assert np.abs(away(found, imu.truth)).max() < 4.5
+
+
+def test_a_gyroscope_of_another_unit_is_refused():
+    rng = np.random.default_rng(33)
+    run = rests(recorded(waved(rng), an_imu(rng), rng))
+    raw = run.averaged.run
+    other = replace(raw, signals={**raw.signals, "w": raw.signals["w"][::-1]})
+    found = attempt(GYRO, [replace(run, averaged=replace(run.averaged, run=other))])
+    assert not found.certificate.trusted
+
+
+def test_a_start_in_the_wrong_valley_of_the_xsens_record_leads_to_the_right_one(
+    shared_data, capsys
+):
+    wrong = f"gyroscope_scale={1 / 6258},0,0;0,{1 / 4758},0;0,0,{1 / 4766}"
+    code, said = command(
+        ["calibrate", "gyro-rests", *xsens(shared_data), "--start", wrong, "--json"], capsys
+    )
+    found = json.loads(said.out)
+    scale = 1 / np.diag(found["estimate"]["parameters"]["gyroscope_scale"]["value"])
+    assert code == 2 or scale == pytest.approx([4778, 4758, 4766], rel=0.01)

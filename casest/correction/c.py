@@ -73,6 +73,20 @@ int {name}(const real *x, real *corrected) {{
   return 0;
 }}
 """
+_SPREAD = """
+/* Standard deviations of a corrected sample, {n} each: by the parameters, by the reading's own
+ * noise, by the references, and together. Returns 0, or 1 where one is no number. */
+int {name}_std(const real *x, const real *corrected, real *std);
+int {name}_std(const real *x, const real *corrected, real *std) {{
+  real in[{width} + {n}];
+  for (int i = 0; i < {width}; ++i) in[i] = x[i];
+  for (int i = 0; i < {n}; ++i) in[{width} + i] = corrected[i];
+  run_spread(in, std);
+  for (int i = 0; i < 4 * {n}; ++i)
+    if (!isfinite(std[i])) return 1;
+  return 0;
+}}
+"""
 _TEST = """
 #ifdef CASEST_SELF_TEST
 /* cc -DCASEST_SELF_TEST {name}.c -lm && ./a.out: against the values that casest computed. */
@@ -104,7 +118,13 @@ int main(void) {{
 """
 
 
-def c_source(program: Program, name: str, single: bool, test: tuple[Array, Array]) -> str:
+def c_source(
+    program: Program,
+    name: str,
+    single: bool,
+    test: tuple[Array, Array],
+    spread: Program | None = None,
+) -> str:
     """The source file, with a self-test on `test` (inputs, corrected) under a macro.
 
     `single` computes with `float` instead of `double`.
@@ -130,6 +150,9 @@ def c_source(program: Program, name: str, single: bool, test: tuple[Array, Array
         )
     if program.seen:
         lines.append(_extrapolates(program, name))
+    if spread is not None:
+        lines += [*function("run_spread", spread.steps, spread.registers)]
+        lines.append(_SPREAD.format(name=name, n=n, width=width))
     inputs, outputs = (_rows(part) for part in test)
     tolerance = "2e-4" if single else "1e-9"
     lines.append(

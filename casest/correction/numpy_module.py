@@ -33,8 +33,24 @@ if __name__ == "__main__":
     raise SystemExit(0 if worst <= 1e-9 else 1)
 '''
 
+_SPREAD = '''
 
-def python_source(program: Program, test: tuple[Array, Array]) -> str:
+SPREAD = {program}
+
+
+def spread(x: Any) -> Any:
+    """Standard deviations (N, 4 n) of the corrected values of every row of x, in their unit.
+
+    By the parameters, by the reading's own noise, by the references, and together.
+    """
+    x = np.asarray(x, dtype=float)
+    return attempted(SPREAD, np.hstack([x, correct(x)]))
+'''
+
+
+def python_source(
+    program: Program, test: tuple[Array, Array], spread: Program | None = None
+) -> str:
     """Source of a module with `correct(x)`: the runtime's text and the program as data.
 
     Run as a script it checks itself on `test` (inputs, corrected), as the C source does.
@@ -57,6 +73,7 @@ def python_source(program: Program, test: tuple[Array, Array]) -> str:
         '    """Corrected values of every row of x."""\n'
         "    return corrected(PROGRAM, x)\n"
         + (_extrapolates(program) if program.seen else "")
+        + ("" if spread is None else _SPREAD.format(program=_loaded(as_data(spread))))
         + _TEST.format(inputs=_loaded(test[0].tolist()), outputs=_loaded(test[1].tolist()))
     )
     return (

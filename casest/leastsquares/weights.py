@@ -14,6 +14,7 @@ import numpy as np
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
 from casest.engine import Replay
+from casest.leastsquares.kinds import noises, whitened
 from casest.leastsquares.problem import Point, Problem
 from casest.leastsquares.sums import some_residuals
 
@@ -39,7 +40,11 @@ def weights(problem: Problem, point: Point) -> tuple[Array, ...]:
 
 
 def weighted(problem: Problem, values: Mapping[str, Array]) -> Problem:
-    """The problem with the weights of its effects on the noise at these values; else as it is."""
+    """The problem with the weights of its effects on the noise at these values; else as it is.
+
+    Where residuals are of several kinds, in the deviations of each.
+    """
+    problem = whitened(problem, problem.point(values)) if noises(problem.model) else problem
     if not has_noise_effects(problem.model):
         return problem
     return problem.with_weights(weights(problem, problem.point(values)))

@@ -28,6 +28,7 @@ STARTED = ("timescale", "share", "lag")
 #: Shipped models: name on the command line -> module and attribute in `casest_problems`.
 SHIPPED = {
     "wheel": ("wheel", "wheel"),
+    "wheel-motion": ("wheel_motion", "wheel_motion"),
     "rate-table": ("rate_table", "rate_table"),
     "norm-diagonal": ("norm", "norm_diagonal"),
     "norm-triangular": ("norm", "norm_triangular"),
@@ -80,9 +81,14 @@ def find_model(name: str) -> Model:
         return found
     path, _, wanted = name.partition(":")
     if path.endswith(".py"):
-        own: Model = _one(load_file(Path(path)), Model, "model", path, wanted)
-        check_units(own)
-        return own
+        declared: Model | Dynamics = _one(
+            load_file(Path(path)), (Model, Dynamics), "model", path, wanted
+        )
+        if isinstance(declared, Dynamics):
+            check_units_in_motion(declared)
+            declared = declared.calibration
+        check_units(declared)
+        return declared
     if name in MOVING:
         raise UsageError(f"{name} is an estimator in motion: casest observe, filter or close it")
     hint = _meant(name, [*SHIPPED, *MOVING])
@@ -172,7 +178,7 @@ def without_grid(effect: Effect) -> Effect:
     return effect
 
 
-def _one(module: ModuleType, kind: type, word: str, path: str, wanted: str) -> Any:
+def _one(module: ModuleType, kind: Any, word: str, path: str, wanted: str) -> Any:
     own: dict[str, Any] = {n: v for n, v in vars(module).items() if isinstance(v, kind)}
     names = {n: v for n, v in own.items() if v.function.__module__ == module.__name__}
     names = names or own

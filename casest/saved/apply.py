@@ -15,6 +15,7 @@ from casest.correction import runtime
 from casest.correction.carried import Carried
 from casest.correction.numpy_module import as_data
 from casest.correction.program import Program
+from casest.correction.spread import PARTS
 from casest.data import load_runs
 from casest.data.run import Run
 from casest.data.write import make_folder, write_atomically
@@ -44,9 +45,14 @@ class Applied(NamedTuple):
 
 
 def corrected_csv(
-    path: Path, data: str, arguments: Mapping[str, Any], *, force: bool = False
+    path: Path,
+    data: str,
+    arguments: Mapping[str, Any],
+    *,
+    force: bool = False,
+    std: bool = False,
 ) -> Applied:
-    """The data corrected as the result says.
+    """The data corrected as the result says; with `std`, the standard deviations beside.
 
     The correction is the one that the result carries: nothing of the model's source is run.
     Readings are converted to the unit that they had in the fit, or refused.
@@ -58,7 +64,9 @@ def corrected_csv(
     runs = load_runs([data], needed, **without(spare, arguments))
     found = [corrected(program, run) for run in runs]
     unit = result.units.get(program.output.name)
-    text = table_of(runs, [s.name for s in needed], found, program.output.name, unit)
+    pairs = zip(runs, found, strict=True) if std else ()
+    spreads = [stds(carried.spread, program, run, value) for run, value in pairs]
+    text = table_of(runs, [s.name for s in needed], found, program.output.name, unit, spreads)
     notes = dict.fromkeys(note for run in runs for note in run.notes)
     far = () if _was_fitted(result, data) else extrapolated(carried, runs)
     return Applied(text, program.left, (*notes, *_of_units(result, runs, data), *far))
@@ -150,6 +158,23 @@ def corrected(program: Program, run: Run) -> Array:
     return found
 
 
+def stds(spread: Program | None, program: Program, run: Run, found: Array) -> Array:
+    """Standard deviations (N, 4·size) of corrected values: see `correction.spread.PARTS`."""
+    x = np.hstack([np.asarray(run.signals[i.name], dtype=float) for i in program.inputs])
+    steps = as_data(required(spread))
+    return np.asarray(runtime.attempted(steps, np.hstack([x, found])), dtype=float)
+
+
+def required(spread: Program | None) -> Program:
+    """What gives standard deviations, which are asked for."""
+    if spread is None:
+        raise UsageError(
+            "there are no standard deviations of corrected readings: an older casest made the "
+            "result, it was exported without --with-std, or its correction differs from run to run"
+        )
+    return spread
+
+
 def of_another_time(path: Path, data: str | None = None) -> tuple[str, ...]:
     """Effects that follow the time of the fitted record, unless it is that record again."""
     result, carried = saved_correction(path, force=True, what="reads")
@@ -184,9 +209,17 @@ def _run_number(carried: Carried, result: SavedResult, data: str) -> int:
 
 
 def table_of(
-    runs: Sequence[Run], given: Sequence[str], found: Sequence[Array], name: str, unit: str | None
+    runs: Sequence[Run],
+    given: Sequence[str],
+    found: Sequence[Array],
+    name: str,
+    unit: str | None,
+    spreads: Sequence[Array] = (),
 ) -> str:
-    """CSV of row, time, the `given` signals and what was `found`, called `name`, in each run."""
+    """CSV of row, time, the `given` signals and what was `found`, called `name`, in each run.
+
+    Behind it `spreads`, its standard deviations together, and by each of their PARTS.
+    """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     first, several = runs[0], len(runs) > 1
@@ -196,6 +229,12 @@ def table_of(
         own = _bracket(first.units.get(signal))
         header += [f"{signal}{a}{own}" for a in axes(first.signals[signal].shape[1])]
     header += [f"{name}{'_' * bool(a)}{a}{_bracket(unit)}" for a in axes(found[0].shape[1])]
+    if spreads:
+        found = [np.hstack([f, _together_first(s)]) for f, s in zip(found, spreads, strict=True)]
+        labels = [f"_{part}" for part in PARTS[:-1]]
+        size = spreads[0].shape[1] // len(PARTS)
+        ends = [p + "_" * bool(a) + a for p in ("", *labels) for a in axes(size)]
+        header += [f"{name}_std{end}{_bracket(unit)}" for end in ends]
     writer.writerow(header)
     for run, value in zip(runs, found, strict=True):
         numbers = np.column_stack([*(run.signals[signal] for signal in given), value])
@@ -205,6 +244,11 @@ def table_of(
                 row.append(f"{float(run.time[i]):.9g}")
             writer.writerow([*row, *(f"{x:.9g}" for x in numbers[i])])
     return text.getvalue()
+
+
+def _together_first(spread: Array) -> Array:
+    size = spread.shape[1] // len(PARTS)
+    return np.hstack([spread[:, -size:], spread[:, :-size]])
 
 
 def axes(size: int) -> list[str]:

@@ -8,7 +8,7 @@ not known.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -57,7 +57,6 @@ def doubts(estimate: Estimate) -> list[Finding] | None:
     if not estimate.certificate.trusted or sum(map(len, runs)) > LONGEST:
         return None
     problem = Problem(estimate.model, prepared(estimate.model, runs))
-    problem = replace(problem, whitening=estimate.problem.whitening)
     with np.errstate(all="ignore"):
         return findings(problem, problem.point(estimate.values), estimate.correlated_over)
 
