@@ -109,7 +109,7 @@ def test_rests_that_are_none_are_asked_for():
     rng = np.random.default_rng(9)
     record = recorded(waved(rng, rests=3), an_imu(rng), rng)
     raw = Run.raw("walk", {n: record[n] for n in "aw"}, units=UNITS, time=record["t"])
-    with pytest.raises(DataError, match=r"walk: .*--at-rest"):
+    with pytest.raises(DataError, match=r"walk: .*at_rest=True"):
         attempt(GYRO, [raw])
 
 
@@ -238,6 +238,12 @@ def test_a_gyroscope_of_another_unit_is_refused():
     other = replace(raw, signals={**raw.signals, "w": raw.signals["w"][::-1]})
     found = attempt(GYRO, [replace(run, averaged=replace(run.averaged, run=other))])
     assert not found.certificate.trusted
+
+
+def test_close_says_that_it_does_not_do_that(capsys):
+    code, said = command(["close", "gyro-rests", "imu.csv"], capsys)
+    assert code == 1
+    assert "compares each with the one before" in said.err
 
 
 def test_a_start_in_the_wrong_valley_of_the_xsens_record_leads_to_the_right_one(
