@@ -6,10 +6,11 @@ READY := $(VENV)/.ready
 # What a demo needs alone: a tenth of the developers' tools.
 USABLE := $(VENV)/.usable
 
-.PHONY: demo test lint types format wheel bench study study-imu study-starts study-nist study-loop \
+.PHONY: demo test lint types format wheel bench study study-imu study-metrology \
+	study-metrology-coverage study-starts study-nist study-loop \
 	study-motion study-flights study-inputs study-records study-asked study-slow study-coverage \
 	study-deceptive study-deceptive-many study-fleet study-mutation study-worlds study-noises \
-	study-structural study-check study-plans \
+	study-structural study-check study-plans study-equations study-told-apart \
 	figures docs clean
 
 demo: $(USABLE)
@@ -54,6 +55,12 @@ study-starts: $(READY)
 
 study-nist: $(READY)
 	$(BIN)/python studies/nist.py
+
+study-metrology: $(READY)
+	$(BIN)/python studies/metrology.py
+
+study-metrology-coverage: $(READY)
+	$(BIN)/python studies/metrology_coverage.py
 
 study-coverage: $(READY)
 	$(BIN)/python studies/coverage.py
@@ -100,11 +107,17 @@ study-check: $(READY)
 study-fleet: $(READY)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python studies/fleet_common.py
 
+study-equations: $(READY)
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python studies/equations.py
+
 study-structural: $(READY)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python studies/structural.py
 
 study-plans: $(READY)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python studies/plans.py
+
+study-told-apart: $(READY)
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python studies/told_apart.py
 
 study-mutation: $(READY)
 	$(BIN)/python studies/mutation.py

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from casest.declaration.dimensions import check_units as check_units
     from casest.declaration.effect import Effect as Effect
     from casest.declaration.effect import effect as effect
+    from casest.declaration.flow import integrate as integrate
     from casest.declaration.model import Model as Model
     from casest.declaration.model import model as model
     from casest.declaration.physics import Residual as Residual

@@ -595,7 +595,8 @@ def remarks(declared: Model, runs: Sequence[Run], values: Mapping[str, Any]) -> 
                 f"the cubic speed law does not hold in {run.name}: the angle departs from it by up "
                 f"to {found.departure:.2g} rad (p = {found.p_value:.1g}), and the other parameters "
                 "take up part of that. Air drag and bearings do it in a long run: record or cut "
-                "shorter runs, or add the effect speed_polynomial (`casest close` tries it)"
+                "shorter runs, calibrate wheel-motion, which has them as constants, or add the "
+                "effect speed_polynomial (`casest close` tries it)"
             )
 
 

@@ -55,7 +55,10 @@ def bash(folder: Path, *words: str) -> list[str]:
         (["casest", "simulate", "wheel", "--effect", "imb"], ["imbalance"]),
         (["casest", "calibrate", "wheel", "x.csv", "--solver", "tr"], ["trust-region"]),
         (["casest", "calibrate", "wheel", "x.csv", "--colu"], ["--columns"]),
-        (["casest", "export", "out", "--to", ""], ["c", "python", "json"]),
+        (
+            ["casest", "export", "out", "--to", ""],
+            ["c", "python", "json", "ros", "kalibr", "ardupilot", "px4"],
+        ),
     ],
 )
 def test_bash_offers_what_may_come_next(words, offered, tmp_path):

@@ -265,11 +265,3 @@ def test_close_does_not_tell_gravity_from_bias_by_noise(file, capsys):
         gravity = told["after"]["parameters"]["gravity"]
         along = np.abs(gravity["std"] @ flights.AXIS)
         assert 0.9 < along < 1.1  # the prior of the bias
-
-
-@pytest.mark.parametrize("command", ["observe", "close"])
-def test_calibrations_have_noise_of_their_own(command, capsys):
-    from casest.demo import WHEEL
-
-    assert cli([command, "wheel", str(WHEEL), "--sensor-noise", "v=1"]) == 1
-    assert "--sensor-noise is for estimators in motion" in capsys.readouterr().err

@@ -125,7 +125,7 @@ def test_temperatures_in_degrees_that_nobody_stated_are_refused():
         [0, 25, 50, 75], [32e3, 1e4, 3.6e3, 1.5e3], "temperature", "resistance", "K", "ohm"
     )
     for model in (thermistor_beta, steinhart_hart):
-        with pytest.raises(UsageError, match="--unit temperature=degC"):
+        with pytest.raises(UsageError, match=r'units=\{"temperature": "degC"\}'):
             calibrate(model, [run])
     with pytest.raises(UsageError, match="resistance: 0 ohm"):
         calibrate(steinhart_hart, [thermistor([0, 25, 50, 75], [32e3, 1e4, 0, 1.5e3])])

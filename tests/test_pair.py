@@ -300,7 +300,8 @@ def test_scales_of_the_laboratory_leave_offsets_and_dip_to_four_poses_in_the_fie
 def test_a_length_or_noise_that_is_not_positive_is_refused():
     _, run = simulated(16)
     for name in ("gravity", "field", "accelerometer_noise", "magnetometer_noise"):
-        with pytest.raises(UsageError, match=f"{name} = 0: it must be positive; --set {name}=…"):
+        said = rf"{name} = 0: it must be positive; model\.having\({name}=…"
+        with pytest.raises(UsageError, match=said):
             attempt(PAIR.having(**{name: 0.0}), (run,))
 
 

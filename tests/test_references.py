@@ -107,7 +107,7 @@ def test_the_result_says_which_share_a_reference_has(cli, tmp_path):
     given = ["norm-triangular", RECORD, *GIVEN, "--set", "norm=9.80665±0.005 m/s^2"]
     code, out, _ = cli("calibrate", *given, "-o", tmp_path)
     estimate = json.loads((tmp_path / "result.json").read_text())["estimate"]
-    (norm,) = estimate["inputs"]
+    (norm,) = [i for i in estimate["inputs"] if i["kind"] == "reference"]
     assert code == 0
     assert "norm = 9.80665 ± 0.005 m/s^2 (held; up to" in out
     assert (norm["name"], norm["std"], norm["unit"]) == ("norm", 0.005, "m/s^2")

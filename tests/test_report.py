@@ -106,8 +106,8 @@ def test_every_section_is_there_and_the_contents_lead_to_it(browser, closed):
     browser.open(closed / "report.html")
     titles = texts(browser, "section > h2")
     assert titles == [
-        "Error before and after", "Residual", "Parameters", "What belongs together",
-        "Effects found", "What stayed invisible", "How the fit was certified",
+        "Effects found", "Parameters", "The evidence", "Error before and after", "Residual",
+        "What belongs together", "What stayed invisible", "How the fit was certified",
         "How to apply the result", "How to get it again",
     ]  # fmt: skip
     leads = "[...document.querySelectorAll('nav a')].map(a => !!document.querySelector(a.hash))"
@@ -273,6 +273,8 @@ def test_a_narrow_screen_needs_no_scrolling_sideways(browser, closed):
 
 def test_dragging_zooms_all_panels_and_a_double_click_goes_back(browser, closed):
     browser.open(closed / "report.html")
+    browser.ask("document.querySelectorAll('details').forEach(d => d.open = true)")
+    browser.ask("new Promise(r => setTimeout(() => r(1), 300))")
     browser.ask("document.querySelector('#over-time svg').scrollIntoView({block: 'center'})")
     places = "[...document.querySelectorAll('#over-time svg')].map(s => s.getBoundingClientRect())"
     box = browser.ask(f"(({{x, y, width, height}}) => [x, y, width, height])({places}[0])")
@@ -285,6 +287,70 @@ def test_dragging_zooms_all_panels_and_a_double_click_goes_back(browser, closed)
     assert "s" in text(browser, "#over-time output")
     browser.ask("document.querySelector('#over-time [data-action=all]').click()")
     assert browser.ask(ticks) == whole
+
+
+def test_the_verdict_has_its_colour_and_its_consequence(browser, closed, calibrated):
+    browser.open(closed / "report.html")
+    colour = "getComputedStyle(document.querySelector('h1')).color"
+    assert browser.ask("document.querySelector('h1').className") == "doubtful"
+    doubtful = browser.ask(colour)
+    moved = json.loads((closed / "result.json").read_text(encoding="utf-8"))["moved"]
+    worst = max(abs(z) for z in moved["gain"])
+    said = f"Fitted without it, gain is off by {worst:.0f} of its printed standard deviations."
+    assert said in text(browser, "h1 + p")
+    browser.open(calibrated / "report.html")
+    assert browser.ask("document.querySelector('h1').className") == "good"
+    assert browser.ask(colour) != doubtful
+
+
+def test_parameters_stand_within_two_screens_and_noise_last(browser, closed):
+    browser.open(closed / "report.html")
+    at = "document.querySelector('{}').getBoundingClientRect().top"
+    assert browser.ask(at.format("#parameters")) < 1500
+    assert browser.ask(at.format("#convincing")) < browser.ask(at.format("#residual"))
+    assert browser.ask("document.querySelector('#over-time').closest('details').open") is False
+    assert "Residual x over angle" in text(browser, "#convincing figcaption")
+
+
+def test_values_are_read_by_pointer_and_by_keys(browser, calibrated):
+    """Of the first pose: its corrected value and its residual, as residuals.csv has it."""
+    browser.open(calibrated / "report.html")
+    browser.ask("document.querySelector('#lengths svg').focus()")
+    press = (
+        "document.querySelector('#lengths svg').dispatchEvent("
+        "new KeyboardEvent('keydown', {key: 'ArrowRight', bubbles: true}))"
+    )
+    for number in ("1", "2"):
+        browser.ask(press)
+        assert text(browser, "#lengths .value").startswith(f"reading: {number}; ")
+    browser.ask("document.querySelector('#convincing svg').scrollIntoView({block: 'center'})")
+    place = "document.querySelector('#convincing circle.point').getBoundingClientRect()"
+    x, y = browser.ask(f"(({{x, y}}) => [x, y])({place})")
+    browser.mouse("mouseMoved", x + 3, y + 3)
+    assert re.fullmatch(r"[−\d.]+ m/s²; [−\d.]+ m/s²", text(browser, "#convincing .value"))
+
+
+def test_the_sphere_shows_every_pose_and_the_widest_gap(browser, calibrated):
+    browser.open(calibrated / "report.html")
+    count = "document.querySelectorAll('#sphere circle.point.after').length"
+    assert browser.ask(count) == 24
+    assert "half angle of" in text(browser, "#sphere figcaption")
+    assert texts(browser, "#lengths text.key") == ["● corrected", "● reading"]
+
+
+@pytest.mark.parametrize("dark", [False, True])
+def test_axe_finds_no_violation(browser, closed, calibrated, dark):
+    """Deque's rules of accessibility: contrast, headings, names, what scrolls, what has focus."""
+    axe = files("axe_core_python").joinpath("axe.min.js").read_text("utf-8")
+    browser.look(dark=dark)
+    for folder in (closed, calibrated):
+        browser.open(folder / "report.html")
+        browser.ask(axe + "; 1")
+        found = browser.ask(
+            "axe.run().then(r => r.violations.map(v => [v.id, v.nodes[0].html.slice(0, 120)]))"
+        )
+        assert found == []
+    browser.look()
 
 
 def test_it_prints(browser, closed):
@@ -313,6 +379,8 @@ def test_a_hundred_thousand_samples_are_a_page_of_less_than_a_megabyte(browser, 
     page.write_text(calibration_page(result), encoding="utf-8")
     assert page.stat().st_size < 1_000_000
     browser.open(page)
+    browser.ask("document.querySelectorAll('details').forEach(d => d.open = true)")
+    browser.ask("new Promise(r => setTimeout(() => r(1), 300))")
     assert browser.ask("document.querySelectorAll('svg, canvas').length") > 0
     assert browser.complaints() == []
     # One sample far out is not lost among the hundred thousand: it reaches the panel's upper edge.

@@ -274,8 +274,6 @@ def test_states_that_run_away_are_said():
 
 
 def test_options_of_motion_are_refused_elsewhere(tmp_path, capsys):
-    plan = ["--duration", "9", "--rate", "9", "--sensor-noise", "v=1", "-o", str(tmp_path)]
+    plan = ["--duration", "9", "--rate", "9", "--intensity", "v=1", "-o", str(tmp_path)]
     assert command(["simulate", "wheel", *plan]) == 1
-    assert (
-        "--sensor-noise is for estimators in motion; wheel has --noise" in capsys.readouterr().err
-    )
+    assert "--intensity is for estimators in motion; wheel has --noise" in capsys.readouterr().err

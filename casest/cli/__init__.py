@@ -12,6 +12,7 @@ import click
 
 from casest.cli import (
     beginning,
+    budgeting,
     checking,
     comparing,
     completing,
@@ -32,8 +33,8 @@ __all__ = ["commands", "main", "run"]
 
 #: Every room adds its commands to the group as it is imported.
 ROOMS = (
-    fitting, checking, motion, comparing, correcting, simulating, planning, fleets, reporting,
-    beginning, completing,
+    fitting, checking, motion, comparing, correcting, budgeting, simulating, planning, fleets,
+    reporting, beginning, completing,
 )  # fmt: skip
 
 

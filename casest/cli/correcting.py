@@ -29,6 +29,11 @@ class ApplyOptions:
         metavar="FILE|DIR",
         help="A .csv file, or a folder for corrected.csv; without it, standard output.",
     )
+    std: bool = flag(
+        False,
+        "--with-std",
+        help="Standard deviations too: by parameters, noise, reference, together.",
+    )
     force: bool = flag(False, "--force", help="Apply a result that was refused.")
 
 
@@ -48,12 +53,14 @@ def apply(result_path: Path, data: str, options: ApplyOptions) -> None:
     progress(f"correcting {data}")
     timed: tuple[str, ...] = ()
     if is_foreign(result_path):
+        if options.std:
+            raise UsageError("--with-std is for a result, or a correction that casest exported")
         text, left, remarks = applied_foreign(result_path, data, arguments)
     elif is_exported(result_path):
-        text, left, remarks = applied(result_path, data, arguments)
+        text, left, remarks = applied(result_path, data, arguments, std=options.std)
     else:
         text, left, remarks = correcting.corrected_csv(
-            result_path, data, arguments, force=options.force
+            result_path, data, arguments, force=options.force, std=options.std
         )
         timed = correcting.of_another_time(result_path, data)
     shown.done()
@@ -121,6 +128,9 @@ class StepOptions:
     help="Without it, standard output.",
 )
 @click.option("--force", is_flag=True, help="Export a result that was refused.")
+@click.option(
+    "--with-std", "std", is_flag=True, help="With the standard deviation of what it gives."
+)
 @taking(StepOptions)
 def export(
     result_path: Path,
@@ -130,6 +140,7 @@ def export(
     run: int,
     output: Path | None,
     force: bool,
+    std: bool,
     options: StepOptions,
 ) -> None:
     """The correction of a saved RESULT, or a filter's step, ready to run on the device.
@@ -146,10 +157,10 @@ def export(
         raise UsageError("--float is for --to c")
     progress(f"exporting {result_path}")
     if names_a_model(result_path):
-        if run or force or to != "c":
+        if run or force or std or to != "c":
             raise UsageError(
-                "of an estimator in motion --to c alone is written, without --run and --force: in "
-                "Python the step is casest.dynamics.Estimator"
+                "of an estimator in motion --to c alone is written, without --run, --force and "
+                "--with-std: in Python the step is casest.dynamics.Estimator"
             )
         saved(step_of(str(result_path), options, single), output)
         return
@@ -158,8 +169,10 @@ def export(
     if to == "c" or to == "python" or to == "json":
         if sensors:
             raise UsageError("--sensor is for --to ros, kalibr, ardupilot and px4")
-        text = exported(result_path, to, single=single, run=run, force=force)
+        text = exported(result_path, to, single=single, run=run, force=force, std=std)
     else:
+        if std:
+            raise UsageError("--with-std is for --to c, python and json")
         text, remarks = exported_as(result_path, to, sensors=sensors, run=run, force=force)
     for remark in remarks:
         echo(f"casest: {remark}", err=True)

@@ -44,13 +44,6 @@ class FleetOptions:
         metavar="STD",
         help="Of one residual of a sound sensor: one with significantly more is refused.",
     )
-    prior: Path | None = flag(
-        None,
-        "--prior",
-        type=click.Path(path_type=Path),
-        metavar="DIR",
-        help="Take sensors as ones of the fleet in this folder: few poses are enough.",
-    )
     covariance: bool = flag(False, "--covariance", help="Write each sensor's covariance too.")
     processes: int | None = flag(
         None,
@@ -146,7 +139,8 @@ def planned(model: Model, dataset: str, options: FleetOptions) -> tuple[Plan, Jo
                 f"--scheduler: its workers may be in another folder; give {word} as "
                 f"{Path(word).resolve()}"
             )
-    if options.prior and options.noise:
+    prior = options.model.prior
+    if prior and options.noise:
         raise UsageError("--noise: with --prior the noise is that of the fleet; leave it out")
     if Path(dataset).resolve() in options.output.resolve().parents:
         raise UsageError(
@@ -166,7 +160,7 @@ def planned(model: Model, dataset: str, options: FleetOptions) -> tuple[Plan, Jo
         options.output,
         options.noise,
         options.covariance,
-        known(options.prior, model, units) if options.prior else None,
+        known(Path(prior.removeprefix("@")), model, units) if prior else None,
         units,
         computing,
     )

@@ -122,7 +122,7 @@ def records(
         seen.add(Path(name).resolve())
     known = {"t", *model.quantities, *(s.name for s in model.signals)}
     extra = [column for column in followed if column not in known]
-    given = options.keywords()
+    given = {**model.reading, **options.keywords()}
     given["at_rest"] = given["at_rest"] or model.resting
     return load_runs(list(data), model.signals, extra=extra, **given)
 

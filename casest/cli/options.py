@@ -64,7 +64,8 @@ class ModelOptions:
         "--prior",
         only=Kind.FITTED,
         metavar="@RESULT",
-        help="What an earlier result knows, with its whole covariance: update it by these data.",
+        help="What an earlier result knows, with its whole covariance: update it by these data. "
+        "For a sensor of a fleet, or more of them: the folder of that fleet.",
     )
     shared: Words = flag(
         (), "--shared", only=Kind.FITTED, metavar="NAME", help="One value for all runs."

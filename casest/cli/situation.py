@@ -47,7 +47,7 @@ def of_model(name: str, options: PlanOptions) -> Situation:
     stated = dict(given.pair() for given in options.reading.units)
     units = {s.name: s.unit or stated.get(s.name) for s in model.signals}
     empty = Run.raw("planned", {s.name: _no_rows(s.size) for s in model.signals}, units=units)
-    return Situation(name, model, values, _noise(model, options), unit_table(model, [empty]))
+    return Situation(name, model, values, _noise(model, options, units), unit_table(model, [empty]))
 
 
 def _no_rows(size: int) -> Any:
@@ -70,7 +70,7 @@ def of_result(path: Path, options: PlanOptions) -> Situation:
     if options.values:
         raise UsageError(f"{path} is a result, and has its values: leave --value out")
     start = started(path)
-    noise = _noise(start.model, options, start.sigma, start.over)
+    noise = _noise(start.model, options, start.table, start.sigma, start.over)
     return Situation(
         str(start.content["model"]),
         start.model,
@@ -84,24 +84,48 @@ def of_result(path: Path, options: PlanOptions) -> Situation:
     )
 
 
-def _noise(model: Model, options: PlanOptions, sigma: Any = None, over: float = 1.0) -> Noise:
-    """The noise as stated, else that of the result, else of size one."""
+def _noise(
+    model: Model,
+    options: PlanOptions,
+    known: Mapping[str, str | None],
+    sigma: Any = None,
+    over: float = 1.0,
+) -> Noise:
+    """The noise as stated, else that of the result, else of size one. `known`: units."""
     import numpy as np
 
     from casest.plan.candidates.candidates import Noise
 
-    stated = dict(given.number() for given in options.noise)
-    readings = {s.name for s in model.readings}
-    for name, std in stated.items():
+    readings = {s.name: s for s in model.readings}
+    stated = {}
+    for given in options.noise:
+        name, text = given.pair()
         if name not in readings:
             raise UsageError(
-                f"--sensor-noise {name}={std:g}: {model.name} reads {', '.join(sorted(readings))}"
+                f"--sensor-noise {given.text}: {model.name} reads {', '.join(readings)}"
             )
-        if not 0 < std < float("inf"):
-            raise UsageError(f"--sensor-noise {name}={std:g}: a standard deviation above 0")
+        own = readings[name].unit or known.get(name)
+        stated[name] = _std(f"--sensor-noise {given.text}", text, own)
     if sigma is None or stated:
         return Noise(np.ones(len(model.axes)), stated, known=bool(stated))
     return Noise(sigma * np.sqrt(max(over, 1.0)), {})
+
+
+def _std(option: str, text: str, own: str | None) -> float:
+    """A standard deviation in the signal's own unit."""
+    from casest import units
+    from casest.errors import CasestError
+
+    try:
+        number, unit = units.parse_quantity(text)
+        factor = 1.0 if not unit or not own or unit == own else units.conversion(unit, own)[0]
+    except CasestError as error:
+        raise type(error)(f"{option}: {error}") from None
+    if unit == "%" and own != "%":
+        raise UsageError(f"{option}: a share of readings that are not there yet; give a number")
+    if not 0 < number < float("inf"):
+        raise UsageError(f"{option}: a standard deviation is above zero, and {text} is not")
+    return number * factor
 
 
 def possible_of(situation: Situation, options: PlanOptions) -> Any:

@@ -73,6 +73,20 @@ int {name}(const real *x, real *corrected) {{
   return 0;
 }}
 """
+_SPREAD = """
+/* Standard deviations of a corrected sample, {n} each: by the parameters, by the reading's own
+ * noise, by the references, and together. Returns 0, or 1 where one is no number. */
+int {name}_std(const real *x, const real *corrected, real *std);
+int {name}_std(const real *x, const real *corrected, real *std) {{
+  real in[{width} + {n}];
+  for (int i = 0; i < {width}; ++i) in[i] = x[i];
+  for (int i = 0; i < {n}; ++i) in[{width} + i] = corrected[i];
+  run_spread(in, std);
+  for (int i = 0; i < 4 * {n}; ++i)
+    if (!isfinite(std[i])) return 1;
+  return 0;
+}}
+"""
 _TEST = """
 #ifdef CASEST_SELF_TEST
 /* cc -DCASEST_SELF_TEST {name}.c -lm && ./a.out: against the values that casest computed. */
@@ -104,7 +118,13 @@ int main(void) {{
 """
 
 
-def c_source(program: Program, name: str, single: bool, test: tuple[Array, Array]) -> str:
+def c_source(
+    program: Program,
+    name: str,
+    single: bool,
+    test: tuple[Array, Array],
+    spread: Program | None = None,
+) -> str:
     """The source file, with a self-test on `test` (inputs, corrected) under a macro.
 
     `single` computes with `float` instead of `double`.
@@ -128,6 +148,11 @@ def c_source(program: Program, name: str, single: bool, test: tuple[Array, Array
                 largest=number(program.largest),
             )
         )
+    if program.seen:
+        lines.append(_extrapolates(program, name))
+    if spread is not None:
+        lines += [*function("run_spread", spread.steps, spread.registers)]
+        lines.append(_SPREAD.format(name=name, n=n, width=width))
     inputs, outputs = (_rows(part) for part in test)
     tolerance = "2e-4" if single else "1e-9"
     lines.append(
@@ -136,6 +161,22 @@ def c_source(program: Program, name: str, single: bool, test: tuple[Array, Array
         )
     )
     return "\n".join(lines)
+
+
+def _extrapolates(program: Program, name: str) -> str:
+    """A function that says whether a sample lies outside what the calibration saw."""
+    ends = [("-INFINITY", "INFINITY") if s is None else tuple(map(number, s)) for s in program.seen]
+    low, high = (", ".join(column) for column in zip(*ends, strict=True))
+    return (
+        "/* 1 where x lies outside what the calibration saw: the correction extrapolates. */\n"
+        f"int {name}_extrapolates(const real *x) {{\n"
+        f"  static const real low[] = {{{low}}};\n"
+        f"  static const real high[] = {{{high}}};\n"
+        f"  for (int i = 0; i < {program.width}; ++i)\n"
+        "    if (!(x[i] >= low[i] && x[i] <= high[i])) return 1;\n"
+        "  return 0;\n"
+        "}\n"
+    )
 
 
 def _head(program: Program, name: str, single: bool) -> str:
@@ -163,6 +204,7 @@ def _head(program: Program, name: str, single: bool) -> str:
         "",
         f"typedef {'float' if single else 'double'} real;",
         f"int {name}(const real *x, real *corrected);",
+        *([f"int {name}_extrapolates(const real *x);"] if program.seen else []),
     ]
     if program.kind == "newton":
         close, exact = ("1e-5f", "2e-7f") if single else ("1e-9", "1e-14")

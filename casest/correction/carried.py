@@ -38,6 +38,8 @@ class Carried:
     readings: tuple[Array, ...]
     timed: tuple[str, ...]
     seen: tuple[tuple[float, float], ...] = ()
+    #: Standard deviations of what it gives (`correction.spread`); None where nothing says them.
+    spread: Program | None = None
 
     @property
     def needed(self) -> tuple[Signal, ...]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import json
+import math
 from typing import Any
 
 from casest import __version__
@@ -32,8 +33,24 @@ if __name__ == "__main__":
     raise SystemExit(0 if worst <= 1e-9 else 1)
 '''
 
+_SPREAD = '''
 
-def python_source(program: Program, test: tuple[Array, Array]) -> str:
+SPREAD = {program}
+
+
+def spread(x: Any) -> Any:
+    """Standard deviations (N, 4 n) of the corrected values of every row of x, in their unit.
+
+    By the parameters, by the reading's own noise, by the references, and together.
+    """
+    x = np.asarray(x, dtype=float)
+    return attempted(SPREAD, np.hstack([x, correct(x)]))
+'''
+
+
+def python_source(
+    program: Program, test: tuple[Array, Array], spread: Program | None = None
+) -> str:
     """Source of a module with `correct(x)`: the runtime's text and the program as data.
 
     Run as a script it checks itself on `test` (inputs, corrected), as the C source does.
@@ -55,6 +72,8 @@ def python_source(program: Program, test: tuple[Array, Array]) -> str:
         "def correct(x: Any) -> Any:\n"
         '    """Corrected values of every row of x."""\n'
         "    return corrected(PROGRAM, x)\n"
+        + (_extrapolates(program) if program.seen else "")
+        + ("" if spread is None else _SPREAD.format(program=_loaded(as_data(spread))))
         + _TEST.format(inputs=_loaded(test[0].tolist()), outputs=_loaded(test[1].tolist()))
     )
     return (
@@ -72,6 +91,25 @@ def _loaded(data: Any, width: int = 88) -> str:
     text = json.dumps(data)
     pieces = [text[k : k + width] for k in range(0, len(text), width)]
     return "json.loads(\n" + "\n".join(f"    {piece!r}" for piece in pieces) + "\n)"
+
+
+def _extrapolates(program: Program) -> str:
+    low = [-math.inf if s is None else s[0] for s in program.seen]
+    high = [math.inf if s is None else s[1] for s in program.seen]
+    return (
+        "\n\nLOW, HIGH = (\n"
+        f"    np.array([{', '.join(map(_python_number, low))}]),\n"
+        f"    np.array([{', '.join(map(_python_number, high))}]),\n"
+        ")\n\n\n"
+        "def extrapolates(x: Any) -> Any:\n"
+        '    """Which rows of x lie outside what the calibration saw."""\n'
+        "    x = np.asarray(x, dtype=float)\n"
+        "    return ~((x >= LOW) & (x <= HIGH)).all(axis=1)\n"
+    )
+
+
+def _python_number(value: float) -> str:
+    return repr(value) if math.isfinite(value) else f"{'-' * (value < 0)}np.inf"
 
 
 def as_data(program: Program) -> dict[str, Any]:

@@ -39,8 +39,8 @@ class Program:
     a value, "output" (with the register as operand) the number of the output. `starts` are the
     levels where Newton's method begins, the reading itself among them where it has as many numbers
     as what is corrected; `measured` is the place of the reading among the inputs. `left` are
-    effects that stay in. `own` numbers of one run follow the inputs (and the trial value): see
-    `of_run`.
+    effects that stay in. `seen`: least and greatest of each input of the fit, None where it is no
+    matter. `own` numbers of one run follow the inputs (and the trial value): see `of_run`.
     """
 
     model: str
@@ -55,6 +55,7 @@ class Program:
     largest: float = 1.0
     left: tuple[str, ...] = ()
     own: int = 0
+    seen: tuple[tuple[float, float] | None, ...] = ()
 
     @property
     def width(self) -> int:

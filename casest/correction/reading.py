@@ -69,6 +69,7 @@ class _Carried(Struct):
     not_undone: list[str]
     follows_time: list[str]
     range: list[tuple[float, float]] = []
+    uncertainty: _Program | None = None
 
 
 def carried_data(found: Carried) -> dict[str, Any]:
@@ -84,6 +85,7 @@ def carried_data(found: Carried) -> dict[str, Any]:
         "not_undone": list(found.program.left),
         "follows_time": list(found.timed),
         "range": [list(pair) for pair in found.seen],
+        **({} if found.spread is None else {"uncertainty": as_data(found.spread)}),
     }
 
 
@@ -203,4 +205,16 @@ def carried_read(content: Any, where: str, runs: int) -> Carried:
         tuple(np.array(part, float).reshape(-1, program.width) for part in found.readings),
         tuple(found.follows_time),
         tuple(found.range),
+        spread_read(content.get("uncertainty"), program, where),
     )
+
+
+def spread_read(content: Any, program: Program, where: str) -> Program | None:
+    """Standard deviations of what a correction gives: of its inputs and of that."""
+    if content is None:
+        return None
+    found = program_read(content, f"{where}.uncertainty")
+    fits = found.width == program.width + program.output.size
+    fits = fits and found.output.size == 4 * program.output.size and found.kind == "direct"
+    _refuse(not fits, f"{where}.uncertainty: not of the program beside it")
+    return found

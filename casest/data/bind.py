@@ -58,6 +58,7 @@ def load_runs(
     time_zero: Literal["first", "column"] = "first",
     gaps: Sequence[str] = (),
     between: Sequence[str] | None = None,
+    steady: Sequence[str] = (),
 ) -> tuple[Run, ...]:
     """Read files and bind their columns to `signals`: one run per file and `run` label.
 
@@ -79,6 +80,7 @@ def load_runs(
     * between: inputs of an estimator in motion, whose signals may have clocks of their own: where
       one has no sample it is a straight line, or held. The samples of a.csv+b.csv are then those of
       all files, every reading at the time when it was made.
+    * steady: signals that may be the same in all rows, which is a dead channel's sign otherwise.
     * time_zero: "first" makes each run's first sample t = 0, "column" keeps the column's own zero.
 
     A row in which a signal, the time of a model that needs it or an extra column has no number
@@ -100,6 +102,7 @@ def load_runs(
         tuple(extra),
         frozenset(gaps) | frozenset(between or ()),
         None if between is None else frozenset(between),
+        frozenset(steady),
     )
     groups = [_tables(given, k if len(listed) > 1 else None) for k, given in enumerate(listed)]
     refuse_unknown_names([table for tables in groups for table in tables], wanted, options)
@@ -197,7 +200,8 @@ def _runs(table: Table, signals: Sequence[Signal], options: Options) -> list[Run
             spread={},
             notes=(*table.notes, *bound.notes, *dropped, *notes, *time_notes),
         )
-        runs.append(_checked(run, signals, bound.sources))
+        varying = [s for s in signals if s.name not in options.steady]
+        runs.append(_checked(run, varying, bound.sources))
     return runs
 
 

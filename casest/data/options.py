@@ -32,6 +32,8 @@ class Options:
     gaps: frozenset[str] = frozenset()
     #: Inputs that are interpolated, or held, where they have no sample; None of a sensor model.
     between: frozenset[str] | None = None
+    #: Signals that may be the same in all rows: settings of an experiment, the noise of a reading.
+    steady: frozenset[str] = frozenset()
 
 
 def stated_unit(name: str, unit: str) -> str:

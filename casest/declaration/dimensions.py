@@ -20,7 +20,7 @@ import casadi as ca
 from casest import units
 from casest.declaration.effect import Attached, of_columns
 from casest.declaration.model import Model
-from casest.declaration.symbols import Constant, param
+from casest.declaration.symbols import Constant, Signal, param
 from casest.declaration.temperatures import Zero, followed, of_symbol, refuse_other_zero
 from casest.declaration.tracing import function_of, trace
 from casest.engine.operations import Operation, Powers, Units, operation_of
@@ -86,7 +86,7 @@ def check_units(model: Model) -> None:
                     raise UnitError(f"{where}: {error}") from None
                 refuse_unless_fits(found, declared, where)
                 _same_zero(found, q.unit, declared, where)
-    if traced.measured is not None:
+    if traced.measured is not None and not _fits_anything(model, model[traced.measured]):
         unit = model.residual_unit
         for found in sizes[-1]:
             where = f"model {model.name}: the prediction of {traced.measured} [{unit}]"
@@ -126,10 +126,16 @@ def _input_sizes(model: Model, numbers: Mapping[str, float]) -> dict[tuple[int, 
         for _ in range(s.size):
             unit = "" if s.kind == "rotation" else f"[{s.name}]"
             own = size_of(s.unit if s.unit is not None else unit, _references(model))
+            own = PLAIN if _fits_anything(model, s) else own
             zero = of_symbol(s.unit or "", signal=True, free=False, number=None)
             sizes[1, k] = replace(named(own, s.name, s.unit or ""), zero=zero)
             k += 1
     return sizes
+
+
+def _fits_anything(model: Model, s: Signal) -> bool:
+    """Of differential equations a signal of any unit is compared with states that have one."""
+    return s.unit is None and s.kind == "plain" and model.traced.integrates
 
 
 def _references(model: Model) -> Mapping[str, Any]:

@@ -31,7 +31,7 @@ NOISE = "noise"
 #: other, or both, or an angle, or another sensor's acceleration on three axes; of a number that
 #: data tell; of what is searched over a grid; and of where one on the noise shows itself.
 COLUMNS = ("temperature", "other", "any", "angle", "acceleration")
-NUMBERS = ("mean", "duration", "radian")
+NUMBERS = ("mean", "least", "greatest", "duration", "radian")
 PROFILES = ("frequency", "time", "timescale", "level", "share", "lag")
 TAILS, RANDOM_WALK = "tails", "random walk"
 
@@ -49,12 +49,12 @@ class Effect:
     argument for which a recorded column is looked for (name -> "temperature", "other", "any",
     "angle", which is also a scalar signal or quantity of the model in rad or deg, or
     "acceleration", another measured signal of three axes); `numbers` those
-    that data tell (name -> "mean" of that column, "radian": rad for each of its unit, or "duration"
-    of the record); `seen_in` where an effect on the noise shows itself: the "tails" of the
-    residuals, or a "random walk" in them; `describes`: it says what a course looks like, and names
-    no cause; `memory` what one on the sequence keeps from sample to sample, and what each begins
-    from (the value acted on, or a number); `otherwise` the form that it takes in a model where it
-    is not applicable as it stands.
+    that data tell (name -> "mean", "least" or "greatest" of that column, "radian": rad for each of
+    its unit, or "duration" of the record); `seen_in` where an effect on the noise shows itself: the
+    "tails" of the residuals, or a "random walk" in them; `describes`: it says what a course looks
+    like, and names no cause; `memory` what one on the sequence keeps from sample to sample, and
+    what each begins from (the value acted on, or a number); `otherwise` the form that it takes in a
+    model where it is not applicable as it stands.
     """
 
     name: str

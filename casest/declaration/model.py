@@ -29,13 +29,21 @@ from casest.declaration.effect import (
     check_null,
     label_of,
 )
+from casest.declaration.flow import Flow
 from casest.declaration.noise import Stated, in_units_of_noise
 from casest.declaration.physics import Quantity, Residual
 from casest.declaration.prior import Prior
 from casest.declaration.sampson import sampson
 from casest.declaration.shapes import Array
 from casest.declaration.symbols import Constant, Parameter, Scope, Signal, Symbol, constant, named
-from casest.declaration.tracing import Traced, describe, function_of, reached_parameters, trace
+from casest.declaration.tracing import (
+    Traced,
+    describe,
+    function_of,
+    reached_parameters,
+    reached_signals,
+    trace,
+)
 from casest.declaration.travelling import reduced
 from casest.errors import CasestError, DeclarationError, UnitError, UsageError
 from casest.units import known, parse_quantity, size
@@ -84,6 +92,11 @@ class Model:
         if self.noise is None:
             return self.signals
         return self.signals + self.noise.columns({s.name: s for s in self.signals})
+
+    @property
+    def without_noise(self) -> Model:
+        """The same relation, its residual in its own unit; itself where no noise was stated."""
+        return self if self.noise is None else replace(self, noise=None)
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -272,7 +285,7 @@ class Model:
     def _not_applicable(self, attached: Attached) -> str:
         """Why an effect of this model does nothing in it, or cannot be; else empty."""
         on = attached.on
-        if any(a.kind in OVER_TIME for a in self.effects):
+        if self.sequential:
             try:
                 traced = self.staged
             except DeclarationError as error:
@@ -337,7 +350,7 @@ class Model:
         """Signals that another instrument than the measured one may give, late: not t."""
         if self.implicit:
             return ()
-        return tuple(s.name for s in self.signals if s.name not in ("t", self.traced.measured))
+        return tuple(s.name for s in self.signals if s.name not in ("t", *self.traced.readings))
 
     def _checked_recorded(self, added: Effect, target: str) -> str:
         """The unit of a recorded signal that comes at another time."""
@@ -442,10 +455,30 @@ class Model:
         """Does the body look back to the rest before (`before`, `turned`)?"""
         return any(stage.word for stage in self.staged.stages)
 
-    @property
+    @cached_property
     def sequential(self) -> bool:
-        """Does a sample's residual depend on other samples?"""
-        return self.resting or any(a.kind in OVER_TIME for a in self.effects)
+        """Does a sample's residual depend on others: by an effect, by equations, by rests?"""
+        over_time = any(a.kind in OVER_TIME for a in self.effects)
+        return over_time or self.traced.integrates or self.resting
+
+    @property
+    def reading(self) -> dict[str, Any]:
+        """What `load_runs` is told of its signals, as keyword arguments.
+
+        Of differential equations a reading may be missing, for the states go on; and inputs may be
+        constant, as settings of an experiment are.
+        """
+        if not self.traced.integrates:
+            return {}
+        traced = self.staged
+        needed = ca.vertcat(traced.predicted, *(s.entered for s in traced.stages))
+        reached = {"t", *reached_signals(self, traced, needed)}
+        gaps = tuple(s.name for s in self.signals if s.name not in reached)
+        measured = {*traced.readings}
+        return {
+            "gaps": gaps,
+            "steady": tuple(s.name for s in self.signals if s.name not in measured),
+        }
 
     # -- numbers -------------------------------------------------------------------------------
 
@@ -463,9 +496,9 @@ class Model:
             raise UsageError(f"model {self.name} needs the signal {missing[0]!r}")
         if self.sequential:
             raise UsageError(
-                f"model {self.name} has an effect on the sequence of samples, or looks at the rest "
-                "before: single samples have no prediction of their own; evaluate it on a run "
-                "(leastsquares.problem)"
+                f"model {self.name} has an effect on the sequence of samples, differential "
+                "equations, or looks at the rest before: single samples have no prediction of "
+                "their own; evaluate it on a run (leastsquares.problem)"
             )
         traced = self.traced
         outputs = {q.name: q.value for q in traced.quantities.values()}
@@ -538,8 +571,10 @@ def _declared(model_name: str, argument: inspect.Parameter) -> Symbol:
 
 
 def _reaches_residual(made: Model, attached: Attached) -> bool:
-    """Does the residual depend on the effect's parameters at all?"""
-    reached = reached_parameters(made, made.traced, made.traced.expression)
+    """Does the residual depend on the effect's parameters at all, also by what it integrates?"""
+    traced = made.staged if made.traced.integrates else made.traced
+    flows = [ca.vertcat(s.rates, s.start) for s in traced.stages if isinstance(s, Flow)]
+    reached = reached_parameters(made, traced, ca.vertcat(traced.expression, *flows))
     own = {p.name for p in attached.parameters}
     return not own or bool(own & reached)
 

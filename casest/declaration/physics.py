@@ -56,10 +56,14 @@ class Trace:
     quantities: dict[str, Quantity] = field(default_factory=dict)
     handed: dict[str, SX] = field(default_factory=dict)
     steps: list[tuple[SX, SX]] = field(default_factory=list)
-    #: What looks at other samples (tracing.Stage), in the order of the body.
+    #: What looks at other samples (tracing.Stage, flow.Flow), in the order of the body; only
+    #: where these are kept apart.
     stages: list[Any] = field(default_factory=list)
+    staged: bool = False
     #: How a word of the body that does so is handed on (tracing.reached).
     reach: Any = None
+    #: Does the body integrate rates?
+    integrates: bool = False
 
     def enter(self, name: str, expression: Any, unit: str, *, implied: bool = False) -> SX:
         """Record a quantity and hand back what the rest of the body shall see."""
@@ -150,7 +154,11 @@ def der(expression: SX, variable: SX) -> SX:
     if trace is not None and trace.naming and expression.is_symbolic():
         return ca.SX.sym(f"der({expression})")
     for stage in [] if trace is None else trace.stages:
-        if stage.attached is not None and ca.depends_on(ca.vec(ca.SX(expression)), stage.given):
+        if ca.depends_on(ca.vec(ca.SX(expression)), stage.given):
+            if stage.word:
+                continue
+            if stage.attached is None:
+                raise DeclarationError("der of what is integrated: write its rate instead")
             on, label = stage.attached.on, stage.attached.label
             raise DeclarationError(f"how fast {on} changes is unknown once {label} acts on it")
     return ca.jtimes(ca.SX(expression), variable, ca.SX.ones(*variable.shape))
@@ -171,7 +179,9 @@ def rotation(angles: SX) -> SX:
 class Residual:
     """What a model's body returns: how readings and parameters are tied together.
 
-    Explicit: `Residual(measured=v, predicted=reading)` with residual v − reading. Implicit:
+    Explicit: `Residual(measured=v, predicted=reading)` with residual v − reading; of several
+    signals `measured=(v, w), predicted=(first, second)`. `std`: of one reading, likewise; the
+    residual is then in these, and they weigh the readings. Implicit:
     `Residual(implicit=expression, unit="m/s^2")`, an expression that is zero but for noise; its
     unit should be that of the reading. `corrected` is the quantity that `apply` gives back.
     `noise` names for each axis the constant that is its standard deviation: a residual of several
@@ -181,19 +191,25 @@ class Residual:
     def __init__(
         self,
         *,
-        measured: SX = None,
-        predicted: SX = None,
+        measured: Any = None,
+        predicted: Any = None,
         implicit: SX = None,
         corrected: SX = None,
         unit: str = "",
         axes: tuple[str, ...] = (),
         noise: tuple[str, ...] = (),
+        std: Any = None,
     ) -> None:
         explicit = measured is not None and predicted is not None
         if explicit == (implicit is not None):
             raise DeclarationError("Residual takes measured= and predicted=, or implicit= alone")
-        self.measured, self.predicted, self.implicit = measured, predicted, implicit
-        self.corrected, self.unit, self.axes, self.noise = corrected, unit, axes, noise
+        several = isinstance(measured, tuple | list)
+        self.signals: tuple[SX, ...] = tuple(measured) if several else (measured,)
+        self.predicted = _side_by_side(predicted) if several else predicted
+        self.measured = _side_by_side(measured) if several else measured
+        self.std = None if std is None else _side_by_side(std) if several else ca.SX(std)
+        self.implicit, self.corrected, self.unit, self.axes = implicit, corrected, unit, axes
+        self.noise = noise
 
     @property
     def expression(self) -> SX:
@@ -204,7 +220,17 @@ class Residual:
             raise DeclarationError(
                 f"measured has shape {self.measured.shape}, predicted {ca.SX(self.predicted).shape}"
             )
-        return ca.vec(self.measured - self.predicted)
+        return self.of(ca.vec(self.measured), ca.vec(ca.SX(self.predicted)))
+
+    def of(self, reading: SX, predicted: SX) -> SX:
+        """The residual of readings and predictions, columns."""
+        away = reading - predicted
+        return away if self.std is None else away / ca.vec(self.std)
+
+
+def _side_by_side(parts: Any) -> SX:
+    """Several expressions as one column."""
+    return ca.vertcat(*(ca.densify(ca.vec(ca.SX(part))) for part in parts))
 
 
 def chart(kind: str, coordinates: SX, reference: SX) -> SX:

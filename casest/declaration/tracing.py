@@ -9,12 +9,14 @@ import sys
 import textwrap
 import warnings
 from collections.abc import Callable, Mapping
+from copy import copy
 from dataclasses import dataclass, replace
 from typing import Any, Literal, Protocol
 
 import casadi as ca
 
 from casest.declaration.effect import Attached
+from casest.declaration.flow import Flow, with_inputs
 from casest.declaration.physics import SX, Quantity, Residual, Trace, chart, current_trace
 from casest.declaration.shapes import in_digits
 from casest.declaration.symbols import Constant, Parameter, Signal, Symbol
@@ -78,7 +80,8 @@ class Traced:
     `coordinates` are the solver's unknowns and `references` the numbers that describe the charts
     of directions and rotations; `expression` is the residual column, `predicted` the reading of
     an explicit model and `reading` what it is compared with; `measured` and `corrected` name a
-    signal and a quantity.
+    signal and a quantity, `readings` every signal that is measured, where there are several as
+    well. `integrates`: it follows differential equations.
     """
 
     symbols: Mapping[str, SX]
@@ -92,7 +95,9 @@ class Traced:
     measured: str | None
     corrected: str | None
     steps: tuple[tuple[SX, SX], ...] = ()
-    stages: tuple[Stage, ...] = ()
+    stages: tuple[Stage | Flow, ...] = ()
+    readings: tuple[str, ...] = ()
+    integrates: bool = False
 
 
 #: Words of a body that look at the rest before.
@@ -115,6 +120,11 @@ class Stage:
     read: tuple[tuple[str, tuple[int, int]], ...] = ()
     word: Word = ""
 
+    @property
+    def entered(self) -> SX:
+        """All by which parameters enter."""
+        return self.taken
+
 
 def trace(
     model: Declared,
@@ -132,7 +142,9 @@ def trace(
     `stages`. Without it those effects are left out.
     """
     symbols, coordinates, references = _symbols(model)
-    running = Trace(cut=cut, naming=naming, straight=straight, reserved=frozenset(symbols))
+    running = Trace(
+        cut=cut, naming=naming, straight=straight, reserved=frozenset(symbols), staged=staged
+    )
     running.reach = _staged_word if staged else _as_if_at_rest
     for attached in model.effects:
         if attached.kind == "quantity":
@@ -140,11 +152,14 @@ def trace(
         if attached.kind == "sequence" and staged:
             running.effects.setdefault(attached.on, []).append(_staged(attached, symbols, running))
     residual = _run_body(model, running, symbols)
-    measured = _name_of(residual.measured, symbols)
-    if residual.measured is not None and measured is None:
+    running.stages = _with_inputs(model, running, symbols, [*coordinates, *references])
+    readings = tuple(_name_of(s, symbols) or "" for s in residual.signals if s is not None)
+    if "" in readings:
         raise DeclarationError(f"model {model.name}: measured= must be one of the model's signals")
-    if measured is not None:
-        residual = _with_named_prediction(residual, running, model[measured].unit or "")
+    if readings:
+        units = {model[name].unit or "" for name in readings}
+        residual = _with_named_prediction(residual, running, units.pop() if len(units) == 1 else "")
+    measured = readings[0] if len(readings) == 1 else None
     traced = Traced(
         symbols,
         ca.vertcat(*coordinates),
@@ -157,14 +172,16 @@ def trace(
         measured,
         _corrected(model, residual, running, symbols),
         stages=tuple(running.stages),
+        readings=readings,
+        integrates=running.integrates,
     )
     on_signals = [a for a in model.effects if a.kind == "signal"]
     for attached in on_signals:
-        if attached.on == traced.measured:
+        if attached.on in traced.readings:
             traced = _with_changed_reading(traced, attached)
     # What is substituted last acts first: so that the first effect added does, go backwards.
     for attached in reversed(on_signals):
-        if attached.on != traced.measured:
+        if attached.on not in traced.readings:
             traced = _with_signal_effect(traced, attached, running)
     for attached in model.effects if staged else ():
         if attached.kind == "time":
@@ -289,19 +306,21 @@ def _with_named_prediction(residual: Residual, running: Trace, unit: str) -> Res
     name = PREDICTED
     while name in running.quantities or name in running.reserved:
         name += "_"
-    return Residual(
-        measured=residual.measured,
-        predicted=running.enter(name, of, unit, implied=True),
-        corrected=residual.corrected,
-        unit=residual.unit,
-        axes=residual.axes,
-    )
+    named = copy(residual)
+    named.predicted = running.enter(name, of, unit, implied=True)
+    return named
 
 
 def _with_changed_reading(traced: Traced, attached: Attached) -> Traced:
     """The prediction stays; what is compared with it does not."""
-    changed = ca.vec(ca.SX(attached.apply(traced.reading, traced.symbols)))
-    return replace(traced, reading=changed, expression=changed - traced.predicted)
+    if traced.measured is not None:
+        changed = ca.vec(ca.SX(attached.apply(traced.reading, traced.symbols)))
+    else:
+        own = traced.symbols[attached.on]
+        part = ca.vec(ca.SX(attached.apply(own, traced.symbols)))
+        changed = ca.substitute(traced.reading, ca.vec(own), part)
+    expression = traced.residual.of(changed, traced.predicted)
+    return replace(traced, reading=changed, expression=expression)
 
 
 def _with_signal_effect(traced: Traced, attached: Attached, running: Trace) -> Traced:
@@ -470,6 +489,16 @@ def _diagonal_positive(p: Parameter) -> bool:
     """Whether the diagonal of a matrix is bounded at 0, which its declaration does not show."""
     diagonal = [k for k, index in enumerate(p.shape.entries) if len(set(index)) == 1]
     return p.shape.positive_diagonal and all(p.lower[k] >= 0 for k in diagonal)
+
+
+def _with_inputs(
+    model: Declared, running: Trace, symbols: Mapping[str, SX], unknown: list[SX]
+) -> list[Any]:
+    """The stages, those that are differential equations with what their rates read."""
+    held = {
+        e.element_hash(): s.held for s in model.signals for e in ca.vertsplit(flat(symbols[s.name]))
+    }
+    return with_inputs(running.stages, ca.vertcat(*unknown), held, symbols.get("t"))
 
 
 def _name_of(symbol: SX | None, symbols: Mapping[str, SX]) -> str | None:

@@ -12,10 +12,13 @@ import casadi as ca
 import numpy as np
 
 from casest import units
+from casest.declaration.changing import check_units_known
+from casest.declaration.model import Model
 from casest.declaration.physics import SX
 from casest.declaration.shapes import Array
-from casest.declaration.symbols import Constant, Signal
+from casest.declaration.symbols import Constant, Parameter, Signal, constant
 from casest.declaration.tracing import flat
+from casest.dynamics.equations import calibration
 from casest.errors import CasestError, DeclarationError, UsageError, last_line
 
 
@@ -24,7 +27,9 @@ class State:
     """A state: `size` numbers in `unit`; `intensity` of the white noise that drives it, unit²/s.
 
     `start` and `std` describe what is known of it at the beginning. `of_data`: the intensity was
-    taken from the record at hand, so that a search for the most likely one begins there.
+    taken from the record at hand, so that a search for the most likely one begins there. `known`:
+    it begins exactly at `start`; `stated`: the declaration says its std. `of`: it is an unknown
+    constant of the equations, declared with `param(…)`, that a filter follows as a state.
     """
 
     name: str
@@ -34,6 +39,19 @@ class State:
     start: tuple[float, ...]
     std: float
     of_data: bool = False
+    known: bool = False
+    stated: bool = False
+    of: Parameter | None = None
+
+    @property
+    def beginning(self) -> str:
+        """Name of the unknown or constant that it begins with, in a calibration."""
+        return f"{self.name}_start"
+
+
+#: Standard deviation at the beginning of a state of which nothing is said, in its own unit; of one
+#: that is known exactly, for its size.
+UNSTATED, EXACT = 1.0, 1e-9
 
 
 def state(
@@ -42,23 +60,50 @@ def state(
     *,
     intensity: float = 0.0,
     start: Any = 0.0,
-    std: float = 1.0,
+    std: float | None = None,
+    known: bool = False,
 ) -> Any:
     """Declare a state: `state(3, "m/s", intensity=1e-3)`, `state("rad")`.
 
     `intensity` is that of its white driving noise in unit²/s (0: driven by nothing), `start` and
-    `std` what is known of it at the beginning, in its own unit.
+    `std` what is known of it at the beginning, in its own unit: in a filter 1 where nothing is
+    said, in a calibration nothing, so that it is an unknown of each run whose search begins at
+    `start`. `known`: it begins exactly there, at t = 0 where the record begins later.
     """
     if isinstance(shape, str):
         size, unit = 1, shape
     else:
         size = shape
-    values = np.broadcast_to(np.asarray(start, float), (size,))
-    for what, number in (("intensity", intensity), ("std", std)):
+    try:
+        values = np.broadcast_to(np.asarray(start, float), (size,))
+    except ValueError:
+        count = np.size(start)
+        raise DeclarationError(
+            f"state: start={start!r} has {count} numbers, the state {size}: give one for each"
+        ) from None
+    if not np.all(np.isfinite(values)):
+        raise DeclarationError(f"state: start={start!r} is not finite")
+    if known and std is not None:
+        raise DeclarationError(
+            f"state: known=True says that it begins exactly at its start, and std={std:g} that it "
+            "does not: give one of them"
+        )
+    exact = EXACT * max(1.0, float(np.max(np.abs(values), initial=0.0)))
+    spread = std if std is not None else exact if known else UNSTATED
+    for what, number in (("intensity", intensity), ("std", spread)):
         wrong = _wrong(what, number)
         if wrong:
             raise DeclarationError(f"state: {wrong}")
-    return State("", size, unit, float(intensity), tuple(values.tolist()), float(std))
+    return State(
+        "",
+        size,
+        unit,
+        float(intensity),
+        tuple(values.tolist()),
+        float(spread),
+        known=known,
+        stated=std is not None,
+    )
 
 
 def _wrong(field: str, number: Any) -> str | None:
@@ -78,14 +123,15 @@ class Measured:
     """An output: the signal that measures it, what it should be, and its noise intensity.
 
     `intensity` in unit²·s: variance of one reading times the time between two; or `std`, the
-    standard deviation of one reading, in its unit. `wraps`: both are angles, which are alike a full
-    turn apart.
+    standard deviation of one reading, in its unit, a number or an expression of signals; or
+    neither: a calibration tells it from the residual. `wraps`: both are angles, which are alike a
+    full turn apart.
     """
 
     signal: SX
     predicted: SX
     intensity: float | None
-    std: float | None = None
+    std: float | SX | None = None
     wraps: bool = False
 
 
@@ -142,18 +188,23 @@ def measured(
     predicted: SX | Angle,
     *,
     intensity: float | None = None,
-    std: float | None = None,
+    std: float | SX | str | None = None,
 ) -> Measured:
     """An output: `measured(v, velocity, std=0.01)`, the standard deviation of one reading; or its
     noise's intensity in unit²·s, the variance of one reading times the time between two; see
-    `angle` too."""
-    if (intensity is None) == (std is None):
-        given = "neither" if std is None else "both"
+    `angle` too.
+
+    In a calibration `std` may also be a signal (a column with that of every reading), an expression
+    of signals, or "5%" of the reading; and nothing need be said where all readings are alike.
+    """
+    if intensity is not None and std is not None:
         raise DeclarationError(
-            f"measured: {given} of std= and intensity= given: say how large the noise of one "
+            "measured: both of std= and intensity= given: say how large the noise of one "
             "reading is (std=), or its variance times the time between two (intensity=)"
         )
-    if std is not None and not 0 < std < np.inf:
+    if isinstance(std, str):
+        std = _share(std) * ca.fabs(signal)
+    elif isinstance(std, int | float) and not 0 < std < np.inf:
         raise DeclarationError(
             f"measured: std={std:g} must be positive and finite: the standard deviation of one "
             "reading"
@@ -163,10 +214,25 @@ def measured(
             f"measured: the noise intensity must be positive, not {intensity}: a reading without "
             "noise makes the Riccati equation singular; give the sensor's variance times its period"
         )
-    intensity, std = (None if v is None else float(v) for v in (intensity, std))
+    intensity = None if intensity is None else float(intensity)
+    std = float(std) if isinstance(std, int | float) else std
     if isinstance(predicted, Angle):
         return Measured(signal, predicted.expression, intensity, std, wraps=True)
     return Measured(signal, predicted, intensity, std)
+
+
+def _share(text: str) -> float:
+    """The share of the reading that "5%" is."""
+    number = text.strip().removesuffix("%").strip()
+    try:
+        share = float(number) / 100 if text.strip().endswith("%") else np.nan
+    except ValueError:
+        share = np.nan
+    if not 0 < share < np.inf:
+        raise DeclarationError(
+            f'measured: std={text!r}: give a number, a signal, or a share of the reading as "5%"'
+        )
+    return share
 
 
 def constraint(expression: SX, value: float | SX) -> Constraint:
@@ -190,7 +256,7 @@ class Dynamics:
 
     # -- new ones from this one ----------------------------------------------------------------
 
-    def having(self, **values: float) -> Dynamics:
+    def having(self, **values: Any) -> Dynamics:
         """The same with other constants."""
         names = {c.name for c in self.constants}
         for name in values:
@@ -198,7 +264,7 @@ class Dynamics:
                 known = ", ".join(sorted(names)) or "none"
                 raise UsageError(f"{self.name} has no constant {name!r}; it has {known}")
         changed = tuple(
-            replace(c, value=(float(values[c.name]),)) if c.name in values else c
+            replace(c, value=_values(c, values[c.name])) if c.name in values else c
             for c in self.constants
         )
         return replace(self, constants=changed)
@@ -339,12 +405,17 @@ class Dynamics:
         own = next(o for n, o in zip(t.measured, t.outputs, strict=True) if n == name)
         if own.intensity is not None:
             return own.intensity
+        if not isinstance(own.std, float):
+            what = "no noise" if own.std is None else "a noise that differs between readings"
+            raise UsageError(
+                f"{self.name}: {name} has {what}, and a filter needs one number: "
+                f"measured({name}, …, std=NUMBER), or --sensor-noise {name}=NUMBER"
+            )
         if period is None:
             raise UsageError(
                 f"{self.name}: {name} has the noise of one reading (std={own.std:g}): its "
                 f"intensity needs the time between two; sensing({name}=…) says it"
             )
-        assert own.std is not None
         return own.std**2 * period
 
     @cached_property
@@ -362,7 +433,67 @@ class Dynamics:
     @cached_property
     def traced(self) -> Traced:
         """The body on CasADi symbols."""
-        return traced_with(self, {c.name: float(c.array) for c in self.constants})
+        return traced_with(self, {c.name: number_of(c) for c in self.constants})
+
+    @property
+    def driven_by_noise(self) -> bool:
+        """Does white noise drive a state, its own or that of an input?"""
+        noisy = set(self.sensors) - {s.name for s in self.signals if s.name in self.input_signals}
+        inputs = {name for name, q in self.sensors.items() if q} - noisy
+        return any(s.intensity for s in self.states) or bool(inputs)
+
+    @property
+    def calibration(self) -> Model:
+        """The model that it is without driving noise: see `equations`."""
+        return calibration(self)
+
+    @property
+    def unknown_constants(self) -> tuple[Parameter, ...]:
+        """Unknown constants of the equations."""
+        return tuple(s.of for s in self.states if s.of is not None)
+
+    def moved(self, symbols: Mapping[str, Any]) -> Motion:
+        """What the body returns, of signals, states and constants by name."""
+        try:
+            motion = self.function(**symbols)
+        except CasestError:
+            raise
+        except (Exception, SystemExit) as error:
+            raise DeclarationError(f"dynamics {self.name}: {last_line(error)}") from None
+        if not isinstance(motion, Motion):
+            raise DeclarationError(f"dynamics {self.name} must return Motion(rates=…, outputs=…)")
+        return motion
+
+    def rates_of(self, motion: Motion) -> dict[str, SX]:
+        """The rate of every state and unknown constant, a column each."""
+        rates = {}
+        for own in self.states:
+            if own.of is not None and own.name in motion.rates:
+                raise DeclarationError(
+                    f"dynamics {self.name}: rate of {own.name!r}, which is a constant: declare "
+                    "state(…) in place of param(…)"
+                )
+            rate = ca.SX(motion.rates.get(own.name, ca.SX.zeros(own.size)))
+            if rate.numel() != own.size:
+                raise DeclarationError(
+                    f"dynamics {self.name}: the rate of {own.name} has {rate.numel()} numbers, "
+                    f"the state {own.size}"
+                )
+            rates[own.name] = ca.densify(rate)
+        for name in motion.rates:
+            if name not in rates:
+                raise DeclarationError(f"dynamics {self.name}: rate of {name!r}, which is no state")
+        return rates
+
+    def measured_in(self, motion: Motion, symbols: Mapping[str, SX]) -> list[str]:
+        """Names of the signals that outputs are compared with."""
+        names = []
+        for o in motion.outputs:
+            found = [s.name for s in self.signals if symbols[s.name] is o.signal]
+            if not found:
+                raise DeclarationError(f"dynamics {self.name}: measured(…) needs a signal first")
+            names.append(found[0])
+        return names
 
     @property
     def input_signals(self) -> tuple[str, ...]:
@@ -426,9 +557,22 @@ class Traced:
         return np.asarray(said + self.wrapped(y - said))
 
 
+def _values(fixed: Constant, value: Any) -> tuple[float, ...]:
+    """A constant's numbers, of its shape."""
+    array = np.asarray(value, float)
+    if array.shape != fixed.array.shape:
+        raise UsageError(f"{fixed.name} has shape {fixed.array.shape}, not {array.shape}")
+    return tuple(array.ravel().tolist())
+
+
+def number_of(fixed: Constant) -> Any:
+    """The value of a constant as the body sees it."""
+    return ca.SX(ca.DM(fixed.array)) if fixed.dims else float(fixed.array)
+
+
 def dynamics(function: Callable[..., Motion]) -> Dynamics:
     """Declare a moving estimator: positional arguments are signals, keyword-only ones states
-    (`state(…)`) or constants."""
+    (`state(…)`), unknown constants of the equations (`param(…)`) or known ones."""
     name = function.__name__.replace("_", "-")
     signals, states, constants = [], [], []
     for argument in inspect.signature(function).parameters.values():
@@ -442,12 +586,29 @@ def dynamics(function: Callable[..., Motion]) -> Dynamics:
             states.append(replace(default, name=argument.name))
         elif isinstance(default, Constant):
             constants.append(replace(default, name=argument.name))
+        elif isinstance(default, Parameter):
+            states.append(_followed(replace(default, name=argument.name)))
+        elif isinstance(default, int | float) and not isinstance(default, bool):
+            plain: Constant = constant(default)
+            constants.append(replace(plain, name=argument.name))
         else:
-            raise DeclarationError(f"{where} must be state(…) or constant(…), not {default!r}")
-    for s in states:
-        if not units.known(s.unit):
-            raise DeclarationError(f"dynamics {name}: {s.name} has unknown unit {s.unit!r}")
+            raise DeclarationError(
+                f"{where} must be state(…), param(…), constant(…) or a number, not {default!r}"
+            )
+    check_units_known(name, (*(own.of for own in states if own.of is not None), *constants))
+    for own in states:
+        if own.of is None and not units.known(own.unit):
+            raise DeclarationError(f"dynamics {name}: {own.name} has unknown unit {own.unit!r}")
     return Dynamics(name, function, tuple(signals), tuple(states), tuple(constants))
+
+
+def _followed(unknown: Parameter) -> State:
+    """A filter's state for an unknown constant: its std is its size, or 1 of what begins at 0."""
+    start = unknown.start_value()
+    size = float(np.max(np.abs(start), initial=0.0))
+    values = tuple(start.tolist())
+    unit = unknown.units[0] if len(set(unknown.units)) == 1 else "1"
+    return State(unknown.name, unknown.shape.size, unit, 0.0, values, size or UNSTATED, of=unknown)
 
 
 def traced_with(declared: Dynamics, constants: Mapping[str, SX | float]) -> Traced:
@@ -456,33 +617,16 @@ def traced_with(declared: Dynamics, constants: Mapping[str, SX | float]) -> Trac
     for s in declared.signals:
         plain = ca.SX.sym(s.name, s.size)
         symbols[s.name] = ca.reshape(plain, 3, 3).T if s.kind == "rotation" else plain
-    xs = {s.name: ca.SX.sym(s.name, s.size) for s in declared.states}
-    try:
-        motion = declared.function(**symbols, **xs, **constants)
-    except CasestError:
-        raise
-    except (Exception, SystemExit) as error:
-        raise DeclarationError(f"dynamics {declared.name}: {last_line(error)}") from None
-    if not isinstance(motion, Motion):
-        raise DeclarationError(f"dynamics {declared.name} must return Motion(rates=…, outputs=…)")
-    rates = []
+    xs = {own.name: ca.SX.sym(own.name, own.size) for own in declared.states}
     for own in declared.states:
-        rate = ca.SX(motion.rates.get(own.name, ca.SX.zeros(own.size)))
-        if rate.numel() != own.size:
+        if own.of is not None and (own.of.shape.curved or len(own.of.shape.dims) > 1):
             raise DeclarationError(
-                f"dynamics {declared.name}: the rate of {own.name} has {rate.numel()} numbers, "
-                f"the state {own.size}"
+                f"dynamics {declared.name}: {own.name} is a matrix or a direction, which a filter "
+                "does not follow; calibrate it, or declare its entries"
             )
-        rates.append(ca.densify(rate))
-    for name in motion.rates:
-        if name not in xs:
-            raise DeclarationError(f"dynamics {declared.name}: rate of {name!r}, which is no state")
-    names = []
-    for o in motion.outputs:
-        found = [n for n, s in symbols.items() if s is o.signal]
-        if not found:
-            raise DeclarationError(f"dynamics {declared.name}: measured(…) needs a signal first")
-        names.append(found[0])
+    motion = declared.moved({**symbols, **xs, **constants})
+    rates = list(declared.rates_of(motion).values())
+    names = declared.measured_in(motion, symbols)
     x, f = ca.vertcat(*xs.values()), ca.vertcat(*rates)
     h = ca.vertcat(*[ca.densify(ca.vec(ca.SX(o.predicted))) for o in motion.outputs])
     reading = ca.vertcat(*[flat(o.signal) for o in motion.outputs])

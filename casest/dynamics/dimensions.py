@@ -21,6 +21,7 @@ from casest.declaration.dimensions import (
 from casest.declaration.temperatures import of_symbol
 from casest.declaration.tracing import flat
 from casest.dynamics.declare import Dynamics, traced_with
+from casest.dynamics.equations import with_units
 
 
 def check_units(model: Dynamics) -> None:
@@ -28,16 +29,25 @@ def check_units(model: Dynamics) -> None:
 
     A declaration that has no unit at all has none to check: its time has none either.
     """
-    given: list[str | None] = [x.unit for part in (model.states, model.constants) for x in part]
-    if not {*given, *(s.unit for s in model.signals)} - {None, "", "1"}:
+    if not with_units(model):
         return
-    symbols = {c.name: ca.SX.sym(c.name) for c in model.constants}
+    model = replace(model, states=tuple(replace(s, unit=s.unit or "1") for s in model.states))
+    symbols = {c.name: ca.SX.sym(c.name, *c.dims) for c in model.constants}
     t = traced_with(model, symbols)
-    inputs = [t.x, *(flat(t.symbols[s.name]) for s in model.signals), *symbols.values()]
+    inputs = [
+        t.x,
+        *(flat(t.symbols[s.name]) for s in model.signals),
+        *map(ca.vec, symbols.values()),
+    ]
     f = ca.Function("units", inputs, [ca.densify(e) for e in (t.f, t.h, ca.densify(t.g))])
     place = f"dynamics {model.name}"
     rates, outputs, _ = followed_through(f, _inputs(model), place)
-    for name, unit, found in zip(model.names, model.state_units, rates, strict=True):
+    constant = [s.of is not None for s in model.states for _ in range(s.size)]
+    for name, unit, found, fixed in zip(
+        model.names, model.state_units, rates, constant, strict=True
+    ):
+        if fixed:
+            continue
         where = f"{place}: the rate of {name} [{unit}]"
         refuse_unless_fits(found, size_of(f"({unit})/s", {}), where)
     signals = {s.name: s for s in model.signals}
@@ -58,9 +68,10 @@ def _inputs(model: Dynamics) -> dict[tuple[int, int], Size]:
             any_unit = s.unit is None and s.kind != "rotation"
             found[1 + k, i] = PLAIN if any_unit else _sized(s.name, s.unit or "", signal=True)
     for k, c in enumerate(model.constants):
-        found[1 + len(model.signals) + k, 0] = (
-            _sized(c.name, c.unit, signal=False) if c.unit else PLAIN
-        )
+        for i in range(c.array.size):
+            found[1 + len(model.signals) + k, i] = (
+                _sized(c.name, c.unit, signal=False) if c.unit else PLAIN
+            )
     return found
 
 

@@ -30,6 +30,12 @@ from casest.effects.motion import (
     vibration,
 )
 from casest.effects.noise import bias_wander, outliers
+from casest.effects.over import (
+    temperature_cubic,
+    temperature_gain_cubic,
+    temperature_gain_table,
+    temperature_table,
+)
 from casest.effects.reference import reference_drift, table_angle
 from casest.effects.response import (
     axis_gain,
@@ -99,7 +105,16 @@ CATALOGUE: tuple[Effect, ...] = (
     outliers,
 )
 
-_FUNCTIONS = frozenset(f.function for e in CATALOGUE for f in (e, e.otherwise) if f is not None)
+#: Shipped effects that the loop does not try: they are there for who asks by name.
+ASKED: tuple[Effect, ...] = (
+    temperature_cubic,
+    temperature_gain_cubic,
+    temperature_table,
+    temperature_gain_table,
+)
+
+_SHIPPED = (*CATALOGUE, *ASKED)
+_FUNCTIONS = frozenset(f.function for e in _SHIPPED for f in (e, e.otherwise) if f is not None)
 
 
 def shipped(effect: Effect) -> bool:
@@ -110,4 +125,4 @@ def shipped(effect: Effect) -> bool:
     return effect.function in _FUNCTIONS
 
 
-__all__ = ["CATALOGUE", "shipped", *(e.name for e in CATALOGUE)]
+__all__ = ["ASKED", "CATALOGUE", "shipped", *(e.name for e in (*CATALOGUE, *ASKED))]

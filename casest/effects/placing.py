@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -111,22 +111,30 @@ def _starting(
     return replace(attached, parameters=tuple(map(begun, attached.parameters)))
 
 
+#: What is told of a column.
+OF_COLUMN: dict[str, Callable[[Array], float]] = {
+    "mean": lambda x: float(np.mean(x)),
+    "least": lambda x: float(np.min(x)),
+    "greatest": lambda x: float(np.max(x)),
+}
+
+
 def with_numbers(
     effect: Effect,
     columns: tuple[tuple[str, str], ...],
     runs: Sequence[Run],
     model: Model | None = None,
 ) -> Effect:
-    """Numbers that come from the data: the channel's mean and unit, the record's duration.
+    """Numbers that come from the data: the channel's mean, range and unit, the record's duration.
 
     `model` tells the unit of a channel that is one of its quantities. Raises UnitError where a
     channel should be an angle and is none.
     """
     values: dict[str, float] = {}
     for name, what in effect.numbers:
-        if what == "mean" and columns:
+        if what in OF_COLUMN and columns:
             x = np.concatenate([run.signals[columns[0][1]][:, 0] for run in runs])
-            values[name] = float(f"{np.mean(x):.6g}")
+            values[name] = float(f"{OF_COLUMN[what](x):.6g}")
         if what == "radian" and columns:
             values[name] = _radian(columns[0][1], runs, model)
         if what == "duration":

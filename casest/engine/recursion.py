@@ -19,7 +19,7 @@ import numpy as np
 from casest.engine.kernel import library
 from casest.engine.operations import Floats
 
-#: Steps that CasADi runs in one call.
+#: Steps that CasADi runs in one call, at most.
 CHUNK = 500
 #: Steps from which on the cache is looked at, and from which on a compiler is worthwhile.
 LOOK, WORTHWHILE = 5_000, 60_000
@@ -55,7 +55,7 @@ class Recursion:
         self._replayed = 0
         self._library: ctypes.CDLL | None = None
         self._looked = self._built = False
-        self._chunk: Any = None
+        self._chunks: dict[int, Any] = {}
 
     def __call__(self, state: Floats, numbers: Floats, *, keep: bool = True) -> list[Floats]:
         """Every output of every step, (N, …) each; without `keep` of the states nothing of use.
@@ -102,18 +102,19 @@ class Recursion:
         return str(generator.dump()) + _LOOP % {**sizes, "wide": self._wide}
 
     def _replay(self, state: Floats, numbers: Floats, found: list[Floats], keep: bool) -> None:
-        if self._chunk is None:
-            self._chunk = self._step.mapaccum("steps", CHUNK)
+        chunk = _chunk(len(numbers))
+        if chunk not in self._chunks:
+            self._chunks[chunk] = self._step.mapaccum("steps", chunk)
         # CasADi's matrices are column by column: a row of these arrays is one of its columns.
-        buffer, run = self._chunk.buffer()
-        parts = [np.empty((CHUNK, size)) for size in self.sizes]
+        buffer, run = self._chunks[chunk].buffer()
+        parts = [np.empty((chunk, size)) for size in self.sizes]
         for i, part in enumerate(parts):
             buffer.set_res(i, memoryview(part))  # type: ignore[arg-type]
-        for k in range(0, len(numbers), CHUNK):
-            given = numbers[k : k + CHUNK]
+        for k in range(0, len(numbers), chunk):
+            given = numbers[k : k + chunk]
             size = len(given)
-            if size < CHUNK:
-                given = np.concatenate([given, np.repeat(given[-1:], CHUNK - size, axis=0)])
+            if size < chunk:
+                given = np.concatenate([given, np.repeat(given[-1:], chunk - size, axis=0)])
             for i, array in enumerate((state, given)):
                 buffer.set_arg(i, memoryview(array))  # type: ignore[arg-type]
             run()
@@ -121,3 +122,8 @@ class Recursion:
                 if keep or i:
                     found[i][k : k + size] = part[:size]
             state = parts[0][-1].copy()
+
+
+def _chunk(count: int) -> int:
+    """Steps in one call for so many in all: those beyond them are for nothing."""
+    return min(CHUNK, 1 << max(count - 1, 7).bit_length())

@@ -32,6 +32,7 @@ from casest.leastsquares.kinds import in_deviations
 from casest.leastsquares.problem import Point, Problem
 from casest.leastsquares.stated import chi_square
 from casest.leastsquares.sums import repeat_noise, second_order_bias
+from casest.solve.horizon import grown
 from casest.solve.outcome import Outcome
 from casest.solve.strategy import SOLVERS, best_of, solve, valleys
 from casest.solve.trust_region import trust_region
@@ -77,6 +78,7 @@ def attempt(
     Without `intervals`, those that only the likelihood can give are left out: each takes fits. So
     is the search for a better valley: the start is taken to lie in the right one.
     """
+    model = getattr(model, "calibration", model)
     # What is not finite is found and named, not warned about.
     with np.errstate(all="ignore"), one_thread():
         return _attempt(Problem(model, tuple(runs)), start, solver, seed, intervals)
@@ -95,6 +97,8 @@ def _attempt(
         first = problem.start() if start is None else problem.point(_merged(problem, start))
     except NotTrusted as error:
         return _refused(problem, problem.point({}), Code.MODEL, str(error), began)
+    if model.traced.integrates and problem.stopped(first):
+        first = grown(problem, first).point  # along the record it may lead somewhere else
     nowhere = _not_finite(problem, first)
     if nowhere:
         return _refused(problem, first, Code.NOT_FINITE, nowhere, began)
@@ -147,6 +151,8 @@ def _not_finite(problem: Problem, start: Point) -> str:
     normal = problem.normal(start)
     if np.isfinite(normal.cost) and np.all(np.isfinite(normal.gradient)):
         return ""
+    if words := problem.stopped(start):
+        return f"{words}; give --start, or bounds that keep the search away"
     for run, residual in zip(problem.runs, problem.residuals(start), strict=True):
         bad = np.flatnonzero(~np.isfinite(residual).all(axis=1))
         if bad.size:
@@ -154,6 +160,11 @@ def _not_finite(problem: Problem, start: Point) -> str:
                 f"the residual is not finite at the start values in {bad.size} of {len(run)} rows, "
                 f"first in {run.file or run.name} row {int(run.rows[bad[0]])}; give --start"
             )
+    if problem.model.traced.integrates:
+        return (
+            "the equations are too stiff at the start values for their slopes to be followed; give "
+            "--start, or bounds that keep the search away"
+        )
     return "a derivative of the residual is not finite at the start values; give --start"
 
 

@@ -180,7 +180,7 @@ def _undetermined(identified: Identifiability) -> list[tuple[Code, str]]:
 def _has_likelihood(problem: Problem) -> bool:
     """Is there one that can be profiled?"""
     curved = any(slot.parameter.shape.curved for slot in problem.slots)
-    return not (problem.model.implicit or curved or problem.sequential)
+    return not (problem.model.implicit or curved or (problem.sequential and not problem.smooth))
 
 
 def _profile(

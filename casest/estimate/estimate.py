@@ -113,10 +113,14 @@ class Estimate:
     @cached_property
     def information(self) -> Array:
         """The inverse of the covariance (n, n); JᵀJ/σ² where that has none."""
-        if self.identifiability.rank == self.problem.unknowns and self.free.all():
-            return np.asarray(np.linalg.inv(self.covariance))
-        R = self.problem.factor(self.optimum or self.point)[0]
-        return np.asarray(R.T @ R / self.noise.sigma**2)
+        with np.errstate(all="ignore"):  # numbers of any size come through here
+            if self.identifiability.rank == self.problem.unknowns and self.free.all():
+                size = np.sqrt(np.diag(self.covariance))
+                scaled = self.covariance / size / size[:, None]
+                if np.isfinite(scaled).all():
+                    return np.asarray(np.linalg.pinv(scaled, hermitian=True) / size / size[:, None])
+            R = self.problem.factor(self.optimum or self.point)[0] / self.noise.sigma
+            return np.asarray(R.T @ R)
 
     @property
     def free(self) -> NDArray[np.bool_]:

@@ -15,8 +15,9 @@ from casest.leastsquares.problem import Point, Problem
 from casest.leastsquares.sums import rounding
 from casest.leastsquares.weights import has_noise_effects
 from casest.solve.aliases import folded, others, without_turns
+from casest.solve.equations import arrived, from_elsewhere
 from casest.solve.equivalent import between_rows, limit_of, roughness, same_on
-from casest.solve.global_search import EFFORTS, ROWS, search, some_rows, unlike
+from casest.solve.global_search import EFFORTS, ROWS, Search, rivals_of, search, some_rows, unlike
 from casest.solve.outcome import Outcome
 from casest.solve.reach import neighbouring, turning
 from casest.solve.strategy import best_of, valleys
@@ -36,6 +37,8 @@ def looked_for(
     None for models that have their own start from the data, are linear in all unknowns or predict
     no reading row by row. `stated`: the start is the user's own.
     """
+    if problem.model.traced.integrates and np.isfinite(best_of(outcomes).cost):
+        return _looked_for_in_equations(problem, first, outcomes, seed)
     if not searchable(problem.model) or not np.isfinite(best_of(outcomes).cost):
         return outcomes, None
     allowed = rows_can_follow(problem, first, stated)
@@ -50,6 +53,32 @@ def looked_for(
     outcomes, equal = _in_one_form(problem, first, outcomes, stated)
     aliases = tuple(others(problem, best_of(outcomes).point))
     return outcomes, replace(evidence, equal=equal, aliases=aliases)
+
+
+def _looked_for_in_equations(
+    problem: Problem, first: Point, outcomes: tuple[Outcome, ...], seed: int
+) -> tuple[tuple[Outcome, ...], Evidence]:
+    """The same of differential equations: unless readings vouch, ways from starts elsewhere."""
+    best = best_of(outcomes)
+    evidence = Evidence(scatter(problem, best.point))
+    if evidence.vouched or problem.model.starter is not None:
+        return outcomes, evidence
+    ends = from_elsewhere(problem, first, best, seed)
+    lowest = best_of((best, *ends))
+    if lowest is not best:
+        best = trust_region(problem, lowest.point, damping=LITTLE)
+        outcomes = (best, *outcomes)
+    finite = [o for o in ends if np.isfinite(o.cost)]
+    found = Search(
+        best,
+        len(ends),
+        len(ends),
+        arrived(best, finite),
+        valleys((best, *finite)),
+        problem.unknowns,
+        rivals_of(problem, best, finite),
+    )
+    return outcomes, Evidence(scatter(problem, best.point), found)
 
 
 def rows_can_follow(problem: Problem, first: Point, stated: bool) -> Callable[[Point], bool]:
@@ -139,4 +168,5 @@ def searchable(model: Model) -> bool:
         or has_noise_effects(model)
         or linear(model)
         or any(a.kind == "sequence" for a in model.effects)
+        or model.traced.integrates
     )

@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casest.data.run import Run
-from casest.declaration.effect import OVER_TIME
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
 from casest.declaration.symbols import Parameter
@@ -148,7 +147,7 @@ def check_model(model: Model) -> None:
             f"model {model.name} has the direction or rotation {curved[0]} among its unknowns, "
             "which calibrate_many cannot move; fix it, or call calibrate for each sensor"
         )
-    if any(a.kind in OVER_TIME for a in model.effects):
+    if model.sequential:
         raise UsageError(
             f"model {model.name} has an effect on the sequence of samples, which calibrate_many "
             "does not follow; call calibrate for each sensor"

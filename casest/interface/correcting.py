@@ -23,7 +23,7 @@ from casest.errors import UsageError
 from casest.interface.reading import Reading, stated
 from casest.interface.tables import as_frame, headers, like
 from casest.results.saved import SavedResult
-from casest.saved.apply import corrected, extrapolated, fitted_unit, without
+from casest.saved.apply import beyond, corrected, fitted_unit, with_margin, without
 
 #: Readings: one array of the sensor's readings, a mapping or frame of columns, a file, or runs.
 Readings = Array | Frame | Path_ | Run | Sequence[Run]
@@ -124,7 +124,7 @@ def _warn(carried: Carried, runs: Sequence[Run], beneath: int = 4) -> None:
 
     The caller is `beneath` as many calls.
     """
-    said = list(extrapolated(carried, runs))
+    said = list(beyond(carried.program, with_margin(carried), runs))
     if carried.program.left:
         said.append(LEFT + ", ".join(carried.program.left))
     if carried.timed:

@@ -73,6 +73,8 @@ def scatter(problem: Problem, point: Point) -> Scatter | None:
     For models that predict a reading from measured inputs, row by row.
     """
     model = problem.model
+    if model.traced.integrates:
+        return _in_time(problem, point)
     if model.implicit or problem.sequential or problem.weights is not None:
         return None
     freedom = problem.residual_count - problem.unknowns
@@ -102,6 +104,37 @@ def scatter(problem: Problem, point: Point) -> Scatter | None:
         float(squares[1] / count),
         (float(freedom), float(dof)),
     )
+
+
+def _in_time(problem: Problem, point: Point) -> Scatter | None:
+    """The same of differential equations: neighbours in time, each reading by itself."""
+    freedom = problem.residual_count - problem.unknowns
+    squares, dof, count = np.zeros(3), 0.0, 0
+    for r, e in enumerate(problem.residuals(point) if freedom > 0 else ()):
+        time = np.asarray(problem.runs[r].time, float)
+        y = _readings(problem.model)(problem.parameters(point, r), problem.samples[r])[0][:, :, 0]
+        for axis in range(y.shape[1]):
+            there = np.flatnonzero(np.isfinite(y[:, axis]))[some_of(len(y))]
+            if len(there) < FEWEST:
+                continue
+            C = predictors(time[there][:, None])
+            own, left, rows = y[there, axis], e[there, axis], C.shape[0]
+            squares += [np.sum((C @ own) ** 2), np.sum((C @ left) ** 2), np.var(own) * rows]
+            dof += float(freedom_of(C)[0])
+            count += rows
+    if count < FEWEST:
+        return None
+    residual = float(2 * problem.cost(point) / freedom)
+    neighbours, left, spread = (float(s) / count for s in squares)
+    return Scatter(neighbours, residual, spread, left, (float(freedom), dof))
+
+
+@lru_cache(maxsize=64)
+def _readings(model: Model) -> Replay:
+    """Readings of one sample as residuals have them: over their std where one is declared."""
+    t = model.traced
+    zero = ca.SX.zeros(t.reading.numel())
+    return Replay(function_of(model, {"y": ca.densify(t.residual.of(t.reading, zero))}))
 
 
 def some_of(count: int) -> Any:

@@ -16,6 +16,7 @@ import casadi as ca
 import numpy as np
 
 from casest.data.run import Run
+from casest.declaration.effect import OVER_TIME
 from casest.declaration.model import Model
 from casest.declaration.physics import chart
 from casest.declaration.shapes import Array
@@ -69,6 +70,8 @@ class Block(NamedTuple):
     weights: Array | None
 
 
+#: Step of a difference, in standard deviations of an unknown alone.
+NUDGE = 1e-3
 #: Points whose normal equations are kept: a solution is asked for again by who judges it.
 LATEST = 16
 #: Samples that are evaluated at once where every residual is looked at on its own.
@@ -344,6 +347,14 @@ class Problem:
             self._thinned[every] = Problem(self.model, runs, weights)
         return self._thinned[every]
 
+    def beginning(self, rows: int) -> Problem:
+        """The same problem on so many first samples of each run: for a start, never for a result.
+
+        What follows is not even looked at: equations are integrated so far alone.
+        """
+        runs = (run.take(slice(0, rows)) for run in self.runs)
+        return Problem(self.model, tuple(replace(run, whole=None, places=None) for run in runs))
+
     @cached_property
     def _thinned(self) -> dict[int, Problem]:
         return {}
@@ -352,6 +363,12 @@ class Problem:
     def sequential(self) -> bool:
         """Does a sample's residual depend on the samples before?"""
         return self._staged is not None
+
+    @property
+    def smooth(self) -> bool:
+        """Are residuals smooth functions of the unknowns, as far as it is known? Not what effects
+        with a memory make of them: a hysteresis has corners."""
+        return not any(a.kind in OVER_TIME for a in self.model.effects)
 
     @cached_property
     def _with_jacobian(self) -> Replay:
@@ -391,6 +408,18 @@ class Problem:
             return self._rows(point, r)[1][:, :, own]
         parameters = self.parameters(point, r)
         return self._staged.rows(parameters, self.samples[r].dense, r, tuple(own))[1]
+
+    def stopped(self, point: Point) -> str:
+        """Where equations could not be followed, at which parameters, in words; empty: nowhere."""
+        for r, run in enumerate(self.runs):
+            words = (
+                "" if self._staged is None else self._staged.stopped(self.parameters(point, r), r)
+            )
+            if words:
+                x = self._selections[r][0]
+                shown = ", ".join(f"{self.names[i]} = {point.x[i]:.4g}" for i in x)
+                return f"{run.file or run.name}: {words} (at {shown})"
+        return ""
 
     def given(self, point: Point, r: int) -> Array:
         """What the effects that look at other samples give at the samples of one run (N, k)."""
@@ -521,10 +550,10 @@ class Problem:
         return full[:n, :n], full[:n, n], float(abs(full[n, n]))
 
     def hessian(self, point: Point) -> Array:
-        """Exact second derivative of the cost, (n, n); Gauss-Newton for sequences of samples."""
+        """Exact second derivative of the cost, (n, n); Gauss-Newton where effects have a memory."""
         matrix = self.normal(point).matrix.copy()
         if self._staged is not None:
-            return matrix
+            return self._differences(point, matrix) if self.smooth else matrix
         for r, samples in enumerate(self.samples):
             x = self._selections[r][0]
             weights = self._weight(r)
@@ -534,6 +563,25 @@ class Problem:
             own = summed(_bend(self.model), self.parameters(point, r), with_weights)
             matrix[np.ix_(x, x)] += own + np.triu(own, 1).T
         return matrix
+
+    def _differences(self, point: Point, matrix: Array) -> Array:
+        """The Hessian by central differences of the slope, which is exact.
+
+        Steps are a thousandth of a standard deviation of each unknown alone: small beside what the
+        cost is curved over, large beside rounding.
+        """
+        freedom = max(self.residual_count - self.unknowns, 1)
+        sigma = np.sqrt(2 * self.normal(point).cost / freedom)
+        column = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+        rounding = 1e-9 * np.maximum(np.abs(point.x), 1e-300)
+        found = np.zeros_like(matrix)
+        for j, size in enumerate(np.maximum(NUDGE * sigma / column, rounding)):
+            step = np.zeros(self.unknowns)
+            step[j] = size
+            ahead, behind = (self.normal(Point(point.x + s, point.references)).gradient
+                             for s in (step, -step))  # fmt: skip
+            found[:, j] = (ahead - behind) / (2 * size)
+        return 0.5 * (found + found.T)
 
     def residuals(self, point: Point) -> tuple[Array, ...]:
         """Residuals of each run, (N, m)."""

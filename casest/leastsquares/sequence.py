@@ -3,7 +3,8 @@
 Each is a stage: what it takes at every sample is computed first, then what it gives, with its
 slopes in the parameters, and that takes the place of a symbol in what comes after. A memory is run
 through sample by sample; a signal at another time is taken from its record by splines; a turn is
-integrated over the raw record between two rests.
+integrated over the raw record between two rests; differential equations are integrated from sample
+to sample.
 """
 
 from __future__ import annotations
@@ -18,12 +19,14 @@ from numpy.typing import NDArray
 from casest.data.curves import Curve
 from casest.data.run import Index, Run, Series
 from casest.declaration.effect import Attached
+from casest.declaration.flow import Flow
 from casest.declaration.model import Model
 from casest.declaration.physics import SX
 from casest.declaration.shapes import Array
 from casest.declaration.tracing import Word, sample_symbol
 from casest.engine import Replay
 from casest.errors import DataError, DeclarationError
+from casest.leastsquares.flow import Course, Integrator, Mesh
 from casest.leastsquares.memory import Memory
 from casest.leastsquares.rests import Rests, before, needing, turns
 
@@ -45,11 +48,19 @@ class Record:
     def of(cls, model: Model, run: Run) -> Record:
         """The whole record where the samples are its own still, else the samples alone."""
         whole, places = _origin(model, run)
+        if whole.time is None and model.traced.integrates:
+            why = next((n for n in whole.notes if n.startswith("time not used")), "")
+            raise DataError(
+                f"{whole.file or whole.name}: differential equations need a time for every row, in "
+                f"order: {why or 'give a time column (--columns t=NAME) or --rate'}"
+            )
         if whole.time is None:
             raise DataError(
                 f"{run.file or run.name}: {_who(model)} needs time: give a time column or "
                 "--rate (--columns t=NAME, --rate HZ)"
             )
+        if model.traced.integrates:
+            _refuse_going_back(whole)
         samples = np.hstack([np.asarray(whole.signals[s.name], float) for s in model.columns])
         rests = Rests.of(model, whole) if model.resting else None
         return cls(whole, samples, np.asarray(whole.time, float), places, rests)
@@ -72,6 +83,18 @@ def _who(model: Model) -> str:
     return model.name if model.resting else "an effect that looks at other samples"
 
 
+def _refuse_going_back(run: Run) -> None:
+    """Times of equations grow from row to row."""
+    time = np.asarray(run.time, float)
+    back = np.flatnonzero(~(np.diff(time) > 0))
+    if back.size:
+        k = int(back[0])
+        raise DataError(
+            f"{run.file or run.name}: the time goes from {time[k]:.6g} to {time[k + 1]:.6g} s in "
+            f"row {int(run.rows[k + 1])}: put the rows in order, one for each time"
+        )
+
+
 def _origin(model: Model, run: Run) -> tuple[Run, Index | slice]:
     """The record that a run was taken from, and where; itself where a signal was changed since.
 
@@ -80,7 +103,7 @@ def _origin(model: Model, run: Run) -> tuple[Run, Index | slice]:
     whole, places = run.whole, run.places
     if whole is None or places is None or len(places) != len(run):
         return run, slice(None)
-    for name in (s.name for s in model.signals if s.name != model.traced.measured):
+    for name in (s.name for s in model.signals if s.name not in model.traced.readings):
         own, there = run.signals[name], whole.signals.get(name)
         if there is None or not np.array_equal(there[places], own, equal_nan=True):
             return run, slice(None)
@@ -146,10 +169,19 @@ class Staged:
         What compares a rest with the one before has nothing to say of a first one.
         """
         record = self._records[r]
-        if record.rests is None:
+        if record.rests is not None:
+            present = record.rests.linked[:, None] | ~needing(self.model)
+            return np.asarray(present[record.places])
+        if not self.model.traced.integrates:
             return None
-        present = record.rests.linked[:, None] | ~needing(self.model)
-        return np.asarray(present[record.places])
+        readings = [self.runs[r].signals[name] for name in self.model.traced.readings]
+        there = ~np.isnan(np.hstack(readings)) if readings else np.ones((1, 1), bool)
+        return None if there.all() else there
+
+    @cached_property
+    def _meshes(self) -> dict[tuple[int, int], Mesh]:
+        """Steps of each run in each stage, kept from one evaluation to the next."""
+        return {}
 
     def given(
         self, parameters: Array, r: int, own: tuple[int, ...] | None = None
@@ -165,9 +197,15 @@ class Staged:
         given = np.zeros((len(record.samples), 0))
         count = self.model.staged.coordinates.numel() if own is None else len(own)
         slopes = np.zeros((len(given), 0, count))
-        for stage in stages:
+        for k, stage in enumerate(stages):
             if stage.word:
                 more = self._of_word(stage, parameters, record, given, slopes)
+            elif stage.flow is not None:
+                taken = given[:, :0], slopes[:, :0]
+                if stage.flow.sizes[1]:
+                    taken = _chained(stage.taken, parameters, record.samples, given, slopes)
+                mesh = self._meshes.setdefault((r, k), Mesh())
+                more = stage.flow.along(parameters, Course(record.time, *taken), mesh)
             elif stage.memory is None:
                 more = self._late(stage, parameters, record)
             else:
@@ -190,6 +228,25 @@ class Staged:
         wide = np.zeros((*moved.shape[:2], slopes.shape[2]))
         wide[:, :, list(stage.columns)] = moved
         return found, wide
+
+    def stopped(self, parameters: Array, r: int) -> str:
+        """What could not be followed from which time on, in words; empty where all was."""
+        given, place = self.given(parameters, r, ())[0], 0
+        time = self._records[r].time[self._records[r].places]
+        for stage in self.model.staged.stages:
+            own = given[:, place : place + stage.given.numel()]
+            place += stage.given.numel()
+            bad = np.flatnonzero(~np.isfinite(own).all(axis=1))
+            if isinstance(stage, Flow) and bad.size:
+                k = max(int(bad[0]) - 1, 0)
+                there = ", ".join(
+                    f"{n} = {v:.4g}" for n, v in zip(stage.names, own[k], strict=True)
+                )
+                return (
+                    f"the equations cannot be followed beyond t = {time[k]:.6g} s, where {there}: "
+                    "a rate is not finite there, grows without bound, or is too stiff"
+                )
+        return ""
 
     def _late(self, stage: Program, parameters: Array, record: Record) -> tuple[Array, Array]:
         """A signal at the times at which the effect says that it is taken, and its slopes."""
@@ -215,6 +272,7 @@ class Program:
     memory: Memory | None = None
     word: Word = ""
     columns: tuple[int, ...] = ()
+    flow: Integrator | None = None
 
 
 @lru_cache(maxsize=64)
@@ -232,7 +290,11 @@ def _programs(model: Model, own: tuple[int, ...] | None = None) -> tuple[Program
         return _replay("stage", [parameters, sample], outputs)
 
     for stage in traced.stages:
-        if stage.word == "turned":
+        if isinstance(stage, Flow):
+            fed = ca.depends_on(stage.taken, ca.vertcat(coordinates, given))
+            flow = Integrator(traced, stage, own, fed)
+            found.append(Program(None, replay(stage.taken), flow=flow))
+        elif stage.word == "turned":
             if ca.depends_on(stage.taken, ca.vertcat(given, ca.SX.sym("none"))):
                 raise DeclarationError(
                     f"model {model.name}: what turns between rests cannot read what was before"

@@ -111,7 +111,7 @@ def second_order(problem: Problem, point: Point, sigma: float) -> float:
         return float(np.sqrt(np.mean(shifts**2)) / sigma)
     if not _implicit_in_noise(problem):
         return 0.0
-    squares, count, noise = 0.0, 0, _signal_noise(problem, point, sigma)
+    squares, count, noise = 0.0, 0, signal_noise(problem, point, sigma)
     for r, samples in enumerate(problem.samples):
         shift = 0.5 * laplacian(problem.model)(problem.parameters(point, r), samples)[0] @ noise**2
         squares, count = squares + float(np.sum(shift**2)), count + shift.size
@@ -132,7 +132,7 @@ def second_order_bias(problem: Problem, point: Point, sigma: float, bread: Array
         return -np.asarray(bread @ slope)
     if not _implicit_in_noise(problem):
         return slope
-    noise = _signal_noise(problem, point, sigma)
+    noise = signal_noise(problem, point, sigma)
     for block in problem.blocks(point):
         parameters = problem.parameters(point, block.run)
         samples = problem.samples[block.run][block.span]
@@ -141,7 +141,7 @@ def second_order_bias(problem: Problem, point: Point, sigma: float, bread: Array
     return np.asarray(-bread @ slope)
 
 
-def _signal_noise(problem: Problem, point: Point, sigma: float) -> Array:
+def signal_noise(problem: Problem, point: Point, sigma: float) -> Array:
     """Noise of each signal that makes up the residual's σ, in the signal's own unit, (signals,).
 
     At most σ over the slope of the residual that sees the signal best. A signal whose spread is

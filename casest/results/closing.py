@@ -37,7 +37,7 @@ from casest.results.fitted import (
 )
 from casest.results.residuals import Residuals, residuals_of, side_of
 from casest.results.result import Certificate, Explained, Number, Numbers, Parameter
-from casest.results.uncertainty import covariance_of, inputs_of
+from casest.results.uncertainty import covariance_of, freedom_of, inputs_of
 from casest.results.units import resolved, unit_table
 from casest.results.values import parameter_table
 
@@ -160,7 +160,8 @@ def closing_result(
             fitted,
             correlation=correlation_of(closing.after),
             covariance=covariance_of(closing.after),
-            inputs=inputs_of(closing.after) or UNSET,
+            inputs=inputs_of(closing.after),
+            degrees_of_freedom=freedom_of(closing.after),
         ),
         effects=[_effect(f, closing) for f in closing.effects],
         invisible=_invisible(closing, units),

@@ -129,10 +129,9 @@ def _covariance(saved: SavedResult, where: str) -> tuple[list[str], Array]:
     if section and section.covariance:
         found = section.covariance
         owners = [name.partition("[")[0].partition(" (")[0] for name in found.names]
-        matrix = np.array(found.matrix, dtype=float).reshape(-1, len(owners))
-        if len(matrix) != len(owners):
+        if {len(found.matrix), *map(len, found.matrix)} != {len(owners)}:
             raise DataError(f"{where}: its covariance is no square; calibrate again")
-        return owners, matrix
+        return owners, np.array(found.matrix, dtype=float).reshape(len(owners), len(owners))
     owners, stds = [], list[float]()
     for name, p in saved.parameters.items():
         own = np.ravel(np.array(p.std, dtype=float))

@@ -20,7 +20,7 @@ from casest.declaration.effect import RECORDED, Effect
 from casest.declaration.model import Model
 from casest.dynamics import Dynamics
 from casest.dynamics import check_units as check_units_in_motion
-from casest.effects import CATALOGUE
+from casest.effects import ASKED, CATALOGUE
 from casest.errors import CasestError, DeclarationError, UsageError
 
 #: Values of effects that a fit finds from where they start, without a grid.
@@ -28,6 +28,7 @@ STARTED = ("timescale", "share", "lag")
 #: Shipped models: name on the command line -> module and attribute in `casest_problems`.
 SHIPPED = {
     "wheel": ("wheel", "wheel"),
+    "wheel-motion": ("wheel_motion", "wheel_motion"),
     "rate-table": ("rate_table", "rate_table"),
     "norm-diagonal": ("norm", "norm_diagonal"),
     "norm-triangular": ("norm", "norm_triangular"),
@@ -80,9 +81,14 @@ def find_model(name: str) -> Model:
         return found
     path, _, wanted = name.partition(":")
     if path.endswith(".py"):
-        own: Model = _one(load_file(Path(path)), Model, "model", path, wanted)
-        check_units(own)
-        return own
+        declared: Model | Dynamics = _one(
+            load_file(Path(path)), (Model, Dynamics), "model", path, wanted
+        )
+        if isinstance(declared, Dynamics):
+            check_units_in_motion(declared)
+            declared = declared.calibration
+        check_units(declared)
+        return declared
     if name in MOVING:
         raise UsageError(f"{name} is an estimator in motion: casest observe, filter or close it")
     hint = _meant(name, [*SHIPPED, *MOVING])
@@ -102,7 +108,7 @@ def _meant(name: str, shipped: Sequence[str]) -> str:
 
 def find_effects(name: str) -> tuple[Effect, ...]:
     """All effects declared in `file.py`, the one of `file.py:name`, or a shipped one's name."""
-    shipped = {e.name: e for e in CATALOGUE}
+    shipped = {e.name: e for e in (*CATALOGUE, *ASKED)}
     if name in shipped:
         return (_whole(shipped[name]),)
     if not Path(name).suffix and ":" not in name:
@@ -130,7 +136,7 @@ def find_asked(text: str) -> tuple[tuple[Effect, str], ...]:
     if found is None:
         return tuple((effect, "") for effect in find_effects(text))
     name, column = found[1], found[2].strip()
-    shipped = {e.name: e for e in CATALOGUE}
+    shipped = {e.name: e for e in (*CATALOGUE, *ASKED)}
     if name not in shipped:
         several = find_effects(name)
         if len(several) > 1:
@@ -172,7 +178,7 @@ def without_grid(effect: Effect) -> Effect:
     return effect
 
 
-def _one(module: ModuleType, kind: type, word: str, path: str, wanted: str) -> Any:
+def _one(module: ModuleType, kind: Any, word: str, path: str, wanted: str) -> Any:
     own: dict[str, Any] = {n: v for n, v in vars(module).items() if isinstance(v, kind)}
     names = {n: v for n, v in own.items() if v.function.__module__ == module.__name__}
     names = names or own

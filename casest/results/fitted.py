@@ -14,13 +14,15 @@ import casadi as ca
 import numpy as np
 from msgspec import UNSET, Struct, UnsetType
 
-from casest.correction.carried import carried
+from casest.correction.carried import Carried, carried
 from casest.correction.reading import carried_data
+from casest.correction.spread import spread_program
 from casest.data.run import Run
 from casest.declaration.effect import Attached
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
 from casest.declaration.symbols import Constant
+from casest.errors import CasestError
 from casest.estimate.estimate import Estimate
 from casest.leastsquares.agreement import between_runs
 from casest.results.application import Application, application_of
@@ -35,7 +37,7 @@ from casest.results.result import (
     Result,
     reproduced,
 )
-from casest.results.uncertainty import Covariance, Input
+from casest.results.uncertainty import CorrectedBudget, Covariance, Input, corrected_budget
 from casest.results.units import unit_table
 from casest.results.values import Entry, Held, entries, held
 from casest.validity.colour import colour_of
@@ -108,6 +110,7 @@ class Section(Struct, frozen=True, kw_only=True):
     correlation: Correlation | UnsetType = UNSET
     covariance: Covariance | UnsetType = UNSET
     inputs: list[Input] | UnsetType = UNSET
+    degrees_of_freedom: dict[str, Number] | UnsetType = UNSET
 
 
 class JudgedSection(Section, frozen=True, kw_only=True):
@@ -238,6 +241,7 @@ class Fitted(Result, frozen=True, kw_only=True, dict=True):
     declared_in: DeclaredIn
     reproduce: Reproduced
     correction: dict[str, Any]
+    corrected_budget: CorrectedBudget | None
     declared: str
     kind: str
     entries: tuple[Entry, ...]
@@ -257,6 +261,14 @@ class Fitted(Result, frozen=True, kw_only=True, dict=True):
     def residuals(self) -> Residuals:
         """What is drawn of the residuals: of one fit, or before and after."""
         raise NotImplementedError
+
+    @property
+    def refusals(self) -> tuple[str, ...]:
+        """Names of what speaks against the estimate: headings of docs/refusals.md."""
+        if self.trusted:
+            return ()
+        codes = self.found.certificate.code
+        return tuple((code.name or "").lower().replace("_", "-") for code in codes)
 
     @cached_property
     def application(self) -> Application:
@@ -297,7 +309,7 @@ def fitted_content(
         "convention": inspect.getdoc(problem.model.function) or "",
         "declared_in": _declared_in(problem.model),
         "reproduce": reproduced(command, data),
-        "correction": _correction(estimate, units, corrected),
+        **_correction(estimate, units, corrected),
         "declared": estimate.model.name,
         "kind": "rest intervals" if problem.runs[0].spread else "samples",
         "entries": entries(estimate),
@@ -405,16 +417,33 @@ def _corrected_range(estimate: Estimate) -> Corrected | None:
 def _correction(
     estimate: Estimate, units: Mapping[str, str], corrected: Corrected | None
 ) -> dict[str, Any]:
-    """What it takes to correct readings without the model's source; else the reason why not."""
+    """What it takes to correct readings without the model's source, else the reason why not; and
+    where the uncertainty of a corrected reading comes from."""
     around = None
     if corrected and corrected.low is not UNSET and corrected.high is not UNSET:
         around = (corrected.low, corrected.high)
-    model = replace(estimate.model, noise=None)  # readings are corrected without their noise
+    model = estimate.model.without_noise  # readings are corrected without their noise
     found = carried(model, estimate.values, estimate.problem.runs, units, around)
     if isinstance(found, str):
-        return {"reason": found}
+        return {"correction": {"reason": found}, "corrected_budget": None}
+    found, budget = _with_spread(estimate, units, found)
     values = {name: plain(value) for name, value in estimate.values.items()}
-    return {"of": digest_of_values(values, estimate.certificate.trusted), **carried_data(found)}
+    of = digest_of_values(values, estimate.certificate.trusted)
+    return {"correction": {"of": of, **carried_data(found)}, "corrected_budget": budget}
+
+
+def _with_spread(
+    estimate: Estimate, units: Mapping[str, str], found: Carried
+) -> tuple[Carried, CorrectedBudget | None]:
+    """Standard deviations of corrected readings; none where runs differ, or nothing is trusted."""
+    if found.own or not estimate.certificate.trusted:
+        return found, None
+    try:
+        spread = spread_program(estimate, units, found.program.output.name)
+        budget = corrected_budget(estimate, found.program, found.readings[0])
+    except (CasestError, RuntimeError):  # an operation without a derivative: there is no std
+        return found, None
+    return replace(found, spread=spread), budget
 
 
 def _solver(estimate: Estimate) -> Solver:

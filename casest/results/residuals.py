@@ -14,6 +14,7 @@ from casest.diagnose.misfit.variables import variables
 from casest.estimate.correlation import is_series
 from casest.estimate.estimate import Estimate
 from casest.leastsquares.problem import Problem
+from casest.results.poses import Poses, poses_of
 from casest.results.units import unit_table
 from casest.results.values import Entry, entries
 
@@ -60,6 +61,7 @@ class Residuals:
     units: Mapping[str, str]
     variables: tuple[Variable, ...]
     series: bool
+    poses: Poses | None = None
 
     @property
     def kind(self) -> str:
@@ -101,6 +103,7 @@ def residuals_of(
         units,
         tuple(_variables(last, runs, units)),
         all(is_series(run) for run in runs),
+        poses_of(last),
     )
 
 

@@ -6,37 +6,67 @@ follow from fewer unknowns.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
+
+import casadi as ca
 import numpy as np
 from msgspec import Struct
 
+from casest.correction import runtime
+from casest.correction.numpy_module import as_data
+from casest.correction.program import Program
+from casest.correction.spread import reading_root, slopes
 from casest.declaration.shapes import Array
-from casest.estimate.estimate import Estimate
+from casest.estimate.estimate import UNLIMITED, Estimate
+from casest.estimate.sources import sources
 from casest.results.file import plain
 from casest.results.result import Number
-from casest.results.units import entry_units, unit_table
+from casest.results.units import entry_units, resolved, unit_table
 
 
 class Covariance(Struct, frozen=True):
-    """Covariance of all entries of all parameters; null where the data do not determine one."""
+    """Values and covariance of all entries of all parameters; null where there is none."""
 
     names: list[str]
+    values: list[Number]
     units: list[str]
     matrix: list[list[Number]]
 
 
 class Input(Struct, frozen=True):
-    """A known number that is not exact: what moves with it, and by how much.
+    """Something uncertain that goes into a fit: what moves with it, and by how much.
 
-    `sensitivity` of each entry to it, in the entry's unit over its own; `share` of each entry's
-    variance. Shares of correlated numbers may be negative.
+    `kind` is reference (a known number, with its `sensitivity` of each entry in the entry's unit
+    over its own), noise (of one reading, `std` in its unit), prior or curvature. `share` of each
+    entry's variance: shares sum to one; those of correlated numbers may be negative.
+    `degrees_of_freedom` is null where the standard uncertainty is as good as known.
     """
 
     name: str
+    kind: str
     value: Number
-    std: float
+    std: Number
     unit: str
+    degrees_of_freedom: Number
     sensitivity: dict[str, Number]
     share: dict[str, Number]
+
+
+class CorrectedBudget(Struct, frozen=True):
+    """The same of one corrected reading, `at` a usual reading of the fit.
+
+    `share` of the variance of each component, by input; what the reading's own noise has is
+    called so. `degrees_of_freedom` are effective ones (Welch & Satterthwaite).
+    """
+
+    name: str
+    unit: str
+    at: list[float]
+    value: list[Number]
+    std: list[Number]
+    degrees_of_freedom: list[Number]
+    sensitivity: dict[str, list[Number]]
+    share: dict[str, list[Number]]
 
 
 def covariance_of(estimate: Estimate) -> Covariance:
@@ -46,31 +76,122 @@ def covariance_of(estimate: Estimate) -> Covariance:
     matrix = slope @ np.where(np.isnan(estimate.covariance), 0.0, estimate.covariance) @ slope.T
     lost = (slope != 0) @ unknown
     matrix[lost, :] = matrix[:, lost] = np.nan
-    return Covariance(names, units, plain(0.5 * (matrix + matrix.T)))
+    return Covariance(names, _values(estimate), units, plain(0.5 * (matrix + matrix.T)))
+
+
+def _values(estimate: Estimate) -> list[Number]:
+    """Every entry, in the order of `_entries`."""
+    found: list[Number] = []
+    for slot in estimate.problem.slots:
+        value, shape = estimate.values[slot.parameter.name], slot.parameter.shape
+        if value.ndim > len(shape.dims):
+            value = value[slot.run]
+        found += [plain(value[i]) for i in shape.entries]
+    return found
 
 
 def inputs_of(estimate: Estimate) -> list[Input]:
-    """Every uncertain number that the model takes as known; none where all are exact."""
-    inputs = estimate.inputs
-    if inputs is None:
-        return []
+    """Every known number that is not exact, then what is random."""
     names, _, slope = _entries(estimate)
-    sensitivity = slope @ inputs.sensitivity
+    units = unit_table(estimate.model, estimate.problem.runs)
     with np.errstate(invalid="ignore", divide="ignore"):
         whole = np.diag(slope @ estimate.covariance @ slope.T)
-        shares = sensitivity * (sensitivity @ inputs.covariance) / whole[:, None]
-    units = unit_table(estimate.model, estimate.problem.runs)
-    return [
-        Input(
+        found = list(_references(estimate, names, slope, whole, units))
+        for source in sources(estimate, units["residual"]):
+            part = np.diag(slope @ source.covariance @ slope.T) / whole
+            found.append(
+                Input(
+                    source.name,
+                    source.name.partition(" ")[0],
+                    None,
+                    plain(source.std),
+                    resolved(source.unit, units) if source.unit else "",
+                    plain(source.degrees_of_freedom),
+                    {},
+                    _by_name(names, part),
+                )
+            )
+    return found
+
+
+def _references(
+    estimate: Estimate, names: list[str], slope: Array, whole: Array, units: Mapping[str, str]
+) -> Iterator[Input]:
+    inputs = estimate.inputs
+    if inputs is None:
+        return
+    sensitivity = slope @ inputs.sensitivity
+    shares = sensitivity * (sensitivity @ inputs.covariance) / whole[:, None]
+    for j, name in enumerate(inputs.names):
+        yield Input(
             name,
+            "reference",
             plain(inputs.values[j]),
             float(inputs.std[j]),
             units.get(name) or units.get(name.partition("[")[0], inputs.units[j]),
-            {n: plain(s) for n, s in zip(names, sensitivity[:, j], strict=True)},
-            {n: plain(s) for n, s in zip(names, shares[:, j], strict=True)},
+            None,
+            _by_name(names, sensitivity[:, j]),
+            _by_name(names, shares[:, j]),
         )
-        for j, name in enumerate(inputs.names)
-    ]
+
+
+def _by_name(names: list[str], values: Array) -> dict[str, Number]:
+    return {n: plain(v) for n, v in zip(names, values, strict=True)}
+
+
+def freedom_of(estimate: Estimate) -> dict[str, Number]:
+    """Effective degrees of freedom of each entry; null where its std is as good as known."""
+    names, _, slope = _entries(estimate)
+    each = estimate.effective_freedom
+    least = [min(each[i] for i in np.flatnonzero(row)) for row in slope]
+    return {n: None if f >= UNLIMITED else float(f) for n, f in zip(names, least, strict=True)}
+
+
+def corrected_budget(
+    estimate: Estimate, program: Program, readings: Array
+) -> CorrectedBudget | None:
+    """Of the one of these readings (N, width) whose length is the median; None without a value."""
+    at = readings[np.argsort(np.linalg.norm(readings, axis=1))[len(readings) // 2]]
+    units = unit_table(estimate.model, estimate.problem.runs)
+    value = runtime.attempted(as_data(program), at[None])[0]
+    if not np.isfinite(value).all():
+        return None
+    found = slopes(estimate, units)
+    function = ca.Function("slopes", [found.sample, found.value],
+                           [found.unknowns, found.known, found.reading])  # fmt: skip
+    unknowns, known, reading = (np.array(part) for part in function(at, value))
+    variance, sensitivity, freedom = (
+        dict[str, Array](),
+        dict[str, list[Number]](),
+        dict[str, float](),
+    )
+    inputs = estimate.inputs
+    if inputs is not None:
+        total = unknowns @ inputs.sensitivity + known
+        both = total * (total @ inputs.covariance)
+        variance |= {n: both[:, j] for j, n in enumerate(inputs.names)}
+        sensitivity = {n: plain(total[:, j]) for j, n in enumerate(inputs.names)}
+    for source in sources(estimate, units["residual"]):
+        own = np.nan_to_num(source.covariance)
+        variance[source.name] = np.diag(unknowns @ own @ unknowns.T)
+        if source.degrees_of_freedom is not None:
+            freedom[source.name] = source.degrees_of_freedom
+    root = reading @ reading_root(estimate, found.inputs)
+    variance["the reading's own noise"] = np.sum(root**2, axis=1)
+    whole = sum(variance.values())
+    left = sum(np.square(variance[n]) / f for n, f in freedom.items())
+    with np.errstate(invalid="ignore", divide="ignore"):
+        effective = np.where(left > 0, np.square(whole) / left, np.inf)
+        return CorrectedBudget(
+            program.output.name,
+            program.output.unit,
+            plain(at),
+            plain(value),
+            plain(np.sqrt(whole)),
+            plain(effective),
+            sensitivity,
+            {n: plain(v / whole) for n, v in variance.items()},
+        )
 
 
 def _entries(estimate: Estimate) -> tuple[list[str], list[str], Array]:

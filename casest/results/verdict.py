@@ -50,6 +50,25 @@ def _remaining_noise(correlated_over: Number) -> str:
     )
 
 
+def consequence(result: Closed) -> str:
+    """What a reader of the values before would have got wrong, a sentence; empty where little."""
+    far = {name: largest(z) for name, z in result.moved.items()}
+    name, most = max(far.items(), key=lambda one: one[1], default=("", 0.0))
+    if not result.effects or most < 1:
+        return ""
+    what = "it" if len(result.effects) == 1 else "them"
+    size = f"{most:.0f}" if most >= 10 else f"{most:.2g}"
+    said = f"{name} is off by {size} of its printed standard deviations"
+    return f"Fitted without {what}, {said}. "
+
+
+def largest(z: Any) -> float:
+    """The largest size in nested lists of numbers; 0 where there is none."""
+    if isinstance(z, list):
+        return max(map(largest, z), default=0.0)
+    return 0.0 if z is None else abs(float(z))
+
+
 class _Named(Protocol):
     @property
     def name(self) -> str: ...

@@ -15,10 +15,13 @@ _NAMES = {
     "check": ("check.json", "report.html"),
     "observe": ("observe.json", "report.html"),
     "filter": ("filter.json", "states.csv", "report.html"),
+    "budget": ("budget.json", "budget.html"),
     "compare": ("compare.json", "compare.png", "compare.svg"),
     "plan": ("plan.json", "plan.csv", "plan.html"),
     "simulate": ("record.csv", "truth.json", "truth.csv"),
 }
+#: Commands whose first word is a saved result.
+OF_A_RESULT = ("apply", "check", "export", "plan", "budget")
 #: Where a command writes that is not told.
 _UNTOLD = {"simulate": "simulated"}
 
@@ -34,7 +37,7 @@ def overwritten(command: str, output: str | Path | None, words: Sequence[str]) -
         return ""
     lost = {_entry(path) for path in _targets(command, Path(output))}
     for k, word in enumerate(words):
-        for path in _read(word, result=k == 0 and command in ("apply", "check", "export", "plan")):
+        for path in _read(word, result=k == 0 and command in OF_A_RESULT):
             # A link in the place of the output is replaced itself, not what it leads to.
             if lost & {_entry(path), os.path.realpath(path)}:
                 return word

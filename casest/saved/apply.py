@@ -15,6 +15,7 @@ from casest.correction import runtime
 from casest.correction.carried import Carried
 from casest.correction.numpy_module import as_data
 from casest.correction.program import Program
+from casest.correction.spread import PARTS
 from casest.data import load_runs
 from casest.data.run import Run
 from casest.data.write import make_folder, write_atomically
@@ -44,9 +45,14 @@ class Applied(NamedTuple):
 
 
 def corrected_csv(
-    path: Path, data: str, arguments: Mapping[str, Any], *, force: bool = False
+    path: Path,
+    data: str,
+    arguments: Mapping[str, Any],
+    *,
+    force: bool = False,
+    std: bool = False,
 ) -> Applied:
-    """The data corrected as the result says.
+    """The data corrected as the result says; with `std`, the standard deviations beside.
 
     The correction is the one that the result carries: nothing of the model's source is run.
     Readings are converted to the unit that they had in the fit, or refused.
@@ -58,7 +64,9 @@ def corrected_csv(
     runs = load_runs([data], needed, **without(spare, arguments))
     found = [corrected(program, run) for run in runs]
     unit = result.units.get(program.output.name)
-    text = table_of(runs, [s.name for s in needed], found, program.output.name, unit)
+    pairs = zip(runs, found, strict=True) if std else ()
+    spreads = [stds(carried.spread, program, run, value) for run, value in pairs]
+    text = table_of(runs, [s.name for s in needed], found, program.output.name, unit, spreads)
     notes = dict.fromkeys(note for run in runs for note in run.notes)
     far = () if _was_fitted(result, data) else extrapolated(carried, runs)
     return Applied(text, program.left, (*notes, *_of_units(result, runs, data), *far))
@@ -82,22 +90,45 @@ def _of_units(result: SavedResult, runs: Sequence[Run], data: str) -> Iterator[s
 
 def extrapolated(carried: Carried, runs: Sequence[Run]) -> Iterator[str]:
     """How many samples lie outside what the calibration saw, and in which numbers."""
+    return beyond(carried.program, with_margin(carried), runs)
+
+
+def with_margin(carried: Carried) -> tuple[tuple[float, float] | None, ...]:
+    """Least and greatest of each number of a sample that need no remark; None of a time or a
+    rotation. Empty where an older result does not say."""
     if not carried.seen:
+        return ()
+    kinds = [i for i in carried.program.inputs for _ in range(i.size)]
+    found: list[tuple[float, float] | None] = []
+    for i, (low, high) in zip(kinds, carried.seen, strict=True):
+        margin = MARGIN * (high - low) + 1e-9 * max(abs(low), abs(high))
+        judged = i.kind != "rotation" and i.name != "t"  # of time, `of_another_time` speaks
+        found.append((low - margin, high + margin) if judged else None)
+    return tuple(found)
+
+
+def beyond(
+    program: Program, allowed: Sequence[tuple[float, float] | None], runs: Sequence[Run]
+) -> Iterator[str]:
+    """How many samples lie outside the ranges `allowed`, and in which numbers."""
+    if len(allowed) != program.width:
         return
     place, far, said = 0, [np.zeros(len(run), dtype=bool) for run in runs], []
-    for i in carried.program.inputs:
-        own = carried.seen[place : place + i.size]
+    for i in program.inputs:
+        own = allowed[place : place + i.size]
         place += i.size
-        if i.kind == "rotation" or i.name == "t":  # of time, `of_another_time` speaks
-            continue
-        for k, (axis, (low, high)) in enumerate(zip(axes(i.size), own, strict=True)):
-            margin = MARGIN * (high - low) + 1e-9 * max(abs(low), abs(high))
+        for k, (axis, ends) in enumerate(zip(axes(i.size), own, strict=True)):
+            if ends is None:
+                continue
+            low, high = ends
             parts = [run.signals[i.name][:, k] for run in runs]
-            beyond = [(x < low - margin) | (x > high + margin) for x in parts]
-            if any(b.any() for b in beyond):
-                far = [f | b for f, b in zip(far, beyond, strict=True)]
+            outside = [(x < low) | (x > high) for x in parts]
+            if any(o.any() for o in outside):
+                far = [f | o for f, o in zip(far, outside, strict=True)]
                 least, most = min(x.min() for x in parts), max(x.max() for x in parts)
-                said.append(f"{i.name}{axis} {least:.4g} to {most:.4g} ({low:.4g} to {high:.4g})")
+                inner = MARGIN / (1 + 2 * MARGIN) * (high - low)
+                seen = f"{low + inner:.4g} to {high - inner:.4g}"
+                said.append(f"{i.name}{axis} {least:.4g} to {most:.4g} ({seen})")
     if said:
         count, rows = sum(int(f.sum()) for f in far), sum(map(len, runs))
         more = f" and {len(said) - SAID} more" if len(said) > SAID else ""
@@ -125,6 +156,23 @@ def corrected(program: Program, run: Run) -> Array:
             "can produce; remove the rows, or calibrate over a wider range"
         )
     return found
+
+
+def stds(spread: Program | None, program: Program, run: Run, found: Array) -> Array:
+    """Standard deviations (N, 4·size) of corrected values: see `correction.spread.PARTS`."""
+    x = np.hstack([np.asarray(run.signals[i.name], dtype=float) for i in program.inputs])
+    steps = as_data(required(spread))
+    return np.asarray(runtime.attempted(steps, np.hstack([x, found])), dtype=float)
+
+
+def required(spread: Program | None) -> Program:
+    """What gives standard deviations, which are asked for."""
+    if spread is None:
+        raise UsageError(
+            "there are no standard deviations of corrected readings: an older casest made the "
+            "result, it was exported without --with-std, or its correction differs from run to run"
+        )
+    return spread
 
 
 def of_another_time(path: Path, data: str | None = None) -> tuple[str, ...]:
@@ -161,9 +209,17 @@ def _run_number(carried: Carried, result: SavedResult, data: str) -> int:
 
 
 def table_of(
-    runs: Sequence[Run], given: Sequence[str], found: Sequence[Array], name: str, unit: str | None
+    runs: Sequence[Run],
+    given: Sequence[str],
+    found: Sequence[Array],
+    name: str,
+    unit: str | None,
+    spreads: Sequence[Array] = (),
 ) -> str:
-    """CSV of row, time, the `given` signals and what was `found`, called `name`, in each run."""
+    """CSV of row, time, the `given` signals and what was `found`, called `name`, in each run.
+
+    Behind it `spreads`, its standard deviations together, and by each of their PARTS.
+    """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     first, several = runs[0], len(runs) > 1
@@ -173,6 +229,12 @@ def table_of(
         own = _bracket(first.units.get(signal))
         header += [f"{signal}{a}{own}" for a in axes(first.signals[signal].shape[1])]
     header += [f"{name}{'_' * bool(a)}{a}{_bracket(unit)}" for a in axes(found[0].shape[1])]
+    if spreads:
+        found = [np.hstack([f, _together_first(s)]) for f, s in zip(found, spreads, strict=True)]
+        labels = [f"_{part}" for part in PARTS[:-1]]
+        size = spreads[0].shape[1] // len(PARTS)
+        ends = [p + "_" * bool(a) + a for p in ("", *labels) for a in axes(size)]
+        header += [f"{name}_std{end}{_bracket(unit)}" for end in ends]
     writer.writerow(header)
     for run, value in zip(runs, found, strict=True):
         numbers = np.column_stack([*(run.signals[signal] for signal in given), value])
@@ -182,6 +244,11 @@ def table_of(
                 row.append(f"{float(run.time[i]):.9g}")
             writer.writerow([*row, *(f"{x:.9g}" for x in numbers[i])])
     return text.getvalue()
+
+
+def _together_first(spread: Array) -> Array:
+    size = spread.shape[1] // len(PARTS)
+    return np.hstack([spread[:, -size:], spread[:, :-size]])
 
 
 def axes(size: int) -> list[str]:

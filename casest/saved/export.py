@@ -21,7 +21,7 @@ from casest.correction.formats_read import YAML, chosen, sensors_read
 from casest.correction.inverse import LEFT
 from casest.correction.numpy_module import as_data, python_source
 from casest.correction.program import Program, refuse_unexported
-from casest.correction.reading import program_read, typed
+from casest.correction.reading import program_read, spread_read, typed
 from casest.data import load_runs
 from casest.declaration.shapes import Array
 from casest.declaration.symbols import Signal
@@ -29,7 +29,16 @@ from casest.errors import DataError, UsageError
 from casest.escaping import c_identifier
 from casest.results.file import load_json
 from casest.results.saved import SavedResult, saved_correction
-from casest.saved.apply import Applied, corrected, table_of, without
+from casest.saved.apply import (
+    Applied,
+    beyond,
+    corrected,
+    required,
+    stds,
+    table_of,
+    with_margin,
+    without,
+)
 
 #: What the JSON form calls itself; its schema is `casest/correction/correction.schema.json`.
 FORMAT = "casest-correction-1"
@@ -42,20 +51,25 @@ def exported(
     single: bool = False,
     run: int = 0,
     force: bool = False,
+    std: bool = False,
 ) -> str:
-    """Text of the exported correction. `run` chooses among runs whose corrections differ."""
+    """Text of the exported correction. `run` chooses among runs whose corrections differ.
+
+    With `std` it gives the standard deviations of corrected values too.
+    """
     result, carried = saved_correction(path, force=force, what="exports")
     if carried.own and not 0 <= run < len(result.runs):
         raise UsageError(f"--run {run}: there are runs 0 to {len(result.runs) - 1}")
     bound, readings = carried.of_run(run if carried.own else 0)
-    built = replace(bound, model=carried.model)
+    built = replace(bound, model=carried.model, seen=with_margin(carried))
     refuse_unexported(built)
+    spread = required(carried.spread) if std else None
     test = _test(built, readings, path)
     if to == "json":
-        return _as_json(built, carried, result, run)
+        return _as_json(built, carried, result, run, spread)
     if to == "python":
-        return python_source(built, test)
-    return c_source(built, f"correct_{c_identifier(carried.model)}", single, test)
+        return python_source(built, test, spread)
+    return c_source(built, f"correct_{c_identifier(carried.model)}", single, test, spread)
 
 
 def exported_as(
@@ -89,7 +103,9 @@ def _test(built: Program, readings: Array, path: Path) -> tuple[Array, Array]:
     return readings[good], expected[good]
 
 
-def _as_json(built: Program, carried: Carried, result: SavedResult, run: int) -> str:
+def _as_json(
+    built: Program, carried: Carried, result: SavedResult, run: int, spread: Program | None
+) -> str:
     several = len(result.runs) > 1
     content = {
         "format": FORMAT,
@@ -109,6 +125,8 @@ def _as_json(built: Program, carried: Carried, result: SavedResult, run: int) ->
         },
         "constants": result.constants,
         "program": as_data(built),
+        "range": [list(s) if s else None for s in built.seen],
+        **({} if spread is None else {"uncertainty": as_data(spread)}),
     }
     return json.dumps(content, indent=1) + "\n"
 
@@ -135,9 +153,11 @@ class _Exported(Struct):
     program: dict[str, Any]
     signals: list[str] = []
     not_undone: list[str] = []
+    range: list[tuple[float, float] | None] = []
+    uncertainty: dict[str, Any] | None = None
 
 
-def applied(path: Path, data: str, arguments: Mapping[str, Any]) -> Applied:
+def applied(path: Path, data: str, arguments: Mapping[str, Any], *, std: bool = False) -> Applied:
     """The data corrected by an exported JSON correction alone."""
     content = typed(load_json(path), _Exported, str(path))
     if content.format != FORMAT:
@@ -147,9 +167,11 @@ def applied(path: Path, data: str, arguments: Mapping[str, Any]) -> Applied:
     spare = set(content.signals) - {s.name for s in signals}
     runs = load_runs([data], signals, **without(spare, arguments))
     found, out = [corrected(built, run) for run in runs], built.output
-    text = table_of(runs, [s.name for s in signals], found, out.name, out.unit)
+    spread = spread_read(content.uncertainty, built, str(path))
+    spreads = [stds(spread, built, *of) for of in zip(runs, found, strict=True)] if std else ()
+    text = table_of(runs, [s.name for s in signals], found, out.name, out.unit, spreads)
     notes = dict.fromkeys(note for run in runs for note in run.notes)
-    return Applied(text, built.left, tuple(notes))
+    return Applied(text, built.left, (*notes, *beyond(built, content.range, runs)))
 
 
 def applied_foreign(path: Path, data: str, arguments: Mapping[str, Any]) -> Applied:

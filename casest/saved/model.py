@@ -68,7 +68,7 @@ def _found_effect(saved: Mapping[str, Any]) -> Effect:
     file, shipped = Path(saved["file"]), Path(effects.__file__).parent
     try:
         if file.parent == shipped:
-            return next(e for e in effects.CATALOGUE if e.name == saved["name"])
+            return next(e for e in (*effects.CATALOGUE, *effects.ASKED) if e.name == saved["name"])
         _refuse_changed(file, saved.get("sha256"))
         return find_effects(f"{file}:{saved['name']}")[0]
     except (UsageError, StopIteration) as error:

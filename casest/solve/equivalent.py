@@ -47,11 +47,13 @@ def same_on(where: Problem, a: Point, b: Point, limit: float) -> bool:
 
 def limit_of(problem: Problem, best: Outcome) -> float:
     """Below this (root mean square) two predictions of all rows are the same solution's."""
-    measured = problem.model.traced.measured
-    readings = np.concatenate([run.signals[measured or ""].ravel() for run in problem.runs])
+    measured = problem.model.traced.readings
+    readings = np.concatenate(
+        [run.signals[name].ravel() for run in problem.runs for name in measured]
+    )
     count = problem.residual_count
     sigma = np.sqrt(2 * best.cost / max(count - problem.unknowns, 1))
-    return float(max(SAME * sigma / np.sqrt(count), EXACT * np.std(readings)))
+    return float(max(SAME * sigma / np.sqrt(count), EXACT * np.nanstd(readings)))
 
 
 def roughness(problem: Problem, moved: Problem, point: Point) -> float:

@@ -90,7 +90,7 @@ def search(
     own = costs[:-1]
     arrived = int(np.sum(own <= known * (1 + ONE_VALLEY)))
     outcome = replace(outcome, seconds=time.perf_counter() - began)
-    rivals = _rivals(problem, outcome, others)
+    rivals = rivals_of(problem, outcome, others)
     return Search(outcome, len(x), len(own), arrived, _distinct(own), max(len(bent), 1), rivals)
 
 
@@ -194,7 +194,7 @@ def unlike(x: Array, start: Array) -> tuple[int, float]:
     return signs, float(np.linalg.norm((x - start) / np.maximum(np.abs(start), 1.0)))
 
 
-def _rivals(problem: Problem, best: Outcome, others: list[Outcome]) -> tuple[Outcome, ...]:
+def rivals_of(problem: Problem, best: Outcome, others: list[Outcome]) -> tuple[Outcome, ...]:
     """Those of the others that the data hardly tell from the best, and that predict otherwise."""
     variance = 2 * best.cost / max(problem.residual_count - problem.unknowns, 1)
     near = [o for o in others if o is not best and o.cost - best.cost < CLOSE * variance]

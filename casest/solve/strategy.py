@@ -21,6 +21,7 @@ from casest.leastsquares.per_sample import linear
 from casest.leastsquares.problem import Point, Problem
 from casest.leastsquares.sums import few_of
 from casest.leastsquares.weights import has_noise_effects, weights
+from casest.solve.equations import by_equations
 from casest.solve.ipopt import ipopt
 from casest.solve.outcome import Outcome
 from casest.solve.trust_region import LITTLE, trust_region
@@ -87,6 +88,8 @@ def _ways(
     The polished outcome comes first and carries the time of both. The second way begins with a
     few of the samples, where the record is long.
     """
+    if problem.model.traced.integrates:
+        return _ways_of_equations(problem, first, solver, automatic)
     if solver == "trust-region" or _singular(problem, first):
         # IPOPT wanders along a direction that changes nothing; the damped steps do not.
         main = trust_region(problem, first)
@@ -107,6 +110,24 @@ def _ways(
     if problem.model.starter is None and best_of((*outcomes,)) is not outcomes[0]:
         outcomes.append(_wary(problem, first))
     return (*outcomes,)
+
+
+def _ways_of_equations(
+    problem: Problem, first: Point, solver: str, automatic: bool
+) -> tuple[Outcome, ...]:
+    """The solver asked for from where the record leads that is followed, and others beside it."""
+    others = [
+        o
+        for start in _other_starts(problem, first, automatic)
+        for o in by_equations(problem, start)
+    ]
+    direct = trust_region(problem, first, max_iterations=OPINION, tolerance=_fine(problem))
+    near = best_of((*others, direct))
+    if solver == "trust-region" or not np.isfinite(near.cost) or _singular(problem, near.point):
+        main = trust_region(problem, near.point, damping=LITTLE)
+    else:
+        main = _polished(problem, ipopt(problem, near.point, exact=solver == "ipopt-exact"))
+    return (main, *others, direct)
 
 
 def _other_starts(problem: Problem, first: Point, automatic: bool) -> Sequence[Point]:

@@ -70,7 +70,7 @@ def _sequential(candidate: Candidate, problem: Problem) -> bool:
         extended = candidate.traced_on(problem.model)
     except CasestError:
         return False  # it is said why where its slope is asked for
-    taken = ca.vertcat(*(stage.taken for stage in extended.staged.stages))
+    taken = ca.vertcat(*(stage.entered for stage in extended.staged.stages))
     places = _coordinates(extended)
     own = ca.vertcat(*(places[p.name] for p in candidate.parameters(extended)))
     return bool(ca.jacobian(taken, own).nnz())
@@ -87,7 +87,7 @@ def _coordinates(model: Model) -> dict[str, SX]:
 
 def _traced(model: Model) -> Traced:
     """The body, with a symbol in the place of what effects on other samples give."""
-    return model.staged if any(a.kind in OVER_TIME for a in model.effects) else model.traced
+    return model.staged if model.sequential else model.traced
 
 
 def _direct(

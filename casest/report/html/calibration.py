@@ -13,7 +13,8 @@ from casest.report.html.fitted import certified, parameters, reproduction, uncer
 from casest.report.html.frame import whole
 from casest.report.html.numbers import alike, printed_unit, with_unit
 from casest.report.html.page import paragraph, points, section, table
-from casest.report.html.residuals import residual_figures
+from casest.report.html.poses import poses_seen
+from casest.report.html.residuals import convincing, residual_figures
 from casest.results.calibration import Calibration, doubt_sentence
 from casest.results.fitted import Doubt
 from casest.results.residuals import Residuals
@@ -22,12 +23,14 @@ from casest.results.residuals import Residuals
 def calibration_page(result: Calibration, folder: str = "out") -> str:
     """`report.html` of a calibration, trusted or refused."""
     residuals, figures = result.residuals, Figures()
+    finite = _finite(residuals)
     body = [
         _first(result.misfit) if result.misfit else "",
-        error_section(result, figures),
-        section("residual", "Residual", residual_figures(residuals, figures))
-        if _finite(residuals) else "",
         parameters(result),
+        section("evidence", "The evidence", poses_seen(residuals.poses, figures),
+                convincing(residuals, figures)) if finite else "",
+        error_section(result, figures),
+        section("residual", "Residual", residual_figures(residuals, figures)) if finite else "",
         uncertain(result),
         section("invisible", "What stayed invisible", paragraph(_asked(result)), paragraph(
             "A calibration looks for no effect. `casest close` with the same arguments does, and "
@@ -42,8 +45,9 @@ def calibration_page(result: Calibration, folder: str = "out") -> str:
     )
     proved = f"The optimum is proved{asked}; what the model may lack is what `casest close` asks."
     under = proved if result.trusted and not result.doubtful else ""
+    look = "bad" if not result.trusted else "doubtful" if result.doubtful else "good"
     return whole(result.declared, sentence(result), under, body, figures, result.data,
-                 trusted=result.trusted)  # fmt: skip
+                 trusted=result.trusted, look=look)  # fmt: skip
 
 
 def _first(doubt: Sequence[Doubt]) -> str:

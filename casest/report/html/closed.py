@@ -13,12 +13,13 @@ from casest.report.html.fitted import certified, parameters, reproduction, uncer
 from casest.report.html.frame import whole
 from casest.report.html.numbers import alike, number, printed, printed_unit, with_unit
 from casest.report.html.page import details, escaped, paragraph, points, section, table, tag
-from casest.report.html.residuals import residual_figures
+from casest.report.html.poses import poses_seen
+from casest.report.html.residuals import convincing, residual_figures
 from casest.results.closing import Closed, Effect
 from casest.results.residuals import Residuals
 from casest.results.result import Parameter
 from casest.results.rounding import rounded
-from casest.results.verdict import instead, judged, sentence, undecided
+from casest.results.verdict import consequence, instead, judged, sentence, undecided
 
 
 def closing_page(result: Closed, folder: str = "out") -> str:
@@ -26,21 +27,27 @@ def closing_page(result: Closed, folder: str = "out") -> str:
     figures = Figures()
     refused = (f"{r.name} was not added: {r.reason}" for r in result.refused)
     notes = [*result.notes, *refused]
+    residuals = result.residuals
+    changed = [_effects(result), parameters(result)]
     body = [
+        *(changed if result.effects else reversed(changed)),
+        section("evidence", "The evidence", poses_seen(residuals.poses, figures),
+                convincing(residuals, figures)),
         _errors(result, figures),
-        section("residual", "Residual", residual_figures(result.residuals, figures)),
-        parameters(result),
+        section("residual", "Residual", residual_figures(residuals, figures)),
         uncertain(result),
-        _effects(result),
         _invisible(result),
         certified(result),
         application(result, folder),
         reproduction(result.reproduce, notes, result.declared_in, result.samples),
-    ]
+    ]  # fmt: skip
     said = sentence(result)
     verdict = said[0].upper() + said[1:] + "."
     return whole(result.declared, verdict, _under(result), body, figures, result.data,
-                 trusted=result.trusted)  # fmt: skip
+                 trusted=result.trusted, look=_LOOKS.get(result.verdict, "bad"))  # fmt: skip
+
+
+_LOOKS: dict[str | None, str] = {"adequate": "good", "extended": "doubtful"}
 
 
 def _under(result: Closed) -> str:
@@ -53,8 +60,8 @@ def _under(result: Closed) -> str:
         return f"Error on data that the fit never saw: {with_unit(after, unit)} rms."
     fell = f" ({_percent(after / before - 1)})" if before else ""
     return (
-        f"Error on data that the fit never saw: {with_unit(before, unit, 4)} rms before, "
-        f"{with_unit(after, unit, 4)} after{fell}."
+        f"{consequence(result)}Error on data that the fit never saw: "
+        f"{with_unit(before, unit, 4)} rms before, {with_unit(after, unit, 4)} after{fell}."
     )
 
 

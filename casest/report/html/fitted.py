@@ -184,6 +184,9 @@ def certified(result: Fitted) -> str:
         verb = "believed" if side.trusted else "refused"
         said.append(paragraph(f"The fit is {verb} because:"))
         said.append(points(side.reasons))
+    if result.refusals:
+        pages = ", ".join(f"`docs/refusals.md#{name}`" for name in result.refusals)
+        said.append(paragraph(f"What that means and what to do: {pages}."))
     solver = result.solver
     seconds = solver.seconds if isinstance(solver.seconds, float) else None
     if solver.name:

@@ -20,8 +20,12 @@ def whole(
     data: Sequence[str],
     *,
     trusted: bool = True,
+    look: str = "",
 ) -> str:
-    """The page around its sections: where it comes from, the verdict, the contents."""
+    """The page around its sections: where it comes from, the verdict, the contents.
+
+    `look` is the verdict's: good, doubtful, bad, or nothing.
+    """
     files = ", ".join(file_name(d) for d in data)
     origin = f"casest {__version__} · {name}" + (f" · {files}" if files else "")
     inside = "".join(body)
@@ -30,9 +34,9 @@ def whole(
     head = tag(
         "header",
         tag("p", escaped(origin), class_="origin"),
-        tag("h1", escaped(verdict), id="verdict"),
+        tag("h1", escaped(verdict), id="verdict", class_=look),
         paragraph(under) if under else "",
-        tag("nav", links),
+        tag("nav", links, aria_label="Contents"),
     )
     return document(
         f"{name}: {verdict}", head + inside, figures.figures, figures.arrays, trusted=trusted

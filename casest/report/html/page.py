@@ -25,7 +25,8 @@ def escaped(text: Any) -> str:
 
 def tag(name: str, *inside: str, **attributes: str) -> str:
     """An element around HTML; a trailing underscore of an attribute's name is dropped."""
-    said = "".join(f' {k.rstrip("_")}="{escaped(v)}"' for k, v in attributes.items() if v)
+    names = {k: k.rstrip("_").replace("_", "-") for k in attributes}
+    said = "".join(f' {names[k]}="{escaped(v)}"' for k, v in attributes.items() if v)
     return f"<{name}{said}>{''.join(inside)}</{name}>"
 
 
@@ -72,7 +73,13 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]], numbers: Sequence[
         tag("tr", *(tag("td", prose(cell), class_=c) for cell, c in zip(row, look, strict=True)))
         for row in zip(*columns, strict=True)
     )
-    return tag("div", tag("table", tag("thead", tag("tr", top)), tag("tbody", body)), class_="wide")
+    return scrolled(tag("table", tag("thead", tag("tr", top)), tag("tbody", body)), head[0])
+
+
+def scrolled(inside: str, name: str) -> str:
+    """A table in a box that scrolls sideways where the screen is narrow, also by keyboard."""
+    return tag("div", inside, class_="wide", tabindex="0", role="group",
+               aria_label=f"table of {name}")  # fmt: skip
 
 
 def aligned(texts: Sequence[str]) -> list[str]:

@@ -96,7 +96,8 @@
   // -- one panel --------------------------------------------------------------------------------------
   const draw = (panel, svg, width, range) => {
     svg.replaceChildren();
-    const height = panel.height || 170, spec = panel.spec, dots = spec.categories;
+    const spec = panel.spec, dots = spec.categories;
+    const height = spec.square ? width - 16 : panel.height || 170;
     const logX = spec.x.log ? Math.log10 : Number, logY = spec.y.log ? Math.log10 : Number;
     let [x0, x1] = (range || spec.x.range).map(logX), [y0, y1] = spec.y.range.map(logY);
     if (x1 - x0 < WIDE * Math.abs(x1)) x1 = x0 + 1;
@@ -147,12 +148,70 @@
         element("line", { class: "edge", x1: left, x2: right, y1: py(edge), y2: py(edge) }, field);
     element("rect", { class: "frame", x: left, y: top, width: right - left, height: bottom - top }, svg);
     element("text", { class: "title", x: left, y: 13 }, svg, panel.title);
+    let beside = right;
+    for (const one of spec.series.filter((s) => s.name).reverse()) {
+      element("text", { class: "key " + one.look, x: beside, y: 13, "text-anchor": "end" }, svg, "● " + one.name);
+      beside -= 6.4 * one.name.length + 24;
+    }
     element("text", { class: "label x", x: (left + right) / 2, y: height - 5, "text-anchor": "middle",
       "data-unit": spec.x.unit }, svg, labelled(spec.x, ex));
     if (!dots)
       element("text", { class: "label y", x: -(top + bottom) / 2, y: 11, "text-anchor": "middle",
         transform: "rotate(-90)", "data-unit": spec.y.unit }, svg, labelled(spec.y, ey));
-    return { left, right, top, bottom, x0, x1, px, py };
+    const within = (v) => logX(v) >= x0 && logX(v) <= x1;
+    return { left, right, top, bottom, x0, x1, px, py, within };
+  };
+
+  // -- values: the point nearest to the pointer, or stepped to by keys ---------------------------------
+  const curves = (p) => p.spec.series.filter((s) => s.y !== undefined && s.look !== "rim" && s.look !== "band");
+  const say = (p, one, k) => {
+    const x = decode(one.x)[k], y = decode(one.y)[k], dots = p.spec.categories;
+    const units = (u) => (u === "1" ? "" : " " + u);
+    const short = (v) => minus(String(Number(v.toPrecision(5))));
+    const ends = one.low === undefined ? ""
+      : ` (${short(decode(one.low)[k])} to ${short(decode(one.high)[k])})`;
+    const first = dots ? dots[Math.round(y)] : short(x) + units(p.spec.x.unit);
+    const second = dots ? short(x) + ends + units(p.spec.x.unit) : short(y) + ends + units(p.spec.y.unit);
+    return `${one.name ? one.name + ": " : ""}${first}; ${second}`;
+  };
+  const point = (p, one, k) => {
+    p.svg.querySelectorAll(".at, .value").forEach((e) => e.remove());
+    if (one === null) return;
+    p.now = [one, k];
+    const x = p.at.px(decode(one.x)[k]), y = p.at.py(decode(one.y)[k]);
+    element("circle", { class: "at", cx: x, cy: y, r: 5 }, p.svg);
+    const end = x > (p.at.left + p.at.right) / 2;
+    element("text", { class: "value", x: x + (end ? -9 : 9), y: Math.max(y - 8, p.at.top + 11),
+      "text-anchor": end ? "end" : "start" }, p.svg, say(p, one, k));
+  };
+  const inspected = (p, zoom) => {
+    p.svg.setAttribute("tabindex", "0");
+    p.svg.addEventListener("pointermove", (e) => {
+      const box = p.svg.getBoundingClientRect(), scale = p.svg.viewBox.baseVal.width / box.width;
+      const [mx, my] = [(e.clientX - box.left) * scale, (e.clientY - box.top) * scale];
+      let best = [null, 0], least = Infinity;
+      for (const one of curves(p)) {
+        const x = decode(one.x), y = decode(one.y), step = Math.max(1, Math.floor(x.length / 20000));
+        for (let k = 0; k < x.length; k += step) {
+          if (!Number.isFinite(y[k]) || !p.at.within(x[k])) continue;
+          const dx = p.at.px(x[k]) - mx, dy = p.at.py(y[k]) - my, far = dx * dx + 0.15 * dy * dy;
+          if (far < least) { least = far; best = [one, k]; }
+        }
+      }
+      point(p, ...best);
+    });
+    p.svg.addEventListener("pointerleave", () => point(p, null));
+    p.svg.addEventListener("blur", () => point(p, null));
+    p.svg.addEventListener("keydown", (e) => {
+      const move = zoom ? { ",": -1, ".": 1 }[e.key] : { ArrowLeft: -1, ArrowRight: 1 }[e.key];
+      const first = curves(p)[0];
+      if (!move || !first) return;
+      const [one, k] = p.now || [first, -1], n = decode(one.x).length;
+      let next = k + move;
+      while (next >= 0 && next < n && !Number.isFinite(decode(one.y)[next])) next += move;
+      if (next >= 0 && next < n) point(p, one, next);
+      e.preventDefault();
+    });
   };
 
   const series = (one, parent, px, py, left, right, afterLow, beforeHigh) => {
@@ -246,6 +305,7 @@
       if (!size) return; // folded away: drawn when it is opened
       for (const p of panels) p.at = draw(p, p.svg, size, p.range);
     };
+    for (const p of panels) inspected(p, figure.zoom);
     if (figure.zoom) zoomable(holder, panels, () => redraw(width()));
     redraw(width());
     let known = width();

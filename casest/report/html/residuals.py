@@ -19,18 +19,39 @@ WHOLE = 120_000
 #: Up to this many samples are drawn as points; bins of a dependence, and samples in one at least.
 POINTS, BINS, IN_BIN = 300, 30, 15
 #: Variables that are shown at once; the others are folded away.
-AT_ONCE = 4
+AT_ONCE = 1
 
 
 def residual_figures(residuals: Residuals, figures: Figures) -> str:
-    """All figures of the residual, or why one is missing."""
+    """All figures of the residual, or why one is missing: what tells something comes first."""
+    whole = over_time(residuals, figures)
     return "".join(
         [
-            over_time(residuals, figures),
             over_variables(residuals, figures),
             *over_frequency(residuals, figures),
+            details("Every residual over time", whole) if _binned(residuals) else whole,
         ]
     )
+
+
+def convincing(residuals: Residuals, figures: Figures) -> str:
+    """The residual over what it depends on most, on the axis where it does; empty without any."""
+    found = [
+        (_dependence_of(residuals, v, a), -k, a, v)
+        for k, v in enumerate(residuals.variables)
+        for a in range(len(residuals.axes))
+    ]
+    if not found:
+        return ""
+    _, _, worst, variable = max(found, key=lambda f: f[:2])
+    what = "mean of each bin" if _binned(residuals) else "every residual"
+    name = f"Residual {residuals.axes[worst]}" if len(residuals.axes) > 1 else "Residual"
+    caption = (
+        f"{name} over {_shown(variable)}, on which it depends most:",
+        f"{what}; shaded is what noise alone would do, 95 %.",
+    )
+    panels = _panels_over(residuals, variable, figures, [worst], height=240)
+    return figures.add("convincing", caption, panels, two=len(residuals.sides) > 1)
 
 
 def _label(residuals: Residuals, a: int) -> str:
@@ -154,6 +175,8 @@ def over_variables(residuals: Residuals, figures: Figures) -> str:
             "to draw the residual over.",
             "soft",
         )
+    if len(residuals.axes) == 1 and len(ranked) > 1:  # the first is the evidence already
+        ranked = ranked[1:]
     drawn = [_over(residuals, v, k, figures) for k, v in enumerate(ranked)]
     more = drawn[AT_ONCE:]
     folded = details(f"More columns and quantities ({len(more)})", *more) if more else ""
@@ -171,12 +194,32 @@ def _binned(residuals: Residuals) -> bool:
     return sum(map(len, residuals.runs)) > POINTS
 
 
+def _shown(variable: Variable) -> str:
+    """A column's name; one that is a number is said to be one."""
+    return f"column {variable.name}" if variable.name.isdigit() else variable.name
+
+
 def _over(residuals: Residuals, variable: Variable, number: int, figures: Figures) -> str:
-    unit = variable.unit
-    name = f"column {variable.name}" if variable.name.isdigit() else variable.name
-    x = variable.values
+    panels = _panels_over(residuals, variable, figures, range(len(residuals.axes)))
+    turn = " (one turn)" if variable.turns else ""
+    nobody = "" if variable.unit else " Its unit is not stated."
+    caption = (f"Over {_shown(variable)}{turn}.", nobody.strip())
+    return figures.add(f"over-variable-{number}", caption, panels, two=len(residuals.sides) > 1)
+
+
+def _panels_over(
+    residuals: Residuals,
+    variable: Variable,
+    figures: Figures,
+    axes: Sequence[int],
+    height: int = 155,
+) -> list[dict[str, Any]]:
+    """Panels of some axes, before beside after."""
+    name, unit, x = _shown(variable), variable.unit, variable.values
     panels = []
     for a, side, title in residuals.panels():
+        if a not in axes:
+            continue
         y = np.concatenate(side.residuals)[:, a]
         if _binned(residuals):
             at, mean, half = bins(x, y, residuals.sigma[a], residuals.correlated_over)
@@ -199,11 +242,8 @@ def _over(residuals: Residuals, variable: Variable, number: int, figures: Figure
         )
         across = axis(name, unit, float(x.min()), float(x.max()), room=0.02)
         upright = axis(label, residuals.unit, -top, top, room=0.08)
-        panels.append(panel(title, across, upright, drawn, bands=bands, height=155))
-    turn = " (one turn)" if variable.turns else ""
-    nobody = "" if unit else " Its unit is not stated."
-    caption = (f"Over {name}{turn}.", nobody.strip())
-    return figures.add(f"over-variable-{number}", caption, panels, two=len(residuals.sides) > 1)
+        panels.append(panel(title, across, upright, drawn, bands=bands, height=height))
+    return panels
 
 
 def bins(
@@ -232,12 +272,13 @@ def _top(residuals: Residuals, a: int, x: Array) -> float:
 
 
 def _dependence(residuals: Residuals, variable: Variable) -> float:
-    """Mean square of the bins' means over that of noise, on the worst axis, at first."""
-    x, side = variable.values, residuals.sides[0]
-    found = []
-    for a in range(len(residuals.axes)):
-        y = np.concatenate(side.residuals)[:, a]
-        _, mean, half = bins(x, y, residuals.sigma[a], residuals.correlated_over)
-        with np.errstate(all="ignore"):
-            found.append(float(np.nan_to_num(np.mean((mean / half) ** 2))))
-    return max(found)
+    """That of the worst axis."""
+    return max(_dependence_of(residuals, variable, a) for a in range(len(residuals.axes)))
+
+
+def _dependence_of(residuals: Residuals, variable: Variable, a: int) -> float:
+    """Mean square of the bins' means over that of noise, at first."""
+    y = np.concatenate(residuals.sides[0].residuals)[:, a]
+    _, mean, half = bins(variable.values, y, residuals.sigma[a], residuals.correlated_over)
+    with np.errstate(all="ignore"):
+        return float(np.nan_to_num(np.mean((mean / half) ** 2)))

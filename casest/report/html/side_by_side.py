@@ -12,7 +12,7 @@ import numpy as np
 from casest.report.html.figures import Figures, axis, panel
 from casest.report.html.frame import whole
 from casest.report.html.numbers import number, printed, printed_unit, with_unit
-from casest.report.html.page import escaped, paragraph, prose, section, table, tag
+from casest.report.html.page import escaped, paragraph, prose, scrolled, section, table, tag
 from casest.results.rounding import rounded
 from casest.results.side_by_side import Across, SideBySide, name_of_data
 
@@ -44,7 +44,8 @@ def side_by_side_page(result: SideBySide, folder: Path) -> str:
         section("results", "The results", _results(result, folder)),
     ]  # fmt: skip
     return whole(result.model, f"{result.sentence}.", under, body, figures, [],
-                 trusted=all(r.trusted for r in result.results))  # fmt: skip
+                 trusted=all(r.trusted for r in result.results),
+                 look="doubtful" if found else "good")  # fmt: skip
 
 
 def _said(result: SideBySide) -> str:
@@ -154,6 +155,5 @@ def _results(result: SideBySide, folder: Path) -> str:
         cells = [name, *map(prose, [r.said, name_of_data(r), with_unit(r.noise, r.unit)])]
         rows.append(tag("tr", *(tag("td", cell) for cell in cells)))
     head = "".join(tag("th", h) for h in ("result", "verdict", "data", "noise of one residual"))
-    return tag(
-        "div", tag("table", tag("thead", tag("tr", head)), tag("tbody", *rows)), class_="wide"
-    )
+    body = tag("table", tag("thead", tag("tr", head)), tag("tbody", *rows))
+    return scrolled(body, "results")

@@ -25,6 +25,7 @@ def calibration_text(result: Calibration, output: Path | None) -> str:
         "\n".join(_fit_lines(result)),
         *_determined(result),
         "\n".join([f"{title}:", *(item(r) for r in certificate.reasons)]),
+        "\n".join(_helped(result)),
         *_written(result, output),
     ]
     return "\n\n".join(b for b in blocks if b)
@@ -80,6 +81,14 @@ def _determined(result: Calibration) -> Iterator[str]:
         yield "\n".join(["Weakly determined (one standard deviation of the combination):", *lines])
     if found.rank == found.unknowns and not found.weak:
         yield "The data determine every unknown; no weak combination."
+
+
+def _helped(result: Calibration) -> Iterator[str]:
+    """Where each refusal is explained."""
+    if result.refusals:
+        pages = [f"docs/refusals.md#{name}" for name in result.refusals]
+        yield f"What each means and what to do: {pages[0]}"
+        yield from (f"  {page}" for page in pages[1:])
 
 
 def _written(result: Calibration, output: Path | None) -> Iterator[str]:

@@ -5,13 +5,12 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 from casest.data.logs import file_name
 from casest.report.next_command import following
 from casest.report.text.layout import WIDTH, held_lines, item, value_table
 from casest.results.closing import Closed
-from casest.results.verdict import instead, of_the_user, refusals, sentence, undecided
+from casest.results.verdict import instead, largest, of_the_user, refusals, sentence, undecided
 
 #: Lists longer than this are left to result.json.
 SHOWN = 4
@@ -80,18 +79,11 @@ def _effects(result: Closed) -> Iterator[str]:
 def _moved(result: Closed) -> Iterator[str]:
     if not result.effects:
         return
-    moved = {n: _largest(z) for n, z in result.moved.items()}
-    far = sorted(((z, n) for n, z in moved.items() if z is not None and z >= 1), reverse=True)
+    moved = {n: largest(z) for n, z in result.moved.items()}
+    far = sorted(((z, n) for n, z in moved.items() if z >= 1), reverse=True)
     if far:
         words = ", ".join(f"{n} by {z:.1f}" for z, n in far)
         yield item(f"Moved by the addition, in standard deviations before it: {words}")
-
-
-def _largest(z: Any) -> float | None:
-    if isinstance(z, list):
-        found = [x for x in map(_largest, z) if x is not None]
-        return max(found, default=None)
-    return None if z is None else abs(z)
 
 
 def _invisible(result: Closed) -> Iterator[str]:

@@ -1,0 +1,207 @@
+"""States that follow differential equations along a record, and their slopes in the parameters.
+
+ẋ = f(x, u, θ) and Ẋ = f_x·X + f_u·U + f_θ (variational equations; X = ∂x/∂θ) are integrated
+together by a Runge-Kutta method of eighth order, whose steps end at every sample: an input is
+smooth between two, and what jumps at one is not smeared. X is the exact slope of the x computed.
+Each step's error is told by two embedded solutions; where it is too large an interval is cut.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import casadi as ca
+import numpy as np
+
+from casest.data.run import Index
+from casest.declaration.flow import Flow
+from casest.declaration.physics import SX
+from casest.declaration.shapes import Array
+from casest.declaration.tracing import Traced
+from casest.engine import Recursion
+from casest.engine.runge_kutta import ORDER, error, step
+
+#: Error of a step allowed, of the largest size that a state has along the record.
+TOLERANCE = 1e-10
+#: Steps of one run in all, from which on it is given up: the equations are stiff there.
+MOST = 300_000
+#: Rounds in which steps are cut; how much at most in one round; a little more than needed.
+ROUNDS, CUT, MARGIN = 30, 8.0, 1.1
+#: An interval along which states are not finite is cut so much in one round, and so much in all.
+BLIND, BLINDLY = 4, 1024
+
+
+@dataclass
+class Mesh:
+    """Steps of one run: how many in each interval between samples; None before the first time."""
+
+    counts: Index | None = None
+
+
+@dataclass(frozen=True)
+class Course:
+    """One record as equations see it: time (N,) in s, inputs (N, k), slopes of these (N, k, p)."""
+
+    time: Array
+    inputs: Array
+    slopes: Array
+
+
+@dataclass(frozen=True)
+class Integrator:
+    """One flow of a model; `own` as in `Staged.rows`; `fed`: its inputs have slopes."""
+
+    traced: Traced
+    flow: Flow
+    own: tuple[int, ...] | None = None
+    fed: bool = False
+
+    @property
+    def _coordinates(self) -> SX:
+        every = self.traced.coordinates
+        return every if self.own is None else every[list(self.own)]
+
+    @property
+    def sizes(self) -> tuple[int, int, int]:
+        """Numbers of states n, inputs k, and unknowns p that slopes are taken in."""
+        return self.flow.x.numel(), self.flow.inputs.numel(), self._coordinates.numel()
+
+    def along(
+        self, parameters: Array, course: Course, mesh: Mesh, finer: int = 1
+    ) -> tuple[Array, Array]:
+        """States (N, n) and slopes (N, n, p) at every sample; NaN from where it could not go on.
+
+        `finer`: every step is cut in so many.
+        """
+        n, _, p = self.sizes
+        leads = self.flow.anchored and course.time[0] > 0
+        course = self._from_zero(course) if leads else course
+        if mesh.counts is None:
+            mesh.counts = np.ones(len(course.time) - 1, dtype=int)
+        start = np.array(self._start(parameters)).ravel()
+        for _ in range(ROUNDS):
+            counts = mesh.counts * finer
+            states, errors = self._run(start, parameters, course, counts)
+            if finer > 1:
+                break
+            wanted = self._wanted(np.vstack([start[None, :n], states[:, :n]]), errors, counts)
+            settled = bool(np.all(wanted <= counts))
+            if settled and np.sum(wanted) > 0.8 * np.sum(counts):
+                break
+            if np.sum(wanted) > MOST + len(counts):
+                states = self._cut_off(states, counts, wanted)
+                break
+            mesh.counts = wanted
+            if settled:
+                break  # the next time with fewer
+        ends = np.cumsum(counts) - 1
+        found = np.vstack([start[None], states[ends]])[1 if leads else 0 :]
+        return found[:, :n], found[:, n:].reshape(len(found), p, n).transpose(0, 2, 1)
+
+    def _from_zero(self, course: Course) -> Course:
+        """The course from t = 0 on: inputs are as at the first sample until then."""
+        first, clock = course.inputs[:1].copy(), self.flow.clock
+        if clock is not None:
+            first[0, clock] -= course.time[0]
+        return Course(
+            np.concatenate([[0.0], course.time]),
+            np.vstack([first, course.inputs]),
+            np.concatenate([course.slopes[:1], course.slopes]),
+        )
+
+    def _run(
+        self, start: Array, parameters: Array, course: Course, counts: Index
+    ) -> tuple[Array, tuple[Array, Array]]:
+        """[x, X] after every step, and its fifth- and third-order differences."""
+        held = np.array(self.flow.held, dtype=bool)
+        place = np.repeat(np.arange(len(counts)), counts)
+        part = (np.arange(len(place)) - np.repeat(np.cumsum(counts) - counts, counts)) / counts[
+            place
+        ]
+        width = 1.0 / counts[place]
+        columns = []
+        for values, keep in (
+            (course.inputs, held),
+            (course.slopes.reshape(len(course.time), -1), np.repeat(held, self.sizes[2])),
+        ):
+            if values is course.inputs or self.fed:
+                rise = np.where(keep, 0.0, np.diff(values, axis=0))[place]
+                columns += [values[place] + rise * part[:, None], rise * width[:, None]]
+        h = np.diff(course.time)[place] * width
+        columns += [h[:, None], np.broadcast_to(parameters, (len(place), len(parameters)))]
+        with np.errstate(all="ignore"):
+            states, errors = self._recursion(start, np.hstack(columns))
+        n = self.sizes[0]
+        return states, (errors[:, :n], errors[:, n:])
+
+    def _wanted(self, x: Array, errors: tuple[Array, Array], counts: Index) -> Index:
+        """Steps for each interval by which errors are as large as allowed, at least one."""
+        good = np.isfinite(x).all(axis=1)
+        bad = np.flatnonzero(~good)
+        steps = len(x) - 1 if not bad.size else int(bad[0]) - 1
+        size = np.max(np.abs(x[: steps + 1]), axis=0)
+        allowed = TOLERANCE * np.where(size > 0, size, 1.0)
+        ends = np.cumsum(counts)
+        share = error(errors[0][:steps], errors[1][:steps], allowed)
+        worst = np.zeros(len(counts))
+        place = np.repeat(np.arange(len(counts)), counts)[:steps]
+        np.maximum.at(worst, place, share)
+        cut = np.clip(MARGIN * worst ** (1 / ORDER), 0.0, CUT)
+        wanted: Index = np.maximum(np.ceil(counts * cut - 1e-9).astype(int), 1)
+        if bad.size:
+            first = int(np.searchsorted(ends, steps, side="right"))
+            wanted[first:] = counts[first:] * BLIND
+            if wanted[first] > BLINDLY:
+                wanted[first] = 2 * MOST
+        return wanted
+
+    @staticmethod
+    def _cut_off(states: Array, counts: Index, wanted: Index) -> Array:
+        """Nothing from the first interval on that would take too many steps."""
+        states = states.copy()
+        first = int(np.argmax(wanted > counts))
+        states[int(np.cumsum(counts)[first] - counts[first]) :] = np.nan
+        return states
+
+    @cached_property
+    def _start(self) -> ca.Function:
+        """θ -> [x, X] at the beginning."""
+        both = [self.flow.start, ca.jacobian(self.flow.start, self._coordinates)]
+        whole = ca.vertcat(*(ca.vec(ca.densify(part)) for part in both))
+        parameters = ca.vertcat(self.traced.coordinates, self.traced.references)
+        return ca.Function("start", [parameters], [ca.densify(whole)])
+
+    @cached_property
+    def _recursion(self) -> Recursion:
+        """([x, X], numbers of a step) -> the next, and the differences of x."""
+        flow, (n, k, p) = self.flow, self.sizes
+        u, du, h = ca.SX.sym("u", k), ca.SX.sym("du", k), ca.SX.sym("h")
+        U, dU = ca.SX.sym("U", k, p), ca.SX.sym("dU", k, p)
+        parameters = ca.vertcat(self.traced.coordinates, self.traced.references)
+        f = flow.rates
+        slopes = [ca.jacobian(f, x) for x in (flow.x, self._coordinates, flow.inputs)]
+
+        def rate(y: SX, c: float) -> SX:
+            x, X = y[:n], ca.reshape(y[n:], n, p)
+            now, A, B, G = ca.substitute(
+                [f, *slopes], [flow.x, flow.inputs], [x, u + c * du if c else u]
+            )
+            X = A @ X + B
+            if self.fed:
+                X = X + G @ (U + c * dU)
+            return ca.vertcat(ca.densify(now), ca.vec(ca.densify(X)))
+
+        y = ca.SX.sym("y", n + n * p)
+        after, fifth, third = step(rate, y, h)
+        # Slopes of inputs lie row by row, as arrays do.
+        fed = [ca.vec(U.T), ca.vec(dU.T)] if self.fed else []
+        numbers = ca.vertcat(u, du, *fed, h, parameters)
+        differences = ca.vertcat(fifth[:n], third[:n])
+        return Recursion(ca.Function("step", [y, numbers], [after, ca.densify(differences)]))
+
+
+def flows(stages: Sequence[object]) -> list[Flow]:
+    """Those of the stages that are differential equations."""
+    return [stage for stage in stages if isinstance(stage, Flow)]

@@ -1,0 +1,105 @@
+"""The uncertainty budget of a saved result, as in the GUM: inputs, and their shares."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from msgspec import UNSET, Struct, UnsetType
+
+from casest.correction.reading import typed
+from casest.errors import UsageError
+from casest.results.file import load_result, result_file
+from casest.results.result import Number, Result
+from casest.results.uncertainty import CorrectedBudget, Covariance, Input
+
+#: Correlation from which on it is told.
+NOTABLE = 0.1
+
+
+class Quantity(Struct, frozen=True):
+    """A value with standard uncertainty; degrees of freedom null where that is as good as known."""
+
+    name: str
+    value: Number
+    std: Number
+    unit: str
+    degrees_of_freedom: Number
+
+
+class Pair(Struct, frozen=True):
+    """Correlation of two values."""
+
+    names: tuple[str, str]
+    correlation: float
+
+
+class Budget(Result, frozen=True, kw_only=True, dict=True):
+    """The content of `budget.json`; `correlations` are those of a tenth and more, largest first."""
+
+    result: str
+    trusted: bool
+    values: list[Quantity]
+    inputs: list[Input]
+    correlations: list[Pair]
+    corrected: CorrectedBudget | None
+
+
+class _Section(Struct, frozen=True):
+    covariance: Covariance | UnsetType = UNSET
+    inputs: list[Input] | UnsetType = UNSET
+    degrees_of_freedom: dict[str, Number] | UnsetType = UNSET
+
+
+class _Saved(Struct, frozen=True):
+    model: str
+    trusted: bool
+    estimate: _Section | UnsetType = UNSET
+    after: _Section | UnsetType = UNSET
+    corrected_budget: CorrectedBudget | None = None
+
+
+def budget_of(path: Path) -> Budget:
+    """The budget of a saved result (a folder stands for the `result.json` in it).
+
+    Raises UsageError where the result was refused, or is of a casest that kept no covariance.
+    """
+    raw, where = load_result(path), str(result_file(path))
+    saved = typed(raw, _Saved, where)
+    section = saved.after or saved.estimate
+    if not saved.trusted:
+        raise UsageError(f"{path}: this estimate was refused, and has no uncertainty to speak of")
+    if not section or not (section.covariance and section.inputs):
+        raise UsageError(f"{path}: was made by an older casest, without a budget: calibrate again")
+    return Budget(
+        model=saved.model,
+        result=str(path),
+        trusted=saved.trusted,
+        values=_values(section.covariance, section.degrees_of_freedom or {}),
+        inputs=section.inputs,
+        correlations=_correlations(section.covariance),
+        corrected=saved.corrected_budget,
+    )
+
+
+def _values(found: Covariance, freedom: dict[str, Number]) -> list[Quantity]:
+    every = zip(found.names, found.values, found.units, strict=True)
+    return [
+        Quantity(name, value, _root(found.matrix[i][i]), unit, freedom.get(name))
+        for i, (name, value, unit) in enumerate(every)
+    ]
+
+
+def _root(variance: Number) -> Number:
+    return None if variance is None else max(variance, 0.0) ** 0.5
+
+
+def _correlations(found: Covariance) -> list[Pair]:
+    """Those that are worth a word, the strongest first."""
+    std = [_root(found.matrix[i][i]) for i in range(len(found.names))]
+    pairs = []
+    for i, a in enumerate(found.names):
+        for j, b in enumerate(found.names[:i]):
+            shared, both = found.matrix[i][j], (std[i] or 0.0) * (std[j] or 0.0)
+            if shared is not None and both > 0 and abs(shared) >= NOTABLE * both:
+                pairs.append(Pair((b, a), shared / both))
+    return sorted(pairs, key=lambda pair: -abs(pair.correlation))

@@ -1,0 +1,307 @@
+"""Differential equations as constraints: collocation, solved by IPOPT.
+
+States at many times are unknowns beside the parameters, and begin where the readings say. So a
+search does not follow a trajectory from a wrong beginning with wrong parameters: what makes a cost
+of integrated equations hilly (oscillations, chaos, what grows without bound) is not met on the way
+(Biegler 2010, ch. 10). What comes out is a start near the solution, as near as the polynomials are;
+the integrated equations are fitted from there.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from casest.data.run import Index
+from casest.declaration.flow import Flow
+from casest.declaration.model import Model
+from casest.declaration.shapes import Array
+from casest.declaration.tracing import flat, sample_symbol
+from casest.interruption import held_back
+from casest.leastsquares.problem import Point, Problem
+from casest.solve.outcome import Outcome
+
+#: Points of a polynomial piece (Radau), and pieces of all runs at least and at most.
+DEGREE, FEWEST, MOST = 4, 60, 1500
+#: Iterations, and seconds that a start may take at most.
+ITERATIONS, SECONDS = 400, 30.0
+
+
+@dataclass(frozen=True)
+class Parts:
+    """What collocation needs of a model: rates and residual as functions, and its one flow."""
+
+    flow: Flow
+    rates: Any
+    residual: Any
+    predicted: Any
+    start: Any
+
+
+@lru_cache(maxsize=32)
+def parts_of(model: Model) -> Parts | None:
+    """None for a model whose equations are fed by what looks at other samples, or that has none."""
+    traced = model.staged
+    if len(traced.stages) != 1 or not isinstance(traced.stages[0], Flow):
+        return None
+    flow = traced.stages[0]
+    parameters = ca.vertcat(traced.coordinates, traced.references)
+    sample = sample_symbol(model, traced)
+    if not ca.depends_on(traced.expression, flow.given):
+        return None
+    reading = ca.vertcat(*(flat(traced.symbols[n]) for n in traced.readings))
+    # Readings that are not there are told by their own symbols: their rows are left out.
+    return Parts(
+        flow,
+        ca.Function("rates", [flow.x, flow.inputs, parameters], [ca.densify(flow.rates)]),
+        ca.Function(
+            "residual",
+            [flow.given, sample, parameters],
+            [traced.expression, ca.densify(reading), ca.densify(flow.taken)],
+        ),
+        ca.Function(
+            "predicted",
+            [flow.given, sample, parameters],
+            [traced.predicted, ca.jacobian(traced.predicted, flow.given)],
+        ),
+        ca.Function("start", [parameters], [ca.densify(flow.start)]),
+    )
+
+
+def collocated(problem: Problem, start: Point) -> Outcome | None:
+    """Where IPOPT ends on the collocated equations from a start; None where they are not such.
+
+    The cost is that of the integrated equations there.
+    """
+    parts = parts_of(problem.model)
+    if parts is None or any(s.parameter.shape.curved for s in problem.slots):
+        return None
+    began = time.perf_counter()
+    made = _Made(problem, parts, start)
+    with held_back(), np.errstate(all="ignore"):
+        found = made.solved()
+    x = np.clip(found.x[: problem.unknowns] * made.scale, *problem.bounds)
+    point = Point(problem.inside(x), start.references)
+    return Outcome(
+        "collocation",
+        point,
+        problem.cost(point),
+        found.iterations,
+        found.iterations,
+        found.success,
+        found.status,
+        time.perf_counter() - began,
+    )
+
+
+@dataclass(frozen=True)
+class _Found:
+    x: Array
+    iterations: int
+    success: bool
+    status: str
+
+
+class _Made:
+    """The nonlinear program of a problem, and where its unknowns begin."""
+
+    def __init__(self, problem: Problem, parts: Parts, start: Point) -> None:
+        self.problem, self.parts, self.start = problem, parts, start
+        size = np.abs(start.x)
+        self.scale = np.where(size > 0, size, 1.0)
+        self.v = ca.MX.sym("v", problem.unknowns)
+        self.unknowns, self.first = [self.v], [start.x / self.scale]
+        self.equalities: list[Any] = []
+        self.cost: Any = 0.0
+        #: Half the squares of residuals as if states stayed where they begin.
+        self.unit = 0.0
+        for r in range(len(problem.runs)):
+            self._add(r)
+
+    def _add(self, r: int) -> None:
+        """One run: its states, what ties them together, and its residuals."""
+        problem, parts = self.problem, self.parts
+        own, ref = problem.seen(r)
+        parameters = ca.vertcat(
+            (self.v * self.scale)[own.tolist()], ca.DM(self.start.references[ref])
+        )
+        at = problem.parameters(self.start, r)
+        grid = Grid.of(problem, r, parts, at)
+        n, size = parts.flow.x.numel(), grid.size
+        z = ca.MX.sym("x", n, grid.pieces * DEGREE)
+        x = z * size
+        begin = parts.start(parameters)
+        ends = x[:, DEGREE - 1 :: DEGREE]
+        before = ca.horzcat(begin, ends[:, :-1])
+        rates = parts.rates.map(grid.pieces * DEGREE)(
+            x, grid.inputs.T, ca.repmat(parameters, 1, grid.pieces * DEGREE)
+        )
+        slope, first = _radau()
+        for k in range(DEGREE):
+            moved = first[k] * before
+            for j in range(DEGREE):
+                moved = moved + slope[j][k] * x[:, j::DEGREE]
+            tied = moved - rates[:, k::DEGREE] * ca.repmat(ca.DM(grid.steps).T, n, 1)
+            self.equalities.append(ca.vec(tied / ca.repmat(ca.DM(size), 1, grid.pieces)))
+        seen = ca.horzcat(begin, ends)[:, grid.nodes.tolist()]
+        count = len(grid.samples)
+        residual = parts.residual.map(count)(
+            seen, np.nan_to_num(grid.samples).T, ca.repmat(parameters, 1, count)
+        )[0]
+        self.cost += 0.5 * ca.sumsqr(residual * ca.DM(grid.there.T.astype(float)))
+        self.unit += grid.still
+        self.unknowns.append(ca.vec(z))
+        self.first.append((grid.guess / size).ravel())
+
+    def solved(self) -> _Found:
+        """What IPOPT finds."""
+        w, w0 = ca.vertcat(*self.unknowns), np.concatenate(self.first)
+        lower, upper = (b / self.scale for b in self.problem.bounds)
+        free = np.full(len(w0) - self.problem.unknowns, np.inf)
+        g = ca.vertcat(*self.equalities)
+        solver = ca.nlpsol(
+            "collocation",
+            "ipopt",
+            {"x": w, "f": self.cost / max(self.unit, 1e-300), "g": g},
+            {
+                "ipopt": {
+                    "print_level": 0,
+                    "sb": "yes",
+                    "max_iter": ITERATIONS,
+                    "max_wall_time": SECONDS,
+                    "tol": 1e-8,
+                    "mu_init": 1e-2,
+                },
+                "print_time": False,
+                "show_eval_warnings": False,
+            },
+        )
+        found = solver(
+            x0=w0,
+            lbx=np.concatenate([lower, -free]),
+            ubx=np.concatenate([upper, free]),
+            lbg=0,
+            ubg=0,
+        )
+        stats = solver.stats()
+        return _Found(
+            np.array(found["x"]).ravel(),
+            int(stats.get("iter_count", 0)),
+            bool(stats["success"]),
+            str(stats["return_status"]),
+        )
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Pieces of one run: their lengths, inputs at all their points, and samples at `nodes`.
+
+    `nodes`: which ends of pieces the samples are, 0 the beginning; `there`: which readings are;
+    `guess` (points, n): states as readings say them; `size` (n,) of these; `still`: cost of states
+    that stay where they begin.
+    """
+
+    steps: Array
+    inputs: Array
+    nodes: Index
+    samples: Array
+    there: Any
+    guess: Array
+    size: Array
+    still: float
+
+    @property
+    def pieces(self) -> int:
+        """How many."""
+        return len(self.steps)
+
+    @classmethod
+    def of(cls, problem: Problem, r: int, parts: Parts, at: Array) -> Grid:
+        """Pieces end at samples, all of them or some; long intervals are cut."""
+        run, whole = problem.runs[r], problem.samples[r].dense
+        time, room = np.asarray(run.time, float), MOST // len(problem.runs)
+        chosen = np.unique(np.linspace(0, len(time) - 1, min(len(time), room + 1)).astype(int))
+        samples, t = whole[chosen], time[chosen]
+        zero = parts.flow.anchored and t[0] > 0
+        knots = np.concatenate([[0.0], t]) if zero else t
+        cut = max(1, -(-FEWEST // max(len(knots) - 1, 1)))
+        steps = np.repeat(np.diff(knots) / cut, cut)
+        starts = np.concatenate([[knots[0]], knots[0] + np.cumsum(steps)[:-1]])
+        points = (starts[:, None] + steps[:, None] * _points()).ravel()
+        residual, reading, taken = parts.residual.map(len(samples))(
+            np.tile(np.array(parts.start(at)), (1, len(samples))),
+            samples.T,
+            np.tile(at[:, None], (1, len(samples))),
+        )
+        u = np.array(taken).T
+        inputs = _inputs(parts.flow, t, u, points)
+        y = np.array(reading).T
+        guess = _guess(parts, samples, at, t, y, points)
+        size = np.maximum(np.abs(guess).max(axis=0), 1e-300)
+        nodes = (np.arange(len(t)) + zero) * cut
+        still = 0.5 * float(np.nansum(np.array(residual) ** 2))
+        return cls(steps, inputs, nodes, samples, np.isfinite(y), guess, _filled(size), still)
+
+
+def _filled(size: Array) -> Array:
+    """Sizes of states, those of nothing as large as the others."""
+    real = size > 1e-12
+    return np.where(real, size, np.median(size[real]) if real.any() else 1.0)
+
+
+def _inputs(flow: Flow, t: Array, u: Array, points: Array) -> Array:
+    """Inputs at the points (P, k): straight lines between samples, or held."""
+    found = np.empty((len(points), u.shape[1]))
+    before = np.clip(np.searchsorted(t, points, side="left") - 1, 0, len(t) - 1)
+    for j in range(u.shape[1]):
+        held = flow.held[j]
+        found[:, j] = u[before, j] if held else np.interp(points, t, u[:, j])
+        if j == flow.clock:
+            found[:, j] += np.minimum(points - t[0], 0.0)
+    return found
+
+
+def _guess(parts: Parts, samples: Array, at: Array, t: Array, y: Array, points: Array) -> Array:
+    """States (P, n) by readings, as far as these say it; else as they begin."""
+    start = np.array(parts.start(at)).ravel()
+    found = np.tile(start, (len(samples), 1))
+    filled = np.column_stack([_between(t, y[:, j]) for j in range(y.shape[1])])
+    for _ in range(3):
+        h, C = parts.predicted.map(len(samples))(
+            found.T, np.nan_to_num(samples).T, np.tile(at[:, None], (1, len(samples)))
+        )
+        away = filled - np.array(h).T
+        slopes = np.array(C.full()).reshape(C.shape[0], len(samples), -1).transpose(1, 0, 2)
+        step = np.linalg.pinv(np.nan_to_num(slopes), rcond=1e-8) @ np.nan_to_num(away)[:, :, None]
+        found = found + step[:, :, 0]
+    return np.column_stack([np.interp(points, t, found[:, i]) for i in range(len(start))])
+
+
+def _between(t: Array, y: Array) -> Array:
+    """Readings, those that are missing as straight lines between the others."""
+    there = np.isfinite(y)
+    return np.interp(t, t[there], y[there]) if there.any() else np.zeros_like(y)
+
+
+@lru_cache(maxsize=1)
+def _points() -> Array:
+    return np.array(ca.collocation_points(DEGREE, "radau"))
+
+
+@lru_cache(maxsize=1)
+def _radau() -> tuple[Array, Array]:
+    """Slopes of the polynomial through a piece's points, at each: of its points, of its start."""
+    tau = np.concatenate([[0.0], _points()])
+    slopes = np.empty((DEGREE + 1, DEGREE + 1))
+    for j in range(DEGREE + 1):
+        p = np.poly1d([1.0])
+        for i in range(DEGREE + 1):
+            if i != j:
+                p *= np.poly1d([1.0, -tau[i]]) / (tau[j] - tau[i])
+        slopes[j] = np.polyder(p)(tau)
+    return slopes[1:, 1:], slopes[0, 1:]

@@ -1,0 +1,51 @@
+"""Differential equations fitted to the beginning of their records first, then to more and more.
+
+Over a short time even a wrong trajectory is near the right one, and a cost has one valley; what is
+learnt there is enough to follow the next part of the record (Voss, Timmer & Kurths 2004, "initial
+value" with a growing horizon).
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from casest.leastsquares.problem import Point, Problem
+from casest.solve.outcome import Outcome
+from casest.solve.trust_region import LITTLE, trust_region
+
+#: Each part of the record over the one before; rows of the first for each unknown; its share of
+#: the record at least.
+GROWTH, ROWS, LEAST = 1.4, 3, 0.01
+#: Steps on each part but the last, and gain over cost that is not worth a step.
+STEPS, GAIN = 30, 1e-6
+
+
+def grown(problem: Problem, start: Point) -> Outcome:
+    """Where a trust region ends that has followed the records from their beginnings."""
+    began, point, count = time.perf_counter(), start, 0
+    for part in _parts(problem):
+        found = trust_region(part, point, max_iterations=STEPS, tolerance=GAIN, wary=count == 0)
+        count += found.iterations
+        if np.isfinite(found.cost):
+            point = found.point
+    found = trust_region(problem, point, max_iterations=100, damping=LITTLE)
+    return replace(
+        found,
+        solver="growing horizon",
+        iterations=found.iterations + count,
+        seconds=time.perf_counter() - began,
+    )
+
+
+def _parts(problem: Problem) -> Iterator[Problem]:
+    """The problem on longer and longer beginnings of its runs, all but the whole."""
+    longest = max(map(len, problem.runs))
+    needed = ROWS * max(len(problem.seen(r)[0]) for r in range(len(problem.runs)))
+    rows = max(needed / len(problem.model.axes), LEAST * longest)
+    while rows < longest:
+        yield problem.beginning(int(np.ceil(rows)))
+        rows *= GROWTH
