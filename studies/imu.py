@@ -44,11 +44,12 @@ WORLDS: dict[str, tuple[str, dict[str, Any], dict[str, Any], int]] = {
 SIMULATED = """\
 # Whole IMUs turned by hand
 
-Made by `make study-imu`. 24 rests (48 where it says so) of two seconds, turns of 70 to 150 degrees
-in a second and a half about axes that wobble, readings at 100 Hz with noises of 0.02 m/s²,
-0.003 rad/s and 0.3 µT; scales off by 2 % (10 % of the magnetometer), axes by some degrees. Coverage of the 95 % intervals over
-all parameters, and of the parameter that is covered least; errors over standard deviations, root
-mean square (of Student's t with 15 degrees of freedom 1.07); processor time for one record."""
+Made by `make study-imu`. 24 rests (48 where it says so) of two seconds, turns of 70 to 150
+degrees in a second and a half about axes that wobble, readings at 100 Hz with noises of 0.02
+m/s², 0.003 rad/s and 0.3 µT; scales off by 2 % (10 % of the magnetometer), axes by some
+degrees. Coverage of the 95 % intervals over all parameters, and of the parameter that is
+covered least; errors over standard deviations, root mean square (of Student's t with 15 degrees
+of freedom 1.07); processor time for one record."""
 MEASURED = """\
 ## Five MPU-9150 (mikoff/imu-calib)
 
