@@ -128,7 +128,7 @@ def test_intervals_of_corrected_readings_hold_the_truth():
     """A norm with noise of its own on every axis: 25 calibrations, 100 fresh readings of each."""
     from casest.correction import runtime
     from casest.correction.numpy_module import as_data
-    from casest.correction.spread import spread_program
+    from casest.correction.spread import slopes, spread_program
 
     rng, std = np.random.default_rng(7), np.array([0.02, 0.05, 0.1])
     scale = np.array([[1, 0, 0], [0.02, 1.03, 0], [-0.01, 0.015, 0.98]])
@@ -141,7 +141,7 @@ def test_intervals_of_corrected_readings_hold_the_truth():
         model = norm_triangular.having(norm=c.constant(stated, std=0.02))
         record = c.Run.raw("r", {"v": v[:30]}, units={"v": "1"})
         found = c.calibrate(*stated_noise(model, [record], {"v": [std]}))
-        program = spread_program(found, {}, "corrected")
+        program = spread_program(found, slopes(found, {}), {}, "corrected")
         got = (v[30:] - found.values["offset"]) @ found.values["scale"].T
         spread = runtime.attempted(as_data(program), np.hstack([v[30:], got]))[:, -3:]
         held.append(np.abs(got - force[30:]) < 1.959964 * spread)

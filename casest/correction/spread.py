@@ -105,12 +105,13 @@ def _sample(
     return ca.vertcat(*needed.values()), inputs, ca.vertcat(*whole)
 
 
-def spread_program(estimate: Estimate, units: Mapping[str, str], name: str) -> Program:
+def spread_program(
+    estimate: Estimate, found: Slopes, units: Mapping[str, str], name: str
+) -> Program:
     """Standard deviations (4·m,) of a corrected reading, its PARTS one after the other.
 
     What goes in is a sample's numbers, then the corrected ones.
     """
-    found = slopes(estimate, units)
     random = np.nan_to_num(estimate.covariance)
     parts = [found.unknowns @ ca.DM(_factor(random - _carried(estimate)))]
     parts.append(found.reading @ ca.DM(reading_root(estimate, found.inputs)))

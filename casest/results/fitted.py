@@ -16,7 +16,7 @@ from msgspec import UNSET, Struct, UnsetType
 
 from casest.correction.carried import Carried, carried
 from casest.correction.reading import carried_data
-from casest.correction.spread import spread_program
+from casest.correction.spread import slopes, spread_program
 from casest.data.run import Run
 from casest.declaration.effect import Attached
 from casest.declaration.model import Model
@@ -439,8 +439,9 @@ def _with_spread(
     if found.own or not estimate.certificate.trusted:
         return found, None
     try:
-        spread = spread_program(estimate, units, found.program.output.name)
-        budget = corrected_budget(estimate, found.program, found.readings[0])
+        how = slopes(estimate, units)
+        spread = spread_program(estimate, how, units, found.program.output.name)
+        budget = corrected_budget(estimate, how, found.program, found.readings[0])
     except (CasestError, RuntimeError):  # an operation without a derivative: there is no std
         return found, None
     return replace(found, spread=spread), budget

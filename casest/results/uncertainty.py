@@ -15,7 +15,7 @@ from msgspec import Struct
 from casest.correction import runtime
 from casest.correction.numpy_module import as_data
 from casest.correction.program import Program
-from casest.correction.spread import reading_root, slopes
+from casest.correction.spread import Slopes, reading_root
 from casest.declaration.shapes import Array
 from casest.estimate.estimate import UNLIMITED, Estimate
 from casest.estimate.sources import sources
@@ -148,7 +148,7 @@ def freedom_of(estimate: Estimate) -> dict[str, Number]:
 
 
 def corrected_budget(
-    estimate: Estimate, program: Program, readings: Array
+    estimate: Estimate, found: Slopes, program: Program, readings: Array
 ) -> CorrectedBudget | None:
     """Of the one of these readings (N, width) whose length is the median; None without a value."""
     at = readings[np.argsort(np.linalg.norm(readings, axis=1))[len(readings) // 2]]
@@ -156,7 +156,6 @@ def corrected_budget(
     value = runtime.attempted(as_data(program), at[None])[0]
     if not np.isfinite(value).all():
         return None
-    found = slopes(estimate, units)
     function = ca.Function("slopes", [found.sample, found.value],
                            [found.unknowns, found.known, found.reading])  # fmt: skip
     unknowns, known, reading = (np.array(part) for part in function(at, value))
