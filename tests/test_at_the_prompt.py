@@ -206,6 +206,31 @@ def test_readings_that_do_not_fit_are_refused_with_the_way_out(estimate, reading
         estimate(readings)
 
 
+def test_plots_hold_the_numbers_that_they_are_of(estimate):
+    (axis,) = estimate.plot().axes
+    drawn = axis.lines[0].get_ydata()
+    assert drawn == pytest.approx(estimate.residuals("dict")["residual"])
+    assert axis.get_xlabel() == "t [s]"
+    names = [a.get_yticklabels()[0].get_text() for a in estimate.plot("parameters").axes]
+    assert names[-1] == "offset[2] [m/s^2]"
+    shown = estimate.plot("correlation").axes[0].images[0].get_array()
+    std = np.sqrt(np.diag(estimate.covariance))
+    assert np.asarray(shown) == pytest.approx(estimate.covariance / np.outer(std, std))
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("histogram",), "there are 'residuals', 'parameters', 'correlation'"),
+        (("residuals", "warmth"), r"the residual is known over corrected\[0\]"),
+        (("correlation", "t"), "is for plot\\('residuals'\\)"),
+    ],
+)
+def test_a_plot_that_there_is_not_says_which_there_are(estimate, words, said):
+    with pytest.raises(casest.UsageError, match=said):
+        estimate.plot(*words)
+
+
 def test_what_is_no_result_is_not_loaded(tmp_path):
     with pytest.raises(casest.DataError, match="no such result"):
         load(tmp_path / "nothing")

@@ -15,6 +15,7 @@ from casest.correction.reading import typed
 from casest.data.finding import Choice
 from casest.data.write import make_folder, write_atomically, written_together
 from casest.interface.correcting import Readings, corrected_readings, kept
+from casest.interface.plots import plot
 from casest.interface.reading import Reading
 from casest.interface.tables import Library, as_frame, headers
 from casest.interface.words import as_python_says, in_python
@@ -102,6 +103,14 @@ class Told:
     def residuals(self, to: Library | None = None) -> Any:
         """A data frame with a row for each sample: run, row, t in s, the residual on each axis."""
         return as_frame(self.residual_columns(), to)
+
+    def plot(self, what: str = "residuals", over: str | None = None) -> Any:
+        """A Matplotlib figure of "residuals", "parameters" (95 % intervals) or "correlation".
+
+        `over` names a column or quantity for the residuals' axis; else it is the time.
+        """
+        with as_python_says():
+            return plot(self.result, what, over)
 
     def __call__(
         self,
