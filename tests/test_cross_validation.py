@@ -275,13 +275,13 @@ def test_a_cause_of_nothing_passes_the_gate_as_rarely_as_its_level_says():
     """A column of noise in records that lack nothing: one-sided 5 % by its level, and a fit to
     noise predicts worse; stretches and regions ask as well."""
     rng, passed, ratios = np.random.default_rng(6), 0, []
-    for _ in range(1000):
+    for _ in range(400):
         linear = problem_of(rng, rng.standard_normal((400, 1)))
         column = rng.standard_normal((400, 1, 1))
         seen = {k: fall(linear, [column], parts) for k, parts in linear.parts.each.items()}
         passed += holds_out(seen, linear)
         ratios.append(seen["pieces"].ratio)
-    assert passed <= 8
+    assert passed <= 5
     assert np.mean(ratios) > 1
 
 

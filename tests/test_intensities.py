@@ -84,9 +84,9 @@ def uneven(kind, rng):
 
 @pytest.mark.parametrize("kind", ["dropped", "in turn"])
 def test_stated_noise_is_that_of_one_reading_however_the_rows_lie(kind):
-    """Errors and innovations of 100 flights are χ² of 9 and of 3 a reading; 99.9 % bands."""
+    """Errors and innovations of 40 flights are χ² of 9 and of 3 a reading; 99.9 % bands."""
     errors, innovations, air = [], [], flights.in_the_air()
-    for seed in range(100):
+    for seed in range(40):
         rng = np.random.default_rng(seed)
         t = uneven(kind, rng)
         record = flights.record(air, t, rng)
@@ -96,9 +96,9 @@ def test_stated_noise_is_that_of_one_reading_however_the_rows_lie(kind):
         left = found.x[-1] - truth
         errors.append(left @ np.linalg.solve(found.P[-1], left))
         innovations.append(found.normalised_innovations[150:].mean())
-    low, high = scipy.stats.chi2.ppf([0.0005, 0.9995], 900) / 100
+    low, high = scipy.stats.chi2.ppf([0.0005, 0.9995], 360) / 40
     assert low < np.mean(errors) < high
-    assert abs(np.mean(innovations) - 3) < 0.05
+    assert abs(np.mean(innovations) - 3) < 0.08
 
 
 def test_steps_that_take_turns_are_no_gaps():
