@@ -3,14 +3,16 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
+# What a demo needs alone: a tenth of the developers' tools.
+USABLE := $(VENV)/.usable
 
 .PHONY: demo test lint types format wheel bench study study-starts study-nist study-loop \
 	study-motion study-flights study-inputs study-records study-asked study-slow study-coverage \
 	study-deceptive study-deceptive-many study-fleet study-mutation study-worlds study-noises \
-	study-structural study-equations \
+	study-structural study-equations study-check study-plans \
 	figures docs clean
 
-demo: $(READY)
+demo: $(USABLE)
 	$(BIN)/casest demo
 
 # Compiled modules and tests are kept whatever the environment says: a hundred processes start here.
@@ -89,6 +91,9 @@ study-records: $(READY)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python studies/agreement.py
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python studies/subsets.py
 
+study-check: $(READY)
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python studies/check.py
+
 study-fleet: $(READY)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python studies/fleet_common.py
 
@@ -97,6 +102,9 @@ study-equations: $(READY)
 
 study-structural: $(READY)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python studies/structural.py
+
+study-plans: $(READY)
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python studies/plans.py
 
 study-mutation: $(READY)
 	$(BIN)/python studies/mutation.py
@@ -112,8 +120,14 @@ docs: $(READY)
 clean:
 	rm -rf $(VENV) build dist *.egg-info out
 
+$(USABLE): pyproject.toml
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install --quiet --disable-pip-version-check --no-compile \
+		--constraint requirements.txt --editable .
+	touch $@
+
 $(READY): pyproject.toml requirements.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --disable-pip-version-check -r requirements.txt
 	$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --editable .
-	touch $@
+	touch $@ $(USABLE)

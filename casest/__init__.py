@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from casest.declaration.physics import asin as asin
     from casest.declaration.physics import atan as atan
     from casest.declaration.physics import atan2 as atan2
+    from casest.declaration.physics import before as before
     from casest.declaration.physics import cos as cos
     from casest.declaration.physics import cosh as cosh
     from casest.declaration.physics import cross as cross
@@ -55,6 +56,7 @@ if TYPE_CHECKING:
     from casest.declaration.physics import sum1 as sum1
     from casest.declaration.physics import tan as tan
     from casest.declaration.physics import tanh as tanh
+    from casest.declaration.physics import turned as turned
     from casest.declaration.physics import vertcat as vertcat
     from casest.declaration.shapes import diagonal as diagonal
     from casest.declaration.shapes import each as each
@@ -66,8 +68,6 @@ if TYPE_CHECKING:
     from casest.declaration.symbols import constant as constant
     from casest.declaration.symbols import param as param
     from casest.declaration.symbols import signal as signal
-    from casest.diagnose.closing import Closing as Closing
-    from casest.diagnose.loop import close as close
     from casest.diagnose.motion.loop import MotionClosing as MotionClosing
     from casest.diagnose.motion.loop import close_motion as close_motion
     from casest.errors import CasestError as CasestError
@@ -76,14 +76,18 @@ if TYPE_CHECKING:
     from casest.errors import NotTrusted as NotTrusted
     from casest.errors import UnitError as UnitError
     from casest.errors import UsageError as UsageError
-    from casest.estimate.calibrate import attempt as attempt
-    from casest.estimate.calibrate import calibrate as calibrate
-    from casest.estimate.estimate import Estimate as Estimate
     from casest.fleet.calibrate_many import Batch as Batch
     from casest.fleet.calibrate_many import calibrate_many as calibrate_many
     from casest.fleet.population import Population as Population
     from casest.fleet.population import calibrate_with as calibrate_with
     from casest.fleet.population import population as population
+    from casest.interface.calibrate import attempt as attempt
+    from casest.interface.calibrate import calibrate as calibrate
+    from casest.interface.calibrate import close as close
+    from casest.interface.estimate import Closing as Closing
+    from casest.interface.estimate import Estimate as Estimate
+    from casest.interface.saved import Saved as Saved
+    from casest.interface.saved import load as load
     from casest.tasks.arrow import calibrate_arrow as calibrate_arrow
 
 

@@ -163,15 +163,15 @@ def _number(declared: Model, name: str) -> float:
     return value
 
 
-def _held(declared: Model) -> dict[str, Array]:
+def held_values(declared: Model) -> dict[str, Array]:
     """Values of what is held: constants, and parameters that were fixed."""
     return {c.name: c.array for c in declared.constants}
 
 
-def _alone(declared: Model, runs: Sequence[Run], sensor: str) -> tuple[Array, Array]:
+def alone(declared: Model, runs: Sequence[Run], sensor: str) -> tuple[Array, Array]:
     """(scale, offset) of one sensor by itself, with what is held as it is."""
     v, length = _readings(runs, sensor), _number(declared, SENSORS[sensor][1])
-    scale, offset = (_held(declared).get(f"{sensor}_{part}") for part in ("scale", "offset"))
+    scale, offset = (held_values(declared).get(f"{sensor}_{part}") for part in ("scale", "offset"))
     if scale is None:
         own_scale, own_offset = ellipsoid(v, length)
         return own_scale, own_offset if offset is None else offset
@@ -193,11 +193,11 @@ def _directions(v: Array, scale: Array, offset: Array) -> Array:
 
 def closed_form(declared: Model, runs: Sequence[Run]) -> dict[str, Array]:
     """Each sensor by itself in closed form, then the rotation between them and the dip."""
-    held = _held(declared)
+    held = held_values(declared)
     found: dict[str, Array] = {}
     directions = []
     for sensor in SENSORS:
-        scale, offset = _alone(declared, runs, sensor)
+        scale, offset = alone(declared, runs, sensor)
         directions.append(_directions(_readings(runs, sensor), scale, offset))
         found |= {f"{sensor}_scale": scale, f"{sensor}_offset": offset}
     if "magnetometer_scale" in held:
@@ -233,7 +233,7 @@ def limits(declared: Model, runs: Sequence[Run]) -> dict[str, tuple[Any, Any]]:
         v = _readings(runs, sensor)
         radius = float(np.max(np.linalg.norm(v, axis=1)))
         found[f"{sensor}_offset"] = (-radius, radius)
-        scale = _alone(declared, runs, sensor)[0]
+        scale = alone(declared, runs, sensor)[0]
         noise = _gain(scale) * _number(declared, f"{sensor}_noise")
         variance += (noise / _number(declared, length)) ** 2
     steepest = np.pi / 2 - min(5 * np.sqrt(variance), 1.0)
@@ -274,7 +274,7 @@ def _noise_alone(declared: Model, runs: Sequence[Run], sensor: str) -> float:
     name, length = SENSORS[sensor]
     v, spread = _readings(runs, sensor), [r.spread[name] for r in runs if name in r.spread]
     if len(v) >= 9 + ENOUGH:
-        misfit = _misfit(v, *_alone(declared, runs, sensor), _number(declared, length))
+        misfit = _misfit(v, *alone(declared, runs, sensor), _number(declared, length))
         return misfit * float(np.sqrt(len(v) / (len(v) - 9)))
     if spread:
         return float(np.sqrt(np.mean(np.vstack(spread) ** 2)))
@@ -293,7 +293,7 @@ def weighed(declared: Model, runs: Sequence[Run]) -> Model:
 def remarks(declared: Model, runs: Sequence[Run], values: Mapping[str, Any]) -> Iterator[str]:
     """What an engineer would notice: wrong units, wrong noises, poses in a plane, a mirror."""
     yield from _coverage(declared, runs)
-    known = {**_held(declared), **{name: np.asarray(value) for name, value in values.items()}}
+    known = {**held_values(declared), **{name: np.asarray(value) for name, value in values.items()}}
     if any(known[f"{s}_{p}"].ndim != n for s in SENSORS for p, n in (("scale", 2), ("offset", 1))):
         return  # values differ from run to run: what follows is about one sensor
     if np.linalg.det(known["magnetometer_scale"]) < 0:
@@ -315,15 +315,23 @@ def _coverage(declared: Model, runs: Sequence[Run]) -> Iterator[str]:
                 f"the readings {name} are {sizes[1]:.3g} times the {length} ({known:g}): is one of "
                 f"the two in another unit? (--unit {name}=…, --set '{length}=…')"
             )
-        spread = np.linalg.svd(away, compute_uv=False) / np.sqrt(len(v))
-        # Noise alone is as thick as it is wide: the extent is at least that of a whole sphere.
-        thickness = spread[2] / max(spread[0], known / np.sqrt(3))
-        if thickness < 0.15:
-            yield (
-                f"the readings of the {sensor} lie close to a plane, a line or a point (thickness "
-                f"{thickness:.1%} of their extent): turning about one axis, such as the vertical, "
-                "is not enough; tilt the sensors about others too"
-            )
+        yield from flat(away, known, sensor)
+
+
+def flat(away: Array, known: float, sensor: str) -> Iterator[str]:
+    """That readings (N, 3), from which their mean is taken, lie close to a plane or a line.
+
+    `known` is the length of what they measure in their own unit.
+    """
+    spread = np.linalg.svd(away, compute_uv=False) / np.sqrt(len(away))
+    # Noise alone is as thick as it is wide: the extent is at least that of a whole sphere.
+    thickness = spread[2] / max(spread[0], known / np.sqrt(3))
+    if thickness < 0.15:
+        yield (
+            f"the readings of the {sensor} lie close to a plane, a line or a point (thickness "
+            f"{thickness:.1%} of their extent): turning about one axis, such as the vertical, "
+            "is not enough; tilt the sensors about others too"
+        )
 
 
 def _noise(declared: Model, runs: Sequence[Run], known: Mapping[str, Array]) -> Iterator[str]:

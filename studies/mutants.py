@@ -182,8 +182,8 @@ MUTANTS = tuple(
         (LEVELS, "confirmed: float = 1.64", "confirmed: float = 0.0"),
         (
             "estimate/held_out.py",
-            "_with_own(model, values, fitted)",
-            "_with_own(model, values, scored)",
+            "with_own(model, values, (fitted,))",
+            "with_own(model, values, (scored,))",
         ),
         ("diagnose/motion/loop.py", "H[~hidden], z[~hidden]", "H, z"),
         ("data/splits.py", "(run.count > 1).any()", "(run.count > 1e9).any()"),
@@ -219,9 +219,9 @@ MUTANTS = tuple(
         (TRANSITION, "np.full(len(steps), usual(steps))", "steps"),
         (TRANSITION, "h**2 / 12 * bend", "h**2 / 6 * bend"),
         (TRANSITION, "0.5 * (step[1:] + step[:-1])", "step[1:]"),
-        (EXTENDED, "Phi @ gap @ Phi.T + Q + gap", "Q"),
+        (EXTENDED, "Phi @ lost @ Phi.T + Q + lost", "Q"),
         (EXTENDED, "driven(path(tau),", "driven(path(0),"),
-        (EXTENDED, "Q = with_lost(model, np.diff(time), Phi, Q)", "pass"),
+        (EXTENDED, "Q = with_lost(model, step, Phi, Q, pace)", "pass"),
         (EXTENDED, "- ca.dot(c, found - along)", ""),
         ("dynamics/filter.py", "first = first or (along, P)", "first = (along, P)"),
         (

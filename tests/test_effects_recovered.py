@@ -419,7 +419,7 @@ def test_effects_of_time_and_of_single_inputs_fit_a_model_of_one_axis():
             fits.add(effect.name)
         except CasestError:
             continue
-    three = {"cross_axis", "soft_iron", "cross_quadratic"}
+    three = {"cross_axis", "soft_iron", "cross_quadratic", "g_sensitivity"}
     wheels = {"imbalance", "speed_polynomial", "table_angle", "lever_arm"}
     recorded = {"signal_lag"}  # of a signal besides the time and what is measured: there is none
     assert {e.name for e in effects.CATALOGUE} - fits == three | wheels | recorded

@@ -72,11 +72,11 @@ KINDS = {f.__name__: f for f in (white, coloured, low_passed, unequal, heavy)}
 @pytest.mark.parametrize("kind", KINDS)
 def test_of_noise_of_any_kind_nothing_is_named(kind):
     """Thirty causes: ten slow shapes, ten columns that vary as they like, ten that live in an
-    eighth of the record. The aim is one alarm in a hundred records; more than six in 200 come by
-    chance once in two hundred then."""
+    eighth of the record. The aim is one alarm in a hundred records; more than four come by chance
+    once in 250 then."""
     rng, t = np.random.default_rng(sum(kind.encode())), np.arange(400) / 400
     confirmed = 0
-    for _ in range(200):
+    for _ in range(100):
         X = np.c_[np.ones(400), rng.standard_normal(400)]
         shapes = [np.sin(2 * np.pi * (t * rng.uniform(0.5, 3) + rng.uniform())) for _ in range(10)]
         shapes += list(rng.standard_normal((10, 400)))
@@ -84,7 +84,7 @@ def test_of_noise_of_any_kind_nothing_is_named(kind):
         trials = [Trial(k, f"{k}", g[:, None, None]) for k, g in enumerate(shapes)]
         found = named(linear_of(KINDS[kind](rng, 400), X), trials)
         confirmed += bool(found[1])
-    assert confirmed <= 6
+    assert confirmed <= 4
 
 
 def test_of_many_variants_the_best_is_named_as_rarely_as_one():

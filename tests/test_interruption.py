@@ -28,9 +28,9 @@ SAID = "casest: interrupted; nothing was written"
 #: The command line as the script calls it, which says when signals can be sent.
 PROGRAM = "import sys; from casest.cli import main; print('ready', flush=True); main()"
 COMMANDS = {
-    "calibrate": (["calibrate", "wheel", str(WHEEL)], 10),
-    "close": (["close", "wheel", str(WHEEL)], 6),
-    "compare": (["compare", "norm-triangular", *HANDHELD, *NORM, "--starts", "2"], 4),
+    "calibrate": (["calibrate", "wheel", str(WHEEL)], 6),
+    "close": (["close", "wheel", str(WHEEL)], 4),
+    "compare": (["compare", "norm-triangular", *HANDHELD, *NORM, "--starts", "2"], 2),
 }
 
 

@@ -72,7 +72,8 @@ def test_every_command_within_a_sentence_exists_with_its_options(page):
 def test_every_question_has_a_page_with_commands():
     index = (ROOT / "docs" / "index.md").read_text(encoding="utf-8")
     questions = set(re.findall(r"\[\]\((\w+)\.md\)", index))
-    assert questions == {"calibrate", "motion_enough", "close", "invisible", "export", "in_motion"}
+    asked = {"calibrate", "motion_enough", "close", "invisible", "export", "in_motion"}
+    assert asked <= questions
     assert questions <= {page.stem for page in WITH_COMMANDS}
 
 

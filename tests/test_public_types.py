@@ -61,7 +61,7 @@ def of(said: list[str], file: str) -> list[str]:
 def test_a_type_checker_sees_what_public_names_are(said):
     fit, declare, effects, values, load, wrong = of(said, "user.py")
     assert "model: casest.declaration.model.Model" in fit
-    assert fit.endswith('-> casest.estimate.estimate.Estimate"')
+    assert fit.endswith('-> casest.interface.estimate.Estimate"')
     assert declare.endswith('-> casest.declaration.model.Model"')
     assert effects.endswith('-> casest.declaration.effect.Effect"')
     assert "Mapping[str, numpy.ndarray" in values

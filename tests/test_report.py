@@ -190,7 +190,7 @@ def flown(tmp_path_factory):
 def test_eigenvalues_over_time_states_with_bands_and_innovations(browser, flown):
     browser.open(flown / "observe" / "report.html")
     assert text(browser, "h1") == "Observable: these data determine all 9 unknowns."
-    assert browser.ask("document.querySelectorAll('#windows path.line').length") == 9
+    assert browser.ask("document.querySelectorAll('#windows-std path.line').length") == 9
     browser.open(flown / "filter" / "report.html")
     assert text(browser, "h1").startswith("Innovations are ")
     for name, unit in (("velocity", "m/s"), ("gravity", "m/s²"), ("bias", "m/s²")):

@@ -164,7 +164,7 @@ def test_the_list_names_every_shipped_problem_and_effect(said):
 
     names = {line.strip().partition(":")[0] for line in said["list"].splitlines()}
     assert {*SHIPPED, *MOVING, *(e.name for e in CATALOGUE)} <= names
-    for effect in ("bias of an input", "lever_arm of an output", "coloured_noise of an output"):
+    for effect in ("bias of an input", "lever_arm of an output", "coloured_noise of any signal"):
         assert effect in names
 
 

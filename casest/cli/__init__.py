@@ -10,7 +10,20 @@ from contextlib import suppress
 
 import click
 
-from casest.cli import comparing, completing, correcting, fitting, fleets, motion, simulating
+from casest.cli import (
+    beginning,
+    checking,
+    comparing,
+    completing,
+    correcting,
+    fitting,
+    fleets,
+    motion,
+    planning,
+    reporting,
+    simulating,
+)
+from casest.cli.project import expanded
 from casest.cli.shared import commands, echo, shown
 from casest.errors import INTERNAL, INTERRUPTED, CasestError
 from casest.interruption import remember
@@ -18,7 +31,10 @@ from casest.interruption import remember
 __all__ = ["commands", "main", "run"]
 
 #: Every room adds its commands to the group as it is imported.
-ROOMS = (fitting, motion, comparing, correcting, simulating, fleets, completing)
+ROOMS = (
+    fitting, checking, motion, comparing, correcting, simulating, planning, fleets, reporting,
+    beginning, completing,
+)  # fmt: skip
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -33,7 +49,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def run(arguments: Sequence[str] | None = None) -> int:
     """Run a command and return its exit code; no traceback reaches the user."""
     try:
-        words = list(sys.argv[1:] if arguments is None else arguments)
+        words = expanded(sys.argv[1:] if arguments is None else arguments, commands)
         result = commands.main(words, prog_name="casest", standalone_mode=False, obj=words)
         _close_output()
         return result if isinstance(result, int) else 0

@@ -38,15 +38,18 @@ class ApplyOptions:
 @taking(ApplyOptions)
 def apply(result_path: Path, data: str, options: ApplyOptions) -> None:
     """Correct the readings in DATA with a saved RESULT (result.json, or its folder)."""
+    from casest.correction.formats_read import is_foreign
     from casest.correction.inverse import LEFT, TIMED
     from casest.report.next_command import following
     from casest.saved import apply as correcting
-    from casest.saved.export import applied, is_exported
+    from casest.saved.export import applied, applied_foreign, is_exported
 
     arguments = options.reading.keywords()
     progress(f"correcting {data}")
     timed: tuple[str, ...] = ()
-    if is_exported(result_path):
+    if is_foreign(result_path):
+        text, left, remarks = applied_foreign(result_path, data, arguments)
+    elif is_exported(result_path):
         text, left, remarks = applied(result_path, data, arguments)
     else:
         text, left, remarks = correcting.corrected_csv(
@@ -97,8 +100,16 @@ class StepOptions:
 @click.option(
     "--to",
     required=True,
-    type=click.Choice(["c", "python", "json"]),
-    help="C99, a Python module with NumPy alone, or JSON that `casest apply` reads.",
+    type=click.Choice(["c", "python", "json", "ros", "kalibr", "ardupilot", "px4"]),
+    help="C99, a Python module with NumPy alone, JSON, or another project's file of offsets and "
+    "matrices; `casest apply` reads the latter five.",
+)
+@click.option(
+    "--sensor",
+    "sensors",
+    multiple=True,
+    type=click.Choice(["accelerometer", "gyroscope", "magnetometer"]),
+    help="ros, kalibr, ardupilot, px4: this sensor alone, of several.",
 )
 @click.option("--float", "single", is_flag=True, help="C: compute with float instead of double.")
 @click.option("--run", default=0, help="Which run, where the correction differs between them.")
@@ -113,7 +124,8 @@ class StepOptions:
 @taking(StepOptions)
 def export(
     result_path: Path,
-    to: Literal["c", "python", "json"],
+    to: Literal["c", "python", "json", "ros", "kalibr", "ardupilot", "px4"],
+    sensors: tuple[str, ...],
     single: bool,
     run: int,
     output: Path | None,
@@ -128,7 +140,7 @@ def export(
     from casest.report.next_command import following
     from casest.results.saved import saved_result
     from casest.saved import apply as correcting
-    from casest.saved.export import exported
+    from casest.saved.export import exported, exported_as
 
     if single and to != "c":
         raise UsageError("--float is for --to c")
@@ -142,7 +154,15 @@ def export(
         saved(step_of(str(result_path), options, single), output)
         return
     refuse(options, Kind.MOVING, f"is for estimators in motion; {result_path} is a saved result")
-    text = exported(result_path, to, single=single, run=run, force=force)
+    remarks: list[str] = []
+    if to == "c" or to == "python" or to == "json":
+        if sensors:
+            raise UsageError("--sensor is for --to ros, kalibr, ardupilot and px4")
+        text = exported(result_path, to, single=single, run=run, force=force)
+    else:
+        text, remarks = exported_as(result_path, to, sensors=sensors, run=run, force=force)
+    for remark in remarks:
+        echo(f"casest: {remark}", err=True)
     if timed := correcting.of_another_time(result_path):
         echo(f"casest: {TIMED}{', '.join(timed)}", err=True)
     saved(text, output)

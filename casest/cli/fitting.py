@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
@@ -17,8 +17,10 @@ from casest.cli.loading import (
     held_out,
     model_and_records,
     moving_model,
+    noisy,
     records,
     trajectory,
+    with_prior,
 )
 from casest.cli.options import (
     DATA,
@@ -30,9 +32,6 @@ from casest.cli.options import (
 )
 from casest.cli.shared import commands, echo, progress, reported, typed, write
 from casest.errors import NotTrusted, UsageError
-
-if TYPE_CHECKING:
-    pass
 
 
 @commands.command("list")
@@ -72,8 +71,11 @@ def calibration(model_name: str, data: Sequence[str], options: FitOptions, comma
     from casest.results.calibration import calibration_result, residual_rows
     from casest.results.file import as_json, save
 
-    model, runs = model_and_records(model_name, data, options.model, options.reading)
+    model, runs = model_and_records(
+        model_name, data, options.model, options.reading, options.sensors
+    )
     hidden = held_out(model, options.holdout, data, options.reading)
+    hidden = noisy(model, hidden, options.sensors)[1] if hidden else hidden
     start = dict(given.start(model) for given in options.starts) or None
     progress(f"fitting {model_name}")
     found = attempt(model, runs, start=start, solver=options.solver, seed=options.seed)
@@ -119,7 +121,6 @@ def close(model_name: str, data: tuple[str, ...], options: CloseOptions) -> int:
 
     if isinstance(find_any(model_name), Dynamics):
         return closing_in_motion(model_name, data, options, typed())
-    refuse(options, Kind.MOVING, f"is for estimators in motion; {model_name} is a calibration")
     if options.sensor:
         return fleet_closing(model_name, data, options)
     if options.keep:
@@ -127,8 +128,14 @@ def close(model_name: str, data: tuple[str, ...], options: CloseOptions) -> int:
     return closing(model_name, data, options, typed())
 
 
-def closing(model_name: str, data: Sequence[str], options: FitOptions, command: str) -> int:
-    """Read, close the loop, save, print."""
+def closing(
+    model_name: str,
+    data: Sequence[str],
+    options: FitOptions,
+    command: str,
+    first: Callable[[Path], str] | None = None,
+) -> int:
+    """Read, close the loop, save, print; `first` is what is said of the folder before the rest."""
     from casest.diagnose import loop
     from casest.diagnose.held_out import scored
     from casest.effects import CATALOGUE
@@ -146,6 +153,8 @@ def closing(model_name: str, data: Sequence[str], options: FitOptions, command: 
     model = declared_model(model_name, replace(options.model, effects=()))
     runs = records(model, data, options.reading, followed)
     apart = held_out(model, options.holdout, data, options.reading, followed)
+    model, runs = noisy(with_prior(model, runs, options.model.prior), runs, options.sensors)
+    apart = noisy(model, apart, options.sensors)[1] if apart else apart
     start = dict(given.start(model) for given in options.starts) or None
     progress(f"fitting {model_name}, looking for effects")
     try:
@@ -172,6 +181,8 @@ def closing(model_name: str, data: Sequence[str], options: FitOptions, command: 
             result = with_formula_in(result, options.output / "formula.py", formula)
         save(options.output, result.content(), residual_rows(found, hidden))
         reported(options.output, closing_page(result, str(options.output)))
+        if first is not None:
+            echo(first(options.output) + "\n")
     if options.as_json:
         echo(as_json(result.content()), nl=False)
     else:
@@ -246,12 +257,10 @@ def refused(
 @click.option("-o", "--output", default=Path("out"), **RESULTS)
 def demo(output: Path) -> int:
     """Close the loop on a shipped record with an effect that its model lacks."""
-    from casest.data.write import written_together
-    from casest.demo import WHEEL, comparison
+    from casest.data.write import written_at_once
+    from casest.demo import WHEEL, story
 
     words = f"casest close wheel {WHEEL} -o {output}"
     echo(f"$ {words}\n")
-    with written_together():  # `comparison` reads them
-        code = closing("wheel", (str(WHEEL),), FitOptions(output=output), words)
-    echo("\n" + comparison(output))
-    return code
+    with written_at_once():  # the story is read from them
+        return closing("wheel", (str(WHEEL),), FitOptions(output=output), words, first=story)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from casest.cli.assignments import Assignments
-from casest.cli.options import ModelOptions, MotionOptions, ReadingOptions
+from casest.cli.options import ModelOptions, MotionOptions, ReadingOptions, SensorOptions
 from casest.cli.shared import progress
 from casest.errors import UsageError
 
@@ -52,14 +52,46 @@ def _with_effects(model: Model, files: Sequence[str]) -> Model:
 
 
 def model_and_records(
-    name: str, data: Sequence[str], options: ModelOptions, reading: ReadingOptions
+    name: str,
+    data: Sequence[str],
+    options: ModelOptions,
+    reading: ReadingOptions,
+    sensors: SensorOptions | None = None,
 ) -> tuple[Model, tuple[Run, ...]]:
-    """The declared model and the runs in the files, from which its effects are told numbers."""
+    """The declared model and the runs in the files, from which its effects are told numbers.
+
+    With what is known of the noise of `sensors`, where a command asks for that.
+    """
     from casest.effects.placing import told
 
     model = declared_model(name, options)
     runs = records(model, data, reading)
+    model = with_prior(model, runs, options.prior)
+    if sensors is not None:
+        model, runs = noisy(model, runs, sensors)
     return told(model, runs), runs
+
+
+def with_prior(model: Model, runs: Sequence[Run], prior: str | None) -> Model:
+    """The model with --prior applied."""
+    if prior is None:
+        return model
+    from casest.results.earlier import earlier_result
+    from casest.results.units import unit_table
+
+    if not prior.startswith("@"):
+        raise UsageError(f"--prior {prior}: write it as --prior @old/result.json")
+    earlier = earlier_result(prior[1:], model)
+    return replace(model, prior=earlier.prior(model, unit_table(model, runs)))
+
+
+def noisy(
+    model: Model, runs: Sequence[Run], sensors: SensorOptions
+) -> tuple[Model, tuple[Run, ...]]:
+    """The model and its runs with --sensor-noise applied."""
+    from casest.cli.sensor_noise import with_sensor_noise
+
+    return with_sensor_noise(model, runs, sensors.stated)
 
 
 def _with_constants(model: Model, constants: Assignments, name: str) -> Model:
@@ -90,7 +122,9 @@ def records(
         seen.add(Path(name).resolve())
     known = {"t", *model.quantities, *(s.name for s in model.signals)}
     extra = [column for column in followed if column not in known]
-    return load_runs(list(data), model.signals, extra=extra, **model.reading, **options.keywords())
+    given = options.keywords()
+    given["at_rest"] = given["at_rest"] or model.resting
+    return load_runs(list(data), model.signals, extra=extra, **model.reading, **given)
 
 
 def held_out(

@@ -59,6 +59,13 @@ class ModelOptions:
         metavar="NAME=VALUE|@RESULT",
         help="Hold a parameter: a number, 1,2,3, rows a,b;c,d, or @result.json.",
     )
+    prior: str | None = flag(
+        None,
+        "--prior",
+        only=Kind.FITTED,
+        metavar="@RESULT",
+        help="What an earlier result knows, with its whole covariance: update it by these data.",
+    )
     shared: Words = flag(
         (), "--shared", only=Kind.FITTED, metavar="NAME", help="One value for all runs."
     )
@@ -100,6 +107,13 @@ class ReadingOptions:
         "--time-zero",
         type=click.Choice(["first", "column"]),
         help="t = 0 at each run's first sample, or where the column has it.",
+    )
+    project: str | None = flag(
+        None,
+        "--project",
+        type=click.Path(),
+        metavar="FILE",
+        help="Options in a TOML file, written by `casest init`; what is typed overrides them.",
     )
 
     def keywords(self) -> dict[str, Any]:
@@ -167,10 +181,9 @@ class SensorOptions:
     stated: Assignments = flag(
         (),
         "--sensor-noise",
-        only=Kind.MOVING,
         of=Assignment,
-        metavar="SIGNAL=STD",
-        help="In motion: std of one reading, in the model's unit; its rate is the record's.",
+        metavar="SIGNAL=STD|%|COLUMN",
+        help="Std of one reading: v=0.02 (model's unit), 'v=0.02 g', v=2%, v=u_x.",
     )
 
     def stds(self) -> dict[str, float]:
@@ -184,6 +197,7 @@ class FitOptions:
 
     model: ModelOptions = field(default_factory=ModelOptions)
     reading: ReadingOptions = field(default_factory=ReadingOptions)
+    sensors: SensorOptions = field(default_factory=SensorOptions)
     holdout: Words = flag(
         (),
         "--holdout",
@@ -230,4 +244,3 @@ class CloseOptions(FitOptions):
         metavar="COLUMN",
         help="With --sensor: does it follow this column (line, supplier, fixture)?",
     )
-    sensors: SensorOptions = field(default_factory=SensorOptions)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,17 +11,24 @@ from casest import units
 from casest.declaration.model import Model
 from casest.declaration.symbols import Constant, constant
 from casest.errors import CasestError, UsageError
-from casest.results.saved import numbers, saved_result
+from casest.results.earlier import earlier_result
 
+#: Between a value and its standard uncertainty.
+_PLUS_MINUS = re.compile(r"\s*(?:±|\+/-|\+-)\s*")
 #: What stands behind the last number; an exponent is part of the number.
 _UNIT_BEHIND = re.compile(r"(?![eE][-+]?\d)[A-Za-z°µ%][^,;]*$")
 
 
 def parse_value(name: str, text: str, option: str, model: Model) -> Constant:
-    """`0.28`, `28 cm`, `1,2,3`, `1,0;0.1,1`, `@result.json`, `gravity(45.5, 120)`: a constant."""
+    """`0.28`, `28 cm`, `1,2,3`, `1,0;0.1,1`, `@result.json`, `gravity(45.5, 120)`: a constant.
+
+    With its standard uncertainty: `9.80665±0.0005 m/s^2`, `28 cm ± 1 mm`, `0.28 m +- 0.5%`.
+    """
     old: Any = model[name]  # raises, with a suggestion, where there is no such name
     if text.startswith("@"):
-        return _from_result(name, text[1:])
+        return earlier_result(text[1:], model, f"its {name}").constant(name)
+    if _PLUS_MINUS.search(text):
+        return _uncertain(name, text, option, model)
     place = re.fullmatch(r"(gravity|field)\(([^()]*)\)", text.replace(" ", ""))
     if place:
         return _of_place(place[1], place[2], f"{option} {name}={text}")
@@ -48,6 +54,42 @@ def parse_value(name: str, text: str, option: str, model: Model) -> Constant:
     return _constant(array, stated)
 
 
+def _uncertain(name: str, text: str, option: str, model: Model) -> Constant:
+    """`VALUE ± STD UNIT`: of each its own unit, else the other's; STD may be a percentage."""
+    where = f"{option} {name}={text}"
+    parts = _PLUS_MINUS.split(text)
+    if len(parts) != 2 or not all(parts):
+        raise UsageError(f"{where}: write VALUE±STD, as in 9.80665±0.0005 m/s^2")
+    try:
+        std, unit = _numbers(parts[1])
+    except (ValueError, CasestError):
+        raise UsageError(
+            f"{where}: behind ± is {parts[1]!r}, and not a number with a unit"
+        ) from None
+    bare = not _UNIT_BEHIND.search(parts[0]) and "(" not in parts[0]
+    shared = f" {unit}" if bare and unit not in (None, "%") else ""
+    value = parse_value(name, parts[0] + shared, option, model)
+    if unit == "%" and value.unit != "%":
+        std = np.abs(value.array) * std / 100
+    elif unit and unit != value.unit:
+        std = std * units.conversion(unit, value.unit or "1")[0]
+    try:
+        made: Constant = constant(value.array, value.unit, std=std)
+    except CasestError as error:
+        raise UsageError(f"{where}: {error}") from None
+    return made
+
+
+def _numbers(text: str) -> tuple[Any, str | None]:
+    """`0.0005 m/s^2` or `0.1,0.1,0.2`: numbers, and their unit if it is said."""
+    behind = _UNIT_BEHIND.search(text)
+    cells = (text[: behind.start()] if behind else text).split(",")
+    numbers = np.array([float(cell) for cell in cells])
+    return (numbers if len(cells) > 1 else numbers[0]), units.canonical(
+        behind[0]
+    ) if behind else None
+
+
 def _of_place(what: str, arguments: str, where: str) -> Constant:
     """`gravity(latitude, height)` in m/s² or `field(latitude, longitude, height, year)` in uT."""
     from casest.cli.earth import magnetic_field, normal_gravity
@@ -68,21 +110,6 @@ def _of_place(what: str, arguments: str, where: str) -> Constant:
 def _declared_unit(symbol: Any) -> str:
     unit: str = symbol.units[0] if hasattr(symbol, "units") else symbol.unit
     return unit
-
-
-def _from_result(name: str, path: str) -> Constant:
-    result = saved_result(Path(path))
-    parameters = result.parameters
-    if name not in parameters:
-        raise UsageError(
-            f"{path} has no parameter {name!r} (it has {', '.join(parameters) or 'none'})"
-        )
-    if not result.trusted:
-        raise UsageError(
-            f"{path}: its estimate was refused; calibrate again before using its {name}"
-        )
-    found = parameters[name]
-    return _constant(numbers(found.value, f"{path}: its {name}"), found.first_unit)
 
 
 def _constant(value: Any, unit: str) -> Constant:

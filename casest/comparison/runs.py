@@ -130,7 +130,7 @@ def run_all(
     clock = _Clock()
     ended: list[Ended] = []
     usual: dict[str, float] = {}
-    limited = _Limited(problem.model, problem.runs, problem.weights, clock)
+    limited = _Limited(problem.model, problem.runs, problem.weights, problem.whitening, clock=clock)
     for k, task in enumerate(tasks, 1):
         say(f"{task.solver} ({k} of {len(tasks)})")
         patience = max(PATIENCE * usual.get(task.solver, np.inf), LEAST)

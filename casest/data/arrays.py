@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import warnings
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from casest.data.column import Column, numeric_column, text_column
 from casest.data.delimited import Contents
-from casest.errors import DataError, last_line
+from casest.errors import DataError, last_line, library
 
 #: Rows of a Parquet file that are read at once.
 PIECE = 65_536
@@ -49,12 +49,12 @@ def read_parquet(file: Path) -> Contents:
 
     In pieces, so that no more than one of them is held beside the columns.
     """
-    import pyarrow
-    import pyarrow.parquet
-
+    parquet = library("pyarrow.parquet", "parquet", f"{file}: a Parquet file")
     try:
-        table = pyarrow.parquet.ParquetFile(str(file), pre_buffer=False)
-        columns, notes = _parquet_columns(table)
+        table = parquet.ParquetFile(str(file), pre_buffer=False)
+        wanted = _wanted(table.schema_arrow)
+        pieces = table.iter_batches(batch_size=PIECE, columns=wanted) if wanted else ()
+        columns, notes = from_batches(table.schema_arrow, table.metadata.num_rows, pieces)
     except DataError as error:
         raise DataError(f"{file}: {error}") from error
     except Exception as error:  # a damaged file can fail anywhere in the library
@@ -63,31 +63,30 @@ def read_parquet(file: Path) -> Contents:
     return Contents(columns, notes)
 
 
-def _parquet_columns(table: Any) -> tuple[list[Column], list[str]]:
-    kinds = {entry.name: str(entry.type) for entry in table.schema_arrow}
+def from_batches(
+    schema: Any, num_rows: int, batches: Iterable[Any]
+) -> tuple[list[Column], list[str]]:
+    """Columns of an Arrow schema, filled from its record batches, and notes on those left out."""
+    kinds = {entry.name: str(entry.type) for entry in schema}
     texts: dict[str, list[str]] = {n: [] for n, kind in kinds.items() if kind.startswith(_TEXT)}
-    numbers = {
-        name: np.empty(table.metadata.num_rows)
-        for name, kind in kinds.items()
-        if kind.startswith(_NUMBER)
-    }
+    numbers = {name: np.empty(num_rows) for name, kind in kinds.items() if kind.startswith(_NUMBER)}
     lists: dict[str, list[NDArray[np.float64]]] = {
         name: [] for name, kind in kinds.items() if _VECTOR.match(kind)
     }
-    first, wanted = 0, [*texts, *numbers, *lists]
-    for piece in table.iter_batches(batch_size=PIECE, columns=wanted) if wanted else ():
+    first = 0
+    for piece in batches:
         for name, values in zip(piece.schema.names, piece.columns, strict=True):
             if name in numbers:
                 numbers[name][first : first + len(values)] = _floats(values, kinds[name])
             elif name in lists:
                 lists[name].append(_vectors(values, name))
-            else:
+            elif name in texts:
                 texts[name] += ["" if v is None else str(v) for v in values.to_pylist()]
         first += len(piece)
-    if numbers and first != table.metadata.num_rows:
-        raise DataError(f"announces {table.metadata.num_rows} rows, holds {first}; copy it again")
+    if numbers and first != num_rows:
+        raise DataError(f"announces {num_rows} rows, holds {first}; copy it again")
     columns, notes = [], []
-    for entry in table.schema_arrow:
+    for entry in schema:
         unit = (entry.metadata or {}).get(b"unit", b"").decode()
         if kinds[entry.name].startswith("timestamp"):
             unit = "ns"
@@ -105,6 +104,12 @@ def _parquet_columns(table: Any) -> tuple[list[Column], list[str]]:
         else:
             notes.append(f"column {entry.name} of type {kinds[entry.name]} left out")
     return columns, notes
+
+
+def _wanted(schema: Any) -> list[str]:
+    """Names of the columns that can be read."""
+    kinds = {entry.name: str(entry.type) for entry in schema}
+    return [n for n, k in kinds.items() if k.startswith((*_TEXT, *_NUMBER)) or _VECTOR.match(k)]
 
 
 def _vectors(values: Any, name: str) -> NDArray[np.float64]:

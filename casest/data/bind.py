@@ -15,6 +15,7 @@ from casest import units as unit_names
 from casest.data import checks, timing
 from casest.data.converting import numbers, rotation, vector
 from casest.data.finding import Choice, as_names, find_column, find_columns
+from casest.data.frames import is_frame
 from casest.data.joining import joined, shared_out
 from casest.data.logs import file_and_topics, parts_of
 from casest.data.matching import find_by_name
@@ -23,11 +24,13 @@ from casest.data.options import Options, refuse_unknown_names, stated_unit
 from casest.data.rest import at_rest as averaged_at_rest
 from casest.data.run import Array, Labels, Run
 from casest.data.scaling import parse_scale
-from casest.data.table import Table, read_table
+from casest.data.table import Table, read_table, table_of
 from casest.declaration.symbols import Signal
 from casest.errors import DataError, UnitError, UsageError
 
 Path_ = str | os.PathLike[str]
+#: A table in memory: a data frame of any library, a mapping of arrays, an array.
+Frame = Any
 
 
 @dataclass(frozen=True)
@@ -43,7 +46,7 @@ class _Bound:
 
 
 def load_runs(
-    paths: Sequence[Path_] | Path_,
+    paths: Sequence[Path_ | Frame] | Path_ | Frame,
     signals: Mapping[str, Signal] | Iterable[Signal],
     *,
     columns: Choice | None = None,
@@ -58,6 +61,9 @@ def load_runs(
     steady: Sequence[str] = (),
 ) -> tuple[Run, ...]:
     """Read files and bind their columns to `signals`: one run per file and `run` label.
+
+    In place of a file stands also a data frame (pandas, polars, PyArrow, xarray), a mapping of
+    arrays by name or an array of numbers (N, k), whose columns are 0 to k - 1.
 
     A path `a.csv+b.csv` is one run of two files, each with a clock of its own: at the samples of a,
     within what b recorded too, the columns of b are interpolated.
@@ -84,7 +90,7 @@ def load_runs(
     Raises DataError, UnitError or UsageError naming file, column, row, value and the way out.
     """
     wanted = tuple(signals.values() if isinstance(signals, Mapping) else signals)
-    listed = [paths] if isinstance(paths, str | os.PathLike) else list(paths)
+    listed = listed_data(paths)
     if not listed:
         raise UsageError("no data file given; name at least one")
     options = Options(
@@ -98,14 +104,39 @@ def load_runs(
         None if between is None else frozenset(between),
         frozenset(steady),
     )
-    groups = [[read_table(part) for part in parts_of(path)] for path in listed]
+    groups = [_tables(given, k if len(listed) > 1 else None) for k, given in enumerate(listed)]
     refuse_unknown_names([table for tables in groups for table in tables], wanted, options)
     runs = [run for tables in groups for run in _group_runs(tables, wanted, options)]
     runs = _named_apart(runs)
     if at_rest is not False:
         also = () if at_rest is True else tuple(at_rest)
-        runs = [averaged_at_rest(run, also=also) for run in runs]
+        wanders = [s.name for s in wanted if s.wanders]
+        runs = [averaged_at_rest(run, also=also, wanders=wanders) for run in runs]
     return tuple(runs)
+
+
+def listed_data(given: Any) -> list[Any]:
+    """Files and tables, one or several, as a list; UsageError where it is neither."""
+    if isinstance(given, str | os.PathLike | Table) or is_frame(given):
+        return [given]
+    found = list(given) if isinstance(given, Iterable) else [given]
+    for one in found:
+        if not (isinstance(one, str | os.PathLike | Table) or is_frame(one)):
+            raise UsageError(
+                f"the data hold {one!r:.40}, of type {type(one).__name__}: give files, data "
+                "frames, mappings of arrays by name, or arrays of numbers"
+            )
+    return found
+
+
+def _tables(given: Any, place: int | None) -> list[Table]:
+    """The tables of one entry: of the files that a + joins, or of a frame, called by its place."""
+    if isinstance(given, Table):
+        return [given]
+    if isinstance(given, str | os.PathLike):
+        return [read_table(part) for part in parts_of(given)]
+    kind = type(given).__name__
+    return [table_of(given, kind if place is None else f"{kind} {place}")]
 
 
 def _group_runs(tables: Sequence[Table], signals: Sequence[Signal], options: Options) -> list[Run]:

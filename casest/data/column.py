@@ -14,7 +14,7 @@ Values = NDArray[np.float64] | NDArray[np.str_]
 
 
 #: What a cell holds where a reading is missing.
-_BLANK = frozenset({"", "nan", "na", "n/a", "null", "none", "-"})
+BLANK = frozenset({"", "nan", "na", "n/a", "null", "none", "-"})
 
 
 _NO_UNITS = ("-", "as", "turn", "code", "none")  # words that name things more often than units
@@ -76,7 +76,7 @@ def numeric_column(header: str, values: NDArray[np.float64], texts: list[str] | 
         if texts is None:
             blank = bool(np.isnan(values[wrong]).all())
         else:
-            blank = all(texts[k].strip().lower() in _BLANK for k in wrong)
+            blank = all(texts[k].strip().lower() in BLANK for k in wrong)
         bad = BadCell(row, _cut(text, 60), int(wrong.size), blank)
         values = np.where(np.isfinite(values), values, np.nan)
     return Column(name, unit, np.ascontiguousarray(values, dtype=np.float64), bad)

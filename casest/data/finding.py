@@ -140,7 +140,7 @@ def _missing(table: Table, signal: Signal) -> DataError:
     wanted = " ".join(_candidates(signal)[0])
     if signal.kind == "rotation":
         wanted = "roll pitch yaw or qw qx qy qz"
-    near = _near_group(table, signal)
+    near = near_group(table, signal)
     some = shlex.quote(f"{signal.name}={','.join(near)}") if near else ""
     some = some or f"{signal.name}={','.join('…' * min(signal.size, 3))}"
     return DataError(
@@ -149,7 +149,7 @@ def _missing(table: Table, signal: Signal) -> DataError:
     )
 
 
-def _near_group(table: Table, signal: Signal) -> list[str]:
+def near_group(table: Table, signal: Signal) -> list[str]:
     """Return columns that could hold the signal: x y z of one stem, else the first numbers."""
     clock = find_time(table)
     numbers = [n for n, column in table.columns.items() if not column.is_text and n not in clock]

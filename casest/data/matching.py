@@ -53,6 +53,15 @@ def vectors_beginning_with(table: Table, stem: str, size: int) -> list[tuple[str
     return []
 
 
+def triads(names: Sequence[str]) -> list[tuple[str, ...]]:
+    """Groups of three columns that differ in their axis only: x y z, else 0 1 2 or 1 2 3."""
+    by_plain = {plain(name): name for name in names}
+    for axes in _AXES:
+        if found := list(dict.fromkeys(_groups(by_plain, "", axes))):
+            return found
+    return []
+
+
 def _groups(by_plain: dict[str, str], start: str, axes: str) -> list[tuple[str, ...]]:
     found = []
     for name in by_plain:

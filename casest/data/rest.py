@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from casest.data.run import Array, Labels, Run
+from casest.data.run import Array, Averaged, Labels, Run
 from casest.data.stillness import WINDOW, Interval, Rests, find_rests, resolution
 from casest.errors import UsageError
 
@@ -19,11 +19,17 @@ _FEWEST, _MOST = 15, 400  # samples in a window
 
 
 def at_rest(
-    run: Run, *, also: Sequence[str] = (), window: int | None = None, shortest: int | None = None
+    run: Run,
+    *,
+    also: Sequence[str] = (),
+    wanders: Sequence[str] = (),
+    window: int | None = None,
+    shortest: int | None = None,
 ) -> Run:
     """Average each rest interval of a raw run into one sample.
 
-    also: names of further columns (a gyro's) that must be at rest too.
+    also: names of further columns (a gyro's) that must be at rest too; they and the signals in
+    `wanders` need not keep their mean.
     window: samples over which the variance is taken; shortest: samples an interval needs.
 
     Returns a run with one sample per interval: means, `count`, `spread` (standard error of the
@@ -31,21 +37,26 @@ def at_rest(
     `columns` the first and last data row of each as "first_row" and "last_row".
     Raises DataError where nothing rests, or rest cannot be told from motion.
     """
-    names, channels = _channels(run, also)
-    n_averaged = channels.shape[1] - len(also)
+    names, channels, n_averaged = _channels(run, also, wanders)
     found = find_rests(channels, run.block, _window(run, window), shortest, run.name, n_averaged)
     return _averaged(run, found, names, channels)
 
 
-def _channels(run: Run, also: Sequence[str]) -> tuple[list[str], Array]:
-    """Stack what must be still: the vector signals (a temperature may drift), then `also`."""
+def _channels(
+    run: Run, also: Sequence[str], wanders: Sequence[str]
+) -> tuple[list[str], Array, int]:
+    """Stack what must be still: the vector signals (a temperature may drift), then `also`.
+
+    And how many must keep their mean: all, but for those that wander, which come last, and `also`.
+    """
     if run.spread:
         raise UsageError(f"{run.name}: is averaged already; leave --at-rest out")
     names: list[str] = []
     parts: list[Array] = []
     plain = {k: v for k, v in run.signals.items() if k != "t" and v.shape[1] != 9}
-    vectors = {k: v for k, v in plain.items() if v.shape[1] > 1}
-    for name, values in (vectors or plain).items():
+    vectors = {k: v for k, v in plain.items() if v.shape[1] > 1} or plain
+    kept = sum(v.shape[1] for k, v in vectors.items() if k not in wanders)
+    for name, values in sorted(vectors.items(), key=lambda item: item[0] in wanders):
         names += _component_names(name, values.shape[1])
         parts.append(values)
     for name in also:
@@ -56,7 +67,7 @@ def _channels(run: Run, also: Sequence[str]) -> tuple[list[str], Array]:
         parts.append(np.asarray(column, dtype=np.float64)[:, None])
     if not parts:
         raise UsageError(f"{run.name}: no signal to look for rest in; leave --at-rest out")
-    return names, np.concatenate(parts, axis=1)
+    return names, np.concatenate(parts, axis=1), kept
 
 
 def _component_names(name: str, size: int) -> list[str]:
@@ -94,6 +105,9 @@ def _averaged(run: Run, found: Rests, names: list[str], channels: Array) -> Run:
         spread={k: _spreads(v, spans) for k, v in run.signals.items() if k != "t"},
         notes=(*run.notes, *_notes(run, found, names, channels)),
         correlation={k: _correlations(v, spans) for k, v in run.signals.items() if k != "t"},
+        averaged=Averaged(
+            run, np.array([s.first for s in spans]), np.array([s.last for s in spans])
+        ),
     )
 
 

@@ -31,6 +31,19 @@ class Series:
 
 
 @dataclass(frozen=True)
+class Averaged:
+    """The raw record whose rests a run's samples are: first and last sample of each, (N,)."""
+
+    run: Run
+    first: Index
+    last: Index
+
+    def take(self, chosen: NDArray[np.int_] | NDArray[np.bool_] | slice) -> Averaged:
+        """The same record, and some of its rests."""
+        return Averaged(self.run, self.first[chosen], self.last[chosen])
+
+
+@dataclass(frozen=True)
 class Run:
     """N samples of one record.
 
@@ -47,6 +60,7 @@ class Run:
     between its own samples an input is interpolated or held; empty where all have one clock.
     elsewhere: signals and columns that come from another file than the first, as they are there.
     whole: the record that these samples were taken from, where `places` (N,) says; None of a whole.
+    averaged: the raw record whose rests the samples are; None of any other.
     """
 
     name: str
@@ -66,6 +80,7 @@ class Run:
     read: Mapping[str, NDArray[np.bool_]] = field(default_factory=dict)
     whole: Run | None = None
     places: Index | None = None
+    averaged: Averaged | None = None
     #: Signals between their samples, once they were asked for; of a changed run they are others.
     curves: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 
@@ -125,6 +140,7 @@ class Run:
             read={name: mask[chosen] for name, mask in self.read.items()},
             whole=self if self.whole is None else self.whole,
             places=places[chosen],
+            averaged=None if self.averaged is None else self.averaged.take(chosen),
         )
 
     def recorded(self, name: str) -> Array:

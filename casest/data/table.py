@@ -9,16 +9,18 @@ import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from casest.data.arrays import read_npy, read_npz, read_parquet
 from casest.data.column import BadCell, Column
 from casest.data.delimited import Contents, read_delimited
+from casest.data.frames import framed
 from casest.data.logs import file_and_topics, is_log, read_log
 from casest.data.matlab import read_matlab
 from casest.data.text import decoded
-from casest.errors import DataError
+from casest.errors import CasestError, DataError
 
-__all__ = ["BadCell", "Column", "Table", "read_table"]
+__all__ = ["BadCell", "Column", "Table", "read_table", "table_of"]
 
 
 @dataclass(frozen=True)
@@ -48,6 +50,20 @@ def read_table(path: str | os.PathLike[str]) -> Table:
         file, contents = _contents(path)
     except OSError as error:  # no permission, a name too long, a drive that has gone
         raise DataError(f"{os.fspath(path)}: cannot be read ({error.strerror or error})") from error
+    return _checked(str(path), str(file), contents)
+
+
+def table_of(data: Any, name: str) -> Table:
+    """A table that is in memory already (see `framed`); `name` is what errors call it."""
+    try:
+        return _checked(name, name, framed(data, name))
+    except CasestError as error:
+        said = str(error)
+        raise type(error)(said if said.startswith(f"{name}: ") else f"{name}: {said}") from None
+
+
+def _checked(name: str, file: str, contents: Contents) -> Table:
+    """The table of what a reader found; DataError where it holds nothing."""
     columns = {column.name: column for column in contents.columns}
     if len(columns) < len(contents.columns):
         names = [column.name for column in contents.columns]
@@ -58,7 +74,7 @@ def read_table(path: str | os.PathLike[str]) -> Table:
     n_rows = len(next(iter(columns.values())).values)
     if n_rows == 0:
         raise DataError(f"{file}: holds a header but no rows below it; check the export")
-    return Table(str(path), columns, tuple(contents.notes), contents.preamble, n_rows)
+    return Table(name, columns, tuple(contents.notes), contents.preamble, n_rows)
 
 
 def _contents(path: str | os.PathLike[str]) -> tuple[Path, Contents]:

@@ -63,11 +63,10 @@ def files_of(dataset: str) -> tuple[File, ...]:
 
 def opened(file: File) -> Any:
     """A `pyarrow.parquet.ParquetFile`; DataError where it cannot be read as one."""
-    import pyarrow.parquet
-
+    parquet = library("pyarrow.parquet", "parquet", f"{file.name}: a Parquet file")
     try:
         source = _stream(file) if file.remote else file.name
-        return pyarrow.parquet.ParquetFile(source, pre_buffer=False, buffer_size=BUFFER)
+        return parquet.ParquetFile(source, pre_buffer=False, buffer_size=BUFFER)
     except Exception as error:  # a damaged file can fail anywhere in the library
         raise unreadable(file, error) from error
 

@@ -5,9 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import replace
 
+import numpy as np
+
 from casest import units
 from casest.declaration.symbols import Constant, Parameter, Symbol, constant
-from casest.errors import UnitError
+from casest.declaration.uncertainty import Uncertainty
+from casest.errors import UnitError, UsageError
 
 
 def converted_constant(name: str, new: Constant, unit: str) -> Constant:
@@ -17,7 +20,22 @@ def converted_constant(name: str, new: Constant, unit: str) -> Constant:
         return new
     factor, offset = units.conversion(new.unit, unit or "1")
     converted: Constant = constant(factor * new.array + offset, unit)
+    if new.uncertainty is not None:
+        converted = replace(converted, uncertainty=new.uncertainty.scaled(factor))
     return converted
+
+
+def uncertainty_of_coordinates(name: str, new: Constant, old: Parameter) -> Uncertainty | None:
+    """What is known of the coordinates of a parameter that is fixed at a constant."""
+    known, shape = new.uncertainty, old.shape
+    if known is None or len(known) == shape.coordinates:
+        return known
+    if shape.curved or new.array.shape != shape.dims:
+        raise UsageError(
+            f"{name} has {shape.coordinates} coordinates, and {len(known)} standard deviations do "
+            "not fit: give a value with all its entries, or take it from a result"
+        )
+    return known.only([int(np.ravel_multi_index(i, new.array.shape)) for i in shape.entries])
 
 
 def converted_parameter(name: str, new: Parameter, old: Symbol) -> Parameter:

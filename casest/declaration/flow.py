@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import casadi as ca
 
@@ -37,6 +37,7 @@ class Flow:
     held: tuple[bool, ...] = ()
     clock: int | None = None
     attached: None = None
+    word: Literal[""] = ""
 
     @property
     def entered(self) -> SX:

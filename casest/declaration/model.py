@@ -16,6 +16,7 @@ from casest.declaration.changing import (
     check_units_known,
     converted_constant,
     converted_parameter,
+    uncertainty_of_coordinates,
 )
 from casest.declaration.effect import (
     NOISE,
@@ -29,7 +30,9 @@ from casest.declaration.effect import (
     label_of,
 )
 from casest.declaration.flow import Flow
+from casest.declaration.noise import Stated, in_units_of_noise
 from casest.declaration.physics import Quantity, Residual
+from casest.declaration.prior import Prior
 from casest.declaration.sampson import sampson
 from casest.declaration.shapes import Array
 from casest.declaration.symbols import Constant, Parameter, Scope, Signal, Symbol, constant, named
@@ -42,8 +45,8 @@ from casest.declaration.tracing import (
     trace,
 )
 from casest.declaration.travelling import reduced
-from casest.errors import DeclarationError, UnitError, UsageError
-from casest.units import known, size
+from casest.errors import CasestError, DeclarationError, UnitError, UsageError
+from casest.units import known, parse_quantity, size
 
 
 @dataclass(frozen=True)
@@ -62,9 +65,12 @@ class Model:
     starter_of_many: Callable[..., Any] | None = None
     limiter: Callable[..., Any] | None = None
     remarker: Callable[..., Any] | None = None
+    refuser: Callable[..., Any] | None = None
     inverter: Callable[..., Any] | None = None
     canonicaliser: Callable[..., Any] | None = None
     estimators: tuple[tuple[str, Callable[..., Any]], ...] = ()
+    noise: Stated | None = None
+    prior: Prior | None = None
 
     def __reduce__(self) -> tuple[Any, ...]:
         """To pickle: the declaration alone; it is traced anew where it arrives."""
@@ -79,6 +85,13 @@ class Model:
         for attached in self.effects:
             own += [s for s in attached.signals if s.name not in {o.name for o in own}]
         return tuple(own)
+
+    @cached_property
+    def columns(self) -> tuple[Signal, ...]:
+        """What a sample holds: the signals, then what is stated of their noise."""
+        if self.noise is None:
+            return self.signals
+        return self.signals + self.noise.columns({s.name: s for s in self.signals})
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -138,6 +151,8 @@ class Model:
     def residual_unit(self) -> str:
         """Unit of the residual; `[v]` stands for the unit of signal v."""
         traced = self.traced
+        if traced.residual.noise:
+            return "1"
         if traced.measured is not None and not traced.residual.unit:
             return self[traced.measured].unit or f"[{traced.measured}]"
         return traced.residual.unit
@@ -165,8 +180,8 @@ class Model:
     def having(self, **changes: Any) -> Model:
         """A model with constants set, parameters redeclared, or either turned into the other.
 
-        A number fixes (`radius=0.3`), a `param(…)` frees (`radius=param("m", start=0.28)`), a
-        `constant(…)` sets value and unit.
+        A number fixes (`radius=0.3`), also with its unit (`norm="48 uT"`), a `param(…)` frees
+        (`radius=param("m", start=0.28)`), a `constant(…)` sets value and unit.
         """
         model = self
         for name, change in changes.items():
@@ -179,7 +194,7 @@ class Model:
             raise UsageError(f"{name} is a signal of model {self.name}: data give it, not having()")
         if isinstance(change, Parameter):
             return replace(converted_parameter(name, change, old), name=name)
-        new = change if isinstance(change, Constant) else constant(change, old.unit)
+        new = change if isinstance(change, Constant) else _stated(name, change, old.unit)
         new = converted_constant(name, new, old.unit)
         if isinstance(old, Parameter):
             try:
@@ -187,7 +202,8 @@ class Model:
             except DeclarationError as error:
                 raise UsageError(f"{name} of model {self.name}: {error}") from None
             fixed: Constant = constant(value, new.unit)
-            return replace(fixed, name=name, frozen=old)
+            known = uncertainty_of_coordinates(name, new, old)
+            return replace(fixed, name=name, frozen=old, uncertainty=known)
         if new.array.shape != old.array.shape:
             raise UsageError(f"{name} has shape {old.array.shape}, not {new.array.shape}")
         like = old.like or (old.unit if "[" in old.unit and new.unit != old.unit else "")
@@ -387,6 +403,10 @@ class Model:
         """A model that comments on its fits: `function(model, runs, values) -> sentences`."""
         return replace(self, remarker=function)
 
+    def refusing(self, function: Callable[..., Any]) -> Model:
+        """A model that refuses fits: `function(model, runs, values) -> sentences`, or none."""
+        return replace(self, refuser=function)
+
     def canonical(self, function: Callable[..., Any]) -> Model:
         """A model that says which of equivalent values it means.
 
@@ -412,6 +432,8 @@ class Model:
     def traced(self) -> Traced:
         """The body in CasADi symbols, with every effect in place."""
         found = trace(self)
+        if self.noise is not None:
+            return in_units_of_noise(found, self.noise)
         acting = any(a.kind in ("quantity", "signal") for a in self.effects)
         if found.residual.implicit is None or not acting:
             return found
@@ -420,12 +442,20 @@ class Model:
     @cached_property
     def staged(self) -> Traced:
         """The body with a symbol in the place of what each effect gives that looks at others."""
-        return trace(self, staged=True)
+        found = trace(self, staged=True)
+        return found if self.noise is None else in_units_of_noise(found, self.noise)
+
+    @cached_property
+    def resting(self) -> bool:
+        """Does the body look back to the rest before (`before`, `turned`)?"""
+        return any(stage.word for stage in self.staged.stages)
 
     @cached_property
     def sequential(self) -> bool:
-        """Does a sample's residual depend on other samples: by an effect, or by equations?"""
-        return any(a.kind in OVER_TIME for a in self.effects) or self.traced.integrates
+        """Does a sample's residual depend on other samples: by a word, an effect, or equations?"""
+        return (
+            self.resting or any(a.kind in OVER_TIME for a in self.effects) or self.traced.integrates
+        )
 
     @property
     def reading(self) -> dict[str, Any]:
@@ -462,8 +492,9 @@ class Model:
             raise UsageError(f"model {self.name} needs the signal {missing[0]!r}")
         if self.sequential:
             raise UsageError(
-                f"model {self.name} has an effect on the sequence of samples, or differential "
-                "equations: single samples have no prediction of their own; evaluate it on a run "
+                f"model {self.name} has an effect on the sequence of samples, looks at the rest "
+                "before, or follows differential equations: "
+                "single samples have no prediction of their own; evaluate it on a run "
                 "(leastsquares.problem)"
             )
         traced = self.traced
@@ -547,3 +578,15 @@ def _reaches_residual(made: Model, attached: Attached) -> bool:
 
 def _rows(value: Any, declared: Signal) -> Array:
     return np.asarray(value, dtype=float).reshape(-1, declared.size)
+
+
+def _stated(name: str, value: Any, unit: str) -> Constant:
+    """A constant from a number, or from text with its unit."""
+    if isinstance(value, str):
+        try:
+            value, stated = parse_quantity(value)
+        except CasestError as error:
+            raise type(error)(f"{name}: {error}") from None
+        unit = stated or unit
+    found: Constant = constant(value, unit)
+    return found

@@ -62,6 +62,8 @@ class Trace:
     staged: bool = False
     #: Does the body integrate rates?
     integrates: bool = False
+    #: How a word of the body that does so is handed on (tracing.reached).
+    reach: Any = None
 
     def enter(self, name: str, expression: Any, unit: str, *, implied: bool = False) -> SX:
         """Record a quantity and hand back what the rest of the body shall see."""
@@ -99,6 +101,27 @@ def quantity(name: str, expression: Any, unit: str = "") -> SX:
     return trace.enter(name, expression, unit)
 
 
+def before(expression: Any) -> SX:
+    """What an expression was at the rest before; of a record's first rest there is none."""
+    return _over_samples("before", expression)
+
+
+def turned(rate: Any) -> SX:
+    """How far the body has turned since the rest before: R (3, 3) of its angular rate in rad/s.
+
+    The rate, in the body's own frame, is integrated over the raw record between the two rests. A
+    direction that stands still, seen as x there, is now seen as R.T @ x.
+    """
+    return _over_samples("turned", rate)
+
+
+def _over_samples(word: str, expression: Any) -> SX:
+    trace = current_trace.get()
+    if trace is None or trace.reach is None:
+        raise DeclarationError(f"{word}(…) belongs in the body of a @model function")
+    return trace.reach(trace, word, ca.SX(expression))
+
+
 def polynomial(coefficients: Any, variable: SX) -> SX:
     """c[0] + c[1]·x + c[2]·x² + …, by Horner's rule."""
     coefficients = ca.SX(coefficients)
@@ -131,6 +154,8 @@ def der(expression: SX, variable: SX) -> SX:
     if trace is not None and trace.naming and expression.is_symbolic():
         return ca.SX.sym(f"der({expression})")
     for stage in [] if trace is None else trace.stages:
+        if stage.attached is None and stage.word:
+            continue
         if ca.depends_on(ca.vec(ca.SX(expression)), stage.given):
             if stage.attached is None:
                 raise DeclarationError("der of what is integrated: write its rate instead")
@@ -159,6 +184,8 @@ class Residual:
     residual is then in these, and they weigh the readings. Implicit:
     `Residual(implicit=expression, unit="m/s^2")`, an expression that is zero but for noise; its
     unit should be that of the reading. `corrected` is the quantity that `apply` gives back.
+    `noise` names for each axis the constant that is its standard deviation: a residual of several
+    kinds is then counted in standard deviations, and what is 0 is found from the data.
     """
 
     def __init__(
@@ -170,6 +197,7 @@ class Residual:
         corrected: SX = None,
         unit: str = "",
         axes: tuple[str, ...] = (),
+        noise: tuple[str, ...] = (),
         std: Any = None,
     ) -> None:
         explicit = measured is not None and predicted is not None
@@ -181,6 +209,7 @@ class Residual:
         self.measured = _side_by_side(measured) if several else measured
         self.std = None if std is None else _side_by_side(std) if several else ca.SX(std)
         self.implicit, self.corrected, self.unit, self.axes = implicit, corrected, unit, axes
+        self.noise = noise
 
     @property
     def expression(self) -> SX:

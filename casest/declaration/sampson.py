@@ -65,5 +65,5 @@ def _ratio(own: SX, changed: SX) -> SX:
 
 def _symbols(model: Declared, traced: Traced) -> SX:
     """All that an expression of the trace is made of."""
-    signals = [flat(traced.symbols[s.name]) for s in model.signals]
+    signals = [flat(traced.symbols[s.name]) for s in model.columns]
     return ca.vertcat(traced.coordinates, traced.references, *signals)

@@ -8,6 +8,7 @@ from typing import Any, Literal
 import numpy as np
 
 from casest.declaration.shapes import Array, Shape, array_shape
+from casest.declaration.uncertainty import Uncertainty, stated
 from casest.errors import DeclarationError
 
 Scope = Literal["all", "run"]
@@ -28,17 +29,21 @@ class Signal:
     unit: str | None
     kind: Literal["plain", "rotation"] = "plain"
     held: bool = False
+    wanders: bool = False
 
 
-def signal(shape: int | str = 1, unit: str | None = None, *, held: bool = False) -> Any:
+def signal(
+    shape: int | str = 1, unit: str | None = None, *, held: bool = False, wanders: bool = False
+) -> Any:
     """Declare a measured input: `signal("s")`, `signal(3, "m/s^2")`, `signal(3)` (any unit).
 
     `held`: an input of an estimator in motion that keeps its value between samples (a command to a
-    motor) in place of a straight line.
+    motor) in place of a straight line. `wanders`: its mean may wander while the sensor lies still,
+    as a gyroscope's does; rest is looked for in its noise alone.
     """
     if isinstance(shape, str):
-        return Signal("", 1, shape, held=held)
-    return Signal("", shape, unit, held=held)
+        return Signal("", 1, shape, held=held, wanders=wanders)
+    return Signal("", shape, unit, held=held, wanders=wanders)
 
 
 def attitude() -> Any:
@@ -102,11 +107,25 @@ class Constant:
     like: str = ""
     #: The declaration as a parameter it was fixed from, so that it can be freed again.
     frozen: Parameter | None = field(default=None, compare=False)
+    #: Of its entries, or of the coordinates of the parameter it was fixed from; None: it is exact.
+    uncertainty: Uncertainty | None = None
 
     @property
     def array(self) -> Array:
         """The value with its shape."""
         return np.array(self.value).reshape(self.dims)
+
+    @property
+    def std(self) -> Array | None:
+        """Standard deviation of every entry, shaped like the value; None where it is exact.
+
+        Of a direction or a rotation, which have no entries of their own, also None.
+        """
+        if self.uncertainty is None or (self.frozen is not None and self.frozen.shape.curved):
+            return None
+        if self.frozen is not None:
+            return self.frozen.shape.unpack(self.uncertainty.std)
+        return self.uncertainty.std.reshape(self.dims)
 
 
 def param(
@@ -198,12 +217,17 @@ def _bounds(shape: Shape, bounds: Any) -> tuple[tuple[float, ...], tuple[float, 
     return tuple(map(float, lower)), tuple(map(float, upper))
 
 
-def constant(value: Any, unit: str = "") -> Any:
-    """Declare a plain number (or array) of the model with its unit: `constant(0.28, "m")`."""
+def constant(value: Any, unit: str = "", *, std: Any = None) -> Any:
+    """Declare a plain number (or array) of the model with its unit: `constant(0.28, "m")`.
+
+    `std` is its standard uncertainty in the same unit, one number or one for each entry:
+    `constant(0.28, "m", std=0.001)`. It is carried into every estimate.
+    """
     array = np.asarray(value, dtype=float)
     if not np.all(np.isfinite(array)):
         raise DeclarationError(f"constant {value!r} is not finite")
-    return Constant("", tuple(map(float, array.ravel())), unit, array.shape)
+    known = None if std is None else stated(std, array.shape)
+    return Constant("", tuple(map(float, array.ravel())), unit, array.shape, uncertainty=known)
 
 
 def named(declaration: Any, name: str) -> Any:

@@ -11,7 +11,7 @@ import warnings
 from collections.abc import Callable, Mapping
 from copy import copy
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import casadi as ca
 
@@ -48,6 +48,10 @@ class Declared(Protocol):
     @property
     def signals(self) -> tuple[Signal, ...]:
         """What is measured, also by what the effects read."""
+
+    @property
+    def columns(self) -> tuple[Signal, ...]:
+        """What a sample holds: the signals, then what is stated of their noise."""
 
     @property
     def readings(self) -> tuple[Signal, ...]:
@@ -96,20 +100,25 @@ class Traced:
     integrates: bool = False
 
 
+#: Words of a body that look at the rest before.
+Word = Literal["", "before", "turned"]
+
+
 @dataclass(frozen=True)
 class Stage:
-    """An effect that looks at other samples, where it acts.
+    """What looks at other samples, where it acts: an effect, or a word of the body.
 
     `taken` is what it takes at a sample, one column: the value acted on, then what else it reads;
     `given` the symbol that stands for what it gives, a column as long as the value; `shape` is the
     value's, and `read` the names and shapes of what else it reads.
     """
 
-    attached: Attached
+    attached: Attached | None
     taken: SX
     given: SX
     shape: tuple[int, int] = (1, 1)
     read: tuple[tuple[str, tuple[int, int]], ...] = ()
+    word: Word = ""
 
     @property
     def entered(self) -> SX:
@@ -136,6 +145,7 @@ def trace(
     running = Trace(
         cut=cut, naming=naming, straight=straight, reserved=frozenset(symbols), staged=staged
     )
+    running.reach = _staged_word if staged else _as_if_at_rest
     for attached in model.effects:
         if attached.kind == "quantity":
             running.effects.setdefault(attached.on, []).append(_applied(attached, symbols, running))
@@ -156,7 +166,7 @@ def trace(
         ca.vertcat(*references),
         running.quantities,
         residual,
-        ca.densify(residual.expression),
+        ca.densify(_in_deviations(model, residual, symbols)),
         None if residual.predicted is None else ca.vec(ca.SX(residual.predicted)),
         None if residual.measured is None else ca.vec(residual.measured),
         measured,
@@ -181,7 +191,7 @@ def trace(
 
 def _symbols(model: Declared) -> tuple[dict[str, SX], list[SX], list[SX]]:
     symbols: dict[str, SX] = {}
-    for s in model.signals:
+    for s in model.columns:
         flat = ca.SX.sym(s.name, s.size)
         symbols[s.name] = ca.reshape(flat, 3, 3).T if s.kind == "rotation" else flat
     coordinates, references = [], []
@@ -221,6 +231,39 @@ def _staged(attached: Attached, symbols: Mapping[str, SX], running: Trace) -> Ca
         return ca.reshape(given, *value.shape)
 
     return apply
+
+
+def _staged_word(running: Trace, word: Word, value: SX) -> SX:
+    """A symbol in the place of what a word of the body gives."""
+    if word == "turned" and value.shape != (3, 1):
+        raise DeclarationError(f"turned(…) takes a rate about three axes, not {value.shape}")
+    shape = (3, 3) if word == "turned" else value.shape
+    given = ca.SX.sym(word, shape[0] * shape[1])
+    running.stages.append(Stage(None, ca.vec(value), given, shape, (), word))
+    return ca.reshape(given, *shape)
+
+
+def _as_if_at_rest(running: Trace, word: Word, value: SX) -> SX:
+    """Of a single sample: all was as it is, and the body has turned for a second."""
+    return value if word == "before" else ca.SX.eye(3) + ca.skew(value)
+
+
+def _in_deviations(model: Declared, residual: Residual, symbols: Mapping[str, SX]) -> SX:
+    """The residual, each axis over the constant that is its noise, where that is known."""
+    found = residual.expression
+    if not residual.noise:
+        return found
+    constants = {c.name for c in model.constants}
+    for name in residual.noise:
+        if name not in constants and not isinstance(symbols.get(name), ca.SX):
+            raise DeclarationError(f"model {model.name}: noise= names {name!r}, no constant of it")
+    if len(residual.noise) != found.numel():
+        raise DeclarationError(
+            f"model {model.name}: noise= has {len(residual.noise)} names for {found.numel()} axes"
+        )
+    sizes = [symbols[name] for name in residual.noise]
+    known = [1.0 if isinstance(size, float) and not size > 0 else size for size in sizes]
+    return found / ca.vertcat(*known)
 
 
 def _run_body(model: Declared, running: Trace, symbols: Mapping[str, SX]) -> Residual:
@@ -361,9 +404,9 @@ def function_of(model: Declared, outputs: Mapping[str, SX], traced: Traced | Non
 
 
 def sample_symbol(model: Declared, traced: Traced | None = None) -> SX:
-    """All signals of one sample as one column, in the order in which data hold them."""
+    """All that a sample holds as one column, in the order in which data hold it."""
     symbols = (traced or model.traced).symbols
-    return ca.vertcat(*[flat(symbols[s.name]) for s in model.signals])
+    return ca.vertcat(*[flat(symbols[s.name]) for s in model.columns])
 
 
 def reading_symbol(model: Declared, traced: Traced | None = None) -> SX:
@@ -389,7 +432,7 @@ def reached_signals(model: Declared, traced: Traced, expression: SX) -> set[str]
     sample = sample_symbol(model, traced)
     columns = ca.jacobian(ca.vec(expression), sample).sparsity().get_triplet()[1]
     reached, place = set(), 0
-    for s in model.signals:
+    for s in model.columns:
         if any(place <= c < place + s.size for c in columns):
             reached.add(s.name)
         place += s.size

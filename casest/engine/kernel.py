@@ -265,14 +265,14 @@ def _made(text: str) -> Kernel | None:
 def library(text: str, flag_sets: Sequence[list[str]], *, build: bool = True) -> ctypes.CDLL | None:
     """C source as a loaded library: from the cache folder, or compiled with the first flags that
     work (with `build`); None where neither can be."""
-    compiler = _compiler()
+    compiler = compiler_found()
     if compiler is None:
         return None
     try:
         folder = kernel_folder()
         if folder is None:
             return None
-        machine = [compiler, _version(compiler), _processor()]
+        machine = [compiler, compiler_version(compiler), _processor()]
         paths = [folder / f"{_key([text, *machine, *flags])}.so" for flags in flag_sets]
         for path in paths:
             if own_file(path) and _whole(path):
@@ -283,6 +283,11 @@ def library(text: str, flag_sets: Sequence[list[str]], *, build: bool = True) ->
     except (OSError, ValueError, subprocess.SubprocessError):
         return None
     return None
+
+
+def compiles() -> bool:
+    """Can a kernel be compiled, kept and loaded here?"""
+    return library("int casest_compiles(void) { return 1; }\n", _FLAGS) is not None
 
 
 def _key(parts: list[str]) -> str:
@@ -321,7 +326,8 @@ def _compiled(compiler: str, text: str, flags: list[str], path: Path) -> bool:
         return True
 
 
-def _compiler() -> str | None:
+def compiler_found() -> str | None:
+    """Path of the C compiler: CC, else cc, gcc or clang; None where there is none."""
     named = os.environ.get("CC")
     for name in [named] if named else ["cc", "gcc", "clang"]:
         found = shutil.which(name) if name else None
@@ -331,7 +337,8 @@ def _compiler() -> str | None:
 
 
 @lru_cache(maxsize=4)
-def _version(compiler: str) -> str:
+def compiler_version(compiler: str) -> str:
+    """The first line of what the compiler says of itself."""
     done = subprocess.run([compiler, "--version"], capture_output=True, timeout=20, check=False)
     return done.stdout.decode(errors="replace").partition("\n")[0]
 

@@ -22,3 +22,9 @@ def one_thread() -> AbstractContextManager[Any]:
     """A context in which linear algebra runs in the calling thread alone."""
     limited: AbstractContextManager[Any] = _controller().limit(limits=1, user_api="blas")
     return limited
+
+
+def pools() -> list[dict[str, Any]]:
+    """Libraries of linear algebra that are loaded, as threadpoolctl describes them."""
+    found: list[dict[str, Any]] = _controller().info()
+    return found

@@ -17,20 +17,25 @@ from casest.estimate import reasons as words
 from casest.estimate.by_estimator import by_estimator
 from casest.estimate.certificate import Certificate, certify
 from casest.estimate.correlation import correlation_time
-from casest.estimate.covariance import covariance_of, inverse_normal
+from casest.estimate.covariance import as_stated, covariance_of, inverse_normal
+from casest.estimate.errors_of_inputs import with_errors_of_inputs
 from casest.estimate.estimate import Estimate as Estimate
 from casest.estimate.estimate import Noise
 from casest.estimate.evidence import judged
 from casest.estimate.on_bounds import free_of, on_bounds
+from casest.estimate.propagation import propagated
 from casest.estimate.reasons import POOR, STARTS, WORTH, Code
 from casest.estimate.remarks import NOTABLE_BIAS
 from casest.estimate.valley import looked_for
 from casest.leastsquares.identifiability import Identifiability, identify, weak_directions
+from casest.leastsquares.kinds import in_deviations
 from casest.leastsquares.problem import Point, Problem
+from casest.leastsquares.stated import chi_square
 from casest.leastsquares.sums import repeat_noise, second_order_bias
 from casest.solve.horizon import grown
 from casest.solve.outcome import Outcome
 from casest.solve.strategy import SOLVERS, best_of, solve, valleys
+from casest.solve.trust_region import trust_region
 
 #: From this many degrees of freedom on the residual alone says how large the noise is.
 ENOUGH_FREEDOM = 10
@@ -97,6 +102,7 @@ def _attempt(
     nowhere = _not_finite(problem, first)
     if nowhere:
         return _refused(problem, first, Code.NOT_FINITE, nowhere, began)
+    problem = in_deviations(problem, first, _fitted)
     problem, outcomes = solve(
         problem,
         first,
@@ -104,6 +110,7 @@ def _attempt(
         seed=seed,
         automatic=start is None,
     )
+    problem, outcomes = with_errors_of_inputs(problem, outcomes, solver, seed)
     evidence = None
     if intervals:
         outcomes, evidence = looked_for(problem, first, outcomes, seed, start is not None)
@@ -114,7 +121,13 @@ def _attempt(
         found = _looked_at_for_a_better_one(found)
     if found.certificate.trusted:
         found = _no_random_walk(found)
+    if found.certificate.trusted and problem.model.refuser is not None:
+        found = _judged_by_the_model(found)
     return by_estimator(found, own[solver], solver) if solver in own else found
+
+
+def _fitted(problem: Problem, first: Point) -> Point:
+    return trust_region(problem, first).point
 
 
 def _enough(problem: Problem) -> None:
@@ -200,13 +213,17 @@ def _estimate(
         return _refused(problem, point, Code.NOT_FINITE, reason, began)
     identified = identify(problem, point, R)
     dof = problem.residual_count - identified.rank
-    noise = _noise(problem, point, float(np.sqrt(2 * best.cost)), dof)
+    noise = _noise(problem, point, float(np.sqrt(2 * best.cost)), dof, identified.rank)
     correlated = correlation_time(problem, point)
     free = free_of(problem.unknowns, on_bounds(problem, point, factor, noise.sigma))
-    covariance = covariance_of(problem, point, R, noise.sigma, correlated, free)
+    normal = problem.model.prior is not None or (noise.known and correlated <= 1)
+    by = as_stated if normal else covariance_of
+    covariance = by(problem, point, R, noise.sigma, correlated, free)
     bias = second_order_bias(problem, point, noise.sigma, inverse_normal(R, free))
     relative = float(np.max(np.abs(bias[free]) / np.sqrt(np.diag(covariance)[free]), initial=0.0))
     shift = np.outer(bias, bias) if relative > NOTABLE_BIAS else 0.0
+    inputs = propagated(problem, point, free)
+    shift = shift if inputs is None else shift + inputs.carried
     covariance = covariance + shift
     factored = (R, factor[1], rest)
     certificate = certify(
@@ -237,6 +254,7 @@ def _estimate(
         correlated,
         relative,
         shift,
+        inputs=inputs,
     )
 
 
@@ -267,6 +285,15 @@ def _no_random_walk(found: Estimate) -> Estimate:
     return replace(found, certificate=found.certificate.refused(Code.POOR_VALLEY, reason))
 
 
+def _judged_by_the_model(found: Estimate) -> Estimate:
+    """Refuse what the model itself says is no calibration."""
+    problem = found.problem
+    assert problem.model.refuser is not None
+    for reason in problem.model.refuser(problem.model, problem.runs, found.values):
+        return replace(found, certificate=found.certificate.refused(Code.MODEL, reason))
+    return found
+
+
 def _canonical(problem: Problem, best: Outcome) -> Outcome:
     """The same solution in the model's own convention, as long as it is the same."""
     convention = problem.model.canonicaliser
@@ -287,11 +314,17 @@ def _beside(other: Outcome, best: Outcome) -> bool:
     return np.allclose(other.point.x, best.point.x, rtol=1e-3, atol=1e-9)
 
 
-def _noise(problem: Problem, point: Point, length: float, dof: int) -> Noise:
+def _noise(problem: Problem, point: Point, length: float, dof: int, rank: int) -> Noise:
     """Noise of one residual: what is left over; with few degrees of freedom to judge that by,
-    never less than what repeats (rest intervals) show."""
+    never less than what repeats (rest intervals) show. Where it was stated, that, but for a
+    residual that is larger by more than chance."""
     residual = length / np.sqrt(dof) if dof > 0 else float("nan")
     repeats = repeat_noise(problem, point)
+    chi = chi_square(problem, point, rank)
+    scale = problem.noise_scale
+    if scale is not None and problem.weights is None:
+        stated = Noise(scale, residual, repeats, dof, scale, chi)
+        return stated if stated.known else replace(stated, sigma=residual)
     if dof >= ENOUGH_FREEDOM:
         return Noise(residual, residual, repeats, dof)
     candidates = [s for s in (residual, repeats) if s is not None and np.isfinite(s)]

@@ -43,6 +43,18 @@ def covariance_of(
     return np.asarray(sigma**2 * inverse_normal(R, free))
 
 
+def as_stated(
+    problem: Problem,
+    point: Point,
+    R: Array,
+    sigma: float,
+    correlated_over: float,
+    free: NDArray[np.bool_] | None = None,
+) -> Array:
+    """The covariance (n, n) of independent noise that was stated of every reading."""
+    return np.asarray(sigma**2 * inverse_normal(R, free))
+
+
 def inverse_normal(R: Array, free: NDArray[np.bool_] | None = None) -> Array:
     """(JᵀJ)⁻¹ from the triangular factor, with unit columns inside; pseudo-inverse if singular.
 
@@ -89,7 +101,7 @@ def sandwich(
 
 def _by_frequencies(problem: Problem, point: Point, bread: Array) -> Array:
     """JᵀSJ (n, n): S the covariance of noise with a smooth spectrum, of each axis its own."""
-    parts = [part for block in _stretches(problem, point) for part in by_frequency(block, bread)]
+    parts = [part for block in stretches(problem, point) for part in by_frequency(block, bread)]
     axes = range(len(problem.model.axes))
     spectra = [noise_spectrum([part.powers for part in parts if part.axis == k]) for k in axes]
     middle = np.zeros((problem.unknowns, problem.unknowns))
@@ -99,7 +111,7 @@ def _by_frequencies(problem: Problem, point: Point, bread: Array) -> Array:
     return middle
 
 
-def _stretches(problem: Problem, point: Point) -> Iterator[Stretch]:
+def stretches(problem: Problem, point: Point) -> Iterator[Stretch]:
     """Uninterrupted samples of each run, weighted."""
     for block in problem.blocks(point):
         root = 1.0 if block.weights is None else np.sqrt(block.weights)

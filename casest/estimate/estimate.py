@@ -12,16 +12,23 @@ from numpy.typing import NDArray
 
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
+from casest.estimate.before import against_prior
 from casest.estimate.certificate import Certificate, one_sided
 from casest.estimate.correlation import ENOUGH, TABLE, correlation_time
 from casest.estimate.covariance import inverse_normal, sandwich
 from casest.estimate.evidence import Evidence, remarks
 from casest.estimate.on_bounds import free_of
 from casest.estimate.profile_likelihood import half_width
-from casest.estimate.remarks import notes
+from casest.estimate.propagation import Inputs
+from casest.estimate.remarks import notes, of_stated_noise
 from casest.leastsquares.identifiability import Identifiability, Weak
+from casest.leastsquares.kinds import freedom
 from casest.leastsquares.problem import Point, Problem
+from casest.leastsquares.stated import UNLIKELY, ChiSquare
 from casest.solve.outcome import Outcome
+
+#: Degrees of freedom from which on a standard deviation is as good as known.
+UNLIMITED = 1_000_000
 
 
 @dataclass(frozen=True)
@@ -29,13 +36,23 @@ class Noise:
     """Standard deviation of one residual, with where it comes from.
 
     `sigma` is what the covariance uses; `residual` the root of RSS over degrees of freedom;
-    `repeats` the scatter that rest intervals show by themselves (None without any).
+    `repeats` the scatter that rest intervals show by themselves (None without any). `stated` is
+    what it should be by the noise that was stated (None without), and `chi_square` compares.
     """
 
     sigma: float
     residual: float
     repeats: float | None
     degrees_of_freedom: int
+    stated: float | None = None
+    chi_square: ChiSquare | None = None
+
+    @property
+    def known(self) -> bool:
+        """Was it stated, and is the residual not larger than that by more than chance?"""
+        if self.stated is None:
+            return False
+        return self.chi_square is None or self.chi_square.larger >= UNLIKELY
 
 
 @dataclass(frozen=True)
@@ -46,7 +63,7 @@ class Estimate:
     are several runs). `std` is `robust`, the sandwich form, where residuals are correlated over
     more than one sample or are many for each unknown, else `plain`. All are taken at the
     least-squares `optimum`, where `point` is not it; `shift` (n, n) is what second-order noise
-    adds, a bias of up to `bias` standard deviations.
+    adds, a bias of up to `bias` standard deviations, and what uncertain `inputs` do.
     `covariance` (n, n) is of the unknowns `names`. Where the data do not determine a value its std
     is NaN.
     """
@@ -68,6 +85,7 @@ class Estimate:
     shift: Array | float = 0.0
     optimum: Point | None = None
     evidence: Evidence | None = None
+    inputs: Inputs | None = None
     extra: Mapping[str, Any] = field(default_factory=dict)
 
     @property
@@ -91,6 +109,14 @@ class Estimate:
         at = self.optimum or self.point
         R = self.problem.factor(at)[0]
         return self._spread(sandwich(self.problem, at, R, self.correlated_over, self.free))
+
+    @cached_property
+    def information(self) -> Array:
+        """The inverse of the covariance (n, n); JᵀJ/σ² where that has none."""
+        if self.identifiability.rank == self.problem.unknowns and self.free.all():
+            return np.asarray(np.linalg.inv(self.covariance))
+        R = self.problem.factor(self.optimum or self.point)[0]
+        return np.asarray(R.T @ R / self.noise.sigma**2)
 
     @property
     def free(self) -> NDArray[np.bool_]:
@@ -116,7 +142,16 @@ class Estimate:
         dof = problem.residual_count - self.identifiability.rank
         with np.errstate(all="ignore"):
             found = notes(problem, at, dof, self.correlated_over, self.bias)
-            return (*remarks(problem, self.evidence), *found, *_of_tables(problem, at))
+            stated = of_stated_noise(self.noise.chi_square)
+            before = against_prior(problem, at)
+            first = [] if before is None or before.agrees else [before.words]
+            return (
+                *first,
+                *stated,
+                *remarks(problem, self.evidence),
+                *found,
+                *_of_tables(problem, at),
+            )
 
     @cached_property
     def interval_reach(self) -> tuple[Mapping[str, Array], Mapping[str, Array]]:
@@ -141,14 +176,32 @@ class Estimate:
         """Squares of the reach below and above, (n, n) each as a covariance, as if unbounded."""
         profile = self.certificate.profile
         if profile is None:
-            half = half_width(int(self.noise.degrees_of_freedom / self.correlated_over))
-            linear = half**2 * self.covariance
+            half = np.array([half_width(freedom) for freedom in self.effective_freedom])
+            linear = np.outer(half, half) * self.covariance
             return linear.copy(), linear.copy()
         R = self.problem.factor(self.optimum or self.point)[0]
         plain = self.noise.sigma**2 * np.diag(inverse_normal(R, self.free))
         with np.errstate(invalid="ignore", divide="ignore"):
             wider = np.sqrt(np.diag(self.covariance) / plain)
         return np.diag((wider * profile[:, 0]) ** 2), np.diag((wider * profile[:, 1]) ** 2)
+
+    @property
+    def effective_freedom(self) -> tuple[int, ...]:
+        """Degrees of freedom of each unknown's standard deviation (Welch & Satterthwaite).
+
+        What comes of references counts as known exactly: their standard uncertainties are.
+        """
+        most, own = self.noise.degrees_of_freedom, freedom(self.problem, self.optimum or self.point)
+        each = np.full(self.problem.unknowns, most) if own is None else np.minimum(own, most)
+        each = np.trunc(each / self.correlated_over)
+        if self.noise.known and self.correlated_over <= 1:
+            each[:] = UNLIMITED
+        if self.inputs is not None:
+            variance, known = np.diag(self.covariance), np.diag(self.inputs.carried)
+            with np.errstate(invalid="ignore", divide="ignore"):
+                larger = np.square(variance / np.maximum(variance - known, 1e-12 * variance))
+            each = each * np.where(np.isfinite(larger), larger, 1.0)
+        return tuple(int(min(f, UNLIMITED)) for f in each)
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -16,6 +16,7 @@ from casest.declaration.model import Model
 from casest.declaration.shapes import Array
 from casest.errors import UsageError
 from casest.estimate.estimate import Estimate
+from casest.leastsquares.kinds import whitened
 from casest.leastsquares.problem import Problem
 from casest.solve.trust_region import trust_region
 
@@ -44,9 +45,10 @@ def residuals(model: Model, values: Mapping[str, Array], fitted: Run | None, sco
     if missing:
         raise UsageError(f"{scored.file}: the held-out record has no {missing[0]!r}")
     if fitted is not None and per_run(model):
-        values = _with_own(model, values, fitted)
+        values = with_own(model, values, (fitted,))
     problem = Problem(model, (scored,))
-    return problem.residuals(problem.point(values))[0]
+    point = problem.point(values)
+    return whitened(problem, point).residuals(point)[0]
 
 
 def per_run(model: Model) -> list[str]:
@@ -54,11 +56,12 @@ def per_run(model: Model) -> list[str]:
     return [p.name for p in model.parameters if p.scope == "run"]
 
 
-def _with_own(model: Model, values: Mapping[str, Array], run: Run) -> dict[str, Array]:
+def with_own(model: Model, values: Mapping[str, Array], runs: Sequence[Run]) -> dict[str, Array]:
+    """The values with those parameters fitted that each of these runs has of its own."""
     own = per_run(model)
     shared = {name: value for name, value in values.items() if name not in own}
-    fit = Problem(model.having(**shared), (run,))
-    alone = Problem(model, (run,))
+    fit = Problem(model.having(**shared), tuple(runs))
+    alone = Problem(model, tuple(runs))
     guess = alone.values(alone.start()) if model.starter else {}
     found = trust_region(fit, fit.point({n: v for n, v in guess.items() if n in own}))
     return {**shared, **fit.values(found.point)}

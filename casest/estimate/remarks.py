@@ -9,6 +9,7 @@ import numpy as np
 from casest.declaration.shapes import Array
 from casest.leastsquares.agreement import between_runs
 from casest.leastsquares.problem import Point, Problem
+from casest.leastsquares.stated import UNLIKELY, ChiSquare
 from casest.leastsquares.sums import rounding, some_residuals
 from casest.leastsquares.weights import robust_scale
 
@@ -43,8 +44,42 @@ def notes(
             "deviations (second order), which the printed ones contain: average readings at rest "
             "(--at-rest), or filter them"
         )
+    yield from _too_fast(problem)
     yield from _runs_that_disagree(problem, point, correlated)
     yield from _furthest_out(problem, point)
+
+
+def of_stated_noise(found: ChiSquare | None) -> Iterator[str]:
+    """Whether the residual is as large as the noise that was stated."""
+    if found is None:
+        return
+    said = f"chi-square is {found.value:.4g} with {found.degrees_of_freedom} degrees of freedom"
+    larger = f"the residual is {found.times:.2g} times the stated noise"
+    if found.larger < UNLIKELY:
+        yield (
+            f"{said} (p = {found.larger:.1g}): {larger}, which was stated too small, or the model "
+            "lacks something; standard deviations are by the residual"
+        )
+    elif found.smaller < UNLIKELY:
+        yield (
+            f"{said} (p = {found.smaller:.1g} of so little): {larger}, which was stated too large, "
+            "or readings are not independent; standard deviations are by the stated noise all the "
+            "same"
+        )
+    else:
+        yield f"{said} (p = {found.larger:.2g}): {larger}, as chance may have it"
+
+
+def _too_fast(problem: Problem) -> Iterator[str]:
+    """Turns between rests that a sensor could not follow."""
+    for r, run in enumerate(problem.runs):
+        lost = problem.lost(r)
+        if len(lost):
+            listed = ", ".join(str(int(k)) for k in lost[:5]) + ", …" * (len(lost) > 5)
+            yield (
+                f"{run.name}: {len(lost)} of {len(run) - 1} turns are left out, since a reading "
+                f"stays at its full scale on the way (to rest interval {listed}): turn more slowly"
+            )
 
 
 def _runs_that_disagree(problem: Problem, point: Point, correlated: float) -> Iterator[str]:

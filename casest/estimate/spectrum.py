@@ -20,6 +20,10 @@ from casest.declaration.shapes import Array
 BANDS = 40
 #: Frequencies in the first band; within it the spectrum is taken as flat.
 FIRST = 8
+#: In the first band a spectrum falls as it does from there to so many times its frequency, ...
+BEYOND = 16
+#: ... by this power of the frequency at most: that of a walk.
+STEEPEST = 2.0
 #: Order of the curve.
 ORDER = 4
 #: The least share of a band that the fit must have left to be asked.
@@ -80,9 +84,26 @@ class Bands:
         # Flat to the first band's end: nothing holds a curve between its middle and there.
         middle[0] = max(float(log[min(FIRST, len(log)) - 1]), middle[0])
         self._middle = middle
+        self._slow = np.minimum(self._log - middle[0], 0.0)
+        self._beyond = np.flatnonzero(middle < middle[0] + np.log(BEYOND))[1:]
 
     def curves(self, power: Array, left: Array) -> Array:
         """The most likely smooth spectra (N, m) of powers (N, m), of which a fit left a share."""
+        shape = np.exp(-np.outer(self._slow, self._falls(power, left)))
+        return np.asarray(shape * self._flat(power / shape, left))
+
+    def _falls(self, power: Array, left: Array) -> Array:
+        """The powers (m,) of the frequency by which these fall beyond the first band."""
+        if len(self._beyond) < 3:
+            return np.zeros(power.shape[1])
+        mean, count, _ = self._banded(power, left)
+        line = np.stack([np.ones(len(self._beyond)), self._middle[self._beyond]], axis=1)
+        mean = np.maximum(mean[self._beyond], 1e-300)
+        slope = _most_likely(line, mean, count[self._beyond])[1]
+        return np.asarray(np.clip(-slope, 0.0, STEEPEST))
+
+    def _flat(self, power: Array, left: Array) -> Array:
+        """Those that are flat in the first band."""
         mean, count, told = self._banded(power, left)
         if told.all():
             shapes, there = self._shapes

@@ -14,6 +14,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from casest.declaration.effect import Attached
 from casest.declaration.model import Model
 from casest.declaration.physics import SX
 from casest.declaration.shapes import Array
@@ -28,6 +29,12 @@ class Memory:
     model: Model
     stage: Stage
     own: tuple[int, ...] | None = None
+
+    @property
+    def attached(self) -> Attached:
+        """The effect, where it acts."""
+        assert self.stage.attached is not None
+        return self.stage.attached
 
     @property
     def size(self) -> int:
@@ -51,7 +58,7 @@ class Memory:
         count, m, n = len(x), self.size, self.unknowns
         first = np.r_[True, block[1:] != block[:-1]]
         columns = [x, _flat(X), _steps(time, first)[:, None], first[:, None]]
-        if self.stage.attached.spanned:
+        if self.attached.spanned:
             columns += [np.repeat(part[None], count, axis=0) for part in _span(x[:, :m], X[:, :m])]
         columns.append(np.repeat(parameters[None], count, axis=0))
         start = np.zeros(self._recursion.sizes[0])
@@ -62,7 +69,7 @@ class Memory:
     def _recursion(self) -> Recursion:
         """([s, S], numbers of a sample) -> the next [s, S], and what it gives with its slopes."""
         traced, m, n = self.model.staged, self.size, self.unknowns
-        s = ca.SX.sym("s", m * len(self.stage.attached.keeps))
+        s = ca.SX.sym("s", m * len(self.attached.keeps))
         x, span = ca.SX.sym("x", self.stage.taken.numel()), ca.SX.sym("span", m)
         dt, first = ca.SX.sym("dt"), ca.SX.sym("first")
         S, X, Y = (ca.SX.sym(name, of.numel(), n) for name, of in (("S", s), ("X", x), ("Y", span)))
@@ -76,19 +83,19 @@ class Memory:
             slope += ca.jacobian(found, span) @ Y + ca.jacobian(found, self._coordinates)
             outputs.append(ca.densify(ca.vertcat(found, ca.vec(ca.densify(slope)))))
         outputs = ca.substitute(outputs, [s], [ca.if_else(first, begin, s)])
-        reach = [span, ca.vec(Y)] if self.stage.attached.spanned else []
+        reach = [span, ca.vec(Y)] if self.attached.spanned else []
         numbers = ca.vertcat(x, ca.vec(X), dt, first, *reach, traced.coordinates, traced.references)
         return Recursion(ca.Function("step", [ca.vertcat(s, ca.vec(S)), numbers], outputs))
 
     def _beginning(self, x: SX) -> SX:
         """What is kept before the first sample of a stretch: as if it had always been like that."""
         m = self.size
-        starts = [start for _, start in self.stage.attached.keeps]
+        starts = [start for _, start in self.attached.keeps]
         return ca.vertcat(*(x[:m] if isinstance(v, str) else v * ca.SX.ones(m) for v in starts))
 
     def _function(self, s: SX, x: SX, dt: SX, span: SX) -> tuple[SX, SX]:
         """What the effect gives and what it keeps, of what it kept and what it takes."""
-        attached, m, shape = self.stage.attached, self.size, self.stage.shape
+        attached, m, shape = self.attached, self.size, self.stage.shape
         kept = {
             name: ca.reshape(s[i * m : (i + 1) * m], *shape)
             for i, (name, _) in enumerate(attached.keeps)

@@ -87,12 +87,14 @@ class Problem:
     """The sum of squares of a model's residuals over runs.
 
     `weights` (one (N, m) array per run, or None) multiply the squares. Residuals are in the
-    model's residual unit. Jacobians are with respect to the unknowns `x`.
+    model's residual unit. Jacobians are with respect to the unknowns `x`. `whitening` (one
+    (N·m, N·m) per run, or None) takes from residuals of rests what they share with those before.
     """
 
     model: Model
     runs: tuple[Run, ...]
     weights: tuple[Array, ...] | None = None
+    whitening: tuple[Array, ...] | None = None
 
     # -- layout --------------------------------------------------------------------------------
 
@@ -118,14 +120,27 @@ class Problem:
 
     @property
     def residual_count(self) -> int:
-        """Number of scalar residuals, of readings that are there."""
-        return sum(len(run) for run in self.runs) * len(self.model.axes) - self._missing
+        """Number of scalar residuals; what is known before counts as one for each number."""
+        every = sum(len(run) for run in self.runs) * len(self.model.axes)
+        every -= sum(int(np.sum(~p)) for p in self.present if p is not None)
+        return every if self.model.prior is None else every + len(self.model.prior.covariance)
+
+    def lost(self, r: int) -> Any:
+        """Rests of a run before which a sensor was beyond its range, by number."""
+        return np.zeros(0) if self._staged is None else self._staged.lost(r)
 
     @cached_property
-    def _missing(self) -> int:
-        """Number of readings that are not there."""
-        found = [] if self._staged is None else self._staged.missing
-        return sum(int(np.sum(gone)) for gone in found if gone is not None)
+    def present(self) -> tuple[Any, ...]:
+        """Which residuals (N, m) of each run there are; None where all are."""
+        staged = self._staged
+        return tuple(None if staged is None else staged.present(r) for r in range(len(self.runs)))
+
+    @property
+    def noise_scale(self) -> float | None:
+        """Standard deviation of a usual residual that was stated, or that a prior had."""
+        if self.model.noise is not None:
+            return self.model.noise.scale
+        return None if self.model.prior is None else self.model.prior.sigma
 
     @cached_property
     def _selections(self) -> tuple[tuple[Any, Any], ...]:
@@ -230,6 +245,9 @@ class Problem:
 
     @cached_property
     def _start(self) -> Point:
+        known_before = {} if self.model.prior is None else self.model.prior.by_name
+        if {p.name for p in self.model.parameters} <= set(known_before):
+            return self.point(known_before)
         try:
             values = self.model.starter(self.model, self.runs) if self.model.starter else {}
         except np.linalg.LinAlgError as error:
@@ -238,7 +256,7 @@ class Problem:
                 "they all alike?"
             ) from error
         known = {p.name for p in self.model.parameters}
-        return self.point({k: v for k, v in values.items() if k in known})
+        return self.point({k: v for k, v in {**values, **known_before}.items() if k in known})
 
     def moved(self, point: Point, step: Array) -> Point:
         """The point after a step, with directions and rotations in a chart around themselves."""
@@ -287,7 +305,7 @@ class Problem:
         for s in self.slots:
             shape, block = s.parameter.shape, covariance[s.x, s.x]
             if shape.curved:
-                jacobian = self._chart_jacobian(s, point)
+                jacobian = self.chart_slope(s, point)
                 std = _root(np.diag(jacobian @ block @ jacobian.T)).reshape(shape.dims)
             else:
                 std = shape.unpack(_root(np.diag(block)))
@@ -296,7 +314,10 @@ class Problem:
         per_run = {p.name for p in self.model.parameters if p.scope == "run"}
         return {n: np.stack(v) if several and n in per_run else v[0] for n, v in found.items()}
 
-    def _chart_jacobian(self, slot: Slot, point: Point) -> Array:
+    def chart_slope(self, slot: Slot, point: Point) -> Array:
+        """Slope (entries, coordinates) of a parameter's entries in its unknowns."""
+        if not slot.parameter.shape.curved:
+            return np.eye(slot.parameter.shape.size)
         x, reference = point.x[slot.x], point.references[slot.ref]
         _, slope = _chart(slot.parameter.shape.kind, len(x), len(reference))
         return np.array(slope(x, reference))
@@ -308,10 +329,10 @@ class Problem:
         """Signals of each run side by side, by column."""
         stacked = []
         for run in self.runs:
-            missing = [s.name for s in self.model.signals if s.name not in run.signals]
+            missing = [s.name for s in self.model.columns if s.name not in run.signals]
             if missing:
                 raise DataError(f"{run.file}: no data for signal {missing[0]!r}; add --columns")
-            parts = [np.asanyarray(run.signals[s.name]) for s in self.model.signals]
+            parts = [np.asanyarray(run.signals[s.name]) for s in self.model.columns]
             if sum(part.size for part in parts) <= COPIED:
                 # Columns first: the kernel reads them in order.
                 parts = [np.ascontiguousarray(part.T, dtype=float).T for part in parts]
@@ -347,11 +368,17 @@ class Problem:
     def smooth(self) -> bool:
         """Are residuals smooth functions of the unknowns, as far as it is known? Not what effects
         with a memory make of them: a hysteresis has corners."""
-        return not any(a.kind in OVER_TIME for a in self.model.effects)
+        over_time = any(a.kind in OVER_TIME for a in self.model.effects)
+        return not (over_time or self.model.resting)
 
     @cached_property
     def _with_jacobian(self) -> Replay:
         return residual_and_jacobian(self.model)
+
+    def slopes_in_readings(self, point: Point, r: int) -> tuple[Array, Array]:
+        """∂r/∂s of one run's rests, (N, m, k) each: in their own means, and in those before."""
+        assert self._staged is not None
+        return self._staged.slopes_in_readings(self.parameters(point, r), r)
 
     @property
     def compiled(self) -> bool:
@@ -361,7 +388,7 @@ class Problem:
     @cached_property
     def _staged(self) -> Staged | None:
         """Where an effect looks at other samples, rows come from the record as a whole."""
-        return Staged(self.model, self.runs) if self.model.sequential else None
+        return Staged(self.model, self.runs, self.whitening) if self.model.sequential else None
 
     def _rows(self, point: Point, r: int, span: slice = slice(None)) -> tuple[Array, Array]:
         """Residuals (N, m) and Jacobians (N, m, n of the run) of one run, unweighted."""
@@ -425,7 +452,7 @@ class Problem:
     def _run_cost(self, point: Point, r: int) -> float:
         if self._staged is not None:
             residual, weights = self._residuals(point, r), self._weight(r)
-            return 0.5 * float(np.sum(residual**2 * (1.0 if weights is None else weights)))
+            return 0.5 * float(np.sum(residual**2 if weights is None else weights * residual**2))
         parameters = self.parameters(point, r)
         return cost(self._with_jacobian, parameters, self.samples[r], self._weight(r))
 
@@ -457,7 +484,10 @@ class Problem:
 
     def cost(self, point: Point) -> float:
         """½ Σ w r²."""
-        return sum(self._run_cost(point, r) for r in range(len(self.runs)))
+        own = sum(self._run_cost(point, r) for r in range(len(self.runs)))
+        if self.model.prior is None:
+            return own
+        return own + 0.5 * float(np.sum(prior_rows(self, point)[:, -1] ** 2))
 
     def normal(self, point: Point) -> Normal:
         """Cost, gradient (n,) and Gauss-Newton matrix (n, n); those of the last points are kept."""
@@ -473,7 +503,7 @@ class Problem:
         return deque(maxlen=LATEST)
 
     def _normal(self, point: Point) -> Normal:
-        if self._alone:
+        if self._alone and self.model.prior is None:
             return self._run_normal(point, 0)
         total, gradient = 0.0, np.zeros(self.unknowns)
         matrix = np.zeros((self.unknowns, self.unknowns))
@@ -483,6 +513,12 @@ class Problem:
             total += own.cost
             gradient[x] += own.gradient
             matrix[np.ix_(x, x)] += own.matrix
+        if self.model.prior is not None:
+            rows_before = prior_rows(self, point)
+            product = rows_before.T @ rows_before
+            total += 0.5 * float(product[-1, -1])
+            gradient += product[:-1, -1]
+            matrix += product[:-1, :-1]
         return Normal(total, gradient, matrix)
 
     def run_normals(self, point: Point) -> list[tuple[Any, Normal]]:
@@ -505,8 +541,10 @@ class Problem:
             block = np.zeros((len(own), n + 1))
             block[:, [*x, n]] = own
             blocks.append(block)
+        if self.model.prior is not None:
+            blocks.append(prior_rows(self, point))
         whole = np.vstack(blocks)
-        if len(self.runs) > 1:
+        if len(blocks) > 1:
             whole = np.asarray(np.linalg.qr(whole, mode="r"))
         full = np.zeros((n + 1, n + 1))
         full[: len(whole)] = whole[: n + 1]
@@ -551,10 +589,9 @@ class Problem:
         return tuple(self._residuals(point, r) for r in range(len(self.runs)))
 
     def _residuals(self, point: Point, r: int, span: slice = slice(None)) -> Array:
-        if self._staged is not None:
-            dense = self.samples[r].dense
-            return self._staged.rows(self.parameters(point, r), dense, r, ())[0][span]
         parameters = self.parameters(point, r)
+        if self._staged is not None:  # without slopes
+            return self._staged.rows(parameters, self.samples[r].dense, r, ())[0][span]
         return residuals(self._with_jacobian, parameters, self.samples[r][span])
 
     def residual_blocks(self, point: Point) -> Iterator[tuple[int, slice, Array]]:
@@ -583,6 +620,27 @@ class Problem:
     def with_weights(self, weights: Sequence[Array] | None) -> Problem:
         """The same problem with other weights on the squares."""
         return replace(self, weights=None if weights is None else tuple(weights))
+
+
+def prior_rows(problem: Problem, point: Point) -> Array:
+    """[J r] (k, n + 1) of what is known before: coordinates off the prior's, in residual units."""
+    prior, scale = problem.model.prior, problem.noise_scale
+    assert prior is not None
+    assert scale is not None
+    parts, slots = [], {s.parameter.name: s for s in problem.slots}
+    for name, before in prior.by_name.items():
+        slot = slots[name]
+        shape, part = slot.parameter.shape, np.zeros((slot.x.stop - slot.x.start, problem.unknowns))
+        if shape.curved:
+            reference = shape.reference(before)
+            here = problem._charted(slot, point.x[slot.x], point.references[slot.ref])
+            off = shape.tangent(here, reference)
+            steps = problem.chart_slope(slot, point).T.reshape(-1, *shape.dims)
+            part[:, slot.x] = np.stack([shape.tangent(s, reference) for s in steps], axis=1)
+        else:
+            off, part[:, slot.x] = point.x[slot.x] - shape.pack(before), np.eye(len(part))
+        parts.append(np.column_stack([part, off]))
+    return np.asarray(scale * prior.root @ np.vstack(parts))
 
 
 @lru_cache(maxsize=8)

@@ -1,9 +1,9 @@
-"""Effects that look at other samples than a residual's own: memory, and signals that come late.
+"""What looks at other samples than a residual's own: memory, late signals, the rest before.
 
 Each is a stage: what it takes at every sample is computed first, then what it gives, with its
 slopes in the parameters, and that takes the place of a symbol in what comes after. A memory is run
-through sample by sample; a signal at another time is taken from its record by splines; differential
-equations are integrated from sample to sample.
+through sample by sample; a signal at another time is taken from its record by splines; a turn is
+integrated over the raw record between two rests, differential equations from sample to sample.
 """
 
 from __future__ import annotations
@@ -22,11 +22,12 @@ from casest.declaration.flow import Flow
 from casest.declaration.model import Model
 from casest.declaration.physics import SX
 from casest.declaration.shapes import Array
-from casest.declaration.tracing import sample_symbol
+from casest.declaration.tracing import Word, sample_symbol
 from casest.engine import Replay
-from casest.errors import DataError
+from casest.errors import DataError, DeclarationError
 from casest.leastsquares.flow import Course, Integrator, Mesh
 from casest.leastsquares.memory import Memory
+from casest.leastsquares.rests import Rests, before, needing, turns
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,7 @@ class Record:
     samples: Array
     time: Array
     places: Index | slice
+    rests: Rests | None = None
 
     @classmethod
     def of(cls, model: Model, run: Run) -> Record:
@@ -53,13 +55,14 @@ class Record:
             )
         if whole.time is None:
             raise DataError(
-                f"{run.file or run.name}: an effect that looks at other samples needs time: give a "
-                "time column or --rate"
+                f"{run.file or run.name}: {_who(model)} needs time: give a time column or "
+                "--rate (--columns t=NAME, --rate HZ)"
             )
         if model.traced.integrates:
             _refuse_going_back(whole)
-        samples = np.hstack([np.asarray(whole.signals[s.name], float) for s in model.signals])
-        return cls(whole, samples, np.asarray(whole.time, float), places)
+        samples = np.hstack([np.asarray(whole.signals[s.name], float) for s in model.columns])
+        rests = Rests.of(model, whole) if model.resting else None
+        return cls(whole, samples, np.asarray(whole.time, float), places, rests)
 
     def at(self, name: str, wanted: Array, *, rotation: bool) -> tuple[Array, Array]:
         """A signal and its rate (N, k) at a time for each sample of the record."""
@@ -87,6 +90,10 @@ def _refuse_going_back(run: Run) -> None:
         )
 
 
+def _who(model: Model) -> str:
+    return model.name if model.resting else "an effect that looks at other samples"
+
+
 def _origin(model: Model, run: Run) -> tuple[Run, Index | slice]:
     """The record that a run was taken from, and where; itself where a signal was changed since.
 
@@ -104,10 +111,11 @@ def _origin(model: Model, run: Run) -> tuple[Run, Index | slice]:
 
 @dataclass(frozen=True)
 class Staged:
-    """Residual and Jacobian of an explicit model with effects that look at other samples."""
+    """Residual and Jacobian of a model that looks at other samples, by itself or by its effects."""
 
     model: Model
     runs: tuple[Run, ...]
+    whitening: tuple[Array, ...] | None = None
 
     @cached_property
     def _records(self) -> tuple[Record, ...]:
@@ -122,11 +130,32 @@ class Staged:
         coordinates that slopes are taken in, where not in all.
         """
         last = _programs(self.model, own)[-1]
-        residual, J = _chained(last.taken, parameters, samples, *self.given(parameters, r, own))
-        missing = self.missing[r]
-        if missing is not None:
-            residual[missing], J[missing] = 0.0, 0.0
-        return residual, J
+        found = _chained(last.taken, parameters, samples, *self.given(parameters, r, own))
+        present = self.present(r)
+        if present is not None:
+            for part in found:
+                part[~present] = 0.0
+        if self.whitening is not None:
+            found = (
+                _multiplied(self.whitening[r], found[0]),
+                _multiplied(self.whitening[r], found[1]),
+            )
+        return found
+
+    def slopes_in_readings(self, parameters: Array, r: int) -> tuple[Array, Array]:
+        """∂r/∂s (N, m, k) in the means of a rest, and in those of the rest before."""
+        record, last = self._records[r], _in_readings(self.model)
+        given = self._given(parameters, r, ())[0]
+        own, through = last.residual(parameters, np.hstack([record.samples, given]))
+        prior = np.zeros_like(own)
+        for first, taken in last.before:
+            slope = taken(parameters, np.hstack([record.samples, given]))[0]
+            prior[1:] += through[1:, :, first : first + slope.shape[1]] @ slope[:-1]
+        present = self.present(r)
+        for part in (own, prior):
+            if present is not None:
+                part[~present] = 0.0
+        return own, prior
 
     @cached_property
     def _meshes(self) -> dict[tuple[int, int], Mesh]:
@@ -134,19 +163,42 @@ class Staged:
         return {}
 
     @cached_property
-    def missing(self) -> tuple[NDArray[np.bool_] | None, ...]:
-        """Which readings (N, m) of each run are not there; None where all are."""
+    def _read(self) -> tuple[NDArray[np.bool_] | None, ...]:
+        """Which readings (N, m) of each run there are; None where all are."""
         found = []
         for run in self.runs:
             readings = [run.signals[name] for name in self.model.traced.readings]
-            gone = np.isnan(np.hstack(readings)) if readings else np.zeros((len(run), 1), bool)
-            found.append(gone if gone.any() else None)
+            there = np.isfinite(np.hstack(readings)) if readings else np.ones((len(run), 1), bool)
+            found.append(None if there.all() else there)
         return tuple(found)
+
+    def lost(self, r: int) -> NDArray[np.int_]:
+        """Rests that were reached too fast, by number."""
+        rests = self._records[r].rests
+        return np.zeros(0, np.int_) if rests is None else np.flatnonzero(rests.lost)
+
+    def present(self, r: int) -> NDArray[np.bool_] | None:
+        """Which residuals (N, m) there are; None where all are.
+
+        What compares a rest with the one before has nothing to say of a first one.
+        """
+        record = self._records[r]
+        if self.model.traced.integrates:
+            return self._read[r]
+        if record.rests is None:
+            return None
+        present = record.rests.linked[:, None] | ~needing(self.model)
+        return np.asarray(present[record.places])
 
     def given(
         self, parameters: Array, r: int, own: tuple[int, ...] | None = None
     ) -> tuple[Array, Array]:
         """What the stages give at the samples of run r (N, k), side by side, and its slopes."""
+        found = self._given(parameters, r, own)
+        return found[0][self._records[r].places], found[1][self._records[r].places]
+
+    def _given(self, parameters: Array, r: int, own: tuple[int, ...] | None) -> tuple[Array, Array]:
+        """The same at all samples of the record."""
         *stages, _ = _programs(self.model, own)
         record = self._records[r]
         given = np.zeros((len(record.samples), 0))
@@ -159,6 +211,8 @@ class Staged:
                     taken = _chained(stage.taken, parameters, record.samples, given, slopes)
                 mesh = self._meshes.setdefault((r, k), Mesh())
                 more = stage.flow.along(parameters, Course(record.time, *taken), mesh)
+            elif stage.word:
+                more = self._of_word(stage, parameters, record, given, slopes)
             elif stage.memory is None:
                 more = self._late(stage, parameters, record)
             else:
@@ -166,7 +220,21 @@ class Staged:
                 more = stage.memory.along(parameters, *taken, record.time, record.run.block)
             given = np.concatenate([given, more[0]], axis=1)
             slopes = np.concatenate([slopes, more[1]], axis=1)
-        return given[record.places], slopes[record.places]
+        return given, slopes
+
+    def _of_word(
+        self, stage: Program, parameters: Array, record: Record, given: Array, slopes: Array
+    ) -> tuple[Array, Array]:
+        """What a word of the body gives at every rest, and its slopes."""
+        assert record.rests is not None
+        if stage.word == "before":
+            return before(*_chained(stage.taken, parameters, record.samples, given, slopes))
+        nothing = np.zeros((len(record.rests.samples), given.shape[1]))
+        own = stage.taken(parameters, np.hstack([record.rests.samples, nothing]))
+        found, moved = turns(own[0][:, :, 0], own[1], record.rests)
+        wide = np.zeros((*moved.shape[:2], slopes.shape[2]))
+        wide[:, :, list(stage.columns)] = moved
+        return found, wide
 
     def stopped(self, parameters: Array, r: int) -> str:
         """What could not be followed from which time on, in words; empty where all was."""
@@ -202,13 +270,16 @@ class Program:
     """What is computed of one stage: what it takes, and how it goes on from it.
 
     Of an effect on a signal's time that is the time asked for. The last of a model's is its
-    residual, with no effect behind it.
+    residual, with no effect behind it. A `word` of the body has no effect either; `columns` are the
+    coordinates in which a turn has slopes.
     """
 
     attached: Attached | None
     taken: Replay
     memory: Memory | None = None
     flow: Integrator | None = None
+    word: Word = ""
+    columns: tuple[int, ...] = ()
 
 
 @lru_cache(maxsize=64)
@@ -231,7 +302,19 @@ def _programs(model: Model, own: tuple[int, ...] | None = None) -> tuple[Program
             found.append(
                 Program(None, replay(stage.taken), flow=Integrator(traced, stage, own, fed))
             )
-        elif stage.attached.kind == "time":
+        elif stage.word == "turned":
+            if ca.depends_on(stage.taken, ca.vertcat(given, ca.SX.sym("none"))):
+                raise DeclarationError(
+                    f"model {model.name}: what turns between rests cannot read what was before"
+                )
+            columns = tuple(sorted(set(ca.jacobian(stage.taken, coordinates).sparsity().get_col())))
+            sample = ca.vertcat(sample_symbol(model, traced), given)
+            outputs = slopes(stage.taken, coordinates[list(columns)])
+            rate = _replay("rate", [parameters, sample], outputs)
+            found.append(Program(None, rate, word=stage.word, columns=columns))
+        elif stage.word:
+            found.append(Program(None, replay(stage.taken), word=stage.word))
+        elif stage.attached is not None and stage.attached.kind == "time":
             t = ca.SX.sym("t")
             moment = ca.SX(stage.attached.apply(t, traced.symbols))
             outputs = slopes(moment, coordinates)
@@ -242,6 +325,40 @@ def _programs(model: Model, own: tuple[int, ...] | None = None) -> tuple[Program
             found.append(Program(stage.attached, replay(stage.taken), memory=memory))
         given = ca.vertcat(given, stage.given)
     return (*found, Program(traced.stages[-1].attached, replay(traced.expression)))
+
+
+@dataclass(frozen=True)
+class Readings:
+    """Slopes in the readings of a rest: of the residual, also in what the stages give, and of what
+    each word `before` takes, with the place of what it gives."""
+
+    residual: Replay
+    before: tuple[tuple[int, Replay], ...]
+
+
+@lru_cache(maxsize=64)
+def _in_readings(model: Model) -> Readings:
+    traced = model.staged
+    parameters = ca.vertcat(traced.coordinates, traced.references)
+    reading, given = sample_symbol(model, traced), ca.vertcat(*(s.given for s in traced.stages))
+    sample = ca.vertcat(reading, given)
+
+    def slope(expression: SX, *of: SX) -> Replay:
+        outputs = [ca.densify(ca.jacobian(expression, x)) for x in of]
+        return _replay("slope", [parameters, sample], outputs)
+
+    found, place = [], 0
+    for stage in traced.stages:
+        if stage.word == "before":
+            found.append((place, slope(stage.taken, reading)))
+        place += stage.given.numel()
+    return Readings(slope(traced.expression, reading, given), tuple(found))
+
+
+def _multiplied(matrix: Array, values: Array) -> Array:
+    """Residuals (N, m) or slopes (N, m, n) of all samples of a run, combined."""
+    count = values.shape[0] * values.shape[1]
+    return np.asarray((matrix @ values.reshape(count, -1)).reshape(values.shape))
 
 
 def _replay(name: str, inputs: list[SX], outputs: list[SX]) -> Replay:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from casest.declaration.shapes import Array
 from casest.leastsquares.per_sample import laplacian, slope_in_sample
 from casest.leastsquares.problem import Block, Point, Problem
+from casest.leastsquares.stated import settles, shifts_of_curvature
 
 #: Residuals that are looked at where a median or a correlation is wanted of a longer record.
 SAMPLED = 1_000_000
@@ -93,12 +94,22 @@ def rounding(problem: Problem, point: Point) -> float:
     return float(4 * np.finfo(float).eps * np.sqrt(squares / max(count, 1)) + 1e-300)
 
 
+def _implicit_in_noise(problem: Problem) -> bool:
+    """Is the residual bent in the noise of the readings, and is that noise not stated?"""
+    model = problem.model
+    return model.implicit and model.noise is None and not model.resting
+
+
 def second_order(problem: Problem, point: Point, sigma: float) -> float:
     """Root mean square over σ of ½Σσ_s²·∂²r/∂s²: what an implicit residual neglects of the noise.
 
-    Zero for explicit models, whose residual is linear in the noise of the reading.
+    Zero for explicit models, whose residual is linear in the noise of the reading, unless noise of
+    their inputs was stated; taken for none where rests are compared, whose means have little.
     """
-    if not problem.model.implicit:
+    if settles(problem.model):
+        shifts = np.concatenate([shift.ravel() for shift in shifts_of_curvature(problem, point)])
+        return float(np.sqrt(np.mean(shifts**2)) / sigma)
+    if not _implicit_in_noise(problem):
         return 0.0
     squares, count, noise = 0.0, 0, _signal_noise(problem, point, sigma)
     for r, samples in enumerate(problem.samples):
@@ -113,7 +124,13 @@ def second_order_bias(problem: Problem, point: Point, sigma: float, bread: Array
     Noise of σ_s in every component of signal s shifts each residual by ½Σσ_s²·∂²r/∂s² on average.
     """
     slope = np.zeros(problem.unknowns)
-    if not problem.model.implicit:
+    if settles(problem.model) and not problem.model.implicit:
+        shifts = tuple(shifts_of_curvature(problem, point))
+        for block in problem.blocks(point):
+            own = shifts[block.run][block.span]
+            np.add.at(slope, block.x, np.einsum("nm,nmk->k", own, block.jacobian))
+        return -np.asarray(bread @ slope)
+    if not _implicit_in_noise(problem):
         return slope
     noise = _signal_noise(problem, point, sigma)
     for block in problem.blocks(point):
@@ -145,9 +162,10 @@ def _signal_noise(problem: Problem, point: Point, sigma: float) -> Array:
 def repeat_noise(problem: Problem, point: Point) -> float | None:
     """Root mean square of the residual's noise that the scatter within rest intervals implies.
 
-    None where no signal carries a spread of its own. What only effects read is exact.
+    None where no signal carries a spread of its own, and where rests are compared. What only
+    effects read is exact.
     """
-    if not any(run.spread for run in problem.runs):
+    if not any(run.spread for run in problem.runs) or problem.model.resting:
         return None
     squares, count = 0.0, 0
     declared = {s.name for s in problem.model.declared}

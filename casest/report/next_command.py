@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -14,8 +14,8 @@ WIDTH = 80
 _OUTPUT = ("-o", "--output")
 _FLAGS = ("--at-rest", "--json", "--force", "--float")
 _READING = ("--columns", "--unit", "--scale", "--rate", "--time-zero")
-_MODEL = ("--set", "--free", "--fix", "--shared", "--per-run", "--effects", "--at-rest")
-_FIT = ("--start", "--solver", "--seed", "--holdout")
+_MODEL = ("--set", "--free", "--fix", "--shared", "--per-run", "--effects", "--at-rest", "--prior")
+_FIT = ("--start", "--solver", "--seed", "--holdout", "--sensor-noise")
 
 
 @dataclass(frozen=True)
@@ -82,6 +82,21 @@ def typed_words(command: str) -> Typed | None:
         else:
             arguments.append(word)
     return Typed(words[1], tuple(arguments), tuple(options))
+
+
+def recalibrating(command: str, fitted: str, data: str, held: Mapping[str, str]) -> str:
+    """The calibration of another file in one line: read as in `command`, the model as in `fitted`,
+    with parameters `held` at a value; empty where the model is not that of a `calibrate`."""
+    typed, made = typed_words(command), typed_words(fitted)
+    if typed is None or made is None or made.name != "calibrate" or not made.arguments:
+        return ""
+    kept = [pair for pair in made.options if pair[0] in _MODEL and pair[0] != "--at-rest"]
+    read = [pair for pair in typed.options if pair[0] in (*_READING, "--at-rest")]
+    held_now = [("--fix", f"{name}={value}") for name, value in held.items()]
+    words = ["casest", "calibrate", made.arguments[0], data]
+    for flag, value in (*kept, *read, *held_now):
+        words += [flag] if value is None else [flag, value]
+    return shlex.join(words)
 
 
 def following(

@@ -7,6 +7,8 @@ import io
 from collections.abc import Sequence
 from functools import cached_property
 
+from msgspec import UNSET
+
 from casest.diagnose.misfit.left import Finding
 from casest.effects.placing import prepared
 from casest.estimate.estimate import Estimate
@@ -23,6 +25,7 @@ from casest.results.fitted import (
 )
 from casest.results.residuals import Residuals, residuals_of, side_of
 from casest.results.result import Certificate
+from casest.results.uncertainty import covariance_of, inputs_of
 from casest.results.units import unit_table
 from casest.results.values import parameter_table
 
@@ -83,6 +86,8 @@ def calibration_result(
         ),
         parameters=parameter_table(estimate, table),
         correlation=correlation_of(estimate),
+        covariance=covariance_of(estimate),
+        inputs=inputs_of(estimate) or UNSET,
     )
     shared = fitted_content(estimate, model_name, data, command)
     doubts = None if misfit is None else [Doubt(f.where, plain(f.p_value)) for f in misfit]

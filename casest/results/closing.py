@@ -37,6 +37,7 @@ from casest.results.fitted import (
 )
 from casest.results.residuals import Residuals, residuals_of, side_of
 from casest.results.result import Certificate, Explained, Number, Numbers, Parameter
+from casest.results.uncertainty import covariance_of, inputs_of
 from casest.results.units import resolved, unit_table
 from casest.results.values import parameter_table
 
@@ -155,7 +156,12 @@ def closing_result(
         **shared,
         verdict=closing.verdict,
         before=_section(closing.before, closing, before),
-        after=replace(fitted, correlation=correlation_of(closing.after)),
+        after=replace(
+            fitted,
+            correlation=correlation_of(closing.after),
+            covariance=covariance_of(closing.after),
+            inputs=inputs_of(closing.after) or UNSET,
+        ),
         effects=[_effect(f, closing) for f in closing.effects],
         invisible=_invisible(closing, units),
         unexplained=_unexplained(closing),

@@ -34,6 +34,11 @@ def _versions() -> dict[str, str]:
     return {name: version(name) for name in ("casadi", "numpy", "scipy")}
 
 
+def is_file(name: str) -> bool:
+    """Whether data that are called so lie in a file, or a folder of one."""
+    return file_and_topics(name)[0].exists()
+
+
 def digest(name: str) -> str:
     """SHA-256 of a data file; of a folder (a ROS 2 bag), of its files' in order of their names."""
     path = file_and_topics(name)[0]
@@ -126,6 +131,7 @@ def load_result(path: Path) -> dict[str, Any]:
 
 #: What other commands leave in their folders.
 _WRITERS = {
+    "check.json": "check",
     "observe.json": "observe",
     "filter.json": "filter",
     "compare.json": "compare",

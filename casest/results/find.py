@@ -34,6 +34,14 @@ SHIPPED = {
     "norm-triangular": ("norm", "norm_triangular"),
     "norm-full": ("norm", "norm_full"),
     "norm-pair": ("pair", "norm_pair"),
+    "linear": ("one_channel", "linear"),
+    "polynomial": ("one_channel", "polynomial"),
+    "thermistor-beta": ("thermistor", "thermistor_beta"),
+    "steinhart-hart": ("thermistor", "steinhart_hart"),
+    "load-cell": ("one_channel", "load_cell"),
+    "pressure": ("one_channel", "pressure"),
+    "gyro-rests": ("imu", "gyro_rests"),
+    "imu": ("imu", "imu"),
 }
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import inspect
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -15,6 +16,7 @@ from msgspec import UNSET, Struct, UnsetType
 
 from casest.correction.carried import carried
 from casest.correction.reading import carried_data
+from casest.data.run import Run
 from casest.declaration.effect import Attached
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
@@ -33,12 +35,26 @@ from casest.results.result import (
     Result,
     reproduced,
 )
+from casest.results.uncertainty import Covariance, Input
 from casest.results.units import unit_table
 from casest.results.values import Entry, Held, entries, held
+from casest.validity.colour import colour_of
+
+
+class Spectrum(Struct, frozen=True):
+    """Noise that is not white: power of each axis, up to a factor, over cycles per sample."""
+
+    frequency: list[float]
+    power: list[list[float]]
+    samples_per_second: Number
 
 
 class Noise(Struct, frozen=True):
-    """Standard deviation of one residual on each axis, and where it comes from."""
+    """Standard deviation of one residual on each axis, and where it comes from.
+
+    `stated` is that of a usual residual by the noise that was stated; `chi_square` compares what
+    is left with it, and `chi_square_p_value` is the chance of as much or more.
+    """
 
     sigma: list[float]
     unit: str
@@ -46,6 +62,9 @@ class Noise(Struct, frozen=True):
     from_repeats: Number
     degrees_of_freedom: int
     correlated_over_samples: Number
+    stated: Number
+    chi_square: Number
+    chi_square_p_value: Number
 
 
 class NoiseModel(Noise, frozen=True):
@@ -65,10 +84,16 @@ class NoiseModel(Noise, frozen=True):
 
 
 class Correlation(Struct, frozen=True):
-    """Correlation of the unknowns: null where the data do not determine one."""
+    """Correlation of the unknowns, and the standard deviation of each: null where the data do not
+    determine one.
+
+    `information` is the inverse of their covariance, from which a plan goes on.
+    """
 
     names: list[str]
     matrix: list[list[Number]]
+    std: list[Number]
+    information: list[list[Number]]
 
 
 class Section(Struct, frozen=True, kw_only=True):
@@ -81,6 +106,8 @@ class Section(Struct, frozen=True, kw_only=True):
     certificate: Certificate
     parameters: dict[str, Parameter]
     correlation: Correlation | UnsetType = UNSET
+    covariance: Covariance | UnsetType = UNSET
+    inputs: list[Input] | UnsetType = UNSET
 
 
 class JudgedSection(Section, frozen=True, kw_only=True):
@@ -200,6 +227,8 @@ class Fitted(Result, frozen=True, kw_only=True, dict=True):
     invisible: Sequence[Any] | None
     unexplained: Any
     misfit: list[Doubt] | None
+    spectrum: Spectrum | None
+    conditions: dict[str, list[float]]
     corrected: Corrected | None
     units: dict[str, str]
     solver: Solver
@@ -258,6 +287,8 @@ def fitted_content(
             weak_of(estimate),
         ),
         "scatter_between_runs": _scatter(estimate),
+        "spectrum": _spectrum(estimate),
+        "conditions": ranges(problem.runs),
         "corrected": corrected,
         "units": units,
         "solver": _solver(estimate),
@@ -271,7 +302,7 @@ def fitted_content(
         "kind": "rest intervals" if problem.runs[0].spread else "samples",
         "entries": entries(estimate),
         "unknown_units": dict(zip(estimate.names, problem.units, strict=True)),
-        "held": held(problem.model, units),
+        "held": held(estimate, units),
         "found": estimate,
     }
 
@@ -286,11 +317,12 @@ def correlation_of(estimate: Estimate) -> Correlation:
     std = np.sqrt(np.diag(estimate.covariance))
     with np.errstate(invalid="ignore", divide="ignore"):
         matrix = np.asarray(estimate.covariance / np.outer(std, std))
-    return Correlation(list(estimate.names), plain(matrix))
+    names, information = list(estimate.names), plain(estimate.information)
+    return Correlation(names, plain(matrix), plain(std), information)
 
 
 def _noise(estimate: Estimate, unit: str) -> Noise:
-    noise = estimate.noise
+    noise, chi = estimate.noise, estimate.noise.chi_square
     return Noise(
         [float(noise.sigma)] * len(estimate.model.axes),
         unit,
@@ -298,7 +330,31 @@ def _noise(estimate: Estimate, unit: str) -> Noise:
         plain(noise.repeats),
         noise.degrees_of_freedom,
         plain(estimate.correlated_over),
+        plain(noise.stated),
+        None if chi is None else plain(chi.value),
+        None if chi is None else plain(chi.larger),
     )
+
+
+def _spectrum(estimate: Estimate) -> Spectrum | None:
+    """The noise's colour, for judging later records; null where it is white."""
+    found = colour_of(estimate) if estimate.certificate.trusted else None
+    if found is None:
+        return None
+    return Spectrum(found.frequency.tolist(), found.power.tolist(), plain(found.rate))
+
+
+def ranges(runs: Sequence[Run]) -> dict[str, list[float]]:
+    """Least and greatest of every other column of numbers: under what conditions it was fitted."""
+    found: dict[str, list[float]] = {}
+    for name in sorted({name for run in runs for name in run.columns}):
+        parts = [np.asarray(run.columns[name]) for run in runs if name in run.columns]
+        if all(p.dtype.kind in "fiu" for p in parts):
+            values = np.concatenate(parts).astype(float)
+            values = values[np.isfinite(values)]
+            if values.size:
+                found[name] = [float(values.min()), float(values.max())]
+    return found
 
 
 def noise_of(noise: Noise) -> tuple[Array, str]:
@@ -353,7 +409,8 @@ def _correction(
     around = None
     if corrected and corrected.low is not UNSET and corrected.high is not UNSET:
         around = (corrected.low, corrected.high)
-    found = carried(estimate.model, estimate.values, estimate.problem.runs, units, around)
+    model = replace(estimate.model, noise=None)  # readings are corrected without their noise
+    found = carried(model, estimate.values, estimate.problem.runs, units, around)
     if isinstance(found, str):
         return {"reason": found}
     values = {name: plain(value) for name, value in estimate.values.items()}

@@ -9,7 +9,8 @@ from msgspec import UNSET, Struct, UnsetType, to_builtins
 from msgspec.structs import replace
 
 from casest import __version__
-from casest.results.file import digest, plain, versions
+from casest.data.logs import parts_of
+from casest.results.file import digest, is_file, plain, versions
 
 #: A number, or None where there is none; and as many as a parameter has, nested by its shape.
 Number = float | None
@@ -28,8 +29,9 @@ class Reproduced(Struct, frozen=True):
 
 
 def reproduced(command: str, data: Sequence[str]) -> Reproduced:
-    """The command that made a result, versions and digests of its files."""
-    return Reproduced(command, **versions(), sha256={name: digest(name) for name in data})
+    """The command that made a result, versions and digests of its files (data frames are none)."""
+    files = [part for name in data for part in parts_of(name)]
+    return Reproduced(command, **versions(), sha256={f: digest(f) for f in files if is_file(f)})
 
 
 class Result(Struct, frozen=True, kw_only=True, dict=True):

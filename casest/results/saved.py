@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from casest.correction.reading import carried_read, typed
 from casest.declaration.shapes import Array
 from casest.errors import DataError, UsageError
 from casest.results.file import digest_of_values, load_result, result_file
+from casest.results.values import Entry
 
 
 class SavedParameter(Struct, frozen=True):
@@ -22,6 +23,7 @@ class SavedParameter(Struct, frozen=True):
     value: Any
     std: Any
     unit: str | list[str]
+    interval95: Any = None
 
     @property
     def first_unit(self) -> str:
@@ -29,8 +31,18 @@ class SavedParameter(Struct, frozen=True):
         return self.unit if isinstance(self.unit, str) else next(iter(self.unit), "")
 
 
+class _SavedCovariance(Struct, frozen=True):
+    names: list[str]
+    matrix: list[list[float | None]]
+
+
+class _SavedNoise(Struct, frozen=True):
+    sigma: list[float]
+
+
 class _Section(Struct, frozen=True):
     parameters: dict[str, SavedParameter]
+    covariance: _SavedCovariance | UnsetType = UNSET
 
 
 class _Reproduced(Struct, frozen=True):
@@ -42,10 +54,12 @@ class SavedResult(Struct, frozen=True, kw_only=True):
 
     model: str
     trusted: bool
+    verdict: str | None = None
     data: list[str] = []
     runs: list[str] = []
     constants: dict[str, Any] = {}
     scopes: dict[str, str] = {}
+    noise: _SavedNoise | None = None
     units: dict[str, str] = {}
     convention: str = ""
     estimate: _Section | UnsetType = UNSET
@@ -60,6 +74,11 @@ class SavedResult(Struct, frozen=True, kw_only=True):
         found = self.after or self.estimate
         return found.parameters if found else {}
 
+    @property
+    def entries(self) -> tuple[Entry, ...]:
+        """Every number of every parameter, but those that its shape holds at zero."""
+        return tuple(e for n, p in self.parameters.items() for e in _entries(n, p))
+
 
 def saved_result(path: Path) -> SavedResult:
     """The checked content of a saved result (a folder stands for the `result.json` in it)."""
@@ -71,28 +90,33 @@ def saved_correction(path: Path, *, force: bool = False, what: str) -> tuple[Sav
 
     `what` is to be done to a refused result only with `force`.
     """
-    result = saved_result(path)
+    return correction_of(saved_result(path), str(result_file(path)), force=force, what=what)
+
+
+def correction_of(
+    result: SavedResult, name: str, *, force: bool = False, what: str
+) -> tuple[SavedResult, Carried]:
+    """The result and the correction that it carries, checked; errors call the result `name`."""
     if result.innovations is not None:
         raise UsageError(
             f"the result is of {result.model}, an estimator in motion: it has states over time "
             f"(casest filter {result.model} DATA) and no correction"
         )
     if not result.trusted and not force:
-        raise UsageError(f"{path}: this estimate was refused; --force {what} it all the same")
+        raise UsageError(f"{name}: this estimate was refused; --force {what} it all the same")
     if result.correction is None:
         raise DataError(
-            f"{path}: was made by an older casest, and carries no correction: calibrate again"
+            f"{name}: was made by an older casest, and carries no correction: calibrate again"
         )
     if "reason" in result.correction:
         raise UsageError(str(result.correction["reason"]))
     values = {name: p.value for name, p in result.parameters.items()}
     if result.correction.get("of") != digest_of_values(values, result.trusted):
         raise DataError(
-            f"{result_file(path)}: its parameters are not those that its correction was made from; "
+            f"{name}: its parameters are not those that its correction was made from; "
             "a result is not edited by hand: calibrate again, with --fix what is to be held"
         )
-    where = f"{result_file(path)}: correction"
-    return result, carried_read(result.correction, where, len(result.runs))
+    return result, carried_read(result.correction, f"{name}: correction", len(result.runs))
 
 
 def numbers(value: Any, where: str) -> Array:
@@ -104,3 +128,21 @@ def numbers(value: Any, where: str) -> Array:
     if not np.isfinite(found).all():
         raise DataError(f"{where}: has no value; calibrate again")
     return found
+
+
+def floats(value: Any) -> Array:
+    """A saved value as it stands, of any shape; NaN where there is none."""
+    return np.array(value, dtype=np.float64)
+
+
+def _entries(name: str, p: SavedParameter) -> Iterator[Entry]:
+    value, std = floats(p.value), floats(p.std)
+    ends = np.stack([value, value]) if p.interval95 is None else floats(p.interval95)
+    for k, place in enumerate(np.ndindex(value.shape)):
+        if value[place] == 0 == std[place]:
+            continue
+        unit = p.unit if isinstance(p.unit, str) else p.unit[k % len(p.unit)]
+        label = f"{name}[{','.join(map(str, place))}]" if place else name
+        reach = value[place] - ends[0][place], ends[1][place] - value[place]
+        shown = "" if unit == "1" else unit
+        yield Entry(label, shown, *(float(x) for x in (value[place], std[place], *reach)))

@@ -53,6 +53,9 @@ def resolved(unit: str, known: Mapping[str, str]) -> str:
     if quotient:
         a, b = (known.get(name, f"[{name}]") for name in quotient.groups())
         return _quotient(a, _difference(b))
+    over = re.fullmatch(r"\(([^\[\]]+)\)/\[([^\]]+)\]", unit)
+    if over:
+        return _quotient(over[1], _difference(known.get(over[2], f"[{over[2]}]")))
     alone = _PLACEHOLDER.fullmatch(unit)
     if alone:
         return known.get(alone[1], unit)

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from casest.declaration.model import Model
 from casest.declaration.shapes import Array
+from casest.declaration.symbols import Constant
 from casest.estimate.estimate import Estimate
 from casest.results.file import plain
 from casest.results.result import Parameter
+from casest.results.uncertainty import Input, inputs_of
 from casest.results.units import entry_units, unit_table
 
 
@@ -41,12 +42,19 @@ class Entry:
 
 @dataclass(frozen=True)
 class Held:
-    """A constant; `frozen`: it was an unknown, and has an uncertainty of its own."""
+    """A constant; `frozen`: it was an unknown, and has an uncertainty of its own.
+
+    `std` is carried into the fit, where it is known: `share` (0 to 1) is the largest part that it
+    has of the variance of any entry, that of `most`.
+    """
 
     name: str
     value: Array
     unit: str
     frozen: bool
+    std: Array | None = None
+    share: float = 0.0
+    most: str = ""
 
 
 def entries(estimate: Estimate) -> tuple[Entry, ...]:
@@ -68,11 +76,20 @@ def _entries(found: Estimate) -> Iterator[Entry]:
                 yield Entry(name + run, shown, *(float(v[i]) for v in own))
 
 
-def held(model: Model, units: Mapping[str, str]) -> tuple[Held, ...]:
+def held(estimate: Estimate, units: Mapping[str, str]) -> tuple[Held, ...]:
     """Constants, and parameters held at a value."""
-    return tuple(
-        Held(c.name, c.array, units.get(c.name, ""), c.frozen is not None) for c in model.constants
-    )
+    found = inputs_of(estimate)
+    return tuple(_held(c, units.get(c.name, ""), found) for c in estimate.model.constants)
+
+
+def _held(c: Constant, unit: str, inputs: Sequence[Input]) -> Held:
+    own = [i for i in inputs if i.name.partition("[")[0].partition(" (")[0] == c.name]
+    if not own:
+        return Held(c.name, c.array, unit, c.frozen is not None)
+    shares = {name: sum(i.share[name] or 0.0 for i in own) for name in own[0].share}
+    most = max(shares, key=lambda name: shares[name])
+    std = np.array([i.std for i in own]) if c.std is None else c.std
+    return Held(c.name, c.array, unit, c.frozen is not None, std, shares[most], most)
 
 
 def parameter_table(estimate: Estimate, table: Mapping[str, str]) -> dict[str, Parameter]:

@@ -12,9 +12,11 @@ _FITTED = ("result.json", "residuals.csv", "report.html")
 _NAMES = {
     "calibrate": _FITTED,
     "close": (*_FITTED, "formula.py"),
+    "check": ("check.json", "report.html"),
     "observe": ("observe.json", "report.html"),
     "filter": ("filter.json", "states.csv", "report.html"),
     "compare": ("compare.json", "compare.png", "compare.svg"),
+    "plan": ("plan.json", "plan.csv", "plan.html"),
     "simulate": ("record.csv", "truth.json", "truth.csv"),
 }
 #: Where a command writes that is not told.
@@ -32,7 +34,7 @@ def overwritten(command: str, output: str | Path | None, words: Sequence[str]) -
         return ""
     lost = {_entry(path) for path in _targets(command, Path(output))}
     for k, word in enumerate(words):
-        for path in _read(word, result=k == 0 and command in ("apply", "export")):
+        for path in _read(word, result=k == 0 and command in ("apply", "check", "export", "plan")):
             # A link in the place of the output is replaced itself, not what it leads to.
             if lost & {_entry(path), os.path.realpath(path)}:
                 return word

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -13,8 +13,12 @@ from msgspec import Struct
 
 from casest import __version__
 from casest.correction import runtime
+from casest.correction.affine import program_of, sensors_of
 from casest.correction.c import c_source
 from casest.correction.carried import Carried
+from casest.correction.formats import Format, written
+from casest.correction.formats_read import YAML, chosen, sensors_read
+from casest.correction.inverse import LEFT
 from casest.correction.numpy_module import as_data, python_source
 from casest.correction.program import Program, refuse_unexported
 from casest.correction.reading import program_read, typed
@@ -52,6 +56,28 @@ def exported(
     if to == "python":
         return python_source(built, test)
     return c_source(built, f"correct_{c_identifier(carried.model)}", single, test)
+
+
+def exported_as(
+    path: Path, to: Format, *, sensors: Sequence[str] = (), run: int = 0, force: bool = False
+) -> tuple[str, list[str]]:
+    """Text of another project's file, of the `sensors` that are named (of all without), and what a
+    reader should know beside it."""
+    result, carried = saved_correction(path, force=force, what="exports")
+    if carried.own and not 0 <= run < len(result.runs):
+        raise UsageError(f"--run {run}: there are runs 0 to {len(result.runs) - 1}")
+    bound, readings = carried.of_run(run if carried.own else 0)
+    constants = {n: result.units[n] for n in result.constants if result.units.get(n)}
+    found = sensors_of(bound, readings, constants, to)
+    kinds = [s.kind for s in found]
+    for wanted in sensors:
+        if wanted not in kinds:
+            raise UsageError(f"--sensor {wanted}: the result has {', '.join(kinds)}")
+    kept = [s for s in found if not sensors or s.kind in sensors]
+    text, remarks = written(kept, to, f"{result.model}, {', '.join(result.data)}")
+    if bound.left:
+        remarks.append(f"{LEFT}{', '.join(bound.left)}")
+    return text, remarks
 
 
 def _test(built: Program, readings: Array, path: Path) -> tuple[Array, Array]:
@@ -124,6 +150,23 @@ def applied(path: Path, data: str, arguments: Mapping[str, Any]) -> Applied:
     text = table_of(runs, [s.name for s in signals], found, out.name, out.unit)
     notes = dict.fromkeys(note for run in runs for note in run.notes)
     return Applied(text, built.left, tuple(notes))
+
+
+def applied_foreign(path: Path, data: str, arguments: Mapping[str, Any]) -> Applied:
+    """The data corrected by a file of ROS, Kalibr, ArduPilot or PX4."""
+    sensors = chosen(sensors_read(path), arguments.get("columns") or {}, path)
+    built = program_of(sensors)
+    signals = [Signal(i.name, i.size, i.unit, i.kind) for i in built.inputs]
+    runs = load_runs([data], signals, **arguments)
+    found = [corrected(built, run) for run in runs]
+    unit = built.output.unit or None
+    text = table_of(runs, [s.name for s in signals], found, built.output.name, unit)
+    notes = list(dict.fromkeys(note for run in runs for note in run.notes))
+    if path.suffix in YAML and not any(s.offset.any() for s in sensors):
+        notes.append(f"{path} holds no bias, and none is taken away")
+    if any(s.per_ampere is not None for s in sensors):
+        notes.append("what the motors' current adds is left in: apply reads no current")
+    return Applied(text, (), tuple(notes))
 
 
 def _unit(stated: str) -> str | None:

@@ -13,7 +13,7 @@ from casest.dataset.layout import layout_of
 from casest.dataset.partitions import Piece
 from casest.dataset.readings import wide_block
 from casest.declaration.model import Model
-from casest.errors import UsageError
+from casest.errors import UsageError, library
 from casest.fleet.calibrate_many import check_model
 from casest.tasks.job import Job
 from casest.tasks.rows import Rows, record_batch, schema
@@ -50,8 +50,7 @@ def calibrate_arrow(
     `mapInArrow` and Ray's `map_batches`. Raises DataError where a column is missing, UsageError
     for what `calibrate_many` does not do.
     """
-    import pyarrow
-
+    pyarrow = library("pyarrow", "parquet", "calibrate_arrow")
     check_model(model)
     if isinstance(table, pyarrow.RecordBatch):
         table = pyarrow.Table.from_batches([table])

@@ -100,7 +100,7 @@ def _direct(
     """All at once; `given` (N, k) of each run: what the model's effects on other samples give."""
     model, kept = problem.model, list[Candidate]()
     slopes, scopes = list[Any](), list[NDArray[np.bool_]]()
-    signals = list(model.signals)
+    signals = list(model.columns)
     symbols = {s.name: _traced(model).symbols[s.name] for s in signals}
     for candidate in found:
         try:
@@ -199,7 +199,7 @@ def slope_of(
     traced, base = _traced(extended), _traced(model)
     held = {f"{candidate.label}.{name}": value for name, value in candidate.held}
     own = {p.name for p in candidate.parameters(extended)}
-    more = [s for s in extended.signals if s.name not in symbols]
+    more = [s for s in extended.columns if s.name not in symbols]
     for s in more:
         symbols[s.name] = ca.SX.sym(s.name, s.size)
     here, there = _coordinates(extended), _coordinates(model)
@@ -213,7 +213,7 @@ def slope_of(
     slope = ca.jacobian(traced.expression, ca.vertcat(*mine))
     old = [traced.coordinates, traced.references]
     old += [stage.given for stage in traced.stages]
-    old += [flat(traced.symbols[s.name]) for s in extended.signals]
+    old += [flat(traced.symbols[s.name]) for s in extended.columns]
     new += [base.references, *(stage.given for stage in base.stages)]
-    new += [flat(symbols[s.name]) for s in extended.signals]
+    new += [flat(symbols[s.name]) for s in extended.columns]
     return ca.substitute(slope, ca.vertcat(*old), ca.vertcat(*new)), scopes, more

@@ -8,7 +8,7 @@ not known.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -25,9 +25,11 @@ from casest.diagnose.noise.noise_model import noise_model, step_of
 from casest.diagnose.noise.slow_course import slow_course
 from casest.diagnose.noise.spectral_line import strongest_line
 from casest.effects.placing import prepared
+from casest.estimate.before import against_prior
 from casest.estimate.estimate import Estimate
 from casest.leastsquares.agreement import between_runs
 from casest.leastsquares.problem import Point, Problem
+from casest.leastsquares.stated import chi_square
 from casest.leastsquares.weights import robust_scale, weighted
 
 #: Longer records are not asked by `calibrate`: all residuals are looked at at once.
@@ -55,6 +57,7 @@ def doubts(estimate: Estimate) -> list[Finding] | None:
     if not estimate.certificate.trusted or sum(map(len, runs)) > LONGEST:
         return None
     problem = Problem(estimate.model, prepared(estimate.model, runs))
+    problem = replace(problem, whitening=estimate.problem.whitening)
     with np.errstate(all="ignore"):
         return findings(problem, problem.point(estimate.values), estimate.correlated_over)
 
@@ -143,7 +146,7 @@ def findings(
     freedom = max(problem.residual_count - problem.unknowns, 1)
     sigma = robust_scale(residuals) * float(np.sqrt(problem.residual_count / freedom))
     clipped = _clipped(problem, residuals, sigma)
-    found = _repeats(problem, point, clipped)
+    found = _before(problem, point) + _repeats(problem, point, clipped) + _stated(problem, point)
     slow = [] if wanders else _slow(problem, clipped, sigma)
     follows = _follows(problem, point, clipped, sigma, in_time=not (slow or wanders))
     found += follows + slow
@@ -171,6 +174,26 @@ def _repeats(problem: Problem, point: Point, clipped: Sequence[Array]) -> list[F
         "within them explains"
     )
     return [Finding(where, tested.p_value, tested.sigma)]
+
+
+def _before(problem: Problem, point: Point) -> list[Finding]:
+    """Data that do not agree with what was known before."""
+    found, scale = against_prior(problem, point), problem.noise_scale
+    if found is None or scale is None or found.agrees:
+        return []
+    return [Finding(found.words, found.chi_square.larger, scale)]
+
+
+def _stated(problem: Problem, point: Point) -> list[Finding]:
+    """A residual that is larger than the noise that was stated, by χ²."""
+    found, scale = chi_square(problem, point, problem.unknowns), problem.noise_scale
+    if found is None or scale is None or found.larger >= LEVELS.misfit:
+        return []
+    where = (
+        f"chi-square is {found.value:.4g} with {found.degrees_of_freedom} degrees of freedom: the "
+        f"residual is {found.times:.2g} times the stated noise"
+    )
+    return [Finding(where, found.larger, scale)]
 
 
 def _slow(problem: Problem, clipped: Sequence[Array], sigma: float) -> list[Finding]:

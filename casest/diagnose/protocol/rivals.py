@@ -41,7 +41,7 @@ def _rivals(subject: Subject[F], state: State[F], kept: Kept) -> tuple[State[F],
     without, best = (squares(linear, c, stretches) for c in ([], [_in_time(ranking, mine[0])]))
     rivals = list[Evidence]()
     for e in ranking.causes:
-        if e is mine[0] or e.score < LEVELS.strong or len(rivals) == LEVELS.contenders:
+        if e is mine[0] or e.score < LEVELS.strong or len(rivals) == 2 * LEVELS.contenders:
             continue
         lost = squares(linear, [_in_time(ranking, e)], stretches) - best
         if _as_well(mine[0].score - e.score, lost, without - best):

@@ -45,11 +45,12 @@ def search(
 
 
 def _small(subject: Subject[F], before: State[F], state: State[F]) -> bool:
-    """Does what came last explain less of the variance than a misfit that counts?"""
+    """Does what came last explain less of the variance than a misfit that counts, each of them?"""
     last = state.kept[len(before.kept) :]
     if not subject.linear(before.fit).series or any(subject.asked(k.what) for k in last):
         return False
-    return all(k.falls["pieces"].ratio > 1 - LEVELS.share for k in last)
+    share = LEVELS.share * len(last)  # a pair explains no more than both of them
+    return all(k.falls["pieces"].ratio > 1 - share for k in last)
 
 
 def _left(ranking: Ranking) -> bool:

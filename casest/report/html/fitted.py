@@ -34,7 +34,7 @@ STRONG, SPOKEN = 0.9, 8
 def parameters(result: Fitted) -> str:
     """Values with uncertainty; beside each other and how far they moved, where there are two."""
     sides = result.residuals.sides
-    rows = [[f"`{e.name}`", *map(printed, _cells(e)), printed_unit(e.unit)] for e in result.entries]
+    rows = parameter_rows(result)
     head = ["parameter", "value", "± std", "95 % from", "to", "unit"]
     said = "± is one standard deviation; the interval holds 95 %."
     if len(sides) > 1:
@@ -43,6 +43,11 @@ def parameters(result: Fitted) -> str:
         said += " Moved: in the value's own standard deviation before."
     shown = table(head, rows, range(1, len(head) - 1))
     return section("parameters", "Parameters", paragraph(said), shown, _held(result.held))
+
+
+def parameter_rows(result: Fitted) -> list[list[str]]:
+    """Name, value, standard deviation, interval and unit of every number."""
+    return [[f"`{e.name}`", *map(printed, _cells(e)), printed_unit(e.unit)] for e in result.entries]
 
 
 def _cells(e: Entry) -> list[str]:
@@ -80,14 +85,29 @@ def _places(value: float, spread: str) -> str:
 
 def _held(held: Sequence[Held]) -> str:
     """Constants: as much a part of the answer as the unknowns."""
-    rows = []
+    rows, uncertain = [], any(c.std is not None for c in held)
     for c in held:
         value = ", ".join(f"{v:.9g}" for v in np.ravel(c.value))
-        rows.append([f"`{c.name}`", printed(value), printed_unit(c.unit) or "1"])
+        row = [f"`{c.name}`", printed(value), printed_unit(c.unit) or "1"]
+        rows.append([*row, *(_known(c) if uncertain else [])])
     if not rows:
         return ""
+    head = ["constant", "value", "unit", *(["± std", "largest share"] if uncertain else [])]
     said = "Held at these values; their own uncertainty is not in the standard deviations above."
-    return tag("h3", "Constants") + paragraph(said) + table(["constant", "value", "unit"], rows)
+    if uncertain:
+        said = (
+            "Held at these values. A standard uncertainty beside one is in the standard deviations "
+            "above; the share is the largest that it has of a variance there."
+        )
+    return tag("h3", "Constants") + paragraph(said) + table(head, rows)
+
+
+def _known(c: Held) -> list[str]:
+    """A constant's standard uncertainty, and the largest share that it has of a variance."""
+    if c.std is None:
+        return ["not stated" if c.frozen else "exact", ""]
+    std = ", ".join(f"{s:.2g}" for s in np.ravel(c.std))
+    return [printed(std), f"{printed(f'{100 * c.share:.2g}')} % of `{c.most}`"]
 
 
 # -- what is uncertain about them ------------------------------------------------------------------

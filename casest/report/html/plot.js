@@ -169,6 +169,17 @@
       return;
     }
     const y = decode(one.y);
+    if (one.kind === "spans" || one.kind === "bars") {
+      const low = decode(one.low), high = decode(one.high), flat = one.kind === "spans";
+      for (let k = 0; k < n; k++) {
+        if (!Number.isFinite(x[k]) || !Number.isFinite(y[k])) continue;
+        const [x1, x2] = flat ? [px(low[k]), px(high[k])] : [px(x[k]), px(x[k])];
+        const [y1, y2] = flat ? [py(y[k]), py(y[k])] : [py(low[k]), py(high[k])];
+        element("line", { class: "line " + one.look, x1, x2, y1, y2 }, parent);
+        element("circle", { class: "dot " + one.look, cx: px(x[k]).toFixed(1), cy: py(y[k]).toFixed(1), r: 3.4 }, parent);
+      }
+      return;
+    }
     if (one.kind === "dots" || one.kind === "points") {
       if (n <= 1500) {
         for (let k = 0; k < n; k++)

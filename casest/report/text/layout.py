@@ -73,7 +73,15 @@ def held_lines(held: Sequence[Held]) -> Iterator[str]:
     """Constants, and parameters held at a value: as much a part of the answer as the unknowns."""
     for c in held:
         unit = "" if c.unit == "1" else c.unit
-        line = f"  {c.name} = {in_digits(c.value, 9)} {unit}".rstrip() + " (held)"
+        spread = "" if c.std is None else f" ± {in_digits(c.std, 2)}"
+        line = f"  {c.name} = {in_digits(c.value, 9)}{spread} {unit}".rstrip() + f" ({_known(c)})"
         yield textwrap.fill(line, WIDTH, subsequent_indent="      ", break_on_hyphens=False)
-    if any(c.frozen for c in held):
+    if any(c.frozen and c.std is None for c in held):
         yield "  (the uncertainty of held values is not in the standard deviations above)"
+
+
+def _known(c: Held) -> str:
+    """What is known of a constant's uncertainty, and how much of the values' that is."""
+    if c.std is None:
+        return "held"
+    return f"held; up to {100 * c.share:.2g} % of a variance above: that of {c.most}"

@@ -20,7 +20,8 @@ def listing_text(listed: Listing, *, as_json: bool = False) -> str:
         lines += ["", f"  {name}", _under([m.about], "")]
         lines.append(_under(m.signals, "signals:   "))
         lines.append(_under(m.parameters, "unknowns:  "))
-        lines.append(_under(list(m.constants), "constants: "))
+        if m.constants:
+            lines.append(_under(list(m.constants), "constants: "))
         lines.append(_under(m.solvers, "solvers:   "))
     lines += ["", "In motion (casest observe NAME DATA, casest filter NAME DATA):"]
     for name, d in listed.motion.items():

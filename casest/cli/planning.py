@@ -1,0 +1,148 @@
+"""`plan`: which measurement next."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from casest.cli.correcting import names_a_model
+from casest.cli.flags import taking
+from casest.cli.live import living
+from casest.cli.plan_options import PlanOptions
+from casest.cli.separating import separating
+from casest.cli.shared import commands, echo, progress, typed, write
+from casest.cli.situation import (
+    Situation,
+    covered,
+    measures_of,
+    of_model,
+    of_result,
+    possible_of,
+)
+from casest.errors import UsageError
+
+if TYPE_CHECKING:
+    from casest.plan.candidates.candidates import Candidates
+    from casest.plan.goals import Goal, Measures
+    from casest.plan.planning import Planned, Task
+    from casest.results.plan import Plan
+
+
+@commands.command()
+@click.argument("given", metavar="RESULT|MODEL", type=click.Path(path_type=Path))
+@taking(PlanOptions)
+def plan(given: Path, options: PlanOptions) -> int:
+    """Which measurement next: poses, runs or rows of a table that bring the most.
+
+    After a RESULT of calibrate or close (its folder), or of a MODEL before any data.
+    """
+    from casest.report.text.plan import plan_text
+    from casest.results.file import as_json
+    from casest.results.plan import plan_rows
+
+    if options.count is not None and options.until:
+        raise UsageError("--count and --until: one of the two says how many")
+    progress(f"planning for {given}")
+    situation = of_model(str(given), options) if names_a_model(given) else of_result(given, options)
+    if options.live.source:
+        return living(situation, options, options.live.source)
+    make = separating if options.separate else planned_result
+    result = make(situation, options)
+    if options.output:
+        from casest.report.html import plan_page
+
+        write(options.output / "plan.csv", plan_rows(result, situation.model))
+        write(options.output / "plan.json", as_json(result.content()))
+        write(options.output / "plan.html", plan_page(result))
+    if options.as_json:
+        echo(as_json(result.content()), nl=False)
+        return 0
+    echo(plan_text(result))
+    if options.output:
+        echo(f"\nWritten: {options.output}/plan.html, plan.json, plan.csv")
+    return 0
+
+
+def planned_result(situation: Situation, options: PlanOptions) -> Plan:
+    """Candidates, goals, the plan."""
+    import numpy as np
+
+    from casest.plan.candidates.finding import candidates
+    from casest.plan.planning import task
+    from casest.results.plan import plan_result
+
+    model = situation.model
+    found = candidates(model, situation.values, situation.noise, possible_of(situation, options))
+    known = np.zeros((len(found.names), len(found.names)))
+    if situation.information is not None:
+        own = [found.names.index(name) for name in situation.names]
+        known[np.ix_(own, own)] = situation.information
+    given = task(found.factors, known, found.names, situation.name)
+    _refuse_hidden(given, situation, found)
+    goals, planned = _planned(given, measures_of(situation, found), options, situation)
+    notes = (
+        []
+        if situation.noise.known
+        else [
+            "the noise is unknown: standard deviations are multiples of it; --sensor-noise "
+            f"{model.readings[0].name}=STD says it"
+        ]
+    )
+    return plan_result(
+        model,
+        found,
+        planned,
+        model_name=situation.name,
+        after=situation.after,
+        criterion=" and ".join(map(str, goals)) if goals else options.criterion,
+        goals=goals,
+        noise=situation.noise,
+        units=situation.units,
+        notes=notes,
+        covered=covered(situation) if found.up is not None else None,
+        command=typed(),
+    )
+
+
+def _refuse_hidden(given: Task, situation: Situation, found: Candidates) -> None:
+    """Refuse candidates that together leave something undetermined, and name it."""
+    from casest.plan.planning import undetermined
+    from casest.plan.words import combination
+
+    if (null := undetermined(given)).shape[1]:
+        raise UsageError(
+            f"{situation.name}: none of these {len(found)} candidates, nor all of them, determine "
+            f"every unknown: {combination(null[:, 0] / given.scale, given.scale, found.names)}; "
+            "vary something else, or hold one of them (--fix)"
+        )
+
+
+def _planned(
+    given: Task, measures: Measures, options: PlanOptions, situation: Situation
+) -> tuple[list[Goal], Planned]:
+    from casest.plan.planning import criterion_of, planned, until
+
+    if options.until:
+        if not situation.noise.known:
+            name = situation.model.readings[0].name
+            raise UsageError(f"--until: how many depends on the noise: --sensor-noise {name}=STD")
+        if options.most < 1:
+            raise UsageError(f"--most {options.most}: at least one")
+        goals = [measures.goal(text) for text in options.until]
+        return goals, until(given, goals, options.most)
+    columns = None
+    if options.criterion == "G":
+        columns = measures.columns("corrected", "--criterion G")[0]
+    elif options.criterion not in ("D", "A", "E"):
+        columns = measures.columns(options.criterion, f"--criterion {options.criterion}")[0]
+    count = _count(given) if options.count is None else options.count
+    if count < 1:
+        raise UsageError(f"--count {count}: at least one")
+    return [], planned(given, criterion_of(given, options.criterion, columns), count)
+
+
+def _count(given: Task) -> int:
+    """Twice as many numbers as unknowns."""
+    return -(-2 * len(given.scale) // int(given.factors.shape[1]))

@@ -1,0 +1,162 @@
+"""`--sensor-noise` of calibrations: standard deviations of readings, from words or columns."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from casest import units
+from casest.cli.assignments import Assignment, Assignments
+from casest.declaration.symbols import Signal
+from casest.errors import CasestError, UsageError
+
+if TYPE_CHECKING:
+    from casest.data.run import Run
+    from casest.declaration.model import Model
+    from casest.declaration.shapes import Array
+
+#: How the column with the standard uncertainty of another is called.
+NAMED = ("u_{}", "{}_std")
+
+
+def with_sensor_noise(
+    model: Model, runs: Sequence[Run], given: Assignments
+) -> tuple[Model, tuple[Run, ...]]:
+    """The model and its runs with the noise that was stated, declared, or stands in columns."""
+    from casest.leastsquares.stated import stated_noise
+
+    known = {s.name: s for s in model.signals}
+    noise: dict[str, list[Array]] = {}
+    used: set[str] = set()
+    for option in given:
+        name, text = option.pair()
+        if name not in known:
+            raise UsageError(
+                f"{option.flag} {option.text}: {model.name} has no signal {name!r}; it has "
+                f"{', '.join(known)}"
+            )
+        noise[name] = [_of_run(option, text, known[name], run, used) for run in runs]
+    found = _found(model, runs, noise)
+    noise |= {name: arrays for name, (arrays, _) in found.items()}
+    used |= {column for _, columns in found.values() for column in columns}
+    said = [f"noise of {name} is {' '.join(columns)}" for name, (_, columns) in found.items()]
+    model, runs = stated_noise(model, runs, noise)
+    return model, tuple(_without(run, used, said) for run in runs)
+
+
+def _without(run: Run, used: set[str], said: Sequence[str]) -> Run:
+    """The run without the columns that tell its noise: they are the cause of nothing."""
+    if not used:
+        return run
+    columns = {name: values for name, values in run.columns.items() if name not in used}
+    return replace(run, columns=columns, notes=(*run.notes, *said))
+
+
+def _of_run(option: Assignment, text: str, signal: Signal, run: Run, used: set[str]) -> Array:
+    """Standard deviations (k,) or (N, k), or a covariance (1, k, k), in the signal's unit."""
+    words = [word.strip() for word in text.split(",")]
+    if all(word in run.columns for word in words):
+        used.update(words)
+        return np.stack([_column(word, signal, run) for word in words], axis=1)
+    try:
+        if text[:1].isalpha() or text[:1] == "_":
+            raise ValueError(text)
+        if ";" in text:
+            rows = [[float(cell) for cell in row.split(",")] for row in text.split(";")]
+            return _covariance(option, np.array(rows), signal)
+        numbers, unit = _numbers(words)
+    except ValueError:
+        there = ", ".join(run.columns) or "no more columns"
+        raise UsageError(
+            f"{option.flag} {option.text}: {text!r} is no number with a unit, no percentage, and "
+            f"no column of {run.file or run.name}; it has {there}"
+        ) from None
+    except CasestError as error:
+        raise type(error)(f"{option.flag} {option.text}: {error}") from None
+    if not (numbers > 0).all() or not np.isfinite(numbers).all():
+        raise UsageError(
+            f"{option.flag} {option.text}: a standard deviation is above zero, and {text} is not"
+        )
+    if unit == "%" and run.units.get(signal.name) != "%":
+        return _share(option, numbers / 100, signal, run)
+    try:
+        return numbers * _factor(unit, signal, run)
+    except CasestError as error:
+        raise type(error)(f"{option.flag} {option.text}: {error}") from None
+
+
+def _covariance(option: Assignment, matrix: Array, signal: Signal) -> Array:
+    """Rows of a covariance between a signal's axes, (1, k, k)."""
+    if matrix.shape != (signal.size, signal.size):
+        raise UsageError(
+            f"{option.flag} {option.text}: {signal.name} has {signal.size} components, and the "
+            f"covariance is {matrix.shape[0]} by {matrix.shape[1]}"
+        )
+    return matrix[None]
+
+
+def _share(option: Assignment, share: Array, signal: Signal, run: Run) -> Array:
+    """A share of each reading; a reading of zero has none."""
+    found = np.abs(run.signals[signal.name]) * share
+    bad = np.flatnonzero((found == 0).any(axis=1))
+    if bad.size:
+        row = int(np.asarray(run.rows)[bad[0]])
+        raise UsageError(
+            f"{option.flag} {option.text}: {signal.name} is zero in row {row} of "
+            f"{run.file or run.name}, and a share of it no noise: give a number or a column"
+        )
+    return found
+
+
+def _numbers(words: Sequence[str]) -> tuple[Array, str | None]:
+    """Numbers with one unit behind the last."""
+    last, unit = units.parse_quantity(words[-1])
+    return np.array([*(float(word) for word in words[:-1]), last]), unit
+
+
+def _factor(unit: str | None, signal: Signal, run: Run) -> float:
+    """From a stated unit to that of the signal, as a difference."""
+    own = signal.unit or run.units.get(signal.name)
+    if not unit or not own or unit == own:
+        return 1.0
+    return units.conversion(unit, own)[0]
+
+
+def _column(name: str, signal: Signal, run: Run) -> Array:
+    values = run.columns[name]
+    if not np.issubdtype(values.dtype, np.number):
+        raise UsageError(f"{run.file}: column {name} holds text, no standard deviations")
+    return np.asarray(values, float) * _factor(run.column_units.get(name), signal, run)
+
+
+def _found(
+    model: Model, runs: Sequence[Run], stated: Mapping[str, object]
+) -> dict[str, tuple[list[Array], tuple[str, ...]]]:
+    """Noise in columns named after a signal, `u_x` or `x_std`; of all that carry noise, or none.
+
+    What a declaration says of a signal counts where there is no column.
+    """
+    found = {}
+    for signal in model.readings:
+        if signal.name in stated:
+            continue
+        for columns in _candidates(signal):
+            if all(column in run.columns for run in runs for column in columns):
+                arrays = [np.stack([_column(c, signal, r) for c in columns], axis=1) for r in runs]
+                found[signal.name] = (arrays, columns)
+                break
+    measured = model.traced.measured
+    every = {*found, *stated}
+    complete = measured in every if measured else bool(every)
+    return found if complete else {}
+
+
+def _candidates(signal: Signal) -> Iterator[tuple[str, ...]]:
+    ends = ("",) if signal.size == 1 else ("x", "y", "z")[: signal.size]
+    for form in NAMED:
+        yield tuple(form.format(signal.name + end) for end in ends)
+    if signal.size > 1:
+        yield from ((form.format(signal.name),) for form in NAMED)

@@ -1,0 +1,84 @@
+"""`plan --separate`: what tells causes apart that a record left open."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from casest.cli.plan_options import PlanOptions
+from casest.cli.shared import progress, typed
+from casest.cli.situation import Situation, covered, possible_of, records_of
+from casest.errors import UsageError
+
+if TYPE_CHECKING:
+    from casest.plan.candidates.candidates import Candidates
+    from casest.results.plan import Plan
+
+
+def separating(situation: Situation, options: PlanOptions) -> Plan:
+    """Candidates as each cause has them, and the plan that tells the causes apart."""
+    from casest.plan.candidates.finding import candidates
+    from casest.plan.rivals.rivals import Rival, open_causes, refitted
+    from casest.plan.rivals.separating import separated, separation
+    from casest.results.plan import separation_result
+
+    if options.until or options.criterion != "D":
+        raise UsageError("--separate has a goal of its own: leave --until and --criterion out")
+    if situation.after is None:
+        raise UsageError(f"--separate: {situation.name} is a model; give a result of close")
+    base, labels = open_causes(situation.content, situation.model)
+    if len(labels) < 2:
+        raise UsageError(
+            f"{situation.after}: its record left no two causes open; plan for precision instead "
+            "(without --separate)"
+        )
+    runs = records_of(situation)
+    if runs is None:
+        raise UsageError(
+            f"{situation.after}: the record that it was made from is not where it was, and the "
+            "causes are fitted to it again"
+        )
+    progress(f"fitting {', '.join(labels)}")
+    rivals = refitted(base, situation.values, runs, labels, situation.noise.residual)
+    possible = _with_columns(possible_of(situation, options), situation, rivals, runs)
+
+    def make(rival: Rival) -> Candidates:
+        return candidates(rival.model, rival.values, situation.noise, possible)
+
+    found = separation(rivals, situation.noise, make, situation.name, possible.rate)
+    planned = separated(found, options.count, options.most, situation.name)
+    named = {r.label for r in rivals}
+    left = [label for label in labels if label not in named]
+    return separation_result(
+        situation.model,
+        found,
+        planned,
+        model_name=situation.name,
+        after=situation.after,
+        noise=situation.noise,
+        units=situation.units,
+        notes=[f"not planned for: {', '.join(left)}"] if left else [],
+        covered=covered(situation) if found.candidates.up is not None else None,
+        command=typed(),
+    )
+
+
+def _with_columns(possible: Any, situation: Situation, rivals: Any, runs: Any) -> Any:
+    """Values of the columns that a rival reads: as typed, else as the record has them."""
+    from dataclasses import replace
+
+    import numpy as np
+
+    from casest.effects.placing import prepared
+    from casest.plan.candidates.varied import values_of
+
+    own = {s.name for s in situation.model.signals}
+    extras = {s.name: s.unit for r in rivals for s in r.model.signals if s.name not in own}
+    typed_ones = dict(possible.varied)
+    also = {}
+    for name, unit in extras.items():
+        if name in typed_ones:
+            also[name] = values_of(name, typed_ones.pop(name), unit)
+            continue
+        seen = np.concatenate([run.signals[name][:, 0] for run in prepared(situation.model, runs)])
+        also[name] = np.unique(np.quantile(seen, [0.0, 0.5, 1.0]))[:, None]
+    return replace(possible, varied=typed_ones, also=also)

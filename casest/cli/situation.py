@@ -1,0 +1,178 @@
+"""What a plan begins with: a model before any data, or what a saved result knows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from casest.cli.assignments import Assignment, Assignments
+from casest.cli.loading import declared_model
+from casest.cli.options import ReadingOptions
+from casest.cli.plan_options import PlanOptions
+from casest.errors import UsageError
+
+if TYPE_CHECKING:
+    from casest.data.run import Run
+    from casest.declaration.model import Model
+    from casest.plan.candidates.candidates import Candidates, Noise
+    from casest.plan.goals import Measures
+
+
+@dataclass(frozen=True)
+class Situation:
+    """What a plan begins with: the model, what is known of it, the noise."""
+
+    name: str
+    model: Model
+    values: Mapping[str, Any]
+    noise: Noise
+    units: Mapping[str, str]
+    names: tuple[str, ...] = ()
+    information: Any = None
+    after: str | None = None
+    content: Mapping[str, Any] = field(default_factory=dict)
+
+
+def of_model(name: str, options: PlanOptions) -> Situation:
+    """A model before any data: its declared starts, or --value."""
+    from casest.data.run import Run
+    from casest.results.units import unit_table
+    from casest.simulation.record import truth
+
+    model = declared_model(name, options.model)
+    given = dict(given.of(model) for given in options.values)
+    values = truth(model, {n: model.having(**{n: v})[n].array for n, v in given.items()})
+    stated = dict(given.pair() for given in options.reading.units)
+    units = {s.name: s.unit or stated.get(s.name) for s in model.signals}
+    empty = Run.raw("planned", {s.name: _no_rows(s.size) for s in model.signals}, units=units)
+    return Situation(name, model, values, _noise(model, options), unit_table(model, [empty]))
+
+
+def _no_rows(size: int) -> Any:
+    import numpy as np
+
+    return np.zeros((0, size))
+
+
+def of_result(path: Path, options: PlanOptions) -> Situation:
+    """What a saved result knows."""
+    from casest.saved.planning import started
+
+    for name in ("constants", "free", "fix", "shared", "per_run", "effects"):
+        if getattr(options.model, name):
+            raise UsageError(
+                f"{path} is a result, and has its model: leave --{name.replace('_', '-')} out"
+                if name != "constants"
+                else f"{path} is a result, and has its model: leave --set out"
+            )
+    if options.values:
+        raise UsageError(f"{path} is a result, and has its values: leave --value out")
+    start = started(path)
+    noise = _noise(start.model, options, start.sigma, start.over)
+    return Situation(
+        str(start.content["model"]),
+        start.model,
+        start.values,
+        noise,
+        start.table,
+        start.names,
+        start.information,
+        str(path),
+        start.content,
+    )
+
+
+def _noise(model: Model, options: PlanOptions, sigma: Any = None, over: float = 1.0) -> Noise:
+    """The noise as stated, else that of the result, else of size one."""
+    import numpy as np
+
+    from casest.plan.candidates.candidates import Noise
+
+    stated = dict(given.number() for given in options.noise)
+    readings = {s.name for s in model.readings}
+    for name, std in stated.items():
+        if name not in readings:
+            raise UsageError(
+                f"--sensor-noise {name}={std:g}: {model.name} reads {', '.join(sorted(readings))}"
+            )
+        if not 0 < std < float("inf"):
+            raise UsageError(f"--sensor-noise {name}={std:g}: a standard deviation above 0")
+    if sigma is None or stated:
+        return Noise(np.ones(len(model.axes)), stated, known=bool(stated))
+    return Noise(sigma * np.sqrt(max(over, 1.0)), {})
+
+
+def possible_of(situation: Situation, options: PlanOptions) -> Any:
+    """What can be measured, as the options say it."""
+    from casest.plan.candidates.finding import Possible
+
+    said = options.possible
+    table = _table(situation.model, said.candidates, options.reading) if said.candidates else None
+    return Possible(
+        dict(given.pair() for given in said.vary),
+        said.step,
+        said.reach,
+        said.duration,
+        options.reading.rate,
+        table,
+    )
+
+
+def _table(model: Model, file: str, reading: ReadingOptions) -> tuple[Run, ...]:
+    """Rows of a file with the signals that are not predicted."""
+    from casest.data import load_runs
+
+    needed = [s for s in model.signals if s.name != model.traced.measured]
+    return load_runs([file], needed, **reading.keywords())
+
+
+def covered(situation: Situation) -> Any:
+    """Directions of up (N, 3) in the records that the result was made from, if they are there."""
+    from casest.errors import CasestError
+    from casest.plan.candidates.poses import upward
+
+    runs = records_of(situation)
+    try:
+        return None if runs is None else upward(situation.model, situation.values, runs)
+    except CasestError:  # a reading that has no pose: nothing is drawn
+        return None
+
+
+def records_of(situation: Situation) -> tuple[Run, ...] | None:
+    """The records that a result was made from, read as they were; None where they are gone."""
+    from casest.data import load_runs
+    from casest.errors import CasestError
+    from casest.report.next_command import typed_words
+
+    words = typed_words(situation.content.get("reproduce", {}).get("command", ""))
+    if words is None:
+        return None
+
+    def given(flag: str) -> Assignments:
+        return tuple(Assignment(flag, v) for f, v in words.options if f == flag and v)
+
+    flags = {flag for flag, _ in words.options}
+    rate = next((float(v) for f, v in words.options if f == "--rate" and v), None)
+    reading = ReadingOptions(
+        given("--columns"), given("--unit"), given("--scale"), rate, "--at-rest" in flags
+    )
+    try:
+        data = list(situation.content["data"])
+        return load_runs(data, situation.model.signals, **reading.keywords())
+    except (CasestError, OSError, ValueError):  # moved or changed since
+        return None
+
+
+def measures_of(known: Any, found: Candidates) -> Measures:
+    """What goals can be about: of anything that has a model, values and units."""
+    from casest.plan.corrected import corrected_slopes
+    from casest.plan.goals import Measures
+
+    model, slopes = known.model, None
+    if found.run is not None:
+        slopes = corrected_slopes(model, known.values, found.run)
+    name = model.traced.corrected or ""
+    units = {n: known.units.get(n, "rad") for n in found.names}
+    return Measures(found.names, units, name, known.units.get(name, ""), slopes)

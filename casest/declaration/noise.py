@@ -1,0 +1,64 @@
+"""Noise that was stated: a residual in units of it, with the true values of the signals beside.
+
+Every noisy signal s has a true value ξ, for which the residual r(x, ξ) vanishes, and the likeliest
+ξ take Σ(s - ξ)ᵀC⁻¹(s - ξ) as small as that lets it be. To first order around an estimate of ξ the
+residual is w = r(x, ξ) + G(s - ξ) with G = ∂r/∂ξ, of covariance V = GCGᵀ, and the likeliest ξ is
+s - CGᵀV⁻¹w. Where x makes Σ|e|² least, e = V^(-1/2)w with ξ, G and V held, and ξ, G and V are those
+at x, the gradient in all unknowns and all true values together is zero (Gauss & Helmert; P. Boggs,
+R. Byrd, R. Schnabel, 1987). Predicted readings and implicit relations go the same way. Each sample
+has a small matrix of its own; nothing grows with the record. Held, the matrices cannot be made
+large to make a residual small.
+
+Of an implicit relation w has a mean b that is not zero where the relation bends (a norm of noisy
+readings is too long): it is taken off, so that the estimate is right to second order of the noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import casadi as ca
+
+from casest.declaration.physics import SX
+from casest.declaration.symbols import Signal
+from casest.declaration.tracing import Traced, flat
+
+#: What a sample holds: V^(-1/2), G, ξ of its noisy signals, b; and of each the root of C.
+WHITENING, SLOPE, TRUE, MEAN = "noise.whitening", "noise.slope", "noise.true", "noise.mean"
+ROOT = "noise.root."
+
+
+@dataclass(frozen=True)
+class Stated:
+    """Noise of each sample is known of these `signals`, in the model's order.
+
+    `residuals` is their number m, `scale` a usual residual's standard deviation: so a residual in
+    units of its noise stays one in the unit of the reading.
+    """
+
+    signals: tuple[str, ...]
+    residuals: int
+    scale: float = 1.0
+
+    def columns(self, signals: Mapping[str, Signal]) -> tuple[Signal, ...]:
+        """What a sample holds of it behind the signals: (m²,), (m·k,), (k,), (m,), row by row."""
+        k, m = sum(signals[name].size for name in self.signals), self.residuals
+        sizes = {WHITENING: m * m, SLOPE: m * k, TRUE: k, MEAN: m}
+        return tuple(Signal(name, size, None) for name, size in sizes.items())
+
+
+def in_units_of_noise(traced: Traced, noise: Stated) -> Traced:
+    """The trace with its residual divided by what the stated noise makes of it."""
+    reading = ca.vertcat(*[flat(traced.symbols[name]) for name in noise.signals])
+    true, m = traced.symbols[TRUE], noise.residuals
+    whitening = ca.reshape(traced.symbols[WHITENING], m, m).T
+    slope = ca.reshape(traced.symbols[SLOPE], reading.numel(), m).T
+    w = ca.substitute(traced.expression, reading, true) + slope @ (reading - true)
+    w -= traced.symbols[MEAN]
+    return replace(traced, expression=ca.densify(ca.tril(whitening) @ w))
+
+
+def slope_in_noisy(traced: Traced, names: tuple[str, ...]) -> SX:
+    """G = ∂r/∂s of a trace without stated noise, (m, k)."""
+    return ca.jacobian(traced.expression, ca.vertcat(*[flat(traced.symbols[n]) for n in names]))

@@ -1,0 +1,60 @@
+"""Errors in variables: unknowns and true values of the signals in turn, until both stay.
+
+With the true values held the unknowns are a least-squares problem like any other; where neither
+moves any more, the gradient in all of them together is zero (`declaration.noise`).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from casest.declaration.shapes import Array
+from casest.errors import NotTrusted
+from casest.leastsquares.problem import Point, Problem
+from casest.leastsquares.stated import at_true_values, settles
+from casest.solve.outcome import Outcome
+from casest.solve.strategy import best_of, solve
+from casest.solve.trust_region import LITTLE, trust_region
+
+#: Turns at most, and the move of the unknowns in their standard deviations that is none.
+TURNS, STILL = 60, 1e-6
+#: Turns that are looked back at to see where they lead (Anderson 1965).
+MEMORY = 5
+
+
+def with_errors_of_inputs(
+    problem: Problem, outcomes: tuple[Outcome, ...], solver: str, seed: int
+) -> tuple[Problem, tuple[Outcome, ...]]:
+    """The problem with its true values at the optimum, and the outcomes there.
+
+    As it is where no noise was stated, or none that depends on the unknowns.
+    """
+    noise = problem.model.noise
+    if noise is None or not settles(problem.model):
+        return problem, outcomes
+    point, steps, ends, size = best_of(outcomes).point, list[Array](), list[Point](), np.inf
+    for _ in range(TURNS):
+        problem = at_true_values(problem, point)
+        end = trust_region(problem, point, damping=LITTLE).point
+        step = problem.difference(end, point)
+        size = float(np.linalg.norm(problem.factor(end)[0] @ step) / noise.scale)
+        if size <= STILL:
+            return solve(problem, end, solver=solver, seed=seed)
+        steps, ends = [*steps, step][-MEMORY:], [*ends, end][-MEMORY:]
+        point = _ahead(problem, steps, ends)
+    raise NotTrusted(
+        f"{problem.model.name}: the true values of {', '.join(noise.signals)} do not settle (the "
+        f"unknowns still move by {size:.1g} standard deviations): the noise is as large as what "
+        "the model bends over; average readings, or state less noise"
+    )
+
+
+def _ahead(problem: Problem, steps: list[Array], ends: list[Point]) -> Point:
+    """Where turns lead to: the combination of their ends whose combined step is least."""
+    last, R = ends[-1], problem.factor(ends[-1])[0]
+    if len(steps) == 1:
+        return last
+    change = np.stack([steps[-1] - step for step in steps[:-1]], axis=1)
+    weights = np.linalg.lstsq(R @ change, R @ steps[-1], rcond=1e-8)[0]
+    apart = np.stack([problem.difference(last, end) for end in ends[:-1]], axis=1)
+    return problem.moved(last, problem.inside(last.x - apart @ weights) - last.x)

@@ -1,0 +1,233 @@
+"""Residuals of several kinds, each with a noise of its own that the data show.
+
+A model that ties lengths in m/s² and turns in degrees together says which constant is the noise of
+each (`Residual(noise=…)`). One in the unit of a signal, `[a]`, is that of the signal's mean at a
+rest: it is in the residuals of that rest, and in those of the turns to it and from it. Any other is
+a noise of the axes that name it, from rest to rest anew. So the covariance of all residuals of a
+run is V = Σ σ_c² V_c. What is 0 is estimated with the fit, by the squares that each part leaves
+over and its share of the redundancy: Helmert's variance components in Förstner's form (Förstner,
+ZfV 104, 1979; Teunissen & Amiri-Simkooei, J. Geodesy 82, 2008, sec. 6).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from casest.declaration.model import Model
+from casest.declaration.shapes import Array
+from casest.declaration.symbols import Constant
+from casest.leastsquares.problem import Point, Problem
+
+#: Rounds of fits, and of noises within one, until these stand still to the share CLOSE.
+ROUNDS, WITHIN, CLOSE = 20, 50, 1e-3
+#: Redundancy of a part below which nothing shows it, and from which on it is shown well enough.
+LEAST, ENOUGH = 0.5, 10
+#: Least noise of a kind, of what its axes have in all: so that there always is one.
+FLOOR = 1e-3
+
+
+def noises(model: Model) -> dict[str, float]:
+    """Constants that are the noise of a kind of residual, by name; 0 where it is not known."""
+    names = dict.fromkeys(model.traced.residual.noise)
+    return {n: float(model[n].array) for n in names if isinstance(model[n], Constant)}
+
+
+def in_deviations(
+    problem: Problem, first: Point, fit: Callable[[Problem, Point], Point]
+) -> Problem:
+    """The problem with its residuals in standard deviations, none of which foretells another.
+
+    Noises that are not known are those that these data show; `fit` solves a problem from a point.
+    As it is where residuals are of one kind.
+    """
+    known = noises(problem.model)
+    if not known:
+        return problem
+    raw = Problem(problem.model.having(**dict.fromkeys(known, 0.0)), problem.runs)
+    sizes = {n: s if s > 0 else _at_start(raw, first, n) for n, s in known.items()}
+    point, unknown = first, [n for n, s in known.items() if not s > 0]
+    for _ in range(ROUNDS if unknown else 1):
+        point = fit(replace(raw, whitening=_whitening(raw, point, sizes)), point)
+        new = _components(raw, point, sizes, unknown)
+        still = all(abs(new[n] - sizes[n]) <= 10 * CLOSE * sizes[n] for n in sizes)
+        sizes = new
+        if still:
+            break
+    found = {n: float(f"{s:.5g}") for n, s in sizes.items()}
+    return whitened(Problem(problem.model.having(**found), problem.runs), point)
+
+
+def whitened(problem: Problem, point: Point) -> Problem:
+    """The problem with what residuals share taken from them, by the noises that its model knows."""
+    sizes = noises(problem.model)
+    if not sizes or not all(s > 0 for s in sizes.values()):
+        return problem
+    return replace(problem, whitening=_whitening(problem, point, sizes))
+
+
+def freedom(problem: Problem, point: Point) -> Array | None:
+    """Degrees of freedom of each unknown's variance (n,), where kinds have noises of their own.
+
+    An unknown that one kind tells is as uncertain as that kind's noise is known (Satterthwaite,
+    Biometrics Bulletin 2, 1946). None where all residuals are of one kind.
+    """
+    sizes = noises(problem.model)
+    if not sizes or problem.whitening is None:
+        return None
+    system = _System(problem, point)
+    left, variances = system.shares(sizes)
+    squares = sum(variances[n] ** 2 / max(left[n], 1.0) for n in sizes)
+    total = sum(variances.values())
+    return np.asarray(np.where(squares > 0, total**2 / np.where(squares > 0, squares, 1.0), 1.0))
+
+
+class _System:
+    """Residuals and slopes of all runs, with the covariance that each noise gives them."""
+
+    def __init__(self, problem: Problem, point: Point) -> None:
+        plain = replace(problem, whitening=None)
+        self.problem, self.point = problem, point
+        self.there = [
+            np.ones(len(run) * len(problem.model.axes), bool) if p is None else p.ravel()
+            for run, p in zip(problem.runs, problem.present, strict=True)
+        ]
+        self.blocks = []
+        for block, there in zip(plain.blocks(point), self.there, strict=True):
+            slopes = np.zeros((len(there), problem.unknowns))
+            slopes[:, block.x] = block.jacobian.reshape(len(there), -1)
+            self.blocks.append((block.residual.ravel()[there], slopes[there]))
+        self.parts = [self._parts(r) for r in range(len(problem.runs))]
+
+    def _parts(self, r: int) -> dict[str, Array]:
+        """V_c of one run for each noise, (M, M), of the residuals that there are."""
+        there = self.there[r]
+        found = _covariances(self.problem, self.point, r)
+        return {name: V[np.ix_(there, there)] for name, V in found.items()}
+
+    def shares(self, sizes: Mapping[str, float]) -> tuple[dict[str, float], dict[str, Array]]:
+        """Redundancy of each part, and the variance (n,) of each unknown that it gives."""
+        left, variances, _ = self._all(sizes)
+        return left, variances
+
+    def updated(self, sizes: Mapping[str, float]) -> tuple[dict[str, float], dict[str, float]]:
+        """Noises that the squares left over show, and the redundancy of each."""
+        left, _, squares = self._all(sizes)
+        new = {n: s * float(np.sqrt(squares[n] / max(left[n], LEAST))) for n, s in sizes.items()}
+        return new, left
+
+    def _all(
+        self, sizes: Mapping[str, float]
+    ) -> tuple[dict[str, float], dict[str, Array], dict[str, float]]:
+        n = self.problem.unknowns
+        inverses = [np.linalg.inv(_total(parts, sizes)) for parts in self.parts]
+        matrix, gradient = np.zeros((n, n)), np.zeros(n)
+        for (residual, slopes), inverse in zip(self.blocks, inverses, strict=True):
+            matrix += slopes.T @ inverse @ slopes
+            gradient += slopes.T @ inverse @ residual
+        scale = np.sqrt(np.where(np.diag(matrix) > 0, np.diag(matrix), 1.0))
+        cofactor = np.linalg.pinv(matrix / np.outer(scale, scale), hermitian=True)
+        cofactor /= np.outer(scale, scale)
+        left, squares = dict.fromkeys(sizes, 0.0), dict.fromkeys(sizes, 0.0)
+        variances = {name: np.zeros(n) for name in sizes}
+        step = cofactor @ gradient
+        for (residual, slopes), inverse, parts in zip(
+            self.blocks, inverses, self.parts, strict=True
+        ):
+            weighed = inverse @ slopes
+            seen, gain = inverse @ residual - weighed @ step, weighed @ cofactor
+            rest = inverse - gain @ weighed.T
+            for name, size in sizes.items():
+                V = size**2 * parts[name]
+                left[name] += float(np.sum(V * rest))
+                squares[name] += float(seen @ V @ seen)
+                variances[name] += np.einsum("ij,ik,kj->j", gain, V, gain)
+        return left, variances, squares
+
+
+def _components(
+    problem: Problem, point: Point, sizes: Mapping[str, float], unknown: list[str]
+) -> dict[str, float]:
+    """The noises that the residuals at a point show.
+
+    With little redundancy that of a signal is never less than what the rests themselves show.
+    """
+    system, found = _System(problem, point), dict(sizes)
+    least = {n: max(_rests_show(problem, n), 1e-300) for n in unknown}
+    floors = {n: FLOOR * _at_start(problem, point, n) for n in unknown}
+    for _ in range(WITHIN):
+        new, left = system.updated(found)
+        before = dict(found)
+        for n in unknown:
+            found[n] = max(new[n] if left[n] > LEAST else found[n], floors[n])
+            if left[n] < ENOUGH:
+                found[n] = max(found[n], least[n])
+        if all(abs(found[n] - before[n]) <= CLOSE * before[n] for n in unknown):
+            break
+    return found
+
+
+def _total(parts: Mapping[str, Array], sizes: Mapping[str, float]) -> Array:
+    return np.asarray(sum(size**2 * parts[name] for name, size in sizes.items()))
+
+
+def _whitening(problem: Problem, point: Point, sizes: Mapping[str, float]) -> tuple[Array, ...]:
+    """Lower triangular W (N·m, N·m) of each run, with W·V·Wᵀ = I."""
+    found = []
+    for r, present in enumerate(problem.present):
+        V = _total(_covariances(problem, point, r), sizes)
+        if present is not None:
+            V[~present.ravel(), ~present.ravel()] = 1.0
+        found.append(np.linalg.inv(np.linalg.cholesky(V)))
+    return tuple(found)
+
+
+def _covariances(problem: Problem, point: Point, r: int) -> dict[str, Array]:
+    """V_c (N·m, N·m) of one run, for each noise, of residuals as the problem has them."""
+    model = problem.model
+    own, prior = problem.slopes_in_readings(point, r)
+    N, m, _ = own.shape
+    known = noises(model)
+    found, first = {}, 0
+    places = {}
+    for s in model.signals:
+        places[s.name] = slice(first, first + s.size)
+        first += s.size
+    for name, size in known.items():
+        signal = _signal_of(model, name)
+        if signal is None:
+            axes = np.array([n == name for n in model.traced.residual.noise], float)
+            there = np.ones((N, m)) if problem.present[r] is None else problem.present[r]
+            found[name] = np.diag((there * axes / (size if size > 0 else 1.0) ** 2).ravel())
+            continue
+        part = places[signal]
+        slopes, each = np.zeros((N, m, N, part.stop - part.start)), np.arange(N)
+        slopes[each, :, each] = own[:, :, part]
+        slopes[each[1:], :, each[:-1]] = prior[1:, :, part]
+        flat = slopes.reshape(N * m, -1)
+        found[name] = flat @ flat.T
+    return found
+
+
+def _signal_of(model: Model, name: str) -> str | None:
+    """The signal in whose unit a noise is counted: [a]; None where in another."""
+    unit = re.fullmatch(r"\[(\w+)\]", model[name].like or model[name].unit)
+    return unit[1] if unit and unit[1] in {s.name for s in model.signals} else None
+
+
+def _rests_show(problem: Problem, name: str) -> float:
+    """Error of a rest's mean, of a noise that is that of a signal; else nothing."""
+    signal = _signal_of(problem.model, name)
+    spreads = [r.spread[signal] for r in problem.runs if signal is not None and signal in r.spread]
+    squares = np.concatenate([s.ravel() ** 2 for s in spreads]) if spreads else np.zeros(1)
+    return float(np.sqrt(np.mean(squares)))
+
+
+def _at_start(problem: Problem, first: Point, name: str) -> float:
+    """Root mean square residual of the axes of a kind, at a point."""
+    axes = np.array([n == name for n in problem.model.traced.residual.noise])
+    squares = np.concatenate([r[:, axes].ravel() ** 2 for r in problem.residuals(first)])
+    return max(float(np.sqrt(np.mean(squares))), _rests_show(problem, name), 1e-300)

@@ -1,0 +1,1 @@
+"""Is an old calibration still valid for a new record? Its test, what changed, the control chart."""

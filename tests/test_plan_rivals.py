@@ -1,0 +1,145 @@
+"""`casest plan --separate`: Atkinson and Fedorov's rivals, and causes that a record left open."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from scipy.optimize import linprog
+
+from casest import Residual, model, param, signal
+from casest.cli import run
+from casest.diagnose.levels import LEVELS
+from casest.errors import UsageError
+from casest.plan.candidates.attitudes import directions
+from casest.plan.candidates.candidates import Noise
+from casest.plan.candidates.rows import settings
+from casest.plan.design.continuous import continuous
+from casest.plan.design.criteria import Trace
+from casest.plan.rivals.rivals import Rival
+from casest.plan.rivals.separating import Pair, separated, separation
+
+
+def test_the_t_optimum_of_atkinson_and_fedorov_is_the_published_one():
+    # Biometrika 62 (1975) 57, example 1: 4.5 − 1.5 eˣ − 2 e⁻ˣ against a parabola on [−1, 1]
+    grid = np.linspace(-1, 1, 2001)
+    truth = 4.5 - 1.5 * np.exp(grid) - 2 * np.exp(-grid)
+    factors = np.column_stack([np.ones_like(grid), grid, grid**2, truth])[:, None, :]
+    amplitude = Trace(np.array([[0.0], [0], [0], [1]]))
+    found = continuous(amplitude, 1e-12 * np.eye(4), factors, 1.0, close=1e-7)
+    taken = found.weights > 1e-4
+    near = [np.abs(grid - x) < 0.01 for x in (-1.0, -0.669, 0.144, 0.957)]
+    assert np.any(near, axis=0)[taken].all()
+    weights = [found.weights[x].sum() for x in near]
+    assert weights == pytest.approx([0.253, 0.428, 0.247, 0.072], abs=1e-3)
+    assert 1 / found.value == pytest.approx(1.087e-3, abs=1e-6)
+    # what it leaves is the best approximation by a parabola, and that is a linear program
+    parabola = np.column_stack([np.ones_like(grid), grid, grid**2])
+    A = np.block([[parabola, -np.ones((len(grid), 1))], [-parabola, -np.ones((len(grid), 1))]])
+    best = linprog([0, 0, 0, 1], A, np.append(truth, -truth), bounds=[(None, None)] * 4)
+    assert 1 / found.value == pytest.approx(best.fun**2, rel=1e-5)
+
+
+def test_the_power_is_that_of_repeated_experiments():
+    pair = Pair("a", "b", lead=2.0)
+    rng = np.random.default_rng(0)
+    off = np.array([1.0, -2.0, 3.0, 0.5, 2.0, 1.5])  # nothing of it is taken up
+    y = off + rng.standard_normal((100_000, 6))
+    ratio = 2.0 + np.sum(y**2, axis=1) - np.sum((y - off) ** 2, axis=1)
+    growth = float(np.sum(off**2))
+    assert pair.power(growth) == pytest.approx(np.mean(ratio > LEVELS.clear), abs=0.005)
+    assert pair.power(pair.needed) == pytest.approx(0.95)
+
+
+@model
+def line(x=signal("m"), y=signal("m"), *, a=param("1"), b=param("m")):
+    """A line."""
+    return Residual(measured=y, predicted=a * x + b)
+
+
+@model
+def bent(x=signal("m"), y=signal("m"), *, a=param("1"), b=param("m"), c=param("1/m")):
+    """A line that bends."""
+    return Residual(measured=y, predicted=a * x + b + c * x**2)
+
+
+@model
+def turned(x=signal("m"), y=signal("m"), *, a=param("1"), b=param("m")):
+    """The same line, counted from elsewhere."""
+    return Residual(measured=y, predicted=a * (x + 2) + b)
+
+
+def rival(of, **values):
+    n = len(values)
+    values = {name: np.array(v) for name, v in values.items()}
+    return Rival(of.name, of, values, 1e-6 * np.eye(n), 0.0)
+
+
+def made(x):
+    noise = Noise(np.array([0.1]), {})
+    return noise, lambda one: settings(one.model, one.values, noise, {"x": x[:, None]})
+
+
+def test_a_bend_is_told_from_a_line_at_the_ends_and_the_middle():
+    x = np.linspace(-1, 1, 21)
+    noise, make = made(x)
+    rivals = [rival(line, a=1.0, b=0.0), rival(bent, a=1.0, b=0.0, c=0.3)]
+    # were the line true, the bend would fit as well: only one of the two ways can be refuted
+    found = separation(rivals[::-1], noise, make, "bend")
+    assert [p.true for p in found.pairs] == ["bent"]
+    planned = separated(found, None, 200, "bend")
+    assert set(np.round(x[list(planned.chosen)], 3)) <= {-1.0, 0.0, 1.0}
+    taken = np.bincount(planned.chosen, minlength=21)
+    assert taken[10] == pytest.approx(taken.sum() / 2, abs=2)  # T-optimal: a quarter, half, quarter
+
+
+def test_an_exact_alias_is_said():
+    noise, make = made(np.linspace(-1, 1, 21))
+    rivals = [rival(line, a=1.0, b=0.0), rival(turned, a=1.0, b=-2.0)]
+    rivals[1].values["b"][...] = -1.5
+    with pytest.raises(UsageError, match="line and turned are one under all 21 candidates"):
+        separation(rivals, noise, make, "lines")
+
+
+@pytest.fixture(scope="module")
+def closed(tmp_path_factory):
+    """Quadratic response in 24 poses: as well explained otherwise."""
+    folder = tmp_path_factory.mktemp("rivals")
+    rng = np.random.default_rng(2)
+    up = directions(10)
+    force = 9.81 * up[rng.choice(len(up), 24, replace=False)]
+    force = force + np.array([4e-4, -5e-4, 6e-4]) * force**2
+    v = force * [0.98, 1.02, 0.99] + [0.3, -0.2, 0.4] + 0.002 * rng.standard_normal((24, 3))
+    np.savetxt(folder / "w.csv", v, delimiter=",", header="vx [m/s^2],vy [m/s^2],vz [m/s^2]",
+               comments="")  # fmt: skip
+    words = ["close", "norm-triangular", str(folder / "w.csv"), "--set", "norm=9.81"]
+    assert run([*words, "-o", str(folder / "out")]) == 0
+    return folder / "out"
+
+
+def test_causes_that_a_record_left_open_are_told_apart_by_the_plan(closed, capsys):
+    effect = json.loads((closed / "result.json").read_text())["effects"][0]
+    assert effect["indistinguishable_from"]
+    capsys.readouterr()
+    assert run(["plan", str(closed), "--separate", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert {effect["name"], effect["indistinguishable_from"][0]} <= {
+        t["true"] for t in found["separates"]
+    }
+    assert all(t["chance"] >= 0.95 for t in found["separates"])
+    chances = [m["told_apart"] for m in found["measurements"]]
+    assert chances[-1] >= 0.95 > chances[0]
+
+
+def test_what_cannot_be_told_apart_is_one_sentence(closed, capsys, tmp_path):
+    def refused(*words):
+        capsys.readouterr()
+        assert run(["plan", *map(str, words)]) == 1
+        said = capsys.readouterr().err
+        assert said.count("\n") == 1
+        return said
+
+    assert "2 measurements tell" in refused(closed, "--separate", "--most", 2)
+    assert "leave --until" in refused(closed, "--separate", "--until", "offset<1")
+    assert "give a result of close" in refused("norm-diagonal", "--separate")

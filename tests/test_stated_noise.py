@@ -1,0 +1,205 @@
+"""Noise that was stated, of what is measured and of inputs: certified values, ODRPACK, χ²."""
+
+from __future__ import annotations
+
+import json
+import warnings
+
+import numpy as np
+import pytest
+
+import casest as c
+from casest.cli import run
+from casest.leastsquares.stated import stated_noise
+from casest_problems.norm import norm_triangular
+
+LINE = '''
+from casest import Residual, model, param, quantity, signal
+
+
+@model
+def line(y=signal("1"), x=signal("1"), *, b0=param("1"), b1=param("1", start=1.0)):
+    """x = b0 + b1 y."""
+    truth = quantity("truth", y, "1")
+    return Residual(measured=x, predicted=b0 + b1 * truth, corrected=truth)
+'''
+
+
+@c.model
+def growth(x=c.signal("1"), y=c.signal("1"), *, a=c.param("1", start=1.0), b=c.param("1")):
+    """An exponential."""
+    return c.Residual(measured=y, predicted=a * c.exp(b * x))
+
+
+def record(**signals):
+    held = {name: np.asarray(v, float).reshape(len(v), -1) for name, v in signals.items()}
+    return c.Run.raw("record", held, units=dict.fromkeys(held, "1"))
+
+
+def noisy(model, run, **stds):
+    return stated_noise(model, [run], {name: [np.asarray(s)] for name, s in stds.items()})
+
+
+@pytest.fixture
+def cli(capsys, tmp_path):
+    (tmp_path / "line.py").write_text(LINE)
+
+    def command(data, *words, model=tmp_path / "line.py"):
+        code = run(["calibrate", str(model), str(data), "--json", *map(str, words)])
+        out, err = capsys.readouterr()
+        return json.loads(out) if code == 0 else (code, err)
+
+    return command
+
+
+def test_iso_6143_example_1_has_all_its_printed_digits(cli, shared_data):
+    found = cli(shared_data / "certified" / "iso6143_example1.csv")
+    values, covariance = found["estimate"]["parameters"], found["estimate"]["covariance"]["matrix"]
+    assert f"{values['b0']['value']:.5f}" == "-0.35747"
+    assert f"{values['b1']['value']:.4f}" == "24.6115"
+    assert f"{values['b0']['std']:.5f}" == "0.15713"
+    assert f"{values['b1']['std']:.5f}" == "0.48036"
+    assert f"{covariance[0][1]:.5f}" == "-0.05689"
+    assert f"{found['noise']['chi_square']:.4f}" == "0.6743"
+    assert "noise of x is u_x" in found["notes"]
+
+
+@pytest.mark.parametrize("size", [1.0, 3.0])
+def test_errors_of_inputs_are_those_of_odrpack(size):
+    rng = np.random.default_rng(1)
+    true, n = np.linspace(0, 3, 40), 40
+    ux, uy = size * (0.05 + 0.1 * rng.random(n)), 0.1 + 0.1 * rng.random(n)
+    x = true + ux * rng.standard_normal(n)
+    y = 2 * np.exp(0.7 * true) + uy * rng.standard_normal(n)
+    model, runs = noisy(growth, record(x=x, y=y), x=ux[:, None], y=uy[:, None])
+    found = c.calibrate(model, runs)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)
+        from scipy import odr
+    data = odr.RealData(x, y, sx=ux, sy=uy)
+    curve = odr.Model(lambda b, x: b[0] * np.exp(b[1] * x))
+    other = odr.ODR(data, curve, beta0=[1, 0.5], sstol=1e-15, partol=1e-15, maxit=500).run()
+    assert found.point.x == pytest.approx(other.beta, rel=1e-5)
+    assert found.noise.chi_square.value == pytest.approx(other.sum_square, rel=1e-9)
+    assert found.covariance - found.shift == pytest.approx(other.cov_beta, rel=1e-3)
+
+
+def test_a_norm_of_unequal_noise_is_right_to_second_order():
+    """Without the noise the fit of so many readings is off by many of its standard deviations."""
+    rng = np.random.default_rng(3)
+    scale = np.array([[1, 0, 0], [0.02, 1.03, 0], [-0.01, 0.015, 0.98]])
+    offset, std = np.array([0.3, -0.2, 0.1]), np.array([0.05, 0.1, 0.5])
+    u = rng.standard_normal((30_000, 3))
+    u /= np.linalg.norm(u, axis=1)[:, None]
+    v = 9.81 * u @ np.linalg.inv(scale).T + offset + std * rng.standard_normal(u.shape)
+    model = norm_triangular.having(norm=9.81)
+    truth = np.array([1, 0.02, 1.03, -0.01, 0.015, 0.98, *offset])
+
+    def away(model, runs):
+        found = c.calibrate(model, runs)
+        return (found.point.x - truth) / np.sqrt(np.diag(found.covariance))
+
+    assert np.abs(away(model, [record(v=v)])).max() > 4
+    assert np.abs(away(*noisy(model, record(v=v), v=std))).max() < 3
+
+
+def test_a_covariance_between_axes_is_that_of_turned_axes():
+    """In axes turned by Q, noise of Q·C·Qᵀ gives the same fit as noise of C in the old ones."""
+    rng = np.random.default_rng(5)
+    turn = np.linalg.qr(rng.standard_normal((3, 3)))[0]
+    own = np.diag(np.square([0.02, 0.1, 0.4]))
+    u = rng.standard_normal((200, 3))
+    v = 9.81 * u / np.linalg.norm(u, axis=1)[:, None]
+    v += rng.standard_normal(v.shape) @ np.sqrt(own)
+
+    @c.model
+    def centre(v=c.signal(3), *, o=c.param(3), r=c.constant(9.81)):
+        """A sphere."""
+        return c.Residual(implicit=c.norm_2(v - o) - r, unit="[v]")
+
+    plain = c.calibrate(*noisy(centre, record(v=v), v=own[None]))
+    turned = c.calibrate(*noisy(centre, record(v=v @ turn.T), v=(turn @ own @ turn.T)[None]))
+    assert turned.values["o"] == pytest.approx(turn @ plain.values["o"], abs=1e-8)
+    assert turned.covariance == pytest.approx(turn @ plain.covariance @ turn.T, abs=1e-10)
+
+
+def test_stated_noise_of_what_is_measured_gives_the_covariance_of_weighted_least_squares():
+    rng = np.random.default_rng(2)
+    x, u = np.linspace(0, 1, 12), np.linspace(0.1, 0.4, 12)
+    y = 1 + 2 * x + u * rng.standard_normal(12)
+
+    @c.model
+    def straight(x=c.signal("1"), y=c.signal("1"), *, a=c.param("1"), b=c.param("1")):
+        """A line."""
+        return c.Residual(measured=y, predicted=a + b * x)
+
+    found = c.calibrate(*noisy(straight, record(x=x, y=y), y=u[:, None]))
+    coefficients, covariance = np.polyfit(x, y, 1, w=1 / u, cov="unscaled")
+    assert found.point.x == pytest.approx(coefficients[::-1])
+    assert found.covariance == pytest.approx(covariance[::-1, ::-1])
+    squares = np.sum(np.square((y - np.polyval(coefficients, x)) / u))
+    assert found.noise.chi_square.value == pytest.approx(squares)
+    assert found.interval_reach[0]["a"] / found.std["a"] == pytest.approx(1.959964, rel=1e-5)
+
+
+@pytest.fixture
+def weighed(tmp_path):
+    rng = np.random.default_rng(4)
+    y = np.linspace(1, 5, 30)
+    x = 3 + 2 * y + 0.05 * rng.standard_normal(30)
+    table = np.column_stack([y, x, np.full(30, 0.05), x * 0 - 1])
+    np.savetxt(tmp_path / "data.csv", table, delimiter=",", header="y,x,wide,wrong", comments="")
+    return tmp_path / "data.csv"
+
+
+def test_a_residual_larger_than_the_stated_noise_is_a_misfit(cli, weighed):
+    right = cli(weighed, "--sensor-noise", "x=0.05")
+    wrong = cli(weighed, "--sensor-noise", "x=0.02")
+    assert right["misfit"] == []
+    assert "as chance may have it" in right["notes"][-1]
+    assert "times the stated noise" in wrong["misfit"][0]["where"]
+    assert any("stated too small, or the model lacks something" in n for n in wrong["notes"])
+    std = [f["estimate"]["parameters"]["b1"]["std"] for f in (right, wrong)]
+    assert std[1] == pytest.approx(std[0], rel=0.3)  # by the residual, and not 0.4 of it
+
+
+def test_much_less_than_the_stated_noise_is_said(cli, weighed):
+    found = cli(weighed, "--sensor-noise", "x=0.5")
+    assert any("stated too large" in note for note in found["notes"])
+
+
+def test_a_column_a_number_and_a_share_say_the_same(cli, weighed):
+    a = cli(weighed, "--sensor-noise", "x=0.05")["estimate"]["parameters"]
+    assert cli(weighed, "--sensor-noise", "x=wide")["estimate"]["parameters"] == a
+    share = cli(weighed, "--sensor-noise", "x=1%")
+    assert share["noise"]["stated"] == pytest.approx(0.09, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["x=0"], "a standard deviation is above zero, and 0 is not"),
+        (["x=-0.1"], "a standard deviation is above zero, and -0.1 is not"),
+        (["x=wrong"], "noise of x is -1 in row 0"),
+        (["x=nowhere"], "'nowhere' is no number with a unit, no percentage, and no column of"),
+        (["z=0.1"], "line has no signal 'z'; it has y, x"),
+        (["y=0.1"], "the residual value of line has no stated noise: say that of x too"),
+        (["x=0.1 kg"], "kg"),
+        (["x=1,2;3,4"], "x has 1 components, and the covariance is 2 by 2"),
+        (["x=0.1,0.2"], "noise of x has shape (2,)"),
+    ],
+)
+def test_noise_that_is_none_is_refused(cli, weighed, words, said):
+    given = [w for word in words for w in ("--sensor-noise", word)]
+    code, err = cli(weighed, *given)
+    assert code == 1
+    assert said in err
+    assert err.count("\n") == 1
+
+
+def test_correlations_that_cannot_be_are_refused():
+    readings = record(v=np.random.default_rng(0).standard_normal((30, 3)))
+    model = norm_triangular.having(norm=1.0)
+    impossible = np.array([[1, 2, 0], [2, 1, 0], [0, 0, 1.0]])[None]
+    with pytest.raises(c.UsageError, match="noise of v: the correlations are not positive semi"):
+        noisy(model, readings, v=impossible)
