@@ -47,7 +47,7 @@ def bash(folder: Path, *words: str) -> list[str]:
         (["casest", "filter", "bias-gravity-po"], ["bias-gravity-position"]),
         (["casest", "filter", "wheel"], ["files"]),
         (["casest", "observe", "bias-gravity-po"], ["bias-gravity-position"]),
-        (["casest", "observe", "whe"], ["wheel"]),
+        (["casest", "observe", "whe"], ["wheel", "wheel-motion"]),
         (["casest", "close", "bias-gravity-po"], ["bias-gravity-position"]),
         (["casest", "calibrate", "b"], ["files"]),
         (["casest", "calibrate", "mine"], ["files"]),
@@ -82,7 +82,10 @@ def test_zsh_takes_the_script(tmp_path):
     assert done.stdout.strip() == "_casest_completion"
 
 
-@pytest.mark.parametrize(("shell", "lines"), [("zsh", ["plain", "wheel", "_"]), ("fish", None)])
+@pytest.mark.parametrize(
+    ("shell", "lines"),
+    [("zsh", ["plain", "wheel", "_", "plain", "wheel-motion", "_"]), ("fish", None)],
+)
 def test_other_shells_are_given_the_same_names(shell, lines, tmp_path):
     """What zsh and fish ask: their variables as the scripts of `casest completion` set them."""
     words = {"zsh": ("casest calibrate whe", "2"), "fish": ("casest calibrate whe", "whe")}[shell]
@@ -129,5 +132,5 @@ def test_tab_needs_neither_numpy_nor_casadi(tmp_path):
     )
     begin = time.perf_counter()
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.split() == ["plain,wheel", "[]"]
+    assert done.stdout.split() == ["plain,wheel", "plain,wheel-motion", "[]"]
     assert time.perf_counter() - begin < 2.0

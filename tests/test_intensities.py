@@ -141,7 +141,6 @@ def test_the_intensity_of_a_stated_reading_needs_its_period():
 
 
 @pytest.mark.parametrize(("given", "words"), [
-    ({}, "neither of std= and intensity= given"),
     ({"std": 1.0, "intensity": 1.0}, "both of std= and intensity= given"),
     ({"std": 0.0}, "std=0 must be positive and finite"),
 ])  # fmt: skip

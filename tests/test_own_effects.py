@@ -174,7 +174,10 @@ def test_an_own_effect_on_the_noise_is_used_where_readings_lie_far_out():
             "effect sag: columns= names 2 arguments, and one column is looked for",
         ),
         ({"numbers": {"at": "mean"}}, "numbers= names 'at', which is none of its parameters"),
-        ({"numbers": {"k": "median"}}, "numbers= says 'median': give mean or duration or radian"),
+        (
+            {"numbers": {"k": "median"}},
+            "numbers= says 'median': give mean or least or greatest or duration or radian",
+        ),
         (
             {"profile": {"k": "moment"}},
             "effect sag: profile= says 'moment': give frequency or time or timescale or level",

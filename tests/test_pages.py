@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shlex
+import shutil
 
 import pytest
 from pages import BLOCK, ROOT, blocks, folder_of_a_reader, follow, run_within
@@ -12,12 +13,17 @@ from casest.cli import commands
 
 PAGES = sorted((ROOT / "docs").glob("*.md"))
 PHYSICS = "casest.declaration.physics"
+#: Pages that work on a measured record, which lies beside the project.
+MEASURED = {"equations": "multiarm-pendulum/pendulum_single.csv"}
 WITH_COMMANDS = [p for p in PAGES if any(language == "sh" for language, _ in blocks(p))]
 
 
 @pytest.mark.parametrize("page", WITH_COMMANDS, ids=lambda p: p.stem)
-def test_a_reader_who_does_what_a_page_says_sees_what_it_shows(page, tmp_path):
-    assert follow(page, folder_of_a_reader(page, tmp_path), run_within) >= 1
+def test_a_reader_who_does_what_a_page_says_sees_what_it_shows(page, tmp_path, request):
+    folder = folder_of_a_reader(page, tmp_path)
+    if page.stem in MEASURED:
+        shutil.copy(request.getfixturevalue("shared_data") / MEASURED[page.stem], folder)
+    assert follow(page, folder, run_within) >= 1
 
 
 EVERY = [*PAGES, ROOT / "README.md", ROOT / "CONTRIBUTING.md"]

@@ -98,7 +98,7 @@ def with_inputs(
 
     `unknown`: the parameters' symbols; `held`: of each signal's symbol by its hash.
     """
-    own = {s.element_hash() for s in ca.symvar(unknown)}
+    own = {s.element_hash() for s in ca.symvar(ca.SX(unknown))}
     time = None if clock is None else clock.element_hash()
     found = []
     for stage in stages:

@@ -178,8 +178,8 @@ def corrected_budget(
     root = reading @ reading_root(estimate, found.inputs)
     variance["the reading's own noise"] = np.sum(root**2, axis=1)
     whole = sum(variance.values())
-    left = sum(np.square(variance[n]) / f for n, f in freedom.items())
     with np.errstate(invalid="ignore", divide="ignore"):
+        left = sum(np.square(variance[n]) / np.float64(f) for n, f in freedom.items())
         effective = np.where(left > 0, np.square(whole) / left, np.inf)
         return CorrectedBudget(
             program.output.name,
