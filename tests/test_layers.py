@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -166,3 +167,10 @@ def test_a_small_calibration_loads_nothing_it_does_not_need(tmp_path):
         "print('slow:', sorted(slow & set(sys.modules)))\n"
     )
     assert python(code).endswith("slow: []\n")
+
+
+def test_the_wheel_has_every_room():
+    """What `pyproject.toml` lists is what there is."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    rooms = {".".join(f.parent.relative_to(ROOT).parts) for f in ROOT.glob("casest/**/__init__.py")}
+    assert {*project["tool"]["setuptools"]["packages"]} == rooms | {"casest_problems"}
