@@ -35,7 +35,8 @@ from casest import (
     sin,
     vertcat,
 )
-from casest_problems.wheel import closed_form, wheel
+
+from .wheel import closed_form, wheel
 
 Array = NDArray[np.float64]
 
