@@ -106,8 +106,6 @@ def test_problems_use_public_names_of_casest_only(path):
         if isinstance(node, ast.Import):
             assert not any(alias.name.partition(".")[0] == "casest" for alias in node.names)
         elif isinstance(node, ast.ImportFrom) and (node.module or "").startswith("casest"):
-            if node.module.startswith("casest_problems"):  # shipped ones may build on each other
-                continue
             # The decorator of moving estimators bears its package's name, so it lives there.
             homes = {"casest": casest, "casest.dynamics": casest.dynamics}
             assert node.module in homes, f"{path.name} imports {node.module}"
