@@ -21,7 +21,7 @@ from casest.diagnose.evidence.score import (
     whitened,
 )
 from casest.diagnose.levels import LEVELS
-from casest.diagnose.protocol import pairs, ranked_of, significant
+from casest.diagnose.protocol import pairs, ranked_of
 
 
 def linear_of(residual, declared, *, in_time=True):
@@ -218,7 +218,8 @@ def test_of_many_families_of_nothing_hardly_one_is_worth_it():
     for _ in range(200):
         linear = linear_of(rng.standard_normal(30), rng.standard_normal((30, 6)), in_time=False)
         trials = [trial_of(rng.standard_normal(30), f"cause {k}") for k in range(20)]
-        named += any(significant(e, linear) for e in ranked_of(linear, trials).found)
+        ranking = ranked_of(linear, trials)
+        named += any(ranking.says(e) for e in ranking.found)
     low, high = chance_of(200, LEVELS.chance)
     assert low <= named <= high
 

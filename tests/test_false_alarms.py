@@ -18,7 +18,7 @@ from casest.diagnose.evidence.linear import Linear, parts_of
 from casest.diagnose.evidence.score import Trial
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.misfit.left import findings
-from casest.diagnose.protocol import falls, holds_out, ranked_of, significant
+from casest.diagnose.protocol import falls, holds_out, ranked_of
 from casest.leastsquares.agreement import between_runs
 from casest.leastsquares.problem import Problem
 
@@ -41,7 +41,7 @@ def linear_of(noise, X):
 def named(linear, trials):
     """Causes that are strong evidence, and those of them that held-out parts confirm."""
     ranking = ranked_of(linear, trials)
-    strong = [e for e in ranking.found if significant(e, linear)]
+    strong = [e for e in ranking.found if ranking.says(e)]
     return strong, [e for e in strong if holds_out(falls(ranking, e), linear)]
 
 
