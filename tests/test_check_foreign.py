@@ -25,6 +25,7 @@ PX4 = """# onboard parameters
 1 1 CAL_ACC0_YSCALE 0.98 9
 1 1 CAL_ACC0_ZSCALE 1.01 9
 """
+KNOCK = np.array([0, 0, 0.07])
 OFFSET, DIAGONAL = np.array([0.3, -0.2, 0.5]), np.array([1.02, 0.98, 1.01])
 #: imu_calib's: SM·reading − bias, with axes that are not square.
 SM = np.array([[1.02, 0.03, 0.0], [-0.01, 0.98, 0.02], [0.02, 0.0, 1.01]])
@@ -51,7 +52,7 @@ def there(tmp_path, monkeypatch):
     rng = np.random.default_rng(1)
     for name, matrix in (("px4", np.diag(DIAGONAL)), ("ros", SM)):
         written(tmp_path / f"{name}.csv", poses(rng, matrix, OFFSET))
-        written(tmp_path / f"{name}_knocked.csv", poses(rng, matrix, OFFSET + [0, 0, 0.07]))
+        written(tmp_path / f"{name}_knocked.csv", poses(rng, matrix, OFFSET + KNOCK))
     return tmp_path
 
 
@@ -67,10 +68,10 @@ def test_a_knock_is_found_and_repaired(there, capsys, file, name):
     assert abs(moved["now"] - 0.57) < 4 * moved["std"]
     assert said["noise"]["before"] is None
     # What it proposes runs, and gives the offset that is there now.
-    assert casest(shlex.split(said["recalibrate"]["command"])[1:] + ["-o", "again"]) == 0
+    assert casest([*shlex.split(said["recalibrate"]["command"])[1:], "-o", "again"]) == 0
     again = json.loads((there / "again" / "result.json").read_text())
     offset = np.array(again["estimate"]["parameters"]["offset"]["value"]) * G
-    np.testing.assert_allclose(offset, OFFSET + [0, 0, 0.07], atol=0.02)
+    np.testing.assert_allclose(offset, OFFSET + KNOCK, atol=0.02)
 
 
 def test_a_length_does_not_see_how_the_sensor_is_mounted(tmp_path):
