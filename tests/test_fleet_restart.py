@@ -172,6 +172,7 @@ def test_no_scheduler_at_an_address_is_said_before_any_work(line, tmp_path, caps
     assert "its workers may be in another folder; give line as /" in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_a_dask_worker_killed_in_the_middle_costs_nothing_but_time(line, tmp_path):
     """And two Dask workers write the bytes of one process."""
     dataset, expected = line

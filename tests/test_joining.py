@@ -196,6 +196,7 @@ def measured(shared_data, first, second, **columns):
     return found, found.values["signal_lag(other).delay"]
 
 
+@pytest.mark.long
 def test_two_gyroscopes_of_twistnsync_differ_by_the_published_lag(shared_data):
     """Published 0.32668 s; SOURCE.md: 0.3267 ± 0.0003."""
     _, delay = measured(
@@ -205,6 +206,7 @@ def test_two_gyroscopes_of_twistnsync_differ_by_the_published_lag(shared_data):
     assert delay == pytest.approx(0.3267, abs=3e-4)
 
 
+@pytest.mark.long
 def test_a_swing_seen_by_two_instruments_differs_by_its_lag(shared_data):
     """SOURCE.md: 3.58 ± 0.02 s (gyro 3.590), and a residual of 0.852 rad/s without it."""
     found, delay = measured(
