@@ -87,7 +87,9 @@ def test_a_worker_killed_in_the_middle_is_said_and_the_same_command_goes_on(line
     assert all(p.stat().st_mtime_ns == at for p, at in kept.items())
 
 
-@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
+@pytest.mark.parametrize(
+    "how", [pytest.param(signal.SIGKILL, marks=pytest.mark.long), signal.SIGINT]
+)
 def test_the_command_ended_in_the_middle_goes_on(line, tmp_path, how):
     dataset, expected = line
     going = started(dataset, tmp_path / "out", "--processes", 1)
