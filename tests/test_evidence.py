@@ -212,9 +212,12 @@ def test_in_poses_the_worth_is_the_bayes_factor_of_a_prior_of_one_observation(un
     assert found.score == pytest.approx(evidence(cause) - evidence(np.eye(n - p)), abs=1e-6)
 
 
-@pytest.mark.parametrize("records", [30, pytest.param(150, marks=pytest.mark.long)])
-def test_of_many_variants_of_nothing_the_best_is_hardly_ever_worth_it(records):
-    """Of fifty columns of noise: without the price of the search one record in four."""
+@pytest.mark.parametrize(
+    ("records", "most", "least"), [(30, 1, 2), pytest.param(150, 3, 31, marks=pytest.mark.long)]
+)
+def test_of_many_variants_of_nothing_the_best_is_hardly_ever_worth_it(records, most, least):
+    """Of fifty columns of noise: without the price of the search one record in four (fewer than two
+    of thirty have a chance of 1 in 500 then)."""
     rng, paid, free = np.random.default_rng(8), 0, 0
     for _ in range(records):
         y, G = rng.standard_normal(300), rng.standard_normal((300, 50))
@@ -222,8 +225,8 @@ def test_of_many_variants_of_nothing_the_best_is_hardly_ever_worth_it(records):
         (best,) = ranked_of(linear, [trial_of(g, variants=50.0) for g in G.T]).found
         paid += best.score > 0
         free += best.score + 2 * np.log(50) > 0
-    assert paid <= chance_of(records, 0.005)[1]
-    assert free >= chance_of(records, 0.25)[0]
+    assert paid <= most
+    assert free >= least
 
 
 @pytest.mark.parametrize("records", [50, pytest.param(200, marks=pytest.mark.long)])
