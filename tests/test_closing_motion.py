@@ -47,7 +47,7 @@ def names(closing):
 
 
 def test_a_flight_that_lacks_nothing_is_adequate():
-    closing = close_motion(bias_gravity, flight(seed=1))
+    closing = close_motion(bias_gravity, flight(seed=1, seconds=20))
     assert names(closing) == []
     result = motion_result(closing, model_name="bias-gravity", data=[])
     assert result.verdict == "adequate"
@@ -57,7 +57,10 @@ def test_a_flight_that_lacks_nothing_is_adequate():
 @pytest.mark.parametrize(
     ("sensors", "label", "planted", "alike"),
     [
-        (Sensors(gyro_bias=(0.01, -0.005, 0.004)), "bias of omega", [0.01, -0.005, 0.004], ()),
+        pytest.param(
+            *(Sensors(gyro_bias=(0.01, -0.005, 0.004)), "bias of omega", [0.01, -0.005, 0.004], ()),
+            marks=pytest.mark.long,
+        ),
         # So large that the matched intensities swallow it at first.
         pytest.param(
             *(Sensors(gyro_bias=(0.1, -0.05, 0.04)), "bias of omega", [0.1, -0.05, 0.04], ()),
@@ -247,8 +250,15 @@ def test_readings_slower_than_the_inputs_are_enough():
     assert np.all(np.abs(arm - [0.3, -0.1, 0.2]) < 4 * better.std)
 
 
-def test_sensitivities_are_the_differences_of_two_filters():
-    """Of every effect, at a small size; the filter's gains are the same on both sides.
+@pytest.mark.parametrize(
+    "labels",
+    [
+        pytest.param({"bias of omega", "lever_arm of v", "time_delay of v"}, id="some"),
+        pytest.param(None, id="all", marks=pytest.mark.long),
+    ],
+)
+def test_sensitivities_are_the_differences_of_two_filters(labels):
+    """Of effects at a small size; the filter's gains are the same on both sides.
 
     To 1 %, after the start: they are taken along the smoothed states, not those of the filter.
     """
@@ -259,6 +269,8 @@ def test_sensitivities_are_the_differences_of_two_filters():
     found = filtered(model, run)
     # A dead zone is a kink where the reading crosses zero: no difference shows its slope there.
     tried = [c for c in candidates(bias_gravity, run) if c.effect.name != "dead_zone"]
+    tried = [c for c in tried if labels is None or c.label in labels]
+    assert labels is None or len(tried) == len(labels)
     answers = sensitivity(model, [], tried, run, found)
     for candidate, where in zip(tried, answers.columns, strict=True):
         typical = np.where(np.isfinite(candidate.typical), candidate.typical, 1e-3)

@@ -105,7 +105,7 @@ def exact(model, run):
 
 def test_what_is_told_less_well_than_it_was_known_is_weak():
     rate = flights.SPINS["all axes, 1 °/s"][0]
-    gravity = flights.spun(rate, T)
+    gravity = turned("all axes, 1 °/s")
     signals = {"a": flights.BIAS - gravity, "omega": rate(T), "v": 0 * gravity}
     run = Run.raw("slow", signals, units=flights.UNITS, time=T)
     model = estimator(0.0).sensing(v=1e4)
