@@ -69,14 +69,18 @@ def heavy(rng, n):
 KINDS = {f.__name__: f for f in (white, coloured, low_passed, unequal, heavy)}
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_of_noise_of_any_kind_nothing_is_named(kind):
+@pytest.mark.parametrize(
+    ("kind", "records", "most"),
+    [("white", 25, 2), ("coloured", 25, 2)]
+    + [pytest.param(kind, 100, 4, marks=pytest.mark.long) for kind in KINDS],
+)
+def test_of_noise_of_any_kind_nothing_is_named(kind, records, most):
     """Thirty causes: ten slow shapes, ten columns that vary as they like, ten that live in an
-    eighth of the record. The aim is one alarm in a hundred records; more than four come by chance
-    once in 250 then."""
+    eighth of the record. The aim is one alarm in a hundred records; more than four in a hundred
+    come by chance once in 250 then, more than two in 25 once in 500."""
     rng, t = np.random.default_rng(sum(kind.encode())), np.arange(400) / 400
     confirmed = 0
-    for _ in range(100):
+    for _ in range(records):
         X = np.c_[np.ones(400), rng.standard_normal(400)]
         shapes = [np.sin(2 * np.pi * (t * rng.uniform(0.5, 3) + rng.uniform())) for _ in range(10)]
         shapes += list(rng.standard_normal((10, 400)))
@@ -84,7 +88,7 @@ def test_of_noise_of_any_kind_nothing_is_named(kind):
         trials = [Trial(k, f"{k}", g[:, None, None]) for k, g in enumerate(shapes)]
         found = named(linear_of(KINDS[kind](rng, 400), X), trials)
         confirmed += bool(found[1])
-    assert confirmed <= 4
+    assert confirmed <= most
 
 
 def test_of_many_variants_the_best_is_named_as_rarely_as_one():

@@ -111,6 +111,7 @@ def test_the_formula_says_what_the_record_was_made_with(bench):
     assert twisted == pytest.approx([SLOPE * 4 * 0.05, 0], rel=0.03)
 
 
+@pytest.mark.long
 @pytest.mark.xfail(
     strict=True,
     reason="saturation is added beside the formula, which is then no longer needed; of saturation "
@@ -182,6 +183,7 @@ def closed_wheel(what, size):
     return close(find_model("wheel"), [record])
 
 
+@pytest.mark.long
 def test_on_a_wheel_the_right_columns_are_named():
     found = closed_wheel("product", 0.02)
     (formula,) = [f.candidate.effect.formula for f in found.effects]
@@ -189,6 +191,7 @@ def test_on_a_wheel_the_right_columns_are_named():
     assert "supply" in formula
 
 
+@pytest.mark.long
 def test_of_a_wave_over_temperature_a_formula_is_a_description_and_its_column_is_right():
     """Waves over the range of a column are in no library: enough of them fit anything."""
     found = closed_wheel("warm_sine", 0.03)

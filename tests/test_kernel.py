@@ -144,7 +144,9 @@ def test_an_angle_far_beyond_a_turn_has_its_sine():
 # -- sums: the replay's ----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", SHIPPED)
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=[pytest.mark.long] * (n == "imu")) for n in SHIPPED]
+)
 def test_sums_and_rows_of_a_shipped_problem_are_those_of_the_replay(name, monkeypatch):
     replay = residual_and_jacobian(find_model(name))
     rng = np.random.default_rng(1)

@@ -69,6 +69,7 @@ def test_what_is_calibrated_alone_is_what_one_calibration_gives():
     assert found.reasons[1] == one.certificate.reasons
 
 
+@pytest.mark.long
 def test_a_start_of_ones_own_is_kept_where_a_sensor_is_calibrated_alone():
     """On even rows 5 and 5 + 16π cannot be told apart: the start says which is meant."""
     x = np.tile(np.linspace(0, 10, 81), (2, 1))
@@ -79,6 +80,7 @@ def test_a_start_of_ones_own_is_kept_where_a_sensor_is_calibrated_alone():
     assert found.values["w"][1] - found.values["w"][0] == pytest.approx(16 * np.pi, abs=0.05)
 
 
+@pytest.mark.long
 def test_the_slowest_of_rates_that_fit_alike_is_given_unless_a_start_says_otherwise():
     x = np.linspace(0, 10, 101)[None]
     y = np.sin(2 * x + 0.5) + 0.05 * np.random.default_rng(1).standard_normal(x.shape)

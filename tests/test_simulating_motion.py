@@ -166,6 +166,7 @@ def test_a_filter_told_the_same_noise_finds_the_truth(tmp_path, capsys):
     assert np.sum(((values - states[-1, 1:]) / stds) ** 2) < chi2.ppf(0.9999, 9)
 
 
+@pytest.mark.long
 def test_an_effect_that_was_simulated_is_found(tmp_path, capsys):
     effect = ["--effect", "lever_arm(v)", "--value", "v_lever_arm=0.3,-0.1,0.2"]
     plan = ["--duration", "40", "--rate", "25", *NOISE, *effect]

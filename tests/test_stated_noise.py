@@ -89,7 +89,7 @@ def test_a_norm_of_unequal_noise_is_right_to_second_order():
     rng = np.random.default_rng(3)
     scale = np.array([[1, 0, 0], [0.02, 1.03, 0], [-0.01, 0.015, 0.98]])
     offset, std = np.array([0.3, -0.2, 0.1]), np.array([0.05, 0.1, 0.5])
-    u = rng.standard_normal((30_000, 3))
+    u = rng.standard_normal((16_000, 3))
     u /= np.linalg.norm(u, axis=1)[:, None]
     v = 9.81 * u @ np.linalg.inv(scale).T + offset + std * rng.standard_normal(u.shape)
     model = norm_triangular.having(norm=9.81)
