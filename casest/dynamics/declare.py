@@ -68,7 +68,8 @@ def state(
     `intensity` is that of its white driving noise in unit²/s (0: driven by nothing), `start` and
     `std` what is known of it at the beginning, in its own unit: in a filter 1 where nothing is
     said, in a calibration nothing, so that it is an unknown of each run whose search begins at
-    `start`. `known`: it begins exactly there, at t = 0 where the record begins later.
+    `start`; with `std` that much is known of it there too, and weighed against the readings.
+    `known`: it begins exactly there, at t = 0 where the record begins later.
     """
     if isinstance(shape, str):
         size, unit = 1, shape
