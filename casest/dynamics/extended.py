@@ -8,8 +8,8 @@ Readings are linearised at the prediction and again where they lead to (Jazwinsk
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -53,6 +53,70 @@ _BLOCK = 4096
 ITERATIONS = 4
 
 
+@dataclass(frozen=True)
+class Sampled:
+    """A record as a nonlinear model takes it, to be linearised along states piece by piece.
+
+    `ends`: inputs at both ends of every step; `steps` (N − 1, 1) their lengths, `shares` what part
+    of the usual one the readings there stand for; `R` (N, m); `signals`: (N, …) each, uncertain ones
+    as estimated behind; `parts`: into how many pieces a step is cut.
+    """
+
+    model: Dynamics
+    pace: Pace
+    ends: tuple[Array, Array]
+    steps: Array
+    shares: Array
+    R: Array
+    signals: tuple[Array, ...]
+    parts: int
+
+    @classmethod
+    def of(cls, model: Dynamics, run: Run, pace: Pace | None = None) -> Sampled:
+        """`pace`: how the whole record is read where this is a part of it."""
+        time, calm = checked_record(model, run), estimates(model, run)
+        u, step, pace = _inputs(model, run, calm), np.diff(time), pace or Pace.of(model, run)
+        signals = (*(run.signals[s.name] for s in model.signals), *calm.values())
+        return cls(
+            model,
+            pace,
+            (u[:-1], _at_ends(model, u)),
+            step[:, None],
+            _stood_for(step, pace),
+            variances(model, step, pace),
+            signals,
+            pieces(model, run, pace),
+        )
+
+    def moved(self, along: Array, first: int = 0) -> tuple[Array, Array, Array]:
+        """Φ, forced step and Q of the steps from states (K, n), that of sample `first` before."""
+        where = slice(first, first + len(along))
+        given = [part[where] for part in (*self.ends, self.steps, self.shares)]
+        step = _step(self.model, self.parts)
+        Phi, forced, Q = over_samples(step, [np.ascontiguousarray(along), *given])
+        return Phi, forced[:, :, 0], Q
+
+    def after(self, x: Array, sample: int) -> Array:
+        """The state a step after x (n,) at a sample."""
+        given = [part[sample] for part in (*self.ends, self.steps, self.shares)]
+        return np.array(_motion(self.model, self.parts)(x, *given)[0], float).ravel()
+
+    def read(self, along: Array, first: int = 0) -> tuple[Array, Array, Array]:
+        """C, d and y at states (K, n), that of sample `first` before."""
+        own = [part[first : first + len(along)] for part in self.signals]
+        return _rows(self.model, own, along)
+
+    def along(self, states: Array, first: int = 0) -> Steps:
+        """Samples from `first` on, linearised along states (K, n)."""
+        Phi, forced, Q = self.moved(states[:-1], first)
+        last = first + len(states) - 1
+        pace = self.pace.part(slice(first, last + 1))
+        Q = with_lost(self.model, self.steps[first:last, 0], Phi, Q, pace)
+        C, d, y = self.read(states, first)
+        R, of_C = self.R[first : last + 1], entries(self.model.traced.C)
+        return Steps(Phi, forced, Q, C, d, R, y, of_C=of_C)
+
+
 def relinearised(
     model: Dynamics,
     run: Run,
@@ -65,28 +129,20 @@ def relinearised(
     `errors` (N, n, n): covariances of what these are wrong by, on which noise of inputs acts;
     `pace`: how the whole record is read where this is a part of it.
     """
-    time = checked_record(model, run)
-    u, step = _inputs(model, run), np.diff(time)
-    pace, ends = pace or Pace.of(model, run), (u[:-1], _at_ends(model, u))
-    columns = [np.ascontiguousarray(along[:-1]), *ends, step[:, None], _stood_for(step, pace)]
-    Phi, forced, Q = over_samples(_step(model, pieces(model, run, pace)), columns)
+    steps = Sampled.of(model, run, pace).along(along)
     if errors is not None and uncertain(model):
         added = acting(model, run, along, errors)
-        Q += 0.5 * step[:, None, None] * (added[1:] + added[:-1])
-    Q = with_lost(model, step, Phi, Q, pace)
-    C, d, y = _rows(model, run, along)
-    R = variances(model, step, pace)
-    return Steps(Phi, forced[:, :, 0], Q, C, d, R, y, of_C=entries(model.traced.C))
+        step = np.diff(np.asarray(run.time, float))[:, None, None]
+        return replace(steps, Q=steps.Q + 0.5 * step * (added[1:] + added[:-1]))
+    return steps
 
 
 def _rows(
-    model: Dynamics, run: Run, along: Array, calm: Mapping[str, Array] | None = None
+    model: Dynamics, signals: Sequence[Array], along: Array
 ) -> tuple[Array, Array, Array]:
     """Readings as rows: C, d and y."""
-    columns = [np.ascontiguousarray(along), *(run.signals[s.name] for s in model.signals)]
-    columns += (estimates(model, run) if calm is None else calm).values()
-    C, d, y = (part[:, :, 0] if k else part
-               for k, part in enumerate(over_samples(_outputs(model), columns)))  # fmt: skip
+    C, d, y = (part[:, :, 0] if k else part for k, part in enumerate(
+        over_samples(_outputs(model), [np.ascontiguousarray(along), *signals])))  # fmt: skip
     return C, d, model.traced.nearest(y, C, d, along)
 
 
@@ -150,8 +206,9 @@ def given(
     time, calm = checked_record(model, run), estimates(model, run)
     u, step, pace = _inputs(model, run, calm), np.diff(time), pace or Pace.of(model, run)
     n, m = model.size, model.traced.h.numel()
-    at = np.concatenate([*(run.signals[s.name] for s in model.signals), *calm.values()], axis=1)
-    y = _rows(model, run, np.broadcast_to(model.start, (len(time), n)), calm)[2][:, :m]
+    signals = [*(run.signals[s.name] for s in model.signals), *calm.values()]
+    at = np.concatenate(signals, axis=1)
+    y = _rows(model, signals, np.broadcast_to(model.start, (len(time), n)))[2][:, :m]
     present = np.isfinite(y)
     parts = [
         np.concatenate([u[:1], u[:-1]]),
