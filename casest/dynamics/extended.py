@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any
 
 import casadi as ca
@@ -27,7 +27,7 @@ from casest.dynamics.declare import Dynamics
 from casest.dynamics.discrete import Steps
 from casest.dynamics.factors import Factors
 from casest.dynamics.inputs import as_read, at_estimates, estimates, slopes, uncertain
-from casest.dynamics.stepping import entries, packed, run_steps, unpacked
+from casest.dynamics.stepping import by_rows, entries, packed, run_steps, unpacked
 from casest.dynamics.transition import (
     Pace,
     acting,
@@ -49,6 +49,9 @@ PIECE, FEWEST, MOST, UNSTABLE = 0.5, 2, 16, 2.5
 #: Samples that are linearised at once.
 _BLOCK = 4096
 
+#: Samples that are evaluated one after the other.
+FEW = 200
+
 #: Rounds of the filter's update where a reading is no linear function of the state.
 ITERATIONS = 4
 
@@ -58,8 +61,8 @@ class Sampled:
     """A record as a nonlinear model takes it, to be linearised along states piece by piece.
 
     `ends`: inputs at both ends of every step; `steps` (N − 1, 1) their lengths, `shares` what part
-    of the usual one the readings there stand for; `R` (N, m); `signals`: (N, …) each, uncertain ones
-    as estimated behind; `parts`: into how many pieces a step is cut.
+    of the usual one the readings there stand for; `R` (N, m); `signals`: (N, …) each, uncertain
+    ones as estimated behind; `parts`: into how many pieces a step is cut.
     """
 
     model: Dynamics
@@ -93,7 +96,7 @@ class Sampled:
         where = slice(first, first + len(along))
         given = [part[where] for part in (*self.ends, self.steps, self.shares)]
         step = _step(self.model, self.parts)
-        Phi, forced, Q = over_samples(step, [np.ascontiguousarray(along), *given])
+        Phi, forced, Q = step([np.ascontiguousarray(along), *given])
         return Phi, forced[:, :, 0], Q
 
     def after(self, x: Array, sample: int) -> Array:
@@ -137,28 +140,52 @@ def relinearised(
     return steps
 
 
-def _rows(
-    model: Dynamics, signals: Sequence[Array], along: Array
-) -> tuple[Array, Array, Array]:
+def _rows(model: Dynamics, signals: Sequence[Array], along: Array) -> tuple[Array, Array, Array]:
     """Readings as rows: C, d and y."""
     C, d, y = (part[:, :, 0] if k else part for k, part in enumerate(
-        over_samples(_outputs(model), [np.ascontiguousarray(along), *signals])))  # fmt: skip
+        _outputs(model)([np.ascontiguousarray(along), *signals])))  # fmt: skip
     return C, d, model.traced.nearest(y, C, d, along)
 
 
 @lru_cache(maxsize=8)
-def _step(model: Dynamics, count: int) -> Replay:
+def _step(model: Dynamics, count: int) -> AtSamples:
     x, (u, v, h, share) = model.traced.x, _two_samples(model)
     end, Phi, Q = _motion(model, count)(x, u, v, h, share)
-    return replay(ca.vertcat(x, u, v, h, share), [Phi, end - Phi @ x, Q])
+    return AtSamples(ca.vertcat(x, u, v, h, share), [Phi, end - Phi @ x, Q])
 
 
 @lru_cache(maxsize=8)
-def _outputs(model: Dynamics) -> Replay:
+def _outputs(model: Dynamics) -> AtSamples:
     t = model.traced
     signals = [flat(t.symbols[s.name]) for s in model.signals]
     (C,), as_was = at_estimates(model, [t.C])
-    return replay(ca.vertcat(t.x, *signals, *as_was), [C, t.h - C @ t.x, t.reading])
+    return AtSamples(ca.vertcat(t.x, *signals, *as_was), [C, t.h - C @ t.x, t.reading])
+
+
+class AtSamples:
+    """Expressions of one sample, evaluated at many: over blocks of them at once, or of a `FEW` one
+    after the other, for which a call of NumPy an operation takes longer."""
+
+    def __init__(self, sample: SX, outputs: list[SX]) -> None:
+        self.sample, self.outputs = sample, [ca.densify(e) for e in outputs]
+
+    def __call__(self, columns: list[Array]) -> list[Array]:
+        """Each expression at every sample, (N, …)."""
+        if len(columns[0]) > FEW:
+            return over_samples(self._blocks, columns)
+        _, *found = self._singly(np.zeros(1), np.hstack(columns))
+        shapes = [e.shape for e in self.outputs]
+        return [part.reshape(-1, *shape) for part, shape in zip(found, shapes, strict=True)]
+
+    @cached_property
+    def _blocks(self) -> Replay:
+        return replay(self.sample, self.outputs)
+
+    @cached_property
+    def _singly(self) -> Recursion:
+        nothing = ca.SX.sym("nothing")
+        rows = [by_rows(e) for e in self.outputs]
+        return Recursion(ca.Function("at", [nothing, self.sample], [nothing, *rows]))
 
 
 def replay(sample: SX, outputs: list[SX]) -> Replay:

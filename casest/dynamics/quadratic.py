@@ -35,9 +35,7 @@ class Kept:
     worst: tuple[int, int]
 
 
-def kept(
-    steps: Steps, covariance: Array, x: Array, bounds: tuple[Array, Array]
-) -> Kept | None:
+def kept(steps: Steps, covariance: Array, x: Array, bounds: tuple[Array, Array]) -> Kept | None:
     """The states of a window within bounds (n,) each; None where they are so already.
 
     `x` (K, n) without them, by readings and by what was known before with `covariance` (n, n).
@@ -49,29 +47,39 @@ def kept(
 
     factor, (K, n) = splu(equations(steps, covariance)), x.shape
     away = np.stack([lower - x, x - upper], axis=1)
-    met = np.argwhere(away > 0)
+    more = np.argwhere(away > 0)
+    met, force = more[:0], np.zeros(0)
     for _ in range(ROUNDS):
+        met = np.vstack([met, more])
         columns = _columns(factor, met, (K, n))
         sign = np.where(met[:, 1] == 0, 1.0, -1.0)
         W = sign[:, None] * columns[met[:, 0], met[:, 2]] * sign
-        force = _multipliers(W, away[tuple(met.T)])
-        if force is None:
-            worst = met[np.argmax(away[tuple(met.T)])]
-            return Kept(None, np.zeros((K, 2, n)), np.zeros((K, n, n)), (worst[0], worst[2]))
+        said = _multipliers(W, away[tuple(met.T)])
+        if said is None:
+            k, _, i = met[np.argmax(away[tuple(met.T)])]
+            return Kept(None, np.zeros((K, 2, n)), np.zeros((K, n, n)), (int(k), int(i)))
+        force = said
         found = x + columns @ (sign * force)
         left = np.stack([lower - found, found - upper], axis=1)
-        size = np.sqrt(np.maximum(np.diag(W).max(), 1e-300))
         left[tuple(met.T)] = 0.0
-        more = np.argwhere(left > ROUNDING * size)
+        more = np.argwhere(left > ROUNDING * np.sqrt(np.diag(W).max()))
         if not len(more):
             break
-        met = np.vstack([met, more])
-    acting = force > 0
+    return _on_bounds(found, bounds, met, force, sign * columns, W)
+
+
+def _on_bounds(
+    found: Array, bounds: tuple[Array, Array], met: Any, force: Array, columns: Array, W: Array
+) -> Kept:
+    """States found, those whose bound acts exactly on it."""
+    (K, n), acting = found.shape, np.flatnonzero(force > 0)
+    k, which, i = met[acting].T
     multipliers = np.zeros((K, 2, n))
-    multipliers[tuple(met[acting].T)] = force[acting]
-    B, inner = columns[:, :, acting] * sign[acting], np.linalg.pinv(W[np.ix_(acting, acting)])
-    known = B @ inner @ B.transpose(0, 2, 1)
-    return Kept(np.clip(found, lower, upper), multipliers, known, (0, 0))
+    multipliers[k, which, i] = force[acting]
+    found = np.clip(found, *bounds)
+    found[k, i] = np.where(which == 0, bounds[0][i], bounds[1][i])
+    B, inner = columns[:, :, acting], np.linalg.pinv(W[np.ix_(acting, acting)])
+    return Kept(found, multipliers, B @ inner @ B.transpose(0, 2, 1), (0, 0))
 
 
 def _columns(factor: Any, met: Any, shape: tuple[int, int]) -> Array:
