@@ -15,8 +15,8 @@ from casest import units
 from casest.declaration.changing import check_units_known
 from casest.declaration.model import Model
 from casest.declaration.physics import SX
-from casest.declaration.shapes import Array
-from casest.declaration.symbols import Constant, Parameter, Signal, constant
+from casest.declaration.shapes import Array, array_shape
+from casest.declaration.symbols import Constant, Parameter, Signal, constant, make_parameter
 from casest.declaration.tracing import flat
 from casest.dynamics.equations import calibration
 from casest.errors import CasestError, DeclarationError, UsageError, last_line
@@ -29,7 +29,8 @@ class State:
     `start` and `std` describe what is known of it at the beginning. `of_data`: the intensity was
     taken from the record at hand, so that a search for the most likely one begins there. `known`:
     it begins exactly at `start`; `stated`: the declaration says its std. `of`: it is an unknown
-    constant of the equations, declared with `param(…)`, that a filter follows as a state.
+    constant of the equations, declared with `param(…)`, that a filter follows as a state. `lower`
+    and `upper`: what each number never leaves.
     """
 
     name: str
@@ -42,6 +43,8 @@ class State:
     known: bool = False
     stated: bool = False
     of: Parameter | None = None
+    lower: tuple[float, ...] = ()
+    upper: tuple[float, ...] = ()
 
     @property
     def beginning(self) -> str:
@@ -62,13 +65,17 @@ def state(
     start: Any = 0.0,
     std: float | None = None,
     known: bool = False,
+    bounds: tuple[Any, Any] | None = None,
 ) -> Any:
     """Declare a state: `state(3, "m/s", intensity=1e-3)`, `state("rad")`.
 
     `intensity` is that of its white driving noise in unit²/s (0: driven by nothing), `start` and
     `std` what is known of it at the beginning, in its own unit: in a filter 1 where nothing is
     said, in a calibration nothing, so that it is an unknown of each run whose search begins at
-    `start`. `known`: it begins exactly there, at t = 0 where the record begins later.
+    `start`; with `std` that much is known of it there too, and weighed against the readings.
+    `known`: it begins exactly there, at t = 0 where the record begins later. `bounds`: (lower,
+    upper), numbers or one for each, None for no end, within which it stays at every time; a filter
+    keeps them over a horizon (`moving_horizon`).
     """
     if isinstance(shape, str):
         size, unit = 1, shape
@@ -94,6 +101,7 @@ def state(
         wrong = _wrong(what, number)
         if wrong:
             raise DeclarationError(f"state: {wrong}")
+    kept = make_parameter(array_shape(size), unit, values, bounds, "run")
     return State(
         "",
         size,
@@ -103,6 +111,8 @@ def state(
         float(spread),
         known=known,
         stated=std is not None,
+        lower=kept.lower,
+        upper=kept.upper,
     )
 
 
@@ -366,6 +376,14 @@ class Dynamics:
         return np.diag(np.concatenate([np.full(s.size, s.std**2) for s in self.states]))
 
     @property
+    def bounds(self) -> tuple[Array, Array]:
+        """What the state never leaves: lower and upper (n,), infinite where nothing is said."""
+        return (
+            np.array([v for s in self.states for v in s.lower]),
+            np.array([v for s in self.states for v in s.upper]),
+        )
+
+    @property
     def process(self) -> Array:
         """Intensity Ξ of the driving noise, (n, n)."""
         return np.diag(np.concatenate([np.full(s.size, s.intensity) for s in self.states]))
@@ -608,7 +626,11 @@ def _followed(unknown: Parameter) -> State:
     size = float(np.max(np.abs(start), initial=0.0))
     values = tuple(start.tolist())
     unit = unknown.units[0] if len(set(unknown.units)) == 1 else "1"
-    return State(unknown.name, unknown.shape.size, unit, 0.0, values, size or UNSTATED, of=unknown)
+    bounds = unknown.lower, unknown.upper
+    return State(
+        unknown.name, unknown.shape.size, unit, 0.0, values, size or UNSTATED, False, False, False,
+        unknown, *bounds,
+    )  # fmt: skip
 
 
 def traced_with(declared: Dynamics, constants: Mapping[str, SX | float]) -> Traced:

@@ -18,6 +18,7 @@ from casest import units
 from casest.declaration.flow import integrated
 from casest.declaration.model import Model
 from casest.declaration.physics import SX, Residual, current_trace, quantity
+from casest.declaration.prior import Prior
 from casest.declaration.shapes import array_shape
 from casest.declaration.symbols import Constant, Parameter, Signal, Symbol, constant, make_parameter
 from casest.declaration.travelling import reduced
@@ -206,7 +207,37 @@ def calibration(declared: Any) -> Model:
         )
     symbols: list[Symbol] = [*declared.signals, *declared.unknown_constants, *declared.constants]
     symbols += _beginnings(declared)
-    return Model(declared.name, Equations(declared), tuple(symbols))
+    model = Model(declared.name, Equations(declared), tuple(symbols))
+    return replace(model, prior=_known_before(declared, model))
+
+
+def _known_before(declared: Declared, model: Model) -> Prior | None:
+    """What the declaration says of where states begin, with std=; None where of none."""
+    own = [s for s in declared.states if s.of is None and s.stated]
+    if not own:
+        return None
+    variances = np.concatenate([np.full(s.size, s.std**2) for s in own])
+    return Prior(
+        tuple(s.beginning for s in own),
+        tuple(s.start for s in own),
+        tuple(() if s.size == 1 else (s.size,) for s in own),
+        tuple(map(tuple, np.diag(variances).tolist())),
+        _noise_of_a_residual(declared, model),
+        f"std= of {' and '.join(s.name for s in own)}",
+    )
+
+
+def _noise_of_a_residual(declared: Declared, model: Model) -> float | None:
+    """Its standard deviation by what measured(…) says; None where it says nothing."""
+    traced = model.traced
+    if traced.residual.std is not None:
+        return 1.0
+    states = {s.name: ca.SX.sym(s.name, s.size) for s in declared.states if s.of is None}
+    known = {
+        n: v for n, v in traced.symbols.items() if n not in {s.beginning for s in declared.states}
+    }
+    found = _std(declared.moved({**known, **states}).outputs[0])
+    return None if found is None else float(found)
 
 
 def _beginnings(declared: Declared) -> Iterator[Symbol]:

@@ -19,6 +19,7 @@ from casest.data.run import Run
 from casest.declaration.effect import OVER_TIME
 from casest.declaration.model import Model
 from casest.declaration.physics import chart
+from casest.declaration.prior import root
 from casest.declaration.shapes import Array
 from casest.declaration.symbols import Parameter
 from casest.declaration.tracing import function_of, sample_symbol
@@ -46,6 +47,14 @@ class Slot:
     run: int | None
     x: slice
     ref: slice
+
+
+class Known(NamedTuple):
+    """What is known of a slot before: its `value`, and its numbers in the prior's covariance."""
+
+    slot: Slot
+    value: Array
+    entries: Any
 
 
 @dataclass(frozen=True)
@@ -123,7 +132,7 @@ class Problem:
         """Number of scalar residuals; what is known before counts as one for each number."""
         every = sum(len(run) for run in self.runs) * len(self.model.axes)
         every -= sum(int(np.sum(~p)) for p in self.present if p is not None)
-        return every if self.model.prior is None else every + len(self.model.prior.covariance)
+        return every + sum(len(known.entries) for known in self.known_before)
 
     def lost(self, r: int) -> Any:
         """Rests of a run before which a sensor was beyond its range, by number."""
@@ -141,6 +150,29 @@ class Problem:
         if self.model.noise is not None:
             return self.model.noise.scale
         return None if self.model.prior is None else self.model.prior.sigma
+
+    @cached_property
+    def known_before(self) -> tuple[Known, ...]:
+        """What a prior says, slot by slot: of a parameter of each run, the same in every run."""
+        found, first = [], 0
+        for name, value in ({} if self.model.prior is None else self.model.prior.by_name).items():
+            own = [s for s in self.slots if s.parameter.name == name]
+            entries = first + np.arange(own[0].parameter.shape.coordinates)
+            found += [Known(s, value, entries) for s in own]
+            first += len(entries)
+        return tuple(found)
+
+    @cached_property
+    def prior_root(self) -> Array:
+        """R (k, k) with RᵀR the inverse of the covariance of all that is known before."""
+        assert self.model.prior is not None
+        every = np.concatenate([known.entries for known in self.known_before])
+        runs = np.repeat(
+            [-1 if known.slot.run is None else known.slot.run for known in self.known_before],
+            [len(known.entries) for known in self.known_before],
+        )
+        covariance = np.array(self.model.prior.covariance)[np.ix_(every, every)]
+        return root(np.where(runs[:, None] == runs, covariance, 0.0))
 
     @cached_property
     def _selections(self) -> tuple[tuple[Any, Any], ...]:
@@ -625,11 +657,14 @@ def prior_rows(problem: Problem, point: Point) -> Array:
     """[J r] (k, n + 1) of what is known before: coordinates off the prior's, in residual units."""
     prior, scale = problem.model.prior, problem.noise_scale
     assert prior is not None
-    assert scale is not None
-    parts, slots = [], {s.parameter.name: s for s in problem.slots}
-    for name, before in prior.by_name.items():
-        slot = slots[name]
-        shape, part = slot.parameter.shape, np.zeros((slot.x.stop - slot.x.start, problem.unknowns))
+    if scale is None:
+        raise UsageError(
+            f"{problem.model.name}: how much {prior.source} weighs is open, since the noise of the "
+            "readings is not stated: measured(…, std=…), or --sensor-noise SIGNAL=STD"
+        )
+    parts = []
+    for slot, before, entries in problem.known_before:
+        shape, part = slot.parameter.shape, np.zeros((len(entries), problem.unknowns))
         if shape.curved:
             reference = shape.reference(before)
             here = problem._charted(slot, point.x[slot.x], point.references[slot.ref])
@@ -639,7 +674,7 @@ def prior_rows(problem: Problem, point: Point) -> Array:
         else:
             off, part[:, slot.x] = point.x[slot.x] - shape.pack(before), np.eye(len(part))
         parts.append(np.column_stack([part, off]))
-    return np.asarray(scale * prior.root @ np.vstack(parts))
+    return np.asarray(scale * problem.prior_root @ np.vstack(parts))
 
 
 @lru_cache(maxsize=8)
