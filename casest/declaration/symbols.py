@@ -49,10 +49,9 @@ def signal(
     as a gyroscope's does; rest is looked for in its noise alone. `std`: of one reading, in the
     signal's unit, one number or one for each component: what `--sensor-noise` says without it.
     """
-    if isinstance(shape, str):
-        shape, unit = 1, shape
-    known = None if std is None else tuple(map(float, stated(std, (shape,)).std))
-    return Signal("", shape, unit, held=held, wanders=wanders, std=known)
+    size, own = (1, shape) if isinstance(shape, str) else (shape, unit)
+    known = None if std is None else tuple(map(float, stated(std, (size,)).std))
+    return Signal("", size, own, held=held, wanders=wanders, std=known)
 
 
 def attitude() -> Any:
