@@ -14,7 +14,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from casest.correction.inverse import Correction, invertible
+from casest.correction.inverse import Correction, correction_of, invertible
 from casest.correction.program import Input, Program, steps_of
 from casest.declaration.model import Model
 from casest.declaration.noise import ROOT
@@ -69,7 +69,7 @@ def opened(estimate: Estimate, units: Mapping[str, str]) -> Opened:
     """Of a fit to one run, or whose parameters are shared by all; UsageError for others."""
     names = [c.name for c in uncertain(estimate.model)]
     model = invertible(_freed(estimate.model, names))[0]
-    correction = Correction(model)
+    correction = correction_of(model)
     own = {p.name for p in model.parameters if p.scope == "run"} & correction.parameters
     if own and len(estimate.problem.runs) > 1:
         raise UsageError(f"{sorted(own)[0]} differs from run to run")
