@@ -10,6 +10,7 @@ import pytest
 
 import casest as c
 from casest.cli import run
+from casest.dynamics import dynamics, state
 from casest.leastsquares.stated import stated_noise
 from casest_problems.norm import norm_triangular
 
@@ -88,8 +89,8 @@ def test_a_norm_of_unequal_noise_is_right_to_second_order():
     """Without the noise the fit of so many readings is off by many of its standard deviations."""
     rng = np.random.default_rng(3)
     scale = np.array([[1, 0, 0], [0.02, 1.03, 0], [-0.01, 0.015, 0.98]])
-    offset, std = np.array([0.3, -0.2, 0.1]), np.array([0.05, 0.1, 0.5])
-    u = rng.standard_normal((16_000, 3))
+    offset, std = np.array([0.3, -0.2, 0.1]), np.array([0.05, 0.1, 0.6])
+    u = rng.standard_normal((8000, 3))
     u /= np.linalg.norm(u, axis=1)[:, None]
     v = 9.81 * u @ np.linalg.inv(scale).T + offset + std * rng.standard_normal(u.shape)
     model = norm_triangular.having(norm=9.81)
@@ -203,3 +204,47 @@ def test_correlations_that_cannot_be_are_refused():
     impossible = np.array([[1, 2, 0], [2, 1, 0], [0, 0, 1.0]])[None]
     with pytest.raises(c.UsageError, match="noise of v: the correlations are not positive semi"):
         noisy(model, readings, v=impossible)
+
+
+DECLARED = LINE.replace(
+    'y=signal("1"), x=signal("1")', 'y=signal("1", std=0.02), x=signal(1, "1", std=0.05)'
+)
+
+
+def test_the_std_of_a_declared_signal_is_its_stated_noise(cli, weighed, tmp_path):
+    declared = tmp_path / "declared.py"
+    declared.write_text(DECLARED)
+    said = cli(weighed, "--sensor-noise", "x=0.05", "--sensor-noise", "y=0.02")
+    found = cli(weighed, model=declared)
+    assert found["estimate"] == said["estimate"]
+    assert found["noise"] == said["noise"]
+    option = cli(weighed, "--sensor-noise", "x=0.2", model=declared)  # goes before
+    also = cli(weighed, "--sensor-noise", "x=0.2", "--sensor-noise", "y=0.02")
+    assert option["noise"] == also["noise"]
+
+
+def test_python_takes_the_std_of_a_declared_signal_too():
+    @c.model
+    def level(v=c.signal(2, "m", std=(0.1, 0.2)), *, a=c.param(2, "m")):
+        """A constant."""
+        return c.Residual(measured=v, predicted=a)
+
+    found = c.calibrate(level, {"v": np.random.default_rng(1).normal(0, [0.1, 0.2], (25, 2))})
+    assert found.std["a"] == pytest.approx([0.1 / 5, 0.2 / 5])
+
+
+def test_std_of_a_signal_is_refused_where_nothing_would_come_of_it():
+    with pytest.raises(c.DeclarationError, match="std -1 must be above zero"):
+        c.signal("m", std=-1)
+    with pytest.raises(c.DeclarationError, match="what an effect reads counts as exact"):
+        c.effect(on="truth")(lambda x, warm=c.signal("K", std=0.1), *, k=c.param("1"): x + k * warm)
+    with pytest.raises(c.DeclarationError, match="as --sensor-noise v=STD"):
+        dynamics(lambda v=c.signal("m", std=0.1), *, x=state("m"): None)
+
+    @c.model
+    def level(v=c.signal("m", std=0.1), *, a=c.param("m")):
+        """A constant."""
+        return c.Residual(measured=v, predicted=a)
+
+    with pytest.raises(c.UsageError, match="calibrate_many does not weigh samples"):
+        c.calibrate_many(level, {"v": np.zeros((3, 5, 1))})

@@ -599,6 +599,11 @@ def dynamics(function: Callable[..., Motion]) -> Dynamics:
         if argument.kind is argument.POSITIONAL_OR_KEYWORD:
             if not isinstance(default, Signal):
                 raise DeclarationError(f"{where} comes before the * and must be signal(…)")
+            if default.std is not None:
+                raise DeclarationError(
+                    f"{where}: std is of a calibration's signals; filter, observe and close take "
+                    f"that of an estimator in motion as --sensor-noise {argument.name}=STD"
+                )
             signals.append(replace(default, name=argument.name))
         elif isinstance(default, State):
             states.append(replace(default, name=argument.name))

@@ -110,7 +110,10 @@ def _attempt(
         seed=seed,
         automatic=start is None,
     )
-    problem, outcomes = with_errors_of_inputs(problem, outcomes, solver, seed)
+    try:
+        problem, outcomes = with_errors_of_inputs(problem, outcomes, solver, seed)
+    except NotTrusted as error:
+        return _refused(problem, best_of(outcomes).point, Code.MODEL, str(error), began)
     evidence = None
     if intervals:
         outcomes, evidence = looked_for(problem, first, outcomes, seed, start is not None)

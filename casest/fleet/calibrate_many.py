@@ -157,6 +157,11 @@ def check_model(model: Model) -> None:
             f"model {model.name} has an effect on the noise, for which calibrate_many does not "
             "weigh samples; call calibrate for each sensor"
         )
+    if any(s.std is not None for s in model.signals):
+        raise UsageError(
+            f"model {model.name} declares the std of a signal, by which calibrate_many does not "
+            "weigh samples; leave it out, or call calibrate for each sensor"
+        )
     if model.canonicaliser is not None:
         raise UsageError(
             f"model {model.name} chooses among equivalent values by a convention of its own, which "

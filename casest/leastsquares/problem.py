@@ -317,6 +317,12 @@ class Problem:
         value, _ = _chart(slot.parameter.shape.kind, len(x), len(reference))
         return np.array(value(x, reference)).reshape(slot.parameter.shape.dims)
 
+    def charted_many(self, slot: Slot, x: Array, reference: Array) -> Array:
+        """Entries (T, k) of a curved parameter from coordinates (T, c) around one reference."""
+        value, _ = _chart(slot.parameter.shape.kind, x.shape[1], len(reference))
+        found = np.array(value.map(len(x))(x.T, np.repeat(reference[:, None], len(x), axis=1)))
+        return found.reshape(-1, len(x)).T
+
     def values(self, point: Point) -> dict[str, Array]:
         """Parameter values by name; per-run ones with a leading run axis if there are several."""
         found: dict[str, list[Array]] = {p.name: [] for p in self.model.parameters}

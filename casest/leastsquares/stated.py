@@ -73,9 +73,11 @@ def stated_noise(
 
     `noise` has for each signal an array for each run: standard deviations of one reading (k,) or
     (N, k), or covariances (1, k, k) or (N, k, k), in the signal's unit. Of a rest interval the mean
-    has less, by the root of its count. Signals that are not named are exact. Raises UsageError
-    where a residual has no noise at all.
+    has less, by the root of its count. Signals that are not named have the noise that they were
+    declared with, else they are exact. Raises UsageError where a residual has no noise at all.
     """
+    own = {s.name: [np.array([s.std])] * len(runs) for s in model.signals if s.std is not None}
+    noise = {**own, **noise}
     if not noise:
         return model, tuple(runs)
     known = {s.name: s for s in model.signals}
