@@ -244,7 +244,8 @@ class Staged:
                 )
                 return (
                     f"the equations cannot be followed beyond t = {time[k]:.6g} s, where {there}: "
-                    "a rate is not finite there, grows without bound, or is too stiff"
+                    "a rate is not finite there, grows without bound, is too stiff, or jumps and "
+                    "holds it there, as dry friction does at rest"
                 )
         return ""
 
