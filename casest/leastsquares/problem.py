@@ -21,7 +21,7 @@ from casest.declaration.model import Model
 from casest.declaration.physics import chart
 from casest.declaration.shapes import Array
 from casest.declaration.symbols import Parameter
-from casest.declaration.tracing import function_of, sample_symbol
+from casest.declaration.tracing import sample_symbol
 from casest.engine import (
     Columns,
     Normal,
@@ -612,9 +612,22 @@ class Problem:
         return np.vstack(parts)
 
     def evaluate(self, point: Point, outputs: Mapping[str, Any]) -> list[list[Array]]:
-        """Expressions of the trace for every sample of every run, each (N, rows, columns)."""
-        replay = Replay(function_of(self.model, outputs))
-        return [replay(self.parameters(point, r), s) for r, s in enumerate(self.samples)]
+        """Expressions of the trace for every sample of every run, each (N, rows, columns).
+
+        Of differential equations those of `model.along`, in which states are what they are there.
+        """
+        traced = self.model.along
+        given = ca.vertcat(ca.SX(0, 1), *(stage.given for stage in traced.stages))
+        sample = ca.vertcat(sample_symbol(self.model, traced), given)
+        inputs = [ca.vertcat(traced.coordinates, traced.references), sample]
+        values = [ca.SX(v) for v in outputs.values()]
+        f = ca.Function("along", inputs, values, ["parameters", "sample"], list(outputs))
+        replay, found = Replay(f), []
+        for r, samples in enumerate(self.samples):
+            if given.numel():
+                samples = Columns([samples.dense, self.given(point, r)])
+            found.append(replay(self.parameters(point, r), samples))
+        return found
 
     def with_weights(self, weights: Sequence[Array] | None) -> Problem:
         """The same problem with other weights on the squares."""
