@@ -89,12 +89,14 @@ class Problem:
     `weights` (one (N, m) array per run, or None) multiply the squares. Residuals are in the
     model's residual unit. Jacobians are with respect to the unknowns `x`. `whitening` (one
     (N·m, N·m) per run, or None) takes from residuals of rests what they share with those before.
+    `states` (one (N, k) per run, or None): those of differential equations, where they are known.
     """
 
     model: Model
     runs: tuple[Run, ...]
     weights: tuple[Array, ...] | None = None
     whitening: tuple[Array, ...] | None = None
+    states: tuple[Array, ...] | None = None
 
     # -- layout --------------------------------------------------------------------------------
 
@@ -387,7 +389,9 @@ class Problem:
     @cached_property
     def _staged(self) -> Staged | None:
         """Where an effect looks at other samples, rows come from the record as a whole."""
-        return Staged(self.model, self.runs, self.whitening) if self.model.sequential else None
+        if not self.model.sequential:
+            return None
+        return Staged(self.model, self.runs, self.whitening, self.states)
 
     def _rows(self, point: Point, r: int, span: slice = slice(None)) -> tuple[Array, Array]:
         """Residuals (N, m) and Jacobians (N, m, n of the run) of one run, unweighted."""
@@ -420,6 +424,13 @@ class Problem:
                 shown = ", ".join(f"{self.names[i]} = {point.x[i]:.4g}" for i in x)
                 return f"{run.file or run.name}: {words} (at {shown})"
         return ""
+
+    def followed(self, point: Point) -> tuple[Array, ...] | None:
+        """States of differential equations along each record (N, k); None where there are none."""
+        if self._staged is None or not self.model.traced.integrates:
+            return None
+        runs = range(len(self.runs))
+        return tuple(self._staged.followed(self.parameters(point, r), r) for r in runs)
 
     def given(self, point: Point, r: int) -> Array:
         """What the effects that look at other samples give at the samples of one run (N, k)."""
