@@ -143,6 +143,15 @@ def held_out(
     return records(model, apart, options, followed) if apart else ()
 
 
+def in_motion(name: str) -> bool:
+    """Is it an estimator in motion, driven by noise? Without it equations are a calibration."""
+    from casest.dynamics import Dynamics
+    from casest.results.find import find_any
+
+    found = find_any(name)
+    return isinstance(found, Dynamics) and found.driven_by_noise
+
+
 def moving_model(name: str, constants: Assignments, options: MotionOptions) -> Dynamics:
     """The estimator in motion with --set, --intensity and --std applied."""
     from casest.dynamics import Dynamics

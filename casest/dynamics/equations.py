@@ -108,7 +108,7 @@ class Equations:
         unit, std = _weights(outputs, names, given, place)
         predicted = []
         for o, n in zip(outputs, names, strict=True):
-            value = put(o.predicted)
+            value = ca.SX(put(o.predicted))  # what is read of a state is not the state itself
             if value.numel() != o.signal.numel():
                 raise DeclarationError(
                     f"{place}: {n} has {o.signal.numel()} numbers and its prediction "

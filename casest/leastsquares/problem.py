@@ -22,7 +22,7 @@ from casest.declaration.physics import chart
 from casest.declaration.prior import root
 from casest.declaration.shapes import Array
 from casest.declaration.symbols import Parameter
-from casest.declaration.tracing import function_of, sample_symbol
+from casest.declaration.tracing import sample_symbol
 from casest.engine import (
     Columns,
     Normal,
@@ -98,12 +98,14 @@ class Problem:
     `weights` (one (N, m) array per run, or None) multiply the squares. Residuals are in the
     model's residual unit. Jacobians are with respect to the unknowns `x`. `whitening` (one
     (N·m, N·m) per run, or None) takes from residuals of rests what they share with those before.
+    `states` (one (N, k) per run, or None): those of differential equations, where they are known.
     """
 
     model: Model
     runs: tuple[Run, ...]
     weights: tuple[Array, ...] | None = None
     whitening: tuple[Array, ...] | None = None
+    states: tuple[Array, ...] | None = None
 
     # -- layout --------------------------------------------------------------------------------
 
@@ -425,7 +427,9 @@ class Problem:
     @cached_property
     def _staged(self) -> Staged | None:
         """Where an effect looks at other samples, rows come from the record as a whole."""
-        return Staged(self.model, self.runs, self.whitening) if self.model.sequential else None
+        if not self.model.sequential:
+            return None
+        return Staged(self.model, self.runs, self.whitening, self.states)
 
     def _rows(self, point: Point, r: int, span: slice = slice(None)) -> tuple[Array, Array]:
         """Residuals (N, m) and Jacobians (N, m, n of the run) of one run, unweighted."""
@@ -458,6 +462,13 @@ class Problem:
                 shown = ", ".join(f"{self.names[i]} = {point.x[i]:.4g}" for i in x)
                 return f"{run.file or run.name}: {words} (at {shown})"
         return ""
+
+    def followed(self, point: Point) -> tuple[Array, ...] | None:
+        """States of differential equations along each record (N, k); None where there are none."""
+        if self._staged is None or not self.model.traced.integrates:
+            return None
+        runs = range(len(self.runs))
+        return tuple(self._staged.followed(self.parameters(point, r), r) for r in runs)
 
     def given(self, point: Point, r: int) -> Array:
         """What the effects that look at other samples give at the samples of one run (N, k)."""
@@ -650,9 +661,22 @@ class Problem:
         return np.vstack(parts)
 
     def evaluate(self, point: Point, outputs: Mapping[str, Any]) -> list[list[Array]]:
-        """Expressions of the trace for every sample of every run, each (N, rows, columns)."""
-        replay = Replay(function_of(self.model, outputs))
-        return [replay(self.parameters(point, r), s) for r, s in enumerate(self.samples)]
+        """Expressions of the trace for every sample of every run, each (N, rows, columns).
+
+        Of differential equations those of `model.along`, in which states are what they are there.
+        """
+        traced = self.model.along
+        given = ca.vertcat(ca.SX(0, 1), *(stage.given for stage in traced.stages))
+        sample = ca.vertcat(sample_symbol(self.model, traced), given)
+        inputs = [ca.vertcat(traced.coordinates, traced.references), sample]
+        values = [ca.SX(v) for v in outputs.values()]
+        f = ca.Function("along", inputs, values, ["parameters", "sample"], list(outputs))
+        replay, found = Replay(f), []
+        for r, samples in enumerate(self.samples):
+            if given.numel():
+                samples = Columns([samples.dense, self.given(point, r)])
+            found.append(replay(self.parameters(point, r), samples))
+        return found
 
     def with_weights(self, weights: Sequence[Array] | None) -> Problem:
         """The same problem with other weights on the squares."""
