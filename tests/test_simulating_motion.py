@@ -126,7 +126,7 @@ def test_a_late_reading_is_an_earlier_velocity():
 
 
 def test_noise_with_a_colour_has_its_size_and_its_memory():
-    t = np.arange(0, 4000, 0.05)
+    t = np.arange(0, 2000, 0.05)
     said = {"v_colour.correlation_time": 0.5, "v_colour.std": 0.04, **BIAS}
     rest = {n: np.zeros((len(t), 3)) for n in ("a", "omega")}
     still = QUIET.beginning(gravity=0.0, bias=0.0)
