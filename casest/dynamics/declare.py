@@ -15,6 +15,8 @@ from casest import units
 from casest.declaration.changing import check_units_known
 from casest.declaration.model import Model
 from casest.declaration.physics import SX
+from casest.declaration.physics import Constraint as Constraint
+from casest.declaration.physics import constraint as constraint
 from casest.declaration.shapes import Array, array_shape
 from casest.declaration.symbols import Constant, Parameter, Signal, constant, make_parameter
 from casest.declaration.tracing import flat
@@ -161,13 +163,6 @@ def angle(expression: SX) -> Angle:
     return Angle(expression)
 
 
-@dataclass(frozen=True)
-class Constraint:
-    """What is known of the state without noise: `expression` is zero at every instant."""
-
-    expression: SX
-
-
 @dataclass(frozen=True, kw_only=True)
 class Motion:
     """What a @dynamics function returns: rates of the states, outputs, and what is known exactly.
@@ -243,11 +238,6 @@ def _share(text: str) -> float:
             f'measured: std={text!r}: give a number, a signal, or a share of the reading as "5%"'
         )
     return share
-
-
-def constraint(expression: SX, value: float | SX) -> Constraint:
-    """Known without noise: `constraint(norm_2(gravity), 9.80665)`; every estimate keeps to it."""
-    return Constraint(ca.densify(ca.SX(expression) - value))
 
 
 @dataclass(frozen=True)
@@ -543,7 +533,8 @@ class Dynamics:
 @dataclass(frozen=True)
 class Traced:
     """Symbols and expressions: x, signals, f(x, u), h(x, u), A = ∂f/∂x, C = ∂h/∂x, readings;
-    constraints g(x, u) = 0 and G = ∂g/∂x; `turn` (m,): a full turn of readings that are angles."""
+    constraints g(x, u) = 0 and G = ∂g/∂x; `turn` (m,): a full turn of readings that are angles;
+    `limited`: something is never passed that is no bound of a state."""
 
     x: SX
     symbols: Mapping[str, SX]
@@ -557,6 +548,7 @@ class Traced:
     outputs: tuple[Measured, ...]
     measured: tuple[str, ...]
     turn: Array
+    limited: bool = False
 
     def wrapped(self, difference: Any) -> Any:
         """Readings less predictions (m) or (N, m), angles within half a turn of zero."""
@@ -659,7 +651,7 @@ def traced_with(declared: Dynamics, constants: Mapping[str, SX | float]) -> Trac
     reading = ca.vertcat(*[flat(o.signal) for o in motion.outputs])
     if reading.numel() != h.numel():
         raise DeclarationError(f"dynamics {declared.name}: outputs and signals differ in shape")
-    g = ca.vertcat(*[ca.vec(c.expression) for c in motion.constraints])
+    g = ca.vertcat(*[ca.vec(c.expression) for c in motion.constraints if not c.limit])
     of = {s.name: s.unit for s in declared.signals}
     turn = [
         np.full(o.predicted.numel(), 2 * np.pi / units.size(of[n] or "rad")[0] if o.wraps else 0.0)
@@ -679,4 +671,5 @@ def traced_with(declared: Dynamics, constants: Mapping[str, SX | float]) -> Trac
         motion.outputs,
         tuple(names),
         np.concatenate([np.zeros(0), *turn]),
+        any(c.limit for c in motion.constraints),
     )

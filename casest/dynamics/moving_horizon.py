@@ -23,6 +23,7 @@ from casest.dynamics.discrete import Estimates, Steps, kalman, smoothed
 from casest.dynamics.extended import Sampled
 from casest.dynamics.filter import coefficients, discretised, normalised
 from casest.dynamics.inputs import uncertain
+from casest.dynamics.known import known
 from casest.dynamics.quadratic import Kept, kept
 from casest.dynamics.riccati import check_covariance
 from casest.dynamics.transition import Pace, checked_record, shares
@@ -66,7 +67,7 @@ def moving_horizon(model: Dynamics, run: Run, horizon: int) -> Horizon:
         began = perf_counter()
         window = _next(source, window, k, horizon)
         found.seconds[k] = perf_counter() - began
-        _put(found, window, k, whole=k == len(run) - 1)
+        _put(found, run, window, k, whole=k == len(run) - 1)
     return replace(found, settled=not found.unsettled.any())
 
 
@@ -210,17 +211,18 @@ def _empty(model: Dynamics, run: Run, horizon: int) -> Horizon:
     )
 
 
-def _put(found: Horizon, window: _Window, k: int, whole: bool) -> None:
+def _put(found: Horizon, run: Run, window: _Window, k: int, whole: bool) -> None:
     """What a window says of its end, and of its first sample, or of its `whole`, as the last to."""
-    found.x[k], found.std[k] = window.states[-1], _std(window.spread[-1:])[0]
+    x, P = known(found.model, run.take(slice(k, k + 1)), window.states[-1:], window.spread[-1:])
+    found.x[k], found.std[k] = x[0], _std(P)[0]
     nu, S = window.innovation
     found.innovations[k], found.expected_std[k] = nu, np.sqrt(np.diag(S))
     found.normalised_innovations[k] = normalised(nu[None], S[None])[0]
     found.rounds[k], found.unsettled[k] = window.rounds, not window.settled
     count = len(window.states) if whole else 1
     own = slice(window.first, window.first + count)
-    found.smoothed[own] = window.states[:count]
-    found.smoothed_std[own] = _std(window.spread[:count])
+    x, P = known(found.model, run.take(own), window.states[:count], window.spread[:count])
+    found.smoothed[own], found.smoothed_std[own] = x, _std(P)
     found.multipliers[own] = 0.0 if window.held is None else window.held.multipliers[:count]
 
 

@@ -35,6 +35,7 @@ from casest.engine import (
     triangular_factor,
 )
 from casest.errors import DataError, NotTrusted, UsageError
+from casest.leastsquares.constrained import FIRST, Constraints, Force, constraints_of
 from casest.leastsquares.per_sample import residual_and_jacobian
 from casest.leastsquares.sequence import Staged
 
@@ -99,6 +100,7 @@ class Problem:
     model's residual unit. Jacobians are with respect to the unknowns `x`. `whitening` (one
     (N·m, N·m) per run, or None) takes from residuals of rests what they share with those before.
     `states` (one (N, k) per run, or None): those of differential equations, where they are known.
+    `force` is how the model's constraints are held (see `constrained`).
     """
 
     model: Model
@@ -106,6 +108,7 @@ class Problem:
     weights: tuple[Array, ...] | None = None
     whitening: tuple[Array, ...] | None = None
     states: tuple[Array, ...] | None = None
+    force: Force | None = None
 
     # -- layout --------------------------------------------------------------------------------
 
@@ -134,7 +137,8 @@ class Problem:
         """Number of scalar residuals; what is known before counts as one for each number."""
         every = sum(len(run) for run in self.runs) * len(self.model.axes)
         every -= sum(int(np.sum(~p)) for p in self.present if p is not None)
-        return every + sum(len(known.entries) for known in self.known_before)
+        every += sum(len(known.entries) for known in self.known_before)
+        return every + self.kept_count
 
     def lost(self, r: int) -> Any:
         """Rests of a run before which a sensor was beyond its range, by number."""
@@ -145,6 +149,19 @@ class Problem:
         """Which residuals (N, m) of each run there are; None where all are."""
         staged = self._staged
         return tuple(None if staged is None else staged.present(r) for r in range(len(self.runs)))
+
+    @cached_property
+    def kept_count(self) -> int:
+        """How many directions of the unknowns constraints hold as equations."""
+        if self.constraints is None:
+            return 0
+        if self.force is None:
+            return int(sum(np.sum(~limit) for limit in self.constraints.limits))
+        held = [slopes[own] for (_, slopes), own in
+                zip(self.kept_at(self.start()), self.force.held, strict=True)]  # fmt: skip
+        whole = np.vstack(held)
+        size = np.linalg.norm(whole, axis=0)
+        return int(np.linalg.matrix_rank(whole / np.where(size > 0, size, 1.0), tol=1e-8))
 
     @property
     def noise_scale(self) -> float | None:
@@ -476,6 +493,65 @@ class Problem:
             return np.zeros((len(self.runs[r]), 0))
         return self._staged.given(self.parameters(point, r), r, ())[0]
 
+    @property
+    def constraints(self) -> Constraints | None:
+        """What the model keeps to, if to anything."""
+        return constraints_of(self.model)
+
+    def kept_at(self, point: Point) -> list[tuple[Array, Array]]:
+        """Values (M,) of the constraints of each run, and their slopes (M, n) in all unknowns."""
+        found = []
+        for r, samples in enumerate(self.samples):
+            assert self.constraints is not None
+            parameters, dense = self.parameters(point, r), samples.dense
+            given, slopes = np.zeros((len(dense), 0)), np.zeros((len(dense), 0, 0))
+            if self._staged is not None:
+                given, slopes = self._staged.given(parameters, r)
+            c, own = self.constraints.at(parameters, dense, given, slopes)
+            wide = np.zeros((len(c), self.unknowns))
+            wide[:, self._selections[r][0]] = own
+            found.append((c, wide))
+        return found
+
+    def forced(self, point: Point, weight: float, multipliers: Sequence[Array]) -> Problem:
+        """The same with constraints held `weight` times as hard as the data say them at a point,
+        with multipliers (M,) of each run."""
+        assert self.constraints is not None
+        sharp = np.diag(self.of_runs(point).matrix)
+        variance = np.where(sharp > 0, 1 / np.where(sharp > 0, sharp, 1.0), 0.0)
+        at, held, root = self.kept_at(point), [], []
+        for samples, (_, slopes) in zip(self.samples, at, strict=True):
+            std = np.sqrt(slopes**2 @ variance)
+            root.append(weight / np.where(std > 0, std, np.max(std, initial=0.0) or 1.0))
+            held.append(~self.constraints.limit(len(samples)))
+        shift = [own / k**2 for own, k in zip(multipliers, root, strict=True)]
+        return replace(self, force=Force(tuple(root), tuple(shift), tuple(held)))
+
+    @cached_property
+    def _force(self) -> Force:
+        """How constraints are held where nothing is said: by no multiplier yet."""
+        if self.force is not None:
+            return self.force
+        start = self.start()
+        nothing = [np.zeros(len(c)) for c, _ in self.kept_at(start)]
+        force = self.forced(start, FIRST, nothing).force
+        assert force is not None
+        return force
+
+    def _rows_beyond(self, point: Point) -> Array:
+        """[J r] (k, n + 1) of all that is no reading: what is known before, and constraints."""
+        parts = [np.zeros((0, self.unknowns + 1))]
+        if self.model.prior is not None:
+            parts.append(prior_rows(self, point))
+        if self.constraints is not None:
+            parts += [self._force.rows(r, *own) for r, own in enumerate(self.kept_at(point))]
+        return np.vstack(parts)
+
+    @cached_property
+    def _bare(self) -> bool:
+        """Are there readings alone?"""
+        return self.model.prior is None and self.constraints is None
+
     def blocks(self, point: Point) -> Iterator[Block]:
         """Residuals and Jacobians of all samples, piece by piece, unweighted."""
         for r, samples in enumerate(self.samples):
@@ -533,9 +609,10 @@ class Problem:
     def cost(self, point: Point) -> float:
         """½ Σ w r²."""
         own = sum(self._run_cost(point, r) for r in range(len(self.runs)))
-        if self.model.prior is None:
+        if self._bare:
             return own
-        return own + 0.5 * float(np.sum(prior_rows(self, point)[:, -1] ** 2))
+        own += 0.5 * float(np.sum(self._rows_beyond(point)[:, -1] ** 2))
+        return own if self.constraints is None else max(own - self._force.spared, 0.0)
 
     def normal(self, point: Point) -> Normal:
         """Cost, gradient (n,) and Gauss-Newton matrix (n, n); those of the last points are kept."""
@@ -551,7 +628,19 @@ class Problem:
         return deque(maxlen=LATEST)
 
     def _normal(self, point: Point) -> Normal:
-        if self._alone and self.model.prior is None:
+        own = self.of_runs(point)
+        if self._bare:
+            return own
+        rows = self._rows_beyond(point)
+        product = rows.T @ rows
+        total = own.cost + 0.5 * float(product[-1, -1])
+        if self.constraints is not None:
+            total = max(total - self._force.spared, 0.0)
+        return Normal(total, own.gradient + product[:-1, -1], own.matrix + product[:-1, :-1])
+
+    def of_runs(self, point: Point) -> Normal:
+        """Normal equations of the readings alone."""
+        if self._alone:
             return self._run_normal(point, 0)
         total, gradient = 0.0, np.zeros(self.unknowns)
         matrix = np.zeros((self.unknowns, self.unknowns))
@@ -561,12 +650,6 @@ class Problem:
             total += own.cost
             gradient[x] += own.gradient
             matrix[np.ix_(x, x)] += own.matrix
-        if self.model.prior is not None:
-            rows_before = prior_rows(self, point)
-            product = rows_before.T @ rows_before
-            total += 0.5 * float(product[-1, -1])
-            gradient += product[:-1, -1]
-            matrix += product[:-1, :-1]
         return Normal(total, gradient, matrix)
 
     def run_normals(self, point: Point) -> list[tuple[Any, Normal]]:
@@ -589,8 +672,8 @@ class Problem:
             block = np.zeros((len(own), n + 1))
             block[:, [*x, n]] = own
             blocks.append(block)
-        if self.model.prior is not None:
-            blocks.append(prior_rows(self, point))
+        if not self._bare:
+            blocks.append(self._rows_beyond(point))
         whole = np.vstack(blocks)
         if len(blocks) > 1:
             whole = np.asarray(np.linalg.qr(whole, mode="r"))
@@ -601,7 +684,7 @@ class Problem:
     def hessian(self, point: Point) -> Array:
         """Exact second derivative of the cost, (n, n); Gauss-Newton where effects have a memory."""
         matrix = self.normal(point).matrix.copy()
-        if self._staged is not None:
+        if self._staged is not None or self.constraints is not None:
             return self._differences(point, matrix) if self.smooth else matrix
         for r, samples in enumerate(self.samples):
             x = self._selections[r][0]
