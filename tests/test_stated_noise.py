@@ -341,3 +341,13 @@ def test_compare_and_observe_know_stated_noise_too(weighed, capsys, tmp_path, ve
     else:
         assert found["noise"]["sigma"] == pytest.approx(0.4)  # of the reading, as it was stated
         assert found["solvers"][0]["same_start"]["right"]
+
+
+def test_residuals_of_which_one_follows_from_others_are_refused():
+    @c.model
+    def twice(v=c.signal("m", std=0.1), *, a=c.param("m"), b=c.param("m")):
+        """Two residuals of one reading."""
+        return c.Residual(implicit=c.vertcat(v - a, 2 * (v - b)), unit="m")
+
+    with pytest.raises(c.UsageError, match="leave residuals out that follow from others"):
+        c.calibrate(twice, {"v": np.arange(5.0)})

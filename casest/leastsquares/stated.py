@@ -241,8 +241,7 @@ def _with(part: _Linear, run: Run, noise: Stated, true: Array, mean: Array | Non
     """The run with whitening, slope, true values and the residual's mean beside its signals."""
     n, m = part.residual.shape
     mean = np.zeros((n, m)) if mean is None else mean
-    lower = np.asarray(np.sqrt(part.variance) if m == 1 else np.linalg.cholesky(part.variance))
-    whitening = noise.scale * _inverse(lower)
+    whitening = noise.scale * _inverse(_lower(part.variance))
     held = {WHITENING: whitening.reshape(n, -1), SLOPE: part.slope.reshape(n, -1)}
     return replace(run, signals={**run.signals, **held, TRUE: true, MEAN: mean})
 
@@ -333,7 +332,25 @@ def shifts_of_curvature(problem: Problem, point: Point) -> Iterator[Array]:
 
 def _inverse(matrices: Array) -> Array:
     """Inverse of each of (N, m, m); of single numbers quickly."""
-    return np.asarray(1 / matrices if matrices.shape[1] == 1 else np.linalg.inv(matrices))
+    try:
+        return np.asarray(1 / matrices if matrices.shape[1] == 1 else np.linalg.inv(matrices))
+    except np.linalg.LinAlgError:
+        raise UsageError(_DEPENDENT) from None
+
+
+def _lower(variance: Array) -> Array:
+    try:
+        return np.asarray(
+            np.sqrt(variance) if variance.shape[1] == 1 else np.linalg.cholesky(variance)
+        )
+    except np.linalg.LinAlgError:
+        raise UsageError(_DEPENDENT) from None
+
+
+_DEPENDENT = (
+    "a combination of the residuals of a sample has no noise, so that it would have to vanish "
+    "exactly: leave residuals out that follow from others, or state more noise"
+)
 
 
 def chi_square(problem: Problem, point: Point, rank: int) -> ChiSquare | None:
