@@ -110,7 +110,9 @@ def observe(model_name: str, data: tuple[str, ...], options: ObserveOptions) -> 
         if not data:
             raise UsageError(f"{model_name}: what can be seen depends on the record: give DATA")
         refuse(options, Kind.MOVING, f"is for estimators in motion; {model_name} is a calibration")
-        model, runs = model_and_records(model_name, data, options.model, options.reading)
+        model, runs = model_and_records(
+            model_name, data, options.model, options.reading, options.sensors
+        )
         progress(f"fitting {model_name}")
         result: Observability = observe_parameters(model, runs, data=data, command=typed())
     else:

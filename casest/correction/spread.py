@@ -17,7 +17,7 @@ import numpy as np
 from casest.correction.inverse import Correction, correction_of, invertible
 from casest.correction.program import Input, Program, steps_of
 from casest.declaration.model import Model
-from casest.declaration.noise import ROOT
+from casest.declaration.noise import root_of
 from casest.declaration.shapes import Array
 from casest.errors import UsageError
 from casest.estimate.estimate import Estimate
@@ -190,22 +190,51 @@ def reading_root(estimate: Estimate, inputs: Sequence[Input]) -> Array:
         root = _signal_root(estimate, i.name, i.size)
         found[first : first + i.size, first : first + root.shape[1]] = root
         first += i.size
+    return _with_correlations(estimate, inputs, found)
+
+
+def _with_correlations(estimate: Estimate, inputs: Sequence[Input], root: Array) -> Array:
+    """The root with what signals share whose noise was stated together."""
+    stated = estimate.model.noise
+    if stated is None or not stated.groups:
+        return root
+    covariance, places, first = root @ root.T, dict[str, range](), 0
+    for i in inputs:
+        places[i.name], first = range(first, first + i.size), first + i.size
+    for group in (g for g in stated.groups if len(g) > 1):
+        whole, own, first = _of_one_reading(estimate, group), list[int](), 0
+        kept = list[int]()
+        for name in group:
+            size = estimate.model[name].size
+            if name in places:
+                own += places[name]
+                kept += range(first, first + size)
+            first += size
+        covariance[np.ix_(own, own)] = whole[np.ix_(kept, kept)]
+    found = np.zeros_like(root)
+    factor = _factor(covariance)
+    found[:, : factor.shape[1]] = factor
     return found
+
+
+def _of_one_reading(estimate: Estimate, group: tuple[str, ...]) -> Array:
+    """Mean covariance (k, k) of one reading's noise of signals together, as it was stated."""
+    size, matrices = sum(estimate.model[name].size for name in group), list[Array]()
+    for run in estimate.problem.runs:
+        root = run.signals[root_of(group)]
+        if root.shape[1] == size:
+            root = root[:, :, None] * np.eye(size)
+        root = root.reshape(-1, size, size) * np.sqrt(run.count)[:, None, None]
+        matrices.append(root @ np.swapaxes(root, 1, 2))
+    return np.asarray(np.mean(np.concatenate(matrices), axis=0))
 
 
 def _signal_root(estimate: Estimate, name: str, size: int) -> Array:
     runs, model = estimate.problem.runs, estimate.model
     if model.noise is not None:
-        roots = [run.signals.get(ROOT + name) for run in runs]
-        if roots[0] is None:
+        if (name,) not in model.noise.together:
             return np.zeros((size, size))
-        single = np.concatenate(
-            [r * np.sqrt(run.count)[:, None] for r, run in zip(roots, runs, strict=True)]
-        )
-        if single.shape[1] == size:
-            return np.diag(np.sqrt(np.mean(single**2, axis=0)))
-        matrices = single.reshape(-1, size, size)
-        return _factor(np.mean(matrices @ np.swapaxes(matrices, 1, 2), axis=0))
+        return _factor(_of_one_reading(estimate, (name,)))
     if all(name in run.spread for run in runs):
         single = np.concatenate([run.spread[name] * np.sqrt(run.count)[:, None] for run in runs])
         return np.diag(np.sqrt(np.mean(single**2, axis=0)))

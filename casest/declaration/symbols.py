@@ -225,16 +225,19 @@ def _bounds(shape: Shape, bounds: Any) -> tuple[tuple[float, ...], tuple[float, 
     return tuple(map(float, lower)), tuple(map(float, upper))
 
 
-def constant(value: Any, unit: str = "", *, std: Any = None) -> Any:
+def constant(value: Any, unit: str = "", *, std: Any = None, freedom: float = np.inf) -> Any:
     """Declare a plain number (or array) of the model with its unit: `constant(0.28, "m")`.
 
     `std` is its standard uncertainty in the same unit, one number or one for each entry:
-    `constant(0.28, "m", std=0.001)`. It is carried into every estimate.
+    `constant(0.28, "m", std=0.001)`. It is carried into every estimate. `freedom`: degrees of
+    freedom of that standard uncertainty, where it is an estimate itself (JCGM 100, G.4).
     """
+    if std is None and np.isfinite(freedom):
+        raise DeclarationError(f"freedom {freedom!r} is that of a std, and there is none: give std")
     array = np.asarray(value, dtype=float)
     if not np.all(np.isfinite(array)):
         raise DeclarationError(f"constant {value!r} is not finite")
-    known = None if std is None else stated(std, array.shape)
+    known = None if std is None else stated(std, array.shape, freedom)
     return Constant("", tuple(map(float, array.ravel())), unit, array.shape, uncertainty=known)
 
 

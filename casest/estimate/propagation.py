@@ -24,8 +24,9 @@ from casest.leastsquares.problem import Point, Problem
 class Inputs:
     """Known numbers that are not exact, and what the unknowns do when they move.
 
-    `names` (k,) of single numbers, `units`, `values` (k,), their `covariance` (k, k), and the
-    `sensitivity` (n, k) of the unknowns: ∂x/∂c. Values of a direction are its coordinates: zero.
+    `names` (k,) of single numbers, `units`, `values` (k,), their `covariance` (k, k), the
+    `sensitivity` (n, k) of the unknowns: ∂x/∂c, and degrees of `freedom` (k,) of each standard
+    uncertainty, infinite where it is known. Values of a direction are its coordinates: zero.
     """
 
     names: tuple[str, ...]
@@ -33,6 +34,7 @@ class Inputs:
     values: Array
     covariance: Array
     sensitivity: Array
+    freedom: Array
 
     @property
     def std(self) -> Array:
@@ -80,6 +82,7 @@ def propagated(problem: Problem, point: Point, free: NDArray[np.bool_]) -> Input
         there.x[more],
         _covariance(constants),
         sensitivity,
+        np.concatenate([np.full(len(u), u.freedom) for c in constants if (u := c.uncertainty)]),
     )
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casest.declaration.model import Model
-from casest.declaration.noise import MEAN, ROOT, slope_in_noisy
+from casest.declaration.noise import MEAN, root_of, slope_in_noisy
 from casest.declaration.shapes import Array
 from casest.declaration.tracing import sample_symbol
 from casest.engine import Replay
@@ -131,21 +131,23 @@ class Refits:
 
     def _root(self, r: int) -> Array:
         """Roots of the covariance of the noise of each sample of a run, (N, k, k)."""
-        run, sizes = self.problem.runs[r], [self._size(n) for n in self.names]
+        run, stated = self.problem.runs[r], self.estimate.model.noise
+        groups = stated.together if stated is not None else tuple((n,) for n in self.names)
+        sizes = [sum(map(self._size, group)) for group in groups]
         found, first = np.zeros((len(run), sum(sizes), sum(sizes))), 0
         each = None
         if not self.stated and self.problem.model.implicit:
             at = self.estimate.optimum or self.estimate.point
             noise = signal_noise(self.estimate.problem, at, self._scale)
             each = dict(zip((s.name for s in self.problem.model.signals), noise, strict=True))
-        for name, size in zip(self.names, sizes, strict=True):
+        for group, size in zip(groups, sizes, strict=True):
             span = slice(first, first + size)
             if self.stated:
-                held = run.signals[ROOT + name]
+                held = run.signals[root_of(group)]
                 diagonal = held.shape[1] == size
                 own = held[:, :, None] * np.eye(size) if diagonal else held.reshape(-1, size, size)
             else:
-                own = np.eye(size) * (self._scale if each is None else each[name])
+                own = np.eye(size) * (self._scale if each is None else each[group[0]])
             found[:, span, span], first = own, first + size
         return found
 

@@ -129,7 +129,7 @@ def _references(
             plain(inputs.values[j]),
             float(inputs.std[j]),
             units.get(name) or units.get(name.partition("[")[0], inputs.units[j]),
-            None,
+            plain(inputs.freedom[j]),
             _by_name(names, sensitivity[:, j]),
             _by_name(names, shares[:, j]),
         )
@@ -170,6 +170,8 @@ def corrected_budget(
         both = total * (total @ inputs.covariance)
         variance |= {n: both[:, j] for j, n in enumerate(inputs.names)}
         sensitivity = {n: plain(total[:, j]) for j, n in enumerate(inputs.names)}
+        each = zip(inputs.names, inputs.freedom, strict=True)
+        freedom = {n: float(f) for n, f in each if np.isfinite(f)}
     for source in sources(estimate, units["residual"]):
         own = np.nan_to_num(source.covariance)
         variance[source.name] = np.diag(unknowns @ own @ unknowns.T)
