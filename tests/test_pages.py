@@ -14,7 +14,10 @@ from casest.cli import commands
 PAGES = sorted((ROOT / "docs").glob("*.md"))
 PHYSICS = "casest.declaration.physics"
 #: Pages that work on a measured record, which lies beside the project.
-MEASURED = {"equations": "multiarm-pendulum/pendulum_single.csv"}
+MEASURED = {
+    "equations": "multiarm-pendulum/pendulum_single.csv",
+    "from_others": "ardupilot-log171/MAG_all.csv",
+}
 WITH_COMMANDS = [p for p in PAGES if any(language == "sh" for language, _ in blocks(p))]
 
 
