@@ -347,3 +347,17 @@ def test_readings_of_no_stated_unit_and_a_norm_of_another_size_do_not_share_a_un
     assert "  norm = 1 (held)" in lines
     units = [line.split()[-1] for line in lines if re.match(r"  (scale|offset)\[", line)]
     assert units == ["1/[v]"] * 3 + ["[v]"] * 3
+
+
+def test_a_norm_that_is_found_has_the_unit_that_scale_and_correction_are_in(tmp_path):
+    """Scale held at one is a pure number, and the correction goes to a file in tesla."""
+    rng = np.random.default_rng(5)
+    poses = 480 * sim.spread_poses(20, rng) / sim.GRAVITY + [100, -50, 20]
+    file = tmp_path / "m.csv"
+    np.savetxt(file, poses, delimiter=",", header="mx [mgauss],my [mgauss],mz [mgauss]")
+    words = f"calibrate norm-diagonal {file} --columns v=m --fix scale=1,1,1 --free norm"
+    out = str(tmp_path / "out")
+    assert run([*shlex.split(words), "--set", "norm=450 mgauss", "-o", out]) == 0
+    assert run(["export", out, "--to", "ardupilot", "-o", f"{out}/m.param"]) == 0
+    text = (tmp_path / "out" / "m.param").read_text(encoding="utf-8")
+    assert float(re.search(r"COMPASS_OFS_X,(\S+)", text)[1]) == pytest.approx(-100, abs=1e-6)

@@ -108,7 +108,7 @@ class Told:
         """A Matplotlib figure of one of these.
 
         "residuals"; "parameters": 95 % intervals; "correlation"; "sphere": where the poses lie, of
-        a vector of known length; "profiles": the cost with each unknown held, the rest fitted.
+        a vector of known length; "profiles": the cost with each unknown held and all else fitted.
 
         `over` names a column or quantity for the residuals' axis; else it is the time.
         """

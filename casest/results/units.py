@@ -28,6 +28,10 @@ def unit_table(model: Model, runs: Sequence[Run]) -> dict[str, str]:
     for s in model.signals:
         stated = next((run.units.get(s.name) for run in runs if run.units.get(s.name)), None)
         known[s.name] = s.unit or stated or f"[{s.name}]"
+    for p in model.parameters:  # a norm that was freed: others are in its unit
+        own = p.units[0]
+        if p.shape.size == 1 and own and ("[" not in own or _PLACEHOLDER.fullmatch(own)):
+            known[p.name] = resolved(own, known)
     for c in model.constants:
         # Raw counts are no unit in which a field or gravity is known: such a norm is a pure number.
         counted = c.unit in {f"[{n}]" for n, u in known.items() if _counts(n, u, c, runs)}
