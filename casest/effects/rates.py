@@ -9,7 +9,7 @@ from __future__ import annotations
 from casest.declaration.effect import RATES, effect
 from casest.declaration.physics import SX, fabs, sign
 from casest.declaration.shapes import each
-from casest.declaration.symbols import constant, param, signal
+from casest.declaration.symbols import param, signal
 
 
 @effect(
@@ -65,12 +65,9 @@ def coupling(r: SX, other: SX = signal(), *, k: SX = param(each, "[r]/[other]"))
 @effect(
     on=RATES,
     columns={"channel": "any"},
-    numbers={"at": "mean"},
     shown_by="a record in which the column moves by itself",
-    formula="rate + k·(channel − at)",
+    formula="rate + k·channel",
 )
-def forcing(
-    r: SX, channel: SX, *, k: SX = param(each, "[r]/[channel]"), at: SX = constant(0.0)
-) -> SX:
-    """What was recorded beside the model drives a state in proportion, about its mean `at`."""
-    return r + k * (channel - at)
+def forcing(r: SX, channel: SX, *, k: SX = param(each, "[r]/[channel]")) -> SX:
+    """What was recorded beside the model drives a state in proportion."""
+    return r + k * channel
