@@ -22,7 +22,7 @@ test: $(READY)
 
 # What is too dear to run at every change: whole loops on measured records, counts, Ctrl-C, restarts.
 test-long: $(READY)
-	PYTHONDONTWRITEBYTECODE= OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist worksteal -rs -m long
+	PYTHONDONTWRITEBYTECODE= OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist loadfile -rs -m long
 
 lint: $(READY)
 	$(BIN)/ruff check .

@@ -9,13 +9,15 @@ from typing import Any
 
 import pytest
 
-#: The files that take longest come first: a long one at the end would leave a core idle.
+#: The files that take longest, with what is marked long, come first: a long one at the end would
+#: leave a core idle.
 LONGEST = (
-    "norm_limits", "nist", "norm_statistics", "closing_records", "fleet_restart", "pages",
-    "fleet_common", "readme", "loop",
-    "adequacy", "examples", "cli", "solvers", "pair", "formula", "closing_motion", "kernel",
-    "false_alarms", "spread", "export", "profile", "batch", "report", "compare", "replay", "wheel",
-    "certificate",
+    "closing_motion", "loop", "interruption", "joining", "false_alarms", "report", "pages",
+    "evidence", "closing_records", "sampson", "on_bounds", "inputs", "noise", "malformed_files",
+    "public_types", "readme", "formula", "exit_codes", "effects", "imu", "norm_limits", "valley",
+    "nist", "kernel", "batch_certificate", "equations", "memory", "fleet_restart",
+    "effects_of_columns", "cli", "replay", "extended", "filter_step", "simulating_motion",
+    "examples", "spread", "structural",
 )  # fmt: skip
 
 

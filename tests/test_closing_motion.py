@@ -190,12 +190,10 @@ def test_a_right_nonlinear_model_is_adequate():
         assert abs(end[2] - 0.8) < 4 * np.sqrt(P[2, 2])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("sensors", "found"),
-    [
-        (Sensors(), []),
-        pytest.param(Sensors(lever=(0.3, -0.1, 0.2)), ["lever_arm of v"], marks=pytest.mark.long),
-    ],
+    [(Sensors(), []), (Sensors(lever=(0.3, -0.1, 0.2)), ["lever_arm of v"])],
     ids=["nothing missing", "lever arm"],
 )
 def test_a_gap_in_time_is_no_effect_and_hides_none(sensors, found):

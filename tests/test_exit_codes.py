@@ -257,11 +257,10 @@ def test_a_reader_who_closes_the_pipe_gets_silence_and_the_files(tmp_path):
 @pytest.mark.parametrize(
     "words",
     [
-        ["simulate", "wheel", "--duration", "20", "--rate", "50"],
-        ["calibrate", *POSES],
-        ["compare", *POSES, "--starts", "0"],
+        pytest.param(["simulate", "wheel", "--duration", "20", "--rate", "50"], id="simulate"),
+        pytest.param(["calibrate", *POSES], id="calibrate"),
+        pytest.param(["compare", *POSES, "--starts", "0"], id="compare", marks=pytest.mark.long),
     ],
-    ids=lambda words: words[0],
 )
 def test_a_disk_that_fills_up_leaves_no_half_of_the_files(words, tmp_path):
     """Files of more than 2 kB are too much: the first of a command fits, or none does."""

@@ -84,9 +84,13 @@ def rows(run):
 
 
 @pytest.mark.parametrize(
-    "model", [bias_gravity, bias_gravity.sensing(a=1e-8), turning_gravity],
-    ids=["linear", "noisy inputs", "nonlinear"],
-)  # fmt: skip
+    "model",
+    [
+        pytest.param(bias_gravity, id="linear", marks=pytest.mark.long),
+        pytest.param(bias_gravity.sensing(a=1e-8), id="noisy inputs"),
+        pytest.param(turning_gravity, id="nonlinear"),
+    ],
+)
 def test_it_is_the_filter_of_the_record(model, compiled):
     run = record([s.name for s in model.signals])
     whole, device = filtered(model, run, smooth=False), compiled(model)
@@ -97,9 +101,18 @@ def test_it_is_the_filter_of_the_record(model, compiled):
         np.testing.assert_allclose(np.sqrt(np.diag(P)), whole.std[k], rtol=1e-9)
 
 
-@pytest.mark.parametrize("model", [
-    bias_gravity, bias_gravity.sensing(omega=1e-6, a=1e-8), turning_gravity.sensing(omega=1e-6),
-], ids=["linear", "noise along states", "nonlinear and noisy"])  # fmt: skip
+@pytest.mark.parametrize(
+    "model",
+    [
+        pytest.param(bias_gravity, id="linear"),
+        pytest.param(
+            bias_gravity.sensing(omega=1e-6, a=1e-8),
+            id="noise along states",
+            marks=pytest.mark.long,
+        ),
+        pytest.param(turning_gravity.sensing(omega=1e-6), id="nonlinear and noisy"),
+    ],
+)
 def test_it_is_estimator_at_irregular_times_and_over_a_gap(model, compiled):
     run = record([s.name for s in model.signals], 80).take(slice(45, 75))
     time = np.cumsum(np.random.default_rng(0).uniform(0.2, 2.0, len(run)) * STEP)

@@ -170,7 +170,10 @@ def test_an_effect_of_the_users_own_takes_part(bench, tmp_path):
     assert np.all(np.abs(off) < 4)
 
 
-@pytest.mark.parametrize("kind", ["white", "ar1", "student", "unequal"])
+@pytest.mark.parametrize(
+    "kind",
+    ["white", "ar1", *(pytest.param(k, marks=pytest.mark.long) for k in ("student", "unequal"))],
+)
 @pytest.mark.parametrize("seed", [1])
 def test_noise_is_no_formula(kind, seed):
     """The count over 308 worlds is in studies/formula.md."""

@@ -46,7 +46,9 @@ def xsens(shared_data):
     return [pair, *columns, "--set", "gravity=9.81744"]
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize(
+    "seed", [1, *(pytest.param(seed, marks=pytest.mark.long) for seed in (2, 3))]
+)
 def test_accelerometer_and_gyroscope_are_found_within_their_uncertainty(seed):
     rng = np.random.default_rng(seed)
     imu = an_imu(rng)

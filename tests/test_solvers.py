@@ -244,7 +244,9 @@ def test_a_direction_is_found_wherever_it_points(where, solver):
     assert np.linalg.norm(found.values["up"] - up) < 4 * np.sqrt(2) * 0.01 / 9.81 / np.sqrt(20)
 
 
-@pytest.mark.parametrize("where", ["start", "120 degrees away"])
+@pytest.mark.parametrize(
+    "where", ["start", pytest.param("120 degrees away", marks=pytest.mark.long)]
+)
 def test_the_covariance_of_a_direction_is_that_of_repeated_fits(where):
     rng, declared = np.random.default_rng(8), table.starting(as_declared)
     up = np.array(DIRECTIONS[where], dtype=float)

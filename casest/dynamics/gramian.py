@@ -8,7 +8,7 @@ products of transition matrices, and the ODE −Ẇ = AᵀW + WA + CᵀΘ⁻¹C,
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import casadi as ca
 import numpy as np
@@ -37,6 +37,8 @@ RESIDUE = 5e-3
 NULL = 1e-11
 #: Steps whose product is kept, and samples that are worked on at once.
 CHUNK, PIECE = 256, 4096
+#: Chunks whose single steps are kept: windows that overlap begin and end in the same ones.
+RECENT = 4
 
 
 @dataclass(frozen=True)
@@ -152,6 +154,7 @@ class Products:
     Phi: Array
     W: Array
     Q: Array | None
+    recent: dict[int, Parts] = field(default_factory=dict, compare=False, repr=False)
 
     @staticmethod
     def of(
@@ -190,16 +193,34 @@ class Products:
         last = len(self.run) - 1 if last is None else last
         begin, end = -(-first // CHUNK), last // CHUNK
         if begin >= end:
-            return _reduced(*self._steps(first, last))[1]
+            return _reduced(*_joined(self._singles(first, last)))[1]
         inner = None if self.Q is None else self.Q[begin:end]
-        parts: list[Parts] = [(self.Phi[begin:end], self.W[begin:end], inner)]
-        if first < begin * CHUNK:
-            parts.insert(0, self._steps(first, begin * CHUNK))
-        if end * CHUNK < last:
-            parts.append(self._steps(end * CHUNK, last))
-        Phi, W, Q = zip(*parts, strict=True)
-        noise = None if self.Q is None else np.concatenate(Q)
-        return _reduced(np.concatenate(Phi), np.concatenate(W), noise)[1]
+        parts = self._singles(first, begin * CHUNK)
+        parts += [(self.Phi[begin:end], self.W[begin:end], inner)]
+        return _reduced(*_joined(parts + self._singles(end * CHUNK, last)))[1]
+
+    def _singles(self, first: int, last: int) -> list[Parts]:
+        """Of the single steps from `first` to `last`, chunk by chunk."""
+        found = []
+        for k in range(first // CHUNK, -(-last // CHUNK)):
+            Phi, W, Q = self._chunk(k)
+            own = slice(max(first - k * CHUNK, 0), last - k * CHUNK)
+            found.append((Phi[own], W[own], None if Q is None else Q[own]))
+        return found
+
+    def _chunk(self, k: int) -> Parts:
+        if k not in self.recent:
+            if len(self.recent) >= RECENT:
+                del self.recent[next(iter(self.recent))]
+            last = min((k + 1) * CHUNK, len(self.run) - 1)
+            self.recent[k] = self._steps(k * CHUNK, last)
+        return self.recent[k]
+
+
+def _joined(parts: Sequence[Parts]) -> Parts:
+    Phi, W, Q = zip(*parts, strict=True)
+    noise = None if any(q is None for q in Q) else np.concatenate(Q)
+    return np.concatenate(Phi), np.concatenate(W), noise
 
 
 def gramian_by_ode(model: Dynamics, system: Linearised, tolerance: float = 1e-12) -> Array:
