@@ -212,7 +212,7 @@ class FitOptions:
         "--solver",
         show_default=True,
         type=SolverName(),
-        help="ipopt, ipopt-exact, trust-region, or an estimator of the model's own.",
+        help="ipopt, ipopt-exact, trust-region, multiple-shooting, or one of the model's own.",
     )
     starts: Assignments = flag(
         (),

@@ -40,6 +40,7 @@ from casest.estimate.reasons import (
     WALKED,
     Code,
 )
+from casest.leastsquares.growth import UNSTABLE, growth
 from casest.leastsquares.identifiability import Identifiability
 from casest.leastsquares.problem import Point, Problem
 from casest.leastsquares.sums import few_of, second_order
@@ -112,7 +113,8 @@ def certify(
     slope, step = _slope_and_step(factor, sigma, rounding)
     # What cannot be told from rounding is no slope, however small the residual.
     exact = float(np.linalg.norm(factor[1])) <= 10 * rounding * np.sqrt(problem.residual_count)
-    against += _undetermined(identified)
+    amplified = growth(problem, best.point) if np.isfinite(best.cost) else 1.0
+    against += _undetermined(identified, PRACTICALLY_NULL / max(amplified / UNSTABLE, 1.0))
     far = BEYOND * np.sqrt(correlated_over)
     if not against:
         wrong = [b for b in at_bound if b.open or not b.beyond <= far]
@@ -179,12 +181,15 @@ def _intervals(shape: tuple[float, float], profiled: bool) -> str:
     return words.cautious_intervals(shape[1]) if wide else words.intervals(*shape)
 
 
-def _undetermined(identified: Identifiability) -> list[tuple[Code, str]]:
-    """Null directions, or else one that is so for all practical purposes."""
+def _undetermined(identified: Identifiability, least: float) -> list[tuple[Code, str]]:
+    """Null directions, or else one that is so for all practical purposes.
+
+    What equations amplify tells each unknown alone the better, and no less of them together.
+    """
     singular = identified.singular_values
     if identified.unknowns - identified.rank:
         return [(Code.NOT_DETERMINED, words.not_determined(w)) for w in identified.unobservable]
-    if singular[-1] < PRACTICALLY_NULL * singular[0]:
+    if singular[-1] < least * singular[0]:
         return [(Code.NOT_DETERMINED, words.practically_not_determined(identified.weakest))]
     return []
 

@@ -552,6 +552,11 @@ class Problem:
         """Are there readings alone?"""
         return self.model.prior is None and self.constraints is None
 
+    def followed(self, point: Point, r: int) -> tuple[Array, Array]:
+        """What `given` says, with its slopes (N, k, n of the run)."""
+        assert self._staged is not None
+        return self._staged.given(self.parameters(point, r), r)
+
     def blocks(self, point: Point) -> Iterator[Block]:
         """Residuals and Jacobians of all samples, piece by piece, unweighted."""
         for r, samples in enumerate(self.samples):

@@ -17,7 +17,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from casest.data.run import Index
+from casest.data.run import Index, Run
 from casest.declaration.flow import Flow
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
@@ -280,6 +280,22 @@ def _guess(parts: Parts, samples: Array, at: Array, t: Array, y: Array, points: 
         step = np.linalg.pinv(np.nan_to_num(slopes), rcond=1e-8) @ np.nan_to_num(away)[:, :, None]
         found = found + step[:, :, 0]
     return np.column_stack([np.interp(points, t, found[:, i]) for i in range(len(start))])
+
+
+def states_by_readings(parts: Parts, samples: Array, run: Run, at: Array) -> tuple[Array, Array]:
+    """States (N, n) at samples as far as readings say them, else as they begin, and the residual
+    (N, m) of these."""
+    t = np.asarray(run.time, float)
+
+    def residual(states: Array) -> Any:
+        return parts.residual.map(len(samples))(
+            states.T, np.nan_to_num(samples).T, np.tile(at[:, None], (1, len(samples)))
+        )
+
+    still = np.tile(np.array(parts.start(at)).ravel(), (len(samples), 1))
+    y = np.array(parts.residual.map(len(samples))(
+        still.T, samples.T, np.tile(at[:, None], (1, len(samples))))[1]).T  # fmt: skip
+    return _guess(parts, samples, at, t, y, t), np.array(residual(still)[0], float).T
 
 
 def _between(t: Array, y: Array) -> Array:

@@ -2,8 +2,9 @@
 
 A cost of integrated equations has many: a trajectory that has lost step fits as badly whichever way
 the parameters go. So a fit follows the record from its beginning (`horizon`); the equations as
-constraints (`collocation`) are a second way where the record is short; and both begin elsewhere too
-where what is known of the noise leaves it open whether something better is left.
+constraints (`collocation`) are a second way where the record is short, and many beginnings at once
+(`shooting`) where what is unstable or chaotic cannot be followed from one; and they begin elsewhere
+too where what is known of the noise leaves it open whether something better is left.
 """
 
 from __future__ import annotations
@@ -14,10 +15,12 @@ from dataclasses import replace
 import numpy as np
 
 from casest.declaration.shapes import Array
+from casest.leastsquares.growth import UNSTABLE, growth
 from casest.leastsquares.problem import Point, Problem
 from casest.solve.collocation import collocated
 from casest.solve.horizon import grown
 from casest.solve.outcome import Outcome
+from casest.solve.shooting import shot
 from casest.solve.trust_region import LITTLE, trust_region
 
 #: Rows of all runs up to which collocation is asked in any case.
@@ -30,11 +33,22 @@ ALIKE = 1e-3
 
 
 def by_equations(problem: Problem, first: Point) -> tuple[Outcome, ...]:
-    """Ways from one start: along the record, and by collocation where that is quick."""
+    """Ways from one start: along the record; from many beginnings where what grows can hardly be
+    followed from one; else by collocation where that is quick."""
     found = [grown(problem, first)]
+    if max(growth(problem, point) for point in (first, found[0].point)) > UNSTABLE:
+        several = by_shooting(problem, first)
+        return (*found, several) if several is not None else (*found,)
     if sum(map(len, problem.runs)) <= SHORT:
         found += by_collocation(problem, first)
     return tuple(found)
+
+
+def by_shooting(problem: Problem, first: Point) -> Outcome | None:
+    """Where multiple shooting leads, at the optimum of the integrated equations; None where it
+    leads nowhere, or the equations are not such."""
+    near = shot(problem, first)
+    return None if near is None or not np.isfinite(near.cost) else _polished(problem, near)
 
 
 def by_collocation(problem: Problem, first: Point) -> Iterator[Outcome]:
@@ -42,10 +56,15 @@ def by_collocation(problem: Problem, first: Point) -> Iterator[Outcome]:
     near = collocated(problem, first)
     if near is None or not np.isfinite(near.cost):
         return
+    yield _polished(problem, near)
+
+
+def _polished(problem: Problem, near: Outcome) -> Outcome:
+    """The optimum of the integrated equations beside what a way has led to."""
     found = trust_region(problem, near.point, damping=LITTLE)
-    yield replace(
+    return replace(
         found,
-        solver="collocation",
+        solver=near.solver,
         iterations=near.iterations + found.iterations,
         seconds=near.seconds + found.seconds,
     )

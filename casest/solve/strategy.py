@@ -21,7 +21,7 @@ from casest.leastsquares.per_sample import linear
 from casest.leastsquares.problem import Point, Problem
 from casest.leastsquares.sums import few_of
 from casest.leastsquares.weights import has_noise_effects, weights
-from casest.solve.equations import by_equations
+from casest.solve.equations import by_equations, by_shooting
 from casest.solve.ipopt import ipopt
 from casest.solve.multipliers import kept
 from casest.solve.outcome import Outcome
@@ -43,7 +43,7 @@ APART = 1e-3
 #: Rise of the cost over that of a parabola within which there is no second valley.
 PARABOLA = (0.8, 1.25)
 #: Solvers of the least-squares problem.
-SOLVERS = ("ipopt", "ipopt-exact", "trust-region")
+SOLVERS = ("ipopt", "ipopt-exact", "trust-region", "multiple-shooting")
 
 
 def solve(
@@ -92,6 +92,10 @@ def _ways(
     The polished outcome comes first and carries the time of both. The second way begins with a
     few of the samples, where the record is long.
     """
+    if solver == "multiple-shooting" and not problem.model.traced.integrates:
+        raise UsageError(
+            f"multiple-shooting is for differential equations, and {problem.model.name} has none"
+        )
     if problem.model.traced.integrates:
         return _ways_of_equations(problem, first, solver, automatic)
     if solver == "trust-region" or _singular(problem, first):
@@ -127,6 +131,14 @@ def _ways_of_equations(
     ]
     direct = trust_region(problem, first, max_iterations=OPINION, tolerance=_fine(problem))
     near = best_of((*others, direct))
+    if solver == "multiple-shooting":
+        several = by_shooting(problem, first)
+        if several is None:
+            raise UsageError(
+                f"multiple shooting leads nowhere for {problem.model.name}: its inputs have "
+                "unknowns of their own, or nothing can be integrated; leave --solver out"
+            )
+        return (several, *others, direct)
     if solver == "trust-region" or not np.isfinite(near.cost) or _singular(problem, near.point):
         main = trust_region(problem, near.point, damping=LITTLE)
     else:
