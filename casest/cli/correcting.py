@@ -107,9 +107,15 @@ class StepOptions:
 @click.option(
     "--to",
     required=True,
-    type=click.Choice(["c", "python", "json", "ros", "kalibr", "ardupilot", "px4"]),
+    type=click.Choice(["c", "python", "json", "ros", "kalibr", "ardupilot", "px4", "dcc"]),
     help="C99, a Python module with NumPy alone, JSON, or another project's file of offsets and "
-    "matrices; `casest apply` reads the latter five.",
+    "matrices; `casest apply` reads these five. dcc: a Digital Calibration Certificate in XML.",
+)
+@click.option(
+    "--certificate",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="dcc: TOML with laboratory, customer, item, serial, person, identifier, begin, end …",
 )
 @click.option(
     "--sensor",
@@ -134,7 +140,8 @@ class StepOptions:
 @taking(StepOptions)
 def export(
     result_path: Path,
-    to: Literal["c", "python", "json", "ros", "kalibr", "ardupilot", "px4"],
+    to: Literal["c", "python", "json", "ros", "kalibr", "ardupilot", "px4", "dcc"],
+    certificate: Path | None,
     sensors: tuple[str, ...],
     single: bool,
     run: int,
@@ -165,6 +172,13 @@ def export(
         saved(step_of(str(result_path), options, single), output)
         return
     refuse(options, Kind.MOVING, f"is for estimators in motion; {result_path} is a saved result")
+    if certificate is not None and to != "dcc":
+        raise UsageError("--certificate is for --to dcc")
+    if to == "dcc":
+        if sensors or run or force or std:
+            raise UsageError("--to dcc takes --certificate alone: it has all values, with their U")
+        certified(result_path, certificate, output)
+        return
     remarks: list[str] = []
     if to == "c" or to == "python" or to == "json":
         if sensors:
@@ -182,6 +196,16 @@ def export(
     if output is not None:
         fitted = saved_result(result_path).reproduce.command
         echo(f"\n{following(typed(), file=output, fitted=fitted)}")
+
+
+def certified(result_path: Path, certificate: Path | None, output: Path | None) -> None:
+    """A Digital Calibration Certificate, and what it does not say."""
+    from casest.saved.dcc import dcc
+
+    text, remarks = dcc(result_path, certificate)
+    for remark in remarks:
+        echo(f"casest: {remark}", err=True)
+    saved(text, output)
 
 
 def saved(text: str, output: Path | None) -> None:
