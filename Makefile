@@ -134,6 +134,8 @@ figures: $(READY)
 
 docs: $(READY)
 	$(BIN)/python docs/picture.py
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python docs/gallery.py
+	$(BIN)/python docs/notebook.py
 	$(BIN)/sphinx-build -q -W --keep-going docs out/docs
 	@echo "open out/docs/index.html"
 

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 
 import casest as c
-from casest.diagnose.loop import close
 
 
 @c.model
@@ -25,7 +24,7 @@ run = c.Run.raw("cooling", {"v": v}, units={"v": "rad/s"}, time=t)
 burst = np.repeat(np.arange(25), 250)
 run = replace(run, columns={"temp": temperature}, block=burst)
 
-found = close(constant_bias, [run])
+found = c.close(constant_bias, [run])
 for effect in found.effects:
     print(effect.candidate.label, *(found.after.values[name] for name in effect.names))
 assert [e.candidate.label for e in found.effects] == ["temperature_bias(temp)"]

@@ -12,7 +12,8 @@ from pages import BLOCK, ROOT, blocks, folder_of_a_reader, follow, run_within
 
 from casest.cli import commands
 
-PAGES = sorted((ROOT / "docs").glob("*.md"))
+#: The notebook's page is made by the build: tests/test_gallery.py.
+PAGES = [p for p in sorted((ROOT / "docs").glob("*.md")) if p.stem != "notebook"]
 PHYSICS = "casest.declaration.physics"
 #: Pages that work on a measured record, which lies beside the project.
 MEASURED = {
