@@ -152,9 +152,9 @@ def simulation(model_name: str, options: SimulateOptions, command: str) -> None:
     values = record.truth(model, {name: value.array for name, value in given.items()})
     progress(f"simulating {model_name}")
     noise = options.noise or 0.0
-    reading = record.simulated(model, run, values, noise, rng)
+    readings = record.simulated(model, run, values, noise, rng)
     paths = record.written(
-        options.output, model, run, reading, values, noise, options.seed, command
+        options.output, model, run, readings, values, noise, options.seed, command
     )
     for path in paths:
         echo(f"Written: {path}")
