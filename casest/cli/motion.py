@@ -102,7 +102,8 @@ def observe(model_name: str, data: tuple[str, ...], options: ObserveOptions) -> 
         observe_structure,
     )
 
-    fits = isinstance(find_any(model_name), Model)
+    found = find_any(model_name)
+    fits = isinstance(found, Model) or (bool(data) and found.without_noise)
     if fits or data:
         why = "is a question about an estimator in motion without DATA"
         refuse(options.structural, Kind.MOVING, why)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -160,9 +161,9 @@ def simulation(model_name: str, options: SimulateOptions, command: str) -> None:
     values = record.truth(model, {name: value.array for name, value in given.items()})
     progress(f"simulating {model_name}")
     noise = options.noise or 0.0
-    name, readings = record.simulated(model, run, values, noise, rng)
-    run = replace(run, signals={**run.signals, name: readings})
-    run, sensors = with_noise(run, _of_sensors(model, run, name, options), rng)
+    readings = record.simulated(model, run, values, noise, rng)
+    run = replace(run, signals={**run.signals, **readings})
+    run, sensors = with_noise(run, _of_sensors(model, run, readings, options), rng)
     paths = record.written(
         options.output, model, run, values, noise, sensors, options.seed, command
     )
@@ -172,7 +173,7 @@ def simulation(model_name: str, options: SimulateOptions, command: str) -> None:
 
 
 def _of_sensors(
-    model: Model, run: Run, measured: str, options: SimulateOptions
+    model: Model, run: Run, measured: Collection[str], options: SimulateOptions
 ) -> dict[str, Array]:
     """Noise of single signals, as --sensor-noise says it, else as it is declared."""
     import numpy as np
@@ -181,11 +182,12 @@ def _of_sensors(
 
     found = noise_of(model, [run], options.sensors.stated, look=False)[0]
     said = {name for key in found for name in key.split(",")}
-    if options.noise is not None and measured in said:
+    twice = sorted(said.intersection(measured))
+    if options.noise is not None and twice:
         raise UsageError(
-            f"--noise and --sensor-noise {measured}=… both say the noise of {measured}: give one"
+            f"--noise and --sensor-noise {twice[0]}=… both say the noise of {twice[0]}: give one"
         )
-    said |= {measured} if options.noise is not None else set()
+    said |= set(measured) if options.noise is not None else set()
     declared = {
         s.name: [np.array([s.std])]
         for s in model.signals

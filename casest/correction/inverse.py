@@ -108,7 +108,14 @@ class Correction:
     def __post_init__(self) -> None:
         """Refuse what has no inverse, sample by sample."""
         if self.model.traced.corrected is None:
-            raise UsageError(f"model {self.model.name} names no corrected quantity: Residual(…)")
+            name = self.model.name
+            if self.model.traced.integrates:
+                raise UsageError(
+                    f"{name} tells how states go on, not what a reading should have been: there is "
+                    "nothing to correct; residuals.csv has readings less predictions, and casest "
+                    "simulate predicts another record (--value NAME=… of the result)"
+                )
+            raise UsageError(f"model {name} names no corrected quantity: Residual(…)")
         left = invertible(self.model)[1]
         if left:
             raise UsageError(

@@ -451,6 +451,12 @@ class Dynamics:
         return any(s.intensity for s in self.states) or bool(inputs)
 
     @property
+    def without_noise(self) -> bool:
+        """Is nothing said of any noise, so that it can be nothing but a calibration?"""
+        silent = all(o.std is None and o.intensity is None for o in self.traced.outputs)
+        return silent and not self.driven_by_noise and not self.sensors
+
+    @property
     def calibration(self) -> Model:
         """The model that it is without driving noise: see `equations`."""
         return calibration(self)

@@ -152,6 +152,12 @@ def check_model(model: Model) -> None:
             f"model {model.name} keeps to constraints, which calibrate_many does not; call "
             "calibrate for each sensor"
         )
+    if model.traced.integrates:
+        raise UsageError(
+            f"{model.name} follows differential equations, which many sensors at once do not: give "
+            "the records to one fit, casest calibrate A.csv B.csv --per-run NAME, or calibrate "
+            "each by itself"
+        )
     if model.sequential:
         raise UsageError(
             f"model {model.name} has an effect on the sequence of samples, which calibrate_many "

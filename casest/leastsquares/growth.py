@@ -18,7 +18,7 @@ def growth(problem: Problem, point: Point) -> float:
         return 1.0
     most = 1.0
     for r in range(len(problem.runs)):
-        states, slopes = problem.followed(point, r)
+        states, slopes = problem.given_with_slopes(point, r)
         if not (np.isfinite(states).all() and np.isfinite(slopes).all()):
             return np.inf
         size = np.max(np.abs(states), axis=0, initial=0.0)

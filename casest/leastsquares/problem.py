@@ -552,7 +552,7 @@ class Problem:
         """Are there readings alone?"""
         return self.model.prior is None and self.constraints is None
 
-    def followed(self, point: Point, r: int) -> tuple[Array, Array]:
+    def given_with_slopes(self, point: Point, r: int) -> tuple[Array, Array]:
         """What `given` says, with its slopes (N, k, n of the run)."""
         assert self._staged is not None
         return self._staged.given(self.parameters(point, r), r)

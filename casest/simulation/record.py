@@ -121,7 +121,7 @@ def without_data(
     rng: np.random.Generator,
 ) -> Run:
     """A run of signals that need no record: time, random attitudes; readings still zero."""
-    needed = [s for s in model.signals if s.name != model.traced.measured]
+    needed = [s for s in model.signals if s.name not in model.traced.readings]
     given = [s.name for s in needed if s.kind != "rotation" and (s.unit != "s" or s.size > 1)]
     if given and not model.implicit:
         raise UsageError(f"{model.name} needs {', '.join(given)}: give --input FILE with them")
@@ -151,17 +151,16 @@ def without_data(
 
 def with_record(model: Model, file: str, arguments: Mapping[str, Any]) -> Run:
     """A run with the signals of a file, and readings of zero where it has none."""
-    measured = model.traced.measured
+    measured = model.traced.readings
     if model.implicit:
         raise UsageError(f"{model.name}: give --directions N instead of --input")
-    needed = [s for s in model.signals if s.name != measured]
+    needed = [s for s in model.signals if s.name not in measured]
     runs = load_runs([file], needed, **arguments)
     if len(runs) > 1:
         raise UsageError(f"{file}: {len(runs)} runs; give one")
-    size = next(s for s in model.signals if s.name == measured)
-    run = runs[0]
-    signals = {**run.signals, size.name: np.zeros((len(run), size.size))}
-    units = {**run.units, size.name: size.unit}
+    run, own = runs[0], [model[name] for name in measured]
+    signals = {**run.signals, **{s.name: np.zeros((len(run), s.size)) for s in own}}
+    units = {**run.units, **{s.name: s.unit for s in own}}
     made = Run.raw("simulated", signals, units=units, time=run.time)
     return replace(made, columns=run.columns, column_units=run.column_units)
 
@@ -179,34 +178,43 @@ def _rotations(count: int, rng: np.random.Generator) -> Array:
 
 def simulated(
     model: Model, run: Run, values: Mapping[str, Array], noise: float, rng: np.random.Generator
-) -> tuple[str, Array]:
-    """Name of the measured signal and its readings (N, m), with white noise of std `noise`."""
+) -> dict[str, Array]:
+    """Readings (N, m) of the measured signals, with white noise of std `noise`."""
     if not (noise >= 0 and np.isfinite(noise)):
         raise UsageError(f"--noise {noise:g}: a standard deviation, not negative")
     run = prepared(model, (run,))[0]
     if model.implicit:
-        name, clean = _of_directions(model, run, values, rng)
+        clean = _of_directions(model, run, values, rng)
     else:
-        name = str(model.traced.measured)
-        clean = _predicted(model, run, name, values)
-    if not np.all(np.isfinite(clean)):
+        clean = _predicted(model, run, values)
+    if not all(np.all(np.isfinite(v)) for v in clean.values()):
         zero = [name for name, value in values.items() if not np.any(value)]
         way = f"{', '.join(zero)} are 0" if len(zero) > 1 else f"{zero[0]} is 0" if zero else ""
         raise UsageError(
             f"{model.name}: the readings are not finite with these values{way and f' ({way})'}; "
             f"give others: --value {zero[0] if zero else 'NAME'}=…"
         )
-    return name, clean + noise * rng.standard_normal(clean.shape)
+    return {name: v + noise * rng.standard_normal(v.shape) for name, v in clean.items()}
 
 
-def _predicted(model: Model, run: Run, name: str, values: Mapping[str, Array]) -> Array:
-    """What is left of readings zero and one tells the prediction: ± (reading − prediction)."""
+def _predicted(model: Model, run: Run, values: Mapping[str, Array]) -> dict[str, Array]:
+    """What is left of readings zero and one tells the prediction: ± (reading − prediction).
+
+    Of differential equations states and what is read of them.
+    """
     left = []
+    if model.traced.integrates:
+        problem = Problem(model, (run,))
+        found = problem.evaluate(problem.point(dict(values)), {"p": model.along.predicted})[0][0]
+        sizes = [model[name].size for name in model.traced.readings]
+        parts = np.split(found[:, :, 0], np.cumsum(sizes)[:-1], axis=1)
+        return dict(zip(model.traced.readings, parts, strict=True))
+    name = str(model.traced.measured)
     for level in (0.0, 1.0):
         signals = {**run.signals, name: np.full_like(run.signals[name], level)}
         problem = Problem(model, (_with(run, signals),))
         left.append(problem.residuals(problem.point(dict(values)))[0])
-    return np.asarray(-left[0] / (left[1] - left[0]))
+    return {name: np.asarray(-left[0] / (left[1] - left[0]))}
 
 
 def _with(run: Run, signals: Mapping[str, Array]) -> Run:
@@ -216,7 +224,7 @@ def _with(run: Run, signals: Mapping[str, Array]) -> Run:
 
 def _of_directions(
     model: Model, run: Run, values: Mapping[str, Array], rng: np.random.Generator
-) -> tuple[str, Array]:
+) -> dict[str, Array]:
     """Readings that correct to random directions of the known length."""
     plain_signals = [s for s in model.signals if s.kind == "plain" and s.size == 3]
     length = _known_length(model, values)
@@ -243,7 +251,7 @@ def _of_directions(
             readings[k] += step
             if np.linalg.norm(step) <= 1e-14 * (1 + np.linalg.norm(readings[k])):
                 break
-    return name, readings
+    return {name: readings}
 
 
 def _known_length(model: Model, values: Mapping[str, Array]) -> float | None:

@@ -40,6 +40,12 @@ def candidates(
     """What could be measured next."""
     if not model.parameters:
         raise UsageError(f"{model.name}: every unknown is held: there is nothing to plan for")
+    if model.traced.integrates:
+        raise UsageError(
+            f"{model.name} follows differential equations: a plan is of rows that stand for "
+            "themselves. Simulate a record that could be taken (casest simulate) and calibrate it: "
+            "its standard deviations are what that record would bring"
+        )
     if not 1 <= possible.step <= 45:
         raise UsageError(f"--step {possible.step:g}: between 1 and 45 degrees")
     if possible.reach is not None and not 0 < possible.reach <= 180:

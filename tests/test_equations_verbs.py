@@ -1,0 +1,111 @@
+"""Every command on differential equations: it works, or says in a sentence why not."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from test_equations import GASOIL
+
+from casest.cli import run
+
+SWING = """
+from casest import param, signal, sin
+from casest.dynamics import Motion, dynamics, measured, state
+
+@dynamics
+def swing(
+    a=signal("rad"), w=signal("rad/s"),
+    *,
+    angle=state("rad", start=1.0),
+    rate=state("rad/s", start=0.5),
+    w2=param("1/s^2", start=39, bounds=(0, None)),
+    viscous=param("1/s", start=0.3),
+):
+    rates = {"angle": rate, "rate": -w2 * sin(angle) - viscous * rate}
+    return Motion(rates=rates, outputs=(measured(a, angle, std=0.01), measured(w, rate, std=0.02)))
+"""
+
+
+@pytest.fixture
+def swing(tmp_path):
+    path = tmp_path / "swing.py"
+    path.write_text(SWING)
+    return str(path)
+
+
+@pytest.fixture
+def gasoil(tmp_path):
+    path = tmp_path / "gasoil.py"
+    path.write_text(GASOIL)
+    return str(path)
+
+
+def simulated(swing, folder, seed):
+    """A record of two measured states by `casest simulate`."""
+    plan = ("--duration", "1.5", "--rate", "40", "--value", "w2=36", "--noise", "0.01")
+    assert run(["simulate", swing, *plan, "--seed", str(seed), "-o", str(folder)]) == 0
+    return str(folder / "record.csv")
+
+
+def test_simulate_calibrate_and_a_held_out_experiment(swing, tmp_path, capsys):
+    """The second begins elsewhere: its own beginning is fitted to one half, the other is scored."""
+    first = simulated(swing, tmp_path / "one", 0)
+    start = ("--value", "angle_start=-0.7", "--value", "rate_start=2")
+    again = tmp_path / "two"
+    plan = ("--duration", "1.5", "--rate", "40", "--value", "w2=36", "--noise", "0.01")
+    assert run(["simulate", swing, *plan, *start, "--seed", "1", "-o", str(again)]) == 0
+    truth = json.loads((again / "truth.json").read_text())
+    assert truth["parameters"]["angle_start"] == -0.7
+    capsys.readouterr()
+    words = ["calibrate", swing, first, "--holdout", str(again / "record.csv"), "--json"]
+    assert run(words) == 0
+    found = json.loads(capsys.readouterr().out)["estimate"]
+    w2 = found["parameters"]["w2"]
+    assert abs(w2["value"] - 36) < 4 * w2["std"]
+    # Noise of 0.01 in units of the declared 0.01 and 0.02.
+    assert found["rmse_holdout"] == pytest.approx(np.sqrt((1 + 0.25) / 2), rel=0.2)
+
+
+def test_compare_puts_every_solver_on_equations(gasoil, shared_data, capsys):
+    data = str(shared_data / "certified/cops_gasoil.csv")
+    words = ["compare", gasoil, data, "--starts", "0", "--json"]
+    assert run(words) == 0
+    found = json.loads(capsys.readouterr().out)
+    ended = {row["name"]: row["same_start"] for row in found["solvers"]}
+    assert ended["trust-region"]["right"]
+
+
+def said(words, capsys) -> str:
+    """What a command says that refuses."""
+    assert run(words) == 1
+    return " ".join(capsys.readouterr().err.split())
+
+
+def test_what_is_asked_of_single_rows_is_refused_in_a_sentence(
+    gasoil, shared_data, tmp_path, capsys
+):
+    data = str(shared_data / "certified/cops_gasoil.csv")
+    assert run(["calibrate", gasoil, data, "-o", str(tmp_path / "g")]) == 0
+    capsys.readouterr()
+    result = str(tmp_path / "g")
+    assert "there is nothing to correct" in said(["apply", result, data], capsys)
+    assert "there is nothing to correct" in said(["export", result, "--to", "c"], capsys)
+    assert "Simulate a record" in said(["plan", result], capsys)
+    line = ["fleet", gasoil, str(tmp_path / "line"), "-o", str(tmp_path / "fleet")]
+    assert "give the records to one fit" in said(line, capsys)
+
+
+def test_observe_tells_what_a_record_of_equations_determines(gasoil, shared_data, capsys):
+    assert run(["observe", gasoil, str(shared_data / "certified/cops_gasoil.csv")]) == 0
+    assert "rank 3 of 3" in capsys.readouterr().out
+
+
+def test_the_wheel_by_its_equation_is_simulated_and_its_readings_corrected(tmp_path, capsys):
+    plan = ["simulate", "wheel-motion", "--duration", "4", "--rate", "50"]
+    values = ["--value", "speed=9", "--value", "friction=0.004", "--value", "drag=4e-4"]
+    assert run([*plan, *values, "-o", str(tmp_path / "w")]) == 0
+    table = np.genfromtxt(tmp_path / "w/record.csv", delimiter=",", skip_header=1)
+    centripetal = 0.28 * 9**2
+    assert table[0, 1] == pytest.approx(centripetal + 9.80665 * np.sin(0.8), rel=1e-9)
