@@ -21,9 +21,17 @@ MEASURED = {
     "from_others": "ardupilot-log171/MAG_all.csv",
 }
 WITH_COMMANDS = [p for p in PAGES if any(language == "sh" for language, _ in blocks(p))]
+#: Pages whose commands take longest.
+DEAR = {"close", "in_motion", "invisible", "plan", "uncertainty"}
 
 
-@pytest.mark.parametrize("page", WITH_COMMANDS, ids=lambda p: p.stem)
+def each_page():
+    for page in WITH_COMMANDS:
+        dear = [pytest.mark.long] if page.stem in DEAR else []
+        yield pytest.param(page, id=page.stem, marks=dear)
+
+
+@pytest.mark.parametrize("page", each_page())
 def test_a_reader_who_does_what_a_page_says_sees_what_it_shows(page, tmp_path, request):
     folder = folder_of_a_reader(page, tmp_path)
     if page.stem in MEASURED:

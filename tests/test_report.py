@@ -378,7 +378,9 @@ def axe():
     return violations
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    "kind", [KINDS[0], *(pytest.param(kind, marks=pytest.mark.long) for kind in KINDS[1:])]
+)
 def test_axe_finds_no_violation_and_a_phone_shows_the_width(browser, kinds, axe, kind):
     """On each kind of page, light; colours in the dark; 400 pixels need no scrolling sideways."""
     browser.open(kinds[kind])
@@ -390,7 +392,10 @@ def test_axe_finds_no_violation_and_a_phone_shows_the_width(browser, kinds, axe,
     browser.look()
 
 
-@pytest.mark.parametrize("kind", ["calibrate", "filter", "fleet"])
+@pytest.mark.parametrize(
+    "kind",
+    ["calibrate", *(pytest.param(kind, marks=pytest.mark.long) for kind in ("filter", "fleet"))],
+)
 def test_without_scripts_every_figure_is_a_still_picture(browser, kinds, kind):
     """As many pictures as the script draws, none of them empty or outside its frame."""
     drawn = browser.open(kinds[kind]) and browser.ask(
