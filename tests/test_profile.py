@@ -101,3 +101,14 @@ def test_of_a_straight_line_nothing_is_profiled():
     x = np.arange(1.0, 9.0)[:, None]
     run = Run.raw("line", {"x": x, "y": 2 * x + 0.1 * np.cos(7 * x)}, units={})
     assert attempt(line, [run]).certificate.profile is None
+
+
+def test_a_drawn_profile_is_the_least_sum_of_squares_at_each_value():
+    run = observed(SIGMA, 2)
+    found = attempt(demand.starting(first_guess), [run])
+    values, rise = found.profile(1, reach=2.0, count=5)
+    y = run.signals["y"][:, 0]
+    squares = np.array([squares_at(rate, y) for rate in values])
+    expected = (squares - squares_at(float(found.values["rate"]), y)) / found.noise.sigma**2
+    assert rise == pytest.approx(expected, rel=1e-3, abs=1e-6)
+    assert rise[0] / rise[-1] > 1.3  # no parabola, and no mirror image

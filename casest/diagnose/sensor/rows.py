@@ -94,13 +94,15 @@ class Rows:
 
     def _met(self, fit: Fit) -> Array:
         """What the sensor met in each row (N, q): the corrected quantity, or the prediction."""
-        traced = fit.model.traced
+        traced = fit.model.along
         name = traced.corrected
-        value = fit.model.quantities[name].value if name else traced.predicted
+        value = traced.quantities[name].value if name else traced.predicted
         if value is None:
             return np.zeros((len(self._numbers[0]), 1))
         problem, point = problem_of(fit, self.runs)
-        if problem.sequential:  # what it met is what it met without a memory as well
+        if (
+            problem.sequential and not traced.integrates
+        ):  # what it met is what it met without a memory as well
             return self._met(_instant(fit))
         found = problem.evaluate(point, {"q": value})
         return np.nan_to_num(self.of([f[0].reshape(len(f[0]), -1) for f in found]))
