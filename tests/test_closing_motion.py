@@ -54,25 +54,17 @@ def test_a_flight_that_lacks_nothing_is_adequate():
     assert result.before.rmse_holdout == result.after.rmse_holdout
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("sensors", "label", "planted", "alike"),
     [
-        pytest.param(
-            *(Sensors(gyro_bias=(0.01, -0.005, 0.004)), "bias of omega", [0.01, -0.005, 0.004], ()),
-            marks=pytest.mark.long,
-        ),
+        (Sensors(gyro_bias=(0.01, -0.005, 0.004)), "bias of omega", [0.01, -0.005, 0.004], ()),
         # So large that the matched intensities swallow it at first.
-        pytest.param(
-            *(Sensors(gyro_bias=(0.1, -0.05, 0.04)), "bias of omega", [0.1, -0.05, 0.04], ()),
-            marks=pytest.mark.long,
-        ),
+        (Sensors(gyro_bias=(0.1, -0.05, 0.04)), "bias of omega", [0.1, -0.05, 0.04], ()),
         # Not a whole number of samples, and no longer small against a period of the motion.
-        pytest.param(*(Sensors(delay=0.31), "time_delay of v", [0.31], ()), marks=pytest.mark.long),
+        (Sensors(delay=0.31), "time_delay of v", [0.31], ()),
         # A scale of the velocity does the same: the unknown gravity follows either.
-        pytest.param(
-            *(Sensors(gain=0.03), "gain of a", [0.03, 0.03, 0.03], ("gain of v",)),
-            marks=pytest.mark.long,
-        ),
+        (Sensors(gain=0.03), "gain of a", [0.03, 0.03, 0.03], ("gain of v",)),
     ],
     ids=["gyro bias", "large gyro bias", "delay", "scale"],
 )
