@@ -124,6 +124,7 @@ def test_an_exported_correction_without_std_says_so(cell, capsys):
     assert "it was exported without --with-std" in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_intervals_of_corrected_readings_hold_the_truth():
     """A norm with noise of its own on every axis: 25 calibrations, 100 fresh readings of each."""
     from casest.correction import runtime

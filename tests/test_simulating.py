@@ -47,6 +47,22 @@ def test_a_simulated_record_is_calibrated_back_to_its_truth(
         assert away.max() < 6, name
 
 
+def test_an_effect_of_poses_that_was_added_is_what_the_loop_finds(tmp_path, capsys):
+    added = ["--effect", "cross_axis", "--value", "cross_axis.k=0.02,-0.01,0.03"]
+    record, truth = made(
+        tmp_path, "norm-diagonal", "--directions", "60", "--noise", "0.003", *G, *added
+    )
+    assert truth["effects"] == ["cross_axis"]
+    out = tmp_path / "out"
+    assert command(["close", "norm-diagonal", str(record), *G, "-o", str(out)]) == 0
+    result = json.loads((out / "result.json").read_text(encoding="utf-8"))
+    assert [e["name"] for e in result["effects"]] == ["cross_axis"]
+    found = result["after"]["parameters"]["cross_axis.k"]
+    away = np.subtract(found["value"], truth["parameters"]["cross_axis.k"])
+    assert np.all(np.abs(away) < 5 * np.array(found["std"]))
+
+
+@pytest.mark.long
 def test_an_effect_that_was_added_is_what_the_loop_finds(tmp_path, capsys):
     effect = ["--effect", "imbalance", "--value", "imbalance.sine=0.3"]
     record, truth = made(tmp_path, "wheel", *WHEEL, *effect)

@@ -11,7 +11,7 @@ import click
 from casest.cli.assignments import Assignment, Assignments
 from casest.cli.completing import EffectName
 from casest.cli.flags import Kind, flag, refuse, taking
-from casest.cli.loading import declared_model, moving_model
+from casest.cli.loading import declared_model, in_motion, moving_model
 from casest.cli.options import (
     FOLDER,
     ModelOptions,
@@ -85,10 +85,7 @@ def simulate(model_name: str, options: SimulateOptions) -> None:
     Of an estimator in motion the states over time are in DIR/truth.csv; the motion is a smooth
     random one, or follows the inputs of --input.
     """
-    from casest.dynamics import Dynamics
-    from casest.results.find import find_any
-
-    if isinstance(find_any(model_name), Dynamics):
+    if in_motion(model_name):
         simulation_in_motion(model_name, options, typed())
     else:
         simulation(model_name, options, typed())

@@ -18,7 +18,7 @@ from casest.estimate.correlation import ENOUGH, TABLE, correlation_time
 from casest.estimate.covariance import inverse_normal, sandwich
 from casest.estimate.evidence import Evidence, remarks
 from casest.estimate.on_bounds import free_of
-from casest.estimate.profile_likelihood import half_width
+from casest.estimate.profile_likelihood import Profile, half_width
 from casest.estimate.propagation import Inputs
 from casest.estimate.remarks import notes, of_stated_noise
 from casest.leastsquares.identifiability import Identifiability, Weak
@@ -175,6 +175,19 @@ class Estimate:
             np.fill_diagonal(squares, reach**2)
             ends.append(self.problem.spread(at, squares))
         return ends[0], ends[1]
+
+    def profile(self, j: int, reach: float = 3.0, count: int = 13) -> tuple[Array, Array]:
+        """Values (count,) of unknown j (as in `names`), and how far 2·cost/σ² rises there.
+
+        They reach so many plain standard deviations to either side; everything else is fitted again
+        at each. Of a linear model that is a parabola, one at one standard deviation.
+        """
+        at, sigma = self.optimum or self.point, self.noise.sigma
+        covariance = sigma**2 * inverse_normal(self.problem.factor(at)[0], self.free)
+        around = Profile(self.problem, at, self.problem.cost(at), covariance, sigma)
+        distances = np.linspace(-reach, reach, count) * np.sqrt(covariance[j, j])
+        with np.errstate(all="ignore"):
+            return at.x[j] + distances, around.curve(j, distances)
 
     def _squared_reach(self) -> tuple[Array, Array]:
         """Squares of the reach below and above, (n, n) each as a covariance, as if unbounded."""

@@ -147,6 +147,11 @@ def check_model(model: Model) -> None:
             f"model {model.name} has the direction or rotation {curved[0]} among its unknowns, "
             "which calibrate_many cannot move; fix it, or call calibrate for each sensor"
         )
+    if model.traced.residual.constraints:
+        raise UsageError(
+            f"model {model.name} keeps to constraints, which calibrate_many does not; call "
+            "calibrate for each sensor"
+        )
     if model.sequential:
         raise UsageError(
             f"model {model.name} has an effect on the sequence of samples, which calibrate_many "

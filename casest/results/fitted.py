@@ -38,7 +38,7 @@ from casest.results.result import (
     reproduced,
 )
 from casest.results.uncertainty import CorrectedBudget, Covariance, Input, corrected_budget
-from casest.results.units import unit_table
+from casest.results.units import resolved, unit_table
 from casest.results.values import Entry, Held, entries, held
 from casest.validity.colour import colour_of
 
@@ -284,6 +284,7 @@ def fitted_content(
     corrected = _corrected_range(estimate)
     table = unit_table(problem.model, problem.runs)
     units = {name: unit for name, unit in table.items() if "[" not in name}
+    unknowns = zip(estimate.names, problem.units, strict=True)
     return {
         "model": model_name,
         "data": list(data),
@@ -313,7 +314,7 @@ def fitted_content(
         "declared": estimate.model.name,
         "kind": "rest intervals" if problem.runs[0].spread else "samples",
         "entries": entries(estimate),
-        "unknown_units": dict(zip(estimate.names, problem.units, strict=True)),
+        "unknown_units": {name: resolved(unit, units) for name, unit in unknowns},
         "held": held(estimate, units),
         "found": estimate,
     }
@@ -406,7 +407,7 @@ def _corrected_range(estimate: Estimate) -> Corrected | None:
     name = estimate.model.traced.corrected
     if name is None:
         return None
-    declared = ca.densify(ca.vec(estimate.model.traced.quantities[name].declared))
+    declared = ca.densify(ca.vec(estimate.model.along.quantities[name].declared))
     values = estimate.problem.evaluate(estimate.point, {"c": declared})
     finite = np.concatenate([v[0][np.isfinite(v[0])] for v in values])
     if not finite.size:

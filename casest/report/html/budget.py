@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 
 from msgspec import UNSET
@@ -38,7 +39,7 @@ def _inputs(budget: Budget) -> str:
             i.kind,
             "" if i.value is None else printed(f"{i.value:.9g}"),
             "" if i.std is None else printed(f"{i.std:.2g}"),
-            printed_unit(i.unit),
+            _unit(i.unit),
             "known" if i.degrees_of_freedom is None else f"{i.degrees_of_freedom:.3g}",
         ]
         for i in budget.inputs
@@ -60,7 +61,7 @@ def _values(budget: Budget) -> str:
                 f"`{v.name}`",
                 printed(shown),
                 printed(std),
-                printed_unit(v.unit),
+                _unit(v.unit),
                 *map(_percent, shares),
             ]
         )
@@ -87,12 +88,12 @@ def _corrected(budget: Budget) -> str:
                 f"`{name}`",
                 printed(shown),
                 printed(spread),
-                printed_unit(found.unit),
+                _unit(found.unit),
                 *map(_percent, shares),
             ]
         )
         bars[name] = shares
-    at = ", ".join(f"{x:.6g}" for x in found.at)
+    at = ", ".join(printed(f"{x:.4g}") for x in found.at)
     head = ["component", "", "± std", "unit", *(f"{n}, %" for n in names)]
     return section(
         "corrected",
@@ -121,6 +122,10 @@ def _validation(budget: Budget) -> str:
     return section("validation", "Monte Carlo", said, table(head, each, [1, 2, 3, 4]))
 
 
+def _unit(unit: str) -> str:
+    return "" if unit == "1" else printed_unit(unit)
+
+
 def _percent(share: Number) -> str:
     return "" if share is None else printed(f"{100 * share:.1f}")
 
@@ -145,8 +150,12 @@ def _bars(shares: Mapping[str, Sequence[Number]], names: Sequence[str]) -> str:
         parts.append(_part(LEFT, y, 14, COLOURS[k % len(COLOURS)], name))
         parts.append(tag("text", escaped(name), x=str(LEFT + 22), y=str(y + 14)))
     high, wide = top + len(names) * HIGH, LEFT + LONG + 10
-    drawing = tag("svg", *parts, viewBox=f"0 0 {wide} {high}", role="img", fill="currentColor")
-    return tag("figure", drawing.replace("text_anchor", "text-anchor"))
+    said = f"shares of {len(names)} inputs in {len(shares)} values; the table has the numbers"
+    drawing = tag("svg", *parts, viewBox=f"0 0 {wide} {high}", role="img", aria_label=said,
+                  fill="currentColor")  # fmt: skip
+    drawing = re.sub("(text|aria)_", r"\1-", drawing)
+    return tag("figure", tag("div", drawing, class_="drawn", tabindex="0", role="group",
+                             aria_label="shares of each value"))  # fmt: skip
 
 
 def _part(x: float, y: float, long: float, colour: str, said: str) -> str:
