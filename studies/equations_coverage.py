@@ -90,8 +90,13 @@ def table(rows: list[dict[str, Any]]) -> str:
     return "\n".join(lines) + "\n"
 
 
-if __name__ == "__main__":
-    count = int(sys.argv[1]) if len(sys.argv) > 1 else 1000
-    text = table(results(count))
+def main(arguments: list[str] | None = None) -> None:
+    """Experiments, and the table of all that are kept."""
+    words = sys.argv[1:] if arguments is None else arguments
+    text = table(results(int(words[0]) if words else 1000))
     (HERE / "equations_coverage.md").write_text(text)
     print(text)
+
+
+if __name__ == "__main__":
+    main()

@@ -31,7 +31,7 @@ def each_page():
         yield pytest.param(page, id=page.stem, marks=dear)
 
 
-@pytest.mark.parametrize("page", each_page())
+@pytest.mark.parametrize("page", list(each_page()))
 def test_a_reader_who_does_what_a_page_says_sees_what_it_shows(page, tmp_path, request):
     folder = folder_of_a_reader(page, tmp_path)
     if page.stem in MEASURED:

@@ -23,6 +23,7 @@ from casest.cli.loading import (
     trajectory,
     with_prior,
 )
+from casest.cli.noise_law import with_noise_law
 from casest.cli.options import (
     DATA,
     RESULTS,
@@ -75,6 +76,7 @@ def calibration(model_name: str, data: Sequence[str], options: FitOptions, comma
     model, runs = model_and_records(
         model_name, data, options.model, options.reading, options.sensors
     )
+    model = with_noise_law(model, runs, options.law)
     hidden = held_out(model, options.holdout, data, options.reading)
     hidden = noisy(model, hidden, options.sensors)[1] if hidden else hidden
     start = dict(given.start(model) for given in options.starts) or None
@@ -147,6 +149,8 @@ def closing(
     )
     from casest.results.file import as_json, save
 
+    if options.law != "normal":
+        raise UsageError("--noise-law is for calibrate: close judges the tails of the noise itself")
     known, own, followed = asked_effects(options.model.effects)
     model = declared_model(model_name, replace(options.model, effects=()))
     if model.resting:

@@ -222,6 +222,13 @@ class FitOptions:
         metavar="NAME=VALUE",
         help="Start value in place of the automatic one.",
     )
+    law: str = flag(
+        "normal",
+        "--noise-law",
+        show_default=True,
+        metavar="normal|t|t:NU",
+        help="Noise with heavy tails: Student's t, NU degrees of freedom or as the residual shows.",
+    )
     seed: int = flag(0, "--seed", show_default=True, help="For random restarts.")
     output: Path | None = flag(None, "-o", "--output", **RESULTS)
     as_json: bool = flag(False, "--json", help="Print result.json instead of a table.")

@@ -30,7 +30,7 @@ from casest.effects.motion import (
     speed_polynomial,
     vibration,
 )
-from casest.effects.noise import bias_wander, outliers
+from casest.effects.noise import bias_wander, outliers, student_t
 from casest.effects.over import (
     temperature_cubic,
     temperature_gain_cubic,
@@ -126,6 +126,7 @@ ASKED: tuple[Effect, ...] = (
     temperature_gain_cubic,
     temperature_table,
     temperature_gain_table,
+    student_t,
 )
 
 _SHIPPED = (*CATALOGUE, *ASKED)

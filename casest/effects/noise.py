@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from casest.declaration.effect import effect
 from casest.declaration.physics import SX, fabs, if_else
+from casest.declaration.symbols import constant
+from casest.errors import DeclarationError
 
 
 @effect(
@@ -15,6 +19,28 @@ from casest.declaration.physics import SX, fabs, if_else
 def outliers(r: SX) -> SX:
     """Samples far out count less: Tukey's biweight, 6 standard deviations wide."""
     return if_else(fabs(r) < 6, (1 - (r / 6) ** 2) ** 2, 0)
+
+
+@effect(
+    on="noise",
+    shown_by="the tails of the residual",
+    formula="weight 1/(1 + r²/ν), r in units of Student's t with ν degrees of freedom",
+    seen_in="tails",
+)
+def student_t(r: SX, *, nu: Any = constant(4.0)) -> SX:
+    """Tails heavy everywhere: noise by Student's t with nu degrees of freedom.
+
+    r comes in robust standard deviations, of which 0.6745 hold half of a normal noise; of t they
+    are its upper quartile. The weights are those of the likelihood (Lange, Little & Taylor, J. Am.
+    Stat. Assoc. 84, 1989, 881).
+    """
+    from scipy.special import stdtrit
+
+    freedom = float(nu)
+    if not freedom > 0:
+        raise DeclarationError(f"nu = {freedom:g}: degrees of freedom are above zero")
+    scaled = r * float(stdtrit(freedom, 0.75)) / 0.6745
+    return 1 / (1 + scaled**2 / freedom)
 
 
 @effect(

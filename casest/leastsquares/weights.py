@@ -69,10 +69,14 @@ def _curve(model: Model) -> Replay:
 
 
 def variance_factor(problem: Problem, point: Point) -> float:
-    """σ² that multiplies the unweighted (JᵀJ)⁻¹: Huber's (1973) mean(ψ²)/mean(ψ′)²."""
+    """σ² that multiplies the unweighted (JᵀJ)⁻¹: Huber's (1973) K²·mean(ψ²)/mean(ψ′)².
+
+    K = 1 + (unknowns/residuals)·var(ψ′)/mean(ψ′)² corrects it where residuals are few.
+    """
     residuals = some_residuals(problem, point)
     scale = robust_scale(residuals)
     r = np.concatenate([x.ravel() for x in residuals]) / scale
     w, slope = (out.ravel() for out in _curve(problem.model)(np.zeros(0), r.reshape(-1, 1)))
     dof = max(len(r) - problem.unknowns, 1)
-    return float(scale**2 * np.sum((w * r) ** 2) / dof / np.mean(slope) ** 2)
+    few = 1 + problem.unknowns / len(r) * np.var(slope) / np.mean(slope) ** 2
+    return float(few**2 * scale**2 * np.sum((w * r) ** 2) / dof / np.mean(slope) ** 2)

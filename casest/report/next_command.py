@@ -15,7 +15,7 @@ _OUTPUT = ("-o", "--output")
 _FLAGS = ("--at-rest", "--json", "--force", "--float", "--with-std", "--validate")
 _READING = ("--columns", "--unit", "--scale", "--rate", "--time-zero")
 _MODEL = ("--set", "--free", "--fix", "--shared", "--per-run", "--effects", "--at-rest", "--prior")
-_FIT = ("--start", "--solver", "--seed", "--holdout", "--sensor-noise")
+_FIT = ("--start", "--solver", "--seed", "--holdout", "--sensor-noise", "--noise-law")
 
 
 @dataclass(frozen=True)
