@@ -24,7 +24,7 @@ from casest import (
 )
 from casest.correction.inverse import Correction, invertible
 from casest.declaration.dimensions import check_units
-from casest.declaration.effect import OVER_TIME, RECORDED
+from casest.declaration.effect import OVER_TIME, RATES, RECORDED
 from casest.effects.on_axes import restricted
 from casest.effects.placing import angles, placed_in, prepared, told
 from casest.errors import CasestError
@@ -373,8 +373,9 @@ def swing(t=signal("s"), v=signal("V"), *, gain=param("V", start=1.0), pace=para
 OWN = {"compass": compass, "cell": cell, "swing": swing}
 
 
-#: Those that act on a signal as another instrument has recorded it are tested in test_memory.py.
-ON_SAMPLES = [e for e in effects.CATALOGUE if e.on not in ("noise", RECORDED)]
+#: Those that act on a signal as another instrument has recorded it are tested in test_memory.py,
+#: those on rates in test_effects_on_rates.py.
+ON_SAMPLES = [e for e in effects.CATALOGUE if e.on not in ("noise", RECORDED, RATES)]
 
 
 @pytest.mark.parametrize("effect", ON_SAMPLES, ids=lambda e: e.name)
@@ -421,5 +422,7 @@ def test_effects_of_time_and_of_single_inputs_fit_a_model_of_one_axis():
             continue
     three = {"cross_axis", "soft_iron", "cross_quadratic", "g_sensitivity"}
     wheels = {"imbalance", "speed_polynomial", "table_angle", "lever_arm"}
+    rates = {e.name for e in effects.CATALOGUE if e.on == RATES}  # of differential equations
     recorded = {"signal_lag"}  # of a signal besides the time and what is measured: there is none
-    assert {e.name for e in effects.CATALOGUE} - fits == three | wheels | recorded
+    rates = {e.name for e in effects.CATALOGUE if e.kind == "rate"}
+    assert {e.name for e in effects.CATALOGUE} - fits == three | wheels | recorded | rates | rates

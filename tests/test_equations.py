@@ -7,10 +7,12 @@ at a tolerance of 1e-13.
 from __future__ import annotations
 
 import json
+from itertools import pairwise
 
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.optimize import least_squares
 
 import casest
 from casest import (
@@ -18,15 +20,19 @@ from casest import (
     Residual,
     Run,
     constant,
+    fabs,
+    if_else,
     integrate,
     model,
     param,
+    sign,
     signal,
     sin,
     vertcat,
 )
 from casest.cli import run as casest_run
 from casest.dynamics import Motion, dynamics, measured, state
+from casest.leastsquares.problem import Problem
 
 HEAD = """
 from casest import cos, param, signal, sin, vertcat
@@ -174,6 +180,64 @@ def test_integrate_in_a_model_follows_the_closed_form():
     assert found.values["start"] == pytest.approx([5, 1.3], abs=1e-8)
 
 
+CHAIN = (
+    HEAD
+    + """
+@dynamics
+def chain(
+    y1=signal(),
+    *,
+    x=state(2, start=[1.0, 0.2], std=0.05),
+    k=param(2, start=[0.5, 0.3], bounds=(0, None)),
+):
+    rates = {"x": vertcat(-k[0] * x[0], k[0] * x[0] - k[1] * x[1])}
+    return Motion(rates=rates, outputs=(measured(y1, x[1], std=0.02),))
+"""
+)
+
+
+def chained(k, start, t):
+    """What flows through the second of two vessels, in closed form."""
+    passing = k[0] * start[0] / (k[1] - k[0])
+    return passing * np.exp(-k[0] * t) + (start[1] - passing) * np.exp(-k[1] * t)
+
+
+def test_what_is_known_of_a_beginning_is_weighed_as_readings_are(tmp_path, capsys):
+    """Two runs, each with its own; SciPy on readings and beginnings side by side."""
+    rng, t, files, readings = np.random.default_rng(1), np.linspace(0.5, 6, 12), [], []
+    for r in range(2):
+        start = np.array([1, 0.2]) + 0.05 * rng.standard_normal(2)
+        y = np.round(chained([0.7, 0.25], start, t) + 0.02 * rng.standard_normal(12), 6)
+        readings.append(y)
+        files.append(tmp_path / f"r{r}.csv")
+        rows = [f"{a!r},{b!r}" for a, b in zip(t.tolist(), y.tolist(), strict=True)]
+        files[r].write_text("\n".join(["t [s],y1", *rows]) + "\n")
+    words = [*map(str, files), "--time-zero", "column"]
+    code, found = calibrated(tmp_path, capsys, CHAIN, *words)
+    assert code == 0
+
+    def residuals(x):
+        starts = x[2:].reshape(2, 2)
+        off = [(chained(x[:2], s, t) - y) / 0.02 for s, y in zip(starts, readings, strict=True)]
+        return np.concatenate([*off, ((starts - [1, 0.2]) / 0.05).ravel()])
+
+    begin = [0.7, 0.25, 1, 0.2, 1, 0.2]
+    known = least_squares(residuals, begin, "3-point", xtol=1e-14, ftol=1e-14, gtol=1e-14)
+    values = np.concatenate([value(found, "k"), np.ravel(value(found, "x_start"))])
+    assert values == pytest.approx(known.x, rel=1e-7)
+    covariance = np.linalg.inv(known.jac.T @ known.jac)
+    got = np.array(found["estimate"]["covariance"]["matrix"])
+    assert got == pytest.approx(covariance, rel=1e-5, abs=1e-6 * covariance.max())
+
+
+def test_a_known_beginning_and_readings_of_unknown_noise_cannot_be_weighed(tmp_path, capsys):
+    (tmp_path / "declared.py").write_text(CHAIN.replace(", std=0.02", ""))
+    (tmp_path / "r.csv").write_text("t [s],y1\n" + "".join(f"{k},0.{9 - k}\n" for k in range(9)))
+    words = ["calibrate", str(tmp_path / "declared.py"), str(tmp_path / "r.csv")]
+    assert casest_run(words) == 1
+    assert "how much std= of x weighs is open" in capsys.readouterr().err
+
+
 def test_slopes_are_those_of_an_independent_integration():
     """Of a driven pendulum with an input that is held: SciPy's DOP853, differences of 1e-6."""
 
@@ -222,6 +286,80 @@ def test_slopes_are_those_of_an_independent_integration():
         step[j] = 1e-6 * max(abs(point.x[j]), 1)
         slope = (reference(point.x + step) - reference(point.x - step)) / (2 * step[j])
         assert -J[:, j] == pytest.approx(slope, rel=1e-6, abs=1e-6 * np.abs(slope).max())
+
+
+def test_jumps_of_a_rate_are_stepped_to_with_their_slopes():
+    """Dry friction, a drag with a corner, a push that ends between two rows: by SciPy's events."""
+
+    @dynamics
+    def swing(
+        t=signal("s"),
+        a=signal("rad"),
+        *,
+        angle=state("rad", start=1.0),
+        rate=state("rad/s", start=0.3),
+        w2=param("1/s^2", start=39),
+        dry=param("rad/s^2", start=0.3),
+        drag=param("1/rad", start=0.02),
+        push=param("rad/s^2", start=0.5),
+    ):
+        slowed = dry * sign(rate) + drag * rate * fabs(rate)
+        rates = -w2 * sin(angle) - slowed + if_else(t < 0.777, push, 0)
+        return Motion(rates={"angle": rate, "rate": rates}, outputs=(measured(a, angle),))
+
+    t = np.arange(0, 2, 0.05)
+
+    def reference(x) -> np.ndarray:
+        w2, dry, drag, push, *y = x
+        found, way, y = [y[0]], np.sign(y[1]), np.array(y)
+        for a, b in pairwise(t):
+            for end in (0.777, b) if a < 0.777 < b else (b,):
+                while a < end:
+
+                    def rates(s, y, way=way, pushed=push * (end <= 0.777)):
+                        slowed = way * (dry + drag * y[1] ** 2)
+                        return [y[1], -w2 * np.sin(y[0]) - slowed + pushed]
+
+                    def turns(s, y, way=way):
+                        return way * y[1]
+
+                    turns.terminal, turns.direction = True, -1
+                    part = solve_ivp(
+                        rates, (a, end), y, "DOP853", rtol=1e-13, atol=1e-13, events=turns
+                    )
+                    a, y = part.t[-1], part.y[:, -1].copy()
+                    if part.status == 1:
+                        way, y[1] = -way, -way * 1e-300
+            found.append(y[0])
+        return np.array(found)
+
+    run = Run.raw("swing", {"t": t[:, None], "a": np.zeros((40, 1))}, units={}, time=t)
+    problem = Problem(swing.calibration, (run,))
+    point = problem.start()
+    assert -problem.residuals(point)[0][:, 0] == pytest.approx(reference(point.x), abs=1e-9)
+    J = problem.jacobian(point)
+    for j in range(6):
+        step = np.zeros(6)
+        step[j] = 1e-5 * max(abs(point.x[j]), 0.1)
+        slope = (reference(point.x + step) - reference(point.x - step)) / (2 * step[j])
+        assert -J[:, j] == pytest.approx(slope, abs=1e-6 * np.abs(slope).max())
+
+
+def test_what_comes_to_rest_by_dry_friction_is_said(tmp_path, capsys):
+    """A block on a table, pushed once: it stands still after 1.02 s."""
+    file = tmp_path / "block.csv"
+    t = np.arange(30) / 10
+    way = np.minimum(t, 1 / 0.98)
+    rows = [f"{s:.1f},{w - 0.49 * w**2:.6f}" for s, w in zip(t, way, strict=True)]
+    file.write_text("\n".join(["t [s],y1", *rows]) + "\n")
+    source = DECAY.format(rate="v", start="0.98", more="v=state(start=1.0),")
+    source = source.replace('"y": v', '"y": v, "v": -k * sign(v)').replace("cos,", "cos, sign,")
+    (tmp_path / "declared.py").write_text(source)
+    words = [str(tmp_path / "declared.py"), str(file), "--fix", "k=0.98"]
+    assert casest_run(["calibrate", *words]) == 2
+    said = capsys.readouterr().err
+    assert "beyond t = 1 s" in said
+    assert "holds it" in said
 
 
 def test_what_a_declaration_says_wrongly_is_one_sentence():

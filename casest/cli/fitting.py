@@ -15,6 +15,7 @@ from casest.cli.loading import (
     asked_effects,
     declared_model,
     held_out,
+    in_motion,
     model_and_records,
     moving_model,
     noisy,
@@ -116,10 +117,7 @@ def close(model_name: str, data: tuple[str, ...], options: CloseOptions) -> int:
     Of an estimator in motion the one-step innovations are diagnosed; with --sensor the effects
     that many sensors have in common.
     """
-    from casest.dynamics import Dynamics
-    from casest.results.find import find_any
-
-    if isinstance(find_any(model_name), Dynamics):
+    if in_motion(model_name):
         return closing_in_motion(model_name, data, options, typed())
     if options.sensor:
         return fleet_closing(model_name, data, options)

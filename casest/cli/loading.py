@@ -82,7 +82,8 @@ def with_prior(model: Model, runs: Sequence[Run], prior: str | None) -> Model:
     if not prior.startswith("@"):
         raise UsageError(f"--prior {prior}: write it as --prior @old/result.json")
     earlier = earlier_result(prior[1:], model)
-    return replace(model, prior=earlier.prior(model, unit_table(model, runs)))
+    found = earlier.prior(model, unit_table(model, runs))
+    return replace(model, prior=found.beside(model.prior))
 
 
 def noisy(
@@ -140,6 +141,15 @@ def held_out(
         if Path(name).resolve() in fitted:
             raise UsageError(f"--holdout {name}: the fit has seen this file; give another record")
     return records(model, apart, options, followed) if apart else ()
+
+
+def in_motion(name: str) -> bool:
+    """Is it an estimator in motion, driven by noise? Without it equations are a calibration."""
+    from casest.dynamics import Dynamics
+    from casest.results.find import find_any
+
+    found = find_any(name)
+    return isinstance(found, Dynamics) and found.driven_by_noise
 
 
 def moving_model(name: str, constants: Assignments, options: MotionOptions) -> Dynamics:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from casest.cli.assignments import Assignment, Assignments
 from casest.cli.completing import EffectName
 from casest.cli.flags import Kind, flag, refuse, taking
-from casest.cli.loading import declared_model, moving_model
+from casest.cli.loading import declared_model, in_motion, moving_model
 from casest.cli.options import (
     FOLDER,
     ModelOptions,
@@ -21,6 +22,12 @@ from casest.cli.options import (
     model_argument,
 )
 from casest.cli.shared import commands, echo, progress, typed
+from casest.errors import UsageError
+
+if TYPE_CHECKING:
+    from casest.data.run import Run
+    from casest.declaration.model import Model
+    from casest.declaration.shapes import Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,10 +85,7 @@ def simulate(model_name: str, options: SimulateOptions) -> None:
     Of an estimator in motion the states over time are in DIR/truth.csv; the motion is a smooth
     random one, or follows the inputs of --input.
     """
-    from casest.dynamics import Dynamics
-    from casest.results.find import find_any
-
-    if isinstance(find_any(model_name), Dynamics):
+    if in_motion(model_name):
         simulation_in_motion(model_name, options, typed())
     else:
         simulation(model_name, options, typed())
@@ -135,6 +139,7 @@ def simulation(model_name: str, options: SimulateOptions, command: str) -> None:
     from casest.report.next_command import following
     from casest.results.find import find_effects
     from casest.simulation import record
+    from casest.simulation.sensor_noise import with_noise
 
     refuse(options, Kind.MOVING, f"is for estimators in motion; {model_name} has --noise")
     own = tuple(e for path in options.model.effects for e in find_effects(path))
@@ -155,10 +160,35 @@ def simulation(model_name: str, options: SimulateOptions, command: str) -> None:
     values = record.truth(model, {name: value.array for name, value in given.items()})
     progress(f"simulating {model_name}")
     noise = options.noise or 0.0
-    reading = record.simulated(model, run, values, noise, rng)
+    name, readings = record.simulated(model, run, values, noise, rng)
+    run = replace(run, signals={**run.signals, name: readings})
+    run, sensors = with_noise(run, _of_sensors(model, run, name, options), rng)
     paths = record.written(
-        options.output, model, run, reading, values, noise, options.seed, command
+        options.output, model, run, values, noise, sensors, options.seed, command
     )
     for path in paths:
         echo(f"Written: {path}")
     echo(f"\n{following(command, file=paths[0])}")
+
+
+def _of_sensors(
+    model: Model, run: Run, measured: str, options: SimulateOptions
+) -> dict[str, Array]:
+    """Noise of single signals, as --sensor-noise says it, else as it is declared."""
+    import numpy as np
+
+    from casest.cli.sensor_noise import noise_of
+
+    found = noise_of(model, [run], options.sensors.stated, look=False)[0]
+    said = {name for key in found for name in key.split(",")}
+    if options.noise is not None and measured in said:
+        raise UsageError(
+            f"--noise and --sensor-noise {measured}=… both say the noise of {measured}: give one"
+        )
+    said |= {measured} if options.noise is not None else set()
+    declared = {
+        s.name: [np.array([s.std])]
+        for s in model.signals
+        if s.std is not None and s.name not in said
+    }
+    return {key: arrays[0] for key, arrays in {**declared, **found}.items()}

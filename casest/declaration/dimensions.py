@@ -183,7 +183,7 @@ def _open(attached: Attached) -> Attached:
     found, more = [], []
     for name, declared in attached.effect.declarations:
         if isinstance(declared, Constant) and declared.unit and not declared.dims:
-            unit = of_columns(declared.unit, dict(attached.columns))
+            unit = of_columns(declared.unit, dict(attached.columns), {})
             opened = param(unit, start=float(declared.array))
             more.append(replace(opened, name=f"{attached.label}.{name}"))
             declared = more[-1]

@@ -16,21 +16,24 @@ from casest.declaration.travelling import reduced
 from casest.errors import DeclarationError, UnitError, last_line
 from casest.units import known
 
-Kind = Literal["quantity", "signal", "noise", "sequence", "time"]
+Kind = Literal["quantity", "signal", "noise", "sequence", "time", "rate"]
 
 #: Kinds that look at other samples than a residual's own.
 OVER_TIME: tuple[Kind, ...] = ("sequence", "time")
 #: What `on` says of an effect that delays any recorded signal: `with_effect(…, on=…)` says which.
 RECORDED = "recorded"
+#: What `on` says of an effect on the rate of any state, and how such a quantity begins.
+RATES, RATE = "rate of a state", "rate of "
 #: Arguments of an effect on the sequence that casest gives, beside the value and what it keeps.
 PREVIOUS, STEP, SPAN = "previous", "dt", "span"
 
 #: What an effect on the noise acts on, instead of a quantity.
 NOISE = "noise"
 #: What an effect may say of a column that is looked for among those recorded: a temperature, any
-#: other, or both, or an angle, or another sensor's acceleration on three axes; of a number that
-#: data tell; of what is searched over a grid; and of where one on the noise shows itself.
-COLUMNS = ("temperature", "other", "any", "angle", "acceleration")
+#: other, or both, or an angle, or another sensor's acceleration on three axes; on a rate, the state
+#: itself whose rate it is, or another state; of a number that data tell; of what is searched over a
+#: grid; and of where one on the noise shows itself.
+COLUMNS = ("temperature", "other", "any", "angle", "acceleration", "itself", "state")
 NUMBERS = ("mean", "least", "greatest", "duration", "radian")
 PROFILES = ("frequency", "time", "timescale", "level", "share", "lag")
 TAILS, RANDOM_WALK = "tails", "random walk"
@@ -48,7 +51,8 @@ class Effect:
     measurement that shows it; `plain` the form that it is tried in once it was found; `columns` the
     argument for which a recorded column is looked for (name -> "temperature", "other", "any",
     "angle", which is also a scalar signal or quantity of the model in rad or deg, or
-    "acceleration", another measured signal of three axes); `numbers` those
+    "acceleration", another measured signal of three axes; on a rate "itself", the state whose rate
+    it is, or "state", any other); `numbers` those
     that data tell (name -> "mean", "least" or "greatest" of that column, "radian": rad for each of
     its unit, or "duration" of the record); `seen_in` where an effect on the noise shows itself: the
     "tails" of the residuals, or a "random walk" in them; `describes`: it says what a course looks
@@ -118,11 +122,14 @@ class Effect:
 def label_of(declared: Effect, on: str, columns: Mapping[str, str], *, moved: bool) -> str:
     """What an effect of a model is called: with the columns it reads, and where it acts if moved.
 
-    One on a signal's time is always called with the signal.
+    One on a signal's time is always called with the signal, one on any rate with the state.
     """
     if declared.kind == "time":
         return f"{declared.name}({on})"
     label = declared.name + "".join(f"({c})" for c in columns.values())
+    if declared.kind == "rate":
+        state = on.removeprefix(RATE)
+        return label if state in columns.values() else f"{label}@{state}"
     return f"{label}@{on}" if moved else label
 
 
@@ -172,6 +179,11 @@ def effect(
             ("numbers", numbers),
         ):  # fmt: skip
             _refuse_unknown(function.__name__, word, given or {}, [name for name, _ in keyword])
+        if uncertain := [s.name for s in extras if s.std is not None]:
+            raise DeclarationError(
+                f"effect {function.__name__}: what an effect reads counts as exact; leave std of "
+                f"{uncertain[0]} out"
+            )
         said = {"columns": columns or {}, "numbers": numbers or {}, "profile": profile or {}}
         _refuse_other_words(function.__name__, on, extras, said, seen_in)
         _refuse_other_memory(function.__name__, positional, memory or {}, kind)
@@ -180,7 +192,8 @@ def effect(
                 f'effect {function.__name__}: kind="time" takes the time of a sample and '
                 f"nothing else, not {extras[0].name!r}"
             )
-        declared_kind: Kind = kind or ("noise" if on == NOISE else "quantity")
+        places: dict[str, Kind] = {NOISE: "noise", RATES: "rate"}
+        declared_kind: Kind = kind or places.get(on, "quantity")
         declarations = tuple(_declaration(function.__name__, name, d) for name, d in keyword)
         return Effect(
             function.__name__,
@@ -413,7 +426,7 @@ def attach(
 ) -> Attached:
     """An effect with its unknowns sized and named for the place where it is attached.
 
-    `units` gives the unit of the value acted on under the name of the effect's first argument.
+    `units` gives the unit of the value acted on, and of quantities that the effect may read.
     """
     parameters = []
     for name, declaration in declared.declarations:
@@ -428,7 +441,8 @@ def attach(
         first = next(iter(inspect.signature(declared.function).parameters))
         own = units.get(on) or f"[{on}]"
         own = f"({own})" if set("/*") & set(own) else own
-        renamed = tuple(of_columns(u.replace(f"[{first}]", own), columns) for u in parameter.units)
+        own_units = (u.replace(f"[{first}]", own) for u in parameter.units)
+        renamed = tuple(of_columns(u, columns, units) for u in own_units)
         for unit in renamed:
             if "[" not in unit and unit and not known(unit):
                 raise UnitError(f"effect {label}: {name} has unknown unit {unit!r}")
@@ -437,10 +451,15 @@ def attach(
     return Attached(declared, on, kind, label, renamed_columns, tuple(parameters), inner)
 
 
-def of_columns(unit: str, columns: Mapping[str, str]) -> str:
-    """The unit with the names of the columns that an effect reads: [channel] is [tyre temp]."""
+def of_columns(unit: str, columns: Mapping[str, str], known: Mapping[str, str]) -> str:
+    """The unit with the names of the columns that an effect reads: [channel] is [tyre temp].
+
+    Of a quantity of the model with its `known` unit.
+    """
     for name, column in columns.items():
-        if not set("[]") & set(column):
+        if column in known:
+            unit = unit.replace(f"[{name}]", f"({known[column]})")
+        elif not set("[]") & set(column):
             unit = unit.replace(f"[{name}]", f"[{column}]")
     return unit
 

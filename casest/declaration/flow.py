@@ -13,7 +13,8 @@ from typing import Any
 
 import casadi as ca
 
-from casest.declaration.physics import SX, Trace, current_trace
+from casest.declaration.effect import RATE
+from casest.declaration.physics import SX, Quantity, Trace, current_trace
 from casest.errors import DeclarationError
 
 
@@ -89,6 +90,24 @@ def integrated(
             trace.handed[name] = moved[id(handed)]
             trace.quantities[name] = replace(q, declared=put(q.declared), value=value)
     return given, put
+
+
+def rates_of(quantities: Mapping[str, Quantity], stages: Sequence[Any]) -> dict[str, str]:
+    """Rates that may lack something, with the state of each: not those that are a state.
+
+    A rate that is another state by definition lacks nothing.
+    """
+    flows = [stage for stage in stages if isinstance(stage, Flow)]
+    given = {s.element_hash() for flow in flows for s in ca.vertsplit(flow.given)}
+    found = {}
+    for name, quantity in quantities.items():
+        state = name.removeprefix(RATE)
+        if state == name or state not in quantities:
+            continue
+        parts = ca.vertsplit(ca.densify(quantity.declared))
+        if not all(p.is_symbolic() and p.element_hash() in given for p in parts):
+            found[name] = state
+    return found
 
 
 def with_inputs(

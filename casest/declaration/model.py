@@ -21,6 +21,7 @@ from casest.declaration.changing import (
 from casest.declaration.effect import (
     NOISE,
     OVER_TIME,
+    RATES,
     RECORDED,
     Attached,
     Effect,
@@ -29,7 +30,7 @@ from casest.declaration.effect import (
     check_null,
     label_of,
 )
-from casest.declaration.flow import Flow
+from casest.declaration.flow import Flow, rates_of
 from casest.declaration.noise import Stated, in_units_of_noise
 from casest.declaration.physics import Quantity, Residual
 from casest.declaration.prior import Prior
@@ -190,7 +191,10 @@ class Model:
         """
         model = self
         for name, change in changes.items():
-            model = model._with(name, model._changed(name, change))
+            old, model = model[name], model._with(name, model._changed(name, change))
+            if model.prior is not None and isinstance(old, Parameter):
+                prior = model.prior.without(name, old.shape.coordinates)
+                model = replace(model, prior=prior)
         return model
 
     def _changed(self, name: str, change: Any) -> Parameter | Constant:
@@ -258,13 +262,31 @@ class Model:
         """
         form = added.otherwise
         if form is None:
-            return self._with_effect(added, on or added.on, dict(columns or {}), on)
+            place = on or (self._rate(added, columns or {}) if added.on == RATES else added.on)
+            return self._with_effect(added, place, dict(columns or {}), on)
         try:
             return self.with_effect(replace(added, otherwise=None), on=on, columns=columns)
         except UsageError:
             told = {n: getattr(added, n) for n in ("name", "on", "typical", "shown_by")}
             said = form.formula or added.formula
             return self.with_effect(replace(form, **told, formula=said), on=on, columns=columns)
+
+    @cached_property
+    def rates(self) -> Mapping[str, str]:
+        """Rates of states that may lack something (`rate of speed`), and the state of each."""
+        return rates_of(self.staged.quantities, self.staged.stages)
+
+    def _rate(self, added: Effect, columns: Mapping[str, str]) -> str:
+        """The rate that an effect on any acts on: that of the state that it reads, or the one."""
+        own = [columns.get(name) for name, what in added.columns if what == "itself"]
+        found = [rate for rate, state in self.rates.items() if not own or state in own]
+        if len(found) == 1:
+            return found[0]
+        there = f"it has {', '.join(self.rates)}" if self.rates else "it follows none"
+        raise UsageError(
+            f"effect {added.name} is not applicable to model {self.name}: it acts on the rate of a "
+            f"state, say of which; {there}"
+        )
 
     def _with_effect(
         self, added: Effect, target: str, columns: dict[str, str], on: str | None
@@ -315,7 +337,8 @@ class Model:
                     f"{own}: declare {s.name}=signal({own!r})"
                 )
         inner = tuple(name for name in self.quantities if name not in signals)
-        return attach(added, target, kind, dims, {target: unit}, columns, label, inner)
+        units = {name: self.quantities[name].unit or "1" for name in inner}
+        return attach(added, target, kind, dims, {**units, target: unit}, columns, label, inner)
 
     def _target_shape(self, target: str) -> tuple[int, int]:
         if target in self.quantities:
@@ -449,6 +472,12 @@ class Model:
         """The body with a symbol in the place of what each effect gives that looks at others."""
         found = trace(self, staged=True)
         return found if self.noise is None else in_units_of_noise(found, self.noise)
+
+    @property
+    def along(self) -> Traced:
+        """The body in which values at samples are told: with states as they are there, and without
+        effects that look at other samples."""
+        return self.staged if self.traced.integrates else self.traced
 
     @cached_property
     def resting(self) -> bool:

@@ -1,8 +1,9 @@
 """The catalogue: physical effects that a model may lack, each a few lines with its source.
 
 An effect on "input" applies to the quantity that a model declares as `corrected`, one on "output"
-to what it predicts (an implicit model: to what it corrects); others to the quantity or signal of
-that name. So a user's own model gets every effect whose quantity it has.
+to what it predicts (an implicit model: to what it corrects), one on "rate of a state" to that of
+any state of differential equations; others to the quantity or signal of that name. So a user's own
+model gets every effect whose quantity it has.
 """
 
 from __future__ import annotations
@@ -35,6 +36,14 @@ from casest.effects.over import (
     temperature_gain_cubic,
     temperature_gain_table,
     temperature_table,
+)
+from casest.effects.rates import (
+    coupling,
+    dry_friction,
+    forcing,
+    linear_damping,
+    quadratic_damping,
+    steady_drive,
 )
 from casest.effects.reference import reference_drift, table_angle
 from casest.effects.response import (
@@ -99,6 +108,12 @@ CATALOGUE: tuple[Effect, ...] = (
     hysteresis,
     table_angle,
     reference_drift,
+    linear_damping,
+    quadratic_damping,
+    dry_friction,
+    steady_drive,
+    coupling,
+    forcing,
     reference_wander,
     bias_course,
     bias_wander,

@@ -206,7 +206,7 @@ class Estimate:
     def effective_freedom(self) -> tuple[int, ...]:
         """Degrees of freedom of each unknown's standard deviation (Welch & Satterthwaite).
 
-        What comes of references counts as known exactly: their standard uncertainties are.
+        What comes of references counts as known exactly, but for those that say otherwise.
         """
         most, own = self.noise.degrees_of_freedom, freedom(self.problem, self.optimum or self.point)
         each = np.full(self.problem.unknowns, most) if own is None else np.minimum(own, most)
@@ -218,6 +218,9 @@ class Estimate:
             with np.errstate(invalid="ignore", divide="ignore"):
                 larger = np.square(variance / np.maximum(variance - known, 1e-12 * variance))
             each = each * np.where(np.isfinite(larger), larger, 1.0)
+            with np.errstate(invalid="ignore", divide="ignore"):
+                shares = np.nan_to_num(self.inputs.shares / variance[:, None])
+                each = 1 / (1 / each + np.sum(shares**2 / self.inputs.freedom, axis=1))
         return tuple(int(min(f, UNLIMITED)) for f in each)
 
     @property

@@ -18,6 +18,7 @@ from casest.errors import UsageError
 from casest.estimate.estimate import Estimate
 from casest.leastsquares.kinds import whitened
 from casest.leastsquares.problem import Problem
+from casest.solve.horizon import grown
 from casest.solve.trust_region import trust_region
 
 #: Stretches that a held-out record is cut into; every other one is scored.
@@ -63,5 +64,7 @@ def with_own(model: Model, values: Mapping[str, Array], runs: Sequence[Run]) -> 
     fit = Problem(model.having(**shared), tuple(runs))
     alone = Problem(model, tuple(runs))
     guess = alone.values(alone.start()) if model.starter else {}
-    found = trust_region(fit, fit.point({n: v for n, v in guess.items() if n in own}))
+    start = fit.point({n: v for n, v in guess.items() if n in own})
+    # From anywhere else equations lose step with a record: they are fitted from its beginning on.
+    found = (grown if model.traced.integrates else trust_region)(fit, start)
     return {**shared, **fit.values(found.point)}

@@ -147,6 +147,11 @@ def check_model(model: Model) -> None:
             f"model {model.name} has the direction or rotation {curved[0]} among its unknowns, "
             "which calibrate_many cannot move; fix it, or call calibrate for each sensor"
         )
+    if model.traced.residual.constraints:
+        raise UsageError(
+            f"model {model.name} keeps to constraints, which calibrate_many does not; call "
+            "calibrate for each sensor"
+        )
     if model.sequential:
         raise UsageError(
             f"model {model.name} has an effect on the sequence of samples, which calibrate_many "
@@ -156,6 +161,11 @@ def check_model(model: Model) -> None:
         raise UsageError(
             f"model {model.name} has an effect on the noise, for which calibrate_many does not "
             "weigh samples; call calibrate for each sensor"
+        )
+    if any(s.std is not None for s in model.signals):
+        raise UsageError(
+            f"model {model.name} declares the std of a signal, by which calibrate_many does not "
+            "weigh samples; leave it out, or call calibrate for each sensor"
         )
     if model.canonicaliser is not None:
         raise UsageError(

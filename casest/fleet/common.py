@@ -120,7 +120,11 @@ def trials(model: Model, catalogue: Sequence[Effect]) -> list[Trial]:
     """
     found = []
     for effect in catalogue:
-        if effect.kind in OVER_TIME or NOISE in (effect.kind, effect.on) or effect.on == RECORDED:
+        if (
+            effect.kind in (*OVER_TIME, "rate")
+            or NOISE in (effect.kind, effect.on)
+            or effect.on == RECORDED
+        ):
             continue
         if effect.profile or effect.columns or effect.numbers:
             continue

@@ -8,12 +8,13 @@ Each step's error is told by two embedded solutions; where it is too large an in
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from casest.data.run import Index
 from casest.declaration.flow import Flow
@@ -21,7 +22,8 @@ from casest.declaration.physics import SX
 from casest.declaration.shapes import Array
 from casest.declaration.tracing import Traced
 from casest.engine import Recursion
-from casest.engine.runge_kutta import ORDER, error, step
+from casest.engine.runge_kutta import ORDER, error
+from casest.leastsquares.stepping import HELD, Inputs, Switched, Way, numbers, switched
 
 #: Error of a step allowed, of the largest size that a state has along the record.
 TOLERANCE = 1e-10
@@ -29,6 +31,8 @@ TOLERANCE = 1e-10
 MOST = 300_000
 #: Rounds in which steps are cut; how much at most in one round; a little more than needed.
 ROUNDS, CUT, MARGIN = 30, 8.0, 1.1
+#: Difference that stands for a step which did not succeed.
+FAILED = 1e100
 #: An interval along which states are not finite is cut so much in one round, and so much in all.
 BLIND, BLINDLY = 4, 1024
 
@@ -83,10 +87,11 @@ class Integrator:
         start = np.array(self._start(parameters)).ravel()
         for _ in range(ROUNDS):
             counts = mesh.counts * finer
-            states, errors = self._run(start, parameters, course, counts)
+            states, errors, held = self._run(start, parameters, course, counts)
             if finer > 1:
                 break
-            wanted = self._wanted(np.vstack([start[None, :n], states[:, :n]]), errors, counts)
+            x = np.vstack([start[None, :n], states[:, :n]])
+            wanted = self._wanted(x, errors, held, counts)
             settled = bool(np.all(wanted <= counts))
             if settled and np.sum(wanted) > 0.8 * np.sum(counts):
                 break
@@ -113,8 +118,8 @@ class Integrator:
 
     def _run(
         self, start: Array, parameters: Array, course: Course, counts: Index
-    ) -> tuple[Array, tuple[Array, Array]]:
-        """[x, X] after every step, and its fifth- and third-order differences."""
+    ) -> tuple[Array, tuple[Array, Array], NDArray[np.bool_]]:
+        """[x, X] after every step, its fifth- and third-order differences, and was it held?"""
         held = np.array(self.flow.held, dtype=bool)
         place = np.repeat(np.arange(len(counts)), counts)
         part = (np.arange(len(place)) - np.repeat(np.cumsum(counts) - counts, counts)) / counts[
@@ -131,12 +136,17 @@ class Integrator:
                 columns += [values[place] + rise * part[:, None], rise * width[:, None]]
         h = np.diff(course.time)[place] * width
         columns += [h[:, None], np.broadcast_to(parameters, (len(place), len(parameters)))]
+        n, rows = self.sizes[0], np.hstack(columns)
         with np.errstate(all="ignore"):
-            states, errors = self._recursion(start, np.hstack(columns))
-        n = self.sizes[0]
-        return states, (errors[:, :n], errors[:, n:])
+            states, errors = self._recursion(start, rows)
+            if np.any(errors[:, 2 * n] > 0):
+                states, errors = self._crossing(start, rows)
+                errors[errors[:, 2 * n] == 1, :n] = FAILED
+        return states, (errors[:, :n], errors[:, n : 2 * n]), errors[:, 2 * n] == HELD
 
-    def _wanted(self, x: Array, errors: tuple[Array, Array], counts: Index) -> Index:
+    def _wanted(
+        self, x: Array, errors: tuple[Array, Array], held: NDArray[np.bool_], counts: Index
+    ) -> Index:
         """Steps for each interval by which errors are as large as allowed, at least one."""
         good = np.isfinite(x).all(axis=1)
         bad = np.flatnonzero(~good)
@@ -152,8 +162,9 @@ class Integrator:
         wanted: Index = np.maximum(np.ceil(counts * cut - 1e-9).astype(int), 1)
         if bad.size:
             first = int(np.searchsorted(ends, steps, side="right"))
-            wanted[first:] = counts[first:] * BLIND
-            if wanted[first] > BLINDLY:
+            settled = bool(np.all(wanted[:first] <= counts[:first]))
+            wanted[first:] = counts[first:] * (1 if held[steps] else BLIND)
+            if wanted[first] > BLINDLY or (held[steps] and settled):
                 wanted[first] = 2 * MOST
         return wanted
 
@@ -174,32 +185,39 @@ class Integrator:
         return ca.Function("start", [parameters], [ca.densify(whole)])
 
     @cached_property
+    def _held(self) -> Switched:
+        """The rates, their jumps and corners held."""
+        return switched(self.flow, ca.vertcat(self.traced.coordinates, self.traced.references))
+
+    @cached_property
     def _recursion(self) -> Recursion:
-        """([x, X], numbers of a step) -> the next, and the differences of x."""
-        flow, (n, k, p) = self.flow, self.sizes
-        u, du, h = ca.SX.sym("u", k), ca.SX.sym("du", k), ca.SX.sym("h")
-        U, dU = ca.SX.sym("U", k, p), ca.SX.sym("dU", k, p)
-        parameters = ca.vertcat(self.traced.coordinates, self.traced.references)
-        f = flow.rates
-        slopes = [ca.jacobian(f, x) for x in (flow.x, self._coordinates, flow.inputs)]
+        """([x, X], numbers of a step) -> the next, the differences of x, and: did a mode change?"""
+        return self._stepping(self._plain)
 
-        def rate(y: SX, c: float) -> SX:
-            x, X = y[:n], ca.reshape(y[n:], n, p)
-            now, A, B, G = ca.substitute(
-                [f, *slopes], [flow.x, flow.inputs], [x, u + c * du if c else u]
-            )
-            X = A @ X + B
-            if self.fed:
-                X = X + G @ (U + c * dU)
-            return ca.vertcat(ca.densify(now), ca.vec(ca.densify(X)))
+    @cached_property
+    def _crossing(self) -> Recursion:
+        """The same through one change of mode in a step; the last says that it failed."""
+        return self._stepping(Way.through)
 
+    @staticmethod
+    def _plain(way: Way, x: SX, X: SX, given: Inputs, h: SX) -> tuple[SX, SX, SX, SX]:
+        modes = way.first_modes(x, given, h)
+        x, X, differences = way.step(x, X, given, h, modes)
+        return x, X, differences, ca.sum1(way.crossed(x, given, modes))
+
+    def _stepping(self, through: Callable[..., tuple[SX, SX, SX, SX]]) -> Recursion:
+        n, k, p = self.sizes
+        given, h = numbers(k, p), ca.SX.sym("h")
         y = ca.SX.sym("y", n + n * p)
-        after, fifth, third = step(rate, y, h)
+        way = Way(self.flow, self._held, self._coordinates, self.fed)
+        x, X, differences, mark = through(way, y[:n], ca.reshape(y[n:], n, p), given, h)
+        after = ca.vertcat(x, ca.vec(X))
         # Slopes of inputs lie row by row, as arrays do.
-        fed = [ca.vec(U.T), ca.vec(dU.T)] if self.fed else []
-        numbers = ca.vertcat(u, du, *fed, h, parameters)
-        differences = ca.vertcat(fifth[:n], third[:n])
-        return Recursion(ca.Function("step", [y, numbers], [after, ca.densify(differences)]))
+        fed = [ca.vec(given.U.T), ca.vec(given.faster.T)] if self.fed else []
+        parameters = ca.vertcat(self.traced.coordinates, self.traced.references)
+        row = ca.vertcat(given.u, given.du, *fed, h, parameters)
+        outputs = [ca.densify(after), ca.densify(ca.vertcat(differences, mark))]
+        return Recursion(ca.Function("step", [y, row], outputs))
 
 
 def flows(stages: Sequence[object]) -> list[Flow]:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -112,11 +113,16 @@ def _origin(model: Model, run: Run) -> tuple[Run, Index | slice]:
 
 @dataclass(frozen=True)
 class Staged:
-    """Residual and Jacobian of a model that looks at other samples, by itself or by its effects."""
+    """Residual and Jacobian of a model that looks at other samples, by itself or by its effects.
+
+    `states`: of each run those along its record (N, k), where they are known already and no slope
+    of theirs is asked for.
+    """
 
     model: Model
     runs: tuple[Run, ...]
     whitening: tuple[Array, ...] | None = None
+    states: tuple[Array, ...] | None = None
 
     @cached_property
     def _records(self) -> tuple[Record, ...]:
@@ -190,16 +196,42 @@ class Staged:
         found = self._given(parameters, r, own)
         return found[0][self._records[r].places], found[1][self._records[r].places]
 
+    def followed(self, parameters: Array, r: int) -> Array:
+        """States of differential equations along the record of run r, (N, k)."""
+        given, place, found = self._given(parameters, r, ())[0], 0, []
+        for stage in self.model.staged.stages:
+            if isinstance(stage, Flow):
+                found.append(given[:, place : place + stage.given.numel()])
+            place += stage.given.numel()
+        return np.hstack([given[:, :0], *found])
+
     def _given(self, parameters: Array, r: int, own: tuple[int, ...] | None) -> tuple[Array, Array]:
-        """The same at all samples of the record."""
+        """The same at all samples of the record; what was asked for last is kept."""
+        asked = (r, own, parameters.tobytes())
+        if self._last.get("asked") != asked:
+            self._last["found"] = self._followed(parameters, r, own)
+            self._last["asked"] = asked
+        found: tuple[Array, Array] = self._last["found"]
+        return found
+
+    @cached_property
+    def _last(self) -> dict[str, Any]:
+        return {}
+
+    def _followed(
+        self, parameters: Array, r: int, own: tuple[int, ...] | None
+    ) -> tuple[Array, Array]:
         *stages, _ = _programs(self.model, own)
-        record = self._records[r]
+        record, followed = self._records[r], 0
         given = np.zeros((len(record.samples), 0))
         count = self.model.staged.coordinates.numel() if own is None else len(own)
         slopes = np.zeros((len(given), 0, count))
         for k, stage in enumerate(stages):
             if stage.word:
                 more = self._of_word(stage, parameters, record, given, slopes)
+            elif stage.flow is not None and self.states is not None:
+                known = self.states[r][:, followed : followed + stage.flow.sizes[0]]
+                more, followed = (known, np.zeros((*known.shape, count))), followed + known.shape[1]
             elif stage.flow is not None:
                 taken = given[:, :0], slopes[:, :0]
                 if stage.flow.sizes[1]:
@@ -244,7 +276,8 @@ class Staged:
                 )
                 return (
                     f"the equations cannot be followed beyond t = {time[k]:.6g} s, where {there}: "
-                    "a rate is not finite there, grows without bound, or is too stiff"
+                    "a rate is not finite there, grows without bound, is too stiff, or jumps and "
+                    "holds it there, as dry friction does at rest"
                 )
         return ""
 

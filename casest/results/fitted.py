@@ -407,7 +407,7 @@ def _corrected_range(estimate: Estimate) -> Corrected | None:
     name = estimate.model.traced.corrected
     if name is None:
         return None
-    declared = ca.densify(ca.vec(estimate.model.traced.quantities[name].declared))
+    declared = ca.densify(ca.vec(estimate.model.along.quantities[name].declared))
     values = estimate.problem.evaluate(estimate.point, {"c": declared})
     finite = np.concatenate([v[0][np.isfinite(v[0])] for v in values])
     if not finite.size:

@@ -63,4 +63,4 @@ def roughness(problem: Problem, moved: Problem, point: Point) -> float:
 
 
 def _predicted(problem: Problem, point: Point) -> list[Array]:
-    return [v[0] for v in problem.evaluate(point, {"p": problem.model.traced.predicted})]
+    return [v[0] for v in problem.evaluate(point, {"p": problem.model.along.predicted})]

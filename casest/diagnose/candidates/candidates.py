@@ -11,7 +11,7 @@ import numpy as np
 
 from casest.data.run import Run
 from casest.declaration.dimensions import check_units
-from casest.declaration.effect import NOISE, RECORDED, Effect
+from casest.declaration.effect import NOISE, RATE, RATES, RECORDED, Effect, label_of
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
 from casest.declaration.symbols import Parameter
@@ -66,8 +66,8 @@ class Candidate:
     @property
     def label(self) -> str:
         """Name and column, as in the parameters' names: `temperature_bias(temp)`."""
-        if self.effect is not None and self.effect.kind == "time":
-            return f"{self.name}({self.on})"
+        if self.effect is not None and self.effect.kind in ("time", "rate"):
+            return label_of(self.effect, self.on, dict(self.columns), moved=False)
         return self.name + (f"({self.column})" if self.column else "")
 
     def among(self, names: Collection[str]) -> bool:
@@ -134,7 +134,10 @@ def candidates(
     skipped: list[Skipped] = []
     measured, unusable = _channels(model, runs)
     unfit = {s.name for s in unusable}
+    if model.traced.integrates:  # the state itself is there: its reading would follow the residual
+        unfit |= {*model.traced.readings}
     turning = [n for n in angles(model, runs) if n not in unfit]
+    states = [s for s in model.rates.values() if not model.quantities[s].dims]
     skipped += unusable
     for effect in _placed(model, catalogue):
         if effect.on == NOISE:
@@ -144,7 +147,7 @@ def candidates(
         except CasestError as error:
             skipped.append(Skipped(effect.name, str(error)))
             continue
-        for columns in _columns_for(placed, measured, turning):
+        for columns in _columns_for(placed, measured, turning, states):
             candidate = Candidate(placed, columns)
             try:
                 told = with_numbers(placed, columns, runs, model)
@@ -162,22 +165,25 @@ def candidates(
 
 
 def _placed(model: Model, catalogue: Sequence[Effect]) -> list[Effect]:
-    """The catalogue, what delays a recorded signal once for each that the body reads."""
+    """The catalogue, what delays a recorded signal once for each that the body reads, and what acts
+    on a rate once for each that may lack something."""
     followed = {column for a in model.effects for _, column in a.columns}
     signals = [name for name in model.recorded if name not in followed]
     found: list[Effect] = []
     for effect in catalogue:
-        several = signals if effect.on == RECORDED else (effect.on,)
+        places: dict[str, Sequence[str]] = {RECORDED: signals, RATES: list(model.rates)}
+        several = places.get(effect.on, (effect.on,))
         found += [replace(effect, on=on) for on in several]
     return found
 
 
 def _columns_for(
-    effect: Effect, channels: Mapping[str, bool], turning: Sequence[str]
+    effect: Effect, channels: Mapping[str, bool], turning: Sequence[str], states: Sequence[str]
 ) -> list[tuple[tuple[str, str], ...]]:
     """For effects that say for which argument a column is looked for: every one that may be it.
 
-    `=temp` for the one of that name. `turning`: angles, also those that the model declares.
+    `=temp` for the one of that name. `turning`: angles, also those that the model declares;
+    `states`: those that may drive another.
     """
     if not effect.columns:
         return [()]
@@ -185,6 +191,13 @@ def _columns_for(
     if kind.startswith("="):
         every = dict.fromkeys([*channels, *turning])
         return [((argument, name),) for name in every if kind == "=" + name]
+    own = effect.on.removeprefix(RATE)
+    if kind in ("itself", "state"):
+        return [
+            ((argument, n),)
+            for n in ([own] if kind == "itself" else states)
+            if kind == "itself" or n != own
+        ]
     if kind == "angle":
         return [((argument, name),) for name in turning if name != effect.on]
     fits = WARM.get(kind, ())

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from casest.data.run import Run
 from casest.declaration.effect import OVER_TIME
+from casest.declaration.flow import Flow
 from casest.declaration.model import Model
 from casest.declaration.physics import SX
 from casest.declaration.shapes import Array
@@ -49,10 +50,11 @@ def slopes(
     given = [problem.given(point, r) for r in range(len(problem.runs))] if direct else []
     for k in range(0, len(direct), size):
         yield from _direct(problem, point, direct[k : k + size], rows, given)
+    states = problem.followed(point) if len(direct) < len(found) else None
     for candidate in found:
         if candidate not in direct:
             try:
-                yield candidate, _through_record(problem, point, candidate, rows)
+                yield candidate, _through_record(problem, point, candidate, rows, states)
             except CasestError as error:
                 yield candidate, error
 
@@ -74,6 +76,18 @@ def _sequential(candidate: Candidate, problem: Problem) -> bool:
     places = _coordinates(extended)
     own = ca.vertcat(*(places[p.name] for p in candidate.parameters(extended)))
     return bool(ca.jacobian(taken, own).nnz())
+
+
+def _moves_states(candidate: Candidate, extended: Model) -> bool:
+    """Does it change what differential equations of the model follow?"""
+    stages, places = extended.staged.stages, _coordinates(extended)
+    entered = [stage.entered for stage in stages if isinstance(stage, Flow)]
+    added = [
+        s.given for s in stages if s.attached is not None and s.attached.label == candidate.label
+    ]
+    names = extended.unknowns_of(candidate.label) | {candidate.freed} & places.keys()
+    own = [places[name] for name in names]
+    return bool(ca.depends_on(ca.vertcat(*entered), ca.vertcat(ca.SX(0, 1), *own, *added)))
 
 
 def _coordinates(model: Model) -> dict[str, SX]:
@@ -152,11 +166,19 @@ def _side_by_side(parts: Sequence[Array], per_run: NDArray[np.bool_]) -> Array:
 
 
 def _through_record(
-    problem: Problem, point: Point, candidate: Candidate, rows: Sequence[Index]
+    problem: Problem,
+    point: Point,
+    candidate: Candidate,
+    rows: Sequence[Index],
+    states: tuple[Array, ...] | None,
 ) -> Array:
-    """Columns of the candidate's own unknowns in the extended problem."""
+    """Columns of the candidate's own unknowns in the extended problem.
+
+    `states` along the records are the same for what does not act on their rates.
+    """
     extended = candidate.traced_on(problem.model)
-    wide = Problem(extended, problem.runs)
+    moves = states is None or _moves_states(candidate, extended)
+    wide = Problem(extended, problem.runs, states=None if moves else states)
     held = {f"{candidate.label}.{name}": np.array(value) for name, value in candidate.held}
     at = wide.point({**wide.values(wide.start()), **problem.values(point), **held})
     own = candidate.parameters(extended)

@@ -127,8 +127,9 @@ def _looks_like(candidate: Candidate) -> str:
 
 def predictions(problem: Problem, point: Point) -> list[Array] | None:
     """What the model predicts, (N, m) per run; None for an implicit or sequential one."""
-    predicted = problem.model.traced.predicted
-    if predicted is None or problem.sequential:
+    traced = problem.model.along
+    predicted = traced.predicted
+    if predicted is None or (problem.sequential and not traced.integrates):
         return None
     return [v[0][:, :, 0] for v in problem.evaluate(point, {"p": predicted})]
 

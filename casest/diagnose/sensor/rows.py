@@ -12,6 +12,7 @@ from casest.data.run import Run
 from casest.declaration.effect import OVER_TIME
 from casest.declaration.shapes import Array
 from casest.diagnose.candidates.slopes import rows_of
+from casest.diagnose.evidence.held_inputs import plateaus_of
 from casest.diagnose.evidence.linear import Index, Linear, parts_of, spans_of
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.sensor.fits import Fit, problem_of
@@ -32,8 +33,9 @@ class Rows:
 
     def _linear(self, fit: Fit) -> Linear:
         residual, J = self._slopes(*problem_of(fit, self.runs))
-        parts = parts_of(*self._numbers, self._met(fit))
-        return Linear(residual, J, self._spans, parts, self._least(fit))
+        met = self._met(fit)
+        parts, held = parts_of(*self._numbers, met), plateaus_of(met, self._spans)
+        return Linear(residual, J, self._spans, parts, self._least(fit), held)
 
     def of(self, values: Sequence[Array]) -> Array:
         """Values of each run (N, …) in the rows that are looked at, one run after the other."""
@@ -92,13 +94,15 @@ class Rows:
 
     def _met(self, fit: Fit) -> Array:
         """What the sensor met in each row (N, q): the corrected quantity, or the prediction."""
-        traced = fit.model.traced
+        traced = fit.model.along
         name = traced.corrected
-        value = fit.model.quantities[name].value if name else traced.predicted
+        value = traced.quantities[name].value if name else traced.predicted
         if value is None:
             return np.zeros((len(self._numbers[0]), 1))
         problem, point = problem_of(fit, self.runs)
-        if problem.sequential:  # what it met is what it met without a memory as well
+        if (
+            problem.sequential and not traced.integrates
+        ):  # what it met is what it met without a memory as well
             return self._met(_instant(fit))
         found = problem.evaluate(point, {"q": value})
         return np.nan_to_num(self.of([f[0].reshape(len(f[0]), -1) for f in found]))

@@ -57,6 +57,10 @@ class Sensor(Subject[Fit]):
     def _without(self) -> Recent[Fit, dict[str, Fit | None]]:
         return Recent()
 
+    @cached_property
+    def _on_rates(self) -> Recent[Fit, dict[str, Fit | str]]:
+        return Recent()
+
     def fitted(self, model: Model, values: Mapping[str, Array]) -> Fit | None:
         """Fit to everything from these values; None where it goes astray."""
         return fitted(model, self.runs, values)
@@ -75,8 +79,10 @@ class Sensor(Subject[Fit]):
         return self.tried.trials(fit)
 
     def shown(self, fit: Fit) -> list[Trial]:
-        """Long lags that the records show by themselves: a slope does not reach as far."""
-        return self.tried.shown(fit)
+        """Where a slope does not reach as far: long lags that the records show by themselves, and
+        what rates may lack, since a trajectory bends in it."""
+        rates = [t for t in self.trials(fit) if _on_rate(t.what)]
+        return [*self.tried.shown(fit), *rates]
 
     def nearer(self, fit: Fit, trial: Trial, scale: float) -> list[Trial]:
         """Values of a grid around the trial's."""
@@ -92,6 +98,15 @@ class Sensor(Subject[Fit]):
 
     def refit(self, fit: Fit, added: Sequence[Trial]) -> Fit | str:
         """The fit with these effects, from their first-order sizes, if it can be trusted."""
+        if len(added) == 1 and _on_rate(added[0].what):  # asked for twice
+            known = self._on_rates.of(fit, dict)
+            label = added[0].what.label
+            if label not in known:
+                known[label] = self._refit(fit, added)
+            return known[label]
+        return self._refit(fit, added)
+
+    def _refit(self, fit: Fit, added: Sequence[Trial]) -> Fit | str:
         try:
             first = [t.what.free() if _is_lag(t.what) else t.what for t in added]
             found = self._with(fit, first, fit.values)
@@ -228,6 +243,11 @@ class Sensor(Subject[Fit]):
 def _is_lag(candidate: Candidate) -> bool:
     """Is it nothing but a time, which cannot be held?"""
     return candidate.effect is not None and candidate.effect.kind == "time"
+
+
+def _on_rate(candidate: Candidate) -> bool:
+    """Does it act on the rate of a state?"""
+    return candidate.effect is not None and candidate.effect.kind == "rate"
 
 
 def _plain(candidate: Candidate) -> Candidate | None:

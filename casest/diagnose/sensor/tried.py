@@ -107,8 +107,9 @@ class Tried:
         if shift is not None:
             push = np.einsum("nmq,nm->nq", shift[1], linear.residual)
         reading = time = None
-        if fit.model.traced.predicted is not None and not problem.sequential:
-            found = problem.evaluate(point, {"p": fit.model.traced.predicted})
+        traced = fit.model.along
+        if traced.predicted is not None and (traced.integrates or not problem.sequential):
+            found = problem.evaluate(point, {"p": traced.predicted})
             reading = self.rows.of([f[0][:, :, 0] for f in found])
         times = [run.time for run in self.rows.runs if run.time is not None]
         if len(times) == len(self.rows.runs):

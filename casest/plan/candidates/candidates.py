@@ -101,7 +101,7 @@ def blank(model: Model, count: int, given: Mapping[str, Array]) -> Run:
 def predicted(model: Model, values: Mapping[str, Any], run: Run) -> Run:
     """The run with its readings as an explicit model predicts them."""
     problem = Problem(model, (run,))
-    found = problem.evaluate(problem.point(values), {"p": model.traced.predicted})[0][0][:, :, 0]
+    found = problem.evaluate(problem.point(values), {"p": model.along.predicted})[0][0][:, :, 0]
     signals = {**run.signals, str(model.traced.measured): found}
     made = Run.raw(run.name, signals, units=run.units, time=run.time)
     return made

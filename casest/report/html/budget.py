@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 
+from msgspec import UNSET
+
 from casest.report.html.figures import Figures
 from casest.report.html.frame import whole
 from casest.report.html.numbers import printed, printed_unit
@@ -12,6 +14,7 @@ from casest.report.html.page import escaped, paragraph, section, table, tag
 from casest.results.budget import Budget
 from casest.results.result import Number
 from casest.results.rounding import rounded
+from casest.results.validation import rows, sentence
 
 PAGE = "budget.html"
 #: Okabe & Ito's colours, told apart by the colour-blind too.
@@ -23,6 +26,7 @@ HIGH, LEFT, LONG = 22, 150, 520
 def budget_page(budget: Budget) -> str:
     """Inputs, shares of every value's variance, shares of a corrected reading's, correlations."""
     body = [_inputs(budget), _values(budget), _corrected(budget), _correlations(budget)]
+    body.append(_validation(budget))
     said = f"Uncertainty budget: {len(budget.inputs)} inputs, {len(budget.values)} values"
     under = f"Made from {budget.result}. Shares are of variances, to first order."
     return whole(budget.model, said, under, body, Figures(), [])
@@ -106,6 +110,16 @@ def _correlations(budget: Budget) -> str:
         for p in budget.correlations
     ]
     return section("correlations", "Correlations", table(["", "", "correlation"], rows, [2]))
+
+
+def _validation(budget: Budget) -> str:
+    found = budget.validation
+    if found is UNSET:
+        return ""
+    head = ["95 % interval", "first order", "Monte Carlo", "apart", "may be", ""]
+    each = [[f"`{name}`", *map(printed, cells), words] for name, *cells, words in rows(found)]
+    said = paragraph(f"{sentence(found)}.")
+    return section("validation", "Monte Carlo", said, table(head, each, [1, 2, 3, 4]))
 
 
 def _unit(unit: str) -> str:

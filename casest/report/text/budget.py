@@ -5,11 +5,14 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 
+from msgspec import UNSET
+
 from casest.report.text.layout import WIDTH, item, wrapped
 from casest.results.budget import Budget
 from casest.results.result import Number
 from casest.results.rounding import rounded
 from casest.results.uncertainty import Input
+from casest.results.validation import rows, sentence
 
 #: Correlations that are printed.
 STRONGEST = 6
@@ -25,6 +28,7 @@ def budget_text(budget: Budget) -> str:
         "\n".join(_values(budget)),
         "\n".join(_corrected(budget)),
         "\n".join(_correlations(budget)),
+        "\n".join(_validation(budget)),
     ]
     return "\n\n".join(b for b in blocks if b)
 
@@ -94,6 +98,17 @@ def _correlations(budget: Budget) -> Iterator[str]:
     said = "; ".join(f"{p.names[0]} and {p.names[1]} {p.correlation:+.2f}" for p in shown)
     more = len(budget.correlations) - len(shown)
     yield item(f"correlated: {said}" + (f"; and {more} more, in budget.json" if more else ""))
+
+
+def _validation(budget: Budget) -> Iterator[str]:
+    """What Monte Carlo says of each interval."""
+    found = budget.validation
+    if found is UNSET:
+        return
+    yield from wrapped([sentence(found) + "."])
+    yield ""
+    head = ("95 % interval", "first order", "Monte Carlo", "apart", "may be", "")
+    yield from _table([head, *rows(found)])
 
 
 def _table(rows: Sequence[Sequence[str]]) -> Iterator[str]:

@@ -16,7 +16,7 @@ from casest.results.calibration import Calibration, doubt_sentence
 def calibration_text(result: Calibration, output: Path | None) -> str:
     """Verdict, values with uncertainty, what was not determined, why it is believed."""
     certificate = result.estimate.certificate
-    doubt = [doubt_sentence(result.misfit)] if result.misfit else []
+    doubt = [doubt_sentence(result)] if result.misfit else []
     title = "Believed because" if result.trusted else "Refused because"
     blocks = [
         _head(result),
