@@ -128,6 +128,32 @@ def test_the_only_column_of_a_signals_unit_is_suggested(tmp_path: Path) -> None:
     assert "try --columns mass=weight" in message
 
 
+def test_all_signals_that_are_missing_are_said_at_once(tmp_path: Path) -> None:
+    """Each once: a user types the command again one time, not once for each signal."""
+    signals = [Signal("temperature", 1, "degC"), Signal("resistance", 1, "ohm")]
+    message = refusal(DataError, tmp_path, "T [degC],R [kOhm]\n1,2\n2,3\n", signals)
+    assert message.endswith("try --columns temperature=T --columns resistance=R")
+    bare = [Signal("load", 1, None), Signal("reading", 1, None)]
+    message = refusal(DataError, tmp_path, "weight [kg],output [mV]\n1,2\n2,3\n", bare)
+    assert message.endswith("try --columns load=… --columns reading=…")
+
+
+def test_every_group_that_a_vector_could_be_is_offered(tmp_path: Path) -> None:
+    text = "turn.x,turn.y,turn.z,force.x,force.y,force.z\n1,2,3,4,5,6\n2,3,4,5,6,7\n"
+    message = refusal(DataError, tmp_path, text)
+    assert "--columns v=force.x,force.y,force.z" in message
+    assert " or --columns v=" in message
+    assert "v=turn.x,turn.y,turn.z" in message
+
+
+def test_a_time_that_is_called_by_its_unit_has_it(tmp_path: Path) -> None:
+    file = tmp_path / "raw.csv"
+    file.write_text("ms,x,y,z\n0,1,2,3\n20,2,3,4\n40,3,4,6\n")
+    (run,) = load_runs(file, (Signal("v", 3, None),), columns={"v": "x,y,z", "t": "ms"})
+    assert run.time is not None
+    assert run.time.tolist() == pytest.approx([0, 0.02, 0.04])
+
+
 def test_a_suggestion_with_blanks_is_quoted_for_the_shell(tmp_path: Path) -> None:
     text = "Acc. X,Acc. Y,Acc. Z\n1,2,3\n2,3,5\n"
     message = refusal(DataError, tmp_path, text)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from casest import units as unit_names
 from casest.data import checks, timing
 from casest.data.converting import numbers, rotation, vector
-from casest.data.finding import Choice, as_names, find_column, find_columns
+from casest.data.finding import Choice, also_missing, as_names, find_column, find_columns
 from casest.data.frames import is_frame
 from casest.data.joining import joined, shared_out
 from casest.data.logs import file_and_topics, parts_of
@@ -208,10 +208,15 @@ def _runs(table: Table, signals: Sequence[Signal], options: Options) -> list[Run
 def _bind(table: Table, signals: Sequence[Signal], options: Options) -> _Bound:
     """Find, scale and convert the columns of every signal but time."""
     found = _Bound({}, {}, {}, None, (), [])
-    for signal in signals:
-        if _is_time(signal):
-            continue
-        names = find_columns(table, signal, options.columns)
+    read = [signal for signal in signals if not _is_time(signal)]
+    for k, signal in enumerate(read):
+        try:
+            names = find_columns(table, signal, options.columns)
+        except DataError as error:
+            if signal.name in options.columns:
+                raise
+            more = also_missing(table, read[k + 1 :], options.columns, str(error))
+            raise DataError(f"{error}{more}") from None
         found.sources[signal.name] = names
         if signal.kind == "rotation":
             values, notes = rotation(table, signal, names, options)

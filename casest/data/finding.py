@@ -143,10 +143,37 @@ def _missing(table: Table, signal: Signal) -> DataError:
     near = near_group(table, signal)
     some = shlex.quote(f"{signal.name}={','.join(near)}") if near else ""
     some = some or f"{signal.name}={','.join('…' * min(signal.size, 3))}"
+    others = [g for g in _groups_of(table, signal) if g != near]
+    instead = "".join(f" or --columns {shlex.quote(f'{signal.name}={o}')}"
+                      for o in map(",".join, others[:3]))  # fmt: skip
     return DataError(
         f"{table.file}: no columns {wanted} for signal {signal.name}; "
-        f"the file has {listed(names)}; try --columns {some}"
+        f"the file has {listed(names)}; try --columns {some}{instead}"
     )
+
+
+def also_missing(table: Table, signals: Sequence[Signal], chosen: Choice, said: str) -> str:
+    """Further `--columns` to try, of the other signals that nothing in the file is called after."""
+    tries = []
+    for signal in signals:
+        if signal.name in chosen or _by_stem(table, signal, signal.name):
+            continue
+        near = ",".join(near_group(table, signal))
+        some = shlex.quote(f"{signal.name}={near}")
+        if not near or f"={near}" in said:
+            some = f"{signal.name}={','.join('…' * min(signal.size, 3))}"
+        tries.append(f" --columns {some}")
+    return "".join(tries)
+
+
+def _groups_of(table: Table, signal: Signal) -> list[list[str]]:
+    """Groups of columns that a vector could be: those in its unit, where some are."""
+    if signal.size == 1 or signal.kind == "rotation":
+        return []
+    clock = find_time(table)
+    numbers = [n for n, column in table.columns.items() if not column.is_text and n not in clock]
+    groups = [g for g in map(list, _stems(numbers)) if len(g) == signal.size]
+    return [g for g in groups if signal.unit and _in_unit(table, g, signal.unit)] or groups
 
 
 def near_group(table: Table, signal: Signal) -> list[str]:
@@ -160,10 +187,8 @@ def near_group(table: Table, signal: Signal) -> list[str]:
         fitting = [n for n in numbers if signal.unit and _in_unit(table, [n], signal.unit)]
         near = fitting[0] if len(fitting) == 1 else _nearest(signal.name, fitting or numbers)
         return [near] if near else []
-    groups = [g for g in map(list, _stems(numbers)) if len(g) == signal.size]
-    if groups:
+    if alike := _groups_of(table, signal):
         wanted = "".join(_candidates(signal)[0])
-        alike = [g for g in groups if signal.unit and _in_unit(table, g, signal.unit)] or groups
         return max(alike, key=lambda g: difflib.SequenceMatcher(None, wanted, "".join(g)).ratio())
     # What always grows is a time or a counter, unless all columns do.
     numbers = [name for name in numbers if not increasing(table, name)] or numbers

@@ -28,6 +28,8 @@ UNUSED = "time not used: "
 
 _NAMES = ("t", "time", "timestamp", "timestamps")
 _CLOCKS = {"millis": "ms", "milliseconds": "ms", "micros": "us", "microseconds": "us"}
+#: A column that was said to be the time may be called by its unit alone.
+_UNITS = ("s", "sec", "ms", "msec", "us", "usec", "ns")
 _PAIR = ["clock", "date"]
 _KINDS = ("both", "date", "clock")
 _LOOK = 100  # rows that tell what a column of text holds
@@ -148,7 +150,8 @@ def seconds(
     Raises UnitError where its unit is no time, UsageError where the header states one that may be
     that before or after scaling.
     """
-    unit = stated or column.unit or _unit_in_name(column.name)
+    called = column.name.lower() if column.name.lower() in _UNITS else None
+    unit = stated or column.unit or _unit_in_name(column.name) or called
     values = np.asarray(column.values, dtype=np.float64)
     if scale is not None:
         values = scale.apply(values, table.file, column.name)
