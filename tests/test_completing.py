@@ -57,7 +57,7 @@ def bash(folder: Path, *words: str) -> list[str]:
         (["casest", "calibrate", "wheel", "x.csv", "--colu"], ["--columns"]),
         (
             ["casest", "export", "out", "--to", ""],
-            ["c", "python", "json", "ros", "kalibr", "ardupilot", "px4"],
+            ["c", "python", "json", "ros", "kalibr", "ardupilot", "px4", "dcc"],
         ),
     ],
 )
