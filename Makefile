@@ -6,7 +6,7 @@ READY := $(VENV)/.ready
 # What a demo needs alone: a tenth of the developers' tools.
 USABLE := $(VENV)/.usable
 
-.PHONY: demo test lint types format wheel bench study study-imu study-metrology \
+.PHONY: demo test test-long lint types format wheel bench study study-imu study-metrology \
 	study-metrology-coverage study-starts study-nist study-loop \
 	study-motion study-flights study-inputs study-records study-asked study-slow study-coverage \
 	study-deceptive study-deceptive-many study-fleet study-mutation study-worlds study-noises \
@@ -19,6 +19,10 @@ demo: $(USABLE)
 # Compiled modules and tests are kept whatever the environment says: a hundred processes start here.
 test: $(READY)
 	PYTHONDONTWRITEBYTECODE= OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist loadfile -rs
+
+# What is too dear to run at every change: whole loops on measured records, counts, Ctrl-C, restarts.
+test-long: $(READY)
+	PYTHONDONTWRITEBYTECODE= OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist worksteal -rs -m long
 
 lint: $(READY)
 	$(BIN)/ruff check .

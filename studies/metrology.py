@@ -91,6 +91,7 @@ class Case:
     covariance: str = ""
     chi_square: str = ""
     relative: bool = False
+    correlation: str = ""
 
 
 def of(text: str) -> np.ndarray:
@@ -141,7 +142,7 @@ def cases() -> list[Case]:
              ["-0.35747", "24.6115"], ["0.15713", "0.48036"], "-0.05689", "0.6743"),
         Case("thermometer", "JCGM 100:2008, H.3", thermometer, {"x": gum[:, 0], "y": gum[:, 1]},
              {"y": np.ones(len(gum))}, ["-0.1712", "0.00218"], ["0.0029", "0.00067"],
-             relative=True),
+             correlation="-0.930", relative=True),
         Case("equal uncertainties", f"{ts}, clause 6 (1)", line,
              {"x": six, "y": of("3.3 5.6 7.1 9.3 10.7 12.1")}, {"y": np.full(6, 0.5)},
              ["1.867", "1.757"], ["0.465", "0.120"], "-0.050", "1.665"),
@@ -196,15 +197,90 @@ def row(case: Case) -> str:
     said = [*zip(case.values, found.point.x, strict=True)]
     said += zip(case.stds, np.sqrt(np.diag(random)), strict=False)
     said += [(case.covariance, random[0, 1])] * bool(case.covariance)
+    shared = random[0, 1] / np.sqrt(random[0, 0] * random[1, 1])
+    said += [(case.correlation, shared)] * bool(case.correlation)
     said += [(case.chi_square, chi.value)] * bool(case.chi_square)
+    return line_of(case.name, case.source, said, f"{at_printed / chi.value - 1:+.1e}", found)
+
+
+def line_of(
+    name: str, source: str, said: Sequence[tuple[str, float]], there: str, found: c.Estimate
+) -> str:
+    """What was printed beside what casest gives, as a line of the table."""
     pairs = [(p, _alike(p, v)) for p, v in said]
     equal = sum(p == v for p, v in pairs)
     others = "; ".join(f"{v} for {p}" for p, v in pairs if p != v)
     trusted = "yes" if found.certificate.trusted else "no: " + found.certificate.reasons[0]
     return (
-        f"| {case.name} | {case.source} | {equal} of {len(pairs)} | {others or '–'} | "
-        f"{at_printed / chi.value - 1:+.1e} | {trusted} |"
+        f"| {name} | {source} | {equal} of {len(pairs)} | {others or '–'} | {there} | {trusted} |"
     )
+
+
+@c.model
+def gauge_block(
+    reading=c.signal("nm"),
+    *,
+    length=c.param("nm", start=5e7),
+    standard=c.constant(50_000_623, "nm", std=25, freedom=18),
+    repeated=c.constant(215, "nm", std=5.8, freedom=24),
+    accidental=c.constant(0, "nm", std=3.9, freedom=5),
+    systematic=c.constant(0, "nm", std=6.7, freedom=8),
+    expansion=c.constant(11.5e-6, "1/K", std=1.2e-6),
+    warmth=c.constant(-0.1, "K", std=0.41),
+    unlike=c.constant(0, "1/K", std=0.58e-6, freedom=50),
+    colder=c.constant(0, "K", std=0.029, freedom=2),
+):
+    """A gauge block beside a standard; the comparator's reading and all else are inputs."""
+    difference = repeated + accidental + systematic
+    told = standard + difference - standard * (unlike * warmth + expansion * colder)
+    return c.Residual(measured=reading, predicted=length - told)
+
+
+def gauge() -> str:
+    """GUM H.1: standard uncertainty to first order, effective degrees of freedom, both printed."""
+    run = c.Run.raw("H.1", {"reading": np.zeros((1, 1))}, units={"reading": "nm"})
+    model, runs = stated_noise(gauge_block, [run], {"reading": [np.full(1, 1e-3)]})
+    found = c.attempt(model, runs)
+    said = [("50000838", float(found.values["length"])), ("32", float(found.std["length"])),
+            ("16", float(found.effective_freedom[0]))]  # fmt: skip
+    return line_of("gauge block", "JCGM 100:2008, H.1", said, "–", found)
+
+
+@c.model
+def impedance(
+    V=c.signal("V"),
+    current=c.signal("A"),
+    phase=c.signal("rad"),
+    *,
+    R=c.param("ohm", start=100.0),
+    X=c.param("ohm", start=100.0),
+):
+    """Resistance and reactance from voltage, current and phase."""
+    parts = c.vertcat(V * c.cos(phase) - R * current, V * c.sin(phase) - X * current)
+    return c.Residual(implicit=parts, unit="V")
+
+
+def alternating() -> str:
+    """GUM H.2: five sets of three readings, whose means are correlated; |Z| follows from both."""
+    sets = np.stack([
+        of("5.007 4.994 5.005 4.990 4.999"),
+        of(".019663 .019639 .019640 .019685 .019678"),
+        of("1.0456 1.0438 1.0468 1.0428 1.0433"),
+    ])  # fmt: skip
+    data = {n: m.reshape(1, 1) for n, m in zip(impedance.symbols, sets.mean(axis=1), strict=False)}
+    run = c.Run.raw("H.2", data, units={"V": "V", "current": "A", "phase": "rad"})
+    noise = {"V,current,phase": [np.cov(sets)[None] / 5]}
+    found = c.attempt(*stated_noise(impedance, [run], noise))
+    size = np.hypot(*found.point.x)
+    slope = np.vstack([np.eye(2), found.point.x / size])
+    covariance = slope @ found.covariance @ slope.T
+    std = np.sqrt(np.diag(covariance))
+    shared = covariance / np.outer(std, std)
+    values = [*found.point.x, size]
+    printed = ["127.732", "219.847", "254.260"], ["0.071", "0.295", "0.236"]
+    said = [*zip(printed[0], values, strict=True), *zip(printed[1], std, strict=True)]
+    said += [("-0.588", shared[0, 1]), ("-0.485", shared[0, 2]), ("0.993", shared[1, 2])]
+    return line_of("resistance and reactance", "JCGM 100:2008, H.2", said, "–", found)
 
 
 def _alike(printed: str, value: float) -> str:
@@ -218,13 +294,14 @@ Made by `make study-metrology` (`studies/metrology.py`). Every printed digit of 
 uncertainties, covariance and χ² counts: what was published beside what casest gives. "χ² there"
 is that at the printed values over casest's least, less one (true values projected): of digits that
 were rounded it is a little more than zero; below zero casest's would be no minimum. ODRPACK's
-examples stop at half of the
-digits that a double has. Of the ellipse casest takes off the mean that curvature gives a residual,
-which ODRPACK does not: hence other values, by fractions of their standard deviations.
+examples stop at half of the digits that a double has. Of the ellipse casest takes off the mean
+that curvature gives a residual, which ODRPACK does not: hence other values, by fractions of their
+standard deviations.
 
-GUM H.1, H.2, H.4 and H.5 and the examples of NIST's uncertainty machine evaluate a measurement
-equation and fit nothing: no case here. ISO 6143 example 2 and the other clauses of ISO/TS 28037
-could not be had with their digits.
+GUM H.1 and H.2 evaluate a measurement equation: fits without freedom, of one row, whose inputs are
+constants with standard uncertainties and degrees of freedom (H.1; 16 are the effective ones), or
+signals whose noise is stated together (H.2). H.4 and H.5 are no fits: no cases here. ISO 6143
+example 2 and the other clauses of ISO/TS 28037 could not be had with their digits.
 
 | case | published in | digits equal | casest for the published | χ² there | trusted |
 | --- | --- | --- | --- | --- | --- |
@@ -233,7 +310,7 @@ could not be had with their digits.
 
 def main() -> None:
     """Write the table."""
-    rows = [row(case) for case in cases()]
+    rows = [gauge(), alternating(), *(row(case) for case in cases())]
     (HERE / "metrology.md").write_text(HEAD + "\n".join(rows) + "\n", encoding="utf-8")
 
 

@@ -221,7 +221,7 @@ MUTANTS = tuple(
         (TRANSITION, "0.5 * (step[1:] + step[:-1])", "step[1:]"),
         (EXTENDED, "Phi @ lost @ Phi.T + Q + lost", "Q"),
         (EXTENDED, "driven(path(tau),", "driven(path(0),"),
-        (EXTENDED, "Q = with_lost(model, step, Phi, Q, pace)", "pass"),
+        (EXTENDED, "Q = with_lost(self.model, self.steps[first:last, 0], Phi, Q, pace)", "pass"),
         (EXTENDED, "- ca.dot(c, found - along)", ""),
         ("dynamics/filter.py", "first = first or (along, P)", "first = (along, P)"),
         (

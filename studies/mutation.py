@@ -126,7 +126,7 @@ def _environment(folder: Path) -> dict[str, str]:
 def _run(folder: Path, test: str) -> tuple[int, str]:
     """Exit code and output of one test file in the copy, up to its first failure."""
     command = [sys.executable, "-m", "pytest", "-x", "-q", "--tb=line", "-p", "no:cacheprovider",
-               str(folder / "tests" / test)]  # fmt: skip
+               "-m", "", str(folder / "tests" / test)]  # fmt: skip
     try:
         found = subprocess.run(
             command, cwd=folder, env=_environment(folder), capture_output=True, text=True,

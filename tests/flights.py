@@ -192,13 +192,14 @@ def spun(omega, t, parts=8):
     """Gravity in body axes (N, 3) of a body that turns with omega(t), by small rotations."""
     step = (t[1] - t[0]) / parts
     middle = t[0] + step * (np.arange((len(t) - 1) * parts) + 0.5)
-    turns = Rotation.from_rotvec(-step * omega(middle))
-    body, found = Rotation.from_euler("ZYX", [0.2, 0.1, -0.3]).inv(), []
-    for k, turn in enumerate(turns):
-        if k % parts == 0:
-            found.append(body.apply(GRAVITY))
-        body = turn * body
-    return np.array([*found, body.apply(GRAVITY)])
+    turns = Rotation.from_rotvec(-step * omega(middle)).as_matrix().reshape(-1, parts, 3, 3)
+    found = [Rotation.from_euler("ZYX", [0.2, 0.1, -0.3]).inv().apply(GRAVITY)]
+    for turn in turns:
+        seen = found[-1]
+        for small in turn:
+            seen = small @ seen
+        found.append(seen)
+    return np.array(found)
 
 
 # -- what a sensor does beside noise: the same motion, other readings ------------------------------

@@ -97,16 +97,18 @@ def judged(run, declared=channels) -> Misfit:
 # -- no misfit -------------------------------------------------------------------------------------
 
 
-def test_noise_of_any_kind_is_no_misfit():
+@pytest.mark.parametrize(("seeds", "most"), [(3, 2), pytest.param(12, 4, marks=pytest.mark.long)])
+def test_noise_of_any_kind_is_no_misfit(seeds, most):
     worlds = [
         (name, positions, judged(record(noise, seed, positions=positions)))
         for name, noise in NOISE.items()
         for positions in (0, 24)
-        for seed in range(12)
+        for seed in range(seeds)
     ]
     alarms = [(name, positions, f.where) for name, positions, f in worlds if f.significant]
-    # At one in a hundred 1.2 of 120 are expected; more than four come once in 130 tries.
-    assert len(alarms) <= 4, alarms
+    # At one in a hundred 1.2 of 120 are expected; more than four come once in 130 tries, and more
+    # than two of 30 once in 300.
+    assert len(alarms) <= most, alarms
 
 
 def test_readings_rounded_to_one_sigma_are_no_misfit_and_the_step_is_found():

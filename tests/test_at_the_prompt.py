@@ -218,6 +218,32 @@ def test_plots_hold_the_numbers_that_they_are_of(estimate):
     assert np.asarray(shown) == pytest.approx(estimate.covariance / np.outer(std, std))
 
 
+def test_the_sphere_shows_every_pose_where_its_corrected_reading_points(estimate):
+    """Lambert's projection keeps areas: its radius squared is 1 − |z|."""
+    run = estimate.problem.runs[0]
+    corrected = estimate(run.signals["v"])
+    corrected /= np.linalg.norm(corrected, axis=1)[:, None]
+    above, below = (
+        np.asarray(axis.collections[0].get_offsets()) for axis in estimate.plot("sphere").axes[:2]
+    )
+    assert len(above) + len(below) == 24
+    for shown, z in ((above, corrected[:, 2] >= 0), (below, corrected[:, 2] < 0)):
+        assert (shown**2).sum(axis=1) == pytest.approx(1 - np.abs(corrected[z, 2]), abs=1e-9)
+        assert np.arctan2(*shown.T[::-1]) == pytest.approx(
+            np.arctan2(corrected[z, 1], corrected[z, 0]), abs=1e-9
+        )
+
+
+def test_profiles_are_drawn_for_every_unknown(estimate):
+    axes = estimate.plot("profiles").axes
+    assert [a.get_xlabel() for a in axes[:9]][-1] == "offset[2] [m/s^2]"
+    values, rise = axes[8].lines[0].get_data()
+    assert rise[len(rise) // 2] == pytest.approx(0, abs=1e-9)
+    assert rise[[0, -1]] == pytest.approx(9, rel=0.1)  # nearly linear there
+    half = (values[-1] - values[0]) / 6
+    assert half == pytest.approx(estimate.plain["offset"][2], rel=1e-6)
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [

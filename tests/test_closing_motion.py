@@ -47,7 +47,7 @@ def names(closing):
 
 
 def test_a_flight_that_lacks_nothing_is_adequate():
-    closing = close_motion(bias_gravity, flight(seed=1))
+    closing = close_motion(bias_gravity, flight(seed=1, seconds=20))
     assert names(closing) == []
     result = motion_result(closing, model_name="bias-gravity", data=[])
     assert result.verdict == "adequate"
@@ -57,13 +57,22 @@ def test_a_flight_that_lacks_nothing_is_adequate():
 @pytest.mark.parametrize(
     ("sensors", "label", "planted", "alike"),
     [
-        (Sensors(gyro_bias=(0.01, -0.005, 0.004)), "bias of omega", [0.01, -0.005, 0.004], ()),
+        pytest.param(
+            *(Sensors(gyro_bias=(0.01, -0.005, 0.004)), "bias of omega", [0.01, -0.005, 0.004], ()),
+            marks=pytest.mark.long,
+        ),
         # So large that the matched intensities swallow it at first.
-        (Sensors(gyro_bias=(0.1, -0.05, 0.04)), "bias of omega", [0.1, -0.05, 0.04], ()),
+        pytest.param(
+            *(Sensors(gyro_bias=(0.1, -0.05, 0.04)), "bias of omega", [0.1, -0.05, 0.04], ()),
+            marks=pytest.mark.long,
+        ),
         # Not a whole number of samples, and no longer small against a period of the motion.
-        (Sensors(delay=0.31), "time_delay of v", [0.31], ()),
+        pytest.param(*(Sensors(delay=0.31), "time_delay of v", [0.31], ()), marks=pytest.mark.long),
         # A scale of the velocity does the same: the unknown gravity follows either.
-        (Sensors(gain=0.03), "gain of a", [0.03, 0.03, 0.03], ("gain of v",)),
+        pytest.param(
+            *(Sensors(gain=0.03), "gain of a", [0.03, 0.03, 0.03], ("gain of v",)),
+            marks=pytest.mark.long,
+        ),
     ],
     ids=["gyro bias", "large gyro bias", "delay", "scale"],
 )
@@ -82,6 +91,7 @@ def test_a_planted_effect_is_found_and_named_with_its_size(sensors, label, plant
     assert later < 0.1 * first
 
 
+@pytest.mark.long
 def test_coloured_noise_becomes_a_state_and_nothing_else_is_named():
     closing = close_motion(bias_gravity, flight(Sensors(colour=0.5, coloured=0.03), seed=4))
     assert names(closing) == ["coloured_noise of v"]
@@ -90,6 +100,7 @@ def test_coloured_noise_becomes_a_state_and_nothing_else_is_named():
     assert 0.015 < effect.parameters["std"].value < 0.06
 
 
+@pytest.mark.long
 def test_a_disturbance_with_a_colour_of_its_own_is_named():
     """What the accelerometer lacks is slow: from sample to sample it shows no such noise."""
     run, still = flight(seed=2), bias_gravity.driven(bias=0.0)
@@ -99,6 +110,7 @@ def test_a_disturbance_with_a_colour_of_its_own_is_named():
     assert not closing.loud
 
 
+@pytest.mark.long
 def test_a_state_that_must_be_driven_absurdly_is_no_answer():
     """A force that comes and goes in steps is no drift of the mass' speed."""
 
@@ -126,6 +138,7 @@ def test_a_state_that_must_be_driven_absurdly_is_no_answer():
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["g-sensitivity", "knock", "temperature"])
 def test_an_effect_of_the_sensors_catalogue_is_found_in_motion(kind):
     """The other kinds: `studies/flight_loop.py`."""
@@ -179,7 +192,10 @@ def test_a_right_nonlinear_model_is_adequate():
 
 @pytest.mark.parametrize(
     ("sensors", "found"),
-    [(Sensors(), []), (Sensors(lever=(0.3, -0.1, 0.2)), ["lever_arm of v"])],
+    [
+        (Sensors(), []),
+        pytest.param(Sensors(lever=(0.3, -0.1, 0.2)), ["lever_arm of v"], marks=pytest.mark.long),
+    ],
     ids=["nothing missing", "lever arm"],
 )
 def test_a_gap_in_time_is_no_effect_and_hides_none(sensors, found):
@@ -192,6 +208,7 @@ def test_a_gap_in_time_is_no_effect_and_hides_none(sensors, found):
     assert closing.left.p_value > 1e-3
 
 
+@pytest.mark.long
 def test_a_delay_is_found_where_samples_come_at_uneven_times():
     rng = np.random.default_rng(7)
     t = np.cumsum(rng.uniform(0.02, 0.06, 750))
@@ -233,8 +250,15 @@ def test_readings_slower_than_the_inputs_are_enough():
     assert np.all(np.abs(arm - [0.3, -0.1, 0.2]) < 4 * better.std)
 
 
-def test_sensitivities_are_the_differences_of_two_filters():
-    """Of every effect, at a small size; the filter's gains are the same on both sides.
+@pytest.mark.parametrize(
+    "labels",
+    [
+        pytest.param({"bias of omega", "lever_arm of v", "time_delay of v"}, id="some"),
+        pytest.param(None, id="all", marks=pytest.mark.long),
+    ],
+)
+def test_sensitivities_are_the_differences_of_two_filters(labels):
+    """Of effects at a small size; the filter's gains are the same on both sides.
 
     To 1 %, after the start: they are taken along the smoothed states, not those of the filter.
     """
@@ -245,6 +269,8 @@ def test_sensitivities_are_the_differences_of_two_filters():
     found = filtered(model, run)
     # A dead zone is a kink where the reading crosses zero: no difference shows its slope there.
     tried = [c for c in candidates(bias_gravity, run) if c.effect.name != "dead_zone"]
+    tried = [c for c in tried if labels is None or c.label in labels]
+    assert labels is None or len(tried) == len(labels)
     answers = sensitivity(model, [], tried, run, found)
     for candidate, where in zip(tried, answers.columns, strict=True):
         typical = np.where(np.isfinite(candidate.typical), candidate.typical, 1e-3)

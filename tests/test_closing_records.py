@@ -63,19 +63,23 @@ def improved(result):
     return {axis: after[axis] / before[axis] for axis in before}
 
 
-@pytest.mark.parametrize("unit", ["imu0", "imu1", "imu2"])
+UNITS = [pytest.param(f"imu{k}", marks=[pytest.mark.long] * (k != 1)) for k in range(3)]
+
+
+@pytest.mark.parametrize("unit", UNITS)
 def test_the_mpu9150s_skew_is_found_and_nothing_else(closed, unit):
     """Three units of 23 or fewer positions: the model without skew lacks the skew."""
     result = closed("norm-diagonal", f"mpu9150-mikoff/{unit}.log", *POSITIONS)
     assert labels(result) == ["cross_axis"]
 
 
-@pytest.mark.parametrize("unit", ["imu0", "imu1", "imu2"])
+@pytest.mark.parametrize("unit", UNITS)
 def test_with_its_skew_the_mpu9150_is_predicted_several_times_better(closed, unit):
     result = closed("norm-diagonal", f"mpu9150-mikoff/{unit}.log", *POSITIONS)
     assert max(improved(result).values()) < 1 / 4
 
 
+@pytest.mark.long
 def test_a_cooling_gyro_has_an_offset_that_time_explains_as_well_as_temperature(closed):
     """They are correlated by -0.999: whichever is kept, the other must be named."""
     result = closed(EXAMPLE, *COOLING)
@@ -89,6 +93,7 @@ def test_a_cooling_gyro_has_an_offset_that_time_explains_as_well_as_temperature(
     assert improved(result)["y"] < 0.5
 
 
+@pytest.mark.long
 def test_the_mpu6050_at_rest_has_no_nonlinearity_and_hardly_anything_to_gain(closed, counting):
     """100 s at rest: no input varies; drift and step are not told apart in it."""
     result = closed(counting, *GYRO)
@@ -99,10 +104,12 @@ def test_the_mpu6050_at_rest_has_no_nonlinearity_and_hardly_anything_to_gain(clo
     assert min(improved(result).values()) > 0.98
 
 
+@pytest.mark.long
 def test_the_accelerometer_beside_it_has_nothing_but_samples_far_out(closed, counting):
     assert set(labels(closed(counting, *ACCELEROMETER))) <= {"outliers"}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("which", ["noisy", "filtered"])
 def test_a_magnetometer_turned_by_hand_asks_for_no_cubic(shared_data, which):
     """Of its misfit of 6 % of the radius no effect explains a good part."""
@@ -123,6 +130,7 @@ def rms(parts):
     return np.sqrt(np.mean(np.vstack(parts) ** 2, axis=0))
 
 
+@pytest.mark.long
 def test_the_example_of_a_gyro_at_rest_traces_a_cold_test(closed):
     """The z axis is the control: what x and y follow is not in it."""
     result = closed(EXAMPLE, *COOLING)
@@ -136,6 +144,7 @@ def test_the_example_of_a_gyro_at_rest_traces_a_cold_test(closed):
     assert 0.95 < improved(result)["z"] < 1.0
 
 
+@pytest.mark.long
 def test_of_the_mpu6050_at_rest_the_accelerometer_is_adequate_and_nothing_is_a_formula(
     closed, counting
 ):

@@ -124,6 +124,7 @@ def test_an_exported_correction_without_std_says_so(cell, capsys):
     assert "it was exported without --with-std" in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_intervals_of_corrected_readings_hold_the_truth():
     """A norm with noise of its own on every axis: 25 calibrations, 100 fresh readings of each."""
     from casest.correction import runtime
@@ -146,3 +147,23 @@ def test_intervals_of_corrected_readings_hold_the_truth():
         spread = runtime.attempted(as_data(program), np.hstack([v[30:], got]))[:, -3:]
         held.append(np.abs(got - force[30:]) < 1.959964 * spread)
     assert 0.94 < np.mean(held) < 0.96
+
+
+def test_a_correction_is_traced_once_for_all_that_a_result_says_of_it(monkeypatch):
+    """Tracing is what takes time; std and budget of a corrected reading ask for the same one."""
+    from casest.correction import inverse
+    from casest.results.calibration import calibration_result
+
+    @c.model
+    def cell(load=c.signal("N"), v=c.signal("V"), *, gain=c.param("V/N", start=1.0)):
+        """A straight line."""
+        force = c.quantity("force", load, "N")
+        return c.Residual(measured=v, predicted=gain * force, corrected=force)
+
+    load = np.arange(1.0, 9.0)[:, None]
+    record = c.Run.raw("r", {"load": load, "v": 2 * load + 0.01 * np.sin(9 * load)}, units={})
+    found, calls, whole = c.attempt(cell, [record]), [], inverse.trace
+    monkeypatch.setattr(inverse, "trace", lambda *a, **k: calls.append(k) or whole(*a, **k))
+    result = calibration_result(found, model_name="cell", data=["r"])
+    assert len(calls) == 1
+    assert result.content()["corrected_budget"]["std"][0] > 0

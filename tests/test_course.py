@@ -46,17 +46,34 @@ def record(count, kind="even"):
     return run
 
 
-@pytest.mark.parametrize("kind", ["even", "uneven"])
-@pytest.mark.parametrize("model", [
-    bias_gravity, bias_gravity.sensing(omega=1e-8, a=1e-8), bias_gravity_magnitude,
-    turning_gravity, turning_gravity.sensing(omega=1e-8), near_the_ground,
-], ids=[
-    "linear", "noisy inputs", "known", "nonlinear", "nonlinear and noisy", "nonlinear and known",
-])  # fmt: skip
+MODELS = {
+    "linear": bias_gravity,
+    "noisy inputs": bias_gravity.sensing(omega=1e-8, a=1e-8),
+    "known": bias_gravity_magnitude,
+    "nonlinear": turning_gravity,
+    "nonlinear and noisy": turning_gravity.sensing(omega=1e-8),
+    "nonlinear and known": near_the_ground,
+}
+#: At uneven times each step of a linear model has an exponential of its own.
+DEAR = pytest.mark.long
+
+
+@pytest.mark.parametrize(
+    ("model", "kind"),
+    [
+        pytest.param(
+            *(model, kind),
+            id=f"{name}, {kind}",
+            marks=[DEAR] * (kind == "uneven" and "nonlinear" not in name),
+        )
+        for name, model in MODELS.items()
+        for kind in ("even", "uneven")
+    ],
+)
 def test_in_pieces_every_number_is_the_wholes_to_rounding(model, kind, monkeypatch):
     monkeypatch.setattr(course, "PIECE", 137)
     monkeypatch.setattr(course, "LARGEST", 0)
-    run = record(1000, kind)
+    run = record(420, kind)
     whole, pieces = filtered(model, run), followed(model, run)
     assert pieces.settled == whole.settled
     for name in NAMES:

@@ -143,7 +143,9 @@ def test_with_positions_the_rank_is_full_too():
     assert observed(model, gramian(model, linearised(model, run))).rank == 12
 
 
-@pytest.mark.parametrize(("seconds", "rate"), [(20, 100), (300, 20)])
+@pytest.mark.parametrize(
+    ("seconds", "rate"), [(20, 100), pytest.param(300, 20, marks=pytest.mark.long)]
+)
 def test_both_forms_of_the_gramian_agree(seconds, rate):
     """Every entry, beside the states' own; at 300 s and 100 Hz: benchmarks/motion.py."""
     t = np.arange(0, seconds, 1 / rate)
@@ -155,7 +157,7 @@ def test_both_forms_of_the_gramian_agree(seconds, rate):
 
 def test_it_is_said_since_when_a_trajectory_tells_everything():
     """Straight on for 30 s, then it turns about changing axes."""
-    t = np.arange(0, 60, 0.02)
+    t = np.arange(0, 60, 0.05)
     run = motionless(np.where((t > 30)[:, None], 2 * turning("all round", t), 0.0), t)
     windows = observe_motion(bias_gravity.known_to(bias=0.5), run, window=10.0).windows
     assert 30 < windows.informative_from_s < 45
@@ -164,7 +166,7 @@ def test_it_is_said_since_when_a_trajectory_tells_everything():
 
 
 def test_a_slow_precession_shows_more_in_longer_windows():
-    t = np.arange(0, 200, 0.05)
+    t = np.arange(0, 200, 0.1)
     axis = np.c_[np.cos(0.01 * t), np.sin(0.01 * t), np.zeros_like(t)]
     run = motionless(0.5 * axis, t)
     smallest = [smallest_eigenvalue(bias_gravity, run, w, 5)[1].min() for w in (10, 40, 160)]
@@ -211,7 +213,7 @@ def test_the_riccati_equation_settles_where_scipy_and_python_control_say(control
     np.testing.assert_allclose(P, by_control, rtol=1e-8)
 
 
-@pytest.mark.parametrize("theta", [1e-4, 1e-8])
+@pytest.mark.parametrize("theta", [1e-4, pytest.param(1e-8, marks=pytest.mark.long)])
 def test_a_stiff_riccati_equation_is_solved_as_an_implicit_integrator_does(theta):
     """Readings so good that the variance falls a million times within the first step."""
 

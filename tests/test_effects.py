@@ -56,6 +56,7 @@ def attached(effect, model):
 
 # -- all of them -----------------------------------------------------------------------------------
 
+OF_RATES = {e.name for e in effects.CATALOGUE if e.kind == "rate"}
 every = pytest.mark.parametrize("effect", effects.CATALOGUE, ids=lambda e: e.name)
 
 

@@ -26,7 +26,7 @@ PULL, GAIN, OFFSET = np.array([0.03, -0.015, 0.006]), 1.02, np.array([0.1, 0.2, 
 def record(tmp_path, monkeypatch):
     """Poses of an accelerometer beside a motor, in plain NumPy; its mean current is returned."""
     monkeypatch.chdir(tmp_path)
-    rng, n = np.random.default_rng(0), 200
+    rng, n = np.random.default_rng(0), 80
     v = rng.standard_normal((n, 3))
     v *= 9.81 / np.linalg.norm(v, axis=1)[:, None]
     amps, temp = rng.uniform(0, 5, n), rng.uniform(20, 30, n)
@@ -77,15 +77,21 @@ def test_a_result_with_a_column_is_applied_with_it(record, command, capsys):
     assert np.std(np.linalg.norm(corrected, axis=1)) < 6e-3  # the noise; 0.03 with the current
 
 
-def test_close_judges_the_effect_of_the_column_that_is_named(record):
-    for asked, follows in (("channel_bias(motor current)", True), ("own.py(temp)", False)):
-        code, found = result("close", "norm-diagonal", "poses.csv", "--effects", asked)
-        assert code == 0
-        assert found["effects"][0]["name"] == "channel_bias"
-        assert found["effects"][0]["column"] == "motor current"
-        refused = {r["name"]: r["reason"] for r in found["refused"]}
-        assert ("pull(temp)" in refused) is not follows
-        assert "pull(motor current)" not in json.dumps(found)
+@pytest.mark.parametrize(
+    ("asked", "follows"),
+    [
+        pytest.param("channel_bias(motor current)", True, marks=pytest.mark.long),
+        ("own.py(temp)", False),
+    ],
+)
+def test_close_judges_the_effect_of_the_column_that_is_named(record, asked, follows):
+    code, found = result("close", "norm-diagonal", "poses.csv", "--effects", asked)
+    assert code == 0
+    assert found["effects"][0]["name"] == "channel_bias"
+    assert found["effects"][0]["column"] == "motor current"
+    refused = {r["name"]: r["reason"] for r in found["refused"]}
+    assert ("pull(temp)" in refused) is not follows
+    assert "pull(motor current)" not in json.dumps(found)
 
 
 def test_a_column_that_would_not_be_tried_is_tried_where_it_is_named(record):
@@ -108,8 +114,15 @@ def spoiled(cell: str, column: int = 3):
         file.write("\n".join([head, *rows]) + "\n")
 
 
-@pytest.mark.parametrize("command", ["calibrate", "close"])
-@pytest.mark.parametrize("cell", ["", "nan"])
+@pytest.mark.parametrize(
+    ("command", "cell"),
+    [
+        ("calibrate", ""),
+        ("calibrate", "nan"),
+        ("close", ""),
+        pytest.param("close", "nan", marks=pytest.mark.long),
+    ],
+)
 def test_a_row_without_the_followed_column_is_dropped_as_one_without_a_reading(
     record, command, cell
 ):
@@ -120,13 +133,20 @@ def test_a_row_without_the_followed_column_is_dropped_as_one_without_a_reading(
     assert found["effects"][0]["name"] == "channel_bias"
     with open("out/residuals.csv", encoding="utf-8") as file:
         rows = {int(line["row"]) for line in csv.DictReader(file)}
-    assert rows == {*range(200)} - {7, 30}
-    said = "2 of 200 rows dropped: 2 without motor current, the first row 7"
+    assert rows == {*range(80)} - {7, 30}
+    said = "2 of 80 rows dropped: 2 without motor current, the first row 7"
     assert any(said in note for note in found["notes"])
 
 
-@pytest.mark.parametrize("command", ["calibrate", "close"])
-@pytest.mark.parametrize("cell", ["inf", "ERR"])
+@pytest.mark.parametrize(
+    ("command", "cell"),
+    [
+        ("calibrate", "inf"),
+        ("calibrate", "ERR"),
+        ("close", "inf"),
+        pytest.param("close", "ERR", marks=pytest.mark.long),
+    ],
+)
 def test_a_followed_column_that_holds_no_number_is_refused_as_a_reading_is(
     record, command, cell, capsys
 ):

@@ -12,6 +12,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.optimize import least_squares
 
 import casest
 from casest import (
@@ -177,6 +178,64 @@ def test_integrate_in_a_model_follows_the_closed_form():
     found = casest.attempt(fall, [run])
     assert found.values["drag"] == pytest.approx(0.7, abs=1e-8)
     assert found.values["start"] == pytest.approx([5, 1.3], abs=1e-8)
+
+
+CHAIN = (
+    HEAD
+    + """
+@dynamics
+def chain(
+    y1=signal(),
+    *,
+    x=state(2, start=[1.0, 0.2], std=0.05),
+    k=param(2, start=[0.5, 0.3], bounds=(0, None)),
+):
+    rates = {"x": vertcat(-k[0] * x[0], k[0] * x[0] - k[1] * x[1])}
+    return Motion(rates=rates, outputs=(measured(y1, x[1], std=0.02),))
+"""
+)
+
+
+def chained(k, start, t):
+    """What flows through the second of two vessels, in closed form."""
+    passing = k[0] * start[0] / (k[1] - k[0])
+    return passing * np.exp(-k[0] * t) + (start[1] - passing) * np.exp(-k[1] * t)
+
+
+def test_what_is_known_of_a_beginning_is_weighed_as_readings_are(tmp_path, capsys):
+    """Two runs, each with its own; SciPy on readings and beginnings side by side."""
+    rng, t, files, readings = np.random.default_rng(1), np.linspace(0.5, 6, 12), [], []
+    for r in range(2):
+        start = np.array([1, 0.2]) + 0.05 * rng.standard_normal(2)
+        y = np.round(chained([0.7, 0.25], start, t) + 0.02 * rng.standard_normal(12), 6)
+        readings.append(y)
+        files.append(tmp_path / f"r{r}.csv")
+        rows = [f"{a!r},{b!r}" for a, b in zip(t.tolist(), y.tolist(), strict=True)]
+        files[r].write_text("\n".join(["t [s],y1", *rows]) + "\n")
+    words = [*map(str, files), "--time-zero", "column"]
+    code, found = calibrated(tmp_path, capsys, CHAIN, *words)
+    assert code == 0
+
+    def residuals(x):
+        starts = x[2:].reshape(2, 2)
+        off = [(chained(x[:2], s, t) - y) / 0.02 for s, y in zip(starts, readings, strict=True)]
+        return np.concatenate([*off, ((starts - [1, 0.2]) / 0.05).ravel()])
+
+    begin = [0.7, 0.25, 1, 0.2, 1, 0.2]
+    known = least_squares(residuals, begin, "3-point", xtol=1e-14, ftol=1e-14, gtol=1e-14)
+    values = np.concatenate([value(found, "k"), np.ravel(value(found, "x_start"))])
+    assert values == pytest.approx(known.x, rel=1e-7)
+    covariance = np.linalg.inv(known.jac.T @ known.jac)
+    got = np.array(found["estimate"]["covariance"]["matrix"])
+    assert got == pytest.approx(covariance, rel=1e-5, abs=1e-6 * covariance.max())
+
+
+def test_a_known_beginning_and_readings_of_unknown_noise_cannot_be_weighed(tmp_path, capsys):
+    (tmp_path / "declared.py").write_text(CHAIN.replace(", std=0.02", ""))
+    (tmp_path / "r.csv").write_text("t [s],y1\n" + "".join(f"{k},0.{9 - k}\n" for k in range(9)))
+    words = ["calibrate", str(tmp_path / "declared.py"), str(tmp_path / "r.csv")]
+    assert casest_run(words) == 1
+    assert "how much std= of x weighs is open" in capsys.readouterr().err
 
 
 def test_slopes_are_those_of_an_independent_integration():

@@ -10,9 +10,13 @@ from pathlib import Path
 import pytest
 
 EXAMPLES = sorted((Path(__file__).parent.parent / "examples").glob("[0-9]*.py"))
+LONG = {"08_find_the_missing_effect", "12_compass_with_attitude"}
 
 
-@pytest.mark.parametrize("path", EXAMPLES, ids=lambda p: p.stem)
+@pytest.mark.parametrize(
+    "path",
+    [pytest.param(p, id=p.stem, marks=[pytest.mark.long] * (p.stem in LONG)) for p in EXAMPLES],
+)
 def test_example_runs_and_its_own_assertions_hold(path, tmp_path, monkeypatch, capsys):
     """As `python PATH` runs it, in a folder of its own."""
     monkeypatch.chdir(tmp_path)

@@ -210,7 +210,7 @@ def test_a_full_standard_output_is_said_and_nothing_is_written(tmp_path):
     ("words", "output"),
     [
         (["simulate", "norm-diagonal", "--directions", "9"], "simulated"),
-        (["compare", *POSES, "--starts", "1"], "compared"),
+        (["compare", *POSES, "--starts", "0"], "compared"),
         (["apply", "fit", *POSES[1:6]], "corrected/new.csv"),
         (["export", "fit", "--to", "c"], "device/new.c"),
     ],

@@ -18,7 +18,7 @@ from casest.diagnose.evidence.linear import Linear, parts_of
 from casest.diagnose.evidence.score import Trial
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.misfit.left import findings
-from casest.diagnose.protocol import falls, holds_out, ranked_of, significant
+from casest.diagnose.protocol import falls, holds_out, ranked_of
 from casest.leastsquares.agreement import between_runs
 from casest.leastsquares.problem import Problem
 
@@ -41,7 +41,7 @@ def linear_of(noise, X):
 def named(linear, trials):
     """Causes that are strong evidence, and those of them that held-out parts confirm."""
     ranking = ranked_of(linear, trials)
-    strong = [e for e in ranking.found if significant(e, linear)]
+    strong = [e for e in ranking.found if ranking.says(e)]
     return strong, [e for e in strong if holds_out(falls(ranking, e), linear)]
 
 
@@ -69,14 +69,18 @@ def heavy(rng, n):
 KINDS = {f.__name__: f for f in (white, coloured, low_passed, unequal, heavy)}
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_of_noise_of_any_kind_nothing_is_named(kind):
+@pytest.mark.parametrize(
+    ("kind", "records", "most"),
+    [("white", 25, 2), ("coloured", 25, 2)]
+    + [pytest.param(kind, 100, 4, marks=pytest.mark.long) for kind in KINDS],
+)
+def test_of_noise_of_any_kind_nothing_is_named(kind, records, most):
     """Thirty causes: ten slow shapes, ten columns that vary as they like, ten that live in an
-    eighth of the record. The aim is one alarm in a hundred records; more than four come by chance
-    once in 250 then."""
+    eighth of the record. The aim is one alarm in a hundred records; more than four in a hundred
+    come by chance once in 250 then, more than two in 25 once in 500."""
     rng, t = np.random.default_rng(sum(kind.encode())), np.arange(400) / 400
     confirmed = 0
-    for _ in range(100):
+    for _ in range(records):
         X = np.c_[np.ones(400), rng.standard_normal(400)]
         shapes = [np.sin(2 * np.pi * (t * rng.uniform(0.5, 3) + rng.uniform())) for _ in range(10)]
         shapes += list(rng.standard_normal((10, 400)))
@@ -84,7 +88,7 @@ def test_of_noise_of_any_kind_nothing_is_named(kind):
         trials = [Trial(k, f"{k}", g[:, None, None]) for k, g in enumerate(shapes)]
         found = named(linear_of(KINDS[kind](rng, 400), X), trials)
         confirmed += bool(found[1])
-    assert confirmed <= 4
+    assert confirmed <= most
 
 
 def test_of_many_variants_the_best_is_named_as_rarely_as_one():
@@ -100,10 +104,11 @@ def test_of_many_variants_the_best_is_named_as_rarely_as_one():
 # -- in poses --------------------------------------------------------------------------------------
 
 
-def test_in_few_poses_an_effect_does_not_hide_itself_and_is_not_made_up():
+@pytest.mark.parametrize("records", [80, pytest.param(400, marks=pytest.mark.long)])
+def test_in_few_poses_an_effect_does_not_hide_itself_and_is_not_made_up(records):
     """24 equations for nine unknowns: an effect of five deviations of its size."""
     rng, made_up, seen = np.random.default_rng(7), 0, 0
-    for _ in range(400):
+    for _ in range(records):
         X, G = rng.standard_normal((24, 9)), rng.standard_normal(24)
         noise, beyond = rng.standard_normal(24), G - X @ np.linalg.lstsq(X, G)[0]
         for size in (0.0, 6 / np.linalg.norm(beyond)):
@@ -111,9 +116,9 @@ def test_in_few_poses_an_effect_does_not_hide_itself_and_is_not_made_up():
             linear = replace(linear_of(residual - X @ np.linalg.lstsq(X, residual)[0], X), spans=())
             found = named(linear, [Trial("it", "it", G[:, None, None])])[0]
             made_up, seen = made_up + bool(found and not size), seen + bool(found and size)
-    low, high = expected(400, LEVELS.chance)
+    low, high = expected(records, LEVELS.chance)
     assert low <= made_up <= high
-    assert seen > 0.95 * 400
+    assert seen > 0.95 * records
 
 
 # -- between runs, and what is left ----------------------------------------------------------------

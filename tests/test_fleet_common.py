@@ -66,6 +66,7 @@ def test_one_such_sensor_alone_shows_nothing():
     assert all(t.whole.chance()[1] > 0.01 for t in asked(v).values())
 
 
+@pytest.mark.long
 def test_fleets_without_an_effect_are_told_of_none():
     """Chances of all effects over 12 fleets are as even as chances are."""
     from scipy.stats import kstest

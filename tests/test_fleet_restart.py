@@ -71,6 +71,7 @@ def children(process):
     return [int(k) for k in listed if b"spawn_main" in Path(f"/proc/{k}/cmdline").read_bytes()]
 
 
+@pytest.mark.long
 def test_a_worker_killed_in_the_middle_is_said_and_the_same_command_goes_on(line, tmp_path):
     dataset, expected = line
     going = started(dataset, tmp_path / "out", "--processes", 2)
@@ -87,7 +88,9 @@ def test_a_worker_killed_in_the_middle_is_said_and_the_same_command_goes_on(line
     assert all(p.stat().st_mtime_ns == at for p, at in kept.items())
 
 
-@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
+@pytest.mark.parametrize(
+    "how", [pytest.param(signal.SIGKILL, marks=pytest.mark.long), signal.SIGINT]
+)
 def test_the_command_ended_in_the_middle_goes_on(line, tmp_path, how):
     dataset, expected = line
     going = started(dataset, tmp_path / "out", "--processes", 1)
@@ -172,6 +175,7 @@ def test_no_scheduler_at_an_address_is_said_before_any_work(line, tmp_path, caps
     assert "its workers may be in another folder; give line as /" in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_a_dask_worker_killed_in_the_middle_costs_nothing_but_time(line, tmp_path):
     """And two Dask workers write the bytes of one process."""
     dataset, expected = line
@@ -204,9 +208,9 @@ def test_a_model_of_ones_own_file_reaches_every_worker(tmp_path):
         '    length = quantity("length", norm_2(v - offset), "m/s^2")\n'
         '    return Residual(implicit=length - 9.80665, unit="m/s^2", axes=("norm",))\n'
     )
-    fleets.dataset(tmp_path / "in", files=2, each=EACH)
+    fleets.dataset(tmp_path / "in", files=2, each=150)
     told = ["fleet", file, tmp_path / "in", "-o", tmp_path / "out", "--processes", 2]
     subprocess.run(fleets.command(*told, numbers=SMALL), check=True, capture_output=True)
     found = fleets.results(tmp_path / "out")
-    assert len(found) == 2 * EACH
+    assert len(found) == 2 * 150
     assert {"offset[0]", "offset[2]_std"} <= set(found.column_names)

@@ -32,6 +32,28 @@ SLOPE = 0.5
 def bench(tmp_path, monkeypatch):
     """A folder with the model and a record whose first axis follows temperature times supply."""
     monkeypatch.chdir(tmp_path)
+    return on_the_bench(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def closed_bench(tmp_path_factory):
+    """Such a folder, whose record was closed once for all; exit code and result."""
+    folder = tmp_path_factory.mktemp("bench")
+    on_the_bench(folder)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        return folder, *closed()
+
+
+@pytest.fixture
+def product(closed_bench, monkeypatch):
+    """In the folder of the closed record: exit code and result."""
+    folder, code, result = closed_bench
+    monkeypatch.chdir(folder)
+    return code, result
+
+
+def on_the_bench(tmp_path):
     (tmp_path / "resting.py").write_text(RESTING, encoding="utf-8")
     rng = np.random.default_rng(3)
     n = 1200
@@ -63,14 +85,14 @@ def closed(*more, data="bench.csv", folder="out"):
     reason="terms are taken greedily: product, tanh(temperature), supply, where the temperature "
     "itself is linear; what tanh leaves is then a vibration at 0.514 rad/s, thrice that of it",
 )
-def test_nothing_else_is_found_beside_a_product_of_two_columns(bench):
-    _, result = closed()
+def test_nothing_else_is_found_beside_a_product_of_two_columns(product):
+    _, result = product
     assert [e["name"] for e in result["effects"]] == ["formula"]
     assert result["after"]["rmse_holdout"] < 1.03 * 0.02
 
 
-def test_a_product_of_two_columns_is_found_and_can_be_pasted(bench):
-    code, result = closed()
+def test_a_product_of_two_columns_is_found_and_can_be_pasted(product):
+    code, result = product
     assert code == 0
     found = result["effects"][0]
     assert (found["name"], found["on"]) == ("formula", "reading")
@@ -90,13 +112,13 @@ def test_a_product_of_two_columns_is_found_and_can_be_pasted(bench):
     assert again["formula.k1"]["value"] == pytest.approx(after["formula.k1"]["value"], rel=0.02)
 
 
-def test_the_formula_says_what_the_record_was_made_with(bench):
+def test_the_formula_says_what_the_record_was_made_with(product):
     """Evaluated on its own, at other temperatures and voltages than the record's means."""
     import casadi as ca
 
     from casest.results.find import find_effects
 
-    _, result = closed()
+    _, result = product
     (effect,) = find_effects("out/formula.py")
     sizes = {k: v["value"] for k, v in result["effects"][0]["parameters"].items()}
     numbers = {n: float(d.array) for n, d in effect.declarations if n not in sizes}
@@ -111,6 +133,7 @@ def test_the_formula_says_what_the_record_was_made_with(bench):
     assert twisted == pytest.approx([SLOPE * 4 * 0.05, 0], rel=0.03)
 
 
+@pytest.mark.long
 @pytest.mark.xfail(
     strict=True,
     reason="saturation is added beside the formula, which is then no longer needed; of saturation "
@@ -182,6 +205,7 @@ def closed_wheel(what, size):
     return close(find_model("wheel"), [record])
 
 
+@pytest.mark.long
 def test_on_a_wheel_the_right_columns_are_named():
     found = closed_wheel("product", 0.02)
     (formula,) = [f.candidate.effect.formula for f in found.effects]
@@ -189,6 +213,7 @@ def test_on_a_wheel_the_right_columns_are_named():
     assert "supply" in formula
 
 
+@pytest.mark.long
 def test_of_a_wave_over_temperature_a_formula_is_a_description_and_its_column_is_right():
     """Waves over the range of a column are in no library: enough of them fit anything."""
     found = closed_wheel("warm_sine", 0.03)
@@ -268,13 +293,11 @@ def failing_refit(monkeypatch):
     monkeypatch.setattr(Sensor, "fitted", failing)
 
 
-def test_where_the_refit_of_a_candidate_fails_the_loop_goes_on(bench, failing_refit):
+def test_where_the_refit_of_a_candidate_fails_it_is_named_and_the_loop_goes_on(
+    bench, failing_refit
+):
     code, result = closed()
     assert code == 0
     assert result["effects"][0]["name"] == "formula"
-
-
-def test_a_candidate_whose_refit_fails_is_named(bench, failing_refit):
-    _, result = closed()
     reasons = {s["name"]: s["reason"] for s in result["refused"]}
     assert reasons["temperature_bias(temperature)"] == "its refit fails: singular matrix"

@@ -125,6 +125,7 @@ def test_without_a_time_it_says_how_to_give_one(tmp_path, capsys):
     assert "--rate" in said.err
 
 
+@pytest.mark.long
 def test_the_xsens_record_is_that_of_its_factory_sheet(shared_data, tmp_path, capsys):
     code, said = command(
         ["calibrate", "gyro-rests", *xsens(shared_data), "--free", "g_sensitivity", "-o", tmp_path],
@@ -246,6 +247,7 @@ def test_close_says_that_it_does_not_do_that(capsys):
     assert "compares each with the one before" in said.err
 
 
+@pytest.mark.long
 def test_a_start_in_the_wrong_valley_of_the_xsens_record_leads_to_the_right_one(
     shared_data, capsys
 ):

@@ -49,8 +49,8 @@ def record(spin, degrees, seed=0):
 
 def test_the_spins_turn_as_they_say():
     """Gravity in body axes changes by −omega × gravity: by finite differences."""
-    for rate, _ in flights.SPINS.values():
-        g = flights.spun(rate, T)
+    for spin, (rate, _) in flights.SPINS.items():
+        g = turned(spin)
         expected = -np.cross(rate(T), g)
         np.testing.assert_allclose(np.gradient(g, T, axis=0)[2:-2], expected[2:-2], atol=5e-4)
 
@@ -104,10 +104,10 @@ def exact(model, run):
 
 
 def test_what_is_told_less_well_than_it_was_known_is_weak():
-    rate = flights.SPINS["all axes, 1 °/s"][0]
-    gravity = flights.spun(rate, T)
-    signals = {"a": flights.BIAS - gravity, "omega": rate(T), "v": 0 * gravity}
-    run = Run.raw("slow", signals, units=flights.UNITS, time=T)
+    rate, t = flights.SPINS["all axes, 1 °/s"][0], T[::4]
+    gravity = turned("all axes, 1 °/s")[::4]
+    signals = {"a": flights.BIAS - gravity, "omega": rate(t), "v": 0 * gravity}
+    run = Run.raw("slow", signals, units=flights.UNITS, time=t)
     model = estimator(0.0).sensing(v=1e4)
     told = observe_motion(model, run)
     assert told.rank == 9
@@ -145,7 +145,11 @@ def hidden():
     [
         pytest.param(bias_gravity, "at rest", 1.0, id="linear, at rest"),
         pytest.param(bias_gravity, "one axis, 17 °/s", 0.2, id="linear, one axis"),
-        pytest.param(hidden(), "all axes, 1 °/s", 0.2, id="nonlinear, all axes"),
+        pytest.param(
+            *(hidden(), "all axes, 1 °/s", 0.2),
+            id="nonlinear, all axes",
+            marks=pytest.mark.long,
+        ),
     ],
 )
 def test_errors_are_no_larger_than_they_are_said_to_be(declared, spin, degrees):
@@ -257,11 +261,12 @@ def test_filter_says_where_noise_is_taken_for_motion(file, capsys):
     assert "taken for motion" not in " ".join(json.loads(capsys.readouterr().out)["notes"])
 
 
-def test_close_does_not_tell_gravity_from_bias_by_noise(file, capsys):
-    for words in ([], STATED):
-        assert cli(["close", "bias-gravity", file, "--json", *words]) == 0
-        told = json.loads(capsys.readouterr().out)
-        assert told["verdict"] == "adequate"
-        gravity = told["after"]["parameters"]["gravity"]
-        along = np.abs(gravity["std"] @ flights.AXIS)
-        assert 0.9 < along < 1.1  # the prior of the bias
+@pytest.mark.long
+@pytest.mark.parametrize("words", [[], STATED], ids=["found", "stated"])
+def test_close_does_not_tell_gravity_from_bias_by_noise(file, capsys, words):
+    assert cli(["close", "bias-gravity", file, "--json", *words]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["verdict"] == "adequate"
+    gravity = told["after"]["parameters"]["gravity"]
+    along = np.abs(gravity["std"] @ flights.AXIS)
+    assert 0.9 < along < 1.1  # the prior of the bias

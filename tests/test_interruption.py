@@ -28,6 +28,7 @@ SAID = "casest: interrupted; nothing was written"
 #: The command line as the script calls it, which says when signals can be sent.
 PROGRAM = "import sys; from casest.cli import main; print('ready', flush=True); main()"
 COMMANDS = {
+    "calibrate poses": (["calibrate", "norm-diagonal", *HANDHELD, *NORM], 2),
     "calibrate": (["calibrate", "wheel", str(WHEEL)], 6),
     "close": (["close", "wheel", str(WHEEL)], 4),
     "compare": (["compare", "norm-triangular", *HANDHELD, *NORM, "--starts", "2"], 2),
@@ -56,7 +57,10 @@ def interrupted(words: list[str], after: float) -> tuple[int, str]:
     return process.returncode, words_of_it
 
 
-@pytest.mark.parametrize("name", COMMANDS)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=[pytest.mark.long] * (n != "calibrate poses")) for n in COMMANDS],
+)
 def test_ctrl_c_at_any_moment_ends_with_130_and_no_file(name, tmp_path):
     words, moments = COMMANDS[name]
     began = time.perf_counter()

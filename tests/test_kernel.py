@@ -28,7 +28,7 @@ from test_replay import (
     unary,
 )
 
-from casest.demo import WHEEL
+from casest.demo import RECORD
 from casest.engine import (
     Columns,
     Replay,
@@ -48,6 +48,8 @@ pytestmark = pytest.mark.skipif(
     not any(map(shutil.which, ("cc", "gcc", "clang"))), reason="no C compiler on this machine"
 )
 INF, NAN = np.inf, np.nan
+POSES = ["norm-triangular", str(RECORD), "--columns", "v=ax,ay,az", "--rate", "50", "--at-rest"]
+POSES += ["--set", "norm=9.80665"]
 COUNTS = [1, 7, 63, 64, 65, 40_000]
 
 
@@ -144,7 +146,9 @@ def test_an_angle_far_beyond_a_turn_has_its_sine():
 # -- sums: the replay's ----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", SHIPPED)
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=[pytest.mark.long] * (n == "imu")) for n in SHIPPED]
+)
 def test_sums_and_rows_of_a_shipped_problem_are_those_of_the_replay(name, monkeypatch):
     replay = residual_and_jacobian(find_model(name))
     rng = np.random.default_rng(1)
@@ -492,8 +496,8 @@ def test_a_model_that_is_only_tried_is_not_compiled_unless_its_record_is_very_lo
 def test_a_result_says_which_kernel_it_is_of_and_they_differ_in_the_last_digits(tmp_path, cache):
     def estimate(wish, expected):
         environment = {**os.environ, "CASEST_KERNEL": wish, "CASEST_CACHE": str(cache)}
-        words = [sys.executable, "-c", "from casest.cli import main; main()", "calibrate", "wheel"]
-        subprocess.run([*words, str(WHEEL), "-o", str(tmp_path)], env=environment, check=True)
+        words = [sys.executable, "-c", "from casest.cli import main; main()", "calibrate"]
+        subprocess.run([*words, *POSES, "-o", str(tmp_path)], env=environment, check=True)
         result = json.loads((tmp_path / "result.json").read_text(encoding="utf-8"))
         assert result["solver"]["kernel"] == expected
         return result["estimate"]

@@ -6,10 +6,13 @@ import ast
 import subprocess
 import sys
 import tomllib
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
 
 ROOT = Path(__file__).parents[1]
 
@@ -37,6 +40,7 @@ def floor(name: str) -> int:
     return ROOMS.index(max(found, key=len))
 
 
+@cache
 def imports(path: Path) -> set[str]:
     """Modules of casest that a file imports, anywhere in it."""
     found = set()
@@ -84,16 +88,12 @@ def test_text_and_page_read_results_and_nothing_else(path):
 def test_no_two_modules_import_each_other():
     below = {module_name(p): imports(p) - {module_name(p)} for p in MODULES}
 
-    def reaches(start: str, goal: str, seen: set[str]) -> bool:
-        for name in below.get(start, set()) - seen:
-            seen.add(name)
-            if name == goal or reaches(name, goal, seen):
-                return True
-        return False
-
+    names = list(below)
+    graph = np.array([[other in below[name] for other in names] for name in names])
+    _, circle = connected_components(csr_array(graph), connection="strong")
+    within = np.bincount(circle)[circle] > 1
     # a package's own front may name its members, which name each other
-    circles = [n for n in below if n.count(".") and reaches(n, n, set())]
-    assert circles == []
+    assert [n for n, own in zip(names, within, strict=True) if own and n.count(".")] == []
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "problems").glob("*.py")), ids=lambda p: p.stem)

@@ -26,7 +26,7 @@ from casest.declaration.symbols import Signal
 from casest.errors import CasestError
 
 SIGNALS = [Signal("t", 1, "s"), Signal("v", 3, None)]
-FILES = 2000
+FILES, SOME = 2000, 200
 LONGEST = 10.0  # s of computing that one file may take
 
 TIME = np.arange(40) * 0.01
@@ -230,8 +230,11 @@ def test_the_files_are_whole_before_they_are_broken(good, tmp_path):
         assert table.n_rows == 40
 
 
-def test_malformed_files_end_in_a_sentence(good, tmp_path):
-    found = try_all(range(FILES), good, tmp_path)
-    assert found.total() == FILES
-    assert found["DataError"] > FILES / 2  # the ways do break files
-    assert found["read"] > FILES / 20  # and not all of them
+@pytest.mark.parametrize(
+    "numbers", [range(SOME), pytest.param(range(SOME, FILES), marks=pytest.mark.long)]
+)
+def test_malformed_files_end_in_a_sentence(good, tmp_path, numbers):
+    found = try_all(numbers, good, tmp_path)
+    assert found.total() == len(numbers)
+    assert found["DataError"] > len(numbers) / 2  # the ways do break files
+    assert found["read"] > len(numbers) / 20  # and not all of them

@@ -161,6 +161,7 @@ def test_noise_in_the_recorded_load_does_not_turn_the_loop_round():
     assert np.std(found.problem.residuals(found.point)[0]) < 1.25 * 2.0 * 0.3
 
 
+@pytest.mark.long
 def test_backlash_is_a_loop_that_turns_over_its_whole_width():
     run = cycled(half=0.0, noise=0.0)
     middle, play = 1.5, []

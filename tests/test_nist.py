@@ -22,7 +22,9 @@ def certified(shared_data):
 
 
 @pytest.mark.parametrize("start", [1, 2])
-@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=[pytest.mark.long] * (n == "Bennett5")) for n in MODELS]
+)
 def test_the_certified_values_are_found_from_either_start_alone(name, start, certified):
     nist = certified(name)
     found = attempt(nist.begun_at(nist.starts[start - 1]), [nist.run])

@@ -46,14 +46,20 @@ def fitted(y):
     return attempt(level.starting(from_zero), [series(y)], solver="trust-region")
 
 
-def test_readings_that_are_a_random_walk_are_no_wheel():
-    """Nothing turned: both records were fitted, and believed, before anybody asked."""
-    wheel = find_model("wheel")
-    for seed, count, size in ((5, 1200, 0.02), (18, 3000, 0.1), (2, 3000, 0.1)):
-        rng, t = np.random.default_rng(seed), np.arange(count) / 100
-        v = size * np.cumsum(rng.standard_normal((count, 3)), axis=0)
-        run = Run.raw("walk", {"t": t[:, None], "v": v}, units={"t": "s", "v": "m/s^2"}, time=t)
-        assert not attempt(wheel, [run]).certificate.trusted
+@pytest.mark.parametrize(
+    ("seed", "count", "size"),
+    [
+        (5, 1200, 0.02),
+        pytest.param(18, 3000, 0.1, marks=pytest.mark.long),
+        pytest.param(2, 3000, 0.1, marks=pytest.mark.long),
+    ],
+)
+def test_readings_that_are_a_random_walk_are_no_wheel(seed, count, size):
+    """Nothing turned: such records were fitted, and believed, before anybody asked."""
+    rng, t = np.random.default_rng(seed), np.arange(count) / 100
+    v = size * np.cumsum(rng.standard_normal((count, 3)), axis=0)
+    run = Run.raw("walk", {"t": t[:, None], "v": v}, units={"t": "s", "v": "m/s^2"}, time=t)
+    assert not attempt(find_model("wheel"), [run]).certificate.trusted
 
 
 def test_white_residuals_leave_the_std_of_a_mean_as_it_is():

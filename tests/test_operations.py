@@ -349,8 +349,8 @@ def test_what_is_not_exported_is_named(tmp_path, capsys):
 
 
 #: Modules with an algebra of their own, to which an operation that they do not name is opaque: sums
-#: multiplied out, from which zero a temperature counts, how far an unknown reaches.
-ALGEBRAS = {"grouping.py", "temperatures.py", "arguments.py"}
+#: multiplied out, from which zero a temperature counts, how far an unknown reaches, where it jumps.
+ALGEBRAS = {"grouping.py", "temperatures.py", "arguments.py", "stepping.py"}
 
 
 def test_no_other_module_lists_operations():

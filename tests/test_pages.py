@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shlex
 import shutil
+import subprocess
 
 import pytest
 from pages import BLOCK, ROOT, blocks, folder_of_a_reader, follow, run_within
@@ -14,7 +15,10 @@ from casest.cli import commands
 PAGES = sorted((ROOT / "docs").glob("*.md"))
 PHYSICS = "casest.declaration.physics"
 #: Pages that work on a measured record, which lies beside the project.
-MEASURED = {"equations": "multiarm-pendulum/pendulum_single.csv"}
+MEASURED = {
+    "equations": "multiarm-pendulum/pendulum_single.csv",
+    "from_others": "ardupilot-log171/MAG_all.csv",
+}
 WITH_COMMANDS = [p for p in PAGES if any(language == "sh" for language, _ in blocks(p))]
 
 
@@ -23,7 +27,26 @@ def test_a_reader_who_does_what_a_page_says_sees_what_it_shows(page, tmp_path, r
     folder = folder_of_a_reader(page, tmp_path)
     if page.stem in MEASURED:
         shutil.copy(request.getfixturevalue("shared_data") / MEASURED[page.stem], folder)
-    assert follow(page, folder, run_within) >= 1
+    assert follow(page, folder, run_once) >= 1
+
+
+#: What the loop over the shipped wheel printed and wrote: pages show the same command.
+WHEEL = "casest close wheel casest/demo/wheel.csv -o out"
+_made: list[tuple[subprocess.CompletedProcess[str], dict[str, bytes]]] = []
+
+
+def run_once(line, folder):
+    """As `run_within`; the command that takes longest is computed for the first page alone."""
+    if line != WHEEL:
+        return run_within(line, folder)
+    if not _made:
+        done = run_within(line, folder)
+        _made.append((done, {p.name: p.read_bytes() for p in (folder / "out").iterdir()}))
+    done, written = _made[0]
+    (folder / "out").mkdir(exist_ok=True)
+    for name, content in written.items():
+        (folder / "out" / name).write_bytes(content)
+    return done
 
 
 EVERY = [*PAGES, ROOT / "README.md", ROOT / "CONTRIBUTING.md"]

@@ -118,6 +118,7 @@ def closed(tmp_path_factory):
     return folder / "out"
 
 
+@pytest.mark.long
 def test_causes_that_a_record_left_open_are_told_apart_by_the_plan(closed, capsys):
     effect = json.loads((closed / "result.json").read_text())["effects"][0]
     assert effect["indistinguishable_from"]
@@ -132,6 +133,7 @@ def test_causes_that_a_record_left_open_are_told_apart_by_the_plan(closed, capsy
     assert chances[-1] >= 0.95 > chances[0]
 
 
+@pytest.mark.long
 def test_what_cannot_be_told_apart_is_one_sentence(closed, capsys, tmp_path):
     def refused(*words):
         capsys.readouterr()

@@ -58,6 +58,7 @@ def of(said: list[str], file: str) -> list[str]:
     return [line for line in own if "Revealed" in line or line.startswith("error")]
 
 
+@pytest.mark.long
 def test_a_type_checker_sees_what_public_names_are(said):
     fit, declare, effects, values, load, wrong = of(said, "user.py")
     assert "model: casest.declaration.model.Model" in fit
@@ -69,12 +70,14 @@ def test_a_type_checker_sees_what_public_names_are(said):
     assert wrong.startswith('error: Module has no attribute "modle"')
 
 
+@pytest.mark.long
 def test_no_public_name_is_any_for_a_type_checker(said):
     revealed = of(said, "every.py")
     assert len(revealed) == len(casest.__all__) - 1
     assert [line for line in revealed if 'Revealed type is "Any"' in line] == []
 
 
+@pytest.mark.long
 def test_a_type_checker_has_nothing_against_the_files_of_the_readme(said):
     assert [line for line in said if not line.startswith(("user.py:", "every.py:"))] == []
 

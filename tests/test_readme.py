@@ -16,6 +16,7 @@ def folder(tmp_path_factory):
     return folder_of_a_reader(README, tmp_path_factory.mktemp("reader"))
 
 
+@pytest.mark.long
 def test_every_command_of_the_readme_does_what_it_shows(folder):
     assert follow(README, folder, first_apart()) >= 7
 

@@ -149,3 +149,40 @@ def test_a_covariance_that_no_numbers_can_have_is_refused(cli, tmp_path):
     code, _, err = cli("calibrate", "norm-triangular", RECORD, *GIVEN, *again)
     assert code == 1
     assert "the correlations are not positive semidefinite" in err
+
+
+@c.model
+def gauge_block(
+    reading=c.signal("nm", std=1e-3),
+    *,
+    length=c.param("nm", start=5e7),
+    standard=c.constant(50_000_623, "nm", std=25, freedom=18),
+    repeated=c.constant(215, "nm", std=5.8, freedom=24),
+    accidental=c.constant(0, "nm", std=3.9, freedom=5),
+    systematic=c.constant(0, "nm", std=6.7, freedom=8),
+    warmth=c.constant(-0.1, "K", std=0.41),
+    unlike=c.constant(0, "1/K", std=0.58e-6, freedom=50),
+    colder=c.constant(0, "K", std=0.029, freedom=2),
+):
+    """JCGM 100:2008, H.1, with an expansion of 11.5e-6 per kelvin."""
+    told = standard + repeated + accidental + systematic
+    return c.Residual(
+        measured=reading,
+        predicted=length - told + standard * (unlike * warmth + 11.5e-6 * colder),
+    )
+
+
+def test_the_gauge_block_of_the_gum_has_its_uncertainty_and_16_degrees_of_freedom():
+    found = c.calibrate(gauge_block, {"reading": [0.0]})
+    assert float(found.values["length"]) == pytest.approx(50_000_838, abs=0.01)
+    assert round(float(found.std["length"])) == 32
+    assert found.effective_freedom == (16,)
+    (low, high) = (float(side["length"]) for side in found.interval_reach)
+    assert (low, high) == pytest.approx((2.119905 * 31.7, 2.119905 * 31.7), rel=2e-3)
+
+
+def test_degrees_of_freedom_of_what_is_exact_are_refused():
+    with pytest.raises(c.DeclarationError, match="is that of a std, and there is none"):
+        c.constant(1.0, "m", freedom=5)
+    with pytest.raises(c.DeclarationError, match="degrees of freedom are above zero"):
+        c.constant(1.0, "m", std=0.1, freedom=0)

@@ -47,6 +47,22 @@ def test_a_simulated_record_is_calibrated_back_to_its_truth(
         assert away.max() < 6, name
 
 
+def test_an_effect_of_poses_that_was_added_is_what_the_loop_finds(tmp_path, capsys):
+    added = ["--effect", "cross_axis", "--value", "cross_axis.k=0.02,-0.01,0.03"]
+    record, truth = made(
+        tmp_path, "norm-diagonal", "--directions", "60", "--noise", "0.003", *G, *added
+    )
+    assert truth["effects"] == ["cross_axis"]
+    out = tmp_path / "out"
+    assert command(["close", "norm-diagonal", str(record), *G, "-o", str(out)]) == 0
+    result = json.loads((out / "result.json").read_text(encoding="utf-8"))
+    assert [e["name"] for e in result["effects"]] == ["cross_axis"]
+    found = result["after"]["parameters"]["cross_axis.k"]
+    away = np.subtract(found["value"], truth["parameters"]["cross_axis.k"])
+    assert np.all(np.abs(away) < 5 * np.array(found["std"]))
+
+
+@pytest.mark.long
 def test_an_effect_that_was_added_is_what_the_loop_finds(tmp_path, capsys):
     effect = ["--effect", "imbalance", "--value", "imbalance.sine=0.3"]
     record, truth = made(tmp_path, "wheel", *WHEEL, *effect)
@@ -141,3 +157,39 @@ def test_completion_is_a_script_for_the_shell(capsys, shell):
     script = capsys.readouterr().out
     assert "_CASEST_COMPLETE" in script
     assert shell in script
+
+
+CURVE = '''
+from casest import Residual, model, param, signal
+
+
+@model
+def curve(x=signal("1", std=0.1), y=signal("1"), *, b=param("1", start=2.0)):
+    """A line through nought."""
+    return Residual(measured=y, predicted=b * x)
+'''
+
+
+def test_every_sensor_of_a_record_has_its_own_noise(tmp_path, capsys):
+    """What the model reads too: declared, as a number, and what two signals share."""
+    (tmp_path / "m.py").write_text(CURVE)
+    x = np.linspace(0, 1, 4000)
+    np.savetxt(tmp_path / "x.csv", x[:, None], header="x", comments="", fmt="%.17g")
+
+    def noise(*words):
+        given = ["simulate", f"{tmp_path}/m.py", "--input", f"{tmp_path}/x.csv", *words]
+        assert command([*given, "-o", f"{tmp_path}/s"]) == 0
+        found = np.loadtxt(tmp_path / "s" / "record.csv", delimiter=",", skiprows=1)
+        return found - np.column_stack([x, 2 * x])
+
+    declared = noise()
+    assert declared[:, 0].std() == pytest.approx(0.1, rel=0.05)
+    assert np.abs(declared[:, 1]).max() < 1e-9
+    both = noise("--sensor-noise", "x,y=0.04,0.03;0.03,0.09")
+    assert np.cov(both.T) == pytest.approx(np.array([[0.04, 0.03], [0.03, 0.09]]), abs=0.005)
+    assert noise("--sensor-noise", "x=0.3", "--noise", "0.2").std(axis=0) == pytest.approx(
+        [0.3, 0.2], rel=0.05
+    )
+    twice = ["--input", f"{tmp_path}/x.csv", "--noise", "0.2", "--sensor-noise", "y=0.2"]
+    assert command(["simulate", f"{tmp_path}/m.py", *twice, "-o", f"{tmp_path}/no"]) == 1
+    assert "--noise and --sensor-noise y=… both say the noise of y" in capsys.readouterr().err

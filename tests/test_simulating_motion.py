@@ -126,7 +126,7 @@ def test_a_late_reading_is_an_earlier_velocity():
 
 
 def test_noise_with_a_colour_has_its_size_and_its_memory():
-    t = np.arange(0, 4000, 0.05)
+    t = np.arange(0, 2000, 0.05)
     said = {"v_colour.correlation_time": 0.5, "v_colour.std": 0.04, **BIAS}
     rest = {n: np.zeros((len(t), 3)) for n in ("a", "omega")}
     still = QUIET.beginning(gravity=0.0, bias=0.0)
@@ -150,7 +150,7 @@ def simulated(folder, *arguments, model="bias-gravity"):
 
 
 def test_a_filter_told_the_same_noise_finds_the_truth(tmp_path, capsys):
-    plan = ["--duration", "60", "--rate", "50", "--value", "bias=0.1,-0.05,0.025", *NOISE]
+    plan = ["--duration", "30", "--rate", "50", "--value", "bias=0.1,-0.05,0.025", *NOISE]
     record, truth, states = simulated(tmp_path, *plan)
     assert truth["states"]["bias"]["start"] == [0.1, -0.05, 0.025]
     assert truth["noise"]["readings"]["v"] == {"std": pytest.approx(0.01), "unit": "m/s"}
@@ -159,13 +159,14 @@ def test_a_filter_told_the_same_noise_finds_the_truth(tmp_path, capsys):
     assert json.loads(capsys.readouterr().out)["rank"] == 9
     assert command(["filter", "bias-gravity", record, *NOISE, "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
-    low, high = chi2.ppf([1e-3, 1 - 1e-3], 3 * 2700) / 2700
+    low, high = chi2.ppf([1e-3, 1 - 1e-3], 3 * 1350) / 1350
     assert low < found["innovations"]["normalised_mean"] < high
     values = np.concatenate([s["value"] for s in found["states"].values()])
     stds = np.concatenate([s["std"] for s in found["states"].values()])
     assert np.sum(((values - states[-1, 1:]) / stds) ** 2) < chi2.ppf(0.9999, 9)
 
 
+@pytest.mark.long
 def test_an_effect_that_was_simulated_is_found(tmp_path, capsys):
     effect = ["--effect", "lever_arm(v)", "--value", "v_lever_arm=0.3,-0.1,0.2"]
     plan = ["--duration", "40", "--rate", "25", *NOISE, *effect]

@@ -10,6 +10,7 @@ import pytest
 
 import casest as c
 from casest.cli import run
+from casest.dynamics import dynamics, state
 from casest.leastsquares.stated import stated_noise
 from casest_problems.norm import norm_triangular
 
@@ -88,8 +89,8 @@ def test_a_norm_of_unequal_noise_is_right_to_second_order():
     """Without the noise the fit of so many readings is off by many of its standard deviations."""
     rng = np.random.default_rng(3)
     scale = np.array([[1, 0, 0], [0.02, 1.03, 0], [-0.01, 0.015, 0.98]])
-    offset, std = np.array([0.3, -0.2, 0.1]), np.array([0.05, 0.1, 0.5])
-    u = rng.standard_normal((30_000, 3))
+    offset, std = np.array([0.3, -0.2, 0.1]), np.array([0.05, 0.1, 0.6])
+    u = rng.standard_normal((8000, 3))
     u /= np.linalg.norm(u, axis=1)[:, None]
     v = 9.81 * u @ np.linalg.inv(scale).T + offset + std * rng.standard_normal(u.shape)
     model = norm_triangular.having(norm=9.81)
@@ -203,3 +204,150 @@ def test_correlations_that_cannot_be_are_refused():
     impossible = np.array([[1, 2, 0], [2, 1, 0], [0, 0, 1.0]])[None]
     with pytest.raises(c.UsageError, match="noise of v: the correlations are not positive semi"):
         noisy(model, readings, v=impossible)
+
+
+DECLARED = LINE.replace(
+    'y=signal("1"), x=signal("1")', 'y=signal("1", std=0.02), x=signal(1, "1", std=0.05)'
+)
+
+
+def test_the_std_of_a_declared_signal_is_its_stated_noise(cli, weighed, tmp_path):
+    declared = tmp_path / "declared.py"
+    declared.write_text(DECLARED)
+    said = cli(weighed, "--sensor-noise", "x=0.05", "--sensor-noise", "y=0.02")
+    found = cli(weighed, model=declared)
+    assert found["estimate"] == said["estimate"]
+    assert found["noise"] == said["noise"]
+    option = cli(weighed, "--sensor-noise", "x=0.2", model=declared)  # goes before
+    also = cli(weighed, "--sensor-noise", "x=0.2", "--sensor-noise", "y=0.02")
+    assert option["noise"] == also["noise"]
+
+
+def test_python_takes_the_std_of_a_declared_signal_too():
+    @c.model
+    def level(v=c.signal(2, "m", std=(0.1, 0.2)), *, a=c.param(2, "m")):
+        """A constant."""
+        return c.Residual(measured=v, predicted=a)
+
+    found = c.calibrate(level, {"v": np.random.default_rng(1).normal(0, [0.1, 0.2], (25, 2))})
+    assert found.std["a"] == pytest.approx([0.1 / 5, 0.2 / 5])
+
+
+def test_std_of_a_signal_is_refused_where_nothing_would_come_of_it():
+    with pytest.raises(c.DeclarationError, match="std -1 must be above zero"):
+        c.signal("m", std=-1)
+    with pytest.raises(c.DeclarationError, match="what an effect reads counts as exact"):
+        c.effect(on="truth")(lambda x, warm=c.signal("K", std=0.1), *, k=c.param("1"): x + k * warm)
+    with pytest.raises(c.DeclarationError, match="as --sensor-noise v=STD"):
+        dynamics(lambda v=c.signal("m", std=0.1), *, x=state("m"): None)
+
+    @c.model
+    def level(v=c.signal("m", std=0.1), *, a=c.param("m")):
+        """A constant."""
+        return c.Residual(measured=v, predicted=a)
+
+    with pytest.raises(c.UsageError, match="calibrate_many does not weigh samples"):
+        c.calibrate_many(level, {"v": np.zeros((3, 5, 1))})
+
+
+PEARSON = "0 .9 1.8 2.6 3.3 4.4 5.2 6.1 6.5 7.4", "5.9 5.4 4.4 4.6 3.5 3.7 2.8 2.8 2.4 1.5"
+YORK = "1000 1000 500 800 200 80 60 20 1.8 1", "1 1.8 4 8 20 20 70 70 100 500"
+
+
+def york(x, y, ux, uy, r, slope):
+    """York et al., Am. J. Phys. 72 (2004) 367, eqs. 13: line, std and χ², by their recipe."""
+    wx, wy = 1 / ux**2, 1 / uy**2
+    alpha = np.sqrt(wx * wy)
+    for _ in range(200):
+        w = wx * wy / (wx + slope**2 * wy - 2 * slope * r * alpha)
+        u, v = x - np.sum(w * x) / np.sum(w), y - np.sum(w * y) / np.sum(w)
+        beta = w * (u / wy + slope * v / wx - (slope * u + v) * r / alpha)
+        slope = np.sum(w * beta * v) / np.sum(w * beta * u)
+    level = np.sum(w * y) / np.sum(w) - slope * np.sum(w * x) / np.sum(w)
+    adjusted = np.sum(w * x) / np.sum(w) + beta
+    at = adjusted - np.sum(w * adjusted) / np.sum(w)
+    std = 1 / np.sqrt(np.sum(w * at**2))
+    return level, slope, std, np.sum(w * (y - slope * x - level) ** 2)
+
+
+@pytest.mark.parametrize("said", ["correlation", "columns"])
+def test_noise_that_two_signals_share_gives_the_line_of_york(cli, tmp_path, said):
+    x, y = (np.array(text.split(), float) for text in PEARSON)
+    ux, uy = (1 / np.sqrt(np.array(text.split(), float)) for text in YORK)
+    r = np.linspace(-0.8, 0.9, 10)
+    table = np.column_stack([x, y, ux, uy, r, ux**2, r * ux * uy, uy**2])
+    head = "y,x,wide,high,r,vx,vxy,vy"
+    np.savetxt(tmp_path / "d.csv", table, delimiter=",", header=head, comments="", fmt="%.16g")
+    words = {
+        "correlation": ["y=wide", "x=high", "y,x=r"],
+        "columns": ["y,x=vx,vxy,vy"],
+    }[said]
+    options = [w for word in words for w in ("--sensor-noise", word)]
+    found = cli(tmp_path / "d.csv", *options)
+    level, slope, std, squares = york(x, y, ux, uy, r, -0.5)
+    values = found["estimate"]["parameters"]
+    assert values["b1"]["value"] == pytest.approx(slope, rel=1e-6)
+    assert values["b0"]["value"] == pytest.approx(level, rel=1e-6)
+    assert values["b1"]["std"] == pytest.approx(std, rel=2e-3)
+    assert found["noise"]["chi_square"] == pytest.approx(squares, rel=1e-6)
+    assert next(i["name"] for i in found["estimate"]["inputs"]) == "noise of y and x"
+
+
+def test_a_covariance_in_a_file_is_that_in_words(cli, weighed, tmp_path):
+    (tmp_path / "c.csv").write_text("4e-4,1e-4\n1e-4,25e-4\n")
+    said = cli(weighed, "--sensor-noise", "y,x=4e-4,1e-4;1e-4,25e-4")
+    assert cli(weighed, "--sensor-noise", f"y,x=@{tmp_path}/c.csv")["estimate"] == said["estimate"]
+    apart = cli(weighed, "--sensor-noise", "y=0.02", "--sensor-noise", "x=0.05")
+    none = cli(weighed, "--sensor-noise", "y,x=4e-4,0;0,25e-4")
+    b1 = [f["estimate"]["parameters"]["b1"] for f in (apart, none)]
+    assert b1[0]["std"] == pytest.approx(b1[1]["std"], rel=1e-9)
+    assert b1[0]["value"] == pytest.approx(b1[1]["value"], rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["y,x=0.5"], "whose standard deviations are stated too"),
+        (["y=0.1", "x=0.1", "y,x=1.5"], "a correlation lies between -1 and 1, and 1.5 does not"),
+        (["y=0.1", "x=0.1", "y,x=many"], "'many' is no correlation, and no column of"),
+        (["y,x=1,2;3"], "is no covariance"),
+        (["y,x=1,0,0;0,1,0;0,0,1"], "y and x have 2 components, and the covariance is 3 by 3"),
+        (["y,x=wide,wide"], "a covariance of 2 numbers has 3 columns"),
+        (["y,x=1,2;2,1"], "noise of y and x: the correlations are not positive semidefinite"),
+        (["y=0.1", "y,x=1,0;0,1"], "noise of y is stated twice"),
+        (["y,x=@nowhere.csv"], "nowhere.csv: No such file"),
+        (["y,z=1,0;0,1"], "line has no signal 'z'"),
+    ],
+)
+def test_what_signals_cannot_share_is_refused(cli, weighed, words, said):
+    given = [w for word in words for w in ("--sensor-noise", word)]
+    code, err = cli(weighed, *given)
+    assert code == 1
+    assert said in err
+    assert err.count("\n") == 1
+
+
+@pytest.mark.parametrize("verb", ["compare", "observe"])
+def test_compare_and_observe_know_stated_noise_too(weighed, capsys, tmp_path, verb):
+    (tmp_path / "line.py").write_text(LINE)
+    words = [verb, f"{tmp_path}/line.py", str(weighed), "--json", "--sensor-noise", "x=0.4"]
+    more = ["--starts", "1", "--solver", "ipopt", "--spread", "0.1"] if verb == "compare" else []
+    assert run([*words, "--sensor-noise", "y=0.1", *more]) == 0
+    found = json.loads(capsys.readouterr().out)
+    if verb == "observe":
+        y = np.linspace(1, 5, 30)
+        std = np.hypot(0.4, 2 * 0.1) / np.sqrt(np.sum((y - 3) ** 2))
+        assert found["std"]["b1"] == pytest.approx(std, rel=0.01)
+    else:
+        assert found["noise"]["sigma"] == pytest.approx(0.4)  # of the reading, as it was stated
+        assert found["solvers"][0]["same_start"]["right"]
+
+
+def test_residuals_of_which_one_follows_from_others_are_refused():
+    @c.model
+    def twice(v=c.signal("m", std=0.1), *, a=c.param("m"), b=c.param("m")):
+        """Two residuals of one reading."""
+        return c.Residual(implicit=c.vertcat(v - a, 2 * (v - b)), unit="m")
+
+    with pytest.raises(c.UsageError, match="leave residuals out that follow from others"):
+        c.calibrate(twice, {"v": np.arange(5.0)})

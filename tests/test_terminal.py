@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 import shlex
 import shutil
 import time
@@ -42,7 +43,15 @@ WORDS = {
     "export to json": "export fit --to json -o fit/correction.json",
     "apply json": "apply fit/correction.json poses.csv --columns v=Acc --unit v=g -o again.csv",
     "list": "list",
+    "budget": "budget tri",
+    "check": "check fit poses.csv --columns v=Acc --unit v=g",
+    "plan": "plan fit --count 3",
+    "report": "report fit tri",
+    "six means": "calibrate norm-diagonal six.csv --columns v=Acc --unit v=g",
+    "counts": "calibrate norm-diagonal counts.csv --columns v=Acc",
 }
+#: Commands that end with another exit code than 0.
+REFUSED = ("refused", "six means")
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +60,11 @@ def said(tmp_path_factory):
     folder, rng = tmp_path_factory.mktemp("prompt"), np.random.default_rng(3)
     sensor = sim.accelerometer(rng, skew=False)
     v = sensor.read(sim.spread_poses(30, rng), 5e-3, rng)
-    np.savetxt(folder / "poses.csv", v / sim.GRAVITY, delimiter=",", header="AccX,AccY,AccZ")
+    header = "AccX,AccY,AccZ"
+    np.savetxt(folder / "poses.csv", v / sim.GRAVITY, delimiter=",", header=header)
+    np.savetxt(folder / "counts.csv", 300 * v, delimiter=",", header=header)
+    six = sensor.read(np.vstack([np.eye(3), -np.eye(3)]), 5e-3, rng)
+    np.savetxt(folder / "six.csv", six / sim.GRAVITY, delimiter=",", header=header)
     shutil.copy(ROOT / "casest" / "demo" / "wheel.csv", folder)
     t = np.arange(0, 10, 0.02)
     omega = np.column_stack([0.3 * np.sin(0.2 * t), 0.3 * np.cos(0.3 * t), 0.2 + 0 * t])
@@ -63,7 +76,7 @@ def said(tmp_path_factory):
     np.savetxt(folder / "flight.csv", table, delimiter=",", header=header, comments="")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        yield {name: printed(words, patch) for name, words in WORDS.items()}
+        yield {name: printed(name, patch) for name in WORDS}
 
 
 def turned_back(vector, t, omega):
@@ -74,11 +87,10 @@ def turned_back(vector, t, omega):
     return np.array(seen)
 
 
-def printed(words: str, patch: pytest.MonkeyPatch) -> str:
+def printed(name: str, patch: pytest.MonkeyPatch) -> str:
     out = io.StringIO()
     patch.setattr("sys.stdout", out)
-    code = run(shlex.split(words))
-    assert code == (2 if "norm-full" in words else 0), words
+    assert run(shlex.split(WORDS[name])) == (2 if name in REFUSED else 0), name
     return out.getvalue()
 
 
@@ -225,10 +237,17 @@ def test_what_is_going_on_is_said_on_a_terminal_and_wiped_away(impatient, monkey
     ("words", "code", "verdict"),
     [
         ("m on a.csv: 9 samples, rank 9:\ntrusted", 32, "trusted"),
+        (
+            "m: trusted, but the\nresidual is not noise",
+            33,
+            "trusted, but the\nresidual is not noise",
+        ),
         ("m on a.csv: 9 samples, rank 8: NOT\nTRUSTED", 31, "NOT\nTRUSTED"),
+        ("m by out on a.csv: valid", 32, "valid"),
+        ("m by out on a.csv: NOT VALID: the scale changed", 31, "NOT VALID"),
         ("m on a.csv: adequate: nothing is missing", 32, "adequate"),
-        ("m on a.csv: extended: cubic was missing", 33, "extended"),
-        ("m on a.csv: unexplained: a misfit remains", 31, "unexplained"),
+        ("m on a.csv: extended: cubic was missing", 36, "extended"),
+        ("m on a.csv: unexplained: a misfit remains", 35, "unexplained"),
     ],
 )
 def test_the_verdict_is_coloured_on_a_terminal_that_wants_it(words, code, verdict, monkeypatch):
@@ -276,7 +295,69 @@ def test_the_line_is_wiped_away_before_an_error(impatient, monkeypatch, tmp_path
         (2.01, 9.7e-17, ("2.01", "1e-16")),
         (9.80665, 0.0, ("9.80665", "0")),
         (0.98957, 0.00023, ("0.98957", "0.00023")),
+        (0.98957, 0.000996, ("0.9896", "0.0010")),
+        (0.98957, float("nan"), ("–", "not determined")),
     ],
 )
 def test_digits_end_where_the_standard_deviation_or_the_double_does(value, std, text):
     assert rounded(value, std) == text
+
+
+PAIR = re.compile(r"(-?\d\S*) +± +(\d\S*)")
+
+
+@pytest.mark.parametrize("name", ["calibrate", "close", "filter", "close in motion", "budget"])
+def test_values_end_at_the_second_digit_of_their_standard_deviation(said, name):
+    shown = [list(pair) for line in said[name].splitlines()
+             for pair in [PAIR.search(line)] if pair for pair in [pair.groups()]]  # fmt: skip
+    assert len(shown) >= 6
+    for value, std in shown:
+        if "e" in std:
+            continue
+        decimals = [text.partition(".")[2] for text in (value, std)]
+        assert len(decimals[0]) == len(decimals[1]), (value, std)
+        assert len(std.replace(".", "").lstrip("0")) == 2 or float(std) >= 100, std
+
+
+def test_six_means_say_what_is_missing_and_that_it_can_be_stated(said, monkeypatch, capsys):
+    """Nothing is called undetermined there: what nothing shows is the noise."""
+    text = " ".join(said["six means"].split())
+    assert "say how large it is: --sensor-noise v=STD" in text
+    assert "± unknown" in text
+    assert "noise of one residual unknown" in text
+    for words in ("not determined", "determine every unknown", "nan", "alone"):
+        assert words not in text
+
+
+def test_the_way_out_of_six_means_leads_out(tmp_path, monkeypatch):
+    poses = np.vstack([np.eye(3), -np.eye(3)]) * 9.81 + [0.1, -0.2, 0.3]
+    np.savetxt(tmp_path / "six.csv", poses, delimiter=",", header="ax,ay,az")
+    out = io.StringIO()
+    monkeypatch.setattr("sys.stdout", out)
+    words = f"calibrate norm-diagonal {tmp_path / 'six.csv'} --columns v=a --unit v=m/s^2"
+    assert run([*shlex.split(words), "--set", "norm=9.81", "--sensor-noise", "v=0.02"]) == 0
+    text = " ".join(out.getvalue().split())
+    assert "the standard deviations rest on the stated noise alone" in text
+    assert re.search(r"offset\[2\] 0\.300 ± 0\.014 m/s\^2", text)
+
+
+def test_readings_of_no_stated_unit_and_a_norm_of_another_size_do_not_share_a_unit(said):
+    """Counts and a norm of 1: `[v]` is the unit of the readings alone."""
+    lines = said["counts"].splitlines()
+    assert "  norm = 1 (held)" in lines
+    units = [line.split()[-1] for line in lines if re.match(r"  (scale|offset)\[", line)]
+    assert units == ["1/[v]"] * 3 + ["[v]"] * 3
+
+
+def test_a_norm_that_is_found_has_the_unit_that_scale_and_correction_are_in(tmp_path):
+    """Scale held at one is a pure number, and the correction goes to a file in tesla."""
+    rng = np.random.default_rng(5)
+    poses = 480 * sim.spread_poses(20, rng) / sim.GRAVITY + [100, -50, 20]
+    file = tmp_path / "m.csv"
+    np.savetxt(file, poses, delimiter=",", header="mx [mgauss],my [mgauss],mz [mgauss]")
+    words = f"calibrate norm-diagonal {file} --columns v=m --fix scale=1,1,1 --free norm"
+    out = str(tmp_path / "out")
+    assert run([*shlex.split(words), "--set", "norm=450 mgauss", "-o", out]) == 0
+    assert run(["export", out, "--to", "ardupilot", "-o", f"{out}/m.param"]) == 0
+    text = (tmp_path / "out" / "m.param").read_text(encoding="utf-8")
+    assert float(re.search(r"COMPASS_OFS_X,(\S+)", text)[1]) == pytest.approx(-100, abs=1e-6)

@@ -61,7 +61,15 @@ def test_of_causes_of_which_none_is_added_it_is_said_how_far_each_moves_the_para
 @pytest.mark.parametrize(
     ("of_field", "of_offset", "name", "words"),
     [
-        (0.006, 0.0, "reference_wander", "the known reference sways: its size follows a smooth"),
+        pytest.param(
+            *(
+                0.006,
+                0.0,
+                "reference_wander",
+                "the known reference sways: its size follows a smooth",
+            ),
+            marks=pytest.mark.long,
+        ),
         (0.0, 0.2, "bias_course", "the offset of each axis follows a smooth course of its own"),
     ],
 )

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import shlex
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+from casest.cli.assignments import Assignment, Assignments
 from casest.cli.flags import flag, taking
 from casest.cli.options import DATA, FOLDER, RESULT, ReadingOptions
 from casest.cli.shared import commands, echo, progress, reported, typed, write
 from casest.errors import UsageError
+
+if TYPE_CHECKING:
+    from casest.data.run import Run
+    from casest.validity.old import Old
 
 #: Exit code of a calibration that is valid no more.
 NOT_VALID = 2
@@ -27,6 +34,13 @@ class CheckOptions:
         type=float,
         metavar="SHARE",
         help="Chance of calling a valid calibration invalid, at each date.",
+    )
+    constants: Assignments = flag(
+        (),
+        "--set",
+        of=Assignment,
+        metavar="norm=VALUE",
+        help="The known length, where RESULT is a file of ROS, Kalibr, ArduPilot or PX4.",
     )
     output: Path | None = flag(
         None,
@@ -53,32 +67,28 @@ def check(result_path: Path, data: tuple[str, ...], options: CheckOptions) -> in
     from casest.report.next_command import recalibrating
     from casest.report.text.check import check_text
     from casest.results.check import CHECK, checked_result
-    from casest.results.file import as_json, result_file
-    from casest.saved import check as saved
+    from casest.results.file import as_json
     from casest.validity.check import check as judge
 
     if not 0 < options.false_alarms < 0.5:
         raise UsageError(
             f"--false-alarms {options.false_alarms:g}: a chance above 0 and below 0.5, as 0.001"
         )
-    old, result = saved.old_estimate(result_path)
-    progress(f"reading {', '.join(data)}")
-    records = saved.new_records(old, result, data, options.reading.keywords())
-    found = judge(old, records, options.false_alarms, say=progress)
-    file, command = result_file(result_path), typed()
+    asked = _asked(result_path, data, options)
+    found = judge(asked.old, asked.records, options.false_alarms, say=progress)
 
     def again(name: str, hold: Sequence[str]) -> str:
-        held = {parameter: f"@{file}" for parameter in hold}
-        return recalibrating(command, result.reproduce.command, name, held)
+        held = {parameter: asked.held(parameter) for parameter in hold}
+        return recalibrating(asked.typed, asked.made, name, held)
 
     said = checked_result(
         found,
-        model_name=result.model,
-        result=str(file),
+        model_name=asked.model,
+        result=str(asked.file),
         data=data,
-        notes=list(saved.remarks(result, data, records)),
-        conditions=[saved.elsewhere(result_path, runs) for runs in records],
-        command=command,
+        notes=asked.notes,
+        conditions=asked.conditions,
+        command=typed(),
         recalibrating=again,
     )
     if options.output:
@@ -90,3 +100,75 @@ def check(result_path: Path, data: tuple[str, ...], options: CheckOptions) -> in
     else:
         echo(check_text(said, options.output), verdict=True)
     return 0 if said.valid else NOT_VALID
+
+
+@dataclass(frozen=True, slots=True)
+class _Asked:
+    """What is judged: an old estimate and the new records; the command as it was `typed`, the
+    calibration that `made` the estimate, or would have; how a parameter is `held` as it was."""
+
+    old: Old
+    records: list[tuple[Run, ...]]
+    file: Path
+    model: str
+    typed: str
+    made: str
+    held: Callable[[str], str]
+    notes: list[str]
+    conditions: list[dict[str, tuple[list[float], list[float]]]]
+
+
+def _asked(path: Path, data: Sequence[str], options: CheckOptions) -> _Asked:
+    from casest.correction.formats_read import is_foreign
+    from casest.results.file import result_file
+    from casest.saved import check as saved
+
+    progress(f"reading {', '.join(data)}")
+    if is_foreign(path):
+        return _foreign(path, data, options)
+    if options.constants:
+        raise UsageError(f"{path} is a result, and has its constants: leave --set out")
+    old, result = saved.old_estimate(path)
+    records = saved.new_records(old, result, data, options.reading.keywords())
+    return _Asked(
+        old,
+        records,
+        result_file(path),
+        result.model,
+        typed(),
+        result.reproduce.command,
+        lambda parameter: f"@{result_file(path)}",
+        list(saved.remarks(result, data, records)),
+        [saved.elsewhere(path, runs) for runs in records],
+    )
+
+
+def _foreign(path: Path, data: Sequence[str], options: CheckOptions) -> _Asked:
+    from casest.cli.loading import declared_model
+    from casest.cli.options import ModelOptions
+    from casest.saved import check_foreign as foreign
+
+    if not options.constants:
+        raise UsageError(
+            f"{path} does not say to which length it corrects: --set 'norm=9.80665 m/s^2', or the "
+            "field as --set 'norm=48 uT'"
+        )
+    name, arguments = "norm-triangular", options.reading.keywords()
+    norm = declared_model(name, ModelOptions(constants=options.constants))["norm"]
+    sensor = foreign.foreign_sensor(path, arguments.get("columns") or {})
+    old = foreign.foreign_estimate(sensor, declared_model(name, ModelOptions()), norm)
+    records = foreign.foreign_records(sensor, old.model, data, arguments)
+    notes = dict.fromkeys(note for runs in records for run in runs for note in run.notes)
+    words = ["casest", "calibrate", name, *data]
+    made = shlex.join([*words, *(w for c in options.constants for w in ("--set", c.text))])
+    return _Asked(
+        old,
+        records,
+        path,
+        name,
+        foreign.renamed(typed(), sensor, old.model),
+        made,
+        lambda parameter: foreign.in_words(old, parameter),
+        [foreign.EXACT, *notes],
+        [{} for _ in records],
+    )

@@ -9,7 +9,15 @@ from typing import TYPE_CHECKING
 from casest.cli.assignments import Assignment, Assignments
 from casest.cli.flags import Kind, flag, taking
 from casest.cli.loading import model_and_records
-from casest.cli.options import DATA, FOLDER, ModelOptions, ReadingOptions, Words, model_argument
+from casest.cli.options import (
+    DATA,
+    FOLDER,
+    ModelOptions,
+    ReadingOptions,
+    SensorOptions,
+    Words,
+    model_argument,
+)
 from casest.cli.shared import commands, echo, progress, typed
 from casest.errors import NotTrusted, UsageError
 
@@ -23,6 +31,7 @@ class CompareOptions:
 
     model: ModelOptions = field(default_factory=ModelOptions)
     reading: ReadingOptions = field(default_factory=ReadingOptions)
+    sensors: SensorOptions = field(default_factory=SensorOptions)
     solvers: Words = flag((), "--solver", metavar="NAME", help="Only this one (repeatable).")
     start: Assignments = flag(
         (),
@@ -77,7 +86,9 @@ def compare(model_name: str, data: tuple[str, ...], options: CompareOptions) -> 
     from casest.results.comparison import comparison_result
     from casest.results.file import as_json
 
-    model, runs = model_and_records(model_name, data, options.model, options.reading)
+    model, runs = model_and_records(
+        model_name, data, options.model, options.reading, options.sensors
+    )
     found = compared(
         model,
         runs,

@@ -51,7 +51,7 @@ def taking(group: Callable[[], Any]) -> Callable[[Callable[..., R]], Callable[..
     def decorate(command: Callable[..., R]) -> Callable[..., R]:
         @wraps(command)
         def called(**words: Any) -> R:
-            return command(options=_built(group, words), **words)
+            return command(options=built(group, words), **words)
 
         return _declared(group, called)
 
@@ -82,14 +82,14 @@ def _words(option: Field[Any]) -> dict[str, Any]:
     return {"default": option.default, "is_flag": option.default is False, **how}
 
 
-def _built(group: Any, words: dict[str, Any]) -> Any:
+def built(group: Any, words: dict[str, Any]) -> Any:
     """The group with what click found, which is taken out of `words`."""
     return group(**{option.name: _value(option, words) for option in fields(group)})
 
 
 def _value(option: Field[Any], words: dict[str, Any]) -> Any:
     if not option.metadata:
-        return _built(option.default_factory, words)
+        return built(option.default_factory, words)
     found, of = words.pop(option.name), option.metadata["of"]
     return tuple(of(option.metadata["flags"][-1], word) for word in found) if of else found
 

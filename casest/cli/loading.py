@@ -82,7 +82,8 @@ def with_prior(model: Model, runs: Sequence[Run], prior: str | None) -> Model:
     if not prior.startswith("@"):
         raise UsageError(f"--prior {prior}: write it as --prior @old/result.json")
     earlier = earlier_result(prior[1:], model)
-    return replace(model, prior=earlier.prior(model, unit_table(model, runs)))
+    found = earlier.prior(model, unit_table(model, runs))
+    return replace(model, prior=found.beside(model.prior))
 
 
 def noisy(

@@ -111,7 +111,9 @@ def observe(model_name: str, data: tuple[str, ...], options: ObserveOptions) -> 
         if not data:
             raise UsageError(f"{model_name}: what can be seen depends on the record: give DATA")
         refuse(options, Kind.MOVING, f"is for estimators in motion; {model_name} is a calibration")
-        model, runs = model_and_records(model_name, data, options.model, options.reading)
+        model, runs = model_and_records(
+            model_name, data, options.model, options.reading, options.sensors
+        )
         progress(f"fitting {model_name}")
         result: Observability = observe_parameters(model, runs, data=data, command=typed())
     else:
@@ -154,6 +156,13 @@ class FilterOptions:
     reading: ReadingOptions = field(default_factory=ReadingOptions)
     motion: MotionOptions = field(default_factory=MotionOptions)
     result: OutputOptions = field(default_factory=OutputOptions)
+    horizon: int | None = flag(
+        None,
+        "--horizon",
+        type=click.IntRange(min=1),
+        metavar="STEPS",
+        help="States by so many steps at once (moving horizon): bounds are kept.",
+    )
     noise: Literal["declared", "ml"] = flag(
         "declared",
         "--noise",
@@ -175,7 +184,10 @@ class FilterOptions:
 @DATA
 @taking(FilterOptions)
 def filter_command(model_name: str, data: tuple[str, ...], options: FilterOptions) -> int:
-    """States over time by the Kalman filter and smoother, with innovations diagnosed."""
+    """States over time by the Kalman filter and smoother, with innovations diagnosed.
+
+    With --horizon by the last steps at once, within the bounds of states and unknown constants.
+    """
     from casest.report.text.states import filter_text
     from casest.results import states
     from casest.results.file import as_json
@@ -183,8 +195,9 @@ def filter_command(model_name: str, data: tuple[str, ...], options: FilterOption
     moving = moving_model(model_name, options.constants, options.motion)
     run = trajectory(moving, model_name, data, options.reading)
     tuned, told = tuned_noise(moving, run, options)
-    progress("filter and smoother")
-    result = states.follow(moving, run, tuned, **told, data=data, command=typed())
+    progress("moving horizon" if options.horizon else "filter and smoother")
+    said = {**told, "horizon": options.horizon}
+    result = states.follow(moving, run, tuned, **said, data=data, command=typed())
     if options.result.output:
         from casest.report.html import filter_page
 

@@ -184,7 +184,7 @@ class SensorOptions:
         "--sensor-noise",
         of=Assignment,
         metavar="SIGNAL=STD|%|COLUMN",
-        help="Std of one reading: v=0.02 (model's unit), 'v=0.02 g', v=2%, v=u_x.",
+        help="Std of one reading: v=0.02 (model's unit), 'v=0.02 g', v=2%, v=u_x; x,y=… together.",
     )
 
     def stds(self) -> dict[str, float]:

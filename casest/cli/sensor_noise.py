@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from casest import units
 from casest.cli.assignments import Assignment, Assignments
+from casest.cli.sensor_covariance import correlation, joint, matrix_in
 from casest.declaration.symbols import Signal
 from casest.errors import CasestError, UsageError
 
@@ -28,23 +29,73 @@ def with_sensor_noise(
     """The model and its runs with the noise that was stated, declared, or stands in columns."""
     from casest.leastsquares.stated import stated_noise
 
+    noise, used, said = noise_of(model, runs, given)
+    model, runs = stated_noise(model, runs, noise)
+    return model, tuple(_without(run, used, said) for run in runs)
+
+
+def noise_of(
+    model: Model, runs: Sequence[Run], given: Assignments, look: bool = True
+) -> tuple[dict[str, list[Array]], set[str], list[str]]:
+    """What options and columns say of the noise of signals, for each run: standard deviations or
+    covariances; the columns that say it, and what is noted of those that nobody named, where they
+    are to be `look`ed for."""
     known = {s.name: s for s in model.signals}
     noise: dict[str, list[Array]] = {}
     used: set[str] = set()
+    correlated = list[Assignment]()
     for option in given:
-        name, text = option.pair()
-        if name not in known:
-            raise UsageError(
-                f"{option.flag} {option.text}: {model.name} has no signal {name!r}; it has "
-                f"{', '.join(known)}"
-            )
-        noise[name] = [_of_run(option, text, known[name], run, used) for run in runs]
-    found = _found(model, runs, noise)
+        key, text = option.pair()
+        names = [name.strip() for name in key.split(",")]
+        for name in names:
+            if name not in known:
+                raise UsageError(
+                    f"{option.flag} {option.text}: {model.name} has no signal {name!r}; it has "
+                    f"{', '.join(known)}"
+                )
+        if len(names) == 1:
+            noise[key] = [_of_run(option, text, known[key], run, used) for run in runs]
+        elif text.startswith("@") or "," in text or ";" in text:
+            own = [known[name] for name in names]
+            noise[",".join(names)] = [joint(option, text, own, run, used) for run in runs]
+        else:
+            correlated.append(option)
+    stated = [name for key in noise for name in key.split(",")]
+    found = _found(model, runs, stated) if look else {}
     noise |= {name: arrays for name, (arrays, _) in found.items()}
+    for option in correlated:
+        _correlate(option, model, runs, noise, used)
     used |= {column for _, columns in found.values() for column in columns}
     said = [f"noise of {name} is {' '.join(columns)}" for name, (_, columns) in found.items()]
-    model, runs = stated_noise(model, runs, noise)
-    return model, tuple(_without(run, used, said) for run in runs)
+    return noise, used, said
+
+
+def _correlate(
+    option: Assignment,
+    model: Model,
+    runs: Sequence[Run],
+    noise: dict[str, list[Array]],
+    used: set[str],
+) -> None:
+    """Two signals of one number each, with a correlation in place of a covariance."""
+    key, text = option.pair()
+    names = [name.strip() for name in key.split(",")]
+    stds = []
+    for name in names:
+        signal = model[name]
+        declared = None if signal.std is None else [np.array([signal.std])] * len(runs)
+        own = noise.pop(name, declared)
+        if own is None or signal.size > 1 or len(names) != 2:
+            raise UsageError(
+                f"{option.flag} {option.text}: a correlation is that of two signals of one number "
+                f"each whose standard deviations are stated too; else give a covariance: rows a,b;"
+                "c,d, @FILE, or columns of its lower triangle"
+            )
+        stds.append(own)
+    noise[",".join(names)] = [
+        correlation(option, text, first, second, run, used)
+        for first, second, run in zip(*stds, runs, strict=True)
+    ]
 
 
 def _without(run: Run, used: set[str], said: Sequence[str]) -> Run:
@@ -61,6 +112,8 @@ def _of_run(option: Assignment, text: str, signal: Signal, run: Run, used: set[s
     if all(word in run.columns for word in words):
         used.update(words)
         return np.stack([_column(word, signal, run) for word in words], axis=1)
+    if text.startswith("@"):
+        return _covariance(option, matrix_in(option, text[1:]), signal)
     try:
         if text[:1].isalpha() or text[:1] == "_":
             raise ValueError(text)
@@ -133,7 +186,7 @@ def _column(name: str, signal: Signal, run: Run) -> Array:
 
 
 def _found(
-    model: Model, runs: Sequence[Run], stated: Mapping[str, object]
+    model: Model, runs: Sequence[Run], stated: Collection[str]
 ) -> dict[str, tuple[list[Array], tuple[str, ...]]]:
     """Noise in columns named after a signal, `u_x` or `x_std`; of all that carry noise, or none.
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
@@ -21,6 +22,12 @@ from casest.cli.options import (
     model_argument,
 )
 from casest.cli.shared import commands, echo, progress, typed
+from casest.errors import UsageError
+
+if TYPE_CHECKING:
+    from casest.data.run import Run
+    from casest.declaration.model import Model
+    from casest.declaration.shapes import Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,6 +139,7 @@ def simulation(model_name: str, options: SimulateOptions, command: str) -> None:
     from casest.report.next_command import following
     from casest.results.find import find_effects
     from casest.simulation import record
+    from casest.simulation.sensor_noise import with_noise
 
     refuse(options, Kind.MOVING, f"is for estimators in motion; {model_name} has --noise")
     own = tuple(e for path in options.model.effects for e in find_effects(path))
@@ -153,9 +161,35 @@ def simulation(model_name: str, options: SimulateOptions, command: str) -> None:
     progress(f"simulating {model_name}")
     noise = options.noise or 0.0
     readings = record.simulated(model, run, values, noise, rng)
+    run = replace(run, signals={**run.signals, **readings})
+    run, sensors = with_noise(run, _of_sensors(model, run, {*readings}, options), rng)
     paths = record.written(
-        options.output, model, run, readings, values, noise, options.seed, command
+        options.output, model, run, values, noise, sensors, options.seed, command
     )
     for path in paths:
         echo(f"Written: {path}")
     echo(f"\n{following(command, file=paths[0])}")
+
+
+def _of_sensors(
+    model: Model, run: Run, measured: set[str], options: SimulateOptions
+) -> dict[str, Array]:
+    """Noise of single signals, as --sensor-noise says it, else as it is declared."""
+    import numpy as np
+
+    from casest.cli.sensor_noise import noise_of
+
+    found = noise_of(model, [run], options.sensors.stated, look=False)[0]
+    said = {name for key in found for name in key.split(",")}
+    both = sorted(measured & said)
+    if options.noise is not None and both:
+        raise UsageError(
+            f"--noise and --sensor-noise {both[0]}=… both say the noise of {both[0]}: give one"
+        )
+    said |= measured if options.noise is not None else set()
+    declared = {
+        s.name: [np.array([s.std])]
+        for s in model.signals
+        if s.std is not None and s.name not in said
+    }
+    return {key: arrays[0] for key, arrays in {**declared, **found}.items()}

@@ -16,6 +16,7 @@ from casest.errors import UsageError
 if TYPE_CHECKING:
     from casest.data.run import Run
     from casest.declaration.model import Model
+    from casest.declaration.symbols import Signal
     from casest.plan.candidates.candidates import Candidates, Noise
     from casest.plan.goals import Measures
 
@@ -97,7 +98,7 @@ def _noise(
     from casest.plan.candidates.candidates import Noise
 
     readings = {s.name: s for s in model.readings}
-    stated = {}
+    stated = {} if sigma is not None else _declared(readings, options)
     for given in options.noise:
         name, text = given.pair()
         if name not in readings:
@@ -109,6 +110,21 @@ def _noise(
     if sigma is None or stated:
         return Noise(np.ones(len(model.axes)), stated, known=bool(stated))
     return Noise(sigma * np.sqrt(max(over, 1.0)), {})
+
+
+def _declared(readings: Mapping[str, Signal], options: PlanOptions) -> dict[str, float]:
+    """Standard deviations of readings as the model declares them, where no option does."""
+    given, found = {given.pair()[0] for given in options.noise}, {}
+    for name, signal in readings.items():
+        if signal.std is None or name in given:
+            continue
+        if len(set(signal.std)) > 1:
+            raise UsageError(
+                f"std of {name} is declared for each component, and a plan takes one number: "
+                f"--sensor-noise {name}=STD"
+            )
+        found[name] = signal.std[0]
+    return found
 
 
 def _std(option: str, text: str, own: str | None) -> float:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from casest.correction.inverse import Correction, invertible, of_their_time
+from casest.correction.inverse import Correction, correction_of, invertible, of_their_time
 from casest.correction.program import Program, program
 from casest.data.run import Run
 from casest.declaration.model import Model
@@ -82,7 +82,7 @@ def _carried(
     around: tuple[float, float] | None,
 ) -> Carried:
     model, left = invertible(fitted)
-    correction = Correction(model)
+    correction = correction_of(model)
     points, differing = _points(model, correction, values, len(runs))
     if not np.isfinite(points).all():
         raise UsageError(f"model {fitted.name} was fitted without a value for every parameter")

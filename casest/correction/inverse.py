@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any, Literal
 
 import casadi as ca
@@ -57,6 +57,8 @@ def invertible(model: Model) -> tuple[Model, tuple[str, ...]]:
         or (a.effect.describes and a.kind != "noise")
         or _acts_on_a_rate(model, a)
     ]
+    if not left:
+        return model, ()
     kept = tuple(a for a in model.effects if a not in left)
     return replace(model, effects=kept), tuple(a.label for a in left)
 
@@ -74,7 +76,7 @@ def of_their_time(model: Model) -> tuple[str, ...]:
 
     A drift, a step, a line in the spectrum: they say nothing of another record.
     """
-    if model.traced.corrected is None or "t" not in {s.name for s in Correction(model).signals}:
+    if model.traced.corrected is None or "t" not in {s.name for s in correction_of(model).signals}:
         return ()
     return tuple(a.label for a in model.effects if "t" in {s.name for s in a.effect.extras})
 
@@ -174,7 +176,7 @@ class Correction:
         """Number of components of the corrected quantity."""
         return int(self._wanted.numel())
 
-    @property
+    @cached_property
     def signals(self) -> tuple[Signal, ...]:
         """The signals that the correction needs: not all that a fit needs."""
         if self.model.implicit:
@@ -183,7 +185,7 @@ class Correction:
             needed = reached_signals(self.model, self._cut, self._cut.expression)
         return tuple(s for s in self.model.signals if s.name in needed)
 
-    @property
+    @cached_property
     def parameters(self) -> set[str]:
         """Names of the parameters that the correction needs."""
         if self.model.implicit:
@@ -320,7 +322,7 @@ class Correction:
     @property
     def measured(self) -> str:
         """The signal that is compared with the prediction; empty for an implicit model."""
-        return self._cut.measured or ""
+        return self.model.traced.measured or ""
 
     def _refuse_unsolved(self, run: Run, reading: Array, best: Array) -> None:
         bad = np.asarray(np.isnan(best).any(axis=1))
@@ -332,6 +334,12 @@ class Correction:
                 f"model ({int(bad.sum())} of {len(bad)} rows): it lies outside what the model can "
                 "produce; remove the rows, or calibrate over a wider range"
             )
+
+
+@lru_cache(maxsize=16)
+def correction_of(model: Model) -> Correction:
+    """The correction of a model, traced once: to correct, to export, to say how sure it is."""
+    return Correction(model)
 
 
 def _starts(reading: Array, like: Array, around: tuple[float, float] | None) -> list[Array]:

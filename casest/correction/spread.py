@@ -14,10 +14,10 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from casest.correction.inverse import Correction, invertible
+from casest.correction.inverse import Correction, correction_of, invertible
 from casest.correction.program import Input, Program, steps_of
 from casest.declaration.model import Model
-from casest.declaration.noise import ROOT
+from casest.declaration.noise import root_of
 from casest.declaration.shapes import Array
 from casest.errors import UsageError
 from casest.estimate.estimate import Estimate
@@ -44,30 +44,61 @@ class Slopes:
     inputs: tuple[Input, ...]
 
 
-def slopes(estimate: Estimate, units: Mapping[str, str]) -> Slopes:
+@dataclass(frozen=True)
+class Opened:
+    """A correction with its parameters and the uncertain known numbers left open.
+
+    `function` of [coordinates, references] and the `whole` sample (and a trial value, for the kind
+    newton); `coordinates` as fitted, which follow the unknowns of the fit with the slope `fitted`
+    (p, n); of the known numbers they are at the places `known`.
+    """
+
+    correction: Correction
+    kind: str
+    function: Any
+    coordinates: Array
+    references: Array
+    fitted: Array
+    known: list[int]
+    sample: ca.SX
+    whole: ca.SX
+    inputs: tuple[Input, ...]
+
+
+def opened(estimate: Estimate, units: Mapping[str, str]) -> Opened:
     """Of a fit to one run, or whose parameters are shared by all; UsageError for others."""
     names = [c.name for c in uncertain(estimate.model)]
     model = invertible(_freed(estimate.model, names))[0]
-    correction = Correction(model)
+    correction = correction_of(model)
     own = {p.name for p in model.parameters if p.scope == "run"} & correction.parameters
     if own and len(estimate.problem.runs) > 1:
         raise UsageError(f"{sorted(own)[0]} differs from run to run")
     kind, function = correction.as_function()
     values = {**_of_first(estimate), **{c.name: c.array for c in uncertain(estimate.model)}}
     coordinates, references = model.point(values)
-    theta = ca.SX.sym("theta", len(coordinates))
-    value = ca.SX.sym("value", correction.size)
     sample, inputs, whole = _sample(correction, units)
-    at = ca.vertcat(whole, value) if kind == "newton" else whole
-    out = function(ca.vertcat(theta, ca.DM(references)), at)[: correction.size]
-    here = [ca.substitute(ca.jacobian(out, x), theta, ca.DM(coordinates)) for x in (theta, sample)]
     places = _places(model)
     fitted = np.zeros((len(coordinates), estimate.problem.unknowns))
     for slot in estimate.problem.slots:
         if slot.run in (None, 0) and slot.parameter.name in places:  # else it is not undone
             fitted[places[slot.parameter.name], slot.x] = np.eye(slot.x.stop - slot.x.start)
     known = [i for name in names for i in range(places[name].start, places[name].stop)]
-    return Slopes(sample, value, here[0] @ ca.DM(fitted), here[0][:, known], here[1], inputs)
+    return Opened(correction, kind, function, np.asarray(coordinates, dtype=float),
+                  np.asarray(references, dtype=float), fitted, known, sample, whole,
+                  inputs)  # fmt: skip
+
+
+def slopes(estimate: Estimate, units: Mapping[str, str]) -> Slopes:
+    """Of a fit to one run, or whose parameters are shared by all; UsageError for others."""
+    found = opened(estimate, units)
+    theta = ca.SX.sym("theta", len(found.coordinates))
+    value = ca.SX.sym("value", found.correction.size)
+    at = ca.vertcat(found.whole, value) if found.kind == "newton" else found.whole
+    out = found.function(ca.vertcat(theta, ca.DM(found.references)), at)[: found.correction.size]
+    of, sample = ca.DM(found.coordinates), found.sample
+    here = [ca.substitute(ca.jacobian(out, x), theta, of) for x in (theta, sample)]
+    fitted, known = ca.DM(found.fitted), here[0][:, found.known]
+    return Slopes(sample, value, here[0] @ fitted, known, here[1], found.inputs)
 
 
 def _freed(model: Model, names: Sequence[str]) -> Model:
@@ -159,22 +190,51 @@ def reading_root(estimate: Estimate, inputs: Sequence[Input]) -> Array:
         root = _signal_root(estimate, i.name, i.size)
         found[first : first + i.size, first : first + root.shape[1]] = root
         first += i.size
+    return _with_correlations(estimate, inputs, found)
+
+
+def _with_correlations(estimate: Estimate, inputs: Sequence[Input], root: Array) -> Array:
+    """The root with what signals share whose noise was stated together."""
+    stated = estimate.model.noise
+    if stated is None or not stated.groups:
+        return root
+    covariance, places, first = root @ root.T, dict[str, range](), 0
+    for i in inputs:
+        places[i.name], first = range(first, first + i.size), first + i.size
+    for group in (g for g in stated.groups if len(g) > 1):
+        whole, own, first = _of_one_reading(estimate, group), list[int](), 0
+        kept = list[int]()
+        for name in group:
+            size = estimate.model[name].size
+            if name in places:
+                own += places[name]
+                kept += range(first, first + size)
+            first += size
+        covariance[np.ix_(own, own)] = whole[np.ix_(kept, kept)]
+    found = np.zeros_like(root)
+    factor = _factor(covariance)
+    found[:, : factor.shape[1]] = factor
     return found
+
+
+def _of_one_reading(estimate: Estimate, group: tuple[str, ...]) -> Array:
+    """Mean covariance (k, k) of one reading's noise of signals together, as it was stated."""
+    size, matrices = sum(estimate.model[name].size for name in group), list[Array]()
+    for run in estimate.problem.runs:
+        root = run.signals[root_of(group)]
+        if root.shape[1] == size:
+            root = root[:, :, None] * np.eye(size)
+        root = root.reshape(-1, size, size) * np.sqrt(run.count)[:, None, None]
+        matrices.append(root @ np.swapaxes(root, 1, 2))
+    return np.asarray(np.mean(np.concatenate(matrices), axis=0))
 
 
 def _signal_root(estimate: Estimate, name: str, size: int) -> Array:
     runs, model = estimate.problem.runs, estimate.model
     if model.noise is not None:
-        roots = [run.signals.get(ROOT + name) for run in runs]
-        if roots[0] is None:
+        if (name,) not in model.noise.together:
             return np.zeros((size, size))
-        single = np.concatenate(
-            [r * np.sqrt(run.count)[:, None] for r, run in zip(roots, runs, strict=True)]
-        )
-        if single.shape[1] == size:
-            return np.diag(np.sqrt(np.mean(single**2, axis=0)))
-        matrices = single.reshape(-1, size, size)
-        return _factor(np.mean(matrices @ np.swapaxes(matrices, 1, 2), axis=0))
+        return _factor(_of_one_reading(estimate, (name,)))
     if all(name in run.spread for run in runs):
         single = np.concatenate([run.spread[name] * np.sqrt(run.count)[:, None] for run in runs])
         return np.diag(np.sqrt(np.mean(single**2, axis=0)))

@@ -179,6 +179,11 @@ def effect(
             ("numbers", numbers),
         ):  # fmt: skip
             _refuse_unknown(function.__name__, word, given or {}, [name for name, _ in keyword])
+        if uncertain := [s.name for s in extras if s.std is not None]:
+            raise DeclarationError(
+                f"effect {function.__name__}: what an effect reads counts as exact; leave std of "
+                f"{uncertain[0]} out"
+            )
         said = {"columns": columns or {}, "numbers": numbers or {}, "profile": profile or {}}
         _refuse_other_words(function.__name__, on, extras, said, seen_in)
         _refuse_other_memory(function.__name__, positional, memory or {}, kind)

@@ -191,7 +191,10 @@ class Model:
         """
         model = self
         for name, change in changes.items():
-            model = model._with(name, model._changed(name, change))
+            old, model = model[name], model._with(name, model._changed(name, change))
+            if model.prior is not None and isinstance(old, Parameter):
+                prior = model.prior.without(name, old.shape.coordinates)
+                model = replace(model, prior=prior)
         return model
 
     def _changed(self, name: str, change: Any) -> Parameter | Constant:

@@ -34,18 +34,30 @@ class Stated:
     """Noise of each sample is known of these `signals`, in the model's order.
 
     `residuals` is their number m, `scale` a usual residual's standard deviation: so a residual in
-    units of its noise stays one in the unit of the reading.
+    units of its noise stays one in the unit of the reading. `groups`: signals whose noise is
+    correlated stand together, in the order of `signals`; empty where each is for itself.
     """
 
     signals: tuple[str, ...]
     residuals: int
     scale: float = 1.0
+    groups: tuple[tuple[str, ...], ...] = ()
+
+    @property
+    def together(self) -> tuple[tuple[str, ...], ...]:
+        """Every signal, with those that its noise is correlated with."""
+        return self.groups or tuple((name,) for name in self.signals)
 
     def columns(self, signals: Mapping[str, Signal]) -> tuple[Signal, ...]:
         """What a sample holds of it behind the signals: (m²,), (m·k,), (k,), (m,), row by row."""
         k, m = sum(signals[name].size for name in self.signals), self.residuals
         sizes = {WHITENING: m * m, SLOPE: m * k, TRUE: k, MEAN: m}
         return tuple(Signal(name, size, None) for name, size in sizes.items())
+
+
+def root_of(group: tuple[str, ...]) -> str:
+    """Where a sample holds the root of the covariance of the noise of signals together."""
+    return ROOT + ",".join(group)
 
 
 def in_units_of_noise(traced: Traced, noise: Stated) -> Traced:

@@ -176,6 +176,32 @@ def rotation(angles: SX) -> SX:
     return rx @ ry @ rz
 
 
+@dataclass(frozen=True)
+class Constraint:
+    """What is known without noise: `expression` is zero at every instant, or as a `limit` never
+    negative."""
+
+    expression: SX
+    limit: bool = False
+
+
+def constraint(
+    expression: SX, value: Any = None, *, at_least: Any = None, at_most: Any = None
+) -> Constraint:
+    """Known without noise: `constraint(norm_2(gravity), 9.80665)`, `constraint(x, at_least=0)`;
+    every estimate keeps to it."""
+    given = [v is not None for v in (value, at_least, at_most)]
+    if sum(given) != 1:
+        raise DeclarationError(
+            "constraint(expression, value) says what it is, at_least= or at_most= what it never "
+            "passes: give one of the three"
+        )
+    of = ca.SX(expression)
+    if at_most is not None:
+        return Constraint(ca.densify(at_most - of), limit=True)
+    return Constraint(ca.densify(of - (at_least if value is None else value)), value is None)
+
+
 class Residual:
     """What a model's body returns: how readings and parameters are tied together.
 
@@ -186,6 +212,7 @@ class Residual:
     unit should be that of the reading. `corrected` is the quantity that `apply` gives back.
     `noise` names for each axis the constant that is its standard deviation: a residual of several
     kinds is then counted in standard deviations, and what is 0 is found from the data.
+    `constraints`: what holds without noise, of parameters or at every sample.
     """
 
     def __init__(
@@ -199,6 +226,7 @@ class Residual:
         axes: tuple[str, ...] = (),
         noise: tuple[str, ...] = (),
         std: Any = None,
+        constraints: tuple[Constraint, ...] | Constraint = (),
     ) -> None:
         explicit = measured is not None and predicted is not None
         if explicit == (implicit is not None):
@@ -210,6 +238,9 @@ class Residual:
         self.std = None if std is None else _side_by_side(std) if several else ca.SX(std)
         self.implicit, self.corrected, self.unit, self.axes = implicit, corrected, unit, axes
         self.noise = noise
+        self.constraints: tuple[Constraint, ...] = (
+            (constraints,) if isinstance(constraints, Constraint) else tuple(constraints)
+        )
 
     @property
     def expression(self) -> SX:

@@ -21,7 +21,8 @@ class Signal:
     `size` is the number of numbers per sample (9 for a rotation matrix, row by row);
     `unit` is None where any unit will do (the data's own is then kept).
     `held`: of an estimator in motion, it keeps its value until the next sample, as a command does;
-    else it is a straight line between two.
+    else it is a straight line between two. `std` of one reading, a number for each of `size`, in
+    `unit`; None where nothing is known.
     """
 
     name: str
@@ -30,20 +31,27 @@ class Signal:
     kind: Literal["plain", "rotation"] = "plain"
     held: bool = False
     wanders: bool = False
+    std: tuple[float, ...] | None = None
 
 
 def signal(
-    shape: int | str = 1, unit: str | None = None, *, held: bool = False, wanders: bool = False
+    shape: int | str = 1,
+    unit: str | None = None,
+    *,
+    held: bool = False,
+    wanders: bool = False,
+    std: Any = None,
 ) -> Any:
     """Declare a measured input: `signal("s")`, `signal(3, "m/s^2")`, `signal(3)` (any unit).
 
     `held`: an input of an estimator in motion that keeps its value between samples (a command to a
     motor) in place of a straight line. `wanders`: its mean may wander while the sensor lies still,
-    as a gyroscope's does; rest is looked for in its noise alone.
+    as a gyroscope's does; rest is looked for in its noise alone. `std`: of one reading, in the
+    signal's unit, one number or one for each component: what `--sensor-noise` says without it.
     """
-    if isinstance(shape, str):
-        return Signal("", 1, shape, held=held, wanders=wanders)
-    return Signal("", shape, unit, held=held, wanders=wanders)
+    size, own = (1, shape) if isinstance(shape, str) else (shape, unit)
+    known = None if std is None else tuple(map(float, stated(std, (size,)).std))
+    return Signal("", size, own, held=held, wanders=wanders, std=known)
 
 
 def attitude() -> Any:
@@ -217,16 +225,19 @@ def _bounds(shape: Shape, bounds: Any) -> tuple[tuple[float, ...], tuple[float, 
     return tuple(map(float, lower)), tuple(map(float, upper))
 
 
-def constant(value: Any, unit: str = "", *, std: Any = None) -> Any:
+def constant(value: Any, unit: str = "", *, std: Any = None, freedom: float = np.inf) -> Any:
     """Declare a plain number (or array) of the model with its unit: `constant(0.28, "m")`.
 
     `std` is its standard uncertainty in the same unit, one number or one for each entry:
-    `constant(0.28, "m", std=0.001)`. It is carried into every estimate.
+    `constant(0.28, "m", std=0.001)`. It is carried into every estimate. `freedom`: degrees of
+    freedom of that standard uncertainty, where it is an estimate itself (JCGM 100, G.4).
     """
+    if std is None and np.isfinite(freedom):
+        raise DeclarationError(f"freedom {freedom!r} is that of a std, and there is none: give std")
     array = np.asarray(value, dtype=float)
     if not np.all(np.isfinite(array)):
         raise DeclarationError(f"constant {value!r} is not finite")
-    known = None if std is None else stated(std, array.shape)
+    known = None if std is None else stated(std, array.shape, freedom)
     return Constant("", tuple(map(float, array.ravel())), unit, array.shape, uncertainty=known)
 
 

@@ -34,11 +34,13 @@ class Uncertainty:
     """Where the numbers of one constant stand in what was found together.
 
     `scale` is what each is multiplied by: the conversion from the unit that it was stated in.
+    `freedom`: degrees of freedom of all their standard deviations; infinite where these are known.
     """
 
     joint: Joint
     places: tuple[int, ...]
     scale: tuple[float, ...]
+    freedom: float = np.inf
 
     def __len__(self) -> int:
         """Count the numbers."""
@@ -74,15 +76,17 @@ class Uncertainty:
         return replace(self, scale=tuple(factor * s for s in self.scale))
 
 
-def stated(std: Any, shape: tuple[int, ...]) -> Uncertainty:
+def stated(std: Any, shape: tuple[int, ...], freedom: float = np.inf) -> Uncertainty:
     """Independent numbers of an array of this shape; one `std` is that of each."""
+    if not freedom > 0:
+        raise DeclarationError(f"freedom {freedom!r}: degrees of freedom are above zero")
     array = np.asarray(std, dtype=float)
     if array.shape not in ((), shape):
         raise DeclarationError(f"std {std!r} has shape {array.shape}, the value has {shape}")
     each = np.broadcast_to(array, shape).ravel()
     if not (np.isfinite(each) & (each > 0)).all():
         raise DeclarationError(f"std {std!r} must be above zero: leave it away for an exact value")
-    return found_together(np.diag(each**2))
+    return replace(found_together(np.diag(each**2)), freedom=float(freedom))
 
 
 def found_together(covariance: Array, source: str = "") -> Uncertainty:

@@ -16,6 +16,7 @@ from casest.dynamics.declare import (
 from casest.dynamics.dimensions import check_units
 from casest.dynamics.discrete import Estimates, Steps, kalman, smoothed
 from casest.dynamics.filter import Filtered, filtered
+from casest.dynamics.moving_horizon import Horizon, moving_horizon
 from casest.dynamics.online import Estimator
 from casest.dynamics.record import Record, least_squares
 from casest.dynamics.statespace import to_statespace
@@ -27,6 +28,7 @@ __all__ = [
     "Estimates",
     "Estimator",
     "Filtered",
+    "Horizon",
     "Motion",
     "Record",
     "State",
@@ -41,6 +43,7 @@ __all__ = [
     "kalman_bucy",
     "least_squares",
     "measured",
+    "moving_horizon",
     "smoothed",
     "state",
     "structure",

@@ -15,8 +15,10 @@ from casest import units
 from casest.declaration.changing import check_units_known
 from casest.declaration.model import Model
 from casest.declaration.physics import SX
-from casest.declaration.shapes import Array
-from casest.declaration.symbols import Constant, Parameter, Signal, constant
+from casest.declaration.physics import Constraint as Constraint
+from casest.declaration.physics import constraint as constraint
+from casest.declaration.shapes import Array, array_shape
+from casest.declaration.symbols import Constant, Parameter, Signal, constant, make_parameter
 from casest.declaration.tracing import flat
 from casest.dynamics.equations import calibration
 from casest.errors import CasestError, DeclarationError, UsageError, last_line
@@ -29,7 +31,8 @@ class State:
     `start` and `std` describe what is known of it at the beginning. `of_data`: the intensity was
     taken from the record at hand, so that a search for the most likely one begins there. `known`:
     it begins exactly at `start`; `stated`: the declaration says its std. `of`: it is an unknown
-    constant of the equations, declared with `param(…)`, that a filter follows as a state.
+    constant of the equations, declared with `param(…)`, that a filter follows as a state. `lower`
+    and `upper`: what each number never leaves.
     """
 
     name: str
@@ -42,6 +45,8 @@ class State:
     known: bool = False
     stated: bool = False
     of: Parameter | None = None
+    lower: tuple[float, ...] = ()
+    upper: tuple[float, ...] = ()
 
     @property
     def beginning(self) -> str:
@@ -62,13 +67,17 @@ def state(
     start: Any = 0.0,
     std: float | None = None,
     known: bool = False,
+    bounds: tuple[Any, Any] | None = None,
 ) -> Any:
     """Declare a state: `state(3, "m/s", intensity=1e-3)`, `state("rad")`.
 
     `intensity` is that of its white driving noise in unit²/s (0: driven by nothing), `start` and
     `std` what is known of it at the beginning, in its own unit: in a filter 1 where nothing is
     said, in a calibration nothing, so that it is an unknown of each run whose search begins at
-    `start`. `known`: it begins exactly there, at t = 0 where the record begins later.
+    `start`; with `std` that much is known of it there too, and weighed against the readings.
+    `known`: it begins exactly there, at t = 0 where the record begins later. `bounds`: (lower,
+    upper), numbers or one for each, None for no end, within which it stays at every time; a filter
+    keeps them over a horizon (`moving_horizon`).
     """
     if isinstance(shape, str):
         size, unit = 1, shape
@@ -94,6 +103,7 @@ def state(
         wrong = _wrong(what, number)
         if wrong:
             raise DeclarationError(f"state: {wrong}")
+    kept = make_parameter(array_shape(size), unit, values, bounds, "run")
     return State(
         "",
         size,
@@ -103,6 +113,8 @@ def state(
         float(spread),
         known=known,
         stated=std is not None,
+        lower=kept.lower,
+        upper=kept.upper,
     )
 
 
@@ -149,13 +161,6 @@ def angle(expression: SX) -> Angle:
     it has none): 179° and −179° are 2° apart.
     """
     return Angle(expression)
-
-
-@dataclass(frozen=True)
-class Constraint:
-    """What is known of the state without noise: `expression` is zero at every instant."""
-
-    expression: SX
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -233,11 +238,6 @@ def _share(text: str) -> float:
             f'measured: std={text!r}: give a number, a signal, or a share of the reading as "5%"'
         )
     return share
-
-
-def constraint(expression: SX, value: float | SX) -> Constraint:
-    """Known without noise: `constraint(norm_2(gravity), 9.80665)`; every estimate keeps to it."""
-    return Constraint(ca.densify(ca.SX(expression) - value))
 
 
 @dataclass(frozen=True)
@@ -364,6 +364,14 @@ class Dynamics:
     def start_covariance(self) -> Array:
         """Its covariance, (n, n)."""
         return np.diag(np.concatenate([np.full(s.size, s.std**2) for s in self.states]))
+
+    @property
+    def bounds(self) -> tuple[Array, Array]:
+        """What the state never leaves: lower and upper (n,), infinite where nothing is said."""
+        return (
+            np.array([v for s in self.states for v in s.lower]),
+            np.array([v for s in self.states for v in s.upper]),
+        )
 
     @property
     def process(self) -> Array:
@@ -531,7 +539,8 @@ class Dynamics:
 @dataclass(frozen=True)
 class Traced:
     """Symbols and expressions: x, signals, f(x, u), h(x, u), A = ∂f/∂x, C = ∂h/∂x, readings;
-    constraints g(x, u) = 0 and G = ∂g/∂x; `turn` (m,): a full turn of readings that are angles."""
+    constraints g(x, u) = 0 and G = ∂g/∂x; `turn` (m,): a full turn of readings that are angles;
+    `limited`: something is never passed that is no bound of a state."""
 
     x: SX
     symbols: Mapping[str, SX]
@@ -545,6 +554,7 @@ class Traced:
     outputs: tuple[Measured, ...]
     measured: tuple[str, ...]
     turn: Array
+    limited: bool = False
 
     def wrapped(self, difference: Any) -> Any:
         """Readings less predictions (m) or (N, m), angles within half a turn of zero."""
@@ -587,6 +597,11 @@ def dynamics(function: Callable[..., Motion]) -> Dynamics:
         if argument.kind is argument.POSITIONAL_OR_KEYWORD:
             if not isinstance(default, Signal):
                 raise DeclarationError(f"{where} comes before the * and must be signal(…)")
+            if default.std is not None:
+                raise DeclarationError(
+                    f"{where}: std is of a calibration's signals; filter, observe and close take "
+                    f"that of an estimator in motion as --sensor-noise {argument.name}=STD"
+                )
             signals.append(replace(default, name=argument.name))
         elif isinstance(default, State):
             states.append(replace(default, name=argument.name))
@@ -614,7 +629,11 @@ def _followed(unknown: Parameter) -> State:
     size = float(np.max(np.abs(start), initial=0.0))
     values = tuple(start.tolist())
     unit = unknown.units[0] if len(set(unknown.units)) == 1 else "1"
-    return State(unknown.name, unknown.shape.size, unit, 0.0, values, size or UNSTATED, of=unknown)
+    bounds = unknown.lower, unknown.upper
+    return State(
+        unknown.name, unknown.shape.size, unit, 0.0, values, size or UNSTATED, False, False, False,
+        unknown, *bounds,
+    )  # fmt: skip
 
 
 def traced_with(declared: Dynamics, constants: Mapping[str, SX | float]) -> Traced:
@@ -638,7 +657,7 @@ def traced_with(declared: Dynamics, constants: Mapping[str, SX | float]) -> Trac
     reading = ca.vertcat(*[flat(o.signal) for o in motion.outputs])
     if reading.numel() != h.numel():
         raise DeclarationError(f"dynamics {declared.name}: outputs and signals differ in shape")
-    g = ca.vertcat(*[ca.vec(c.expression) for c in motion.constraints])
+    g = ca.vertcat(*[ca.vec(c.expression) for c in motion.constraints if not c.limit])
     of = {s.name: s.unit for s in declared.signals}
     turn = [
         np.full(o.predicted.numel(), 2 * np.pi / units.size(of[n] or "rad")[0] if o.wraps else 0.0)
@@ -658,4 +677,5 @@ def traced_with(declared: Dynamics, constants: Mapping[str, SX | float]) -> Trac
         motion.outputs,
         tuple(names),
         np.concatenate([np.zeros(0), *turn]),
+        any(c.limit for c in motion.constraints),
     )

@@ -17,7 +17,15 @@ import numpy as np
 from casest import units
 from casest.declaration.flow import integrated
 from casest.declaration.model import Model
-from casest.declaration.physics import SX, Residual, current_trace, quantity
+from casest.declaration.physics import (
+    SX,
+    Constraint,
+    Residual,
+    constraint,
+    current_trace,
+    quantity,
+)
+from casest.declaration.prior import Prior
 from casest.declaration.shapes import array_shape
 from casest.declaration.symbols import Constant, Parameter, Signal, Symbol, constant, make_parameter
 from casest.declaration.travelling import reduced
@@ -92,13 +100,16 @@ class Equations:
         names = tuple(entry for s in states for entry in _entries(s.name, s.size))
         whole = ca.vertcat(ca.SX(0, 1), *x.values())
         _, put = integrated(trace, rates, whole, ca.densify(start), names, anchored=anchored)
-        return self._residual(motion, symbols, put)
+        return self._residual(motion, symbols, put, tuple(_bounds(states, x)))
 
-    def _residual(self, motion: Any, symbols: Mapping[str, SX], put: Any) -> Residual:
+    def _residual(
+        self, motion: Any, symbols: Mapping[str, SX], put: Any, within: tuple[Constraint, ...]
+    ) -> Residual:
         """Readings against what is predicted of them, in standard deviations where these differ."""
         outputs, place = motion.outputs, f"dynamics {self.declared.name}"
-        if motion.constraints:
-            raise DeclarationError(f"{place}: a calibration takes no constraint(…) yet")
+        kept = tuple(
+            replace(c, expression=put(c.expression)) for c in (*motion.constraints, *within)
+        )
         if not outputs:
             raise DeclarationError(f"{place}: outputs= is empty: say what is measured(…)")
         names = self.declared.measured_in(motion, symbols)
@@ -117,14 +128,32 @@ class Equations:
         axes = tuple(entry for n in names for entry in _entries(n, signals[n].size))
         if len(outputs) == 1:
             only = outputs[0].signal, predicted[0], std[0] if std else None
-            return Residual(measured=only[0], predicted=only[1], std=only[2], unit=unit, axes=axes)
+            return Residual(
+                measured=only[0],
+                predicted=only[1],
+                std=only[2],
+                unit=unit,
+                axes=axes,
+                constraints=kept,
+            )
         return Residual(
             measured=tuple(o.signal for o in outputs),
             predicted=tuple(predicted),
             std=std or None,
             unit=unit or f"[{names[0]}]",
             axes=axes,
+            constraints=kept,
         )
+
+
+def _bounds(states: Sequence[Any], x: Mapping[str, SX]) -> Iterator[Constraint]:
+    """What the declared bounds of states say at every sample."""
+    for s in states:
+        for k in range(s.size):
+            if np.isfinite(s.lower[k]):
+                yield constraint(x[s.name][k], at_least=s.lower[k])
+            if np.isfinite(s.upper[k]):
+                yield constraint(x[s.name][k], at_most=s.upper[k])
 
 
 def with_units(declared: Declared) -> bool:
@@ -215,7 +244,37 @@ def calibration(declared: Any) -> Model:
         )
     symbols: list[Symbol] = [*declared.signals, *declared.unknown_constants, *declared.constants]
     symbols += _beginnings(declared)
-    return Model(declared.name, Equations(declared), tuple(symbols))
+    model = Model(declared.name, Equations(declared), tuple(symbols))
+    return replace(model, prior=_known_before(declared, model))
+
+
+def _known_before(declared: Declared, model: Model) -> Prior | None:
+    """What the declaration says of where states begin, with std=; None where of none."""
+    own = [s for s in declared.states if s.of is None and s.stated]
+    if not own:
+        return None
+    variances = np.concatenate([np.full(s.size, s.std**2) for s in own])
+    return Prior(
+        tuple(s.beginning for s in own),
+        tuple(s.start for s in own),
+        tuple(() if s.size == 1 else (s.size,) for s in own),
+        tuple(map(tuple, np.diag(variances).tolist())),
+        _noise_of_a_residual(declared, model),
+        f"std= of {' and '.join(s.name for s in own)}",
+    )
+
+
+def _noise_of_a_residual(declared: Declared, model: Model) -> float | None:
+    """Its standard deviation by what measured(…) says; None where it says nothing."""
+    traced = model.traced
+    if traced.residual.std is not None:
+        return 1.0
+    states = {s.name: ca.SX.sym(s.name, s.size) for s in declared.states if s.of is None}
+    known = {
+        n: v for n, v in traced.symbols.items() if n not in {s.beginning for s in declared.states}
+    }
+    found = _std(declared.moved({**known, **states}).outputs[0])
+    return None if found is None else float(found)
 
 
 def _beginnings(declared: Declared) -> Iterator[Symbol]:
@@ -232,7 +291,7 @@ def _beginnings(declared: Declared) -> Iterator[Symbol]:
         shape = array_shape(None if s.size == 1 else s.size)
         start: Any = s.start[0] if s.size == 1 else list(s.start)
         free: Parameter = make_parameter(shape, s.unit if s.unit != "1" else "", start, None, "run")
-        free = replace(free, name=s.beginning)
+        free = replace(free, name=s.beginning, lower=s.lower, upper=s.upper)
         if s.known:
             fixed: Constant = constant(start, free.unit)
             yield replace(fixed, name=s.beginning, frozen=free)

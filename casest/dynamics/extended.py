@@ -8,9 +8,9 @@ Readings are linearised at the prediction and again where they lead to (Jazwinsk
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from functools import lru_cache
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 from typing import Any
 
 import casadi as ca
@@ -27,7 +27,7 @@ from casest.dynamics.declare import Dynamics
 from casest.dynamics.discrete import Steps
 from casest.dynamics.factors import Factors
 from casest.dynamics.inputs import as_read, at_estimates, estimates, slopes, uncertain
-from casest.dynamics.stepping import entries, packed, run_steps, unpacked
+from casest.dynamics.stepping import by_rows, entries, packed, run_steps, unpacked
 from casest.dynamics.transition import (
     Pace,
     acting,
@@ -49,8 +49,75 @@ PIECE, FEWEST, MOST, UNSTABLE = 0.5, 2, 16, 2.5
 #: Samples that are linearised at once.
 _BLOCK = 4096
 
+#: Samples that are evaluated one after the other.
+FEW = 200
+
 #: Rounds of the filter's update where a reading is no linear function of the state.
 ITERATIONS = 4
+
+
+@dataclass(frozen=True)
+class Sampled:
+    """A record as a nonlinear model takes it, to be linearised along states piece by piece.
+
+    `ends`: inputs at both ends of every step; `steps` (N − 1, 1) their lengths, `shares` what part
+    of the usual one the readings there stand for; `R` (N, m); `signals`: (N, …) each, uncertain
+    ones as estimated behind; `parts`: into how many pieces a step is cut.
+    """
+
+    model: Dynamics
+    pace: Pace
+    ends: tuple[Array, Array]
+    steps: Array
+    shares: Array
+    R: Array
+    signals: tuple[Array, ...]
+    parts: int
+
+    @classmethod
+    def of(cls, model: Dynamics, run: Run, pace: Pace | None = None) -> Sampled:
+        """`pace`: how the whole record is read where this is a part of it."""
+        time, calm = checked_record(model, run), estimates(model, run)
+        u, step, pace = _inputs(model, run, calm), np.diff(time), pace or Pace.of(model, run)
+        signals = (*(run.signals[s.name] for s in model.signals), *calm.values())
+        return cls(
+            model,
+            pace,
+            (u[:-1], _at_ends(model, u)),
+            step[:, None],
+            _stood_for(step, pace),
+            variances(model, step, pace),
+            signals,
+            pieces(model, run, pace),
+        )
+
+    def moved(self, along: Array, first: int = 0) -> tuple[Array, Array, Array]:
+        """Φ, forced step and Q of the steps from states (K, n), that of sample `first` before."""
+        where = slice(first, first + len(along))
+        given = [part[where] for part in (*self.ends, self.steps, self.shares)]
+        step = _step(self.model, self.parts)
+        Phi, forced, Q = step([np.ascontiguousarray(along), *given])
+        return Phi, forced[:, :, 0], Q
+
+    def after(self, x: Array, sample: int) -> Array:
+        """The state a step after x (n,) at a sample."""
+        given = [part[sample] for part in (*self.ends, self.steps, self.shares)]
+        return np.array(_motion(self.model, self.parts)(x, *given)[0], float).ravel()
+
+    def read(self, along: Array, first: int = 0) -> tuple[Array, Array, Array]:
+        """C, d and y at states (K, n), that of sample `first` before."""
+        own = [part[first : first + len(along)] for part in self.signals]
+        return _rows(self.model, own, along)
+
+    def along(self, states: Array, first: int = 0) -> Steps:
+        """Samples from `first` on, linearised along states (K, n)."""
+        Phi, forced, Q = self.moved(states[:-1], first)
+        last = first + len(states) - 1
+        pace = self.pace.part(slice(first, last + 1))
+        Q = with_lost(self.model, self.steps[first:last, 0], Phi, Q, pace)
+        C, d, y = self.read(states, first)
+        R, of_C = self.R[first : last + 1], entries(self.model.traced.C)
+        return Steps(Phi, forced, Q, C, d, R, y, of_C=of_C)
 
 
 def relinearised(
@@ -65,44 +132,60 @@ def relinearised(
     `errors` (N, n, n): covariances of what these are wrong by, on which noise of inputs acts;
     `pace`: how the whole record is read where this is a part of it.
     """
-    time = checked_record(model, run)
-    u, step = _inputs(model, run), np.diff(time)
-    pace, ends = pace or Pace.of(model, run), (u[:-1], _at_ends(model, u))
-    columns = [np.ascontiguousarray(along[:-1]), *ends, step[:, None], _stood_for(step, pace)]
-    Phi, forced, Q = over_samples(_step(model, pieces(model, run, pace)), columns)
+    steps = Sampled.of(model, run, pace).along(along)
     if errors is not None and uncertain(model):
         added = acting(model, run, along, errors)
-        Q += 0.5 * step[:, None, None] * (added[1:] + added[:-1])
-    Q = with_lost(model, step, Phi, Q, pace)
-    C, d, y = _rows(model, run, along)
-    R = variances(model, step, pace)
-    return Steps(Phi, forced[:, :, 0], Q, C, d, R, y, of_C=entries(model.traced.C))
+        step = np.diff(np.asarray(run.time, float))[:, None, None]
+        return replace(steps, Q=steps.Q + 0.5 * step * (added[1:] + added[:-1]))
+    return steps
 
 
-def _rows(
-    model: Dynamics, run: Run, along: Array, calm: Mapping[str, Array] | None = None
-) -> tuple[Array, Array, Array]:
+def _rows(model: Dynamics, signals: Sequence[Array], along: Array) -> tuple[Array, Array, Array]:
     """Readings as rows: C, d and y."""
-    columns = [np.ascontiguousarray(along), *(run.signals[s.name] for s in model.signals)]
-    columns += (estimates(model, run) if calm is None else calm).values()
-    C, d, y = (part[:, :, 0] if k else part
-               for k, part in enumerate(over_samples(_outputs(model), columns)))  # fmt: skip
+    C, d, y = (part[:, :, 0] if k else part for k, part in enumerate(
+        _outputs(model)([np.ascontiguousarray(along), *signals])))  # fmt: skip
     return C, d, model.traced.nearest(y, C, d, along)
 
 
 @lru_cache(maxsize=8)
-def _step(model: Dynamics, count: int) -> Replay:
+def _step(model: Dynamics, count: int) -> AtSamples:
     x, (u, v, h, share) = model.traced.x, _two_samples(model)
     end, Phi, Q = _motion(model, count)(x, u, v, h, share)
-    return replay(ca.vertcat(x, u, v, h, share), [Phi, end - Phi @ x, Q])
+    return AtSamples(ca.vertcat(x, u, v, h, share), [Phi, end - Phi @ x, Q])
 
 
 @lru_cache(maxsize=8)
-def _outputs(model: Dynamics) -> Replay:
+def _outputs(model: Dynamics) -> AtSamples:
     t = model.traced
     signals = [flat(t.symbols[s.name]) for s in model.signals]
     (C,), as_was = at_estimates(model, [t.C])
-    return replay(ca.vertcat(t.x, *signals, *as_was), [C, t.h - C @ t.x, t.reading])
+    return AtSamples(ca.vertcat(t.x, *signals, *as_was), [C, t.h - C @ t.x, t.reading])
+
+
+class AtSamples:
+    """Expressions of one sample, evaluated at many: over blocks of them at once, or of a `FEW` one
+    after the other, for which a call of NumPy an operation takes longer."""
+
+    def __init__(self, sample: SX, outputs: list[SX]) -> None:
+        self.sample, self.outputs = sample, [ca.densify(e) for e in outputs]
+
+    def __call__(self, columns: list[Array]) -> list[Array]:
+        """Each expression at every sample, (N, …)."""
+        if len(columns[0]) > FEW:
+            return over_samples(self._blocks, columns)
+        _, *found = self._singly(np.zeros(1), np.hstack(columns))
+        shapes = [e.shape for e in self.outputs]
+        return [part.reshape(-1, *shape) for part, shape in zip(found, shapes, strict=True)]
+
+    @cached_property
+    def _blocks(self) -> Replay:
+        return replay(self.sample, self.outputs)
+
+    @cached_property
+    def _singly(self) -> Recursion:
+        nothing = ca.SX.sym("nothing")
+        rows = [by_rows(e) for e in self.outputs]
+        return Recursion(ca.Function("at", [nothing, self.sample], [nothing, *rows]))
 
 
 def replay(sample: SX, outputs: list[SX]) -> Replay:
@@ -150,8 +233,9 @@ def given(
     time, calm = checked_record(model, run), estimates(model, run)
     u, step, pace = _inputs(model, run, calm), np.diff(time), pace or Pace.of(model, run)
     n, m = model.size, model.traced.h.numel()
-    at = np.concatenate([*(run.signals[s.name] for s in model.signals), *calm.values()], axis=1)
-    y = _rows(model, run, np.broadcast_to(model.start, (len(time), n)), calm)[2][:, :m]
+    signals = [*(run.signals[s.name] for s in model.signals), *calm.values()]
+    at = np.concatenate(signals, axis=1)
+    y = _rows(model, signals, np.broadcast_to(model.start, (len(time), n)))[2][:, :m]
     present = np.isfinite(y)
     parts = [
         np.concatenate([u[:1], u[:-1]]),

@@ -19,6 +19,7 @@ from casest.declaration.tracing import flat
 from casest.dynamics.declare import Dynamics
 from casest.dynamics.extended import over_samples, replay
 from casest.engine import Replay
+from casest.errors import UsageError
 
 #: Rounds of Newton's method towards the constraint, and the change in standard deviations that
 #: ends them.
@@ -31,6 +32,11 @@ def known(model: Dynamics, run: Run, x: Array, P: Array) -> tuple[Array, Array]:
     The most probable state on the constraint; the covariance keeps what the constraint's curvature
     hides.
     """
+    if model.traced.limited:
+        raise UsageError(
+            f"{model.name}: a filter does not keep constraint(…, at_least=…): give the state "
+            "bounds= and filter with --horizon"
+        )
     count = model.traced.g.numel()
     if not count:
         return x, P

@@ -71,20 +71,23 @@ def _solved(model: Dynamics, steps: Steps) -> Record:
     columns = np.zeros((N, 2, n, 1 + 2 * n))
     columns[..., 0] = right
     columns[0, 0, :, 1 : 1 + n] = columns[-1, 0, :, 1 + n :] = np.eye(n)
-    whole = splu(_equations(model, steps)).solve(columns.reshape(2 * n * N, -1))
+    whole = splu(equations(steps, model.start_covariance)).solve(columns.reshape(2 * n * N, -1))
     found = whole.reshape(N, 2, n, -1)[:, 0]
     start, end = found[0, :, 1 : 1 + n], found[-1, :, 1 + n :]
     return Record(found[..., 0], 0.5 * (start + start.T), 0.5 * (end + end.T))
 
 
-def _equations(model: Dynamics, steps: Steps) -> Any:
-    """The augmented equations of x(k), λ(k), sample by sample, as a sparse matrix."""
+def equations(steps: Steps, covariance: Array) -> Any:
+    """The augmented equations of x(k), λ(k), sample by sample, as a sparse matrix.
+
+    `covariance` (n, n) holds before the first reading.
+    """
     from scipy.sparse import csc_array
 
-    N, n = len(steps.C), model.size
+    N, n = len(steps.C), steps.C.shape[2]
     seen = steps.seen
     information = seen.transpose(0, 2, 1) @ (seen / steps.R[:, :, None])
-    driven = np.concatenate([model.start_covariance[None], steps.Q])
+    driven = np.concatenate([covariance[None], steps.Q])
     eyes = np.broadcast_to(np.eye(n), (N, n, n))
     # (row: sample, x or λ; column: sample, x or λ; entries)
     here, after = np.arange(N), np.arange(N - 1)

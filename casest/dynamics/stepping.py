@@ -128,12 +128,13 @@ def run_steps(
     Without `keep` of the first output nothing of use.
     """
     N = max(map(len, parts))
-    numbers = np.empty((N, sum(p[0].size for p in parts)))
+    sizes = [int(np.prod(p.shape[1:])) for p in parts]
+    numbers = np.empty((N, sum(sizes)))
     place = 0
-    for p in parts:
-        own = numbers[:, place : place + p[0].size]
-        place += p[0].size
-        own[N - len(p) :] = p.reshape(len(p), -1)
+    for p, size in zip(parts, sizes, strict=True):
+        own = numbers[:, place : place + size]
+        place += size
+        own[N - len(p) :] = p.reshape(len(p), size)
         own[: N - len(p)] = 0.0
     return steps(state, numbers, keep=keep)
 

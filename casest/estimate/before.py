@@ -52,13 +52,13 @@ def against_prior(problem: Problem, point: Point) -> Disagreement | None:
     alone = trust_region(bare, point, damping=LITTLE)
     more = max(problem.cost(point) - min(alone.cost, bare.cost(point)), 0.0)
     rank = identify(bare, point, bare.factor(point)[0]).rank
-    freedom = rank + len(prior.covariance) - problem.unknowns
+    places = [i for slot, *_ in problem.known_before for i in range(slot.x.start, slot.x.stop)]
+    freedom = rank + len(places) - problem.unknowns
     if freedom < 1:
         return None
     known = problem.point({**problem.values(point), **prior.by_name})
-    std = np.sqrt(np.diag(np.array(prior.covariance)))
-    own = {s.parameter.name: s.x for s in problem.slots}
-    places = [i for name in prior.names for i in range(own[name].start, own[name].stop)]
+    entries = np.concatenate([known.entries for known in problem.known_before])
+    std = np.sqrt(np.diag(np.array(prior.covariance)))[entries]
     away = np.abs(problem.difference(point, known)[places]) / std
     worst = int(np.argmax(away))
     found = ChiSquare(2 * more / scale**2, freedom)

@@ -11,6 +11,7 @@ import numpy as np
 
 from casest.data.run import Run
 from casest.declaration.model import Model
+from casest.declaration.shapes import Array
 from casest.engine.threads import one_thread
 from casest.errors import DataError, NotTrusted, UsageError
 from casest.estimate import reasons as words
@@ -22,6 +23,7 @@ from casest.estimate.errors_of_inputs import with_errors_of_inputs
 from casest.estimate.estimate import Estimate as Estimate
 from casest.estimate.estimate import Noise
 from casest.estimate.evidence import judged
+from casest.estimate.keeping import keeping
 from casest.estimate.on_bounds import free_of, on_bounds
 from casest.estimate.propagation import propagated
 from casest.estimate.reasons import POOR, STARTS, WORTH, Code
@@ -110,12 +112,18 @@ def _attempt(
         seed=seed,
         automatic=start is None,
     )
-    problem, outcomes = with_errors_of_inputs(problem, outcomes, solver, seed)
+    try:
+        problem, outcomes = with_errors_of_inputs(problem, outcomes, solver, seed)
+    except NotTrusted as error:
+        return _refused(problem, best_of(outcomes).point, Code.MODEL, str(error), began)
     evidence = None
     if intervals:
         outcomes, evidence = looked_for(problem, first, outcomes, seed, start is not None)
     found = _estimate(problem, best_of(outcomes), outcomes, began, intervals)
     certificate = judged(problem, found.certificate, evidence)
+    certificate = keeping(
+        problem, found.point, found.noise.sigma, found.correlated_over, certificate
+    )
     found = replace(found, certificate=certificate, evidence=evidence)
     if start is None and model.starter is None and found.certificate.trusted:
         found = _looked_at_for_a_better_one(found)
@@ -211,7 +219,7 @@ def _estimate(
     if not np.isfinite(R).all():
         reason = "a derivative of the residual is not finite at the best point found; give --start"
         return _refused(problem, point, Code.NOT_FINITE, reason, began)
-    identified = identify(problem, point, R)
+    identified = identify(problem, point, _told_apart(problem, point, R))
     dof = problem.residual_count - identified.rank
     noise = _noise(problem, point, float(np.sqrt(2 * best.cost)), dof, identified.rank)
     correlated = correlation_time(problem, point)
@@ -256,6 +264,13 @@ def _estimate(
         shift,
         inputs=inputs,
     )
+
+
+def _told_apart(problem: Problem, point: Point, R: Array) -> Array:
+    """The factor in which it is seen what is determined: constraints no harder than data."""
+    if problem.force is None:
+        return R
+    return replace(problem, force=problem.force.softer).factor(point)[0]
 
 
 def _looked_at_for_a_better_one(found: Estimate) -> Estimate:

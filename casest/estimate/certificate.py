@@ -16,7 +16,9 @@ from operator import or_
 import numpy as np
 from numpy.typing import NDArray
 
+from casest.declaration.model import Model
 from casest.declaration.shapes import Array
+from casest.declaration.symbols import Signal
 from casest.estimate import reasons as words
 from casest.estimate.covariance import inverse_normal
 from casest.estimate.on_bounds import OnBound, free_of, of_the_free, on_bounds
@@ -77,6 +79,12 @@ class Certificate:
         return replace(self, trusted=False, reasons=(reason,), code=code)
 
 
+def _noisy(model: Model) -> Sequence[Signal]:
+    """Signals whose noise is that of the residual: what is predicted, else all readings."""
+    measured = [s for s in model.readings if s.name == model.traced.measured]
+    return measured or model.readings
+
+
 def certify(
     problem: Problem,
     best: Outcome,
@@ -110,7 +118,11 @@ def certify(
         wrong = [b for b in at_bound if b.open or not b.beyond <= far]
         against += [(Code.BOUND, _bound_words(problem, b)) for b in wrong]
     if not against and not np.isfinite(sigma):
-        way = "record more, or rest intervals whose scatter shows it"
+        stated = " ".join(f"--sensor-noise {s.name}=STD" for s in _noisy(problem.model))
+        way = (
+            "record more, or rest intervals whose scatter shows it (--at-rest), or say how large "
+            f"it is: {stated}"
+        )
         counts = problem.residual_count, problem.unknowns
         against.append((Code.NO_REDUNDANCY, words.no_redundancy(*counts, way)))
     if not np.isfinite(best.cost):

@@ -18,7 +18,7 @@ from casest.estimate.correlation import ENOUGH, TABLE, correlation_time
 from casest.estimate.covariance import inverse_normal, sandwich
 from casest.estimate.evidence import Evidence, remarks
 from casest.estimate.on_bounds import free_of
-from casest.estimate.profile_likelihood import half_width
+from casest.estimate.profile_likelihood import Profile, half_width
 from casest.estimate.propagation import Inputs
 from casest.estimate.remarks import notes, of_stated_noise
 from casest.leastsquares.identifiability import Identifiability, Weak
@@ -176,6 +176,19 @@ class Estimate:
             ends.append(self.problem.spread(at, squares))
         return ends[0], ends[1]
 
+    def profile(self, j: int, reach: float = 3.0, count: int = 13) -> tuple[Array, Array]:
+        """Values (count,) of unknown j (as in `names`), and how far 2·cost/σ² rises there.
+
+        They reach so many plain standard deviations to either side; everything else is fitted again
+        at each. Of a linear model that is a parabola, one at one standard deviation.
+        """
+        at, sigma = self.optimum or self.point, self.noise.sigma
+        covariance = sigma**2 * inverse_normal(self.problem.factor(at)[0], self.free)
+        around = Profile(self.problem, at, self.problem.cost(at), covariance, sigma)
+        distances = np.linspace(-reach, reach, count) * np.sqrt(covariance[j, j])
+        with np.errstate(all="ignore"):
+            return at.x[j] + distances, around.curve(j, distances)
+
     def _squared_reach(self) -> tuple[Array, Array]:
         """Squares of the reach below and above, (n, n) each as a covariance, as if unbounded."""
         profile = self.certificate.profile
@@ -193,7 +206,7 @@ class Estimate:
     def effective_freedom(self) -> tuple[int, ...]:
         """Degrees of freedom of each unknown's standard deviation (Welch & Satterthwaite).
 
-        What comes of references counts as known exactly: their standard uncertainties are.
+        What comes of references counts as known exactly, but for those that say otherwise.
         """
         most, own = self.noise.degrees_of_freedom, freedom(self.problem, self.optimum or self.point)
         each = np.full(self.problem.unknowns, most) if own is None else np.minimum(own, most)
@@ -205,6 +218,9 @@ class Estimate:
             with np.errstate(invalid="ignore", divide="ignore"):
                 larger = np.square(variance / np.maximum(variance - known, 1e-12 * variance))
             each = each * np.where(np.isfinite(larger), larger, 1.0)
+            with np.errstate(invalid="ignore", divide="ignore"):
+                shares = np.nan_to_num(self.inputs.shares / variance[:, None])
+                each = 1 / (1 / each + np.sum(shares**2 / self.inputs.freedom, axis=1))
         return tuple(int(min(f, UNLIMITED)) for f in each)
 
     @property

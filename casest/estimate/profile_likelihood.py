@@ -112,6 +112,22 @@ class Profile:
         above = self._end_or_bound(j, 1, rise) if below is not None else None
         return None if below is None or above is None else (below, above)
 
+    def curve(self, j: int, distances: Array) -> Array:
+        """Rise of 2·cost over σ² with unknown j at distances from its best value, (k,).
+
+        Everything else is fitted again; NaN outside the bounds. Each side goes outwards.
+        """
+        found = np.full(len(distances), np.nan)
+        for sign in (-1, 1):
+            here, own = self.best, np.flatnonzero(sign * distances >= 0)
+            for k in own[np.argsort(np.abs(distances[own]))]:
+                there = self.held_at(here, j, float(distances[k])) if distances[k] else self.best
+                if there is None:
+                    break
+                here = there
+                found[k] = 2 * (self.problem.cost(here) - self.cost) / self.sigma**2
+        return found
+
     def _end_or_bound(self, j: int, sign: int, rise: float) -> float | None:
         """The end, or the distance to the bound where the cost has not risen so far there."""
         room = float(abs(self.problem.bounds[0 if sign < 0 else 1][j] - self.best.x[j]))

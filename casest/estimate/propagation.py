@@ -24,8 +24,9 @@ from casest.leastsquares.problem import Point, Problem
 class Inputs:
     """Known numbers that are not exact, and what the unknowns do when they move.
 
-    `names` (k,) of single numbers, `units`, `values` (k,), their `covariance` (k, k), and the
-    `sensitivity` (n, k) of the unknowns: ∂x/∂c. Values of a direction are its coordinates: zero.
+    `names` (k,) of single numbers, `units`, `values` (k,), their `covariance` (k, k), the
+    `sensitivity` (n, k) of the unknowns: ∂x/∂c, and degrees of `freedom` (k,) of each standard
+    uncertainty, infinite where it is known. Values of a direction are its coordinates: zero.
     """
 
     names: tuple[str, ...]
@@ -33,6 +34,7 @@ class Inputs:
     values: Array
     covariance: Array
     sensitivity: Array
+    freedom: Array
 
     @property
     def std(self) -> Array:
@@ -64,10 +66,8 @@ def propagated(problem: Problem, point: Point, free: NDArray[np.bool_]) -> Input
     constants = uncertain(problem.model)
     if not constants:
         return None
-    extended = _extended(problem, constants)
-    there = _same_place(problem, point, extended)
+    extended, there, own, more = extended_at(problem, point)
     hessian = extended.hessian(there)
-    own, more = _places(problem, extended, [c.name for c in constants])
     sensitivity = np.zeros((problem.unknowns, len(more)))
     inner = own[free]
     scale = np.sqrt(np.where(np.diag(hessian)[inner] > 0, np.diag(hessian)[inner], 1.0))
@@ -82,7 +82,20 @@ def propagated(problem: Problem, point: Point, free: NDArray[np.bool_]) -> Input
         there.x[more],
         _covariance(constants),
         sensitivity,
+        np.concatenate([np.full(len(u), u.freedom) for c in constants if (u := c.uncertainty)]),
     )
+
+
+def extended_at(
+    problem: Problem, point: Point
+) -> tuple[Problem, Point, NDArray[np.intp], NDArray[np.intp]]:
+    """The problem in which uncertain constants are unknowns, the same point there, and the places
+    of the problem's own unknowns and of the constants."""
+    constants = uncertain(problem.model)
+    extended = _extended(problem, constants)
+    names = [c.name for c in constants]
+    there = _same_place(problem, point, extended)
+    return extended, there, *_places(problem, extended, names)
 
 
 def _extended(problem: Problem, constants: Sequence[Constant]) -> Problem:
@@ -117,7 +130,7 @@ def _places(
             more[slot.parameter.name] = here
         else:
             own[known[slot.parameter.name, slot.run]] = here
-    return own, np.concatenate([more[name] for name in added])
+    return own, np.concatenate([np.zeros(0, dtype=np.intp), *(more[name] for name in added)])
 
 
 def _covariance(constants: Sequence[Constant]) -> Array:

@@ -142,6 +142,30 @@ def bound(name: str, lower: float, upper: float, beyond: float | None = None) ->
     return f"`{name}` ended on its bound ({lower:.4g}, {upper:.4g}): {asked}"
 
 
+def not_kept(expression: str, value: float, where: str) -> str:
+    """BOUND: a constraint that no values keep, what it comes to, and where."""
+    return (
+        f"a constraint cannot be kept: {expression} comes to {value:.3g}{where}; the equations or "
+        "the constraint are wrong"
+    )
+
+
+def pulled(pull: float) -> str:
+    """BOUND: how far the data would go without the constraints."""
+    return (
+        f"the data ask for {pull:.3g} standard deviations away from the constraints: these or the "
+        "model are wrong"
+    )
+
+
+def kept(acting: int, every: int, pull: float) -> str:
+    """For constraints: how many act, and what the data would rather."""
+    return (
+        f"constraints are kept, {acting} of {every} act; without them the data would go {pull:.2g} "
+        "standard deviations away"
+    )
+
+
 def held(name: str, bound: float, end: float, upper: bool, beyond: float) -> str:
     """For an unknown on its bound: how far inside it may be, and what the data would rather."""
     rather = f"; the data ask for {beyond:.2g} standard deviations more" if beyond >= 0.05 else ""

@@ -10,7 +10,7 @@ from casest.declaration.shapes import Array
 from casest.leastsquares.agreement import between_runs
 from casest.leastsquares.problem import Point, Problem
 from casest.leastsquares.stated import UNLIKELY, ChiSquare
-from casest.leastsquares.sums import rounding, some_residuals
+from casest.leastsquares.sums import repeat_noise, rounding, some_residuals
 from casest.leastsquares.weights import robust_scale
 
 #: Second-order shift, in standard deviations, from which on it is added to them.
@@ -27,10 +27,10 @@ def notes(
     """All that there is to say. `bias` is the second-order shift in standard deviations."""
     if problem.model.remarker is not None:
         yield from problem.model.remarker(problem.model, problem.runs, problem.values(point))
-    if dof == 0:
+    if dof == 0 and (known_by := _known_by(problem, point)):
         yield (
             "as many unknowns as equations: nothing checks the model; the standard deviations rest "
-            "on the scatter within the rest intervals alone"
+            f"on {known_by} alone"
         )
     if correlated > 1:
         count = sum(len(run) for run in problem.runs)
@@ -47,6 +47,14 @@ def notes(
     yield from _too_fast(problem)
     yield from _runs_that_disagree(problem, point, correlated)
     yield from _furthest_out(problem, point)
+
+
+def _known_by(problem: Problem, point: Point) -> str:
+    """What shows the noise where no residual does; empty where nothing does."""
+    if problem.noise_scale is not None:
+        return "the stated noise"
+    within = repeat_noise(problem, point) is not None
+    return "the scatter within the rest intervals" if within else ""
 
 
 def of_stated_noise(found: ChiSquare | None) -> Iterator[str]:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from casest.declaration.noise import ROOT, SLOPE, WHITENING
+from casest.declaration.noise import SLOPE, WHITENING, root_of
 from casest.declaration.shapes import Array
 from casest.estimate.covariance import inverse_normal
 from casest.estimate.estimate import Estimate
@@ -65,32 +65,32 @@ def _of_signals(
         return [Source("noise of a residual", sigma, unit, random, freedom)]
     problem, at = estimate.problem, estimate.optimum or estimate.point
     bread = inverse_normal(problem.factor(at)[0], estimate.free)
-    middles = {name: np.zeros_like(random) for name in stated.signals}
-    usual = dict.fromkeys(stated.signals, 0.0)
+    middles = {group: np.zeros_like(random) for group in stated.together}
+    usual = dict.fromkeys(stated.together, 0.0)
     for block in problem.blocks(at):
         run, m = problem.runs[block.run], stated.residuals
         held = {k: run.signals[k][block.span] for k in run.signals if k.startswith("noise.")}
         W = held[WHITENING].reshape(-1, m, m)
         G = W @ held[SLOPE].reshape(len(W), m, -1)
         first = 0
-        for name in stated.signals:
-            size = run.signals[name].shape[1]
-            part = _spread(G[:, :, first : first + size], held[ROOT + name])
+        for group in stated.together:
+            size, root = sum(run.signals[n].shape[1] for n in group), held[root_of(group)]
+            part = _spread(G[:, :, first : first + size], root)
             first += size
             scores = np.einsum("nmk,nmr->nkr", block.jacobian, part)
             middle = np.einsum("nkr,nlr->kl", scores, scores)
-            middles[name][np.ix_(block.x, block.x)] += middle
-            usual[name] += float(np.sum(held[ROOT + name] ** 2)) / size
+            middles[group][np.ix_(block.x, block.x)] += middle
+            usual[group] += float(np.sum(root**2)) / size
     count = sum(map(len, problem.runs))
     return [
         Source(
-            f"noise of {name}",
-            float(np.sqrt(usual[name] / count)),
-            f"[{name}]",
-            np.where(np.isnan(random), np.nan, bread @ middles[name] @ bread),
+            f"noise of {' and '.join(group)}",
+            float(np.sqrt(usual[group] / count)) if len(group) == 1 else None,
+            f"[{group[0]}]" if len(group) == 1 else "",
+            np.where(np.isnan(random), np.nan, bread @ middles[group] @ bread),
             freedom,
         )
-        for name in stated.signals
+        for group in stated.together
     ]
 
 

@@ -153,6 +153,11 @@ def check_model(model: Model) -> None:
             "the records to one fit, casest calibrate A.csv B.csv --per-run NAME, or calibrate "
             "each by itself"
         )
+    if model.traced.residual.constraints:
+        raise UsageError(
+            f"model {model.name} keeps to constraints, which calibrate_many does not; call "
+            "calibrate for each sensor"
+        )
     if model.sequential:
         raise UsageError(
             f"model {model.name} has an effect on the sequence of samples, which calibrate_many "
@@ -162,6 +167,11 @@ def check_model(model: Model) -> None:
         raise UsageError(
             f"model {model.name} has an effect on the noise, for which calibrate_many does not "
             "weigh samples; call calibrate for each sensor"
+        )
+    if any(s.std is not None for s in model.signals):
+        raise UsageError(
+            f"model {model.name} declares the std of a signal, by which calibrate_many does not "
+            "weigh samples; leave it out, or call calibrate for each sensor"
         )
     if model.canonicaliser is not None:
         raise UsageError(

@@ -1,4 +1,4 @@
-"""`estimate.plot()`: residuals, parameters or their correlation as a figure of Matplotlib."""
+"""`estimate.plot()`: residuals, parameters, profiles, the sphere as a figure of Matplotlib."""
 
 from __future__ import annotations
 
@@ -7,9 +7,11 @@ from typing import Any
 import numpy as np
 
 from casest.errors import UsageError, library
+from casest.estimate.profile_likelihood import half_width
 from casest.results.fitted import Fitted
+from casest.results.poses import cap, flat
 
-KINDS = ("residuals", "parameters", "correlation")
+KINDS = ("residuals", "parameters", "correlation", "sphere", "profiles")
 
 
 def plot(result: Fitted, what: str, over: str | None) -> Any:
@@ -21,8 +23,9 @@ def plot(result: Fitted, what: str, over: str | None) -> Any:
     figure = library("matplotlib.figure", "plot", "plot()").Figure(layout="constrained")
     if what == "residuals":
         _residuals(result, figure, over)
-    else:
-        (_parameters if what == "parameters" else _correlation)(result, figure)
+        return figure
+    drawn = {"parameters": _parameters, "correlation": _correlation, "sphere": _sphere}
+    drawn.get(what, _profiles)(result, figure)
     return figure
 
 
@@ -68,3 +71,48 @@ def _correlation(result: Fitted, figure: Any) -> None:
     axis.set_xticks(range(len(found.names)), found.names, rotation=90)
     axis.set_yticks(range(len(found.names)), found.names)
     figure.colorbar(shown, label="correlation")
+
+
+def _sphere(result: Fitted, figure: Any) -> None:
+    """Corrected directions above and below, equal areas; colour: how far the length is off."""
+    poses = result.residuals.poses
+    if poses is None:
+        raise UsageError(f"plot('sphere'): {result.declared} corrects no vector of known length")
+    axes = figure.subplots(1, 2)
+    figure.set_size_inches(7.6, 3.6)
+    off = 100 * (poses.corrected - 1)
+    most = float(np.abs(off).max()) or 1.0
+    rim, turn = cap(poses.empty, np.radians(poses.radius)), np.linspace(0, 2 * np.pi, 181)
+    for axis, sign, title in zip(axes, (1, -1), ("z up", "z down"), strict=True):
+        own = poses.directions[:, 2] * sign >= 0
+        axis.plot(np.cos(turn), np.sin(turn), color="0.6", linewidth=0.8)
+        shown = axis.scatter(*flat(poses.directions[own]), c=off[own], s=16, cmap="RdBu_r",
+                             vmin=-most, vmax=most, edgecolor="0.3", linewidth=0.4)  # fmt: skip
+        axis.plot(*flat(np.where((rim[:, 2] * sign >= 0)[:, None], rim, np.nan)), "--", color="C1")
+        axis.set(title=title, aspect="equal", xlabel="x", ylabel="y")
+    figure.colorbar(shown, ax=axes, label="length off its median [%]", shrink=0.7)
+    figure.suptitle(f"widest gap (dashed): {poses.radius:.0f}° around it", fontsize="medium")
+
+
+def _profiles(result: Fitted, figure: Any) -> None:
+    """2·cost over σ² with each unknown held; dashed what its standard deviation assumes."""
+    found = result.found
+    if not result.trusted:
+        raise UsageError("plot('profiles'): this estimate was refused, and has no noise to go by")
+    columns = min(3, len(found.names))
+    rows = -(-len(found.names) // columns)
+    axes = figure.subplots(rows, columns, squeeze=False, sharey=True)
+    figure.set_size_inches(3 * columns, 2.2 * rows)
+    for j, axis in enumerate(axes.flat):
+        if j >= len(found.names):
+            axis.set_visible(False)
+            continue
+        values, rise = found.profile(j)
+        name, unit = found.names[j], result.unknown_units.get(found.names[j], "")
+        shares = np.linspace(-1, 1, len(values))
+        axis.plot(values, rise, ".-")
+        axis.plot(values, 9 * shares**2, "--", color="0.5")
+        axis.axhline(half_width(found.noise.degrees_of_freedom) ** 2, color="C1", linewidth=0.8)
+        axis.set_xlabel(f"{name} [{unit or '1'}]")
+        axis.locator_params(axis="x", nbins=4)
+    figure.supylabel("rise of the cost over that of the noise (line: 95 %)", fontsize="medium")

@@ -11,6 +11,7 @@ from casest.data.run import Run
 from casest.declaration.model import Model
 from casest.effects.placing import told
 from casest.errors import UsageError
+from casest.leastsquares.stated import stated_noise
 from casest.results.find import find_model
 
 #: What a fit is made from.
@@ -43,12 +44,17 @@ def model_and_runs(
         )
     given = [data] if isinstance(data, Run) else data
     if isinstance(given, Sequence) and any(isinstance(one, Run) for one in given):
-        return found, _as_they_are(given, reading)
+        return _with_noise(found, _as_they_are(given, reading))
     listed = listed_data(given)
     if not listed:
         return found, ()
     runs = load_runs(listed, found.signals, **stated(reading))
-    return (told(found, runs) if found.effects else found), runs
+    return _with_noise(told(found, runs) if found.effects else found, runs)
+
+
+def _with_noise(model: Model, runs: tuple[Run, ...]) -> tuple[Model, tuple[Run, ...]]:
+    """With the noise that the model declares of its signals, where none was stated before."""
+    return (model, runs) if model.noise is not None else stated_noise(model, runs, {})
 
 
 def stated(reading: Reading) -> Any:

@@ -105,7 +105,10 @@ class Told:
         return as_frame(self.residual_columns(), to)
 
     def plot(self, what: str = "residuals", over: str | None = None) -> Any:
-        """A Matplotlib figure of "residuals", "parameters" (95 % intervals) or "correlation".
+        """A Matplotlib figure of one of these.
+
+        "residuals"; "parameters": 95 % intervals; "correlation"; "sphere": where the poses lie, of
+        a vector of known length; "profiles": the cost with each unknown held and all else fitted.
 
         `over` names a column or quantity for the residuals' axis; else it is the time.
         """

@@ -25,7 +25,8 @@ def bent(model: Model, parameters: Array, run: Run, pull: Array, inverse: Array)
 
     `pull` CGᵀ (N, k, m) and `inverse` V⁻¹ (N, m, m) are those there; the model is without noise.
     """
-    names = tuple(name.removeprefix(ROOT) for name in run.signals if name.startswith(ROOT))
+    groups = [name for name in run.signals if name.startswith(ROOT)]
+    names = tuple(n for group in groups for n in group.removeprefix(ROOT).split(","))
     ends = np.cumsum([0, *(run.signals[name].shape[1] for name in names)])
     parts = dict(zip(names, np.split(run.signals[TRUE], ends[1:-1], axis=1), strict=True))
     samples = Columns([parts.get(s.name, run.signals[s.name]) for s in model.signals])
@@ -33,8 +34,12 @@ def bent(model: Model, parameters: Array, run: Run, pull: Array, inverse: Array)
     n, k, m = pull.shape
     H = found.reshape(n, m, k, k)
     mean = -np.einsum("nka,nmkl,nlb,nab->nm", pull, H, pull, inverse, optimize=True)
-    for name, a, b in zip(names, ends, ends[1:], strict=False):
-        mean += _trace(H[:, :, a:b, a:b], run.signals[ROOT + name])
+    first = 0
+    for group in groups:
+        of = group.removeprefix(ROOT).split(",")
+        last = first + sum(run.signals[n].shape[1] for n in of)
+        mean += _trace(H[:, :, first:last, first:last], run.signals[group])
+        first = last
     return np.asarray(0.5 * mean)
 
 

@@ -19,6 +19,7 @@ from casest.data.run import Run
 from casest.declaration.effect import OVER_TIME
 from casest.declaration.model import Model
 from casest.declaration.physics import chart
+from casest.declaration.prior import root
 from casest.declaration.shapes import Array
 from casest.declaration.symbols import Parameter
 from casest.declaration.tracing import sample_symbol
@@ -34,6 +35,7 @@ from casest.engine import (
     triangular_factor,
 )
 from casest.errors import DataError, NotTrusted, UsageError
+from casest.leastsquares.constrained import FIRST, Constraints, Force, constraints_of
 from casest.leastsquares.per_sample import residual_and_jacobian
 from casest.leastsquares.sequence import Staged
 
@@ -46,6 +48,14 @@ class Slot:
     run: int | None
     x: slice
     ref: slice
+
+
+class Known(NamedTuple):
+    """What is known of a slot before: its `value`, and its numbers in the prior's covariance."""
+
+    slot: Slot
+    value: Array
+    entries: Any
 
 
 @dataclass(frozen=True)
@@ -90,6 +100,7 @@ class Problem:
     model's residual unit. Jacobians are with respect to the unknowns `x`. `whitening` (one
     (N·m, N·m) per run, or None) takes from residuals of rests what they share with those before.
     `states` (one (N, k) per run, or None): those of differential equations, where they are known.
+    `force` is how the model's constraints are held (see `constrained`).
     """
 
     model: Model
@@ -97,6 +108,7 @@ class Problem:
     weights: tuple[Array, ...] | None = None
     whitening: tuple[Array, ...] | None = None
     states: tuple[Array, ...] | None = None
+    force: Force | None = None
 
     # -- layout --------------------------------------------------------------------------------
 
@@ -125,7 +137,8 @@ class Problem:
         """Number of scalar residuals; what is known before counts as one for each number."""
         every = sum(len(run) for run in self.runs) * len(self.model.axes)
         every -= sum(int(np.sum(~p)) for p in self.present if p is not None)
-        return every if self.model.prior is None else every + len(self.model.prior.covariance)
+        every += sum(len(known.entries) for known in self.known_before)
+        return every + self.kept_count
 
     def lost(self, r: int) -> Any:
         """Rests of a run before which a sensor was beyond its range, by number."""
@@ -137,12 +150,48 @@ class Problem:
         staged = self._staged
         return tuple(None if staged is None else staged.present(r) for r in range(len(self.runs)))
 
+    @cached_property
+    def kept_count(self) -> int:
+        """How many directions of the unknowns constraints hold as equations."""
+        if self.constraints is None:
+            return 0
+        if self.force is None:
+            return int(sum(np.sum(~limit) for limit in self.constraints.limits))
+        held = [slopes[own] for (_, slopes), own in
+                zip(self.kept_at(self.start()), self.force.held, strict=True)]  # fmt: skip
+        whole = np.vstack(held)
+        size = np.linalg.norm(whole, axis=0)
+        return int(np.linalg.matrix_rank(whole / np.where(size > 0, size, 1.0), tol=1e-8))
+
     @property
     def noise_scale(self) -> float | None:
         """Standard deviation of a usual residual that was stated, or that a prior had."""
         if self.model.noise is not None:
             return self.model.noise.scale
         return None if self.model.prior is None else self.model.prior.sigma
+
+    @cached_property
+    def known_before(self) -> tuple[Known, ...]:
+        """What a prior says, slot by slot: of a parameter of each run, the same in every run."""
+        found, first = [], 0
+        for name, value in ({} if self.model.prior is None else self.model.prior.by_name).items():
+            own = [s for s in self.slots if s.parameter.name == name]
+            entries = first + np.arange(own[0].parameter.shape.coordinates)
+            found += [Known(s, value, entries) for s in own]
+            first += len(entries)
+        return tuple(found)
+
+    @cached_property
+    def prior_root(self) -> Array:
+        """R (k, k) with RᵀR the inverse of the covariance of all that is known before."""
+        assert self.model.prior is not None
+        every = np.concatenate([known.entries for known in self.known_before])
+        runs = np.repeat(
+            [-1 if known.slot.run is None else known.slot.run for known in self.known_before],
+            [len(known.entries) for known in self.known_before],
+        )
+        covariance = np.array(self.model.prior.covariance)[np.ix_(every, every)]
+        return root(np.where(runs[:, None] == runs, covariance, 0.0))
 
     @cached_property
     def _selections(self) -> tuple[tuple[Any, Any], ...]:
@@ -286,6 +335,12 @@ class Problem:
     def _charted(self, slot: Slot, x: Array, reference: Array) -> Array:
         value, _ = _chart(slot.parameter.shape.kind, len(x), len(reference))
         return np.array(value(x, reference)).reshape(slot.parameter.shape.dims)
+
+    def charted_many(self, slot: Slot, x: Array, reference: Array) -> Array:
+        """Entries (T, k) of a curved parameter from coordinates (T, c) around one reference."""
+        value, _ = _chart(slot.parameter.shape.kind, x.shape[1], len(reference))
+        found = np.array(value.map(len(x))(x.T, np.repeat(reference[:, None], len(x), axis=1)))
+        return found.reshape(-1, len(x)).T
 
     def values(self, point: Point) -> dict[str, Array]:
         """Parameter values by name; per-run ones with a leading run axis if there are several."""
@@ -438,6 +493,65 @@ class Problem:
             return np.zeros((len(self.runs[r]), 0))
         return self._staged.given(self.parameters(point, r), r, ())[0]
 
+    @property
+    def constraints(self) -> Constraints | None:
+        """What the model keeps to, if to anything."""
+        return constraints_of(self.model)
+
+    def kept_at(self, point: Point) -> list[tuple[Array, Array]]:
+        """Values (M,) of the constraints of each run, and their slopes (M, n) in all unknowns."""
+        found = []
+        for r, samples in enumerate(self.samples):
+            assert self.constraints is not None
+            parameters, dense = self.parameters(point, r), samples.dense
+            given, slopes = np.zeros((len(dense), 0)), np.zeros((len(dense), 0, 0))
+            if self._staged is not None:
+                given, slopes = self._staged.given(parameters, r)
+            c, own = self.constraints.at(parameters, dense, given, slopes)
+            wide = np.zeros((len(c), self.unknowns))
+            wide[:, self._selections[r][0]] = own
+            found.append((c, wide))
+        return found
+
+    def forced(self, point: Point, weight: float, multipliers: Sequence[Array]) -> Problem:
+        """The same with constraints held `weight` times as hard as the data say them at a point,
+        with multipliers (M,) of each run."""
+        assert self.constraints is not None
+        sharp = np.diag(self.of_runs(point).matrix)
+        variance = np.where(sharp > 0, 1 / np.where(sharp > 0, sharp, 1.0), 0.0)
+        at, held, root = self.kept_at(point), [], []
+        for samples, (_, slopes) in zip(self.samples, at, strict=True):
+            std = np.sqrt(slopes**2 @ variance)
+            root.append(weight / np.where(std > 0, std, np.max(std, initial=0.0) or 1.0))
+            held.append(~self.constraints.limit(len(samples)))
+        shift = [own / k**2 for own, k in zip(multipliers, root, strict=True)]
+        return replace(self, force=Force(tuple(root), tuple(shift), tuple(held)))
+
+    @cached_property
+    def _force(self) -> Force:
+        """How constraints are held where nothing is said: by no multiplier yet."""
+        if self.force is not None:
+            return self.force
+        start = self.start()
+        nothing = [np.zeros(len(c)) for c, _ in self.kept_at(start)]
+        force = self.forced(start, FIRST, nothing).force
+        assert force is not None
+        return force
+
+    def _rows_beyond(self, point: Point) -> Array:
+        """[J r] (k, n + 1) of all that is no reading: what is known before, and constraints."""
+        parts = [np.zeros((0, self.unknowns + 1))]
+        if self.model.prior is not None:
+            parts.append(prior_rows(self, point))
+        if self.constraints is not None:
+            parts += [self._force.rows(r, *own) for r, own in enumerate(self.kept_at(point))]
+        return np.vstack(parts)
+
+    @cached_property
+    def _bare(self) -> bool:
+        """Are there readings alone?"""
+        return self.model.prior is None and self.constraints is None
+
     def blocks(self, point: Point) -> Iterator[Block]:
         """Residuals and Jacobians of all samples, piece by piece, unweighted."""
         for r, samples in enumerate(self.samples):
@@ -495,9 +609,10 @@ class Problem:
     def cost(self, point: Point) -> float:
         """½ Σ w r²."""
         own = sum(self._run_cost(point, r) for r in range(len(self.runs)))
-        if self.model.prior is None:
+        if self._bare:
             return own
-        return own + 0.5 * float(np.sum(prior_rows(self, point)[:, -1] ** 2))
+        own += 0.5 * float(np.sum(self._rows_beyond(point)[:, -1] ** 2))
+        return own if self.constraints is None else max(own - self._force.spared, 0.0)
 
     def normal(self, point: Point) -> Normal:
         """Cost, gradient (n,) and Gauss-Newton matrix (n, n); those of the last points are kept."""
@@ -513,7 +628,19 @@ class Problem:
         return deque(maxlen=LATEST)
 
     def _normal(self, point: Point) -> Normal:
-        if self._alone and self.model.prior is None:
+        own = self.of_runs(point)
+        if self._bare:
+            return own
+        rows = self._rows_beyond(point)
+        product = rows.T @ rows
+        total = own.cost + 0.5 * float(product[-1, -1])
+        if self.constraints is not None:
+            total = max(total - self._force.spared, 0.0)
+        return Normal(total, own.gradient + product[:-1, -1], own.matrix + product[:-1, :-1])
+
+    def of_runs(self, point: Point) -> Normal:
+        """Normal equations of the readings alone."""
+        if self._alone:
             return self._run_normal(point, 0)
         total, gradient = 0.0, np.zeros(self.unknowns)
         matrix = np.zeros((self.unknowns, self.unknowns))
@@ -523,12 +650,6 @@ class Problem:
             total += own.cost
             gradient[x] += own.gradient
             matrix[np.ix_(x, x)] += own.matrix
-        if self.model.prior is not None:
-            rows_before = prior_rows(self, point)
-            product = rows_before.T @ rows_before
-            total += 0.5 * float(product[-1, -1])
-            gradient += product[:-1, -1]
-            matrix += product[:-1, :-1]
         return Normal(total, gradient, matrix)
 
     def run_normals(self, point: Point) -> list[tuple[Any, Normal]]:
@@ -551,8 +672,8 @@ class Problem:
             block = np.zeros((len(own), n + 1))
             block[:, [*x, n]] = own
             blocks.append(block)
-        if self.model.prior is not None:
-            blocks.append(prior_rows(self, point))
+        if not self._bare:
+            blocks.append(self._rows_beyond(point))
         whole = np.vstack(blocks)
         if len(blocks) > 1:
             whole = np.asarray(np.linalg.qr(whole, mode="r"))
@@ -563,7 +684,7 @@ class Problem:
     def hessian(self, point: Point) -> Array:
         """Exact second derivative of the cost, (n, n); Gauss-Newton where effects have a memory."""
         matrix = self.normal(point).matrix.copy()
-        if self._staged is not None:
+        if self._staged is not None or self.constraints is not None:
             return self._differences(point, matrix) if self.smooth else matrix
         for r, samples in enumerate(self.samples):
             x = self._selections[r][0]
@@ -649,11 +770,14 @@ def prior_rows(problem: Problem, point: Point) -> Array:
     """[J r] (k, n + 1) of what is known before: coordinates off the prior's, in residual units."""
     prior, scale = problem.model.prior, problem.noise_scale
     assert prior is not None
-    assert scale is not None
-    parts, slots = [], {s.parameter.name: s for s in problem.slots}
-    for name, before in prior.by_name.items():
-        slot = slots[name]
-        shape, part = slot.parameter.shape, np.zeros((slot.x.stop - slot.x.start, problem.unknowns))
+    if scale is None:
+        raise UsageError(
+            f"{problem.model.name}: how much {prior.source} weighs is open, since the noise of the "
+            "readings is not stated: measured(…, std=…), or --sensor-noise SIGNAL=STD"
+        )
+    parts = []
+    for slot, before, entries in problem.known_before:
+        shape, part = slot.parameter.shape, np.zeros((len(entries), problem.unknowns))
         if shape.curved:
             reference = shape.reference(before)
             here = problem._charted(slot, point.x[slot.x], point.references[slot.ref])
@@ -663,7 +787,7 @@ def prior_rows(problem: Problem, point: Point) -> Array:
         else:
             off, part[:, slot.x] = point.x[slot.x] - shape.pack(before), np.eye(len(part))
         parts.append(np.column_stack([part, off]))
-    return np.asarray(scale * prior.root @ np.vstack(parts))
+    return np.asarray(scale * problem.prior_root @ np.vstack(parts))
 
 
 @lru_cache(maxsize=8)

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -205,7 +206,21 @@ class Staged:
         return np.hstack([given[:, :0], *found])
 
     def _given(self, parameters: Array, r: int, own: tuple[int, ...] | None) -> tuple[Array, Array]:
-        """The same at all samples of the record."""
+        """The same at all samples of the record; what was asked for last is kept."""
+        asked = (r, own, parameters.tobytes())
+        if self._last.get("asked") != asked:
+            self._last["found"] = self._followed(parameters, r, own)
+            self._last["asked"] = asked
+        found: tuple[Array, Array] = self._last["found"]
+        return found
+
+    @cached_property
+    def _last(self) -> dict[str, Any]:
+        return {}
+
+    def _followed(
+        self, parameters: Array, r: int, own: tuple[int, ...] | None
+    ) -> tuple[Array, Array]:
         *stages, _ = _programs(self.model, own)
         record, followed = self._records[r], 0
         given = np.zeros((len(record.samples), 0))

@@ -17,11 +17,11 @@ from casest.data.run import Run
 from casest.declaration.model import Model
 from casest.declaration.noise import (
     MEAN,
-    ROOT,
     SLOPE,
     TRUE,
     WHITENING,
     Stated,
+    root_of,
     slope_in_noisy,
 )
 from casest.declaration.shapes import Array
@@ -72,30 +72,53 @@ def stated_noise(
     """The model whose residual is in units of the noise, and the runs that hold it.
 
     `noise` has for each signal an array for each run: standard deviations of one reading (k,) or
-    (N, k), or covariances (1, k, k) or (N, k, k), in the signal's unit. Of a rest interval the mean
-    has less, by the root of its count. Signals that are not named are exact. Raises UsageError
-    where a residual has no noise at all.
+    (N, k), or covariances (1, k, k) or (N, k, k), in the signal's unit; for signals whose noise is
+    correlated covariances of all their numbers one after the other, under "x,y". Of a rest interval
+    the mean has less, by the root of its count. Signals that are not named have the noise that they
+    were declared with, else they are exact. Raises UsageError where a residual has no noise at all.
     """
+    said = {name for key in noise for name in key.split(",")}
+    own = {
+        s.name: [np.array([s.std])] * len(runs)
+        for s in model.signals
+        if s.std is not None and s.name not in said
+    }
+    noise = {**own, **noise}
     if not noise:
         return model, tuple(runs)
-    known = {s.name: s for s in model.signals}
-    for name in noise:
-        if name not in known or known[name].kind != "plain":
-            there = ", ".join(s.name for s in model.signals if s.kind == "plain")
-            raise UsageError(f"noise of {name!r}: {model.name} has the signals {there}")
-    names = tuple(s.name for s in model.signals if s.name in noise)
-    form = Stated(names, len(model.axes))
+    groups = _groups(model, noise)
+    names = tuple(name for group in groups for name in group)
+    form = Stated(names, len(model.axes), groups=groups if len(names) > len(groups) else ())
     held = []
     for r, run in enumerate(runs):
-        roots = {ROOT + n: _roots(n, noise[n][r], run).reshape(len(run), -1) for n in names}
-        held.append(replace(run, signals={**run.signals, **roots}))
+        roots = {root_of(g): roots_of(g, noise[",".join(g)][r], run) for g in groups}
+        flat = {name: root.reshape(len(run), -1) for name, root in roots.items()}
+        held.append(replace(run, signals={**run.signals, **flat}))
     problem = _begun(Problem(replace(model, noise=form), tuple(held)))
     return problem.model, problem.runs
 
 
-def _roots(name: str, given: Array, run: Run) -> Array:
-    """Standard deviations (N, k) or roots of covariances (N, k, k) of the noise of each sample."""
-    size, array = run.signals[name].shape[1], np.asarray(given, dtype=float)
+def _groups(model: Model, noise: Mapping[str, object]) -> tuple[tuple[str, ...], ...]:
+    """Signals with those that their noise is correlated with, in the model's order."""
+    known = {s.name: k for k, s in enumerate(model.signals) if s.kind == "plain"}
+    groups = [tuple(key.split(",")) for key in noise]
+    for name in (every := [name for group in groups for name in group]):
+        if name not in known:
+            raise UsageError(f"noise of {name!r}: {model.name} has the signals {', '.join(known)}")
+        if every.count(name) > 1:
+            raise UsageError(
+                f"noise of {name} is stated twice: once, with all it is correlated with"
+            )
+    return tuple(sorted(groups, key=lambda group: min(known[name] for name in group)))
+
+
+def roots_of(group: tuple[str, ...], given: Array, run: Run) -> Array:
+    """Standard deviations (N, k) or roots of covariances (N, k, k) of the noise of each sample.
+
+    `given` is that of one reading of the signals of a group together (see `stated_noise`).
+    """
+    name, size = " and ".join(group), sum(run.signals[n].shape[1] for n in group)
+    array = np.asarray(given, dtype=float)
     count = np.sqrt(run.count)[:, None]
     if array.ndim == 3:
         for covariance in np.unique(array.reshape(-1, size, size), axis=0):
@@ -180,15 +203,18 @@ def _linearised(
     Of the noise of one signal alone, if `noisy` names it. The model is without stated noise.
     """
     sizes = [run.signals[name].shape[1] for name in noise.signals]
+    widths = dict(zip(noise.signals, sizes, strict=True))
     reading = np.concatenate([run.signals[name] for name in noise.signals], axis=1)
     true = run.signals.get(TRUE, reading)
     at = dict(zip(noise.signals, np.split(true, np.cumsum(sizes)[:-1], axis=1), strict=True))
     samples = Columns([at.get(s.name, run.signals[s.name]) for s in model.signals])
     residual, slope = _residual_and_slope(model, noise.signals)(parameters, samples)
     pulls, first = [], 0
-    for name, size in zip(noise.signals, sizes, strict=True):
-        own, first = slope[:, :, first : first + size], first + size
-        pulls.append(_times_covariance(run.signals[ROOT + name], own) * (noisy in (None, name)))
+    for group in noise.together:
+        last = first + sum(widths[name] for name in group)
+        pull = _times_covariance(run.signals[root_of(group)], slope[:, :, first:last])
+        pulls.append(pull * (noisy is None or noisy in group))
+        first = last
     pull = np.concatenate(pulls, axis=1)
     return _Linear(reading, residual[:, :, 0], slope, pull, slope @ pull)
 
@@ -202,7 +228,7 @@ def _residual_and_slope(model: Model, names: tuple[str, ...]) -> Replay:
 
 
 def _times_covariance(root: Array, slope: Array) -> Array:
-    """CGᵀ (N, k, m) of one signal, from standard deviations (N, k) or roots (N, k²)."""
+    """CGᵀ (N, k, m) of signals together, from standard deviations (N, k) or roots (N, k²)."""
     k = slope.shape[2]
     transposed = np.swapaxes(slope, 1, 2)
     if root.shape[1] == k:
@@ -215,8 +241,7 @@ def _with(part: _Linear, run: Run, noise: Stated, true: Array, mean: Array | Non
     """The run with whitening, slope, true values and the residual's mean beside its signals."""
     n, m = part.residual.shape
     mean = np.zeros((n, m)) if mean is None else mean
-    lower = np.asarray(np.sqrt(part.variance) if m == 1 else np.linalg.cholesky(part.variance))
-    whitening = noise.scale * _inverse(lower)
+    whitening = noise.scale * _inverse(_lower(part.variance))
     held = {WHITENING: whitening.reshape(n, -1), SLOPE: part.slope.reshape(n, -1)}
     return replace(run, signals={**run.signals, **held, TRUE: true, MEAN: mean})
 
@@ -277,7 +302,10 @@ def _step(part: _Linear, run: Run, noise: Stated) -> tuple[Array, Array]:
     w = part.residual + np.einsum("nmk,nk->nm", part.slope, part.reading - true)
     pulled = _inverse(part.variance) @ w[:, :, None]
     step = part.reading - (part.pull @ pulled)[:, :, 0] - true
-    roots = [(run.signals[ROOT + n], run.signals[n].shape[1]) for n in noise.signals]
+    roots = [
+        (run.signals[root_of(group)], sum(run.signals[n].shape[1] for n in group))
+        for group in noise.together
+    ]
     spread = np.concatenate([_deviations(*of) for of in roots], axis=1)
     return step, np.max(np.abs(step) / spread, axis=1)
 
@@ -304,7 +332,25 @@ def shifts_of_curvature(problem: Problem, point: Point) -> Iterator[Array]:
 
 def _inverse(matrices: Array) -> Array:
     """Inverse of each of (N, m, m); of single numbers quickly."""
-    return np.asarray(1 / matrices if matrices.shape[1] == 1 else np.linalg.inv(matrices))
+    try:
+        return np.asarray(1 / matrices if matrices.shape[1] == 1 else np.linalg.inv(matrices))
+    except np.linalg.LinAlgError:
+        raise UsageError(_DEPENDENT) from None
+
+
+def _lower(variance: Array) -> Array:
+    try:
+        return np.asarray(
+            np.sqrt(variance) if variance.shape[1] == 1 else np.linalg.cholesky(variance)
+        )
+    except np.linalg.LinAlgError:
+        raise UsageError(_DEPENDENT) from None
+
+
+_DEPENDENT = (
+    "a combination of the residuals of a sample has no noise, so that it would have to vanish "
+    "exactly: leave residuals out that follow from others, or state more noise"
+)
 
 
 def chi_square(problem: Problem, point: Point, rank: int) -> ChiSquare | None:

@@ -11,6 +11,7 @@ from casest.errors import UsageError
 from casest.results.file import load_result, result_file
 from casest.results.result import Number, Result
 from casest.results.uncertainty import CorrectedBudget, Covariance, Input
+from casest.results.validation import Validated
 
 #: Correlation from which on it is told.
 NOTABLE = 0.1
@@ -42,6 +43,7 @@ class Budget(Result, frozen=True, kw_only=True, dict=True):
     inputs: list[Input]
     correlations: list[Pair]
     corrected: CorrectedBudget | None
+    validation: Validated | UnsetType = UNSET
 
 
 class _Section(Struct, frozen=True):

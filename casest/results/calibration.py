@@ -95,14 +95,20 @@ def calibration_result(
                        effects=[attachment(a) for a in problem.model.effects])  # fmt: skip
 
 
-def doubt_sentence(misfit: Sequence[Doubt]) -> str:
-    """What a reader must know before using the values."""
-    where = "; ".join(f"{f.where} (p = {f.p_value:.1g})" for f in misfit)
+def doubt_sentence(result: Calibration) -> str:
+    """What a reader must know before using the values of a result with a misfit."""
+    where = "; ".join(f"{f.where} (p = {f.p_value:.1g})" for f in result.misfit or [])
     return (
         f"the residual is not noise: {where}. The model lacks something, which may have moved the "
-        "values by many of their standard deviations, however small the residual: `casest close` "
-        "looks for it"
+        "values by many of their standard deviations, however small the residual: "
+        f"{_way_out(result)}"
     )
+
+
+def _way_out(result: Calibration) -> str:
+    if result.found.model.resting:
+        return "free what you know to be there (--free NAME)"
+    return "`casest close` looks for it"
 
 
 def residual_rows(estimate: Estimate) -> str:

@@ -222,7 +222,7 @@ def _dated(
         ),
         noise=NoiseTested(
             plain(found.old.sigma),
-            plain(found.old.sigma * noise.ratio),
+            plain(noise.sigma if np.isnan(noise.ratio) else found.old.sigma * noise.ratio),
             plain(noise.ratio),
             units["residual"],
             plain(noise.p_value),

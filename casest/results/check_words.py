@@ -16,10 +16,13 @@ def reasons(date: Dated) -> Iterator[str]:
         f"p = {test.p_value:.2g}; an alarm below {test.level:.2g}"
     )
     unit = "" if noise.unit == "1" else f" {noise.unit}"
-    yield (
-        f"the noise: {noise.now:.3g}{unit}, {noise.ratio:.2f} times that of the calibration: "
-        f"p = {noise.p_value:.2g}; an alarm below {noise.level:.2g}"
-    )
+    if noise.ratio is None:
+        yield f"the noise: {noise.now:.3g}{unit}; nothing is known of it before"
+    else:
+        yield (
+            f"the noise: {noise.now:.3g}{unit}, {noise.ratio:.2f} times that of the calibration: "
+            f"p = {noise.p_value:.2g}; an alarm below {noise.level:.2g}"
+        )
     if noise.another_colour:
         yield "the noise has another colour than in the calibration; the record's own is used"
     for place in date.conditions:
@@ -38,10 +41,8 @@ def repair(date: Dated) -> Iterator[str]:
     if cause.or_else:
         yield f"nearly as well: {', '.join(cause.or_else)}"
     hold = f", with {' and '.join(again.hold)} held" if again.hold else ""
-    yield (
-        f"{' and '.join(again.fit)} anew{hold}: {again.samples} {again.kind} like these make it as "
-        "sharp as it was"
-    )
+    enough = f": {again.samples} {again.kind} like these make it as sharp as it was"
+    yield f"{' and '.join(again.fit)} anew{hold}{enough if again.samples else ''}"
 
 
 def drift(result: Checked) -> Iterator[str]:
@@ -54,7 +55,8 @@ def drift(result: Checked) -> Iterator[str]:
     for line in result.chart.lines:
         if last in line.out:
             since = result.dates[line.out[0]].data
+            unit = "" if line.unit == "1" else f" {line.unit}"
             yield (
-                f"{line.name}: the weighted mean of its shifts, {line.mean[-1]:.3g} {line.unit}, "
+                f"{line.name}: the weighted mean of its shifts, {line.mean[-1]:.3g}{unit}, "
                 f"is beyond ±{line.limit[-1]:.3g}, first on {file_name(since)}"
             )

@@ -38,7 +38,7 @@ from casest.results.result import (
     reproduced,
 )
 from casest.results.uncertainty import CorrectedBudget, Covariance, Input, corrected_budget
-from casest.results.units import unit_table
+from casest.results.units import resolved, unit_table
 from casest.results.values import Entry, Held, entries, held
 from casest.validity.colour import colour_of
 
@@ -284,6 +284,7 @@ def fitted_content(
     corrected = _corrected_range(estimate)
     table = unit_table(problem.model, problem.runs)
     units = {name: unit for name, unit in table.items() if "[" not in name}
+    unknowns = zip(estimate.names, problem.units, strict=True)
     return {
         "model": model_name,
         "data": list(data),
@@ -313,7 +314,7 @@ def fitted_content(
         "declared": estimate.model.name,
         "kind": "rest intervals" if problem.runs[0].spread else "samples",
         "entries": entries(estimate),
-        "unknown_units": dict(zip(estimate.names, problem.units, strict=True)),
+        "unknown_units": {name: resolved(unit, units) for name, unit in unknowns},
         "held": held(estimate, units),
         "found": estimate,
     }

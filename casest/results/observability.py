@@ -400,5 +400,5 @@ def could_reach(result: Observability) -> str:
 
 
 def number_or_not(value: Number) -> str:
-    """A number, or that there is none."""
-    return "not determined" if value is None else f"{value:.3g}"
+    """A standard deviation, or that there is none."""
+    return "not determined" if value is None else f"{value:.2g}"

@@ -69,3 +69,19 @@ def _coverage(directions: Array) -> tuple[Array, float, float]:
     angle = np.degrees(np.arccos(np.clip(nearest, -1, 1)))
     widest = int(np.argmax(angle))
     return asked[widest], float(angle[widest]), float(np.mean(angle <= NEAR))
+
+
+def flat(v: Array) -> tuple[Array, Array]:
+    """Lambert's azimuthal projection of one half, its rim on the unit circle."""
+    with np.errstate(invalid="ignore"):
+        scale = 1 / np.sqrt(1 + np.abs(v[:, 2]))
+    return v[:, 0] * scale, v[:, 1] * scale
+
+
+def cap(middle: Array, radius: float) -> Array:
+    """The circle at `radius` around a direction, (k, 3)."""
+    side = np.cross(middle, np.eye(3)[int(np.argmin(np.abs(middle)))])
+    side = side / np.linalg.norm(side)
+    other, turn = np.cross(middle, side), np.linspace(0, 2 * np.pi, 121)[:, None]
+    around = np.cos(turn) * side + np.sin(turn) * other
+    return np.asarray(np.cos(radius) * middle + np.sin(radius) * around)

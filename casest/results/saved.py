@@ -143,6 +143,6 @@ def _entries(name: str, p: SavedParameter) -> Iterator[Entry]:
             continue
         unit = p.unit if isinstance(p.unit, str) else p.unit[k % len(p.unit)]
         label = f"{name}[{','.join(map(str, place))}]" if place else name
-        reach = value[place] - ends[0][place], ends[1][place] - value[place]
+        at, low, high = (float(x[place]) for x in (value, ends[0], ends[1]))
         shown = "" if unit == "1" else unit
-        yield Entry(label, shown, *(float(x) for x in (value[place], std[place], *reach)))
+        yield Entry(label, shown, at, float(std[place]), at - low, high - at)

@@ -16,6 +16,7 @@ from casest.dynamics import Dynamics
 from casest.dynamics.course import Course, followed
 from casest.dynamics.inputs import unstated
 from casest.dynamics.intensities import Tuned, intensities, units
+from casest.dynamics.moving_horizon import Horizon, moving_horizon
 from casest.results.file import plain
 from casest.results.observability import assumed, too_short
 from casest.results.result import Number, Reproduced, Result, reproduced
@@ -50,6 +51,17 @@ class UsedIntensities(Struct, frozen=True):
     declared_normalised_mean: Number
 
 
+class UsedHorizon(Struct, frozen=True):
+    """A moving horizon: its steps; at how many samples the bound of each number acts; windows that
+    did not settle, and the rounds that a window takes, on average."""
+
+    steps: int
+    at_lower: dict[str, int]
+    at_upper: dict[str, int]
+    unsettled: int
+    rounds: Number
+
+
 class States(Result, frozen=True, kw_only=True, dict=True):
     """The content of `filter.json`; `filtered`: states and covariances.
 
@@ -65,6 +77,7 @@ class States(Result, frozen=True, kw_only=True, dict=True):
     intensities: UsedIntensities
     innovations: Innovations
     allan: Mapping[str, Any] | UnsetType = UNSET
+    horizon: UsedHorizon | UnsetType = UNSET
     data: list[str]
     reproduce: Reproduced
     as_expected: bool
@@ -82,24 +95,30 @@ def follow(
     tuned: Tuned | None = None,
     *,
     allan: Mapping[str, Any] | None = None,
+    horizon: int | None = None,
     data: Sequence[str] = (),
     command: str = "",
 ) -> States:
     """States over time by the Kalman filter, and whether the innovations are as expected.
 
     `tuned`: the same model with other noise intensities, used in place of the declared ones, which
-    are shown beside them; `allan`: what a record at rest said of them.
+    are shown beside them; `allan`: what a record at rest said of them; `horizon`: by so many steps
+    at once, in place of the filter.
     """
-    declared = followed(model, run, smooth=tuned is None)
-    found = followed(tuned.model, run) if tuned else declared
+
+    def states(of: Dynamics, smooth: bool = True) -> Course:
+        return moving_horizon(of, run, horizon) if horizon else followed(of, run, smooth=smooth)
+
+    declared = states(model, smooth=tuned is None)
+    found = states(tuned.model) if tuned else declared
     mean, m = _normalised_mean(found), found.innovations.shape[1]
     return States(
         model=found.model.name,
         notes=[
             *assumed(run),
             *_taken_for_motion(found.model, run),
-            *_unsettled(found),
-            *_parted(found),
+            *_bounded(found),
+            *(_of_windows(found) if isinstance(found, Horizon) else _of_the_record(found)),
             *_too_short(run, found.model.size),
         ],
         samples=len(found.time),
@@ -120,6 +139,7 @@ def follow(
             plain(_lag1(found.innovations)),
         ),
         allan=allan or UNSET,
+        horizon=_used(found) if isinstance(found, Horizon) else UNSET,
         data=list(data),
         reproduce=reproduced(command, data),
         as_expected=bool(SMALLEST < mean / m < LARGEST),
@@ -142,6 +162,55 @@ def _final(found: Course) -> dict[str, FinalState]:
 
 def _plain_values(values: Mapping[str, float]) -> dict[str, Number]:
     return {name: plain(value) for name, value in values.items()}
+
+
+def _used(found: Horizon) -> UsedHorizon:
+    at = np.count_nonzero(found.multipliers > 0, axis=0)
+    names = found.model.names
+    return UsedHorizon(
+        found.horizon,
+        {name: int(count) for name, count in zip(names, at[0], strict=True) if count},
+        {name: int(count) for name, count in zip(names, at[1], strict=True) if count},
+        int(np.count_nonzero(found.unsettled)),
+        plain(float(np.mean(found.rounds))),
+    )
+
+
+def _of_windows(found: Horizon) -> list[str]:
+    """What a moving horizon says otherwise than filter and smoother, and where it is in doubt."""
+    said = [
+        f"states by a moving horizon of {found.horizon} steps; smoothed ones are by so many "
+        "samples after each"
+    ]
+    used = _used(found)
+    for which, counts in (("lower", used.at_lower), ("upper", used.at_upper)):
+        said += [
+            f"the {which} bound of {name} acts at {count} of {len(found.time)} samples"
+            for name, count in counts.items()
+        ]
+    if used.unsettled:
+        said.append(
+            f"{used.unsettled} of {len(found.time)} windows did not settle: their states are "
+            "approximate; a longer --horizon, a nearer start or a smaller std at the beginning may "
+            "help"
+        )
+    return said
+
+
+def _of_the_record(found: Course) -> list[str]:
+    return [*_unsettled(found), *_parted(found)]
+
+
+def _bounded(found: Course) -> list[str]:
+    """Declared bounds that a filter, which does not know them, has left."""
+    lower, upper = found.model.bounds
+    outside = np.count_nonzero((found.x < lower) | (found.x > upper), axis=0)
+    return [
+        f"{name} leaves its bounds at {count} of {len(found.time)} samples, which a filter does "
+        "not keep: --horizon 20 does"
+        for name, count in zip(found.model.names, outside, strict=True)
+        if count
+    ]
 
 
 def _unsettled(found: Course) -> list[str]:

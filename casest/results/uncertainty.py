@@ -71,7 +71,7 @@ class CorrectedBudget(Struct, frozen=True):
 
 def covariance_of(estimate: Estimate) -> Covariance:
     """Covariance of the values, in the order of the declaration, run by run."""
-    names, units, slope = _entries(estimate)
+    names, units, slope = entries_of(estimate)
     unknown = np.isnan(np.diag(estimate.covariance))
     matrix = slope @ np.where(np.isnan(estimate.covariance), 0.0, estimate.covariance) @ slope.T
     lost = (slope != 0) @ unknown
@@ -80,7 +80,7 @@ def covariance_of(estimate: Estimate) -> Covariance:
 
 
 def _values(estimate: Estimate) -> list[Number]:
-    """Every entry, in the order of `_entries`."""
+    """Every entry, in the order of `entries_of`."""
     found: list[Number] = []
     for slot in estimate.problem.slots:
         value, shape = estimate.values[slot.parameter.name], slot.parameter.shape
@@ -92,7 +92,7 @@ def _values(estimate: Estimate) -> list[Number]:
 
 def inputs_of(estimate: Estimate) -> list[Input]:
     """Every known number that is not exact, then what is random."""
-    names, _, slope = _entries(estimate)
+    names, _, slope = entries_of(estimate)
     units = unit_table(estimate.model, estimate.problem.runs)
     with np.errstate(invalid="ignore", divide="ignore"):
         whole = np.diag(slope @ estimate.covariance @ slope.T)
@@ -129,7 +129,7 @@ def _references(
             plain(inputs.values[j]),
             float(inputs.std[j]),
             units.get(name) or units.get(name.partition("[")[0], inputs.units[j]),
-            None,
+            plain(inputs.freedom[j]),
             _by_name(names, sensitivity[:, j]),
             _by_name(names, shares[:, j]),
         )
@@ -141,7 +141,7 @@ def _by_name(names: list[str], values: Array) -> dict[str, Number]:
 
 def freedom_of(estimate: Estimate) -> dict[str, Number]:
     """Effective degrees of freedom of each entry; null where its std is as good as known."""
-    names, _, slope = _entries(estimate)
+    names, _, slope = entries_of(estimate)
     each = estimate.effective_freedom
     least = [min(each[i] for i in np.flatnonzero(row)) for row in slope]
     return {n: None if f >= UNLIMITED else float(f) for n, f in zip(names, least, strict=True)}
@@ -170,6 +170,8 @@ def corrected_budget(
         both = total * (total @ inputs.covariance)
         variance |= {n: both[:, j] for j, n in enumerate(inputs.names)}
         sensitivity = {n: plain(total[:, j]) for j, n in enumerate(inputs.names)}
+        each = zip(inputs.names, inputs.freedom, strict=True)
+        freedom = {n: float(f) for n, f in each if np.isfinite(f)}
     for source in sources(estimate, units["residual"]):
         own = np.nan_to_num(source.covariance)
         variance[source.name] = np.diag(unknowns @ own @ unknowns.T)
@@ -193,7 +195,7 @@ def corrected_budget(
         )
 
 
-def _entries(estimate: Estimate) -> tuple[list[str], list[str], Array]:
+def entries_of(estimate: Estimate) -> tuple[list[str], list[str], Array]:
     """Name and unit of every entry, and its slope (entries, n) in the unknowns."""
     problem, point = estimate.problem, estimate.optimum or estimate.point
     known = unit_table(problem.model, problem.runs)

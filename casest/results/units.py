@@ -5,12 +5,16 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 
+import numpy as np
+
 from casest import units
 from casest.data.run import Run
 from casest.declaration.model import Model
-from casest.declaration.symbols import Parameter
+from casest.declaration.symbols import Constant, Parameter
 from casest.errors import UnitError
 
+#: Readings of no stated unit that differ so many times from a norm of none are in another unit.
+APART = 3.0
 _PLACEHOLDER = re.compile(r"\[([^\]]+)\]")
 
 
@@ -24,9 +28,13 @@ def unit_table(model: Model, runs: Sequence[Run]) -> dict[str, str]:
     for s in model.signals:
         stated = next((run.units.get(s.name) for run in runs if run.units.get(s.name)), None)
         known[s.name] = s.unit or stated or f"[{s.name}]"
+    for p in model.parameters:  # a norm that was freed: others are in its unit
+        own = p.units[0]
+        if p.shape.size == 1 and own and ("[" not in own or _PLACEHOLDER.fullmatch(own)):
+            known[p.name] = resolved(own, known)
     for c in model.constants:
         # Raw counts are no unit in which a field or gravity is known: such a norm is a pure number.
-        counted = c.unit in {f"[{n}]" for n, u in known.items() if u == "count"}
+        counted = c.unit in {f"[{n}]" for n, u in known.items() if _counts(n, u, c, runs)}
         known[c.name] = "1" if counted else resolved(c.unit, known)
     for c in model.constants:
         if c.like:
@@ -40,6 +48,26 @@ def unit_table(model: Model, runs: Sequence[Run]) -> dict[str, str]:
         table.setdefault(q.name, resolved(q.unit, known) if q.unit else "")
     table["residual"] = resolved(model.residual_unit, known)
     return table
+
+
+def _counts(name: str, unit: str, c: Constant, runs: Sequence[Run]) -> bool:
+    """Are readings raw counts beside a constant: called so, or of no stated unit and size?
+
+    Readings 300 long and a norm of 1 cannot both be in "the unit of v".
+    """
+    if unit != f"[{name}]":
+        return unit == "count"
+    lengths = [length for run in runs if (length := _length(run, name))]
+    size = float(np.linalg.norm(c.array))
+    return bool(lengths and size and not 1 / APART < lengths[0] / size < APART)
+
+
+def _length(run: Run, name: str) -> float:
+    """How long a reading is, of some that stand for all; 0 where there are none."""
+    values = np.asarray(run.signals.get(name, ()), float)
+    some = values[:: max(1, len(values) // 1000)]
+    lengths = np.linalg.norm(some.reshape(len(some), -1), axis=1) if len(some) else np.zeros(1)
+    return float(np.median(lengths))
 
 
 def entry_units(parameter: Parameter, known: Mapping[str, str]) -> list[str]:

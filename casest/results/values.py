@@ -12,6 +12,7 @@ from casest.declaration.symbols import Constant
 from casest.estimate.estimate import Estimate
 from casest.results.file import plain
 from casest.results.result import Parameter
+from casest.results.rounding import rounded
 from casest.results.uncertainty import Input, inputs_of
 from casest.results.units import entry_units, unit_table
 
@@ -20,7 +21,8 @@ from casest.results.units import entry_units, unit_table
 class Entry:
     """One number of a parameter: `below` and `above` is how far its 95 % interval reaches.
 
-    The name says of which run it is, if there are several; a unit of 1 is empty.
+    The name says of which run it is, if there are several; a unit of 1 is empty. `missing` stands
+    for a standard deviation that there is not.
     """
 
     name: str
@@ -29,6 +31,12 @@ class Entry:
     std: float
     below: float
     above: float
+    missing: str = "not determined"
+
+    @property
+    def shown(self) -> tuple[str, str]:
+        """Value and standard deviation with the digits that mean something."""
+        return rounded(self.value, self.std, self.missing)
 
     @property
     def on_bound(self) -> str:
@@ -65,6 +73,8 @@ def entries(estimate: Estimate) -> tuple[Entry, ...]:
 def _entries(found: Estimate) -> Iterator[Entry]:
     known = _stated(unit_table(found.model, found.problem.runs))
     numbers = (found.values, found.std, *found.interval_reach)
+    seen = found.identifiability.rank == found.identifiability.unknowns
+    missing = "unknown" if seen else "not determined"
     for p in found.model.parameters:
         units = entry_units(p, known)
         several = found.values[p.name].ndim > len(p.shape.dims)
@@ -73,7 +83,8 @@ def _entries(found: Estimate) -> Iterator[Entry]:
             own = [of[p.name][r] if several else of[p.name] for of in numbers]
             for name, i, unit in zip(p.entry_names, p.shape.entries, units, strict=True):
                 shown = "" if unit == "1" else unit
-                yield Entry(name + run, shown, *(float(v[i]) for v in own))
+                value, std, below, above = (float(v[i]) for v in own)
+                yield Entry(name + run, shown, value, std, below, above, missing)
 
 
 def held(estimate: Estimate, units: Mapping[str, str]) -> tuple[Held, ...]:

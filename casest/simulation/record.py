@@ -285,20 +285,21 @@ def written(
     folder: Path,
     model: Model,
     run: Run,
-    readings: Mapping[str, Array],
     values: Mapping[str, Array],
     noise: float,
+    sensors: Mapping[str, list[float]],
     seed: int,
     command: str,
 ) -> tuple[Path, Path]:
-    """`record.csv` and `truth.json` in the folder."""
-    text = record_text(model.signals, replace(run, signals={**run.signals, **readings}))
+    """`record.csv` and `truth.json` in the folder; `sensors` is the noise of single signals."""
+    text = record_text(model.signals, run)
     content = {
         "casest": __version__,
         "model": model.name,
         "command": command,
         "seed": seed,
         "noise": noise,
+        "sensor_noise": dict(sensors),
         "parameters": {n: plain(v) for n, v in values.items()},
         "constants": {c.name: plain(c.array) for c in model.constants},
         "effects": [a.label for a in model.effects],

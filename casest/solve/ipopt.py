@@ -43,8 +43,12 @@ def ipopt(
         "print_level": 0,
         "sb": "yes",
         "max_iter": 500,
-        # Beyond this tolerance the line search fights rounding; a polish follows anyway.
+        # Beyond this tolerance the line search fights rounding; a polish follows anyway. Where
+        # rounding comes earlier (long products of rotations), the cost stands still before that.
         "tol": 1e-8,
+        "acceptable_tol": 1e-6,
+        "acceptable_obj_change_tol": 1e-13,
+        "acceptable_iter": 2,
         "bound_relax_factor": 0.0,
         # Starts are good and bounds rarely active: a weak barrier from the beginning.
         "mu_strategy": "monotone",

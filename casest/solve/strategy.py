@@ -23,6 +23,7 @@ from casest.leastsquares.sums import few_of
 from casest.leastsquares.weights import has_noise_effects, weights
 from casest.solve.equations import by_equations
 from casest.solve.ipopt import ipopt
+from casest.solve.multipliers import kept
 from casest.solve.outcome import Outcome
 from casest.solve.trust_region import LITTLE, trust_region
 
@@ -55,6 +56,9 @@ def solve(
     if solver not in SOLVERS:
         raise UsageError(f"unknown solver {solver!r}; there are {', '.join(SOLVERS)}")
     outcomes = _ways(problem, first, solver, seed, automatic)
+    if problem.constraints is not None:
+        problem, point = kept(problem, best_of(outcomes).point)
+        outcomes = _ways(problem, point, solver, seed, automatic=True)
     outcomes += _around_the_sphere(problem, first)
     outcomes += _along_the_weakest(problem, best_of(outcomes))
     best = best_of(outcomes)

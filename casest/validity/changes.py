@@ -105,7 +105,7 @@ def _repaired(subject: Subject, cause: Cause, rest: Test, alike: tuple[str, ...]
 
 
 def _needed(subject: Subject, factor: Factor, touched: NDArray[np.int_]) -> int:
-    """Samples like these that make the touched unknowns as sharp as they were."""
+    """Samples like these that make the touched unknowns as sharp as they were; 0: as exact."""
     columns = factor.R[:, touched]
     size = np.linalg.norm(columns, axis=0)
     size = np.where(size > 0, size, np.nan)
@@ -114,6 +114,8 @@ def _needed(subject: Subject, factor: Factor, touched: NDArray[np.int_]) -> int:
     old = np.diag(subject.covariance)[touched]
     count = sum(map(len, subject.problem.runs))
     known = old > 0
+    if not known.any():
+        return 0
     times = float(np.max(now[known] / old[known], initial=0.0))
     return max(int(np.ceil(count * times)), len(touched) + 1) if np.isfinite(times) else 0
 

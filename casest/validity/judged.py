@@ -123,9 +123,17 @@ def _noise(old: Old, rows: Whitened, point: Point, there: Factor) -> Noise:
     left = problem.residual_count - _rank(there.R)
     correlation, count = rows.neighbours(point)
     coloured = count >= ENOUGH and correlation > max(ALIKE, 4 / np.sqrt(count))
-    if left <= 0 or not old.sigma > 0:
+    if left <= 0:
+        if np.isnan(old.sigma):
+            raise UsageError(
+                f"{problem.runs[0].file}: {problem.residual_count} residuals for "
+                f"{problem.unknowns} unknowns say nothing of the noise, and nor does the old "
+                "calibration: more readings are needed"
+            )
         return Noise(old.sigma, 1.0, 1.0, coloured, old.freedom)
     sigma = there.rest / np.sqrt(left)
+    if not old.sigma > 0:
+        return Noise(sigma, np.nan, 1.0, coloured, float(left))
     ratio = sigma / old.sigma
     tails = _tails(problem, point)
     known = max(old.freedom * tails, 1.0)

@@ -20,7 +20,8 @@ class Old:
     """An old estimate as a new record is judged by it.
 
     `covariance` (n, n) of the unknowns `names`, NaN in those that nothing determined; `sigma` of
-    one residual with `freedom` degrees of it (in independent residuals), `colour` of the noise.
+    one residual (NaN: unknown) with `freedom` degrees of it (in independent residuals), `colour` of
+    the noise.
     """
 
     model: Model

@@ -46,7 +46,7 @@ class Linear:
 
     `spans` are stretches of evenly spaced rows: their noise may have a colour. Without any, rows
     are poses, or of a table, and their noise is white. `least`: share of a cause's length that must
-    survive beside the unknowns.
+    survive beside the unknowns. `plateaus`: the number of each row's (N,), where inputs are held.
     """
 
     residual: Array
@@ -54,6 +54,7 @@ class Linear:
     spans: tuple[slice, ...]
     parts: Parts
     least: float = LEVELS.survives
+    plateaus: Index | None = None
 
     @property
     def coloured(self) -> bool:

@@ -6,7 +6,7 @@ confirms it, and what cannot be told apart. A state of the search is a value: wh
 dropped leaves no trace. Imports evidence, levels.
 """
 
-from casest.diagnose.protocol.confirming import falls, holds_out, significant
+from casest.diagnose.protocol.confirming import falls, holds_out
 from casest.diagnose.protocol.ranking import pairs, ranked, ranked_of
 from casest.diagnose.protocol.rounds import search
 from casest.diagnose.protocol.state import Kept, Ranking, Rival, State
@@ -14,5 +14,5 @@ from casest.diagnose.protocol.subject import Subject
 
 __all__ = [
     "Kept", "Ranking", "Rival", "State", "Subject", "falls", "holds_out", "pairs", "ranked",
-    "ranked_of", "search", "significant",
+    "ranked_of", "search",
 ]  # fmt: skip

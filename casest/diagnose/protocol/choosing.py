@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from casest.diagnose.evidence.score import Evidence, again
 from casest.diagnose.levels import LEVELS
-from casest.diagnose.protocol.confirming import FAR_AWAY, falls, passing, significant
+from casest.diagnose.protocol.confirming import FAR_AWAY, falls, passing
 from casest.diagnose.protocol.ranking import pairs, ranked
 from casest.diagnose.protocol.refits import best_refits, refitted, shown, torn_between
 from casest.diagnose.protocol.state import F, Kept, Ranking, Refit, State
@@ -23,7 +23,7 @@ def with_the_best(
     """The state with the best cause that held-out parts confirm; as it is if none is."""
     state, asked = _hypotheses(subject, state, ranking)
     every = (*ranking.causes, *pairs(ranking))
-    options = [e for e in every if significant(e, ranking.linear)]
+    options = [e for e in every if ranking.says(e)]
     options.sort(key=lambda e: -e.score)
     described = None if asked else subject.formula(state.fit, ranking)
     left, tried = options, list[Evidence]()

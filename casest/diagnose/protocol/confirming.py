@@ -1,4 +1,4 @@
-"""Is a cause strong evidence, and are parts that were held out foretold better with it?"""
+"""Are parts that were held out foretold better with a cause?"""
 
 from __future__ import annotations
 
@@ -12,11 +12,6 @@ from casest.diagnose.protocol.state import Ranking
 
 #: Parts that are held out whole.
 FAR_AWAY = ("stretches", "regions")
-
-
-def significant(evidence: Evidence, linear: Linear) -> bool:
-    """Strong evidence in a series; in poses the F test, shared among all that was tried."""
-    return evidence.score > LEVELS.strong if linear.series else evidence.p_value < LEVELS.chance
 
 
 def falls(ranking: Ranking, evidence: Evidence) -> dict[str, Fall]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from casest.diagnose.evidence.score import Evidence, expected_loss, judged
 from casest.diagnose.levels import LEVELS
-from casest.diagnose.protocol.confirming import falls, falls_of_refit, holds_out, significant
+from casest.diagnose.protocol.confirming import falls, falls_of_refit, holds_out
 from casest.diagnose.protocol.ranking import sharpened
 from casest.diagnose.protocol.state import F, Ranking, Refit, State
 from casest.diagnose.protocol.subject import Subject
@@ -74,9 +74,7 @@ def _with_parts(options: Sequence[Evidence], ranking: Ranking) -> list[Evidence]
     more = [
         e
         for e in parts.values()
-        if id(e) not in own
-        and significant(e, ranking.linear)
-        and holds_out(falls(ranking, e), ranking.linear)
+        if id(e) not in own and ranking.says(e) and holds_out(falls(ranking, e), ranking.linear)
     ]
     return [*options, *more]
 

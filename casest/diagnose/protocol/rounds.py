@@ -8,7 +8,6 @@ from dataclasses import replace
 from casest.diagnose.evidence.score import Evidence
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.protocol.choosing import with_the_best
-from casest.diagnose.protocol.confirming import significant
 from casest.diagnose.protocol.elimination import eliminated, on_all_axes
 from casest.diagnose.protocol.ranking import ranked
 from casest.diagnose.protocol.rivals import with_rivals
@@ -55,7 +54,7 @@ def _small(subject: Subject[F], before: State[F], state: State[F]) -> bool:
 
 def _left(ranking: Ranking) -> bool:
     """Is there strong evidence for something still?"""
-    return any(significant(e, ranking.linear) for e in ranking.found)
+    return any(ranking.says(e) for e in ranking.found)
 
 
 def _as_before(before: State[F], state: State[F]) -> State[F]:
@@ -65,6 +64,6 @@ def _as_before(before: State[F], state: State[F]) -> State[F]:
         before = before.refusing(kept.what, "a small part of what is missing: it may be another's")
         open_[id(kept.evidence)] = kept.evidence
     assert before.last is not None
-    others = [e for e in before.last.causes if significant(e, before.last.linear)]
+    others = [e for e in before.last.causes if before.last.says(e)]
     torn = (*open_.values(), *(e for e in others if id(e) not in open_))
     return replace(before, open=torn[: LEVELS.contenders])

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, Generic, TypeVar
 
+from casest.diagnose.evidence.held_inputs import Held
 from casest.diagnose.evidence.held_out import Fall
 from casest.diagnose.evidence.likelihood import Explained, Likelihood
 from casest.diagnose.evidence.linear import Linear
@@ -25,6 +27,17 @@ class Ranking:
     found: tuple[Evidence, ...]
     families: int
     order: Mapping[str, int] = field(default_factory=dict, repr=False)
+
+    def says(self, evidence: Evidence) -> bool:
+        """Strong evidence in a series; in poses the F test, shared among all that was tried."""
+        if not self.linear.series:
+            return evidence.p_value < LEVELS.chance
+        strong = evidence.score > LEVELS.strong
+        return strong and (self._held is None or self._held.says(evidence.trials))
+
+    @cached_property
+    def _held(self) -> Held | None:
+        return None if self.linear.plateaus is None else Held(self.linear, self.families)
 
     @property
     def causes(self) -> tuple[Evidence, ...]:

@@ -12,6 +12,7 @@ from casest.data.run import Run
 from casest.declaration.effect import OVER_TIME
 from casest.declaration.shapes import Array
 from casest.diagnose.candidates.slopes import rows_of
+from casest.diagnose.evidence.held_inputs import plateaus_of
 from casest.diagnose.evidence.linear import Index, Linear, parts_of, spans_of
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.sensor.fits import Fit, problem_of
@@ -32,8 +33,9 @@ class Rows:
 
     def _linear(self, fit: Fit) -> Linear:
         residual, J = self._slopes(*problem_of(fit, self.runs))
-        parts = parts_of(*self._numbers, self._met(fit))
-        return Linear(residual, J, self._spans, parts, self._least(fit))
+        met = self._met(fit)
+        parts, held = parts_of(*self._numbers, met), plateaus_of(met, self._spans)
+        return Linear(residual, J, self._spans, parts, self._least(fit), held)
 
     def of(self, values: Sequence[Array]) -> Array:
         """Values of each run (N, …) in the rows that are looked at, one run after the other."""

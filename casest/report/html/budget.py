@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
+
+from msgspec import UNSET
 
 from casest.report.html.figures import Figures
 from casest.report.html.frame import whole
@@ -11,6 +14,7 @@ from casest.report.html.page import escaped, paragraph, section, table, tag
 from casest.results.budget import Budget
 from casest.results.result import Number
 from casest.results.rounding import rounded
+from casest.results.validation import rows, sentence
 
 PAGE = "budget.html"
 #: Okabe & Ito's colours, told apart by the colour-blind too.
@@ -22,6 +26,7 @@ HIGH, LEFT, LONG = 22, 150, 520
 def budget_page(budget: Budget) -> str:
     """Inputs, shares of every value's variance, shares of a corrected reading's, correlations."""
     body = [_inputs(budget), _values(budget), _corrected(budget), _correlations(budget)]
+    body.append(_validation(budget))
     said = f"Uncertainty budget: {len(budget.inputs)} inputs, {len(budget.values)} values"
     under = f"Made from {budget.result}. Shares are of variances, to first order."
     return whole(budget.model, said, under, body, Figures(), [])
@@ -34,7 +39,7 @@ def _inputs(budget: Budget) -> str:
             i.kind,
             "" if i.value is None else printed(f"{i.value:.9g}"),
             "" if i.std is None else printed(f"{i.std:.2g}"),
-            printed_unit(i.unit),
+            _unit(i.unit),
             "known" if i.degrees_of_freedom is None else f"{i.degrees_of_freedom:.3g}",
         ]
         for i in budget.inputs
@@ -56,7 +61,7 @@ def _values(budget: Budget) -> str:
                 f"`{v.name}`",
                 printed(shown),
                 printed(std),
-                printed_unit(v.unit),
+                _unit(v.unit),
                 *map(_percent, shares),
             ]
         )
@@ -83,12 +88,12 @@ def _corrected(budget: Budget) -> str:
                 f"`{name}`",
                 printed(shown),
                 printed(spread),
-                printed_unit(found.unit),
+                _unit(found.unit),
                 *map(_percent, shares),
             ]
         )
         bars[name] = shares
-    at = ", ".join(f"{x:.6g}" for x in found.at)
+    at = ", ".join(printed(f"{x:.4g}") for x in found.at)
     head = ["component", "", "± std", "unit", *(f"{n}, %" for n in names)]
     return section(
         "corrected",
@@ -105,6 +110,20 @@ def _correlations(budget: Budget) -> str:
         for p in budget.correlations
     ]
     return section("correlations", "Correlations", table(["", "", "correlation"], rows, [2]))
+
+
+def _validation(budget: Budget) -> str:
+    found = budget.validation
+    if found is UNSET:
+        return ""
+    head = ["95 % interval", "first order", "Monte Carlo", "apart", "may be", ""]
+    each = [[f"`{name}`", *map(printed, cells), words] for name, *cells, words in rows(found)]
+    said = paragraph(f"{sentence(found)}.")
+    return section("validation", "Monte Carlo", said, table(head, each, [1, 2, 3, 4]))
+
+
+def _unit(unit: str) -> str:
+    return "" if unit == "1" else printed_unit(unit)
 
 
 def _percent(share: Number) -> str:
@@ -131,8 +150,12 @@ def _bars(shares: Mapping[str, Sequence[Number]], names: Sequence[str]) -> str:
         parts.append(_part(LEFT, y, 14, COLOURS[k % len(COLOURS)], name))
         parts.append(tag("text", escaped(name), x=str(LEFT + 22), y=str(y + 14)))
     high, wide = top + len(names) * HIGH, LEFT + LONG + 10
-    drawing = tag("svg", *parts, viewBox=f"0 0 {wide} {high}", role="img", fill="currentColor")
-    return tag("figure", drawing.replace("text_anchor", "text-anchor"))
+    said = f"shares of {len(names)} inputs in {len(shares)} values; the table has the numbers"
+    drawing = tag("svg", *parts, viewBox=f"0 0 {wide} {high}", role="img", aria_label=said,
+                  fill="currentColor")  # fmt: skip
+    drawing = re.sub("(text|aria)_", r"\1-", drawing)
+    return tag("figure", tag("div", drawing, class_="drawn", tabindex="0", role="group",
+                             aria_label="shares of each value"))  # fmt: skip
 
 
 def _part(x: float, y: float, long: float, colour: str, said: str) -> str:

@@ -17,7 +17,6 @@ from casest.report.html.poses import poses_seen
 from casest.report.html.profiles import profile_figures
 from casest.report.html.residuals import convincing, residual_figures
 from casest.results.calibration import Calibration, doubt_sentence
-from casest.results.fitted import Doubt
 from casest.results.profiles import ProfileOf
 from casest.results.residuals import Residuals
 
@@ -29,7 +28,7 @@ def calibration_page(
     residuals, figures = result.residuals, Figures()
     finite = _finite(residuals)
     body = [
-        _first(result.misfit) if result.misfit else "",
+        _first(result) if result.misfit else "",
         parameters(result),
         section("evidence", "The evidence", poses_seen(residuals.poses, figures),
                 convincing(residuals, figures)) if finite else "",
@@ -39,8 +38,7 @@ def calibration_page(
         section("residual", "Residual", residual_figures(residuals, figures)) if finite else "",
         uncertain(result),
         section("invisible", "What stayed invisible", paragraph(_asked(result)), paragraph(
-            "A calibration looks for no effect. `casest close` with the same arguments does, and "
-            "names what these data could not show."
+            _looked_for(result)
         )),
         certified(result),
         application(result, folder),
@@ -49,15 +47,16 @@ def calibration_page(
     asked = (
         "" if result.misfit is None else ", and nothing in the residual speaks against the model"
     )
-    proved = f"The optimum is proved{asked}; what the model may lack is what `casest close` asks."
+    lacks = "; what the model may lack is what `casest close` asks"
+    proved = f"The optimum is proved{asked}{'' if result.found.model.resting else lacks}."
     under = proved if result.trusted and not result.doubtful else ""
     look = "bad" if not result.trusted else "doubtful" if result.doubtful else "good"
     return whole(result.declared, sentence(result), under, body, figures, result.data,
                  trusted=result.trusted, look=look)  # fmt: skip
 
 
-def _first(doubt: Sequence[Doubt]) -> str:
-    return paragraph(f"Before you use these values: {doubt_sentence(doubt)}.", "doubt")
+def _first(result: Calibration) -> str:
+    return paragraph(f"Before you use these values: {doubt_sentence(result)}.", "doubt")
 
 
 def sentence(result: Calibration) -> str:
@@ -83,6 +82,15 @@ def _asked(result: Calibration) -> str:
         "Nothing in the residual speaks against the model. It was asked whether it depends on a "
         "column or quantity; of a record in time, whether on that, and for lines; and how large it "
         "is, where repeats say so. What the values have swallowed would not show there."
+    )
+
+
+def _looked_for(result: Calibration) -> str:
+    if result.found.model.resting:
+        return "A calibration looks for no effect; what you know to be there, `--free NAME` adds."
+    return (
+        "A calibration looks for no effect. `casest close` with the same arguments does, and names "
+        "what these data could not show."
     )
 
 

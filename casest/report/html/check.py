@@ -20,20 +20,22 @@ def check_page(result: Checked) -> str:
     verdict = "Still valid." if result.valid else f"Not valid: {' and '.join(result.what)} changed."
     last = result.dates[-1]
     body = [
-        points(result.notes),
-        section("test", "What was asked", points(reasons(last)), points(drift(result))),
+        section("test", "What was asked", points(map(printed_unit, reasons(last))),
+                points(drift(result))),
         section("changed", "What changed", _changes(result), points(repair(last)), _again(result))
         if result.changed
         else "",
         section("chart", "Control chart", _chart(result, figures)),
         _dates(result),
-    ]
+        section("notes", "Noted while reading", points(result.notes)),
+    ]  # fmt: skip
     alarms = f"{result.false_alarm_rate:.2g}"
     under = (
         f"By {result.result}; a valid calibration is called invalid with a chance of {alarms} at "
         "each date."
     )
-    return whole(result.model, verdict, under, body, figures, result.data, trusted=result.valid)
+    return whole(result.model, verdict, under, body, figures, result.data, trusted=result.valid,
+                 look="good" if result.valid else "bad")  # fmt: skip
 
 
 def _changes(result: Checked) -> str:

@@ -13,6 +13,7 @@ import numpy as np
 from casest.declaration.shapes import Array
 from casest.report.html.numbers import printed_unit
 from casest.report.html.page import escaped, prose, tag
+from casest.report.html.still import still
 
 #: Arrays up to this length are written out as numbers.
 SHORT = 400
@@ -27,6 +28,7 @@ class Figures:
     figures: list[dict[str, Any]] = field(default_factory=list)
     arrays: list[Any] = field(default_factory=list)
     _known: dict[bytes, int] = field(default_factory=dict)
+    _values: list[Array] = field(default_factory=list)
 
     def array(self, values: Array, *, exact: bool = False) -> int:
         """Number of an array; 16 bits a value, or single precision where `exact`."""
@@ -35,6 +37,7 @@ class Figures:
         if key not in self._known:
             self._known[key] = len(self.arrays)
             self.arrays.append(_stored(values, exact))
+            self._values.append(values)
         return self._known[key]
 
     def series(
@@ -53,14 +56,18 @@ class Figures:
         two: bool = False,
         zoom: bool = False,
     ) -> str:
-        """A figure's place in the page. `two`: panels stand in pairs, before beside after."""
+        """A figure's place in the page, and still pictures for a reader without scripts.
+
+        `two`: panels stand in pairs, before beside after.
+        """
         self.figures.append({"id": name, "panels": list(panels), "two": two, "zoom": zoom})
         bold, text = caption
         said = tag("figcaption", tag("b", escaped(bold)), " ", prose(text))
         box = tag("div", class_="panels two" if two else "panels")
-        return tag(
-            "figure", said, _TOOLS if zoom else "", box, id=name, class_="zoom" if zoom else ""
-        )
+        pictures = "".join(still(p, self._values.__getitem__) for p in panels)
+        others = tag("noscript", tag("div", pictures, class_="panels still"))
+        inside = said, _TOOLS if zoom else "", box, others
+        return tag("figure", *inside, id=name, class_="zoom" if zoom else "")
 
 
 _TOOLS = (

@@ -55,7 +55,7 @@ def _cells(e: Entry) -> list[str]:
     if e.on_bound:
         reached = (f"{end:.4g}" for end in (e.value - e.below, e.value + e.above))
         return [f"{e.value:.6g}", "on its bound", *reached]
-    shown, spread = rounded(e.value, e.std)
+    shown, spread = e.shown
     ends = [e.value - e.below, e.value + e.above]
     known = math.isfinite(e.std) and e.std > 0
     return [shown, spread, *(_places(end, spread) if known else "–" for end in ends)]

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from casest.declaration.shapes import Array
 from casest.report.html.figures import BAND, Figures, axis, panel
 from casest.report.html.frame import whole
-from casest.report.html.numbers import alike, number, printed
+from casest.report.html.numbers import number, printed, printed_unit, two_digits
 from casest.report.html.page import paragraph, section, table
-from casest.results.fleet import FleetResult
+from casest.results.fleet import FleetResult, Spread
 from casest.results.fleet_rows import OUTLYING, Drawn
+from casest.results.rounding import rounded
 
 PAGE = "fleet.html"
 #: Bars of a histogram, and how many standard deviations of the fleet it reaches.
@@ -39,10 +42,11 @@ def fleet_page(result: FleetResult, drawn: Drawn) -> str:
         _versions(result),
     ]
     said = f"{result.trusted:,} of {result.sensors:,} sensors trusted."
-    under = f"{result.partitions:,} partitions; rejected.parquet names every sensor without numbers"
-    return whole(
-        result.model, said, under, body, figures, [result.dataset], trusted=result.trusted > 0
-    )
+    parts = "partition" if result.partitions == 1 else "partitions"
+    under = f"{result.partitions:,} {parts}; rejected.parquet names every sensor without numbers."
+    look = "good" if result.trusted == result.sensors else "doubtful" if result.trusted else "bad"
+    return whole(result.model, said, under, body, figures, [result.dataset],
+                 trusted=result.trusted > 0, look=look)  # fmt: skip
 
 
 def _yield(result: FleetResult, drawn: Drawn, figures: Figures) -> str:
@@ -70,7 +74,7 @@ def _misfit(drawn: Drawn, figures: Figures) -> str:
         "largest residual",
         axis("chance that noise makes one as large", "1", 0, 1),
         axis("density", "1", 0, float(y.max()), room=0.06),
-        [figures.series("line", "before", x, y=y)],
+        [figures.series("line", "after", x, y=y)],
     )
     few = 100 * float(np.mean(chance < 0.001))
     text = (
@@ -83,13 +87,8 @@ def _misfit(drawn: Drawn, figures: Figures) -> str:
 def _distributions(result: FleetResult, drawn: Drawn, figures: Figures) -> str:
     if not result.trusted:
         return ""
-    rows, spreads = [], result.parameters
-    columns = [
-        alike([getattr(p, name) for p in spreads.values()])
-        for name in ("mean", "std", "least", "largest", "typical_std")
-    ]
-    for k, (name, p) in enumerate(spreads.items()):
-        rows.append([f"`{name}`", *(c[k] for c in columns), printed(p.unit)])
+    spreads = result.parameters
+    rows = [[f"`{name}`", *_over(p), _unit(p.unit)] for name, p in spreads.items()]
     head = ["unknown", "mean", "spread", "least", "largest", "std of one sensor", "unit"]
     panels = [_histogram(drawn, k, spreads[name].unit, figures)
               for k, name in enumerate(drawn.names)]  # fmt: skip
@@ -102,6 +101,18 @@ def _distributions(result: FleetResult, drawn: Drawn, figures: Figures) -> str:
     )
 
 
+def _over(p: Spread) -> list[str]:
+    """Mean, spread, least and largest to two digits of the spread; what one sensor's is worth."""
+    spread = math.nan if p.std is None else p.std
+    shown = [rounded(math.nan if v is None else v, spread) for v in (p.mean, p.least, p.largest)]
+    (mean, std), (least, _), (largest, _) = shown
+    return [*map(printed, (mean, std, least, largest)), two_digits(p.typical_std)]
+
+
+def _unit(unit: str) -> str:
+    return "" if unit == "1" else printed_unit(unit)
+
+
 def _histogram(drawn: Drawn, k: int, unit: str, figures: Figures) -> dict[str, object]:
     values = drawn.values[k][drawn.trusted]
     half = REACH * float(drawn.scale[k]) or abs(float(drawn.centre[k])) or 1.0
@@ -112,7 +123,7 @@ def _histogram(drawn: Drawn, k: int, unit: str, figures: Figures) -> dict[str, o
         drawn.names[k],
         axis(drawn.names[k], unit or "1", low, high),
         axis("sensors", "%", 0, float(y.max()), room=0.06),
-        [figures.series("line", "before", x, y=y)],
+        [figures.series("line", "after", x, y=y)],
     )
 
 
@@ -136,15 +147,15 @@ def _drift(result: FleetResult, drawn: Drawn, figures: Figures) -> str:
     x = axis(label, unit, float(at.min()), float(at.max()))
     good = np.array([100 * drawn.trusted[g].mean() for g in groups])
     panels = [panel("yield", x, axis("trusted", "%", float(good.min()), 100, room=0.1),
-                    [figures.series("line", "before", at, y=good)])]  # fmt: skip
+                    [figures.series("line", "after", at, y=good)])]  # fmt: skip
     for k, name in enumerate(drawn.names):
         own = [drawn.values[k][g][drawn.trusted[g]] for g in groups]
         mean = np.array([v.mean() if v.size else np.nan for v in own])
         half = np.array([BAND * v.std() / np.sqrt(v.size) if v.size else np.nan for v in own])
         low, high = float(np.nanmin(mean - half)), float(np.nanmax(mean + half))
         series = [
-            figures.series("ribbon", "before", at, low=mean - half, high=mean + half),
-            figures.series("line", "before", at, y=mean),
+            figures.series("ribbon", "after", at, low=mean - half, high=mean + half),
+            figures.series("line", "after", at, y=mean),
         ]
         unit = result.parameters[name].unit or "1"
         panels.append(panel(name, x, axis(name, unit, low, high, room=0.06), series))

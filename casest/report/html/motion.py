@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator, Sequence
 
@@ -11,7 +12,7 @@ from casest.declaration.shapes import Array
 from casest.report.html.figures import BAND, Figures, axis, panel
 from casest.report.html.fitted import reproduction
 from casest.report.html.frame import whole
-from casest.report.html.numbers import alike, number, printed, printed_unit
+from casest.report.html.numbers import alike, number, printed, printed_unit, two_digits
 from casest.report.html.page import paragraph, points, section, table, tag
 from casest.report.html.spectra import autocorrelation
 from casest.results.observability import (
@@ -25,6 +26,7 @@ from casest.results.observability import (
     weak_directions,
     window_words,
 )
+from casest.results.rounding import rounded
 from casest.results.states import States, intensity_spread, verdict_words
 from casest.results.trajectory import Innovations, Trajectory
 
@@ -44,7 +46,8 @@ def observe_page(result: Observability) -> str:
     ]
     trusted = result.trusted if isinstance(result, ObservedParameters) else True
     said = observe_sentence(result)
-    return whole(result.model, said, "", body, figures, result.data, trusted=trusted)
+    return whole(result.model, said, "", body, figures, result.data, trusted=trusted,
+                 look="good" if result.observable else "bad")  # fmt: skip
 
 
 def observe_sentence(result: Observability) -> str:
@@ -111,7 +114,7 @@ def _deviations(result: Observability) -> str:
             if value == 0 and index:  # an entry that the shape holds at zero
                 continue
             label = f"`{name}[{','.join(map(str, index))}]`" if index else f"`{name}`"
-            shown = "not determined" if value is None else number(value)
+            shown = "not determined" if value is None else two_digits(value)
             rows.append([label, shown, printed_unit(units.get(name, ""))])
     said = "One standard deviation that these data allow, before any prior knowledge."
     shown = table(["unknown", "± std", "unit"], rows, [1])
@@ -186,20 +189,22 @@ def filter_page(result: States) -> str:
     figures, along = Figures(), result.trajectory
     innovations = innovation_figures(along, result.innovations, figures)
     body = [
-        section("states", "States", *state_figures(along, figures)),
         _final(result),
+        section("states", "States", *state_figures(along, figures)),
         section("innovations", "Innovations", *innovations),
         _intensities(result),
         conventions(along),
         reproduction(result.reproduce),
     ]
-    said = re.sub(r"\d\S*e[-+]\d+", lambda m: printed(m[0]), verdict_words(result))
-    verdict = f"Innovations are {said}."
+    said, _, cure = verdict_words(result).partition(": ")
+    said = re.sub(r"\d\S*e[-+]\d+", lambda m: printed(m[0]), said)
+    cure = re.sub(r"--\w[\w-]*( ml)?", lambda m: f"`{m[0]}`", cure)
     under = (
         f"{result.samples} samples; a filter that fits has innovations of the size it expects, "
-        "and none of them foretells the next."
+        "and none of them foretells the next." + (f" {_sentence(cure)}" if cure else "")
     )
-    return whole(result.model, verdict, under, body, figures, result.data)
+    return whole(result.model, f"Innovations are {said}.", under, body, figures, result.data,
+                 look="good" if result.as_expected else "doubtful")  # fmt: skip
 
 
 def state_figures(along: Trajectory, figures: Figures) -> Iterator[str]:
@@ -246,8 +251,10 @@ def _final(result: States) -> str:
     for name, s in result.states.items():
         for k, (value, std) in enumerate(zip(s.value, s.std, strict=True)):
             label = f"`{name}[{k}]`" if len(s.value) > 1 else f"`{name}`"
-            middle = number(s.smoothed_std_median[k])
-            rows.append([label, number(value, 5), number(std, 2), middle, printed_unit(s.unit)])
+            middle = two_digits(s.smoothed_std_median[k])
+            known = math.nan if std is None else std
+            shown = map(printed, rounded(math.nan if value is None else value, known))
+            rows.append([label, *shown, middle, printed_unit(s.unit)])
     head = ["state", "at the end", "± std", "smoothed ± std (median)", "unit"]
     return section("parameters", "At the end of the record", table(head, rows, [1, 2, 3]))
 

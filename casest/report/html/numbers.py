@@ -33,6 +33,13 @@ def number(value: float | None, digits: int = 3) -> str:
     return printed(f"{value:.{digits}g}")
 
 
+def two_digits(value: float | None) -> str:
+    """A standard deviation: 0.001 is 0.0010."""
+    if value is None or not math.isfinite(value):
+        return "–"
+    return printed(f"{value:#.2g}" if 0 < abs(value) < 9.95 else f"{value:.2g}")
+
+
 def with_unit(value: float | None, unit: str, digits: int = 3) -> str:
     """A number with its unit."""
     return f"{number(value, digits)} {printed_unit(unit)}".removesuffix(" 1").strip()

@@ -119,11 +119,16 @@ def document(
         '<link rel="icon" href="data:,">'
         f"<title>{escaped(title)}</title><style>{style}</style></head>\n"
         f"<body{'' if trusted else ' class=refused'}><main>{body}"
-        "<noscript><p>The figures are drawn by a script of this page, which is switched off.</p>"
-        "</noscript></main>\n"
+        f"{tag('noscript', paragraph(_STILL)) if figures else ''}</main>\n"
         f'<script type="application/json" id="data">{data}</script>\n'
         f"<script>{script}</script></body></html>\n"
     )
+
+
+_STILL = (
+    "Scripts are switched off: these pictures are still. With the script of this page they show "
+    "values under the pointer, and long records can be zoomed."
+)
 
 
 def _shipped(name: str) -> str:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from casest.report.html.figures import Figures
 from casest.report.html.fitted import reproduction
 from casest.report.html.frame import whole
-from casest.report.html.numbers import number, printed_unit
+from casest.report.html.numbers import number, printed_unit, two_digits
 from casest.report.html.page import escaped, paragraph, points, section, table, tag
 from casest.report.html.sphere import sphere
 from casest.results.plan import Plan, headline, plan_words
@@ -76,18 +77,26 @@ def _sphere(result: Plan) -> str:
         ),
     )
     empty = paragraph(result.emptiest) if result.emptiest else ""
-    return section(
-        "sphere", "Where they lie", tag("figure", caption, sphere(up, result.covered)), empty
-    )
+    return section("sphere", "Where they lie", tag("figure", caption, _drawn(up, result)), empty)
+
+
+def _drawn(up: Sequence[Sequence[float]], result: Plan) -> str:
+    return tag("div", sphere(up, result.covered), class_="drawn", tabindex="0", role="group",
+               aria_label="sphere of directions")  # fmt: skip
 
 
 def _unknowns(result: Plan) -> str:
     if not result.unknowns:
         return ""
     rows = [
-        [f"`{n}`", number(u.before), number(u.after), printed_unit(u.unit)]
+        [
+            f"`{n}`",
+            two_digits(u.before),
+            two_digits(u.after),
+            printed_unit(u.unit).removeprefix("1"),
+        ]
         for n, u in result.unknowns.items()
-    ]
+    ]  # fmt: skip
     times = "" if result.noise.stated else " In units of the noise, which nobody stated."
     said = paragraph(f"One standard deviation of each unknown.{times}")
     return section(

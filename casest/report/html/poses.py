@@ -6,10 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from casest.declaration.shapes import Array
 from casest.report.html.figures import Figures, axis, panel
 from casest.report.html.numbers import number
-from casest.results.poses import NEAR, Poses
+from casest.results.poses import NEAR, Poses, cap, flat
 
 #: Poses that are drawn.
 DRAWN = 4000
@@ -40,31 +39,15 @@ def _half(poses: Poses, figures: Figures, sign: int) -> dict[str, Any]:
     turn = np.linspace(0, 2 * np.pi, 181)
     edge = figures.series("line", "rim", np.cos(turn), y=np.sin(turn), exact=True)
     chosen = poses.directions[:: max(1, len(poses.directions) // DRAWN)]
-    x, y = _flat(chosen[chosen[:, 2] * sign >= 0], sign)
+    x, y = flat(chosen[chosen[:, 2] * sign >= 0])
     dots = figures.series("points", "after", x, y=y, exact=True)
-    cap = _cap(poses.empty, np.radians(poses.radius))
-    cap_x, cap_y = _flat(np.where((cap[:, 2] * sign >= 0)[:, None], cap, np.nan), sign)
+    rim = cap(poses.empty, np.radians(poses.radius))
+    cap_x, cap_y = flat(np.where((rim[:, 2] * sign >= 0)[:, None], rim, np.nan))
     outline = figures.series("line", "before", cap_x, y=cap_y, exact=True)
     drawn = [edge, dots] + ([outline] if np.isfinite(cap_x).any() else [])
     title = "z up" if sign > 0 else "z down"
     span = axis("direction [0]", "1", -1.04, 1.04), axis("direction [1]", "1", -1.04, 1.04)
     return panel(title, *span, drawn, height=330, square=True)
-
-
-def _flat(v: Array, sign: int) -> tuple[Array, Array]:
-    """Lambert's azimuthal projection of one half, its rim on the unit circle."""
-    with np.errstate(invalid="ignore"):
-        scale = 1 / np.sqrt(1 + np.abs(v[:, 2]))
-    return v[:, 0] * scale, v[:, 1] * scale
-
-
-def _cap(middle: Array, radius: float) -> Array:
-    """The circle at `radius` around a direction, (k, 3)."""
-    side = np.cross(middle, np.eye(3)[int(np.argmin(np.abs(middle)))])
-    side = side / np.linalg.norm(side)
-    other, turn = np.cross(middle, side), np.linspace(0, 2 * np.pi, 121)[:, None]
-    around = np.cos(turn) * side + np.sin(turn) * other
-    return np.asarray(np.cos(radius) * middle + np.sin(radius) * around)
 
 
 def _lengths(poses: Poses, figures: Figures) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 
 from casest.report.html.figures import Figures, axis, panel
 from casest.report.html.frame import whole
-from casest.report.html.numbers import number, printed, printed_unit, with_unit
+from casest.report.html.numbers import number, printed, printed_unit, two_digits, with_unit
 from casest.report.html.page import escaped, paragraph, prose, scrolled, section, table, tag
 from casest.results.rounding import rounded
 from casest.results.side_by_side import Across, SideBySide, name_of_data
@@ -86,7 +86,7 @@ def _mean(n: Across) -> list[str]:
     if n.mean is None or n.mean_std is None:
         return ["–", "–", "–", "–"]
     value, std = map(printed, rounded(n.mean, n.mean_std))
-    return [value, std, number(n.spread, 2), number(n.p_value, 2)]
+    return [value, std, two_digits(n.spread), number(n.p_value, 2)]
 
 
 def _figures(

@@ -21,7 +21,7 @@ def sphere(planned: Sequence[Sequence[float]], covered: Sequence[Sequence[float]
     parts = [_disc(k, sign) for k, sign in enumerate((1, -1))]
     for direction in covered:
         x, y = _place(np.asarray(direction))
-        parts.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="2.6" class="band edge"/>')
+        parts.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="2.6" class="there"/>')
     for (x, y), said in _numbered(planned):
         parts.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="4" class="after" fill="none"/>')
         if said:

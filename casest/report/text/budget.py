@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 
-from casest.report.text.layout import item
+from msgspec import UNSET
+
+from casest.report.text.layout import WIDTH, item, wrapped
 from casest.results.budget import Budget
 from casest.results.result import Number
 from casest.results.rounding import rounded
 from casest.results.uncertainty import Input
+from casest.results.validation import rows, sentence
 
 #: Correlations that are printed.
 STRONGEST = 6
+#: Columns of a table that is too wide are at least so wide.
+NARROW = 10
 
 
 def budget_text(budget: Budget) -> str:
@@ -22,6 +28,7 @@ def budget_text(budget: Budget) -> str:
         "\n".join(_values(budget)),
         "\n".join(_corrected(budget)),
         "\n".join(_correlations(budget)),
+        "\n".join(_validation(budget)),
     ]
     return "\n\n".join(b for b in blocks if b)
 
@@ -61,8 +68,8 @@ def _corrected(budget: Budget) -> Iterator[str]:
     if found is None:
         return
     unit = "" if found.unit in ("", "1") else f" {found.unit}"
-    at = ", ".join(f"{x:.6g}" for x in found.at)
-    yield f"Of a corrected reading, {found.name} at the reading {at}, in percent:"
+    at = ", ".join(f"{x:.4g}" for x in found.at)
+    yield from wrapped([f"Of a corrected reading, {found.name} at the reading {at}, in percent:"])
     rows = [("component", "", "std", *found.share, "freedom")]
     for k, (value, std) in enumerate(zip(found.value, found.std, strict=True)):
         name = found.name + (f"[{k}]" if len(found.value) > 1 else "")
@@ -93,10 +100,34 @@ def _correlations(budget: Budget) -> Iterator[str]:
     yield item(f"correlated: {said}" + (f"; and {more} more, in budget.json" if more else ""))
 
 
+def _validation(budget: Budget) -> Iterator[str]:
+    """What Monte Carlo says of each interval."""
+    found = budget.validation
+    if found is UNSET:
+        return
+    yield from wrapped([sentence(found) + "."])
+    yield ""
+    head = ("95 % interval", "first order", "Monte Carlo", "apart", "may be", "")
+    yield from _table([head, *rows(found)])
+
+
 def _table(rows: Sequence[Sequence[str]]) -> Iterator[str]:
     widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
+    if 2 * len(widths) + sum(widths) > WIDTH:
+        rows = [*_stacked(rows[0], rows[1:]), *rows[1:]]
+        widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
     for row in rows:
         first, *rest = row
         cells = [first.ljust(widths[0])]
         cells += [cell.rjust(w) for cell, w in zip(rest, widths[1:], strict=True)]
         yield ("  " + "  ".join(cells)).rstrip()
+
+
+def _stacked(head: Sequence[str], body: Sequence[Sequence[str]]) -> Iterator[tuple[str, ...]]:
+    """The words of a head above each other, as far as the cells below are narrower."""
+    columns = [
+        textwrap.wrap(name, max([NARROW, *(len(row[k]) for row in body)])) or [""]
+        for k, name in enumerate(head)
+    ]
+    tallest = max(map(len, columns))
+    yield from zip(*([""] * (tallest - len(c)) + c for c in columns), strict=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import textwrap
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,7 +16,7 @@ from casest.results.calibration import Calibration, doubt_sentence
 def calibration_text(result: Calibration, output: Path | None) -> str:
     """Verdict, values with uncertainty, what was not determined, why it is believed."""
     certificate = result.estimate.certificate
-    doubt = [doubt_sentence(result.misfit)] if result.misfit else []
+    doubt = [doubt_sentence(result)] if result.misfit else []
     title = "Believed because" if result.trusted else "Refused because"
     blocks = [
         _head(result),
@@ -47,8 +48,8 @@ def _head(result: Calibration) -> str:
 def _fit_lines(result: Calibration) -> Iterator[str]:
     noise, errors, solver = result.noise, result.estimate, result.solver
     unit = "" if noise.unit == "1" else f" {noise.unit}"
-    sigma = f"noise of one residual {noise.sigma[0]:.3g}{unit}"
-    yield f"  residual rms {errors.rmse_fit:.3g}{unit}; {sigma}"
+    sigma = f"{noise.sigma[0]:.3g}{unit}" if math.isfinite(noise.sigma[0]) else "unknown"
+    yield f"  residual rms {errors.rmse_fit:.3g}{unit}; noise of one residual {sigma}"
     if errors.rmse_holdout is not None:
         yield f"  held-out residual rms {errors.rmse_holdout:.3g}{unit}"
     if result.over_repeats and not result.doubtful:
@@ -79,7 +80,7 @@ def _determined(result: Calibration) -> Iterator[str]:
         if len(found.weak) > 3:
             lines.append(f"  - and {len(found.weak) - 3} more, in result.json")
         yield "\n".join(["Weakly determined (one standard deviation of the combination):", *lines])
-    if found.rank == found.unknowns and not found.weak:
+    if found.rank == found.unknowns and not found.weak and result.trusted:
         yield "The data determine every unknown; no weak combination."
 
 

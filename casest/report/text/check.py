@@ -53,8 +53,10 @@ _HEAD = ("parameter", "before", "now", "unit")
 
 
 def _numbers(c: Changed) -> tuple[str, str]:
-    before = rounded(_number(c.before), _number(c.std_before))
-    return f"{before[0]} ± {before[1]}", " ± ".join(rounded(_number(c.now), _number(c.std)))
+    before = " ± ".join(rounded(_number(c.before), _number(c.std_before)))
+    if not c.std_before:
+        before = f"{c.before:.6g}"
+    return before, " ± ".join(rounded(_number(c.now), _number(c.std)))
 
 
 def _number(value: float | None) -> float:

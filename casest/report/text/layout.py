@@ -9,16 +9,17 @@ from collections.abc import Iterator, Sequence
 from typing import TextIO
 
 from casest.declaration.shapes import in_digits
-from casest.results.rounding import rounded
 from casest.results.values import Entry, Held
 
 WIDTH = 80
 
-#: Verdicts and their colours (SGR codes): red, green, yellow.
+#: Verdicts and their colours (SGR codes): red, magenta, yellow, cyan, green.
 _COLOURS = {
-    r"NOT\s+TRUSTED|unexplained(?=:)|no\s+trustworthy\s+estimate": 31,
-    r"trusted,\s+but\s+the\s+residual\s+is\s+not\s+noise|extended(?=:)": 33,
-    r"trusted$|adequate(?=:)": 32,
+    r"NOT\s+(TRUSTED|VALID)|no\s+trustworthy\s+estimate": 31,
+    r"unexplained(?=:)": 35,
+    r"trusted,\s+but\s+the\s+residual\s+is\s+not\s+noise": 33,
+    r"extended(?=:)": 36,
+    r"(trusted|valid)$|adequate(?=:)": 32,
 }
 
 
@@ -66,7 +67,7 @@ def value_table(entries: Sequence[Entry]) -> Iterator[str]:
 
 
 def _value_and_std(e: Entry) -> tuple[str, str]:
-    return (f"{e.value:.6g}", e.on_bound) if e.on_bound else rounded(e.value, e.std)
+    return (f"{e.value:.6g}", e.on_bound) if e.on_bound else e.shown
 
 
 def held_lines(held: Sequence[Held]) -> Iterator[str]:

@@ -38,7 +38,8 @@ def _table(result: SideBySide) -> Iterator[str]:
         line = f"  {n.name:<{width}} {shown:>12} ± {sigma:<10} "
         if several:
             p = "–" if n.p_value is None else f"{n.p_value:.2g}"
-            line += f"{'' if n.spread is None else format(n.spread, '.2g'):<10} {p:<8} {n.furthest}"
+            between = "" if n.spread is None else f"{n.spread:#.2g}"
+            line += f"{between:<10} {p:<8} {n.furthest}"
         else:
             line += n.unit
         yield line.rstrip()

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from casest.report.text.layout import note_lines, wrapped
-from casest.results.observability import number_or_not
+from casest.results.result import Number
+from casest.results.rounding import rounded
 from casest.results.states import States, intensity_spread, verdict_words
 
 
@@ -11,14 +12,19 @@ def filter_text(result: States) -> str:
     """Final states and the innovations' verdict."""
     lines = [f"{result.model}: {result.samples} samples", "", "  at the end of the record:"]
     for name, s in result.states.items():
-        for k, (value, std) in enumerate(zip(s.value, s.std, strict=True)):
+        for k, (x, spread) in enumerate(zip(s.value, s.std, strict=True)):
             label = name if len(s.value) == 1 else f"{name}[{k}]"
-            lines.append(f"    {label:<14} {value:>12.5g} ± {std:<10.2g} {s.unit}")
+            value, std = rounded(_number(x), _number(spread))
+            lines.append(f"    {label:<14} {value:>12} ± {std:<10} {s.unit}")
     lines += ["", *intensity_lines(result)]
     lines += ["", f"  innovations are {verdict_words(result)}"]
     if missing := result.innovations.missing_readings:
         lines.append(f"  {missing} samples without a complete reading")
     return "\n".join(wrapped([*lines, *note_lines(result.notes)]))
+
+
+def _number(value: Number) -> float:
+    return float("nan") if value is None else value
 
 
 def intensity_lines(result: States) -> list[str]:
@@ -36,5 +42,5 @@ def intensity_lines(result: States) -> list[str]:
         lines.append(f"    {name:<14} {shown} {said.units[name]}{share and ' ' + share}")
     means = [said.declared_normalised_mean]
     means += [] if same else [result.innovations.normalised_mean]
-    shown = " ".join(f"{number_or_not(v):>12}" for v in means)
+    shown = " ".join(f"{'-' if v is None else format(v, '.3g'):>12}" for v in means)
     return [*lines, f"    {'innovations²':<14} {shown} ({expected} expected)"]

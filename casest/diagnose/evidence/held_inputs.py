@@ -1,0 +1,98 @@
+"""Records whose inputs are held: a weight that lies on a cell, a bath that stays at a temperature.
+
+What such a record says of the model is as much as it has plateaus: each has an error of its own
+(the weight's, the seat's), and a thousand readings of it are one. So a cause is judged twice: from
+plateau to plateau by the F test of their means, as poses are, and within the plateaus as a series.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from casest.declaration.shapes import Array
+from casest.diagnose.evidence.held_out import clipped
+from casest.diagnose.evidence.likelihood import Explained, Likelihood
+from casest.diagnose.evidence.linear import Index, Linear, Parts
+from casest.diagnose.evidence.score import Trial, judged
+from casest.diagnose.levels import LEVELS
+
+
+def plateaus_of(met: Array, spans: Sequence[slice]) -> Index | None:
+    """Number of each row's plateau (N,), where what the sensor met (N, q) is held; else None.
+
+    Where plateaus are many, their errors are a noise as any other.
+    """
+    change = np.any(np.diff(met, axis=0) != 0, axis=1)
+    change[[span.start - 1 for span in spans if span.start]] = True
+    number = np.concatenate([[0], np.cumsum(change)])
+    count = int(number[-1]) + 1
+    few = 1 < count < LEVELS.series and count * LEVELS.block <= len(met)
+    return number if few else None
+
+
+def means(values: Array, plateaus: Index) -> Array:
+    """Of rows (N, …) on each plateau (U, …)."""
+    count = np.bincount(plateaus)
+    flat = values.reshape(len(values), -1)
+    sums = np.stack([np.bincount(plateaus, column) for column in flat.T], axis=1)
+    return np.asarray(sums / count[:, None]).reshape(len(count), *values.shape[1:])
+
+
+@dataclass(frozen=True)
+class Held:
+    """A fit to a record with plateaus; causes are of so many `families`."""
+
+    linear: Linear
+    families: int
+
+    def says(self, trials: Sequence[Trial]) -> bool:
+        """Do the plateaus' means say it, as so many poses, or the course within them?"""
+        inside = judged(trials, *self._within, families=self.families)
+        if inside is not None and inside.score > LEVELS.strong:
+            return True
+        poses = [replace(t, columns=self._means(t.columns)) for t in trials]
+        between = judged(poses, *self._between, families=self.families)
+        return between is not None and between.p_value < LEVELS.chance
+
+    @cached_property
+    def _within(self) -> tuple[Likelihood, Explained]:
+        """Of the series, where each plateau has an offset of its own on each axis."""
+        N, m = self.linear.residual.shape
+        own = np.zeros((N, m, self._count, m))
+        for axis in range(m):
+            own[np.arange(N), axis, self._number, axis] = 1.0
+        slopes = np.concatenate([self.linear.slopes, own.reshape(N, m, -1)], axis=2)
+        return _beside_none(replace(self.linear, slopes=slopes))
+
+    @cached_property
+    def _between(self) -> tuple[Likelihood, Explained]:
+        """Of the means as poses."""
+        residual, slopes = (self._means(v) for v in (clipped(self.linear), self.linear.slopes))
+        place = np.arange(self._count)
+        poses = Linear(residual, slopes, (), Parts(place, place, place, place), self.linear.least)
+        return _beside_none(poses)
+
+    @property
+    def _number(self) -> Index:
+        assert self.linear.plateaus is not None
+        return self.linear.plateaus
+
+    @property
+    def _count(self) -> int:
+        return int(self._number[-1]) + 1
+
+    def _means(self, values: Array) -> Array:
+        """Of rows (N, …) on each plateau (U, …)."""
+        flat = values.reshape(len(values), -1)
+        sums = np.stack([np.bincount(self._number, column) for column in flat.T], axis=1)
+        found = sums / np.bincount(self._number)[:, None]
+        return np.asarray(found.reshape(self._count, *values.shape[1:]))
+
+
+def _beside_none(linear: Linear) -> tuple[Likelihood, Explained]:
+    likelihood = Likelihood(linear)
+    return likelihood, likelihood.beside()
