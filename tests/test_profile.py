@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import csv
+
 import numpy as np
 import pytest
-from scipy.optimize import brentq
+from scipy.optimize import brentq, minimize_scalar
 from scipy.stats import t as student
 
 from casest import Residual, Run, attempt, exp, model, param, signal
+from casest.cli import run
 
 DAYS = np.array([1.0, 1.5, 2.0, 3.0, 4.0, 5.0])
 SIGMA = 12.0
@@ -101,6 +104,44 @@ def test_of_a_straight_line_nothing_is_profiled():
     x = np.arange(1.0, 9.0)[:, None]
     run = Run.raw("line", {"x": x, "y": 2 * x + 0.1 * np.cos(7 * x)}, units={})
     assert attempt(line, [run]).certificate.profile is None
+
+
+#: Biochemical oxygen demand (Bates & Watts 1988, A1.4): the example of a cost that is no parabola.
+DEMAND = ((1, 8.3), (2, 10.3), (3, 19.0), (4, 16.0), (5, 15.6), (7, 19.8))
+
+
+def test_the_command_line_draws_what_is_no_parabola(tmp_path, capsys):
+    """Every point is the cost that SciPy finds with the unknown held there."""
+    (tmp_path / "demand.py").write_text(
+        "from casest import Residual, exp, model, param, signal\n"
+        "@model\n"
+        'def demand(x=signal("s"), y=signal("1"), *, a=param(start=1.0), '
+        'b=param("1/s", start=0.3)):\n'
+        "    return Residual(measured=y, predicted=a * (1 - exp(-b * x)))\n"
+    )
+    x, y = np.array(DEMAND).T
+    rows = "\n".join(f"{a},{b}" for a, b in DEMAND)
+    (tmp_path / "demand.csv").write_text(f"x [s],y\n{rows}\n")
+    words = ["calibrate", str(tmp_path / "demand.py"), str(tmp_path / "demand.csv"), "--profile"]
+    assert run(words) == 1
+    assert "say where with -o DIR" in capsys.readouterr().err
+    assert run([*words, "-o", str(tmp_path / "out")]) == 0
+    said = capsys.readouterr()
+    assert "no parabola: a, b" in said.err
+    assert "demand.csv -o" in " ".join(said.out.replace("\\\n", "").split())
+    assert 'id="profiles"' in (tmp_path / "out/report.html").read_text()
+    with (tmp_path / "out/profiles.csv").open() as file:
+        points = [row for row in csv.DictReader(file) if row["unknown"] == "b"]
+
+    def cost(b):
+        shape = 1 - np.exp(-b * x)
+        return float(np.sum((y - shape * (shape @ y) / (shape @ shape)) ** 2))
+
+    best = minimize_scalar(cost, (0.3, 0.6)).fun
+    assert len(points) > 10
+    for row in points:
+        rise = (cost(float(row["value"])) - best) / (best / 4)
+        assert float(row["rise"]) == pytest.approx(rise, abs=1e-3)
 
 
 def test_a_drawn_profile_is_the_least_sum_of_squares_at_each_value():

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -27,6 +27,7 @@ from casest.cli.noise_law import with_noise_law
 from casest.cli.options import (
     DATA,
     RESULTS,
+    CalibrateOptions,
     CloseOptions,
     FitOptions,
     MotionOptions,
@@ -34,6 +35,10 @@ from casest.cli.options import (
 )
 from casest.cli.shared import commands, echo, progress, reported, typed, write
 from casest.errors import NotTrusted, UsageError
+
+if TYPE_CHECKING:
+    from casest.estimate.estimate import Estimate
+    from casest.results.profiles import ProfileOf
 
 
 @commands.command("list")
@@ -54,16 +59,25 @@ def list_command(as_json: bool) -> None:
 @commands.command()
 @model_argument(Kind.FITTED)
 @DATA
-@taking(FitOptions)
-def calibrate(model_name: str, data: tuple[str, ...], options: FitOptions) -> int:
+@taking(CalibrateOptions)
+def calibrate(model_name: str, data: tuple[str, ...], options: CalibrateOptions) -> int:
     """Fit MODEL to DATA: values with uncertainty, certificate, what was not determined.
 
     Exit code 0: trusted; 1: bad input; 2: no trustworthy estimate (result.json says why).
     """
-    return calibration(model_name, data, options, typed())
+    if options.profile and not options.output:
+        raise UsageError("--profile draws on a page: say where with -o DIR")
+    return calibration(model_name, data, options, typed(), profile=options.profile)
 
 
-def calibration(model_name: str, data: Sequence[str], options: FitOptions, command: str) -> int:
+def calibration(
+    model_name: str,
+    data: Sequence[str],
+    options: FitOptions,
+    command: str,
+    *,
+    profile: bool = False,
+) -> int:
     """Read, fit, save, print; the exit code says whether the estimate is trusted."""
     from casest.diagnose.misfit.left import doubts
     from casest.estimate.calibrate import attempt
@@ -95,7 +109,8 @@ def calibration(model_name: str, data: Sequence[str], options: FitOptions, comma
     if options.output:
         progress(f"writing {options.output}")
         save(options.output, result.content(), residual_rows(found))
-        reported(options.output, calibration_page(result, str(options.output)))
+        drawn = profiled(found, options.output) if profile else []
+        reported(options.output, calibration_page(result, str(options.output), drawn))
     if options.as_json:
         echo(as_json(result.content()), nl=False)
     else:
@@ -105,6 +120,22 @@ def calibration(model_name: str, data: Sequence[str], options: FitOptions, comma
         echo(f"casest: no trustworthy estimate: {reason}", err=True)
         return NotTrusted.exit_code
     return 0
+
+
+def profiled(found: Estimate, folder: Path) -> list[ProfileOf]:
+    """Profiles that are no parabola, and `profiles.csv` of all; of a trusted estimate."""
+    from casest.results.profiles import profile_rows, profiles_of
+
+    progress("following the likelihood's profiles")
+    every = profiles_of(found)
+    if not every:
+        return []
+    write(folder / "profiles.csv", "\n".join(profile_rows(every)) + "\n")
+    bent = [p for p in every if p.bent]
+    names = ", ".join(p.name for p in bent)
+    said = f"no parabola: {names}: report.html draws it" if bent else "a parabola for every unknown"
+    echo(f"casest: the cost is {said}; profiles.csv has every point", err=True)
+    return bent
 
 
 @commands.command()

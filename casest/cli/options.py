@@ -235,6 +235,17 @@ class FitOptions:
 
 
 @dataclass(frozen=True, slots=True)
+class CalibrateOptions(FitOptions):
+    """Options of `calibrate`."""
+
+    profile: bool = flag(
+        False,
+        "--profile",
+        help="Draw the likelihood's profile of every unknown whose cost is no parabola.",
+    )
+
+
+@dataclass(frozen=True, slots=True)
 class CloseOptions(FitOptions):
     """Options of `close`."""
 

@@ -121,7 +121,7 @@ class Profile:
         for sign in (-1, 1):
             here, own = self.best, np.flatnonzero(sign * distances >= 0)
             for k in own[np.argsort(np.abs(distances[own]))]:
-                there = self._held(here, j, float(distances[k])) if distances[k] else self.best
+                there = self.held_at(here, j, float(distances[k])) if distances[k] else self.best
                 if there is None:
                     break
                 here = there
@@ -132,7 +132,7 @@ class Profile:
         """The end, or the distance to the bound where the cost has not risen so far there."""
         room = float(abs(self.problem.bounds[0 if sign < 0 else 1][j] - self.best.x[j]))
         if np.isfinite(room) and room < REACH * np.sqrt(rise * self.covariance[j, j]):
-            there = self._held(self.best, j, sign * room * (1 - 1e-9))
+            there = self.held_at(self.best, j, sign * room * (1 - 1e-9))
             if there is None or 2 * (self.problem.cost(there) - self.cost) < rise * self.sigma**2:
                 return room
         return self._end(j, sign, rise)
@@ -147,7 +147,7 @@ class Profile:
         for _ in range(TRIES):
             if size + step > REACH * linear:
                 return None
-            there = self._held(here, j, sign * (size + step))
+            there = self.held_at(here, j, sign * (size + step))
             square = 2 * (self.problem.cost(there) - self.cost) / self.sigma**2 if there else -1.0
             reached = float(np.sqrt(square)) if square >= height**2 else float("inf")
             if abs(reached / wanted - 1) < CLOSE:
@@ -159,7 +159,7 @@ class Profile:
             step = _next(size, height, outside, wanted, step)
         return None
 
-    def _held(self, point: Point, j: int, distance: float) -> Point | None:
+    def held_at(self, point: Point, j: int, distance: float) -> Point | None:
         """Best point with unknown j at a distance from its best value; None outside the bounds."""
         lower, upper = self.problem.bounds
         value = self.best.x[j] + distance

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from casest.declaration.shapes import Array
@@ -12,13 +14,17 @@ from casest.report.html.frame import whole
 from casest.report.html.numbers import alike, printed_unit, with_unit
 from casest.report.html.page import paragraph, points, section, table
 from casest.report.html.poses import poses_seen
+from casest.report.html.profiles import profile_figures
 from casest.report.html.residuals import convincing, residual_figures
 from casest.results.calibration import Calibration, doubt_sentence
+from casest.results.profiles import ProfileOf
 from casest.results.residuals import Residuals
 
 
-def calibration_page(result: Calibration, folder: str = "out") -> str:
-    """`report.html` of a calibration, trusted or refused."""
+def calibration_page(
+    result: Calibration, folder: str = "out", profiles: Sequence[ProfileOf] = ()
+) -> str:
+    """`report.html` of a calibration, trusted or refused; with `profiles` that were asked for."""
     residuals, figures = result.residuals, Figures()
     finite = _finite(residuals)
     body = [
@@ -26,6 +32,8 @@ def calibration_page(result: Calibration, folder: str = "out") -> str:
         parameters(result),
         section("evidence", "The evidence", poses_seen(residuals.poses, figures),
                 convincing(residuals, figures)) if finite else "",
+        section("profiles", "Where the cost is no parabola",
+                profile_figures(profiles, figures)) if profiles else "",
         error_section(result, figures),
         section("residual", "Residual", residual_figures(residuals, figures)) if finite else "",
         uncertain(result),
