@@ -120,7 +120,7 @@ MUTANTS = tuple(
         ("estimate/covariance.py", "groups / (groups - 1)", "(groups - 1) / groups"),
         ("estimate/correlation.py", "2 * pairs.sum() - 1", "pairs.sum()"),
         ("estimate/correlation.py", "neighbours < 2.33", "neighbours < 23.3"),
-        ("leastsquares/weights.py", "/ np.mean(slope) ** 2", "/ np.mean(w) ** 2"),
+        ("leastsquares/weights.py", "/ dof / np.mean(slope) ** 2", "/ dof / np.mean(w) ** 2"),
         ("leastsquares/weights.py", "np.sum((w * r) ** 2)", "np.sum(w * r**2)"),
         ("leastsquares/weights.py", "np.median(everything)) / 0.6745", "np.median(everything))"),
         (
