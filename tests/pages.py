@@ -43,7 +43,7 @@ def folder_of_a_reader(page: Path, folder: Path) -> Path:
     shutil.copytree(ROOT / "casest" / "demo", folder / "casest" / "demo")
     for language, text in blocks(page):
         first, _, rest = text.partition("\n")
-        if language in ("python", "csv"):
+        if language in ("python", "csv", "toml"):
             assert first.startswith("# "), f"{page.name}: a block without the name of its file"
             (folder / first[2:]).write_text(rest, encoding="utf-8")
     return folder

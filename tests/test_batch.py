@@ -94,6 +94,7 @@ def test_a_shipped_model_knows_where_many_sensors_start():
     assert found.trusted.all()
 
 
+@pytest.mark.long
 def test_the_verdict_is_that_of_one_calibration():
     rng, records = np.random.default_rng(3), []
     directions = [
@@ -138,6 +139,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say():
     assert 0.94 < inside[found.trusted].mean() < 0.96
 
 
+@pytest.mark.long
 def test_what_is_trusted_is_near_the_truth_however_poor_the_poses():
     from scipy.stats import t
 

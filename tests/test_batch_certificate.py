@@ -67,7 +67,7 @@ NEAR = [197, 198, 338, 360, 448, 519, 543, 615, 671, 707, 907, 930, 1005, 1064, 
 FAR = [32, 46, 84, 88, 123, 143, 153, 173, 174, 182, 186, 231, 234, 239, 284, 289, 300, 325, 367]
 
 
-@pytest.mark.parametrize("chosen", [NEAR, FAR])
+@pytest.mark.parametrize("chosen", [NEAR, pytest.param(FAR, marks=pytest.mark.long)])
 def test_a_false_optimum_is_not_believed_where_the_right_one_is_within_reach(chosen):
     rng = np.random.default_rng(0)
     x = rng.standard_normal((4000, 6))
@@ -229,6 +229,7 @@ def test_alike_neighbours_are_a_time_series_and_independent_ones_are_not(share):
     assert found.trusted.mean() == pytest.approx(1.0 if share == 0 else 0.02, abs=0.02)
 
 
+@pytest.mark.long
 def test_flat_directions_are_measured_and_not_believed():
     """Readings of a cap: the cost over two standard deviations is no parabola for many of them."""
     rng = np.random.default_rng(12)

@@ -463,6 +463,7 @@ def peak(
     return Residual(measured=y, predicted=level + height * exp(-(((x - place) / width) ** 2)))
 
 
+@pytest.mark.long
 def test_one_of_several_valleys_that_leaves_a_course_is_refused_until_a_start_says_which():
     """Two peaks where the model has one: either is a minimum."""
     x = np.arange(200) * 0.1

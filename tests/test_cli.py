@@ -200,6 +200,7 @@ def test_list_for_programs(capsys):
     assert problems["norm-full"]["constants"] == {"norm": 1.0}
 
 
+@pytest.mark.long
 def test_the_demo_finds_the_effect_and_comes_close_to_the_truth(tmp_path, capsys):
     assert run(["demo", "-o", str(tmp_path / "demo")]) == 0
     text = capsys.readouterr().out
@@ -216,6 +217,7 @@ def test_the_demo_finds_the_effect_and_comes_close_to_the_truth(tmp_path, capsys
     assert (tmp_path / "demo" / "result.json").exists()
 
 
+@pytest.mark.long
 def test_a_real_process_does_the_same(records, tmp_path):
     command = [str(Path(sys.executable).parent / "casest")]
     lab = str(records / "lab_acc.csv")
@@ -553,6 +555,7 @@ def test_one_effect_of_a_file_and_one_of_its_parameters_held(records, tmp_path, 
     assert parameter(result, "sensitivity") == pytest.approx(slope, rel=1e-9)
 
 
+@pytest.mark.long
 def test_outliers_are_an_effect_on_the_noise_from_a_file(records, tmp_path, capsys):
     lines = (records / "cell.csv").read_text(encoding="utf-8").splitlines()
     for k in (5, 17, 29):  # three readings of 40 are off by a volt

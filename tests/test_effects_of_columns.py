@@ -65,7 +65,7 @@ def test_calibrate_fits_the_effect_of_the_column_that_is_named(record, asked, na
     assert list(found["effects"][0]["columns"].values()) == ["motor current"]
 
 
-@pytest.mark.parametrize("command", ["calibrate", "close"])
+@pytest.mark.parametrize("command", ["calibrate", pytest.param("close", marks=pytest.mark.long)])
 def test_a_result_with_a_column_is_applied_with_it(record, command, capsys):
     asked = ["--effects", "channel_bias(motor current)"]
     assert result(command, "norm-diagonal", "poses.csv", *asked)[0] == 0
@@ -94,6 +94,7 @@ def test_close_judges_the_effect_of_the_column_that_is_named(record, asked, foll
     assert "pull(motor current)" not in json.dumps(found)
 
 
+@pytest.mark.long
 def test_a_column_that_would_not_be_tried_is_tried_where_it_is_named(record):
     """Of a temperature the catalogue tries temperature_bias alone."""
     asked = ["--effects", "channel_bias(temp)"]
@@ -143,7 +144,7 @@ def test_a_row_without_the_followed_column_is_dropped_as_one_without_a_reading(
     [
         ("calibrate", "inf"),
         ("calibrate", "ERR"),
-        ("close", "inf"),
+        pytest.param("close", "inf", marks=pytest.mark.long),
         pytest.param("close", "ERR", marks=pytest.mark.long),
     ],
 )

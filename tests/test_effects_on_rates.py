@@ -104,6 +104,7 @@ def room(
 """
 
 
+@pytest.mark.long
 def test_a_column_that_drives_a_state_is_named_and_a_second_record_is_foretold(tmp_path, capsys):
     (tmp_path / "room.py").write_text(ROOM)
     first, second = cooling(tmp_path), cooling(tmp_path, "second.csv", 1)
@@ -112,6 +113,8 @@ def test_a_column_that_drives_a_state_is_named_and_a_second_record_is_foretold(t
     found = json.loads(capsys.readouterr().out)
     (added,) = found["effects"]
     assert (added["name"], added["on"], added["column"]) == ("forcing", "rate of warmth", "sun")
+    # Others gain nine tenths of it, and leave many times what it leaves.
+    assert added["indistinguishable_from"] == []
     k = found["after"]["parameters"]["forcing(sun)@warmth.k"]
     assert abs(k["value"] - 2.5) < 4 * k["std"]
     assert k["unit"] == "(K/s)/kW"

@@ -127,6 +127,7 @@ def test_gasoil_to_all_printed_digits(tmp_path, capsys, shared_data):
         assert value(found, name) == pytest.approx(expected, rel=1e-8)
 
 
+@pytest.mark.long
 def test_pinene_whose_beginning_is_before_the_first_reading(tmp_path, capsys, shared_data):
     file = str(shared_data / "certified/cops_pinene.csv")
     code, found = calibrated(tmp_path, capsys, PINENE, file, "--time-zero", "column")
@@ -157,6 +158,7 @@ def falling(**more):
     return t, height
 
 
+@pytest.mark.long
 def test_integrate_in_a_model_follows_the_closed_form():
     """Sampled irregularly; the free beginning and the drag come back to rounding."""
 

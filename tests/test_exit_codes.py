@@ -98,6 +98,7 @@ def test_a_keyboard_interrupt_of_a_model_is_one(line):
     assert (code, err.strip()) == (130, "casest: interrupted; nothing was written")
 
 
+@pytest.mark.long
 def test_a_sum_of_3000_terms_is_fitted(line):
     loop = "    t = 0 * x\n    for k in range(3000):\n        t = t + a * x / 3000\n"
     code, _, _ = line(LINE + loop + "    return Residual(measured=y, predicted=t)\n")
@@ -210,7 +211,7 @@ def test_a_full_standard_output_is_said_and_nothing_is_written(tmp_path):
     ("words", "output"),
     [
         (["simulate", "norm-diagonal", "--directions", "9"], "simulated"),
-        (["compare", *POSES, "--starts", "0"], "compared"),
+        pytest.param(["compare", *POSES, "--starts", "0"], "compared", marks=pytest.mark.long),
         (["apply", "fit", *POSES[1:6]], "corrected/new.csv"),
         (["export", "fit", "--to", "c"], "device/new.c"),
     ],

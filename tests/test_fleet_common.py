@@ -41,6 +41,7 @@ def close(file, *words):
     return run(["close", "norm-triangular", str(file), "--sensor", "sensor", *fleets.NORM, *words])
 
 
+@pytest.mark.long
 def test_an_effect_that_no_sensor_shows_is_named_by_three_thousand(tmp_path, capsys):
     """0.2 standard deviations in each sensor; its size is right, and sensors held out agree."""
     size, count = 0.0075, 3000

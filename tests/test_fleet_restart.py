@@ -142,6 +142,7 @@ def test_results_of_input_that_is_gone_are_removed(tmp_path, monkeypatch):
     assert sorted(sensors) == fleets.names(10) + fleets.names(10, 20)
 
 
+@pytest.mark.long
 def test_a_full_disk_is_said_and_the_same_command_goes_on(line, tmp_path):
     """A limit on the size of files fails each write as a full disk does."""
     import resource
@@ -199,6 +200,7 @@ def test_what_a_worker_is_sent_pickles(line, tmp_path):
     assert again[0].key(plan.partitions[0]) == job.key(plan.partitions[0])
 
 
+@pytest.mark.long
 def test_a_model_of_ones_own_file_reaches_every_worker(tmp_path):
     file = tmp_path / "own_triad.py"
     file.write_text(

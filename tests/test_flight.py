@@ -77,6 +77,7 @@ def test_errors_reach_the_bound_and_do_not_pass_it(runs):
     assert chi2.ppf(0.005, late.size) < ratio < chi2.ppf(0.995, late.size)
 
 
+@pytest.mark.long
 def test_errors_stay_within_what_the_filter_claims_on_both_sides_of_a_gap():
     """What the inputs did for 4 s is unknown: velocity and gravity are forgotten, the bias not."""
     t, squares, bias = np.concatenate([T[T < 14], T[T > 18]]), [], []

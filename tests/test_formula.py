@@ -242,6 +242,7 @@ def test_where_nothing_can_be_held_out_there_is_no_verdict_and_the_fit_is_kept(b
     assert "nothing was added: short: 5 samples" in capsys.readouterr().out
 
 
+@pytest.mark.long
 def test_a_constant_column_and_a_copy_are_named(bench, capsys):
     from pathlib import Path
 
@@ -265,6 +266,7 @@ BAD = {
 }  # fmt: skip
 
 
+@pytest.mark.long
 def test_effects_of_the_users_own_that_cannot_be_used_are_named(bench, tmp_path, capsys):
     text = "from casest import effect, param, signal\n"
     for name, (arguments, value, _) in BAD.items():
@@ -296,6 +298,7 @@ def failing_refit(monkeypatch):
     monkeypatch.setattr(Sensor, "fitted", failing)
 
 
+@pytest.mark.long
 def test_where_the_refit_of_a_candidate_fails_it_is_named_and_the_loop_goes_on(
     bench, failing_refit
 ):

@@ -234,6 +234,7 @@ def test_a_turn_at_full_scale_is_left_out_and_said():
     assert np.abs(away(found, imu.truth)).max() < 4.5
 
 
+@pytest.mark.long
 def test_a_gyroscope_of_another_unit_is_refused():
     rng = np.random.default_rng(33)
     run = rests(recorded(waved(rng), an_imu(rng), rng))

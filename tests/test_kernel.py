@@ -493,6 +493,7 @@ def test_a_model_that_is_only_tried_is_not_compiled_unless_its_record_is_very_lo
     assert compiled(replay)
 
 
+@pytest.mark.long
 def test_a_result_says_which_kernel_it_is_of_and_they_differ_in_the_last_digits(tmp_path, cache):
     def estimate(wish, expected):
         environment = {**os.environ, "CASEST_KERNEL": wish, "CASEST_CACHE": str(cache)}

@@ -23,7 +23,8 @@ def certified(shared_data):
 
 @pytest.mark.parametrize("start", [1, 2])
 @pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=[pytest.mark.long] * (n == "Bennett5")) for n in MODELS]
+    "name",
+    [pytest.param(n, marks=[pytest.mark.long] * (n in ("Bennett5", "ENSO"))) for n in MODELS],
 )
 def test_the_certified_values_are_found_from_either_start_alone(name, start, certified):
     nist = certified(name)

@@ -48,6 +48,7 @@ def test_standard_deviations_are_those_of_fishers_information(freedom):
     assert estimated(line, [one])[1] == pytest.approx(freedom, rel=0.15)
 
 
+@pytest.mark.long
 def test_intervals_hold_the_truth_as_often_as_they_say():
     """Of two hundred unknowns of a hundred lines, each with its own twenty readings."""
     each = line.scoped("a", "run").scoped("b", "run")

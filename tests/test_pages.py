@@ -22,7 +22,7 @@ MEASURED = {
 }
 WITH_COMMANDS = [p for p in PAGES if any(language == "sh" for language, _ in blocks(p))]
 #: Pages whose commands take longest.
-DEAR = {"close", "in_motion", "invisible", "plan", "uncertainty"}
+DEAR = {"close", "equations", "in_motion", "invisible", "plan", "uncertainty"}
 
 
 def each_page():
@@ -79,7 +79,7 @@ def test_no_block_of_a_page_slips_through(page):
 
 
 #: Languages of blocks that are run, written or compared.
-RUN = {"sh", "text", "python", "csv", "c"}
+RUN = {"sh", "text", "python", "csv", "toml", "c"}
 
 
 def understood(line):

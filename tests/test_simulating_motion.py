@@ -149,6 +149,7 @@ def simulated(folder, *arguments, model="bias-gravity"):
     return str(folder / "record.csv"), truth, np.array(rows[1:], float)
 
 
+@pytest.mark.long
 def test_a_filter_told_the_same_noise_finds_the_truth(tmp_path, capsys):
     plan = ["--duration", "30", "--rate", "50", "--value", "bias=0.1,-0.05,0.025", *NOISE]
     record, truth, states = simulated(tmp_path, *plan)
@@ -224,6 +225,7 @@ def test_a_users_own_estimator_is_simulated_and_followed(tmp_path, capsys):
         assert abs(own["value"][0] - states[-1, 1 + k]) < 4 * own["std"][0]
 
 
+@pytest.mark.long
 def test_the_position_variant_ends_where_its_filter_says():
     noisy = bias_gravity_position.driven(velocity=0.0, gravity=0.0, bias=0.0)
     noisy = noisy.sensing(a=1e-7, omega=1e-9, p=1e-5)

@@ -170,6 +170,7 @@ def test_correlated_noise_in_few_batches_widens_it_too():
     assert 0.8 < ratio < 1.15
 
 
+@pytest.mark.long
 def test_white_noise_in_time_is_hardly_ever_taken_for_coloured():
     """One series in a hundred gets past by the level that is asked of neighbours."""
     found = fits(300, normal, 150, seed=1)[2]

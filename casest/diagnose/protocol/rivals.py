@@ -44,7 +44,7 @@ def _rivals(subject: Subject[F], state: State[F], kept: Kept) -> tuple[State[F],
         if e is mine[0] or e.score < LEVELS.strong or len(rivals) == 2 * LEVELS.contenders:
             continue
         lost = squares(linear, [_in_time(ranking, e)], stretches) - best
-        if _as_well(mine[0].score - e.score, lost, without - best):
+        if _as_well(mine[0].score - e.score, lost, without - best, best):
             rivals.append(e)
     after = subject.linear(state.fit)
     found = list[Rival]()
@@ -56,11 +56,11 @@ def _rivals(subject: Subject[F], state: State[F], kept: Kept) -> tuple[State[F],
         ours, its = subject.rises(base, [state.fit, fit])
         behind = (mine[0].score - mine[0].gain + ours) - (e.score - e.gain + its)
         other = subject.linear(fit)
-        lost = np.zeros(1)
+        lost, left = np.zeros(1), best
         if {x.residual.shape for x in (linear, after, other)} == {linear.residual.shape}:
-            best, worse = (squares(x, [], stretches) for x in (after, other))
-            lost = worse - best
-        if _as_well(behind, lost, without - best):
+            left, worse = (squares(x, [], stretches) for x in (after, other))
+            lost = worse - left
+        if _as_well(behind, lost, without - left, left):
             found.append(Rival(e.trials[0].what, fit))
     return state, found
 
@@ -69,8 +69,11 @@ def _in_time(ranking: Ranking, evidence: Evidence) -> Array:
     return ranking.likelihood.in_time(evidence.basis)
 
 
-def _as_well(behind: float, lost: Array, gained: Array) -> bool:
-    """Not clearly less evidence, or what was held out is foretold as well."""
-    little = float(lost.sum()) < LEVELS.alike * float(gained.sum())
+def _as_well(behind: float, lost: Array, gained: Array, left: Array) -> bool:
+    """Not clearly less evidence, or what was held out is foretold as well.
+
+    A cause may gain so much that a tenth of it is many times what it leaves: that is not as well.
+    """
+    little = float(lost.sum()) < min(LEVELS.alike * float(gained.sum()), float(left.sum()))
     alike = len(lost) > 1 and standard_errors(lost) < LEVELS.apart and little
     return behind < LEVELS.clear or alike
