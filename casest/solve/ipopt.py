@@ -22,6 +22,9 @@ from casest.solve.outcome import Outcome
 
 #: Solvers kept for the next problem of as many unknowns.
 KEPT = 32
+#: Settings where a polish follows: of long products of rotations the cost stands still earlier, and
+#: the line search would fight rounding two hundred times.
+STANDSTILL = {"acceptable_tol": 1e-6, "acceptable_obj_change_tol": 1e-13, "acceptable_iter": 2}
 #: Evaluations after which a search is given up: three for each iteration allowed. From wild starts
 #: the line search may halve its step thirty times in every iteration, and get nowhere.
 PATIENCE = 1500
@@ -43,12 +46,8 @@ def ipopt(
         "print_level": 0,
         "sb": "yes",
         "max_iter": 500,
-        # Beyond this tolerance the line search fights rounding; a polish follows anyway. Where
-        # rounding comes earlier (long products of rotations), the cost stands still before that.
+        # Beyond this tolerance the line search fights rounding; a polish follows anyway.
         "tol": 1e-8,
-        "acceptable_tol": 1e-6,
-        "acceptable_obj_change_tol": 1e-13,
-        "acceptable_iter": 2,
         "bound_relax_factor": 0.0,
         # Starts are good and bounds rarely active: a weak barrier from the beginning.
         "mu_strategy": "monotone",

@@ -22,7 +22,7 @@ from casest.leastsquares.problem import Point, Problem
 from casest.leastsquares.sums import few_of
 from casest.leastsquares.weights import has_noise_effects, weights
 from casest.solve.equations import by_equations, by_shooting
-from casest.solve.ipopt import ipopt
+from casest.solve.ipopt import STANDSTILL, ipopt
 from casest.solve.multipliers import kept
 from casest.solve.outcome import Outcome
 from casest.solve.trust_region import LITTLE, trust_region
@@ -102,7 +102,7 @@ def _ways(
         # IPOPT wanders along a direction that changes nothing; the damped steps do not.
         main = trust_region(problem, first)
     else:
-        main = _polished(problem, ipopt(problem, first, exact=solver == "ipopt-exact"))
+        main = _ipopt(problem, first, solver)
     outcomes = [main, *_opinions(problem, _other_starts(problem, first, automatic))]
     costs = [_cost(o) for o in outcomes]
     disagree = max(costs) - min(costs) > 1e-6 * max(min(costs), 1e-300)
@@ -142,7 +142,7 @@ def _ways_of_equations(
     if solver == "trust-region" or not np.isfinite(near.cost) or _singular(problem, near.point):
         main = trust_region(problem, near.point, damping=LITTLE)
     else:
-        main = _polished(problem, ipopt(problem, near.point, exact=solver == "ipopt-exact"))
+        main = _ipopt(problem, near.point, solver)
     return (main, *others, direct)
 
 
@@ -162,6 +162,12 @@ def valleys(outcomes: Sequence[Outcome]) -> int:
     costs = sorted(_cost(o) for o in outcomes)
     apart = [b > a * (1 + APART) + 1e-300 for a, b in itertools.pairwise(costs) if np.isfinite(b)]
     return 1 + sum(apart)
+
+
+def _ipopt(problem: Problem, start: Point, solver: str) -> Outcome:
+    """Where IPOPT ends from there, polished."""
+    exact = solver == "ipopt-exact"
+    return _polished(problem, ipopt(problem, start, exact=exact, options=STANDSTILL))
 
 
 def _polished(problem: Problem, main: Outcome, max_iterations: int = 300) -> Outcome:
