@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy import stats
 
-from casest import Residual, Run, model, param, signal
+from casest import Residual, Run, calibrate_many, model, param, signal
 from casest.effects import CATALOGUE
 from casest.estimate.calibrate import attempt
 from casest.estimate.covariance import sandwich
@@ -175,3 +176,29 @@ def test_white_noise_in_time_is_hardly_ever_taken_for_coloured():
     """One series in a hundred gets past by the level that is asked of neighbours."""
     found = fits(300, normal, 150, seed=1)[2]
     assert np.sum([f.correlated_over > 1 for f in found]) <= 9  # 3 expected, 1 in 1000 above 9
+
+
+@model
+def beginning(x=signal(), z=signal(), y=signal(), *, slope=param(), start=param()):
+    """A line, and what the first readings tell alone."""
+    return Residual(measured=y, predicted=slope * x + start * z)
+
+
+def test_what_a_few_readings_tell_has_the_spread_of_the_noise_of_all():
+    """As where a trajectory begins: two readings say nothing of their own noise. 2000 records, by
+    the formulas of linear regression; those of the sandwich hold the start in 97.4 %."""
+    rng, n = np.random.default_rng(1), 40
+    x, z = np.linspace(0, 1, n), np.exp(-np.arange(n) / 0.4)
+    y = 2 * x + 3 * z + 0.1 * rng.standard_normal((2000, n))
+    found = calibrate_many(beginning, {"x": x + 0 * y, "z": z + 0 * y, "y": y})
+    reach = stats.t.ppf(0.975, n - 2)
+    for name, truth in (("slope", 2), ("start", 3)):
+        held = np.abs(found.values[name] - truth) <= reach * found.std[name]
+        assert 0.935 < held.mean() < 0.965  # three standard deviations of such a share
+    # Equal noise: σ²(XᵀX)⁻¹, of one record by NumPy, in both ways of calibrating.
+    X = np.stack([x, z], axis=1)
+    left = y[0] - X @ np.linalg.lstsq(X, y[0])[0]
+    std = np.sqrt(left @ left / (n - 2) * np.linalg.inv(X.T @ X)[1, 1])
+    signals = {"x": x[:, None], "z": z[:, None], "y": y[0][:, None]}
+    one = attempt(beginning, [Run.raw("one", signals, units={})])
+    np.testing.assert_allclose([found.std["start"][0], one.std["start"]], std, rtol=1e-8)

@@ -11,7 +11,7 @@ from casest.declaration.shapes import Array
 from casest.estimate.correlation import batches
 from casest.estimate.spectrum import Stretch, by_frequency, noise_spectrum
 from casest.leastsquares.problem import Point, Problem
-from casest.leastsquares.sums import squares_of_gradients
+from casest.leastsquares.sums import squares_of_gradients, told_by
 from casest.leastsquares.weights import has_noise_effects, variance_factor
 
 #: Batches per unknown from which on those say enough of correlated noise by themselves; and of all,
@@ -30,7 +30,7 @@ def covariance_of(
     correlated_over: float,
     free: NDArray[np.bool_] | None = None,
 ) -> Array:
-    """The covariance (n, n) that is printed: robust, but for few residuals.
+    """The covariance (n, n) that is printed: robust, but for few residuals in all or of an unknown.
 
     Unknowns that are not `free` are held where they are, and have none.
     """
@@ -39,8 +39,22 @@ def covariance_of(
         return np.asarray(variance_factor(problem, point) * inverse_normal(plain, free))
     many = problem.residual_count >= MANY_RESIDUALS * problem.unknowns
     if correlated_over > 1 or many:
-        return sandwich(problem, point, R, correlated_over, free)
+        robust = sandwich(problem, point, R, correlated_over, free)
+        if correlated_over > 1:
+            return robust
+        bread = inverse_normal(R, free)
+        few = told_by(problem, point, bread) < MANY_RESIDUALS
+        return as_plain(robust, sigma**2 * np.diag(bread), few)
     return np.asarray(sigma**2 * inverse_normal(R, free))
+
+
+def as_plain(robust: Array, plain: Array, few: NDArray[np.bool_]) -> Array:
+    """The robust covariance (n, n, …) with the plain variances (n, …) of unknowns that a `few`
+    (n, …) residuals tell, as where a trajectory begins: those say nothing of their own noise."""
+    own = np.einsum("ii...->i...", robust)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        size = np.where(few & (own > 0), np.sqrt(plain / own), 1.0)
+    return np.asarray(robust * size[:, None] * size[None])
 
 
 def as_stated(

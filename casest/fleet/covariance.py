@@ -6,6 +6,7 @@ import numpy as np
 
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
+from casest.estimate.covariance import MANY_RESIDUALS, as_plain
 from casest.fleet.derivatives import dense
 from casest.fleet.linear import whole
 from casest.fleet.local import Local
@@ -25,4 +26,8 @@ def sandwich(model: Model, squares: Squares, here: Local, sensors: Sensors) -> A
     inverse = (vectors / np.maximum(values, 1e-3)[..., None, :]) @ vectors.swapaxes(-1, -2)
     unseen = np.einsum("nwml,nwl->mnw", inverse, residual)
     pulls = np.einsum("abw,mbnw,mnw->anw", bread, J, unseen, optimize=True)
-    return np.asarray(np.einsum("anw,bnw->abw", pulls, pulls))
+    robust = np.einsum("anw,bnw->abw", pulls, pulls)
+    own = np.einsum("abw,mbnw->amnw", bread, J) ** 2
+    told_by = own.sum(axis=(1, 2)) ** 2 / np.maximum((own**2).sum(axis=(1, 2)), 1e-300)
+    plain = here.sigma**2 * np.einsum("aaw->aw", bread)
+    return as_plain(robust, plain, told_by < MANY_RESIDUALS)

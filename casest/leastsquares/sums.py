@@ -56,6 +56,21 @@ def squares_of_gradients(
     return middle
 
 
+def told_by(problem: Problem, point: Point, bread: Array) -> Array:
+    """How many residuals say what each unknown is, (n,): (Σl²)²/Σl⁴ of their pulls l on it.
+
+    As many as there are where all pull alike, one where one tells it alone. `bread` = (JᵀWJ)⁻¹.
+    """
+    second, fourth = np.zeros(problem.unknowns), np.zeros(problem.unknowns)
+    for block in problem.blocks(point):
+        root = np.ones((1, 1)) if block.weights is None else np.sqrt(block.weights)
+        rows = (block.jacobian * root[:, :, None]).reshape(-1, block.jacobian.shape[2])
+        pulls = (rows @ bread[block.x]) ** 2
+        second += pulls.sum(axis=0)
+        fourth += (pulls**2).sum(axis=0)
+    return np.asarray(second**2 / np.maximum(fourth, 1e-300))
+
+
 def _without_leverage(block: Block, bread: Array) -> Array:
     """(I − H)⁻¹r sample by sample: what the residual would be had the fit not seen it."""
     moved = block.jacobian @ bread
