@@ -182,12 +182,17 @@ class Estimate:
         They reach so many plain standard deviations to either side; everything else is fitted again
         at each. Of a linear model that is a parabola, one at one standard deviation.
         """
+        around = self.around
+        distances = np.linspace(-reach, reach, count) * np.sqrt(around.covariance[j, j])
+        with np.errstate(all="ignore"):
+            return around.best.x[j] + distances, around.curve(j, distances)
+
+    @cached_property
+    def around(self) -> Profile:
+        """The cost around the optimum, as any unknown is held at other values."""
         at, sigma = self.optimum or self.point, self.noise.sigma
         covariance = sigma**2 * inverse_normal(self.problem.factor(at)[0], self.free)
-        around = Profile(self.problem, at, self.problem.cost(at), covariance, sigma)
-        distances = np.linspace(-reach, reach, count) * np.sqrt(covariance[j, j])
-        with np.errstate(all="ignore"):
-            return at.x[j] + distances, around.curve(j, distances)
+        return Profile(self.problem, at, self.problem.cost(at), covariance, sigma)
 
     def _squared_reach(self) -> tuple[Array, Array]:
         """Squares of the reach below and above, (n, n) each as a covariance, as if unbounded."""

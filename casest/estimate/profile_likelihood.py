@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -119,14 +120,21 @@ class Profile:
         """
         found = np.full(len(distances), np.nan)
         for sign in (-1, 1):
-            here, own = self.best, np.flatnonzero(sign * distances >= 0)
-            for k in own[np.argsort(np.abs(distances[own]))]:
-                there = self.held_at(here, j, float(distances[k])) if distances[k] else self.best
-                if there is None:
-                    break
-                here = there
-                found[k] = 2 * (self.problem.cost(here) - self.cost) / self.sigma**2
+            own = np.flatnonzero(sign * distances >= 0)
+            own = own[np.argsort(np.abs(distances[own]))]
+            for k, rise in zip(own, self.outwards(j, distances[own]), strict=False):
+                found[k] = rise
         return found
+
+    def outwards(self, j: int, distances: Array) -> Iterator[float]:
+        """The rise at one distance after the other, each farther out, until a bound is reached."""
+        here = self.best
+        for distance in distances:
+            there = self.held_at(here, j, float(distance)) if distance else self.best
+            if there is None:
+                return
+            here = there
+            yield 2 * (self.problem.cost(here) - self.cost) / self.sigma**2
 
     def _end_or_bound(self, j: int, sign: int, rise: float) -> float | None:
         """The end, or the distance to the bound where the cost has not risen so far there."""

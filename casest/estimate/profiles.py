@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from casest.declaration.shapes import Array
 from casest.estimate.estimate import Estimate
@@ -42,28 +41,16 @@ def profiles(estimate: Estimate) -> list[Drawn]:
 
     The other unknowns are fitted again at every point, from the last one on, up to a bound.
     """
-    problem, at = estimate.problem, estimate.optimum or estimate.point
+    problem, around = estimate.problem, estimate.around
     curved = {
         i for s in problem.slots if s.parameter.shape.curved for i in range(s.x.start, s.x.stop)
     }
-    covariance = np.array(estimate.noise.sigma**2 * _inverse(problem.factor(at)[0], estimate.free))
-    around = Profile(problem, at, problem.cost(at), covariance, estimate.noise.sigma)
     found = []
     with np.errstate(all="ignore"):
-        for j in np.flatnonzero(estimate.free):
-            if int(j) in curved:
-                continue
-            away, rise = _curve(around, int(j))
-            parabola = away**2 / covariance[j, j]
-            found.append(Drawn(problem.names[j], problem.units[j], at.x[j] + away, rise, parabola))
-    return found
-
-
-def _inverse(R: Array, free: NDArray[np.bool_]) -> Array:
-    """(JᵀJ)⁻¹ in the unknowns that are on no bound, zero elsewhere, of the triangular factor."""
-    own = np.flatnonzero(free)
-    found = np.zeros_like(R)
-    found[np.ix_(own, own)] = np.linalg.inv(R[:, own].T @ R[:, own])
+        for j in sorted(set(np.flatnonzero(estimate.free).tolist()) - curved):
+            away, rise = _curve(around, j)
+            value, parabola = around.best.x[j] + away, away**2 / around.covariance[j, j]
+            found.append(Drawn(problem.names[j], problem.units[j], value, rise, parabola))
     return found
 
 
@@ -72,17 +59,11 @@ def _curve(around: Profile, j: int) -> tuple[Array, Array]:
     step = float(np.sqrt(HIGH * around.covariance[j, j])) / POINTS
     found = [(0.0, 0.0)]
     for sign in (-1, 1):
-        here, distance = around.best, 0.0
-        for _ in range(MOST):
-            distance += step
-            there = around.held_at(here, j, sign * distance)
-            if there is None:
-                break
-            rise = 2 * (around.problem.cost(there) - around.cost) / around.sigma**2
+        distances = np.asarray(sign * step * np.arange(1.0, MOST + 1))
+        for distance, rise in zip(distances, around.outwards(j, distances), strict=False):
             if not np.isfinite(rise):
                 break
-            found.append((sign * distance, max(rise, 0.0)))
-            here = there
+            found.append((distance, max(rise, 0.0)))
             if rise >= HIGH:
                 break
     away, rises = np.array(sorted(found)).T

@@ -100,10 +100,8 @@ class Rows:
         if value is None:
             return np.zeros((len(self._numbers[0]), 1))
         problem, point = problem_of(fit, self.runs)
-        if (
-            problem.sequential and not traced.integrates
-        ):  # what it met is what it met without a memory as well
-            return self._met(_instant(fit))
+        if problem.sequential and not traced.integrates:
+            return self._met(_instant(fit))  # what it met is that without a memory as well
         found = problem.evaluate(point, {"q": value})
         return np.nan_to_num(self.of([f[0].reshape(len(f[0]), -1) for f in found]))
 
