@@ -10,7 +10,8 @@ USABLE := $(VENV)/.usable
 	study-metrology-coverage study-starts study-nist study-loop \
 	study-motion study-flights study-inputs study-records study-asked study-slow study-coverage \
 	study-deceptive study-deceptive-many study-fleet study-mutation study-worlds study-noises \
-	study-structural study-check study-plans study-equations study-equations-coverage study-told-apart \
+	study-structural study-check study-plans study-equations study-equations-coverage study-frictions \
+	study-told-apart \
 	figures docs clean
 
 demo: $(USABLE)
@@ -113,6 +114,9 @@ study-fleet: $(READY)
 
 study-equations: $(READY)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python studies/equations.py
+
+study-frictions: $(READY)
+	$(BIN)/python studies/frictions.py
 
 study-equations-coverage: $(READY)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python studies/equations_coverage.py
