@@ -39,16 +39,12 @@ from sensors.world import World  # noqa: E402
 
 from casest import Closing, Estimate, Model, NotTrusted, Run, close, effect, param, signal  # noqa: E402
 from casest.effects.placing import prepared  # noqa: E402
+from casest.estimate.held_out import lasting  # noqa: E402
 from casest.leastsquares.problem import Problem  # noqa: E402
 from casest.results.find import find_model  # noqa: E402
 from casest.solve.trust_region import trust_region  # noqa: E402
 
 KEPT, TABLE = ROOT / "out" / "loop_worlds.jsonl", ROOT / "studies" / "loop_worlds.md"
-#: Effects that belong to one record alone: what else was found is asked to hold on the second.
-OF_ONE_RECORD = {
-    "bias_step", "pulse", "bias_drift", "reference_drift", "bias_course", "reference_wander",
-    "bias_wander", "vibration",
-}  # fmt: skip
 #: Effects that are a property of the noise or describe a course: they claim no cause.
 DESCRIBING = {"outliers", "bias_wander", "reference_wander", "bias_course"}
 
@@ -122,17 +118,8 @@ def fitted(model: Model, run: Run, start: Any) -> tuple[float, Any]:
 
 def carried(estimate: Estimate) -> tuple[Model, Any]:
     """What holds on another record too: without what happened in the first one alone."""
-    own = tuple(a for a in estimate.model.effects if _lasts(a))
-    model = replace(estimate.model, effects=own)
-    names = {p.name for p in model.parameters}
-    return model, {n: v for n, v in estimate.values.items() if n in names}
-
-
-def _lasts(attached: Any) -> bool:
-    """A formula of time has no other record to hold on."""
-    reads = {s.name for s in attached.reads}
-    in_time = attached.effect.name == "formula" and "t" in reads
-    return attached.effect.name not in OF_ONE_RECORD and not in_time
+    model = lasting(estimate)
+    return model, model.among(estimate.values)
 
 
 def off(model: Model, values: Any, world: World) -> float:

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import json
+import warnings
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import simulators as sim
 from models.load_cell import curvature, load_cell, warming
 from models.thermistor import thermistor
 from models.wheel import quadratic, wheel
 
+import casest
 from casest import (
     DataError,
     Residual,
@@ -170,7 +174,10 @@ def test_an_effect_on_the_sequence_is_not_undone_in_silence():
 
 
 def test_what_follows_the_time_of_the_fitted_record_is_said_for_another_one(tmp_path, capsys):
-    """A drift belongs to its record; the same file again is corrected without a word."""
+    """A drift belongs to its record; the same file again is corrected for it without a word.
+
+    Another one is not: mass from its reading by hand, (reading − zero)/(9.81·sensitivity).
+    """
     rng = np.random.default_rng(3)
     for name in ("first", "other"):
         t, mass = np.arange(200) / 10, rng.uniform(0, 5, 200)
@@ -181,15 +188,31 @@ def test_what_follows_the_time_of_the_fitted_record_is_said_for_another_one(tmp_
     cell, out = str(Path(__file__).parent / "models" / "load_cell.py:load_cell"), tmp_path / "out"
     first, other = (str(tmp_path / f"{name}.csv") for name in ("first", "other"))
     assert run(["close", cell, first, "-o", str(out)]) == 0
-    said = {}
+    result, said, corrected = json.loads((out / "result.json").read_text("utf-8")), {}, {}
     for name in (first, other):
         capsys.readouterr()
         assert run(["apply", str(out), name, "-o", str(tmp_path / "c.csv")]) == 0
         said[name] = capsys.readouterr().err
-    assert "a guess for any other: bias_drift" in said[other]
-    assert "a guess" not in said[first]
+        table = np.genfromtxt(tmp_path / "c.csv", delimiter=",", names=True)
+        value = {n: p["value"] for n, p in result["after"]["parameters"].items()}
+        t = np.arange(200) / 10 if name == first else 0.0
+        plain = np.loadtxt(name, delimiter=",", skiprows=1)[:, 3] - value["bias_drift.k"] * t
+        expected = (plain - value["zero"]) / value["sensitivity"]
+        corrected[name] = table["force_N"]
+        assert corrected[name] == pytest.approx(expected, rel=1e-6, abs=1e-6)
+    assert "says nothing of another: bias_drift" in said[other]
+    assert "bias_drift" not in said[first]
     assert run(["export", str(out), "--to", "c", "-o", str(tmp_path / "c.c")]) == 0
-    assert "a guess for any other: bias_drift" in capsys.readouterr().err
+    assert "says nothing of another: bias_drift" in capsys.readouterr().err
+    # In Python: the fitted record as a table, and the other one.
+    found, tables = casest.load(out), [pd.read_csv(name) for name in (first, other)]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        own = found(tables[0]).to_numpy().ravel()
+    assert own == pytest.approx(corrected[first], rel=1e-8)
+    with pytest.warns(UserWarning, match="bias_drift"):
+        others = found(tables[1]).to_numpy().ravel()
+    assert others == pytest.approx(corrected[other], rel=1e-8)
 
 
 def test_an_effect_on_an_implicit_models_corrected_quantity_is_in_the_correction():

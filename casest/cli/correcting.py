@@ -154,7 +154,7 @@ def export(
 
     Of an estimator in motion, MODEL is its name or file, and --to c writes one step of its filter.
     """
-    from casest.correction.inverse import TIMED
+    from casest.correction.inverse import ONCE, TIMED
     from casest.report.next_command import following
     from casest.results.saved import saved_result
     from casest.saved import apply as correcting
@@ -192,6 +192,8 @@ def export(
         echo(f"casest: {remark}", err=True)
     if timed := correcting.of_another_time(result_path):
         echo(f"casest: {TIMED}{', '.join(timed)}", err=True)
+    if once := correcting.left_out(result_path):
+        echo(f"casest: {ONCE}{', '.join(once)}", err=True)
     saved(text, output)
     if output is not None:
         fitted = saved_result(result_path).reproduce.command

@@ -40,12 +40,28 @@ class Carried:
     seen: tuple[tuple[float, float], ...] = ()
     #: Standard deviations of what it gives (`correction.spread`); None where nothing says them.
     spread: Program | None = None
+    #: That of other records, without what happened `once`, in the fitted one; None: it is the same.
+    elsewhere: Carried | None = None
+    once: tuple[str, ...] = ()
 
     @property
     def needed(self) -> tuple[Signal, ...]:
         """The signals that the correction reads."""
         names = [i.name for i in self.program.inputs]
         return tuple(s for s in self.signals if s.name in names)
+
+    @property
+    def lasting(self) -> Carried:
+        """What is done to other records than the fitted one."""
+        return self.elsewhere or self
+
+    def was_fitted(self, runs: Sequence[Run]) -> bool:
+        """Are these the samples that it was fitted to?"""
+        names, (own, *more) = [i.name for i in self.program.inputs], self.readings
+        if more or any(name not in run.signals for run in runs for name in names):
+            return False
+        there = _readings(runs, names, each=False)[0]
+        return bool(np.array_equal(there, own))
 
     def of_run(self, which: int) -> tuple[Program, Array]:
         """The program of one run, and readings of it; of all where they share one."""

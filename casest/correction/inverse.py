@@ -37,6 +37,9 @@ LEFT = (
 #: What is said of effects that follow the time of the record they were found in.
 TIMED = "found at the times of the fitted record, and a guess for any other: "
 
+#: What is said of those that happened in it alone.
+ONCE = "left out, since it happened in the record of the fit and says nothing of another: "
+
 #: Newton steps, each halved up to HALVINGS times until it gains.
 STEPS, HALVINGS = 60, 30
 

@@ -70,6 +70,8 @@ class _Carried(Struct):
     follows_time: list[str]
     range: list[tuple[float, float]] = []
     uncertainty: _Program | None = None
+    elsewhere: dict[str, Any] | None = None
+    happened_once: list[str] = []
 
 
 def carried_data(found: Carried) -> dict[str, Any]:
@@ -86,7 +88,9 @@ def carried_data(found: Carried) -> dict[str, Any]:
         "follows_time": list(found.timed),
         "range": [list(pair) for pair in found.seen],
         **({} if found.spread is None else {"uncertainty": as_data(found.spread)}),
-    }
+        **({} if found.elsewhere is None else {"elsewhere": carried_data(found.elsewhere),
+                                               "happened_once": list(found.once)}),
+    }  # fmt: skip
 
 
 def typed(content: Any, kind: type[T], where: str) -> T:
@@ -206,6 +210,8 @@ def carried_read(content: Any, where: str, runs: int) -> Carried:
         tuple(found.follows_time),
         tuple(found.range),
         spread_read(content.get("uncertainty"), program, where),
+        carried_read(found.elsewhere, f"{where}.elsewhere", runs) if found.elsewhere else None,
+        tuple(found.happened_once),
     )
 
 

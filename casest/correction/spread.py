@@ -65,10 +65,13 @@ class Opened:
     inputs: tuple[Input, ...]
 
 
-def opened(estimate: Estimate, units: Mapping[str, str]) -> Opened:
-    """Of a fit to one run, or whose parameters are shared by all; UsageError for others."""
+def opened(estimate: Estimate, units: Mapping[str, str], model: Model | None = None) -> Opened:
+    """Of a fit to one run, or whose parameters are shared by all; UsageError for others.
+
+    `model`: what is left of the fitted one, if not all of it.
+    """
     names = [c.name for c in uncertain(estimate.model)]
-    model = invertible(_freed(estimate.model, names))[0]
+    model = invertible(_freed(model or estimate.model, names))[0]
     correction = correction_of(model)
     own = {p.name for p in model.parameters if p.scope == "run"} & correction.parameters
     if own and len(estimate.problem.runs) > 1:
@@ -88,9 +91,9 @@ def opened(estimate: Estimate, units: Mapping[str, str]) -> Opened:
                   inputs)  # fmt: skip
 
 
-def slopes(estimate: Estimate, units: Mapping[str, str]) -> Slopes:
+def slopes(estimate: Estimate, units: Mapping[str, str], model: Model | None = None) -> Slopes:
     """Of a fit to one run, or whose parameters are shared by all; UsageError for others."""
-    found = opened(estimate, units)
+    found = opened(estimate, units, model)
     theta = ca.SX.sym("theta", len(found.coordinates))
     value = ca.SX.sym("value", found.correction.size)
     at = ca.vertcat(found.whole, value) if found.kind == "newton" else found.whole

@@ -58,7 +58,8 @@ class Effect:
     "tails" of the residuals, or a "random walk" in them; `describes`: it says what a course looks
     like, and names no cause; `memory` what one on the sequence keeps from sample to sample, and
     what each begins from (the value acted on, or a number); `otherwise` the form that it takes in a
-    model where it is not applicable as it stands.
+    model where it is not applicable as it stands; `once`: it happened in the record that it was
+    found in, and says nothing of another one.
     """
 
     name: str
@@ -84,6 +85,7 @@ class Effect:
     otherwise: Effect | None = None
     #: Python text of one that the loop wrote, to be given again.
     source: str = ""
+    once: bool = False
 
     def __reduce__(self) -> tuple[Any, ...]:
         """To pickle: its function by name."""
@@ -149,6 +151,7 @@ def effect(
     describes: bool = False,
     memory: Mapping[str, str | float] | None = None,
     otherwise: Effect | None = None,
+    once: bool = False,
 ) -> Callable[[Callable[..., Any]], Effect]:
     """Declare an effect: first argument the value acted on, further ones signals or columns.
 
@@ -215,6 +218,7 @@ def effect(
             describes,
             tuple((memory or {}).items()),
             otherwise,
+            once=once,
         )
 
     return declare
@@ -324,6 +328,11 @@ class Attached:
     def signals(self) -> tuple[Signal, ...]:
         """Those of them that data give; `inner` are quantities of the model."""
         return tuple(s for s in self.reads if s.name not in self.inner)
+
+    @property
+    def lasts(self) -> bool:
+        """Does it say something of other records than the one it was found in?"""
+        return self.kind == "noise" or not (self.effect.once or self.effect.describes)
 
     @property
     def keeps(self) -> tuple[tuple[str, str | float], ...]:

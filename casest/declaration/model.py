@@ -94,6 +94,19 @@ class Model:
             return self.signals
         return self.signals + self.noise.columns({s.name: s for s in self.signals})
 
+    def elsewhere(self, runs: int) -> Model:
+        """Without what happened in the record alone that it was fitted to; itself without such.
+
+        What several `runs` of a fit share came again in each of them: it stays.
+        """
+        kept = tuple(a for a in self.effects if a.lasts or (runs > 1 and a.effect.once))
+        return self if len(kept) == len(self.effects) else replace(self, effects=kept)
+
+    def among(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        """Those of the values that are its parameters'."""
+        names = {p.name for p in self.parameters}
+        return {name: value for name, value in values.items() if name in names}
+
     @property
     def without_noise(self) -> Model:
         """The same relation, its residual in its own unit; itself where no noise was stated."""

@@ -8,17 +8,17 @@ from casest.data.run import Run
 from casest.declaration.shapes import Array
 from casest.diagnose.closing import Closing
 from casest.effects.placing import prepared
-from casest.estimate.held_out import residuals, split
+from casest.estimate.held_out import lasting, residuals, split
 
 
 def scored(
     closing: Closing, runs: Sequence[Run]
 ) -> tuple[tuple[Run, ...], list[Array], list[Array]]:
     """The samples that are scored, and their residuals before and after: the same samples."""
-    models = closing.before.model, closing.after.model
+    each = [(lasting(found), found.values) for found in (closing.before, closing.after)]
+    models = [model for model, _ in each]
     halves = [split(run, models) for run in prepared(closing.before.model, runs)]
     before, after = (
-        [residuals(found.model, found.values, *half) for half in halves]
-        for found in (closing.before, closing.after)
+        [residuals(model, model.among(values), *half) for half in halves] for model, values in each
     )
     return tuple(half[1] for half in halves), before, after

@@ -23,13 +23,27 @@ from casest.solve.trust_region import trust_region
 
 #: Stretches that a held-out record is cut into; every other one is scored.
 STRETCHES = 40
+#: What is said of effects that are not there in a record that is scored.
+ALONE = "found in the record of the fit, and left out where another one is foretold"
 
 
 def score(found: Estimate, runs: Sequence[Run]) -> float:
     """Root mean square residual of the estimate on runs that it did not see, residual unit."""
-    halves = [split(run, (found.model,)) for run in runs]
-    rows = [residuals(found.model, found.values, *half) for half in halves]
+    model = lasting(found)
+    halves = [split(run, (model,)) for run in runs]
+    rows = [residuals(model, model.among(found.values), *half) for half in halves]
     return float(np.sqrt(np.mean(np.concatenate([r.ravel() for r in rows]) ** 2)))
+
+
+def happened_once(found: Estimate) -> tuple[str, ...]:
+    """Effects that say nothing of another record than the fitted one."""
+    kept = lasting(found).effects
+    return tuple(a.label for a in found.model.effects if a not in kept)
+
+
+def lasting(found: Estimate) -> Model:
+    """The fitted model without what happened in its record alone."""
+    return found.model.elsewhere(len(found.problem.runs))
 
 
 def split(run: Run, models: Sequence[Model]) -> tuple[Run | None, Run]:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from casest.correction.carried import Carried
-from casest.correction.inverse import LEFT, TIMED
+from casest.correction.inverse import LEFT, ONCE, TIMED
 from casest.data import load_runs
 from casest.data.bind import Frame, Path_
 from casest.data.frames import is_frame
@@ -19,7 +19,7 @@ from casest.data.run import Run
 from casest.data.table import Table, read_table, table_of
 from casest.declaration.shapes import Array
 from casest.declaration.symbols import Signal
-from casest.errors import UsageError
+from casest.errors import CasestError, UsageError
 from casest.interface.reading import Reading, stated
 from casest.interface.tables import as_frame, headers, like
 from casest.results.saved import SavedResult
@@ -33,6 +33,9 @@ def corrected_readings(
     result: SavedResult, carried: Carried, readings: Readings, reading: Reading, run: str | None
 ) -> Any:
     """What was given with the corrected quantity in it alone; NaN where a reading is missing."""
+    if carried.once and not _was_fitted(result, carried, readings, reading):
+        warnings.warn(ONCE + ", ".join(carried.once), stacklevel=3)
+        carried = carried.lasting
     program = carried.of_run(_place(result, carried, run))[0]
     units = {s.name: s.unit or fitted_unit(result, s) for s in carried.needed}
     needed = [replace(s, unit=units[s.name]) for s in carried.needed]
@@ -54,6 +57,24 @@ def corrected_readings(
         return like(readings, program.output.name, whole)
     names = headers(program.output.name, whole.shape[1])
     return as_frame(dict(zip(names, whole.T, strict=True)))
+
+
+def _was_fitted(result: SavedResult, carried: Carried, readings: Any, reading: Reading) -> bool:
+    """Are these the samples of the fit, and not those of another record?"""
+    if isinstance(readings, Run):
+        return carried.was_fitted([readings])
+    if isinstance(readings, list | tuple) and readings and isinstance(readings[0], Run):
+        return carried.was_fitted(readings)
+    if _bare(readings):
+        return False
+    units = {s.name: s.unit or fitted_unit(result, s) for s in carried.needed}
+    needed = [replace(s, unit=units[s.name]) for s in carried.needed]
+    spare = {s.name for s in carried.signals} - {s.name for s in needed}
+    said = {**stated(reading), "at_rest": False}
+    try:
+        return carried.was_fitted(load_runs(_table(readings), needed, **without(spare, said)))
+    except CasestError:
+        return False
 
 
 def _table(readings: Any) -> Table:
@@ -127,8 +148,8 @@ def _warn(carried: Carried, runs: Sequence[Run], beneath: int = 4) -> None:
     said = list(beyond(carried.program, with_margin(carried), runs))
     if carried.program.left:
         said.append(LEFT + ", ".join(carried.program.left))
-    if carried.timed:
-        said.append(TIMED + ", ".join(carried.timed))
+    if timed := [name for name in carried.timed if name not in carried.once]:
+        said.append(TIMED + ", ".join(timed))
     for text in said:
         warnings.warn(text, stacklevel=beneath)
 

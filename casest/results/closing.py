@@ -23,6 +23,7 @@ from casest.diagnose.formula.terms import source
 from casest.diagnose.found import Found
 from casest.diagnose.levels import LEVELS
 from casest.estimate.estimate import Estimate
+from casest.estimate.held_out import ALONE, happened_once
 from casest.leastsquares.problem import Problem
 from casest.results.application import formula_of
 from casest.results.file import plain
@@ -152,6 +153,8 @@ def closing_result(
     before, after = held_out or (closing.before_held_out, closing.after_held_out)
     fitted = _section(closing.after, closing, after)
     shared["noise"] = NoiseModel(**asdict(shared["noise"]), **left.noise)
+    if held_out and (once := happened_once(closing.after)):
+        shared["notes"].append(f"{', '.join(once)}: {ALONE}")
     return Closed(
         **shared,
         verdict=closing.verdict,

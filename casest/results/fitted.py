@@ -427,20 +427,33 @@ def _correction(
     found = carried(model, estimate.values, estimate.problem.runs, units, around)
     if isinstance(found, str):
         return {"correction": {"reason": found}, "corrected_budget": None}
-    found, budget = _with_spread(estimate, units, found)
+    found, budget = _with_spread(estimate, units, found, model)
+    lasting = model.elsewhere(len(estimate.problem.runs))
+    if lasting is not model:
+        values, runs = lasting.among(estimate.values), estimate.problem.runs
+        other = carried(lasting, values, runs, units, around)
+        if isinstance(other, str):
+            return {"correction": {"reason": other}, "corrected_budget": None}
+        other = _with_spread(estimate, units, other, lasting)[0]
+        once = tuple(a.label for a in model.effects if a not in lasting.effects)
+        once = tuple(name for name in once if name not in found.program.left)
+        found = replace(found, elsewhere=other, once=once)
     values = {name: plain(value) for name, value in estimate.values.items()}
     of = digest_of_values(values, estimate.certificate.trusted)
     return {"correction": {"of": of, **carried_data(found)}, "corrected_budget": budget}
 
 
 def _with_spread(
-    estimate: Estimate, units: Mapping[str, str], found: Carried
+    estimate: Estimate, units: Mapping[str, str], found: Carried, model: Model
 ) -> tuple[Carried, CorrectedBudget | None]:
-    """Standard deviations of corrected readings; none where runs differ, or nothing is trusted."""
+    """Standard deviations of corrected readings; none where runs differ, or nothing is trusted.
+
+    By what the `model` has of the fitted one.
+    """
     if found.own or not estimate.certificate.trusted:
         return found, None
     try:
-        how = slopes(estimate, units)
+        how = slopes(estimate, units, model)
         spread = spread_program(estimate, how, units, found.program.output.name)
         budget = corrected_budget(estimate, how, found.program, found.readings[0])
     except (CasestError, RuntimeError):  # an operation without a derivative: there is no std

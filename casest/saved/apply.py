@@ -13,6 +13,7 @@ import numpy as np
 
 from casest.correction import runtime
 from casest.correction.carried import Carried
+from casest.correction.inverse import ONCE
 from casest.correction.numpy_module import as_data
 from casest.correction.program import Program
 from casest.correction.spread import PARTS
@@ -58,6 +59,9 @@ def corrected_csv(
     Readings are converted to the unit that they had in the fit, or refused.
     """
     result, carried = saved_correction(path, force=force, what="applies")
+    remarks: tuple[str, ...] = ()
+    if carried.once and not _was_fitted(result, data):
+        carried, remarks = carried.lasting, (f"{ONCE}{', '.join(carried.once)}",)
     program = carried.of_run(_run_number(carried, result, data))[0]
     spare = {s.name for s in carried.signals} - {s.name for s in carried.needed}
     needed = [s if s.unit else replace(s, unit=fitted_unit(result, s)) for s in carried.needed]
@@ -69,7 +73,7 @@ def corrected_csv(
     text = table_of(runs, [s.name for s in needed], found, program.output.name, unit, spreads)
     notes = dict.fromkeys(note for run in runs for note in run.notes)
     far = () if _was_fitted(result, data) else extrapolated(carried, runs)
-    return Applied(text, program.left, (*notes, *_of_units(result, runs, data), *far))
+    return Applied(text, program.left, (*notes, *remarks, *_of_units(result, runs, data), *far))
 
 
 def fitted_unit(result: SavedResult, signal: Signal) -> str | None:
@@ -178,7 +182,12 @@ def required(spread: Program | None) -> Program:
 def of_another_time(path: Path, data: str | None = None) -> tuple[str, ...]:
     """Effects that follow the time of the fitted record, unless it is that record again."""
     result, carried = saved_correction(path, force=True, what="reads")
-    return () if data is not None and _was_fitted(result, data) else carried.timed
+    return () if data is not None and _was_fitted(result, data) else carried.lasting.timed
+
+
+def left_out(path: Path) -> tuple[str, ...]:
+    """Effects of the fitted record alone, which no other record is corrected for."""
+    return saved_correction(path, force=True, what="reads")[1].once
 
 
 def _was_fitted(result: SavedResult, data: str) -> bool:

@@ -13,7 +13,6 @@ from msgspec import UNSET, Struct, UnsetType
 from casest.correction.reading import typed
 from casest.data import load_runs
 from casest.data.run import Run
-from casest.declaration.model import Model
 from casest.declaration.shapes import Array
 from casest.errors import DataError, UsageError
 from casest.results.file import load_result, result_file
@@ -75,7 +74,9 @@ def old_estimate(path: Path) -> tuple[Old, SavedResult]:
             f"{where}: was made by an older casest, and does not say how uncertain its unknowns "
             "are together: calibrate again"
         )
-    model, values = _of_other_records(*saved_model(content))
+    model, values = saved_model(content)
+    model = model.elsewhere(len(result.runs))
+    values = model.among(values)
     sigma = np.array([s for s in more.noise.sigma if s is not None], float)
     over = max(more.noise.correlated_over_samples or 1.0, 1.0)
     old = Old(
@@ -88,14 +89,6 @@ def old_estimate(path: Path) -> tuple[Old, SavedResult]:
         _colour(more, over, len(model.axes)),
     )
     return old, result
-
-
-def _of_other_records(model: Model, values: Mapping[str, Any]) -> tuple[Model, dict[str, Any]]:
-    """The model without what describes the course of the fitted record, which no other has."""
-    kept = tuple(a for a in model.effects if not a.effect.describes or a.kind == "noise")
-    model = replace(model, effects=kept)
-    names = {p.name for p in model.parameters}
-    return model, {name: value for name, value in values.items() if name in names}
 
 
 def _covariance(correlation: _Correlation, where: str) -> Array:

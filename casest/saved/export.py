@@ -58,6 +58,7 @@ def exported(
     With `std` it gives the standard deviations of corrected values too.
     """
     result, carried = saved_correction(path, force=force, what="exports")
+    carried = carried.lasting
     if carried.own and not 0 <= run < len(result.runs):
         raise UsageError(f"--run {run}: there are runs 0 to {len(result.runs) - 1}")
     bound, readings = carried.of_run(run if carried.own else 0)
@@ -78,6 +79,7 @@ def exported_as(
     """Text of another project's file, of the `sensors` that are named (of all without), and what a
     reader should know beside it."""
     result, carried = saved_correction(path, force=force, what="exports")
+    carried = carried.lasting
     if carried.own and not 0 <= run < len(result.runs):
         raise UsageError(f"--run {run}: there are runs 0 to {len(result.runs) - 1}")
     bound, readings = carried.of_run(run if carried.own else 0)

@@ -238,9 +238,10 @@ def _text(terms: Sequence[Term], size: int, on: str, unit: str, names: Mapping[s
         for n, a in names.items()
         if n not in (on, a)
     ]
+    once = ", once=True" if "t" in units else ""
     return (
         "from casest import constant, cos, effect, exp, fabs, param, signal, sin, tanh, vertcat\n"
-        "\n\n" + "".join(renamed) + f'@effect(on={on!r}, formula="")\n'
+        "\n\n" + "".join(renamed) + f'@effect(on={on!r}, formula=""{once})\n'
         f"def formula(\n    {arguments},\n):\n"
         '    """Terms outside the catalogue, found in the residual."""\n'
         f"    return {names[on]} + {added}\n"
