@@ -127,8 +127,14 @@ def _closed(sensor: Sensor, before: Estimate, folds: Folds, say: Callable[[str],
         _visible(sensor, declared),
         sensor.runs,
         _undecided(sensor, state),
-        tuple(e.trials[0].what for e in state.last.descriptions) if state.last else (),
+        _courses(state),
     )
+
+
+def _courses(state: State[Fit]) -> tuple[Candidate, ...]:
+    """What a slow course in what is left looks like."""
+    found = state.last.descriptions if state.last else ()
+    return tuple(e.trials[0].what for e in found if not e.trials[0].what.column)
 
 
 def _declared_walks(sensor: Sensor) -> list[Effect]:

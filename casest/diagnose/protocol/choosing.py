@@ -50,7 +50,8 @@ def with_the_best(
         asked, left = [], left or options
     for evidence in [e for e in options if e not in tried][:2]:
         state = state.refusing(evidence.trials[0].what, NOT_HELD_OUT)
-    return replace(state, open=tuple(options[: LEVELS.contenders]))
+    missing = sorted([*options, *ranking.followed], key=lambda e: -e.score)
+    return replace(state, open=tuple(missing[: LEVELS.contenders]))
 
 
 def _first_certified(

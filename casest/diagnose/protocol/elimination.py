@@ -41,8 +41,12 @@ def on_all_axes(subject: Subject[F], state: State[F], *, needed: bool) -> State[
 
 
 def eliminated(subject: Subject[F], state: State[F]) -> State[F]:
-    """Each cause must earn its place again beside the others; the weakest goes first."""
-    while len(state.kept) > 1:
+    """Each cause must earn its place again beside the others; the weakest goes first.
+
+    Also the last one, where another has gone: of a pair each was judged beside the other.
+    """
+    count = len(state.kept)
+    while len(state.kept) > 1 or (state.kept and len(state.kept) < count):
         weak = []
         for kept in state.kept:
             base = subject.without(state.fit, kept.what)

@@ -45,6 +45,13 @@ class Ranking:
         return tuple(e for e in self.found if not e.trials[0].describes)
 
     @property
+    def followed(self) -> tuple[Evidence, ...]:
+        """What follows a column that is no cause by itself: something there is missing all the
+        same."""
+        described = [e for e in self.found if e.trials[0].describes and e.trials[0].what.column]
+        return tuple(e for e in described if self.says(e))
+
+    @property
     def descriptions(self) -> tuple[Evidence, ...]:
         """Courses of unknown cause that there is evidence for, and none for a better one."""
         found = [e for e in self.found if e.trials[0].describes and e.score > LEVELS.strong]

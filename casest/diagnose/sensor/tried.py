@@ -15,6 +15,7 @@ from casest.declaration.shapes import Array, each
 from casest.declaration.symbols import param
 from casest.diagnose.candidates.axes import axes_of
 from casest.diagnose.candidates.candidates import Candidate, Skipped, candidates
+from casest.diagnose.candidates.carried_through import columns_of_motion
 from casest.diagnose.candidates.grid import Seen, nearer, on_grid
 from casest.diagnose.candidates.slopes import slopes
 from casest.diagnose.evidence.linear import Index
@@ -78,16 +79,24 @@ class Tried:
     def of(self, fit: Fit, several: Sequence[Candidate]) -> list[Trial]:
         """These candidates in their columns, without those that have none here."""
         problem, point = problem_of(fit, self.rows.runs)
-        found = []
+        found, motion = [], columns_of_motion(fit.model, self.rows.runs)
         for candidate, columns in slopes(problem, point, several, self.rows.index):
             if isinstance(columns, CasestError):
                 continue
             axes = _axes(fit, candidate, columns.shape[2])
-            effect = candidate.effect
-            describes = effect is not None and effect.describes and not self.asked(candidate)
+            describes = self._describes(candidate, motion) and not self.asked(candidate)
             family, trials = candidate.label, candidate.trials
             found.append(Trial(candidate, family, columns, trials, axes, describes))
         return found
+
+    @staticmethod
+    def _describes(candidate: Candidate, motion: Collection[str]) -> bool:
+        """Does it say what an error looks like, and name no cause?"""
+        effect = candidate.effect
+        if effect is None or effect.describes:
+            return effect is not None
+        follows = (kind == "other" for _, kind in effect.columns)
+        return any(follows) and candidate.column in motion
 
     def nearer(self, fit: Fit, trial: Trial, scale: float) -> list[Trial]:
         """Values of a grid around the trial's."""

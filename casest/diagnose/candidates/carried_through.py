@@ -1,0 +1,39 @@
+"""Columns that record the motion that a sensor is carried through, and no influence on it.
+
+What the sensor meets while it is moved goes with the motion, whatever it is: places where the field
+differs, axes that come late, a body that bends. So a gain that follows a gyro's axis may describe
+an error, and names no cause. A temperature, a current, a supply is an influence of its own.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+from casest.data.run import Run
+from casest.declaration.model import Model
+from casest.units import known, size
+
+#: What inertial sensors and magnetometers measure.
+_MEASURED = tuple(size(unit)[1] for unit in ("m/s^2", "rad/s", "T"))
+#: What their columns are called where no unit says it: ax, gyr_y, mag_z, qw, pitch.
+_CALLED = re.compile(
+    r"(^|_)(a|acc|accel|g|gyr|gyro|w|omega|m|mag)_?[xyz]$|(^|_)q(uat)?_?[wxyz0-3]$"
+    r"|^(roll|pitch|yaw)$",
+    re.IGNORECASE,
+)
+
+
+def columns_of_motion(model: Model, runs: Sequence[Run]) -> frozenset[str]:
+    """Columns of the motion, where the model's sensor is one that is moved. `runs` are prepared."""
+    run = runs[0]
+    moved = any(s.kind == "rotation" or _is_motion("", run.units.get(s.name)) for s in model.signals)
+    if not moved and not any(s.size == 3 for s in model.signals):
+        return frozenset()
+    return frozenset(n for n in run.columns if _is_motion(n, run.units.get(n)))
+
+
+def _is_motion(name: str, unit: str | None) -> bool:
+    if unit and known(unit) and "count" not in unit:
+        return size(unit)[1] in _MEASURED
+    return bool(_CALLED.search(name))
