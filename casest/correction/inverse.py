@@ -38,7 +38,7 @@ LEFT = (
 TIMED = "found at the times of the fitted record, and a guess for any other: "
 
 #: What is said of those that happened in it alone.
-ONCE = "left out, since it happened in the record of the fit and says nothing of another: "
+ONCE = "happened in the record of the fit, and is taken as its mean over that, of any other: "
 
 #: Newton steps, each halved up to HALVINGS times until it gains.
 STEPS, HALVINGS = 60, 30

@@ -116,6 +116,12 @@ class Run:
         zeros, ones = (np.broadcast_to(np.array([k]), (n,)) for k in (0, 1))
         return cls(name, file, signals, units, {}, {}, time, range(n), zeros, ones, {}, notes)
 
+    @property
+    def span(self) -> tuple[float, float] | None:
+        """First and last time in s; None where the record has none."""
+        time = self.signals.get("t") if self.time is None else self.time
+        return None if time is None or not len(time) else (float(time.min()), float(time.max()))
+
     def __len__(self) -> int:
         """Return the number of samples N."""
         return len(self.rows)

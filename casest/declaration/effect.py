@@ -306,6 +306,10 @@ def _declaration(effect_name: str, name: str, declared: Any) -> tuple[str, Any]:
     )
 
 
+#: Moments of a record of which the mean of an effect is taken.
+MOMENTS = 50
+
+
 @dataclass(frozen=True)
 class Attached:
     """An effect at its place in a model: what it acts on, which columns it reads, its unknowns."""
@@ -317,12 +321,13 @@ class Attached:
     columns: tuple[tuple[str, str], ...]
     parameters: tuple[Parameter, ...]
     inner: tuple[str, ...] = ()
+    #: Times in s between which it is averaged: what it is in another record nobody knows.
+    over: tuple[float, float] | None = None
 
     @property
     def reads(self) -> tuple[Signal, ...]:
         """All that the effect reads, under the names of data and model."""
-        renamed = dict(self.columns)
-        return tuple(replace(s, name=renamed.get(s.name, s.name)) for s in self.effect.extras)
+        return tuple(read for _, read in _paired(self))
 
     @property
     def signals(self) -> tuple[Signal, ...]:
@@ -347,8 +352,16 @@ class Attached:
 
     def apply(self, value: SX, symbols: Mapping[str, SX]) -> SX:
         """The value with the effect in it, from the model's symbols by name."""
-        extras = [symbols[s.name] for s in self.reads]
-        return evaluated(self.effect, value, *extras, **self._numbers(symbols))
+        numbers, moments = self._numbers(symbols), [ca.SX.nan()]
+        if self.over is not None:
+            first, last = self.over
+            moments = [ca.SX(first + (last - first) * (k + 0.5) / MOMENTS) for k in range(MOMENTS)]
+        found = []
+        for t in moments:
+            known = {"t": t, **{s.name: symbols[read.name] for s, read in _paired(self)}}
+            extras = [known[s.name] for s in self.effect.extras]
+            found.append(evaluated(self.effect, value, *extras, **numbers))
+        return found[0] if len(found) == 1 else sum(found[1:], found[0]) / len(found)
 
     def step(
         self, value: SX, symbols: Mapping[str, SX], before: Mapping[str, SX], dt: SX, span: SX
@@ -377,7 +390,9 @@ class Attached:
 
 def _paired(attached: Attached) -> list[tuple[Signal, Signal]]:
     """What it reads: as the effect's function calls it, and as the model and the data do."""
-    return list(zip(attached.effect.extras, attached.reads, strict=True))
+    renamed, averaged = dict(attached.columns), attached.over is not None
+    own = [s for s in attached.effect.extras if not (averaged and s.name == "t")]
+    return [(s, replace(s, name=renamed.get(s.name, s.name))) for s in own]
 
 
 def stepped(

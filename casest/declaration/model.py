@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -94,13 +94,20 @@ class Model:
             return self.signals
         return self.signals + self.noise.columns({s.name: s for s in self.signals})
 
-    def elsewhere(self, runs: int) -> Model:
-        """Without what happened in the record alone that it was fitted to; itself without such.
+    def elsewhere(self, spans: Sequence[tuple[float, float] | None]) -> Model:
+        """As it is for other records than those that it was fitted to, from first to last time.
 
-        What several `runs` of a fit share came again in each of them: it stays.
+        What happened in the only one of them is there as its mean over that record: when it would
+        happen in another one nobody knows. What several share came again in each: it stays.
+        Itself where all lasts.
         """
-        kept = tuple(a for a in self.effects if a.lasts or (runs > 1 and a.effect.once))
-        return self if len(kept) == len(self.effects) else replace(self, effects=kept)
+        kept = []
+        for a in self.effects:
+            if a.lasts or (a.effect.once and len(spans) > 1):
+                kept.append(a)
+            elif a.effect.once and spans and spans[0] is not None:
+                kept.append(replace(a, over=spans[0]))
+        return self if tuple(kept) == self.effects else replace(self, effects=tuple(kept))
 
     def among(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """Those of the values that are its parameters'."""

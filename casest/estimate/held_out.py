@@ -24,7 +24,7 @@ from casest.solve.trust_region import trust_region
 #: Stretches that a held-out record is cut into; every other one is scored.
 STRETCHES = 40
 #: What is said of effects that are not there in a record that is scored.
-ALONE = "found in the record of the fit, and left out where another one is foretold"
+ALONE = "happened in the record of the fit; another one is foretold with its mean over that"
 
 
 def score(found: Estimate, runs: Sequence[Run]) -> float:
@@ -42,8 +42,8 @@ def happened_once(found: Estimate) -> tuple[str, ...]:
 
 
 def lasting(found: Estimate) -> Model:
-    """The fitted model without what happened in its record alone."""
-    return found.model.elsewhere(len(found.problem.runs))
+    """The fitted model as it is for other records."""
+    return found.model.elsewhere([run.span for run in found.problem.runs])
 
 
 def split(run: Run, models: Sequence[Model]) -> tuple[Run | None, Run]:

@@ -183,11 +183,12 @@ class Solver(Struct, frozen=True):
 
 
 class Samples(Struct, frozen=True):
-    """How many samples a run has, of how many readings."""
+    """How many samples a run has, of how many readings; its first and last time in s, if any."""
 
     run: str
     samples: int
     readings: int
+    span: list[float] | None = None
 
 
 class DeclaredIn(Struct, frozen=True):
@@ -305,7 +306,10 @@ def fitted_content(
         "corrected": corrected,
         "units": units,
         "solver": _solver(estimate),
-        "samples": [Samples(run.name, len(run), int(np.sum(run.count))) for run in problem.runs],
+        "samples": [
+            Samples(run.name, len(run), int(np.sum(run.count)), run.span and list(run.span))
+            for run in problem.runs
+        ],
         "notes": [note for run in problem.runs for note in run.notes] + list(estimate.notes),
         "convention": inspect.getdoc(problem.model.function) or "",
         "declared_in": _declared_in(problem.model),
@@ -428,7 +432,7 @@ def _correction(
     if isinstance(found, str):
         return {"correction": {"reason": found}, "corrected_budget": None}
     found, budget = _with_spread(estimate, units, found, model)
-    lasting = model.elsewhere(len(estimate.problem.runs))
+    lasting = model.elsewhere([run.span for run in estimate.problem.runs])
     if lasting is not model:
         values, runs = lasting.among(estimate.values), estimate.problem.runs
         other = carried(lasting, values, runs, units, around)

@@ -46,12 +46,17 @@ class _Spectrum(Struct, frozen=True):
     samples_per_second: float | None = None
 
 
+class _Samples(Struct, frozen=True):
+    span: tuple[float, float] | None = None
+
+
 class _Judging(Struct, frozen=True, kw_only=True):
     """What is read of a result besides what `SavedResult` has."""
 
     noise: _Noise
     spectrum: _Spectrum | None = None
     conditions: dict[str, list[float]] = {}
+    samples: list[_Samples] = []
     estimate: _Section | UnsetType = UNSET
     after: _Section | UnsetType = UNSET
 
@@ -75,7 +80,7 @@ def old_estimate(path: Path) -> tuple[Old, SavedResult]:
             "are together: calibrate again"
         )
     model, values = saved_model(content)
-    model = model.elsewhere(len(result.runs))
+    model = model.elsewhere([s.span for s in more.samples])
     values = model.among(values)
     sigma = np.array([s for s in more.noise.sigma if s is not None], float)
     over = max(more.noise.correlated_over_samples or 1.0, 1.0)

@@ -27,7 +27,9 @@ _CALLED = re.compile(
 def columns_of_motion(model: Model, runs: Sequence[Run]) -> frozenset[str]:
     """Columns of the motion, where the model's sensor is one that is moved. `runs` are prepared."""
     run = runs[0]
-    moved = any(s.kind == "rotation" or _is_motion("", run.units.get(s.name)) for s in model.signals)
+    moved = any(
+        s.kind == "rotation" or _is_motion("", run.units.get(s.name)) for s in model.signals
+    )
     if not moved and not any(s.size == 3 for s in model.signals):
         return frozenset()
     return frozenset(n for n in run.columns if _is_motion(n, run.units.get(n)))
