@@ -176,7 +176,7 @@ def test_a_loop_prints_saves_and_corrects(loop, tmp_path):
 
 def test_what_a_correction_guesses_is_said(loop):
     later = {"v": [[5.6, 5.6, 5.7], [5.7, 5.6, 5.6]], "t": np.array([0.0, 1.0])}
-    with pytest.warns(UserWarning, match="found at the times of the fitted record"):
+    with pytest.warns(UserWarning, match="happened in the record of the fit"):
         loop(later)
 
 
