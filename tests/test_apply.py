@@ -200,10 +200,10 @@ def test_what_follows_the_time_of_the_fitted_record_is_said_for_another_one(tmp_
         expected = (plain - value["zero"]) / value["sensitivity"]
         corrected[name] = table["force_N"]
         assert corrected[name] == pytest.approx(expected, rel=1e-6, abs=1e-6)
-    assert "taken as its mean over that, of any other: bias_drift" in said[other]
+    assert "mean over that of what stayed: bias_drift" in said[other]
     assert "bias_drift" not in said[first]
     assert run(["export", str(out), "--to", "c", "-o", str(tmp_path / "c.c")]) == 0
-    assert "taken as its mean over that, of any other: bias_drift" in capsys.readouterr().err
+    assert "mean over that of what stayed: bias_drift" in capsys.readouterr().err
     # In Python: the fitted record as a table, and the other one.
     found, tables = casest.load(out), [pd.read_csv(name) for name in (first, other)]
     with warnings.catch_warnings():

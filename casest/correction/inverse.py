@@ -38,7 +38,10 @@ LEFT = (
 TIMED = "found at the times of the fitted record, and a guess for any other: "
 
 #: What is said of those that happened in it alone.
-ONCE = "happened in the record of the fit, and is taken as its mean over that, of any other: "
+ONCE = (
+    "happened in the record of the fit; any other is corrected without what passed, and with the "
+    "mean over that of what stayed: "
+)
 
 #: Newton steps, each halved up to HALVINGS times until it gains.
 STEPS, HALVINGS = 60, 30

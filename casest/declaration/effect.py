@@ -39,6 +39,10 @@ PROFILES = ("frequency", "time", "timescale", "level", "share", "lag")
 TAILS, RANDOM_WALK = "tails", "random walk"
 
 
+#: What became of what happened in one record alone.
+Once = Literal["", "passed", "stayed"]
+
+
 @dataclass(frozen=True)
 class Effect:
     """A function of one quantity, signal, the noise, the sequence of samples, or a signal's time.
@@ -59,7 +63,8 @@ class Effect:
     like, and names no cause; `memory` what one on the sequence keeps from sample to sample, and
     what each begins from (the value acted on, or a number); `otherwise` the form that it takes in a
     model where it is not applicable as it stands; `once`: it happened in the record that it was
-    found in, and says nothing of another one.
+    found in, and has "passed" (in another one it is not there) or "stayed" (in another one nobody
+    knows how much of it is there).
     """
 
     name: str
@@ -85,7 +90,7 @@ class Effect:
     otherwise: Effect | None = None
     #: Python text of one that the loop wrote, to be given again.
     source: str = ""
-    once: bool = False
+    once: Once = ""
 
     def __reduce__(self) -> tuple[Any, ...]:
         """To pickle: its function by name."""
@@ -151,7 +156,7 @@ def effect(
     describes: bool = False,
     memory: Mapping[str, str | float] | None = None,
     otherwise: Effect | None = None,
-    once: bool = False,
+    once: Once = "",
 ) -> Callable[[Callable[..., Any]], Effect]:
     """Declare an effect: first argument the value acted on, further ones signals or columns.
 

@@ -97,15 +97,15 @@ class Model:
     def elsewhere(self, spans: Sequence[tuple[float, float] | None]) -> Model:
         """As it is for other records than those that it was fitted to, from first to last time.
 
-        What happened in the only one of them is there as its mean over that record: when it would
-        happen in another one nobody knows. What several share came again in each: it stays.
-        Itself where all lasts.
+        What happened in the only one of them and passed is not there; what stayed is, as its mean
+        over that record: how much of it another one has nobody knows. What several share came again
+        in each: it is kept. Itself where all lasts.
         """
         kept = []
         for a in self.effects:
             if a.lasts or (a.effect.once and len(spans) > 1):
                 kept.append(a)
-            elif a.effect.once and spans and spans[0] is not None:
+            elif a.effect.once == "stayed" and spans and spans[0] is not None:
                 kept.append(replace(a, over=spans[0]))
         return self if tuple(kept) == self.effects else replace(self, effects=tuple(kept))
 

@@ -13,7 +13,7 @@ from casest.declaration.symbols import param, signal
     typical={"k": 1e-4},
     shown_by="the first pose repeated at the end of the record, at the temperature of its start",
     formula="y + k·t",
-    once=True,
+    once="stayed",
 )
 def bias_drift(y: SX, t: SX = signal("s"), *, k: SX = param(each, "[y]/s")) -> SX:
     """An offset that drifts linearly in time."""
@@ -26,7 +26,7 @@ def bias_drift(y: SX, t: SX = signal("s"), *, k: SX = param(each, "[y]/s")) -> S
     profile={"when": "time"},
     shown_by="the same pose before and after the event",
     formula="y + k from t = when on",
-    once=True,
+    once="stayed",
 )
 def bias_step(
     y: SX, t: SX = signal("s"), *, k: SX = param(each, "[y]"), when: SX = param("s")
@@ -41,7 +41,7 @@ def bias_step(
     profile={"start": "time", "stop": "time"},
     shown_by="the same pose before, during and after the event",
     formula="y + k from t = start on, until t = stop",
-    once=True,
+    once="passed",
 )
 def pulse(
     y: SX,

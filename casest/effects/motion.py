@@ -82,7 +82,7 @@ def lever_arm(u: SX, angle: SX, t: SX = signal("s"), *, arm: SX = param(each, "m
     profile={"frequency": "frequency"},
     shown_by="a record with the machine beside it switched off",
     formula="y + sine·sin(frequency·t) + cosine·cos(frequency·t)",
-    once=True,
+    once="passed",
 )
 def vibration(
     y: SX,

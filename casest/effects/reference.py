@@ -27,7 +27,7 @@ def table_angle(attitude: SX, *, cosine: SX = param("rad"), sine: SX = param("ra
     typical={"k": 1e-6},
     shown_by="the same pose at the beginning and at the end, for large and small inputs",
     formula="u·(1 + k·t)",
-    once=True,
+    once="stayed",
 )
 def reference_drift(u: SX, t: SX = signal("s"), *, k: SX = param("1/s")) -> SX:
     """The known reference (field, gravity, table) changes size with time."""

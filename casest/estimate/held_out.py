@@ -24,7 +24,10 @@ from casest.solve.trust_region import trust_region
 #: Stretches that a held-out record is cut into; every other one is scored.
 STRETCHES = 40
 #: What is said of effects that are not there in a record that is scored.
-ALONE = "happened in the record of the fit; another one is foretold with its mean over that"
+ALONE = (
+    "happened in the record of the fit; another one is foretold without what passed, and with the "
+    "mean over that of what stayed"
+)
 
 
 def score(found: Estimate, runs: Sequence[Run]) -> float:

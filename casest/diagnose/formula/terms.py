@@ -238,7 +238,7 @@ def _text(terms: Sequence[Term], size: int, on: str, unit: str, names: Mapping[s
         for n, a in names.items()
         if n not in (on, a)
     ]
-    once = ", once=True" if "t" in units else ""
+    once = ', once="stayed"' if "t" in units else ""
     return (
         "from casest import constant, cos, effect, exp, fabs, param, signal, sin, tanh, vertcat\n"
         "\n\n" + "".join(renamed) + f'@effect(on={on!r}, formula=""{once})\n'
