@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -21,13 +22,15 @@ def on_all_axes(subject: Subject[F], state: State[F], *, needed: bool) -> State[
     axis set to nothing because it is not seen would leave the other unknowns off, and too sure.
     """
     for k, kept in enumerate(state.kept):
-        found = subject.wider(state.fit, kept.what)
+        found = _certified(subject, subject.wider(state.fit, kept.what))
+        if found is None and needed:
+            found = _certified(subject, subject.better_axes(state.fit, kept.what))
         if found is None:
             continue
         what, fit = found
         none, all_ = Likelihood(subject.linear(state.fit)), subject.linear(fit)
         more = all_.basis.shape[1] - none.declared.shape[1]
-        if more < 1 or isinstance(subject.certified(fit), str):
+        if more < 1:
             continue
         rise = worth(subject.rises(state.fit, [fit])[0], more, 0.0, none) if needed else np.inf
         if rise > LEVELS.strong:
@@ -38,6 +41,10 @@ def on_all_axes(subject: Subject[F], state: State[F], *, needed: bool) -> State[
             several[k] = replace(kept, what=what, evidence=evidence)
             state = replace(state, fit=fit, kept=tuple(several))
     return state
+
+
+def _certified(subject: Subject[F], found: tuple[Any, F] | None) -> tuple[Any, F] | None:
+    return None if found is None or isinstance(subject.certified(found[1]), str) else found
 
 
 def eliminated(subject: Subject[F], state: State[F]) -> State[F]:

@@ -25,6 +25,8 @@ def search(
     state = State(fit) if begun is None else replace(begun, fit=fit)
     before: State[F] | None = None
     for _ in range(LEVELS.rounds):
+        # Else what lies on an axis that was nothing before would look like another cause.
+        state = on_all_axes(subject, state, needed=True)
         ranking = ranked(subject, state.fit)
         if before is not None and _small(subject, before, state) and _left(ranking):
             state = _as_before(before, state)

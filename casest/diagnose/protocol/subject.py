@@ -56,6 +56,10 @@ class Subject(Protocol[F]):
         """Something that was added on some axes only, and the fit with it on all of them."""
         return None
 
+    def better_axes(self, fit: F, what: Any) -> tuple[Any, F] | None:
+        """The same where it cannot be on all of them: on those that are worth it by now."""
+        return None
+
     def apart(self, fit: F, kept: Kept) -> tuple[Linear, Trial] | None:
         """The linear problem as if a cause were not there, and the cause as a trial of it."""
         ...

@@ -13,9 +13,9 @@ from casest.declaration.effect import Effect
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
 from casest.diagnose.candidates.candidates import Candidate
-from casest.diagnose.evidence.likelihood import rises
+from casest.diagnose.evidence.likelihood import Likelihood, rises
 from casest.diagnose.evidence.linear import Linear
-from casest.diagnose.evidence.score import Evidence, Trial
+from casest.diagnose.evidence.score import Evidence, Trial, judged, on_fewer_axes
 from casest.diagnose.formula.search import NAME, described, readable, with_sizes
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.protocol import Kept, Ranking, Subject
@@ -166,16 +166,37 @@ class Sensor(Subject[Fit]):
     def wider(self, fit: Fit, what: Candidate) -> tuple[Candidate, Fit] | None:
         """An effect that was added on some axes only, and the fit with it on all of them."""
         base = self.without(fit, what)
-        if base is None or what.effect is None:
+        whole = None if base is None else self._whole(fit, base, what)
+        if base is None or whole is None:
             return None
-        whole = next((c for c in self.tried.found(base)[0] if c.label == what.label), None)
-        if whole is None or what.parameters(fit.model) == whole.parameters(
-            whole.traced_on(base.model)
-        ):
-            return None
-        whole = replace(whole, held=what.held, trials=what.trials)
         found = self.refit(base, [Trial(whole, whole.label, np.zeros((0, 0, 0)))])
         return None if isinstance(found, str) else (whole, found)
+
+    def better_axes(self, fit: Fit, what: Candidate) -> tuple[Candidate, Fit] | None:
+        """The same where it cannot be on all of them: on those that are worth it by now."""
+        base = self.without(fit, what)
+        whole = None if base is None else self._whole(fit, base, what)
+        if base is None or whole is None:
+            return None
+        likelihood = Likelihood(self.linear(base))
+        trials = self.tried.of(base, [whole])
+        evidence = judged(trials, likelihood, likelihood.beside(), families=1) if trials else None
+        axes = None if evidence is None else on_fewer_axes(evidence, likelihood)
+        if axes is None:
+            return None
+        less = self.on_axes(base, trials[0], axes)
+        found = self.refit(base, [less])
+        return None if isinstance(found, str) else (less.what, found)
+
+    def _whole(self, fit: Fit, base: Fit, what: Candidate) -> Candidate | None:
+        """An effect of the fit on all axes, beside the base; None where it is that already."""
+        every = self.tried.found(base)[0] if what.effect is not None else []
+        whole = next((c for c in every if c.label == what.label), None)
+        if whole is None:
+            return None
+        if what.parameters(fit.model) == whole.parameters(whole.traced_on(base.model)):
+            return None
+        return replace(whole, held=what.held, trials=what.trials)
 
     def apart(self, fit: Fit, kept: Kept) -> tuple[Linear, Trial] | None:
         """The linear problem as if an effect were not there, and the effect as a trial of it."""
