@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from math import inf
 
-from casest.diagnose.evidence.score import Evidence, again
+from casest.diagnose.evidence.score import Evidence, again, judged
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.protocol.confirming import FAR_AWAY, falls, passing
 from casest.diagnose.protocol.ranking import pairs, ranked
@@ -26,7 +27,7 @@ def with_the_best(
     options = [e for e in every if ranking.says(e)]
     options.sort(key=lambda e: -e.score)
     described = None if asked else subject.formula(state.fit, ranking)
-    left, tried = options, list[Evidence]()
+    left, tried = _beyond_columns(ranking, options), list[Evidence]()
     while True:
         held = asked or passing(ranking, left)
         state, refits = refitted(subject, state, ranking, held)
@@ -47,11 +48,28 @@ def with_the_best(
         left = [] if asked else [e for e in left if e not in held]
         if over or not held or not (left or asked):
             break
-        asked, left = [], left or options
+        asked, left = [], left or _beyond_columns(ranking, options)
     for evidence in [e for e in options if e not in tried][:2]:
         state = state.refusing(evidence.trials[0].what, NOT_HELD_OUT)
     missing = sorted([*options, *ranking.followed], key=lambda e: -e.score)
     return replace(state, open=tuple(missing[: LEVELS.contenders]))
+
+
+def _beyond_columns(ranking: Ranking, options: Sequence[Evidence]) -> list[Evidence]:
+    """Without pairs of which what only follows a column can take the place of one: it would explain
+    nearly as much."""
+    paired = {t.family for e in options if len(e.trials) > 1 for t in e.trials}
+    beside: dict[str, float] = {}
+    for one in ranking.followed[: LEVELS.nearest]:
+        for other in (e for e in ranking.causes if e.trials[0].family in paired):
+            both = judged([*one.trials, *other.trials], ranking.likelihood, ranking.none,
+                          start=one.explained, families=ranking.families)  # fmt: skip
+            if both is not None:
+                family = other.trials[0].family
+                beside[family] = max(beside.get(family, -inf), both.score)
+    alike = {id(e) for e in options if len(e.trials) > 1 and e.score <= LEVELS.clear
+             + max(beside.get(f, -inf) for f in e.families)}  # fmt: skip
+    return [e for e in options if id(e) not in alike]
 
 
 def _first_certified(
