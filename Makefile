@@ -8,7 +8,7 @@ USABLE := $(VENV)/.usable
 
 .PHONY: demo test test-long lint types format wheel bench study study-imu study-metrology \
 	study-metrology-coverage study-starts study-nist study-loop \
-	study-motion study-flights study-inputs study-records study-asked study-slow study-coverage \
+	study-motion study-flights study-inputs study-records study-halves study-asked study-slow study-coverage \
 	study-deceptive study-deceptive-many study-fleet study-mutation study-worlds study-noises \
 	study-structural study-check study-plans study-equations study-equations-coverage study-frictions \
 	study-told-apart \
@@ -100,6 +100,9 @@ study-deceptive-many: $(READY)
 
 study-deceptive: $(READY)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python studies/deceptive.py
+
+study-halves: $(READY)
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python studies/halves.py
 
 study-records: $(READY)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python studies/records.py
