@@ -23,6 +23,7 @@ COOLING = (
 )  # fmt: skip
 STILL = ("mpu6050-tomisuarez/imu_static_test.csv", "--unit", "v=count", "--rate", "100")
 GYRO, ACCELEROMETER = (*STILL, "--columns", "v=gx,gy,gz"), (*STILL, "--columns", "v=ax,ay,az")
+MODELS = Path(__file__).parents[1] / "studies" / "record_models.py"
 POSITIONS = ("--columns", "v=0,1,2", "--rate", "100", "--at-rest", "--set", "norm=9.80665")
 
 
@@ -163,3 +164,28 @@ def test_six_orientations_have_none_to_spare(closed):
     assert result["verdict"] is None
     assert result["trusted"]
     assert any("record more orientations" in r["reason"] for r in result["refused"])
+
+
+def test_four_plateaus_of_a_load_cell_are_a_straight_line(shared_data, tmp_path):
+    """A pair of causes was strong evidence, and each alone is none.
+
+    By NumPy from the means of the plateaus: a quadratic term has F(1, 1) = 0.39.
+    """
+    lines = (shared_data / "swing-project/loadcell_swing.csv").read_text("utf-8").splitlines()
+    half = tmp_path / "half.csv"
+    half.write_text("\n".join(lines[: 1 + len(lines) // 2]) + "\n", encoding="utf-8")
+    words = ["close", f"{MODELS}:cell", str(half), "--columns", "load=load_lb"]
+    words += ["--columns", "counts=cellA_counts", "--unit", "load=lbf", "--unit", "counts=count"]
+    assert run([*words, "-o", str(tmp_path)]) == 0
+    result = json.loads((tmp_path / "result.json").read_text(encoding="utf-8"))
+    assert (result["verdict"], labels(result)) == ("adequate", [])
+
+
+@pytest.mark.long
+def test_beside_a_lag_the_soft_iron_is_whole_and_no_axis_of_the_motion_a_cause(closed):
+    """By NumPy: a lag of 11 ms, a 3x3, an offset while it is moved: 0.744 uT on stretches; what
+    else there is makes 0.6 % at most."""
+    result = closed(f"{MODELS}:compass", "broad/mag01.csv")
+    assert labels(result) == ["signal_lag", "soft_iron", "pulse"]
+    assert result["verdict"] == "unexplained"
+    assert result["after"]["rmse_holdout"] < 0.75

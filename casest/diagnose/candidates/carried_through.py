@@ -32,7 +32,7 @@ def columns_of_motion(model: Model, runs: Sequence[Run]) -> frozenset[str]:
     )
     if not moved and not any(s.size == 3 for s in model.signals):
         return frozenset()
-    return frozenset(n for n in run.columns if _is_motion(n, run.units.get(n)))
+    return frozenset(n for n in run.columns if _is_motion(n, run.column_units.get(n)))
 
 
 def _is_motion(name: str, unit: str | None) -> bool:
