@@ -90,7 +90,7 @@ def noisy(
     model: Model, runs: Sequence[Run], sensors: SensorOptions
 ) -> tuple[Model, tuple[Run, ...]]:
     """The model and its runs with --sensor-noise applied."""
-    from casest.cli.sensor_noise import with_sensor_noise
+    from casest.interface.sensor_noise import with_sensor_noise
 
     return with_sensor_noise(model, runs, sensors.stated)
 

@@ -178,7 +178,7 @@ def _of_sensors(
     """Noise of single signals, as --sensor-noise says it, else as it is declared."""
     import numpy as np
 
-    from casest.cli.sensor_noise import noise_of
+    from casest.interface.sensor_noise import noise_of
 
     found = noise_of(model, [run], options.sensors.stated, look=False)[0]
     said = {name for key in found for name in key.split(",")}

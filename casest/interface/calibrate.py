@@ -15,6 +15,7 @@ from casest.errors import NotTrusted
 from casest.estimate import calibrate as fitting
 from casest.interface.estimate import Closing, Estimate
 from casest.interface.reading import Data, Reading, model_and_runs
+from casest.interface.sensor_noise import SensorNoise
 from casest.interface.words import as_python_says
 
 
@@ -28,6 +29,7 @@ def calibrate(
     rate: float | None = None,
     at_rest: bool | Sequence[str] = False,
     time_zero: Literal["first", "column"] = "first",
+    sensor_noise: SensorNoise | None = None,
     start: Mapping[str, Any] | None = None,
     solver: str = "ipopt",
     seed: int = 0,
@@ -37,7 +39,9 @@ def calibrate(
     `model` is declared, or named as on the command line. `data` are runs, files, data frames
     (pandas, polars, PyArrow, xarray), mappings of arrays by name or arrays (N, k); several are
     several runs. `columns`, `units`, `scales`, `rate`, `at_rest` and `time_zero` say how they are
-    read, as in `load_runs`: columns={"v": ["ax", "ay", "az"]}, units={"v": "g"}.
+    read, as in `load_runs`: columns={"v": ["ax", "ay", "az"]}, units={"v": "g"}. `sensor_noise`
+    states the standard deviation of one reading by signal: {"v": "4.5 mg"}, {"v": 0.02} in the
+    model's unit, {"x": "u_x"} a column, one by axis, or a covariance between axes.
 
     `start` overrides the automatic start values; `solver` is one of SOLVERS or an estimator of
     the model's own (`closed-form`), which is judged against the least-squares optimum. Raises
@@ -47,7 +51,7 @@ def calibrate(
     reading = Reading(columns=columns, units=units, scales=scales, rate=rate, at_rest=at_rest,
                       time_zero=time_zero)  # fmt: skip
     with _told(reading):
-        found, runs = model_and_runs(model, data, reading)
+        found, runs = model_and_runs(model, data, reading, sensor_noise)
         fit = fitting.calibrate(found, runs, start=start, solver=solver, seed=seed)
         return Estimate.of(fit, reading)
 
@@ -62,6 +66,7 @@ def attempt(
     rate: float | None = None,
     at_rest: bool | Sequence[str] = False,
     time_zero: Literal["first", "column"] = "first",
+    sensor_noise: SensorNoise | None = None,
     start: Mapping[str, Any] | None = None,
     solver: str = "ipopt",
     seed: int = 0,
@@ -75,7 +80,7 @@ def attempt(
     reading = Reading(columns=columns, units=units, scales=scales, rate=rate, at_rest=at_rest,
                       time_zero=time_zero)  # fmt: skip
     with _told(reading):
-        found, runs = model_and_runs(model, data, reading)
+        found, runs = model_and_runs(model, data, reading, sensor_noise)
         fit = fitting.attempt(
             found, runs, start=start, solver=solver, seed=seed, intervals=intervals
         )
@@ -92,6 +97,7 @@ def close(
     rate: float | None = None,
     at_rest: bool | Sequence[str] = False,
     time_zero: Literal["first", "column"] = "first",
+    sensor_noise: SensorNoise | None = None,
     catalogue: Sequence[Effect] = CATALOGUE,
     start: Mapping[str, Any] | None = None,
     known: Collection[str] = (),
@@ -109,7 +115,7 @@ def close(
     reading = Reading(columns=columns, units=units, scales=scales, rate=rate, at_rest=at_rest,
                       time_zero=time_zero)  # fmt: skip
     with _told(reading):
-        found, runs = model_and_runs(model, data, reading)
+        found, runs = model_and_runs(model, data, reading, sensor_noise)
         closed = loop.close(
             found, runs, catalogue=catalogue, start=start, known=known, seed=seed, say=say
         )

@@ -11,6 +11,7 @@ from casest.data.run import Run
 from casest.declaration.model import Model
 from casest.effects.placing import told
 from casest.errors import UsageError
+from casest.interface.sensor_noise import SensorNoise, said, with_sensor_noise
 from casest.leastsquares.stated import stated_noise
 from casest.results.find import find_model
 
@@ -30,9 +31,9 @@ class Reading(TypedDict, total=False):
 
 
 def model_and_runs(
-    model: Model | str, data: Data, reading: Reading
+    model: Model | str, data: Data, reading: Reading, noise: SensorNoise | None = None
 ) -> tuple[Model, tuple[Run, ...]]:
-    """The model, also by its name on the command line, and its runs.
+    """The model, also by its name on the command line, and its runs, with the noise as stated.
 
     Where the data are read here, effects are told the numbers that data tell them.
     """
@@ -44,16 +45,20 @@ def model_and_runs(
         )
     given = [data] if isinstance(data, Run) else data
     if isinstance(given, Sequence) and any(isinstance(one, Run) for one in given):
-        return _with_noise(found, _as_they_are(given, reading))
+        return _with_noise(found, _as_they_are(given, reading), noise)
     listed = listed_data(given)
     if not listed:
         return found, ()
     runs = load_runs(listed, found.signals, **stated(reading))
-    return _with_noise(told(found, runs) if found.effects else found, runs)
+    return _with_noise(told(found, runs) if found.effects else found, runs, noise)
 
 
-def _with_noise(model: Model, runs: tuple[Run, ...]) -> tuple[Model, tuple[Run, ...]]:
-    """With the noise that the model declares of its signals, where none was stated before."""
+def _with_noise(
+    model: Model, runs: tuple[Run, ...], noise: SensorNoise | None
+) -> tuple[Model, tuple[Run, ...]]:
+    """With the noise that is stated, or that the model declares where none was stated before."""
+    if noise:
+        return with_sensor_noise(model, runs, said(noise))
     return (model, runs) if model.noise is not None else stated_noise(model, runs, {})
 
 

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from casest.cli.assignments import Assignment
 from casest.declaration.symbols import Signal
 from casest.errors import UsageError
 
@@ -16,9 +15,22 @@ if TYPE_CHECKING:
     from casest.declaration.shapes import Array
 
 
-def joint(
-    option: Assignment, text: str, signals: Sequence[Signal], run: Run, used: set[str]
-) -> Array:
+class Option(Protocol):
+    """What was said of one signal, or of several that have something in common."""
+
+    @property
+    def flag(self) -> str:
+        """How it is called where it was said."""
+
+    @property
+    def text(self) -> str:
+        """All that was said, for errors."""
+
+    def pair(self) -> tuple[str, str]:
+        """The signals, and what is said of them."""
+
+
+def joint(option: Option, text: str, signals: Sequence[Signal], run: Run, used: set[str]) -> Array:
     """Covariance (1, k, k) or (N, k, k) of all numbers of signals one after the other.
 
     Rows `a,b;c,d`, a file of them, or the columns of its lower triangle, row by row, in the
@@ -49,7 +61,7 @@ def joint(
     return matrix[None]
 
 
-def matrix_in(option: Assignment, file: str) -> Array:
+def matrix_in(option: Option, file: str) -> Array:
     """A matrix in a text file, its cells apart by commas or blanks."""
     try:
         with open(file, encoding="utf-8") as lines:
@@ -59,7 +71,7 @@ def matrix_in(option: Assignment, file: str) -> Array:
         raise UsageError(f"{option.flag} {option.text}: {file}: {said}") from None
 
 
-def _of_columns(option: Assignment, words: Sequence[str], size: int, run: Run) -> Array:
+def _of_columns(option: Option, words: Sequence[str], size: int, run: Run) -> Array:
     rows, columns = np.tril_indices(size)
     if len(words) != len(rows):
         raise UsageError(
@@ -81,7 +93,7 @@ def numbers_in(name: str, run: Run) -> Array:
 
 
 def correlation(
-    option: Assignment, text: str, first: Array, second: Array, run: Run, used: set[str]
+    option: Option, text: str, first: Array, second: Array, run: Run, used: set[str]
 ) -> Array:
     """Covariances (N, 2, 2) from standard deviations (1,), (1, 1) or (N, 1) and a correlation."""
     if text in run.columns:

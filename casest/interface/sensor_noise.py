@@ -1,18 +1,17 @@
-"""`--sensor-noise` of calibrations: standard deviations of readings, from words or columns."""
+"""Stated noise of signals: standard deviations of readings, from words, numbers or columns."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from casest import units
-from casest.cli.assignments import Assignment, Assignments
-from casest.cli.sensor_covariance import correlation, joint, matrix_in
 from casest.declaration.symbols import Signal
 from casest.errors import CasestError, UsageError
+from casest.interface.sensor_covariance import Option, correlation, joint, matrix_in
 
 if TYPE_CHECKING:
     from casest.data.run import Run
@@ -23,8 +22,43 @@ if TYPE_CHECKING:
 NAMED = ("u_{}", "{}_std")
 
 
+#: What Python takes for each signal: 0.02, "4.5 mg", "2%", a column, one by axis, a covariance.
+SensorNoise = Mapping[str, "float | str | Sequence[float] | Array"]
+
+
+@dataclass(frozen=True)
+class Said:
+    """`sensor_noise={"v": 0.02}`, as the prompt says it."""
+
+    name: str
+    value: str
+    flag: str = "sensor_noise"
+
+    @property
+    def text(self) -> str:
+        """As it is said in errors."""
+        return f"{self.name}={self.value}"
+
+    def pair(self) -> tuple[str, str]:
+        """Signals and their noise."""
+        return self.name, self.value
+
+
+def said(given: SensorNoise | None) -> list[Option]:
+    """What Python was given, in the prompt's words."""
+    return [Said(str(name), _words(value)) for name, value in (given or {}).items()]
+
+
+def _words(value: object) -> str:
+    if isinstance(value, str):
+        return value
+    rows = np.asarray(value, float)
+    words = [",".join(repr(float(x)) for x in row) for row in np.atleast_2d(rows)]
+    return ";".join(words)
+
+
 def with_sensor_noise(
-    model: Model, runs: Sequence[Run], given: Assignments
+    model: Model, runs: Sequence[Run], given: Sequence[Option]
 ) -> tuple[Model, tuple[Run, ...]]:
     """The model and its runs with the noise that was stated, declared, or stands in columns."""
     from casest.leastsquares.stated import stated_noise
@@ -35,7 +69,7 @@ def with_sensor_noise(
 
 
 def noise_of(
-    model: Model, runs: Sequence[Run], given: Assignments, look: bool = True
+    model: Model, runs: Sequence[Run], given: Sequence[Option], look: bool = True
 ) -> tuple[dict[str, list[Array]], set[str], list[str]]:
     """What options and columns say of the noise of signals, for each run: standard deviations or
     covariances; the columns that say it, and what is noted of those that nobody named, where they
@@ -43,7 +77,7 @@ def noise_of(
     known = {s.name: s for s in model.signals}
     noise: dict[str, list[Array]] = {}
     used: set[str] = set()
-    correlated = list[Assignment]()
+    correlated = list[Option]()
     for option in given:
         key, text = option.pair()
         names = [name.strip() for name in key.split(",")]
@@ -71,7 +105,7 @@ def noise_of(
 
 
 def _correlate(
-    option: Assignment,
+    option: Option,
     model: Model,
     runs: Sequence[Run],
     noise: dict[str, list[Array]],
@@ -106,7 +140,7 @@ def _without(run: Run, used: set[str], said: Sequence[str]) -> Run:
     return replace(run, columns=columns, notes=(*run.notes, *said))
 
 
-def _of_run(option: Assignment, text: str, signal: Signal, run: Run, used: set[str]) -> Array:
+def _of_run(option: Option, text: str, signal: Signal, run: Run, used: set[str]) -> Array:
     """Standard deviations (k,) or (N, k), or a covariance (1, k, k), in the signal's unit."""
     words = [word.strip() for word in text.split(",")]
     if all(word in run.columns for word in words):
@@ -141,7 +175,7 @@ def _of_run(option: Assignment, text: str, signal: Signal, run: Run, used: set[s
         raise type(error)(f"{option.flag} {option.text}: {error}") from None
 
 
-def _covariance(option: Assignment, matrix: Array, signal: Signal) -> Array:
+def _covariance(option: Option, matrix: Array, signal: Signal) -> Array:
     """Rows of a covariance between a signal's axes, (1, k, k)."""
     if matrix.shape != (signal.size, signal.size):
         raise UsageError(
@@ -151,7 +185,7 @@ def _covariance(option: Assignment, matrix: Array, signal: Signal) -> Array:
     return matrix[None]
 
 
-def _share(option: Assignment, share: Array, signal: Signal, run: Run) -> Array:
+def _share(option: Option, share: Array, signal: Signal, run: Run) -> Array:
     """A share of each reading; a reading of zero has none."""
     found = np.abs(run.signals[signal.name]) * share
     bad = np.flatnonzero((found == 0).any(axis=1))
