@@ -18,7 +18,8 @@ from casest import load_runs
 from casest.cli import run
 from casest.demo import RECORD, WHEEL
 from casest.estimate.calibrate import calibrate
-from casest.report.html import calibration_page, figures
+from casest.report.html import figures
+from casest.report.html.calibration import calibration_page
 from casest.report.html.page import aligned
 from casest.report.html.residuals import bins
 from casest.report.html.spectra import autocorrelation, spectrum, white_band
