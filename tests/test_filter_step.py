@@ -87,7 +87,7 @@ def rows(run):
     "model",
     [
         pytest.param(bias_gravity, id="linear", marks=pytest.mark.long),
-        pytest.param(bias_gravity.sensing(a=1e-8), id="noisy inputs"),
+        pytest.param(bias_gravity.sensing(a=1e-8), id="noisy inputs", marks=pytest.mark.long),
         pytest.param(turning_gravity, id="nonlinear"),
     ],
 )

@@ -51,6 +51,8 @@ INF, NAN = np.inf, np.nan
 POSES = ["norm-triangular", str(RECORD), "--columns", "v=ax,ay,az", "--rate", "50", "--at-rest"]
 POSES += ["--set", "norm=9.80665"]
 COUNTS = [1, 7, 63, 64, 65, 40_000]
+#: Shipped problems of one and of three residuals, with many branches and with none.
+KINDS = {"norm-triangular", "norm-pair", "wheel", "steinhart-hart"}
 
 
 @pytest.fixture(scope="module")
@@ -147,7 +149,7 @@ def test_an_angle_far_beyond_a_turn_has_its_sine():
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=[pytest.mark.long] * (n == "imu")) for n in SHIPPED]
+    "name", [pytest.param(n, marks=[pytest.mark.long] * (n not in KINDS)) for n in SHIPPED]
 )
 def test_sums_and_rows_of_a_shipped_problem_are_those_of_the_replay(name, monkeypatch):
     replay = residual_and_jacobian(find_model(name))

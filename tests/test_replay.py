@@ -183,7 +183,7 @@ SUMS = st.recursive(
 INTEGERS = st.integers(-3, 3).map(float)
 
 
-@settings(max_examples=300, deadline=None, derandomize=True)
+@settings(max_examples=150, deadline=None, derandomize=True)
 @given(
     trees=st.lists(SUMS, min_size=1, max_size=6),
     p=st.tuples(INTEGERS, INTEGERS),
