@@ -94,10 +94,10 @@ def test_of_many_variants_the_best_is_named_as_rarely_as_one():
     """Two hundred moments of a step are tried in every record, and the best is kept."""
     rng, alarms = np.random.default_rng(8), 0
     steps = [np.where(np.arange(400) < k, 0.0, 1.0) for k in range(2, 400, 2)]
-    for _ in range(60):
+    for _ in range(40):
         trials = [Trial(k, "step", s[:, None, None], 200.0) for k, s in enumerate(steps)]
         alarms += bool(named(linear_of(white(rng, 400), np.ones((400, 1))), trials)[1])
-    assert alarms <= 2
+    assert alarms <= 1
 
 
 # -- in poses --------------------------------------------------------------------------------------

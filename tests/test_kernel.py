@@ -350,7 +350,10 @@ def test_two_processes_may_build_at_once(tmp_path):
     assert [path.suffix for path in tmp_path.iterdir()] == [".so"]
 
 
-@pytest.mark.parametrize("damage", ["cut", "empty", "text", "flipped"])
+@pytest.mark.parametrize(
+    "damage",
+    ["cut", "flipped", *(pytest.param(d, marks=pytest.mark.long) for d in ("empty", "text"))],
+)
 def test_a_damaged_library_is_built_again(tmp_path, is_compiled, damage):
     assert is_compiled(tmp_path / "whole")
     (library,) = (tmp_path / "whole").iterdir()

@@ -15,7 +15,9 @@ VALUES, STD, SQUARES = 6, 4, 6
 #: so that of its square and of what is derived from it no more than this share is determined.
 ROUNDED = 0.05
 #: Those that take longest, and those whose model another has: Lanczos3, Gauss2, Chwirut2.
-DEAR = {"Bennett5", "ENSO", "Lanczos1", "Lanczos2", "Gauss1", "Gauss3", "Chwirut1"}
+DEAR = {
+    "Bennett5", "ENSO", "MGH17", "Nelson", "Lanczos1", "Lanczos2", "Gauss1", "Gauss3", "Chwirut1",
+}  # fmt: skip
 
 
 @pytest.fixture(scope="session")
