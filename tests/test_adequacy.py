@@ -260,7 +260,9 @@ def test_outliers_are_found_and_counted():
     assert np.mean(shares) == pytest.approx(0.01, rel=0.2)
 
 
-@pytest.mark.parametrize("freedom", [3, 4, 6])
+@pytest.mark.parametrize(
+    "freedom", [3, pytest.param(4, marks=pytest.mark.long), pytest.param(6, marks=pytest.mark.long)]
+)
 def test_heavy_tails_are_no_outliers(freedom):
     rng = np.random.default_rng(7)
     found = [

@@ -42,16 +42,18 @@ def nearly_parallel(count, apart, seed, n=40, sigma=0.01):
     return {"x": x, "z": z, "y": y}
 
 
-@pytest.mark.parametrize(("count", "least"), [(20, 1), pytest.param(60, 4, marks=pytest.mark.long)])
-def test_a_mirrored_solution_within_reach_is_found(count, least):
+@pytest.mark.parametrize(
+    ("count", "seed", "least"), [(4, 2, 1), pytest.param(60, 1, 4, marks=pytest.mark.long)]
+)
+def test_a_mirrored_solution_within_reach_is_found(count, seed, least):
     """From six standard deviations along the weakest direction another fit ends at −b."""
-    signals = nearly_parallel(count, 0.005, 1)
+    signals = nearly_parallel(count, 0.005, seed)
     found = calibrate_many(mirrored, signals)
     said = [i for i, reasons in enumerate(found.reasons) if re.search("fit.? alike", reasons[0])]
     assert len(said) >= least
     assert not found.trusted[said].any()
     # Where the data hold b away from zero, many are believed.
-    assert calibrate_many(mirrored, nearly_parallel(20, 0.05, 2)).trusted.all()
+    assert calibrate_many(mirrored, nearly_parallel(6, 0.05, 2)).trusted.all()
 
 
 @model
@@ -67,7 +69,9 @@ NEAR = [197, 198, 338, 360, 448, 519, 543, 615, 671, 707, 907, 930, 1005, 1064, 
 FAR = [32, 46, 84, 88, 123, 143, 153, 173, 174, 182, 186, 231, 234, 239, 284, 289, 300, 325, 367]
 
 
-@pytest.mark.parametrize("chosen", [NEAR, pytest.param(FAR, marks=pytest.mark.long)])
+@pytest.mark.parametrize(
+    "chosen", [NEAR[:8], *(pytest.param(c, marks=pytest.mark.long) for c in (NEAR[8:], FAR))]
+)
 def test_a_false_optimum_is_not_believed_where_the_right_one_is_within_reach(chosen):
     rng = np.random.default_rng(0)
     x = rng.standard_normal((4000, 6))

@@ -46,6 +46,7 @@ def names(closing):
 # -- the loop ----------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_a_flight_that_lacks_nothing_is_adequate():
     closing = close_motion(bias_gravity, flight(seed=1, seconds=20))
     assert names(closing) == []
@@ -155,7 +156,8 @@ def test_what_one_sample_says_adds_up_to_what_all_say():
             np.testing.assert_allclose(said[:, :, 0].sum(axis=0), together, rtol=1e-8)
 
 
-def test_a_right_nonlinear_model_is_adequate():
+@pytest.mark.parametrize("seeds", [[0], pytest.param([1, 2], marks=pytest.mark.long)])
+def test_a_right_nonlinear_model_is_adequate(seeds):
     """A pendulum whose length is found: the filter that steps forward is far off at first."""
 
     @dynamics
@@ -170,14 +172,14 @@ def test_a_right_nonlinear_model_is_adequate():
         return Motion(rates=rates, outputs=(measured(y, angle, intensity=2e-8),))
 
     t = np.arange(0, 20, 0.02)
-    for seed in range(3):
+    for seed in seeds:
         rng = np.random.default_rng(300 + seed)
         start = [rng.uniform(0.3, 1.2), rng.uniform(-0.5, 0.5)]
         swing = solve_ivp(lambda _, x: [x[1], -9.81 / 0.8 * np.sin(x[0])], (0, 20), start,
                           t_eval=t, rtol=1e-11, atol=1e-12)  # fmt: skip
         y = swing.y[0] + 0.001 * rng.standard_normal(len(t))
         closing = close_motion(pendulum, Run.raw("p", {"y": y[:, None]}, units={}, time=t))
-        assert closing.verdict == "adequate"
+        assert (closing.verdict, names(closing)) == ("adequate", [])
         end, P = closing.after.found.end
         assert abs(end[2] - 0.8) < 4 * np.sqrt(P[2, 2])
 
@@ -361,7 +363,7 @@ def symbols(model):
 
 @pytest.fixture
 def record(tmp_path):
-    run = flight(Sensors(lever=(0.3, -0.1, 0.2)), seed=3)
+    run = flight(Sensors(lever=(0.3, -0.1, 0.2)), seed=3, seconds=16)
     path = tmp_path / "flight.csv"
     head = ",".join(f"{s}{x} [{u}]" for s, u in flights.UNITS.items() for x in "xyz")
     columns = [run.time, *(run.signals[s] for s in flights.UNITS)]
@@ -384,7 +386,7 @@ def test_close_writes_what_the_design_says(record, tmp_path, capsys):
     with (tmp_path / "out" / "residuals.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert list(rows[0]) == ["file", "run", "row", "t", "axis", "split", "before", "after"]
-    assert len(rows) == 2 * 3 * 750
+    assert len(rows) == 2 * 3 * 400
     assert "lever_arm of v was missing" in (tmp_path / "out" / "report.html").read_text()
 
 

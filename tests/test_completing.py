@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 import time
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -14,13 +15,22 @@ import pytest
 from casest.cli.completing import declared_names
 
 BIN = Path(sys.executable).parent
+ENVIRONMENT = {**os.environ, "PATH": f"{BIN}:{os.environ['PATH']}"}
+
+
+@cache
+def printed() -> str:
+    """The script for bash, as a shell that starts reads it."""
+    words = ["casest", "completion", "bash"]
+    done = subprocess.run(words, env=ENVIRONMENT, capture_output=True, text=True, check=True)
+    return done.stdout
 
 
 def bash(folder: Path, *words: str) -> list[str]:
     """What bash offers for the last of `words`, by the script that casest prints."""
     listed = " ".join(f"'{word}'" for word in words)
     script = (
-        'eval "$(casest completion bash)"; '
+        'eval "$SCRIPT"; '
         f"COMP_WORDS=({listed}); COMP_CWORD={len(words) - 1}; COMPREPLY=(); "
         "compopt() { echo files; }; "
         "complete -p casest > /dev/null && _casest_completion casest; "
@@ -29,7 +39,7 @@ def bash(folder: Path, *words: str) -> list[str]:
     done = subprocess.run(
         ["bash", "-c", script],
         cwd=folder,
-        env={**os.environ, "PATH": f"{BIN}:{os.environ['PATH']}"},
+        env={**ENVIRONMENT, "SCRIPT": printed()},
         capture_output=True,
         text=True,
         check=True,

@@ -154,7 +154,7 @@ def used(path: Path, folder: Path, name: str) -> int:
     return len(said)
 
 
-EDITS = [20, pytest.param(75, marks=pytest.mark.long)]
+EDITS = [12, pytest.param(75, marks=pytest.mark.long)]
 
 
 @pytest.mark.parametrize("edits", EDITS)

@@ -57,6 +57,8 @@ def attached(effect, model):
 # -- all of them -----------------------------------------------------------------------------------
 
 OF_RATES = {e.name for e in effects.CATALOGUE if e.kind == "rate"}
+#: Shipped problems of which no two have the same quantities.
+APART = {"norm-triangular", "norm-pair", "wheel", "rate-table", "gyro-rests", "steinhart-hart"}
 every = pytest.mark.parametrize("effect", effects.CATALOGUE, ids=lambda e: e.name)
 
 
@@ -75,7 +77,9 @@ def test_an_effect_says_what_it_is_and_what_would_show_it(effect):
 
 
 @every
-@pytest.mark.parametrize("name", SHIPPED)
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=[pytest.mark.long] * (n not in APART)) for n in SHIPPED]
+)
 def test_an_effect_attaches_where_its_quantity_exists_and_says_so_elsewhere(effect, name):
     """Attaching checks that the effect vanishes at its null value."""
     model = find_model(name)

@@ -120,7 +120,7 @@ def spoiled(cell: str, column: int = 3):
     [
         ("calibrate", ""),
         ("calibrate", "nan"),
-        ("close", ""),
+        pytest.param("close", "", marks=pytest.mark.long),
         pytest.param("close", "nan", marks=pytest.mark.long),
     ],
 )

@@ -57,7 +57,10 @@ def recorded(signals, columns=None):
 
 @pytest.mark.parametrize(
     ("name", "term"),
-    [("dry_friction", lambda w: 0.3), ("quadratic_damping", lambda w: 0.02 * w**2)],
+    [
+        ("dry_friction", lambda w: 0.3),
+        pytest.param("quadratic_damping", lambda w: 0.02 * w**2, marks=pytest.mark.long),
+    ],
 )
 def test_what_slows_a_flywheel_besides_viscous_friction_is_named(name, term):
     w = followed(lambda t, w: -0.1 * w - term(w), 10.0, 0.01)

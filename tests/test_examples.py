@@ -10,7 +10,10 @@ from pathlib import Path
 import pytest
 
 EXAMPLES = sorted((Path(__file__).parent.parent / "examples").glob("[0-9]*.py"))
-LONG = {"05_gyro_bias_and_temperature", "08_find_the_missing_effect", "12_compass_with_attitude"}
+LONG = {
+    "02_was_the_motion_enough", "05_gyro_bias_and_temperature", "08_find_the_missing_effect",
+    "10_compare_solvers", "12_compass_with_attitude",
+}  # fmt: skip
 
 
 @pytest.mark.parametrize(

@@ -71,8 +71,7 @@ KINDS = {f.__name__: f for f in (white, coloured, low_passed, unequal, heavy)}
 
 @pytest.mark.parametrize(
     ("kind", "records", "most"),
-    [("white", 25, 2), ("coloured", 25, 2)]
-    + [pytest.param(kind, 100, 4, marks=pytest.mark.long) for kind in KINDS],
+    [("coloured", 25, 2)] + [pytest.param(kind, 100, 4, marks=pytest.mark.long) for kind in KINDS],
 )
 def test_of_noise_of_any_kind_nothing_is_named(kind, records, most):
     """Thirty causes: ten slow shapes, ten columns that vary as they like, ten that live in an
@@ -95,10 +94,10 @@ def test_of_many_variants_the_best_is_named_as_rarely_as_one():
     """Two hundred moments of a step are tried in every record, and the best is kept."""
     rng, alarms = np.random.default_rng(8), 0
     steps = [np.where(np.arange(400) < k, 0.0, 1.0) for k in range(2, 400, 2)]
-    for _ in range(60):
+    for _ in range(40):
         trials = [Trial(k, "step", s[:, None, None], 200.0) for k, s in enumerate(steps)]
         alarms += bool(named(linear_of(white(rng, 400), np.ones((400, 1))), trials)[1])
-    assert alarms <= 2
+    assert alarms <= 1
 
 
 # -- in poses --------------------------------------------------------------------------------------

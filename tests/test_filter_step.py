@@ -87,7 +87,7 @@ def rows(run):
     "model",
     [
         pytest.param(bias_gravity, id="linear", marks=pytest.mark.long),
-        pytest.param(bias_gravity.sensing(a=1e-8), id="noisy inputs"),
+        pytest.param(bias_gravity.sensing(a=1e-8), id="noisy inputs", marks=pytest.mark.long),
         pytest.param(turning_gravity, id="nonlinear"),
     ],
 )
@@ -104,7 +104,7 @@ def test_it_is_the_filter_of_the_record(model, compiled):
 @pytest.mark.parametrize(
     "model",
     [
-        pytest.param(bias_gravity, id="linear"),
+        pytest.param(bias_gravity, id="linear", marks=pytest.mark.long),
         pytest.param(
             bias_gravity.sensing(omega=1e-6, a=1e-8),
             id="noise along states",

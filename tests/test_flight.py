@@ -38,7 +38,7 @@ def nees(found, errors):
 @pytest.fixture(scope="module")
 def runs():
     rng = np.random.default_rng(0)
-    return [follow(MATCHED, flights.somewhere(rng), rng) for _ in range(20)]
+    return [follow(MATCHED, flights.somewhere(rng), rng) for _ in range(10)]
 
 
 def test_the_flights_are_rigid_motions():

@@ -152,6 +152,7 @@ def test_beside_a_formula_parameters_are_what_they_are_at_the_middle_of_a_column
     assert bias["value"][0] == pytest.approx(0.4 + 0.1, abs=4 * 0.002)
 
 
+@pytest.mark.long
 def test_an_effect_of_the_users_own_takes_part(bench, tmp_path):
     text = (
         "from casest import effect, param, signal, constant\n\n\n"

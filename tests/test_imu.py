@@ -197,6 +197,7 @@ def test_the_export_is_one_function_of_nine_readings(whole):
     assert np.abs(names["correct"](rows) - apart).max() < 1e-6
 
 
+@pytest.mark.long
 def test_three_files_with_clocks_of_their_own_are_one_record(whole, tmp_path, capsys):
     _, record, truth = whole
     late = {**record, "t": record["t"] + 0.0031}

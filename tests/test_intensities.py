@@ -85,8 +85,8 @@ def uneven(kind, rng):
 @pytest.mark.parametrize(
     ("kind", "flown"),
     [
-        ("dropped", 8),
-        ("in turn", 8),
+        ("dropped", 5),
+        ("in turn", 5),
         pytest.param("dropped", 40, marks=pytest.mark.long),
         pytest.param("in turn", 40, marks=pytest.mark.long),
     ],

@@ -51,6 +51,8 @@ INF, NAN = np.inf, np.nan
 POSES = ["norm-triangular", str(RECORD), "--columns", "v=ax,ay,az", "--rate", "50", "--at-rest"]
 POSES += ["--set", "norm=9.80665"]
 COUNTS = [1, 7, 63, 64, 65, 40_000]
+#: Shipped problems of one and of three residuals, with many branches and with none.
+KINDS = {"norm-triangular", "norm-pair", "wheel", "steinhart-hart"}
 
 
 @pytest.fixture(scope="module")
@@ -147,7 +149,7 @@ def test_an_angle_far_beyond_a_turn_has_its_sine():
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=[pytest.mark.long] * (n == "imu")) for n in SHIPPED]
+    "name", [pytest.param(n, marks=[pytest.mark.long] * (n not in KINDS)) for n in SHIPPED]
 )
 def test_sums_and_rows_of_a_shipped_problem_are_those_of_the_replay(name, monkeypatch):
     replay = residual_and_jacobian(find_model(name))
@@ -348,7 +350,10 @@ def test_two_processes_may_build_at_once(tmp_path):
     assert [path.suffix for path in tmp_path.iterdir()] == [".so"]
 
 
-@pytest.mark.parametrize("damage", ["cut", "empty", "text", "flipped"])
+@pytest.mark.parametrize(
+    "damage",
+    ["cut", "flipped", *(pytest.param(d, marks=pytest.mark.long) for d in ("empty", "text"))],
+)
 def test_a_damaged_library_is_built_again(tmp_path, is_compiled, damage):
     assert is_compiled(tmp_path / "whole")
     (library,) = (tmp_path / "whole").iterdir()

@@ -162,6 +162,7 @@ def test_a_small_calibration_loads_nothing_it_does_not_need(tmp_path):
         "from casest.cli import run\n"
         f"assert run(['calibrate', 'norm-diagonal', {str(tmp_path / 'n.csv')!r}]) == 0\n"
         "slow = {'scipy.stats', 'scipy.optimize', 'matplotlib', 'pandas', 'pint', 'pyarrow'}\n"
+        "slow |= {f'casest.report.html.{page}' for page in ('check', 'motion', 'side_by_side')}\n"
         "print('slow:', sorted(slow & set(sys.modules)))\n"
     )
     assert python(code).endswith("slow: []\n")

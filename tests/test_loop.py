@@ -234,6 +234,7 @@ def test_a_cause_that_the_record_cannot_size_does_no_harm():
         assert np.all(away < 5 * closing.after.std[name])
 
 
+@pytest.mark.long
 def test_of_two_causes_that_pull_opposite_ways_both_are_named_where_none_is_added():
     """A drift in an offset that is constant in half of the samples: warming up is as likely."""
     rng = np.random.default_rng(2)

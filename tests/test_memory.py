@@ -475,8 +475,8 @@ def lag_by_hand(file, quaternion):
     [
         ("broad/mag26.csv", True, 0.3e-3),
         ("ardupilot-log171/MAG_all.csv", False, 4e-3),
-        ("ardupilot-log171/MAG2_all.csv", False, 4e-3),
-        ("ardupilot-log171/MAG3_all.csv", False, 4e-3),
+        pytest.param("ardupilot-log171/MAG2_all.csv", False, 4e-3, marks=pytest.mark.long),
+        pytest.param("ardupilot-log171/MAG3_all.csv", False, 4e-3, marks=pytest.mark.long),
     ],
 )
 def test_the_lag_of_a_logged_attitude_is_what_slerp_and_a_grid_find(

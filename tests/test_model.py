@@ -519,6 +519,7 @@ def test_an_implicit_model_says_so_and_an_explicit_one_does_not():
     assert wheel.residual_unit == "m/s^2"
 
 
+@pytest.mark.long
 def test_a_wheel_at_three_tilts_is_calibrated_from_pedersinis_equations():
     rng = np.random.default_rng(0)
     t = np.linspace(0, 4, 120)

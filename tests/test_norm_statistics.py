@@ -89,7 +89,7 @@ def simulated(name, seed, calibrations):
     return outcomes
 
 
-@pytest.fixture(scope="module", params=[100, pytest.param(MANY, marks=pytest.mark.long)])
+@pytest.fixture(scope="module", params=[60, pytest.param(MANY, marks=pytest.mark.long)])
 def calibrations(request):
     """{model: outcomes} of so many calibrations of each."""
     names = ("norm-diagonal", "norm-triangular")
@@ -150,6 +150,7 @@ def test_estimates_are_unbiased_and_their_covariance_is_right(calibrations):
     assert unbiased > 1e-3
 
 
+@pytest.mark.long
 def test_the_std_is_right_when_noise_differs_between_poses_and_the_plain_one_is_not():
     """Six times the noise where x points along gravity: 150 calibrations of 200 poses each."""
     rng, model = np.random.default_rng(7), norm_model("norm-diagonal")

@@ -22,7 +22,10 @@ MEASURED = {
 }
 WITH_COMMANDS = [p for p in PAGES if any(language == "sh" for language, _ in blocks(p))]
 #: Pages whose commands take longest.
-DEAR = {"close", "equations", "in_motion", "invisible", "plan", "uncertainty"}
+DEAR = {
+    "close", "equations", "fleet", "from_others", "imu", "in_motion", "invisible", "plan",
+    "uncertainty",
+}  # fmt: skip
 
 
 def each_page():

@@ -269,7 +269,7 @@ def test_fewer_than_ten_poses_are_refused_with_the_way_out():
         attempt(PAIR, (run,))
 
 
-@pytest.mark.parametrize("axis", ["vertical", "horizontal"])
+@pytest.mark.parametrize("axis", ["horizontal", pytest.param("vertical", marks=pytest.mark.long)])
 def test_turning_about_one_axis_only_is_refused_and_said(axis):
     rng = np.random.default_rng(1)
     R = turned_about([0, 0, 1] if axis == "vertical" else [0, 1, 0], 30, rng)

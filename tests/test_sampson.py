@@ -222,7 +222,6 @@ def z_values(estimate, sensor, per_ampere, current):
 @pytest.mark.parametrize(
     ("declared", "seeds"),
     [
-        pytest.param(norm_diagonal, range(1), id="one record"),
         pytest.param(norm_diagonal, range(3), id="norm-diagonal", marks=pytest.mark.long),
         pytest.param(norm_triangular, range(3), id="norm-triangular", marks=pytest.mark.long),
     ],

@@ -164,6 +164,7 @@ def test_correlated_noise_widens_the_std_as_much_as_it_spreads_the_estimates():
     assert over == pytest.approx((1 + 0.8) / (1 - 0.8), rel=0.12)
 
 
+@pytest.mark.long
 def test_correlated_noise_in_few_batches_widens_it_too():
     error, std, found = fits(180, of_colour(0.8), 240)
     assert np.median([240 / (10 * f.correlated_over) for f in found]) < 30

@@ -29,6 +29,7 @@ def lorenz(
     return Motion(rates={"x": rates}, outputs=(measured(y, x[0]),))
 
 
+@pytest.mark.long
 def test_lorenz_from_one_coordinate_by_multiple_shooting_where_single_shooting_ends_elsewhere():
     t = np.arange(0, 5, 0.05)
     found = solve_ivp(

@@ -25,6 +25,8 @@ from casest_problems.wheel import (
 )
 
 TABLE_1 = sim.TABLE_1
+#: Mountings turned about one axis.
+SINGLE = [[0.5, 0.0, 0.0], [0.0, 0.0, 0.5]]
 
 
 def turn(angles):
@@ -174,7 +176,7 @@ def test_with_the_tilt_fixed_the_radius_is_determined():
 
 @pytest.mark.parametrize(
     "angles",
-    [[0.0, 0.0, 0.5], pytest.param([0.5, 0.0, 0.0], marks=pytest.mark.long), [0.0, 0.0, 0.0]],
+    [[0.0, 0.0, 0.0], *(pytest.param(a, marks=pytest.mark.long) for a in SINGLE)],
 )
 def test_a_mounting_turned_about_a_single_axis_is_refused_in_words(angles):
     truth = {**TABLE_1, "misalignment": np.array(angles)}

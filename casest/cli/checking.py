@@ -63,7 +63,7 @@ def check(result_path: Path, data: tuple[str, ...], options: CheckOptions) -> in
     Each file is a date, in the order given; several have a control chart. Parameters that belong
     to a run alone are fitted to the new record, shared ones are tested. Exit code 0: valid; 2: not.
     """
-    from casest.report.html import check_page
+    from casest.report.html.check import check_page
     from casest.report.next_command import recalibrating
     from casest.report.text.check import check_text
     from casest.results.check import CHECK, checked_result

@@ -82,7 +82,7 @@ def calibration(
     from casest.diagnose.misfit.left import doubts
     from casest.estimate.calibrate import attempt
     from casest.estimate.held_out import score
-    from casest.report.html import calibration_page
+    from casest.report.html.calibration import calibration_page
     from casest.report.text.calibration import calibration_text
     from casest.results.calibration import calibration_result, residual_rows
     from casest.results.file import as_json, save
@@ -170,7 +170,7 @@ def closing(
     from casest.diagnose import loop
     from casest.diagnose.held_out import scored
     from casest.effects import CATALOGUE
-    from casest.report.html import closing_page
+    from casest.report.html.closed import closing_page
     from casest.report.text.closing import closing_text
     from casest.results.closing import (
         closing_result,
@@ -235,7 +235,7 @@ def closing_in_motion(
     """Filter, diagnose the innovations, add what is missing, save, print."""
     from casest.diagnose.motion import loop
     from casest.dynamics.intensities import with_stated
-    from casest.report.html import closing_motion_page
+    from casest.report.html.motion_closed import closing_motion_page
     from casest.report.text.motion import motion_text
     from casest.results.file import as_json, save
     from casest.results.motion import motion_result, residual_rows
@@ -275,7 +275,7 @@ def refused(
     error: NotTrusted, model_name: str, data: Sequence[str], options: FitOptions, command: str
 ) -> int:
     """Write and say what there is where the declared model itself has no trustworthy fit."""
-    from casest.report.html import calibration_page
+    from casest.report.html.calibration import calibration_page
     from casest.results.calibration import calibration_result, residual_rows
     from casest.results.file import as_json, save
 

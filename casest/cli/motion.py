@@ -133,7 +133,7 @@ def observe(model_name: str, data: tuple[str, ...], options: ObserveOptions) -> 
                 command=typed(),
             )
     if options.result.output:
-        from casest.report.html import observe_page
+        from casest.report.html.motion import observe_page
 
         write(options.result.output / "observe.json", as_json(result.content()))
         reported(options.result.output, observe_page(result))
@@ -199,7 +199,7 @@ def filter_command(model_name: str, data: tuple[str, ...], options: FilterOption
     said = {**told, "horizon": options.horizon}
     result = states.follow(moving, run, tuned, **said, data=data, command=typed())
     if options.result.output:
-        from casest.report.html import filter_page
+        from casest.report.html.motion import filter_page
 
         write(options.result.output / "states.csv", states.states_csv(result.filtered))
         write(options.result.output / "filter.json", as_json(result.content()))

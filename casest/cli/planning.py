@@ -51,7 +51,7 @@ def plan(given: Path, options: PlanOptions) -> int:
     make = separating if options.separate else planned_result
     result = make(situation, options)
     if options.output:
-        from casest.report.html import plan_page
+        from casest.report.html.plan import plan_page
 
         write(options.output / "plan.csv", plan_rows(result, situation.model))
         write(options.output / "plan.json", as_json(result.content()))

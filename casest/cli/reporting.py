@@ -25,7 +25,8 @@ def report(results: tuple[Path, ...], output: Path | None, as_json: bool) -> Non
 
     They stand in the order given, or over the dates or numbers in the names of their folders.
     """
-    from casest.report.html import REPORT, side_by_side_page
+    from casest.report.html import REPORT
+    from casest.report.html.side_by_side import side_by_side_page
     from casest.report.text.side_by_side import side_by_side_text
     from casest.results.file import as_json as text_of
     from casest.results.side_by_side import side_by_side

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -13,10 +12,11 @@ from casest.engine.operations import BY_CODE, operation_of
 
 PARAMETER = 0  # which input
 SAMPLE = 1
+_CONSTANT, _INPUT, _OUTPUT = ca.OP_CONST, ca.OP_INPUT, ca.OP_OUTPUT
+_COMMUTATIVE = frozenset(code for code, operation in BY_CODE.items() if operation.commutative)
 
 
-@dataclass(frozen=True)
-class Value:
+class Value(NamedTuple):
     """One value of the single-assignment form: a constant, an input entry or an operation."""
 
     kind: str  # "constant", "parameter", "sample" or "operation"
@@ -40,19 +40,20 @@ class Graph:
         where = f"function {function.name()!r}"
         for k in range(function.n_instructions()):
             code = function.instruction_id(k)
-            source = function.instruction_input(k)
             target = function.instruction_output(k)
-            if code == ca.OP_OUTPUT:
-                self.outputs[target[0]][target[1]] = register[source[0]]
-            elif code == ca.OP_CONST:
+            if code == _CONSTANT:
                 constant = float(function.instruction_constant(k))
                 register[target[0]] = self.add(Value("constant", constant=constant))
-            elif code == ca.OP_INPUT:
+                continue
+            source = function.instruction_input(k)
+            if code == _OUTPUT:
+                self.outputs[target[0]][target[1]] = register[source[0]]
+            elif code == _INPUT:
                 register[target[0]] = self.add(_input(source[0], source[1]))
             elif operation_of(code, where).same:
                 register[target[0]] = register[source[0]]
             else:
-                operands = tuple(register[i] for i in source)
+                operands = tuple([register[i] for i in source])
                 register[target[0]] = self.add(self.operation(code, operands))
 
     def needed(self, wanted: Iterable[int]) -> list[int]:
@@ -68,16 +69,17 @@ class Graph:
 
     def operation(self, code: int, operands: tuple[int, ...]) -> Value:
         """An operation on values of the graph, not yet one of them."""
-        if BY_CODE[code].commutative:
+        if code in _COMMUTATIVE:
             operands = tuple(sorted(operands))
-        per_sample = any(self.values[i].per_sample for i in operands)
-        return Value("operation", code, operands, per_sample=per_sample)
+        values = self.values
+        per_sample = True in [values[i].per_sample for i in operands]
+        return Value("operation", code, operands, 0.0, per_sample)
 
     def add(self, value: Value) -> int:
         """The number of a value, which is added where there is no equal one."""
         # Constants by their bits, to keep -0.0 from 0.0.
-        bits = np.float64(value.constant).tobytes() if value.kind == "constant" else b""
-        key = (value.kind, value.code, value.operands, bits)
+        constant = value.kind == "constant"
+        key: object = np.float64(value.constant).tobytes() if constant else value
         if key not in self._known:
             self._known[key] = len(self.values)
             self.values.append(value)

@@ -13,7 +13,8 @@ from casest.estimate.estimate import Estimate as Fit
 from casest.interface.naming import data_names, name_of
 from casest.interface.reading import Reading
 from casest.interface.told import Told, by_axis, sample_columns
-from casest.report.html import calibration_page, closing_page
+from casest.report.html.calibration import calibration_page
+from casest.report.html.closed import closing_page
 from casest.report.text.calibration import calibration_text
 from casest.report.text.closing import closing_text
 from casest.results import calibration, closing
