@@ -13,14 +13,13 @@ from msgspec import UNSET, Struct, UnsetType
 from casest.correction.reading import typed
 from casest.data import load_runs
 from casest.data.run import Run
-from casest.declaration.model import Model
 from casest.declaration.shapes import Array
 from casest.errors import DataError, UsageError
 from casest.results.file import load_result, result_file
 from casest.results.fitted import ranges
 from casest.results.saved import SavedResult
 from casest.saved.apply import MARGIN, fitted_unit
-from casest.saved.model import saved_model
+from casest.saved.model import of_other_records, saved_model
 from casest.validity.colour import Colour, autoregressive
 from casest.validity.old import Old
 
@@ -75,7 +74,7 @@ def old_estimate(path: Path) -> tuple[Old, SavedResult]:
             f"{where}: was made by an older casest, and does not say how uncertain its unknowns "
             "are together: calibrate again"
         )
-    model, values = _of_other_records(*saved_model(content))
+    model, values = of_other_records(*saved_model(content))
     sigma = np.array([s for s in more.noise.sigma if s is not None], float)
     over = max(more.noise.correlated_over_samples or 1.0, 1.0)
     old = Old(
@@ -88,14 +87,6 @@ def old_estimate(path: Path) -> tuple[Old, SavedResult]:
         _colour(more, over, len(model.axes)),
     )
     return old, result
-
-
-def _of_other_records(model: Model, values: Mapping[str, Any]) -> tuple[Model, dict[str, Any]]:
-    """The model without what describes the course of the fitted record, which no other has."""
-    kept = tuple(a for a in model.effects if not a.effect.describes or a.kind == "noise")
-    model = replace(model, effects=kept)
-    names = {p.name for p in model.parameters}
-    return model, {name: value for name, value in values.items() if name in names}
 
 
 def _covariance(correlation: _Correlation, where: str) -> Array:

@@ -52,6 +52,14 @@ def saved_model(result: Mapping[str, Any]) -> tuple[Model, dict[str, Any]]:
     return model, {name: np.array(p["value"], dtype=float) for name, p in parameters.items()}
 
 
+def of_other_records(model: Model, values: Mapping[str, Any]) -> tuple[Model, dict[str, Any]]:
+    """The model without what describes the course of the fitted record, which no other has."""
+    kept = tuple(a for a in model.effects if not a.effect.describes or a.kind == "noise")
+    model = replace(model, effects=kept)
+    names = {p.name for p in model.parameters}
+    return model, {name: value for name, value in values.items() if name in names}
+
+
 def _found_model(result: Mapping[str, Any]) -> Model:
     """The model where it was when the result was made, and as it was."""
     name, declared = str(result["model"]), result.get("declared_in") or {}
