@@ -130,7 +130,15 @@ def run_all(
     clock = _Clock()
     ended: list[Ended] = []
     usual: dict[str, float] = {}
-    limited = _Limited(problem.model, problem.runs, problem.weights, problem.whitening, clock=clock)
+    # Constraints are held as the certified optimum found: with its multipliers.
+    limited = _Limited(
+        problem.model,
+        problem.runs,
+        problem.weights,
+        problem.whitening,
+        force=problem.force,
+        clock=clock,
+    )
     for k, task in enumerate(tasks, 1):
         say(f"{task.solver} ({k} of {len(tasks)})")
         patience = max(PATIENCE * usual.get(task.solver, np.inf), LEAST)
