@@ -138,8 +138,11 @@ class Integrator:
         columns += [h[:, None], np.broadcast_to(parameters, (len(place), len(parameters)))]
         n, rows = self.sizes[0], np.hstack(columns)
         with np.errstate(all="ignore"):
-            states, errors = self._recursion(start, rows)
-            if np.any(errors[:, 2 * n] > 0):
+            crosses = "_crossing" in vars(self)
+            if not crosses:
+                states, errors = self._recursion(start, rows)
+                crosses = bool(np.any(errors[:, 2 * n] > 0))
+            if crosses:
                 states, errors = self._crossing(start, rows)
                 errors[errors[:, 2 * n] == 1, :n] = FAILED
         return states, (errors[:, :n], errors[:, n : 2 * n]), errors[:, 2 * n] == HELD
@@ -192,12 +195,12 @@ class Integrator:
     @cached_property
     def _recursion(self) -> Recursion:
         """([x, X], numbers of a step) -> the next, the differences of x, and: did a mode change?"""
-        return self._stepping(self._plain)
+        return Recursion(self._stepping(self._plain))
 
     @cached_property
     def _crossing(self) -> Recursion:
-        """The same through one change of mode in a step; the last says that it failed."""
-        return self._stepping(Way.through)
+        """The same, where a mode changes through that change; the last says that it failed."""
+        return Recursion(self._stepping(self._plain), self._stepping(Way.through))
 
     @staticmethod
     def _plain(way: Way, x: SX, X: SX, given: Inputs, h: SX) -> tuple[SX, SX, SX, SX]:
@@ -205,7 +208,7 @@ class Integrator:
         x, X, differences = way.step(x, X, given, h, modes)
         return x, X, differences, ca.sum1(way.crossed(x, given, modes))
 
-    def _stepping(self, through: Callable[..., tuple[SX, SX, SX, SX]]) -> Recursion:
+    def _stepping(self, through: Callable[..., tuple[SX, SX, SX, SX]]) -> ca.Function:
         n, k, p = self.sizes
         given, h = numbers(k, p), ca.SX.sym("h")
         y = ca.SX.sym("y", n + n * p)
@@ -217,7 +220,7 @@ class Integrator:
         parameters = ca.vertcat(self.traced.coordinates, self.traced.references)
         row = ca.vertcat(given.u, given.du, *fed, h, parameters)
         outputs = [ca.densify(after), ca.densify(ca.vertcat(differences, mark))]
-        return Recursion(ca.Function("step", [y, row], outputs))
+        return ca.Function("step", [y, row], outputs)
 
 
 def flows(stages: Sequence[object]) -> list[Flow]:
