@@ -317,7 +317,7 @@ def table_of_solvers(found: list[dict[str, Any]]) -> Iterator[str]:
 
 def main() -> None:
     """Both tables."""
-    starts = int(sys.argv[1]) if len(sys.argv) > 1 else 10
+    starts = int(sys.argv[1]) if len(sys.argv) > 1 else 6
     found = list(rows(starts))
     lines = [
         "# Differential equations with published optima",
