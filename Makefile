@@ -47,6 +47,7 @@ bench: $(READY)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/long.py
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/motion.py
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/motion_long.py
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/equations.py
 
 study: $(READY)
 	$(BIN)/python studies/bound.py

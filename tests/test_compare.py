@@ -13,6 +13,7 @@ import casest
 from casest import NotTrusted, Residual, Run, UsageError, attitude, model, param, unit_vector
 from casest.cli import run
 from casest.comparison.judge import SOLVERS, compare
+from casest.declaration.prior import Prior
 from casest.leastsquares.problem import Problem
 from casest.report.picture import draw
 from casest.report.text.comparison import comparison_text
@@ -368,3 +369,34 @@ def test_a_plot_without_a_folder_is_named(poses, tmp_path):
     pytest.importorskip("matplotlib")
     with pytest.raises(casest.DataError, match="no plot can be written"):
         draw(comparison_result(poses, model_name="norm", data=[]), tmp_path / "nowhere")
+
+
+def test_every_solver_keeps_constraints_and_weighs_what_is_known_before():
+    """Fractions that sum to one, of which one is known better than the data tell."""
+
+    @model
+    def mixture(x=casest.signal(), y=casest.signal(), *, f=param(2, start=0.3), g=param(start=1.0)):
+        predicted = f[0] * casest.exp(-x) + f[1] * casest.exp(-3 * x) + g * x
+        kept = casest.constraint(casest.sum1(f), 1)
+        return Residual(measured=y, predicted=predicted, constraints=kept)
+
+    x = np.linspace(0, 4, 40)
+    noise = 0.01 * np.random.default_rng(0).standard_normal(40)
+    runs = [as_run(x=x, y=0.4 * np.exp(-x) + 0.6 * np.exp(-3 * x) + 0.1 * x + noise)]
+    known = Prior(("g",), ((0.11,),), ((),), ((1e-6,),), 0.01, "an earlier fit")
+    free, held = (compare(m, runs, starts=2) for m in (mixture, replace(mixture, prior=known)))
+    for found in (free, held):
+        assert found.certified
+        assert {row.solver: row.first.right for row in found.rows} == dict.fromkeys(SOLVERS, True)
+        assert all(row.right == 2 for row in found.rows)
+    # By Lagrange's linear equations, in units of the noise and of what is known.
+    columns = np.column_stack([np.exp(-x), np.exp(-3 * x), x])
+    y = runs[0].signals["y"][:, 0]
+    for found, more in ((free, 0.0), (held, 0.01**2 / 1e-6)):
+        matrix, right = columns.T @ columns, columns.T @ y
+        matrix[2, 2] += more
+        right[2] += more * 0.11
+        one = np.array([[1.0, 1, 0]])
+        whole = np.block([[matrix, one.T], [one, np.zeros((1, 1))]])
+        truth = np.linalg.solve(whole, [*right, 1])[:3]
+        assert found.estimate.point.x == pytest.approx(truth, abs=1e-9)

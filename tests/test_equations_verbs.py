@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 from test_equations import GASOIL
 
 from casest.cli import run
@@ -70,11 +71,16 @@ def test_simulate_calibrate_and_a_held_out_experiment(swing, tmp_path, capsys):
 
 def test_compare_puts_every_solver_on_equations(gasoil, shared_data, capsys):
     data = str(shared_data / "certified/cops_gasoil.csv")
-    words = ["compare", gasoil, data, "--starts", "0", "--json"]
-    assert run(words) == 0
+    several = ("trust-region", "scipy-trf", "growing-horizon", "multiple-shooting", "collocation")
+    words = [word for name in several for word in ("--solver", name)]
+    assert run(["compare", gasoil, data, "--starts", "0", "--json", *words]) == 0
     found = json.loads(capsys.readouterr().out)
     ended = {row["name"]: row["same_start"] for row in found["solvers"]}
-    assert ended["trust-region"]["right"]
+    assert set(ended) == set(several)
+    # Collocation ends at the optimum of what it has made of the equations, judged as it ends.
+    assert all(ended[name]["right"] for name in several if name != "collocation")
+    assert ended["collocation"]["claims_success"]
+    assert ended["collocation"]["distance_in_std"] < 0.1
 
 
 def said(words, capsys) -> str:
@@ -90,11 +96,62 @@ def test_what_is_asked_of_single_rows_is_refused_in_a_sentence(
     assert run(["calibrate", gasoil, data, "-o", str(tmp_path / "g")]) == 0
     capsys.readouterr()
     result = str(tmp_path / "g")
-    assert "there is nothing to correct" in said(["apply", result, data], capsys)
+    assert "of states that are followed" in said(["apply", result, data, "--with-std"], capsys)
     assert "there is nothing to correct" in said(["export", result, "--to", "c"], capsys)
     assert "Simulate a record" in said(["plan", result], capsys)
     line = ["fleet", gasoil, str(tmp_path / "line"), "-o", str(tmp_path / "fleet")]
     assert "give the records to one fit" in said(line, capsys)
+
+
+def test_apply_follows_a_new_record_from_its_own_beginning(swing, tmp_path, capsys):
+    """SciPy integrates the same equation with the result's constants and the beginning told."""
+    first = simulated(swing, tmp_path / "one", 0)
+    assert run(["calibrate", swing, first, "-o", str(tmp_path / "c")]) == 0
+    start = ("--value", "angle_start=-0.7", "--value", "rate_start=2", "--value", "w2=36")
+    plan = ("--duration", "1.5", "--rate", "40", "--noise", "0.01", "--seed", "1")
+    assert run(["simulate", swing, *plan, *start, "-o", str(tmp_path / "two")]) == 0
+    capsys.readouterr()
+    assert run(["apply", str(tmp_path / "c"), str(tmp_path / "two/record.csv")]) == 0
+    out, err = capsys.readouterr()
+    assert "fitted to this record: angle_start = -0." in err
+    heading, *rows = out.splitlines()
+    assert heading == (
+        "row,t [s],a [rad],w [rad/s],angle [rad],rate [rad/s],a_predicted [rad],w_predicted [rad/s]"
+    )
+    table = np.array([row.split(",") for row in rows], float)
+    found = json.loads((tmp_path / "c/result.json").read_text())["estimate"]["parameters"]
+    w2, viscous = found["w2"]["value"], found["viscous"]["value"]
+
+    def slope(t, x):
+        return x[1], -w2 * np.sin(x[0]) - viscous * x[1]
+
+    t = table[:, 1]
+    truth = solve_ivp(slope, (0, t[-1]), table[0, 4:6], t_eval=t, method="DOP853", rtol=1e-12,
+                      atol=1e-12).y.T  # fmt: skip
+    np.testing.assert_allclose(table[:, 4:6], truth, atol=2e-8)  # nine digits are written
+    np.testing.assert_array_equal(table[:, 4:6], table[:, 6:8])
+    # The record's own beginning is what was simulated, to a few standard deviations of 60 readings.
+    np.testing.assert_allclose(table[0, 4:6], (-0.7, 2), atol=0.05)
+
+
+def test_apply_needs_no_reading_where_the_beginning_is_known(gasoil, shared_data, tmp_path, capsys):
+    data = str(shared_data / "certified/cops_gasoil.csv")
+    assert run(["calibrate", gasoil, data, "-o", str(tmp_path / "g")]) == 0
+    (tmp_path / "times.csv").write_text("t [s]\n0\n0.1\n0.5\n2\n")
+    capsys.readouterr()
+    assert run(["apply", str(tmp_path / "g"), str(tmp_path / "times.csv")]) == 0
+    heading, *rows = capsys.readouterr().out.splitlines()
+    assert heading == "row,t [s],y[0],y[1],y1_predicted,y2_predicted"
+    table = np.array([row.split(",") for row in rows], float)
+    found = json.loads((tmp_path / "g/result.json").read_text())["estimate"]["parameters"]
+    k = [found[name]["value"] for name in ("k1", "k2", "k3")]
+
+    def slope(t, y):
+        return -(k[0] + k[2]) * y[0] ** 2, k[0] * y[0] ** 2 - k[1] * y[1]
+
+    truth = solve_ivp(slope, (0, 2), (1, 0), t_eval=table[:, 1], method="DOP853", rtol=1e-12,
+                      atol=1e-14).y.T  # fmt: skip
+    np.testing.assert_allclose(table[:, 2:4], truth, atol=2e-9)
 
 
 def test_observe_tells_what_a_record_of_equations_determines(gasoil, shared_data, capsys):

@@ -42,15 +42,21 @@ class ApplyOptions:
 @click.argument("data", type=click.Path())
 @taking(ApplyOptions)
 def apply(result_path: Path, data: str, options: ApplyOptions) -> None:
-    """Correct the readings in DATA with a saved RESULT (result.json, or its folder)."""
+    """Correct the readings in DATA with a saved RESULT (result.json, or its folder).
+
+    Of differential equations: their states and the predicted readings along DATA, whose own
+    beginning is fitted to it.
+    """
     from casest.correction.formats_read import is_foreign
     from casest.correction.inverse import LEFT, TIMED
     from casest.report.next_command import following
     from casest.saved import apply as correcting
     from casest.saved.export import applied, applied_foreign, is_exported
+    from casest.saved.following import followed_csv, follows
 
     arguments = options.reading.keywords()
     progress(f"correcting {data}")
+    left: tuple[str, ...] = ()
     timed: tuple[str, ...] = ()
     if is_foreign(result_path):
         if options.std:
@@ -58,6 +64,13 @@ def apply(result_path: Path, data: str, options: ApplyOptions) -> None:
         text, left, remarks = applied_foreign(result_path, data, arguments)
     elif is_exported(result_path):
         text, left, remarks = applied(result_path, data, arguments, std=options.std)
+    elif follows(result_path):
+        if options.std:
+            raise UsageError(
+                "--with-std: of states that are followed along a record no standard deviations "
+                "are told; casest budget RESULT tells those of the constants"
+            )
+        text, remarks = followed_csv(result_path, data, arguments, force=options.force)
     else:
         text, left, remarks = correcting.corrected_csv(
             result_path, data, arguments, force=options.force, std=options.std

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from casest.comparison.runs import SOLVERS, Ended, run_all, tasks_of
+from casest.comparison.runs import SOLVERS, TRANSCRIPTIONS, Ended, run_all, solvers_of, tasks_of
 from casest.data.run import Run
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
@@ -167,7 +167,7 @@ def compare(
 
 
 def _wanted(model: Model, solvers: Sequence[str]) -> list[str]:
-    known = [*SOLVERS, *(name for name, _ in model.estimators)]
+    known = [*solvers_of(model), *(name for name, _ in model.estimators)]
     for name in solvers:
         if name not in known:
             raise UsageError(f"unknown solver {name!r} for {model.name}; it has {', '.join(known)}")
@@ -279,7 +279,9 @@ def _rows(judge: _Judge, ended: Sequence[Ended]) -> Iterator[Row]:
         trials = [_trial(judge, e) for e in ended if e.task.solver == name]
         first = [t for t in trials if t.size == 0]
         spread = tuple(t for t in trials if t.size > 0)
-        yield Row(name, name not in SOLVERS, first[0] if first else None, spread)
+        yield Row(
+            name, name not in {**SOLVERS, **TRANSCRIPTIONS}, first[0] if first else None, spread
+        )
 
 
 def _trial(judge: _Judge, ended: Ended) -> Trial:

@@ -17,9 +17,12 @@ from casest.declaration.shapes import Array
 from casest.engine import Normal
 from casest.errors import CasestError
 from casest.leastsquares.problem import Point, Problem
+from casest.solve.collocation import collocated
+from casest.solve.horizon import grown
 from casest.solve.ipopt import ipopt
 from casest.solve.others import METHODS, scipy_solver, sqpmethod
 from casest.solve.outcome import Outcome
+from casest.solve.shooting import shot
 from casest.solve.trust_region import trust_region
 
 #: Solvers of the least-squares problem, from a start.
@@ -29,6 +32,13 @@ SOLVERS: dict[str, Callable[[Problem, Point], Outcome]] = {
     "sqpmethod": sqpmethod,
     "trust-region": trust_region,
     **{f"scipy-{method}": partial(scipy_solver, method=method) for method in METHODS},
+}
+#: Beside them for differential equations: along the record, from many beginnings at once, and with
+#: the equations as constraints. The cost is that of the integrated equations where each ends.
+TRANSCRIPTIONS: dict[str, Callable[[Problem, Point], Outcome | None]] = {
+    "growing-horizon": grown,
+    "multiple-shooting": shot,
+    "collocation": collocated,
 }
 #: A run of the spread is stopped after this many times the solver's time from the same start, but
 #: not before so many seconds: what is lost by then is not found later.
@@ -112,12 +122,17 @@ class _Limited(Problem):
         return super().jacobian(point)
 
 
+def solvers_of(model: Model) -> dict[str, Callable[[Problem, Point], Outcome | None]]:
+    """Those that a model's problem can be given to, by name."""
+    return {**SOLVERS, **(TRANSCRIPTIONS if model.traced.integrates else {})}
+
+
 def tasks_of(
     model: Model, names: Sequence[str], starts: Sequence[tuple[float, Point]]
 ) -> list[Task]:
     """What to run, start by start."""
     own = [name for name, _ in model.estimators if name in names]
-    ours = [name for name in names if name in SOLVERS]
+    ours = [name for name in names if name in solvers_of(model)]
     tasks = [Task(name, size, point) for size, point in starts for name in ours]
     first = [*tasks[: len(ours)], *(Task(name, None, None) for name in own)]
     return [*first, *tasks[len(ours) :]]
@@ -130,7 +145,15 @@ def run_all(
     clock = _Clock()
     ended: list[Ended] = []
     usual: dict[str, float] = {}
-    limited = _Limited(problem.model, problem.runs, problem.weights, problem.whitening, clock=clock)
+    # Constraints are held as the certified optimum found: with its multipliers.
+    limited = _Limited(
+        problem.model,
+        problem.runs,
+        problem.weights,
+        problem.whitening,
+        force=problem.force,
+        clock=clock,
+    )
     for k, task in enumerate(tasks, 1):
         say(f"{task.solver} ({k} of {len(tasks)})")
         patience = max(PATIENCE * usual.get(task.solver, np.inf), LEAST)
@@ -159,7 +182,8 @@ def _run(task: Task, problem: _Limited, limit: float) -> Ended:
             if task.start is None:
                 outcome, kept = _estimated(task.solver, problem, began)
             else:
-                outcome = SOLVERS[task.solver](problem, task.start)
+                outcome = solvers_of(problem.model)[task.solver](problem, task.start)
+                reason = reason if outcome else "cannot be written so"
     except _OutOfTime:
         pass
     except CasestError as error:

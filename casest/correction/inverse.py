@@ -118,8 +118,8 @@ class Correction:
             if self.model.traced.integrates:
                 raise UsageError(
                     f"{name} tells how states go on, not what a reading should have been: there is "
-                    "nothing to correct; residuals.csv has readings less predictions, and casest "
-                    "simulate predicts another record (--value NAME=… of the result)"
+                    "nothing to correct; casest apply RESULT RECORD follows its states along a "
+                    "record, and casest simulate makes one (--value NAME=… of the result)"
                 )
             raise UsageError(f"model {name} names no corrected quantity: Residual(…)")
         left = invertible(self.model)[1]

@@ -29,15 +29,16 @@ _FLAGS = [["-O1", "-ffp-contract=off", "-fno-math-errno"]]
 _LOOP = """
 void casest_run(const double *state, const double *numbers, long n, double **out, int keep) {
   const double *from = state;
-  const double *arg[2];
-  double *res[%(outputs)d];
+  const double *arg[%(arg)d];
+  double *res[%(res)d], w[%(w)d];
+  casadi_int iw[%(iw)d];
   static const long size[] = {%(sizes)s};
   for (long k = 0; k < n; ++k) {
     arg[0] = from;
     arg[1] = numbers + k * %(wide)d;
     res[0] = out[0] + (keep ? k : k %% 2) * size[0];
     for (int i = 1; i < %(outputs)d; ++i) res[i] = out[i] + k * size[i];
-    casest_step(arg, res, 0, 0, 0);
+    casest_step(arg, res, iw, w, 0);
     from = res[0];
   }
 }
@@ -45,11 +46,15 @@ void casest_run(const double *state, const double *numbers, long n, double **out
 
 
 class Recursion:
-    """`step`: (state, numbers of one sample) -> (state, …), both vectors, of SX."""
+    """`step`: (state, numbers of one sample) -> (state, …), both vectors.
 
-    def __init__(self, step: ca.Function) -> None:
-        arguments = step.sx_in()
-        self._step = ca.Function("casest_step", arguments, step.call(arguments), {"cse": True})
+    `instead`: a dearer step that is made where the last number of what `step` gives is above zero.
+    """
+
+    def __init__(self, step: ca.Function, instead: ca.Function | None = None) -> None:
+        self._step = _shared(step, "casest_step")
+        if instead is not None:
+            self._step = _either(self._step, _shared(instead, "instead"))
         self.sizes = [int(step.numel_out(i)) for i in range(step.n_out())]
         self._wide = int(step.numel_in(1))
         self._replayed = 0
@@ -98,7 +103,9 @@ class Recursion:
     def _source(self) -> str:
         generator = ca.CodeGenerator("step.c")
         generator.add(self._step)
-        sizes = {"outputs": len(self.sizes), "sizes": ", ".join(map(str, self.sizes))}
+        sizes: dict[str, Any] = {name: getattr(self._step, f"sz_{name}")() + 1
+                                 for name in ("arg", "res", "iw", "w")}  # fmt: skip
+        sizes |= {"outputs": len(self.sizes), "sizes": ", ".join(map(str, self.sizes))}
         return str(generator.dump()) + _LOOP % {**sizes, "wide": self._wide}
 
     def _replay(self, state: Floats, numbers: Floats, found: list[Floats], keep: bool) -> None:
@@ -122,6 +129,24 @@ class Recursion:
                 if keep or i:
                     found[i][k : k + size] = part[:size]
             state = parts[0][-1].copy()
+
+
+def _shared(step: ca.Function, name: str) -> ca.Function:
+    """The same of SX, what is computed twice computed once."""
+    arguments = step.sx_in()
+    return ca.Function(name, arguments, step.call(arguments), {"cse": True})
+
+
+def _either(step: ca.Function, instead: ca.Function) -> ca.Function:
+    """The step, or that instead where it says so; only one of them is computed then."""
+    arguments = [ca.MX.sym(f"i{i}", step.size_in(i)) for i in range(step.n_in())]
+    first = step.call(arguments)
+    given = [ca.MX.sym(f"g{i}", step.size_out(i)) for i in range(step.n_out())]
+    taken = ca.Function("taken", [*arguments, *given], instead.call(arguments))
+    kept = ca.Function("kept", [*arguments, *given], given)
+    chosen = ca.Function.if_else("chosen", taken, kept)
+    found = chosen.call([first[-1][-1] > 0, *arguments, *first])
+    return ca.Function("casest_step", arguments, found)
 
 
 def _chunk(count: int) -> int:

@@ -24,11 +24,13 @@ from casest.declaration.tracing import Traced
 from casest.engine import Recursion
 from casest.engine.runge_kutta import ORDER, error
 from casest.leastsquares.stepping import HELD, Inputs, Switched, Way, numbers, switched
+from casest.leastsquares.stiff import Stiff
 
 #: Error of a step allowed, of the largest size that a state has along the record.
 TOLERANCE = 1e-10
-#: Steps of one run in all, from which on it is given up: the equations are stiff there.
-MOST = 300_000
+#: Steps of one run in all, from which on it is given up, the equations being stiff there; and from
+#: which on implicit ones are tried, where they can be.
+MOST, MANY = 300_000, 30_000
 #: Rounds in which steps are cut; how much at most in one round; a little more than needed.
 ROUNDS, CUT, MARGIN = 30, 8.0, 1.1
 #: Difference that stands for a step which did not succeed.
@@ -39,9 +41,13 @@ BLIND, BLINDLY = 4, 1024
 
 @dataclass
 class Mesh:
-    """Steps of one run: how many in each interval between samples; None before the first time."""
+    """Steps of one run: how many in each interval between samples; None before the first time.
+
+    `stiff`: explicit ones would be too many, and implicit ones are made instead.
+    """
 
     counts: Index | None = None
+    stiff: bool = False
 
 
 @dataclass(frozen=True)
@@ -79,12 +85,14 @@ class Integrator:
 
         `finer`: every step is cut in so many.
         """
-        n, _, p = self.sizes
+        n = self.sizes[0]
         leads = self.flow.anchored and course.time[0] > 0
         course = self._from_zero(course) if leads else course
         if mesh.counts is None:
             mesh.counts = np.ones(len(course.time) - 1, dtype=int)
         start = np.array(self._start(parameters)).ravel()
+        if mesh.stiff:
+            return self._unpacked(self._implicit(start, parameters, course)[int(leads) :])
         for _ in range(ROUNDS):
             counts = mesh.counts * finer
             states, errors, held = self._run(start, parameters, course, counts)
@@ -95,6 +103,11 @@ class Integrator:
             settled = bool(np.all(wanted <= counts))
             if settled and np.sum(wanted) > 0.8 * np.sum(counts):
                 break
+            if np.sum(wanted) > MANY + 4 * len(counts) and self._stiff is not None:
+                found = self._implicit(start, parameters, course)
+                mesh.stiff = bool(np.isfinite(found).all())
+                if mesh.stiff:
+                    return self._unpacked(found[int(leads) :])
             if np.sum(wanted) > MOST + len(counts):
                 states = self._cut_off(states, counts, wanted)
                 break
@@ -102,8 +115,37 @@ class Integrator:
             if settled:
                 break  # the next time with fewer
         ends = np.cumsum(counts) - 1
-        found = np.vstack([start[None], states[ends]])[1 if leads else 0 :]
+        return self._unpacked(np.vstack([start[None], states[ends]])[int(leads) :])
+
+    def _unpacked(self, found: Array) -> tuple[Array, Array]:
+        """States (N, n) and slopes (N, n, p) of [x, X] (N, n + n·p)."""
+        n, _, p = self.sizes
         return found[:, :n], found[:, n:].reshape(len(found), p, n).transpose(0, 2, 1)
+
+    def _implicit(self, start: Array, parameters: Array, course: Course) -> Array:
+        """[x, X] at every sample by a method for stiff equations; NaN behind the first where it
+        cannot go on, jumps, or is fed by inputs."""
+        found = np.full((len(course.time), len(start)), np.nan)
+        found[0] = start
+        if self._stiff is None:
+            return found
+        clock = self.flow.clock
+        late = 0.0 if clock is None else course.inputs[0, clock] - course.time[0]
+        along = self._stiff.along(start, parameters, course.time + late)
+        return found if along is None else along
+
+    @cached_property
+    def _stiff(self) -> Stiff | None:
+        """The equations of [x, X] as a whole; None where they jump or are fed by inputs."""
+        flow, (n, k, p) = self.flow, self.sizes
+        if k > (flow.clock is not None) or self._held.modes.numel():
+            return None
+        X = ca.SX.sym("X", n, p)
+        A, B = ca.jacobian(flow.rates, flow.x), ca.jacobian(flow.rates, self._coordinates)
+        rate = ca.vertcat(flow.rates, ca.vec(A @ X + B))
+        clock = None if flow.clock is None else flow.inputs[flow.clock]
+        parameters = ca.vertcat(self.traced.coordinates, self.traced.references)
+        return Stiff(ca.vertcat(flow.x, ca.vec(X)), ca.densify(rate), parameters, clock)
 
     def _from_zero(self, course: Course) -> Course:
         """The course from t = 0 on: inputs are as at the first sample until then."""
@@ -138,8 +180,11 @@ class Integrator:
         columns += [h[:, None], np.broadcast_to(parameters, (len(place), len(parameters)))]
         n, rows = self.sizes[0], np.hstack(columns)
         with np.errstate(all="ignore"):
-            states, errors = self._recursion(start, rows)
-            if np.any(errors[:, 2 * n] > 0):
+            crosses = "_crossing" in vars(self)
+            if not crosses:
+                states, errors = self._recursion(start, rows)
+                crosses = bool(np.any(errors[:, 2 * n] > 0))
+            if crosses:
                 states, errors = self._crossing(start, rows)
                 errors[errors[:, 2 * n] == 1, :n] = FAILED
         return states, (errors[:, :n], errors[:, n : 2 * n]), errors[:, 2 * n] == HELD
@@ -192,12 +237,12 @@ class Integrator:
     @cached_property
     def _recursion(self) -> Recursion:
         """([x, X], numbers of a step) -> the next, the differences of x, and: did a mode change?"""
-        return self._stepping(self._plain)
+        return Recursion(self._stepping(self._plain))
 
     @cached_property
     def _crossing(self) -> Recursion:
-        """The same through one change of mode in a step; the last says that it failed."""
-        return self._stepping(Way.through)
+        """The same, where a mode changes through that change; the last says that it failed."""
+        return Recursion(self._stepping(self._plain), self._stepping(Way.through))
 
     @staticmethod
     def _plain(way: Way, x: SX, X: SX, given: Inputs, h: SX) -> tuple[SX, SX, SX, SX]:
@@ -205,7 +250,7 @@ class Integrator:
         x, X, differences = way.step(x, X, given, h, modes)
         return x, X, differences, ca.sum1(way.crossed(x, given, modes))
 
-    def _stepping(self, through: Callable[..., tuple[SX, SX, SX, SX]]) -> Recursion:
+    def _stepping(self, through: Callable[..., tuple[SX, SX, SX, SX]]) -> ca.Function:
         n, k, p = self.sizes
         given, h = numbers(k, p), ca.SX.sym("h")
         y = ca.SX.sym("y", n + n * p)
@@ -217,7 +262,7 @@ class Integrator:
         parameters = ca.vertcat(self.traced.coordinates, self.traced.references)
         row = ca.vertcat(given.u, given.du, *fed, h, parameters)
         outputs = [ca.densify(after), ca.densify(ca.vertcat(differences, mark))]
-        return Recursion(ca.Function("step", [y, row], outputs))
+        return ca.Function("step", [y, row], outputs)
 
 
 def flows(stages: Sequence[object]) -> list[Flow]:

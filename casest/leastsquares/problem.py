@@ -538,7 +538,7 @@ class Problem:
         assert force is not None
         return force
 
-    def _rows_beyond(self, point: Point) -> Array:
+    def rows_beyond(self, point: Point) -> Array:
         """[J r] (k, n + 1) of all that is no reading: what is known before, and constraints."""
         parts = [np.zeros((0, self.unknowns + 1))]
         if self.model.prior is not None:
@@ -616,7 +616,7 @@ class Problem:
         own = sum(self._run_cost(point, r) for r in range(len(self.runs)))
         if self._bare:
             return own
-        own += 0.5 * float(np.sum(self._rows_beyond(point)[:, -1] ** 2))
+        own += 0.5 * float(np.sum(self.rows_beyond(point)[:, -1] ** 2))
         return own if self.constraints is None else max(own - self._force.spared, 0.0)
 
     def normal(self, point: Point) -> Normal:
@@ -636,7 +636,7 @@ class Problem:
         own = self.of_runs(point)
         if self._bare:
             return own
-        rows = self._rows_beyond(point)
+        rows = self.rows_beyond(point)
         product = rows.T @ rows
         total = own.cost + 0.5 * float(product[-1, -1])
         if self.constraints is not None:
@@ -678,7 +678,7 @@ class Problem:
             block[:, [*x, n]] = own
             blocks.append(block)
         if not self._bare:
-            blocks.append(self._rows_beyond(point))
+            blocks.append(self.rows_beyond(point))
         whole = np.vstack(blocks)
         if len(blocks) > 1:
             whole = np.asarray(np.linalg.qr(whole, mode="r"))

@@ -430,7 +430,8 @@ def _correction(
     model = estimate.model.without_noise  # readings are corrected without their noise
     found = carried(model, estimate.values, estimate.problem.runs, units, around)
     if isinstance(found, str):
-        return {"correction": {"reason": found}, "corrected_budget": None}
+        why = {"reason": found, **({"follows": True} if follows(model) else {})}
+        return {"correction": why, "corrected_budget": None}
     found, budget = _with_spread(estimate, units, found, model)
     lasting = model.elsewhere([run.span for run in estimate.problem.runs])
     if lasting is not model:
@@ -445,6 +446,11 @@ def _correction(
     values = {name: plain(value) for name, value in estimate.values.items()}
     of = digest_of_values(values, estimate.certificate.trusted)
     return {"correction": {"of": of, **carried_data(found)}, "corrected_budget": budget}
+
+
+def follows(model: Model) -> bool:
+    """Are its states followed along a record, with nothing that would be corrected?"""
+    return model.traced.integrates and model.traced.corrected is None
 
 
 def _with_spread(

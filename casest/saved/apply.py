@@ -73,7 +73,7 @@ def corrected_csv(
     text = table_of(runs, [s.name for s in needed], found, program.output.name, unit, spreads)
     notes = dict.fromkeys(note for run in runs for note in run.notes)
     far = () if _was_fitted(result, data) else extrapolated(carried, runs)
-    return Applied(text, program.left, (*notes, *remarks, *_of_units(result, runs, data), *far))
+    return Applied(text, program.left, (*notes, *remarks, *of_units(result, runs, data), *far))
 
 
 def fitted_unit(result: SavedResult, signal: Signal) -> str | None:
@@ -82,7 +82,7 @@ def fitted_unit(result: SavedResult, signal: Signal) -> str | None:
     return stated if stated and "[" not in stated and signal.kind == "plain" else None
 
 
-def _of_units(result: SavedResult, runs: Sequence[Run], data: str) -> Iterator[str]:
+def of_units(result: SavedResult, runs: Sequence[Run], data: str) -> Iterator[str]:
     """That a unit cannot be compared with that of the fit, which nobody stated."""
     for name, unit in runs[0].units.items():
         if unit and result.units.get(name) == f"[{name}]":
@@ -235,15 +235,15 @@ def table_of(
     given = [signal for signal in given if signal != "t" or first.time is None]
     header = ["run"] * several + ["row"] + ["t [s]"] * (first.time is not None)
     for signal in given:
-        own = _bracket(first.units.get(signal))
+        own = bracket(first.units.get(signal))
         header += [f"{signal}{a}{own}" for a in axes(first.signals[signal].shape[1])]
-    header += [f"{name}{'_' * bool(a)}{a}{_bracket(unit)}" for a in axes(found[0].shape[1])]
+    header += [f"{name}{'_' * bool(a)}{a}{bracket(unit)}" for a in axes(found[0].shape[1])]
     if spreads:
         found = [np.hstack([f, _together_first(s)]) for f, s in zip(found, spreads, strict=True)]
         labels = [f"_{part}" for part in PARTS[:-1]]
         size = spreads[0].shape[1] // len(PARTS)
         ends = [p + "_" * bool(a) + a for p in ("", *labels) for a in axes(size)]
-        header += [f"{name}_std{end}{_bracket(unit)}" for end in ends]
+        header += [f"{name}_std{end}{bracket(unit)}" for end in ends]
     writer.writerow(header)
     for run, value in zip(runs, found, strict=True):
         numbers = np.column_stack([*(run.signals[signal] for signal in given), value])
@@ -265,7 +265,8 @@ def axes(size: int) -> list[str]:
     return [""] if size == 1 else list("xyz") if size == 3 else [str(i) for i in range(size)]
 
 
-def _bracket(unit: str | None) -> str:
+def bracket(unit: str | None) -> str:
+    """A unit as it stands behind a name in a header."""
     return f" [{unit}]" if unit and "[" not in unit and unit != "1" else ""
 
 

@@ -19,7 +19,7 @@ from casest.results.file import load_result, result_file
 from casest.results.fitted import ranges
 from casest.results.saved import SavedResult
 from casest.saved.apply import MARGIN, fitted_unit
-from casest.saved.model import saved_model
+from casest.saved.model import of_other_records
 from casest.validity.colour import Colour, autoregressive
 from casest.validity.old import Old
 
@@ -46,17 +46,12 @@ class _Spectrum(Struct, frozen=True):
     samples_per_second: float | None = None
 
 
-class _Samples(Struct, frozen=True):
-    span: tuple[float, float] | None = None
-
-
 class _Judging(Struct, frozen=True, kw_only=True):
     """What is read of a result besides what `SavedResult` has."""
 
     noise: _Noise
     spectrum: _Spectrum | None = None
     conditions: dict[str, list[float]] = {}
-    samples: list[_Samples] = []
     estimate: _Section | UnsetType = UNSET
     after: _Section | UnsetType = UNSET
 
@@ -79,9 +74,7 @@ def old_estimate(path: Path) -> tuple[Old, SavedResult]:
             f"{where}: was made by an older casest, and does not say how uncertain its unknowns "
             "are together: calibrate again"
         )
-    model, values = saved_model(content)
-    model = model.elsewhere([s.span for s in more.samples])
-    values = model.among(values)
+    model, values = of_other_records(content)
     sigma = np.array([s for s in more.noise.sigma if s is not None], float)
     over = max(more.noise.correlated_over_samples or 1.0, 1.0)
     old = Old(

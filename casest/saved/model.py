@@ -52,6 +52,14 @@ def saved_model(result: Mapping[str, Any]) -> tuple[Model, dict[str, Any]]:
     return model, {name: np.array(p["value"], dtype=float) for name, p in parameters.items()}
 
 
+def of_other_records(result: Mapping[str, Any]) -> tuple[Model, dict[str, Any]]:
+    """The model of a saved result as it is for other records than its own, and its values."""
+    model, values = saved_model(result)
+    spans = [s.get("span") for s in result.get("samples", [])]
+    lasting = model.elsewhere([(float(s[0]), float(s[1])) if s else None for s in spans])
+    return lasting, lasting.among(values)
+
+
 def _found_model(result: Mapping[str, Any]) -> Model:
     """The model where it was when the result was made, and as it was."""
     name, declared = str(result["model"]), result.get("declared_in") or {}

@@ -75,7 +75,10 @@ def _refuse_large(problem: Problem, method: str) -> None:
 
 
 class _Dense:
-    """Weighted residuals and Jacobian of all samples, in the chart of the start."""
+    """Weighted residuals and Jacobian of all samples, in the chart of the start.
+
+    Behind them what is known before, and constraints, as all solvers see them.
+    """
 
     def __init__(self, problem: Problem, start: Point) -> None:
         self.problem, self.references = problem, start.references
@@ -85,16 +88,18 @@ class _Dense:
 
     def residual(self, x: Array) -> Array:
         """All residuals, (residuals,)."""
-        parts = self.problem.residuals(Point(x, self.references))
-        whole = np.concatenate([part.ravel() for part in parts])
-        return whole if self.root is None else self.root * whole
+        point = Point(x, self.references)
+        whole = np.concatenate([part.ravel() for part in self.problem.residuals(point)])
+        whole = whole if self.root is None else self.root * whole
+        return np.concatenate([whole, self.problem.rows_beyond(point)[:, -1]])
 
     def jacobian(self, x: Array) -> Array:
         """The whole Jacobian, (residuals, n)."""
-        whole = self.problem.jacobian(Point(x, self.references))
+        point = Point(x, self.references)
+        whole = self.problem.jacobian(point)
         if self.root is not None:
             whole *= self.root[:, None]
-        return whole
+        return np.vstack([whole, self.problem.rows_beyond(point)[:, :-1]])
 
 
 def sqpmethod(problem: Problem, start: Point) -> Outcome:

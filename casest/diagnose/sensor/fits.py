@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from casest.data.run import Run
 from casest.declaration.model import Model
@@ -62,12 +63,24 @@ def certified(fit: Fit, runs: tuple[Run, ...]) -> Fit | str:
     found = trust_region(problem, problem.point(fit.values), max_iterations=LONG)
     values = problem.values(found.point)
     why = undetermined(problem, values)
-    normal = problem.normal(found.point)
-    step = np.linalg.lstsq(normal.matrix, normal.gradient, rcond=1e-12)[0]
-    length = float(np.sqrt(max(float(step @ normal.gradient), 0.0)))
+    normal, free = problem.normal(found.point), ~_held(problem, found.point)
+    slope, matrix = normal.gradient[free], normal.matrix[np.ix_(free, free)]
+    step = np.linalg.lstsq(matrix, slope, rcond=1e-12)[0]
+    length = float(np.sqrt(max(float(step @ slope), 0.0)))
     if not why and length > RESTLESS * fit.noise:
         why = "not a stationary point"
     return f"its fit is refused: {why}" if why else replace(fit, values=values)
+
+
+def _held(problem: Problem, point: Point) -> NDArray[np.bool_]:
+    """Declared unknowns that lie on a bound and would go beyond: a friction that is none."""
+    effects = {p.name for a in problem.model.effects for p in a.parameters}
+    lower, upper = problem.bounds
+    slope = problem.normal(point).gradient
+    held = ((point.x <= lower) & (slope > 0)) | ((point.x >= upper) & (slope < 0))
+    for slot in problem.slots:
+        held[slot.x] &= slot.parameter.name not in effects
+    return np.asarray(held)
 
 
 def starts(model: Model, runs: tuple[Run, ...], values: Mapping[str, Array]) -> dict[str, Array]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Iterator
+from itertools import combinations
 from pathlib import Path
 
 from casest.data.logs import file_name
@@ -14,6 +15,8 @@ from casest.results.verdict import instead, largest, of_the_user, refusals, sent
 
 #: Lists longer than this are left to result.json.
 SHOWN = 4
+#: Correlation from which two unknowns are nearly one.
+ONE = 0.99
 
 
 def closing_text(result: Closed, output: Path | None) -> str:
@@ -84,6 +87,26 @@ def _moved(result: Closed) -> Iterator[str]:
     if far:
         words = ", ".join(f"{n} by {z:.1f}" for z, n in far)
         yield item(f"Moved by the addition, in standard deviations before it: {words}")
+    alike = _alike(result)
+    if alike:
+        yield item(
+            f"Hardly told apart by this record: {', '.join(alike)}: what they do together is known "
+            "far better than each alone"
+        )
+
+
+def _alike(result: Closed) -> list[str]:
+    """Pairs of unknowns, one of them added, that are nearly one."""
+    found = result.after.correlation
+    if not found:
+        return []
+    pairs = combinations(range(len(found.names)), 2)
+    sizes = [(i, j, found.matrix[i][j]) for i, j in pairs]
+    return [
+        f"{found.names[i]} and {found.names[j]} (correlation {rho:.3f})"
+        for i, j, rho in sizes
+        if rho is not None and abs(rho) >= ONE and "." in found.names[i] + found.names[j]
+    ]
 
 
 def _invisible(result: Closed) -> Iterator[str]:

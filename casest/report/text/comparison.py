@@ -54,7 +54,7 @@ def _first_table(result: SolversCompared, rows: Sequence[Compared]) -> Iterator[
     start = "the automatic start" if result.same_start == "automatic" else "the start given"
     yield f"From {start}:"
     yield ""
-    form = "  {:<13} {:>11} {:>9}  {:>5} {:>6} {:>5} {:>5} {:>9}"
+    form = f"  {{:<{_names(rows)}}} {{:>11}} {{:>9}}  {{:>5}} {{:>6}} {{:>5}} {{:>5}} {{:>9}}"
     heads = "solver", "cost excess", "distance", "right", "claims", "iter", "eval", "time"
     yield form.format(*heads)
     for row in rows:
@@ -93,11 +93,14 @@ def _own_table(rows: Sequence[Compared]) -> Iterator[str]:
 
 
 def _spread_table(result: SolversCompared, rows: Sequence[Compared]) -> Iterator[str]:
-    sizes, width = _shown(result)
+    names = _names(rows)
+    sizes, width = _shown(result, names)
     starts = max(row.spread.starts for row in rows)
     yield f"From {starts} starts around it, moved by shares of each unknown's size:"
     yield ""
-    form = "  {:<13} {:>5} {:>7} {:>7} {:>7} {:>8}" + f" {{:>{width}}}" * len(sizes)
+    form = f"  {{:<{names}}} {{:>5}} {{:>7}} {{:>7}} {{:>7}} {{:>8}}" + f" {{:>{width}}}" * len(
+        sizes
+    )
     heads = [_percent(size) for size in sizes]
     yield form.format("solver", "right", "claimed", "falsely", "doubted", "time", *heads)
     for row in rows:
@@ -121,11 +124,16 @@ def _spread_table(result: SolversCompared, rows: Sequence[Compared]) -> Iterator
     )
 
 
-def _shown(result: SolversCompared) -> tuple[list[float], int]:
+def _names(rows: Sequence[Compared]) -> int:
+    """How wide the column of names is."""
+    return max(13, *(len(row.name) for row in rows))
+
+
+def _shown(result: SolversCompared, names: int) -> tuple[list[float], int]:
     """As many sizes as fit beside the rest, and the width of their columns."""
     sizes = list(dict.fromkeys(result.spread.sizes))
     width = max(5, *(len(_percent(size)) for size in sizes))
-    return sizes[: (WIDTH - 54) // (width + 1)], width
+    return sizes[: (WIDTH - 41 - names) // (width + 1)], width
 
 
 def _percent(size: float) -> str:

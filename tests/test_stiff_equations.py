@@ -1,0 +1,86 @@
+"""Stiff equations: the fast part dies away a million times faster than the record lasts.
+
+Readings are made by SciPy's Radau, which shares nothing with what fits them.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from casest import Run, attempt, param, signal, vertcat
+from casest.dynamics import Motion, dynamics, measured, state
+from casest.leastsquares.problem import Problem
+
+#: Robertson's reaction (1966), as published: 1/s.
+PUBLISHED = (0.04, 3e7, 1e4)
+
+
+@dynamics
+def robertson(
+    a=signal(),
+    b=signal(),
+    c=signal(),
+    *,
+    y=state(3, start=[1, 0, 0], known=True),
+    k1=param("1/s", start=0.1, bounds=(0, None)),
+    k2=param("1/s", start=1e7, bounds=(0, None)),
+    k3=param("1/s", start=3e4, bounds=(0, None)),
+):
+    """An autocatalytic reaction of three substances."""
+    made, used = k1 * y[0] - k3 * y[1] * y[2], k2 * y[1] ** 2
+    outputs = (
+        measured(a, y[0], std=0.01),
+        measured(b, y[1], std=1e-7),
+        measured(c, y[2], std=0.01),
+    )
+    return Motion(rates={"y": vertcat(-made, made - used, used)}, outputs=outputs)
+
+
+def reaction(_, y):
+    k1, k2, k3 = PUBLISHED
+    made, used = k1 * y[0] - k3 * y[1] * y[2], k2 * y[1] ** 2
+    return -made, made - used, used
+
+
+@pytest.mark.long
+def test_robertsons_rate_constants_are_found_from_starts_three_times_off():
+    t = np.concatenate([[0], np.logspace(-1, 5, 13)])
+    made = solve_ivp(reaction, (0, t[-1]), (1, 0, 0), "Radau", t, rtol=1e-11, atol=1e-15).y.T
+    noise = np.random.default_rng(1).standard_normal(made.shape) * [0.01, 1e-7, 0.01]
+    read = {name: (made + noise)[:, [i]] for i, name in enumerate("abc")}
+    run = Run.raw("reaction", read, units={}, time=t)
+    found = attempt(robertson.calibration, [run], intervals=False)
+    assert found.certificate.trusted, found.certificate.reasons
+    for name, truth in zip(("k1", "k2", "k3"), PUBLISHED, strict=True):
+        assert abs(found.values[name] - truth) < 4 * found.std[name]
+        assert found.std[name] < 0.1 * truth
+
+
+@dynamics
+def relaxing(
+    x=signal(), v=signal(), *, z=state(2, start=[2, 0], known=True), mu=param(start=1000.0)
+):
+    """Van der Pol's oscillator."""
+    rates = vertcat(z[1], mu * (1 - z[0] ** 2) * z[1] - z[0])
+    outputs = measured(x, z[0], std=1.0), measured(v, z[1], std=1e-3)
+    return Motion(rates={"z": rates}, outputs=outputs)
+
+
+def test_van_der_pols_oscillator_is_followed_through_its_jumps():
+    """mu = 1000 up to t = 2000: the reference of the Test Set for IVP Solvers (Mazzia & Magherini),
+    there in units of mu; slopes against differences of states that are followed without them."""
+    t = np.linspace(0, 2000, 21)
+    nothing = np.zeros((len(t), 1))
+    run = Run.raw("oscillator", {"x": nothing, "v": nothing}, units={}, time=t)
+    problem = Problem(relaxing.calibration, (run,))
+
+    def followed(mu):
+        return -problem.residuals(problem.point({"mu": mu}))[0]
+
+    known = 1.706167732170469, -0.8928097010248125
+    np.testing.assert_allclose(followed(1000)[-1], known, rtol=1e-7)
+    slope = -problem.jacobian(problem.point({"mu": 1000})).reshape(len(t), 2)
+    differences = (followed(1000.1) - followed(999.9)) / 0.2
+    np.testing.assert_allclose(slope, differences, atol=5e-4 * np.abs(slope).max())
