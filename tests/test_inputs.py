@@ -18,6 +18,7 @@ from casest.dynamics.gramian import gramian, observed
 from casest.dynamics.inputs import estimate, scatter, unstated
 from casest.dynamics.record import least_squares
 from casest.results.observability import observe_motion
+from casest.results.states import follow
 from casest_problems.bias_gravity import bias_gravity
 
 DT, SIGMA = 0.02, {"a": 0.02, "v": 0.01}
@@ -171,6 +172,25 @@ def test_errors_are_no_larger_than_they_are_said_to_be(declared, spin, degrees):
     assert np.mean(squares[::2]) < chi2.ppf(0.9995, 9 * flown) / flown
     assert np.mean(squares[1::2]) < chi2.ppf(0.9995, 9 * flown) / flown
     assert np.mean(squares) > chi2.ppf(0.0005, 9 * flown) / flown  # and not much smaller either
+
+
+def test_a_rate_as_small_as_the_noise_of_one_reading_deceives_no_filter():
+    """Along the filter's own states: 58 and 59, of a χ² with nine degrees of freedom."""
+    run, truth = record("all axes, 1 °/s", 1.0, seed=7)
+    rng = np.random.default_rng([7, 1])
+    start = truth[0] + np.repeat(list(PRIOR.values()), 3) * rng.standard_normal(9)
+    begun = estimator(1.0).beginning(velocity=start[:3], gravity=start[3:6], bias=start[6:])
+    found = filtered(begun, run)
+    for k in (len(T) // 2, -1):
+        e = found.x[k] - truth[k]
+        assert e @ np.linalg.solve(found.P[k], e) < chi2.ppf(1 - 1e-4, 9)
+
+
+def test_where_noise_acts_on_what_stays_hidden_the_filter_says_that_it_claims_too_much():
+    told = follow(estimator(1.0), record("one axis, 17 °/s", 1.0)[0])
+    assert "squared errors of all states together may be as small as" in told.notes[-1]
+    assert 0.5 < told.filtered.least < 0.9  # NEES of 200 runs: 7.5 of 9 (studies/inputs.md)
+    assert filtered(estimator(0.2), record("all axes, 30 °/s", 0.2)[0]).least > 0.99
 
 
 @pytest.mark.parametrize("declared", [bias_gravity, hidden()], ids=["linear", "nonlinear"])
