@@ -103,7 +103,8 @@ def row(spin: str, degrees: float, runs: int) -> str:
     right = f"{np.mean(np.array(ranks) == 3 + known):.0%}"
     return (
         f"| {spin} | {degrees:g} | {3 + known} | {right} | {bound(told)} | "
-        f"{np.median(claimed):.3g} | {' | '.join(shown)} | {9 * np.median(least):.2f} | {mean[4]:.3f} |"
+        f"{np.median(claimed):.3g} | {' | '.join(shown)} | {9 * np.median(least):.2f} | "
+        f"{mean[4]:.3f} |"
     )
 
 
