@@ -125,7 +125,12 @@ class Run:
 
         It remembers the whole record: what happened before a sample may still be felt in it.
         """
-        places = np.arange(len(self)) if self.places is None else self.places
+        if self.places is not None:
+            places = self.places[chosen]
+        elif isinstance(chosen, slice):  # a long record has no room for a number of each sample
+            places = np.arange(*chosen.indices(len(self)))
+        else:
+            places = np.arange(len(self))[chosen]
         rows = self.rows[chosen] if isinstance(chosen, slice) else np.asarray(self.rows)[chosen]
         return replace(
             self,
@@ -139,7 +144,7 @@ class Run:
             correlation={name: values[chosen] for name, values in self.correlation.items()},
             read={name: mask[chosen] for name, mask in self.read.items()},
             whole=self if self.whole is None else self.whole,
-            places=places[chosen],
+            places=places,
             averaged=None if self.averaged is None else self.averaged.take(chosen),
         )
 

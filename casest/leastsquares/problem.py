@@ -86,6 +86,8 @@ NUDGE = 1e-3
 LATEST = 16
 #: Samples that are evaluated at once where every residual is looked at on its own.
 BLOCK = 32_768
+#: Samples of a run that a model's own functions (a start, bounds from data) look at.
+LOOKED = 1_000_000
 #: Records smaller than this (numbers) are copied once into columns, which are quicker to read.
 COPIED = 4_000_000
 #: From this condition of the scaled Jacobian on a triangular factor is computed from the rows.
@@ -126,6 +128,14 @@ class Problem:
             slots.append(Slot(p, run, slice(x, x + width), slice(ref, ref + numbers)))
             x, ref = x + width, ref + numbers
         return tuple(slots)
+
+    @cached_property
+    def seen_runs(self) -> tuple[Run, ...]:
+        """The runs as the model's own functions see them, at once: of a long one every k-th sample,
+        as few as LOOKED."""
+        every = [-(-len(run) // LOOKED) for run in self.runs]
+        return tuple(run.take(slice(None, None, k)) if k > 1 else run
+                     for run, k in zip(self.runs, every, strict=True))  # fmt: skip
 
     @cached_property
     def unknowns(self) -> int:
@@ -241,7 +251,7 @@ class Problem:
         """Lower and upper bound of every unknown; data may tighten the declared ones."""
         lower, upper = np.full(self.unknowns, -np.inf), np.full(self.unknowns, np.inf)
         with np.errstate(all="ignore"):  # a reading of 1e300 has a square that is not finite
-            from_data = self.model.limiter(self.model, self.runs) if self.model.limiter else {}
+            from_data = self.model.limiter(self.model, self.seen_runs) if self.model.limiter else {}
         for s in self.slots:
             if s.parameter.shape.curved:
                 continue
@@ -300,7 +310,7 @@ class Problem:
         if {p.name for p in self.model.parameters} <= set(known_before):
             return self.point(known_before)
         try:
-            values = self.model.starter(self.model, self.runs) if self.model.starter else {}
+            values = self.model.starter(self.model, self.seen_runs) if self.model.starter else {}
         except np.linalg.LinAlgError as error:
             raise NotTrusted(
                 f"{self.model.name}: no start values follow from these readings ({error}); are "
