@@ -161,3 +161,22 @@ class Run:
         spread = self.spread[name]
         outer = spread[:, :, None] * spread[:, None, :]
         return outer * self.correlation.get(name, np.eye(spread.shape[1]))
+
+
+#: Samples that are looked at together where a long record has no room for a copy.
+LOOK = 1 << 20
+
+
+def extent(values: NDArray[Any]) -> tuple[Array, Array] | None:
+    """Least and greatest of every number (k,) over the samples (N, k) that are finite; None where
+    there is none."""
+    found: tuple[Array, Array] | None = None
+    for first in range(0, len(values), LOOK):
+        part = np.asarray(values[first : first + LOOK], float)
+        part = part[np.isfinite(part).all(axis=1)]
+        if len(part):
+            low, high = part.min(axis=0), part.max(axis=0)
+            if found is not None:
+                low, high = np.minimum(found[0], low), np.maximum(found[1], high)
+            found = low, high
+    return found

@@ -7,7 +7,7 @@ parameters that each run has for itself, run after run. Every run sees its own s
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
@@ -763,18 +763,33 @@ class Problem:
 
         Of differential equations those of `model.along`, in which states are what they are there.
         """
+        every = self._along(outputs)
+        return [every(point, r, slice(None)) for r in range(len(self.runs))]
+
+    def evaluated_pieces(self, point: Point, outputs: Mapping[str, Any]) -> Iterator[list[Array]]:
+        """The same piece by piece: of a long record there is no room for all at once."""
+        every = self._along(outputs)
+        for r, samples in enumerate(self.samples):
+            length = max(len(samples), 1) if self.sequential else BLOCK
+            for start in range(0, len(samples), length):
+                yield every(point, r, slice(start, min(start + length, len(samples))))
+
+    def _along(self, outputs: Mapping[str, Any]) -> Callable[[Point, int, slice], list[Array]]:
         traced = self.model.along
         given = ca.vertcat(ca.SX(0, 1), *(stage.given for stage in traced.stages))
         sample = ca.vertcat(sample_symbol(self.model, traced), given)
         inputs = [ca.vertcat(traced.coordinates, traced.references), sample]
         values = [ca.SX(v) for v in outputs.values()]
         f = ca.Function("along", inputs, values, ["parameters", "sample"], list(outputs))
-        replay, found = Replay(f), []
-        for r, samples in enumerate(self.samples):
+        replay = Replay(f)
+
+        def evaluated(point: Point, r: int, span: slice) -> list[Array]:
+            samples = self.samples[r]
             if given.numel():
                 samples = Columns([samples.dense, self.given(point, r)])
-            found.append(replay(self.parameters(point, r), samples))
-        return found
+            return replay(self.parameters(point, r), samples[span])
+
+        return evaluated
 
     def with_weights(self, weights: Sequence[Array] | None) -> Problem:
         """The same problem with other weights on the squares."""
