@@ -149,14 +149,14 @@ smoother, start | smoother, half | at least | NIS |
 
 SAID = """Before inputs were estimated, the same filter counted the noise as motion: at rest with
 0.05 °/s it claimed 0.78 m/s² for what nothing shows, and its NEES was 37 after a minute; with 1 °/s
-0.13 m/s² and 48 000, with NIS at 1.0 in both, so that nothing warned (20 runs).
+0.13 m/s² and 48 000, with NIS at 1.0 in both, so that nothing warned (20 runs). Along the filter's
+own states, not the smoothed ones, 1 °/s of noise beside 1 °/s of rate gave 10.8 at half time.
 
-Not within the band: at rest and on one axis the filter claims up to a tenth more than its
-errors are (NEES 7 to 8.2), since an input that shows no motion might have moved by the mean of
-its noise, and the prior of what stays hidden is as large as gravity itself. Where the noise of
-one reading is as large as the rate, 1 °/s of both on all axes, it claims too little at half
-time (NEES 10.8): the estimate of the motion is then itself too rough, and this is not
-guaranteed."""
+Not within the band is what shows a direction of gravity and bias to nobody, at rest and on one
+axis: the filter claims up to a fifth more than its errors are (squared; NEES 7 to 8.2), never
+less. What an estimate of the rate is wrong by lasts there as long as the record, acts on an error
+as large as what was known beforehand, and is counted as if it were new at every sample. `filter`
+says so, and how far the errors may fall below what it claims (at least)."""
 
 
 def main() -> None:
