@@ -14,10 +14,14 @@ from casest import Run, constant, cross, signal, sin
 from casest.cli import run as cli
 from casest.dynamics import Motion, dynamics, measured, state
 from casest.dynamics.filter import coefficients, filtered
-from casest.dynamics.gramian import gramian, observed
+from casest.dynamics.gramian import Products, gramian, observed, over_windows
 from casest.dynamics.inputs import estimate, scatter, unstated
 from casest.dynamics.record import least_squares
-from casest.results.observability import observe_motion
+from casest.report.text.observability import observe_text
+from casest.results.fitted import WeakCombination
+from casest.results.observability import ObservedParameters, observe_motion
+from casest.results.result import reproduced
+from casest.results.states import follow
 from casest_problems.bias_gravity import bias_gravity
 
 DT, SIGMA = 0.02, {"a": 0.02, "v": 0.01}
@@ -116,6 +120,42 @@ def test_what_is_told_less_well_than_it_was_known_is_weak():
     assert not observe_motion(estimator(0.0), run).weak
 
 
+def test_a_weak_direction_is_named_without_the_shares_of_rounding():
+    """Nearly one axis: -0.00595 of a velocity beside it would be no part of a sentence."""
+    t = T[::4]
+    rate = (0.1 + 0.3 * np.sin(0.4 * t))[:, None] * flights.AXIS
+    rate[:, 0] += 1e-3 * np.cos(t)
+
+    def turning(s):
+        return np.column_stack([np.interp(s, t, part) for part in rate.T])
+
+    gravity = flights.spun(turning, t)
+    signals = {"a": flights.BIAS - gravity, "omega": rate, "v": 0 * gravity}
+    run = Run.raw("slow", signals, units=flights.UNITS, time=t)
+    told = observed(bias_gravity, gramian(bias_gravity, coefficients(bias_gravity, run)))
+    (words,) = told.weak
+    assert words.startswith("gravity and bias along the body axis (0.27, 0.53, 0.80) move together")
+    assert told.rank == 9
+
+
+def test_windows_that_hide_a_direction_say_zero_and_no_rounding():
+    run = record("at rest", 0.0)[0].take(slice(0, None, 10))
+    smallest = over_windows(Products.of(bias_gravity, run), 3.0, 3).eigenvalues[:, :3]
+    assert np.all(smallest == 0)
+
+
+def test_a_calibration_of_full_rank_whose_numbers_say_nothing_is_called_weak():
+    """A wheel seen for 2 s: offset[2] to 2.8e8 m/s^2 is not "every unknown is determined"."""
+    weak = WeakCombination("offset[2] +2.9e+06, gain[2] -6.4e+05", 1.17e9, 2.8e8)
+    told = ObservedParameters(
+        model="wheel", rank=15, unknowns=15, unobservable=[], weak=[weak], std={"offset": [2.8e8]},
+        trusted=False, data=[], reproduce=reproduced("", ()),
+    )  # fmt: skip
+    text = observe_text(told)
+    assert text.startswith("wheel: rank 15 of 15, 1 of them weak\n  - weak: offset[2] +2.9e+06")
+    assert "every unknown is determined" not in text
+
+
 # -- the filter and the smoother -------------------------------------------------------------------
 
 
@@ -171,6 +211,25 @@ def test_errors_are_no_larger_than_they_are_said_to_be(declared, spin, degrees):
     assert np.mean(squares[::2]) < chi2.ppf(0.9995, 9 * flown) / flown
     assert np.mean(squares[1::2]) < chi2.ppf(0.9995, 9 * flown) / flown
     assert np.mean(squares) > chi2.ppf(0.0005, 9 * flown) / flown  # and not much smaller either
+
+
+def test_a_rate_as_small_as_the_noise_of_one_reading_deceives_no_filter():
+    """Along the filter's own states: 58 and 59, of a χ² with nine degrees of freedom."""
+    run, truth = record("all axes, 1 °/s", 1.0, seed=7)
+    rng = np.random.default_rng([7, 1])
+    start = truth[0] + np.repeat(list(PRIOR.values()), 3) * rng.standard_normal(9)
+    begun = estimator(1.0).beginning(velocity=start[:3], gravity=start[3:6], bias=start[6:])
+    found = filtered(begun, run)
+    for k in (len(T) // 2, -1):
+        e = found.x[k] - truth[k]
+        assert e @ np.linalg.solve(found.P[k], e) < chi2.ppf(1 - 1e-4, 9)
+
+
+def test_where_noise_acts_on_what_stays_hidden_the_filter_says_that_it_claims_too_much():
+    told = follow(estimator(1.0), record("one axis, 17 °/s", 1.0)[0])
+    assert "squared errors of all states together may be as small as" in told.notes[-1]
+    assert 0.5 < told.filtered.least < 0.9  # NEES of 200 runs: 7.5 of 9 (studies/inputs.md)
+    assert filtered(estimator(0.2), record("all axes, 30 °/s", 0.2)[0]).least > 0.99
 
 
 @pytest.mark.parametrize("declared", [bias_gravity, hidden()], ids=["linear", "nonlinear"])

@@ -23,6 +23,7 @@ from casest.cli.loading import (
     trajectory,
     with_prior,
 )
+from casest.cli.long_record import long_record
 from casest.cli.noise_law import with_noise_law
 from casest.cli.options import (
     DATA,
@@ -67,6 +68,10 @@ def calibrate(model_name: str, data: tuple[str, ...], options: CalibrateOptions)
     """
     if options.profile and not options.output:
         raise UsageError("--profile draws on a page: say where with -o DIR")
+    if options.partitions:
+        return long_record(model_name, data, options, typed())
+    if options.workers:
+        raise UsageError("--workers is for a record in --partitions; others need none")
     return calibration(model_name, data, options, typed(), profile=options.profile)
 
 

@@ -243,6 +243,18 @@ class CalibrateOptions(FitOptions):
         "--profile",
         help="Draw the likelihood's profile of every unknown whose cost is no parabola.",
     )
+    partitions: bool = flag(
+        False,
+        "--partitions",
+        help="DATA is one record that need not fit in memory: a Parquet file, folder or pattern.",
+    )
+    workers: int | None = flag(
+        None,
+        "--workers",
+        type=click.IntRange(min=1),
+        metavar="N",
+        help="Threads that add it up (as many as there are cores); the numbers are the same.",
+    )
 
 
 @dataclass(frozen=True, slots=True)

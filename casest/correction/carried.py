@@ -10,7 +10,7 @@ import numpy as np
 
 from casest.correction.inverse import Correction, correction_of, invertible, of_their_time
 from casest.correction.program import Program, program
-from casest.data.run import Run
+from casest.data.run import Run, extent
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
 from casest.declaration.symbols import Signal
@@ -143,27 +143,38 @@ def _points(
 def _largest(correction: Correction, runs: Sequence[Run]) -> float:
     """The largest reading of the fit; 1 where nothing is compared with it."""
     name = correction.measured
-    sizes = [np.abs(run.signals[name]).max(initial=0.0) for run in runs if name in run.signals]
+    parts = [run.signals[name] for run in runs if name in run.signals]
+    sizes = [max(v.max(initial=0.0), -v.min(initial=0.0)) for v in parts]
     finite = [float(s) for s in sizes if np.isfinite(s) and s > 0]
     return max(finite, default=1.0)
 
 
 def _seen(runs: Sequence[Run], names: Sequence[str]) -> tuple[tuple[float, float], ...]:
     """Range of each number of a sample in the fit."""
-    parts = [np.hstack([np.asarray(run.signals[n], float) for n in names]) for run in runs]
-    samples = np.vstack(parts)
-    samples = samples[np.isfinite(samples).all(axis=1)]
-    if not len(samples):
+    every = [[extent(run.signals[name]) for name in names] for run in runs]
+    whole = [[pair for pair in ends if pair is not None] for ends in every]
+    whole = [ends for ends in whole if len(ends) == len(names)]
+    if not whole:
         return ()
-    low, high = samples.min(axis=0).tolist(), samples.max(axis=0).tolist()
+    low = np.min([np.concatenate([a for a, _ in ends]) for ends in whole], axis=0).tolist()
+    high = np.max([np.concatenate([b for _, b in ends]) for ends in whole], axis=0).tolist()
     return tuple(zip(low, high, strict=True))
 
 
 def _readings(runs: Sequence[Run], names: Sequence[str], *, each: bool) -> list[Array]:
     """Samples of what is needed, evenly over each run or over all of them."""
-    parts = [np.hstack([np.asarray(run.signals[n], float) for n in names]) for run in runs]
-    parts = parts if each else [np.vstack(parts)]
-    parts = [p[np.isfinite(p).all(axis=1)] for p in parts]
     count = TESTED_EACH if each else TESTED
-    return [p[np.unique(np.linspace(0, len(p), count, endpoint=False).astype(int))] if len(p) else p
-            for p in parts]  # fmt: skip
+    groups = [[run] for run in runs] if each else [list(runs)]
+    return [_evenly(group, names, count) for group in groups]
+
+
+def _evenly(runs: Sequence[Run], names: Sequence[str], count: int) -> Array:
+    """So many complete samples (count, k), evenly over several runs."""
+    first = np.cumsum([0, *map(len, runs)])
+    places = np.unique(np.linspace(0, first[-1], count, endpoint=False).astype(int))
+    parts = []
+    for run, start, stop in zip(runs, first, first[1:], strict=False):
+        own = places[(places >= start) & (places < stop)] - start
+        parts.append(np.hstack([np.asarray(run.signals[n][own], float) for n in names]))
+    found = np.vstack(parts)
+    return np.asarray(found[np.isfinite(found).all(axis=1)])

@@ -208,7 +208,7 @@ def _runs(table: Table, signals: Sequence[Signal], options: Options) -> list[Run
 def _bind(table: Table, signals: Sequence[Signal], options: Options) -> _Bound:
     """Find, scale and convert the columns of every signal but time."""
     found = _Bound({}, {}, {}, None, (), [])
-    read = [signal for signal in signals if not _is_time(signal)]
+    read = [signal for signal in signals if not is_time(signal)]
     for k, signal in enumerate(read):
         try:
             names = find_columns(table, signal, options.columns)
@@ -261,7 +261,8 @@ def _complete(table: Table, bound: _Bound, options: Options) -> tuple[NDArray[np
     return complete, [note]
 
 
-def _is_time(signal: Signal) -> bool:
+def is_time(signal: Signal) -> bool:
+    """Is a signal the time of the record?"""
     return signal.name == "t" and signal.size == 1 and signal.kind == "plain"
 
 
@@ -269,7 +270,7 @@ def _with_time_column(
     table: Table, signals: Sequence[Signal], options: Options, found: _Bound
 ) -> _Bound:
     """Add the time column in s, where there is one and no rate is given."""
-    needed = any(_is_time(signal) for signal in signals)
+    needed = any(is_time(signal) for signal in signals)
     chosen = _chosen_time(table, options)
     names = chosen or timing.find_time(table)
     if not names or set(names) & {n for used in found.sources.values() for n in used}:
@@ -317,7 +318,7 @@ def _seconds(
     columns = tuple(table.columns[name] for name in names)
     if any(column.is_text for column in columns):
         return timing.from_text(table, columns), [f"time from {' and '.join(names)}"]
-    needed = any(_is_time(signal) for signal in signals) or "t" in options.columns
+    needed = any(is_time(signal) for signal in signals) or "t" in options.columns
     numbers(table, columns[0], "time", "--columns t=… or --rate HZ", gaps=needed)
     stated = timing.time_units_declared(options.units, names[0])
     scale = options.scales.get(names[0]) or options.scales.get("t")
@@ -334,7 +335,7 @@ def _run_time(
     options: Options,
 ) -> tuple[Array | None, list[str]]:
     """Return the time of one run in s, (N,), and notes; None where nothing tells it."""
-    needed = any(_is_time(signal) for signal in signals)
+    needed = any(is_time(signal) for signal in signals)
     if bound.time is not None:
         return _from_column(table, bound, rows, needed, options)
     if options.rate is not None:
@@ -385,7 +386,7 @@ def _with_time(
     """Put the time signal in, in the order in which the model declares its signals."""
     ordered: dict[str, Array] = {}
     for signal in wanted:
-        if not _is_time(signal):
+        if not is_time(signal):
             ordered[signal.name] = signals[signal.name]
         elif time is not None:
             factor, _ = unit_names.conversion("s", signal.unit or "s")
@@ -394,7 +395,7 @@ def _with_time(
 
 
 def _time_unit(signals: Sequence[Signal]) -> dict[str, str | None]:
-    return {s.name: unit_names.canonical(s.unit or "s") for s in signals if _is_time(s)}
+    return {s.name: unit_names.canonical(s.unit or "s") for s in signals if is_time(s)}
 
 
 def _group(table: Table, kind: str, options: Options) -> str | None:
@@ -452,7 +453,7 @@ def _checked(run: Run, signals: Sequence[Signal], sources: Mapping[str, tuple[st
     """Refuse signals that never change; note components that are dead or clipped."""
     notes: list[str] = []
     for signal in signals:
-        if _is_time(signal) or signal.kind == "rotation":
+        if is_time(signal) or signal.kind == "rotation":
             continue
         values, columns = run.signals[signal.name], sources[signal.name]
         values = values[np.isfinite(values).all(axis=1)]

@@ -131,7 +131,12 @@ class Run:
 
         It remembers the whole record: what happened before a sample may still be felt in it.
         """
-        places = np.arange(len(self)) if self.places is None else self.places
+        if self.places is not None:
+            places = self.places[chosen]
+        elif isinstance(chosen, slice):  # a long record has no room for a number of each sample
+            places = np.arange(*chosen.indices(len(self)))
+        else:
+            places = np.arange(len(self))[chosen]
         rows = self.rows[chosen] if isinstance(chosen, slice) else np.asarray(self.rows)[chosen]
         return replace(
             self,
@@ -145,7 +150,7 @@ class Run:
             correlation={name: values[chosen] for name, values in self.correlation.items()},
             read={name: mask[chosen] for name, mask in self.read.items()},
             whole=self if self.whole is None else self.whole,
-            places=places[chosen],
+            places=places,
             averaged=None if self.averaged is None else self.averaged.take(chosen),
         )
 
@@ -162,3 +167,22 @@ class Run:
         spread = self.spread[name]
         outer = spread[:, :, None] * spread[:, None, :]
         return outer * self.correlation.get(name, np.eye(spread.shape[1]))
+
+
+#: Samples that are looked at together where a long record has no room for a copy.
+LOOK = 1 << 20
+
+
+def extent(values: NDArray[Any]) -> tuple[Array, Array] | None:
+    """Least and greatest of every number (k,) over the samples (N, k) that are finite; None where
+    there is none."""
+    found: tuple[Array, Array] | None = None
+    for first in range(0, len(values), LOOK):
+        part = np.asarray(values[first : first + LOOK], float)
+        part = part[np.isfinite(part).all(axis=1)]
+        if len(part):
+            low, high = part.min(axis=0), part.max(axis=0)
+            if found is not None:
+                low, high = np.minimum(found[0], low), np.maximum(found[1], high)
+            found = low, high
+    return found

@@ -56,7 +56,7 @@ class Course:
     (N, m) with the std that is expected of them, NaN where a reading is missing.
 
     `normalised_innovations` (N,): νᵀS⁻¹ν of every complete reading; `settled`: did the rounds of a
-    nonlinear model's smoother settle?
+    nonlinear model's smoother settle? `least`: see `Filtered`.
     """
 
     model: Dynamics
@@ -69,6 +69,7 @@ class Course:
     expected_std: Array
     normalised_innovations: Array
     settled: bool = True
+    least: float = 1.0
 
     @property
     def end(self) -> tuple[Array, Array]:
@@ -247,4 +248,5 @@ def _of(found: Filtered) -> Course:
         std_of(found.S),
         found.normalised_innovations,
         found.settled,
+        found.least,
     )

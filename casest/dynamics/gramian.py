@@ -32,6 +32,9 @@ from casest.leastsquares.null_space import sparsest
 #: Below this share of the largest, in standard deviations known beforehand, a part of a direction
 #: is no part of it: what two printed digits do not show.
 RESIDUE = 5e-3
+#: The same in a direction that is told badly, which has no exact shape: of all states, and within
+#: one of them.
+BLURRED, WITHIN = 0.02, 0.1
 #: A direction counts as observable from this share of the largest scaled eigenvalue on. Rounding
 #: and the error of a fourth-order step stay below 1e-13.
 NULL = 1e-11
@@ -270,14 +273,9 @@ def _entries(matrices: Array, like: ca.SX) -> Array:
 
 def observed(model: Dynamics, W: Array) -> Observed:
     """Rank, unobservable directions in words, and the standard deviations that the data allow."""
-    scale = np.sqrt(np.where(np.diag(W) > 0, np.diag(W), 1.0))
-    # Scaled by what is known beforehand: so many of a state's own standard deviations are visible.
     prior = np.sqrt(np.diag(model.start_covariance))
-    scale = np.where(np.diag(W) > 0, scale, 1 / prior)
-    values, vectors = np.linalg.eigh(W / np.outer(scale, scale))
-    order = np.argsort(values)[::-1]
-    values, vectors = values[order], vectors[:, order]
-    rank = int(np.sum(values > NULL * values[0])) if values[0] > 0 else 0
+    values, vectors, scale = _spectrum(W, prior)
+    rank = _rank(values)
     null = vectors[:, rank:] / scale[:, None]
     null = null / np.maximum(np.linalg.norm(null, axis=0), 1e-300)
     kept = vectors[:, :rank] / np.sqrt(np.maximum(values[:rank], 1e-300))
@@ -286,6 +284,19 @@ def observed(model: Dynamics, W: Array) -> Observed:
     touched = (hidden > RESIDUE * hidden.max(axis=0, initial=0.0)).any(axis=1)
     words, weak = tuple(_words(model, null)), tuple(_weak(model, W, rank))
     return Observed(rank, model.size, values, words, weak, null, np.where(touched, np.nan, std), W)
+
+
+def _spectrum(W: Array, prior: Array) -> tuple[Array, Array, Array]:
+    """Eigenvalues, largest first, and vectors of W scaled to a unit diagonal, and that scale; where
+    the diagonal is zero, what is known beforehand is."""
+    told = np.diag(W) > 0
+    scale = np.where(told, np.sqrt(np.where(told, np.diag(W), 1.0)), 1 / prior)
+    values, vectors = np.linalg.eigh(W / np.outer(scale, scale))
+    return values[::-1], vectors[:, ::-1], scale
+
+
+def _rank(values: Array) -> int:
+    return int(np.sum(values > NULL * values[0])) if values[0] > 0 else 0
 
 
 def _words(model: Dynamics, null: Array) -> Sequence[str]:
@@ -303,9 +314,18 @@ def _weak(model: Dynamics, W: Array, rank: int) -> Iterator[str]:
             most = int(np.argmax(np.abs(v)))
             std, unit = prior[most] * abs(v[most]) / np.sqrt(value), model.state_units[most]
             yield (
-                f"{_subject(model, v * prior)[0]}: {model.names[most]} is told to {std:.3g} {unit} "
-                f"only; {prior[most]:.3g} was known beforehand"
+                f"{_subject(model, _clear(model, v * prior), BLURRED)[0]}: {model.names[most]} is "
+                f"told to {std:.3g} {unit} only; {prior[most]:.3g} was known beforehand"
             )
+
+
+def _clear(model: Dynamics, direction: Array) -> Array:
+    """Without what is small within its own state."""
+    found = direction.copy()
+    for where in model.slices().values():
+        own = np.abs(found[where])
+        found[where] = np.where(own > WITHIN * own.max(), found[where], 0.0)
+    return found
 
 
 def sentence(model: Dynamics, direction: Array) -> str:
@@ -316,22 +336,23 @@ def sentence(model: Dynamics, direction: Array) -> str:
     return f"{subject} changes no reading" if alone else f"{subject} together change no reading"
 
 
-def _subject(model: Dynamics, direction: Array) -> tuple[str, bool]:
-    """What moves in a direction, in words; is it a single number?"""
+def _subject(model: Dynamics, direction: Array, residue: float = RESIDUE) -> tuple[str, bool]:
+    """What moves in a direction, in words, without what is below a share `residue` of it; is it a
+    single number?"""
     prior = np.sqrt(np.diag(model.start_covariance))
     share = np.abs(direction / prior)
-    direction = np.where(share > RESIDUE * share.max(), direction, 0.0)
+    direction = np.where(share > residue * share.max(), direction, 0.0)
     parts = [(name, direction[where]) for name, where in model.slices().items()
              if np.any(direction[where])]  # fmt: skip
     if len(parts) > 1 and all(len(v) == 3 for _, v in parts):
         unit = parts[0][1] / np.linalg.norm(parts[0][1])
         unit = unit * np.sign(unit[np.argmax(np.abs(unit))])
         along = [float(v @ unit) for _, v in parts]
-        if all(np.linalg.norm(v - a * unit) < RESIDUE * np.linalg.norm(v)
+        if all(np.linalg.norm(v - a * unit) < residue * np.linalg.norm(v)
                for (_, v), a in zip(parts, along, strict=True)):  # fmt: skip
             axis = ", ".join(f"{u if abs(u) >= 5e-3 else 0.0:.2f}" for u in unit)
             names = " and ".join(name for name, _ in parts)
-            same = all(abs(a - along[0]) < RESIDUE * abs(along[0]) for a in along)
+            same = all(abs(a - along[0]) < residue * abs(along[0]) for a in along)
             how = "move together" if same else "move in proportion"
             return f"{names} along the body axis ({axis}) {how}", False
     largest = np.abs(direction).max()
@@ -380,7 +401,9 @@ def over_windows(products: Products, window: float, count: int = 60) -> Windows:
     for end in ends:
         first = min(int(np.searchsorted(time, end - window - 1e-12)), len(time) - 2)
         last = max(int(np.searchsorted(time, end + 1e-12)) - 1, first + 1)
-        values, axes = np.linalg.eigh(products.gramian(first, last) * np.outer(prior, prior))
+        W = products.gramian(first, last)
+        values, axes = np.linalg.eigh(W * np.outer(prior, prior))
+        values[: len(values) - _rank(_spectrum(W, prior)[0])] = 0.0  # rounding
         found.append(values)
         stds.append(prior * np.sqrt(axes**2 @ (1 / (1 + np.maximum(values, 0.0)))))
     return Windows(np.asarray(ends, float), np.array(found), np.array(stds))

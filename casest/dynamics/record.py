@@ -23,7 +23,6 @@ from casest.dynamics.filter import (
     coefficients,
     discretised,
     filtered,
-    in_hindsight,
 )
 from casest.dynamics.inputs import uncertain
 from casest.dynamics.riccati import check_covariance
@@ -46,9 +45,8 @@ def least_squares(model: Dynamics, run: Run) -> Record:
     """
     check_covariance(model.start_covariance, "the covariance at the beginning")
     if model.linear:
-        system = coefficients(model, run)
-        if uncertain(model):
-            system = in_hindsight(model, run, filtered(model, run, system=system))
+        noisy = uncertain(model)
+        system = filtered(model, run).system if noisy else coefficients(model, run)
         return _solved(model, discretised(model, system))
     x, P = extended(model, run)[:2]
     for _ in range(ROUNDS):

@@ -6,7 +6,7 @@ operations (`operations`): NumPy, C and exported programs read the same rows.
 
 from __future__ import annotations
 
-from casest.engine.kernel import evaluated
+from casest.engine.kernel import by_workers, evaluated
 from casest.engine.normal import (
     Normal,
     cost,
@@ -26,6 +26,7 @@ __all__ = [
     "Recursion",
     "Replay",
     "Samples",
+    "by_workers",
     "cost",
     "evaluated",
     "normal_equations",

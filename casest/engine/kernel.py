@@ -41,6 +41,8 @@ WORTHWHILE = 5_000
 SELDOM, SMALL = 10_000, 1_000
 #: Samples summed on their own, to keep rounding small and to share the work between cores.
 PIECE = 32_768
+#: Pieces whose sums are kept side by side until they are added.
+PIECES = 4096
 #: The first set that compiles and runs is used. No -ffast-math: it would hide what is not finite.
 _FLAGS = (
     # -O3 would unroll whole chunks: three times as long to compile, and no quicker.
@@ -127,20 +129,24 @@ class Kernel:
         samples: Columns,
         weights: Floats | None,
     ) -> Floats:
-        """Sums over pieces, added in their order: the same digits on any number of cores."""
-        starts = range(0, len(samples), PIECE)
-        parts = np.zeros((len(starts), count))
+        """Sums over pieces, then over PIECES of them, each in its order: the same digits on any
+        number of cores, in memory that does not grow with the record."""
+        starts, total = range(0, len(samples), PIECE), np.zeros(count)
+        for first in range(0, len(starts), PIECES):
+            own = starts[first : first + PIECES]
+            parts = np.zeros((len(own), count))
 
-        def piece(k: int) -> None:
-            span = slice(starts[k], min(starts[k] + PIECE, len(samples)))
-            self._call(name, parameters, samples, span, weights, parts[k])
+            def piece(k: int, own: range = own, parts: Floats = parts) -> None:
+                span = slice(own[k], min(own[k] + PIECE, len(samples)))
+                self._call(name, parameters, samples, span, weights, parts[k])
 
-        if len(starts) > 2 and _cores() > 1:
-            list(_threads().map(piece, range(len(starts))))
-        else:
-            for k in range(len(starts)):
-                piece(k)
-        return np.asarray(parts.sum(axis=0))
+            if len(own) > 2 and workers() > 1:
+                list(_threads(workers()).map(piece, range(len(own))))
+            else:
+                for k in range(len(own)):
+                    piece(k)
+            total = parts.sum(axis=0) if not first else total + parts.sum(axis=0)
+        return np.asarray(total)
 
     def _call(
         self,
@@ -361,9 +367,27 @@ def _cores() -> int:
     return os.cpu_count() or 1
 
 
-@lru_cache(maxsize=1)
-def _threads() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(_cores(), thread_name_prefix="casest")
+def workers() -> int:
+    """How many threads add up a record: as many as there are cores, unless told."""
+    return _told.get() or _cores()
+
+
+@contextmanager
+def by_workers(count: int | None) -> Iterator[None]:
+    """Within it a record is added up by so many threads (None: one for each core)."""
+    before = _told.set(count)
+    try:
+        yield
+    finally:
+        _told.reset(before)
+
+
+_told: ContextVar[int | None] = ContextVar("workers", default=None)
+
+
+@lru_cache(maxsize=2)
+def _threads(count: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(count, thread_name_prefix="casest")
 
 
 if hasattr(os, "register_at_fork"):

@@ -304,7 +304,7 @@ def _judged_by_the_model(found: Estimate) -> Estimate:
     """Refuse what the model itself says is no calibration."""
     problem = found.problem
     assert problem.model.refuser is not None
-    for reason in problem.model.refuser(problem.model, problem.runs, found.values):
+    for reason in problem.model.refuser(problem.model, problem.seen_runs, found.values):
         return replace(found, certificate=found.certificate.refused(Code.MODEL, reason))
     return found
 

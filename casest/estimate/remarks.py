@@ -8,7 +8,7 @@ import numpy as np
 
 from casest.declaration.shapes import Array
 from casest.leastsquares.agreement import between_runs
-from casest.leastsquares.problem import Point, Problem
+from casest.leastsquares.problem import LOOKED, Point, Problem
 from casest.leastsquares.stated import UNLIKELY, ChiSquare
 from casest.leastsquares.sums import repeat_noise, rounding, some_residuals
 from casest.leastsquares.weights import robust_scale
@@ -26,7 +26,7 @@ def notes(
 ) -> Iterator[str]:
     """All that there is to say. `bias` is the second-order shift in standard deviations."""
     if problem.model.remarker is not None:
-        yield from problem.model.remarker(problem.model, problem.runs, problem.values(point))
+        yield from _of_the_model(problem, point)
     if dof == 0 and (known_by := _known_by(problem, point)):
         yield (
             "as many unknowns as equations: nothing checks the model; the standard deviations rest "
@@ -47,6 +47,14 @@ def notes(
     yield from _too_fast(problem)
     yield from _runs_that_disagree(problem, point, correlated)
     yield from _furthest_out(problem, point)
+
+
+def _of_the_model(problem: Problem, point: Point) -> Iterator[str]:
+    if max(map(len, problem.runs)) > LOOKED:
+        yield f"{problem.model.name} was not asked what it says of more than {LOOKED:.0e} samples"
+        return
+    assert problem.model.remarker is not None
+    yield from problem.model.remarker(problem.model, problem.runs, problem.values(point))
 
 
 def _known_by(problem: Problem, point: Point) -> str:

@@ -7,7 +7,7 @@ parameters that each run has for itself, run after run. Every run sees its own s
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
@@ -86,6 +86,8 @@ NUDGE = 1e-3
 LATEST = 16
 #: Samples that are evaluated at once where every residual is looked at on its own.
 BLOCK = 32_768
+#: Samples of a run that a model's own functions (a start, bounds from data) look at.
+LOOKED = 1_000_000
 #: Records smaller than this (numbers) are copied once into columns, which are quicker to read.
 COPIED = 4_000_000
 #: From this condition of the scaled Jacobian on a triangular factor is computed from the rows.
@@ -126,6 +128,14 @@ class Problem:
             slots.append(Slot(p, run, slice(x, x + width), slice(ref, ref + numbers)))
             x, ref = x + width, ref + numbers
         return tuple(slots)
+
+    @cached_property
+    def seen_runs(self) -> tuple[Run, ...]:
+        """The runs as the model's own functions see them, at once: of a long one every k-th sample,
+        as few as LOOKED."""
+        every = [-(-len(run) // LOOKED) for run in self.runs]
+        return tuple(run.take(slice(None, None, k)) if k > 1 else run
+                     for run, k in zip(self.runs, every, strict=True))  # fmt: skip
 
     @cached_property
     def unknowns(self) -> int:
@@ -241,7 +251,7 @@ class Problem:
         """Lower and upper bound of every unknown; data may tighten the declared ones."""
         lower, upper = np.full(self.unknowns, -np.inf), np.full(self.unknowns, np.inf)
         with np.errstate(all="ignore"):  # a reading of 1e300 has a square that is not finite
-            from_data = self.model.limiter(self.model, self.runs) if self.model.limiter else {}
+            from_data = self.model.limiter(self.model, self.seen_runs) if self.model.limiter else {}
         for s in self.slots:
             if s.parameter.shape.curved:
                 continue
@@ -300,7 +310,7 @@ class Problem:
         if {p.name for p in self.model.parameters} <= set(known_before):
             return self.point(known_before)
         try:
-            values = self.model.starter(self.model, self.runs) if self.model.starter else {}
+            values = self.model.starter(self.model, self.seen_runs) if self.model.starter else {}
         except np.linalg.LinAlgError as error:
             raise NotTrusted(
                 f"{self.model.name}: no start values follow from these readings ({error}); are "
@@ -753,18 +763,33 @@ class Problem:
 
         Of differential equations those of `model.along`, in which states are what they are there.
         """
+        every = self._along(outputs)
+        return [every(point, r, slice(None)) for r in range(len(self.runs))]
+
+    def evaluated_pieces(self, point: Point, outputs: Mapping[str, Any]) -> Iterator[list[Array]]:
+        """The same piece by piece: of a long record there is no room for all at once."""
+        every = self._along(outputs)
+        for r, samples in enumerate(self.samples):
+            length = max(len(samples), 1) if self.sequential else BLOCK
+            for start in range(0, len(samples), length):
+                yield every(point, r, slice(start, min(start + length, len(samples))))
+
+    def _along(self, outputs: Mapping[str, Any]) -> Callable[[Point, int, slice], list[Array]]:
         traced = self.model.along
         given = ca.vertcat(ca.SX(0, 1), *(stage.given for stage in traced.stages))
         sample = ca.vertcat(sample_symbol(self.model, traced), given)
         inputs = [ca.vertcat(traced.coordinates, traced.references), sample]
         values = [ca.SX(v) for v in outputs.values()]
         f = ca.Function("along", inputs, values, ["parameters", "sample"], list(outputs))
-        replay, found = Replay(f), []
-        for r, samples in enumerate(self.samples):
+        replay = Replay(f)
+
+        def evaluated(point: Point, r: int, span: slice) -> list[Array]:
+            samples = self.samples[r]
             if given.numel():
                 samples = Columns([samples.dense, self.given(point, r)])
-            found.append(replay(self.parameters(point, r), samples))
-        return found
+            return replay(self.parameters(point, r), samples[span])
+
+        return evaluated
 
     def with_weights(self, weights: Sequence[Array] | None) -> Problem:
         """The same problem with other weights on the squares."""

@@ -5,14 +5,15 @@ Everything here runs through the record piece by piece: memory does not grow wit
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from casest.declaration.shapes import Array
+from casest.engine import Columns
 from casest.leastsquares.per_sample import laplacian, slope_in_sample
-from casest.leastsquares.problem import Block, Point, Problem
+from casest.leastsquares.problem import BLOCK, Block, Point, Problem
 from casest.leastsquares.stated import settles, shifts_of_curvature
 
 #: Residuals that are looked at where a median or a correlation is wanted of a longer record.
@@ -128,8 +129,10 @@ def second_order(problem: Problem, point: Point, sigma: float) -> float:
         return 0.0
     squares, count, noise = 0.0, 0, signal_noise(problem, point, sigma)
     for r, samples in enumerate(problem.samples):
-        shift = 0.5 * laplacian(problem.model)(problem.parameters(point, r), samples)[0] @ noise**2
-        squares, count = squares + float(np.sum(shift**2)), count + shift.size
+        parameters = problem.parameters(point, r)
+        for own in _spans(samples):
+            shift = 0.5 * laplacian(problem.model)(parameters, samples[own])[0] @ noise**2
+            squares, count = squares + float(np.sum(shift**2)), count + shift.size
     return float(np.sqrt(squares / max(count, 1)) / sigma)
 
 
@@ -156,6 +159,12 @@ def second_order_bias(problem: Problem, point: Point, sigma: float, bread: Array
     return np.asarray(-bread @ slope)
 
 
+def _spans(samples: Columns) -> Iterator[slice]:
+    """Pieces of a record that are evaluated at once."""
+    for first in range(0, len(samples), BLOCK):
+        yield slice(first, min(first + BLOCK, len(samples)))
+
+
 def signal_noise(problem: Problem, point: Point, sigma: float) -> Array:
     """Noise of each signal that makes up the residual's σ, in the signal's own unit, (signals,).
 
@@ -166,8 +175,9 @@ def signal_noise(problem: Problem, point: Point, sigma: float) -> Array:
     ends = np.cumsum([0, *(s.size for s in problem.model.signals)])
     squares = np.zeros((len(problem.model.axes), len(ends) - 1))
     for r, samples in enumerate(problem.samples):
-        G = slope_in_sample(problem.model)(problem.parameters(point, r), samples)[0]
-        squares += np.add.reduceat(np.sum(G**2, axis=0), ends[:-1], axis=1)
+        for span in _spans(samples):
+            G = slope_in_sample(problem.model)(problem.parameters(point, r), samples[span])[0]
+            squares += np.add.reduceat(np.sum(G**2, axis=0), ends[:-1], axis=1)
     count = sum(len(run) for run in problem.runs)
     slope = np.sqrt(squares.max(axis=0) / max(count, 1))
     own = [s.name in {d.name for d in problem.model.declared} for s in problem.model.signals]

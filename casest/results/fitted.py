@@ -17,7 +17,7 @@ from msgspec import UNSET, Struct, UnsetType
 from casest.correction.carried import Carried, carried
 from casest.correction.reading import carried_data
 from casest.correction.spread import slopes, spread_program
-from casest.data.run import Run
+from casest.data.run import Run, extent
 from casest.declaration.effect import Attached
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
@@ -365,12 +365,11 @@ def ranges(runs: Sequence[Run]) -> dict[str, list[float]]:
     """Least and greatest of every other column of numbers: under what conditions it was fitted."""
     found: dict[str, list[float]] = {}
     for name in sorted({name for run in runs for name in run.columns}):
-        parts = [np.asarray(run.columns[name]) for run in runs if name in run.columns]
+        parts = [run.columns[name] for run in runs if name in run.columns]
         if all(p.dtype.kind in "fiu" for p in parts):
-            values = np.concatenate(parts).astype(float)
-            values = values[np.isfinite(values)]
-            if values.size:
-                found[name] = [float(values.min()), float(values.max())]
+            ends = [pair for pair in (extent(p[:, None]) for p in parts) if pair is not None]
+            if ends:
+                found[name] = [float(min(a[0] for a, _ in ends)), float(max(b[0] for _, b in ends))]
     return found
 
 
@@ -412,11 +411,11 @@ def _corrected_range(estimate: Estimate) -> Corrected | None:
     if name is None:
         return None
     declared = ca.densify(ca.vec(estimate.model.along.quantities[name].declared))
-    values = estimate.problem.evaluate(estimate.point, {"c": declared})
-    finite = np.concatenate([v[0][np.isfinite(v[0])] for v in values])
-    if not finite.size:
+    pieces = estimate.problem.evaluated_pieces(estimate.point, {"c": declared})
+    finite = [own for own in (values[0][np.isfinite(values[0])] for values in pieces) if own.size]
+    if not finite:
         return Corrected(name)
-    return Corrected(name, float(finite.min()), float(finite.max()))
+    return Corrected(name, float(min(map(np.min, finite))), float(max(map(np.max, finite))))
 
 
 def _correction(

@@ -379,8 +379,15 @@ def combination_words(found: Structural) -> str:
 
 
 def weak_directions(result: Observability) -> list[str]:
-    """What a trajectory tells less well than it was known beforehand, in words."""
-    return result.weak if isinstance(result, ObservedMotion) else []
+    """What a trajectory tells less well than it was known beforehand, or a calibration's data much
+    worse than each unknown alone, in words; the worst first."""
+    if isinstance(result, ObservedMotion):
+        return result.weak
+    combinations = result.weak if isinstance(result, ObservedParameters) else []
+    return [
+        f"{w.direction}: {w.inflation:.3g} times worse than each alone"
+        for w in sorted(combinations, key=lambda w: -w.inflation)
+    ]
 
 
 def weak_words(result: Observability) -> str:

@@ -18,7 +18,7 @@ def rounded(value: float, std: float, missing: str = "not determined") -> tuple[
     digits = 1 - int(np.floor(np.log10(std)))
     if -6 <= digits <= 9 and abs(value) < 1e7:
         places = max(digits, 0)
-        return f"{value:.{places}f}", f"{std:.{places}f}"
+        return f"{value:z.{places}f}", f"{std:.{places}f}"  # no -0.00
     exponent = int(np.floor(np.log10(max(abs(value), std))))
     places = max(exponent + digits, 0)
     return f"{value:.{places}e}", f"{std:.1e}"

@@ -14,7 +14,7 @@ from msgspec import UNSET, Struct, UnsetType
 from casest.data.run import Run
 from casest.dynamics import Dynamics
 from casest.dynamics.course import Course, followed
-from casest.dynamics.inputs import unstated
+from casest.dynamics.inputs import uncertain, unstated
 from casest.dynamics.intensities import Tuned, intensities, units
 from casest.dynamics.moving_horizon import Horizon, moving_horizon
 from casest.results.file import plain
@@ -26,6 +26,8 @@ from casest.results.trajectory import Innovations, Trajectory, trajectory_of
 ROWS = 8192
 #: Between these shares of what is expected innovations are called as large as expected.
 SMALLEST, LARGEST = 0.8, 1.25
+#: Squared errors that may be below this share of what is claimed: it is said.
+CLAIMED = 0.95
 #: Filter and smoother disagree at the end by more than so many standard deviations: it is said.
 PARTED = 1.0
 
@@ -198,7 +200,20 @@ def _of_windows(found: Horizon) -> list[str]:
 
 
 def _of_the_record(found: Course) -> list[str]:
-    return [*_unsettled(found), *_parted(found)]
+    return [*_unsettled(found), *_parted(found), *_cautious(found)]
+
+
+def _cautious(found: Course) -> list[str]:
+    """Where what noise of inputs does is counted for more than it is."""
+    if not found.least < CLAIMED:
+        return []
+    noisy = " and ".join(uncertain(found.model))
+    return [
+        f"noise of {noisy} acts on what this record does not tell of the states, and is counted as "
+        "if that were new at every sample: squared errors of all states together may be as small "
+        f"as {100 * found.least:.0f} % of what their covariance says (casest observe names what is "
+        "not told)"
+    ]
 
 
 def _bounded(found: Course) -> list[str]:

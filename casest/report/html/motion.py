@@ -58,17 +58,14 @@ def observe_sentence(result: Observability) -> str:
             return f"Observable: suitable data determine all {unknowns} unknowns."
         return f"Not observable: no data determine more than {rank} of {unknowns} unknowns."
     if result.observable:
-        return f"Observable: these data determine all {unknowns} unknowns."
+        weakly = len(weak_directions(result))
+        but = f", {weakly} combination{'s' * (weakly > 1)} of them weakly" if weakly else ""
+        return f"Observable: these data determine all {unknowns} unknowns{but}."
     return f"Not observable: these data determine {rank} of {unknowns} unknowns."
 
 
 def _directions(result: Observability) -> str:
-    combinations = result.weak if isinstance(result, ObservedParameters) else []
-    weak = [
-        f"{w.direction}: {number(w.inflation)} times less certain than each alone."
-        for w in combinations
-    ]
-    weak += [_sentence(words) for words in weak_directions(result)]
+    weak = [_sentence(words) for words in weak_directions(result)]
     if not result.unobservable and not weak:
         return section("hidden", "What is hidden", paragraph("Nothing: no combination is lost."))
     tolerance = "" if isinstance(result, ObservedParameters) else result.tolerance

@@ -10,6 +10,7 @@ from casest.results.observability import (
     ObservedMotion,
     ObservedParameters,
     ObservedStructure,
+    Windows,
     combination_words,
     could_reach,
     number_or_not,
@@ -31,16 +32,18 @@ def observe_text(result: Observability) -> str:
         lines.append("  every unknown is determined by these data")
     lines += ["", "  standard deviation that these data allow:", *_deviations(result)]
     if isinstance(result, ObservedMotion):
-        w = result.windows
-        low, high = min(w.smallest_eigenvalue), max(w.smallest_eigenvalue)
-        lines += [
-            "",
-            f"  over windows of {w.length_s:.3g} s the smallest eigenvalue (information over "
-            f"prior) goes from {low:.3g} to {high:.3g};",
-            f"  {window_words(w)}",
-            *note_lines(result.notes),
-        ]
+        lines += ["", *_over_windows(result.windows), *note_lines(result.notes)]
     return "\n".join(wrapped(lines))
+
+
+def _over_windows(w: Windows) -> Iterator[str]:
+    low, high = min(w.smallest_eigenvalue), max(w.smallest_eigenvalue)
+    course = f"goes from {low:.3g} to {high:.3g}" if high > 0 else "is zero in all"
+    yield (
+        f"  over windows of {w.length_s:.3g} s the smallest eigenvalue (information over prior) "
+        f"{course};"
+    )
+    yield f"  {window_words(w)}"
 
 
 def _deviations(result: ObservedParameters | ObservedMotion) -> Iterator[str]:

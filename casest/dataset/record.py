@@ -1,0 +1,202 @@
+"""One long record in partitions: a Parquet data set whose rows are the samples of one run.
+
+Signals are put once, in the model's units, into files of plain numbers that are mapped into memory.
+What computes runs through these piece by piece, so that a record may be larger than memory.
+"""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from casest.data import checks, timing
+from casest.data.bind import is_time, load_runs
+from casest.data.run import Run
+from casest.data.table import Table, table_of
+from casest.dataset.files import File, files_of, opened, unreadable
+from casest.declaration.shapes import Array
+from casest.declaration.symbols import Signal
+from casest.errors import CasestError, DataError
+from casest.units import conversion
+
+#: Samples that are read at once.
+BATCH = 262_144
+#: Notes of batches that are kept: each may have one of its own.
+NOTES = 8
+
+
+def mapped_record(
+    dataset: str,
+    signals: Sequence[Signal],
+    folder: Path,
+    *,
+    kept: Sequence[str] = (),
+    **reading: Any,
+) -> Run:
+    """The run that a data set (a Parquet file, folder or pattern) holds, in the files' order.
+
+    `folder` takes one file of numbers for each signal, for the time and for the `kept` columns,
+    and must stay as long as the run; `reading` as in `load_runs`. Raises DataError as that does,
+    with rows counted in each file; where the folder has not enough room; where the data set holds
+    several runs.
+    """
+    files = files_of(dataset)
+    total = sum(int(opened(file).metadata.num_rows) for file in files)
+    made = _Mapped(dataset, tuple(signals), folder, total, tuple(kept))
+    for first, table in _batches(files):
+        try:
+            made.take(_bound(table, made.signals, reading), reading.get("rate"))
+        except CasestError as error:
+            since = f" (rows are counted from row {first} of the file)" if first else ""
+            raise type(error)(f"{error}{since}") from None
+    return made.run(reading.get("time_zero", "first"))
+
+
+def _batches(files: Sequence[File]) -> Iterator[tuple[int, Table]]:
+    """Rows of every file as tables, each with the number of its first one in the file."""
+    import pyarrow
+
+    for file in files:
+        first = 0
+        try:
+            for batch in opened(file).iter_batches(BATCH):
+                if batch.num_rows:
+                    table = pyarrow.Table.from_batches([batch])
+                    yield first, table_of(table, file.name)
+                first += batch.num_rows
+        except (OSError, pyarrow.ArrowException) as error:
+            raise unreadable(file, error) from error
+
+
+def _bound(table: Table, signals: Sequence[Signal], reading: Mapping[str, Any]) -> Run:
+    """The samples of one table, their time as it is written."""
+    # What is still in one part of a record may move in another.
+    steady = [s.name for s in signals]
+    given = {**reading, "time_zero": "column", "at_rest": False, "steady": steady}
+    runs = load_runs([table], signals, **given)
+    if len(runs) != 1:
+        raise DataError(
+            f"{table.file}: holds {len(runs)} runs, and --partitions is for one record; leave the "
+            "column run out, or give each run as a file of its own"
+        )
+    return runs[0]
+
+
+@dataclass
+class _Mapped:
+    """A record on the way into mapped files: `count` of its `total` rows at most."""
+
+    dataset: str
+    signals: tuple[Signal, ...]
+    folder: Path
+    total: int
+    columns: tuple[str, ...]
+    count: int = 0
+    rows: int = 0
+    values: dict[str, Any] = field(default_factory=dict)
+    low: dict[str, Array] = field(default_factory=dict)
+    high: dict[str, Array] = field(default_factory=dict)
+    units: Mapping[str, str | None] = field(default_factory=dict)
+    column_units: Mapping[str, str | None] = field(default_factory=dict)
+    notes: Counter[str] = field(default_factory=Counter)
+    usual: float = 0.0
+    blocks: int = 0
+
+    def take(self, run: Run, rate: float | None) -> None:
+        """The samples of one batch."""
+        where = slice(self.count, self.count + len(run))
+        self.units, self.column_units = run.units, run.column_units
+        self.notes.update(run.notes)
+        for s in self.signals:
+            if not is_time(s):
+                self._put(s.name, run.signals[s.name], where)
+        for name in self.columns:
+            if name not in run.columns:
+                raise DataError(f"{run.file}: no column {name!r}, which an effect reads")
+            self._put(f"column {name}", np.asarray(run.columns[name], float)[:, None], where)
+        time = run.time
+        if rate is not None:
+            time = (self.count + np.arange(len(run))) / rate
+        if time is not None:
+            self._follow(run, time, where)
+        self.count += len(run)
+
+    def _put(self, name: str, values: Any, where: slice) -> None:
+        if name not in self.values:
+            self.values[name] = self._made(name, values.shape[1], values.dtype)
+        self.values[name][:, where] = values.T
+        low, high = values.min(axis=0), values.max(axis=0)
+        self.low[name] = np.minimum(self.low.get(name, low), low)
+        self.high[name] = np.maximum(self.high.get(name, high), high)
+
+    def _made(self, name: str, size: int, kind: Any) -> Any:
+        """A file for so many numbers of every sample, (size, total)."""
+        path, need = self.folder / str(len(self.values)), 8 * size * self.total
+        try:
+            with path.open("wb") as file:
+                file.truncate(need)
+                if hasattr(os, "posix_fallocate"):  # a full disk shows here, not while computing
+                    os.posix_fallocate(file.fileno(), 0, need)
+        except OSError as error:
+            raise DataError(
+                f"{self.folder}: no room for {need / 1e9:.3g} GB of {name} ({error.strerror}); "
+                "TMPDIR names another folder"
+            ) from None
+        return np.memmap(path, kind, "r+", shape=(size, self.total))
+
+    def _follow(self, run: Run, time: Array, where: slice) -> None:
+        """Put the time, which must go on, and count the gaps."""
+        if self.count:
+            before = float(self.values["the time"][0, self.count - 1])
+            timing.refuse_unordered(run.file, "of the time", np.array([before, time[0]]),
+                                    np.array([-1, 0]))  # fmt: skip
+        else:
+            before = float(time[0])
+            self.usual = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
+        starts = np.diff(time, prepend=before) > timing.GAP * self.usual
+        self._put("the time", time[:, None], where)
+        if starts.any() or "the block" in self.values:
+            self._put("the block", (self.blocks + np.cumsum(starts))[:, None], where)
+        self.blocks += int(starts.sum())
+
+    def run(self, zero: str) -> Run:
+        """All of it as one run."""
+        if not self.count:
+            raise DataError(f"{self.dataset}: holds no sample; check the export")
+        found = {name: values[:, : self.count].T for name, values in self.values.items()}
+        time, block = found.pop("the time", None), found.pop("the block", None)
+        if time is not None and zero == "first":
+            time -= float(time[0, 0])
+        signals, units = {}, dict(self.units)
+        for s in self.signals:
+            if not is_time(s):
+                signals[s.name] = found[s.name]
+                self._refuse_still(s)
+            elif time is not None:
+                factor, _ = conversion("s", s.unit or "s")
+                signals[s.name] = time if factor == 1.0 else time * factor
+        run = Run.raw(
+            Path(self.dataset).stem, signals, units=units, file=self.dataset,
+            time=None if time is None else time[:, 0], notes=self._said(),
+        )  # fmt: skip
+        run = run if block is None else replace(run, block=block[:, 0])
+        own = {name: found[f"column {name}"][:, 0] for name in self.columns}
+        return replace(run, columns=own, column_units={n: self.column_units.get(n) for n in own})
+
+    def _refuse_still(self, signal: Signal) -> None:
+        if signal.kind != "rotation":
+            ends = np.stack([self.low[signal.name], self.high[signal.name]])
+            checks.refuse_constant(self.dataset, signal.name, ends, (signal.name,))
+
+    def _said(self) -> tuple[str, ...]:
+        kept = list(self.notes)[:NOTES]
+        more = len(self.notes) - len(kept)
+        gaps = [f"{self.blocks} gaps in time"] if self.blocks else []
+        left = [f"and {more} more notes of single partitions"] if more else []
+        return (*kept, *gaps, *left)
