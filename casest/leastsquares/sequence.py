@@ -29,7 +29,7 @@ from casest.engine import Replay
 from casest.errors import DataError, DeclarationError
 from casest.leastsquares.flow import Course, Integrator, Mesh
 from casest.leastsquares.memory import Memory
-from casest.leastsquares.rests import Rests, before, needing, turns
+from casest.leastsquares.rests import LastTurns, Rests, before, needing, turns
 
 
 @dataclass(frozen=True)
@@ -205,6 +205,10 @@ class Staged:
             place += stage.given.numel()
         return np.hstack([given[:, :0], *found])
 
+    @cached_property
+    def _turns(self) -> LastTurns:
+        return LastTurns()
+
     def _given(self, parameters: Array, r: int, own: tuple[int, ...] | None) -> tuple[Array, Array]:
         """The same at all samples of the record; what was asked for last is kept."""
         asked = (r, own, parameters.tobytes())
@@ -254,9 +258,12 @@ class Staged:
         assert record.rests is not None
         if stage.word == "before":
             return before(*_chained(stage.taken, parameters, record.samples, given, slopes))
-        nothing = np.zeros((len(record.rests.samples), given.shape[1]))
-        own = stage.taken(parameters, np.hstack([record.rests.samples, nothing]))
-        found, moved = turns(own[0][:, :, 0], own[1], record.rests)
+        asked = id(record), stage.columns, parameters[list(stage.turning)].tobytes()
+        if self._turns.asked != asked:
+            nothing = np.zeros((len(record.rests.samples), given.shape[1]))
+            rate, sloped = stage.taken(parameters, np.hstack([record.rests.samples, nothing]))
+            self._turns.keep(asked, turns(rate[:, :, 0], sloped, record.rests))
+        found, moved = self._turns.found
         wide = np.zeros((*moved.shape[:2], slopes.shape[2]))
         wide[:, :, list(stage.columns)] = moved
         return found, wide
@@ -297,7 +304,7 @@ class Program:
 
     Of an effect on a signal's time that is the time asked for. The last of a model's is its
     residual, with no effect behind it. A `word` of the body has no effect either; `columns` are the
-    coordinates in which a turn has slopes.
+    coordinates in which a turn has slopes, `turning` the parameters that it depends on.
     """
 
     attached: Attached | None
@@ -305,6 +312,7 @@ class Program:
     memory: Memory | None = None
     word: Word = ""
     columns: tuple[int, ...] = ()
+    turning: tuple[int, ...] = ()
     flow: Integrator | None = None
 
 
@@ -332,11 +340,11 @@ def _programs(model: Model, own: tuple[int, ...] | None = None) -> tuple[Program
                 raise DeclarationError(
                     f"model {model.name}: what turns between rests cannot read what was before"
                 )
-            columns = tuple(sorted(set(ca.jacobian(stage.taken, coordinates).sparsity().get_col())))
+            columns, turning = (_reaching(stage.taken, x) for x in (coordinates, parameters))
             sample = ca.vertcat(sample_symbol(model, traced), given)
             outputs = slopes(stage.taken, coordinates[list(columns)])
             rate = _replay("rate", [parameters, sample], outputs)
-            found.append(Program(None, rate, word=stage.word, columns=columns))
+            found.append(Program(None, rate, word=stage.word, columns=columns, turning=turning))
         elif stage.word:
             found.append(Program(None, replay(stage.taken), word=stage.word))
         elif stage.attached is not None and stage.attached.kind == "time":
@@ -350,6 +358,11 @@ def _programs(model: Model, own: tuple[int, ...] | None = None) -> tuple[Program
             found.append(Program(stage.attached, replay(stage.taken), memory=memory))
         given = ca.vertcat(given, stage.given)
     return (*found, Program(traced.stages[-1].attached, replay(traced.expression)))
+
+
+def _reaching(expression: SX, variables: SX) -> tuple[int, ...]:
+    """Numbers of the variables that an expression depends on."""
+    return tuple(sorted(set(ca.jacobian(expression, variables).sparsity().get_col())))
 
 
 @dataclass(frozen=True)

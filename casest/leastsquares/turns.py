@@ -42,20 +42,23 @@ def rotations(
         turns.append(_pair(_magnus(rate, time, place[_steps(ends, first, last)])[0]))
     a, b = (np.concatenate(part) for part in zip(*turns, strict=True))
     whole, behind = _products((a, b), ends, sloped=slopes.shape[2] > 0)
+    found = np.ascontiguousarray(_matrix(whole).transpose(2, 0, 1))
     S = np.zeros((len(spans), 3, slopes.shape[2]))
-    for first, last in groups if behind is not None else ():
+    if behind is None:
+        return found, S
+    for first, last in groups:
         own = _steps(ends, first, last)
         here = behind[0][own], behind[1][own]
         before, after = _weights(here, *_magnus(rate, time, place[own]))
         end = 0
         for k in range(first, last):
-            begin, (a, b) = end, spans[k]
-            end += b - a
-            part = np.zeros((3, 3, b - a + 1))
+            begin, (left, right) = end, spans[k]
+            end += right - left
+            part = np.zeros((3, 3, right - left + 1))
             part[:, :, :-1] += before[:, :, begin:end]
             part[:, :, 1:] += after[:, :, begin:end]
-            S[k] = sum(part[:, j] @ slopes[a : b + 1, j] for j in range(3))
-    return np.ascontiguousarray(_matrix(whole).transpose(2, 0, 1)), S
+            S[k] = sum(part[:, j] @ slopes[left : right + 1, j] for j in range(3))
+    return found, S
 
 
 def _groups(ends: Array) -> list[tuple[int, int]]:
