@@ -149,20 +149,27 @@ class Staged:
             )
         return found
 
-    def slopes_in_readings(self, parameters: Array, r: int) -> tuple[Array, Array]:
-        """∂r/∂s (N, m, k) in the means of a rest, and in those of the rest before."""
+    def slopes_in_readings(self, parameters: Array, r: int) -> tuple[Array, Array, Array]:
+        """∂r/∂s (N, m, k) in the means of a rest, in those of the rest before, and in all readings
+        of the turn between at once."""
         record, last = self._records[r], _in_readings(self.model)
         given = self._given(parameters, r, ())[0]
         own, through = last.residual(parameters, np.hstack([record.samples, given]))
-        prior = np.zeros_like(own)
+        prior, between = np.zeros_like(own), np.zeros_like(own)
         for first, taken in last.before:
             slope = taken(parameters, np.hstack([record.samples, given]))[0]
             prior[1:] += through[1:, :, first : first + slope.shape[1]] @ slope[:-1]
+        for first, taken in last.turned:
+            assert record.rests is not None
+            nothing = np.zeros((len(record.rests.samples), given.shape[1]))
+            rate, slope = taken(parameters, np.hstack([record.rests.samples, nothing]))
+            moved = turns(rate[:, :, 0], slope, record.rests)[1]
+            between += through[:, :, first : first + moved.shape[1]] @ moved
         present = self.present(r)
-        for part in (own, prior):
+        for part in (own, prior, between):
             if present is not None:
                 part[~present] = 0.0
-        return own, prior
+        return own, prior, between
 
     def lost(self, r: int) -> NDArray[np.int_]:
         """Rests that were reached too fast, by number."""
@@ -368,10 +375,11 @@ def _reaching(expression: SX, variables: SX) -> tuple[int, ...]:
 @dataclass(frozen=True)
 class Readings:
     """Slopes in the readings of a rest: of the residual, also in what the stages give, and of what
-    each word `before` takes, with the place of what it gives."""
+    each word `before` takes, with the place of what it gives; each rate that turns, and its."""
 
     residual: Replay
     before: tuple[tuple[int, Replay], ...]
+    turned: tuple[tuple[int, Replay], ...]
 
 
 @lru_cache(maxsize=64)
@@ -385,12 +393,15 @@ def _in_readings(model: Model) -> Readings:
         outputs = [ca.densify(ca.jacobian(expression, x)) for x in of]
         return _replay("slope", [parameters, sample], outputs)
 
-    found, place = [], 0
+    before, turned, place = [], [], 0
     for stage in traced.stages:
         if stage.word == "before":
-            found.append((place, slope(stage.taken, reading)))
+            before.append((place, slope(stage.taken, reading)))
+        if stage.word == "turned":
+            both = [ca.densify(stage.taken), ca.densify(ca.jacobian(stage.taken, reading))]
+            turned.append((place, _replay("rate", [parameters, sample], both)))
         place += stage.given.numel()
-    return Readings(slope(traced.expression, reading, given), tuple(found))
+    return Readings(slope(traced.expression, reading, given), tuple(before), tuple(turned))
 
 
 def _multiplied(matrix: Array, values: Array) -> Array:
