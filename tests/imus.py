@@ -44,7 +44,8 @@ def into_body(q: Array, v: Array) -> Array:
 
 @dataclass
 class Motion:
-    """Attitude (N, 4), rate in the body (N, 3) rad/s, hand's acceleration (N, 3) m/s², at rest?"""
+    """Attitude (N, 4), rate in the body (N, 3) rad/s, the hand's acceleration in the world (N, 3)
+    m/s², at rest?"""
 
     t: Array
     attitude: Array
@@ -76,7 +77,8 @@ def waved(
 ) -> Motion:
     """Rests of `rest` s, turns of `turn` s by `angle` rad about random axes (or those given).
 
-    On the way the axis wobbles by `wobble` rad and the hand accelerates by up to `shake` m/s².
+    On the way the axis wobbles by `wobble` rad and the hand accelerates by up to `shake` m/s²,
+    first along some direction of the world and then against it: at its end it is at rest.
     """
     here, attitudes, rates, shaking, still = (
         about(_unit(rng), np.array(rng.uniform(0, 6))),
@@ -176,7 +178,7 @@ def recorded(
     """t (N,), a, w, m (N, 3): m/s² (+g on an axis that points up), rad/s, µT; and what the
     gyroscope's bias has drifted by at each time, (N, 3)."""
     up = np.broadcast_to(np.array([0, 0, GRAVITY]), (len(motion.t), 3))
-    force = into_body(motion.attitude, up) + motion.shaking
+    force = into_body(motion.attitude, up + motion.shaking)
     north = field_ * np.array([np.cos(dip), 0.0, -np.sin(dip)])
     flux = into_body(motion.attitude, np.zeros_like(up) + north)
     a, w, m = imu.noises

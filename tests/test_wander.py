@@ -1,7 +1,8 @@
-"""A gyroscope's offset that wanders between rests, against an independent simulator."""
+"""A gyroscope's offset that wanders, and a clock of its own, against an independent simulator."""
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +14,7 @@ from casest.data import at_rest
 from casest.data.run import Averaged
 from casest.leastsquares.wander import wandering
 from casest.results.find import find_model
+from casest_problems.imu_clock import late
 
 GYRO = find_model("gyro-rests")
 UNITS = {"a": "m/s^2", "w": "rad/s"}
@@ -60,6 +62,30 @@ def test_a_turn_is_integrated_with_the_offset_of_the_rests_beside_it(drifting):
     still = attempt(GYRO.having(gyroscope_wander=1e-9), [run], intervals=False)
     assert constant(found, "turn_noise") < 0.03
     assert constant(still, "turn_noise") > 2 * constant(found, "turn_noise")
+
+
+def test_how_late_the_gyroscope_is_read_is_said(drifting):
+    note = next(note for note in drifting[2].notes if "older" in note)
+    found = re.match(r"the gyroscope's readings are (\S+) ± (\S+) ms older", note)
+    delay, std = float(found[1]), float(found[2])
+    assert std < 0.3
+    assert abs(delay - 4) < 4 * std
+
+
+def test_of_an_accelerometer_that_is_read_late_it_says_so_and_of_none_nothing():
+    rng = np.random.default_rng(4)
+    imu, motion = an_imu(rng), waved(rng, rests=12)
+    known = {**imu.truth, "gravity": 9.80665, "g_sensitivity": np.zeros((3, 3))}
+
+    def said(seconds):
+        record = recorded(motion, replace(imu, late=seconds), np.random.default_rng(5))
+        raw = Run.raw("imu", {n: record[n] for n in "aw"}, units=UNITS, time=record["t"])
+        return list(late([at_rest(raw, wanders=["w"])], known))
+
+    assert said(0.0) == []
+    (note,) = said(-0.01)
+    found = re.match(r"the accelerometer's readings are (\S+) ± \S+ ms older than the gyro", note)
+    assert float(found[1]) == pytest.approx(10, abs=0.5)
 
 
 def test_the_means_of_a_walk_are_as_correlated_as_those_of_many_small_steps():

@@ -148,7 +148,7 @@ class _System:
                 V = size**2 * parts[name]
                 left[name] += float(np.sum(V * rest))
                 squares[name] += float(seen @ V @ seen)
-                variances[name] += np.einsum("ij,ik,kj->j", gain, V, gain)
+                variances[name] += np.sum(gain * (V @ gain), axis=0)
         return left, variances, squares
 
 
