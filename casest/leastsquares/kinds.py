@@ -14,7 +14,7 @@ ZfV 104, 1979; Teunissen & Amiri-Simkooei, J. Geodesy 82, 2008, sec. 6).
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -76,16 +76,15 @@ def whitened(problem: Problem, point: Point) -> Problem:
 def freedom(problem: Problem, point: Point) -> Array | None:
     """Degrees of freedom of each unknown's variance (n,), where kinds have noises of their own.
 
-    An unknown that one kind tells is as uncertain as that kind's noise is known (Satterthwaite,
-    Biometrics Bulletin 2, 1946). None where all residuals are of one kind.
+    An unknown that one kind tells is as uncertain as that kind's noise is known, beside the others
+    (Satterthwaite, Biometrics Bulletin 2, 1946). None where all residuals are of one kind.
     """
     sizes = noises(problem.model)
     if not sizes or problem.whitening is None:
         return None
-    system = _System(problem, point)
-    left, variances = system.shares(sizes)
-    squares = sum(variances[n] ** 2 / max(left[n], 1.0) for n in sizes)
-    total = sum(variances.values())
+    variances, information = _System(problem, point).told(sizes)
+    total = variances.sum(axis=0)
+    squares = np.einsum("cn,cd,dn->n", variances, np.linalg.pinv(information), variances)
     return np.asarray(np.where(squares > 0, total**2 / np.where(squares > 0, squares, 1.0), 1.0))
 
 
@@ -112,20 +111,34 @@ class _System:
         found = _covariances(self.problem, self.point, r)
         return {name: V[np.ix_(there, there)] for name, V in found.items()}
 
-    def shares(self, sizes: Mapping[str, float]) -> tuple[dict[str, float], dict[str, Array]]:
-        """Redundancy of each part, and the variance (n,) of each unknown that it gives."""
-        left, variances, _ = self._all(sizes)
-        return left, variances
+    def told(self, sizes: Mapping[str, float]) -> tuple[Array, Array]:
+        """Variance (c, n) of each unknown that each part gives, and how well the data tell the
+        parts from each other: tr(R V_c R V_d) (c, c), twice the inverse covariance of σ²."""
+        variances = np.zeros((len(sizes), self.problem.unknowns))
+        information = np.zeros((len(sizes), len(sizes)))
+        for _, gain, rest, parts in self._left(sizes):
+            scaled = [size**2 * parts[name] for name, size in sizes.items()]
+            variances += np.array([np.sum(gain * (V @ gain), axis=0) for V in scaled])
+            seen = [rest @ V for V in scaled]
+            information += np.array([[np.sum(x * y.T) for y in seen] for x in seen])
+        return variances, information
 
     def updated(self, sizes: Mapping[str, float]) -> tuple[dict[str, float], dict[str, float]]:
         """Noises that the squares left over show, and the redundancy of each."""
-        left, _, squares = self._all(sizes)
+        left, squares = dict.fromkeys(sizes, 0.0), dict.fromkeys(sizes, 0.0)
+        for seen, _, rest, parts in self._left(sizes):
+            for name, size in sizes.items():
+                V = size**2 * parts[name]
+                left[name] += float(np.sum(V * rest))
+                squares[name] += float(seen @ V @ seen)
         new = {n: s * float(np.sqrt(squares[n] / max(left[n], LEAST))) for n, s in sizes.items()}
         return new, left
 
-    def _all(
+    def _left(
         self, sizes: Mapping[str, float]
-    ) -> tuple[dict[str, float], dict[str, Array], dict[str, float]]:
+    ) -> Iterator[tuple[Array, Array, Array, dict[str, Array]]]:
+        """Of each run V⁻¹ of what the fit leaves over, what a residual moves (M, n), the matrix R
+        that leaves over (M, M), and the parts."""
         n = self.problem.unknowns
         inverses = [np.linalg.inv(_total(parts, sizes)) for parts in self.parts]
         matrix, gradient = np.zeros((n, n)), np.zeros(n)
@@ -135,21 +148,13 @@ class _System:
         scale = np.sqrt(np.where(np.diag(matrix) > 0, np.diag(matrix), 1.0))
         cofactor = np.linalg.pinv(matrix / np.outer(scale, scale), hermitian=True)
         cofactor /= np.outer(scale, scale)
-        left, squares = dict.fromkeys(sizes, 0.0), dict.fromkeys(sizes, 0.0)
-        variances = {name: np.zeros(n) for name in sizes}
         step = cofactor @ gradient
         for (residual, slopes), inverse, parts in zip(
             self.blocks, inverses, self.parts, strict=True
         ):
             weighed = inverse @ slopes
-            seen, gain = inverse @ residual - weighed @ step, weighed @ cofactor
-            rest = inverse - gain @ weighed.T
-            for name, size in sizes.items():
-                V = size**2 * parts[name]
-                left[name] += float(np.sum(V * rest))
-                squares[name] += float(seen @ V @ seen)
-                variances[name] += np.sum(gain * (V @ gain), axis=0)
-        return left, variances, squares
+            gain = weighed @ cofactor
+            yield inverse @ residual - weighed @ step, gain, inverse - gain @ weighed.T, parts
 
 
 def _components(
