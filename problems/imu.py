@@ -96,6 +96,7 @@ def gyro_rests(
     gravity=constant(9.80665, "m/s^2"),
     accelerometer_noise=constant(0.0, "[a]"),
     gyroscope_noise=constant(0.0, "[w]"),
+    gyroscope_wander=constant(0.0, "[w]/s^0.5"),
     turn_noise=constant(0.0, "deg"),
 ):
     """A gyroscope by the accelerometer beside it, from rest to rest: 21 unknowns.
@@ -117,6 +118,7 @@ def gyro_rests(
         ),
         axes=("gravity", "rest_x", "rest_y", "rest_z", "turn_x", "turn_y"),
         noise=("accelerometer_noise", *3 * ("gyroscope_noise",), *2 * ("turn_noise",)),
+        wander=("gyroscope_wander",),
         corrected=quantity("corrected", vertcat(force, rate)),
     )
 
@@ -141,6 +143,7 @@ def imu(
     magnetometer_noise=constant(0.0, "[m]"),
     dip_noise=constant(0.0, "deg"),
     gyroscope_noise=constant(0.0, "[w]"),
+    gyroscope_wander=constant(0.0, "[w]/s^0.5"),
     turn_noise=constant(0.0, "deg"),
 ):
     """Accelerometer, gyroscope and magnetometer of one body together: 34 unknowns.
@@ -185,6 +188,7 @@ def imu(
             *3 * ("gyroscope_noise",),
             *3 * ("turn_noise",),
         ),
+        wander=("gyroscope_wander",),
         corrected=quantity("corrected", vertcat(force, rate, flux)),
     )
 

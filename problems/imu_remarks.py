@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from casest import Model, NotTrusted, Run
 
+from .imu_clock import late
 from .pair import flat, held_values
 
 Array = NDArray[np.float64]
@@ -23,7 +24,7 @@ FOLLOWS = 1e-3
 
 
 def remarks(declared: Model, runs: Sequence[Run], values: Mapping[str, Any]) -> Iterator[str]:
-    """Poses in a plane, an offset that follows the force."""
+    """Poses in a plane, an offset that follows the force, sensors that are not read together."""
     known = {**held_values(declared), **{n: np.asarray(v) for n, v in values.items()}}
     sensors = {"accelerometer": ("a", "gravity"), "magnetometer": ("m", "field")}
     present = {s.name for s in declared.signals}
@@ -34,6 +35,7 @@ def remarks(declared: Model, runs: Sequence[Run], values: Mapping[str, Any]) -> 
             yield from flat(v - v.mean(axis=0), float(known[length]) / gain, sensor)
     if not known["g_sensitivity"].any() and "g_sensitivity" not in values:
         yield from _following(runs, known)
+    yield from late(runs, known)
 
 
 def refuse_few_axes(runs: Sequence[Run], bias: Array) -> None:

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
 
 Array = NDArray[np.float64]
 GRAVITY = 9.80665
@@ -43,7 +44,8 @@ def into_body(q: Array, v: Array) -> Array:
 
 @dataclass
 class Motion:
-    """Attitude (N, 4), rate in the body (N, 3) rad/s, hand's acceleration (N, 3) m/s², at rest?"""
+    """Attitude (N, 4), rate in the body (N, 3) rad/s, the hand's acceleration in the world (N, 3)
+    m/s², at rest?"""
 
     t: Array
     attitude: Array
@@ -75,7 +77,8 @@ def waved(
 ) -> Motion:
     """Rests of `rest` s, turns of `turn` s by `angle` rad about random axes (or those given).
 
-    On the way the axis wobbles by `wobble` rad and the hand accelerates by up to `shake` m/s².
+    On the way the axis wobbles by `wobble` rad and the hand accelerates by up to `shake` m/s²,
+    first along some direction of the world and then against it: at its end it is at rest.
     """
     here, attitudes, rates, shaking, still = (
         about(_unit(rng), np.array(rng.uniform(0, 6))),
@@ -136,6 +139,8 @@ class Imu:
     noises: tuple[float, float, float] = (0.02, 0.003, 0.3)
     #: Random walk of the gyroscope's bias, rad/s after one second.
     walk: float = 0.0
+    #: Seconds by which the gyroscope's readings are older than their time says.
+    late: float = 0.0
 
     @property
     def truth(self) -> dict[str, Array]:
@@ -170,9 +175,10 @@ def an_imu(rng: np.random.Generator, **more: object) -> Imu:
 def recorded(
     motion: Motion, imu: Imu, rng: np.random.Generator, *, field_: float = 48.0, dip: float = 1.1
 ) -> dict[str, Array]:
-    """t (N,), a, w, m (N, 3): m/s² (+g on an axis that points up), rad/s, µT."""
+    """t (N,), a, w, m (N, 3): m/s² (+g on an axis that points up), rad/s, µT; and what the
+    gyroscope's bias has drifted by at each time, (N, 3)."""
     up = np.broadcast_to(np.array([0, 0, GRAVITY]), (len(motion.t), 3))
-    force = into_body(motion.attitude, up) + motion.shaking
+    force = into_body(motion.attitude, up + motion.shaking)
     north = field_ * np.array([np.cos(dip), 0.0, -np.sin(dip)])
     flux = into_body(motion.attitude, np.zeros_like(up) + north)
     a, w, m = imu.noises
@@ -183,9 +189,17 @@ def recorded(
     return {
         "t": motion.t,
         "a": force @ imu.accelerometer.T + imu.accelerometer_bias + a * noise[0],
-        "w": motion.rate @ imu.gyroscope.T + bias + w * noise[1],
+        "w": _earlier(motion, imu.late) @ imu.gyroscope.T + bias + w * noise[1],
         "m": flux @ imu.magnetometer.T + imu.magnetometer_bias + m * noise[2],
+        "drift": drift,
     }
+
+
+def _earlier(motion: Motion, by: float) -> Array:
+    """The rate as it was some seconds before each time."""
+    if not by:
+        return motion.rate
+    return np.asarray(CubicSpline(motion.t, motion.rate)(np.clip(motion.t - by, 0, motion.t[-1])))
 
 
 def written(path: object, record: dict[str, Array], names: str = "awm") -> str:

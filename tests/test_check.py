@@ -13,6 +13,7 @@ from scipy import stats
 from casest import Run, UsageError, attempt, calibrate, constant
 from casest.cli import run as casest
 from casest.estimate.estimate import Estimate
+from casest.estimate.spectrum import Certainty, Powers, noise_spectrum
 from casest.validity.chart import Sums, solved
 from casest.validity.check import check
 from casest.validity.colour import colour_of
@@ -86,6 +87,29 @@ def test_noise_with_the_colour_of_the_old_record_is_no_change():
         assert subject.noise.p_value > 1e-3
         found.append(judged(subject).p_value)
     assert stats.binomtest(int(np.sum(np.array(found) < 0.05)), 120, 0.05).pvalue > 0.01
+
+
+def test_how_well_a_spectrum_is_known_is_how_far_it_scatters_from_record_to_record():
+    rng, count = np.random.default_rng(5), 1000
+    frequency = (np.arange(count) + 0.5) / (2 * count)
+    low = np.array([1e-3, 5e-3, 3e-2])
+    found = []
+    for _ in range(150):
+        power = rng.standard_normal(count) ** 2  # of white noise, by any orthonormal transform
+        curve = noise_spectrum([Powers(frequency, power, np.ones(count))])
+        found.append(np.log(curve(low)) - np.log(curve(frequency)).mean())
+    known = np.sqrt(Certainty(count).variances(np.log(low), np.eye(3)))
+    assert np.std(found, axis=0) == pytest.approx(known, rel=0.25)
+
+
+def test_what_is_told_slowly_in_noise_that_follows_itself_has_few_degrees_of_freedom():
+    rng, freedom, time = np.random.default_rng(6), {}, np.arange(2000.0)
+    for phi in (0.0, 0.95):
+        first, second = (line(rng, n, noise=red(rng, n, phi), time=time[:n]) for n in (2000, 500))
+        old = old_of(attempt(linear, [first], solver="trust-region"))
+        freedom[phi] = judged(subject_of(old, (second,))).freedom
+    assert freedom[0.95] < 40  # the offset is told by the slowest frequencies alone
+    assert freedom[0.0] > 400
 
 
 CHANGES = {

@@ -211,7 +211,8 @@ class Residual:
     `Residual(implicit=expression, unit="m/s^2")`, an expression that is zero but for noise; its
     unit should be that of the reading. `corrected` is the quantity that `apply` gives back.
     `noise` names for each axis the constant that is its standard deviation: a residual of several
-    kinds is then counted in standard deviations, and what is 0 is found from the data.
+    kinds is then counted in standard deviations, and what is 0 is found from the data. `wander`
+    names constants in `[s]/s^0.5`: how far the offset of signal s walks in a second.
     `constraints`: what holds without noise, of parameters or at every sample.
     """
 
@@ -225,6 +226,7 @@ class Residual:
         unit: str = "",
         axes: tuple[str, ...] = (),
         noise: tuple[str, ...] = (),
+        wander: tuple[str, ...] = (),
         std: Any = None,
         constraints: tuple[Constraint, ...] | Constraint = (),
     ) -> None:
@@ -237,7 +239,7 @@ class Residual:
         self.measured = _side_by_side(measured) if several else measured
         self.std = None if std is None else _side_by_side(std) if several else ca.SX(std)
         self.implicit, self.corrected, self.unit, self.axes = implicit, corrected, unit, axes
-        self.noise = noise
+        self.noise, self.wander = noise, wander
         self.constraints: tuple[Constraint, ...] = (
             (constraints,) if isinstance(constraints, Constraint) else tuple(constraints)
         )

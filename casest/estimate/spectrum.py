@@ -155,6 +155,27 @@ def noise_spectrum(parts: Sequence[Powers]) -> Callable[[Array], Array]:
     return lambda frequency: smooth(np.log(frequency))
 
 
+class Certainty:
+    """How well a curve is known that so many samples show: by what Whittle's likelihood tells.
+
+    A power of one frequency has two degrees of freedom less one, so tells ½ of its logarithm.
+    """
+
+    def __init__(self, count: int) -> None:
+        bands = Bands((np.arange(count) + 0.5) / (2 * count))
+        self._shapes = Shapes(bands._middle)
+        there = self._shapes(bands._middle)
+        self._covariance = np.linalg.inv(0.5 * (there.T * bands._size) @ there)
+        self._mean = bands._size @ there / bands._size.sum()
+
+    def variances(self, log: Array, weights: Array) -> Array:
+        """Variance (n,) of the logarithm of the power, against its mean over all frequencies, where
+        weights (N, n) of frequencies (N,) by their logarithm see it."""
+        share = weights / np.maximum(weights.sum(axis=0), 1e-300)
+        seen = share.T @ self._shapes(log) - self._mean
+        return np.asarray(np.einsum("nk,kl,nl->n", seen, self._covariance, seen))
+
+
 def _most_likely(shapes: Array, mean: Array, count: Array) -> Array:
     """Least Σ count·(log S + mean/S), log S = shapes·b: Newton's method on a convex function.
 

@@ -2,17 +2,19 @@
 
 A model that ties lengths in m/s² and turns in degrees together says which constant is the noise of
 each (`Residual(noise=…)`). One in the unit of a signal, `[a]`, is that of the signal's mean at a
-rest: it is in the residuals of that rest, and in those of the turns to it and from it. Any other is
-a noise of the axes that name it, from rest to rest anew. So the covariance of all residuals of a
-run is V = Σ σ_c² V_c. What is 0 is estimated with the fit, by the squares that each part leaves
-over and its share of the redundancy: Helmert's variance components in Förstner's form (Förstner,
+rest: it is in the residuals of that rest, and in those of the turns to it and from it. One in
+`[w]/s^0.5` is how far the signal's offset wanders: in the residuals of all rests and of all turns
+between. Any other is a noise of the axes that name it, from rest to rest anew. So the covariance of
+all residuals of a run is V = Σ σ_c² V_c. What is 0 is estimated with the fit, by the squares that
+each part leaves over and its share of the redundancy: Helmert's variance components in Förstner's
+form (Förstner,
 ZfV 104, 1979; Teunissen & Amiri-Simkooei, J. Geodesy 82, 2008, sec. 6).
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -21,6 +23,7 @@ from casest.declaration.model import Model
 from casest.declaration.shapes import Array
 from casest.declaration.symbols import Constant
 from casest.leastsquares.problem import Point, Problem
+from casest.leastsquares.wander import wandering
 
 #: Rounds of fits, and of noises within one, until these stand still to the share CLOSE.
 ROUNDS, WITHIN, CLOSE = 20, 50, 1e-3
@@ -32,7 +35,8 @@ FLOOR = 1e-3
 
 def noises(model: Model) -> dict[str, float]:
     """Constants that are the noise of a kind of residual, by name; 0 where it is not known."""
-    names = dict.fromkeys(model.traced.residual.noise)
+    residual = model.traced.residual
+    names = dict.fromkeys((*residual.noise, *residual.wander))
     return {n: float(model[n].array) for n in names if isinstance(model[n], Constant)}
 
 
@@ -72,16 +76,15 @@ def whitened(problem: Problem, point: Point) -> Problem:
 def freedom(problem: Problem, point: Point) -> Array | None:
     """Degrees of freedom of each unknown's variance (n,), where kinds have noises of their own.
 
-    An unknown that one kind tells is as uncertain as that kind's noise is known (Satterthwaite,
-    Biometrics Bulletin 2, 1946). None where all residuals are of one kind.
+    An unknown that one kind tells is as uncertain as that kind's noise is known, beside the others
+    (Satterthwaite, Biometrics Bulletin 2, 1946). None where all residuals are of one kind.
     """
     sizes = noises(problem.model)
     if not sizes or problem.whitening is None:
         return None
-    system = _System(problem, point)
-    left, variances = system.shares(sizes)
-    squares = sum(variances[n] ** 2 / max(left[n], 1.0) for n in sizes)
-    total = sum(variances.values())
+    variances, information = _System(problem, point).told(sizes)
+    total = variances.sum(axis=0)
+    squares = np.einsum("cn,cd,dn->n", variances, np.linalg.pinv(information), variances)
     return np.asarray(np.where(squares > 0, total**2 / np.where(squares > 0, squares, 1.0), 1.0))
 
 
@@ -108,20 +111,34 @@ class _System:
         found = _covariances(self.problem, self.point, r)
         return {name: V[np.ix_(there, there)] for name, V in found.items()}
 
-    def shares(self, sizes: Mapping[str, float]) -> tuple[dict[str, float], dict[str, Array]]:
-        """Redundancy of each part, and the variance (n,) of each unknown that it gives."""
-        left, variances, _ = self._all(sizes)
-        return left, variances
+    def told(self, sizes: Mapping[str, float]) -> tuple[Array, Array]:
+        """Variance (c, n) of each unknown that each part gives, and how well the data tell the
+        parts from each other: tr(R V_c R V_d) (c, c), twice the inverse covariance of σ²."""
+        variances = np.zeros((len(sizes), self.problem.unknowns))
+        information = np.zeros((len(sizes), len(sizes)))
+        for _, gain, rest, parts in self._left(sizes):
+            scaled = [size**2 * parts[name] for name, size in sizes.items()]
+            variances += np.array([np.sum(gain * (V @ gain), axis=0) for V in scaled])
+            seen = [rest @ V for V in scaled]
+            information += np.array([[np.sum(x * y.T) for y in seen] for x in seen])
+        return variances, information
 
     def updated(self, sizes: Mapping[str, float]) -> tuple[dict[str, float], dict[str, float]]:
         """Noises that the squares left over show, and the redundancy of each."""
-        left, _, squares = self._all(sizes)
+        left, squares = dict.fromkeys(sizes, 0.0), dict.fromkeys(sizes, 0.0)
+        for seen, _, rest, parts in self._left(sizes):
+            for name, size in sizes.items():
+                V = size**2 * parts[name]
+                left[name] += float(np.sum(V * rest))
+                squares[name] += float(seen @ V @ seen)
         new = {n: s * float(np.sqrt(squares[n] / max(left[n], LEAST))) for n, s in sizes.items()}
         return new, left
 
-    def _all(
+    def _left(
         self, sizes: Mapping[str, float]
-    ) -> tuple[dict[str, float], dict[str, Array], dict[str, float]]:
+    ) -> Iterator[tuple[Array, Array, Array, dict[str, Array]]]:
+        """Of each run V⁻¹ of what the fit leaves over, what a residual moves (M, n), the matrix R
+        that leaves over (M, M), and the parts."""
         n = self.problem.unknowns
         inverses = [np.linalg.inv(_total(parts, sizes)) for parts in self.parts]
         matrix, gradient = np.zeros((n, n)), np.zeros(n)
@@ -131,21 +148,13 @@ class _System:
         scale = np.sqrt(np.where(np.diag(matrix) > 0, np.diag(matrix), 1.0))
         cofactor = np.linalg.pinv(matrix / np.outer(scale, scale), hermitian=True)
         cofactor /= np.outer(scale, scale)
-        left, squares = dict.fromkeys(sizes, 0.0), dict.fromkeys(sizes, 0.0)
-        variances = {name: np.zeros(n) for name in sizes}
         step = cofactor @ gradient
         for (residual, slopes), inverse, parts in zip(
             self.blocks, inverses, self.parts, strict=True
         ):
             weighed = inverse @ slopes
-            seen, gain = inverse @ residual - weighed @ step, weighed @ cofactor
-            rest = inverse - gain @ weighed.T
-            for name, size in sizes.items():
-                V = size**2 * parts[name]
-                left[name] += float(np.sum(V * rest))
-                squares[name] += float(seen @ V @ seen)
-                variances[name] += np.einsum("ij,ik,kj->j", gain, V, gain)
-        return left, variances, squares
+            gain = weighed @ cofactor
+            yield inverse @ residual - weighed @ step, gain, inverse - gain @ weighed.T, parts
 
 
 def _components(
@@ -188,7 +197,7 @@ def _whitening(problem: Problem, point: Point, sizes: Mapping[str, float]) -> tu
 def _covariances(problem: Problem, point: Point, r: int) -> dict[str, Array]:
     """V_c (N·m, N·m) of one run, for each noise, of residuals as the problem has them."""
     model = problem.model
-    own, prior = problem.slopes_in_readings(point, r)
+    own, prior, between = problem.slopes_in_readings(point, r)
     N, m, _ = own.shape
     known = noises(model)
     found, first = {}, 0
@@ -204,22 +213,34 @@ def _covariances(problem: Problem, point: Point, r: int) -> dict[str, Array]:
             found[name] = np.diag((there * axes / (size if size > 0 else 1.0) ** 2).ravel())
             continue
         part = places[signal]
-        slopes, each = np.zeros((N, m, N, part.stop - part.start)), np.arange(N)
+        # Of the rests' means, then of the turns before them.
+        slopes, each = np.zeros((N, m, 2 * N, part.stop - part.start)), np.arange(N)
         slopes[each, :, each] = own[:, :, part]
         slopes[each[1:], :, each[:-1]] = prior[1:, :, part]
-        flat = slopes.reshape(N * m, -1)
+        if name in model.traced.residual.wander:
+            slopes[each, :, N + each] = between[:, :, part]
+            flat = slopes.transpose(0, 1, 3, 2).reshape(N * m, -1)
+            ways = np.kron(np.eye(part.stop - part.start), wandering(problem.runs[r]))
+            found[name] = flat @ ways @ flat.T
+            continue
+        flat = slopes[:, :, :N].reshape(N * m, -1)
         found[name] = flat @ flat.T
     return found
 
 
+_OF_A_SIGNAL = re.compile(r"\[(\w+)\](/s\^0\.5)?")
+
+
 def _signal_of(model: Model, name: str) -> str | None:
-    """The signal in whose unit a noise is counted: [a]; None where in another."""
-    unit = re.fullmatch(r"\[(\w+)\]", model[name].like or model[name].unit)
+    """The signal in whose unit a noise is counted: [a], [a]/s^0.5; None where in another."""
+    unit = _OF_A_SIGNAL.fullmatch(model[name].like or model[name].unit)
     return unit[1] if unit and unit[1] in {s.name for s in model.signals} else None
 
 
 def _rests_show(problem: Problem, name: str) -> float:
     """Error of a rest's mean, of a noise that is that of a signal; else nothing."""
+    if name in problem.model.traced.residual.wander:
+        return 0.0
     signal = _signal_of(problem.model, name)
     spreads = [r.spread[signal] for r in problem.runs if signal is not None and signal in r.spread]
     squares = np.concatenate([s.ravel() ** 2 for s in spreads]) if spreads else np.zeros(1)
@@ -227,7 +248,25 @@ def _rests_show(problem: Problem, name: str) -> float:
 
 
 def _at_start(problem: Problem, first: Point, name: str) -> float:
-    """Root mean square residual of the axes of a kind, at a point."""
+    """Root mean square residual of the axes of a kind, at a point; of what wanders, how far a
+    signal's means at rest are apart, as if nothing else made them differ."""
+    if name in problem.model.traced.residual.wander:
+        return max(_steps_show(problem, name), 1e-300)
     axes = np.array([n == name for n in problem.model.traced.residual.noise])
     squares = np.concatenate([r[:, axes].ravel() ** 2 for r in problem.residuals(first)])
     return max(float(np.sqrt(np.mean(squares))), _rests_show(problem, name), 1e-300)
+
+
+def _steps_show(problem: Problem, name: str) -> float:
+    """Root mean square of the steps from rest to rest of a signal, in the root of a second."""
+    signal, squares = _signal_of(problem.model, name), []
+    for run in problem.runs:
+        assert signal is not None
+        assert run.averaged is not None
+        assert run.averaged.run.time is not None
+        time = np.asarray(run.averaged.run.time, float)
+        middle = 0.5 * (time[run.averaged.first] + time[run.averaged.last])
+        steps = np.diff(run.signals[signal], axis=0) ** 2 / np.diff(middle)[:, None]
+        squares.append(steps.ravel())
+    each = np.concatenate(squares)
+    return float(np.sqrt(np.mean(each))) if len(each) else 0.0

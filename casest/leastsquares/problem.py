@@ -441,8 +441,9 @@ class Problem:
     def _with_jacobian(self) -> Replay:
         return residual_and_jacobian(self.model)
 
-    def slopes_in_readings(self, point: Point, r: int) -> tuple[Array, Array]:
-        """∂r/∂s of one run's rests, (N, m, k) each: in their own means, and in those before."""
+    def slopes_in_readings(self, point: Point, r: int) -> tuple[Array, Array, Array]:
+        """∂r/∂s of one run's rests, (N, m, k) each: in their own means, in those before, and in all
+        the readings of the turn between."""
         assert self._staged is not None
         return self._staged.slopes_in_readings(self.parameters(point, r), r)
 

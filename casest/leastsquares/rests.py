@@ -58,6 +58,18 @@ class Rests:
         return cls(linked, lost, spans, np.hstack(values), np.asarray(raw.time, float)[places])
 
 
+class LastTurns:
+    """What was integrated last. Most unknowns turn nothing: where only these have changed since,
+    there is nothing to integrate anew."""
+
+    def __init__(self) -> None:
+        self.asked: tuple[object, ...] = ()
+
+    def keep(self, asked: tuple[object, ...], found: tuple[Array, Array]) -> None:
+        """Rotations and their slopes, and what they were asked with."""
+        self.asked, self.found = asked, found
+
+
 def _too_fast(
     model: Model, raw: Run, last: NDArray[np.int_], first: NDArray[np.int_]
 ) -> NDArray[np.bool_]:

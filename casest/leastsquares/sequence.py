@@ -29,7 +29,7 @@ from casest.engine import Replay
 from casest.errors import DataError, DeclarationError
 from casest.leastsquares.flow import Course, Integrator, Mesh
 from casest.leastsquares.memory import Memory
-from casest.leastsquares.rests import Rests, before, needing, turns
+from casest.leastsquares.rests import LastTurns, Rests, before, needing, turns
 
 
 @dataclass(frozen=True)
@@ -149,20 +149,27 @@ class Staged:
             )
         return found
 
-    def slopes_in_readings(self, parameters: Array, r: int) -> tuple[Array, Array]:
-        """∂r/∂s (N, m, k) in the means of a rest, and in those of the rest before."""
+    def slopes_in_readings(self, parameters: Array, r: int) -> tuple[Array, Array, Array]:
+        """∂r/∂s (N, m, k) in the means of a rest, in those of the rest before, and in all readings
+        of the turn between at once."""
         record, last = self._records[r], _in_readings(self.model)
         given = self._given(parameters, r, ())[0]
         own, through = last.residual(parameters, np.hstack([record.samples, given]))
-        prior = np.zeros_like(own)
+        prior, between = np.zeros_like(own), np.zeros_like(own)
         for first, taken in last.before:
             slope = taken(parameters, np.hstack([record.samples, given]))[0]
             prior[1:] += through[1:, :, first : first + slope.shape[1]] @ slope[:-1]
+        for first, taken in last.turned:
+            assert record.rests is not None
+            nothing = np.zeros((len(record.rests.samples), given.shape[1]))
+            rate, slope = taken(parameters, np.hstack([record.rests.samples, nothing]))
+            moved = turns(rate[:, :, 0], slope, record.rests)[1]
+            between += through[:, :, first : first + moved.shape[1]] @ moved
         present = self.present(r)
-        for part in (own, prior):
+        for part in (own, prior, between):
             if present is not None:
                 part[~present] = 0.0
-        return own, prior
+        return own, prior, between
 
     def lost(self, r: int) -> NDArray[np.int_]:
         """Rests that were reached too fast, by number."""
@@ -204,6 +211,10 @@ class Staged:
                 found.append(given[:, place : place + stage.given.numel()])
             place += stage.given.numel()
         return np.hstack([given[:, :0], *found])
+
+    @cached_property
+    def _turns(self) -> LastTurns:
+        return LastTurns()
 
     def _given(self, parameters: Array, r: int, own: tuple[int, ...] | None) -> tuple[Array, Array]:
         """The same at all samples of the record; what was asked for last is kept."""
@@ -254,9 +265,12 @@ class Staged:
         assert record.rests is not None
         if stage.word == "before":
             return before(*_chained(stage.taken, parameters, record.samples, given, slopes))
-        nothing = np.zeros((len(record.rests.samples), given.shape[1]))
-        own = stage.taken(parameters, np.hstack([record.rests.samples, nothing]))
-        found, moved = turns(own[0][:, :, 0], own[1], record.rests)
+        asked = id(record), stage.columns, parameters[list(stage.turning)].tobytes()
+        if self._turns.asked != asked:
+            nothing = np.zeros((len(record.rests.samples), given.shape[1]))
+            rate, sloped = stage.taken(parameters, np.hstack([record.rests.samples, nothing]))
+            self._turns.keep(asked, turns(rate[:, :, 0], sloped, record.rests))
+        found, moved = self._turns.found
         wide = np.zeros((*moved.shape[:2], slopes.shape[2]))
         wide[:, :, list(stage.columns)] = moved
         return found, wide
@@ -297,7 +311,7 @@ class Program:
 
     Of an effect on a signal's time that is the time asked for. The last of a model's is its
     residual, with no effect behind it. A `word` of the body has no effect either; `columns` are the
-    coordinates in which a turn has slopes.
+    coordinates in which a turn has slopes, `turning` the parameters that it depends on.
     """
 
     attached: Attached | None
@@ -305,6 +319,7 @@ class Program:
     memory: Memory | None = None
     word: Word = ""
     columns: tuple[int, ...] = ()
+    turning: tuple[int, ...] = ()
     flow: Integrator | None = None
 
 
@@ -332,11 +347,11 @@ def _programs(model: Model, own: tuple[int, ...] | None = None) -> tuple[Program
                 raise DeclarationError(
                     f"model {model.name}: what turns between rests cannot read what was before"
                 )
-            columns = tuple(sorted(set(ca.jacobian(stage.taken, coordinates).sparsity().get_col())))
+            columns, turning = (_reaching(stage.taken, x) for x in (coordinates, parameters))
             sample = ca.vertcat(sample_symbol(model, traced), given)
             outputs = slopes(stage.taken, coordinates[list(columns)])
             rate = _replay("rate", [parameters, sample], outputs)
-            found.append(Program(None, rate, word=stage.word, columns=columns))
+            found.append(Program(None, rate, word=stage.word, columns=columns, turning=turning))
         elif stage.word:
             found.append(Program(None, replay(stage.taken), word=stage.word))
         elif stage.attached is not None and stage.attached.kind == "time":
@@ -352,13 +367,19 @@ def _programs(model: Model, own: tuple[int, ...] | None = None) -> tuple[Program
     return (*found, Program(traced.stages[-1].attached, replay(traced.expression)))
 
 
+def _reaching(expression: SX, variables: SX) -> tuple[int, ...]:
+    """Numbers of the variables that an expression depends on."""
+    return tuple(sorted(set(ca.jacobian(expression, variables).sparsity().get_col())))
+
+
 @dataclass(frozen=True)
 class Readings:
     """Slopes in the readings of a rest: of the residual, also in what the stages give, and of what
-    each word `before` takes, with the place of what it gives."""
+    each word `before` takes, with the place of what it gives; each rate that turns, and its."""
 
     residual: Replay
     before: tuple[tuple[int, Replay], ...]
+    turned: tuple[tuple[int, Replay], ...]
 
 
 @lru_cache(maxsize=64)
@@ -372,12 +393,15 @@ def _in_readings(model: Model) -> Readings:
         outputs = [ca.densify(ca.jacobian(expression, x)) for x in of]
         return _replay("slope", [parameters, sample], outputs)
 
-    found, place = [], 0
+    before, turned, place = [], [], 0
     for stage in traced.stages:
         if stage.word == "before":
-            found.append((place, slope(stage.taken, reading)))
+            before.append((place, slope(stage.taken, reading)))
+        if stage.word == "turned":
+            both = [ca.densify(stage.taken), ca.densify(ca.jacobian(stage.taken, reading))]
+            turned.append((place, _replay("rate", [parameters, sample], both)))
         place += stage.given.numel()
-    return Readings(slope(traced.expression, reading, given), tuple(found))
+    return Readings(slope(traced.expression, reading, given), tuple(before), tuple(turned))
 
 
 def _multiplied(matrix: Array, values: Array) -> Array:

@@ -20,6 +20,10 @@ from casest.declaration.shapes import Array
 _SMALL = 1e-4
 #: Steps that are multiplied side by side.
 PIECE = 32
+#: Steps whose numbers fit into a processor's cache, and into memory that need not be asked for.
+TOGETHER = 2048
+#: A rotation as the first row (a, b) of its matrix in SU(2): the half of a quaternion's products.
+Pair = tuple[NDArray[np.complex128], NDArray[np.complex128]]
 
 
 def rotations(
@@ -33,28 +37,66 @@ def rotations(
     """
     place = np.concatenate([np.zeros(0, np.int_), *(np.arange(a, b) for a, b in spans)])
     ends = np.cumsum(spans[:, 1] - spans[:, 0])
-    h = (time[place + 1] - time[place])[:, None]
-    w0, w1 = rate[place], rate[place + 1]
-    phi = 0.5 * h * (w0 + w1) + h**2 / 12 * np.cross(w0, w1)
-    R, behind = _products(exponential(phi), ends)
-    if not slopes.shape[2]:
-        return R, np.zeros((len(spans), 3, 0))
-    # S = Σ M_i ∂φ_i with ∂φ_i = (h/2 − h²/12 [ω₁]×) ∂ω₀ + (h/2 + h²/12 [ω₀]×) ∂ω₁.
-    M = behind.transpose(0, 2, 1) @ right_jacobian(phi)
-    half, twelfth = 0.5 * h[:, :, None] * M, h[:, :, None] ** 2 / 12 * M
-    before, after = half - twelfth @ skew(w1), half + twelfth @ skew(w0)
+    groups, turns = _groups(ends), []
+    for first, last in groups:
+        turns.append(_pair(_magnus(rate, time, place[_steps(ends, first, last)])[0]))
+    a, b = (np.concatenate(part) for part in zip(*turns, strict=True))
+    whole, behind = _products((a, b), ends, sloped=slopes.shape[2] > 0)
+    found = np.ascontiguousarray(_matrix(whole).transpose(2, 0, 1))
     S = np.zeros((len(spans), 3, slopes.shape[2]))
-    for k, (a, b) in enumerate(spans):
-        own = slice(ends[k] - (b - a), ends[k])
-        part = np.zeros((b - a + 1, 3, 3))
-        part[:-1] += before[own]
-        part[1:] += after[own]
-        S[k] = np.tensordot(part, slopes[a : b + 1], axes=([0, 2], [0, 1]))
-    return R, S
+    if behind is None:
+        return found, S
+    for first, last in groups:
+        own = _steps(ends, first, last)
+        here = behind[0][own], behind[1][own]
+        before, after = _weights(here, *_magnus(rate, time, place[own]))
+        end = 0
+        for k in range(first, last):
+            begin, (left, right) = end, spans[k]
+            end += right - left
+            part = np.zeros((3, 3, right - left + 1))
+            part[:, :, :-1] += before[:, :, begin:end]
+            part[:, :, 1:] += after[:, :, begin:end]
+            S[k] = sum(part[:, j] @ slopes[left : right + 1, j] for j in range(3))
+    return found, S
 
 
-def _products(steps: Array, ends: Array) -> tuple[Array, Array]:
-    """Product of each span's rotations (K, 3, 3), and what is turned after each step (N, 3, 3).
+def _groups(ends: Array) -> list[tuple[int, int]]:
+    """Spans first to last, one after the other, of together TOGETHER steps at most, or one."""
+    found, first = [], 0
+    for k in range(1, len(ends) + 1):
+        begin = ends[first - 1] if first else 0
+        if k == len(ends) or ends[k] - begin > TOGETHER:
+            found.append((first, k))
+            first = k
+    return found
+
+
+def _steps(ends: Array, first: int, last: int) -> slice:
+    """Steps of some spans."""
+    return slice(ends[first - 1] if first else 0, ends[last - 1])
+
+
+def _magnus(rate: Array, time: Array, place: NDArray[np.int_]) -> tuple[Array, Array, Array, Array]:
+    """Rotation vectors (3, N) of steps, their lengths (N,), and the rates (3, N) at both ends."""
+    h = time[place + 1] - time[place]
+    w0, w1 = np.ascontiguousarray(rate[place].T), np.ascontiguousarray(rate[place + 1].T)
+    return 0.5 * h * (w0 + w1) + h**2 / 12 * _crossed(w0, w1), h, w0, w1
+
+
+def _weights(behind: Pair, phi: Array, h: Array, w0: Array, w1: Array) -> tuple[Array, Array]:
+    """What a small rate before and after each step turns the whole by, (3, 3, N) each.
+
+    S = Σ M_i ∂φ_i with ∂φ_i = (h/2 − h²/12 [ω₁]×) ∂ω₀ + (h/2 + h²/12 [ω₀]×) ∂ω₁.
+    """
+    M = _through_jacobian(_matrix(behind).transpose(1, 0, 2), phi)
+    half, twelfth = 0.5 * h * M, h**2 / 12 * M.transpose(1, 0, 2)
+    before, after = _crossed(twelfth, w1), _crossed(twelfth, w0)
+    return half - before.transpose(1, 0, 2), half + after.transpose(1, 0, 2)
+
+
+def _products(steps: Pair, ends: Array, *, sloped: bool) -> tuple[Pair, Pair | None]:
+    """Product of each span's rotations (K,), and what is turned after each step (N,) if `sloped`.
 
     `ends` (K,): where each span ends among the steps. First within pieces, all side by side, then
     from piece to piece.
@@ -63,61 +105,99 @@ def _products(steps: Array, ends: Array) -> tuple[Array, Array]:
     counts = -(-(ends - starts) // PIECE)
     owner = np.repeat(np.arange(len(ends)), counts)
     number = np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
-    first = starts[owner] + number * PIECE
-    place = first[:, None] + np.arange(PIECE)
-    there = place < ends[owner][:, None]
-    padded = np.where(there[:, :, None, None], steps[np.where(there, place, 0)], np.eye(3))
-    whole, within = _from_the_end(padded)
-    table = np.broadcast_to(np.eye(3), (len(ends), int(counts.max(initial=0)), 3, 3)).copy()
-    table[owner, number] = whole
-    products, pieces = _from_the_end(table)
-    behind = within @ pieces[owner, number][:, None]
-    return products, behind[there]
+    place = starts[owner] + number * PIECE + np.arange(PIECE)[:, None]
+    there = place < ends[owner]
+    place = np.where(there, place, 0)
+    a, b = (np.where(there, part[place], none) for part, none in zip(steps, (1, 0), strict=True))
+    piece, within = _from_the_end((a, b))
+    size = int(counts.max(initial=0)), len(ends)
+    table = np.ones(size, complex), np.zeros(size, complex)
+    for part, own in zip(table, piece, strict=True):
+        part[number, owner] = own
+    whole, pieces = _from_the_end(table)
+    if not sloped:
+        return whole, None
+    behind = _after(within, (pieces[0][number, owner], pieces[1][number, owner]))
+    return whole, (behind[0].T[there.T], behind[1].T[there.T])
 
 
-def _from_the_end(steps: Array) -> tuple[Array, Array]:
-    """Product of each row of rotations (K, L, 3, 3), (K, 3, 3), and that of what is behind each."""
-    product = np.broadcast_to(np.eye(3), (len(steps), 3, 3)).copy()
-    behind = np.empty_like(steps)
-    for k in range(steps.shape[1] - 1, -1, -1):
-        behind[:, k] = product
-        product = steps[:, k] @ product
-    return product, behind
+def _from_the_end(steps: Pair) -> tuple[Pair, Pair]:
+    """Product of each column of rotations (L, K), (K,), and that of what is behind each (L, K)."""
+    a, b = np.empty_like(steps[0]), np.empty_like(steps[1])
+    product = np.ones(a.shape[1], complex), np.zeros(a.shape[1], complex)
+    for k in range(len(a) - 1, -1, -1):
+        a[k], b[k] = product
+        product = _after((steps[0][k], steps[1][k]), product)
+    return product, (a, b)
+
+
+def _after(first: Pair, second: Pair) -> Pair:
+    """One rotation and then, in its frame, another."""
+    (a, b), (c, d) = first, second
+    return a * c - b * d.conj(), a * d + b * c.conj()
+
+
+def _pair(phi: Array) -> Pair:
+    """Rotations of rotation vectors (3, N): cos(φ/2) − i·sin(φ/2)·(σ·axis), its first row."""
+    square, safe, small = _squares(phi)
+    half = 0.5 * np.sqrt(safe)
+    series = 0.5 * _series(0.25 * square, 1.0, 6.0, 20.0, 42.0)
+    x, y, z = np.where(small, series, 0.5 * np.sin(half) / half) * phi
+    cosine = np.cos(0.5 * np.sqrt(square))
+    return cosine - 1j * z, -y - 1j * x
+
+
+def _matrix(rotation: Pair) -> Array:
+    """Rotation matrices (3, 3, N)."""
+    a, b = rotation
+    w, x, y, z = np.sqrt(2) * np.array([a.real, -b.imag, -b.real, -a.imag])
+    xx, yy, zz = x * x, y * y, z * z
+    return np.array([
+        [1 - yy - zz, x * y - w * z, x * z + w * y],
+        [x * y + w * z, 1 - xx - zz, y * z - w * x],
+        [x * z - w * y, y * z + w * x, 1 - xx - yy],
+    ])  # fmt: skip
+
+
+def _crossed(a: Array, b: Array) -> Array:
+    """a × b, axes first, of whatever else there is behind them."""
+    return np.array([a[i] * b[j] - a[j] * b[i] for i, j in ((1, 2), (2, 0), (0, 1))])
 
 
 def exponential(phi: Array) -> Array:
     """Rotations exp([φ]×), (N, 3, 3), of rotation vectors (N, 3)."""
-    square, safe, small = _squares(phi)
-    angle = np.sqrt(safe)
-    sine = np.where(small, _series(square, 1.0, 6.0, 20.0, 42.0), np.sin(angle) / angle)
-    cosine = np.where(small, _series(square, 0.5, 12.0, 30.0, 56.0), (1 - np.cos(angle)) / safe)
-    return _combined(phi, square, sine, cosine)
+    return np.ascontiguousarray(_matrix(_pair(phi.T)).transpose(2, 0, 1))
 
 
 def right_jacobian(phi: Array) -> Array:
     """J_r (N, 3, 3): exp([φ + δ]×) = exp([φ]×)·exp([J_r δ]×) to first order in δ."""
+    same = np.broadcast_to(np.eye(3)[:, :, None], (3, 3, len(phi)))
+    return np.ascontiguousarray(_through_jacobian(same, phi.T).transpose(2, 0, 1))
+
+
+def _through_jacobian(M: Array, phi: Array) -> Array:
+    """M·J_r, (3, 3, N), of M (3, 3, N) and φ (3, N).
+
+    J_r = I − c·[φ]× + d·[φ]×² with [φ]×² = φφᵀ − |φ|²·I; of a row m that is m − c·m × φ + ….
+    """
     square, safe, small = _squares(phi)
     angle = np.sqrt(safe)
     cosine = np.where(small, _series(square, 0.5, 12.0, 30.0, 56.0), (1 - np.cos(angle)) / safe)
-    sine = np.sin(angle) / angle
-    cubic = np.where(small, _series(square, 1 / 6, 20.0, 42.0, 72.0), (1 - sine) / safe)
-    return _combined(phi, square, -cosine, cubic)
+    sine = np.where(
+        small, _series(square, 1 / 6, 20.0, 42.0, 72.0), (1 - np.sin(angle) / angle) / safe
+    )
+    columns = M.transpose(1, 0, 2)
+    along = columns[0] * phi[0] + columns[1] * phi[1] + columns[2] * phi[2]
+    found = (1 - sine * square) * columns - _crossed(columns, cosine * phi)
+    found += along * (sine * phi)[:, None]
+    return np.asarray(found.transpose(1, 0, 2))
 
 
 def _squares(phi: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Squared angles, the same with ones where they are small, and where that is."""
-    square = np.sum(phi**2, axis=1)
+    square = np.sum(phi**2, axis=0)
     small = square < _SMALL
     return square, np.where(small, 1.0, square), small
-
-
-def _combined(phi: Array, square: Array, one: Array, two: Array) -> Array:
-    """I + one·[φ]× + two·[φ]×², where [φ]×² = φφᵀ − |φ|²·I."""
-    found = skew(one[:, None] * phi) + (two[:, None] * phi)[:, :, None] * phi[:, None, :]
-    diagonal = 1 - two * square
-    for k in range(3):
-        found[:, k, k] += diagonal
-    return np.asarray(found)
 
 
 def _series(x: Array, first: float, *over: float) -> Array:
@@ -130,6 +210,10 @@ def _series(x: Array, first: float, *over: float) -> Array:
 
 def skew(v: Array) -> Array:
     """[v]× of vectors (N, 3), (N, 3, 3)."""
-    zero = np.zeros(len(v))
-    x, y, z = v.T
-    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
+    return np.ascontiguousarray(_skew(v.T).transpose(2, 0, 1))
+
+
+def _skew(v: Array) -> Array:
+    """The same, (3, 3, N) of (3, N)."""
+    (x, y, z), zero = v, np.zeros(v.shape[1])
+    return np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -11,12 +12,14 @@ from casest.declaration.shapes import Array
 from casest.estimate.correlation import is_series
 from casest.estimate.covariance import inverse_normal, stretches
 from casest.estimate.estimate import Estimate
-from casest.estimate.spectrum import Powers, by_frequency, noise_spectrum
+from casest.estimate.spectrum import Certainty, Powers, by_frequency, noise_spectrum
 from casest.leastsquares.problem import Point, Problem
 from casest.leastsquares.sums import SAMPLED
 
-#: Frequencies at which a spectrum is kept, evenly in their logarithm.
+#: Frequencies at which a spectrum is kept, evenly in their logarithm, ...
 KEPT = 25
+#: ... from so much on, over the samples of the record.
+LOWEST = 0.25
 
 
 @dataclass(frozen=True)
@@ -31,10 +34,19 @@ class Colour:
     power: Array
     rate: float
 
+    def asked(self, count: int, rate: float) -> Array:
+        """Logarithms (count,) of the frequencies of the cosine transform of so many samples."""
+        ratio = rate / self.rate if np.isfinite(rate) and np.isfinite(self.rate) else 1.0
+        return np.asarray(np.log(ratio * (np.arange(count) + 0.5) / (2 * count)))
+
+    @cached_property
+    def certainty(self) -> Certainty:
+        """How well it is known of a record as long as the one that showed it."""
+        return Certainty(max(round(LOWEST / float(self.frequency[0])), 1))
+
     def at(self, count: int, rate: float) -> Array:
         """Power (count, m) at the frequencies of the cosine transform of so many samples."""
-        ratio = rate / self.rate if np.isfinite(rate) and np.isfinite(self.rate) else 1.0
-        asked = np.log(ratio * (np.arange(count) + 0.5) / (2 * count))
+        asked = self.asked(count, rate)
         log = np.log(self.frequency)
         power = np.stack([np.exp(np.interp(asked, log, np.log(p))) for p in self.power], axis=1)
         return np.asarray(power / power.mean(axis=0))
@@ -77,7 +89,7 @@ def spectrum_of(problem: Problem, point: Point, bread: Array) -> Colour | None:
             break
         for part in by_frequency(stretch, bread):
             parts[part.axis].append(part.powers)
-    frequency = np.geomspace(0.25 / longest, 0.5, KEPT)
+    frequency = np.geomspace(LOWEST / longest, 0.5, KEPT)
     each = np.array([noise_spectrum(own)(frequency) for own in parts])
     if not (np.isfinite(each).all() and (each > 0).all()):
         return None

@@ -9,6 +9,7 @@ fewer samples than unknowns will do: T asks only what the record can see.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -79,6 +80,11 @@ class Subject:
     def problem(self) -> Problem:
         """The new record's least-squares problem."""
         return self.rows.problem
+
+    @cached_property
+    def power_known(self) -> float:
+        """Variance of the logarithm of the noise's power where the shared unknowns are told."""
+        return float(np.mean(self.rows.power_known(self.point)[self.shared]))
 
     @property
     def shared(self) -> Array:
@@ -187,12 +193,17 @@ def tested(subject: Subject, factor: Factor, free: Array) -> Test:
 
 
 def _freedom(subject: Subject, share: float) -> float:
-    """Degrees of freedom of V, of which so large a share is of the old errors (Satterthwaite)."""
+    """Degrees of freedom of V, of which so large a share is of the old errors (Satterthwaite).
+
+    What is told slowly has the noise of slow frequencies, of which a record shows few, in both
+    parts alike: a variance of ν degrees of freedom has a logarithm of variance 2/ν.
+    """
     noise, old = subject.noise, max(subject.old.freedom, 1.0)
     if noise.known_by is not None:
         return max(noise.freedom, 1.0)
     share = min(max(share, 0.0), 1.0)
-    return 1 / (share**2 / old + (1 - share) ** 2 / max(noise.freedom, 1.0))
+    each = share**2 / old + (1 - share) ** 2 / max(noise.freedom, 1.0)
+    return 1 / (each + 0.5 * subject.power_known)
 
 
 def beside(R: Array, free: Array) -> Array:

@@ -76,6 +76,24 @@ class Whitened:
             rows = dct(rows, axis=0, norm="ortho") / np.sqrt(power)[:, :, None]
         return np.asarray(rows / self.axes[:, None])
 
+    def power_known(self, point: Point) -> Array:
+        """Variance (n,) of the logarithm of the noise's power where each unknown is told."""
+        n, colour = self.problem.unknowns, self.colour
+        if colour is None:
+            return np.zeros(n)
+        logs, weights = [np.zeros(0)], [np.zeros((0, n))]
+        for block in self.problem.blocks(point):
+            run = self.problem.runs[block.run]
+            if not is_series(run):
+                continue
+            for own in _stretches(run, block.span):
+                rows = self._white(block.jacobian[own], run)
+                wide = np.zeros((len(own), n))
+                wide[:, block.x] = np.sum(rows**2, axis=1)
+                logs.append(colour.asked(len(own), rate_of(run)))
+                weights.append(wide)
+        return colour.certainty.variances(np.concatenate(logs), np.concatenate(weights))
+
     def neighbours(self, point: Point) -> tuple[float, int]:
         """Correlation of neighbouring whitened residuals of series, and of how many."""
         from scipy.fft import dct, idct
