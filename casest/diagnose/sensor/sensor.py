@@ -164,16 +164,34 @@ class Sensor(Subject[Fit]):
         return self.fitted(replace(fit.model, effects=left), values)
 
     def wider(self, fit: Fit, what: Candidate) -> tuple[Candidate, Fit] | None:
-        """An effect that was added on some axes only, and the fit with it on all of them."""
-        base = self.without(fit, what)
-        whole = None if base is None else self._whole(fit, base, what)
-        if base is None or whole is None:
+        """An effect that was added on some axes only, and the fit with it on all of them.
+
+        If the data determine each of them there: what they do not would lead the fit anywhere.
+        """
+        found = self._anew(fit, what)
+        if found is None:
             return None
-        found = self.refit(base, [Trial(whole, whole.label, np.zeros((0, 0, 0)))])
-        return None if isinstance(found, str) else (whole, found)
+        base, trial, evidence, _ = found
+        if evidence.freedom < trial.columns.shape[2]:
+            return None
+        refit = self.refit(base, [trial])
+        return None if isinstance(refit, str) else (trial.what, refit)
 
     def better_axes(self, fit: Fit, what: Candidate) -> tuple[Candidate, Fit] | None:
         """The same where it cannot be on all of them: on those that are worth it by now."""
+        found = self._anew(fit, what)
+        if found is None:
+            return None
+        base, trial, evidence, likelihood = found
+        axes = on_fewer_axes(evidence, likelihood)
+        if axes is None:
+            return None
+        less = self.on_axes(base, trial, axes)
+        refit = self.refit(base, [less])
+        return None if isinstance(refit, str) else (less.what, refit)
+
+    def _anew(self, fit: Fit, what: Candidate) -> tuple[Fit, Trial, Evidence, Likelihood] | None:
+        """The fit without an effect, and that on all axes as a trial beside it."""
         base = self.without(fit, what)
         whole = None if base is None else self._whole(fit, base, what)
         if base is None or whole is None:
@@ -181,12 +199,7 @@ class Sensor(Subject[Fit]):
         likelihood = Likelihood(self.linear(base))
         trials = self.tried.of(base, [whole])
         evidence = judged(trials, likelihood, likelihood.beside(), families=1) if trials else None
-        axes = None if evidence is None else on_fewer_axes(evidence, likelihood)
-        if axes is None:
-            return None
-        less = self.on_axes(base, trials[0], axes)
-        found = self.refit(base, [less])
-        return None if isinstance(found, str) else (less.what, found)
+        return None if evidence is None else (base, trials[0], evidence, likelihood)
 
     def _whole(self, fit: Fit, base: Fit, what: Candidate) -> Candidate | None:
         """An effect of the fit on all axes, beside the base; None where it is that already."""
