@@ -314,7 +314,10 @@ def _products(model: Dynamics, run: Run) -> Products:
     along = None if model.linear else filtered(model, run).smoothed
     if model.input_noise is None:
         return Products.of(model, run, along)
-    system = coefficients(model, run) if model.linear else linearised(model, run, along)
+    if not model.linear:
+        system = linearised(model, run, along)
+    else:  # as the filter goes, which no bound may be above
+        system = filtered(model, run).system if uncertain(model) else coefficients(model, run)
     return Products.of(model, run, system=system)
 
 
