@@ -83,6 +83,7 @@ def share(words: str, records: Sequence[Record], test: Callable[[Record], bool],
 def table(records: Sequence[Record]) -> str:
     """Markdown: the figures with their goals, then each kind."""
     good = [r for r in records if "verdict" in r]
+    seeds = [r["seed"] for r in records]
     without = [r for r in good if not r["there"]]
     seen = [r for r in good if visible(r)]
     unseen = [r for r in good if r["there"] and not visible(r)]
@@ -97,7 +98,8 @@ def table(records: Sequence[Record]) -> str:
         "the error). Named: first, or among the two nearest that are not told apart. Harmed: the",
         "declared parameters, by what they predict of the record without the effect, are further",
         "off than before by more than their scatter (99.9 %). On the second record nothing is",
-        "fitted; what happened in the first alone (a step, a pulse, a drift) is left out there.",
+        "fitted; what happened in the first alone (a step, a pulse, a drift) is not carried there.",
+        f"Seeds {min(seeds)} to {max(seeds)}.",
         "",
         "| figure | worlds | found | goal |",
         "| --- | --- | --- | --- |",
