@@ -5,7 +5,9 @@
 From starts drawn over two decades each, and `casest compare` on every problem: where each solver
 and each transcription ends, and what it claims. Three collections: COPS and casiopeia
 (`../shared/data/certified`), two of Esposito & Floudas 2000, and NIST's nonlinear regressions
-written as the equations that their curves follow, whose values NIST certifies to eleven digits.
+written as the equations that their curves follow, whose values NIST certifies to eleven digits. The
+readings and optima of Esposito & Floudas were typed without a copy of the paper at hand: what
+vouches for them is that SciPy's optimum of these readings has every digit given here.
 What was computed is kept in `out/equations.jsonl`: a second call goes on where the first was ended,
 or with more starts. The tables are written to `studies/equations.md`.
 """
@@ -323,7 +325,9 @@ def main() -> None:
         "# Differential equations with published optima",
         "",
         f"`make study-equations` (`python studies/equations.py {starts}`, whose first lines tell "
-        "the sources).",
+        "the sources). Readings and optima of the two problems of Esposito & Floudas (E & F) were "
+        "typed without a copy of the paper at hand; SciPy's optimum of these readings has every "
+        "digit.",
         "",
         "## Starts over two decades",
         "",

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from casest.cli import run
-from casest.diagnose.candidates.carried_through import columns_of_motion
+from casest.diagnose.candidates.motion_columns import columns_of_motion
 
 
 def turning(seed, size=900):

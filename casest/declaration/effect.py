@@ -357,16 +357,19 @@ class Attached:
 
     def apply(self, value: SX, symbols: Mapping[str, SX]) -> SX:
         """The value with the effect in it, from the model's symbols by name."""
-        numbers, moments = self._numbers(symbols), [ca.SX.nan()]
-        if self.over is not None:
-            first, last = self.over
-            moments = [ca.SX(first + (last - first) * (k + 0.5) / MOMENTS) for k in range(MOMENTS)]
-        found = []
-        for t in moments:
-            known = {"t": t, **{s.name: symbols[read.name] for s, read in _paired(self)}}
+        read = {s.name: symbols[own.name] for s, own in _paired(self)}
+        numbers = self._numbers(symbols)
+
+        def given(more: Mapping[str, SX]) -> SX:
+            known = {**read, **more}
             extras = [known[s.name] for s in self.effect.extras]
-            found.append(evaluated(self.effect, value, *extras, **numbers))
-        return found[0] if len(found) == 1 else sum(found[1:], found[0]) / len(found)
+            return evaluated(self.effect, value, *extras, **numbers)
+
+        if self.over is None:
+            return given({})
+        first, last = self.over
+        moments = (first + (last - first) * (k + 0.5) / MOMENTS for k in range(MOMENTS))
+        return sum(given({"t": ca.SX(t)}) for t in moments) / MOMENTS
 
     def step(
         self, value: SX, symbols: Mapping[str, SX], before: Mapping[str, SX], dt: SX, span: SX

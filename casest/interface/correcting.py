@@ -37,8 +37,7 @@ def corrected_readings(
         warnings.warn(ONCE + ", ".join(carried.once), stacklevel=3)
         carried = carried.lasting
     program = carried.of_run(_place(result, carried, run))[0]
-    units = {s.name: s.unit or fitted_unit(result, s) for s in carried.needed}
-    needed = [replace(s, unit=units[s.name]) for s in carried.needed]
+    needed = _needed(result, carried)
     if isinstance(readings, Run):
         return corrected(program, _of_fit(readings, needed, result))
     if isinstance(readings, list | tuple) and readings and isinstance(readings[0], Run):
@@ -46,9 +45,7 @@ def corrected_readings(
     if _bare(readings):
         return _of_array(np.asarray(readings, float), carried, needed, program)
     table = _table(readings)
-    spare = {s.name for s in carried.signals} - {s.name for s in needed}
-    said = {**stated(reading), "at_rest": False}
-    runs = load_runs(table, needed, **without(spare, said))
+    runs = _loaded(result, carried, table, reading)
     _warn(carried, runs)
     whole = np.full((table.n_rows, program.output.size), np.nan)
     for one in runs:
@@ -67,14 +64,24 @@ def _was_fitted(result: SavedResult, carried: Carried, readings: Any, reading: R
         return carried.was_fitted(readings)
     if _bare(readings):
         return False
-    units = {s.name: s.unit or fitted_unit(result, s) for s in carried.needed}
-    needed = [replace(s, unit=units[s.name]) for s in carried.needed]
-    spare = {s.name for s in carried.signals} - {s.name for s in needed}
-    said = {**stated(reading), "at_rest": False}
     try:
-        return carried.was_fitted(load_runs(_table(readings), needed, **without(spare, said)))
-    except CasestError:
+        return carried.was_fitted(_loaded(result, carried, _table(readings), reading))
+    except CasestError:  # it has not what the correction of the fitted record needs
         return False
+
+
+def _needed(result: SavedResult, carried: Carried) -> list[Signal]:
+    """What the correction reads, in the units of the fit."""
+    return [replace(s, unit=s.unit or fitted_unit(result, s)) for s in carried.needed]
+
+
+def _loaded(
+    result: SavedResult, carried: Carried, table: Table, reading: Reading
+) -> tuple[Run, ...]:
+    """The runs of a table, with what the correction reads."""
+    needed = _needed(result, carried)
+    spare = {s.name for s in carried.signals} - {s.name for s in needed}
+    return load_runs(table, needed, **without(spare, {**stated(reading), "at_rest": False}))
 
 
 def _table(readings: Any) -> Table:

@@ -186,7 +186,7 @@ def of_another_time(path: Path, data: str | None = None) -> tuple[str, ...]:
 
 
 def left_out(path: Path) -> tuple[str, ...]:
-    """Effects of the fitted record alone, which no other record is corrected for."""
+    """Effects that happened in the fitted record alone: any other is corrected otherwise."""
     return saved_correction(path, force=True, what="reads")[1].once
 
 

@@ -16,6 +16,8 @@ from casest.diagnose.protocol.subject import Subject
 
 #: Why a cause with strong evidence is not added.
 NOT_HELD_OUT = "held-out data do not confirm it"
+#: Why one of a pair is not, beside a column of the motion.
+FOLLOWED = "what only follows a column explains nearly as much"
 
 
 def with_the_best(
@@ -27,7 +29,8 @@ def with_the_best(
     options = [e for e in every if ranking.says(e)]
     options.sort(key=lambda e: -e.score)
     described = None if asked else subject.formula(state.fit, ranking)
-    left, tried = _beyond_columns(ranking, options), list[Evidence]()
+    beyond = _beyond_columns(ranking, options)
+    left, tried = beyond, list[Evidence]()
     while True:
         held = asked or passing(ranking, left)
         state, refits = refitted(subject, state, ranking, held)
@@ -48,9 +51,10 @@ def with_the_best(
         left = [] if asked else [e for e in left if e not in held]
         if over or not held or not (left or asked):
             break
-        asked, left = [], left or _beyond_columns(ranking, options)
+        asked, left = [], left or beyond
     for evidence in [e for e in options if e not in tried][:2]:
-        state = state.refusing(evidence.trials[0].what, NOT_HELD_OUT)
+        why = NOT_HELD_OUT if evidence in beyond else FOLLOWED
+        state = state.refusing(evidence.trials[0].what, why)
     missing = sorted([*options, *ranking.followed], key=lambda e: -e.score)
     return replace(state, open=tuple(missing[: LEVELS.contenders]))
 
@@ -59,17 +63,19 @@ def _beyond_columns(ranking: Ranking, options: Sequence[Evidence]) -> list[Evide
     """Without pairs of which what only follows a column can take the place of one: it would explain
     nearly as much."""
     paired = {t.family for e in options if len(e.trials) > 1 for t in e.trials}
-    beside: dict[str, float] = {}
+    beside = dict.fromkeys(paired, -inf)
     for one in ranking.followed[: LEVELS.nearest]:
         for other in (e for e in ranking.causes if e.trials[0].family in paired):
             both = judged([*one.trials, *other.trials], ranking.likelihood, ranking.none,
                           start=one.explained, families=ranking.families)  # fmt: skip
             if both is not None:
                 family = other.trials[0].family
-                beside[family] = max(beside.get(family, -inf), both.score)
-    alike = {id(e) for e in options if len(e.trials) > 1 and e.score <= LEVELS.clear
-             + max(beside.get(f, -inf) for f in e.families)}  # fmt: skip
-    return [e for e in options if id(e) not in alike]
+                beside[family] = max(beside[family], both.score)
+
+    def clear(pair: Evidence) -> bool:
+        return pair.score > max(beside[f] for f in pair.families) + LEVELS.clear
+
+    return [e for e in options if len(e.trials) == 1 or clear(e)]
 
 
 def _first_certified(

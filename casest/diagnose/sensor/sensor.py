@@ -58,6 +58,10 @@ class Sensor(Subject[Fit]):
         return Recent()
 
     @cached_property
+    def _beside(self) -> Recent[Fit, dict[str, tuple[Fit, Trial, Evidence, Likelihood] | None]]:
+        return Recent(2)
+
+    @cached_property
     def _on_rates(self) -> Recent[Fit, dict[str, Fit | str]]:
         return Recent()
 
@@ -192,6 +196,14 @@ class Sensor(Subject[Fit]):
 
     def _anew(self, fit: Fit, what: Candidate) -> tuple[Fit, Trial, Evidence, Likelihood] | None:
         """The fit without an effect, and that on all axes as a trial beside it."""
+        known = self._beside.of(fit, dict)
+        if what.label not in known:
+            known[what.label] = self._looked_at_anew(fit, what)
+        return known[what.label]
+
+    def _looked_at_anew(
+        self, fit: Fit, what: Candidate
+    ) -> tuple[Fit, Trial, Evidence, Likelihood] | None:
         base = self.without(fit, what)
         whole = None if base is None else self._whole(fit, base, what)
         if base is None or whole is None:

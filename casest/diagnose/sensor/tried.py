@@ -15,8 +15,8 @@ from casest.declaration.shapes import Array, each
 from casest.declaration.symbols import param
 from casest.diagnose.candidates.axes import axes_of
 from casest.diagnose.candidates.candidates import Candidate, Skipped, candidates
-from casest.diagnose.candidates.carried_through import columns_of_motion
 from casest.diagnose.candidates.grid import Seen, nearer, on_grid
+from casest.diagnose.candidates.motion_columns import columns_of_motion
 from casest.diagnose.candidates.slopes import slopes
 from casest.diagnose.evidence.linear import Index
 from casest.diagnose.evidence.score import Trial
