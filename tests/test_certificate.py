@@ -233,7 +233,9 @@ def compass(a=signal(), d=signal(3), *, up=param(unit_vector)):
     return Residual(measured=a, predicted=d.T @ up)
 
 
-@pytest.mark.parametrize("degrees", [0.0, pytest.param(40.0, marks=pytest.mark.long), 130.0])
+@pytest.mark.parametrize(
+    "degrees", [0.0, *(pytest.param(d, marks=pytest.mark.long) for d in (40, 130))]
+)
 def test_noise_free_directions_and_rotations_are_accepted(degrees):
     c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     M = np.array([[1, 0, 0], [0, c, -s], [0, s, c]])

@@ -144,6 +144,7 @@ def test_an_effect_of_the_sensors_catalogue_is_found_in_motion(kind):
     assert closing.verdict == "extended"
 
 
+@pytest.mark.long
 def test_what_one_sample_says_adds_up_to_what_all_say():
     """The adjoint of the sensitivities: pushes summed over the samples are Hᵀz."""
     run = with_columns(bias_gravity, flight(seed=6, seconds=20))

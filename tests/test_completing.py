@@ -6,7 +6,6 @@ import os
 import shutil
 import subprocess
 import sys
-import time
 from functools import cache
 from pathlib import Path
 
@@ -140,7 +139,5 @@ def test_tab_needs_neither_numpy_nor_casadi(tmp_path):
         "    pass\n"
         "print(sorted({'numpy', 'casadi'} & set(sys.modules)))\n"
     )
-    begin = time.perf_counter()
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["plain,wheel", "plain,wheel-motion", "[]"]
-    assert time.perf_counter() - begin < 2.0

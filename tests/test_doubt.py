@@ -65,6 +65,7 @@ def test_a_temperature_that_moves_a_sensor_by_a_hundred_deviations_is_a_doubt(or
     assert any("temp" in f.where for f in found)
 
 
+@pytest.mark.long
 def test_two_effects_of_one_column_on_a_prediction_without_a_name_are_both_found():
     """Zero and gain of a pressure transmitter depend on its temperature: 1.5 mV/K, 1e-3/K."""
     closing = close(cell, [transmitter(np.random.default_rng(5))])

@@ -81,7 +81,7 @@ def test_a_result_with_a_column_is_applied_with_it(record, command, capsys):
     ("asked", "follows"),
     [
         pytest.param("channel_bias(motor current)", True, marks=pytest.mark.long),
-        ("own.py(temp)", False),
+        pytest.param("own.py(temp)", False, marks=pytest.mark.long),
     ],
 )
 def test_close_judges_the_effect_of_the_column_that_is_named(record, asked, follows):

@@ -58,7 +58,7 @@ def recorded(signals, columns=None):
 @pytest.mark.parametrize(
     ("name", "term"),
     [
-        ("dry_friction", lambda w: 0.3),
+        pytest.param("dry_friction", lambda w: 0.3, marks=pytest.mark.long),
         pytest.param("quadratic_damping", lambda w: 0.02 * w**2, marks=pytest.mark.long),
     ],
 )

@@ -243,7 +243,8 @@ def test_of_many_families_of_nothing_hardly_one_is_worth_it(records):
 
 
 @pytest.mark.parametrize(
-    ("n", "p", "k"), [(24, 9, 1), pytest.param(24, 9, 3, marks=pytest.mark.long), (90, 6, 2)]
+    ("n", "p", "k"),
+    [(24, 9, 1), *(pytest.param(*s, marks=pytest.mark.long) for s in [(24, 9, 3), (90, 6, 2)])],
 )
 def test_the_chance_of_a_cause_in_poses_is_uniform_where_there_is_none(n, p, k):
     rng = np.random.default_rng(10)

@@ -389,6 +389,7 @@ def test_a_smoother_that_does_not_settle_says_so(monkeypatch):
     assert "the smoother's rounds did not settle" in " ".join(result.notes)
 
 
+@pytest.mark.long
 def test_a_known_gravity_brings_its_error_and_the_biass_down():
     """Independent flights, matched noise: errors fall, and stay as large as they are said to be."""
     t = np.arange(0, 10, 0.02)

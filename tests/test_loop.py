@@ -311,6 +311,7 @@ def pressure_cell(
     return c.Residual(measured=out, predicted=reading, corrected=inside)
 
 
+@pytest.mark.long
 def test_a_bend_that_two_causes_make_together_is_no_formula():
     """A cube about the middle of the range, half of a percent of the variance: cube and square
     about zero are the same curve."""

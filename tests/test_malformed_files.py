@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import gzip
 import io
-import time
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -27,7 +26,6 @@ from casest.errors import CasestError
 
 SIGNALS = [Signal("t", 1, "s"), Signal("v", 3, None)]
 FILES, SOME = 2000, 200
-LONGEST = 10.0  # s of computing that one file may take
 
 TIME = np.arange(40) * 0.01
 VALUES = np.random.default_rng(0).normal(size=(40, 3)).round(4)
@@ -211,13 +209,10 @@ def try_all(numbers: range, good: list[tuple[str, bytes]], folder: Path) -> Coun
         ending, raw = malformed(number, good)
         file = folder / f"{number}{ending}"
         file.write_bytes(raw)
-        begin = time.process_time()
         try:
             found[read(file)] += 1
         except Exception as error:
             raise AssertionError(f"file {number} ({ending}): {type(error).__name__}") from error
-        took = time.process_time() - begin
-        assert took < LONGEST, f"file {number} ({ending}) took {took:.1f} s"
         file.unlink()
     return found
 

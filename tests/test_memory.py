@@ -490,6 +490,7 @@ def test_the_lag_of_a_logged_attitude_is_what_slerp_and_a_grid_find(
     assert found.values["signal_lag(attitude).delay"] == pytest.approx(by_hand, abs=within)
 
 
+@pytest.mark.long
 def test_a_lag_and_soft_iron_together_take_what_the_record_supports(shared_data):
     """SOURCE.md: 15 ms, and 1.36 to 0.87 uT held out by a fit of its own."""
     declared = find_model(str(EXAMPLES / "compass.py"))

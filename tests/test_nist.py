@@ -16,7 +16,8 @@ VALUES, STD, SQUARES = 6, 4, 6
 ROUNDED = 0.05
 #: Those that take longest, and those whose model another has: Lanczos3, Gauss2, Chwirut2.
 DEAR = {
-    "Bennett5", "ENSO", "MGH17", "Nelson", "Lanczos1", "Lanczos2", "Gauss1", "Gauss3", "Chwirut1",
+    "Bennett5", "ENSO", "MGH09", "MGH10", "MGH17", "Nelson", "Lanczos1",
+    "Lanczos2", "Gauss1", "Gauss3", "Chwirut1", "Rat43",
 }  # fmt: skip
 
 

@@ -89,7 +89,7 @@ def simulated(name, seed, calibrations):
     return outcomes
 
 
-@pytest.fixture(scope="module", params=[60, pytest.param(MANY, marks=pytest.mark.long)])
+@pytest.fixture(scope="module", params=[30, pytest.param(MANY, marks=pytest.mark.long)])
 def calibrations(request):
     """{model: outcomes} of so many calibrations of each."""
     names = ("norm-diagonal", "norm-triangular")

