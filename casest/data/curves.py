@@ -90,11 +90,18 @@ class Curve:
 
     def covers(self, wanted: Array) -> NDArray[np.bool_]:
         """Which of the times (N,) lie within a piece."""
-        own = self.nearest(wanted)
-        first, last = (
-            np.array([getattr(p, end) for p in self.pieces]) for end in ("first", "last")
+        return self.tells(wanted, self.nearest(wanted), reach=0)
+
+    def tells(
+        self, wanted: Array, stretch: NDArray[np.int_], reach: float = REACH
+    ) -> NDArray[np.bool_]:
+        """Which of the times (N,) the piece of each tells of, up to some samples beyond its ends."""
+        first, last, step = (
+            np.array([getattr(p, name) for p in self.pieces])[stretch]
+            for name in ("first", "last", "step")
         )
-        return np.asarray((wanted >= first[own]) & (wanted <= last[own]))
+        beyond = np.maximum(first - wanted, wanted - last)
+        return np.asarray(beyond <= reach * step)
 
 
 def _piece(time: Array, values: Array) -> Piece:

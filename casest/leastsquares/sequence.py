@@ -9,6 +9,7 @@ to sample.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any
@@ -68,16 +69,26 @@ class Record:
 
     def at(self, name: str, wanted: Array, *, rotation: bool) -> tuple[Array, Array]:
         """A signal and its rate (N, k) at a time for each sample of the record."""
+        return self._curve(name, rotation).at(wanted, self._pieces(name, wanted, rotation))
+
+    def tells(self, name: str, wanted: Array, *, rotation: bool) -> NDArray[np.bool_]:
+        """At which of these times, one for each sample, the signal was recorded."""
+        return self._curve(name, rotation).tells(wanted, self._pieces(name, wanted, rotation))
+
+    def _curve(self, name: str, rotation: bool) -> Curve:
         curves = self.run.curves
         if name not in curves:
             own = Series("", self.time, self.run.signals[name], self.run.block)
             one = self.run.elsewhere.get(name, own)
             made = Curve.through(one.time, one.values, one.block, rotation=rotation)
             curves[name] = made
-        curve: Curve = curves[name]
-        # Within its own record a signal crosses no gap; another file's has gaps of its own.
-        apart = name in self.run.elsewhere
-        return curve.at(wanted, curve.nearest(wanted) if apart else curve.stretch)
+        found: Curve = curves[name]
+        return found
+
+    def _pieces(self, name: str, wanted: Array, rotation: bool) -> NDArray[np.int_]:
+        """Within its own record a signal crosses no gap; another file's has gaps of its own."""
+        curve = self._curve(name, rotation)
+        return curve.nearest(wanted) if name in self.run.elsewhere else curve.stretch
 
 
 def _who(model: Model) -> str:
@@ -179,17 +190,46 @@ class Staged:
     def present(self, r: int) -> NDArray[np.bool_] | None:
         """Which residuals (N, m) there are; None where all are.
 
-        What compares a rest with the one before has nothing to say of a first one.
+        What compares a rest with the one before has nothing to say of a first one, and what follows
+        a late signal nothing of times at which nobody recorded that.
         """
-        record = self._records[r]
+        record, axes = self._records[r], len(self.model.axes)
+        there = np.repeat(self._told(record)[:, None], axes, axis=1)
         if record.rests is not None:
-            present = record.rests.linked[:, None] | ~needing(self.model)
-            return np.asarray(present[record.places])
-        if not self.model.traced.integrates:
-            return None
-        readings = [self.runs[r].signals[name] for name in self.model.traced.readings]
-        there = ~np.isnan(np.hstack(readings)) if readings else np.ones((1, 1), bool)
+            there &= record.rests.linked[:, None] | ~needing(self.model)
+        there = there[record.places]
+        if self.model.traced.integrates and self.model.traced.readings:
+            readings = [self.runs[r].signals[name] for name in self.model.traced.readings]
+            there = there & ~np.isnan(np.hstack(readings))
         return None if there.all() else there
+
+    def _told(self, record: Record) -> NDArray[np.bool_]:
+        """Samples (N,) at whose time all late signals were recorded.
+
+        Late by what their delay is where it begins: were it what it is just now, each step of a
+        search would be judged by other samples.
+        """
+        told = np.ones(len(record.time), bool)
+        for stage in _programs(self.model)[:-1]:
+            if stage.attached is None or stage.attached.kind != "time":
+                continue
+            begun = {p.name: float(p.start_value().ravel()[0]) for p in stage.attached.parameters}
+            if not any(begun.values()):
+                continue
+            name = stage.attached.on
+            wanted = stage.taken(self._at(begun), record.time[:, None])[0][:, 0, 0]
+            told &= record.tells(name, wanted, rotation=self.model[name].kind == "rotation")
+        return told
+
+    def _at(self, values: Mapping[str, float]) -> Array:
+        """Parameters with some scalar values, and nothing of the others."""
+        traced, place = self.model.staged, 0
+        found = np.zeros(traced.coordinates.numel() + traced.references.numel())
+        for p in self.model.parameters:
+            if p.name in values:
+                found[place] = values[p.name]
+            place += p.shape.coordinates
+        return found
 
     @cached_property
     def _meshes(self) -> dict[tuple[int, int], Mesh]:

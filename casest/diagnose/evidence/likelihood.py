@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casest.declaration.shapes import Array
-from casest.diagnose.evidence.linear import Linear, robust_sd
+from casest.diagnose.evidence.linear import Linear, alike, robust_sd
 from casest.diagnose.levels import LEVELS
 from casest.estimate.spectrum import Bands
 
@@ -151,6 +151,7 @@ def rises(less: Linear, fits: Sequence[Linear]) -> list[float]:
 
     What the fit with the least noise leaves far out is cut from all of them.
     """
+    less, *fits = alike([less, *fits])
     best = min(fits, key=lambda x: float(np.sum(np.log(robust_sd(x.residual)))))
 
     def cost(linear: Linear) -> float:

@@ -84,6 +84,24 @@ class Linear:
         return replace(self, residual=self.residual + part, slopes=columns)
 
 
+def alike(fits: Sequence[Linear]) -> list[Linear]:
+    """Fits to the same rows, without those that one of them has nothing to say of: a lag leaves
+    some whose cause nobody recorded. Fits to other rows are returned as they are."""
+    if len({fit.residual.shape for fit in fits}) > 1:
+        return list(fits)
+    silent = [~(fit.residual.any(axis=1) | fit.slopes.any(axis=(1, 2))) for fit in fits]
+    gone = np.any(silent, axis=0)
+    return [_less(fit, gone & ~own) for fit, own in zip(fits, silent, strict=True)]
+
+
+def _less(fit: Linear, gone: NDArray[np.bool_]) -> Linear:
+    if not gone.any():
+        return fit
+    residual, slopes = fit.residual.copy(), fit.slopes.copy()
+    residual[gone], slopes[gone] = 0.0, 0.0
+    return replace(fit, residual=residual, slopes=slopes)
+
+
 def robust_sd(residual: Array) -> Array:
     """Standard deviation of each axis (m,) by the nearest 95 % of the residuals.
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from casest.diagnose.evidence.held_out import Fall, fall, fall_between
-from casest.diagnose.evidence.linear import Linear
+from casest.diagnose.evidence.linear import Linear, alike
 from casest.diagnose.evidence.score import Evidence
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.protocol.state import Ranking
@@ -22,6 +22,7 @@ def falls(ranking: Ranking, evidence: Evidence) -> dict[str, Fall]:
 
 def falls_of_refit(before: Linear, after: Linear) -> dict[str, Fall]:
     """Held-out squares of two fits, each near its own optimum."""
+    before, after = alike([before, after])
     return {k: fall_between(before, after, parts) for k, parts in before.parts.each.items()}
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from casest.declaration.shapes import Array
 from casest.diagnose.evidence.held_out import squares, standard_errors
+from casest.diagnose.evidence.linear import alike
 from casest.diagnose.evidence.score import Evidence
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.protocol.ranking import ranked_of
@@ -58,7 +59,7 @@ def _rivals(subject: Subject[F], state: State[F], kept: Kept) -> tuple[State[F],
         other = subject.linear(fit)
         lost, left = np.zeros(1), best
         if {x.residual.shape for x in (linear, after, other)} == {linear.residual.shape}:
-            left, worse = (squares(x, [], stretches) for x in (after, other))
+            left, worse = (squares(x, [], stretches) for x in alike([after, other]))
             lost = worse - left
         if _as_well(behind, lost, without - left, left):
             found.append(Rival(e.trials[0].what, fit))
