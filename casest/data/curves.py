@@ -95,7 +95,7 @@ class Curve:
     def tells(
         self, wanted: Array, stretch: NDArray[np.int_], reach: float = REACH
     ) -> NDArray[np.bool_]:
-        """Which of the times (N,) the piece of each tells of, up to some samples beyond its ends."""
+        """Which of the times (N,) the piece of each tells of, some samples beyond its ends too."""
         first, last, step = (
             np.array([getattr(p, name) for p in self.pieces])[stretch]
             for name in ("first", "last", "step")

@@ -91,7 +91,7 @@ def cross_fitted(
         )
         if _left_open(problem, fit.point, hidden, point):
             continue
-        for r, residual in enumerate(hidden.residuals(point)):
+        for r, residual in enumerate(hidden.told_residuals(point)):
             found[r][folds.of[r] == k] = residual
     return found
 

@@ -79,8 +79,7 @@ def told(model: Model, runs: Sequence[Run]) -> Model:
 def _begun(attached: Attached, model: Model, runs: Sequence[Run]) -> Attached:
     """Times of an effect begin where the records say: neither zero nor a guess is near."""
     if attached.kind == "time":
-        measured = model.traced.measured or ""
-        start = likely_lag(runs, measured, attached.on)
+        start = _lag(model, runs, attached.on)
         own = {p.name.rpartition(".")[2] for p in attached.parameters if start}
         return _starting(attached, own, start)
     scales = {name for name, what in attached.effect.profile if what == "timescale"}
@@ -91,6 +90,16 @@ def _begun(attached: Attached, model: Model, runs: Sequence[Run]) -> Attached:
     duration = max(float(np.ptp(t)) for t in times)
     # In the middle of what the record can tell apart, on a scale of ratios.
     return _starting(attached, scales, float(np.sqrt(step * duration)), (step, duration))
+
+
+def _lag(model: Model, runs: Sequence[Run], name: str) -> float:
+    """Of another file's signal, and a long one within a file; what is short a slope reaches."""
+    rotation = any(s.name == name and s.kind == "rotation" for s in model.signals)
+    measured = model.traced.measured or ""
+    lag = likely_lag(runs, measured, name, within=True, rotation=rotation)
+    steps = [float(np.median(np.diff(r.time))) for r in runs if r.time is not None and len(r) > 1]
+    apart = any(name in run.elsewhere for run in runs)
+    return lag if apart or abs(lag) > 2 * max(steps, default=np.inf) else 0.0
 
 
 def _starting(

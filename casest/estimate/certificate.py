@@ -40,11 +40,12 @@ from casest.estimate.reasons import (
     WALKED,
     Code,
 )
+from casest.leastsquares.fewer import few_of
 from casest.leastsquares.growth import UNSTABLE, growth
 from casest.leastsquares.identifiability import Identifiability
 from casest.leastsquares.problem import Point, Problem
-from casest.leastsquares.sums import few_of, second_order
 from casest.leastsquares.sums import rounding as rounding_error
+from casest.leastsquares.sums import second_order
 from casest.solve.outcome import Outcome
 from casest.solve.trust_region import LITTLE, trust_region
 

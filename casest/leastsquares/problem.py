@@ -408,11 +408,18 @@ class Problem:
 
     def thinned(self, every: int) -> Problem:
         """The same problem on one sample in `every`: for a start, never for a result."""
-        if every not in self._thinned:
-            runs = tuple(run.take(slice(None, None, every)) for run in self.runs)
-            weights = None if self.weights is None else tuple(w[::every] for w in self.weights)
-            self._thinned[every] = Problem(self.model, runs, weights)
-        return self._thinned[every]
+        if every not in self.shortened:
+            spans = [slice(None, None, every)] * len(self.runs)
+            self.shortened[every] = self.shorter(spans)
+        return self.shortened[every]
+
+    def shorter(self, spans: Sequence[slice]) -> Problem:
+        """The same problem on one span of each run, which remembers the whole."""
+        runs = tuple(run.take(span) for run, span in zip(self.runs, spans, strict=True))
+        weights = self.weights
+        if weights is not None:
+            weights = tuple(w[span] for w, span in zip(weights, spans, strict=True))
+        return Problem(self.model, runs, weights)
 
     def beginning(self, rows: int) -> Problem:
         """The same problem on so many first samples of each run: for a start, never for a result.
@@ -423,7 +430,8 @@ class Problem:
         return Problem(self.model, tuple(replace(run, whole=None, places=None) for run in runs))
 
     @cached_property
-    def _thinned(self) -> dict[int, Problem]:
+    def shortened(self) -> dict[int | str, Problem]:
+        """Shorter ones that were made of it."""
         return {}
 
     @property
@@ -734,6 +742,11 @@ class Problem:
     def residuals(self, point: Point) -> tuple[Array, ...]:
         """Residuals of each run, (N, m)."""
         return tuple(self._residuals(point, r) for r in range(len(self.runs)))
+
+    def told_residuals(self, point: Point) -> tuple[Array, ...]:
+        """The same, NaN where there is none."""
+        found = zip(self.residuals(point), self.present, strict=True)
+        return tuple(r if there is None else np.where(there, r, np.nan) for r, there in found)
 
     def _residuals(self, point: Point, r: int, span: slice = slice(None)) -> Array:
         parameters = self.parameters(point, r)

@@ -20,8 +20,6 @@ from casest.leastsquares.stated import settles, shifts_of_curvature
 SAMPLED = 1_000_000
 #: The same where an order of magnitude is wanted.
 FEW = 600
-#: Samples of each run that are enough to come near a solution of a longer record.
-NEARBY = 2000
 
 
 def squares_of_gradients(
@@ -208,15 +206,6 @@ def repeat_noise(problem: Problem, point: Point) -> float | None:
 def some_residuals(problem: Problem, point: Point) -> tuple[Array, ...]:
     """Residuals of each run, (N, m); of a long record those of every k-th sample."""
     return _sampled(problem, SAMPLED).residuals(point)
-
-
-def few_of(problem: Problem) -> Problem | None:
-    """The problem on as few of its samples as are enough to come near the solution of all.
-
-    None where it has no more than that, or where its samples need each other.
-    """
-    every = problem.residual_count // (NEARBY * len(problem.model.axes) * len(problem.runs))
-    return None if every < 2 or problem.sequential else problem.thinned(every)
 
 
 def _sampled(problem: Problem, limit: int) -> Problem:

@@ -117,7 +117,7 @@ def residual_rows(estimate: Estimate) -> str:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["file", "run", "row", "t", "axis", "split", "before", "after"])
-    for run, residual in zip(problem.runs, problem.residuals(estimate.point), strict=True):
+    for run, residual in zip(problem.runs, problem.told_residuals(estimate.point), strict=True):
         for k, row in enumerate(residual):
             t = "" if run.time is None else repr(float(run.time[k]))
             for axis, value in zip(problem.model.axes, row, strict=True):

@@ -198,7 +198,7 @@ def _invisible(closing: Closing, units: Mapping[str, str]) -> list[Hidden]:
 
 
 def _section(estimate: Estimate, closing: Closing, held_out: Sequence[Array]) -> JudgedSection:
-    residuals = Problem(estimate.model, closing.runs).residuals(estimate.point)
+    residuals = Problem(estimate.model, closing.runs).told_residuals(estimate.point)
     axes, certificate = estimate.model.axes, estimate.certificate
     return JudgedSection(
         rmse_fit=plain(rms(residuals)),
@@ -330,7 +330,8 @@ def residual_rows(
     writer.writerow(["file", "run", "row", "t", "axis", "split", "before", "after"])
     axes = closing.before.model.axes
     fits = [
-        Problem(e.model, closing.runs).residuals(e.point) for e in (closing.before, closing.after)
+        Problem(e.model, closing.runs).told_residuals(e.point)
+        for e in (closing.before, closing.after)
     ]
     hidden = held_out or (closing.runs, closing.before_held_out, closing.after_held_out)
     for split, runs, before, after in (("fit", closing.runs, *fits), ("holdout", *hidden)):

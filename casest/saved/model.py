@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -37,6 +37,8 @@ def saved_model(result: Mapping[str, Any]) -> tuple[Model, dict[str, Any]]:
         label = label_of(effect, on, columns, moved=moved)
         own = {n.removeprefix(label + ".") for n in parameters if n.startswith(label + ".")}
         effect = _as_it_was(effect, saved, own, model)
+        if effect.kind == "time":  # which samples it tells of goes by where it begins
+            effect = effect.starting(**_values(parameters, label, own))
         effect = effect if moved else replace(effect, on=on)
         model = model.with_effect(effect, on=on, columns=columns)
     for name in parameters:
@@ -50,6 +52,10 @@ def saved_model(result: Mapping[str, Any]) -> tuple[Model, dict[str, Any]]:
     if missing:
         raise DataError(f"the result has no value for {missing[0]!r} of model {model.name}")
     return model, {name: np.array(p["value"], dtype=float) for name, p in parameters.items()}
+
+
+def _values(parameters: Mapping[str, Any], label: str, own: Collection[str]) -> dict[str, float]:
+    return {n: float(parameters[f"{label}.{n}"]["value"]) for n in own}
 
 
 def of_other_records(result: Mapping[str, Any]) -> tuple[Model, dict[str, Any]]:

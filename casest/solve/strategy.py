@@ -16,10 +16,10 @@ import numpy as np
 
 from casest.declaration.shapes import Array
 from casest.errors import UsageError
+from casest.leastsquares.fewer import few_of
 from casest.leastsquares.identifiability import identify
 from casest.leastsquares.per_sample import linear
 from casest.leastsquares.problem import Point, Problem
-from casest.leastsquares.sums import few_of
 from casest.leastsquares.weights import has_noise_effects, weights
 from casest.solve.equations import by_equations, by_shooting
 from casest.solve.ipopt import STANDSTILL, ipopt
@@ -103,7 +103,8 @@ def _ways(
         main = trust_region(problem, first)
     else:
         main = _ipopt(problem, first, solver)
-    outcomes = [main, *_opinions(problem, _other_starts(problem, first, automatic))]
+    known: list[tuple[Outcome, Outcome]] = []
+    outcomes = [main, *_opinions(problem, _other_starts(problem, first, automatic), known)]
     costs = [_cost(o) for o in outcomes]
     disagree = max(costs) - min(costs) > 1e-6 * max(min(costs), 1e-300)
     # From a start that was declared, not computed, two ways may end in one valley, and the wrong.
@@ -111,10 +112,10 @@ def _ways(
     if disagree or (problem.model.starter is None and not linear(problem.model)):
         rival = best_of((*outcomes,))
         starts = list(_perturbations(problem, first, seed))
-        outcomes += [_opinion(problem, start, rival) for start in starts[:STARTS]]
+        outcomes += _opinions(problem, starts[:STARTS], known, rival)
     if problem.model.starter is None and valleys(outcomes) > 1:
         # One valley more is a reason to look for others.
-        outcomes += [_opinion(problem, start, best_of((*outcomes,))) for start in starts[STARTS:]]
+        outcomes += _opinions(problem, starts[STARTS:], known, best_of((*outcomes,)))
     if problem.model.starter is None and best_of((*outcomes,)) is not outcomes[0]:
         outcomes.append(_wary(problem, first))
     return (*outcomes,)
@@ -207,18 +208,26 @@ def _nearby(
     return replace(near, cost=min(here, there), seconds=time.perf_counter() - began), worse
 
 
-def _opinions(problem: Problem, starts: Sequence[Point]) -> list[Outcome]:
-    """Opinions from several starts.
+def _opinions(
+    problem: Problem,
+    starts: Sequence[Point],
+    known: list[tuple[Outcome, Outcome]],
+    rival: Outcome | None = None,
+) -> list[Outcome]:
+    """Opinions from several starts, kept in `known` with where a few of the samples led.
 
-    Where a few of the samples lead two starts to one place, the rest of the way is one as well.
+    Where these lead two starts to one place, the rest of the way is one as well. All samples are
+    only looked at where a few of them leave it open which is better, it or a rival.
     """
-    found: list[tuple[Outcome, Outcome]] = []
+    found = []
     for start in starts:
-        near, _ = _nearby(problem, start)
-        same = (o for place, o in found if _one_place(problem, place, near))
-        opinion = next(same, None) or _followed(problem, near)
-        found.append((near, opinion))
-    return [opinion for _, opinion in found]
+        near, worse = _nearby(problem, start, rival)
+        same = (o for place, o in known if _one_place(problem, place, near))
+        opinion = near if worse else next(same, None) or _followed(problem, near)
+        if not worse:
+            known.append((near, opinion))
+        found.append(opinion)
+    return found
 
 
 def _one_place(problem: Problem, a: Outcome, b: Outcome) -> bool:
@@ -231,13 +240,9 @@ def _one_place(problem: Problem, a: Outcome, b: Outcome) -> bool:
     return bool(away @ normal.matrix @ away <= 1e-2 * 2 * normal.cost / freedom)
 
 
-def _opinion(problem: Problem, start: Point, rival: Outcome | None = None) -> Outcome:
-    """Where a trust region ends from a start: near a solution to a fraction of its deviations.
-
-    All samples are only looked at where a few of them leave it open which is better, it or a rival.
-    """
-    near, worse = _nearby(problem, start, rival)
-    return near if worse else _followed(problem, near)
+def _opinion(problem: Problem, start: Point) -> Outcome:
+    """Where a trust region ends from a start: near a solution to a fraction of its deviations."""
+    return _followed(problem, _nearby(problem, start)[0])
 
 
 def _followed(problem: Problem, near: Outcome) -> Outcome:
