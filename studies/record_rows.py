@@ -132,7 +132,7 @@ def _headings(which: str, supports: str, right: Right) -> Record:
 
 
 def _log171(which: str, supports: str, within: float) -> Record:
-    alike = BY_COLUMN | {"bias_step", "pulse", "channel_gain"}
+    alike = BY_COLUMN | {"bias_step", "pulse", "channel_gain", "channel_gain_curve"}
     return Record(
         f"ArduPilot log 171, {which}, until it falls",
         f"{MODELS}:compass",

@@ -50,7 +50,7 @@ def _rivals(subject: Subject[F], state: State[F], kept: Kept) -> tuple[State[F],
     after = subject.linear(state.fit)
     found = list[Rival]()
     for e in rivals:  # what the columns promise, a refit must keep
-        fit = subject.refit(base, e.trials)
+        fit = _in_its_place(subject, state, kept, base, e)
         if isinstance(fit, str):
             state = state.failing(e, f"in the place of {own.family} {fit}")
             continue
@@ -64,6 +64,22 @@ def _rivals(subject: Subject[F], state: State[F], kept: Kept) -> tuple[State[F],
         if _as_well(behind, lost, without - left, left):
             found.append(Rival(e.trials[0].what, fit))
     return state, found
+
+
+def _in_its_place(
+    subject: Subject[F], state: State[F], kept: Kept, base: F, evidence: Evidence
+) -> F | str:
+    """The better refit of two: without the cause, another one may have gone far to stand in for it,
+    and not find its way back."""
+    several = [
+        subject.refit(base, evidence.trials),
+        subject.instead(state.fit, kept.what, evidence.trials),
+    ]
+    fits = [fit for fit in several if not isinstance(fit, str)]
+    if len(fits) < 2:
+        return fits[0] if fits else several[0]
+    first, second = subject.rises(base, fits)
+    return fits[0] if first >= second else fits[1]
 
 
 def _in_time(ranking: Ranking, evidence: Evidence) -> Array:

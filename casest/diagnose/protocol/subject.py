@@ -52,6 +52,10 @@ class Subject(Protocol[F]):
         """The fit without something that was added."""
         ...
 
+    def instead(self, fit: F, what: Any, added: Sequence[Trial]) -> F | str:
+        """The fit with these in the place of something that was added, from where it is."""
+        return ""
+
     def wider(self, fit: F, what: Any) -> tuple[Any, F] | None:
         """Something that was added on some axes only, and the fit with it on all of them."""
         return None

@@ -162,10 +162,12 @@ class Sensor(Subject[Fit]):
         return known[what.label]
 
     def _fitted_without(self, fit: Fit, what: Candidate) -> Fit | None:
-        own = fit.model.unknowns_of(what.label)
-        left = tuple(a for a in fit.model.effects if a.label != what.label)
-        values = {n: v for n, v in fit.values.items() if n not in own}
-        return self.fitted(replace(fit.model, effects=left), values)
+        less = _less(fit, what)
+        return self.fitted(less.model, less.values)
+
+    def instead(self, fit: Fit, what: Candidate, added: Sequence[Trial]) -> Fit | str:
+        """The fit with these in the place of an effect that was added, from where it is."""
+        return "it is no effect" if what.freed else self._refit(_less(fit, what), added)
 
     def wider(self, fit: Fit, what: Candidate) -> tuple[Candidate, Fit] | None:
         """An effect that was added on some axes only, and the fit with it on all of them.
@@ -284,6 +286,14 @@ class Sensor(Subject[Fit]):
         on, slope = found
         read = readable(problem, point, slope, on, self.rows.index)
         return described(read, ranking.likelihood, ranking.none, ranking.families)
+
+
+def _less(fit: Fit, what: Candidate) -> Fit:
+    """An effect taken out, all else where it is."""
+    own = fit.model.unknowns_of(what.label)
+    left = tuple(a for a in fit.model.effects if a.label != what.label)
+    values = {n: v for n, v in fit.values.items() if n not in own}
+    return replace(fit, model=replace(fit.model, effects=left), values=values)
 
 
 def _is_lag(candidate: Candidate) -> bool:
