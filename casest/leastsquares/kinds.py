@@ -201,10 +201,14 @@ def _whitening(problem: Problem, point: Point, sizes: Mapping[str, float]) -> tu
 
 
 def _covariances(problem: Problem, point: Point, r: int) -> dict[str, Array]:
-    """V_c (N·m, N·m) of one run, for each noise, of residuals as the problem has them."""
-    model = problem.model
+    """V_c (N·m, N·m) of one run, for each noise, of residuals as the problem has them.
+
+    Of some of a record's rests those that belong to them of the whole record's.
+    """
+    model, (record, chosen) = problem.model, problem.origin(r)
     own, prior, between = problem.slopes_in_readings(point, r)
     N, m, _ = own.shape
+    rows = np.arange(N * m).reshape(N, m)[chosen].ravel()
     known = noises(model)
     found, first = {}, 0
     places = {}
@@ -215,7 +219,8 @@ def _covariances(problem: Problem, point: Point, r: int) -> dict[str, Array]:
         signal = _signal_of(model, name)
         if signal is None:
             axes = np.array([n == name for n in model.traced.residual.noise], float)
-            there = np.ones((N, m)) if problem.present[r] is None else problem.present[r]
+            there = np.ones((1, 1)) if problem.present[r] is None else problem.present[r]
+            there = np.broadcast_to(there, (len(problem.runs[r]), m))
             found[name] = np.diag((there * axes / (size if size > 0 else 1.0) ** 2).ravel())
             continue
         part = places[signal]
@@ -225,11 +230,11 @@ def _covariances(problem: Problem, point: Point, r: int) -> dict[str, Array]:
         slopes[each[1:], :, each[:-1]] = prior[1:, :, part]
         if name in model.traced.residual.wander:
             slopes[each, :, N + each] = between[:, :, part]
-            flat = slopes.transpose(0, 1, 3, 2).reshape(N * m, -1)
-            ways = np.kron(np.eye(part.stop - part.start), wandering(problem.runs[r]))
+            flat = slopes.transpose(0, 1, 3, 2).reshape(N * m, -1)[rows]
+            ways = np.kron(np.eye(part.stop - part.start), wandering(record))
             found[name] = flat @ ways @ flat.T
             continue
-        flat = slopes[:, :, :N].reshape(N * m, -1)
+        flat = slopes[:, :, :N].reshape(N * m, -1)[rows]
         found[name] = flat @ flat.T
     return found
 

@@ -165,11 +165,15 @@ class Staged:
             rate, slope = taken(parameters, np.hstack([record.rests.samples, nothing]))
             moved = followed(rate[:, :, 0], slope, record.rests)[1]
             between += through[:, :, first : first + moved.shape[1]] @ moved
-        present = self.present(r)
-        for part in (own, prior, between):
-            if present is not None:
+        if record.rests is not None:
+            present = record.rests.linked[:, None] | ~needing(self.model)
+            for part in (own, prior, between):
                 part[~present] = 0.0
         return own, prior, between
+
+    def origin(self, r: int) -> tuple[Run, Index | slice]:
+        """The record that the samples of run r were taken from, and their places in it."""
+        return self._records[r].run, self._records[r].places
 
     def lost(self, r: int) -> NDArray[np.int_]:
         """Rests that were reached too fast, by number."""
