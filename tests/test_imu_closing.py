@@ -60,7 +60,7 @@ def test_causes_act_on_the_readings_of_each_sensor_and_no_noise_is_one():
 
 
 def close(tmp_path, imu, seed, temperature=(0, 0, 0), model="gyro-rests"):
-    """`result.json` of a record with a column of temperature that the gyroscope's offset follows."""
+    """`result.json` of a record with a column that the gyroscope's offset follows."""
     rng = np.random.default_rng(seed)
     record = recorded(waved(rng), imu, rng)
     warm = 3 * np.sin(record["t"] / 20)

@@ -59,7 +59,9 @@ def close(
     if all(noises(model).values()):
         return closing
     return _noises_anew(
-        closing, model, lambda *wide: _once(*wide, catalogue, None, known, seed, say)
+        closing,
+        model,
+        lambda wide, ready: _once(wide, ready, catalogue, None, known, seed, say),
     )
 
 
