@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from casest.declaration.physics import atan as atan
     from casest.declaration.physics import atan2 as atan2
     from casest.declaration.physics import before as before
+    from casest.declaration.physics import carried as carried
     from casest.declaration.physics import constraint as constraint
     from casest.declaration.physics import cos as cos
     from casest.declaration.physics import cosh as cosh

@@ -25,6 +25,7 @@ from casest import (
     Run,
     atan2,
     before,
+    carried,
     constant,
     cos,
     cross,
@@ -83,6 +84,21 @@ def _heading(up: Any, north: Any, foretold_up: Any, foretold_north: Any) -> Any:
     return DEGREE * atan2(dot(up, cross(level, seen)), dot(level, seen))
 
 
+def _late(delay: Any, rate: Any, force: Any, at_rest: Any) -> tuple[tuple[Any, ...], Any, Any]:
+    """Rows, axes and noises that tell how late the rate is read, where that is unknown.
+
+    The body has no velocity at either rest, so that the mean force on the way, in the frame of the
+    rest before, is that at rest. What turns by R until now is turned by R·exp([δ·rate]×) where the
+    rate is read δ late: to second order in that angle.
+    """
+    if isinstance(delay, float):
+        return (), (), ()
+    angle = delay * rate
+    met = force + cross(angle, force) + 0.5 * cross(angle, cross(angle, force))
+    axes = ("motion_x", "motion_y", "motion_z")
+    return (carried(rate, met) - at_rest,), axes, 3 * ("motion_noise",)
+
+
 @model
 def gyro_rests(
     a=signal(3),
@@ -98,6 +114,8 @@ def gyro_rests(
     gyroscope_noise=constant(0.0, "[w]"),
     gyroscope_wander=constant(0.0, "[w]/s^0.5"),
     turn_noise=constant(0.0, "deg"),
+    gyroscope_delay=constant(0.0, "s"),
+    motion_noise=constant(0.0, "[gravity]"),
 ):
     """A gyroscope by the accelerometer beside it, from rest to rest: 21 unknowns.
 
@@ -110,14 +128,21 @@ def gyro_rests(
     bias = gyroscope_offset + g_sensitivity @ force
     rate = quantity("rate", gyroscope_scale @ (w - bias), "rad/s")
     up = force / norm_2(force)
+    late, late_axes, late_noise = _late(gyroscope_delay, rate, force, gravity * before(up))
     return Residual(
         implicit=vertcat(
             _length(force, accelerometer_scale, gravity),
             w - bias,
             _apart(up, turned(rate).T @ before(up)),
+            *late,
         ),
-        axes=("gravity", "rest_x", "rest_y", "rest_z", "turn_x", "turn_y"),
-        noise=("accelerometer_noise", *3 * ("gyroscope_noise",), *2 * ("turn_noise",)),
+        axes=("gravity", "rest_x", "rest_y", "rest_z", "turn_x", "turn_y", *late_axes),
+        noise=(
+            "accelerometer_noise",
+            *3 * ("gyroscope_noise",),
+            *2 * ("turn_noise",),
+            *late_noise,
+        ),
         wander=("gyroscope_wander",),
         corrected=quantity("corrected", vertcat(force, rate)),
     )
@@ -145,6 +170,8 @@ def imu(
     gyroscope_noise=constant(0.0, "[w]"),
     gyroscope_wander=constant(0.0, "[w]/s^0.5"),
     turn_noise=constant(0.0, "deg"),
+    gyroscope_delay=constant(0.0, "s"),
+    motion_noise=constant(0.0, "[gravity]"),
 ):
     """Accelerometer, gyroscope and magnetometer of one body together: 34 unknowns.
 
@@ -161,6 +188,7 @@ def imu(
     up, north = force / norm_2(force), flux / norm_2(flux)
     back = turned(rate).T
     foretold = back @ before(up)
+    late, late_axes, late_noise = _late(gyroscope_delay, rate, force, gravity * before(up))
     return Residual(
         implicit=vertcat(
             _length(force, accelerometer_scale, gravity),
@@ -169,6 +197,7 @@ def imu(
             w - bias,
             _apart(up, foretold),
             _heading(up, north, foretold, back @ before(north)),
+            *late,
         ),
         axes=(
             "gravity",
@@ -180,6 +209,7 @@ def imu(
             "turn_x",
             "turn_y",
             "heading",
+            *late_axes,
         ),
         noise=(
             "accelerometer_noise",
@@ -187,6 +217,7 @@ def imu(
             "dip_noise",
             *3 * ("gyroscope_noise",),
             *3 * ("turn_noise",),
+            *late_noise,
         ),
         wander=("gyroscope_wander",),
         corrected=quantity("corrected", vertcat(force, rate, flux)),

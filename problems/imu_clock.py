@@ -39,7 +39,8 @@ def late(runs: Sequence[Run], known: Mapping[str, Array]) -> Iterator[str]:
         yield (
             f"the {old}'s readings are {1e3 * abs(delay):.3g} ± {1e3 * std:.2g} ms older than the "
             f"{other}'s beside them ({count} turns, at whose ends the velocity is zero): the "
-            "calibration looks from rest to rest and is not moved by it; in motion, shift one"
+            "calibration looks from rest to rest and is not moved by it; in motion, shift one "
+            "(--free gyroscope_delay: with everything else)"
         )
 
 

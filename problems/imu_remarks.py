@@ -35,7 +35,8 @@ def remarks(declared: Model, runs: Sequence[Run], values: Mapping[str, Any]) -> 
             yield from flat(v - v.mean(axis=0), float(known[length]) / gain, sensor)
     if not known["g_sensitivity"].any() and "g_sensitivity" not in values:
         yield from _following(runs, known)
-    yield from late(runs, known)
+    if "gyroscope_delay" not in values:
+        yield from late(runs, known)
 
 
 def refuse_few_axes(runs: Sequence[Run], bias: Array) -> None:

@@ -78,6 +78,7 @@ def simulated(world: str, seed: int) -> dict[str, Any]:
     found = attempt(declared, [run])
     seconds = time.process_time() - began
     assert run.averaged is not None
+    noises = {c.name: float(c.array) for c in found.model.constants if "_noise" in c.name}
     rests = zip(run.averaged.first, run.averaged.last, strict=True)
     drifted = np.mean([record["drift"][i : j + 1].mean(axis=0) for i, j in rests], axis=0)
     imu.gyroscope_bias = imu.gyroscope_bias + drifted  # the offset of the whole record
@@ -96,6 +97,7 @@ def simulated(world: str, seed: int) -> dict[str, Any]:
         "trusted": found.certificate.trusted,
         "seconds": seconds,
         "rests": len(run),
+        "noises": noises,
         "parameters": parts,
     }
 

@@ -245,12 +245,6 @@ def test_a_gyroscope_of_another_unit_is_refused():
     assert not found.certificate.trusted
 
 
-def test_close_says_that_it_does_not_do_that(capsys):
-    code, said = command(["close", "gyro-rests", "imu.csv"], capsys)
-    assert code == 1
-    assert "compares each with the one before" in said.err
-
-
 @pytest.mark.long
 def test_a_start_in_the_wrong_valley_of_the_xsens_record_leads_to_the_right_one(
     shared_data, capsys

@@ -189,12 +189,6 @@ def closing(
         raise UsageError("--noise-law is for calibrate: close judges the tails of the noise itself")
     known, own, followed = asked_effects(options.model.effects)
     model = declared_model(model_name, replace(options.model, effects=()))
-    if model.resting:
-        raise UsageError(
-            f"close looks for its causes rest by rest, and {model_name} compares each with the one "
-            "before: calibrate says whether the residual is noise; free what you know to be there "
-            "(--free NAME)"
-        )
     runs = records(model, data, options.reading, followed)
     apart = held_out(model, options.holdout, data, options.reading, followed)
     model, runs = noisy(with_prior(model, runs, options.model.prior), runs, options.sensors)

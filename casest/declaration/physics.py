@@ -115,6 +115,14 @@ def turned(rate: Any) -> SX:
     return _over_samples("turned", rate)
 
 
+def carried(rate: Any, vector: Any) -> SX:
+    """Mean (3,) of a vector over the way since the rest before, as that rest's frame sees it.
+
+    Both are of the body's own frame; `rate`, in rad/s, says how that has turned on the way.
+    """
+    return _over_samples("carried", ca.vertcat(ca.SX(rate), ca.SX(vector)))
+
+
 def _over_samples(word: str, expression: Any) -> SX:
     trace = current_trace.get()
     if trace is None or trace.reach is None:

@@ -101,7 +101,9 @@ class Traced:
 
 
 #: Words of a body that look at the rest before.
-Word = Literal["", "before", "turned"]
+Word = Literal["", "before", "turned", "carried"]
+#: Those of them that are followed over the raw record between two rests.
+ON_THE_WAY: tuple[Word, ...] = ("turned", "carried")
 
 
 @dataclass(frozen=True)
@@ -237,7 +239,9 @@ def _staged_word(running: Trace, word: Word, value: SX) -> SX:
     """A symbol in the place of what a word of the body gives."""
     if word == "turned" and value.shape != (3, 1):
         raise DeclarationError(f"turned(…) takes a rate about three axes, not {value.shape}")
-    shape = (3, 3) if word == "turned" else value.shape
+    if word == "carried" and value.shape != (6, 1):
+        raise DeclarationError("carried(…) takes a rate and a vector, of three axes each")
+    shape = {"turned": (3, 3), "carried": (3, 1)}.get(word, value.shape)
     given = ca.SX.sym(word, shape[0] * shape[1])
     running.stages.append(Stage(None, ca.vec(value), given, shape, (), word))
     return ca.reshape(given, *shape)
@@ -245,6 +249,8 @@ def _staged_word(running: Trace, word: Word, value: SX) -> SX:
 
 def _as_if_at_rest(running: Trace, word: Word, value: SX) -> SX:
     """Of a single sample: all was as it is, and the body has turned for a second."""
+    if word == "carried":
+        return value[3:]
     return value if word == "before" else ca.SX.eye(3) + ca.skew(value)
 
 

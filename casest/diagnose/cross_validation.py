@@ -17,6 +17,7 @@ from casest.errors import DataError
 from casest.estimate.estimate import Estimate
 from casest.estimate.reasons import PRACTICALLY_NULL
 from casest.leastsquares.identifiability import identify
+from casest.leastsquares.kinds import whitened
 from casest.leastsquares.problem import Point, Problem
 from casest.leastsquares.weights import weighted
 from casest.solve.trust_region import trust_region
@@ -91,7 +92,7 @@ def cross_fitted(
         )
         if _left_open(problem, fit.point, hidden, point):
             continue
-        for r, residual in enumerate(hidden.told_residuals(point)):
+        for r, residual in enumerate(whitened(hidden, point).told_residuals(point)):
             found[r][folds.of[r] == k] = residual
     return found
 
@@ -127,7 +128,10 @@ def check_folds(before: Estimate, runs: Sequence[Run], folds: Folds) -> None:
         ]
         if any(len(run) == 0 for run in parts[0]) or not sum(map(len, parts[1])):
             continue  # the fits themselves say so
-        rest, part = (Problem(before.model, p) for p in parts)
+        rest, part = (
+            whitened(one, one.point(before.values))
+            for one in (Problem(before.model, p) for p in parts)
+        )
         words = "there are too few equations"
         if rest.residual_count >= rest.unknowns:
             words = undetermined(rest, before.values)

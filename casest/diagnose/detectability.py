@@ -60,8 +60,9 @@ def invisible(closing: Closing) -> list[Invisible]:
         moves = _moves(closing, score, typical, hidden)
         if hidden.any() and moves:
             names = [p.name.rpartition(".")[2] for p in parameters]
+            place = f"@{candidate.on}" if candidate.declared_on else ""
             found[candidate.label] = Invisible(
-                candidate.name,
+                candidate.name + place,
                 candidate.column,
                 dict(zip(names, _sizes(parameters, typical), strict=True)),
                 moves,

@@ -31,6 +31,7 @@ from casest.errors import DataError, NotTrusted
 from casest.estimate.calibrate import attempt
 from casest.estimate.estimate import Estimate
 from casest.estimate.reasons import Code
+from casest.leastsquares.kinds import noises
 from casest.leastsquares.problem import Problem
 
 #: What no effect that is added could mend.
@@ -54,6 +55,25 @@ def close(
     `refused` says so. Raises NotTrusted, with the refused estimate, where the declared model itself
     has no trustworthy fit, and what it lacks is not found either.
     """
+    closing = _once(model, runs, catalogue, start, known, seed, say)
+    if all(noises(model).values()):
+        return closing
+    return _noises_anew(
+        closing,
+        model,
+        lambda wide, ready: _once(wide, ready, catalogue, None, known, seed, say),
+    )
+
+
+def _once(
+    model: Model,
+    runs: Sequence[Run],
+    catalogue: Sequence[Effect],
+    start: Mapping[str, Any] | None,
+    known: Collection[str],
+    seed: int,
+    say: Callable[[str], None],
+) -> Closing:
     before = attempt(model, runs, start=start, seed=seed)
     if before.certificate.trusted:
         return _searched(before, model, runs, catalogue, known, seed, say)
@@ -64,6 +84,37 @@ def close(
         if closing.effects and closing.after.certificate.trusted:
             return closing
     raise error
+
+
+def _noises_anew(
+    closing: Closing, model: Model, again: Callable[[Model, Sequence[Run]], Closing]
+) -> Closing:
+    """The loop where residuals have noises of their own, which were found beside what is missing.
+
+    With the first cause in the model they are found anew, and what else is missing is looked for
+    with those; and so on, until nothing is.
+    """
+    first, added = closing, list[Found]()
+    while cause := next((f for f in closing.effects if not f.of_noise), None):
+        model = cause.candidate.added_to(model)
+        try:
+            closing = again(model, closing.runs)
+        except NotTrusted:
+            break
+        added.append(cause)
+    if not added:
+        return closing
+    before, after = first.before, closing.after
+    judged = before.model.having(**noises(after.model))
+    hidden = cross_fitted(judged, closing.runs, before.values, closing.folds)
+    sides = _on_the_same_samples(hidden, closing.after_held_out)
+    return replace(
+        closing,
+        before=before,
+        before_held_out=sides[0],
+        after_held_out=sides[1],
+        effects=(*added, *closing.effects),
+    )
 
 
 def _searched(
@@ -198,7 +249,8 @@ def certified(sensor: Sensor, state: State[Fit], before: Estimate) -> tuple[Stat
     """The last estimate, with intervals; without effects that leave one without an end."""
     while True:
         with only_tried(False):
-            after = attempt(state.fit.model, sensor.runs, start=state.fit.values, seed=sensor.seed)
+            model = state.fit.model.having(**noises(sensor.model))  # as they are beside it
+            after = attempt(model, sensor.runs, start=state.fit.values, seed=sensor.seed)
         if after.certificate.trusted:
             return state, after
         if not state.kept:

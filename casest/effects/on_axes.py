@@ -16,7 +16,7 @@ from casest.declaration.symbols import Parameter, Undecided, make_parameter
 
 def restricted(effect: Effect, kept: Sequence[int], model: Model) -> Effect:
     """The effect with one scalar unknown per kept axis, `k_x`, in place of every vector `k`."""
-    size = model.quantities[effect.on].declared.numel() if effect.on in model.quantities else 0
+    size = _size(effect, model)
     vectors, declarations = {}, []
     for name, declared in effect.declarations:
         parameter = declared.decided((size,)) if isinstance(declared, Undecided) else declared
@@ -63,12 +63,16 @@ def restricted(effect: Effect, kept: Sequence[int], model: Model) -> Effect:
 
 def lengths(effect: Effect, model: Model) -> set[int]:
     """How long the effect's vectors of unknowns are, where it is attached."""
-    place = model.quantities.get(effect.on)
-    own = [
-        d.decided((place.declared.numel() if place else 0,)) if isinstance(d, Undecided) else d
-        for _, d in effect.declarations
-    ]
+    size = _size(effect, model)
+    own = [d.decided((size,)) if isinstance(d, Undecided) else d for _, d in effect.declarations]
     return {d.shape.size for d in own if isinstance(d, Parameter) and len(d.shape.dims) == 1}
+
+
+def _size(effect: Effect, model: Model) -> int:
+    """Numbers of the quantity or of the vector signal that it acts on; 0 of anything else."""
+    if effect.on in model.quantities:
+        return int(model.quantities[effect.on].declared.numel())
+    return next((s.size for s in model.signals if s.name == effect.on and s.size > 1), 0)
 
 
 def axis_name(i: int, size: int) -> str:

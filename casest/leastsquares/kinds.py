@@ -83,6 +83,8 @@ def freedom(problem: Problem, point: Point) -> Array | None:
     if not sizes or problem.whitening is None:
         return None
     variances, information = _System(problem, point).told(sizes)
+    # A noise that is taken from the readings at rest is known by all of those.
+    information += np.diag([_readings_tell(problem, n, size) for n, size in sizes.items()])
     total = variances.sum(axis=0)
     squares = np.einsum("cn,cd,dn->n", variances, np.linalg.pinv(information), variances)
     return np.asarray(np.where(squares > 0, total**2 / np.where(squares > 0, squares, 1.0), 1.0))
@@ -162,11 +164,15 @@ def _components(
 ) -> dict[str, float]:
     """The noises that the residuals at a point show.
 
-    With little redundancy that of a signal is never less than what the rests themselves show.
+    With little redundancy that of a signal is never less than what the rests themselves show. Where
+    the signal wanders it never is less than its readings scatter: from rest to rest a walk can pass
+    for the noise of the means.
     """
     system, found = _System(problem, point), dict(sizes)
     least = {n: max(_rests_show(problem, n), 1e-300) for n in unknown}
     floors = {n: FLOOR * _at_start(problem, point, n) for n in unknown}
+    floors |= {n: max(floors[n], _readings_show(problem, n)) for n in unknown
+               if _beside_a_walk(problem.model, n)}  # fmt: skip
     for _ in range(WITHIN):
         new, left = system.updated(found)
         before = dict(found)
@@ -195,10 +201,14 @@ def _whitening(problem: Problem, point: Point, sizes: Mapping[str, float]) -> tu
 
 
 def _covariances(problem: Problem, point: Point, r: int) -> dict[str, Array]:
-    """V_c (N·m, N·m) of one run, for each noise, of residuals as the problem has them."""
-    model = problem.model
+    """V_c (N·m, N·m) of one run, for each noise, of residuals as the problem has them.
+
+    Of some of a record's rests those that belong to them of the whole record's.
+    """
+    model, (record, chosen) = problem.model, problem.origin(r)
     own, prior, between = problem.slopes_in_readings(point, r)
     N, m, _ = own.shape
+    rows = np.arange(N * m).reshape(N, m)[chosen].ravel()
     known = noises(model)
     found, first = {}, 0
     places = {}
@@ -209,7 +219,8 @@ def _covariances(problem: Problem, point: Point, r: int) -> dict[str, Array]:
         signal = _signal_of(model, name)
         if signal is None:
             axes = np.array([n == name for n in model.traced.residual.noise], float)
-            there = np.ones((N, m)) if problem.present[r] is None else problem.present[r]
+            there = np.ones((1, 1)) if problem.present[r] is None else problem.present[r]
+            there = np.broadcast_to(there, (len(problem.runs[r]), m))
             found[name] = np.diag((there * axes / (size if size > 0 else 1.0) ** 2).ravel())
             continue
         part = places[signal]
@@ -219,11 +230,11 @@ def _covariances(problem: Problem, point: Point, r: int) -> dict[str, Array]:
         slopes[each[1:], :, each[:-1]] = prior[1:, :, part]
         if name in model.traced.residual.wander:
             slopes[each, :, N + each] = between[:, :, part]
-            flat = slopes.transpose(0, 1, 3, 2).reshape(N * m, -1)
-            ways = np.kron(np.eye(part.stop - part.start), wandering(problem.runs[r]))
+            flat = slopes.transpose(0, 1, 3, 2).reshape(N * m, -1)[rows]
+            ways = np.kron(np.eye(part.stop - part.start), wandering(record))
             found[name] = flat @ ways @ flat.T
             continue
-        flat = slopes[:, :, :N].reshape(N * m, -1)
+        flat = slopes[:, :, :N].reshape(N * m, -1)[rows]
         found[name] = flat @ flat.T
     return found
 
@@ -245,6 +256,39 @@ def _rests_show(problem: Problem, name: str) -> float:
     spreads = [r.spread[signal] for r in problem.runs if signal is not None and signal in r.spread]
     squares = np.concatenate([s.ravel() ** 2 for s in spreads]) if spreads else np.zeros(1)
     return float(np.sqrt(np.mean(squares)))
+
+
+def _beside_a_walk(model: Model, name: str) -> bool:
+    """Is a noise that of a signal whose offset wanders as well?"""
+    walks = model.traced.residual.wander
+    return name not in walks and _signal_of(model, name) in {_signal_of(model, w) for w in walks}
+
+
+def _readings_show(problem: Problem, name: str) -> float:
+    """Error of a rest's mean by the differences of neighbouring readings, which no walk moves.
+
+    Half their mean square is the variance of white noise (von Neumann, Ann. Math. Stat. 12, 1941),
+    and less than that of one whose neighbours are alike.
+    """
+    signal, squares = _signal_of(problem.model, name) or "", []
+    for run in problem.runs:
+        assert run.averaged is not None
+        raw = run.averaged.run.signals[signal]
+        ends = zip(run.averaged.first, run.averaged.last, strict=True)
+        squares += [0.5 * np.mean(np.diff(raw[i : j + 1], axis=0) ** 2) / (j + 1 - i)
+                    for i, j in ends if j > i]  # fmt: skip
+    return float(np.sqrt(np.mean(squares))) if squares else 0.0
+
+
+def _readings_tell(problem: Problem, name: str, size: float) -> float:
+    """Degrees of freedom of a noise that is no larger than the readings at rest say, else 0."""
+    least = _readings_show(problem, name) if _beside_a_walk(problem.model, name) else 0.0
+    if size > (1 + CLOSE) * least:
+        return 0.0
+    signal = _signal_of(problem.model, name) or ""
+    # Of differences, two thirds of what the readings have.
+    return float(sum(run.signals[signal].shape[1] * np.sum(run.count - 1)
+                     for run in problem.runs) * 2 / 3)  # fmt: skip
 
 
 def _at_start(problem: Problem, first: Point, name: str) -> float:

@@ -455,6 +455,11 @@ class Problem:
         assert self._staged is not None
         return self._staged.slopes_in_readings(self.parameters(point, r), r)
 
+    def origin(self, r: int) -> tuple[Run, Any]:
+        """The record that the samples of one run were taken from, and which of it they are."""
+        assert self._staged is not None
+        return self._staged.origin(r)
+
     @property
     def compiled(self) -> bool:
         """Have sums been computed by a compiled kernel? Else by NumPy, with other last digits."""

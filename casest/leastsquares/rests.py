@@ -15,6 +15,7 @@ from casest.declaration.model import Model
 from casest.declaration.shapes import Array
 from casest.declaration.tracing import reached_signals
 from casest.errors import DataError
+from casest.leastsquares.on_the_way import means_on_the_way
 from casest.leastsquares.turns import rotations, skew
 
 
@@ -109,6 +110,19 @@ def before(value: Array, slopes: Array) -> tuple[Array, Array]:
     """Values (N, m) and slopes (N, m, n) of the sample before; the first's are its own."""
     order = np.maximum(np.arange(len(value)) - 1, 0)
     return value[order], slopes[order]
+
+
+def followed(values: Array, slopes: Array, rests: Rests) -> tuple[Array, Array]:
+    """What a word gives at every rest, and its slopes: `turned` of a rate (M, 3), `carried` of a
+    rate and a vector (M, 6)."""
+    if values.shape[1] == 3:
+        return turns(values, slopes, rests)
+    n = slopes.shape[2]
+    found, moved = np.zeros((len(rests.linked), 3)), np.zeros((len(rests.linked), 3, n))
+    if rests.linked.any():
+        means = means_on_the_way(values, slopes, rests.time, rests.spans)
+        found[rests.linked], moved[rests.linked] = means
+    return found, moved
 
 
 def turns(rate: Array, slopes: Array, rests: Rests) -> tuple[Array, Array]:

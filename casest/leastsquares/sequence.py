@@ -25,12 +25,12 @@ from casest.declaration.flow import Flow
 from casest.declaration.model import Model
 from casest.declaration.physics import SX
 from casest.declaration.shapes import Array
-from casest.declaration.tracing import Word, sample_symbol
+from casest.declaration.tracing import ON_THE_WAY, Word, sample_symbol
 from casest.engine import Replay
 from casest.errors import DataError, DeclarationError
 from casest.leastsquares.flow import Course, Integrator, Mesh
 from casest.leastsquares.memory import Memory
-from casest.leastsquares.rests import LastTurns, Rests, before, needing, turns
+from casest.leastsquares.rests import LastTurns, Rests, before, followed, needing
 
 
 @dataclass(frozen=True)
@@ -174,13 +174,17 @@ class Staged:
             assert record.rests is not None
             nothing = np.zeros((len(record.rests.samples), given.shape[1]))
             rate, slope = taken(parameters, np.hstack([record.rests.samples, nothing]))
-            moved = turns(rate[:, :, 0], slope, record.rests)[1]
+            moved = followed(rate[:, :, 0], slope, record.rests)[1]
             between += through[:, :, first : first + moved.shape[1]] @ moved
-        present = self.present(r)
-        for part in (own, prior, between):
-            if present is not None:
+        if record.rests is not None:
+            present = record.rests.linked[:, None] | ~needing(self.model)
+            for part in (own, prior, between):
                 part[~present] = 0.0
         return own, prior, between
+
+    def origin(self, r: int) -> tuple[Run, Index | slice]:
+        """The record that the samples of run r were taken from, and their places in it."""
+        return self._records[r].run, self._records[r].places
 
     def lost(self, r: int) -> NDArray[np.int_]:
         """Rests that were reached too fast, by number."""
@@ -253,8 +257,8 @@ class Staged:
         return np.hstack([given[:, :0], *found])
 
     @cached_property
-    def _turns(self) -> LastTurns:
-        return LastTurns()
+    def _turns(self) -> dict[Word, LastTurns]:
+        return {word: LastTurns() for word in ON_THE_WAY}
 
     def _given(self, parameters: Array, r: int, own: tuple[int, ...] | None) -> tuple[Array, Array]:
         """The same at all samples of the record; what was asked for last is kept."""
@@ -306,11 +310,12 @@ class Staged:
         if stage.word == "before":
             return before(*_chained(stage.taken, parameters, record.samples, given, slopes))
         asked = id(record), stage.columns, parameters[list(stage.turning)].tobytes()
-        if self._turns.asked != asked:
+        last = self._turns[stage.word]
+        if last.asked != asked:
             nothing = np.zeros((len(record.rests.samples), given.shape[1]))
             rate, sloped = stage.taken(parameters, np.hstack([record.rests.samples, nothing]))
-            self._turns.keep(asked, turns(rate[:, :, 0], sloped, record.rests))
-        found, moved = self._turns.found
+            last.keep(asked, followed(rate[:, :, 0], sloped, record.rests))
+        found, moved = last.found
         wide = np.zeros((*moved.shape[:2], slopes.shape[2]))
         wide[:, :, list(stage.columns)] = moved
         return found, wide
@@ -382,7 +387,7 @@ def _programs(model: Model, own: tuple[int, ...] | None = None) -> tuple[Program
             fed = ca.depends_on(stage.taken, ca.vertcat(coordinates, given))
             flow = Integrator(traced, stage, own, fed)
             found.append(Program(None, replay(stage.taken), flow=flow))
-        elif stage.word == "turned":
+        elif stage.word in ON_THE_WAY:
             if ca.depends_on(stage.taken, ca.vertcat(given, ca.SX.sym("none"))):
                 raise DeclarationError(
                     f"model {model.name}: what turns between rests cannot read what was before"
@@ -437,7 +442,7 @@ def _in_readings(model: Model) -> Readings:
     for stage in traced.stages:
         if stage.word == "before":
             before.append((place, slope(stage.taken, reading)))
-        if stage.word == "turned":
+        if stage.word in ON_THE_WAY:
             both = [ca.densify(stage.taken), ca.densify(ca.jacobian(stage.taken, reading))]
             turned.append((place, _replay("rate", [parameters, sample], both)))
         place += stage.given.numel()

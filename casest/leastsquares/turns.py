@@ -61,6 +61,18 @@ def rotations(
     return found, S
 
 
+def steps(rate: Array, time: Array) -> tuple[Array, Array, Array, Array]:
+    """Length (N - 1,) of each step of a record, rotation in it, and what a small rate at its
+    beginning and at its end turns that by, in the frame of its end: (N - 1, 3, 3) each.
+
+    Of neighbours that do not belong together what comes out means nothing.
+    """
+    phi, h, w0, w1 = _magnus(rate, time, np.arange(len(rate) - 1))
+    own = _weights(_pair(np.zeros_like(phi)), phi, h, w0, w1)
+    before, after = (np.ascontiguousarray(w.transpose(2, 0, 1)) for w in own)
+    return h, exponential(phi.T), before, after
+
+
 def _groups(ends: Array) -> list[tuple[int, int]]:
     """Spans first to last, one after the other, of together TOGETHER steps at most, or one."""
     found, first = [], 0

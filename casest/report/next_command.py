@@ -106,7 +106,6 @@ def following(
     trusted: bool = True,
     doubtful: bool = False,
     applies: bool = True,
-    closes: bool = True,
     moving: bool = False,
     file: str | Path = "",
     fitted: str = "",
@@ -115,8 +114,7 @@ def following(
 
     output: folder of its results; trusted: whether there is an estimate to go on with; doubtful:
     whether its residual speaks against the model; applies: whether the model says what readings
-    correct to, or that an estimator in motion lacks nothing; closes: whether the loop is closed on
-    such a model; moving: whether it is one; file: what
+    correct to, or that an estimator in motion lacks nothing; moving: whether it is one; file: what
     simulate, apply or export has written; fitted: the command that made the result.
     """
     typed = typed_words(command)
@@ -125,7 +123,7 @@ def following(
     if typed.name == "close" and moving:
         steps = _after_motion(typed, output, trusted and applies)
     elif typed.name in ("calibrate", "close"):
-        steps = _after_fit(typed, output, trusted, applies and not doubtful, closes)
+        steps = _after_fit(typed, output, trusted, applies and not doubtful)
     elif typed.name == "simulate":
         steps = (_after_flight if moving else _after_simulate)(typed, file)
     elif typed.name == "export":
@@ -146,14 +144,12 @@ def applying(typed: Typed, output: str | Path) -> Typed:
 _Steps = Iterator[tuple[str, str]]
 
 
-def _after_fit(
-    typed: Typed, output: str | Path | None, trusted: bool, applies: bool, closes: bool
-) -> _Steps:
+def _after_fit(typed: Typed, output: str | Path | None, trusted: bool, applies: bool) -> _Steps:
     flags = (*_MODEL, *_READING, *_FIT)
     if not trusted:
         yield "what can these data see?", typed.keeping("observe", (*_MODEL, *_READING)).lines()
         return
-    if typed.name == "calibrate" and closes:
+    if typed.name == "calibrate":
         into = Path(output) / "closed" if output else "out"
         yield "does the model lack an effect?", typed.keeping("close", flags).into(into).lines()
     if output is None:

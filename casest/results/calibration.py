@@ -101,14 +101,8 @@ def doubt_sentence(result: Calibration) -> str:
     return (
         f"the residual is not noise: {where}. The model lacks something, which may have moved the "
         "values by many of their standard deviations, however small the residual: "
-        f"{_way_out(result)}"
+        "`casest close` looks for it"
     )
-
-
-def _way_out(result: Calibration) -> str:
-    if result.found.model.resting:
-        return "free what you know to be there (--free NAME)"
-    return "`casest close` looks for it"
 
 
 def residual_rows(estimate: Estimate) -> str:

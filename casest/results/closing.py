@@ -24,6 +24,7 @@ from casest.diagnose.found import Found
 from casest.diagnose.levels import LEVELS
 from casest.estimate.estimate import Estimate
 from casest.estimate.held_out import ALONE, happened_once
+from casest.leastsquares.kinds import noises, whitened
 from casest.leastsquares.problem import Problem
 from casest.results.application import formula_of
 from casest.results.file import plain
@@ -132,7 +133,7 @@ class Closed(Fitted, frozen=True, kw_only=True, dict=True):
         fits = [("before", "before", closing.before), ("after", "after", closing.after)]
         if not closing.effects:
             fits = [("residual", "after", closing.after)]
-        sides = [side_of(*fit, Problem(fit[2].model, runs)) for fit in fits]
+        sides = [side_of(*fit, _judged_alike(fit[2], closing)) for fit in fits]
         return residuals_of(sides, closing.after, runs, noise_of(self.noise))
 
 
@@ -197,8 +198,14 @@ def _invisible(closing: Closing, units: Mapping[str, str]) -> list[Hidden]:
     ]
 
 
+def _judged_alike(estimate: Estimate, closing: Closing) -> Problem:
+    """Its problem; where residuals are counted in deviations, in those that are left at last."""
+    model = estimate.model.having(**noises(closing.after.model))
+    return whitened(Problem(model, closing.runs), estimate.point)
+
+
 def _section(estimate: Estimate, closing: Closing, held_out: Sequence[Array]) -> JudgedSection:
-    residuals = Problem(estimate.model, closing.runs).told_residuals(estimate.point)
+    residuals = _judged_alike(estimate, closing).told_residuals(estimate.point)
     axes, certificate = estimate.model.axes, estimate.certificate
     return JudgedSection(
         rmse_fit=plain(rms(residuals)),
@@ -330,7 +337,7 @@ def residual_rows(
     writer.writerow(["file", "run", "row", "t", "axis", "split", "before", "after"])
     axes = closing.before.model.axes
     fits = [
-        Problem(e.model, closing.runs).told_residuals(e.point)
+        _judged_alike(e, closing).told_residuals(e.point)
         for e in (closing.before, closing.after)
     ]
     hidden = held_out or (closing.runs, closing.before_held_out, closing.after_held_out)

@@ -112,7 +112,8 @@ def new_records(
 ) -> list[tuple[Run, ...]]:
     """The runs of each file, in the units of the fit."""
     signals = [s if s.unit else replace(s, unit=fitted_unit(result, s)) for s in old.model.signals]
-    return [load_runs([name], signals, **arguments) for name in data]
+    given = {**arguments, "at_rest": arguments.get("at_rest") or old.model.resting}
+    return [load_runs([name], signals, **given) for name in data]
 
 
 def remarks(

@@ -7,23 +7,28 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import casadi as ca
 import numpy as np
 
 from casest.data.run import Run
 from casest.declaration.dimensions import check_units
-from casest.declaration.effect import NOISE, RATE, RATES, RECORDED, Effect, label_of
+from casest.declaration.effect import NOISE, OVER_TIME, RATE, RATES, RECORDED, Effect, label_of
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
-from casest.declaration.symbols import Parameter
+from casest.declaration.symbols import Constant, Parameter
+from casest.declaration.tracing import reached_parameters
 from casest.effects import shipped
 from casest.effects.placing import angles, placed_in, with_numbers
 from casest.errors import CasestError, UsageError
+from casest.leastsquares.kinds import noises
 
 #: Columns whose name or unit says that they are temperatures.
 _TEMPERATURE = re.compile(r"temp|(^|_)t_?(deg)?c$|celsius|kelvin", re.IGNORECASE)
 _DEGREES = {"degC", "K", "kelvin", "degree_Celsius", "°C"}
 #: What is searched over first and fitted then: an effect is smooth in it.
 SMOOTH = ("frequency", "timescale", "lag")
+#: Where effects act that go with what a sensor gives.
+READINGS = ("input", "output")
 #: Which columns an effect asks for: temperatures, others, both.
 WARM = {"temperature": (True,), "other": (False,), "any": (True, False)}
 #: Columns that number things instead of measuring them.
@@ -45,6 +50,8 @@ class Candidate:
     #: Values that it is held at, of what it is searched over; so many were looked through.
     held: tuple[tuple[str, float], ...] = ()
     trials: int = 1
+    #: What the effect declares to act on, where it acts on a reading of several instead.
+    declared_on: str = ""
     #: The model that it was tried on, and that model with it: tracing takes longer than scoring.
     traced: tuple[Model, Model] | None = field(default=None, compare=False, repr=False)
 
@@ -68,11 +75,14 @@ class Candidate:
         """Name and column, as in the parameters' names: `temperature_bias(temp)`."""
         if self.effect is not None and self.effect.kind in ("time", "rate"):
             return label_of(self.effect, self.on, dict(self.columns), moved=False)
+        moved = bool(self.declared_on)
+        if self.effect is not None and moved:
+            return label_of(self.effect, self.on, dict(self.columns), moved=True)
         return self.name + (f"({self.column})" if self.column else "")
 
     def among(self, names: Collection[str]) -> bool:
         """Is it called so, with its column or without?"""
-        return self.name in names or self.label in names
+        return self.name in names or self.label in names or self.label.split("@")[0] in names
 
     def added_to(self, model: Model) -> Model:
         """The model with it. Raises where it does not apply."""
@@ -81,8 +91,7 @@ class Candidate:
         if not self.held:
             return self.traced_on(model)
         assert self.effect is not None
-        effect = self.effect.holding(**dict(self.held))
-        return model.with_effect(effect, columns=dict(self.columns))
+        return self._attached_to(model, self.effect.holding(**dict(self.held)))
 
     def traced_on(self, model: Model) -> Model:
         """The model with it, nothing held."""
@@ -91,7 +100,13 @@ class Candidate:
         if self.freed:
             return model.freed(self.freed)
         assert self.effect is not None
-        return model.with_effect(self.effect, columns=dict(self.columns))
+        return self._attached_to(model, self.effect)
+
+    def _attached_to(self, model: Model, effect: Effect) -> Model:
+        if not self.declared_on:
+            return model.with_effect(effect, columns=dict(self.columns))
+        declared = replace(effect, on=self.declared_on)
+        return model.with_effect(declared, on=effect.on, columns=dict(self.columns))
 
     def on_model(self, model: Model) -> Candidate:
         """The candidate that remembers the model with it. Raises where it does not apply."""
@@ -142,13 +157,15 @@ def candidates(
     for effect in _placed(model, catalogue):
         if effect.on == NOISE:
             continue
+        moved = effect.on if effect.on in READINGS and model.resting else ""
         try:
-            placed = placed_in(effect, model)
+            several = _on_readings(effect, model) if moved else [placed_in(effect, model)]
         except CasestError as error:
             skipped.append(Skipped(effect.name, str(error)))
             continue
-        for columns in _columns_for(placed, measured, turning, states):
-            candidate = Candidate(placed, columns)
+        every = [(p, c) for p in several for c in _columns_for(p, measured, turning, states)]
+        for placed, columns in every:
+            candidate = Candidate(placed, columns, declared_on=moved)
             try:
                 told = with_numbers(placed, columns, runs, model)
                 candidate = replace(candidate, effect=told)
@@ -156,12 +173,38 @@ def candidates(
                     continue  # of the catalogue, and asked for with its column
                 found.append(_tried(candidate, model, runs))
             except CasestError as error:
-                skipped.append(Skipped(candidate.label, str(error)))
+                why = Skipped(effect.name if moved else candidate.label, str(error))
+                skipped += [] if any(s.name == why.name for s in skipped) and moved else [why]
     for constant in model.constants:
-        candidate = Candidate(None, freed=constant.name)
-        if constant.frozen is None and not constant.dims:
-            found.append(candidate)
+        if constant.frozen is None and _may_be_wrong(constant, model):
+            found.append(Candidate(None, freed=constant.name))
     return found, skipped
+
+
+def _may_be_wrong(constant: Constant, model: Model) -> bool:
+    """Is it one number, or several that are nothing as they stand?
+
+    Of a model that looks from rest to rest no noise, and nothing that brings rows of its own.
+    """
+    if constant.dims and constant.array.any():
+        return False
+    if not model.resting:
+        return not constant.dims
+    if constant.name in noises(model):
+        return False
+    wide = model.freed(constant.name)
+    stages = [stage.entered for stage in wide.staged.stages]
+    reached = ca.vertcat(wide.staged.expression, *stages)
+    return wide.axes == model.axes and constant.name in reached_parameters(
+        wide, wide.staged, reached
+    )
+
+
+def _on_readings(effect: Effect, model: Model) -> list[Effect]:
+    """The effect on each sensor's reading: what several sensors give at once has no one place."""
+    if effect.kind in OVER_TIME or effect.otherwise is not None:
+        raise UsageError("from rest to rest there is no sequence of readings that it could follow")
+    return [replace(effect, on=s.name) for s in model.signals if s.kind == "plain" and s.size > 1]
 
 
 def _placed(model: Model, catalogue: Sequence[Effect]) -> list[Effect]:
@@ -282,8 +325,8 @@ def _refuse_more_than_data(extended: Model, runs: Sequence[Run]) -> None:
 def typical_sizes(candidate: Candidate, parameters: Sequence[Parameter], model: Model) -> Any:
     """A typical size of each of its unknowns (packed), or None where nobody knows one."""
     if candidate.freed:
-        value = float(model[candidate.freed].array)
-        return np.array([0.01 * abs(value) or 1.0])
+        value = model[candidate.freed].array
+        return None if value.ndim else np.array([0.01 * abs(float(value)) or 1.0])
     assert candidate.effect is not None
     typical = dict(candidate.effect.typical)
     sizes = [typical.get(p.name.rpartition(".")[2]) for p in parameters]

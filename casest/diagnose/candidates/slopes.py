@@ -68,6 +68,8 @@ def _sequential(candidate: Candidate, problem: Problem) -> bool:
         return True
     if not problem.sequential:
         return False
+    if problem.model.resting:  # rests share what they are uncertain by
+        return True
     try:
         extended = candidate.traced_on(problem.model)
     except CasestError:
@@ -178,7 +180,12 @@ def _through_record(
     """
     extended = candidate.traced_on(problem.model)
     moves = states is None or _moves_states(candidate, extended)
-    wide = Problem(extended, problem.runs, states=None if moves else states)
+    wide = Problem(
+        extended,
+        problem.runs,
+        whitening=problem.whitening,
+        states=None if moves else states,
+    )
     held = {f"{candidate.label}.{name}": np.array(value) for name, value in candidate.held}
     at = wide.point({**wide.values(wide.start()), **problem.values(point), **held})
     own = candidate.parameters(extended)

@@ -17,6 +17,7 @@ from casest.diagnose.evidence.linear import Index, Linear, parts_of, spans_of
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.sensor.fits import Fit, problem_of
 from casest.diagnose.sensor.recent import Recent
+from casest.leastsquares.kinds import noises
 from casest.leastsquares.problem import Point, Problem
 
 
@@ -78,7 +79,7 @@ class Rows:
 
     def _least(self, fit: Fit) -> float:
         """Slopes of an implicit residual contain the residual: what survives must be more."""
-        if not fit.model.implicit:
+        if not fit.model.implicit or noises(fit.model):  # or is counted in deviations
             return LEVELS.survives
         names = [
             s.name
@@ -100,7 +101,8 @@ class Rows:
         if value is None:
             return np.zeros((len(self._numbers[0]), 1))
         problem, point = problem_of(fit, self.runs)
-        if problem.sequential and not traced.integrates:
+        over_time = any(a.kind in OVER_TIME for a in fit.model.effects)
+        if over_time and not traced.integrates:
             return self._met(_instant(fit))  # what it met is that without a memory as well
         found = problem.evaluate(point, {"q": value})
         return np.nan_to_num(self.of([f[0].reshape(len(f[0]), -1) for f in found]))

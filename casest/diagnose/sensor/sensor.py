@@ -27,6 +27,7 @@ from casest.engine.kernel import only_tried
 from casest.errors import CasestError
 from casest.estimate.calibrate import attempt
 from casest.estimate.estimate import Estimate
+from casest.leastsquares.kinds import whitened
 from casest.leastsquares.problem import Problem
 
 #: Why there is no refit.
@@ -249,14 +250,16 @@ class Sensor(Subject[Fit]):
         """Residuals (N, m) of the model without an effect, at the values of the fit."""
         own = fit.model.unknowns_of(what.label)
         if what.freed:
-            model = fit.model.having(**{what.freed: float(self.model[what.freed].array)})
+            held = self.model[what.freed].array
+            model = fit.model.having(**{what.freed: held if held.ndim else float(held)})
             own = {what.freed}
         else:
             left = tuple(a for a in fit.model.effects if a.label != what.label)
             model = replace(fit.model, effects=left)
         values = {n: v for n, v in fit.values.items() if n not in own}
         problem = Problem(model, self.runs)
-        residuals = problem.residuals(problem.point(values))
+        point = problem.point(values)
+        residuals = whitened(problem, point).residuals(point)
         weights = problem_of(fit, self.runs)[0].weights
         if weights is not None:
             residuals = tuple(r * np.sqrt(w) for r, w in zip(residuals, weights, strict=True))
@@ -271,6 +274,8 @@ class Sensor(Subject[Fit]):
         if made.source:
             own = {p.name.rpartition(".")[2]: p.name for p in attached.parameters}
             made = with_sizes(made, {k: float(fit.values[n]) for k, n in own.items()})
+        if what.declared_on:
+            made = replace(made, on=what.on)
         return replace(what, effect=made, held=(), traced=None)
 
     def moved_by(self, fit: Fit, other: Fit) -> dict[str, Array]:

@@ -38,7 +38,7 @@ def calibration_page(
         section("residual", "Residual", residual_figures(residuals, figures)) if finite else "",
         uncertain(result),
         section("invisible", "What stayed invisible", paragraph(_asked(result)), paragraph(
-            _looked_for(result)
+            _looked_for()
         )),
         certified(result),
         application(result, folder),
@@ -48,7 +48,7 @@ def calibration_page(
         "" if result.misfit is None else ", and nothing in the residual speaks against the model"
     )
     lacks = "; what the model may lack is what `casest close` asks"
-    proved = f"The optimum is proved{asked}{'' if result.found.model.resting else lacks}."
+    proved = f"The optimum is proved{asked}{lacks}."
     under = proved if result.trusted and not result.doubtful else ""
     look = "bad" if not result.trusted else "doubtful" if result.doubtful else "good"
     return whole(result.declared, sentence(result), under, body, figures, result.data,
@@ -85,9 +85,7 @@ def _asked(result: Calibration) -> str:
     )
 
 
-def _looked_for(result: Calibration) -> str:
-    if result.found.model.resting:
-        return "A calibration looks for no effect; what you know to be there, `--free NAME` adds."
+def _looked_for() -> str:
     return (
         "A calibration looks for no effect. `casest close` with the same arguments does, and names "
         "what these data could not show."

@@ -102,5 +102,4 @@ def _written(result: Calibration, output: Path | None) -> Iterator[str]:
         trusted=result.trusted,
         doubtful=result.doubtful,
         applies=result.corrected is not None,
-        closes=not result.found.model.resting,
     )
