@@ -36,19 +36,19 @@ def mapped_record(
     signals: Sequence[Signal],
     folder: Path,
     *,
-    kept: Sequence[str] = (),
+    kept: Sequence[str] | None = (),
     **reading: Any,
 ) -> Run:
     """The run that a data set (a Parquet file, folder or pattern) holds, in the files' order.
 
-    `folder` takes one file of numbers for each signal, for the time and for the `kept` columns,
-    and must stay as long as the run; `reading` as in `load_runs`. Raises DataError as that does,
-    with rows counted in each file; where the folder has not enough room; where the data set holds
-    several runs.
+    `folder` takes one file of numbers for each signal, for the time and for the `kept` columns
+    (None: all that are numbers), and must stay as long as the run; `reading` as in `load_runs`.
+    Raises DataError as that does, with rows counted in each file; where the folder has not enough
+    room; where the data set holds several runs.
     """
     files = files_of(dataset)
     total = sum(int(opened(file).metadata.num_rows) for file in files)
-    made = _Mapped(dataset, tuple(signals), folder, total, tuple(kept))
+    made = _Mapped(dataset, tuple(signals), folder, total, None if kept is None else tuple(kept))
     for first, table in _batches(files):
         try:
             made.take(_bound(table, made.signals, reading), reading.get("rate"))
@@ -96,7 +96,7 @@ class _Mapped:
     signals: tuple[Signal, ...]
     folder: Path
     total: int
-    columns: tuple[str, ...]
+    columns: tuple[str, ...] | None
     count: int = 0
     rows: int = 0
     values: dict[str, Any] = field(default_factory=dict)
@@ -116,6 +116,9 @@ class _Mapped:
         for s in self.signals:
             if not is_time(s):
                 self._put(s.name, run.signals[s.name], where)
+        if self.columns is None:
+            numbers = {n for n, v in run.columns.items() if np.issubdtype(v.dtype, np.number)}
+            self.columns = tuple(n for n in run.columns if n in numbers)
         for name in self.columns:
             if name not in run.columns:
                 raise DataError(f"{run.file}: no column {name!r}, which an effect reads")
@@ -186,7 +189,7 @@ class _Mapped:
             time=None if time is None else time[:, 0], notes=self._said(),
         )  # fmt: skip
         run = run if block is None else replace(run, block=block[:, 0])
-        own = {name: found[f"column {name}"][:, 0] for name in self.columns}
+        own = {name: found[f"column {name}"][:, 0] for name in self.columns or ()}
         return replace(run, columns=own, column_units={n: self.column_units.get(n) for n in own})
 
     def _refuse_still(self, signal: Signal) -> None:
