@@ -36,7 +36,7 @@ from casest.estimate.estimate import Estimate
 from casest.leastsquares.problem import Problem
 
 #: Samples that causes are looked for in, at most.
-SEARCHED = 200_000
+SEARCHED = 100_000
 #: Why some effects are not tried where not every sample is looked at.
 NEIGHBOURS = "it looks at neighbouring samples, of which one in {} is looked at; close a stretch"
 WEIGHTS = "it weighs every residual by itself, for which a long record has no room"
