@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from casest.cli.loading import asked_effects, declared_model, with_prior
 from casest.cli.options import (
@@ -159,16 +159,33 @@ def mapped_records(
     reading = {**model.reading, **options.keywords()}
     with tempfile.TemporaryDirectory(prefix="casest-record-") as folder:
         progress(f"reading {data[0]}")
-        run = mapped_record(data[0], model.signals, Path(folder), kept=kept, **reading)
+        parts = tables_of(data[0])
+        run = mapped_record(data[0], model.signals, Path(folder), kept=kept, parts=parts, **reading)
         yield (run,)
+
+
+def tables_of(name: str) -> Callable[[], Iterable[Any]] | None:
+    """The function `file.py:name` that makes the tables of a record; None of files."""
+    from casest.results.find import load_file
+
+    path, colon, wanted = name.partition(":")
+    if not path.endswith(".py") or not colon:
+        return None
+    found = getattr(load_file(Path(path)), wanted, None)
+    if not callable(found):
+        raise UsageError(
+            f"{path}: no function {wanted!r}; name the one that yields the tables of the record"
+        )
+    made: Callable[[], Iterable[Any]] = found
+    return made
 
 
 def _refuse(model: Model, data: Sequence[str], options: FitOptions) -> None:
     """What needs all samples in memory, and what is asked of several records."""
     if len(data) > 1:
         raise UsageError(
-            f"--partitions: {len(data)} data sets; give one: a Parquet file, a folder of them, or "
-            "a pattern in quotes, whose rows are one record"
+            f"--partitions: {len(data)} data sets; give one: a Parquet file, a folder of them, a "
+            "pattern in quotes, or file.py:function, whose rows are one record"
         )
     others = {
         "--at-rest": options.reading.at_rest or model.resting,

@@ -242,7 +242,7 @@ class RecordOptions:
         False,
         "--partitions",
         only=Kind.FITTED,
-        help="DATA is one record that need not fit in memory: a Parquet file, folder or pattern.",
+        help="DATA is one record that need not fit in memory: Parquet files, or file.py:function.",
     )
     workers: int | None = flag(
         None,
