@@ -23,7 +23,7 @@ from casest.cli.loading import (
     trajectory,
     with_prior,
 )
-from casest.cli.long_record import long_record
+from casest.cli.long_record import in_partitions, long_closing, long_record
 from casest.cli.noise_law import with_noise_law
 from casest.cli.options import (
     DATA,
@@ -68,10 +68,8 @@ def calibrate(model_name: str, data: tuple[str, ...], options: CalibrateOptions)
     """
     if options.profile and not options.output:
         raise UsageError("--profile draws on a page: say where with -o DIR")
-    if options.partitions:
+    if in_partitions(options.record):
         return long_record(model_name, data, options, typed())
-    if options.workers:
-        raise UsageError("--workers is for a record in --partitions; others need none")
     return calibration(model_name, data, options, typed(), profile=options.profile)
 
 
@@ -159,6 +157,8 @@ def close(model_name: str, data: tuple[str, ...], options: CloseOptions) -> int:
         return closing_in_motion(model_name, data, options, typed())
     if options.sensor:
         return fleet_closing(model_name, data, options)
+    if in_partitions(options.record):
+        return long_closing(model_name, data, options, typed())
     if options.keep:
         raise UsageError("--keep is for a data set of many sensors: say --sensor COLUMN too")
     return closing(model_name, data, options, typed())

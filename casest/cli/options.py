@@ -235,6 +235,26 @@ class FitOptions:
 
 
 @dataclass(frozen=True, slots=True)
+class RecordOptions:
+    """A record that need not fit in memory."""
+
+    partitions: bool = flag(
+        False,
+        "--partitions",
+        only=Kind.FITTED,
+        help="DATA is one record that need not fit in memory: Parquet files, or file.py:function.",
+    )
+    workers: int | None = flag(
+        None,
+        "--workers",
+        only=Kind.FITTED,
+        type=click.IntRange(min=1),
+        metavar="N",
+        help="Threads that add it up (as many as there are cores); the numbers are the same.",
+    )
+
+
+@dataclass(frozen=True, slots=True)
 class CalibrateOptions(FitOptions):
     """Options of `calibrate`."""
 
@@ -243,18 +263,7 @@ class CalibrateOptions(FitOptions):
         "--profile",
         help="Draw the likelihood's profile of every unknown whose cost is no parabola.",
     )
-    partitions: bool = flag(
-        False,
-        "--partitions",
-        help="DATA is one record that need not fit in memory: a Parquet file, folder or pattern.",
-    )
-    workers: int | None = flag(
-        None,
-        "--workers",
-        type=click.IntRange(min=1),
-        metavar="N",
-        help="Threads that add it up (as many as there are cores); the numbers are the same.",
-    )
+    record: RecordOptions = field(default_factory=RecordOptions)
 
 
 @dataclass(frozen=True, slots=True)
@@ -275,3 +284,4 @@ class CloseOptions(FitOptions):
         metavar="COLUMN",
         help="With --sensor: does it follow this column (line, supplier, fixture)?",
     )
+    record: RecordOptions = field(default_factory=RecordOptions)

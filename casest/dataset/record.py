@@ -1,4 +1,5 @@
-"""One long record in partitions: a Parquet data set whose rows are the samples of one run.
+"""One long record in partitions: a Parquet data set whose rows are the samples of one run, or
+tables that a function makes one after the other.
 
 Signals are put once, in the model's units, into files of plain numbers that are mapped into memory.
 What computes runs through these piece by piece, so that a record may be larger than memory.
@@ -8,7 +9,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,8 @@ from casest.units import conversion
 
 #: Samples that are read at once.
 BATCH = 262_144
+#: A file for samples that nobody counted grows by this factor.
+GROWS = 1.5
 #: Notes of batches that are kept: each may have one of its own.
 NOTES = 8
 
@@ -36,26 +39,44 @@ def mapped_record(
     signals: Sequence[Signal],
     folder: Path,
     *,
-    kept: Sequence[str] = (),
+    kept: Sequence[str] | None = (),
+    parts: Callable[[], Iterable[Any]] | None = None,
     **reading: Any,
 ) -> Run:
     """The run that a data set (a Parquet file, folder or pattern) holds, in the files' order.
 
-    `folder` takes one file of numbers for each signal, for the time and for the `kept` columns,
-    and must stay as long as the run; `reading` as in `load_runs`. Raises DataError as that does,
-    with rows counted in each file; where the folder has not enough room; where the data set holds
-    several runs.
+    `folder` takes one file of numbers for each signal, for the time and for the `kept` columns
+    (None: all that are numbers), and must stay as long as the run; `reading` as in `load_runs`.
+    `parts` makes the tables in place of files (data frames, mappings of arrays: see `table_of`),
+    one after the other. Raises DataError as `load_runs` does, with rows counted in each file or
+    part; where the folder has not enough room; where the data set holds several runs.
     """
-    files = files_of(dataset)
+    files = () if parts is not None else files_of(dataset)
     total = sum(int(opened(file).metadata.num_rows) for file in files)
-    made = _Mapped(dataset, tuple(signals), folder, total, tuple(kept))
-    for first, table in _batches(files):
+    columns = None if kept is None else tuple(kept)
+    made = _Mapped(dataset, tuple(signals), folder, total, columns)
+    for first, table in _batches(files) if parts is None else _made_by(parts, dataset):
         try:
             made.take(_bound(table, made.signals, reading), reading.get("rate"))
         except CasestError as error:
             since = f" (rows are counted from row {first} of the file)" if first else ""
             raise type(error)(f"{error}{since}") from None
     return made.run(reading.get("time_zero", "first"))
+
+
+def _made_by(parts: Callable[[], Iterable[Any]], name: str) -> Iterator[tuple[int, Table]]:
+    """The tables that a function of the user's makes."""
+    count = 0
+    try:
+        for part in parts():
+            table = table_of(part, f"{name}, part {count}")
+            count += 1
+            yield 0, table
+    except (CasestError, GeneratorExit):
+        raise
+    except Exception as error:  # whatever a function of the user's raises
+        text = (str(error) or type(error).__name__).splitlines()[0]
+        raise DataError(f"{name}, part {count}: {type(error).__name__}: {text}") from error
 
 
 def _batches(files: Sequence[File]) -> Iterator[tuple[int, Table]]:
@@ -96,9 +117,9 @@ class _Mapped:
     signals: tuple[Signal, ...]
     folder: Path
     total: int
-    columns: tuple[str, ...]
+    columns: tuple[str, ...] | None
     count: int = 0
-    rows: int = 0
+    files: int = 0
     values: dict[str, Any] = field(default_factory=dict)
     low: dict[str, Array] = field(default_factory=dict)
     high: dict[str, Array] = field(default_factory=dict)
@@ -111,11 +132,16 @@ class _Mapped:
     def take(self, run: Run, rate: float | None) -> None:
         """The samples of one batch."""
         where = slice(self.count, self.count + len(run))
+        if where.stop > self.total:
+            self._grow(where.stop)
         self.units, self.column_units = run.units, run.column_units
         self.notes.update(run.notes)
         for s in self.signals:
             if not is_time(s):
                 self._put(s.name, run.signals[s.name], where)
+        if self.columns is None:
+            numbers = {n for n, v in run.columns.items() if np.issubdtype(v.dtype, np.number)}
+            self.columns = tuple(n for n in run.columns if n in numbers)
         for name in self.columns:
             if name not in run.columns:
                 raise DataError(f"{run.file}: no column {name!r}, which an effect reads")
@@ -137,7 +163,8 @@ class _Mapped:
 
     def _made(self, name: str, size: int, kind: Any) -> Any:
         """A file for so many numbers of every sample, (size, total)."""
-        path, need = self.folder / str(len(self.values)), 8 * size * self.total
+        path, need = self.folder / str(self.files), 8 * size * self.total
+        self.files += 1
         try:
             with path.open("wb") as file:
                 file.truncate(need)
@@ -149,6 +176,15 @@ class _Mapped:
                 "TMPDIR names another folder"
             ) from None
         return np.memmap(path, kind, "r+", shape=(size, self.total))
+
+    def _grow(self, least: int) -> None:
+        """Room for more samples than were counted, of all that is there already."""
+        self.total = max(least, int(GROWS * self.total))
+        for name, old in self.values.items():
+            new = self._made(name, len(old), old.dtype)
+            new[:, : self.count] = old[:, : self.count]
+            self.values[name] = new
+            Path(old.filename).unlink()
 
     def _follow(self, run: Run, time: Array, where: slice) -> None:
         """Put the time, which must go on, and count the gaps."""
@@ -186,7 +222,7 @@ class _Mapped:
             time=None if time is None else time[:, 0], notes=self._said(),
         )  # fmt: skip
         run = run if block is None else replace(run, block=block[:, 0])
-        own = {name: found[f"column {name}"][:, 0] for name in self.columns}
+        own = {name: found[f"column {name}"][:, 0] for name in self.columns or ()}
         return replace(run, columns=own, column_units={n: self.column_units.get(n) for n in own})
 
     def _refuse_still(self, signal: Signal) -> None:

@@ -26,6 +26,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -33,6 +34,9 @@ from casest.engine.cache import kernel_folder, own_file
 from casest.engine.emit import source, source_of_sum, source_of_values
 from casest.engine.operations import Floats
 from casest.engine.replay import Columns, Entry, Replay
+
+T = TypeVar("T")
+U = TypeVar("U")
 
 #: A kernel is built for at least this many samples: below, compiling costs more than it saves.
 WORTHWHILE = 5_000
@@ -380,6 +384,11 @@ def by_workers(count: int | None) -> Iterator[None]:
         yield
     finally:
         _told.reset(before)
+
+
+def in_order(task: Callable[[T], U], items: Sequence[T]) -> Iterator[U]:
+    """What a task makes of each item, in their order, whoever works."""
+    return iter(map(task, items) if workers() == 1 else _threads(workers()).map(task, items))
 
 
 _told: ContextVar[int | None] = ContextVar("workers", default=None)

@@ -72,23 +72,32 @@ def told_by(problem: Problem, point: Point, bread: Array) -> Array:
 
 def _without_leverage(block: Block, bread: Array) -> Array:
     """(I − H)⁻¹r sample by sample: what the residual would be had the fit not seen it."""
-    moved = block.jacobian @ bread
-    leverage = moved @ block.jacobian.transpose(0, 2, 1)
-    if block.weights is not None:
-        leverage = leverage * block.weights[:, None, :]
+    J, root = block.jacobian, block.weights
+    moved = (J.reshape(-1, J.shape[2]) @ bread).reshape(J.shape)
+    own = np.einsum("nmk,nmk->nm", moved, J)
+    most = float(np.nanmax(np.sum(own if root is None else own * root, axis=1), initial=0.0))
     residual = block.residual
-    if np.nanmax(np.trace(leverage, axis1=1, axis2=2), initial=0.0) < 0.01:
-        # The geometric series: what is left out is below 1e-12.
+    if most < 0.01:
+        # The geometric series Σ HᵏR: what is left out is below 1e-12.
         term = residual
-        for _ in range(5):
-            term = np.einsum("nmk,nk->nm", leverage, term)
+        for _ in range(_terms(most)):
+            pull = np.einsum("nm,nmk->nk", term if root is None else term * root, J)
+            term = np.einsum("nmk,nk->nm", moved, pull)
             residual = residual + term
         return np.asarray(residual)
+    leverage = moved @ J.transpose(0, 2, 1)
+    if root is not None:
+        leverage = leverage * root[:, None, :]
     left = np.eye(residual.shape[1]) - np.where(np.isfinite(leverage), leverage, 0.0)
     # A residual that the fit follows entirely says nothing: keep the inverse finite.
     values, vectors = np.linalg.eigh(0.5 * (left + left.transpose(0, 2, 1)))
     inverse = (vectors / np.maximum(values, 1e-3)[:, None, :]) @ vectors.transpose(0, 2, 1)
     return np.asarray(np.einsum("nmk,nk->nm", inverse, residual))
+
+
+def _terms(most: float) -> int:
+    """Powers of a leverage until they are below 1e-12 of it, five at most."""
+    return next((k for k in range(5) if most ** (k + 1) < 1e-12), 5)
 
 
 def rounding(problem: Problem, point: Point) -> float:

@@ -105,6 +105,25 @@ class Detectable(Struct, frozen=True):
     unit: str
 
 
+class WholeScore(Struct, frozen=True):
+    """What a whole record says of a cause that was not added: the chance of as much in noise, the
+    share of the squares that it would take away, its sizes to first order."""
+
+    name: str
+    p_value: Number
+    share: Number
+    parameters: dict[str, Number]
+    std: dict[str, Number]
+
+
+class WholeRecord(Struct, frozen=True):
+    """Of a record that need not fit in memory: its samples, and one in how many was looked at."""
+
+    samples: int
+    looked_at_every: int
+    scores: list[WholeScore]
+
+
 class Closed(Fitted, frozen=True, kw_only=True, dict=True):
     """The content of `result.json` of `close`.
 
@@ -123,6 +142,7 @@ class Closed(Fitted, frozen=True, kw_only=True, dict=True):
     smallest_detectable: list[Detectable]
     refused: list[Explained]
     not_tried: list[Explained]
+    whole_record: WholeRecord | UnsetType = UNSET
     docs: dict[str, str]
     closing: Closing
 
