@@ -275,7 +275,10 @@ def test_an_effect_that_fails_is_named_by_effect_file_and_line(refused):
         ),
         (["--free", "gravty"], "has no 'gravty'; did you mean 'gravity'?"),
         (["--free", "mass"], "mass is a signal of model load-cell"),
-        (["--fix", "zero=1,2"], "zero of model load-cell: it takes one number, and a list of 2 is given"),
+        (
+            ["--fix", "zero=1,2"],
+            "zero of model load-cell: it takes one number, and a list of 2 is given",
+        ),
         (["--fix", "zero=1,x"], "--fix zero=1,x: not a number, a list 1,2,3 or rows 1,0;0,1"),
         (["--fix", "zero=1,2 volt-ish"], "--fix zero=1,2 volt-ish: "),
         (["--fix", "zero=@nowhere.json"], "nowhere.json: no such result"),

@@ -286,8 +286,11 @@ def test_a_value_of_a_result_of_another_form_names_both_and_the_way_out(
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["--fix", "scale=1,2"], "takes a 3 by 3 matrix, and a list of 2 is given; write 1,0,0;0"),
-        (["--start", "offset=1,2,3,4"], "takes a list of 3, and a list of 4 is given; write 1,2,3"),
+        (
+            ["--fix", "scale=1,2"],
+            "takes a 3 by 3 matrix (1,0,0;0,1,0;0,0,1), and a list of 2 is given",
+        ),
+        (["--start", "offset=1,2,3,4"], "takes a list of 3 (1,2,3), and a list of 4 is given"),
         (["--set", "norm=1,2"], "norm of model norm-triangular is one number, and a list of 2 is"),
     ],
 )

@@ -28,11 +28,11 @@ def in_words(dims: tuple[int, ...]) -> str:
 
 
 def _example(dims: tuple[int, ...]) -> str:
-    """How a value of a shape is written behind an option."""
+    """How a list or matrix is written, in brackets."""
     if len(dims) < 2:
-        return ",".join(str(k + 1) for k in range(dims[0] if dims else 1))
+        return f" ({','.join(str(k + 1) for k in range(dims[0]))})" if dims else ""
     rows = np.eye(dims[0], dims[-1])
-    return ";".join(",".join(f"{x:g}" for x in row) for row in rows)
+    return f" ({';'.join(','.join(f'{x:g}' for x in row) for row in rows)})"
 
 
 @dataclass(frozen=True)
@@ -76,8 +76,8 @@ class Shape:
             array = np.diag(array)
         if array.shape != self.dims:
             raise DeclarationError(
-                f"it takes {in_words(self.dims)}, and {in_words(array.shape)} is given; write "
-                f"{_example(self.dims)}"
+                f"it takes {in_words(self.dims)}{_example(self.dims)}, and "
+                f"{in_words(array.shape)} is given"
             )
         if self.kind == "lower" and np.any(np.triu(array, 1)):
             raise DeclarationError("a lower triangular value must have zeros above its diagonal")
