@@ -2,7 +2,8 @@
 
     make study-metrology-coverage       # python studies/metrology_coverage.py [TRIALS]
 
-Each trial draws the reference's error once, and the noise of each reading. Trials are kept in
+Each trial draws the reference's error once, and the noise of each reading. Of norm and load cell
+it also corrects twenty fresh readings, each with its standard deviation. Trials are kept in
 `out/metrology_coverage.jsonl`: interrupted, the study goes on where it stopped. The table is
 written to `studies/metrology_coverage.md`.
 """
@@ -11,6 +12,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,13 +20,31 @@ import numpy as np
 import resumed
 
 import casest as c
+from casest.correction import runtime
+from casest.correction.numpy_module import as_data
+from casest.correction.spread import slopes, spread_program
 from casest.engine.threads import one_thread
 from casest.leastsquares.stated import stated_noise
 from casest_problems.norm import norm_triangular
 
 ROOT = Path(__file__).resolve().parent.parent
 KEPT, TABLE = ROOT / "out" / "metrology_coverage.jsonl", ROOT / "studies" / "metrology_coverage.md"
-Fit = tuple[c.Estimate, dict[str, np.ndarray]]
+#: Fresh readings that a calibration corrects.
+FRESH = 20
+
+
+@dataclass(frozen=True)
+class World:
+    """A calibration, the true values, and fresh readings (FRESH, k) with what was true of them.
+
+    `corrected` undoes readings by the calibration's values; None where nothing is corrected.
+    """
+
+    found: c.Estimate
+    truth: dict[str, np.ndarray]
+    reading: np.ndarray | None = None
+    real: np.ndarray | None = None
+    corrected: Callable[[dict[str, np.ndarray], np.ndarray], np.ndarray] | None = None
 
 
 @c.model
@@ -53,23 +73,30 @@ def cell(
     gravity=c.constant(9.81, "m/s^2", std=0.01),
 ):
     """A load cell; each mass has an error of its own, and gravity one for all."""
-    return c.Residual(measured=reading, predicted=zero + gain * mass * gravity)
+    force = c.quantity("force", mass * gravity, "N")
+    return c.Residual(measured=reading, predicted=zero + gain * force, corrected=force)
 
 
-def norm(rng: np.random.Generator) -> Fit:
+def norm(rng: np.random.Generator) -> World:
     """Thirty poses, unequal axes, a length known to 0.1 %."""
     scale = np.array([[1, 0, 0], [0.02, 1.03, 0], [-0.01, 0.015, 0.98]])
     offset, std = np.array([0.3, -0.2, 0.1]), np.array([0.02, 0.05, 0.1])
-    u = rng.standard_normal((30, 3))
+    u = rng.standard_normal((30 + FRESH, 3))
     force = 9.81 * u / np.linalg.norm(u, axis=1)[:, None]
     v = force @ np.linalg.inv(scale).T + offset + std * rng.standard_normal(u.shape)
     known = c.constant(9.81 + 0.01 * rng.standard_normal(), std=0.01)
-    run = c.Run.raw("r", {"v": v}, units={"v": "1"})
+    run = c.Run.raw("r", {"v": v[:30]}, units={"v": "1"})
     model, runs = stated_noise(norm_triangular.having(norm=known), [run], {"v": [std]})
-    return c.attempt(model, runs), {"scale": scale, "offset": offset}
+    truth = {"scale": scale, "offset": offset}
+    return World(c.attempt(model, runs), truth, v[30:], force[30:], undone_norm)
 
 
-def wheel(rng: np.random.Generator) -> Fit:
+def undone_norm(values: dict[str, np.ndarray], v: np.ndarray) -> np.ndarray:
+    """scale · (v − offset)."""
+    return (v - values["offset"]) @ values["scale"].T
+
+
+def wheel(rng: np.random.Generator) -> World:
     """Ten seconds at 20 Hz; the offset along the radius rests on the radius."""
     t, std = np.arange(200) / 20, np.array([0.05, 0.1])
     angle = 0.4 + 5 * t
@@ -79,11 +106,11 @@ def wheel(rng: np.random.Generator) -> Fit:
     run = c.Run.raw("r", {"t": t[:, None], "v": v}, units={}, time=t)
     model, runs = stated_noise(turning.having(radius=known), [run], {"v": [std]})
     truth = {"rate": 5.0, "phase": 0.4, "offset": np.array([0.2, -0.1])}
-    return c.attempt(model, runs), truth
+    return World(c.attempt(model, runs), truth)
 
 
-def load_cell(rng: np.random.Generator) -> Fit:
-    """Eight masses, each known to 5 g, and readings to 0.05 mV."""
+def load_cell(rng: np.random.Generator) -> World:
+    """Eight masses, each known to 5 g, and readings to 0.05 mV; forces are what it is for."""
     mass = np.linspace(0, 5, 8)
     reading = 0.3 + 2 * mass * 9.81 + 0.05 * rng.standard_normal(8)
     told = mass + 0.005 * rng.standard_normal(8)
@@ -91,49 +118,82 @@ def load_cell(rng: np.random.Generator) -> Fit:
     run = c.Run.raw("r", {"mass": told[:, None], "reading": reading[:, None]}, units={})
     noise = {"mass": [np.full(1, 0.005)], "reading": [np.full(1, 0.05)]}
     model, runs = stated_noise(cell.having(gravity=known), [run], noise)
-    return c.attempt(model, runs), {"zero": 0.3, "gain": 2.0}
+    real = np.linspace(1, 45, FRESH)[:, None]
+    fresh = 0.3 + 2 * real + 0.05 * rng.standard_normal(real.shape)
+    truth = {"zero": 0.3, "gain": 2.0}
+    return World(c.attempt(model, runs), truth, fresh, real, undone_cell)
 
 
-SCENES: dict[str, Callable[[np.random.Generator], Fit]] = {
+def undone_cell(values: dict[str, np.ndarray], reading: np.ndarray) -> np.ndarray:
+    """The force."""
+    return (reading - values["zero"]) / values["gain"]
+
+
+#: Those that take longest last.
+SCENES: dict[str, Callable[[np.random.Generator], World]] = {
+    "load cell": load_cell,
     "norm": norm,
     "wheel": wheel,
-    "load cell": load_cell,
 }
 
 
 def trial(scene: str, seed: int) -> dict[str, Any]:
-    """Which intervals held the truth."""
+    """Which intervals held the truth: of each unknown, and how many of the corrected readings."""
     with one_thread():
-        found, truth = SCENES[scene](np.random.default_rng([seed, len(scene)]))
-        low, high = found.interval_reach
-    held = []
-    for name, true in truth.items():
-        away = np.asarray(true) - found.values[name]
-        free = found.std[name] > 0
-        held += ((away > -low[name]) & (away < high[name]))[free].tolist() if away.ndim else [
-            bool(-low[name] < away < high[name])
-        ]  # fmt: skip
-    trusted = found.certificate.trusted
-    return {"scene": scene, "seed": seed, "trusted": trusted, "held": sum(held), "of": len(held)}
+        world = SCENES[scene](np.random.default_rng([seed, len(scene)]))
+        low, high = world.found.interval_reach
+        fresh = corrected(world)
+    held = {}
+    for name, true in world.truth.items():
+        away = np.asarray(true) - world.found.values[name]
+        free = world.found.std[name] > 0
+        inside = (away > -np.asarray(low[name])) & (away < np.asarray(high[name]))
+        held[name] = np.atleast_1d(inside)[np.atleast_1d(free)].tolist()
+    trusted = world.found.certificate.trusted
+    return {"scene": scene, "seed": seed, "trusted": trusted, "held": held, "corrected": fresh}
+
+
+def corrected(world: World) -> list[int]:
+    """Corrected numbers whose 95 % interval by the standard deviation holds the truth, and all."""
+    if world.corrected is None:
+        return [0, 0]
+    got = world.corrected(world.found.values, world.reading)
+    program = spread_program(world.found, slopes(world.found, {}), {}, "corrected")
+    parts = runtime.attempted(as_data(program), np.hstack([world.reading, got]))
+    std = parts[:, -got.shape[1] :]
+    held = np.abs(got - world.real) < 1.959964 * std
+    return [int(held.sum()), held.size]
+
+
+def table(kept: list[dict[str, Any]]) -> list[str]:
+    """A line for each scene: intervals of unknowns, the worst of them, and corrected readings."""
+    rows = []
+    for scene in SCENES:
+        own = [r for r in kept if r["scene"] == scene]
+        good = [r for r in own if r["trusted"]]
+        each = np.array([[h for name in r["held"].values() for h in name] for r in good], float)
+        share = 100 * each.mean(axis=0) if len(good) else np.full(1, np.nan)
+        inside, of = np.sum([r["corrected"] for r in good] or [[0, 0]], axis=0)
+        fresh = f"{100 * inside / of:.1f} %" if of else "–"
+        rows.append(
+            f"| {scene} | {len(own)} | {len(good)} | {share.mean():.1f} % | "
+            f"{share.min():.1f}–{share.max():.1f} % | {fresh} |"
+        )
+    return rows
 
 
 def main(trials: int = 2000, workers: int = 1) -> None:
     """All trials that are not kept yet, then the table."""
     known = {(r["scene"], r["seed"]) for r in resumed.kept(KEPT)}
-    left = [(s, k) for k in range(trials) for s in SCENES if (s, k) not in known]
+    left = [(s, k) for s in SCENES for k in range(trials) if (s, k) not in known]
     if left:
         resumed.done(trial, left, KEPT, workers)
-    rows = []
-    for scene in SCENES:
-        own = [r for r in resumed.kept(KEPT) if r["scene"] == scene]
-        good = [r for r in own if r["trusted"]]
-        share = 100 * sum(r["held"] for r in good) / max(sum(r["of"] for r in good), 1)
-        rows.append(f"| {scene} | {len(own)} | {len(good)} | {share:.1f} % |")
     TABLE.write_text(
         "# Coverage with uncertain references and inputs\n\n"
         "Made by `make study-metrology-coverage`; every trial draws the reference's error anew.\n\n"
-        "| what | trials | trusted | 95 % intervals that held the truth |\n"
-        "| --- | --- | --- | --- |\n" + "\n".join(rows) + "\n",
+        "| what | trials | trusted | 95 % intervals that held the truth | of single unknowns "
+        f"| of readings corrected, {FRESH} fresh ones each |\n"
+        "| --- | --- | --- | --- | --- | --- |\n" + "\n".join(table(resumed.kept(KEPT))) + "\n",
         encoding="utf-8",
     )
 

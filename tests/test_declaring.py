@@ -162,7 +162,10 @@ def test_a_constant_may_be_an_array():
         (lambda: param("V", bounds=3), "bounds 3 are not a pair (lower, upper)"),
         (lambda: param("V", start=5, bounds=(0, 1)), "start 5 is outside bounds (0, 1)"),
         (lambda: param(3, ("V", "A")), "2 units for 3 entries: give one, or one each"),
-        (lambda: param(3, start=[1.0, 2.0]), "a value of shape (2,) does not fit shape (3,)"),
+        (
+            lambda: param(3, start=[1.0, 2.0]),
+            "it takes a list of 3 (1,2,3), and a list of 2 is given",
+        ),
         (lambda: param(0), "shape (0,) is not a length or a pair of lengths"),
         (lambda: param((1, 2, 3)), "shape (1, 2, 3) is not a length or a pair of lengths"),
         (lambda: param(unit_vector, bounds=(0, 1)), "a unit parameter has no bounds"),

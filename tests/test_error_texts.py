@@ -263,3 +263,36 @@ def test_the_papers_algorithms_refuse_what_they_were_not_made_for():
     table = Run.raw("t", still, units={"a": "m/s^2", "attitude": None})
     with pytest.raises(NotTrusted, match="more than one solution"):
         rate_table.two_stage(rate_table.rate_table, [table])
+
+
+@pytest.mark.parametrize(
+    ("first", "then", "forms"),
+    [
+        ("norm-triangular", "norm-diagonal", ("a 3 by 3 matrix", "a list of 3")),
+        ("norm-diagonal", "norm-triangular", ("a list of 3", "a 3 by 3 matrix")),
+    ],
+)
+def test_a_value_of_a_result_of_another_form_names_both_and_the_way_out(
+    readings, tmp_path, capsys, first, then, forms
+):
+    out = tmp_path / first
+    assert run(["calibrate", first, str(readings), *G, "-o", str(out)]) == 0
+    error = failing(capsys, "calibrate", then, readings, *G, "--fix", f"scale=@{out}")
+    there, here = forms
+    assert f"--fix scale=@{out}: scale of {first} is {there}, that of {then} {here}" in error
+    assert f"calibrate with {first}, or type the numbers that you mean" in error
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (
+            ["--fix", "scale=1,2"],
+            "takes a 3 by 3 matrix (1,0,0;0,1,0;0,0,1), and a list of 2 is given",
+        ),
+        (["--start", "offset=1,2,3,4"], "takes a list of 3 (1,2,3), and a list of 4 is given"),
+        (["--set", "norm=1,2"], "norm of model norm-triangular is one number, and a list of 2 is"),
+    ],
+)
+def test_a_typed_value_of_the_wrong_form_shows_how_it_is_written(readings, capsys, words, said):
+    assert said in failing(capsys, "calibrate", "norm-triangular", readings, *words)

@@ -340,7 +340,34 @@ def test_a_measured_ardupilot_log_is_what_another_reader_decoded(shared_data, na
         )
         np.testing.assert_array_equal(raw[rows], beside.columns[f"m_{axis}"].values)
         assert table.columns[f"Mag{axis.upper()}"].unit == "mgauss"
-    assert table.notes == (f"time of {name}: TimeMS",)
+    assert table.notes[0] == f"time of {name}: TimeMS"
+    corrected = [f"the topic {name}.raw is what the sensor read" in n for n in table.notes[1:]]
+    assert corrected == ([] if name == "MAG3" else [True])
+
+
+@pytest.mark.parametrize(("name", "number"), [("MAG", ""), ("MAG2", "2"), ("MAG3", "3")])
+def test_what_a_compass_read_gives_what_was_logged_by_the_autopilots_parameters(
+    shared_data, name, number
+):
+    """D·(reading + COMPASS_OFS), as AP_Compass corrects, is the logged number to its rounding."""
+    file = str(shared_data / LOG171 / "log171.bin")
+    log, given = DFReader.DFReader_binary(file), {}
+    while (message := log.recv_match(type="PARM")) is not None:
+        given[message.Name] = message.Value
+    log.filehandle.close()
+    of = {
+        what: [given[f"COMPASS_{what}{number}_{a}"] for a in "XYZ"]
+        for what in ("OFS", "DIA", "ODI")
+    }
+    (a, b, c), D = of["ODI"], np.diag(of["DIA"])
+    D += [[0, a, b], [a, 0, c], [b, c, 0]]
+    axes = ("MagX", "MagY", "MagZ")
+    read, logged = (read_table(f"{file}:{n}").columns for n in (f"{name}.raw", name))
+    reading = np.stack([read[a].values for a in axes], axis=1)
+    again = (reading + np.array(of["OFS"])) @ D.T
+    np.testing.assert_allclose(again, np.stack([logged[a].values for a in axes], axis=1), atol=1e-9)
+    assert "OfsX" not in read
+    assert read["MagX"].unit == "mgauss"
 
 
 @pytest.mark.parametrize("name", ["ATT", "GPS", "CURR", "BARO", "IMU2"])
@@ -416,7 +443,7 @@ MULTIPLIERS = {"F": 1e-6, "C": 1e-3, "0": 1.0, "-": 0.0, "G": 1e-7}
 
 def test_units_multipliers_and_instances_are_as_the_log_states_them(tmp_path):
     path = logs.dataflash(tmp_path / "a.bin", KINDS, UNITS, MULTIPLIERS)
-    assert "MAG[0] (MAG, 20), MAG[1] (MAG, 20), BAT (BAT, 40)" in error_of(path)
+    assert "MAG[0] (MAG, 20), MAG[1] (MAG, 20), BAT (40)" in error_of(path)
     assert "no topic MAG; did you mean" in error_of(f"{path}:MAG")
     table = read_table(f"{path}:MAG[1]")
     np.testing.assert_allclose(table.columns["MagX"].values, (100 + np.arange(20)) * 1e-3)
@@ -443,6 +470,84 @@ def test_an_ardupilot_log_is_calibrated(sensor, readings, tmp_path):
     words = ["calibrate", "norm-triangular", f"{path}:IMU", "--columns", "v=Acc", *G]
     assert run([*words, "-o", str(out)]) == 0
     assert_found(json.loads((out / "result.json").read_text(encoding="utf-8")), sensor)
+
+
+COMPASS = {
+    **{f"COMPASS_OFS_{a}": v for a, v in zip("XYZ", (12, -30, 5), strict=True)},
+    **{f"COMPASS_OFS2_{a}": v for a, v in zip("XYZ", (-80, 40, 60), strict=True)},
+    **{f"COMPASS_DIA2_{a}": v for a, v in zip("XYZ", (1.1, 0.95, 1.02), strict=True)},
+    **{f"COMPASS_ODI2_{a}": v for a, v in zip("XYZ", (0.02, -0.01, 0.03), strict=True)},
+}
+
+
+def compass_log(path, parameters, offset=(-80, 40, 60)):
+    """A log of today's form, in gauss, of the second compass; motors add (7, 8, -9) mGauss."""
+    rng = np.random.default_rng(5)
+    reading = 400 * rng.standard_normal((30, 3))
+    D = np.array([[1.1, 0.02, -0.01], [0.02, 0.95, 0.03], [-0.01, 0.03, 1.02]])
+    logged = (reading + np.array([-80, 40, 60])) @ D + np.array([7, 8, -9])
+    rows = [(k * 100_000, 1, *logged[k], *offset, 7, 8, -9) for k in range(30)]
+    axes = [f"{what}{a}" for what in ("Mag", "Ofs", "MO") for a in "XYZ"]
+    kinds = {
+        "PARM": ("QNf", "TimeUS,Name,Value", "s--", "F--",
+                 [(k, name.encode(), float(v)) for k, (name, v) in enumerate(parameters)]),
+        "MAG": ("QBfffffffff", f"TimeUS,I,{','.join(axes)}", "s#" + 9 * "G", "F-" + 9 * "C", rows),
+    }  # fmt: skip
+    return logs.dataflash(path, kinds, UNITS, MULTIPLIERS), reading
+
+
+def test_motors_and_a_matrix_are_taken_off_a_compass_in_gauss(tmp_path):
+    path, reading = compass_log(tmp_path / "a.bin", COMPASS.items())
+    table = read_table(f"{path}:MAG[1].raw")
+    found = np.stack([table.columns[f"Mag{a}"].values for a in "XYZ"], axis=1)
+    np.testing.assert_allclose(found, 1e-3 * reading, atol=1e-7)
+    assert "what motors add, the matrix COMPASS_DIA and ODI taken off" in table.notes[-1]
+
+
+def test_where_a_log_does_not_tell_what_a_compass_read_that_is_said(tmp_path):
+    anew = [*COMPASS.items(), ("COMPASS_DIA2_X", 1.2)]
+    path = compass_log(tmp_path / "a.bin", anew)[0]
+    assert "COMPASS_DIA2_X was set anew within the log, from 1.1 to 1.2" in error_of(
+        f"{path}:MAG.raw"
+    )
+    assert "MAG.raw is what the sensor read" in read_table(f"{path}:MAG").notes[-1]
+    path = compass_log(tmp_path / "b.bin", COMPASS.items(), offset=(1, 2, 3))[0]
+    assert "offsets 1, 2, 3 are not those of one compass" in error_of(f"{path}:MAG.raw")
+    path = logs.dataflash(tmp_path / "c.bin", KINDS, UNITS, MULTIPLIERS)
+    assert "name BAT" in error_of(f"{path}:BAT.raw")
+
+
+def test_parameters_for_an_autopilot_are_not_made_of_readings_it_had_corrected(
+    sensor, readings, tmp_path, capsys
+):
+    turned = [(20_000 * k, *(50 * row), 30, 0, 0) for k, row in enumerate(readings)]
+    fields = "TimeUS,MagX,MagY,MagZ,OfsX,OfsY,OfsZ"
+    rows = {"MAG": ("Qffffff", fields, "sGGGGGG", "FCCCCCC", turned)}
+    path = logs.dataflash(tmp_path / "a.bin", rows, UNITS, MULTIPLIERS)
+    norm = ["--set", "norm=490 mgauss"]
+    found = {}
+    for topic in ("MAG", "MAG.raw"):
+        words = ["calibrate", "norm-triangular", f"{path}:{topic}", "--columns", "v=Mag", *norm]
+        assert run([*words, "-o", str(tmp_path / topic)]) == 0
+        found[topic] = run(
+            ["export", str(tmp_path / topic), "--to", "ardupilot", "-o", str(tmp_path / "c.param")]
+        )
+    assert found == {"MAG": 1, "MAG.raw": 0}
+    assert (
+        "corrected them, with OfsX 0.03; its parameters are for what the sensor reads"
+        in capsys.readouterr().err
+    )
+    for topic, code in (("MAG", 1), ("MAG.raw", 0)):
+        for words in (["apply"], ["check", *norm]):
+            given = [
+                words[0],
+                str(tmp_path / "c.param"),
+                f"{path}:{topic}",
+                "--columns",
+                "m=Mag",
+                *words[1:],
+            ]
+            assert run(given) == code, given
 
 
 def test_a_cut_ardupilot_log_is_read_as_far_as_it_goes_and_garbage_is_skipped(tmp_path, capfd):

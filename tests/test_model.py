@@ -293,8 +293,11 @@ def test_a_unit_of_another_dimension_is_refused(change):
     [
         ({"radios": 1.0}, "model wheel has no 'radios'; did you mean 'radius'?"),
         ({"v": 1.0}, "v is a signal of model wheel: data give it"),
-        ({"offset": [1.0, 2.0]}, "offset of model wheel: a value of shape (2,) does not fit"),
-        ({"radius": [1.0, 2.0]}, "radius has shape (), not (2,)"),
+        (
+            {"offset": [1.0, 2.0]},
+            "offset of model wheel: it takes a list of 3 (1,2,3), and a list of 2",
+        ),
+        ({"radius": [1.0, 2.0]}, "radius of model wheel is one number, and a list of 2 is given"),
     ],
 )
 def test_a_change_that_does_not_fit_is_refused_by_name(change, words):

@@ -104,7 +104,8 @@ def test_the_page_shows_what_differs_before_the_rest(line, tmp_path):
     assert titles == ["What differs", "All numbers", "Intervals", "The results"]
     data = json.loads(re.search(r'id="data">(.*?)</script>', text, re.DOTALL)[1])
     first, rest = data["figures"]
-    assert [p["y"]["label"] for p in first["panels"]] == ["offset[2]"]
+    assert [p["title"].partition(" ")[0] for p in first["panels"]] == ["offset[2]"]
+    assert {p["y"]["label"] for p in first["panels"]} == {"value"}  # the title has the name
     assert len(rest["panels"]) == 5
     links = re.findall(r'<a href="([^"#]+report.html)"', text)
     assert all((tmp_path / link).is_file() for link in links)

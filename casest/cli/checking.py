@@ -10,12 +10,13 @@ from typing import TYPE_CHECKING
 
 from casest.cli.assignments import Assignment, Assignments
 from casest.cli.flags import flag, taking
-from casest.cli.options import DATA, FOLDER, RESULT, ReadingOptions
+from casest.cli.options import DATA, FOLDER, RESULT, ReadingOptions, SensorOptions
 from casest.cli.shared import commands, echo, progress, reported, typed, write
 from casest.errors import UsageError
 
 if TYPE_CHECKING:
     from casest.data.run import Run
+    from casest.declaration.model import Model
     from casest.validity.old import Old
 
 #: Exit code of a calibration that is valid no more.
@@ -27,6 +28,7 @@ class CheckOptions:
     """Options of `check`."""
 
     reading: ReadingOptions = field(default_factory=ReadingOptions)
+    sensors: SensorOptions = field(default_factory=SensorOptions)
     false_alarms: float = flag(
         0.001,
         "--false-alarms",
@@ -75,7 +77,7 @@ def check(result_path: Path, data: tuple[str, ...], options: CheckOptions) -> in
             f"--false-alarms {options.false_alarms:g}: a chance above 0 and below 0.5, as 0.001"
         )
     asked = _asked(result_path, data, options)
-    found = judge(asked.old, asked.records, options.false_alarms, say=progress)
+    found = judge(asked.old, asked.records, options.false_alarms, say=progress, models=asked.models)
 
     def again(name: str, hold: Sequence[str]) -> str:
         held = {parameter: asked.held(parameter) for parameter in hold}
@@ -104,11 +106,13 @@ def check(result_path: Path, data: tuple[str, ...], options: CheckOptions) -> in
 
 @dataclass(frozen=True, slots=True)
 class _Asked:
-    """What is judged: an old estimate and the new records; the command as it was `typed`, the
+    """What is judged: an old estimate and the new records, each with its own `models` where its
+    noise is stated; the command as it was `typed`, the
     calibration that `made` the estimate, or would have; how a parameter is `held` as it was."""
 
     old: Old
     records: list[tuple[Run, ...]]
+    models: list[Model]
     file: Path
     model: str
     typed: str
@@ -130,9 +134,12 @@ def _asked(path: Path, data: Sequence[str], options: CheckOptions) -> _Asked:
         raise UsageError(f"{path} is a result, and has its constants: leave --set out")
     old, result = saved.old_estimate(path)
     records = saved.new_records(old, result, data, options.reading.keywords())
+    given = options.sensors.stated or _said_before(path, result.reproduce.command)
+    models, records = _with_noise(old.model, records, given)
     return _Asked(
         old,
         records,
+        models,
         result_file(path),
         result.model,
         typed(),
@@ -141,6 +148,34 @@ def _asked(path: Path, data: Sequence[str], options: CheckOptions) -> _Asked:
         list(saved.remarks(result, data, records)),
         [saved.elsewhere(path, runs) for runs in records],
     )
+
+
+def _with_noise(
+    model: Model, records: Sequence[tuple[Run, ...]], given: Assignments
+) -> tuple[list[Model], list[tuple[Run, ...]]]:
+    """Each record with what was stated of its noise, and its model; no models where nothing was."""
+    from casest.interface.sensor_noise import with_sensor_noise
+
+    found = [with_sensor_noise(model, runs, given) for runs in records]
+    stated = any(m.noise is not None for m, _ in found)
+    return [m for m, _ in found] if stated else [], [runs for _, runs in found]
+
+
+def _said_before(path: Path, command: str) -> Assignments:
+    """What the command that made a result stated of the noise, if the result stands by it."""
+    from casest.cli.project import expanded
+    from casest.report.next_command import typed_words
+    from casest.saved.check import noise_stated
+
+    words = shlex.split(command)
+    if not noise_stated(path) or words[:1] != ["casest"]:
+        return ()
+    made = typed_words(shlex.join(["casest", *expanded(words[1:], commands)]))
+    options = made.options if made else ()
+    return tuple(
+        Assignment("--sensor-noise", text) for flag, text in options
+        if flag == "--sensor-noise" and text
+    )  # fmt: skip
 
 
 def _foreign(path: Path, data: Sequence[str], options: CheckOptions) -> _Asked:
@@ -158,12 +193,14 @@ def _foreign(path: Path, data: Sequence[str], options: CheckOptions) -> _Asked:
     sensor = foreign.foreign_sensor(path, arguments.get("columns") or {})
     old = foreign.foreign_estimate(sensor, declared_model(name, ModelOptions()), norm)
     records = foreign.foreign_records(sensor, old.model, data, arguments)
+    models, records = _with_noise(old.model, records, options.sensors.stated)
     notes = dict.fromkeys(note for runs in records for run in runs for note in run.notes)
     words = ["casest", "calibrate", name, *data]
     made = shlex.join([*words, *(w for c in options.constants for w in ("--set", c.text))])
     return _Asked(
         old,
         records,
+        models,
         path,
         name,
         foreign.renamed(typed(), sensor, old.model),

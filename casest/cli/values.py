@@ -9,7 +9,8 @@ import numpy as np
 
 from casest import units
 from casest.declaration.model import Model
-from casest.declaration.symbols import Constant, constant
+from casest.declaration.shapes import in_words
+from casest.declaration.symbols import Constant, Parameter, constant
 from casest.errors import CasestError, UsageError
 from casest.results.earlier import earlier_result
 
@@ -26,7 +27,7 @@ def parse_value(name: str, text: str, option: str, model: Model) -> Constant:
     """
     old: Any = model[name]  # raises, with a suggestion, where there is no such name
     if text.startswith("@"):
-        return earlier_result(text[1:], model, f"its {name}").constant(name)
+        return _of_result(name, text, option, model)
     if _PLUS_MINUS.search(text):
         return _uncertain(name, text, option, model)
     place = re.fullmatch(r"(gravity|field)\(([^()]*)\)", text.replace(" ", ""))
@@ -52,6 +53,20 @@ def parse_value(name: str, text: str, option: str, model: Model) -> Constant:
     except CasestError as error:
         raise type(error)(f"{option} {name}={text}: {error}") from None
     return _constant(array, stated)
+
+
+def _of_result(name: str, text: str, option: str, model: Model) -> Constant:
+    """A value of an earlier result, of the form that the model's has."""
+    earlier = earlier_result(text[1:], model, f"its {name}")
+    value, old = earlier.constant(name), model[name]
+    own = old.shape.dims if isinstance(old, Parameter) else value.array.shape
+    if value.array.ndim and value.array.shape != own:
+        raise UsageError(
+            f"{option} {name}={text}: {name} of {earlier.result.model} is "
+            f"{in_words(value.array.shape)}, that of {model.name} {in_words(own)}: calibrate with "
+            f"{earlier.result.model}, or type the numbers that you mean"
+        )
+    return value
 
 
 def _uncertain(name: str, text: str, option: str, model: Model) -> Constant:

@@ -15,7 +15,8 @@ gauss and gauss per kiloampere.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Literal, get_args
 
 import numpy as np
@@ -55,6 +56,22 @@ def written(sensors: Sequence[Affine], to: Format, origin: str) -> tuple[str, li
     first = "# Onboard parameters for Vehicle 1\n#\n"
     title = "#\n# Vehicle-Id Component-Id Name Value Type\n"
     return "".join([first, f"# {head}\n", title, *lines]), remarks
+
+
+def refuse_corrected(sensors: Sequence[Affine], columns: Mapping[str, Sequence[float]]) -> None:
+    """UsageError where a magnetometer's readings had the autopilot's own offsets in them.
+
+    `columns`: least and greatest of what was recorded beside the readings; a log of ArduPilot has
+    the offsets that were added there. A file for the autopilot corrects what the sensor reads.
+    """
+    if all(s.kind != "magnetometer" for s in sensors):
+        return
+    for name, ends in columns.items():
+        if re.fullmatch(r"(.*\.)?Ofs[XYZ]", name) and any(ends):
+            raise UsageError(
+                f"the readings are as the autopilot corrected them, with {name} {ends[0]:g}; its "
+                "parameters are for what the sensor reads: take that, as in log.bin:MAG.raw"
+            )
 
 
 def _type(value: float | int) -> int:

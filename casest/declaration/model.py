@@ -35,7 +35,7 @@ from casest.declaration.noise import Stated, in_units_of_noise
 from casest.declaration.physics import Quantity, Residual
 from casest.declaration.prior import Prior
 from casest.declaration.sampson import sampson
-from casest.declaration.shapes import Array
+from casest.declaration.shapes import Array, in_words
 from casest.declaration.symbols import Constant, Parameter, Scope, Signal, Symbol, constant, named
 from casest.declaration.tracing import (
     Traced,
@@ -234,7 +234,10 @@ class Model:
             known = uncertainty_of_coordinates(name, new, old)
             return replace(fixed, name=name, frozen=old, uncertainty=known)
         if new.array.shape != old.array.shape:
-            raise UsageError(f"{name} has shape {old.array.shape}, not {new.array.shape}")
+            raise UsageError(
+                f"{name} of model {self.name} is {in_words(old.array.shape)}, and "
+                f"{in_words(new.array.shape)} is given"
+            )
         like = old.like or (old.unit if "[" in old.unit and new.unit != old.unit else "")
         return replace(new, name=name, frozen=old.frozen, like=like)
 

@@ -20,6 +20,21 @@ Array = NDArray[np.float64]
 Kind = Literal["array", "lower", "unit", "rotation", "each"]
 
 
+def in_words(dims: tuple[int, ...]) -> str:
+    """One number, a list of 3, a 3 by 3 matrix."""
+    if len(dims) < 2:
+        return f"a list of {dims[0]}" if dims else "one number"
+    return f"a {' by '.join(map(str, dims))} matrix"
+
+
+def _example(dims: tuple[int, ...]) -> str:
+    """How a list or matrix is written, in brackets."""
+    if len(dims) < 2:
+        return f" ({','.join(str(k + 1) for k in range(dims[0]))})" if dims else ""
+    rows = np.eye(dims[0], dims[-1])
+    return f" ({';'.join(','.join(f'{x:g}' for x in row) for row in rows)})"
+
+
 @dataclass(frozen=True)
 class Shape:
     """Form of a parameter: `dims` is the shape of its value, `kind` its structure."""
@@ -60,7 +75,10 @@ class Shape:
         elif array.ndim == 1 and square and self.dims[0] == array.size:
             array = np.diag(array)
         if array.shape != self.dims:
-            raise DeclarationError(f"a value of shape {array.shape} does not fit shape {self.dims}")
+            raise DeclarationError(
+                f"it takes {in_words(self.dims)}{_example(self.dims)}, and "
+                f"{in_words(array.shape)} is given"
+            )
         if self.kind == "lower" and np.any(np.triu(array, 1)):
             raise DeclarationError("a lower triangular value must have zeros above its diagonal")
         array = self._on_the_set(array)

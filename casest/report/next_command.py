@@ -93,8 +93,9 @@ def recalibrating(command: str, fitted: str, data: str, held: Mapping[str, str])
     kept = [pair for pair in made.options if pair[0] in _MODEL and pair[0] != "--at-rest"]
     read = [pair for pair in typed.options if pair[0] in (*_READING, "--at-rest")]
     held_now = [("--fix", f"{name}={value}") for name, value in held.items()]
+    now, before = ([o for o in t.options if o[0] == "--sensor-noise"] for t in (typed, made))
     words = ["casest", "calibrate", made.arguments[0], data]
-    for flag, value in (*kept, *read, *held_now):
+    for flag, value in (*kept, *read, *held_now, *(now or before)):
         words += [flag] if value is None else [flag, value]
     return shlex.join(words)
 

@@ -34,7 +34,8 @@ class Tested(Struct, frozen=True):
 
 
 class NoiseTested(Struct, frozen=True):
-    """The noise before and now, and the chance of as much where it is at most a tenth larger."""
+    """The noise before (or as it was `stated` of the record) and now, and the chance of as much
+    where it is at most a tenth larger."""
 
     before: Number
     now: Number
@@ -43,6 +44,7 @@ class NoiseTested(Struct, frozen=True):
     p_value: Number
     level: float
     another_colour: bool
+    stated: bool = False
 
 
 class Changed(Struct, frozen=True):
@@ -221,13 +223,14 @@ def _dated(
             level,
         ),
         noise=NoiseTested(
-            plain(found.old.sigma),
-            plain(noise.sigma if np.isnan(noise.ratio) else found.old.sigma * noise.ratio),
+            plain(noise.expected),
+            plain(noise.sigma if np.isnan(noise.ratio) else noise.expected * noise.ratio),
             plain(noise.ratio),
             units["residual"],
             plain(noise.p_value),
             level,
             bool(noise.coloured),
+            date.subject.old.model.noise is not None,
         ),
         changed=[
             Changed(m.name, m.before, m.after, plain(m.std), plain(m.std_before),

@@ -19,8 +19,9 @@ def reasons(date: Dated) -> Iterator[str]:
     if noise.ratio is None:
         yield f"the noise: {noise.now:.3g}{unit}; nothing is known of it before"
     else:
+        that = "as stated" if noise.stated else "that of the calibration"
         yield (
-            f"the noise: {noise.now:.3g}{unit}, {noise.ratio:.2f} times that of the calibration: "
+            f"the noise: {noise.now:.3g}{unit}, {noise.ratio:.2f} times {that}: "
             f"p = {noise.p_value:.2g}; an alarm below {noise.level:.2g}"
         )
     if noise.another_colour:

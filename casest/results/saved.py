@@ -66,6 +66,7 @@ class SavedResult(Struct, frozen=True, kw_only=True):
     after: _Section | UnsetType = UNSET
     innovations: Any = None
     correction: dict[str, Any] | None = None
+    conditions: dict[str, list[float]] = {}
     reproduce: _Reproduced = _Reproduced()
 
     @property

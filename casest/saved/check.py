@@ -21,7 +21,7 @@ from casest.results.saved import SavedResult
 from casest.saved.apply import MARGIN, fitted_unit
 from casest.saved.model import of_other_records
 from casest.validity.colour import Colour, autoregressive
-from casest.validity.old import Old
+from casest.validity.old import STATED, Old
 
 
 class _Correlation(Struct, frozen=True):
@@ -36,6 +36,7 @@ class _Section(Struct, frozen=True):
 
 class _Noise(Struct, frozen=True):
     sigma: list[float | None]
+    stated: float | None = None
     degrees_of_freedom: int = 0
     correlated_over_samples: float | None = None
 
@@ -77,16 +78,29 @@ def old_estimate(path: Path) -> tuple[Old, SavedResult]:
     model, values = of_other_records(content)
     sigma = np.array([s for s in more.noise.sigma if s is not None], float)
     over = max(more.noise.correlated_over_samples or 1.0, 1.0)
+    known = is_stated(more.noise)
     old = Old(
         model,
         values,
         tuple(correlation.names),
         _covariance(correlation, where),
         float(np.sqrt(np.mean(sigma**2))) if sigma.size else 0.0,
-        more.noise.degrees_of_freedom / over,
+        STATED if known else more.noise.degrees_of_freedom / over,
         _colour(more, over, len(model.axes)),
     )
     return old, result
+
+
+def is_stated(noise: _Noise) -> bool:
+    """Is the noise of a result the one that was stated of it? A residual that was larger is not."""
+    sigma = np.array([s for s in noise.sigma if s is not None], float)
+    own = np.sqrt(np.mean(sigma**2)) if sigma.size else np.nan
+    return noise.stated is not None and bool(np.isclose(own, noise.stated))
+
+
+def noise_stated(path: Path) -> bool:
+    """Was the noise of a saved result stated, and the residual no larger?"""
+    return is_stated(typed(load_result(path), _Judging, str(result_file(path))).noise)
 
 
 def _covariance(correlation: _Correlation, where: str) -> Array:

@@ -12,6 +12,7 @@ import numpy as np
 
 from casest import units
 from casest.correction.affine import SI, Affine
+from casest.correction.formats import refuse_corrected
 from casest.correction.formats_read import chosen, sensors_read
 from casest.data import load_runs
 from casest.data.run import Run
@@ -19,6 +20,7 @@ from casest.declaration.model import Model
 from casest.declaration.shapes import Array
 from casest.declaration.symbols import Constant, constant
 from casest.errors import UsageError
+from casest.results.fitted import ranges
 from casest.validity.old import Old
 
 #: What such a file leaves open.
@@ -63,7 +65,10 @@ def foreign_records(
         given = own.get(key) or {}
         own[key] = {reading.name if n == sensor.signal else n: v for n, v in given.items()}
     known = [replace(reading, unit=SI[sensor.kind])]
-    return [load_runs([name], known, **own) for name in data]
+    found = [load_runs([name], known, **own) for name in data]
+    for runs in found:
+        refuse_corrected([sensor], ranges(runs))
+    return found
 
 
 def renamed(command: str, sensor: Affine, model: Model) -> str:

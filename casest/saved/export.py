@@ -16,7 +16,7 @@ from casest.correction import runtime
 from casest.correction.affine import program_of, sensors_of
 from casest.correction.c import c_source
 from casest.correction.carried import Carried
-from casest.correction.formats import Format, written
+from casest.correction.formats import Format, refuse_corrected, written
 from casest.correction.formats_read import YAML, chosen, sensors_read
 from casest.correction.inverse import LEFT
 from casest.correction.numpy_module import as_data, python_source
@@ -28,6 +28,7 @@ from casest.declaration.symbols import Signal
 from casest.errors import DataError, UsageError
 from casest.escaping import c_identifier
 from casest.results.file import load_json
+from casest.results.fitted import ranges
 from casest.results.saved import SavedResult, saved_correction
 from casest.saved.apply import (
     Applied,
@@ -90,6 +91,7 @@ def exported_as(
         if wanted not in kinds:
             raise UsageError(f"--sensor {wanted}: the result has {', '.join(kinds)}")
     kept = [s for s in found if not sensors or s.kind in sensors]
+    refuse_corrected(kept, result.conditions)
     text, remarks = written(kept, to, f"{result.model}, {', '.join(result.data)}")
     if bound.left:
         remarks.append(f"{LEFT}{', '.join(bound.left)}")
@@ -182,6 +184,7 @@ def applied_foreign(path: Path, data: str, arguments: Mapping[str, Any]) -> Appl
     built = program_of(sensors)
     signals = [Signal(i.name, i.size, i.unit, i.kind) for i in built.inputs]
     runs = load_runs([data], signals, **arguments)
+    refuse_corrected(sensors, ranges(runs))
     found = [corrected(built, run) for run in runs]
     unit = built.output.unit or None
     text = table_of(runs, [s.name for s in signals], found, built.output.name, unit)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 from casest.data.run import Run
+from casest.declaration.model import Model
 from casest.validity.changes import Change, changed
 from casest.validity.chart import Chart, chart
 from casest.validity.judged import Subject, Test, judged, subject_of
@@ -65,17 +66,19 @@ def check(
     records: Sequence[tuple[Run, ...]],
     level: float = 1e-3,
     say: Callable[[str], None] = lambda text: None,
+    models: Sequence[Model] = (),
 ) -> Check:
     """Judge the records of one or several dates, each by itself, and all of them by a chart.
 
     `level`: chance of a false alarm at a date. Half of it is the parameters' and half the noise's;
-    with several dates the chart has a half of it all.
+    with several dates the chart has a half of it all. `models`: that of each record, where what
+    its noise is was stated (`stated_noise`).
     """
     own = level / 2 if len(records) > 1 else level
     dates = []
-    for runs in records:
+    for k, runs in enumerate(records):
         say(f"asking {runs[0].file or runs[0].name}")
-        dates.append(_date(old, runs, own))
+        dates.append(_date(replace(old, model=models[k]) if models else old, runs, own))
     return Check(old, level, tuple(dates), chart([d.subject for d in dates], level / 2))
 
 

@@ -20,10 +20,11 @@ from casest.errors import UsageError
 from casest.estimate.covariance import inverse_normal
 from casest.estimate.held_out import per_run, with_own
 from casest.leastsquares.problem import Point, Problem
+from casest.leastsquares.stated import UNLIKELY, at_true_values
 from casest.leastsquares.sums import some_residuals
 from casest.leastsquares.weights import weighted
 from casest.validity.colour import spectrum_of
-from casest.validity.old import Old
+from casest.validity.old import STATED, Old
 from casest.validity.whitened import Factor, Whitened
 
 #: Degrees of freedom from which on a record's noise is known from itself; with fewer it is that of
@@ -39,9 +40,10 @@ SEEN = 1e-8
 
 @dataclass(frozen=True)
 class Noise:
-    """The new record's noise: standard deviation, its ratio to the old one, and the chance of a
-    ratio as large while nothing changed; `freedom` of what judges the parameters. `known_by` is
-    what the old covariance grows by, where both records together say how large the noise is.
+    """The new record's noise: standard deviation, its ratio to the `expected` one (the old one, or
+    the one that was stated of this record), and the chance of a ratio as large while nothing
+    changed; `freedom` of what judges the parameters. `known_by` is what the old covariance grows
+    by, where both records together say how large the noise is.
     """
 
     sigma: float
@@ -50,6 +52,7 @@ class Noise:
     coloured: bool
     freedom: float
     known_by: float | None = None
+    expected: float = float("nan")
 
 
 @dataclass(frozen=True)
@@ -101,6 +104,8 @@ def subject_of(old: Old, runs: tuple[Run, ...]) -> Subject:
         kept = {name: value for name, value in values.items() if name not in own}
         values = with_own(old.model, kept, runs)
     problem = weighted(Problem(old.model, runs), values)
+    if old.model.noise is not None:
+        problem = at_true_values(problem, problem.point(values))
     covariance, loose = old.shared(problem)
     if loose.all():
         raise UsageError(
@@ -110,7 +115,10 @@ def subject_of(old: Old, runs: tuple[Run, ...]) -> Subject:
     free = np.eye(problem.unknowns)[:, loose]
     rows = Whitened(problem, old.colour, np.ones(len(problem.model.axes)))
     everything, _ = rows.fitted(problem.point(values), np.eye(problem.unknowns))
-    rows = rows.with_own_axes(everything)
+    if old.model.noise is None:
+        rows = rows.with_own_axes(everything)
+    else:  # what the noise makes of each residual is known, and the axes' with it
+        rows = replace(rows, problem=at_true_values(problem, everything))
     everything, there = rows.fitted(everything, np.eye(problem.unknowns))
     noise = _noise(old, rows, everything, there)
     if noise.coloured:
@@ -129,6 +137,8 @@ def _noise(old: Old, rows: Whitened, point: Point, there: Factor) -> Noise:
     left = problem.residual_count - _rank(there.R)
     correlation, count = rows.neighbours(point)
     coloured = count >= ENOUGH and correlation > max(ALIKE, 4 / np.sqrt(count))
+    if problem.noise_scale is not None:
+        return _by_stated(problem.noise_scale, there.rest, left, coloured)
     if left <= 0:
         if np.isnan(old.sigma):
             raise UsageError(
@@ -136,7 +146,7 @@ def _noise(old: Old, rows: Whitened, point: Point, there: Factor) -> Noise:
                 f"{problem.unknowns} unknowns say nothing of the noise, and nor does the old "
                 "calibration: more readings are needed"
             )
-        return Noise(old.sigma, 1.0, 1.0, coloured, old.freedom)
+        return Noise(old.sigma, 1.0, 1.0, coloured, old.freedom, expected=old.sigma)
     sigma = there.rest / np.sqrt(left)
     if not old.sigma > 0:
         return Noise(sigma, np.nan, 1.0, coloured, float(left))
@@ -145,11 +155,24 @@ def _noise(old: Old, rows: Whitened, point: Point, there: Factor) -> Noise:
     known = max(old.freedom * tails, 1.0)
     p = float(fdtrc(max(left * tails, 1.0), known, (ratio / LOUDER) ** 2))
     if left >= ENOUGH or p < 1e-3 or ratio < 1e-3:
-        return Noise(sigma, ratio, p, coloured, float(left))
+        return Noise(sigma, ratio, p, coloured, float(left), expected=old.sigma)
     together = left + old.freedom
     pooled = np.sqrt((left * sigma**2 + old.freedom * old.sigma**2) / together)
     known_by = float(pooled / old.sigma) ** 2
-    return Noise(float(pooled), ratio, p, coloured, float(together), known_by)
+    return Noise(float(pooled), ratio, p, coloured, float(together), known_by, old.sigma)
+
+
+def _by_stated(scale: float, rest: float, left: int, coloured: bool) -> Noise:
+    """As it was stated, unless a fit of everything leaves more than that by more than chance."""
+    from scipy.special import chdtrc
+
+    if left <= 0:
+        return Noise(scale, 1.0, 1.0, coloured, STATED, expected=scale)
+    ratio = rest / np.sqrt(left) / scale
+    p = float(chdtrc(left, left * (ratio / LOUDER) ** 2))
+    if p < UNLIKELY:
+        return Noise(ratio * scale, ratio, p, coloured, float(left), expected=scale)
+    return Noise(scale, ratio, p, coloured, STATED, expected=scale)
 
 
 def _tails(problem: Problem, point: Point) -> float:

@@ -14,6 +14,9 @@ from casest.declaration.shapes import Array
 from casest.leastsquares.problem import Problem
 from casest.validity.colour import Colour
 
+#: Degrees of freedom of noise that was stated.
+STATED = 1e9
+
 
 @dataclass(frozen=True)
 class Old:
@@ -21,7 +24,7 @@ class Old:
 
     `covariance` (n, n) of the unknowns `names`, NaN in those that nothing determined; `sigma` of
     one residual (NaN: unknown) with `freedom` degrees of it (in independent residuals), `colour` of
-    the noise.
+    the noise. `model` has a noise where that of a new record is stated.
     """
 
     model: Model

@@ -1,7 +1,8 @@
 """ArduPilot logs (DataFlash .bin), indexed by the library pymavlink.
 
 A topic is a type of message; where a log tells sensors of one type apart by a field (marked # in
-FMTU), each is a topic of its own: MAG[0], MAG[1].
+FMTU), each is a topic of its own: MAG[0], MAG[1]. MAG.raw holds a compass's readings before the
+autopilot corrected them.
 """
 
 from __future__ import annotations
@@ -20,6 +21,16 @@ from numpy.typing import NDArray
 
 from casest import units
 from casest.data.column import Column, numeric_column
+from casest.data.logs.compass import (
+    ADDED,
+    MILLIGAUSS,
+    RAW,
+    READING,
+    as_logged,
+    as_read,
+    compass_parameters,
+    is_compass,
+)
 from casest.data.logs.series import Series, Topic, chosen
 from casest.errors import CasestError, DataError, library
 
@@ -51,7 +62,7 @@ Records = NDArray[np.void]
 
 
 def read_ardupilot(file: Path, wanted: Sequence[str]) -> list[Series]:
-    """Read types of message of a log as topics: `MAG`, or `MAG[1]` of several sensors."""
+    """Read types of message of a log as topics: `MAG`, `MAG.raw`, `MAG[1]` of several sensors."""
     reader = library(_LIBRARY, "ardupilot", f"{file}: an ArduPilot log")
     try:
         with _silent():
@@ -118,15 +129,40 @@ def _topics(file: Path, log: Any, wanted: Sequence[str]) -> list[Series]:
         if _stamp(kind) and kind.name in log.name_to_id:
             for name, records in _instances(kind, _records(log, raw, kind)):
                 found[name] = (kind, records)
-    names = [_alias(found, name) for name in wanted]
+    names = [_alias(found, name.removesuffix(RAW)) for name in wanted]
     topics = [Topic(name, kind.name, len(records)) for name, (kind, records) in found.items()]
     notes = _unread(log, raw)
     series = []
-    for topic in chosen(file, topics, names):
+    for k, topic in enumerate(chosen(file, topics, names)):
         kind, records = found[topic.name]
-        series.append(_series(file, topic, kind, records, told.get(kind.type, []), notes))
+        one = _series(file, topic, kind, records, told.get(kind.type, []), notes)
+        before = k < len(wanted) and wanted[k].endswith(RAW)
+        series.append(_compass(file, one, log, raw, before=before))
         notes = []
     return series
+
+
+def _compass(file: Path, one: Series, log: Any, raw: NDArray[np.uint8], *, before: bool) -> Series:
+    """A compass's readings `before` the autopilot corrected them, or a note that it has."""
+    unit = next((c.unit for c in one.columns if c.name == READING[0] and c.unit), MILLIGAUSS)
+    factor = units.conversion(unit, MILLIGAUSS)[0]
+    fields = {c.name: factor * np.asarray(c.values, dtype=np.float64) for c in one.columns}
+    if not is_compass(fields):
+        if before:
+            raise DataError(
+                f"{file}: {one.topic}{RAW}: only readings of a compass beside what was added to "
+                f"them (OfsX, OfsY, OfsZ) have a topic {RAW}; name {one.topic}"
+            )
+        return one
+    number = log.name_to_id.get("PARM")
+    given = compass_parameters(_records(log, raw, log.formats[number]) if number else None)
+    if not before:
+        return replace(one, notes=[*one.notes, *as_logged(one.topic, fields, given)])
+    values, note = as_read(f"{file}: {one.topic}", fields, given)
+    own = dict(zip(READING, values.T / factor, strict=True))
+    kept = [c for c in one.columns if c.name not in ADDED]
+    columns = [replace(c, values=np.ascontiguousarray(own.get(c.name, c.values))) for c in kept]
+    return replace(one, columns=columns, notes=[*one.notes, note])
 
 
 def _stamp(kind: Any) -> str | None:

@@ -32,8 +32,9 @@ class Topic:
     count: int
 
     def __str__(self) -> str:
-        """Name, type and number of messages."""
-        return f"{self.name} ({self.kind}, {self.count})" if self.kind else self.name
+        """Name, type (where the name is not it) and number of messages."""
+        said = f"{self.kind}, {self.count}" if self.kind != self.name else f"{self.count}"
+        return f"{self.name} ({said})" if self.kind else self.name
 
 
 @dataclass(frozen=True)
@@ -98,7 +99,8 @@ def joined(file: Path, series: Sequence[Series]) -> Contents:
     time = slowest.time[kept]
     notes = [f"{one.topic}: {note}" for one in series for note in one.notes]
     if left := int((~kept).sum()):
-        notes.append(f"{left} samples of {slowest.topic} left out: another topic has none there")
+        many = "samples" if left > 1 else "sample"
+        notes.append(f"{left} {many} of {slowest.topic} left out: another topic has none there")
     columns = [_clock(time)]
     for one in series:
         columns += [_renamed(one.topic, column) for column in _at(one, time)]

@@ -138,19 +138,6 @@ def _effects(result: Closed) -> str:
             paragraph(f"{100 * left.fraction:.2g} % of the held-out variance: {left.where}."),
             *(paragraph(f"{w[0].upper()}{w[1:]}.") for w in words),
         ]
-    rows = [
-        [d.name, f"`{d.parameter}`", number(d.size), printed_unit(d.unit)]
-        for d in result.smallest_detectable
-    ]
-    if rows:
-        head = ["effect", "parameter", "smallest size", "unit"]
-        said.append(
-            details("The smallest effects that would have been seen", table(head, rows, [2]))
-        )
-    skipped = [[s.name, s.reason] for s in result.not_tried]
-    if skipped:
-        summary = f"Candidates that do not apply to this model or these data ({len(skipped)})"
-        said.append(details(summary, table(["candidate", "why"], skipped)))
     return section("effects", "Effects found", *said)
 
 
@@ -188,11 +175,14 @@ def _effect(e: Effect, result: Closed) -> str:
 
 
 def _value(p: Parameter) -> tuple[str, str]:
+    """Every number to two digits of its own standard deviation."""
     values, spreads = _list(p.value), _list(p.std)
-    if len(values) == 1 and values[0] is not None and spreads[0] is not None:
-        value, std = rounded(values[0], spreads[0])
-        return printed(value), printed(std)
-    return ", ".join(map(number, values)), ", ".join(map(number, spreads))
+    spreads = spreads if len(spreads) == len(values) else [None] * len(values)
+    pairs = [
+        (number(v), number(s)) if v is None or s is None else tuple(map(printed, rounded(v, s)))
+        for v, s in zip(values, spreads, strict=True)
+    ]
+    return ", ".join(v for v, _ in pairs), ", ".join(s for _, s in pairs)
 
 
 def _list(value: Any) -> list[Any]:
@@ -205,12 +195,18 @@ def _list(value: Any) -> list[Any]:
 
 
 def _invisible(result: Closed) -> str:
+    """What would not have shown, what would from which size on, what could not be asked."""
+    return section("invisible", "What stayed invisible", *_hidden(result), *_asked(result))
+
+
+def _hidden(result: Closed) -> Iterator[str]:
     hidden = result.invisible
     if not hidden:
         said = "Every effect of the catalogue that applies here would have shown at a typical size."
         if not result.smallest_detectable and not result.effects:
             said = "No effect of the catalogue applies here: nobody knows what stays invisible."
-        return section("invisible", "What stayed invisible", paragraph(said))
+        yield paragraph(said)
+        return
     rows = [
         [
             i.name + (f" ({i.column})" if i.column else ""),
@@ -220,12 +216,27 @@ def _invisible(result: Closed) -> str:
         ]
         for i in hidden
     ]
-    said = paragraph(
+    yield paragraph(
         "Each of these, of a typical size, would be taken over by the declared parameters: nothing "
         "would show in the residual, and the parameters would be wrong by as much as is written."
     )
     head = ["effect", "typical size", "would move", "the measurement that shows it"]
-    return section("invisible", "What stayed invisible", said, table(head, rows))
+    yield table(head, rows)
+
+
+def _asked(result: Closed) -> Iterator[str]:
+    """Each behind its heading: they are long."""
+    rows = [
+        [d.name, f"`{d.parameter}`", number(d.size), printed_unit(d.unit)]
+        for d in result.smallest_detectable
+    ]
+    if rows:
+        head = ["effect", "parameter", "smallest size", "unit"]
+        yield details("The smallest effects that would have been seen", table(head, rows, [2]))
+    skipped = [[s.name, s.reason] for s in result.not_tried]
+    if skipped:
+        summary = f"Candidates that do not apply to this model or these data ({len(skipped)})"
+        yield details(summary, table(["candidate", "why"], skipped))
 
 
 def _moves(would_move: Mapping[str, float], residuals: Residuals) -> str:

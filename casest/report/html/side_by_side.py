@@ -138,7 +138,7 @@ def _as_points(result: SideBySide, n: Across, figures: Figures) -> dict[str, Any
     series = figures.series("bars", "after", x, y=own["value"], low=own["low"],
                             high=own["high"], exact=True)  # fmt: skip
     across = axis(result.over or "result", "1", x.min(), x.max(), room=0.05)
-    upright = axis(n.name, n.unit, np.nanmin(own["low"]), np.nanmax(own["high"]), room=0.06)
+    upright = axis("value", n.unit, np.nanmin(own["low"]), np.nanmax(own["high"]), room=0.06)
     bands = []
     if n.mean is not None and n.mean_std:
         bands = [{"low": n.mean - 1.96 * n.mean_std, "high": n.mean + 1.96 * n.mean_std}]
