@@ -1,7 +1,7 @@
 """Measured houses whose heating was recorded as a temperature, not as power: what is refused.
 
 JulienLeprince/fiftyshadesofgrey (MIT): a network of two resistances and two capacities, fitted to
-four days, explains less than neighbouring rows share, whichever house and stretch; see the SOURCE.md of
+four days, explains less than neighbouring rows share, whichever house and stretch; see SOURCE.md of
 the record.
 """
 
