@@ -9,7 +9,10 @@ import pytest
 from scipy.integrate import solve_ivp
 from test_equations import GASOIL
 
+from casest import Run, attempt, calibrate_many
 from casest.cli import run
+from casest.errors import UsageError
+from casest.results.find import find_model
 
 SWING = """
 from casest import param, signal, sin
@@ -99,8 +102,64 @@ def test_what_is_asked_of_single_rows_is_refused_in_a_sentence(
     assert "of states that are followed" in said(["apply", result, data, "--with-std"], capsys)
     assert "there is nothing to correct" in said(["export", result, "--to", "c"], capsys)
     assert "Simulate a record" in said(["plan", result], capsys)
-    line = ["fleet", gasoil, str(tmp_path / "line"), "-o", str(tmp_path / "fleet")]
-    assert "give the records to one fit" in said(line, capsys)
+
+
+@pytest.fixture
+def line(tmp_path):
+    """Three reactors by SciPy, one reading missing; of a fourth times are out of order."""
+    t, rng, rows = np.linspace(0, 0.95, 20), np.random.default_rng(0), []
+    for k in range(4):
+        k1 = 11 + k
+
+        def slope(_, y, k1=k1):
+            return -(k1 + 1) * y[0] ** 2, k1 * y[0] ** 2 - 8 * y[1]
+
+        y = solve_ivp(slope, (0, t[-1]), (1, 0), "DOP853", t, rtol=1e-10, atol=1e-12).y
+        y += 0.003 * rng.standard_normal(y.shape)
+        rows.append({"sensor": f"R{k}", "t": t[: 20 - k].tolist(), "y1": y[0, : 20 - k].tolist(),
+                     "y2": y[1, : 20 - k].tolist()})  # fmt: skip
+    rows[1]["y1"][4] = None
+    rows[3]["t"][5] = rows[3]["t"][4]
+    pyarrow = pytest.importorskip("pyarrow")
+    pytest.importorskip("pyarrow.parquet").write_table(
+        pyarrow.Table.from_pylist(rows), tmp_path / "line.parquet"
+    )
+    return str(tmp_path / "line.parquet")
+
+
+def test_a_fleet_of_equations_is_calibrated_record_by_record(gasoil, line, tmp_path, capsys):
+    folder = tmp_path / "fleet"
+    words = ["fleet", gasoil, line, "--processes", "1", "-o", str(folder)]
+    assert run(words) == 0
+    assert "3 of 4 sensors trusted" in " ".join(capsys.readouterr().out.split())
+    parquet = pytest.importorskip("pyarrow.parquet")
+    found = parquet.read_table(folder / "results").to_pylist()
+    for k in range(3):
+        assert abs(found[k]["k1"] - 11 - k) < 4 * found[k]["k1_std"]
+        assert abs(found[k]["k2"] - 8) < 4 * found[k]["k2_std"]
+    assert found[3]["k1"] is None
+    assert "put the rows in order" in found[3]["reason"]
+    # What the sensors have in common is asked of rows that stand for themselves.
+    common = ["close", gasoil, line, "--sensor", "sensor"]
+    assert "give the records to one fit" in said(common, capsys)
+
+
+def test_one_record_of_a_fleet_is_fitted_as_by_itself(gasoil, shared_data):
+    """Both are the certified optimum; a louder sensor than is said to be sound is refused."""
+    model = find_model(gasoil)
+    table = np.loadtxt(shared_data / "certified/cops_gasoil.csv", delimiter=",", skiprows=1)
+    given = dict(zip(("t", "y1", "y2"), table.T[:, None, :], strict=True))
+    found = calibrate_many(model, given)
+    own = attempt(model, [Run.raw("r", {n: given[n][0][:, None] for n in ("y1", "y2")}, units={},
+                                  time=table[:, 0])])  # fmt: skip
+    assert found.trusted[0]
+    assert found.values["k1"][0] == own.values["k1"]
+    assert found.std["k1"][0] == own.std["k1"]
+    loud = calibrate_many(model, given, noise=1e-4)
+    assert not loud.trusted[0]
+    assert "larger than the noise=" in loud.reasons[0][0]
+    with pytest.raises(UsageError, match="needs the signal 't'"):
+        calibrate_many(model, {n: given[n] for n in ("y1", "y2")})
 
 
 def test_apply_follows_a_new_record_from_its_own_beginning(swing, tmp_path, capsys):

@@ -20,6 +20,7 @@ def fleet_closing(model_name: str, data: Sequence[str], options: CloseOptions) -
     from casest.cli.fleets import FleetOptions, planned
     from casest.diagnose.levels import LEVELS
     from casest.effects import CATALOGUE
+    from casest.fleet.calibrate_many import refuse_equations
     from casest.fleet.common import CHANCE
     from casest.report.text.fleet import common_text
     from casest.results.file import as_json
@@ -33,6 +34,7 @@ def fleet_closing(model_name: str, data: Sequence[str], options: CloseOptions) -
         )
     _, own, _ = asked_effects(options.model.effects)
     model = declared_model(model_name, replace(options.model, effects=()))
+    refuse_equations(model, "--sensor: what many have in common is asked of poses, not of")
     asked = FleetOptions(
         reading=options.reading,
         sensor=options.sensor or "sensor",

@@ -125,7 +125,7 @@ def fleet(model_name: str, dataset: str, options: FleetOptions) -> int:
 def planned(model: Model, dataset: str, options: FleetOptions) -> tuple[Plan, Job]:
     """The partitions of a data set, and what they have in common; all that can be refused is."""
     from casest.dataset.partitions import plan
-    from casest.fleet.calibrate_many import check_model
+    from casest.fleet.calibrate_many import check_model, refuse_equations
     from casest.results.file import versions
     from casest.results.fleet import known
     from casest.tasks.job import Job
@@ -148,9 +148,11 @@ def planned(model: Model, dataset: str, options: FleetOptions) -> tuple[Plan, Jo
             "of; give a folder beside it"
         )
     check_model(model)
+    if prior:
+        refuse_equations(model, "--prior: a fleet is no prior for")
     reading = read_options(options.reading)
     progress(f"looking through {dataset}")
-    found = plan(dataset, model.signals, reading, sensor=options.sensor, kept=options.keep)
+    found = plan(dataset, model.in_records, reading, sensor=options.sensor, kept=options.keep)
     computing = {name: v for name, v in versions().items() if name != "python"}
     units = units_of(model, found)
     job = Job(

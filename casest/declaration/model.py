@@ -141,6 +141,12 @@ class Model:
         return tuple(c for c in self.declared if isinstance(c, Constant))
 
     @property
+    def in_records(self) -> tuple[Signal, ...]:
+        """All that a record must hold: its signals, and of differential equations the time `t`."""
+        timed = not self.traced.integrates or any(s.name == "t" for s in self.signals)
+        return self.signals if timed else (*self.signals, Signal("t", 1, "s"))
+
+    @property
     def readings(self) -> tuple[Signal, ...]:
         """Signals of the body that carry noise: all but time and attitude, which are exact.
 

@@ -70,6 +70,12 @@ class Evidence:
         return _against(self, 0) is None and (little or not self.misfit)
 
     @property
+    def lacking(self) -> bool:
+        """Of what neighbouring readings share, is more left than a small rest?"""
+        found = self.scatter
+        return self.misfit and found is not None and found.explained < LITTLE_LEFT * found.resolved
+
+    @property
     def misfit(self) -> bool:
         """Is there something left that rows with nearly the same inputs share?"""
         found = self.scatter
@@ -86,6 +92,8 @@ def judged(problem: Problem, certificate: Certificate, evidence: Evidence | None
         return certificate.refused(Code.AMBIGUOUS, rival)
     if against := _against(evidence, others):
         return certificate.refused(Code.POOR_VALLEY, against)
+    if problem.model.traced.integrates and evidence.lacking:
+        return certificate.refused(Code.POOR_VALLEY, _undriven(evidence))
     found = evidence.search
     if found is not None:
         more = (
@@ -131,6 +139,22 @@ def _against(evidence: Evidence, agreeing: int) -> str | None:
     return (
         f"no better than chance: {looked.valleys} valleys were seen, and the best explains "
         f"{100 * max(found.explained, 0.0):.0f} % of the readings' variance; {advice}"
+    )
+
+
+def _undriven(evidence: Evidence) -> str:
+    """Equations without driving noise that leave a course: one like it would move every constant.
+
+    Standard deviations of a misfit hold where it has nothing to do with what drives the states;
+    a course as large as this is another input, or another term.
+    """
+    found = evidence.scatter
+    assert found is not None
+    return (
+        f"the equations explain {100 * max(found.explained, 0.0):.0f} % of the readings' variance, "
+        f"of which neighbouring readings share {100 * found.resolved:.0f} %: a term or an input is "
+        "missing, and no interval of a constant would hold; measure what drives the states, or "
+        "add the term (casest close looks for it)"
     )
 
 

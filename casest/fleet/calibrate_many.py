@@ -22,11 +22,13 @@ from casest.declaration.symbols import Parameter
 from casest.engine.threads import one_thread
 from casest.errors import DataError, UsageError
 from casest.estimate.calibrate import attempt
+from casest.estimate.estimate import Estimate
 from casest.estimate.reasons import Code
 from casest.estimate.valley import searchable
 from casest.fleet.fit import Bounds, Places, minimise, padded
 from casest.fleet.judge import Judge
 from casest.fleet.outlying import outlying
+from casest.fleet.records import Records
 from casest.fleet.sums import NARROWEST, Sensors, Squares, widest
 from casest.fleet.valley import Doubt, Ended
 from casest.fleet.verdicts import Verdicts
@@ -97,6 +99,10 @@ def calibrate_many(
     that many do (`model.starting(…, many=…)`: the shipped norm models), else from the declared
     values; bounds that the model computes from data are then asked for sensor by sensor, in Python.
 
+    Of a model of differential equations each sensor is calibrated alone: `signals` has their times
+    too, as `t` (S, N), in s where the model has no such signal; readings may be missing (NaN); and
+    `start` gives plain values.
+
     Standard deviations and covariances are of JᵀJ at the solution or at most a tenth of a standard
     deviation from it: a fit that is as near takes its last step without summing JᵀJ again.
 
@@ -117,8 +123,11 @@ def calibrate_many(
     check_model(model)
     readings, lengths = checked(model, signals, counts)
     size, samples = readings[0].shape[:2]
-    job = _Job(model, readings, lengths, start or model.starter_of_many, noise)
     result = _Result.empty(model, size, misfit)
+    if model.traced.integrates:
+        _each_alone(Records(model, readings, lengths, start, noise), result)
+        return result.batch(model)
+    job = _Job(model, readings, lengths, start or model.starter_of_many, noise)
     width = widest(samples)
     with np.errstate(all="ignore"), one_thread():
         for first in range(0, size, width):
@@ -128,35 +137,48 @@ def calibrate_many(
     return result.batch(model)
 
 
+def _each_alone(records: Records, result: _Result) -> None:
+    """Calibrate each record by itself; one that cannot be has its reason."""
+    records.check_start()
+    for i in range(len(records)):
+        try:
+            found = attempt(records.model, [records.run(i)], start=records.begin(i))
+        except DataError as error:
+            result.x[i] = result.std[i] = result.covariance[i] = np.nan
+            result.verdicts.replace(i, Code.READING, (str(error),))
+            continue
+        result.take(i, found)
+        if found.certificate.trusted:
+            result.verdicts.ask(i, records.asked_of_many(found), found.noise.sigma)
+    if result.misfit is not None:
+        result.misfit[:] = np.nan  # it is asked of rows that stand for themselves
+
+
 # -- what is asked for ---------------------------------------------------------------------------
 
 
 def check_model(model: Model) -> None:
     """UsageError where many sensors of this model cannot be calibrated together."""
-    per_run = [p.name for p in model.parameters if p.scope == "run"]
     curved = [p.name for p in model.parameters if p.shape.curved]
     if not model.parameters:
         raise UsageError(f"model {model.name} has nothing left to estimate; free something")
-    if per_run:
-        raise UsageError(
-            f"model {model.name} has a {per_run[0]} per run: calibrate_many takes one record of "
-            f"each sensor; declare it shared with .scoped({per_run[0]!r}, 'all'), or call calibrate"
-        )
     if curved:
         raise UsageError(
             f"model {model.name} has the direction or rotation {curved[0]} among its unknowns, "
             "which calibrate_many cannot move; fix it, or call calibrate for each sensor"
         )
+    if model.traced.integrates:  # each alone, as by calibrate
+        return
+    per_run = [p.name for p in model.parameters if p.scope == "run"]
+    if per_run:
+        raise UsageError(
+            f"model {model.name} has a {per_run[0]} per run: calibrate_many takes one record of "
+            f"each sensor; declare it shared with .scoped({per_run[0]!r}, 'all'), or call calibrate"
+        )
     if model.traced.residual.constraints:
         raise UsageError(
             f"model {model.name} keeps to constraints, which calibrate_many does not; call "
             "calibrate for each sensor"
-        )
-    if model.traced.integrates:
-        raise UsageError(
-            f"{model.name} follows differential equations, which many sensors at once do not: give "
-            "the records to one fit, casest calibrate A.csv B.csv --per-run NAME, or calibrate "
-            "each by itself"
         )
     if model.sequential:
         raise UsageError(
@@ -180,15 +202,24 @@ def check_model(model: Model) -> None:
         )
 
 
+def refuse_equations(model: Model, what: str) -> None:
+    """UsageError for a model of differential equations: `what` is not for them."""
+    if model.traced.integrates:
+        raise UsageError(
+            f"{what} differential equations ({model.name}): give the records to one fit, casest "
+            "calibrate A.csv B.csv --per-run NAME"
+        )
+
+
 def checked(
     model: Model, signals: Mapping[str, Any], counts: Any
 ) -> tuple[list[Array], Array | None]:
     """Readings (S, N, size) in the model's order, and how many of each sensor count, (S,)."""
-    unknown = set(signals) - {s.name for s in model.signals}
+    unknown = set(signals) - {s.name for s in model.in_records}
     if unknown:
         raise UsageError(f"model {model.name} has no signal {sorted(unknown)[0]!r}")
     found: list[Array] = []
-    for s in model.signals:
+    for s in model.in_records:
         if s.name not in signals:
             raise UsageError(f"model {model.name} needs the signal {s.name!r}, (S, N, {s.size})")
         array = _array(s.name, signals[s.name])
@@ -201,7 +232,7 @@ def checked(
         if found and array.shape[:2] != found[0].shape[:2]:
             raise DataError(
                 f"signal {s.name} has {array.shape[0]} sensors of {array.shape[1]} samples, "
-                f"{model.signals[0].name} {found[0].shape[0]} of {found[0].shape[1]}"
+                f"{model.in_records[0].name} {found[0].shape[0]} of {found[0].shape[1]}"
             )
         found.append(array)
     if not found or 0 in found[0].shape:
@@ -255,6 +286,13 @@ class _Result:
         covariance = np.empty((n, n, size)).transpose(2, 0, 1)
         asked = np.empty(size) if misfit else None
         return cls(x, std, covariance, np.empty(size), np.empty(size), verdicts, asked)
+
+    def take(self, i: int, found: Estimate) -> None:
+        """What was found of sensor i alone."""
+        self.x[i], self.covariance[i] = found.point.x, found.covariance
+        self.std[i] = np.sqrt(np.diag(found.covariance))
+        self.sigma[i], self.rmse[i] = found.noise.sigma, found.rmse
+        self.verdicts.replace(i, found.certificate.code, found.certificate.reasons)
 
     def batch(self, model: Model) -> Batch:
         trusted = self.verdicts.trusted
@@ -457,11 +495,7 @@ class _Job:
             found = attempt(model or self.model, [run], start=start)
         except DataError:  # too few samples, which the sensor's reasons say already
             return
-        result.x[i], result.covariance[i] = found.point.x, found.covariance
-        result.std[i] = np.sqrt(np.diag(found.covariance))
-        result.sigma[i], result.rmse[i] = found.noise.sigma, found.rmse
-        certificate = found.certificate
-        result.verdicts.replace(i, certificate.code, certificate.reasons)
+        result.take(i, found)
 
 
 def _numbers(span: slice) -> range:

@@ -23,6 +23,7 @@ from casest.fleet.calibrate_many import (
     Batch,
     checked,
     entry_names,
+    refuse_equations,
     unpacked,
 )
 from casest.fleet.fit import residual_counts
@@ -97,6 +98,7 @@ def calibrate_with(
     A sensor is refused whose readings, with the distance to the fleet, are less probable than one
     in a million; σ is the fleet's. `misfit` is that probability. Raises what `calibrate_many` does.
     """
+    refuse_equations(model, "calibrate_with: a fleet is no prior for")
     readings, lengths = checked(model, signals, counts)
     size, samples = readings[0].shape[:2]
     n = len(fleet.mean)

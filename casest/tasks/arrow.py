@@ -57,7 +57,7 @@ def calibrate_arrow(
     stated = {name: stated_unit(name, unit) for name, unit in (units or {}).items()}
     options = Options(dict(columns or {}), stated, {}, None, "first", ())
     file = File("table", False, 0)
-    layout = layout_of(file, _Held(table), model.signals, options, sensor=sensor, kept=keep)
+    layout = layout_of(file, _Held(table), model.in_records, options, sensor=sensor, kept=keep)
     if not layout.wide:
         raise UsageError("calibrate_arrow takes one row for each sensor, its readings as lists")
     job = Job(model, layout, options, Path(), noise)

@@ -69,7 +69,7 @@ def calibrated(
     write: Write,
 ) -> None:
     """Calibrate a block, write its rows, count."""
-    signals = bound(block, job.layout, job.model.signals, job.options)
+    signals = bound(block, job.layout, job.model.in_records, job.options)
     rows = Rows(job.model, len(block.counts))
     chosen = _named(block, twice, tally)
     ends = np.concatenate([[0], np.cumsum(block.counts)])
