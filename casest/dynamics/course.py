@@ -18,26 +18,26 @@ from casest.dynamics.declare import Dynamics
 from casest.dynamics.discrete import (
     Brief,
     Steps,
-    brief,
-    continued,
     ended,
-    kalman,
+    normalised,
     smoothed_before,
     smoothed_brief,
     states,
+    std_of,
 )
 from casest.dynamics.filter import (
+    ALIKE,
+    PASSES,
     ROUNDS,
     SETTLED,
     Filtered,
     discretised,
     filtered,
-    normalised,
     refuse_divergence,
-    std_of,
 )
+from casest.dynamics.hindsight import Passes
 from casest.dynamics.inputs import as_read, uncertain
-from casest.dynamics.known import known
+from casest.dynamics.known import known, shown
 from casest.dynamics.riccati import check_covariance
 from casest.dynamics.transition import (
     Pace,
@@ -84,15 +84,17 @@ class Course:
 
 def followed(model: Dynamics, run: Run, *, smooth: bool = True) -> Course:
     """Filter and smoother over a record in constant memory beyond the result, a nonlinear model's
-    states once more; unless inputs with noise enter its coefficients: their estimates are of the
-    whole record.
+    states once more; where inputs with noise enter the coefficients, twice what a pass goes along
+    (`hindsight`), or, of a nonlinear one, all covariances.
 
     Raises DataError as `filtered` does.
     """
     check_covariance(model.start_covariance, "the covariance at the beginning")
-    if uncertain(model):
+    if uncertain(model) and not model.linear:
         return _of(filtered(model, run, smooth=smooth))
     pieces = Pieces.of(model, run)
+    if uncertain(model):
+        return _in_hindsight(pieces, smooth)
     if not model.linear:
         return _nonlinear(pieces, smooth)
     found, begun = _empty(pieces, smooth), [pieces.start]
@@ -104,8 +106,24 @@ def followed(model: Dynamics, run: Run, *, smooth: bool = True) -> Course:
     state = pieces.start
     for where in pieces.every:
         _, own, state = pieces.filtered(where, state)
-        _put(found, where, own)
+        _put(found, slice(where.stop - len(own.x), where.stop), own)
     return found
+
+
+def _in_hindsight(pieces: Pieces, smooth: bool) -> Course:
+    found = _empty(pieces, smooth)
+    passes = Passes.of(pieces.model, pieces.run, pieces.pace, pieces.every)
+    along = passes.first()
+
+    def put(where: slice, x: Array, std: Array) -> None:
+        if smooth:
+            found.smoothed[where], found.smoothed_std[where] = x, std
+
+    for k in range(PASSES + 1):
+        change, end = passes.smooth(along, lambda where, own: _put(found, where, own), put)
+        if k and change < ALIKE:
+            break
+    return replace(found, least=passes.least(along, end))
 
 
 def _nonlinear(pieces: Pieces, smooth: bool) -> Course:
@@ -173,11 +191,8 @@ class Pieces:
 
         At the beginning of the record: at its first sample too.
         """
-        (steps, first), model = self._steps(where, begun), self.model
-        if model.traced.g.numel():
-            found = self._constrained(where, steps, begun[1])
-        else:
-            found = brief(steps, begun[1], model.start, model.start_covariance)
+        steps, first = self._steps(where, begun)
+        found = shown(self.model, self.run, where, steps, begun[1])
         # Copied: a view would keep the whole piece.
         return steps, found, (first, found.factored[-1].copy())
 
@@ -207,16 +222,6 @@ class Pieces:
             first = early[-1].copy()
         return discretised(model, system), first
 
-    def _constrained(self, where: slice, steps: Steps, begun: Array | None) -> Brief:
-        model = self.model
-        if begun is None:
-            own = kalman(steps, model.start, model.start_covariance)
-        else:
-            own = continued(steps, begun)
-        x, std = self.known(slice(where.stop - len(own.x), where.stop), own.x, own.P)
-        squares = normalised(own.innovations, own.S)
-        return Brief(x, std, own.innovations, std_of(own.S), squares, own.factored)
-
     def known(self, where: slice, x: Array, P: Array) -> tuple[Array, Array]:
         """With what is known exactly put in: states and their standard deviations."""
         x, P = known(self.model, self.run.take(where), x, P)
@@ -228,7 +233,7 @@ def _back(found: Course, pieces: Pieces, begun: list[States]) -> None:
     told = np.zeros(n * n + 2 * n)
     for where, state in zip(pieces.every[::-1], begun[::-1], strict=True):
         steps, own, _ = pieces.filtered(where, state)
-        _put(found, where, own)
+        _put(found, slice(where.stop - len(own.x), where.stop), own)
         factored = own.factored if state[1] is None else np.vstack([state[1], own.factored])
         x, std, told = pieces.smoothed(where, steps, factored[:-1], told)
         before = slice(where.start, where.stop - 1)
@@ -237,7 +242,6 @@ def _back(found: Course, pieces: Pieces, begun: list[States]) -> None:
 
 
 def _put(found: Course, where: slice, own: Brief) -> None:
-    where = slice(where.stop - len(own.x), where.stop)
     for name in ("x", "std", "innovations", "expected_std", "normalised_innovations"):
         getattr(found, name)[where] = getattr(own, name)
 

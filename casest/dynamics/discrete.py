@@ -121,12 +121,45 @@ def states(steps: Steps, state: Array | None, start: Array, covariance: Array) -
     return kalman_step(n, m, *samples.patterns, give="end")(begun, parts)[0]
 
 
+def after_readings(
+    steps: Steps, state: Array | None, start: Array, covariance: Array
+) -> tuple[Array, Array, Array]:
+    """The same as states (N, n) and covariances (N, n, n), and the last one as factored."""
+    samples, parts, begun = _begun(steps, state, start, covariance)
+    m, n = samples.C.shape[1:]
+    step = kalman_step(n, m, *samples.patterns, give="after")
+    last, both = step(begun, parts, keep=False)
+    return *unpacked(both, n), last[-1]
+
+
 def ended(steps: Steps, state: Array | None, start: Array, covariance: Array) -> Array:
     """Where the filter comes to, as factored, from `state`, or from the start where it is None."""
     samples, parts, begun = _begun(steps, state, start, covariance)
     m, n = samples.C.shape[1:]
     step = kalman_step(n, m, *samples.patterns, give="end")
     return np.asarray(step(begun, parts, keep=False)[0][-1])
+
+
+def unfactored(factored: Array, n: int) -> tuple[Array, Array]:
+    """States (N, n) and covariances (N, n, n)."""
+    U = np.tile(np.eye(n), (len(factored), 1, 1))
+    rows, columns = np.triu_indices(n, 1)
+    order = np.lexsort((rows, columns))  # column by column
+    U[:, rows[order], columns[order]] = factored[:, 2 * n :]
+    return factored[:, :n], (U * factored[:, None, n : 2 * n]) @ U.transpose(0, 2, 1)
+
+
+def std_of(covariances: Array) -> Array:
+    """Standard deviations, (N, n), of covariances (N, n, n)."""
+    return np.asarray(np.sqrt(np.diagonal(covariances, axis1=1, axis2=2)))
+
+
+def normalised(innovations: Array, S: Array) -> Array:
+    """νᵀS⁻¹ν of innovations (N, m), NaN where one is missing in part."""
+    whole = np.isfinite(innovations).all(axis=1)
+    found, own = np.full(len(innovations), np.nan), innovations[whole]
+    found[whole] = np.sum(own * np.linalg.solve(S[whole], own[:, :, None])[:, :, 0], axis=1)
+    return found
 
 
 #: Samples, what is given of each, and the state before the first.

@@ -43,9 +43,9 @@ def _matrix(name: str, shape: tuple[int, int], pattern: Pattern) -> tuple[Any, A
     return full, used
 
 
-#: What a step gives beside the state after it: nothing; states and covariances; what is shown of
-#: them, states with standard deviations.
-Give = Literal["end", "all", "brief"]
+#: What a step gives beside the state after it: nothing; states and covariances, after the reading
+#: alone or before it too; what is shown of them, states with standard deviations.
+Give = Literal["end", "after", "all", "brief"]
 
 
 @lru_cache(maxsize=16)
@@ -54,8 +54,8 @@ def kalman_step(n: int, m: int, of_Phi: Pattern, of_C: Pattern, give: Give = "al
 
     state: x with the factors of P; numbers: Φ, forced step, Q, C, diagonal of R, y. Readings are
     taken one component after the other, which needs no inverse (their noise is independent).
-    all: x and P after the reading; and before it. brief: x and std after the reading; innovations,
-    the std expected of them, and νᵀS⁻¹ν.
+    after: x and P after the reading; all: and before it. brief: x and std after the reading;
+    innovations, the std expected of them, and νᵀS⁻¹ν.
     """
     both = ca.SX.sym("both", factors.size(n))
     x, (U, D) = factors.unpacked(both, n)
@@ -73,8 +73,9 @@ def kalman_step(n: int, m: int, of_Phi: Pattern, of_C: Pattern, give: Give = "al
         squares += factors.over(innovation**2, variance)
     numbers = ca.vertcat(*[by_rows(e) for e in (full, u, Q, whole, R, y)])
     outputs = [factors.packed(after_x, after)]
-    if give == "all":
+    if give in ("after", "all"):
         outputs.append(packed(after_x, factors.multiplied(after)))
+    if give == "all":
         outputs.append(packed(before_x, factors.multiplied(before)))
     if give == "brief":
         expected = [ca.sqrt(factors.variance(before, C[i, :].T) + R[i]) for i in range(m)]
