@@ -1,7 +1,8 @@
 """Does the loop in motion find what is missing, and nothing else? Simulated flights of 60 s.
 
-    make study-motion                         # after the other one: half an hour or so
+    make study-flights                        # 200 of each kind: days on one core
     python studies/flight_loop.py --only null # worlds whose names match this pattern
+    python studies/flight_loop.py --table     # of what is there so far
 
 Flights and sensors come from `tests/flights.py`, closed forms that share no code with the filter or
 the catalogue. Each world is kept in `out/flight_loop.jsonl`, so that an interrupted study goes on
@@ -17,7 +18,7 @@ import re
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from time import perf_counter
+from time import perf_counter, process_time
 from typing import Any
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -37,7 +38,8 @@ from casest.results.motion import rms_settled  # noqa: E402
 from casest_problems.bias_gravity import bias_gravity  # noqa: E402
 
 KEPT, TABLE = ROOT / "out" / "flight_loop.jsonl", ROOT / "studies" / "flight_loop.md"
-NULLS, SEEDS = 120, 5
+#: Flights of each kind, in turns of so many of all kinds; the first seed.
+COUNT, TURN, FIRST = 200, 5, 80_000
 
 #: World -> its sensors at full size, the label that should be found, the size in words.
 WORLDS: dict[str, tuple[Sensors, str, str]] = {
@@ -59,7 +61,10 @@ KINDS = {
     "null, readings in steps of one σ": Sensors(quantised=True),
     "null, bias that wanders (1e-5 m²/s⁵)": Sensors(wander=1e-5),
 }
-OTHERS = 15
+#: A gyro so noisy, rad/s (ten times Batista's): its rates are an input of the model.
+NOISY = {**flights.SIGMA, "omega": np.radians(0.5)}
+#: What is planted beside it.
+BESIDE = ("gyro bias", "velocity delay", "lever arm", "accelerometer scale", "knock", "motor")
 #: Two at once.
 PAIR = Sensors(gyro_bias=(0.002, -0.001, 0.0015), lever=(0.1, -0.05, 0.07))
 
@@ -75,21 +80,36 @@ def smaller(sensors: Sensors, share: float) -> Sensors:
     )
 
 
-def tasks() -> Iterator[tuple[str, int, Sensors, float]]:
-    """Name, seed, sensors, rate (Hz)."""
-    for seed in range(NULLS):
+#: Name, seed, sensors, rate (Hz).
+Task = tuple[str, int, Sensors, float]
+
+
+def tasks() -> Iterator[Task]:
+    """Flights of nothing missing first; then some of every kind, some more, …"""
+    for seed in range(FIRST, FIRST + COUNT):
         yield "null", seed, Sensors(), 50.0 if seed % 2 else 25.0
-    for seed in range(OTHERS):
-        for name, sensors in KINDS.items():
-            yield name, 2000 + seed, sensors, 50.0
-    for seed in range(SEEDS):
-        for name, (sensors, _, _) in WORLDS.items():
-            for share in SHARES:
-                yield f"{name} x{share:g}", 1000 + seed, smaller(sensors, share), 50.0
-        yield "gyro bias and lever arm", 1000 + seed, PAIR, 50.0
-        for name in flights.CHANGES:
-            for share in SHARES:
-                yield f"{name} x{share:g}", 3000 + seed, Sensors(), 50.0
+    for first in range(FIRST, FIRST + COUNT, TURN):
+        seeds = range(first, first + TURN)
+        for share in (1.0, None, 5.0, 0.2):
+            for seed in seeds:
+                yield from _others(seed) if share is None else _planted_ones(seed, share)
+
+
+def _planted_ones(seed: int, share: float) -> Iterator[Task]:
+    for name, (sensors, _, _) in WORLDS.items():
+        yield f"{name} x{share:g}", seed, smaller(sensors, share), 50.0
+    for name in flights.CHANGES:
+        yield f"{name} x{share:g}", seed, Sensors(), 50.0
+
+
+def _others(seed: int) -> Iterator[Task]:
+    """Two at once, noise of other kinds, a noisy gyro."""
+    yield "gyro bias and lever arm", seed, PAIR, 50.0
+    for name, sensors in KINDS.items():
+        yield name, seed, sensors, 50.0
+    yield "noisy gyro", seed, Sensors(), 50.0
+    for name in BESIDE:
+        yield f"{name}, noisy gyro", seed, WORLDS.get(name, (Sensors(),))[0], 50.0
 
 
 def world(name: str, seed: int, sensors: Sensors, rate: float) -> dict[str, Any]:
@@ -97,29 +117,37 @@ def world(name: str, seed: int, sensors: Sensors, rate: float) -> dict[str, Any]
     rng = np.random.default_rng(seed)
     flight = flights.somewhere(rng)
     worse = rng.uniform(1, 3, 3) if name == "null" else np.ones(3)
-    sigma = {k: s * w for (k, s), w in zip(flights.SIGMA.items(), worse, strict=True)}
+    base = NOISY if name.endswith("noisy gyro") else flights.SIGMA
+    sigma = {k: s * w for (k, s), w in zip(base.items(), worse, strict=True)}
     t = np.arange(0, 60, 1 / rate)
     run = flights.record(flight, t, rng, sensors, sigma)
-    kind, _, share = name.partition(" x")
+    kind, share = kind_of(name)
     if kind in flights.CHANGES:
-        run = flights.CHANGES[kind][0](run, flight, t, float(share))
-    begin = perf_counter()
+        run = flights.CHANGES[kind][0](run, flight, t, share)
+    begin = process_time()
     found = close_motion(bias_gravity, run)
     before, after = rms_settled(found)
     return {
         "name": name,
         "seed": seed,
-        "seconds": perf_counter() - begin,
+        "seconds": process_time() - begin,
         "found": [a.candidate.label for a in found.effects],
         "alike": [list(a.indistinguishable_from) for a in found.effects],
         "unexplained": found.left.p_value < LEVELS.coloured,
         "numbers": {c.label: v.tolist() for c, v in found.after.added},
         "stds": found.after.std.tolist(),
+        "undecided": list(found.undecided),
         "verdict": found.verdict,
         "before": before,
         "after": after,
         "gain": found.after.likelihood - found.before.likelihood,
     }
+
+
+def kind_of(name: str) -> tuple[str, float]:
+    """What is planted, and how many times its size."""
+    kind, _, share = name.removesuffix(", noisy gyro").partition(" x")
+    return kind, float(share or 1)
 
 
 # -- table -------------------------------------------------------------------------------------

@@ -16,25 +16,28 @@ from casest.declaration.shapes import Array
 from casest.dynamics import rounds
 from casest.dynamics.declare import Dynamics
 from casest.dynamics.discrete import (
-    Estimates,
+    Brief,
     Steps,
-    continued,
     ended,
-    kalman,
+    normalised,
     smoothed_before,
+    smoothed_brief,
+    states,
+    std_of,
 )
 from casest.dynamics.filter import (
+    ALIKE,
+    PASSES,
     ROUNDS,
     SETTLED,
     Filtered,
     discretised,
     filtered,
-    normalised,
     refuse_divergence,
-    std_of,
 )
+from casest.dynamics.hindsight import Passes
 from casest.dynamics.inputs import as_read, uncertain
-from casest.dynamics.known import known
+from casest.dynamics.known import known, shown
 from casest.dynamics.riccati import check_covariance
 from casest.dynamics.transition import (
     Pace,
@@ -81,28 +84,46 @@ class Course:
 
 def followed(model: Dynamics, run: Run, *, smooth: bool = True) -> Course:
     """Filter and smoother over a record in constant memory beyond the result, a nonlinear model's
-    states once more; unless inputs with noise enter its coefficients: their estimates are of the
-    whole record.
+    states once more; where inputs with noise enter the coefficients, twice what a pass goes along
+    (`hindsight`), or, of a nonlinear one, all covariances.
 
     Raises DataError as `filtered` does.
     """
     check_covariance(model.start_covariance, "the covariance at the beginning")
-    if uncertain(model):
+    if uncertain(model) and not model.linear:
         return _of(filtered(model, run, smooth=smooth))
     pieces = Pieces.of(model, run)
+    if uncertain(model):
+        return _in_hindsight(pieces, smooth)
     if not model.linear:
         return _nonlinear(pieces, smooth)
-    found, states = _empty(pieces, smooth), [pieces.start]
+    found, begun = _empty(pieces, smooth), [pieces.start]
     if smooth:
         for where in pieces.every[:-1]:
-            states.append(pieces.ahead(where, states[-1]))
-        _back(found, pieces, states)
+            begun.append(pieces.ahead(where, begun[-1]))
+        _back(found, pieces, begun)
         return found
     state = pieces.start
     for where in pieces.every:
         _, own, state = pieces.filtered(where, state)
-        _put(found, pieces, where, own)
+        _put(found, slice(where.stop - len(own.x), where.stop), own)
     return found
+
+
+def _in_hindsight(pieces: Pieces, smooth: bool) -> Course:
+    found = _empty(pieces, smooth)
+    passes = Passes.of(pieces.model, pieces.run, pieces.pace, pieces.every)
+    along = passes.first()
+
+    def put(where: slice, x: Array, std: Array) -> None:
+        if smooth:
+            found.smoothed[where], found.smoothed_std[where] = x, std
+
+    for k in range(PASSES + 1):
+        change, end = passes.smooth(along, lambda where, own: _put(found, where, own), put)
+        if k and change < ALIKE:
+            break
+    return replace(found, least=passes.least(along, end))
 
 
 def _nonlinear(pieces: Pieces, smooth: bool) -> Course:
@@ -115,7 +136,8 @@ def _nonlinear(pieces: Pieces, smooth: bool) -> Course:
         refuse_divergence(model, run.take(where), x)
         along[where] = x
         found.x[where], found.std[where] = pieces.known(where, x, P)
-        _read(found, where, innovations, S)
+        found.innovations[where], found.expected_std[where] = innovations, std_of(S)
+        found.normalised_innovations[where] = normalised(innovations, S)
     if not smooth:
         return found
     first: tuple[Array, Array] | None = None
@@ -164,13 +186,13 @@ class Pieces:
         pace = replace(pace, share=shares(np.diff(time), pace))
         return Pieces(model, run, pace, time, cuts(len(time), PIECE))
 
-    def filtered(self, where: slice, begun: States) -> tuple[Steps, Estimates, States]:
+    def filtered(self, where: slice, begun: States) -> tuple[Steps, Brief, States]:
         """The steps of a piece, the filter at every sample after its first, and where it came to.
 
         At the beginning of the record: at its first sample too.
         """
         steps, first = self._steps(where, begun)
-        found = self._through(steps, begun[1])
+        found = shown(self.model, self.run, where, steps, begun[1])
         # Copied: a view would keep the whole piece.
         return steps, found, (first, found.factored[-1].copy())
 
@@ -179,23 +201,26 @@ class Pieces:
         (steps, first), model = self._steps(where, begun), self.model
         return first, ended(steps, begun[1], model.start, model.start_covariance)
 
+    def smoothed(
+        self, where: slice, steps: Steps, factored: Array, told: Array
+    ) -> tuple[Array, Array, Array]:
+        """States and std of all samples but the last, and what is told of the first."""
+        if not self.model.traced.g.numel():
+            return smoothed_brief(steps, factored, told)
+        x, P, told = smoothed_before(steps, factored, told)
+        return *self.known(slice(where.start, where.stop - 1), x, P), told
+
     def _steps(self, where: slice, begun: States) -> tuple[Steps, Array | None]:
         model, own = self.model, self.run.take(where)
         pace = self.pace.part(where)
         system, first = linearised(model, own, pace=pace, calm=as_read(model, own)), None
         if model.input_noise is not None:
-            early = self._through(discretised(model, system), begun[0])
-            x = early.x if begun[0] is None else np.vstack([begun[0][: model.size], early.x])
-            system, first = (
-                system.driven(process_along(model, own, x, pace)),
-                early.factored[-1].copy(),
-            )
+            early = states(discretised(model, system), begun[0], model.start,
+                           model.start_covariance)  # fmt: skip
+            whole = early if begun[0] is None else np.vstack([begun[0], early])
+            system = system.driven(process_along(model, own, whole[:, : model.size], pace))
+            first = early[-1].copy()
         return discretised(model, system), first
-
-    def _through(self, steps: Steps, begun: Array | None) -> Estimates:
-        if begun is None:
-            return kalman(steps, self.model.start, self.model.start_covariance)
-        return continued(steps, begun)
 
     def known(self, where: slice, x: Array, P: Array) -> tuple[Array, Array]:
         """With what is known exactly put in: states and their standard deviations."""
@@ -203,28 +228,22 @@ class Pieces:
         return x, std_of(P)
 
 
-def _back(found: Course, pieces: Pieces, states: list[States]) -> None:
+def _back(found: Course, pieces: Pieces, begun: list[States]) -> None:
     n = pieces.model.size
     told = np.zeros(n * n + 2 * n)
-    for where, begun in zip(pieces.every[::-1], states[::-1], strict=True):
-        steps, own, _ = pieces.filtered(where, begun)
-        _put(found, pieces, where, own)
-        factored = own.factored if begun[1] is None else np.vstack([begun[1], own.factored])
-        x, P, told = smoothed_before(steps, factored[:-1], told)
+    for where, state in zip(pieces.every[::-1], begun[::-1], strict=True):
+        steps, own, _ = pieces.filtered(where, state)
+        _put(found, slice(where.stop - len(own.x), where.stop), own)
+        factored = own.factored if state[1] is None else np.vstack([state[1], own.factored])
+        x, std, told = pieces.smoothed(where, steps, factored[:-1], told)
         before = slice(where.start, where.stop - 1)
-        found.smoothed[before], found.smoothed_std[before] = pieces.known(before, x, P)
+        found.smoothed[before], found.smoothed_std[before] = x, std
     found.smoothed[-1], found.smoothed_std[-1] = found.x[-1], found.std[-1]
 
 
-def _put(found: Course, pieces: Pieces, where: slice, own: Estimates) -> None:
-    where = slice(where.stop - len(own.x), where.stop)
-    found.x[where], found.std[where] = pieces.known(where, own.x, own.P)
-    _read(found, where, own.innovations, own.S)
-
-
-def _read(found: Course, where: slice, innovations: Array, S: Array) -> None:
-    found.innovations[where], found.expected_std[where] = innovations, std_of(S)
-    found.normalised_innovations[where] = normalised(innovations, S)
+def _put(found: Course, where: slice, own: Brief) -> None:
+    for name in ("x", "std", "innovations", "expected_std", "normalised_innovations"):
+        getattr(found, name)[where] = getattr(own, name)
 
 
 def _empty(pieces: Pieces, smooth: bool) -> Course:

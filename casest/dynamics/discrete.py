@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from casest.declaration.shapes import Array
 from casest.dynamics.factors import size
-from casest.dynamics.stepping import Pattern, kalman_step, run_steps, smoother_step, unpacked
+from casest.dynamics.stepping import Pattern, kalman_step, smoother_step, unpacked
 
 
 @dataclass(frozen=True)
@@ -90,20 +90,86 @@ def continued(steps: Steps, state: Array) -> Estimates:
     return _followed(*_from_state(steps, state))
 
 
+@dataclass(frozen=True)
+class Brief:
+    """Of `Estimates` what is shown: states x (N, n) with their std, innovations (N, m) with the std
+    that is expected of them, NaN where a reading is missing, and νᵀS⁻¹ν (N,) of every whole one."""
+
+    x: Array
+    std: Array
+    innovations: Array
+    expected_std: Array
+    normalised_innovations: Array
+    factored: Array
+
+
+def brief(steps: Steps, state: Array | None, start: Array, covariance: Array) -> Brief:
+    """The filter from `state` (None: from the start), without covariances: half of the work."""
+    samples, parts, begun = _begun(steps, state, start, covariance)
+    m, n = samples.C.shape[1:]
+    factored, own, said = kalman_step(n, m, *samples.patterns, give="brief")(begun, parts)
+    if not samples.present.all():
+        said[:, : 2 * m][~np.tile(samples.present, 2)] = np.nan
+        said[~samples.present.all(axis=1), -1] = np.nan
+    return Brief(own[:, :n], own[:, n:], said[:, :m], said[:, m:-1], said[:, -1], factored)
+
+
+def states(steps: Steps, state: Array | None, start: Array, covariance: Array) -> Array:
+    """States alone, as factored, from `state`, or from the start where it is None."""
+    samples, parts, begun = _begun(steps, state, start, covariance)
+    m, n = samples.C.shape[1:]
+    return kalman_step(n, m, *samples.patterns, give="end")(begun, parts)[0]
+
+
+def after_readings(
+    steps: Steps, state: Array | None, start: Array, covariance: Array
+) -> tuple[Array, Array, Array]:
+    """The same as states (N, n) and covariances (N, n, n), and the last one as factored."""
+    samples, parts, begun = _begun(steps, state, start, covariance)
+    m, n = samples.C.shape[1:]
+    step = kalman_step(n, m, *samples.patterns, give="after")
+    last, both = step(begun, parts, keep=False)
+    return *unpacked(both, n), last[-1]
+
+
 def ended(steps: Steps, state: Array | None, start: Array, covariance: Array) -> Array:
     """Where the filter comes to, as factored, from `state`, or from the start where it is None."""
-    if state is None:
-        samples, parts, begun = _from_start(steps, start, covariance)
-    else:
-        samples, parts, begun = _from_state(steps, state)
+    samples, parts, begun = _begun(steps, state, start, covariance)
     m, n = samples.C.shape[1:]
-    step = kalman_step(n, m, *samples.patterns, alone=True)
-    (found,) = run_steps(step, begun, parts)
-    return np.array(found[-1])
+    step = kalman_step(n, m, *samples.patterns, give="end")
+    return np.asarray(step(begun, parts, keep=False)[0][-1])
+
+
+def unfactored(factored: Array, n: int) -> tuple[Array, Array]:
+    """States (N, n) and covariances (N, n, n)."""
+    U = np.tile(np.eye(n), (len(factored), 1, 1))
+    rows, columns = np.triu_indices(n, 1)
+    order = np.lexsort((rows, columns))  # column by column
+    U[:, rows[order], columns[order]] = factored[:, 2 * n :]
+    return factored[:, :n], (U * factored[:, None, n : 2 * n]) @ U.transpose(0, 2, 1)
+
+
+def std_of(covariances: Array) -> Array:
+    """Standard deviations, (N, n), of covariances (N, n, n)."""
+    return np.asarray(np.sqrt(np.diagonal(covariances, axis1=1, axis2=2)))
+
+
+def normalised(innovations: Array, S: Array) -> Array:
+    """νᵀS⁻¹ν of innovations (N, m), NaN where one is missing in part."""
+    whole = np.isfinite(innovations).all(axis=1)
+    found, own = np.full(len(innovations), np.nan), innovations[whole]
+    found[whole] = np.sum(own * np.linalg.solve(S[whole], own[:, :, None])[:, :, 0], axis=1)
+    return found
 
 
 #: Samples, what is given of each, and the state before the first.
 Given = tuple[Steps, Sequence[Array], Array]
+
+
+def _begun(steps: Steps, state: Array | None, start: Array, covariance: Array) -> Given:
+    if state is None:
+        return _from_start(steps, start, covariance)
+    return _from_state(steps, state)
 
 
 def _from_start(steps: Steps, start: Array, covariance: Array) -> Given:
@@ -123,7 +189,7 @@ def _from_state(steps: Steps, state: Array) -> Given:
 
 def _followed(samples: Steps, parts: Sequence[Array], state: Array) -> Estimates:
     m, n = samples.C.shape[1:]
-    factored, *both = run_steps(kalman_step(n, m, *samples.patterns), state, parts)
+    factored, *both = kalman_step(n, m, *samples.patterns)(state, parts)
     (x, P), before = (unpacked(part, n) for part in both)
     return Estimates(x, P, *before, *_innovations(samples, *before), factored)
 
@@ -150,12 +216,24 @@ def smoothed_before(steps: Steps, factored: Array, told: Array) -> tuple[Array, 
 
     `factored` (N − 1, …) by the filter; also returned: what is told of the first sample.
     """
+    both, back = _backwards(steps, factored, told, brief=False)
+    return *unpacked(both, steps.C.shape[2]), back
+
+
+def smoothed_brief(steps: Steps, factored: Array, told: Array) -> tuple[Array, Array, Array]:
+    """The same with standard deviations (N − 1, n) in place of covariances."""
+    both, back = _backwards(steps, factored, told, brief=True)
+    n = steps.C.shape[2]
+    return both[:, :n], both[:, n:], back
+
+
+def _backwards(steps: Steps, factored: Array, told: Array, brief: bool) -> tuple[Array, Array]:
     m, n = steps.C.shape[1:]
-    step, later = smoother_step(n, m, *steps.patterns), slice(None, 0, -1)
+    step, later = smoother_step(n, m, *steps.patterns, brief=brief), slice(None, 0, -1)
     parts = [p[::-1] for p in (steps.Phi, steps.forced, steps.Q)]
     parts += [p[later] for p in (steps.seen, steps.R, steps.read)] + [factored[::-1]]
-    back, both = run_steps(step, told, parts)
-    return *unpacked(both[::-1], n), back[-1]
+    back, both = step(told, parts, keep=False)
+    return both[::-1], back[-1]
 
 
 def linear_recursion(M: Array, b: Array, first: Array) -> Array:

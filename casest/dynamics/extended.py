@@ -27,7 +27,7 @@ from casest.dynamics.declare import Dynamics
 from casest.dynamics.discrete import Steps
 from casest.dynamics.factors import Factors
 from casest.dynamics.inputs import as_read, at_estimates, estimates, slopes, uncertain
-from casest.dynamics.stepping import by_rows, entries, packed, run_steps, unpacked
+from casest.dynamics.stepping import by_rows, entries, packed, unpacked
 from casest.dynamics.transition import (
     Pace,
     acting,
@@ -206,7 +206,7 @@ def extended(model: Dynamics, run: Run) -> tuple[Array, Array, Array, Array, Arr
     n, m, (parts, present) = model.size, model.traced.h.numel(), given(model, run)
     state = beginning(model)
     steps = extended_step(model, pieces(model, run))
-    _, after, before, said = run_steps(steps, state, parts, keep=False)
+    _, after, before, said = steps(state, parts, keep=False)
     return *unpacked(after, n), *unpacked(before, n), *told(said, present, m)
 
 

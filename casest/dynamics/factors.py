@@ -28,6 +28,18 @@ def multiplied(factors: Factors) -> Any:
     return ca.densify(upper + ca.triu(upper, False).T)
 
 
+def variance(factors: Factors, c: Any) -> Any:
+    """cᵀPc."""
+    U, D = factors
+    return ca.dot(D, (U.T @ c) ** 2)
+
+
+def std(factors: Factors) -> Any:
+    """Roots of P's diagonal."""
+    U, D = factors
+    return ca.densify(ca.sqrt(ca.sum2((U * U) @ ca.diag(D))))
+
+
 def factored(P: Any) -> Factors:
     """U and D of a covariance; what rounding makes negative in D is zero."""
     n = P.size1()

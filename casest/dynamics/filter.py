@@ -14,7 +14,14 @@ import numpy as np
 from casest.data.run import Run
 from casest.declaration.shapes import Array
 from casest.dynamics.declare import Dynamics
-from casest.dynamics.discrete import Steps, kalman, smoothed, smoothed_states
+from casest.dynamics.discrete import (
+    Steps,
+    kalman,
+    normalised,
+    smoothed,
+    smoothed_states,
+    std_of,
+)
 from casest.dynamics.extended import extended, relinearised
 from casest.dynamics.inputs import uncertain
 from casest.dynamics.known import known
@@ -100,19 +107,6 @@ class Filtered:
         return normalised(self.innovations, self.S)
 
 
-def std_of(covariances: Array) -> Array:
-    """Standard deviations, (N, n), of covariances (N, n, n)."""
-    return np.asarray(np.sqrt(np.diagonal(covariances, axis1=1, axis2=2)))
-
-
-def normalised(innovations: Array, S: Array) -> Array:
-    """νᵀS⁻¹ν of innovations (N, m), NaN where one is missing in part."""
-    whole = np.isfinite(innovations).all(axis=1)
-    found, own = np.full(len(innovations), np.nan), innovations[whole]
-    found[whole] = np.sum(own * np.linalg.solve(S[whole], own[:, :, None])[:, :, 0], axis=1)
-    return found
-
-
 def filtered(
     model: Dynamics,
     run: Run,
@@ -183,13 +177,17 @@ def _in_hindsight(model: Dynamics, run: Run, smooth: bool) -> Filtered:
 
 
 def _least(model: Dynamics, run: Run, found: Filtered) -> float:
-    """tr(P⁻¹P₀)/n at the end, with P₀ of inputs that are estimated without an error."""
     process = process_along(model, run, found.smoothed)
     exact = _once(model, run, found.system.driven(process), smooth=False)
-    std = found.std[-1]
+    return share_left(found.P[-1], exact.P[-1])
+
+
+def share_left(P: Array, without: Array) -> float:
+    """tr(P⁻¹P₀)/n, with P₀ `without` errors of the inputs; of what is not certain in P (n, n)."""
+    std = np.sqrt(np.diag(P))
     open_ = std > 0
     scale = np.outer(std[open_], std[open_])
-    P, without = (x.P[-1][np.ix_(open_, open_)] / scale for x in (found, exact))
+    P, without = (x[np.ix_(open_, open_)] / scale for x in (P, without))
     return float(np.trace(np.linalg.pinv(P, hermitian=True) @ without)) / max(len(P), 1)
 
 

@@ -15,6 +15,7 @@ octave of its frequencies, shrunk by what noise adds to it (James & Stein 1961; 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import lru_cache
 from itertools import pairwise
 
 import casadi as ca
@@ -26,7 +27,8 @@ from casest.declaration.physics import SX
 from casest.declaration.shapes import Array
 from casest.declaration.tracing import flat
 from casest.dynamics.declare import Dynamics
-from casest.engine import Columns, Replay
+from casest.dynamics.stepping import Pattern, by_rows, entries
+from casest.engine import Columns, Replay, evaluated
 
 #: Chance that noise alone stands out, for each octave of each direction.
 FALSE_ALARM = 1e-5
@@ -174,20 +176,42 @@ def on_errors(model: Dynamics, run: Run, along: Array, P: Array) -> Array:
 
     Σq·N·P·Nᵀ with N = ∂A/∂u; `along` (N, n), P (N, n, n) of these errors.
     """
-    found = np.zeros_like(P)
-    for name, slope in slopes(model):
-        N = _along(model, run, along, slope)
-        found += model.sensors[name] * (N @ P @ N.transpose(0, 2, 1))
+    return whole(model, on_errors_alone(model, run, along, P))
+
+
+def on_errors_alone(model: Dynamics, run: Run, along: Array, P: Array) -> Array:
+    """The same, what can differ from zero alone: (N, …), as `whole` takes it."""
+    columns = [np.ascontiguousarray(along), *(run.signals[s.name] for s in model.signals)]
+    columns.append(np.ascontiguousarray(P).reshape(len(P), P.shape[1] * P.shape[2]))
+    intensities = np.array([model.sensors[name] for name, _ in slopes(model)])
+    return np.asarray(evaluated(_acting(model), intensities, Columns(columns))[0])[:, :, 0]
+
+
+def whole(model: Dynamics, alone: Array) -> Array:
+    """Symmetric matrices (N, n, n) of what can differ from zero of them."""
+    found = np.zeros((len(alone), model.size, model.size))
+    rows, columns = np.array(_reached(model), int).reshape(-1, 2).T
+    found[:, rows, columns] = found[:, columns, rows] = alone
     return found
 
 
-def _along(model: Dynamics, run: Run, along: Array, expression: SX) -> Array:
-    """An expression at every sample (N, …), or at one where it is the same at all."""
-    t = model.traced
-    sample = ca.vertcat(t.x, *[flat(t.symbols[s.name]) for s in model.signals])
-    columns = [np.ascontiguousarray(along), *(run.signals[s.name] for s in model.signals)]
-    if not ca.depends_on(expression, sample):
-        columns = [c[:1] for c in columns]
-    function = ca.Function("slopes", [ca.SX.sym("none", 0), sample], [ca.densify(expression)],
-                           ["parameters", "sample"], ["N"])  # fmt: skip
-    return np.asarray(Replay(function)(np.zeros(0), Columns(columns))[0])
+@lru_cache(maxsize=8)
+def _acting(model: Dynamics) -> Replay:
+    """Σq·N·P·Nᵀ at a sample, what can differ from zero of its upper half; q are its parameters."""
+    t, P = model.traced, ca.SX.sym("P", model.size, model.size)
+    added, q = _added(model, P)
+    sample = ca.vertcat(t.x, *[flat(t.symbols[s.name]) for s in model.signals], by_rows(P))
+    found = ca.vertcat(*[added[i, j] for i, j in _reached(model)])
+    return Replay(ca.Function("acting", [q, sample], [ca.densify(found)],
+                              ["parameters", "sample"], ["Xi"]))  # fmt: skip
+
+
+@lru_cache(maxsize=8)
+def _reached(model: Dynamics) -> Pattern:
+    return entries(ca.triu(_added(model, ca.SX.sym("P", model.size, model.size))[0]))
+
+
+def _added(model: Dynamics, P: SX) -> tuple[SX, SX]:
+    every = [slope for _, slope in slopes(model)]
+    q = ca.SX.sym("q", len(every))
+    return sum((q[k] * (N @ P @ N.T) for k, N in enumerate(every)), ca.SX(*P.shape)), q

@@ -17,6 +17,15 @@ from casest.data.run import Run
 from casest.declaration.shapes import Array
 from casest.declaration.tracing import flat
 from casest.dynamics.declare import Dynamics
+from casest.dynamics.discrete import (
+    Brief,
+    Steps,
+    brief,
+    continued,
+    kalman,
+    normalised,
+    std_of,
+)
 from casest.dynamics.extended import over_samples, replay
 from casest.engine import Replay
 from casest.errors import UsageError
@@ -57,6 +66,22 @@ def known(model: Dynamics, run: Run, x: Array, P: Array) -> tuple[Array, Array]:
     S[:, np.arange(count), np.arange(count)] += hidden
     after = P - PG @ _solved(S, PG.transpose(0, 2, 1))
     return at, 0.5 * (after + after.transpose(0, 2, 1))
+
+
+def shown(model: Dynamics, run: Run, where: slice, steps: Steps, state: Array | None) -> Brief:
+    """What is shown of the filter over a piece of the record, with what is known put in.
+
+    From `state` of the piece's first sample, which is left out; None: from the start.
+    """
+    if not model.traced.g.numel():
+        return brief(steps, state, model.start, model.start_covariance)
+    if state is None:
+        own = kalman(steps, model.start, model.start_covariance)
+    else:
+        own = continued(steps, state)
+    x, P = known(model, run.take(slice(where.stop - len(own.x), where.stop)), own.x, own.P)
+    squares = normalised(own.innovations, own.S)
+    return Brief(x, std_of(P), own.innovations, std_of(own.S), squares, own.factored)
 
 
 @lru_cache(maxsize=8)

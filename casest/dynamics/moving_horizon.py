@@ -19,9 +19,9 @@ from casest.data.run import Run
 from casest.declaration.shapes import Array
 from casest.dynamics.course import Course
 from casest.dynamics.declare import Dynamics
-from casest.dynamics.discrete import Estimates, Steps, kalman, smoothed
+from casest.dynamics.discrete import Estimates, Steps, kalman, normalised, smoothed
 from casest.dynamics.extended import Sampled
-from casest.dynamics.filter import coefficients, discretised, normalised
+from casest.dynamics.filter import coefficients, discretised
 from casest.dynamics.inputs import uncertain
 from casest.dynamics.known import known
 from casest.dynamics.quadratic import Kept, kept

@@ -15,7 +15,7 @@ from casest.declaration.shapes import Array
 from casest.dynamics.declare import Dynamics
 from casest.dynamics.discrete import continued, ended, kalman, smoothed_before
 from casest.dynamics.extended import beginning, extended_step, given, pieces, relinearised, told
-from casest.dynamics.stepping import run_steps, unpacked
+from casest.dynamics.stepping import unpacked
 from casest.dynamics.transition import Pace
 
 #: Samples, and of each x (…, n), P (…, n, n), innovations (…, m) and their covariance (…, m, m).
@@ -30,7 +30,7 @@ def filtered(model: Dynamics, run: Run, pace: Pace, cuts: Sequence[slice]) -> It
     for where in cuts:
         parts, present = given(model, run.take(where), pace.part(where))
         first = int(where.start > 0)
-        states, after, _, said = run_steps(step, state, [p[first:] for p in parts])
+        states, after, _, said = step(state, [p[first:] for p in parts])
         state = states[-1].copy()
         own = slice(where.start + first, where.stop)
         yield own, *unpacked(after, n), *told(said, present[first:], m)

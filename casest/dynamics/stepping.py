@@ -5,9 +5,8 @@ A step of nine states is a few thousand operations: in NumPy the calls alone tak
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import lru_cache
-from typing import Any
+from typing import Any, Literal
 
 import casadi as ca
 import numpy as np
@@ -44,13 +43,19 @@ def _matrix(name: str, shape: tuple[int, int], pattern: Pattern) -> tuple[Any, A
     return full, used
 
 
+#: What a step gives beside the state after it: nothing; states and covariances, after the reading
+#: alone or before it too; what is shown of them, states with standard deviations.
+Give = Literal["end", "after", "all", "brief"]
+
+
 @lru_cache(maxsize=16)
-def kalman_step(n: int, m: int, of_Phi: Pattern, of_C: Pattern, alone: bool = False) -> Recursion:
-    """(state, numbers of one sample) -> (state; x and P after the reading; and before it), or the
-    state `alone`.
+def kalman_step(n: int, m: int, of_Phi: Pattern, of_C: Pattern, give: Give = "all") -> Recursion:
+    """(state, numbers of one sample) -> state, and what is asked for.
 
     state: x with the factors of P; numbers: Φ, forced step, Q, C, diagonal of R, y. Readings are
     taken one component after the other, which needs no inverse (their noise is independent).
+    after: x and P after the reading; all: and before it. brief: x and std after the reading;
+    innovations, the std expected of them, and νᵀS⁻¹ν.
     """
     both = ca.SX.sym("both", factors.size(n))
     x, (U, D) = factors.unpacked(both, n)
@@ -59,25 +64,31 @@ def kalman_step(n: int, m: int, of_Phi: Pattern, of_C: Pattern, alone: bool = Fa
     u, Q = ca.SX.sym("u", n), ca.SX.sym("Q", n, n)
     R, y = ca.SX.sym("R", m), ca.SX.sym("y", m)
     before_x, before = Phi @ x + u, factors.moved((U, D), Phi, factors.factored(Q))
-    after_x, after = before_x, before
+    after_x, after, squares = before_x, before, ca.SX(0)
     for i in range(m):
         c = C[i, :].T
         innovation = y[i] - ca.dot(c, after_x)
-        after, gain = factors.read(after, c, R[i])
+        after, gain, variance = factors.read_with(after, c, R[i])
         after_x = after_x + gain * innovation
+        squares += factors.over(innovation**2, variance)
     numbers = ca.vertcat(*[by_rows(e) for e in (full, u, Q, whole, R, y)])
-    outputs = [
-        factors.packed(after_x, after),
-        packed(after_x, factors.multiplied(after)),
-        packed(before_x, factors.multiplied(before)),
-    ]
-    outputs = outputs[:1] if alone else outputs
+    outputs = [factors.packed(after_x, after)]
+    if give in ("after", "all"):
+        outputs.append(packed(after_x, factors.multiplied(after)))
+    if give == "all":
+        outputs.append(packed(before_x, factors.multiplied(before)))
+    if give == "brief":
+        expected = [ca.sqrt(factors.variance(before, C[i, :].T) + R[i]) for i in range(m)]
+        outputs.append(ca.vertcat(after_x, factors.std(after)))
+        outputs.append(ca.vertcat(y - C @ before_x, *expected, squares))
+    outputs = [ca.densify(e) for e in outputs]
     return Recursion(ca.Function("step", [both, numbers], outputs, {"cse": True}))
 
 
 @lru_cache(maxsize=16)
-def smoother_step(n: int, m: int, of_Phi: Pattern, of_C: Pattern) -> Recursion:
-    """(what is read after a sample; numbers) -> (what is read after the sample before it; x and P).
+def smoother_step(n: int, m: int, of_Phi: Pattern, of_C: Pattern, brief: bool = False) -> Recursion:
+    """(what is read after a sample; numbers) -> (what is read after the sample before it; x and P,
+    or in `brief` x and std).
 
     What later readings say of a sample are n readings of it, with gradients B, weights and values,
     which the filter's state there takes like its own (two filters: Mayne 1966; Fraser & Potter
@@ -104,7 +115,8 @@ def smoother_step(n: int, m: int, of_Phi: Pattern, of_C: Pattern) -> Recursion:
         x = x + gain * (value[j] - ca.dot(B[:, j], x))
     numbers = ca.vertcat(*[by_rows(e) for e in (full, u, Q, whole, R, y, own)])
     back = ca.vertcat(*[ca.vec(ca.densify(e)) for e in (B, weight, value)])
-    outputs = [back, packed(x, factors.multiplied(found))]
+    shown = ca.vertcat(x, factors.std(found)) if brief else packed(x, factors.multiplied(found))
+    outputs = [back, ca.densify(shown)]
     return Recursion(ca.Function("step", [later, numbers], outputs, {"cse": True}))
 
 
@@ -116,27 +128,6 @@ def by_rows(matrix: Any) -> Any:
 def packed(x: Any, P: Any) -> Any:
     """x and P column by column."""
     return ca.vertcat(ca.densify(x), ca.vec(ca.densify(P)))
-
-
-def run_steps(
-    steps: Recursion, state: Array, parts: Sequence[Array], *, keep: bool = True
-) -> list[Array]:
-    """Every output of the steps, (N, …) each.
-
-    `state`: what the first step begins from; `parts`: arrays (N, …) of what each step is given,
-    matrices included, in the order of its numbers; (N − 1, …) where the first is given zeros.
-    Without `keep` of the first output nothing of use.
-    """
-    N = max(map(len, parts))
-    sizes = [int(np.prod(p.shape[1:])) for p in parts]
-    numbers = np.empty((N, sum(sizes)))
-    place = 0
-    for p, size in zip(parts, sizes, strict=True):
-        own = numbers[:, place : place + size]
-        place += size
-        own[N - len(p) :] = p.reshape(len(p), size)
-        own[: N - len(p)] = 0.0
-    return steps(state, numbers, keep=keep)
 
 
 def unpacked(both: Array, n: int) -> tuple[Array, Array]:

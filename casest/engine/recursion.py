@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import ctypes
 import os
+from collections.abc import Sequence
 from typing import Any
 
 import casadi as ca
@@ -24,18 +25,26 @@ CHUNK = 500
 #: Steps from which on the cache is looked at, and from which on a compiler is worthwhile.
 LOOK, WORTHWHILE = 5_000, 60_000
 #: No contraction: the digits are those of the virtual machine.
-_FLAGS = [["-O1", "-ffp-contract=off", "-fno-math-errno"]]
+_FLAGS = [["-O2", "-ffp-contract=off", "-fno-math-errno"]]
 
+#: Part p of what a step is given lies at part[p] + k·step[p], from k = late[p] on.
 _LOOP = """
-void casest_run(const double *state, const double *numbers, long n, double **out, int keep) {
+void casest_run(const double *state, const double **part, const long *own, const long *step,
+                const long *late, long parts, long n, double **out, int keep) {
   const double *from = state;
+  double given[%(wide)d];
   const double *arg[%(arg)d];
   double *res[%(res)d], w[%(w)d];
   casadi_int iw[%(iw)d];
   static const long size[] = {%(sizes)s};
   for (long k = 0; k < n; ++k) {
+    double *to = given;
+    for (long p = 0; p < parts; ++p) {
+      const double *at = part[p] + (k - late[p]) * step[p];
+      for (long i = 0; i < own[p]; ++i) *to++ = k < late[p] ? 0.0 : at[i];
+    }
     arg[0] = from;
-    arg[1] = numbers + k * %(wide)d;
+    arg[1] = given;
     res[0] = out[0] + (keep ? k : k %% 2) * size[0];
     for (int i = 1; i < %(outputs)d; ++i) res[i] = out[i] + k * size[i];
     casest_step(arg, res, iw, w, 0);
@@ -62,30 +71,35 @@ class Recursion:
         self._looked = self._built = False
         self._chunks: dict[int, Any] = {}
 
-    def __call__(self, state: Floats, numbers: Floats, *, keep: bool = True) -> list[Floats]:
-        """Every output of every step, (N, …) each; without `keep` of the states nothing of use.
+    def __call__(
+        self, state: Floats, numbers: Floats | Sequence[Floats], *, keep: bool = True
+    ) -> list[Floats]:
+        """Every output of every step, (N, …) each; without `keep` the last state alone.
 
-        `state`: what the first step begins from; `numbers` (N, …): what each step is given.
+        `state`: what the first step begins from; `numbers` (N, …): what each step is given, or
+        parts of it, arrays (N, …) one after the other; a shorter one is zero at the first steps.
         """
-        count = len(numbers)
+        parts = [_rows(p) for p in ([numbers] if isinstance(numbers, np.ndarray) else numbers)]
+        count = max(map(len, parts))
         state = np.ascontiguousarray(state, float).ravel()
-        numbers = np.ascontiguousarray(numbers, float)
         rows = [count if keep or i else 2 for i in range(len(self.sizes))]
         found = [np.empty((r, size)) for r, size in zip(rows, self.sizes, strict=True)]
         compiled = self._compiled(count)
         if compiled is None:
-            self._replay(state, numbers, found, keep)
+            last = self._replay(state, parts, found, keep)
             self._replayed += count
-            return found
-        places = (ctypes.c_void_p * len(found))(*[f.ctypes.data for f in found])
+            return found if keep else [last[None], *found[1:]]
+        sizes, steps = [p.shape[1] for p in parts], [p.strides[0] // 8 for p in parts]
         compiled.casest_run(
             ctypes.c_void_p(state.ctypes.data),
-            ctypes.c_void_p(numbers.ctypes.data),
+            (ctypes.c_void_p * len(parts))(*[p.ctypes.data for p in parts]),
+            *[_longs(x) for x in (sizes, steps, [count - len(p) for p in parts])],
+            ctypes.c_long(len(parts)),
             ctypes.c_long(count),
-            places,
+            (ctypes.c_void_p * len(found))(*[f.ctypes.data for f in found]),
             ctypes.c_int(keep),
         )
-        return found
+        return found if keep else [found[0][[(count - 1) % 2]], *found[1:]]
 
     def _compiled(self, count: int) -> ctypes.CDLL | None:
         wish = os.environ.get("CASEST_KERNEL", "auto")
@@ -106,10 +120,14 @@ class Recursion:
         sizes: dict[str, Any] = {name: getattr(self._step, f"sz_{name}")() + 1
                                  for name in ("arg", "res", "iw", "w")}  # fmt: skip
         sizes |= {"outputs": len(self.sizes), "sizes": ", ".join(map(str, self.sizes))}
-        return str(generator.dump()) + _LOOP % {**sizes, "wide": self._wide}
+        return str(generator.dump()) + _LOOP % {**sizes, "wide": max(self._wide, 1)}
 
-    def _replay(self, state: Floats, numbers: Floats, found: list[Floats], keep: bool) -> None:
-        chunk = _chunk(len(numbers))
+    def _replay(
+        self, state: Floats, given: Sequence[Floats], found: list[Floats], keep: bool
+    ) -> Floats:
+        """The last state; every output in `found`, states only with `keep`."""
+        count = max(map(len, given))
+        chunk = _chunk(count)
         if chunk not in self._chunks:
             self._chunks[chunk] = self._step.mapaccum("steps", chunk)
         # CasADi's matrices are column by column: a row of these arrays is one of its columns.
@@ -117,18 +135,19 @@ class Recursion:
         parts = [np.empty((chunk, size)) for size in self.sizes]
         for i, part in enumerate(parts):
             buffer.set_res(i, memoryview(part))  # type: ignore[arg-type]
-        for k in range(0, len(numbers), chunk):
-            given = numbers[k : k + chunk]
-            size = len(given)
+        for k in range(0, count, chunk):
+            size = min(chunk, count - k)
+            numbers = _side_by_side(given, k, size, count)
             if size < chunk:
-                given = np.concatenate([given, np.repeat(given[-1:], chunk - size, axis=0)])
-            for i, array in enumerate((state, given)):
+                numbers = np.concatenate([numbers, np.repeat(numbers[-1:], chunk - size, axis=0)])
+            for i, array in enumerate((state, numbers)):
                 buffer.set_arg(i, memoryview(array))  # type: ignore[arg-type]
             run()
             for i, part in enumerate(parts):
                 if keep or i:
                     found[i][k : k + size] = part[:size]
-            state = parts[0][-1].copy()
+            state = parts[0][size - 1].copy()
+        return state
 
 
 def _shared(step: ca.Function, name: str) -> ca.Function:
@@ -147,6 +166,31 @@ def _either(step: ca.Function, instead: ca.Function) -> ca.Function:
     chosen = ca.Function.if_else("chosen", taken, kept)
     found = chosen.call([first[-1][-1] > 0, *arguments, *first])
     return ca.Function("casest_step", arguments, found)
+
+
+def _rows(part: Floats) -> Floats:
+    """An array (N, …) as rows of numbers that lie one after the other; how far apart they are is of
+    no matter."""
+    size = int(np.prod(part.shape[1:]))
+    rows = np.asarray(part, float).reshape(len(part), size)
+    even = rows.strides[0] % 8 == 0 and (size < 2 or rows.strides[1] == 8)
+    return rows if even else np.ascontiguousarray(rows)
+
+
+def _side_by_side(parts: Sequence[Floats], first: int, count: int, whole: int) -> Floats:
+    """What so many steps are given, (count, …)."""
+    numbers = np.zeros((count, sum(p.shape[1] for p in parts)))
+    place = 0
+    for p in parts:
+        late = whole - len(p)
+        own = p[max(first - late, 0) : max(first + count - late, 0)]
+        numbers[count - len(own) :, place : place + p.shape[1]] = own
+        place += p.shape[1]
+    return numbers
+
+
+def _longs(numbers: Sequence[int]) -> Any:
+    return (ctypes.c_long * max(len(numbers), 1))(*numbers)
 
 
 def _chunk(count: int) -> int:

@@ -19,7 +19,6 @@ from casest.declaration.shapes import Array
 from casest.declaration.tracing import flat
 from casest.dynamics.declare import Dynamics
 from casest.dynamics.extended import over_samples, replay
-from casest.dynamics.stepping import run_steps
 from casest.engine import Recursion
 from casest.errors import CasestError, UsageError
 
@@ -195,7 +194,7 @@ def _way(step: Recursion, given: Curve, start: Array, time: Array, noise: Array)
         return start[None]
     h = np.diff(time)
     numbers = [given(time[:-1]), given(time[:-1] + 0.5 * h), given(time[1:]), h[:, None], noise]
-    (after,) = run_steps(step, start, numbers)
+    (after,) = step(start, numbers)
     return np.concatenate([start[None], after])
 
 
