@@ -57,6 +57,12 @@ class Tried:
         catalogue = [e for e in self.catalogue if self._in_time or e.kind not in OVER_TIME]
         return self._found.of(fit.model, lambda: candidates(fit.model, self.rows.runs, catalogue))
 
+    def like(self, fit: Fit, what: Candidate) -> Candidate | None:
+        """The candidate of that label, as it could be missing in a fit."""
+        own = [e for e in self.catalogue if e.name == what.name]
+        several = candidates(fit.model, self.rows.runs, own)[0] if what.effect is not None else []
+        return next((c for c in several if c.label == what.label), None)
+
     def trials(self, fit: Fit) -> list[Trial]:
         """Every candidate in its columns, over its grid."""
         return self._trials.of(fit, lambda: self.of(fit, self._expanded(fit)))
