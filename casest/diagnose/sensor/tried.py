@@ -34,7 +34,7 @@ LONGEST_POSE = 32
 
 
 @effect(on="output")
-def _shift(y: SX, *, k: SX = param(each, "[y]")) -> SX:
+def offset(y: SX, *, k: SX = param(each, "[y]")) -> SX:
     """An offset: its slope is that of the residual in what the sensor gives."""
     return y + k
 
@@ -133,9 +133,13 @@ class Tried:
 
     def shift(self, fit: Fit) -> tuple[str, Array] | None:
         """What the sensor gives, and the residual's slope (N, m, axes) in a shift of it."""
+        return self.slope(fit, offset)
+
+    def slope(self, fit: Fit, probing: Effect) -> tuple[str, Array] | None:
+        """What an effect acts on, and the residual's slope (N, m, k) in its unknowns."""
         problem, point = problem_of(fit, self.rows.runs)
         try:
-            probe = Candidate(placed_in(_shift, fit.model))
+            probe = Candidate(placed_in(probing, fit.model))
         except CasestError:
             return None
         ((_, slope),) = slopes(problem, point, [probe], self.rows.index)
