@@ -171,6 +171,7 @@ def said(closing: Closing) -> dict[str, Any]:
         "verdict": closing.verdict,
         "found": found,
         "one_of": one_of,
+        "described": list(closing.misfit.described),
         "share": float(closing.misfit.fraction),
     }
 

@@ -38,7 +38,8 @@ def is_named(r: Record) -> bool:
     """Is the first thing that is found the one that is there, or a description of it?"""
     first = (causes(r) or r["found"])[:1]
     every = [f for f in r["found"] if f["describes"]]
-    return any(is_right(f, r) for f in [*first, *every])
+    said = {*r.get("described", ())} & {*r["right"]}
+    return bool(said) or any(is_right(f, r) for f in [*first, *every])
 
 
 def wrong(r: Record) -> bool:

@@ -58,27 +58,25 @@ def test_of_causes_of_which_none_is_added_it_is_said_how_far_each_moves_the_para
     assert "who knows which of them is there says so, as --effects warm_up" in printed
 
 
+SWAYS = "the known reference sways: its size follows a smooth course"
+WANDERS = "the offset of each axis follows a smooth course of its own"
+
+
 @pytest.mark.parametrize(
-    ("of_field", "of_offset", "name", "words"),
+    ("of_field", "of_offset", "times", "name", "words"),
     [
-        pytest.param(
-            *(
-                0.006,
-                0.0,
-                "reference_wander",
-                "the known reference sways: its size follows a smooth",
-            ),
-            marks=pytest.mark.long,
-        ),
-        (0.0, 0.2, "bias_course", "the offset of each axis follows a smooth course of its own"),
+        pytest.param(0.006, 0.0, 1, "reference_wander", SWAYS, marks=pytest.mark.long),
+        (0.006, 0.0, 10, "reference_wander", SWAYS),
+        (0.0, 0.2, 1, "bias_course", WANDERS),
     ],
 )
 def test_a_slow_course_is_said_to_be_of_the_reference_or_of_the_offset(
-    tmp_path, of_field, of_offset, name, words
+    tmp_path, of_field, of_offset, times, name, words
 ):
+    """Also one that sways many times, which six polynomials do not follow."""
     rng = np.random.default_rng(3)
     t = 0.1 * np.arange(600)
-    x = 2 * t / t[-1] - 1
+    x = times * (2 * t / t[-1] - 1)
     course = np.sin(2.5 * x) + 0.4 * np.cos(5 * x)
     b = rng.standard_normal((600, 3))
     b *= 48 / np.linalg.norm(b, axis=1)[:, None]

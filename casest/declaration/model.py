@@ -329,6 +329,7 @@ class Model:
         shape = (1, 1) if attached.kind == "time" else self._target_shape(target)
         check_null(attached, shape, shapes)
         made = replace(self, effects=(*self.effects, attached))
+        made.__dict__["resting"] = self.resting  # that is the body's, and to look takes a trace
         if why := made._not_applicable(attached):
             raise UsageError(f"effect {label} is not applicable to model {self.name}: {why}")
         return made

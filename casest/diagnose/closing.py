@@ -9,9 +9,9 @@ import numpy as np
 
 from casest.data.run import Run
 from casest.declaration.shapes import Array
-from casest.diagnose.candidates.candidates import Candidate, Skipped
+from casest.diagnose.candidates.candidates import Skipped
 from casest.diagnose.cross_validation import Folds
-from casest.diagnose.found import Found, Undecided
+from casest.diagnose.found import Course, Found, Undecided
 from casest.diagnose.misfit.left import Misfit, left_over
 from casest.diagnose.visibility import Visible
 from casest.estimate.estimate import Estimate
@@ -38,7 +38,7 @@ class Closing:
     runs: tuple[Run, ...]
     undecided: Undecided | None = None
     #: What a slow course in the residual looks like, though its cause is not known.
-    described: tuple[Candidate, ...] = ()
+    described: tuple[Course, ...] = ()
 
     @cached_property
     def misfit(self) -> Misfit:

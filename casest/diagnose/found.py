@@ -54,3 +54,12 @@ class Undecided:
     names: tuple[str, ...]
     share: float
     moves: Mapping[str, Mapping[str, Array]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Course:
+    """A slow course in what is left, what it looks like, and its share of the variance; 0: unknown,
+    and then it is no evidence by itself."""
+
+    what: Candidate
+    share: float = 0.0

@@ -22,6 +22,7 @@ from casest.diagnose.misfit.left import predictions
 from casest.diagnose.noise.tails import outliers_p_value
 from casest.diagnose.protocol import Kept, State, search
 from casest.diagnose.sensor import NOT_FINITE, Fit, Sensor
+from casest.diagnose.sensor.courses import courses
 from casest.diagnose.visibility import Visible, visible
 from casest.effects import CATALOGUE
 from casest.effects.placing import prepared
@@ -178,14 +179,8 @@ def _closed(sensor: Sensor, before: Estimate, folds: Folds, say: Callable[[str],
         _visible(sensor, declared),
         sensor.runs,
         _undecided(sensor, state),
-        _courses(state),
+        courses(sensor, state.fit, state.last) if state.last else (),
     )
-
-
-def _courses(state: State[Fit]) -> tuple[Candidate, ...]:
-    """What a slow course in what is left looks like."""
-    found = state.last.descriptions if state.last else ()
-    return tuple(e.trials[0].what for e in found if not e.trials[0].what.column)
 
 
 def _declared_walks(sensor: Sensor) -> list[Effect]:

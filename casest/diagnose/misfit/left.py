@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from casest.declaration.shapes import Array
 from casest.diagnose.candidates.candidates import Candidate, usable_columns
-from casest.diagnose.found import Undecided
+from casest.diagnose.found import Course, Undecided
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.misfit.pure_error import pure_error
 from casest.diagnose.misfit.structure import structures
@@ -83,7 +83,7 @@ def left_over(
     held_out: Sequence[Array],
     correlated_over: float = 1.0,
     undecided: Undecided | None = None,
-    described: Sequence[Candidate] = (),
+    described: Sequence[Course] = (),
     *,
     wanders: bool = False,
 ) -> Misfit:
@@ -110,11 +110,16 @@ def left_over(
         fraction = max(fraction, undecided.share)
         several = " and other shapes" if len(undecided.names) == 1 else ""
         where = [f"which {' or '.join(undecided.names[:3])}{several} explain alike", *where]
+    share = 0.0 if wanders else max((c.share for c in described), default=0.0)
+    if share > LEVELS.share and not any(f.slow for f in found):
+        # Slow is what it goes with, not what it looks like where the motion is quick.
+        fraction = max(fraction, share)
+        where.append(f"{100 * share:.0f} % of it is a slow course of unknown cause")
     said = described if where and not wanders else ()
     if said:
-        looks = " or ".join(_looks_like(c) for c in said)
+        looks = " or ".join(_looks_like(c.what) for c in said)
         where.append(f"its slow course is best described by {looks}")
-    names = tuple(c.label for c in said)
+    names = tuple(c.what.label for c in said)
     return Misfit(bool(where), float(fraction), "; ".join(where), noise.content, names)
 
 

@@ -218,8 +218,7 @@ class Sensor(Subject[Fit]):
 
     def _whole(self, fit: Fit, base: Fit, what: Candidate) -> Candidate | None:
         """An effect of the fit on all axes, beside the base; None where it is that already."""
-        every = self.tried.found(base)[0] if what.effect is not None else []
-        whole = next((c for c in every if c.label == what.label), None)
+        whole = self.tried.like(base, what)
         if whole is None:
             return None
         if what.parameters(fit.model) == whole.parameters(whole.traced_on(base.model)):

@@ -34,7 +34,7 @@ LONGEST_POSE = 32
 
 
 @effect(on="output")
-def _shift(y: SX, *, k: SX = param(each, "[y]")) -> SX:
+def offset(y: SX, *, k: SX = param(each, "[y]")) -> SX:
     """An offset: its slope is that of the residual in what the sensor gives."""
     return y + k
 
@@ -56,6 +56,12 @@ class Tried:
         """What could be missing, and what does not apply here."""
         catalogue = [e for e in self.catalogue if self._in_time or e.kind not in OVER_TIME]
         return self._found.of(fit.model, lambda: candidates(fit.model, self.rows.runs, catalogue))
+
+    def like(self, fit: Fit, what: Candidate) -> Candidate | None:
+        """The candidate of that label, as it could be missing in a fit."""
+        own = [e for e in self.catalogue if e.name == what.name]
+        several = candidates(fit.model, self.rows.runs, own)[0] if what.effect is not None else []
+        return next((c for c in several if c.label == what.label), None)
 
     def trials(self, fit: Fit) -> list[Trial]:
         """Every candidate in its columns, over its grid."""
@@ -127,9 +133,13 @@ class Tried:
 
     def shift(self, fit: Fit) -> tuple[str, Array] | None:
         """What the sensor gives, and the residual's slope (N, m, axes) in a shift of it."""
+        return self.slope(fit, offset)
+
+    def slope(self, fit: Fit, probing: Effect) -> tuple[str, Array] | None:
+        """What an effect acts on, and the residual's slope (N, m, k) in its unknowns."""
         problem, point = problem_of(fit, self.rows.runs)
         try:
-            probe = Candidate(placed_in(_shift, fit.model))
+            probe = Candidate(placed_in(probing, fit.model))
         except CasestError:
             return None
         ((_, slope),) = slopes(problem, point, [probe], self.rows.index)
