@@ -303,8 +303,8 @@ def _other(name: str, share: float, kept: list[dict[str, Any]]) -> str:
     said = f"{named} of {len(kept)}" if label else f"– ({len(kept)})"
     planted = size if share == 1 else f"{share:g} times that"
     return (
-        f"| {name or 'nothing'} | {planted} | {said} | {other} | {_unexplained(kept)} | {before:.5f} | "
-        f"{after:.5f} |"
+        f"| {name or 'nothing'} | {planted} | {said} | {other} | {_unexplained(kept)} | "
+        f"{before:.5f} | {after:.5f} |"
     )
 
 
