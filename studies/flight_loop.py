@@ -16,7 +16,7 @@ import json
 import os
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from time import perf_counter, process_time
 from typing import Any
@@ -154,30 +154,26 @@ def kind_of(name: str) -> tuple[str, float]:
 
 PAGE = """# The loop in motion on simulated flights
 
-Made by `python studies/flight_loop.py` (part of `make study-motion`). Flights of 60 s by closed
-forms (`tests/flights.py`), Batista's sensor noises; `casest close bias-gravity` as it is shipped,
-with the published intensities as its start.
+Made by `python studies/flight_loop.py` (`make study-flights`), {count} flights and {minutes:.0f}
+minutes of processor time. Flights of 60 s by closed forms (`tests/flights.py`), Batista's sensor
+noises; `casest close bias-gravity` as it is shipped, with the published intensities as its start.
+Seeds from {first} on were looked at by no rule. {aim}
 
 ## Nothing missing
 
 {nulls} flights, half at 25 Hz, half at 50 Hz, with noises of one to three times Batista's, which
 the loop is not told: an effect was reported in {false} ({share:.1%}, at most {upper:.1%} with 95 %
-confidence), a misfit without a name in {unexplained}. Median time {seconds:.1f} s
-(on a machine busy with other work).
+confidence); called unexplained: {unexplained}. Median processor time {seconds:.1f} s.
 
-| other noise | flights | with an effect | with a misfit without a name |
-| --- | --- | --- | --- |
 {kinds}
 
 ## One effect planted
 
-{seeds} flights each, at 50 Hz. Named: first, or among at most two that it cannot be told
-apart from. Errors are one-step innovations of the velocity (m/s, rms, held-out time; noise of
-0.01 m/s stays in any case), and what a flight's log-likelihood gained. `error` is the median
-distance of the found number from the planted one, in its own standard deviations.
+At 50 Hz. Named: first, or among at most two that it cannot be told apart from. Errors are one-step
+innovations of the velocity (m/s, rms, held-out time; noise of 0.01 m/s stays in any case), and what
+a flight's log-likelihood gained. `error` is the median distance of the found number from the
+planted one, in its own standard deviations.
 
-| planted | size | named | of them alone | anything else | before | after | log-likelihood | error |
-| --- | --- | --- | --- | --- | --- | --- | --- | --- |
 {rows}
 
 ## Effects of the sensors' catalogue
@@ -185,14 +181,32 @@ distance of the found number from the planted one, in its own standard deviation
 As above. A constant wind changes nothing of gravity and bias that a speed through air shows, and
 nothing should be found.
 
-| planted | size | named | anything else | unexplained | before | after |
-| --- | --- | --- | --- | --- | --- | --- |
 {others}
+
+## A noisy gyro
+
+White noise of 0.5 °/s in one reading, ten times Batista's, which the loop is not told either.
+
+{noisy}
 
 ## Two at once
 
 {pair}
 """
+
+#: Columns of the tables.
+KIND_HEAD = ("other noise", "flights", "with an effect", "unexplained")
+ROW_HEAD = ("planted", "size", "named", "of them alone", "anything else", "before", "after",
+            "log-likelihood", "error")  # fmt: skip
+OTHER_HEAD = ("planted", "size", "named", "anything else", "unexplained", "before", "after")
+
+
+def _table(head: Sequence[str], lines: Iterable[str]) -> str:
+    """A table, or that there is none yet."""
+    lines = [line for line in lines if line]
+    if not lines:
+        return "Not made yet."
+    return "\n".join([f"| {' | '.join(head)} |", f"|{' --- |' * len(head)}", *lines])
 
 
 def read() -> dict[tuple[str, int], dict[str, Any]]:
@@ -202,46 +216,53 @@ def read() -> dict[tuple[str, int], dict[str, Any]]:
 
 
 def table(kept: dict[tuple[str, int], dict[str, Any]]) -> str:
-    nulls = [k for k in kept.values() if k["name"] == "null"]
+    def of(name: str) -> list[dict[str, Any]]:
+        return [k for k in kept.values() if k["name"] == name]
+
+    nulls = of("null")
     false = sum(bool(k["found"]) for k in nulls)
-    rows = [
-        _row(name, share, [k for k in kept.values() if k["name"] == f"{name} x{share:g}"])
-        for name in WORLDS
-        for share in SHARES
-    ]
-    kinds = [_kind(name, [k for k in kept.values() if k["name"] == name]) for name in KINDS]
-    both = [k for k in kept.values() if k["name"] == "gyro bias and lever arm"]
+    both = of("gyro bias and lever arm")
     named = sum({"bias of omega", "lever_arm of v"} == set(k["found"]) for k in both)
+    aim = f"Meant are {COUNT} of each kind: what there is is said in each row."
     return PAGE.format(
+        count=len(kept),
+        minutes=sum(k["seconds"] for k in kept.values()) / 60,
+        first=FIRST,
+        aim="" if len(kept) == sum(1 for _ in tasks()) else aim,
         nulls=len(nulls),
         false=false,
         share=false / max(len(nulls), 1),
         upper=float(beta.ppf(0.95, false + 1, max(len(nulls) - false, 1))),
-        unexplained=sum(k["unexplained"] for k in nulls),
+        unexplained=_unexplained(nulls),
         seconds=float(np.median([k["seconds"] for k in nulls])) if nulls else np.nan,
-        kinds="\n".join(kinds),
-        seeds=SEEDS,
-        rows="\n".join(r for r in rows if r),
-        others="\n".join(
-            line
-            for name in flights.CHANGES
-            for share in SHARES
-            if (
-                line := _other(
-                    name, share, [k for k in kept.values() if k["name"] == f"{name} x{share:g}"]
-                )
-            )
+        kinds=_table(KIND_HEAD, (_kind(name, of(name)) for name in KINDS)),
+        rows=_table(ROW_HEAD, (_row(n, s, of(f"{n} x{s:g}")) for n in WORLDS for s in SHARES)),
+        others=_table(
+            OTHER_HEAD,
+            (_other(n, s, of(f"{n} x{s:g}")) for n in flights.CHANGES for s in SHARES),
+        ),
+        noisy=_table(
+            OTHER_HEAD,
+            [_other("", 1.0, of("noisy gyro"))]
+            + [_other(n, 1.0, of(f"{n}, noisy gyro")) for n in BESIDE],
         ),
         pair=f"Gyro bias and lever arm of the table's sizes: exactly both named in {named} of "
         f"{len(both)} flights.",
     )
 
 
+def _unexplained(kept: list[dict[str, Any]]) -> int:
+    return sum(k["verdict"] == "unexplained" for k in kept)
+
+
 def _kind(name: str, kept: list[dict[str, Any]]) -> str:
+    if not kept:
+        return ""
     found = sorted({label for k in kept for label in k["found"]})
     said = f" ({', '.join(found)})" if found else ""
-    some, none = sum(bool(k["found"]) for k in kept), sum(k["unexplained"] for k in kept)
-    return f"| {name.removeprefix('null, ')} | {len(kept)} | {some}{said} | {none} |"
+    some = sum(bool(k["found"]) for k in kept)
+    title = name.removeprefix("null, ")
+    return f"| {title} | {len(kept)} | {some}{said} | {_unexplained(kept)} |"
 
 
 def _row(name: str, share: float, kept: list[dict[str, Any]]) -> str:
@@ -273,17 +294,17 @@ def _other(name: str, share: float, kept: list[dict[str, Any]]) -> str:
     """A line of what changes readings beyond `Sensors`."""
     if not kept:
         return ""
-    _, label, size = flights.CHANGES[name]
+    _, label, size = flights.CHANGES.get(name) or WORLDS.get(name) or (None, "", "–")
     named = other = 0
     for k in kept:
         right = [label == f or label in a for f, a in zip(k["found"], k["alike"], strict=True)]
         named, other = named + any(right), other + (len(right) - sum(right) > 0)
     before, after = (np.median([k[w] for k in kept]) for w in ("before", "after"))
-    unexplained = sum(k["verdict"] == "unexplained" for k in kept)
+    said = f"{named} of {len(kept)}" if label else f"– ({len(kept)})"
     planted = size if share == 1 else f"{share:g} times that"
     return (
-        f"| {name} | {planted} | {f'{named} of {len(kept)}' if label else '–'} | {other} | "
-        f"{unexplained} | {before:.5f} | {after:.5f} |"
+        f"| {name or 'nothing'} | {planted} | {said} | {other} | {_unexplained(kept)} | "
+        f"{before:.5f} | {after:.5f} |"
     )
 
 
@@ -300,10 +321,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--only", default="")
     parser.add_argument("--seconds", type=float, default=np.inf, help="of work, then stop")
+    parser.add_argument(
+        "--table", action="store_true", help="of what there is, and no more flights"
+    )
     options = parser.parse_args()
     KEPT.parent.mkdir(exist_ok=True)
     done, begin = read(), perf_counter()
     left = [x for x in tasks() if x[:2] not in done and re.search(options.only, x[0])]
+    left = [] if options.table else left
     for k, (name, seed, sensors, rate) in enumerate(left):
         if perf_counter() - begin > options.seconds:
             break

@@ -100,11 +100,11 @@ def test_the_gramian_of_any_window_is_that_of_its_record(kind, monkeypatch):
         assert np.abs((products.gramian(first, last) - expected) / scale).max() < 1e-12
 
 
-def peak(work, run):
+def peak(work, run, model=bias_gravity):
     """Bytes at the worst moment beyond the record and what is returned."""
     tracemalloc.start()
     try:
-        found = work(bias_gravity, run)
+        found = work(model, run)
         left, most = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
@@ -121,6 +121,19 @@ def test_memory_beyond_the_record_and_the_result_is_constant(work, monkeypatch):
     work(bias_gravity, runs[0])  # what is made once
     few, many = (peak(work, run) for run in runs)
     assert many - few < 8000 * 100
+
+
+@pytest.mark.long
+def test_beside_noisy_inputs_a_pass_keeps_what_it_goes_along_twice(monkeypatch):
+    """States, and of the noise on their errors 21 numbers, twice; beside them the inputs and std:
+    fewer than 90 numbers a sample, where one covariance and its steps have 243."""
+    monkeypatch.setattr(course, "PIECE", 64)
+    monkeypatch.setenv("CASEST_KERNEL", "off")
+    runs = [record(n) for n in (300, 700)]
+    model = MODELS["noisy inputs"]
+    followed(model, runs[1])  # what is made once
+    few, many = (peak(followed, run, model) for run in runs)
+    assert many - few < 400 * 90 * 8
 
 
 def test_the_file_of_states_is_written_in_pieces_and_holds_every_digit(monkeypatch):

@@ -22,6 +22,7 @@ from casest.results.fitted import WeakCombination
 from casest.results.observability import ObservedParameters, observe_motion
 from casest.results.result import reproduced
 from casest.results.states import follow
+from casest.results.trajectory import weakly_told
 from casest_problems.bias_gravity import bias_gravity
 
 DT, SIGMA = 0.02, {"a": 0.02, "v": 0.01}
@@ -223,6 +224,21 @@ def test_a_rate_as_small_as_the_noise_of_one_reading_deceives_no_filter():
     for k in (len(T) // 2, -1):
         e = found.x[k] - truth[k]
         assert e @ np.linalg.solve(found.P[k], e) < chi2.ppf(1 - 1e-4, 9)
+
+
+@pytest.mark.parametrize(
+    ("spin", "weak"), [("one axis, 17 °/s", ["bias[2]"]), ("all axes, 30 °/s", [])]
+)
+def test_what_a_record_tells_less_of_than_was_declared_is_called_weak(spin, weak):
+    """Of gravity and bias along the axis only the sum is seen, and known to ± 10 and ± 1."""
+    left = flights.AXIS[2] / np.sqrt(1 + PRIOR["bias"] ** 2 / PRIOR["gravity"] ** 2)
+    run = record(spin, 0.0)[0].take(slice(0, 900))
+    result = follow(estimator(0.0), run)
+    said = [note for note in result.notes if note.startswith("weak: ")]
+    assert said == weakly_told(filtered(estimator(0.0), run))  # as close does
+    assert [f"weak: {name} (± {left:.3g} m/s^2 at the end, ± 1 declared" for name in weak] == [
+        note.partition(" of the start")[0] for note in said
+    ]
 
 
 def test_where_noise_acts_on_what_stays_hidden_the_filter_says_that_it_claims_too_much():

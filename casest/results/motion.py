@@ -34,7 +34,7 @@ from casest.results.result import (
     reproduced,
 )
 from casest.results.rounding import rounded
-from casest.results.trajectory import Innovations, Trajectory, trajectory_of
+from casest.results.trajectory import Innovations, Trajectory, trajectory_of, weakly_told
 
 
 class Intensities(Struct, frozen=True):
@@ -164,7 +164,7 @@ def motion_result(
         refused=[Explained(name, why) for name, why in closing.refused],
         innovations=_innovations(after),
         units={s.name: s.unit for s in declared.states},
-        notes=assumed(closing.run),
+        notes=[*assumed(closing.run), *weakly_told(after.found)],
         convention=inspect.getdoc(declared.function) or "",
         reproduce=reproduced(command, data),
         closing=closing,

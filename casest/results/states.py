@@ -20,7 +20,7 @@ from casest.dynamics.moving_horizon import Horizon, moving_horizon
 from casest.results.file import plain
 from casest.results.observability import assumed, too_short
 from casest.results.result import Number, Reproduced, Result, reproduced
-from casest.results.trajectory import Innovations, Trajectory, trajectory_of
+from casest.results.trajectory import Innovations, Trajectory, trajectory_of, weakly_told
 
 #: Rows of states.csv that are written at once.
 ROWS = 8192
@@ -121,7 +121,7 @@ def follow(
             *_taken_for_motion(found.model, run),
             *_bounded(found),
             *(_of_windows(found) if isinstance(found, Horizon) else _of_the_record(found)),
-            *_too_short(run, found.model.size),
+            *(_too_short(run, found.model.size) or weakly_told(found)),
         ],
         samples=len(found.time),
         states=_final(found),

@@ -6,14 +6,19 @@ import inspect
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 from msgspec import Struct
 
 from casest.data.run import Run
 from casest.declaration.shapes import Array
 from casest.dynamics import Dynamics
 from casest.dynamics.course import Course
+from casest.dynamics.declare import EXACT
 from casest.dynamics.filter import Filtered
 from casest.results.result import Number
+
+#: A record that tells as much as was known beforehand leaves this share of its standard deviation.
+HALF = 0.5**0.5
 
 
 class Innovations(Struct, frozen=True):
@@ -94,3 +99,22 @@ def _readings(model: Dynamics) -> list[tuple[str, str]]:
         names = [f"{name}[{k}]" for k in range(signal.size)] if signal.size > 1 else [name]
         found += [(n, signal.unit or "1") for n in names]
     return found
+
+
+def weakly_told(found: Filtered | Course) -> list[str]:
+    """A sentence on numbers of the state of which the record tells less than was declared of them,
+    from its beginning to its end: what is printed of them is the declaration."""
+    model, first, (_, last) = found.model, found.smoothed_std[0], found.end
+    last = last if last.ndim == 1 else np.sqrt(np.diag(last))
+    declared = np.sqrt(np.diag(model.start_covariance))
+    guessed = declared > 2 * EXACT * np.maximum(1.0, np.abs(model.start))
+    weak = guessed & (first > HALF * declared) & (last > HALF * declared) & (last < declared / HALF)
+    said = ", ".join(
+        f"{model.names[k]} (± {last[k]:.3g} {model.state_units[k]} at the end, ± {declared[k]:.3g} "
+        "declared of the start)"
+        for k in np.flatnonzero(weak)
+    )
+    return [
+        f"weak: {said}: this record tells less than was declared, and what depends on it is no "
+        "better known (casest observe names the direction)"
+    ] if said else []  # fmt: skip
