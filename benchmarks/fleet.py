@@ -4,7 +4,8 @@ Run `python benchmarks/fleet.py [SENSORS …]` (10⁵ and 10⁶ unless told; 10�
 A data set is written first, 100 000 sensors in a file. Then in turns, seconds of the processor (so
 that other work on the machine counts less): `calibrate_many` on arrays, with and without `misfit`,
 and the command from Parquet to Parquet in a process of its own, whose start is counted; its largest
-memory; and what two processes take together. Last, what a sensor costs whose readings are sent to a
+memory; and what two processes take together, beside two commands at the same time with half of the
+files each. Last, what a sensor costs whose readings are sent to a
 Dask worker rather than read by it.
 """
 
@@ -16,6 +17,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from time import perf_counter, process_time, sleep
 from typing import Any
@@ -59,19 +61,36 @@ def write(folder: Path, sensors: int) -> None:
 
 def command(dataset: Path, out: Path, processes: int) -> tuple[float, float, float]:
     """Seconds of the processor, seconds, and largest memory of one process in MB."""
-    shutil.rmtree(out, ignore_errors=True)
-    words = ["fleet", "norm-triangular", dataset, "-o", out, "--set", f"norm={GRAVITY} m/s^2"]
-    before, began = resource.getrusage(resource.RUSAGE_CHILDREN), perf_counter()
-    argv = [sys.executable, "-c", CODE, *map(str, words), "--processes", str(processes)]
-    going = subprocess.Popen(argv, stdout=subprocess.DEVNULL)
+    return commands([dataset], [out], processes)
+
+
+def commands(
+    datasets: Sequence[Path], outs: Sequence[Path], processes: int
+) -> tuple[float, float, float]:
+    """The same of several commands at the same time."""
+    before, began, going = resource.getrusage(resource.RUSAGE_CHILDREN), perf_counter(), []
+    for dataset, out in zip(datasets, outs, strict=True):
+        shutil.rmtree(out, ignore_errors=True)
+        words = ["fleet", "norm-triangular", dataset, "-o", out, "--set", f"norm={GRAVITY} m/s^2"]
+        argv = [sys.executable, "-c", CODE, *map(str, words), "--processes", str(processes)]
+        going.append(subprocess.Popen(argv, stdout=subprocess.DEVNULL))
     most = 0.0
-    while going.poll() is None:
-        most = max(most, largest_of(going.pid))
+    while any(one.poll() is None for one in going):
+        most = max(most, *(largest_of(one.pid) for one in going))
         sleep(0.05)
-    assert going.returncode == 0
+    assert not any(one.returncode for one in going)
     after, took = resource.getrusage(resource.RUSAGE_CHILDREN), perf_counter() - began
     spent = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
     return spent, took, most
+
+
+def halves(dataset: Path) -> list[Path]:
+    """Two folders with every other file of a data set each, as links."""
+    found = [dataset.parent / f"half-{k}" for k in range(2)]
+    for k, file in enumerate(sorted(dataset.iterdir())):
+        found[k % 2].mkdir(exist_ok=True)
+        (found[k % 2] / file.name).symlink_to(file)
+    return found
 
 
 def largest_of(command: int) -> float:
@@ -140,11 +159,16 @@ def main() -> None:
             if size > EACH:
                 one = spent
                 spent, took, memory = command(dataset, out, 2)
+                apart = halves(dataset)
+                own, _, _ = commands(apart, [half.with_suffix(".out") for half in apart], 1)
                 print(
                     f"  two processes: {took:.1f} s, {spent:.1f} s of the processor, "
-                    f"{one / spent:.2f} of the rate per core of one; at most {memory:.0f} MB",
+                    f"{one / spent:.2f} of the rate per core of one, {own / spent:.2f} of two "
+                    f"commands at the same time; at most {memory:.0f} MB",
                     flush=True,
                 )
+                for half in apart:
+                    shutil.rmtree(half)
             shutil.rmtree(dataset)
     wire, copy = over_the_wire(v)
     print(f"over the wire {wire:.2f} µs a sensor of {v[0].nbytes} bytes; a copy {copy:.2f} µs")

@@ -50,6 +50,9 @@ def test_an_effect_that_no_sensor_shows_is_named_by_three_thousand(tmp_path, cap
     pq.write_table(fleets.wide(v, fleets.names(count)), file)
     assert close(file, "-o", str(tmp_path / "out")) == 0
     assert "3000 sensors have cubic in common" in " ".join(capsys.readouterr().out.split())
+    page = (tmp_path / "out" / "common.html").read_text(encoding="utf-8")
+    assert "3,000 sensors have cubic in common." in page
+    assert "sigma before" in page
     found = json.loads((tmp_path / "out" / "common.json").read_text())
     (effect,) = found["effects"]
     assert effect["name"] == "cubic"

@@ -148,6 +148,57 @@ def test_memory_does_not_grow_with_the_record(there, tmp_path, monkeypatch):
     assert peaks[1] - peaks[0] < 0.1e6
 
 
+SOURCE = """
+import pyarrow.parquet
+
+WHOLE = pyarrow.parquet.read_table("whole.parquet")
+
+
+def tables():
+    for first in (0, 1500, 1503):
+        yield WHOLE.slice(first, 1500 if not first else 3 if first == 1500 else None)
+
+
+def broken():
+    yield WHOLE.slice(0, 700)
+    raise OSError("the disk is gone")
+
+
+def numbers():
+    return [{"time [ms]": [1.0]}, 3.0]
+
+
+something = 7
+"""
+
+
+def test_tables_that_a_function_makes_are_the_record(there, capsys):
+    Path("source.py").write_text(SOURCE, encoding="utf-8")
+    _, found, _ = calibrated(capsys, "source.py:tables", "--partitions")
+    _, whole, _ = calibrated(capsys, "parts", "--partitions")
+    assert found["estimate"] == whole["estimate"]
+    assert [len(digest) for digest in found["reproduce"]["sha256"].values()] == [64]
+
+
+WRONG = {
+    "source.py:tabels": "no function 'tabels'",
+    "source.py:something": "no function 'something'",
+    "source.py:broken": "source.py:broken, part 1: OSError: the disk is gone",
+    "source.py:numbers": "source.py:numbers, part 0",
+    "nothing.py:tables": "nothing.py: no such file",
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_a_function_that_makes_no_record_is_named(there, capsys, name):
+    Path("source.py").write_text(SOURCE, encoding="utf-8")
+    code, _, said = calibrated(capsys, name, "--partitions", "-o", "out")
+    assert code == 1
+    assert WRONG[name] in said
+    assert len(said.strip().splitlines()) == 1
+    assert not Path("out").exists()
+
+
 # -- what is refused -------------------------------------------------------------------------------
 
 

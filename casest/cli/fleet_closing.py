@@ -22,6 +22,7 @@ def fleet_closing(model_name: str, data: Sequence[str], options: CloseOptions) -
     from casest.effects import CATALOGUE
     from casest.fleet.calibrate_many import refuse_equations
     from casest.fleet.common import CHANCE
+    from casest.report.html.common import PAGE, common_page
     from casest.report.text.fleet import common_text
     from casest.results.file import as_json
     from casest.results.fleet import COMMON, common_result
@@ -53,6 +54,7 @@ def fleet_closing(model_name: str, data: Sequence[str], options: CloseOptions) -
     result = common_result(job, told, data[0])
     if options.output:
         write(options.output / COMMON, as_json(result.content()))
+        write(options.output / PAGE, common_page(result))
     if options.as_json:
         echo(as_json(result.content()), nl=False)
     else:

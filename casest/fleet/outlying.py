@@ -9,7 +9,7 @@ the two samples with the largest residuals alone: the chance that is told is nev
 from __future__ import annotations
 
 import numpy as np
-from scipy.special import stdtr
+from scipy.special import ndtri, stdtr
 
 from casest.declaration.shapes import Array
 from casest.fleet.fit import Fits, residual_counts
@@ -33,5 +33,9 @@ def outlying(squares: Squares, sensors: Sensors, fits: Fits) -> Array:
         largest = squares.studentised(fits.x, Sensors(few, None), cholesky(fits.matrix))
         own = np.minimum(largest * freedom / squared, freedom * (1 - LEFT))
         t = np.sqrt(own * (freedom - 1) / (freedom - own))
-        chance = np.minimum(1.0, 2 * count * stdtr(freedom - 1, -t))
+        chance = np.ones(len(t))
+        # Student's tails are no lighter than the normal ones: below, the bound says nothing.
+        told = ~(t < -ndtri(0.5 / count))
+        chance[told] = 2 * count[told] * stdtr(freedom[told] - 1, -t[told])
+        chance = np.minimum(1.0, chance)
     return np.asarray(np.where(freedom > 1, chance, np.nan))

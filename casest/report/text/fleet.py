@@ -65,7 +65,7 @@ def common_text(result: FleetClosed, folder: Path | None) -> str:
     if result.invisible:
         lines += ["", item(f"no pose could show: {', '.join(result.invisible)}")]
     if folder is not None:
-        lines += ["", f"Written: {folder}/{COMMON}"]
+        lines += ["", f"Written: {folder}/{COMMON}, common.html"]
     return "\n".join(lines)
 
 
