@@ -18,6 +18,9 @@ from casest.leastsquares.kinds import noises, whitened
 from casest.leastsquares.problem import Point, Problem
 from casest.leastsquares.sums import some_residuals
 
+#: Residuals for each unknown from which on Huber's correction is enough: to 2 % of a variance.
+FEW = 50
+
 
 def has_noise_effects(model: Model) -> bool:
     """Does any effect of the model act on the noise?"""
@@ -71,12 +74,32 @@ def _curve(model: Model) -> Replay:
 def variance_factor(problem: Problem, point: Point) -> float:
     """σ² that multiplies the unweighted (JᵀJ)⁻¹: Huber's (1973) K²·mean(ψ²)/mean(ψ′)².
 
-    K = 1 + (unknowns/residuals)·var(ψ′)/mean(ψ′)² corrects it where residuals are few.
+    K = 1 + (unknowns/residuals)·var(ψ′)/mean(ψ′)² corrects it where residuals are few. Of fewer
+    than FEW for each unknown that is too little, and `_reach` takes the place of K/mean(ψ′).
     """
     residuals = some_residuals(problem, point)
     scale = robust_scale(residuals)
     r = np.concatenate([x.ravel() for x in residuals]) / scale
     w, slope = (out.ravel() for out in _curve(problem.model)(np.zeros(0), r.reshape(-1, 1)))
-    dof = max(len(r) - problem.unknowns, 1)
-    few = 1 + problem.unknowns / len(r) * np.var(slope) / np.mean(slope) ** 2
-    return float(few**2 * scale**2 * np.sum((w * r) ** 2) / dof / np.mean(slope) ** 2)
+    count, squares = len(r), float(scale**2 * np.sum((w * r) ** 2))
+    share = problem.unknowns / count
+    few = 1 + share * np.var(slope) / np.mean(slope) ** 2
+    huber = float(few**2 * squares / max(count - problem.unknowns, 1) / np.mean(slope) ** 2)
+    if not 0 < share < 1 or share * FEW <= 1 or not np.ptp(slope) > 0:
+        return huber
+    return max(huber, (_reach(slope, share) / share) ** 2 * squares / count)
+
+
+def _reach(slope: Array, share: float) -> float:
+    """c: a residual foretold without its own sample exceeds the fitted one by c·ψ, on average.
+
+    It solves mean(1/(1 + c·ψ′)) = 1 − unknowns/residuals (El Karoui, Bean, Bickel, Lim & Yu, PNAS
+    110, 2013, 14557). Where ψ falls again, at most half of what would undo a residual.
+    """
+    from scipy.optimize import brentq
+
+    def left(c: float) -> float:
+        return float(np.mean(1 / (1 + c * slope))) - (1 - share)
+
+    most = 0.5 / max(-float(np.min(slope)), 1e-3)
+    return float(brentq(left, 0.0, most)) if left(most) < 0 else most
