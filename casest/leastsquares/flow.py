@@ -97,7 +97,7 @@ class Integrator:
         every = self.traced.coordinates
         return every if self.own is None else every[list(self.own)]
 
-    @property
+    @cached_property
     def sizes(self) -> tuple[int, int, int]:
         """Numbers of states n, inputs k, and unknowns p that slopes are taken in."""
         return self.flow.x.numel(), self.flow.inputs.numel(), self._coordinates.numel()
