@@ -117,9 +117,9 @@ def _against(evidence: Evidence, agreeing: int) -> str | None:
         return None
     if looked.given_up and looked.arrived < AGAIN:
         return (
-            f"stiff equations: of the starts of a search for a better valley {looked.followed} "
-            "could be followed in the time that it was given, and "
-            f"{looked.arrived} ended here; give --start near the solution, or bounds that keep the "
+            f"a search for a better valley was given up: {looked.followed} of its starts could be "
+            f"followed in its time, and {looked.arrived} ended here, since the equations are stiff "
+            "there or the record is long; give --start near the solution, or bounds that keep the "
             "search away from what is stiff"
         )
     advice = "give --start near the solution, bounds, or more rows"
