@@ -8,9 +8,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.optimize import curve_fit
 
 from casest import Run, attempt, param, signal, vertcat
 from casest.dynamics import Motion, dynamics, measured, state
+from casest.leastsquares.flow import GivenUp, for_seconds
 from casest.leastsquares.problem import Problem
 
 #: Robertson's reaction (1966), as published: 1/s.
@@ -84,3 +86,35 @@ def test_van_der_pols_oscillator_is_followed_through_its_jumps():
     slope = -problem.jacobian(problem.point({"mu": 1000})).reshape(len(t), 2)
     differences = (followed(1000.1) - followed(999.9)) / 0.2
     np.testing.assert_allclose(slope, differences, atol=5e-4 * np.abs(slope).max())
+
+
+def test_a_search_that_takes_too_long_is_given_up_and_the_best_point_kept(monkeypatch):
+    """One exponential, in too few rows to vouch for it: the fit is that of SciPy, and refused."""
+    t = np.array([0, 0.3, 0.7, 1.2, 2, 3, 4.5, 6.0])
+    read = np.exp(-0.5 * t) + 0.01 * np.random.default_rng(0).standard_normal(t.size)
+    run = Run.raw("decay", {"x": read[:, None]}, units={}, time=t)
+    assert attempt(decaying.calibration, [run]).certificate.trusted
+    monkeypatch.setattr("casest.estimate.valley.allowed", lambda outcomes, least: 0.0)
+    found = attempt(decaying.calibration, [run])
+    assert not found.certificate.trusted
+    assert "0 of its starts could be followed in its time" in found.certificate.reasons[0]
+    best = curve_fit(lambda s, k: np.exp(-k * s), t, read, 0.4)[0]
+    assert found.values["k"] == pytest.approx(best[0], rel=1e-6)
+
+
+@dynamics
+def decaying(
+    x=signal(), *, z=state(start=1, known=True), k=param("1/s", start=0.4, bounds=(0, None))
+):
+    """What decays by itself."""
+    return Motion(rates={"z": -k * z}, outputs=(measured(x, z),))
+
+
+def test_equations_are_followed_no_longer_than_is_allowed():
+    t = np.linspace(0, 20, 21)
+    nothing = np.zeros((len(t), 1))
+    run = Run.raw("oscillator", {"x": nothing, "v": nothing}, units={}, time=t)
+    problem = Problem(relaxing.calibration, (run,))
+    with for_seconds(0.0), pytest.raises(GivenUp):
+        problem.cost(problem.point({"mu": 5}))
+    assert np.isfinite(problem.cost(problem.point({"mu": 5})))

@@ -115,6 +115,13 @@ def _against(evidence: Evidence, agreeing: int) -> str | None:
     found, looked = evidence.scatter, evidence.search
     if looked is None or evidence.vouched:
         return None
+    if looked.given_up and looked.arrived < AGAIN:
+        return (
+            f"a search for a better valley was given up: {looked.followed} of its starts could be "
+            f"followed in its time, and {looked.arrived} ended here, since the equations are stiff "
+            "there or the record is long; give --start near the solution, or bounds that keep the "
+            "search away from what is stiff"
+        )
     advice = "give --start near the solution, bounds, or more rows"
     most = looked.arrived >= 0.5 * looked.followed
     if found is None:

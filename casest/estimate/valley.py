@@ -15,7 +15,7 @@ from casest.leastsquares.problem import Point, Problem
 from casest.leastsquares.sums import rounding
 from casest.leastsquares.weights import has_noise_effects
 from casest.solve.aliases import folded, others, without_turns
-from casest.solve.equations import arrived, from_elsewhere
+from casest.solve.equations import SEARCH, allowed, arrived, from_elsewhere
 from casest.solve.equivalent import between_rows, limit_of, roughness, same_on
 from casest.solve.global_search import EFFORTS, ROWS, Search, rivals_of, search, some_rows, unlike
 from casest.solve.outcome import Outcome
@@ -63,7 +63,7 @@ def _looked_for_in_equations(
     evidence = Evidence(scatter(problem, best.point))
     if evidence.vouched or problem.model.starter is not None:
         return outcomes, evidence
-    ends = from_elsewhere(problem, first, best, seed)
+    ends, given_up = from_elsewhere(problem, first, best, seed, allowed(outcomes, SEARCH))
     lowest = best_of((best, *ends))
     if lowest is not best:
         best = trust_region(problem, lowest.point, damping=LITTLE)
@@ -77,6 +77,7 @@ def _looked_for_in_equations(
         valleys((best, *finite)),
         problem.unknowns,
         rivals_of(problem, best, finite),
+        given_up,
     )
     return outcomes, Evidence(scatter(problem, best.point), found)
 

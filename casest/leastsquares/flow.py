@@ -8,7 +8,10 @@ Each step's error is told by two embedded solutions; where it is too large an in
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -37,6 +40,27 @@ ROUNDS, CUT, MARGIN = 30, 8.0, 1.1
 FAILED = 1e100
 #: An interval along which states are not finite is cut so much in one round, and so much in all.
 BLIND, BLINDLY = 4, 1024
+#: Processor time at which equations are followed no further.
+_until: ContextVar[float] = ContextVar("_until", default=float("inf"))
+
+
+class GivenUp(Exception):
+    """The time that was given for following equations is over."""
+
+
+@contextmanager
+def for_seconds(seconds: float) -> Iterator[None]:
+    """Within it equations are followed for so much processor time, and GivenUp is raised then."""
+    token = _until.set(min(time.process_time() + seconds, _until.get()))
+    try:
+        yield
+    finally:
+        _until.reset(token)
+
+
+def left() -> float:
+    """Seconds for which equations may still be followed."""
+    return _until.get() - time.process_time()
 
 
 @dataclass
@@ -73,7 +97,7 @@ class Integrator:
         every = self.traced.coordinates
         return every if self.own is None else every[list(self.own)]
 
-    @property
+    @cached_property
     def sizes(self) -> tuple[int, int, int]:
         """Numbers of states n, inputs k, and unknowns p that slopes are taken in."""
         return self.flow.x.numel(), self.flow.inputs.numel(), self._coordinates.numel()
@@ -85,6 +109,8 @@ class Integrator:
 
         `finer`: every step is cut in so many.
         """
+        if left() <= 0:
+            raise GivenUp
         n = self.sizes[0]
         leads = self.flow.anchored and course.time[0] > 0
         course = self._from_zero(course) if leads else course
@@ -92,7 +118,11 @@ class Integrator:
             mesh.counts = np.ones(len(course.time) - 1, dtype=int)
         start = np.array(self._start(parameters)).ravel()
         if mesh.stiff:
-            return self._unpacked(self._implicit(start, parameters, course)[int(leads) :])
+            found = self._implicit(start, parameters, course)
+            mesh.stiff = not self._mild(found[:, :n], parameters, course)
+            if np.isfinite(found).all():
+                return self._unpacked(found[int(leads) :])
+            mesh.counts = np.ones_like(mesh.counts)
         for _ in range(ROUNDS):
             counts = mesh.counts * finer
             states, errors, held = self._run(start, parameters, course, counts)
@@ -121,6 +151,27 @@ class Integrator:
         """States (N, n) and slopes (N, n, p) of [x, X] (N, n + n·p)."""
         n, _, p = self.sizes
         return found[:, :n], found[:, n:].reshape(len(found), p, n).transpose(0, 2, 1)
+
+    def _mild(self, states: Array, parameters: Array, course: Course) -> bool:
+        """Would explicit steps be few along these states, as fast as they change? Also where they
+        could not be followed: the next time explicit steps are tried."""
+        count, n = states.shape
+        slopes = self._slope.map(count)(
+            states.T, course.inputs.T, np.tile(parameters[:, None], (1, count))
+        )
+        A = np.array(slopes).T.reshape(count, n, n)
+        if not np.isfinite(A).all():
+            return True
+        fastest = np.max(np.abs(np.linalg.eigvals(A)), axis=1)
+        between = np.maximum(fastest[1:], fastest[:-1]) * np.diff(course.time)
+        return bool(np.sum(between) < 0.5 * MANY)
+
+    @cached_property
+    def _slope(self) -> ca.Function:
+        """(x, inputs, parameters) -> ∂f/∂x (n, n)."""
+        parameters = ca.vertcat(self.traced.coordinates, self.traced.references)
+        A = ca.jacobian(self.flow.rates, self.flow.x)
+        return ca.Function("A", [self.flow.x, self.flow.inputs, parameters], [ca.densify(A)])
 
     def _implicit(self, start: Array, parameters: Array, course: Course) -> Array:
         """[x, X] at every sample by a method for stiff equations; NaN behind the first where it

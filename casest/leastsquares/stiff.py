@@ -18,7 +18,7 @@ from casest.declaration.physics import SX
 from casest.declaration.shapes import Array
 
 #: Error of a step, of the size of each number, and steps between two samples at most.
-TOLERANCE, STEPS = 1e-11, 20_000
+TOLERANCE, STEPS = 1e-11, 5_000
 #: Rounds in which sizes are found, and by how much they may still change.
 ROUNDS, ALIKE = 3, 10.0
 
@@ -66,6 +66,7 @@ class Stiff:
                 "max_num_steps": STEPS,
                 "linear_solver": "qr",
                 "print_stats": False,
+                "disable_internal_warnings": True,
                 "show_eval_warnings": False,
             }
             self._kept.clear()

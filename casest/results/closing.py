@@ -357,8 +357,7 @@ def residual_rows(
     writer.writerow(["file", "run", "row", "t", "axis", "split", "before", "after"])
     axes = closing.before.model.axes
     fits = [
-        _judged_alike(e, closing).told_residuals(e.point)
-        for e in (closing.before, closing.after)
+        _judged_alike(e, closing).told_residuals(e.point) for e in (closing.before, closing.after)
     ]
     hidden = held_out or (closing.runs, closing.before_held_out, closing.after_held_out)
     for split, runs, before, after in (("fit", closing.runs, *fits), ("holdout", *hidden)):

@@ -73,10 +73,10 @@ def parts_of(model: Model) -> Parts | None:
     )
 
 
-def collocated(problem: Problem, start: Point) -> Outcome | None:
+def collocated(problem: Problem, start: Point, seconds: float = SECONDS) -> Outcome | None:
     """Where IPOPT ends on the collocated equations from a start; None where they are not such.
 
-    The cost is that of the integrated equations there.
+    The cost is that of the integrated equations there. IPOPT is given so many `seconds` at most.
     """
     parts = parts_of(problem.model)
     if parts is None or any(s.parameter.shape.curved for s in problem.slots):
@@ -84,7 +84,7 @@ def collocated(problem: Problem, start: Point) -> Outcome | None:
     began = time.perf_counter()
     made = _Made(problem, parts, start)
     with held_back(), np.errstate(all="ignore"):
-        found = made.solved()
+        found = made.solved(min(seconds, SECONDS))
     x = np.clip(found.x[: problem.unknowns] * made.scale, *problem.bounds)
     point = Point(problem.inside(x), start.references)
     return Outcome(
@@ -158,8 +158,8 @@ class _Made:
         self.unknowns.append(ca.vec(z))
         self.first.append((grid.guess / size).ravel())
 
-    def solved(self) -> _Found:
-        """What IPOPT finds."""
+    def solved(self, seconds: float) -> _Found:
+        """What IPOPT finds in this time."""
         w, w0 = ca.vertcat(*self.unknowns), np.concatenate(self.first)
         lower, upper = (b / self.scale for b in self.problem.bounds)
         free = np.full(len(w0) - self.problem.unknowns, np.inf)
@@ -173,7 +173,7 @@ class _Made:
                     "print_level": 0,
                     "sb": "yes",
                     "max_iter": ITERATIONS,
-                    "max_wall_time": SECONDS,
+                    "max_wall_time": seconds,
                     "tol": 1e-8,
                     "mu_init": 1e-2,
                 },

@@ -9,16 +9,18 @@ too where what is known of the noise leaves it open whether something better is 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
 
 from casest.declaration.shapes import Array
+from casest.leastsquares.flow import GivenUp, for_seconds
 from casest.leastsquares.growth import UNSTABLE, growth
 from casest.leastsquares.problem import Point, Problem
 from casest.solve.collocation import collocated
-from casest.solve.horizon import grown
+from casest.solve.horizon import ALONG, grown
 from casest.solve.outcome import Outcome
 from casest.solve.shooting import shot
 from casest.solve.trust_region import LITTLE, trust_region
@@ -28,6 +30,9 @@ SHORT = 600
 #: Starts of a search, how many are enough where all end alike, and how far they lie: factors of
 #: ten, up and down.
 STARTS, ENOUGH, DECADES = 16, 6, 1.5
+#: Seconds after which a search, another opinion, and IPOPT's part of one are given up, and how many
+#: times as much as the way along the record takes, where that is more, up to the longest.
+SEARCH, OPINION, COLLOCATED, TIMES, LONGEST = 60.0, 20.0, 4.0, 4.0, 200.0
 #: Ends whose costs differ by no more than this share are one.
 ALIKE = 1e-3
 
@@ -36,12 +41,24 @@ def by_equations(problem: Problem, first: Point) -> tuple[Outcome, ...]:
     """Ways from one start: along the record; from many beginnings where what grows can hardly be
     followed from one; else by collocation where that is quick."""
     found = [grown(problem, first)]
-    if max(growth(problem, point) for point in (first, found[0].point)) > UNSTABLE:
-        several = by_shooting(problem, first)
-        return (*found, several) if several is not None else (*found,)
-    if sum(map(len, problem.runs)) <= SHORT:
-        found += by_collocation(problem, first)
+    with suppress(GivenUp), for_seconds(allowed(found, OPINION)):  # else an opinion less
+        found += _beside(problem, first, found[0])
     return tuple(found)
+
+
+def allowed(outcomes: Sequence[Outcome], least: float) -> float:
+    """Seconds that may be spent beside the ways along the record among these."""
+    usual = max((o.seconds for o in outcomes if o.solver == ALONG), default=0.0)
+    return max(least, min(TIMES * usual, LONGEST))
+
+
+def _beside(problem: Problem, first: Point, along: Outcome) -> list[Outcome]:
+    """What other ways lead to, beside that along the record."""
+    if max(growth(problem, point) for point in (first, along.point)) > UNSTABLE:
+        several = by_shooting(problem, first)
+        return [several] if several is not None else []
+    short = sum(map(len, problem.runs)) <= SHORT
+    return list(by_collocation(problem, first, allowed([along], COLLOCATED))) if short else []
 
 
 def by_shooting(problem: Problem, first: Point) -> Outcome | None:
@@ -51,9 +68,9 @@ def by_shooting(problem: Problem, first: Point) -> Outcome | None:
     return None if near is None or not np.isfinite(near.cost) else _polished(problem, near)
 
 
-def by_collocation(problem: Problem, first: Point) -> Iterator[Outcome]:
+def by_collocation(problem: Problem, first: Point, seconds: float) -> Iterator[Outcome]:
     """What collocation leads to, at the optimum of the integrated equations, if anywhere."""
-    near = collocated(problem, first)
+    near = collocated(problem, first, seconds)
     if near is None or not np.isfinite(near.cost):
         return
     yield _polished(problem, near)
@@ -70,17 +87,33 @@ def _polished(problem: Problem, near: Outcome) -> Outcome:
     )
 
 
-def from_elsewhere(problem: Problem, first: Point, best: Outcome, seed: int) -> list[Outcome]:
-    """Where both ways lead from starts over decades around the first."""
-    short, found = sum(map(len, problem.runs)) <= SHORT, list[Outcome]()
+def from_elsewhere(
+    problem: Problem, first: Point, best: Outcome, seed: int, seconds: float
+) -> tuple[list[Outcome], bool]:
+    """Where both ways lead from starts over decades around the first, and: was it given up, the
+    seconds being over?"""
+    found = list[Outcome]()
+    try:
+        with for_seconds(seconds):
+            for count, ends in enumerate(_ends(problem, first, seed, found), 1):
+                found += ends
+                if count == ENOUGH and arrived(best, found) == len(found):
+                    break
+    except GivenUp:
+        return found, True
+    return found, False
+
+
+def _ends(
+    problem: Problem, first: Point, seed: int, known: Sequence[Outcome]
+) -> Iterator[list[Outcome]]:
+    """Where each start leads, collocation every fourth of a short record; `known` from before."""
+    short = sum(map(len, problem.runs)) <= SHORT
     for k, start in enumerate(_starts(problem, first, seed)):
         if short and k % 4 == 3:
-            found += by_collocation(problem, start)
+            yield list(by_collocation(problem, start, allowed(known, COLLOCATED)))
         else:
-            found.append(grown(problem, start))
-        if k + 1 == ENOUGH and arrived(best, found) == len(found):
-            break
-    return found
+            yield [grown(problem, start)]
 
 
 def arrived(best: Outcome, others: list[Outcome]) -> int:

@@ -58,6 +58,8 @@ class Search:
     valleys: int
     bent: int
     rivals: tuple[Outcome, ...] = ()
+    #: Was the time over before it came to its end?
+    given_up: bool = False
 
 
 def search(

@@ -13,29 +13,45 @@ from dataclasses import replace
 
 import numpy as np
 
+from casest.leastsquares.flow import GivenUp, for_seconds, left
 from casest.leastsquares.problem import Point, Problem
 from casest.solve.outcome import Outcome
 from casest.solve.trust_region import LITTLE, trust_region
 
+#: What this way is called.
+ALONG = "growing horizon"
 #: Each part of the record over the one before; rows of the first for each unknown; its share of
 #: the record at least.
 GROWTH, ROWS, LEAST = 1.4, 3, 0.01
 #: Steps on each part but the last, and gain over cost that is not worth a step.
 STEPS, GAIN = 30, 1e-6
+#: Processor time after which it is given up.
+SECONDS = 300.0
 
 
 def grown(problem: Problem, start: Point) -> Outcome:
-    """Where a trust region ends that has followed the records from their beginnings."""
+    """Where a trust region ends that has followed the records from their beginnings.
+
+    Where equations are so stiff that this takes longer than SECONDS, the best point until then.
+    """
     began, point, count = time.perf_counter(), start, 0
-    for part in _parts(problem):
-        found = trust_region(part, point, max_iterations=STEPS, tolerance=GAIN, wary=count == 0)
-        count += found.iterations
-        if np.isfinite(found.cost):
-            point = found.point
-    found = trust_region(problem, point, max_iterations=100, damping=LITTLE)
+    try:
+        with for_seconds(SECONDS):
+            for part in _parts(problem):
+                found = trust_region(part, point, max_iterations=STEPS, tolerance=GAIN,
+                                     wary=count == 0)  # fmt: skip
+                count += found.iterations
+                if np.isfinite(found.cost):
+                    point = found.point
+            found = trust_region(problem, point, max_iterations=100, damping=LITTLE)
+    except GivenUp:
+        if left() <= 0:  # the time of all ways together is over
+            raise
+        cost = problem.cost(point)
+        found = Outcome("", point, cost, 0, 1, False, f"given up after {SECONDS:g} s", 0.0)
     return replace(
         found,
-        solver="growing horizon",
+        solver=ALONG,
         iterations=found.iterations + count,
         seconds=time.perf_counter() - began,
     )

@@ -17,6 +17,7 @@ import numpy as np
 
 from casest.declaration.shapes import Array
 from casest.interruption import held_back, waits
+from casest.leastsquares.flow import GivenUp
 from casest.leastsquares.problem import Point, Problem
 from casest.solve.outcome import Outcome
 
@@ -36,11 +37,12 @@ def ipopt(
     *,
     exact: bool = False,
     options: dict[str, Any] | None = None,
+    patience: int = PATIENCE,
 ) -> Outcome:
     """Minimise the cost from `start`. `exact` uses the exact Hessian instead of JᵀJ.
 
     Unknowns are scaled by their Jacobian columns and the cost by its start value. `options` are
-    IPOPT's own.
+    IPOPT's own; after so many evaluations as `patience` it is given up.
     """
     settings = {
         "print_level": 0,
@@ -54,16 +56,22 @@ def ipopt(
         "mu_init": 1e-6,
         **(options or {}),
     }
-    found = run_nlpsol("ipopt", problem, start, settings, exact=exact)
+    found = run_nlpsol("ipopt", problem, start, settings, exact=exact, patience=patience)
     return replace(found, solver="ipopt-exact") if exact else found
 
 
 def run_nlpsol(
-    plugin: str, problem: Problem, start: Point, settings: dict[str, Any], *, exact: bool = False
+    plugin: str,
+    problem: Problem,
+    start: Point,
+    settings: dict[str, Any],
+    *,
+    exact: bool = False,
+    patience: int = PATIENCE,
 ) -> Outcome:
     """Minimise the cost from `start` by an nlpsol plugin of CasADi: "ipopt" or "sqpmethod"."""
     began = time.perf_counter()
-    scaled = _Scaled(problem, start, exact)
+    scaled = _Scaled(problem, start, exact, patience)
     z0 = start.x / scaled.scale
     lower, upper = problem.bounds
     with _solver(plugin, problem.unknowns, settings) as solver, np.errstate(invalid="ignore"):
@@ -89,8 +97,8 @@ def run_nlpsol(
 class _Scaled:
     """Cost, gradient and Hessian in scaled unknowns z, remembering the last point."""
 
-    def __init__(self, problem: Problem, start: Point, exact: bool) -> None:
-        self.problem, self.start, self.exact = problem, start, exact
+    def __init__(self, problem: Problem, start: Point, exact: bool, patience: int) -> None:
+        self.problem, self.start, self.exact, self.patience = problem, start, exact, patience
         first = problem.normal(start)
         self.unit = first.cost if np.isfinite(first.cost) and first.cost > 0 else 1.0
         columns = np.sqrt(np.maximum(np.diag(first.matrix), 0.0))
@@ -122,8 +130,13 @@ class _Scaled:
     def cost(self, z: Array) -> float:
         """Scaled cost; with its slope, for nearly every point that IPOPT tries is accepted."""
         # What is not finite makes IPOPT's line search give up: after Ctrl-C, or at long last.
-        given_up = waits() or self.evaluations > PATIENCE
-        return float("nan") if given_up else float(self.normal(z).cost / self.unit)
+        if waits() or self.evaluations > self.patience:
+            return float("nan")
+        try:
+            return float(self.normal(z).cost / self.unit)
+        except GivenUp:  # raised again where nobody swallows it: when IPOPT has ended
+            self.patience = -1
+            return float("nan")
 
     def gradient(self, z: Array) -> Array:
         """Gradient of the scaled cost, (n,)."""

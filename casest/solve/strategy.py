@@ -10,6 +10,7 @@ from __future__ import annotations
 import itertools
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -17,11 +18,14 @@ import numpy as np
 from casest.declaration.shapes import Array
 from casest.errors import UsageError
 from casest.leastsquares.fewer import few_of
+from casest.leastsquares.flow import GivenUp, for_seconds
 from casest.leastsquares.identifiability import identify
 from casest.leastsquares.per_sample import linear
 from casest.leastsquares.problem import Point, Problem
 from casest.leastsquares.weights import has_noise_effects, weights
-from casest.solve.equations import by_equations, by_shooting
+from casest.solve.equations import OPINION as OPINIONS
+from casest.solve.equations import allowed, by_equations, by_shooting
+from casest.solve.ipopt import PATIENCE as EVALUATIONS
 from casest.solve.ipopt import STANDSTILL, ipopt
 from casest.solve.multipliers import kept
 from casest.solve.outcome import Outcome
@@ -31,6 +35,9 @@ from casest.solve.trust_region import LITTLE, trust_region
 OPINION = 50
 #: Iterations in which a bent valley is followed to its end, once ways disagree.
 PATIENCE = 1000
+#: Evaluations by IPOPT where equations have been fitted already: where steps are chosen anew at
+#: every point (`leastsquares.stiff`) its line search would fight their rounding.
+CLOSE_BY = 60
 #: More starts, and their spread as a share of each unknown: what reveals 19 of 20 false optima of
 #: NIST's problems (studies/nist.md).
 STARTS, SPREAD = 8, 0.3
@@ -130,8 +137,6 @@ def _ways_of_equations(
         for start in _other_starts(problem, first, automatic)
         for o in by_equations(problem, start)
     ]
-    direct = trust_region(problem, first, max_iterations=OPINION, tolerance=_fine(problem))
-    near = best_of((*others, direct))
     if solver == "multiple-shooting":
         several = by_shooting(problem, first)
         if several is None:
@@ -139,12 +144,20 @@ def _ways_of_equations(
                 f"multiple shooting leads nowhere for {problem.model.name}: its inputs have "
                 "unknowns of their own, or nothing can be integrated; leave --solver out"
             )
-        return (several, *others, direct)
+        others.insert(0, several)
+    with suppress(GivenUp), for_seconds(allowed(others, OPINIONS)):  # else an opinion less
+        direct = trust_region(problem, first, max_iterations=OPINION, tolerance=_fine(problem))
+        others.append(direct)
+        if solver != "multiple-shooting":
+            others.insert(0, _asked_for(problem, best_of((*others,)), solver))
+    return (*others,)
+
+
+def _asked_for(problem: Problem, near: Outcome, solver: str) -> Outcome:
+    """The solver asked for, from where other ways have led."""
     if solver == "trust-region" or not np.isfinite(near.cost) or _singular(problem, near.point):
-        main = trust_region(problem, near.point, damping=LITTLE)
-    else:
-        main = _ipopt(problem, near.point, solver)
-    return (main, *others, direct)
+        return trust_region(problem, near.point, damping=LITTLE)
+    return _ipopt(problem, near.point, solver, patience=CLOSE_BY)
 
 
 def _other_starts(problem: Problem, first: Point, automatic: bool) -> Sequence[Point]:
@@ -165,10 +178,11 @@ def valleys(outcomes: Sequence[Outcome]) -> int:
     return 1 + sum(apart)
 
 
-def _ipopt(problem: Problem, start: Point, solver: str) -> Outcome:
+def _ipopt(problem: Problem, start: Point, solver: str, patience: int = EVALUATIONS) -> Outcome:
     """Where IPOPT ends from there, polished."""
     exact = solver == "ipopt-exact"
-    return _polished(problem, ipopt(problem, start, exact=exact, options=STANDSTILL))
+    found = ipopt(problem, start, exact=exact, options=STANDSTILL, patience=patience)
+    return _polished(problem, found)
 
 
 def _polished(problem: Problem, main: Outcome, max_iterations: int = 300) -> Outcome:

@@ -1,0 +1,1 @@
+"""PEtab problems: tables of conditions, readings and parameters, with SBML or written equations."""
