@@ -8,8 +8,8 @@ from pathlib import Path
 import click
 
 from casest.cli.assignments import Assignment, Assignments
-from casest.cli.flags import flag
-from casest.cli.options import FOLDER, ModelOptions, ReadingOptions, Words
+from casest.cli.flags import Kind, flag
+from casest.cli.options import FOLDER, ModelOptions, MotionOptions, ReadingOptions, Words
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +36,29 @@ class PossibleOptions:
     reach: float | None = flag(
         None, "--reach", type=float, metavar="DEGREES", help="Furthest tilt from z up."
     )
-    duration: float | None = flag(None, "--duration", type=float, help="Seconds of a run.")
+    duration: float | None = flag(
+        None, "--duration", type=float, help="Seconds of a run, or of a motion."
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class FlyingOptions:
+    """What a motion may do, and how it is searched for."""
+
+    limits: Words = flag(
+        (),
+        "--limit",
+        only=Kind.MOVING,
+        metavar="'NAME=MAX UNIT'",
+        help="Of an input, a state or 'rate of NAME': its greatest length, or LOW:HIGH.",
+    )
+    pieces: int = flag(
+        30, "--pieces", type=int, show_default=True, help="Straight lines that an input is made of."
+    )
+    searches: int = flag(
+        1, "--searches", type=int, show_default=True, help="From so many of the random motions."
+    )
+    seed: int = flag(0, "--seed", show_default=True, help="Of the random motions.")
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +93,8 @@ class PlanOptions:
         help="Standard deviation of one reading, in the model's unit.",
     )
     possible: PossibleOptions = field(default_factory=PossibleOptions)
+    flying: FlyingOptions = field(default_factory=FlyingOptions)
+    motion: MotionOptions = field(default_factory=MotionOptions)
     reading: ReadingOptions = field(default_factory=ReadingOptions)
     separate: bool = flag(
         False, "--separate", help="After close: what tells the causes apart that it left open."

@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING
 import click
 
 from casest.cli.correcting import names_a_model
-from casest.cli.flags import taking
+from casest.cli.flags import Kind, refuse, taking
+from casest.cli.flying import flying
 from casest.cli.live import living
+from casest.cli.loading import in_motion
 from casest.cli.plan_options import PlanOptions
 from casest.cli.separating import separating
 from casest.cli.shared import commands, echo, progress, typed, write
@@ -34,7 +36,7 @@ if TYPE_CHECKING:
 @click.argument("given", metavar="RESULT|MODEL", type=click.Path(path_type=Path))
 @taking(PlanOptions)
 def plan(given: Path, options: PlanOptions) -> int:
-    """Which measurement next: poses, runs or rows of a table that bring the most.
+    """Which measurement next: poses, runs or rows of a table that bring the most; or a motion.
 
     After a RESULT of calibrate or close (its folder), or of a MODEL before any data.
     """
@@ -44,6 +46,9 @@ def plan(given: Path, options: PlanOptions) -> int:
 
     if options.count is not None and options.until:
         raise UsageError("--count and --until: one of the two says how many")
+    if names_a_model(given) and in_motion(str(given)):
+        return flying(str(given), options)
+    refuse(options, Kind.MOVING, f"is for estimators in motion; {given} is none")
     progress(f"planning for {given}")
     situation = of_model(str(given), options) if names_a_model(given) else of_result(given, options)
     if options.live.source:
