@@ -11,10 +11,11 @@ from casest.errors import UsageError
 
 if TYPE_CHECKING:
     from casest.dynamics import Dynamics
+    from casest.plan.motion.limits import Limit
     from casest.plan.motion.program import Task
 
-#: Nodes of a motion at least, and pieces at most.
-NODES, MOST = 30, 400
+#: Pieces of an input, nodes of a motion at least, and pieces at most.
+PIECES, NODES, MOST = 30, 30, 400
 
 
 def flying(name: str, options: PlanOptions) -> int:
@@ -26,7 +27,7 @@ def flying(name: str, options: PlanOptions) -> int:
     from casest.results.file import as_json
     from casest.results.motion_plan import motion_result, motion_rows
 
-    _refuse_others(name, options)
+    refuse_others(name, options)
     task, rate = task_of(name, options)
     progress(f"planning a motion for {name}")
     found = planned_motion(
@@ -57,13 +58,13 @@ def flying(name: str, options: PlanOptions) -> int:
     return 0
 
 
-def _refuse_others(name: str, options: PlanOptions) -> None:
-    """Options that belong to measurements that are counted."""
+def refuse_others(name: str, options: PlanOptions, counted: bool = False) -> None:
+    """Refuse options of poses, runs and rows; `counted`: readings are counted all the same."""
     given = {
         "--candidates": options.possible.candidates,
         "--vary": options.possible.vary,
         "--reach": options.possible.reach,
-        "--count": options.count,
+        "--count": None if counted else options.count,
         "--until": options.until,
         "--separate": options.separate,
         "--live": options.live.source,
@@ -75,6 +76,8 @@ def _refuse_others(name: str, options: PlanOptions) -> None:
         "--effects": options.model.effects,
         "--prior": options.model.prior,
     }
+    if not counted and options.robust:
+        raise UsageError("--robust: what a motion shows is told for the states that it begins with")
     for flag, value in given.items():
         if value not in (None, (), False):
             raise UsageError(
@@ -86,10 +89,10 @@ def _refuse_others(name: str, options: PlanOptions) -> None:
 def task_of(name: str, options: PlanOptions) -> tuple[Task, float]:
     """The model with its noise, limits, grid; and samples per second."""
     from casest.plan.motion.criteria import Wanted
-    from casest.plan.motion.limits import limits_of
     from casest.plan.motion.program import Grid, Task
 
-    duration, rate, pieces = options.possible.duration, options.reading.rate, options.flying.pieces
+    duration, rate = options.possible.duration, options.reading.rate
+    pieces = PIECES if options.flying.pieces is None else options.flying.pieces
     if duration is None or rate is None:
         raise UsageError(f"{name} is an estimator in motion: say --duration and --rate")
     for flag, value in (("--duration", duration), ("--rate", rate)):
@@ -107,20 +110,24 @@ def task_of(name: str, options: PlanOptions) -> tuple[Task, float]:
     model = _noisy(moving_model(name, options.model.constants, options.motion), options, rate)
     values = dict(given.numbers() for given in options.values)
     model = model.beginning(**values)
-    said = [(key.strip(), value) for key, _, value in (x.partition("=") for x in _limits(options))]
-    limits = limits_of(model, said)
+    limits = input_limits(model, options)
     held = _held(model)
     grid = Grid.of(duration, pieces, NODES, held)
     wanted = Wanted.of(model, options.criterion)
     return Task(model, wanted, limits, grid, model.noise_at(1 / rate)), rate
 
 
-def _limits(options: PlanOptions) -> list[str]:
+def input_limits(model: Dynamics, options: PlanOptions) -> tuple[Limit, ...]:
+    """Limits as they are typed."""
+    from casest.plan.motion.limits import limits_of
+
+    said = []
     for text in options.flying.limits:
         name, equals, value = text.partition("=")
         if not (name.strip() and equals and value.strip()):
             raise UsageError(f"--limit {text}: write it as --limit 'omega=30 deg/s'")
-    return list(options.flying.limits)
+        said.append((name.strip(), value))
+    return limits_of(model, said)
 
 
 def _held(model: Dynamics) -> bool:

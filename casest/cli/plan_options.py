@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 import click
 
@@ -52,8 +53,12 @@ class FlyingOptions:
         metavar="'NAME=MAX UNIT'",
         help="Of an input, a state or 'rate of NAME': its greatest length, or LOW:HIGH.",
     )
-    pieces: int = flag(
-        30, "--pieces", type=int, show_default=True, help="Straight lines that an input is made of."
+    pieces: int | None = flag(
+        None,
+        "--pieces",
+        type=int,
+        only=Kind.MOVING,
+        help="Pieces of an input: 30 straight lines of a motion, 8 constants of an experiment.",
     )
     searches: int = flag(
         1, "--searches", type=int, show_default=True, help="From so many of the random motions."
@@ -113,6 +118,12 @@ class PlanOptions:
         metavar="D|A|E|G|NAME",
         show_default=True,
         help="Volume, sum, worst combination, corrected readings, or one unknown.",
+    )
+    robust: Literal["average", "worst"] | None = flag(
+        None,
+        "--robust",
+        type=click.Choice(["average", "worst"]),
+        help="For values that the unknowns may have, not for the likeliest alone.",
     )
     live: LiveOptions = field(default_factory=LiveOptions)
     output: Path | None = flag(

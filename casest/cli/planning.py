@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from casest.cli.correcting import names_a_model
+from casest.cli.experimenting import equations_of, experimenting
 from casest.cli.flags import Kind, refuse, taking
 from casest.cli.flying import flying
 from casest.cli.live import living
@@ -48,6 +49,9 @@ def plan(given: Path, options: PlanOptions) -> int:
         raise UsageError("--count and --until: one of the two says how many")
     if names_a_model(given) and in_motion(str(given)):
         return flying(str(given), options)
+    equations = equations_of(given, options)
+    if equations is not None:
+        return experimenting(str(given), *equations, options)
     refuse(options, Kind.MOVING, f"is for estimators in motion; {given} is none")
     progress(f"planning for {given}")
     situation = of_model(str(given), options) if names_a_model(given) else of_result(given, options)

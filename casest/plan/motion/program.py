@@ -108,8 +108,8 @@ class Grid:
 class Task:
     """The best motion of a model: what is wanted, within which limits, on which grid.
 
-    weights (K + 1,): how much the reading at each node counts, in units of what a reading of the
-    noise intensity Θ tells: seconds, or 1 for one reading with Θ its covariance. noise: Θ (m, m).
+    noise: Θ (m, m), in whose units a reading tells CᵀΘ⁻¹C; finer: times as many Runge-Kutta steps
+    as are usual.
     """
 
     model: Dynamics
@@ -117,6 +117,7 @@ class Task:
     limits: tuple[Limit, ...]
     grid: Grid
     noise: Array
+    finer: int = 1
 
     # -- functions of one sample ---------------------------------------------------------------
 
@@ -162,12 +163,19 @@ class Task:
         return ca.Function("rate", [x, u], out)
 
     @cached_property
+    def slope(self) -> Any:
+        """(x, u) -> Θ^(-1/2)·C, of states in the sizes that are wanted."""
+        size = ca.DM(np.diag(self.wanted.scale))
+        root = ca.DM(np.linalg.inv(np.linalg.cholesky(self.noise)))
+        x, u, out = self._expressions([root @ self.model.traced.C @ size])
+        return ca.Function("slope", [x, u], out)
+
+    @cached_property
     def told(self) -> Any:
         """(x, u) -> CᵀΘ⁻¹C, of states in the sizes that are wanted."""
-        t, size = self.model.traced, ca.DM(np.diag(self.wanted.scale))
-        C = t.C @ size
-        x, u, out = self._expressions([C.T @ ca.DM(np.linalg.inv(self.noise)) @ C])
-        return ca.Function("told", [x, u], out)
+        x, u = self.slope.sx_in()
+        C = self.slope(x, u)
+        return ca.Function("told", [x, u], [C.T @ C])
 
     @cached_property
     def step(self) -> Any:
@@ -178,12 +186,12 @@ class Task:
             f, A = self.rate(state[0], u)
             return f, up @ A @ down @ state[1]
 
-        return self._stepped("step", slopes, STEPS, ca.SX.eye(self.model.size))
+        return self._stepped("step", slopes, self.finer * STEPS, ca.SX.eye(self.model.size))
 
     @cached_property
     def move(self) -> Any:
         """(x, u at both ends) -> x alone."""
-        return self._stepped("move", lambda s, u: (self.rate(s[0], u)[0],), FINE)
+        return self._stepped("move", lambda s, u: (self.rate(s[0], u)[0],), self.finer * FINE)
 
     def _stepped(
         self, name: str, slopes: Callable[[Parts, Any], Parts], steps: int, *more: Any
@@ -231,6 +239,19 @@ class Task:
             own = Phi[:, k * n : (k + 1) * n]
             W = weights[k] * T[:, k * n : (k + 1) * n] + own.T @ W @ own
         return np.asarray(0.5 * (W + W.T))
+
+    def factors(self, u: Array, start: Array | None = None) -> Array:
+        """What the reading at each node tells of the scaled states that are unknown, as factors
+        (K + 1, m, f) of its information."""
+        x, (begin, end) = self.states(u, start), self.ends(u)
+        Phi, found = np.eye(self.model.size), []
+        at = np.vstack([begin, end[-1:]])
+        for k in range(len(at)):
+            C = np.array(self.slope(x[k], at[k])).reshape(-1, self.model.size)
+            found.append((C @ Phi)[:, self.wanted.free])
+            if k < len(begin):
+                Phi = np.array(self.step(x[k], begin[k], end[k])[1]) @ Phi
+        return np.array(found)
 
     # -- the program ---------------------------------------------------------------------------
 
