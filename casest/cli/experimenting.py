@@ -183,12 +183,13 @@ def _noise(model: Dynamics, options: PlanOptions, start: Start | None) -> Any:
             raise UsageError(f"--sensor-noise {name}=…: {model.name} reads {', '.join(t.measured)}")
         if not 0 < said < float("inf"):
             raise UsageError(f"--sensor-noise {name}={said:g}: a standard deviation is above zero")
-    found = []
+    found: list[Array] = []
     for name, output in zip(t.measured, t.outputs, strict=True):
         std: float | None = stated.get(name)
-        if std is None and start is not None and len(start.sigma) in (1, int(t.reading.numel())):
-            place = sum(len(part) for part in found)
-            unit = start.sigma[place : place + output.predicted.numel()]
+        if std is None and start is not None:
+            place = len(np.concatenate([np.zeros(0), *found]))
+            every = np.broadcast_to(start.sigma, (int(t.reading.numel()),))
+            unit = every[place : place + output.predicted.numel()]
             declared = output.std if isinstance(output.std, float) else 1.0
             weighted = start.model.traced.residual.std is not None
             found.append(np.asarray(unit * (declared if weighted else 1.0)))
