@@ -63,7 +63,7 @@ class FlyingOptions:
     searches: int = flag(
         1, "--searches", type=int, show_default=True, help="From so many of the random motions."
     )
-    seed: int = flag(0, "--seed", show_default=True, help="Of the random motions.")
+    seed: int = flag(0, "--seed", show_default=True, help="Of random motions and values.")
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,6 +105,13 @@ class PlanOptions:
         False, "--separate", help="After close: what tells the causes apart that it left open."
     )
     count: int | None = flag(None, "--count", type=int, metavar="N", help="How many to plan.")
+    budget: float | None = flag(
+        None,
+        "--budget",
+        type=float,
+        metavar="COST",
+        help="What all may cost together (of the column cost, or seconds of runs).",
+    )
     until: Words = flag(
         (),
         "--until",

@@ -24,7 +24,7 @@ from casest.plan.motion.starts import random_inputs
 #: steps of a search, exchanges.
 RANDOM, SEARCHES, TURNS, STEPS, PASSES = 20, 3, 4, 60, 10
 #: Gain below which a turn was the last; change of standard deviations that finer steps may make.
-GAIN, FINE = 1e-4, 1e-3
+GAIN, FINE = 1e-4, 2e-4
 #: Information, as a share of what reading everywhere tells, below which nothing is told.
 UNTOLD = 1e-9
 
