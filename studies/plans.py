@@ -15,15 +15,29 @@ from typing import Any
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from casest import Run, attempt, calibrate_many
+from casest import Run, attempt, calibrate_many, constant, exp, param, signal
+from casest.dynamics import Motion as Motions
+from casest.dynamics import dynamics, measured, state
+from casest.dynamics.gramian import gramian, observed
+from casest.dynamics.transition import linearised
 from casest.plan.candidates.candidates import Candidates, Noise
 from casest.plan.candidates.finding import Possible, candidates
 from casest.plan.candidates.runs import runs
 from casest.plan.design.continuous import continuous, information
 from casest.plan.design.criteria import Trace, Volume, inverse
+from casest.plan.design.several import Several, beside
+from casest.plan.motion.criteria import Wanted
+from casest.plan.motion.experiment import planned_experiment
+from casest.plan.motion.limits import limits_of
+from casest.plan.motion.planning import planned_motion
+from casest.plan.motion.program import Grid
+from casest.plan.motion.program import Task as Motion
+from casest.plan.planning import Task as Poses
 from casest.plan.planning import criterion_of, planned, task
+from casest_problems.bias_gravity import bias_gravity
 from casest_problems.norm import norm_diagonal, norm_triangular
 from casest_problems.pair import norm_pair
 from casest_problems.rate_table import rate_table
@@ -186,6 +200,194 @@ def pyomo() -> Iterator[str]:
     yield f"| best first temperature, K | 579.212 | {t:.1f} (grid of 0.5; CA0 = {c:g}) |"
     yield f"| log10 trace after | 3.214432 | {np.log10(np.trace(after)):.6f} |"
     yield f"| log10 det after | 6.214118 | {np.linalg.slogdet(after)[1] / np.log(10):.6f} |"
+
+
+# -- motions and experiments -----------------------------------------------------------------------
+
+#: Limits of a small vehicle that stays about where it is.
+LIMITS = [
+    ("a", "12 m/s^2"),
+    ("omega", "30 deg/s"),
+    ("rate of omega", "30 deg/s^2"),
+    ("velocity", "0.5 m/s"),
+    ("rate of velocity", "1 m/s^2"),
+]
+
+
+def motion() -> Iterator[str]:
+    """60 s of Batista's estimator at 50 Hz, v read with 0.01 m/s, planned, random and hovering."""
+    model = bias_gravity.sensing(v=0.01**2 / 50)
+    yield (
+        "| criterion | rank | std over that of the median of 20 random motions | gravity, m/s² | "
+        "bias, m/s² | largest share of a limit | processor s |"
+    )
+    yield "| --- | --- | --- | --- | --- | --- | --- |"
+    for name, seed in (("D", 0), ("D", 1), ("A", 0), ("E", 0), ("bias", 0)):
+        began = time.process_time()
+        grid = Grid.of(60.0, 30, 30, False)
+        given = Motion(
+            model, Wanted.of(model, name), limits_of(model, LIMITS), grid, model.noise_at(1 / 50)
+        )
+        found = planned_motion(given, 50.0, np.random.default_rng(seed))
+        seconds = time.process_time() - began
+        seen, random = found.motion.seen, found.random.seen
+        ratio = np.exp(np.mean(np.log(seen.std / random.std)))
+        yield (
+            f"| {name} (seed {seed}) | {seen.rank} | {ratio:.2f} | {worst(seen.std[3:6])} | "
+            f"{worst(seen.std[6:])} | {max(found.motion.shares.values()):.3f} | {seconds:.1f} |"
+        )
+    seen = hovering(model)
+    yield (
+        f"| hovering (docs/in_motion.md) | {seen.rank} | | {worst(seen.std[3:6])} | "
+        f"{worst(seen.std[6:])} | | |"
+    )
+
+
+def worst(std: Array) -> str:
+    """The largest of some standard deviations; what is not determined has none."""
+    return "not determined" if np.isnan(std).any() else f"{std.max():.1e}"
+
+
+def hovering(model: Any) -> Any:
+    """What the documentation's hovering flight shows: about one axis, up and down."""
+    t = np.arange(0, 60, 0.02)
+    a = np.column_stack([0 * t, 0 * t, -9.80665 + 0.2 * np.sin(0.5 * t)])
+    omega = np.column_stack([0 * t, 0 * t, 0.3 + 0.1 * np.sin(t)])
+    signals = {"a": a, "omega": omega, "v": 0 * a}
+    units = {"a": "m/s^2", "omega": "rad/s", "v": "m/s"}
+    run = Run.raw("hovering", signals, units=units, time=t)
+    return observed(model, gramian(model, linearised(model, run)))
+
+
+@dynamics
+def reaction(
+    T=signal("K", held=True),
+    ca=signal(),
+    cb=signal(),
+    cc=signal(),
+    *,
+    a=state(start=5.0, known=True),
+    b=state(start=0.0, known=True),
+    A1=param("1/s", start=NOMINAL[0]),
+    A2=param("1/s", start=NOMINAL[1]),
+    E1=param("kJ/mol", start=NOMINAL[2]),
+    E2=param("kJ/mol", start=NOMINAL[3]),
+    R=constant(8.31446261815324e-3, "kJ/(mol K)"),
+):
+    """Two reactions in series by Arrhenius (Pyomo.DoE's example)."""
+    k1, k2 = A1 * exp(-E1 / (R * T)), A2 * exp(-E2 / (R * T))
+    outputs = (measured(ca, a, std=1.0), measured(cb, b, std=1.0), measured(cc, 5 - a - b, std=1.0))
+    return Motions(rates={"a": -k1 * a, "b": k1 * a - k2 * b}, outputs=outputs)
+
+
+def experiment() -> Iterator[str]:
+    """The reactor as declared equations, integrated exactly: eight temperatures by IPOPT."""
+    began = time.process_time()
+    wanted = Wanted.of(reaction, "D", PRIOR)
+    limits = limits_of(reaction, [("T", "300:700 K")])
+    given = Motion(reaction, wanted, limits, Grid.of(1.0, 8, 8, True), np.eye(3))
+    found = planned_experiment(given, 9, np.random.default_rng(0))
+    seconds = time.process_time() - began
+    size = wanted.scale[list(wanted.free)]
+    own = -np.linalg.slogdet(found.after / np.outer(size, size))[1] / np.log(10)
+    firsts = np.arange(540.0, 610.0, 2.0)
+    dets = [exact_det([first] + [300.0] * 7) for first in firsts]
+    best = np.polyfit(firsts, dets, 4)
+    fine = np.arange(540, 608, 0.1)
+    peak = int(np.argmax(np.polyval(best, fine)))
+    f = reactor()
+    planned_ = np.array(f(5, [*found.u.ravel(), found.u[-1, 0]], NOMINAL))
+    theirs = np.linalg.slogdet(PRIOR + planned_.T @ planned_)[1] / np.log(10)
+    yield "| | first temperature, K | others, K | log10 det after |"
+    yield "| --- | --- | --- | --- |"
+    yield "| published (last points of collocation: the next one's) | 579.212 | 300 | 6.214118 |"
+    yield (
+        f"| casest, integrated exactly | {found.u[0, 0]:.1f} | {found.u[1:].min():.1f} to "
+        f"{found.u[1:].max():.1f} | {own:.6f} ({theirs:.6f} in the published collocation) |"
+    )
+    yield (
+        f"| SciPy, integrated exactly, others at 300 K | {fine[peak]:.1f} | 300 | "
+        f"{np.polyval(best, fine[peak]):.6f} |"
+    )
+    yield ""
+    yield f"Found in {seconds:.1f} s of processor time."
+
+
+def exact_det(T: list[float]) -> float:
+    """log10 det of the information after, by SciPy's integration and differences."""
+
+    def seen(p: Array) -> Array:
+        state_, out = np.array([5.0, 0.0]), [5.0, 0.0, 0.0]
+        for t in T:
+            k1, k2 = (p[i] * np.exp(-p[i + 2] * 1000 / 8.31446261815324 / t) for i in (0, 1))
+            M = np.array([[-k1, 0.0], [k1, -k2]])
+            state_ = expm(M / 8) @ state_
+            out += [*state_, 5 - state_.sum()]
+        return np.array(out)
+
+    p = np.array(NOMINAL)
+    J = np.column_stack([
+        (seen(p + h) - seen(p - h)) / 2e-5 for h in 1e-5 * np.diag(p)
+    ])  # fmt: skip
+    return float(np.linalg.slogdet(PRIOR + J.T @ J)[1] / np.log(10))
+
+
+#: A decay exp(−kt) whose ln k is known to 0.7; noise of a reading, times at which one can read.
+SPREAD, NOISE, TIMES = 0.7, 0.05, np.arange(0.0, 20.05, 0.1)
+
+
+def sequential() -> Iterator[str]:
+    """Six readings of a decay: planned at once, averaged, for the worst, or two by two."""
+    rng = np.random.default_rng(11)
+    logs = np.log(0.5) + SPREAD * rng.standard_normal(SENSORS)
+    even = np.linspace(0, len(TIMES) - 1, 7).round().astype(int)[1:]
+    draws = np.log(0.5) + SPREAD * np.random.default_rng(5).standard_normal(16)
+    at_once = {
+        "evenly spread": even,
+        "at once, for the likeliest value": best_times([np.log(0.5)], 6, False, []),
+        "at once, averaged": best_times(draws, 6, False, []),
+        "at once, for the worst": best_times(draws, 6, True, []),
+    }
+    yield "| plan | rms error of ln k | 90 % of the errors below |"
+    yield "| --- | --- | --- |"
+    for name, chosen in at_once.items():
+        errors_ = [fit(x, chosen, np.random.default_rng(i)) - x for i, x in enumerate(logs)]
+        yield told_as(name, errors_)
+    for name, first in (("likeliest", [np.log(0.5)]), ("averaged", draws)):
+        errors_ = []
+        for i, x in enumerate(logs):
+            chosen = list(best_times(first, 2, False, []))
+            for _ in range(2):
+                now = fit(x, chosen, np.random.default_rng(i))
+                chosen += best_times([now], 2, False, chosen)
+            errors_.append(fit(x, chosen, np.random.default_rng(i)) - x)
+        yield told_as(f"two by two, the first {name}, each fitted before the next", errors_)
+
+
+def told_as(name: str, errors_: list[float]) -> str:
+    """A row of the table."""
+    size = np.abs(errors_)
+    return f"| {name} | {np.sqrt(np.mean(size**2)):.3f} | {np.quantile(size, 0.9):.3f} |"
+
+
+def best_times(logs: Any, count: int, worst: bool, before: list[int]) -> list[int]:
+    """Times for values of ln k, after readings that there are already."""
+    factors = [(-np.exp(x) * TIMES * np.exp(-np.exp(x) * TIMES) / NOISE)[:, None, None]
+               for x in logs]  # fmt: skip
+    known = [1 / SPREAD**2 + np.sum(F[before] ** 2) for F in factors]
+    names = tuple(f"ln k {i}" for i in range(len(known)))
+    given = Poses(beside(factors), np.diag(known), np.ones(len(known)), names)
+    return list(planned(given, Several(Volume(), len(known), worst), count).chosen)
+
+
+def fit(x: float, chosen: Any, rng: Any) -> float:
+    """ln k of readings of a decay, with what is known of it beforehand."""
+    t = TIMES[list(chosen)]
+    y = np.exp(-np.exp(x) * t) + NOISE * rng.standard_normal(len(t))
+    grid = np.linspace(np.log(0.5) - 4 * SPREAD, np.log(0.5) + 4 * SPREAD, 4001)
+    off = (y - np.exp(-np.exp(grid)[:, None] * t)) / NOISE
+    cost = np.sum(off**2, axis=1) + ((grid - np.log(0.5)) / SPREAD) ** 2
+    return float(grid[int(np.argmin(cost))])
 
 
 # -- what planned poses are worth ------------------------------------------------------------------
@@ -393,6 +595,9 @@ PARTS = {
     "The sphere": sphere,
     "Two rivals (Atkinson & Fedorov 1975, example 1)": rivals,
     "Pyomo.DoE's reactor": pyomo,
+    "A motion of 60 s": motion,
+    "Pyomo.DoE's reactor as declared equations": experiment,
+    f"Robust and sequential: {SENSORS} decays": sequential,
     f"{POSES} poses, {SENSORS} simulated sensors (of two models {ALONE})": worth,
     "A wheel's second run": mountings,
     "Time of 24 of 2000 candidates, 22 unknowns": speed,

@@ -101,7 +101,7 @@ def test_what_is_asked_of_single_rows_is_refused_in_a_sentence(
     result = str(tmp_path / "g")
     assert "of states that are followed" in said(["apply", result, data, "--with-std"], capsys)
     assert "there is nothing to correct" in said(["export", result, "--to", "c"], capsys)
-    assert "Simulate a record" in said(["plan", result], capsys)
+    assert "say --duration, and with --rate" in said(["plan", result], capsys)
 
 
 @pytest.fixture

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 import click
 
 from casest.cli.assignments import Assignment, Assignments
-from casest.cli.flags import flag
-from casest.cli.options import FOLDER, ModelOptions, ReadingOptions, Words
+from casest.cli.flags import Kind, flag
+from casest.cli.options import FOLDER, ModelOptions, MotionOptions, ReadingOptions, Words
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +37,33 @@ class PossibleOptions:
     reach: float | None = flag(
         None, "--reach", type=float, metavar="DEGREES", help="Furthest tilt from z up."
     )
-    duration: float | None = flag(None, "--duration", type=float, help="Seconds of a run.")
+    duration: float | None = flag(
+        None, "--duration", type=float, help="Seconds of a run, or of a motion."
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class FlyingOptions:
+    """What a motion may do, and how it is searched for."""
+
+    limits: Words = flag(
+        (),
+        "--limit",
+        only=Kind.MOVING,
+        metavar="'NAME=MAX UNIT'",
+        help="Of an input, a state or 'rate of NAME': its greatest length, or LOW:HIGH.",
+    )
+    pieces: int | None = flag(
+        None,
+        "--pieces",
+        type=int,
+        only=Kind.MOVING,
+        help="Pieces of an input: 30 straight lines of a motion, 8 constants of an experiment.",
+    )
+    searches: int = flag(
+        1, "--searches", type=int, show_default=True, help="From so many of the random motions."
+    )
+    seed: int = flag(0, "--seed", show_default=True, help="Of random motions and values.")
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,11 +98,20 @@ class PlanOptions:
         help="Standard deviation of one reading, in the model's unit.",
     )
     possible: PossibleOptions = field(default_factory=PossibleOptions)
+    flying: FlyingOptions = field(default_factory=FlyingOptions)
+    motion: MotionOptions = field(default_factory=MotionOptions)
     reading: ReadingOptions = field(default_factory=ReadingOptions)
     separate: bool = flag(
         False, "--separate", help="After close: what tells the causes apart that it left open."
     )
     count: int | None = flag(None, "--count", type=int, metavar="N", help="How many to plan.")
+    budget: float | None = flag(
+        None,
+        "--budget",
+        type=float,
+        metavar="COST",
+        help="What all may cost together (of the column cost, or seconds of runs).",
+    )
     until: Words = flag(
         (),
         "--until",
@@ -89,6 +125,12 @@ class PlanOptions:
         metavar="D|A|E|G|NAME",
         show_default=True,
         help="Volume, sum, worst combination, corrected readings, or one unknown.",
+    )
+    robust: Literal["average", "worst"] | None = flag(
+        None,
+        "--robust",
+        type=click.Choice(["average", "worst"]),
+        help="For values that the unknowns may have, not for the likeliest alone.",
     )
     live: LiveOptions = field(default_factory=LiveOptions)
     output: Path | None = flag(

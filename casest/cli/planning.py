@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from casest.cli.correcting import names_a_model
-from casest.cli.flags import taking
+from casest.cli.experimenting import equations_of, experimenting
+from casest.cli.flags import Kind, refuse, taking
+from casest.cli.flying import flying
 from casest.cli.live import living
+from casest.cli.loading import in_motion
 from casest.cli.plan_options import PlanOptions
 from casest.cli.separating import separating
 from casest.cli.shared import commands, echo, progress, typed, write
@@ -25,6 +29,7 @@ from casest.errors import UsageError
 
 if TYPE_CHECKING:
     from casest.plan.candidates.candidates import Candidates
+    from casest.plan.design.criteria import Criterion
     from casest.plan.goals import Goal, Measures
     from casest.plan.planning import Planned, Task
     from casest.results.plan import Plan
@@ -34,7 +39,7 @@ if TYPE_CHECKING:
 @click.argument("given", metavar="RESULT|MODEL", type=click.Path(path_type=Path))
 @taking(PlanOptions)
 def plan(given: Path, options: PlanOptions) -> int:
-    """Which measurement next: poses, runs or rows of a table that bring the most.
+    """Which measurement next: poses, runs or rows of a table that bring the most; or a motion.
 
     After a RESULT of calibrate or close (its folder), or of a MODEL before any data.
     """
@@ -42,8 +47,20 @@ def plan(given: Path, options: PlanOptions) -> int:
     from casest.results.file import as_json
     from casest.results.plan import plan_rows
 
-    if options.count is not None and options.until:
-        raise UsageError("--count and --until: one of the two says how many")
+    said = {
+        "--count": options.count,
+        "--until": options.until or None,
+        "--budget": options.budget,
+    }
+    several = [name for name, value in said.items() if value is not None]
+    if len(several) > 1:
+        raise UsageError(f"{several[0]} and {several[1]}: one of the two says how many")
+    if names_a_model(given) and in_motion(str(given)):
+        return flying(str(given), options)
+    equations = equations_of(given, options)
+    if equations is not None:
+        return experimenting(str(given), *equations, options)
+    refuse(options, Kind.MOVING, f"is for estimators in motion; {given} is none")
     progress(f"planning for {given}")
     situation = of_model(str(given), options) if names_a_model(given) else of_result(given, options)
     if options.live.source:
@@ -81,7 +98,7 @@ def planned_result(situation: Situation, options: PlanOptions) -> Plan:
         known[np.ix_(own, own)] = situation.information
     given = task(found.factors, known, found.names, situation.name)
     _refuse_hidden(given, situation, found)
-    goals, planned = _planned(given, measures_of(situation, found), options, situation)
+    goals, planned = _planned(given, found, options, situation)
     notes = (
         []
         if situation.noise.known
@@ -103,6 +120,8 @@ def planned_result(situation: Situation, options: PlanOptions) -> Plan:
         notes=notes,
         covered=covered(situation) if found.up is not None else None,
         command=typed(),
+        budget=options.budget,
+        robust=options.robust,
     )
 
 
@@ -120,27 +139,74 @@ def _refuse_hidden(given: Task, situation: Situation, found: Candidates) -> None
 
 
 def _planned(
-    given: Task, measures: Measures, options: PlanOptions, situation: Situation
+    given: Task, found: Candidates, options: PlanOptions, situation: Situation
 ) -> tuple[list[Goal], Planned]:
+    from casest.plan.budget import bought
     from casest.plan.planning import criterion_of, planned, until
 
+    measures = measures_of(situation, found)
     if options.until:
-        if not situation.noise.known:
-            name = situation.model.readings[0].name
-            raise UsageError(f"--until: how many depends on the noise: --sensor-noise {name}=STD")
-        if options.most < 1:
-            raise UsageError(f"--most {options.most}: at least one")
-        goals = [measures.goal(text) for text in options.until]
-        return goals, until(given, goals, options.most)
+        if options.robust:
+            raise UsageError("--robust goes with --count, not with --until")
+        return _until(given, measures, options, situation, until)
     columns = None
     if options.criterion == "G":
         columns = measures.columns("corrected", "--criterion G")[0]
     elif options.criterion not in ("D", "A", "E"):
         columns = measures.columns(options.criterion, f"--criterion {options.criterion}")[0]
+    criterion = criterion_of(given, options.criterion, columns)
+    if options.budget is not None:
+        if options.robust:
+            raise UsageError("--robust goes with --count, not with --budget")
+        return [], bought(given, criterion, found.cost, options.budget)
     count = _count(given) if options.count is None else options.count
     if count < 1:
         raise UsageError(f"--count {count}: at least one")
-    return [], planned(given, criterion_of(given, options.criterion, columns), count)
+    if options.robust:
+        return [], _robustly(given, criterion, count, options, situation)
+    return [], planned(given, criterion, count)
+
+
+def _until(
+    given: Task, measures: Measures, options: PlanOptions, situation: Situation, until: Any
+) -> tuple[list[Goal], Planned]:
+    if not situation.noise.known:
+        name = situation.model.readings[0].name
+        raise UsageError(f"--until: how many depends on the noise: --sensor-noise {name}=STD")
+    if options.most < 1:
+        raise UsageError(f"--most {options.most}: at least one")
+    goals = [measures.goal(text) for text in options.until]
+    return goals, until(given, goals, options.most)
+
+
+def _robustly(
+    given: Task, criterion: Criterion, count: int, options: PlanOptions, situation: Situation
+) -> Planned:
+    """For values drawn from the covariance of a result."""
+    import numpy as np
+
+    from casest.plan.candidates.finding import candidates
+    from casest.plan.robust import planned_robustly, possible_values
+
+    if situation.information is None:
+        raise UsageError(
+            f"--robust: nothing says how uncertain the unknowns of {situation.name} are: plan from "
+            "a result of calibrate"
+        )
+    possible = possible_of(situation, options)
+
+    def make(values: Mapping[str, Any]) -> Candidates:
+        return candidates(situation.model, values, situation.noise, possible)
+
+    drawn = possible_values(
+        situation.model,
+        situation.values,
+        situation.names,
+        situation.information,
+        np.random.default_rng(options.flying.seed),
+    )
+    worst = options.robust == "worst"
+    return planned_robustly(given, make, drawn, criterion, count, worst)
 
 
 def _count(given: Task) -> int:

@@ -169,14 +169,14 @@ def _rates(states: Sequence[Any], motion: Any, found: Mapping[str, SX], united: 
     whole = [ca.SX(0, 1)]
     for s in states:
         if s.name in motion.rates:
-            unit = _per_second(s.unit) if united else ""
+            unit = per_second(s.unit) if united else ""
             whole.append(quantity(f"rate of {s.name}", found[s.name], unit))
         else:
             whole.append(found[s.name])
     return ca.densify(ca.vertcat(*whole))
 
 
-def _per_second(unit: str) -> str:
+def per_second(unit: str) -> str:
     """The unit of a rate: of rad/s it is rad/s^2, of degC K/s."""
     if unit in ("", "1"):
         return "1/s"

@@ -125,6 +125,8 @@ class Plan(Result, frozen=True, kw_only=True, dict=True):
     measurements: list[Measurement]
     unknowns: dict[str, Unknown]
     separates: list[ToldApart] | UnsetType = UNSET
+    budget: float | UnsetType = UNSET
+    robust: str | UnsetType = UNSET
     best_possible: BestPossible
     noise: PlanNoise
     units: dict[str, str]
@@ -155,6 +157,8 @@ def plan_result(
     covered: Array | None = None,
     data: Sequence[str] = (),
     command: str = "",
+    budget: float | None = None,
+    robust: str | None = None,
 ) -> Plan:
     """What `plan` leaves. `units` are those of signals and of unknowns."""
     first, last = planned.covariances[0], planned.covariances[-1]
@@ -182,6 +186,8 @@ def plan_result(
             plain(noise.residual), units.get("residual", ""), dict(noise.readings), noise.known
         ),
         units={n: u for n, u in units.items() if n in found.signals or n in found.settings},
+        budget=UNSET if budget is None else budget,
+        robust=UNSET if robust is None else robust,
         notes=list(notes),
         reproduce=reproduced(command, data),
         declared=model.name,
@@ -308,10 +314,21 @@ def plan_words(result: Plan) -> Iterator[str]:
             f"{best.share_of_std**-2:.4g} times as much"
         )
     elif result.count:
+        which = f"no {result.count} {result.things} of these {result.candidates} have"
+        if result.budget is not UNSET:
+            which = (
+                f"nothing that costs {result.budget:g} (this: {result.cost:g}), of these "
+                f"{result.candidates} {result.things}, has"
+            )
         yield (
-            f"certified: no {result.count} {result.things} of these {result.candidates} have "
-            f"standard deviations below {100 * best.share_of_std:.4g} % of these "
-            f"({CRITERIA.get(result.criterion, result.criterion)})"
+            f"certified: {which} standard deviations below {100 * best.share_of_std:.4g} % of "
+            f"these ({CRITERIA.get(result.criterion, result.criterion)})"
+        )
+    if result.robust is not UNSET:
+        how = "averaged over" if result.robust == "average" else "for the worst of"
+        yield (
+            f"planned and certified {how} values that the unknowns may have; standard deviations "
+            "are those at the likeliest"
         )
     if best.at_least and result.goals:
         yield f"fewer than {best.at_least} {result.things} cannot reach the goal, however chosen"
