@@ -92,7 +92,7 @@ def _first_certified(
             return _with_kept(state, ranking, replace(refit, fit=fit), say), True
         state = state.refusing(refit.evidence.trials[0].what, fit)
         later = refits[k + 1].evidence.score if k + 1 < len(refits) else 0.0
-        if len(refit.evidence.trials) == 1 and refit.evidence.score > later + LEVELS.strong:
+        if len(refit.evidence.trials) == 1 and refit.evidence.score > later + LEVELS.clear:
             return state, True  # what explains clearly less is not the cause
     return state, False
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from casest.declaration.shapes import Array
 from casest.diagnose.evidence.score import Evidence, expected_loss, judged
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.protocol.confirming import falls, falls_of_refit, holds_out
@@ -101,6 +102,23 @@ def _contains(wide: Evidence, narrow: Evidence) -> bool:
     return bool(np.sum(beyond**2) < LEVELS.nested * narrow.freedom)
 
 
+def _different(refits: Sequence[Refit[F]]) -> list[Refit[F]]:
+    """Those of which none does all that an earlier one does, and no more."""
+    found: list[Refit[F]] = []
+    for refit in refits:
+        own = refit.evidence.basis
+        if not any(_same(own, other.evidence.basis) for other in found):
+            found.append(refit)
+    return found
+
+
+def _same(one: Array, other: Array) -> bool:
+    """Do orthonormal columns (n, k) span the same?"""
+    if one.shape != other.shape:
+        return False
+    return bool(np.linalg.norm(one - other @ (other.T @ one)) < 1e-3)
+
+
 def _near(refits: Sequence[Refit[F]]) -> list[Refit[F]]:
     """Those that the evidence does not tell from the best."""
     best = max((r.evidence.score for r in refits), default=0.0)
@@ -110,9 +128,10 @@ def _near(refits: Sequence[Refit[F]]) -> list[Refit[F]]:
 def torn_between(refits: Sequence[Refit[F]], ranking: Ranking) -> list[Refit[F]]:
     """Causes of which each, were it the wrong one, would do more harm than none of them.
 
-    That is, leave the declared parameters further off: what is added hangs on which it is.
+    That is, leave the declared parameters further off: what is added hangs on which it is. Causes
+    that predict the same whatever their sizes are one model, which is called so or otherwise.
     """
-    near = _near(refits)
+    near = _different(_near(refits))
     if len(near) < 2:
         return []
     loss, none = expected_loss([r.evidence for r in near], ranking.likelihood)
