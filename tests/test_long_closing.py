@@ -232,6 +232,20 @@ def test_what_cannot_be_is_refused_in_a_sentence(there, capsys, case):
     assert len(said.strip().splitlines()) == 1
 
 
+def test_a_fit_that_is_refused_is_written_with_its_reasons(there, capsys):
+    twice = MODEL.replace("gain=", 'other=param("mV"),\n    gain=').replace(
+        "zero +", "zero + other +"
+    )
+    Path("probe.py").write_text(twice, encoding="utf-8")
+    pq.write_table(table(), "a.parquet")
+    code, found, said = closed(capsys, "a.parquet", "--partitions", "-o", "out")
+    assert code == 2
+    assert found["trusted"] is False
+    assert found["samples"][0]["samples"] == COUNT
+    assert "no trustworthy estimate: not determined" in said
+    assert json.loads(Path("out/result.json").read_text())["trusted"] is False
+
+
 def test_workers_are_for_partitions(there, capsys):
     pq.write_table(table(count=1500), "short.parquet")
     code, _, said = closed(capsys, "short.parquet", "--workers", "2")

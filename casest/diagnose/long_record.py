@@ -94,7 +94,7 @@ def close_long(
             model, [few], catalogue=tried, start=start, known=known, seed=seed, say=say
         )
     except NotTrusted as error:
-        error.estimate = before or error.estimate
+        error.estimate = error.estimate if before is None else before
         raise
     if before is not None:
         say("fitting what was found to the whole record")

@@ -17,8 +17,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
-from scipy.stats import f as fisher
+from scipy.special import chdtrc, fdtrc
 
 from casest.declaration.effect import NOISE, OVER_TIME, RECORDED, Effect
 from casest.declaration.model import Model
@@ -88,7 +87,7 @@ class Sums:
         mean = self.score / self.count
         t2 = float(self.count * mean @ inverse @ mean)
         ratio = t2 * (self.count - q) / (q * (self.count - 1))
-        return t2, float(fisher.sf(ratio, q, self.count - q))
+        return t2, float(fdtrc(q, self.count - q, ratio))
 
 
 @dataclass
@@ -234,7 +233,7 @@ def between(trial: Trial, column: str) -> float:
     mean, (inverse, rank) = whole.score / whole.count, _inverse(whole.scatter)
     apart = [(g.score / g.count - mean, g.count) for g in groups]
     total = sum(n * float(d @ inverse @ d) for d, n in apart)
-    return float(chi2.sf(total, rank * (len(groups) - 1)))
+    return float(chdtrc(rank * (len(groups) - 1), total))
 
 
 def _inverse(matrix: Array) -> tuple[Array, int]:
