@@ -303,6 +303,11 @@ constants with standard uncertainties and degrees of freedom (H.1; 16 are the ef
 signals whose noise is stated together (H.2). H.4 and H.5 are no fits: no cases here. ISO 6143
 example 2 and the other clauses of ISO/TS 28037 could not be had with their digits.
 
+Of H.2 the GUM prints 0.295 for u(X). Its first way, first order from the means, gives 0.29558 from
+all digits of the readings (0.29572 from the rounded ones of its Table H.2); its second way, X of
+each of the five sets and the scatter of those, gives 0.29549. The GUM prints that for both; casest
+goes the first way (`pytest tests/test_metrology.py`).
+
 | case | published in | digits equal | casest for the published | χ² there | trusted |
 | --- | --- | --- | --- | --- | --- |
 """

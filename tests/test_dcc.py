@@ -53,6 +53,7 @@ def test_values_are_in_base_units_with_expanded_uncertainties(folder):
     found = {
         q.find("dcc:name/dcc:content", NAMES).text: q.find("si:real", NAMES)
         for q in root.iterfind(".//dcc:quantity", NAMES)
+        if q.find("si:real", NAMES) is not None
     }
     assert list(found) == ["zero", "gain", "share"]
 
@@ -72,6 +73,31 @@ def test_values_are_in_base_units_with_expanded_uncertainties(folder):
     assert found["share"].find("si:unit", NAMES).text == "\\one"
 
 
+def test_all_parameters_stand_together_with_their_covariance(folder):
+    """By NumPy's line, in base units; a reference of 1 % of the mass adds to the gain alone."""
+    root = exported(folder)
+    mass = 0.1 * np.arange(6)
+    (gain, zero), covariance = np.polyfit(mass, 1e-3 * np.array(READINGS), 1, cov=True)
+    covariance[0, 0] += (0.01 * gain) ** 2
+    vector = root.find(".//si:realListXMLList", NAMES)
+
+    def texts(of, what):
+        return [found.text for found in of.iterfind(what, NAMES)]
+
+    assert texts(vector, "si:labelXMLList") == ["zero gain"]
+    values = np.array(texts(vector, "si:valueXMLList")[0].split(), dtype=float)
+    assert values == pytest.approx([zero, gain])
+    region = vector.find("si:ellipsoidalRegionXMLList", NAMES)
+    columns = region.findall("si:covarianceMatrix/si:column", NAMES)
+    matrix = [[float(x) for x in texts(c, "si:covariance/si:value")] for c in columns]
+    np.testing.assert_allclose(matrix, covariance[::-1, ::-1], rtol=1e-6)
+    unit = texts(columns[0], "si:covariance/si:unit")[1]  # V * V/kg
+    expected = "\\kilogram\\metre\\tothe{4}\\second\\tothe{-6}\\ampere\\tothe{-2}"
+    assert unit == expected
+    factor = float(region.find("si:coverageFactor", NAMES).text)
+    assert factor == pytest.approx(np.sqrt(2 * 6.94427), abs=1e-3)  # F(2, 4) at 95 %
+
+
 def test_what_a_certificate_is_not_told_is_said(folder, capsys, tmp_path):
     root = exported(folder)
     assert "the certificate does not say identifier, country" in capsys.readouterr().err
@@ -81,7 +107,8 @@ def test_what_a_certificate_is_not_told_is_said(folder, capsys, tmp_path):
     told += [f'{name} = "x"' for name in names]
     (tmp_path / "c.toml").write_text("\n".join(told))
     root = exported(folder, "--certificate", f"{tmp_path}/c.toml")
-    assert capsys.readouterr().err == ""
+    unsigned = "casest: the certificate is not signed: the laboratory does that\n"
+    assert capsys.readouterr().err == unsigned
     assert root.find(".//dcc:calibrationLaboratory//dcc:content", NAMES).text == "A & B"
     assert root.find(".//dcc:endPerformanceDate", NAMES).text == "2026-11-21"
 

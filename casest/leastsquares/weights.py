@@ -81,10 +81,11 @@ def variance_factor(problem: Problem, point: Point) -> float:
     scale = robust_scale(residuals)
     r = np.concatenate([x.ravel() for x in residuals]) / scale
     w, slope = (out.ravel() for out in _curve(problem.model)(np.zeros(0), r.reshape(-1, 1)))
-    count, squares = len(r), float(scale**2 * np.sum((w * r) ** 2))
+    count, dof = len(r), max(len(r) - problem.unknowns, 1)
+    squares = float(scale**2 * np.sum((w * r) ** 2))
     share = problem.unknowns / count
     few = 1 + share * np.var(slope) / np.mean(slope) ** 2
-    huber = float(few**2 * squares / max(count - problem.unknowns, 1) / np.mean(slope) ** 2)
+    huber = float(few**2 * squares / dof / np.mean(slope) ** 2)
     if not 0 < share < 1 or share * FEW <= 1 or not np.ptp(slope) > 0:
         return huber
     return max(huber, (_reach(slope, share) / share) ** 2 * squares / count)

@@ -83,6 +83,15 @@ def budget_of(path: Path) -> Budget:
     )
 
 
+def covariance_in(path: Path) -> Covariance:
+    """Every number of a result that has a budget, with the covariance of all."""
+    saved = typed(load_result(path), _Saved, str(result_file(path)))
+    section = saved.after or saved.estimate
+    assert section
+    assert section.covariance
+    return section.covariance
+
+
 def _values(found: Covariance, freedom: dict[str, Number]) -> list[Quantity]:
     every = zip(found.names, found.values, found.units, strict=True)
     return [

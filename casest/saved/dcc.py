@@ -9,18 +9,21 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from datetime import date
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
+import numpy as np
+from scipy.special import fdtri
+
 from casest import __version__, units
 from casest.errors import CasestError, UsageError
 from casest.estimate.profile_likelihood import half_width
-from casest.results.budget import Budget, Quantity, budget_of
+from casest.results.budget import Budget, Quantity, budget_of, covariance_in
 from casest.results.file import result_file
-from casest.results.uncertainty import Input
+from casest.results.uncertainty import Covariance, Input
 
 VERSION = "3.2.0"
 DCC, SI = "https://ptb.de/dcc", "https://ptb.de/si"
@@ -98,7 +101,7 @@ def dcc(path: Path, file: Path | None = None) -> tuple[str, list[str]]:
     budget, said = budget_of(path), certificate_in(file)
     missing = [f.name for f in fields(Certificate) if getattr(said, f.name) in (UNKNOWN, "ZZ")]
     day = date.fromtimestamp(result_file(path).stat().st_mtime).isoformat()
-    remarks = []
+    remarks = ["the certificate is not signed: the laboratory does that"]
     if missing:
         remarks.append(
             f"the certificate does not say {', '.join(missing)}: write them to a TOML file, "
@@ -110,7 +113,7 @@ def dcc(path: Path, file: Path | None = None) -> tuple[str, list[str]]:
         "schemaVersion": VERSION, f"{{{INSTANCE}}}schemaLocation": SCHEMA})  # fmt: skip
     _administrative(_in(root, "administrativeData"), said, day)
     results = _in(_in(root, "measurementResults"), "measurementResult")
-    _measured(results, budget)
+    _measured(results, budget, covariance_in(path))
     for prefix, uri in (("dcc", DCC), ("si", SI), ("xsi", INSTANCE)):
         ET.register_namespace(prefix, uri)
     ET.indent(root)
@@ -164,14 +167,15 @@ def _contact(parent: ET.Element, name: str, country: str) -> None:
     _in(_in(parent, "location"), "countryCode", country)
 
 
-def _measured(ring: ET.Element, budget: Budget) -> None:
-    """Ring 2: what was determined, and what that rests on."""
+def _measured(ring: ET.Element, budget: Budget, together: Covariance) -> None:
+    """Ring 2: what was determined, apart and together, and what that rests on."""
     _named(ring, f"Calibration with the model {budget.model}")
     method = _in(_in(ring, "usedMethods"), "usedMethod")
     _named(method, "weighted least squares; uncertainty by JCGM 100, 5.1.2 and G.4")
     _software(_in(ring, "usedSoftware"))
     results = _in(ring, "results")
     _quantities(results, "Parameters", [_of_value(v) for v in budget.values])
+    _all_together(results, together, budget)
     known = [_of_input(i) for i in budget.inputs if i.kind == "reference"]
     if known:
         _quantities(results, "References, as they were stated", known)
@@ -204,6 +208,55 @@ def _quantities(results: ET.Element, name: str, numbers: Sequence[_Number]) -> N
         quantity = _in(data, "quantity")
         _named(quantity, number.name)
         _real(ET.SubElement(quantity, f"{{{SI}}}real"), number)
+
+
+def _all_together(results: ET.Element, found: Covariance, budget: Budget) -> None:
+    """All parameters as one vector, with the covariance of each two and the ellipsoid of 95 %.
+
+    Those without a standard deviation (on a bound) are left out; its coverage factor is by the F
+    distribution with the fewest degrees of freedom of any.
+    """
+    matrix = np.array(found.matrix, dtype=float)
+    kept = [i for i in range(len(found.names)) if np.isfinite(matrix[i, i]) and matrix[i, i] > 0]
+    if len(kept) < 2:
+        return
+    result = _in(results, "result")
+    _named(result, "Parameters together")
+    quantity = _in(_in(result, "data"), "quantity")
+    _named(quantity, "all parameters, with their covariance")
+    vector = ET.SubElement(quantity, f"{{{SI}}}realListXMLList")
+    scale = {i: d_si(found.units[i], found.names[i]) for i in kept}
+
+    def own(parent: ET.Element, name: str, text: str | None = None) -> ET.Element:
+        made = ET.SubElement(parent, f"{{{SI}}}{name}")
+        made.text = text
+        return made
+
+    own(vector, "labelXMLList", " ".join(found.names[i].replace(" ", "_") for i in kept))
+    values = {i: scale[i][0] * float(found.values[i] or 0.0) + scale[i][1] for i in kept}
+    own(vector, "valueXMLList", " ".join(repr(values[i]) for i in kept))
+    own(vector, "unitXMLList", " ".join(scale[i][2] for i in kept))
+    region = own(vector, "ellipsoidalRegionXMLList")
+    covariances = own(region, "covarianceMatrix")
+    for j in kept:
+        column = own(covariances, "column")
+        for i in kept:
+            one = own(column, "covariance")
+            own(one, "value", f"{scale[i][0] * scale[j][0] * matrix[i, j]:.9g}")
+            own(one, "unit", _product(found.units[i], found.units[j]))
+    known = [v.degrees_of_freedom for v in budget.values if v.degrees_of_freedom is not None]
+    factor = np.sqrt(len(kept) * fdtri(len(kept), min([*known, 1e6]), 0.95))
+    own(region, "coverageFactor", f"{factor:.4g}")
+    own(region, "coverageProbability", "0.95")
+
+
+def _product(one: str, other: str) -> str:
+    """D-SI unit of the product of two units."""
+    powers: dict[str, float] = {}
+    for unit in (one, other):
+        for base, power in units.size(unit or "1")[1]:
+            powers[base] = powers.get(base, 0.0) + float(power)
+    return _spelled(powers)
 
 
 def _real(real: ET.Element, number: _Number) -> None:
@@ -239,10 +292,13 @@ def d_si(unit: str, name: str) -> tuple[float, float, str]:
             f"the unit of {name} is {unit}, and a certificate needs one: say it when calibrating, "
             "--unit SIGNAL=UNIT"
         ) from None
-    powers = dict(dimension)
+    return factor, offset, _spelled({base: float(power) for base, power in dimension})
+
+
+def _spelled(powers: Mapping[str, float]) -> str:
     words = []
     for base, word in BASES.items():
         power = powers.get(base)
         if power:
             words.append(f"\\{word}" + ("" if power == 1 else f"\\tothe{{{float(power):g}}}"))
-    return factor, offset, "".join(words) or "\\one"
+    return "".join(words) or "\\one"
