@@ -118,3 +118,29 @@ def test_equations_are_followed_no_longer_than_is_allowed():
     with for_seconds(0.0), pytest.raises(GivenUp):
         problem.cost(problem.point({"mu": 5}))
     assert np.isfinite(problem.cost(problem.point({"mu": 5})))
+
+
+@dynamics
+def seen(
+    x=signal(), *, z=state(2, start=[2, 0], known=True), mu=param(start=800, bounds=(0, None))
+):
+    """The same oscillator, of which the angle alone is read."""
+    return Motion(
+        rates={"z": vertcat(z[1], mu * (1 - z[0] ** 2) * z[1] - z[0])}, outputs=(measured(x, z[0]),)
+    )
+
+
+@pytest.mark.long
+def test_van_der_pols_oscillator_is_fitted_over_two_jumps():
+    t = np.linspace(0, 2000, 101)
+    made = solve_ivp(
+        lambda _, z: (z[1], 1000 * (1 - z[0] ** 2) * z[1] - z[0]), (0, 2000), (2, 0), "Radau", t,
+        rtol=1e-9, atol=1e-12,
+    ).y[0]  # fmt: skip
+    read = made + 0.02 * np.random.default_rng(0).standard_normal(t.size)
+    found = attempt(
+        seen.calibration, [Run.raw("oscillator", {"x": read[:, None]}, units={}, time=t)]
+    )
+    assert found.certificate.trusted, found.certificate.reasons
+    assert abs(found.values["mu"] - 1000) < 4 * found.std["mu"]
+    assert found.std["mu"] < 2
