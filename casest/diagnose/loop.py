@@ -12,6 +12,7 @@ from casest.data.run import Run
 from casest.declaration.effect import RANDOM_WALK, TAILS, Effect
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
+from casest.declaration.symbols import Constant
 from casest.diagnose.candidates.candidates import Candidate, Skipped
 from casest.diagnose.closing import Closing
 from casest.diagnose.cross_validation import Folds, check_folds, cross_fitted, folded, rms
@@ -62,6 +63,7 @@ def close(
     return _noises_anew(
         closing,
         model,
+        catalogue,
         lambda wide, ready: _once(wide, ready, catalogue, None, known, seed, say),
     )
 
@@ -88,7 +90,10 @@ def _once(
 
 
 def _noises_anew(
-    closing: Closing, model: Model, again: Callable[[Model, Sequence[Run]], Closing]
+    closing: Closing,
+    model: Model,
+    catalogue: Sequence[Effect],
+    again: Callable[[Model, Sequence[Run]], Closing],
 ) -> Closing:
     """The loop where residuals have noises of their own, which were found beside what is missing.
 
@@ -97,12 +102,14 @@ def _noises_anew(
     """
     first, added = closing, list[Found]()
     while cause := next((f for f in closing.effects if not f.of_noise), None):
-        model = cause.candidate.added_to(model)
+        whole = _on_all_axes(cause.candidate, catalogue)
+        model = whole.added_to(model)
         try:
             closing = again(model, closing.runs)
         except NotTrusted:
             break
-        added.append(cause)
+        names = tuple(p.name for p in whole.parameters(model))
+        added.append(replace(cause, candidate=whole, names=names))
     if not added:
         return closing
     before, after = first.before, closing.after
@@ -116,6 +123,18 @@ def _noises_anew(
         after_held_out=sides[1],
         effects=(*added, *closing.effects),
     )
+
+
+def _on_all_axes(what: Candidate, catalogue: Sequence[Effect]) -> Candidate:
+    """A cause on every axis, as the catalogue has it: on which it shows hangs on the noises."""
+    own = what.effect
+    whole = next((e for e in catalogue if own is not None and e.name == own.name), None)
+    if own is None or whole is None:
+        return what
+    told = {
+        n: float(d.array) for n, d in own.declarations if isinstance(d, Constant) and not d.dims
+    }
+    return replace(what, effect=replace(whole, on=own.on).holding(**told), held=(), traced=None)
 
 
 def _searched(
