@@ -153,6 +153,8 @@ REFUSED = {
     "--limit 'a=3 kg'": "--limit 'a=3 kg': ",
     "--limit a=12 --limit omega=1 --criterion G": "one can ask for D, A, E or one of velocity",
     "--limit a=12 --limit omega=1 --count 3": "--count is of measurements that are counted",
+    "--limit a=12 --limit omega=1 --budget 3": "--budget is of measurements that are counted",
+    "--limit a=12 --limit omega=1 --robust worst": "--robust: what a motion shows",
     "--limit a=12 --limit omega=1 --pieces 0": "--pieces 0: from 1 to 400",
     "--limit a=12 --limit omega=1 --pieces 300": "samples for 300 pieces",
     "--limit a=12 --limit omega=1 --searches 0": "--searches 0: at least one",

@@ -66,6 +66,7 @@ def refuse_others(name: str, options: PlanOptions, counted: bool = False) -> Non
         "--reach": options.possible.reach,
         "--count": None if counted else options.count,
         "--until": options.until,
+        "--budget": options.budget,
         "--separate": options.separate,
         "--live": options.live.source,
         "--columns": options.reading.columns,
