@@ -14,9 +14,10 @@ from casest import cross, signal
 from casest.cli import run
 from casest.dynamics import Motion, dynamics, measured, state
 from casest.plan.motion.criteria import Wanted
+from casest.plan.motion.grid import Grid
 from casest.plan.motion.limits import limits_of
 from casest.plan.motion.planning import planned_motion
-from casest.plan.motion.program import NEAREST, Grid, Task
+from casest.plan.motion.program import NEAREST, Task
 
 WORDS = ["bias-gravity", "--duration", "10", "--rate", "20", "--pieces", "6"]
 WORDS += ["--sensor-noise", "v=0.01", "--limit", "a=12", "--limit", "omega=30 deg/s"]
