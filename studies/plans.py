@@ -31,9 +31,9 @@ from casest.plan.design.criteria import Trace, Volume, inverse
 from casest.plan.design.several import Several, beside
 from casest.plan.motion.criteria import Wanted
 from casest.plan.motion.experiment import planned_experiment
+from casest.plan.motion.grid import Grid
 from casest.plan.motion.limits import limits_of
 from casest.plan.motion.planning import planned_motion
-from casest.plan.motion.program import Grid
 from casest.plan.motion.program import Task as Motion
 from casest.plan.planning import Task as Poses
 from casest.plan.planning import criterion_of, planned, task

@@ -100,6 +100,8 @@ def test_from_the_prompt_a_table_with_costs_is_bought(tmp_path, capsys):
         (["--budget", "20", "--count", "3"], "--count and --budget: one of the two"),
         (["--robust", "worst"], "plan from a result of calibrate"),
         (["--budget", "20", "--robust", "worst"], "--robust goes with --count"),
+        (["--budget", "20", "--separate"], "--separate tells causes apart"),
+        (["--robust", "worst", "--live", "-"], "leave --robust and --budget out"),
     ):
         assert run([*words, *more]) == 1
         assert why in capsys.readouterr().err

@@ -14,9 +14,10 @@ from casest import cross, signal
 from casest.cli import run
 from casest.dynamics import Motion, dynamics, measured, state
 from casest.plan.motion.criteria import Wanted
+from casest.plan.motion.grid import Grid
 from casest.plan.motion.limits import limits_of
 from casest.plan.motion.planning import planned_motion
-from casest.plan.motion.program import NEAREST, Grid, Task
+from casest.plan.motion.program import NEAREST, Task
 
 WORDS = ["bias-gravity", "--duration", "10", "--rate", "20", "--pieces", "6"]
 WORDS += ["--sensor-noise", "v=0.01", "--limit", "a=12", "--limit", "omega=30 deg/s"]
@@ -153,6 +154,8 @@ REFUSED = {
     "--limit 'a=3 kg'": "--limit 'a=3 kg': ",
     "--limit a=12 --limit omega=1 --criterion G": "one can ask for D, A, E or one of velocity",
     "--limit a=12 --limit omega=1 --count 3": "--count is of measurements that are counted",
+    "--limit a=12 --limit omega=1 --budget 3": "--budget is of measurements that are counted",
+    "--limit a=12 --limit omega=1 --robust worst": "--robust: what a motion shows",
     "--limit a=12 --limit omega=1 --pieces 0": "--pieces 0: from 1 to 400",
     "--limit a=12 --limit omega=1 --pieces 300": "samples for 300 pieces",
     "--limit a=12 --limit omega=1 --searches 0": "--searches 0: at least one",

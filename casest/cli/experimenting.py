@@ -136,7 +136,8 @@ def _task(
     name: str, model: Dynamics, known: Any, options: PlanOptions, start: Start | None
 ) -> Task:
     """Limits, grid and noise of the experiment."""
-    from casest.plan.motion.program import Grid, Task
+    from casest.plan.motion.grid import Grid
+    from casest.plan.motion.program import Task
 
     duration, rate = options.possible.duration, options.reading.rate
     if duration is None or rate is None:

@@ -66,6 +66,7 @@ def refuse_others(name: str, options: PlanOptions, counted: bool = False) -> Non
         "--reach": options.possible.reach,
         "--count": None if counted else options.count,
         "--until": options.until,
+        "--budget": options.budget,
         "--separate": options.separate,
         "--live": options.live.source,
         "--columns": options.reading.columns,
@@ -89,7 +90,8 @@ def refuse_others(name: str, options: PlanOptions, counted: bool = False) -> Non
 def task_of(name: str, options: PlanOptions) -> tuple[Task, float]:
     """The model with its noise, limits, grid; and samples per second."""
     from casest.plan.motion.criteria import Wanted
-    from casest.plan.motion.program import Grid, Task
+    from casest.plan.motion.grid import Grid
+    from casest.plan.motion.program import Task
 
     duration, rate = options.possible.duration, options.reading.rate
     pieces = PIECES if options.flying.pieces is None else options.flying.pieces

@@ -23,6 +23,8 @@ def separating(situation: Situation, options: PlanOptions) -> Plan:
 
     if options.until or options.criterion != "D":
         raise UsageError("--separate has a goal of its own: leave --until and --criterion out")
+    if options.robust or options.budget is not None:
+        raise UsageError("--separate tells causes apart: leave --robust and --budget out")
     if situation.after is None:
         raise UsageError(f"--separate: {situation.name} is a model; give a result of close")
     base, labels = open_causes(situation.content, situation.model)

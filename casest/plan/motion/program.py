@@ -20,6 +20,7 @@ from casest.declaration.tracing import flat
 from casest.dynamics.declare import Dynamics
 from casest.errors import UsageError
 from casest.plan.motion.criteria import Wanted
+from casest.plan.motion.grid import Grid
 from casest.plan.motion.limits import Limit
 
 #: Runge-Kutta steps between two nodes, of Φ and of the states alone, which limits are kept by.
@@ -68,40 +69,6 @@ class Scenario:
     guess: Array
     constraints: Constraints
     W: Any
-
-
-@dataclass(frozen=True)
-class Grid:
-    """Nodes (K + 1,) in s, and inputs there as sums of those at knots (P, size each).
-
-    begin, end (K, P): inputs at both ends of every interval; they differ from interval to interval
-    where inputs are held.
-    """
-
-    time: Array
-    knots: Array
-    held: bool
-
-    @staticmethod
-    def of(duration: float, pieces: int, nodes: int, held: bool) -> Grid:
-        """So many pieces of inputs, and at least so many intervals, a whole number in each."""
-        each = -(-nodes // pieces)
-        time = np.linspace(0.0, duration, pieces * each + 1)
-        return Grid(time, time[: -1 if held else None : each], held)
-
-    @property
-    def step(self) -> float:
-        """Between two nodes, s."""
-        return float(self.time[1] - self.time[0])
-
-    def at(self, time: Array, before: bool = False) -> Array:
-        """Weights (N, P) of the knots at times; of held inputs `before` they change there."""
-        eye = np.eye(len(self.knots))
-        if not self.held:
-            return np.column_stack([np.interp(time, self.knots, column) for column in eye.T])
-        inside = time - 1e-6 * self.step if before else time + 1e-6 * self.step
-        place = np.searchsorted(self.knots, inside, "right") - 1
-        return np.asarray(eye[np.clip(place, 0, len(eye) - 1)])
 
 
 @dataclass(frozen=True)
