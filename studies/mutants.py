@@ -234,7 +234,7 @@ MUTANTS = tuple(
         ("dynamics/riccati.py", "both[:, n:, n:] = -A", "both[:, n:, n:] = A"),
         ("dynamics/riccati.py", "W = _even(W + back @ W", "W = _even(back @ W"),
         ("dynamics/stepping.py", "ca.vertcat(weight, 1 / R)", "ca.vertcat(weight, R)"),
-        ("dynamics/course.py", "_back(found, pieces, states)", "pass"),
+        ("dynamics/course.py", "_back(found, pieces, begun)", "pass"),
         ("dynamics/gramian.py", "pace.usual / system.steps)", "0 * system.steps + 1)"),
         ("dynamics/known.py", "S[:, np.arange(count), np.arange(count)] += hidden", "pass"),
         # -- corrections and readers ---------------------------------------------------------------

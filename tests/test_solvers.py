@@ -181,7 +181,7 @@ def test_an_estimate_does_not_depend_on_what_ipopt_says(monkeypatch):
 
     from casest.solve import strategy
 
-    def idle(problem, start, *, exact=False, options=None):
+    def idle(problem, start, *, exact=False, options=None, patience=0):
         found = ipopt(problem, start, exact=exact, options={"max_iter": 0})
         return replace(found, claims_success=True, status="Solve_Succeeded")
 

@@ -18,6 +18,8 @@ from casest.declaration.shapes import Array
 GRID = 2**16
 #: Part of the shorter record by which one may be late.
 FARTHEST = 0.5
+#: Two signals go together where the correlation of how lively they are is this; else 0 is as good.
+TOGETHER = 0.5
 
 
 def likely_lag(
@@ -25,8 +27,8 @@ def likely_lag(
 ) -> float:
     """Time in s by which the signal `measured` follows `name` of another file; 0 if untold.
 
-    With `within` also one of the same file, which is a `rotation` or not. Of several runs that of
-    the longest is taken.
+    With `within` also one of the same file, which is a `rotation` or not, where the two are lively
+    together: a load and a thermometer are not. Of several runs that of the longest is taken.
     """
     told = [run for run in runs if name in run.elsewhere or (within and name in run.signals)]
     told = [run for run in told if run.time is not None and len(run) > 3]
@@ -48,7 +50,11 @@ def likely_lag(
     product = np.fft.rfft(a, size) * np.conj(np.fft.rfft(b, size))
     together = np.fft.irfft(product, size)
     lags = np.arange(-longest, longest + 1)
-    return float(step * lags[np.argmax(together[lags])])
+    best = lags[np.argmax(together[lags])]
+    alone = np.linalg.norm(a) * np.linalg.norm(b)
+    if name not in run.elsewhere and together[best] < TOGETHER * alone:
+        return 0.0
+    return float(step * best)
 
 
 def _liveliness(curve: Curve, grid: Array) -> Array:
