@@ -19,7 +19,7 @@ GRID = 2**16
 #: Part of the shorter record by which one may be late.
 FARTHEST = 0.5
 #: Two signals go together where the correlation of how lively they are is this; else 0 is as good.
-TOGETHER = 0.5
+TOGETHER = 0.3
 
 
 def likely_lag(
