@@ -46,6 +46,8 @@ class Levels:
         all of it.
     outliers: log-likelihood over that of Student's t from which on samples are outliers: t noise of
         3 to 6 degrees of freedom gets there in less than one of a hundred records.
+    louder: median difference of neighbours, in that of most blocks, from which on the noise of a
+        block counts as louder: of white noise on one axis three blocks in a thousand get there.
     rows: of a longer record so many, evenly chosen, are looked at.
 
     In motion: suspect: whiteness below which noise with a colour is tried, and insists: gain of
@@ -90,6 +92,7 @@ class Levels:
     lacks: float = 1.5
     rounded: float = 0.45
     outliers: float = 4.0
+    louder: float = 2.0
     rows: int = 12_000
     suspect: float = 0.05
     insists: float = 10.0

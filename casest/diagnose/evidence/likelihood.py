@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casest.declaration.shapes import Array
-from casest.diagnose.evidence.linear import Linear, alike, robust_sd
+from casest.diagnose.evidence.linear import Index, Linear, alike, robust_sd
 from casest.diagnose.levels import LEVELS
 from casest.estimate.spectrum import Bands
 
@@ -60,7 +60,16 @@ class Likelihood:
         for span in self.linear.spans:
             n = span.stop - span.start
             frequency[span] = (np.arange(n) + 0.5) / (2 * n)
+        means = self._means
+        frequency[means] = (np.arange(len(means)) + 0.5) / (2 * self.shape[0])
         return Bands(frequency)
+
+    @cached_property
+    def _means(self) -> Index:
+        """Where the means of stretches are, if these are many: what is slow goes on from pose to
+        pose, and their means are a series as well."""
+        spans = self.linear.spans
+        return np.array([s.start for s in spans if len(spans) >= LEVELS.stretches], int)
 
     @cached_property
     def declared(self) -> Array:
@@ -74,13 +83,15 @@ class Likelihood:
         return self.by_frequency((r if self.cut is None else r - self.cut)[:, :, None])[:, 0]
 
     def by_frequency(self, columns: Array) -> Array:
-        """(N, m, k) as (N·m, k): each stretch by its cosines."""
+        """(N, m, k) as (N·m, k): each stretch by its cosines, and the means of many by theirs."""
         from scipy.fft import dct
 
         if self.linear.coloured:
             found = np.empty(columns.shape)
             for span in self.linear.spans:
                 found[span] = dct(columns[span], axis=0, norm="ortho")
+            if len(self._means):
+                found[self._means] = dct(found[self._means], axis=0, norm="ortho")
             columns = found
         return columns.reshape(columns.shape[0] * columns.shape[1], -1)
 
@@ -91,7 +102,9 @@ class Likelihood:
         columns = columns.reshape(*self.shape, -1)
         if not self.linear.coloured:
             return columns
-        found = np.empty(columns.shape)
+        columns, found = columns.copy(), np.empty(columns.shape)
+        if len(self._means):
+            columns[self._means] = idct(columns[self._means], axis=0, norm="ortho")
         for span in self.linear.spans:
             found[span] = idct(columns[span], axis=0, norm="ortho")
         return found

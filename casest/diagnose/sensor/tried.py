@@ -89,6 +89,7 @@ class Tried:
         for candidate, columns in slopes(problem, point, several, self.rows.index):
             if isinstance(columns, CasestError):
                 continue
+            columns = self.rows.evened(columns)
             axes = _axes(fit, candidate, columns.shape[2])
             describes = self._describes(candidate, motion) and not self.asked(candidate)
             family, trials = candidate.label, candidate.trials
@@ -143,7 +144,7 @@ class Tried:
         except CasestError:
             return None
         ((_, slope),) = slopes(problem, point, [probe], self.rows.index)
-        return None if isinstance(slope, CasestError) else (probe.on, slope)
+        return None if isinstance(slope, CasestError) else (probe.on, self.rows.evened(slope))
 
     @cached_property
     def _in_time(self) -> bool:
