@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -21,20 +23,24 @@ from casest.diagnose.evidence.score import (
     whitened,
 )
 from casest.diagnose.levels import LEVELS
+from casest.diagnose.noise.louder import louder
 from casest.diagnose.protocol import pairs, ranked_of
 
 
-def linear_of(residual, declared, *, in_time=True):
+def linear_of(residual, declared, *, in_time=True, poses=1):
     """A fit with residuals (N,) or (N, m) and declared columns (N, p) or (N, m, p).
 
-    The residual may still hold what the declared columns explain: a fit that has not ended.
+    The residual may still hold what the declared columns explain: a fit that has not ended. Of
+    several poses each is a stretch of its own.
     """
     residual = np.reshape(residual, (len(residual), -1))
     declared = np.reshape(declared, (*residual.shape, -1))
     n = len(residual)
     number = np.zeros(n, dtype=int)
     parts = parts_of(number, number, np.linspace(0, 1, n)[:, None])
-    return Linear(residual, declared, (slice(0, n),) if in_time else (), parts)
+    edges = np.linspace(0, n, poses + 1).astype(int)
+    spans = tuple(slice(a, b) for a, b in pairwise(edges)) if in_time else ()
+    return Linear(residual, declared, spans, parts)
 
 
 def trial_of(columns, name="cause", **more):
@@ -157,6 +163,59 @@ def test_smooth_causes_do_not_win_in_coloured_noise(kind, records):
         found = [judged([trial_of(G)], likelihood, none, families=6) for G in slow_ones(t)]
         won += max(e.score for e in found) > LEVELS.strong
     assert won <= chance_of(records, 0.02)[1]
+
+
+@pytest.mark.parametrize("records", [30, pytest.param(150, marks=pytest.mark.long)])
+def test_smooth_causes_do_not_win_in_what_goes_on_from_pose_to_pose(records):
+    """Forty poses of ten readings in noise that stays alike over four of them."""
+    rng, t, won = np.random.default_rng(6), np.arange(400) / 400, 0
+    for _ in range(records):
+        likelihood = Likelihood(linear_of(autoregressive(rng, 400, 0.95), np.ones(400), poses=40))
+        none = likelihood.beside()
+        found = [judged([trial_of(G)], likelihood, none, families=6) for G in slow_ones(t)]
+        won += max(e.score for e in found) > LEVELS.strong
+    assert won <= chance_of(records, 0.02)[1]
+
+
+def test_a_cause_in_poses_is_seen_beside_errors_of_seating():
+    """Each pose is off by its own error: what differs from pose to pose is judged by that."""
+    rng, pose = np.random.default_rng(7), np.repeat(np.arange(40), 10)
+    warm = np.sin(7 * pose)  # not in the order of time
+    scores = []
+    for size in (0.0, 2.0):
+        seating = rng.standard_normal(40)[pose]
+        y = size * warm + seating + 0.3 * rng.standard_normal(400)
+        likelihood = Likelihood(linear_of(y, np.ones(400), poses=40))
+        scores.append(judged([trial_of(warm)], likelihood, likelihood.beside()).score)
+    assert scores[0] < 0
+    assert LEVELS.strong < scores[1] < 100  # forty poses: 40 log(1 + 2) at most, not 400
+
+
+# -- where noise is louder -------------------------------------------------------------------------
+
+
+def test_noise_is_as_loud_as_it_was_made():
+    """Two bursts of five times the noise; a pulse and a wave of thirty times are none of it."""
+    rng, n = np.random.default_rng(8), 2000
+    made = np.ones(n)
+    made[300:360] = made[1500:1580] = 5
+    t = np.arange(n)
+    course = 30 * np.sin(2 * np.pi * t / 400) + 30 * ((t > 700) & (t <= 1100))
+    residual = made[:, None] * rng.standard_normal((n, 3)) + course[:, None]
+    found = louder(residual, (slice(0, n),))
+    assert np.all(found[made == 1] == 1)
+    assert found[made > 1] == pytest.approx(5, rel=0.35)
+
+
+def test_of_white_noise_hardly_a_block_is_called_louder():
+    rng = np.random.default_rng(9)
+    found = louder(rng.standard_normal((40_000, 1)), (slice(0, 40_000),))
+    assert np.mean(found > 1) < 0.005
+
+
+def test_readings_that_are_held_have_no_loudness():
+    held = np.repeat(np.random.default_rng(10).standard_normal((100, 1)), 5, axis=0)
+    assert np.all(louder(held, (slice(0, 500),)) == 1)
 
 
 # -- price -----------------------------------------------------------------------------------------

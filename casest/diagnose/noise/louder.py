@@ -15,14 +15,15 @@ def louder(residual: Array, spans: Sequence[slice]) -> Array:
     """Size of the noise at each row (N,) in that of most of the record; 1 where it is like it.
 
     By the differences of neighbours, in which what is slower than the noise has no part, over
-    blocks of rows; only what is plainly louder counts. `spans`: stretches of evenly spaced rows.
+    blocks of rows; only what is plainly louder than three quarters of them counts: what more of a
+    record does is no burst, but how the sensor is used. `spans`: stretches of evenly spaced rows.
     """
     found = np.ones(len(residual))
     blocks = [block for span in spans for block in _blocks(span)]
     sizes = np.array([_size(residual[block]) for block in blocks])
     if not len(sizes):
         return found
-    usual = np.median(sizes, axis=0)
+    usual = np.quantile(sizes, 0.75, axis=0)
     if not np.all(usual > 0):
         return found
     for block, size in zip(blocks, np.mean(sizes / usual, axis=1), strict=True):
