@@ -46,7 +46,7 @@ class Levels:
         all of it.
     outliers: log-likelihood over that of Student's t from which on samples are outliers: t noise of
         3 to 6 degrees of freedom gets there in less than one of a hundred records.
-    louder: median difference of neighbours, in that of three quarters of the blocks, from which on
+    louder: median third difference, in that of three quarters of the blocks, from which on
         the noise of a block counts as louder: none of 20 000 blocks of white noise on one axis did.
     rows: of a longer record so many, evenly chosen, are looked at.
 

@@ -14,9 +14,9 @@ from casest.diagnose.levels import LEVELS
 def louder(residual: Array, spans: Sequence[slice]) -> Array:
     """Size of the noise at each row (N,) in that of most of the record; 1 where it is like it.
 
-    By the differences of neighbours, in which what is slower than the noise has no part, over
-    blocks of rows; only what is plainly louder than three quarters of them counts: what more of a
-    record does is no burst, but how the sensor is used. `spans`: stretches of evenly spaced rows.
+    By third differences, in which a misfit that follows a motion has no part, over blocks of rows;
+    only what is plainly louder than three quarters of them counts: what more of a record does is no
+    burst, but how the sensor is used. `spans`: stretches of evenly spaced rows.
     """
     found = np.ones(len(residual))
     blocks = [block for span in spans for block in _blocks(span)]
@@ -35,9 +35,9 @@ def louder(residual: Array, spans: Sequence[slice]) -> Array:
 def _blocks(span: slice) -> list[slice]:
     count = max(1, (span.stop - span.start) // LEVELS.block)
     edges = np.linspace(span.start, span.stop, count + 1).astype(int)
-    return [slice(a, b) for a, b in pairwise(edges) if b - a > 3]
+    return [slice(a, b) for a, b in pairwise(edges) if b - a > 6]
 
 
 def _size(residual: Array) -> Array:
-    """Median difference of neighbours (m,)."""
-    return np.asarray(np.median(np.abs(np.diff(residual, axis=0)), axis=0))
+    """Median third difference (m,)."""
+    return np.asarray(np.median(np.abs(np.diff(residual, 3, axis=0)), axis=0))
