@@ -78,6 +78,11 @@ class Linear:
         U, s, _ = np.linalg.svd(R)
         return np.asarray(Q @ U[:, s > 1e-9 * s[0]])
 
+    def evened(self, size: Array) -> Linear:
+        """The problem in the sizes (N,) that the noise has at each row."""
+        r, J = self.residual / size[:, None], self.slopes / size[:, None, None]
+        return replace(self, residual=r, slopes=J)
+
     def without(self, columns: Array, part: Array) -> Linear:
         """The problem as if some unknowns were not there: `columns` (N, m, p − k) are the slopes of
         the others, `part` (N, m) is what the fit took away by them."""

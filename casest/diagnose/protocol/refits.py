@@ -8,8 +8,10 @@ from dataclasses import replace
 import numpy as np
 
 from casest.declaration.shapes import Array
+from casest.diagnose.evidence.likelihood import rises
 from casest.diagnose.evidence.score import Evidence, expected_loss, judged
 from casest.diagnose.levels import LEVELS
+from casest.diagnose.noise.louder import louder
 from casest.diagnose.protocol.confirming import falls, falls_of_refit, holds_out
 from casest.diagnose.protocol.ranking import sharpened
 from casest.diagnose.protocol.state import F, Ranking, Refit, State
@@ -31,11 +33,14 @@ def refitted(
             state = state.failing(evidence, better)
         else:
             fits.append((evidence, better))
-    gains = subject.rises(state.fit, [fit for _, fit in fits]) if fits else []
+    refits = [fit for _, fit in fits]
+    gains = subject.rises(state.fit, refits) if fits else []
+    even = _where_noise_is_louder(subject, ranking, refits) or gains
     found: list[Refit[F]] = []
-    for (evidence, better), gain in zip(fits, gains, strict=True):
+    for (evidence, better), gain, least in zip(fits, gains, even, strict=True):
         kept = _gaining(evidence, gain)
-        if _enough(ranking, kept) or subject.asked(evidence.trials[0].what):
+        enough = _enough(ranking, kept) and _strong(ranking, _gaining(evidence, least))
+        if enough or subject.asked(evidence.trials[0].what):
             found.append(Refit(state.fit, better, kept))
     found.sort(key=lambda r: -r.evidence.score)
     near = [r.evidence for r in _near(found)]
@@ -54,9 +59,27 @@ def _gaining(evidence: Evidence, gain: float) -> Evidence:
     return replace(evidence, gain=gain, score=evidence.score - evidence.gain + gain)
 
 
+def _where_noise_is_louder(subject: Subject[F], ranking: Ranking, fits: Sequence[F]) -> list[float]:
+    """The gains of refits where readings in bursts of noise count as less; none without bursts.
+
+    In a burst of a few readings the largest are on one side by chance, and any event is seen.
+    """
+    size = louder(ranking.linear.residual, ranking.linear.spans)
+    if not fits or np.all(size == 1):
+        return []
+    after = [subject.linear(fit) for fit in fits]
+    if any(x.residual.shape != ranking.linear.residual.shape for x in after):
+        return []
+    return rises(ranking.linear.evened(size), [x.evened(size) for x in after])
+
+
+def _strong(ranking: Ranking, evidence: Evidence) -> bool:
+    return evidence.score > (LEVELS.strong if ranking.linear.series else 0.0)
+
+
 def _enough(ranking: Ranking, evidence: Evidence) -> bool:
     """Is it strong evidence, clearly more than a course of unknown cause has, or beside one?"""
-    if evidence.score <= (LEVELS.strong if ranking.linear.series else 0.0):
+    if not _strong(ranking, evidence):
         return False
     course = next(iter(ranking.descriptions), None)
     if course is None or evidence.score > course.score + LEVELS.clear:

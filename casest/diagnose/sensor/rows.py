@@ -15,7 +15,6 @@ from casest.diagnose.candidates.slopes import rows_of
 from casest.diagnose.evidence.held_inputs import plateaus_of
 from casest.diagnose.evidence.linear import Index, Linear, parts_of, spans_of
 from casest.diagnose.levels import LEVELS
-from casest.diagnose.noise.louder import louder
 from casest.diagnose.sensor.fits import Fit, problem_of
 from casest.diagnose.sensor.recent import Recent
 from casest.leastsquares.kinds import noises
@@ -28,8 +27,6 @@ class Rows:
 
     runs: tuple[Run, ...]
     _linears: Recent[Fit, Linear] = field(default_factory=Recent, repr=False)
-    #: Of the first fit that was looked at, so that all are compared by the same.
-    _louder: list[Array] = field(default_factory=list, repr=False)
 
     def linear(self, fit: Fit) -> Linear:
         """Residuals and slopes in the rows that are looked at."""
@@ -37,18 +34,9 @@ class Rows:
 
     def _linear(self, fit: Fit) -> Linear:
         residual, J = self._slopes(*problem_of(fit, self.runs))
-        if not self._louder:
-            self._louder.append(louder(residual, self._spans))
-        residual, J = self.evened(residual), self.evened(J)
         met = self._met(fit)
         parts, held = parts_of(*self._numbers, met), plateaus_of(met, self._spans)
         return Linear(residual, J, self._spans, parts, self._least(fit), held)
-
-    def evened(self, values: Array) -> Array:
-        """Residuals or slopes (N, …) in the size that the noise has there."""
-        if not self._louder:
-            return values
-        return np.asarray(values / self._louder[0].reshape(-1, *[1] * (values.ndim - 1)))
 
     def of(self, values: Sequence[Array]) -> Array:
         """Values of each run (N, …) in the rows that are looked at, one run after the other."""

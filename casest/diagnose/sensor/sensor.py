@@ -262,7 +262,7 @@ class Sensor(Subject[Fit]):
         weights = problem_of(fit, self.runs)[0].weights
         if weights is not None:
             residuals = tuple(r * np.sqrt(w) for r, w in zip(residuals, weights, strict=True))
-        return self.rows.evened(self.rows.of(residuals))
+        return self.rows.of(residuals)
 
     def final(self, fit: Fit, what: Candidate) -> Candidate:
         """The candidate as it stands in the model."""

@@ -89,7 +89,6 @@ class Tried:
         for candidate, columns in slopes(problem, point, several, self.rows.index):
             if isinstance(columns, CasestError):
                 continue
-            columns = self.rows.evened(columns)
             axes = _axes(fit, candidate, columns.shape[2])
             describes = self._describes(candidate, motion) and not self.asked(candidate)
             family, trials = candidate.label, candidate.trials
@@ -144,7 +143,7 @@ class Tried:
         except CasestError:
             return None
         ((_, slope),) = slopes(problem, point, [probe], self.rows.index)
-        return None if isinstance(slope, CasestError) else (probe.on, self.rows.evened(slope))
+        return None if isinstance(slope, CasestError) else (probe.on, slope)
 
     @cached_property
     def _in_time(self) -> bool:
