@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import textwrap
 
 from casest.report.html.numbers import printed_unit
@@ -80,5 +81,5 @@ def _size(size: int) -> str:
 
 def _in(unit: str) -> str:
     unit = printed_unit(unit)
-    article = "the " if unit.startswith("unit of") else ""
-    return f" in {article}{unit}" if unit and unit != "1" else ""
+    unstated = f", the unit of {unit[1:-1]}" if re.fullmatch(r"\[[^\[\]]+\]", unit) else ""
+    return f" in {unit}{unstated}" if unit and unit != "1" else ""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 
@@ -41,6 +42,9 @@ def parameters(result: Fitted) -> str:
         head = ["parameter", "before", "± std", "after", *head[2:5], "moved", "unit"]
         rows = list(_beside(rows, sides[0].entries, result.entries))
         said += " Moved: in the value's own standard deviation before."
+    names = (name for e in result.entries for name in re.findall(r"\[(.+?)\]", e.unit))
+    unstated = [f" [{name}] is the unit of {name}, which nobody stated." for name in names]
+    said += "".join(dict.fromkeys(unstated))
     shown = table(head, rows, range(1, len(head) - 1))
     return section("parameters", "Parameters", paragraph(said), shown, _held(result.held))
 
@@ -80,7 +84,7 @@ def _places(value: float, spread: str) -> str:
     """The value with as many decimals as its standard deviation is written with."""
     if "e" in spread:
         return f"{value:.4g}"
-    return f"{value:.{len(spread.partition('.')[2])}f}"
+    return f"{value:z.{len(spread.partition('.')[2])}f}"  # no -0.00
 
 
 def _held(held: Sequence[Held]) -> str:
