@@ -12,7 +12,16 @@ from casest.report.html.figures import Figures
 from casest.report.html.fitted import certified, parameters, reproduction, uncertain
 from casest.report.html.frame import whole
 from casest.report.html.numbers import alike, in_words, number, printed, printed_unit, with_unit
-from casest.report.html.page import details, escaped, paragraph, points, section, table, tag
+from casest.report.html.page import (
+    code_block,
+    details,
+    escaped,
+    paragraph,
+    points,
+    section,
+    table,
+    tag,
+)
 from casest.report.html.poses import poses_seen
 from casest.report.html.residuals import convincing, residual_figures
 from casest.results.closing import Closed, Effect
@@ -167,7 +176,7 @@ def _effect(e: Effect, result: Closed) -> str:
         [
             tag("h3", escaped(f"{e.name} on {e.on}{column}")),
             paragraph(doc.partition("\n\n")[0].replace("\n", " ")) if doc else "",
-            tag("pre", tag("code", escaped(f"{e.on} → {e.formula}"))),
+            code_block(f"{e.on} → {e.formula}"),
             table(["parameter", "value", "± std", "unit"], rows, [1, 2]),
             points(evidence),
         ]

@@ -11,7 +11,7 @@ import numpy as np
 
 from casest import __version__
 from casest.report.html.numbers import number, printed, printed_unit, with_unit
-from casest.report.html.page import escaped, paragraph, points, section, table, tag
+from casest.report.html.page import code_block, escaped, paragraph, points, section, table, tag
 from casest.report.next_command import typed_words
 from casest.results.fitted import (
     Correlation,
@@ -244,7 +244,7 @@ def reproduction(
     if again.command:
         words = typed_words(again.command)
         shown = textwrap.dedent(words.lines()) if words else again.command
-        said.append(tag("pre", tag("code", escaped(shown))))
+        said.append(code_block(shown))
     versions = [["casest", __version__], ["python", again.python], ["casadi", again.casadi],
                 ["numpy", again.numpy], ["scipy", again.scipy]]  # fmt: skip
     said.append(table(["software", "version"], versions))

@@ -44,6 +44,11 @@ def prose(text: str) -> str:
     return "".join(f"<code>{p}</code>" if k % 2 else _options(p) for k, p in enumerate(parts))
 
 
+def code_block(text: str) -> str:
+    """Lines of code, which scroll sideways where the screen is narrow, also by keyboard."""
+    return tag("pre", tag("code", escaped(text)), tabindex="0")
+
+
 def _options(text: str) -> str:
     """Text in which no line breaks behind the hyphens of --at-rest."""
     return re.sub(r"(?<![\w-])--[a-z][a-z-]*", r'<code class="option">\g<0></code>', text)
