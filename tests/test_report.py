@@ -330,7 +330,8 @@ def test_values_are_read_by_pointer_and_by_keys(browser, calibrated):
 def test_the_sphere_shows_every_pose_and_the_widest_gap(browser, calibrated):
     browser.open(calibrated / "report.html")
     count = "document.querySelectorAll('#sphere circle.point.after').length"
-    assert browser.ask(count) == 24
+    assert browser.ask(count) == browser.ask(count.replace("after", "before")) == 24
+    assert texts(browser, "#sphere text.key") == ["● corrected", "● reading"] * 2
     assert "half angle of" in text(browser, "#sphere figcaption")
     assert texts(browser, "#lengths text.key") == ["● corrected", "● reading"]
 

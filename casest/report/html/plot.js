@@ -164,7 +164,7 @@
   };
 
   // -- values: the point nearest to the pointer, or stepped to by keys ---------------------------------
-  const curves = (p) => p.spec.series.filter((s) => s.y !== undefined && s.look !== "rim" && s.look !== "band");
+  const curves = (p) => p.spec.series.filter((s) => s.y !== undefined && !s.bare && s.look !== "rim" && s.look !== "band");
   const say = (p, one, k) => {
     const x = decode(one.x)[k], y = decode(one.y)[k], dots = p.spec.categories;
     const units = (u) => (u === "1" ? "" : " " + u);

@@ -24,10 +24,10 @@ def poses_seen(poses: Poses | None, figures: Figures) -> str:
     seen = figures.add(
         "sphere",
         (
-            "Directions of the poses.",
+            "Directions of the poses, before and after.",
             f"The sphere from above and below, equal areas as they are. "
             f"{100 * poses.covered:.0f} % of all directions have a pose within {NEAR:g}°; the "
-            f"widest empty cap (outlined) has a half angle of {poses.radius:.0f}° around "
+            f"widest empty cap (dashed) has a half angle of {poses.radius:.0f}° around "
             f"({where}).",
         ),
         halves,
@@ -39,12 +39,17 @@ def poses_seen(poses: Poses | None, figures: Figures) -> str:
 def _half(poses: Poses, figures: Figures, sign: int) -> dict[str, Any]:
     turn = np.linspace(0, 2 * np.pi, 181)
     edge = figures.series("line", "rim", np.cos(turn), y=np.sin(turn), exact=True)
-    x, y = _told_apart(*flat(poses.directions[poses.directions[:, 2] * sign >= 0]))
-    dots = figures.series("points", "after", x, y=y, exact=True)
+    dots = []
+    for vectors, look, name in (
+        (poses.before, "before", "reading"),
+        (poses.directions, "after", "corrected"),
+    ):
+        x, y = _told_apart(*flat(vectors[vectors[:, 2] * sign >= 0]))
+        dots.append(figures.series("points", look, x, y=y, exact=True) | {"name": name})
     rim = cap(poses.empty, np.radians(poses.radius))
     cap_x, cap_y = flat(np.where((rim[:, 2] * sign >= 0)[:, None], rim, np.nan))
-    outline = figures.series("line", "before", cap_x, y=cap_y, exact=True) | {"bare": True}
-    drawn = [edge, dots] + ([outline] if np.isfinite(cap_x).any() else [])
+    outline = figures.series("line", "edge", cap_x, y=cap_y, exact=True) | {"bare": True}
+    drawn = [edge, *dots] + ([outline] if np.isfinite(cap_x).any() else [])
     title = "z up" if sign > 0 else "z down"
     span = axis("direction [0]", "1", -1.04, 1.04), axis("direction [1]", "1", -1.04, 1.04)
     return panel(title, *span, drawn, height=330, square=True)
