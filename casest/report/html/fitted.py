@@ -6,6 +6,7 @@ import math
 import re
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
+from importlib.resources import files
 
 import numpy as np
 
@@ -179,6 +180,13 @@ def _pair(one: str, other: str, correlation: float) -> str:
 # -- why it is believed ----------------------------------------------------------------------------
 
 
+def _meaning(name: str) -> str:
+    """What the page of refusals, which the package carries, says of one."""
+    page = files("casest.report").joinpath("refusals.md").read_text("utf-8")
+    sections = re.split(r"^## (\S+)$", page, flags=re.MULTILINE)
+    return " ".join(dict(zip(sections[1::2], sections[2::2], strict=True))[name].split())
+
+
 def certified(result: Fitted) -> str:
     """The certificate of each fit, and how it was found."""
     said = []
@@ -189,8 +197,8 @@ def certified(result: Fitted) -> str:
         said.append(paragraph(f"The fit is {verb} because:"))
         said.append(points(side.reasons))
     if result.refusals:
-        pages = ", ".join(f"`docs/refusals.md#{name}`" for name in result.refusals)
-        said.append(paragraph(f"What that means and what to do: {pages}."))
+        said.append(tag("h3", "What that means and what to do"))
+        said += [paragraph(f"{_meaning(n)} (`docs/refusals.md#{n}`)") for n in result.refusals]
     solver = result.solver
     seconds = solver.seconds if isinstance(solver.seconds, float) else None
     if solver.name:
