@@ -450,7 +450,7 @@ def _registry() -> Any:
 
 
 def _unknown(unit: str) -> UnitError:
-    near = difflib.get_close_matches(unit.strip(), list(_CANONICAL), n=1, cutoff=0.5)
+    near = difflib.get_close_matches(unit.strip(), list(_CANONICAL), n=1)
     hint = f"did you mean '{near[0]}'?" if near else "write it like m/s^2, g, deg/s, uT or count"
     return UnitError(f"unknown unit '{unit.strip()}': {hint}")
 

@@ -473,11 +473,14 @@ def remarks(declared: Model, runs: Sequence[Run], values: dict[str, Array]) -> l
     found = []
     unit = runs[0].units.get("v")
     symbol = declared["norm"]
-    same = unit is not None and unit != "count" and symbol.unit in (unit, "[v]")
     length = float(np.median(np.linalg.norm(v, axis=1)))
-    if same and not 1 / 3 < length / norm < 3:
+    other = unit if symbol.unit == "[v]" else symbol.unit
+    alike = None if unit in (None, "count") else runs[0].in_unit("v", str(other))
+    times = 1.0 if alike is None else float(np.median(np.linalg.norm(alike, axis=1))) / norm
+    if not 1 / 3 < times < 3:
+        both = f"({norm:g}), both in {unit}" if other == unit else f"({norm:g} {other})"
         found.append(
-            f"readings are {length / norm:.3g} times the norm ({norm:g}), both in {unit}: is "
+            f"readings are {times:.3g} times the norm {both}: is "
             f"one of the two in another unit? (--unit v=…, --set 'norm=… {unit}')"
         )
     elif unit is None and norm == 1 and 9 < length < 11:
@@ -487,7 +490,9 @@ def remarks(declared: Model, runs: Sequence[Run], values: dict[str, Array]) -> l
         )
     spread = np.linalg.svd(v - v.mean(axis=0), compute_uv=False) / np.sqrt(len(v))
     unknowns = sum(p.shape.size for p in declared.parameters)
-    poses = _orientations(v, max(unknowns, 2), norm / 3 if same else 0.0)
+    poses = _orientations(
+        v, max(unknowns, 2), norm / 3 if alike is not None and other == unit else 0.0
+    )
     if poses == 1:
         found.append("the readings never leave one orientation: turn the sensor")
     elif poses < unknowns:

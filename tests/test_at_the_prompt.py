@@ -227,6 +227,11 @@ def test_the_sphere_shows_every_pose_where_its_corrected_reading_points(estimate
         np.asarray(axis.collections[0].get_offsets()) for axis in estimate.plot("sphere").axes[:2]
     )
     assert len(above) + len(below) == 24
+    raw = run.signals["v"] / np.linalg.norm(run.signals["v"], axis=1)[:, None]
+    x, y = np.hstack([axis.lines[1].get_data() for axis in estimate.plot("sphere").axes[:2]])
+    order = np.argsort(raw[:, 2] < 0, kind="stable")
+    assert x * np.sqrt(1 + np.abs(raw[order, 2])) == pytest.approx(raw[order, 0], abs=1e-9)
+    assert y * np.sqrt(1 + np.abs(raw[order, 2])) == pytest.approx(raw[order, 1], abs=1e-9)
     for shown, z in ((above, corrected[:, 2] >= 0), (below, corrected[:, 2] < 0)):
         assert (shown**2).sum(axis=1) == pytest.approx(1 - np.abs(corrected[z, 2]), abs=1e-9)
         assert np.arctan2(*shown.T[::-1]) == pytest.approx(

@@ -138,6 +138,15 @@ def test_all_signals_that_are_missing_are_said_at_once(tmp_path: Path) -> None:
     assert message.endswith("try --columns load=… --columns reading=…")
 
 
+def test_a_suggestion_needs_more_than_two_letters_in_common_and_brings_its_unit(tmp_path) -> None:
+    bare = [Signal("load", 1, None), Signal("reading", 1, None)]
+    message = refusal(DataError, tmp_path, "Gewicht,ADC\n1,2\n2,3\n", bare)
+    assert message.endswith("try --columns load=… --columns reading=…")
+    turned = [Signal("attitude", 9, None, "rotation")]
+    message = refusal(DataError, tmp_path, "roll_deg,pitch_deg,yaw_deg\n0,0,0\n0,1,9\n", turned)
+    assert message.endswith("try --columns attitude=roll_deg,pitch_deg,yaw_deg --unit attitude=deg")
+
+
 def test_every_group_that_a_vector_could_be_is_offered(tmp_path: Path) -> None:
     text = "turn.x,turn.y,turn.z,force.x,force.y,force.z\n1,2,3,4,5,6\n2,3,4,5,6,7\n"
     message = refusal(DataError, tmp_path, text)
@@ -148,10 +157,11 @@ def test_every_group_that_a_vector_could_be_is_offered(tmp_path: Path) -> None:
 
 def test_a_time_that_is_called_by_its_unit_has_it(tmp_path: Path) -> None:
     file = tmp_path / "raw.csv"
-    file.write_text("ms,x,y,z\n0,1,2,3\n20,2,3,4\n40,3,4,6\n")
-    (run,) = load_runs(file, (Signal("v", 3, None),), columns={"v": "x,y,z", "t": "ms"})
-    assert run.time is not None
-    assert run.time.tolist() == pytest.approx([0, 0.02, 0.04])
+    for name in ("ms", "tick_ms"):
+        file.write_text(f"{name},x,y,z\n0,1,2,3\n20,2,3,4\n40,3,4,6\n")
+        (run,) = load_runs(file, (Signal("v", 3, None),), columns={"v": "x,y,z", "t": name})
+        assert run.time is not None
+        assert run.time.tolist() == pytest.approx([0, 0.02, 0.04])
 
 
 def test_a_suggestion_with_blanks_is_quoted_for_the_shell(tmp_path: Path) -> None:

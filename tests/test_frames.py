@@ -210,6 +210,20 @@ def test_what_cannot_be_read_is_named_with_the_way_out(given, words):
     assert words in str(error.value)
 
 
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ({"columns": ["a", "b", "c"]}, """columns=['a', 'b', 'c'] is of type list"""),
+        ({"columns": {"v": "0,1,2"}, "units": "g"}, """like units={"v": 'g'}"""),
+        ({"columns": {"v": "0,1,2"}, "units": {"v": "gg"}}, """units={"v": "gg"}: unknown unit"""),
+    ],
+)
+def test_arguments_of_another_type_are_named_with_what_to_give(v, words, said):
+    with pytest.raises(casest.CasestError) as error:
+        calibrate(norm_diagonal, v, **words)
+    assert said in str(error.value)
+
+
 def test_runs_are_not_read_again_and_not_mixed(v):
     (run,) = load_runs(v, SIGNALS, columns={"v": "0,1,2"})
     with pytest.raises(casest.UsageError, match="these are runs already: say it where they are"):

@@ -165,6 +165,17 @@ def two_topics(tmp_path):
     )
 
 
+def test_the_topic_that_speaks_most_often_is_the_example(tmp_path):
+    make = logs.Messages()
+    field = [(k, make.field(k, (k, 1, 2))) for k in range(3)]
+    imu = [(k, make.imu(k, (0, 0, 9))) for k in range(9)]
+    topics = {
+        "/mag": ("sensor_msgs/msg/MagneticField", field),
+        "/imu": ("sensor_msgs/msg/Imu", imu),
+    }
+    assert "two.bag:/imu," in error_of(logs.bag(tmp_path / "two.bag", "bag", topics))
+
+
 def test_several_topics_without_a_choice_are_listed(two_topics):
     said = error_of(two_topics)
     assert f"holds 2 topics; name one behind the file, {two_topics}:/imu" in said

@@ -165,6 +165,30 @@ def test_units_are_read_from_names_and_sizes_and_marked_as_guesses(tmp_path, pos
     assert "# no header says it; the median length is" in text
 
 
+def test_a_time_and_angles_are_read_from_the_last_words_of_their_names(tmp_path, poses):
+    ticks = np.arange(len(poses)) * 10_000
+    angles = np.linspace(-170, 170, 3 * len(poses)).reshape(-1, 3)
+    rows = np.column_stack([ticks, poses, angles])
+    header = "tick_us,ax,ay,az,roll_deg,pitch_deg,yaw_deg"
+    found = initiated(tmp_path, table(tmp_path / "x.csv", header, rows))
+    assert found["columns"]["t"] == ["tick_us"]
+    assert found["units"]["attitude"] == "deg"
+    again = table(tmp_path / "x.csv", "k,ax,ay,az,roll,pitch,yaw", rows)
+    assert initiated(tmp_path, again)["units"]["attitude"] == "deg"  # none turns 170 rad
+    counted = table(tmp_path / "y.csv", "ax_raw,ay_raw,az_raw", np.round(poses * 400))
+    counts = initiated(tmp_path, counted)
+    assert counts["units"]["v"] == "count"
+    assert counts["constants"]["norm"] == "9.80665 m/s^2"
+
+
+def test_two_columns_for_two_signals_are_taken_in_order_and_marked(tmp_path, capsys):
+    file = table(tmp_path / "x.csv", "Gewicht,ADC", np.array([[0, 8110], [1, 8530], [2, 8949.0]]))
+    found = initiated(tmp_path, file, "--model", "load-cell")
+    assert found["columns"] == {"load": ["Gewicht"], "reading": ["ADC"]}
+    assert "a guess, by the order of the columns" in (tmp_path / "bench.toml").read_text()
+    assert "column of load guessed: Gewicht" in capsys.readouterr().out
+
+
 def test_a_unit_in_the_header_is_not_said_again(tmp_path, poses):
     file = table(tmp_path / "x.csv", "vx [m/s^2],vy [m/s^2],vz [m/s^2]", poses)
     assert "units" not in initiated(tmp_path, file)

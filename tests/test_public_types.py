@@ -23,6 +23,7 @@ reveal_type(model)
 reveal_type(effect(on="output"))
 def of(found: Estimate) -> None: reveal_type(found.values)
 reveal_type(casest.load_runs)
+def array(found: Estimate) -> None: reveal_type(found(found.values["offset"]))
 casest.modle
 """
 
@@ -60,13 +61,14 @@ def of(said: list[str], file: str) -> list[str]:
 
 @pytest.mark.long
 def test_a_type_checker_sees_what_public_names_are(said):
-    fit, declare, effects, values, load, wrong = of(said, "user.py")
+    fit, declare, effects, values, load, array, wrong = of(said, "user.py")
     assert "model: casest.declaration.model.Model" in fit
     assert fit.endswith('-> casest.interface.estimate.Estimate"')
     assert declare.endswith('-> casest.declaration.model.Model"')
     assert effects.endswith('-> casest.declaration.effect.Effect"')
     assert "Mapping[str, numpy.ndarray" in values
     assert "casest.data.run.Run" in load
+    assert "numpy.ndarray" in array  # what a call with an array returns
     assert wrong.startswith('error: Module has no attribute "modle"')
 
 

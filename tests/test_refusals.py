@@ -32,6 +32,13 @@ def test_a_refusal_that_is_printed_names_its_heading(capsys):
     assert named == ["not-determined"]
 
 
+def test_the_report_of_a_refusal_says_what_it_means():
+    poses = np.vstack([np.eye(3), -np.eye(3)]) * 9.81 + [0.1, 0.2, 0.3]
+    page = attempt("norm-diagonal", poses, columns={"v": "0,1,2"}).page()
+    assert "Six means of six positions are such a record. Give more poses, the raw record" in page
+    assert "docs/refusals.md#no-redundancy" in page
+
+
 def test_a_trusted_estimate_names_none(capsys):
     words = ["--columns", "v=a", "--rate", "50", "--at-rest", "--set", "norm=9.80665 m/s^2"]
     assert run(["calibrate", "norm-triangular", str(RECORD), *words]) == 0

@@ -12,6 +12,7 @@ import simulators as sim
 
 from casest import Run, attempt
 from casest.cli import run
+from casest.data import load_runs
 from casest.results.find import find_model
 
 MODELS = Path(__file__).parent / "models"
@@ -46,6 +47,16 @@ def test_a_norm_in_another_unit_than_the_readings_is_noticed():
     assert noted(mixed_up, "times the norm")
     right = attempt(find_model("norm-triangular").having(norm=9.80665), [poses(v)])
     assert not right.notes
+
+
+def test_a_norm_of_another_size_in_another_unit_of_its_kind_is_noticed(tmp_path):
+    rng = np.random.default_rng(1)
+    v = sim.accelerometer(rng).read(sim.spread_poses(30, rng), 0.005, rng)
+    file = table(tmp_path / "x.csv", "vx [m/s^2],vy [m/s^2],vz [m/s^2]", v)
+    model = find_model("norm-triangular")
+    runs = load_runs([file], model.signals)
+    assert noted(attempt(model.having(norm="1 mg"), runs), "times the norm (1 mg): is one of")
+    assert not attempt(model.having(norm="1 g"), runs).notes
 
 
 def test_poses_near_a_plane_are_called_so():

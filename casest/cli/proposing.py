@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from casest import units
 from casest.data import at_rest, load_runs, read_table
-from casest.data.finding import find_columns, near_group
+from casest.data.finding import find_columns, near_group, unit_in_names
 from casest.data.logs.naming import parts_of
 from casest.data.matching import triads
 from casest.data.run import Run
 from casest.data.table import Table
-from casest.data.timing import find_time, rate_in_preamble
+from casest.data.timing import find_time, increasing, rate_in_preamble, unit_at_end
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
 from casest.declaration.symbols import Signal
@@ -62,29 +62,53 @@ class _Group:
     guess: str
 
 
+@dataclass
+class _Found:
+    """What the record shows: columns and units by signal, and why, where that is a guess."""
+
+    table: Table
+    groups: Sequence[_Group]
+    columns: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    units: dict[str, str] = field(default_factory=dict)
+    why: dict[str, str] = field(default_factory=dict)
+    in_order: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    rests: int = 0
+
+
 def proposal(data: Sequence[str], model_name: str | None, folder: Path) -> Proposal:
     """A project file in `folder` for records that look alike; DataError where nothing fits."""
     table = _first_table(data)
     groups = [_group(table, columns) for columns in triads(_numbers(table))]
     name = model_name or _model_name(table, groups)
-    model, chosen = find_model(name), dict[str, tuple[str, ...]]()
-    units, comments = dict[str, str](), dict[str, str]()
+    model = find_model(name)
+    found = _found(table, groups, model)
+    given = {signal: columns for signal, columns in found.columns.items() if columns}
+    runs = load_runs(list(data), model.signals, columns=given, units=found.units,
+                     rate=1.0 if _lacks_time(table, model) else None)  # fmt: skip
+    found.rests = _rests(model, runs)
+    few = found.rests < ENOUGH_POSES and len(runs[0]) < ENOUGH_POSES
+    if model_name is None and name == "norm-triangular" and few:
+        name = "norm-diagonal"
+    lines = _lines(name, model, data, folder, found)
+    return Proposal("\n".join(lines) + "\n", tuple(_said(name, runs, found)))
+
+
+def _found(table: Table, groups: Sequence[_Group], model: Model) -> _Found:
+    """The columns of each signal of a model, and their units where no header states them."""
+    found = _Found(table, groups)
+    if not find_time(table) and (clock := _clock(table)):
+        found.columns["t"] = clock
     for signal in model.signals:
         if signal.name == "t":
             continue
-        chosen[signal.name] = _columns(table, signal, groups)
-        group = next((g for g in groups if g.columns == chosen[signal.name]), None)
-        if group and group.guess and group.unit:
-            units[signal.name], comments[signal.name] = group.unit, group.guess
-    runs = load_runs(list(data), model.signals, columns=_given(chosen), units=units,
-                     rate=1.0 if _lacks_time(table, model) else None)  # fmt: skip
-    rests = _rests(model, runs)
-    if model_name is None and name == "norm-triangular" and rests < ENOUGH_POSES and len(
-        runs[0]
-    ) < ENOUGH_POSES:  # fmt: skip
-        name = "norm-diagonal"
-    lines = _lines(name, model, data, folder, chosen, units, comments, rests, table)
-    return Proposal("\n".join(lines) + "\n", tuple(_said(name, table, runs, rests, comments)))
+        columns = found.columns[signal.name] = _columns(table, signal, groups)
+        group = next((g for g in groups if g.columns == columns), None)
+        unit, why = (group.unit, group.guess) if group else _own_unit(table, signal, columns)
+        if unit and why:
+            found.units[signal.name], found.why[signal.name] = unit, why
+    found.in_order = _in_order(model, found)
+    found.columns |= found.in_order
+    return found
 
 
 def _first_table(data: Sequence[str]) -> Table:
@@ -95,14 +119,22 @@ def _first_table(data: Sequence[str]) -> Table:
     return Table(data[0], columns, tables[0].notes, tables[0].preamble, tables[0].n_rows)
 
 
+def _clock(table: Table) -> tuple[str, ...]:
+    """The time: by its name, else what always grows and ends in a unit of time, tick_us."""
+    if found := find_time(table):
+        return found
+    grows = (n for n in table.columns if "_" in n and unit_at_end(n) and increasing(table, n))
+    return tuple(grows)[:1]
+
+
 def _numbers(table: Table) -> list[str]:
-    clock = find_time(table)
+    clock = _clock(table)
     return [n for n, c in table.columns.items() if not c.is_text and n not in clock]
 
 
 def _lacks_time(table: Table, model: Model) -> bool:
     """Does the model need a time that nothing tells?"""
-    told = find_time(table) or rate_in_preamble(table)
+    told = _clock(table) or rate_in_preamble(table)
     return not told and any(s.name == "t" for s in model.signals)
 
 
@@ -122,6 +154,18 @@ def _group(table: Table, columns: tuple[str, ...]) -> _Group:
             columns, _kind_of_unit(word) or kind, units.canonical(word), "so its name says"
         )
     return _guessed(columns, kind, values[np.isfinite(values).all(axis=1)])
+
+
+def _own_unit(table: Table, signal: Signal, names: Sequence[str]) -> tuple[str | None, str]:
+    """The unit of columns whose headers state none, with the reason: by their names, by size."""
+    columns = [table.columns[name] for name in names]
+    if columns and (unit := unit_in_names(table, names, signal)):
+        return unit, "so its name says"
+    angles = signal.kind == "rotation" and len(columns) == 3 and not any(c.unit for c in columns)
+    largest = max(float(np.nanmax(np.abs(c.values))) for c in columns) if angles else 0.0
+    if largest > 2 * np.pi:
+        return "deg", f"no header says it; the largest angle is {largest:.4g}"
+    return None, ""
 
 
 def _kind_of_unit(unit: str) -> str:
@@ -183,8 +227,14 @@ def _columns(table: Table, signal: Signal, groups: Sequence[_Group]) -> tuple[st
         return tuple(near_group(table, signal))
 
 
-def _given(chosen: Mapping[str, tuple[str, ...]]) -> dict[str, tuple[str, ...]]:
-    return {name: columns for name, columns in chosen.items() if columns}
+def _in_order(model: Model, found: _Found) -> dict[str, tuple[str, ...]]:
+    """Signals of one column that nothing tells, in the file's order, where none is left over."""
+    used = {name for columns in found.columns.values() for name in columns}
+    left = [name for name in _numbers(found.table) if name not in used]
+    open_ = [signal for signal in model.signals if found.columns.get(signal.name) == ()]
+    if len(open_) != len(left) or any(signal.size != 1 for signal in open_):
+        return {}
+    return {signal.name: (name,) for signal, name in zip(open_, left, strict=True)}
 
 
 def _rests(model: Model, runs: Sequence[Run]) -> int:
@@ -199,54 +249,50 @@ def _rests(model: Model, runs: Sequence[Run]) -> int:
 
 
 def _lines(
-    name: str,
-    model: Model,
-    data: Sequence[str],
-    folder: Path,
-    chosen: Mapping[str, tuple[str, ...]],
-    stated: Mapping[str, str],
-    why: Mapping[str, str],
-    rests: int,
-    table: Table,
+    name: str, model: Model, data: Sequence[str], folder: Path, found: _Found
 ) -> Iterator[str]:
+    table = found.table
     yield "# Options of casest for this record; what is typed overrides them, names are seen from"
     yield "# this file's folder. Every entry is an option of the command line: casest close --help."
     yield f"model = {_text(_beside(name, folder) if '.py' in name else name)}"
     yield f"data = {_text([_beside(d, folder) for d in data])}"
     yield 'output = "out"'
-    if not find_time(table) and not rate_in_preamble(table):
+    if not _clock(table) and not rate_in_preamble(table):
         yield "# rate = 100  # samples per second: no column is the time"
-    if rests:
-        yield f"at_rest = true  # {rests} rest intervals are found; each becomes one pose"
+    if found.rests:
+        yield f"at_rest = true  # {found.rests} rest intervals are found; each becomes one pose"
     yield from ("", "[columns]")
-    for signal, columns in chosen.items():
-        yield f"{signal} = {_text(list(columns))}" if columns else f"# {signal} = […]  # which?"
-    used = {c for columns in chosen.values() for c in columns}
+    for signal, columns in found.columns.items():
+        guess = "  # a guess, by the order of the columns" if signal in found.in_order else ""
+        yield f"{signal} = {_text(list(columns))}{guess}" if columns else f"# {signal} = […]"
+    used = {c for columns in found.columns.values() for c in columns}
     if others := [n for n in _numbers(table) if n not in used]:
         yield f"# kept, and tried as causes by casest close: {', '.join(others[:12])}"
-    if stated:
+    if found.units:
         yield from ("", "[units]")
-        yield from (f"{s} = {_text(unit)}  # {why[s]}" for s, unit in stated.items())
-    yield from _constants(model, table, chosen, stated)
+        yield from (f"{s} = {_text(unit)}  # {found.why[s]}" for s, unit in found.units.items())
+    yield from _constants(model, found)
 
 
-def _constants(
-    model: Model, table: Table, chosen: Mapping[str, tuple[str, ...]], stated: Mapping[str, str]
-) -> Iterator[str]:
+def _constants(model: Model, found: _Found) -> Iterator[str]:
     """What is known beforehand: gravity where something measures it, the rest to be filled in."""
     yield from ("", "[constants]")
-    names = [c.name for c in model.constants]
-    if "norm" in names:
-        columns = chosen.get("v", ())
-        unit = stated.get("v") or (table.columns[columns[0]].unit if columns else None)
-        kind = _kind_of_unit(unit) if unit and units.known(unit) else ""
-        if kind == "acc":
+    if any(c.name == "norm" for c in model.constants):
+        if _measured(found) == "acc":
             yield f'norm = "{_G} m/s^2"  # standard gravity; gravity(latitude, height) is your own'
         else:
             yield '# norm = "48 uT"  # the known length; field(latitude, longitude, height, year)'
     for c in model.constants:
         if c.name != "norm" and not c.dims:
             yield f"# {c.name} = {_text(f'{float(c.array):.9g} {c.unit}'.strip())}"
+
+
+def _measured(found: _Found) -> str:
+    """What the signal v measures: by its unit, else by the columns' names."""
+    columns = found.columns.get("v", ())
+    unit = found.units.get("v") or (found.table.columns[columns[0]].unit if columns else None)
+    kind = _kind_of_unit(unit) if unit and units.known(unit) else ""
+    return kind or next((g.kind for g in found.groups if g.columns == columns and unit), "")
 
 
 def _beside(name: str, folder: Path) -> str:
@@ -257,19 +303,19 @@ def _text(value: str | list[str]) -> str:
     return json.dumps(value, ensure_ascii=False)
 
 
-def _said(
-    name: str, table: Table, runs: Sequence[Run], rests: int, why: Mapping[str, str]
-) -> Iterator[str]:
+def _said(name: str, runs: Sequence[Run], found: _Found) -> Iterator[str]:
     rows = sum(len(run) for run in runs)
     time = runs[0].time
     lasts = "" if time is None else f" over {float(np.ptp(time)):.4g} s"
     several = "runs" if len(runs) > 1 else "run"
-    yield f"{len(runs)} {several}, {rows} rows{lasts}, {len(table.columns)} columns"
+    yield f"{len(runs)} {several}, {rows} rows{lasts}, {len(found.table.columns)} columns"
     if not lasts:
         yield "no column is the time; where it matters say the rate"
-    if rests:
-        yield f"{rests} rest intervals: a record of poses"
+    if found.rests:
+        yield f"{found.rests} rest intervals: a record of poses"
     elif name in POSES and rows > MANY_ROWS:
         yield "no rest intervals: each row is taken as a pose; of a moving accelerometer none is"
-    yield from (f"unit of {signal} guessed: {reason}" for signal, reason in why.items())
+    yield from (f"unit of {signal} guessed: {reason}" for signal, reason in found.why.items())
+    for signal, (column,) in found.in_order.items():
+        yield f"column of {signal} guessed: {column}, by the order of the columns"
     yield f"model {name}"

@@ -89,6 +89,8 @@ def load_runs(
 
     Raises DataError, UnitError or UsageError naming file, column, row, value and the way out.
     """
+    for name, said in (("columns", columns), ("units", units), ("scales", scales)):
+        _refuse_no_mapping(name, said)
     wanted = tuple(signals.values() if isinstance(signals, Mapping) else signals)
     listed = listed_data(paths)
     if not listed:
@@ -113,6 +115,15 @@ def load_runs(
         wanders = [s.name for s in wanted if s.wanders]
         runs = [averaged_at_rest(run, also=also, wanders=wanders) for run in runs]
     return tuple(runs)
+
+
+def _refuse_no_mapping(name: str, said: object) -> None:
+    """A list of columns does not say of which signal they are."""
+    if said is not None and not isinstance(said, Mapping):
+        raise UsageError(
+            f"{name}={said!r:.60} is of type {type(said).__name__}, and does not say what it is "
+            f'of: give a mapping from signals, like {name}={{"v": {said!r:.60}}}'
+        )
 
 
 def listed_data(given: Any) -> list[Any]:

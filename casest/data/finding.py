@@ -141,8 +141,7 @@ def _missing(table: Table, signal: Signal) -> DataError:
     if signal.kind == "rotation":
         wanted = "roll pitch yaw or qw qx qy qz"
     near = near_group(table, signal)
-    some = shlex.quote(f"{signal.name}={','.join(near)}") if near else ""
-    some = some or f"{signal.name}={','.join('…' * min(signal.size, 3))}"
+    some = _as_typed(table, signal, near)
     others = [g for g in _groups_of(table, signal) if g != near]
     instead = "".join(f" or --columns {shlex.quote(f'{signal.name}={o}')}"
                       for o in map(",".join, others[:3]))  # fmt: skip
@@ -158,12 +157,29 @@ def also_missing(table: Table, signals: Sequence[Signal], chosen: Choice, said: 
     for signal in signals:
         if signal.name in chosen or _by_stem(table, signal, signal.name):
             continue
-        near = ",".join(near_group(table, signal))
-        some = shlex.quote(f"{signal.name}={near}")
-        if not near or f"={near}" in said:
-            some = f"{signal.name}={','.join('…' * min(signal.size, 3))}"
-        tries.append(f" --columns {some}")
+        near = near_group(table, signal)
+        taken = f"={','.join(near)}" in said
+        tries.append(f" --columns {_as_typed(table, signal, [] if taken else near)}")
     return "".join(tries)
+
+
+def _as_typed(table: Table, signal: Signal, near: Sequence[str]) -> str:
+    """What to type behind --columns, and behind it the unit that the columns' names end in."""
+    if not near:
+        return f"{signal.name}={','.join('…' * min(signal.size, 3))}"
+    unit = unit_in_names(table, near, signal)
+    said = f" --unit {shlex.quote(f'{signal.name}={unit}')}" if unit else ""
+    return shlex.quote(f"{signal.name}={','.join(near)}") + said
+
+
+def unit_in_names(table: Table, names: Sequence[str], signal: Signal) -> str | None:
+    """Return the unit that is the last word of all names, where no header states one: roll_deg."""
+    wanted = "rad" if signal.kind == "rotation" else signal.unit
+    ends = {name.rpartition("_")[2] if "_" in name else "" for name in names}
+    end = ends.pop()
+    if ends or not wanted or any(table.columns[name].unit for name in names):
+        return None
+    return end if units.familiar(end) and _converts(end, wanted) else None
 
 
 def _groups_of(table: Table, signal: Signal) -> list[list[str]]:
@@ -185,7 +201,9 @@ def near_group(table: Table, signal: Signal) -> list[str]:
         return [a for a in angles if a] if all(angles) and len(set(angles)) == 3 else []
     if signal.size == 1:
         fitting = [n for n in numbers if signal.unit and _in_unit(table, [n], signal.unit)]
-        near = fitting[0] if len(fitting) == 1 else _nearest(signal.name, fitting or numbers)
+        if len(fitting) == 1:
+            return fitting
+        near = _nearest_name(signal.name, fitting or numbers)
         return [near] if near else []
     if alike := _groups_of(table, signal):
         wanted = "".join(_candidates(signal)[0])
@@ -197,8 +215,12 @@ def near_group(table: Table, signal: Signal) -> list[str]:
 
 def _in_unit(table: Table, names: Sequence[str], unit: str) -> bool:
     """Whether all these columns state a unit that converts to `unit`."""
+    return all(_converts(table.columns[n].unit or "", unit) for n in names)
+
+
+def _converts(have: str, wanted: str) -> bool:
     try:
-        return all(units.conversion(table.columns[n].unit or "", unit) for n in names)
+        return bool(units.conversion(have, wanted))
     except UnitError:
         return False
 
@@ -213,7 +235,13 @@ def _stems(names: list[str]) -> list[list[str]]:
     return list(groups.values())
 
 
-def _nearest(name: str, names: list[str]) -> str | None:
+def _nearest_name(name: str, names: list[str]) -> str | None:
+    """Return what abbreviates a name (temp) or is spelled much like it: ADC is no load."""
+    short = [have for have in names if len(plain(have)) > 2 and plain(name).startswith(plain(have))]
+    return short[0] if short else _nearest(name, names, cutoff=0.6)
+
+
+def _nearest(name: str, names: list[str], cutoff: float = 0.5) -> str | None:
     by_plain = {plain(have): have for have in names}
-    near = difflib.get_close_matches(plain(name), list(by_plain), n=1, cutoff=0.5)
+    near = difflib.get_close_matches(plain(name), list(by_plain), n=1, cutoff=cutoff)
     return by_plain[near[0]] if near else None

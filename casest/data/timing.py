@@ -28,7 +28,7 @@ UNUSED = "time not used: "
 
 _NAMES = ("t", "time", "timestamp", "timestamps")
 _CLOCKS = {"millis": "ms", "milliseconds": "ms", "micros": "us", "microseconds": "us"}
-#: A column that was said to be the time may be called by its unit alone.
+#: A column that was said to be the time may be called by its unit alone, or end in it: tick_us.
 _UNITS = ("s", "sec", "ms", "msec", "us", "usec", "ns")
 _PAIR = ["clock", "date"]
 _KINDS = ("both", "date", "clock")
@@ -150,8 +150,7 @@ def seconds(
     Raises UnitError where its unit is no time, UsageError where the header states one that may be
     that before or after scaling.
     """
-    called = column.name.lower() if column.name.lower() in _UNITS else None
-    unit = stated or column.unit or _unit_in_name(column.name) or called
+    unit = stated or column.unit or _unit_in_name(column.name) or unit_at_end(column.name)
     values = np.asarray(column.values, dtype=np.float64)
     if scale is not None:
         values = scale.apply(values, table.file, column.name)
@@ -275,6 +274,12 @@ def _unit_in_name(name: str) -> str | None:
         return unit
     found = re.fullmatch(r"(?:t|time|time_?stamp)[_.\s]?(s|sec|ms|msec|us|usec|ns)", name.lower())
     return found[1] if found and name.lower() != "ts" else None
+
+
+def unit_at_end(name: str) -> str | None:
+    """Return the unit of time that is the last word of a column's name: tick_us, ms."""
+    last = name.lower().rpartition("_")[2]
+    return last if last in _UNITS else None
 
 
 def time_units_declared(mapping: Mapping[str, str], column: str | None) -> str | None:

@@ -6,7 +6,7 @@ import os
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from casest.correction.carried import Carried
 from casest.correction.inverse import LEFT, ONCE, TIMED
 from casest.data import load_runs
 from casest.data.bind import Frame, Path_
+from casest.data.finding import Choice
 from casest.data.frames import is_frame
 from casest.data.run import Run
 from casest.data.table import Table, read_table, table_of
@@ -22,11 +23,70 @@ from casest.declaration.symbols import Signal
 from casest.errors import CasestError, UsageError
 from casest.interface.reading import Reading, stated
 from casest.interface.tables import as_frame, headers, like
+from casest.interface.words import as_python_says
 from casest.results.saved import SavedResult
 from casest.saved.apply import beyond, corrected, fitted_unit, with_margin, without
 
 #: Readings: one array of the sensor's readings, a mapping or frame of columns, a file, or runs.
 Readings = Array | Frame | Path_ | Run | Sequence[Run]
+
+
+class Corrects:
+    """What is called with readings and returns them corrected."""
+
+    reading: Reading
+
+    @overload
+    def __call__(
+        self,
+        readings: Array,
+        *,
+        columns: Choice | None = None,
+        units: Mapping[str, str] | None = None,
+        scales: Mapping[str, str] | None = None,
+        rate: float | None = None,
+        run: str | None = None,
+        force: bool = False,
+    ) -> Array: ...
+
+    @overload
+    def __call__(
+        self,
+        readings: Readings,
+        *,
+        columns: Choice | None = None,
+        units: Mapping[str, str] | None = None,
+        scales: Mapping[str, str] | None = None,
+        rate: float | None = None,
+        run: str | None = None,
+        force: bool = False,
+    ) -> Any: ...
+
+    def __call__(
+        self,
+        readings: Readings,
+        *,
+        columns: Choice | None = None,
+        units: Mapping[str, str] | None = None,
+        scales: Mapping[str, str] | None = None,
+        rate: float | None = None,
+        run: str | None = None,
+        force: bool = False,
+    ) -> Any:
+        """The corrected quantity of new readings, as what was given: an array (N, size) or a frame.
+
+        Columns and units are those of the fit's data unless they are said (nothing is known of them
+        where a saved result was loaded); an array is in the unit of the fit. `run` names the run
+        whose correction it is, where they differ; `force` uses an estimate that was refused. A
+        warning says where readings leave what the fit saw.
+        """
+        said = {"columns": columns, "units": units, "scales": scales, "rate": rate}
+        with as_python_says():
+            result, carried = self._correction(force)
+            return corrected_readings(result, carried, readings, kept(self.reading, said), run)
+
+    def _correction(self, force: bool) -> tuple[SavedResult, Carried]:
+        raise NotImplementedError
 
 
 def corrected_readings(

@@ -74,7 +74,7 @@ def _correlation(result: Fitted, figure: Any) -> None:
 
 
 def _sphere(result: Fitted, figure: Any) -> None:
-    """Corrected directions above and below, equal areas; colour: how far the length is off."""
+    """Directions above and below, equal areas, before (grey) and after; colour: length's error."""
     poses = result.residuals.poses
     if poses is None:
         raise UsageError(f"plot('sphere'): {result.declared} corrects no vector of known length")
@@ -86,12 +86,15 @@ def _sphere(result: Fitted, figure: Any) -> None:
     for axis, sign, title in zip(axes, (1, -1), ("z up", "z down"), strict=True):
         own = poses.directions[:, 2] * sign >= 0
         axis.plot(np.cos(turn), np.sin(turn), color="0.6", linewidth=0.8)
+        raw = poses.before[poses.before[:, 2] * sign >= 0]
+        axis.plot(*flat(raw), ".", color="0.7", markersize=3, label="reading")
         shown = axis.scatter(*flat(poses.directions[own]), c=off[own], s=16, cmap="RdBu_r",
                              vmin=-most, vmax=most, edgecolor="0.3", linewidth=0.4)  # fmt: skip
         axis.plot(*flat(np.where((rim[:, 2] * sign >= 0)[:, None], rim, np.nan)), "--", color="C1")
         axis.set(title=title, aspect="equal", xlabel="x", ylabel="y")
     figure.colorbar(shown, ax=axes, label="length off its median [%]", shrink=0.7)
-    figure.suptitle(f"widest gap (dashed): {poses.radius:.0f}° around it", fontsize="medium")
+    said = f"widest gap (dashed): {poses.radius:.0f}° around it; grey: readings before"
+    figure.suptitle(said, fontsize="medium")
 
 
 def _profiles(result: Fitted, figure: Any) -> None:

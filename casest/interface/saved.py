@@ -10,9 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from casest.correction.carried import Carried
-from casest.data.finding import Choice
 from casest.declaration.shapes import Array
-from casest.interface.correcting import Readings, corrected_readings, kept
+from casest.interface.correcting import Corrects
 from casest.interface.reading import Reading
 from casest.interface.tables import Library, as_frame
 from casest.interface.told import table_columns
@@ -32,7 +31,7 @@ def load(path: str | os.PathLike[str]) -> Saved:
 
 
 @dataclass(frozen=True, repr=False)
-class Saved:
+class Saved(Corrects):
     """A saved result: `values` and `std` by parameter, `units`; called, it corrects readings."""
 
     content: SavedResult
@@ -85,26 +84,6 @@ class Saved:
     @property
     def _entries(self) -> tuple[Entry, ...]:
         return self.content.entries
-
-    def __call__(
-        self,
-        readings: Readings,
-        *,
-        columns: Choice | None = None,
-        units: Mapping[str, str] | None = None,
-        scales: Mapping[str, str] | None = None,
-        rate: float | None = None,
-        run: str | None = None,
-        force: bool = False,
-    ) -> Any:
-        """The corrected quantity of new readings, as what was given: an array (N, size) or a frame.
-
-        The same as an estimate does it; nothing is known here of how the fit's data were read.
-        """
-        said = {"columns": columns, "units": units, "scales": scales, "rate": rate}
-        with as_python_says():
-            result, carried = self._correction(force)
-            return corrected_readings(result, carried, readings, kept(self.reading, said), run)
 
     def _correction(self, force: bool) -> tuple[SavedResult, Carried]:
         return correction_of(self.content, str(self.path), force=force, what="uses")

@@ -12,11 +12,9 @@ import numpy as np
 
 from casest.correction.carried import Carried
 from casest.correction.reading import typed
-from casest.data.finding import Choice
 from casest.data.write import make_folder, write_atomically, written_together
-from casest.interface.correcting import Readings, corrected_readings, kept
+from casest.interface.correcting import Corrects
 from casest.interface.plots import plot
-from casest.interface.reading import Reading
 from casest.interface.tables import Library, as_frame, headers
 from casest.interface.words import as_python_says, in_python
 from casest.report.html import REPORT
@@ -40,10 +38,8 @@ def table_columns(entries: tuple[Entry, ...]) -> dict[str, Any]:
     }
 
 
-class Told:
+class Told(Corrects):
     """A fit, as Python's prompt, a notebook and a file show it."""
-
-    reading: Reading
 
     @property
     def result(self) -> Fitted:
@@ -114,28 +110,6 @@ class Told:
         """
         with as_python_says():
             return plot(self.result, what, over)
-
-    def __call__(
-        self,
-        readings: Readings,
-        *,
-        columns: Choice | None = None,
-        units: Mapping[str, str] | None = None,
-        scales: Mapping[str, str] | None = None,
-        rate: float | None = None,
-        run: str | None = None,
-        force: bool = False,
-    ) -> Any:
-        """The corrected quantity of new readings, as what was given: an array (N, size) or a frame.
-
-        Columns and units are those of the fit's data unless they are said; an array is in the unit
-        of the fit. `run` names the run whose correction it is, where they differ; `force` uses an
-        estimate that was refused. A warning says where readings leave what the fit saw.
-        """
-        said = {"columns": columns, "units": units, "scales": scales, "rate": rate}
-        with as_python_says():
-            result, carried = self._correction(force)
-            return corrected_readings(result, carried, readings, kept(self.reading, said), run)
 
     def _correction(self, force: bool) -> tuple[SavedResult, Carried]:
         return correction_of(self._as_saved, "the estimate", force=force, what="uses")

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 
 from casest.errors import CasestError
 
-_VALUE = r"(\w[\w.]*)=([^\s;,)]+(?:,[^\s;,)]+)*)"
+_VALUE = r"(\w[\w.]*)=([^\s;,)]*[^\s;,):](?:,[^\s;,)]*[^\s;,):])*)"
 #: An option of the command line, and what Python says instead.
 _WORDS = (
     (rf"--columns {_VALUE}", r'columns={"\1": "\2"}'),

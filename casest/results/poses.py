@@ -18,7 +18,7 @@ NEAR = 30.0
 
 @dataclass(frozen=True)
 class Poses:
-    """Unit vectors `directions` (n, 3) of the corrected reading in each pose.
+    """Unit vectors (n, 3) of each pose: `directions` of the corrected reading, `before` of the raw.
 
     `raw` and `corrected` (n,) are lengths over the known one, before and after the correction;
     `raw` is over its own median, since a reading may be in another unit. `empty` (3,) is the middle
@@ -27,6 +27,7 @@ class Poses:
     """
 
     directions: Array
+    before: Array
     raw: Array
     corrected: Array
     empty: Array
@@ -47,14 +48,15 @@ def poses_of(estimate: Estimate) -> Poses | None:
     vectors = np.vstack([np.asarray(own[0]).reshape(-1, 3) for own in found])
     raw = np.vstack([run.signals[readings[0].name] for run in estimate.problem.runs])
     length, own = np.linalg.norm(vectors, axis=1), np.linalg.norm(raw, axis=1)
-    there = np.isfinite(length) & (length > 0)
+    there = np.isfinite(length) & (length > 0) & (own > 0)
     if there.sum() < 3:
         return None
     directions = vectors[there] / length[there, None]
     empty, radius, covered = _coverage(directions)
     known = float(np.median(length[there]))
     shown = own[there] / np.median(own[there])
-    return Poses(directions, shown, length[there] / known, empty, radius, covered)
+    before, after = raw[there] / own[there, None], length[there] / known
+    return Poses(directions, before, shown, after, empty, radius, covered)
 
 
 def _coverage(directions: Array) -> tuple[Array, float, float]:

@@ -58,9 +58,10 @@ def chosen(file: Path, topics: Sequence[Topic], wanted: Sequence[str]) -> list[T
     listed = ", ".join(str(topic) for topic in filled[:_LISTED])
     listed += f", … ({len(filled)} in all)" if len(filled) > _LISTED else ""
     if not wanted:
+        longest = max(filled, key=lambda topic: topic.count)  # sensors speak most often
         raise DataError(
             f"{file}: holds {len(filled)} topics; name one behind the file, "
-            f"{file}:{filled[0].name}, or several that were recorded together, separated by "
+            f"{file}:{longest.name}, or several that were recorded together, separated by "
             f"commas. It holds {listed}"
         )
     names = {topic.name: topic for topic in filled}

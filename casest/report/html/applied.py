@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import re
 import textwrap
 
 from casest.report.html.numbers import printed_unit
-from casest.report.html.page import details, escaped, paragraph, points, section, tag
+from casest.report.html.page import code_block, details, paragraph, points, section, tag
 from casest.report.next_command import applying, typed_words
 from casest.results.application import Steps
 from casest.results.fitted import Fitted
@@ -32,7 +33,7 @@ def application(result: Fitted, folder: str) -> str:
             paragraph("t = 0 is the first sample of each run unless the column said otherwise.")
         )
     if how.source:
-        source = tag("pre", tag("code", escaped(how.source)))
+        source = code_block(how.source)
         said.append(details("The model as it was declared", source))
     return section("apply", "How to apply the result", *said)
 
@@ -62,9 +63,9 @@ def _steps(how: Steps, typed: str, folder: str) -> list[str]:
         names = ", ".join(f"`{label}` on `{on}`" for label, on in how.elsewhere)
         before = "what it acts on lies before the correction"
         steps.append(f"Nothing is to be undone for {names}: {before}.")
-    shown = tag("pre", tag("code", escaped("\n".join(how.formulas)))) if how.formulas else ""
+    shown = code_block("\n".join(how.formulas)) if how.formulas else ""
     said = paragraph("In one command, with all digits of the values:")
-    command = tag("pre", tag("code", escaped(_command(typed, folder))))
+    command = code_block(_command(typed, folder))
     return [shown, points(steps, "ol"), said, command]
 
 
@@ -80,5 +81,5 @@ def _size(size: int) -> str:
 
 def _in(unit: str) -> str:
     unit = printed_unit(unit)
-    article = "the " if unit.startswith("unit of") else ""
-    return f" in {article}{unit}" if unit and unit != "1" else ""
+    unstated = f", the unit of {unit[1:-1]}" if re.fullmatch(r"\[[^\[\]]+\]", unit) else ""
+    return f" in {unit}{unstated}" if unit and unit != "1" else ""

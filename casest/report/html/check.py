@@ -9,7 +9,7 @@ from casest.declaration.shapes import Array
 from casest.report.html.figures import Figures, axis, panel
 from casest.report.html.frame import whole
 from casest.report.html.numbers import number, printed_unit
-from casest.report.html.page import escaped, paragraph, points, section, table, tag
+from casest.report.html.page import code_block, paragraph, points, section, table
 from casest.results.check import Charted, Checked, changes_of
 from casest.results.check_words import drift, reasons, repair
 
@@ -51,7 +51,7 @@ def _again(result: Checked) -> str:
     again = result.recalibrate
     if again is None or not again.command:
         return ""
-    return tag("pre", tag("code", escaped(again.command)))
+    return code_block(again.command)
 
 
 def _chart(result: Checked, figures: Figures) -> str:

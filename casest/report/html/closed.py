@@ -11,8 +11,17 @@ from casest.report.html.calibration import by_axis, error_picture
 from casest.report.html.figures import Figures
 from casest.report.html.fitted import certified, parameters, reproduction, uncertain
 from casest.report.html.frame import whole
-from casest.report.html.numbers import alike, number, printed, printed_unit, with_unit
-from casest.report.html.page import details, escaped, paragraph, points, section, table, tag
+from casest.report.html.numbers import alike, in_words, number, printed, printed_unit, with_unit
+from casest.report.html.page import (
+    code_block,
+    details,
+    escaped,
+    paragraph,
+    points,
+    section,
+    table,
+    tag,
+)
 from casest.report.html.poses import poses_seen
 from casest.report.html.residuals import convincing, residual_figures
 from casest.results.closing import Closed, Effect
@@ -136,7 +145,7 @@ def _effects(result: Closed) -> str:
         said += [
             tag("h3", "What is left unexplained"),
             paragraph(f"{100 * left.fraction:.2g} % of the held-out variance: {left.where}."),
-            *(paragraph(f"{w[0].upper()}{w[1:]}.") for w in words),
+            *(paragraph(in_words(f"{w[0].upper()}{w[1:]}.")) for w in words),
         ]
     return section("effects", "Effects found", *said)
 
@@ -160,14 +169,14 @@ def _effect(e: Effect, result: Closed) -> str:
         evidence.append(f"These data do not tell it apart from {names}{more}.")
         evidence += [f"To tell them apart, {words}." for words in e.would_separate]
         words = instead(e, result.after.parameters)
-        evidence += [f"{w[0].upper()}{w[1:]}." for w in words]
+        evidence += [in_words(f"{w[0].upper()}{w[1:]}.") for w in words]
     else:
         evidence.append("No other candidate explains the held-out data as well.")
     return "".join(
         [
             tag("h3", escaped(f"{e.name} on {e.on}{column}")),
             paragraph(doc.partition("\n\n")[0].replace("\n", " ")) if doc else "",
-            tag("pre", tag("code", escaped(f"{e.on} → {e.formula}"))),
+            code_block(f"{e.on} → {e.formula}"),
             table(["parameter", "value", "± std", "unit"], rows, [1, 2]),
             points(evidence),
         ]

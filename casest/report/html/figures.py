@@ -94,7 +94,8 @@ def axis(
     else:
         wide = (high - low) or max(abs(high), 1.0) * 0.1
         low, high = low - room * wide, high + room * wide
-    return {"label": label, "unit": printed_unit(unit) or "1", "range": [low, high], "log": log}
+    said = "1" if unit == f"[{label}]" else printed_unit(unit) or "1"  # its own name says no more
+    return {"label": label, "unit": said, "range": [low, high], "log": log}
 
 
 def panel(

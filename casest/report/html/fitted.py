@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
+import re
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
+from importlib.resources import files
 
 import numpy as np
 
 from casest import __version__
 from casest.report.html.numbers import number, printed, printed_unit, with_unit
-from casest.report.html.page import escaped, paragraph, points, section, table, tag
+from casest.report.html.page import code_block, escaped, paragraph, points, section, table, tag
 from casest.report.next_command import typed_words
 from casest.results.fitted import (
     Correlation,
@@ -41,6 +43,9 @@ def parameters(result: Fitted) -> str:
         head = ["parameter", "before", "± std", "after", *head[2:5], "moved", "unit"]
         rows = list(_beside(rows, sides[0].entries, result.entries))
         said += " Moved: in the value's own standard deviation before."
+    names = (name for e in result.entries for name in re.findall(r"\[(.+?)\]", e.unit))
+    unstated = [f" [{name}] is the unit of {name}, which nobody stated." for name in names]
+    said += "".join(dict.fromkeys(unstated))
     shown = table(head, rows, range(1, len(head) - 1))
     return section("parameters", "Parameters", paragraph(said), shown, _held(result.held))
 
@@ -80,7 +85,7 @@ def _places(value: float, spread: str) -> str:
     """The value with as many decimals as its standard deviation is written with."""
     if "e" in spread:
         return f"{value:.4g}"
-    return f"{value:.{len(spread.partition('.')[2])}f}"
+    return f"{value:z.{len(spread.partition('.')[2])}f}"  # no -0.00
 
 
 def _held(held: Sequence[Held]) -> str:
@@ -175,6 +180,13 @@ def _pair(one: str, other: str, correlation: float) -> str:
 # -- why it is believed ----------------------------------------------------------------------------
 
 
+def _meaning(name: str) -> str:
+    """What the page of refusals, which the package carries, says of one."""
+    page = files("casest.report").joinpath("refusals.md").read_text("utf-8")
+    sections = re.split(r"^## (\S+)$", page, flags=re.MULTILINE)
+    return " ".join(dict(zip(sections[1::2], sections[2::2], strict=True))[name].split())
+
+
 def certified(result: Fitted) -> str:
     """The certificate of each fit, and how it was found."""
     said = []
@@ -185,8 +197,8 @@ def certified(result: Fitted) -> str:
         said.append(paragraph(f"The fit is {verb} because:"))
         said.append(points(side.reasons))
     if result.refusals:
-        pages = ", ".join(f"`docs/refusals.md#{name}`" for name in result.refusals)
-        said.append(paragraph(f"What that means and what to do: {pages}."))
+        said.append(tag("h3", "What that means and what to do"))
+        said += [paragraph(f"{_meaning(n)} (`docs/refusals.md#{n}`)") for n in result.refusals]
     solver = result.solver
     seconds = solver.seconds if isinstance(solver.seconds, float) else None
     if solver.name:
@@ -240,7 +252,7 @@ def reproduction(
     if again.command:
         words = typed_words(again.command)
         shown = textwrap.dedent(words.lines()) if words else again.command
-        said.append(tag("pre", tag("code", escaped(shown))))
+        said.append(code_block(shown))
     versions = [["casest", __version__], ["python", again.python], ["casadi", again.casadi],
                 ["numpy", again.numpy], ["scipy", again.scipy]]  # fmt: skip
     said.append(table(["software", "version"], versions))

@@ -14,8 +14,13 @@ def printed_unit(unit: str) -> str:
     text = re.sub(r"\^(?:\((-?\d+)\)|(-?\d+))", lambda m: (m[1] or m[2]).translate(_RAISED), unit)
     text = re.sub(r"\((\([^()]*\))\)", r"\1", text)
     text = re.sub(r"^\(([^()]*)\)$", r"\1", text)
-    text = re.sub(r"^\[(\w+)\]$", r"unit of \1", text)  # nobody stated it
     return text.replace("*", "·").replace("degC", "°C")
+
+
+def in_words(text: str) -> str:
+    """A sentence whose numbers and units are printed as those of tables: 2.2e-07 1/s^2."""
+    powers = re.sub(r"-?\d+(?:\.\d+)?e[-+]\d+", lambda m: printed(m[0]), text)
+    return printed_unit(powers)
 
 
 def printed(text: str) -> str:

@@ -10,6 +10,7 @@ import base64
 import hashlib
 import html
 import json
+import re
 from collections.abc import Iterable, Sequence
 from importlib.resources import files
 from typing import Any
@@ -36,11 +37,21 @@ def paragraph(text: str, look: str = "") -> str:
 
 
 def prose(text: str) -> str:
-    """Escaped text in which `code` is set as code."""
+    """Escaped text in which `code` is set as code, and options of commands like it."""
     parts = escaped(text).split("`")
     if len(parts) % 2 == 0:  # an odd backtick is only a backtick
-        return escaped(text)
-    return "".join(f"<code>{p}</code>" if k % 2 else p for k, p in enumerate(parts))
+        return _options(escaped(text))
+    return "".join(f"<code>{p}</code>" if k % 2 else _options(p) for k, p in enumerate(parts))
+
+
+def code_block(text: str) -> str:
+    """Lines of code, which scroll sideways where the screen is narrow, also by keyboard."""
+    return tag("pre", tag("code", escaped(text)), tabindex="0")
+
+
+def _options(text: str) -> str:
+    """Text in which no line breaks behind the hyphens of --at-rest."""
+    return re.sub(r"(?<![\w-])--[a-z][a-z-]*", r'<code class="option">\g<0></code>', text)
 
 
 def points(texts: Iterable[str], kind: str = "ul") -> str:
@@ -70,10 +81,15 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]], numbers: Sequence[
     look = ["number" if k in numbers else "" for k in range(len(head))]
     top = "".join(tag("th", escaped(h), class_=c) for h, c in zip(head, look, strict=True))
     body = "".join(
-        tag("tr", *(tag("td", prose(cell), class_=c) for cell, c in zip(row, look, strict=True)))
+        tag("tr", *(tag("td", _cell(cell), class_=c) for cell, c in zip(row, look, strict=True)))
         for row in zip(*columns, strict=True)
     )
     return scrolled(tag("table", tag("thead", tag("tr", top)), tag("tbody", body)), head[0])
+
+
+def _cell(text: str) -> str:
+    """A long name may break before its parameter, on paper: channel_curve(Throttle).k."""
+    return prose(text).replace(").", ")<wbr>.") if text.startswith("`") else prose(text)
 
 
 def scrolled(inside: str, name: str) -> str:

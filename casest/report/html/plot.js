@@ -90,7 +90,8 @@
   const labelled = (axis, exponent) => {
     const unit = axis.unit === "1" ? "" : axis.unit;
     const factor = exponent ? "10" + raised(exponent) + (unit ? " " : "") : "";
-    return axis.label + (factor + unit ? ` (${factor}${unit})` : "");
+    const said = factor + unit, own = said.startsWith("[") && said.indexOf("]") === said.length - 1;
+    return axis.label + (said ? (own ? " " + said : ` (${said})`) : "");
   };
 
   // -- one panel --------------------------------------------------------------------------------------
@@ -163,7 +164,7 @@
   };
 
   // -- values: the point nearest to the pointer, or stepped to by keys ---------------------------------
-  const curves = (p) => p.spec.series.filter((s) => s.y !== undefined && s.look !== "rim" && s.look !== "band");
+  const curves = (p) => p.spec.series.filter((s) => s.y !== undefined && !s.bare && s.look !== "rim" && s.look !== "band");
   const say = (p, one, k) => {
     const x = decode(one.x)[k], y = decode(one.y)[k], dots = p.spec.categories;
     const units = (u) => (u === "1" ? "" : " " + u);
@@ -259,7 +260,7 @@
     while (first < n - 1 && !afterLow(x[first + 1])) first++;
     while (last > 0 && !beforeHigh(x[last - 1])) last--;
     element("path", { class: "line " + one.look, d: path(x, y, first, last, px, py, right - left) }, parent);
-    if (last - first < (right - left) / 6)
+    if (last - first < (right - left) / 6 && !one.bare)
       for (let k = first; k <= last; k++)
         if (Number.isFinite(y[k]))
           element("circle", { class: "point " + one.look, cx: px(x[k]).toFixed(1), cy: py(y[k]).toFixed(1), r: 1.8 }, parent);

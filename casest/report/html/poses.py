@@ -6,12 +6,13 @@ from typing import Any
 
 import numpy as np
 
+from casest.declaration.shapes import Array
 from casest.report.html.figures import Figures, axis, panel
 from casest.report.html.numbers import number
 from casest.results.poses import NEAR, Poses, cap, flat
 
-#: Poses that are drawn.
-DRAWN = 4000
+#: Poses that are drawn: of each half as dots, of the lengths as a line.
+DOTS, DRAWN = 400, 4000
 
 
 def poses_seen(poses: Poses | None, figures: Figures) -> str:
@@ -23,10 +24,10 @@ def poses_seen(poses: Poses | None, figures: Figures) -> str:
     seen = figures.add(
         "sphere",
         (
-            "Directions of the poses.",
+            "Directions of the poses, before and after.",
             f"The sphere from above and below, equal areas as they are. "
             f"{100 * poses.covered:.0f} % of all directions have a pose within {NEAR:g}°; the "
-            f"widest empty cap (outlined) has a half angle of {poses.radius:.0f}° around "
+            f"widest empty cap (dashed) has a half angle of {poses.radius:.0f}° around "
             f"({where}).",
         ),
         halves,
@@ -38,16 +39,31 @@ def poses_seen(poses: Poses | None, figures: Figures) -> str:
 def _half(poses: Poses, figures: Figures, sign: int) -> dict[str, Any]:
     turn = np.linspace(0, 2 * np.pi, 181)
     edge = figures.series("line", "rim", np.cos(turn), y=np.sin(turn), exact=True)
-    chosen = poses.directions[:: max(1, len(poses.directions) // DRAWN)]
-    x, y = flat(chosen[chosen[:, 2] * sign >= 0])
-    dots = figures.series("points", "after", x, y=y, exact=True)
+    dots = []
+    for vectors, look, name in (
+        (poses.before, "before", "reading"),
+        (poses.directions, "after", "corrected"),
+    ):
+        x, y = _told_apart(*flat(vectors[vectors[:, 2] * sign >= 0]))
+        dots.append(figures.series("points", look, x, y=y, exact=True) | {"name": name})
     rim = cap(poses.empty, np.radians(poses.radius))
     cap_x, cap_y = flat(np.where((rim[:, 2] * sign >= 0)[:, None], rim, np.nan))
-    outline = figures.series("line", "before", cap_x, y=cap_y, exact=True)
-    drawn = [edge, dots] + ([outline] if np.isfinite(cap_x).any() else [])
+    outline = figures.series("line", "edge", cap_x, y=cap_y, exact=True) | {"bare": True}
+    drawn = [edge, *dots] + ([outline] if np.isfinite(cap_x).any() else [])
     title = "z up" if sign > 0 else "z down"
     span = axis("direction [0]", "1", -1.04, 1.04), axis("direction [1]", "1", -1.04, 1.04)
     return panel(title, *span, drawn, height=330, square=True)
+
+
+def _told_apart(x: Array, y: Array) -> tuple[Array, Array]:
+    """Points that an eye can tell apart: one of each place, and places as wide as it takes."""
+    for apart in (0.0, 0.01, 0.02, 0.03, 0.05, 0.07, 0.1):
+        if len(x) <= DOTS:
+            break
+        places = np.floor(np.column_stack([x, y]) / apart) if apart else np.column_stack([x, y])
+        kept = np.sort(np.unique(places, axis=0, return_index=True)[1])
+        x, y = x[kept], y[kept]
+    return x, y
 
 
 def _lengths(poses: Poses, figures: Figures) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
@@ -56,7 +57,8 @@ def _scale(axis: Mapping[str, Any], begin: float, end: float) -> Place:
 
 def _labelled(axis: Mapping[str, Any]) -> str:
     label, unit = axis["label"], axis["unit"]
-    return f"{label} ({unit})" if unit != "1" else str(label)
+    own = re.fullmatch(r"\[[^\]]*\]", unit)  # brackets of its own
+    return str(label) if unit == "1" else f"{label} {unit}" if own else f"{label} ({unit})"
 
 
 def _keys(panel: Mapping[str, Any]) -> str:
