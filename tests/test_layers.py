@@ -140,6 +140,12 @@ def test_help_needs_neither_numpy_nor_casadi():
     assert text.endswith("heavy: []\n")
 
 
+def test_the_module_is_the_command_line():
+    command = [sys.executable, "-m", "casest", "--help"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert done.stdout.startswith("Usage: casest ")
+
+
 def test_help_of_every_command_needs_neither_numpy_nor_casadi():
     code = (
         "import sys\n"
