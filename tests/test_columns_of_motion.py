@@ -11,7 +11,7 @@ from casest.cli import run
 from casest.diagnose.candidates.motion_columns import columns_of_motion
 
 
-def turning(seed, size=900):
+def turning(seed, size=500):
     """Directions of a body that is turned about by hand (N, 3), and its rate about y in rad/s."""
     t = np.arange(size) / 50
     a = 1.3 * np.sin(0.7 * t) + 0.9 * np.sin(0.31 * t + seed)
