@@ -49,6 +49,7 @@ def test_what_follows_a_gyroscope_is_named_and_not_claimed(closed):
     assert "channel_gain(gyr_y)" in found["unexplained"]["one_of"]
 
 
+@pytest.mark.long
 def test_who_asks_for_it_has_it(closed):
     found = closed("motion", "gyr_y", "rad/s", "--effects", "channel_gain(gyr_y)")
     assert [(e["name"], e["column"]) for e in found["effects"]] == [("channel_gain", "gyr_y")]

@@ -333,7 +333,7 @@ def late(delay, noise=0.1, rate=50.0, seconds=40.0, seed=4):
     return run_of(time, m=m, attitude=tumbling(time).reshape(-1, 9))
 
 
-@pytest.mark.parametrize("delay", [0.013, -0.027, 0.05])
+@pytest.mark.parametrize("delay", [pytest.param(0.013, marks=pytest.mark.long), -0.027, 0.05])
 def test_a_lag_of_the_attitude_is_found_whichever_sign_it_has(delay):
     found = attempt(compass.with_effect(signal_lag, on="attitude"), [late(delay)])
     assert found.certificate.trusted

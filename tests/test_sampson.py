@@ -33,6 +33,12 @@ SIGMA = 0.3
 EFFECTS = {e.name: e for e in CATALOGUE}
 
 
+@pytest.fixture(autouse=True)
+def by_numpy(monkeypatch):
+    """What is evaluated once or twice is not compiled for it."""
+    monkeypatch.setenv("CASEST_KERNEL", "off")
+
+
 def along(declared, name, **columns):
     return declared.with_effect(replace(EFFECTS[name], on="corrected"), columns=columns)
 
@@ -163,7 +169,7 @@ def test_a_gain_that_the_scale_has_already_changes_no_residual_and_is_refused():
 )
 def test_of_two_sensors_each_keeps_its_own_noise(place, part):
     """Three residuals of one pose: lengths and dip, with noises in m/s² and µT."""
-    rng, n = np.random.default_rng(6), 4_900
+    rng, n = np.random.default_rng(6), 5_000
     turn = np.array([sim.random_rotation(rng) for _ in range(n)])
     dip, noises = 1.1, {"force": 0.02, "flux": 0.3}
     true = {

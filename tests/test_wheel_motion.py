@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 
 import numpy as np
+import pytest
 import simulators
 from scipy.spatial.transform import Rotation
 
@@ -55,6 +56,7 @@ def spun(folder, name, seed, phase, speed):
     return str(path), (v - offset) / gain
 
 
+@pytest.mark.long
 def test_a_second_spin_is_foretold_and_corrected(tmp_path, capsys):
     """Held out, only its own phase, speed, tilt and mounting are fitted; corrected are readings."""
     first, _ = spun(tmp_path, "one", 1, 0.6, 9.0)
