@@ -229,7 +229,7 @@ def test_readings_that_were_moved_are_given_back_in_their_rows():
 
 def test_readings_slower_than_the_inputs_are_enough():
     """Five readings a second, 25 of the inputs: one candidate, scored and then fitted."""
-    run = flight(Sensors(lever=(0.3, -0.1, 0.2)), seed=5)
+    run = flight(Sensors(lever=(0.3, -0.1, 0.2)), seed=5, seconds=16)
     v = run.signals["v"].copy()
     v[np.arange(len(v)) % 5 != 0] = np.nan
     run = Run.raw("slow", {**run.signals, "v": v}, units=flights.UNITS, time=run.time)

@@ -166,6 +166,7 @@ def test_six_orientations_have_none_to_spare(closed):
     assert any("record more orientations" in r["reason"] for r in result["refused"])
 
 
+@pytest.mark.long
 def test_four_plateaus_of_a_load_cell_are_a_straight_line(shared_data, tmp_path):
     """A pair of causes was strong evidence, and each alone is none.
 

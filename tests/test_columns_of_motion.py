@@ -11,7 +11,7 @@ from casest.cli import run
 from casest.diagnose.candidates.motion_columns import columns_of_motion
 
 
-def turning(seed, size=900):
+def turning(seed, size=500):
     """Directions of a body that is turned about by hand (N, 3), and its rate about y in rad/s."""
     t = np.arange(size) / 50
     a = 1.3 * np.sin(0.7 * t) + 0.9 * np.sin(0.31 * t + seed)
@@ -49,6 +49,7 @@ def test_what_follows_a_gyroscope_is_named_and_not_claimed(closed):
     assert "channel_gain(gyr_y)" in found["unexplained"]["one_of"]
 
 
+@pytest.mark.long
 def test_who_asks_for_it_has_it(closed):
     found = closed("motion", "gyr_y", "rad/s", "--effects", "channel_gain(gyr_y)")
     assert [(e["name"], e["column"]) for e in found["effects"]] == [("channel_gain", "gyr_y")]

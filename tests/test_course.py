@@ -64,7 +64,7 @@ DEAR = pytest.mark.long
         pytest.param(
             *(model, kind),
             id=f"{name}, {kind}",
-            marks=[DEAR] * (kind == "uneven" and "nonlinear" not in name),
+            marks=[DEAR] * (kind == "uneven" and name != "nonlinear"),
         )
         for name, model in MODELS.items()
         for kind in ("even", "uneven")

@@ -158,7 +158,9 @@ EDITS = [12, pytest.param(75, marks=pytest.mark.long)]
 
 
 @pytest.mark.parametrize("edits", EDITS)
-@pytest.mark.parametrize("name", ["newton", "runs", "direct", "closed"])
+@pytest.mark.parametrize(
+    "name", [pytest.param("newton", marks=pytest.mark.long), "runs", "direct", "closed"]
+)
 def test_an_edited_result_gives_a_sentence_or_works(folder, tmp_path, name, edits):
     rng = np.random.default_rng(len(name))
     text = (folder / name / "result.json").read_text(encoding="utf-8")

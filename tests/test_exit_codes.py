@@ -216,13 +216,14 @@ def test_a_full_standard_output_is_said_and_nothing_is_written(tmp_path):
         (["export", "fit", "--to", "c"], "device/new.c"),
     ],
 )
-def test_a_command_that_fails_leaves_no_empty_folder(tmp_path, monkeypatch, words, output):
+def test_a_command_that_fails_leaves_no_empty_folder(tmp_path, monkeypatch, capsys, words, output):
     monkeypatch.chdir(tmp_path)
     assert run(["calibrate", *POSES, "-o", "fit"]) == 0
-    with open("/dev/full", "w") as full:
-        done = ended(*words, "-o", output, stdout=full)
-    assert "standard output cannot be written" in done.stderr
-    assert (done.returncode, os.listdir(tmp_path)) == (1, ["fit"])
+    with open("/dev/full", "w") as full, monkeypatch.context() as patch:
+        patch.setattr(sys, "stdout", full)
+        code = run([*words, "-o", output])
+    assert "standard output cannot be written" in capsys.readouterr().err
+    assert (code, os.listdir(tmp_path)) == (1, ["fit"])
 
 
 def test_a_closed_standard_output_is_said_before_anything_is_computed(tmp_path):
@@ -235,12 +236,11 @@ def test_a_closed_standard_output_is_said_before_anything_is_computed(tmp_path):
     assert not written(tmp_path / "out")
 
 
-def test_without_standard_error_the_answer_is_the_same():
-    open_, closed = (
-        ended("calibrate", *POSES, stdout=subprocess.PIPE, stderr=None, preexec_fn=how)
-        for how in (None, lambda: os.close(2))
-    )
-    assert (closed.returncode, closed.stdout) == (0, open_.stdout)
+def test_without_standard_error_the_answer_is_the_same(capsys):
+    how = {"stdout": subprocess.PIPE, "stderr": None, "preexec_fn": lambda: os.close(2)}
+    closed = ended("calibrate", *POSES, **how)
+    assert run(["calibrate", *POSES]) == 0
+    assert (closed.returncode, closed.stdout) == (0, capsys.readouterr().out)
 
 
 def test_a_reader_who_closes_the_pipe_gets_silence_and_the_files(tmp_path):

@@ -199,7 +199,13 @@ BENT = {
 }
 
 
-@pytest.mark.parametrize("asked", BENT)
+@pytest.mark.parametrize(
+    "asked",
+    [
+        pytest.param(a, marks=[pytest.mark.long] * (a in ("axis_gain", "second_harmonic(heading)")))
+        for a in BENT
+    ],
+)
 def test_what_bends_a_reading_is_undone_by_every_form(tmp_path, capsys, monkeypatch, asked):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "compass.py").write_text(COMPASS, encoding="utf-8")

@@ -86,12 +86,12 @@ def test_fleets_without_an_effect_are_told_of_none():
 
 
 def test_the_column_that_an_effect_follows_is_named(tmp_path):
-    lines = np.arange(2000) % 4
-    v = fleets.readings(2000)
+    lines = np.arange(1000) % 4
+    v = fleets.readings(1000)
     v = np.where((lines == 1)[:, None, None], with_cubic(v, 0.02), v)
-    table = fleets.wide(v, fleets.names(2000))
+    table = fleets.wide(v, fleets.names(1000))
     table = table.append_column("line", pa.array([f"L{k}" for k in lines]))
-    table = table.append_column("shift", pa.array((np.arange(2000) // 7) % 3))
+    table = table.append_column("shift", pa.array((np.arange(1000) // 7) % 3))
     pq.write_table(table, tmp_path / "a.parquet")
     words = ["--keep", "line", "--keep", "shift", "-o", str(tmp_path / "out")]
     assert close(tmp_path / "a.parquet", *words) == 0

@@ -17,7 +17,7 @@ from casest.dataset import partitions
 from casest.tasks import task
 
 #: Files of a data set, each of which is a partition, and sensors in each.
-FILES, EACH = 12, 1500
+FILES, EACH = 12, 1000
 SMALL = EACH * fleets.POSES * 3
 
 

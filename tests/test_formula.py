@@ -173,7 +173,7 @@ def test_an_effect_of_the_users_own_takes_part(bench, tmp_path):
 
 @pytest.mark.parametrize(
     "kind",
-    ["white", "ar1", *(pytest.param(k, marks=pytest.mark.long) for k in ("student", "unequal"))],
+    ["ar1", *(pytest.param(k, marks=pytest.mark.long) for k in ("white", "student", "unequal"))],
 )
 @pytest.mark.parametrize("seed", [1])
 def test_noise_is_no_formula(kind, seed):

@@ -38,6 +38,7 @@ def test_a_picture_is_drawn_from_what_an_example_found(made, tmp_path):
     assert drawn.count("<use ") > 24  # a mark for each pose, among those of the axes
 
 
+@pytest.mark.long
 def test_the_notebook_runs_and_shows_verdict_figures_and_corrected_readings(made):
     _, notebook = made
     text = notebook.page(notebook.NOTEBOOK)

@@ -63,7 +63,7 @@ def test_accelerometer_and_gyroscope_are_found_within_their_uncertainty(seed):
 def test_the_noise_of_every_kind_is_found():
     rng = np.random.default_rng(5)
     record = recorded(waved(rng, rests=60), an_imu(rng), rng)
-    found = attempt(GYRO, [rests(record)])
+    found = attempt(GYRO, [rests(record)], intervals=False)
     noise = {c.name: float(c.array) for c in found.model.constants if c.name.endswith("noise")}
     # Means of about 200 readings of 0.02 m/s² and 0.003 rad/s; 150 steps of 0.01 s at 0.003 rad/s
     # and two directions, each 0.02/√200/g.
@@ -89,7 +89,7 @@ def test_a_gyroscope_in_degrees_or_mounted_on_its_side_is_found_as_well():
 def test_a_first_rest_has_no_turn_and_counts_as_none():
     rng = np.random.default_rng(7)
     run = rests(recorded(waved(rng, rests=15), an_imu(rng), rng))
-    found = attempt(GYRO, [run])
+    found = attempt(GYRO, [run], intervals=False)
     assert found.problem.residual_count == 6 * len(run) - 2
 
 

@@ -86,7 +86,7 @@ def uneven(kind, rng):
     ("kind", "flown"),
     [
         ("dropped", 5),
-        ("in turn", 5),
+        pytest.param("in turn", 5, marks=pytest.mark.long),
         pytest.param("dropped", 40, marks=pytest.mark.long),
         pytest.param("in turn", 40, marks=pytest.mark.long),
     ],
@@ -256,7 +256,8 @@ VELOCITY = ["--sensor-noise", "v=0.01"]
 
 
 @pytest.mark.parametrize("options", [
-    [*STATED, *VELOCITY], ["--noise", "ml"], ["--rest", "rest.csv", *VELOCITY],
+    [*STATED, *VELOCITY], pytest.param(["--noise", "ml"], marks=pytest.mark.long),
+    ["--rest", "rest.csv", *VELOCITY],
 ])  # fmt: skip
 def test_declared_and_matched_stand_side_by_side(files, capsys, monkeypatch, options):
     monkeypatch.chdir(files)

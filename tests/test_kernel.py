@@ -52,7 +52,7 @@ POSES = ["norm-triangular", str(RECORD), "--columns", "v=ax,ay,az", "--rate", "5
 POSES += ["--set", "norm=9.80665"]
 COUNTS = [1, 7, 63, 64, 65, 40_000]
 #: Shipped problems of one and of three residuals, with many branches and with none.
-KINDS = {"norm-triangular", "norm-pair", "wheel", "steinhart-hart"}
+KINDS = {"norm-triangular", "wheel", "steinhart-hart"}
 
 
 @pytest.fixture(scope="module")

@@ -52,6 +52,7 @@ def record(signals, i, count=None):
 # -- found -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_frequencies_far_from_the_start_are_found():
     w = np.array([4.2, 13.5])
     found = calibrate_many(sine, waves(w), noise=0.05)

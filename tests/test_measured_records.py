@@ -315,6 +315,7 @@ def test_imucals_example_calibration_of_the_raw_counts_lies_within_three_std_of_
     assert np.max(np.abs(found.values["offset"] - published["b_a"]) / found.std["offset"]) < 3
 
 
+@pytest.mark.long
 def test_six_orientations_of_a_ferraris_session_do_not_determine_nine_unknowns(shared_data):
     """Thirteen rests, but six directions: a skew model must be refused, not solved."""
     found = attempt(model_of("norm-triangular", 9.81), (ferraris(shared_data),))

@@ -138,6 +138,7 @@ def test_noise_that_the_residual_shows_has_students_t():
     )
 
 
+@pytest.mark.long
 def test_trials_of_several_runs_with_a_direction_have_the_covariance_of_the_fit():
     """Small noise: what is bent is straight, and first order is right."""
     rng = np.random.default_rng(2)

@@ -14,10 +14,11 @@ VALUES, STD, SQUARES = 6, 4, 6
 #: Lanczos1 has exact data: its residual, 1e-13 of readings given to 14 digits, is mostly rounding,
 #: so that of its square and of what is derived from it no more than this share is determined.
 ROUNDED = 0.05
-#: Those that take longest, and those whose model another has: Lanczos3, Gauss2, Chwirut2.
+#: Those that take longest, and those whose model another has: Lanczos3, Gauss2, Chwirut2,
+#: Thurber.
 DEAR = {
     "Bennett5", "ENSO", "MGH09", "MGH10", "MGH17", "Nelson", "Lanczos1",
-    "Lanczos2", "Gauss1", "Gauss3", "Chwirut1", "Rat43",
+    "Lanczos2", "Gauss1", "Gauss3", "Chwirut1", "Rat43", "Hahn1",
 }  # fmt: skip
 
 

@@ -134,6 +134,7 @@ def test_a_reading_beyond_the_parabolas_top_is_refused_with_its_row():
         Correction(rate_table)(run, values)
 
 
+@pytest.mark.long
 def test_too_few_attitudes_are_refused():
     found = find_model("rate-table")
     with pytest.raises(Exception, match=r"more than one solution|not determined|equations"):

@@ -401,8 +401,7 @@ def point_and_record(n, seed=3):
     ("weighted", "n"),  # different BLAS routines
     [
         *((weighted, n) for n in (3, 12) for weighted in (False, True)),
-        (True, 40),
-        pytest.param(False, 40, marks=pytest.mark.long),
+        *(pytest.param(weighted, 40, marks=pytest.mark.long) for weighted in (False, True)),
     ],
 )
 def test_normal_equations_are_the_sums_over_all_rows(n, weighted):

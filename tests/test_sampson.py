@@ -33,6 +33,12 @@ SIGMA = 0.3
 EFFECTS = {e.name: e for e in CATALOGUE}
 
 
+@pytest.fixture(autouse=True)
+def by_numpy(monkeypatch):
+    """What is evaluated once or twice is not compiled for it."""
+    monkeypatch.setenv("CASEST_KERNEL", "off")
+
+
 def along(declared, name, **columns):
     return declared.with_effect(replace(EFFECTS[name], on="corrected"), columns=columns)
 

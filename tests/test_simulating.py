@@ -47,6 +47,7 @@ def test_a_simulated_record_is_calibrated_back_to_its_truth(
         assert away.max() < 6, name
 
 
+@pytest.mark.long
 def test_an_effect_of_poses_that_was_added_is_what_the_loop_finds(tmp_path, capsys):
     added = ["--effect", "cross_axis", "--value", "cross_axis.k=0.02,-0.01,0.03"]
     record, truth = made(

@@ -294,10 +294,10 @@ def test_a_rotation_is_the_one_of_kabsch_however_far_from_the_start(angle, solve
 def test_the_covariance_of_a_rotation_is_that_of_repeated_fits():
     rng, declared = np.random.default_rng(4), mount.starting(as_declared)
     M, z = rotations(1, rng)[0], []
-    for _ in range(40):
+    for _ in range(25):
         d = rng.standard_normal((20, 3))
         run = as_run(a=d @ M.T + 0.01 * rng.standard_normal((20, 3)), d=d)
-        found = attempt(declared, [run], solver="trust-region")
+        found = attempt(declared, [run], solver="trust-region", intervals=False)
         error = found.values["M"].T @ M  # small turn in the chart's own frame
         turn = np.array([error[2, 1], error[0, 2], error[1, 0]])
         z.append(turn @ np.linalg.solve(found.covariance, turn))

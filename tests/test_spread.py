@@ -156,6 +156,7 @@ def of_colour(share):
     return noise
 
 
+@pytest.mark.long
 def test_correlated_noise_widens_the_std_as_much_as_it_spreads_the_estimates():
     """AR(1) of 0.8: a level is known nine times less well than from as many white readings."""
     error, std, found = fits(180, of_colour(0.8), 800)

@@ -69,7 +69,9 @@ def test_a_world_is_its_seed(study, kind):
         assert not np.array_equal(one.signals[one.read][:9], other.signals[other.read][:9])
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    "kind", [pytest.param(k, marks=[pytest.mark.long] * (k == "late attitude")) for k in KINDS]
+)
 def test_without_its_effect_a_world_is_the_declared_model(study, kind):
     """The simulators' truth, in the model as users declare it, leaves nothing of the reading."""
     loop_worlds, made = study("loop_worlds"), study("sensors").made

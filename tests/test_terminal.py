@@ -75,6 +75,7 @@ def said(tmp_path_factory):
     np.savetxt(folder / "flight.csv", table, delimiter=",", header=header, comments="")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
+        patch.setattr("casest.report.picture.draw", lambda _, to: [to / "compare.png"])
         yield {name: printed(name, patch) for name in WORDS}
 
 

@@ -172,6 +172,7 @@ def test_a_peak_far_from_the_start_is_found():
     assert float(found.values["place"]) == pytest.approx(8.0, abs=0.05)
 
 
+@pytest.mark.long
 def test_the_same_data_give_the_same_answer():
     first, second = (attempt(sine, [sine_run()]) for _ in range(2))
     np.testing.assert_array_equal(first.point.x, second.point.x)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 
 import numpy as np
+import pytest
 import simulators
 from scipy.spatial.transform import Rotation
 
@@ -17,7 +18,7 @@ from casest_problems.wheel_motion import wheel_motion
 def test_friction_drag_and_imbalance_of_a_long_spin_are_found():
     """150 s, in which a cubic speed law ends; all within four standard deviations of the truth."""
     rng = np.random.default_rng(7)
-    t = np.arange(0, 150, 0.04)
+    t = np.arange(0, 150, 0.08)
     motion = simulators.physical_motion(t, 0.6, 9.0, eccentric=0.3)
     turn = Rotation.from_euler("XYZ", [30, 20, 25], degrees=True).as_matrix()
     offset, gain = np.array([0.35, -0.2, 0.15]), np.array([0.97, 1.01, 1.04])
@@ -55,6 +56,7 @@ def spun(folder, name, seed, phase, speed):
     return str(path), (v - offset) / gain
 
 
+@pytest.mark.long
 def test_a_second_spin_is_foretold_and_corrected(tmp_path, capsys):
     """Held out, only its own phase, speed, tilt and mounting are fitted; corrected are readings."""
     first, _ = spun(tmp_path, "one", 1, 0.6, 9.0)

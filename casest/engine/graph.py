@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -53,8 +53,8 @@ class Graph:
             elif operation_of(code, where).same:
                 register[target[0]] = register[source[0]]
             else:
-                operands = tuple([register[i] for i in source])
-                register[target[0]] = self.add(self.operation(code, operands))
+                operands = [register[i] for i in source]
+                register[target[0]] = self.operation(code, operands)
 
     def needed(self, wanted: Iterable[int]) -> list[int]:
         """Values that these take, in order of computation."""
@@ -67,16 +67,18 @@ class Graph:
                 stack.extend(self.values[i].operands)
         return sorted(found)
 
-    def operation(self, code: int, operands: tuple[int, ...]) -> Value:
-        """An operation on values of the graph, not yet one of them."""
-        if code in _COMMUTATIVE:
-            operands = tuple(sorted(operands))
-        values = self.values
-        per_sample = True in [values[i].per_sample for i in operands]
-        return Value("operation", code, operands, 0.0, per_sample)
+    def operation(self, code: int, operands: Sequence[int]) -> int:
+        """The number of an operation on values of the graph, added where there is no equal one."""
+        key = (code, *(sorted(operands) if code in _COMMUTATIVE else operands))
+        known = self._known.get(key)
+        if known is None:
+            known = self._known[key] = len(self.values)
+            per_sample = True in [self.values[i].per_sample for i in operands]
+            self.values.append(Value("operation", code, key[1:], 0.0, per_sample))
+        return known
 
     def add(self, value: Value) -> int:
-        """The number of a value, which is added where there is no equal one."""
+        """The number of a constant or an input, added where there is no equal one."""
         # Constants by their bits, to keep -0.0 from 0.0.
         constant = value.kind == "constant"
         key: object = np.float64(value.constant).tobytes() if constant else value

@@ -226,4 +226,4 @@ class _Grouping:
         return self._operation(ca.OP_MUL, self._fixed(factor), atom)
 
     def _operation(self, code: int, *operands: int) -> int:
-        return self.graph.add(self.graph.operation(code, operands))
+        return self.graph.operation(code, operands)

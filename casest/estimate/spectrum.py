@@ -187,21 +187,22 @@ def _most_likely(shapes: Array, mean: Array, count: Array) -> Array:
     b = np.linalg.pinv(A) @ (np.log(mean.T) * root)[:, :, None]
     mean, count = mean.T, count.T
 
-    def cost(b: Array) -> Array:
+    def at(b: Array) -> tuple[Array, Array]:
+        """The cost, and the means as shares of the curve."""
         z = np.clip(b[:, :, 0] @ shapes.T, -700, 700)
-        return np.asarray(np.sum(count * (z + mean * np.exp(-z)), axis=1))
+        share = mean * np.exp(-z)
+        return (count * (z + share)).sum(axis=1), share
 
-    here, length = cost(b), np.ones(len(b))
+    (here, share), length = at(b), np.ones(len(b))
     for _ in range(50):
-        share = mean * np.exp(-np.clip(b[:, :, 0] @ shapes.T, -700, 700))
         gradient = (count * (1 - share)) @ shapes
         hessian = shapes.T @ ((count * share)[:, :, None] * shapes) + small
         step, length[:] = np.linalg.solve(hessian, gradient[:, :, None]), 1.0
-        after = cost(b - step)
+        after, share = at(b - step)
         while (longer := ~(after <= here) & (length > 1e-6)).any():
             length[longer] /= 2
-            after = cost(b - length[:, None, None] * step)
+            after, share = at(b - length[:, None, None] * step)
         b, before, here = b - length[:, None, None] * step, here, after
-        if np.all(before - here < 1e-6):
+        if (before - here < 1e-6).all():
             break
     return np.asarray(b[:, :, 0].T)

@@ -65,9 +65,9 @@ def _student(q: Array) -> tuple[float, float]:
     n, variance, found = len(q), 1.0, []
     for nu in FREEDOMS:
         for _ in range(6):  # EM for the scale, from that of the last ν
-            variance = float(np.mean((nu + 1) / (nu + q / variance) * q))
+            variance = float(((nu + 1) / (nu + q / variance) * q).mean())
         constant = gammaln((nu + 1) / 2) - gammaln(nu / 2) - 0.5 * np.log(nu * np.pi * variance)
-        found.append(n * constant - (nu + 1) / 2 * float(np.sum(np.log1p(q / (nu * variance)))))
+        found.append(n * constant - (nu + 1) / 2 * float(np.log1p(q / (nu * variance)).sum()))
     best = int(np.argmax(found))
     return float(found[best]), _between(1 / FREEDOMS, np.array(found), best)
 
@@ -88,11 +88,12 @@ def _contaminated(q: Array, normal: float) -> tuple[float, Array]:
         return normal, far
     for _ in range(60):
         share = min(max(float(far.mean()), 1e-9), FEW)
-        variance = float(np.sum((1 - far) * q) / max(np.sum(1 - far), 1e-300))
-        wide = max(float(np.sum(far * q) / max(np.sum(far), 1e-300)), FAR**2 * variance)
+        inside = 1 - far
+        variance = float((inside * q).sum() / max(inside.sum(), 1e-300))
+        wide = max(float((far * q).sum() / max(far.sum(), 1e-300)), FAR**2 * variance)
         near = np.log1p(-share) - 0.5 * np.log(variance) - q / (2 * variance)
         out = np.log(share) - 0.5 * np.log(wide) - q / (2 * wide)
-        far = 1 / (1 + np.exp(np.clip(near - out, -700, 700)))
+        far = 1 / (1 + np.exp(np.minimum(np.maximum(near - out, -700), 700)))
     likelihood = float(np.sum(np.logaddexp(near, out))) - 0.5 * len(q) * np.log(2 * np.pi)
     return likelihood, far
 
