@@ -190,7 +190,8 @@ def main(trials: int = 2000, workers: int = 1) -> None:
         resumed.done(trial, left, KEPT, workers)
     TABLE.write_text(
         "# Coverage with uncertain references and inputs\n\n"
-        "Made by `make study-metrology-coverage`; every trial draws the reference's error anew.\n\n"
+        "Made by `make study-metrology-coverage`; every trial draws the reference's error anew. Of "
+        "2000\ntrials of one unknown chance leaves 94.0 to 96.0 % in 19 of 20 cases.\n\n"
         "| what | trials | trusted | 95 % intervals that held the truth | of single unknowns "
         f"| of readings corrected, {FRESH} fresh ones each |\n"
         "| --- | --- | --- | --- | --- | --- |\n" + "\n".join(table(resumed.kept(KEPT))) + "\n",
