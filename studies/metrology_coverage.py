@@ -26,8 +26,12 @@ from casest.correction.spread import slopes, spread_program
 from casest.engine.threads import one_thread
 from casest.leastsquares.stated import stated_noise
 from casest_problems.norm import norm_triangular
+from casest_problems.wheel import wheel as tilted
 
 ROOT = Path(__file__).resolve().parent.parent
+sys.path.append(str(ROOT / "benchmarks"))
+import by_hand  # noqa: E402
+
 KEPT, TABLE = ROOT / "out" / "metrology_coverage.jsonl", ROOT / "studies" / "metrology_coverage.md"
 #: Fresh readings that a calibration corrects.
 FRESH = 20
@@ -109,6 +113,19 @@ def wheel(rng: np.random.Generator) -> World:
     return World(c.attempt(model, runs), truth)
 
 
+def shipped_wheel(rng: np.random.Generator) -> World:
+    """The shipped wheel, 600 samples in 30 s, simulated without casest; its radius to 0.7 %."""
+    t, std = np.arange(600) / 20, np.full(3, by_hand.SIGMA)
+    exact = by_hand.Wheel(t, np.zeros((600, 3))).residual(by_hand.TRUTH).reshape(3, -1).T
+    known = c.constant(by_hand.RADIUS + 0.002 * rng.standard_normal(), "m", std=0.002)
+    v = exact + std * rng.standard_normal(exact.shape)
+    run = c.Run.raw("r", {"t": t[:, None], "v": v}, units={}, time=t)
+    fixed = tilted.having(radius=known, gravity=by_hand.GRAVITY)
+    model, runs = stated_noise(fixed, [run], {"v": [std]})
+    truth = {name: by_hand.TRUTH[place] for name, place in by_hand.NAMES.items()}
+    return World(c.attempt(model, runs), truth)
+
+
 def load_cell(rng: np.random.Generator) -> World:
     """Eight masses, each known to 5 g, and readings to 0.05 mV; forces are what it is for."""
     mass = np.linspace(0, 5, 8)
@@ -133,6 +150,7 @@ def undone_cell(values: dict[str, np.ndarray], reading: np.ndarray) -> np.ndarra
 SCENES: dict[str, Callable[[np.random.Generator], World]] = {
     "load cell": load_cell,
     "norm": norm,
+    "shipped wheel": shipped_wheel,
     "wheel": wheel,
 }
 
@@ -190,7 +208,8 @@ def main(trials: int = 2000, workers: int = 1) -> None:
         resumed.done(trial, left, KEPT, workers)
     TABLE.write_text(
         "# Coverage with uncertain references and inputs\n\n"
-        "Made by `make study-metrology-coverage`; every trial draws the reference's error anew.\n\n"
+        "Made by `make study-metrology-coverage`; every trial draws the reference's error anew. Of "
+        "2000\ntrials of one unknown chance leaves 94.0 to 96.0 % in 19 of 20 cases.\n\n"
         "| what | trials | trusted | 95 % intervals that held the truth | of single unknowns "
         f"| of readings corrected, {FRESH} fresh ones each |\n"
         "| --- | --- | --- | --- | --- | --- |\n" + "\n".join(table(resumed.kept(KEPT))) + "\n",

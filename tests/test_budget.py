@@ -68,9 +68,13 @@ def test_the_table_and_the_page_say_what_the_file_says(folder, capsys):
     out = capsys.readouterr().out
     assert "Of the variance of each value, in percent:" in out
     assert out.count("reading's") == 1
+    said = out.split("Sensitivity of each value, its unit over that of the input:")[1].split()
+    slope = json.loads((folder / "budget" / "budget.json").read_text())["inputs"][0]["sensitivity"]
+    assert said[:4] == ["value", "shift", "b0", f"{slope['b0']:.3g}"]
     page = (folder / "budget" / "budget.html").read_text()
     assert page.count("<rect") > 6
     assert "noise of y" in page
+    assert f"{slope['b0']:.3g}" in page.split("Sensitivities")[-1]
 
 
 def test_a_result_of_an_older_casest_has_no_budget(folder, capsys, tmp_path):

@@ -60,6 +60,10 @@ def test_python_takes_what_the_prompt_takes(poses, tmp_path, words, noise):
         ({"v": -0.1}, "sensor_noise v=-0.1: a standard deviation is above zero"),
         ({"v": "much"}, "no column of"),
         ({"v": "0.004 K"}, "sensor_noise v=0.004 K"),
+        (
+            {"v": np.full((40, 3), 0.004)},
+            r"v: an array of shape \(40, 3\) is no noise of one reading",
+        ),
     ],
 )
 def test_what_is_no_noise_is_refused_in_pythons_words(poses, noise, match):
@@ -68,3 +72,20 @@ def test_what_is_no_noise_is_refused_in_pythons_words(poses, noise, match):
         casest.calibrate(
             model, poses[1], columns={"v": "ax,ay,az"}, units={"v": "g"}, sensor_noise=noise
         )
+
+
+def test_columns_of_a_frame_are_found_by_their_names(poses):
+    """As of a file: else what was written down of the noise would be left out unsaid."""
+    model = find_model("norm-diagonal").having(norm="1 g")
+    said = {"columns": {"v": "ax,ay,az"}, "units": {"v": "g"}}
+    frame = poses[1].rename(columns={"spread": "u_v"})
+    found = casest.calibrate(model, frame, **said)
+    named = casest.calibrate(model, poses[1], sensor_noise={"v": "spread"}, **said)
+    assert found.noise.chi_square == named.noise.chi_square
+    assert found.covariance == pytest.approx(named.covariance, rel=1e-9)
+
+
+def test_noise_that_is_stated_twice_is_refused(poses, capsys):
+    said = ["calibrate", "norm-diagonal", str(poses[0]), "--columns", "v=ax,ay,az", "--unit", "v=g"]
+    assert run([*said, "--sensor-noise", "v=0.02", "--sensor-noise", "v=0.03"]) == 1
+    assert "v=0.03: the noise of v is stated twice" in capsys.readouterr().err

@@ -85,7 +85,10 @@ def stated(std: Any, shape: tuple[int, ...], freedom: float = np.inf) -> Uncerta
         raise DeclarationError(f"std {std!r} has shape {array.shape}, the value has {shape}")
     each = np.broadcast_to(array, shape).ravel()
     if not (np.isfinite(each) & (each > 0)).all():
-        raise DeclarationError(f"std {std!r} must be above zero: leave it away for an exact value")
+        below = each[~(np.isfinite(each) & (each > 0))][0]
+        raise DeclarationError(
+            f"std {below:g} must be above zero: leave it away for an exact value"
+        )
     return replace(found_together(np.diag(each**2)), freedom=float(freedom))
 
 

@@ -12,7 +12,6 @@ from casest.declaration.model import Model
 from casest.effects.placing import told
 from casest.errors import UsageError
 from casest.interface.sensor_noise import SensorNoise, said, with_sensor_noise
-from casest.leastsquares.stated import stated_noise
 from casest.results.find import find_model
 
 #: What a fit is made from.
@@ -56,10 +55,10 @@ def model_and_runs(
 def _with_noise(
     model: Model, runs: tuple[Run, ...], noise: SensorNoise | None
 ) -> tuple[Model, tuple[Run, ...]]:
-    """With the noise that is stated, or that the model declares where none was stated before."""
-    if noise:
-        return with_sensor_noise(model, runs, said(noise))
-    return (model, runs) if model.noise is not None else stated_noise(model, runs, {})
+    """With the noise that is stated, declared or in columns, where none was stated before."""
+    if model.noise is not None and not noise:
+        return model, runs
+    return with_sensor_noise(model, runs, said(noise, model))
 
 
 def stated(reading: Reading) -> Any:

@@ -44,15 +44,27 @@ class Said:
         return self.name, self.value
 
 
-def said(given: SensorNoise | None) -> list[Option]:
+def said(given: SensorNoise | None, model: Model) -> list[Option]:
     """What Python was given, in the prompt's words."""
-    return [Said(str(name), _words(value)) for name, value in (given or {}).items()]
+    sizes = {signal.name: signal.size for signal in model.signals}
+    options = list[Option]()
+    for name, value in (given or {}).items():
+        size = sum(sizes.get(one.strip(), 0) for one in str(name).split(","))
+        options.append(Said(str(name), _words(str(name), value, size)))
+    return options
 
 
-def _words(value: object) -> str:
+def _words(name: str, value: object, size: int) -> str:
+    """Words as they are; numbers of so many axes as a list, or as rows of a covariance."""
     if isinstance(value, str):
         return value
     rows = np.asarray(value, float)
+    if size and rows.shape not in ((), (size,), (size, size)):
+        raise UsageError(
+            f"sensor_noise {name}: an array of shape {rows.shape} is no noise of one reading: give "
+            f"one number, {size} by axis or a covariance {size} by {size}; what differs from "
+            f"reading to reading is a column of the data: sensor_noise={{{name!r}: 'u_{name}'}}"
+        )
     words = [",".join(repr(float(x)) for x in row) for row in np.atleast_2d(rows)]
     return ";".join(words)
 
@@ -87,6 +99,8 @@ def noise_of(
                     f"{option.flag} {option.text}: {model.name} has no signal {name!r}; it has "
                     f"{', '.join(known)}"
                 )
+        if ",".join(names) in noise:
+            raise UsageError(f"{option.flag} {option.text}: the noise of {key} is stated twice")
         if len(names) == 1:
             noise[key] = [_of_run(option, text, known[key], run, used) for run in runs]
         elif text.startswith("@") or "," in text or ";" in text:

@@ -15,6 +15,8 @@ from casest.results.validation import Validated
 
 #: Correlation from which on it is told.
 NOTABLE = 0.1
+#: Share of a value's standard uncertainty below which an input does not move it.
+LITTLE = 1e-6
 
 
 class Quantity(Struct, frozen=True):
@@ -81,6 +83,26 @@ def budget_of(path: Path) -> Budget:
         correlations=_correlations(section.covariance),
         corrected=saved.corrected_budget,
     )
+
+
+def sensitivities(budget: Budget) -> tuple[list[str], list[list[str]]]:
+    """Names of the references, and for each value how it follows them: its unit over theirs.
+
+    Zero where a standard uncertainty moves it by less than a millionth of its own.
+    """
+    moving = [i for i in budget.inputs if i.sensitivity]
+    rows = []
+    for value in budget.values:
+        if value.std is not None:
+            row = [_moved(i.sensitivity.get(value.name), i.std, value.std) for i in moving]
+            rows.append([value.name, *row])
+    return [i.name for i in moving], rows
+
+
+def _moved(slope: Number, by: Number, std: float) -> str:
+    if slope is None or by is None:
+        return ""
+    return f"{slope:.3g}" if abs(slope) * by >= LITTLE * std else "0"
 
 
 def covariance_in(path: Path) -> Covariance:

@@ -11,7 +11,7 @@ from casest.report.html.figures import Figures
 from casest.report.html.frame import whole
 from casest.report.html.numbers import printed, printed_unit
 from casest.report.html.page import escaped, paragraph, section, table, tag
-from casest.results.budget import Budget
+from casest.results.budget import Budget, sensitivities
 from casest.results.result import Number
 from casest.results.rounding import rounded
 from casest.results.validation import rows, sentence
@@ -25,8 +25,8 @@ HIGH, LEFT, LONG = 22, 150, 520
 
 def budget_page(budget: Budget) -> str:
     """Inputs, shares of every value's variance, shares of a corrected reading's, correlations."""
-    body = [_inputs(budget), _values(budget), _corrected(budget), _correlations(budget)]
-    body.append(_validation(budget))
+    body = [_inputs(budget), _values(budget), _sensitivities(budget), _corrected(budget)]
+    body += [_correlations(budget), _validation(budget)]
     said = f"Uncertainty budget: {len(budget.inputs)} inputs, {len(budget.values)} values"
     under = f"Made from {budget.result}. Shares are of variances, to first order."
     return whole(budget.model, said, under, body, Figures(), [])
@@ -70,6 +70,17 @@ def _values(budget: Budget) -> str:
     return section(
         "values", "Values", _bars(bars, names), table(head, rows, [1, 2, *range(4, len(head))])
     )
+
+
+def _sensitivities(budget: Budget) -> str:
+    names, each = sensitivities(budget)
+    if not names:
+        return ""
+    rows = [[f"`{name}`", *map(printed, cells)] for name, *cells in each]
+    said = paragraph("The unit of the value over that of the input; noise has no one slope.")
+    head = ["value", *names]
+    body = table(head, rows, [*range(1, len(head))])
+    return section("sensitivities", "Sensitivities", said, body)
 
 
 def _corrected(budget: Budget) -> str:

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from msgspec import UNSET
 
 from casest.report.text.layout import WIDTH, item, wrapped
-from casest.results.budget import Budget
+from casest.results.budget import Budget, sensitivities
 from casest.results.result import Number
 from casest.results.rounding import rounded
 from casest.results.uncertainty import Input
@@ -26,6 +26,7 @@ def budget_text(budget: Budget) -> str:
         f"uncertainty budget of {budget.model} ({budget.result})",
         "\n".join(_inputs(budget.inputs)),
         "\n".join(_values(budget)),
+        "\n".join(_sensitivities(budget)),
         "\n".join(_corrected(budget)),
         "\n".join(_correlations(budget)),
         "\n".join(_validation(budget)),
@@ -60,6 +61,14 @@ def _values(budget: Budget) -> Iterator[str]:
         shares = (_percent(i.share.get(v.name)) for i in budget.inputs)
         rows.append((v.name, shown, f"± {std}", *shares, freedom))
     yield from _table(rows)
+
+
+def _sensitivities(budget: Budget) -> Iterator[str]:
+    """How each value follows the known numbers; noise has no one slope."""
+    names, each = sensitivities(budget)
+    if names:
+        yield "Sensitivity of each value, its unit over that of the input:"
+        yield from _table([("value", *names), *each])
 
 
 def _corrected(budget: Budget) -> Iterator[str]:
