@@ -15,6 +15,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from casest.declaration.effect import OVER_TIME
 from casest.declaration.shapes import Array
 from casest.errors import UsageError
 from casest.leastsquares.fewer import few_of
@@ -166,9 +167,30 @@ def _other_starts(problem: Problem, first: Point, automatic: bool) -> Sequence[P
     A start of the user's may lie in a wrong valley: the automatic one must agree. Where that is
     computed from the data, it is second opinion enough.
     """
+    bare = _without_effects(problem)
     if automatic:
-        return (first,)
-    return (problem.start(),) if problem.model.starter else (first, problem.start())
+        return (first, *bare)
+    return (problem.start(), *bare) if problem.model.starter else (first, problem.start(), *bare)
+
+
+def _without_effects(problem: Problem) -> tuple[Point, ...]:
+    """Where the model is best without its effects over time, which begin at nothing there.
+
+    A fit with more in it is no worse. A lag that begins where two records looked alike, or a memory,
+    may be in a wrong valley, with all starts that are near it.
+    """
+    model = problem.model
+    over = [a for a in model.effects if a.kind in OVER_TIME]
+    if not over or model.traced.integrates:
+        return ()
+    kept = tuple(a for a in model.effects if a not in over)
+    bare = Problem(replace(model, effects=kept), problem.runs)
+    found = trust_region(bare, bare.start(), max_iterations=OPINION)
+    lags = {p.name for a in over if a.kind == "time" for p in a.parameters}
+    begun = {
+        n: np.zeros_like(v) if n in lags else v for n, v in problem.values(problem.start()).items()
+    }
+    return (problem.point({**begun, **bare.values(found.point)}),)
 
 
 def valleys(outcomes: Sequence[Outcome]) -> int:
