@@ -171,6 +171,17 @@ def test_an_internal_error_is_exit_code_3_says_where_to_and_leaves_nothing(
     assert "test_exit_codes.py" in capsys.readouterr().err
 
 
+def test_an_end_of_file_within_is_no_ctrl_c(capsys, monkeypatch):
+    """As of a compiled module that was cut: click would call it an abort."""
+
+    def cut(*_):
+        raise EOFError("marshal data too short")
+
+    monkeypatch.setattr(fitting, "model_and_records", cut)
+    assert run(["calibrate", *POSES]) == 3
+    assert "internal error (EOFError: marshal data too short)" in capsys.readouterr().err
+
+
 def test_too_little_memory_for_the_data_is_said(capsys, monkeypatch):
     def little(*_):
         raise MemoryError("Unable to allocate 14.7 MiB")
@@ -269,9 +280,10 @@ def test_a_disk_that_fills_up_leaves_no_half_of_the_files(words, tmp_path):
     def limited():
         resource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000))
 
-    kernel = {**os.environ, "CASEST_KERNEL": "off"}
+    # Nor does Python keep half of a compiled module, which others would stumble over.
+    alone = {**os.environ, "CASEST_KERNEL": "off", "PYTHONDONTWRITEBYTECODE": "1"}
     folder = tmp_path / "out"
-    done = ended(*words, "-o", str(folder), preexec_fn=limited, env=kernel, stdout=subprocess.PIPE)
+    done = ended(*words, "-o", str(folder), preexec_fn=limited, env=alone, stdout=subprocess.PIPE)
     assert done.returncode == 1
     assert "cannot be written (File too large)" in done.stderr
     assert done.stderr.count("\n") == 1

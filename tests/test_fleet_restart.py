@@ -154,7 +154,10 @@ def test_a_full_disk_is_said_and_the_same_command_goes_on(line, tmp_path):
         resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
 
     told = fleets.command(*words(dataset, tmp_path / "out", "--processes", 1), numbers=SMALL)
-    done = subprocess.run(told, capture_output=True, text=True, preexec_fn=no_room, check=False)
+    alone = {**os.environ, "PYTHONDONTWRITEBYTECODE": "1"}
+    done = subprocess.run(
+        told, capture_output=True, text=True, preexec_fn=no_room, check=False, env=alone
+    )
     assert done.returncode == 1
     assert "cannot be written (File too large)" in done.stderr
     assert not results_of(tmp_path / "out")

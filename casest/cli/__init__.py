@@ -81,6 +81,8 @@ def _said(error: BaseException) -> tuple[str, int]:
     """What is said of an error, and the exit code."""
     if isinstance(error, CasestError):
         return str(error), error.exit_code
+    if isinstance(error, click.Abort) and isinstance(error.__cause__, EOFError):
+        error = error.__cause__  # click takes an end of anything for Ctrl-C
     if isinstance(error, click.Abort | KeyboardInterrupt):
         return "interrupted; nothing was written", INTERRUPTED
     if isinstance(error, click.ClickException):

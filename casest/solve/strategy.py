@@ -176,7 +176,7 @@ def _other_starts(problem: Problem, first: Point, automatic: bool) -> Sequence[P
 def _without_effects(problem: Problem) -> tuple[Point, ...]:
     """Where the model is best without its effects over time, which begin at nothing there.
 
-    A fit with more in it is no worse. A lag that begins where two records looked alike, or a memory,
+    A fit with more in it is no worse. A lag that begins where two records look alike, or a memory,
     may be in a wrong valley, with all starts that are near it.
     """
     model = problem.model
