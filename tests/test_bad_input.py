@@ -271,13 +271,13 @@ def test_an_effect_that_fails_is_named_by_effect_file_and_line(refused):
         (["--set", "gravity"], "--set gravity: write it as --set name=value"),
         (
             ["--set", "gravity=1,2"],
-            "gravity of model load-cell is one number, and a list of 2 is given",
+            "gravity is one number, and these are two; decimals stand behind a point: gravity=1.2",
         ),
         (["--free", "gravty"], "has no 'gravty'; did you mean 'gravity'?"),
         (["--free", "mass"], "mass is a signal of model load-cell"),
         (
             ["--fix", "zero=1,2"],
-            "zero of model load-cell: it takes one number, and a list of 2 is given",
+            "zero is one number, and these are two; decimals stand behind a point: zero=1.2",
         ),
         (["--fix", "zero=1,x"], "--fix zero=1,x: not a number, a list 1,2,3 or rows 1,0;0,1"),
         (["--fix", "zero=1,2 volt-ish"], "--fix zero=1,2 volt-ish: "),

@@ -52,6 +52,12 @@ def parse_value(name: str, text: str, option: str, model: Model) -> Constant:
         ) from None
     except CasestError as error:
         raise type(error)(f"{option} {name}={text}: {error}") from None
+    dims = old.shape.dims if isinstance(old, Parameter) else getattr(old, "dims", ())
+    if array.shape == (2,) and not dims:
+        raise UsageError(
+            f"{option} {name}={text}: {name} is one number, and these are two; decimals stand "
+            f"behind a point: {name}={text.replace(',', '.', 1)}"
+        )
     return _constant(array, stated)
 
 
