@@ -30,7 +30,7 @@ from casest.estimate.reasons import POOR, STARTS, WORTH, Code
 from casest.estimate.remarks import NOTABLE_BIAS
 from casest.estimate.valley import looked_for
 from casest.leastsquares.identifiability import Identifiability, identify, weak_directions
-from casest.leastsquares.kinds import in_deviations
+from casest.leastsquares.kinds import in_deviations, noises
 from casest.leastsquares.problem import Point, Problem
 from casest.leastsquares.stated import chi_square
 from casest.leastsquares.sums import repeat_noise, second_order_bias
@@ -340,6 +340,9 @@ def _noise(problem: Problem, point: Point, length: float, dof: int, rank: int) -
     if scale is not None and problem.weights is None:
         stated = Noise(scale, residual, repeats, dof, scale, chi)
         return stated if stated.known else replace(stated, sigma=residual)
+    if noises(problem.model) and np.isfinite(residual):
+        # In deviations found one by one: one that is taken to be no less leaves the others theirs.
+        return Noise(max(residual, 1.0), residual, repeats, dof)
     if dof >= ENOUGH_FREEDOM:
         return Noise(residual, residual, repeats, dof)
     candidates = [s for s in (residual, repeats) if s is not None and np.isfinite(s)]
