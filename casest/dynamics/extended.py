@@ -27,7 +27,7 @@ from casest.dynamics.declare import Dynamics
 from casest.dynamics.discrete import Steps
 from casest.dynamics.factors import Factors
 from casest.dynamics.inputs import as_read, at_estimates, estimates, slopes, uncertain
-from casest.dynamics.stepping import by_rows, entries, packed, unpacked
+from casest.dynamics.stepping import by_rows, entries, packed, reach, unpacked
 from casest.dynamics.transition import (
     Pace,
     acting,
@@ -117,7 +117,7 @@ class Sampled:
         Q = with_lost(self.model, self.steps[first:last, 0], Phi, Q, pace)
         C, d, y = self.read(states, first)
         R, of_C = self.R[first : last + 1], entries(self.model.traced.C)
-        return Steps(Phi, forced, Q, C, d, R, y, of_C=of_C)
+        return Steps(Phi, forced, Q, C, d, R, y, reach(self.model.traced.A), of_C)
 
 
 def relinearised(

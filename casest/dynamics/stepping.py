@@ -82,7 +82,7 @@ def kalman_step(n: int, m: int, of_Phi: Pattern, of_C: Pattern, give: Give = "al
         outputs.append(ca.vertcat(after_x, factors.std(after)))
         outputs.append(ca.vertcat(y - C @ before_x, *expected, squares))
     outputs = [ca.densify(e) for e in outputs]
-    return Recursion(ca.Function("step", [both, numbers], outputs, {"cse": True}))
+    return Recursion(ca.Function("step", [both, numbers], outputs))
 
 
 @lru_cache(maxsize=16)
@@ -117,7 +117,7 @@ def smoother_step(n: int, m: int, of_Phi: Pattern, of_C: Pattern, brief: bool = 
     back = ca.vertcat(*[ca.vec(ca.densify(e)) for e in (B, weight, value)])
     shown = ca.vertcat(x, factors.std(found)) if brief else packed(x, factors.multiplied(found))
     outputs = [back, ca.densify(shown)]
-    return Recursion(ca.Function("step", [later, numbers], outputs, {"cse": True}))
+    return Recursion(ca.Function("step", [later, numbers], outputs))
 
 
 def by_rows(matrix: Any) -> Any:
