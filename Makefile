@@ -11,7 +11,7 @@ USABLE := $(VENV)/.usable
 	study-motion study-flights study-inputs study-records study-halves study-asked study-slow study-coverage \
 	study-deceptive study-deceptive-many study-fleet study-mutation study-worlds study-noises \
 	study-structural study-check study-plans study-equations study-equations-coverage study-frictions \
-	study-told-apart \
+	study-told-apart study-mag-gyro \
 	figures docs clean
 
 demo: $(USABLE)
@@ -86,6 +86,9 @@ study-motion: $(READY)
 
 study-flights: $(READY)
 	$(BIN)/python studies/flight_loop.py
+
+study-mag-gyro: $(READY)
+	$(BIN)/python studies/mag_gyro.py
 
 study-inputs: $(READY)
 	$(BIN)/python studies/inputs.py

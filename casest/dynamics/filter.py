@@ -198,9 +198,8 @@ def _extended(model: Dynamics, run: Run, smooth: bool) -> Filtered:
     after = known(model, run, x, P)
     if not smooth:
         return Filtered(model, linearised(model, run, x), *after, *before, *after)
-    along, smooth_P, settled = trajectory(model, run, x, P)
-    both = known(model, run, along, smooth_P)
-    return Filtered(model, linearised(model, run, along), *after, *before, *both, settled)
+    *both, settled = trajectory(model, run, x, P)
+    return Filtered(model, linearised(model, run, both[0]), *after, *before, *both, settled)
 
 
 def refuse_divergence(model: Dynamics, run: Run, x: Array) -> None:
@@ -227,7 +226,10 @@ def trajectory(
     for _ in range(ROUNDS):
         steps = relinearised(model, run, along, errors)
         before = along
-        along, P = smoothed(steps, kalman(steps, model.start, model.start_covariance))
+        # What is known exactly is put in here, too: from afar its slope leads astray.
+        along, P = known(
+            model, run, *smoothed(steps, kalman(steps, model.start, model.start_covariance))
+        )
         first = first or (along, P)
         std = np.sqrt(np.maximum(np.diagonal(P, axis1=1, axis2=2), 1e-300))
         change = np.max(np.abs(along - before) / std)

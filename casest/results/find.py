@@ -50,6 +50,7 @@ MOVING = {
     "bias-gravity": ("bias_gravity", "bias_gravity"),
     "bias-gravity-magnitude": ("bias_gravity", "bias_gravity_magnitude"),
     "bias-gravity-position": ("bias_gravity", "bias_gravity_position"),
+    "mag-gyro": ("mag_gyro", "mag_gyro"),
 }
 
 
