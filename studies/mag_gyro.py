@@ -4,10 +4,10 @@
     python studies/mag_gyro.py        # make study-mag-gyro
     python studies/mag_gyro.py --table
 
-Rodríguez-Martínez & Troni's simulation (arXiv 2410.13827; the library's `simulated_data.md`): 600 s
-at 10 Hz of a vehicle that sways in roll, pitch and heading, 10 mG and 10 mrad/s of white noise.
-Their records are not at hand: these are ours by their description, by SciPy's rotations, which share
-no code with the estimator. Each is kept in `out/mag_gyro.jsonl`; the table is
+Rodríguez-Martínez & Troni's simulation (arXiv 2410.13827; the library's `simulated_data.md`): 600
+s at 10 Hz of a vehicle that sways in roll, pitch and heading, 10 mG and 10 mrad/s of white noise.
+Their records are not at hand: these are ours by their description, by SciPy's rotations, which
+share no code with the estimator. Each is kept in `out/mag_gyro.jsonl`; the table is
 `studies/mag_gyro.md`. Also measured: BROAD's trials 01 and 26, against the attitude by cameras.
 """
 
@@ -49,7 +49,7 @@ COUNT, FIRST = 100, 90_000
 
 
 def record(motion: str, seed: int) -> tuple[Array, Array, Array]:
-    """Times (N,), readings of the magnetometer in mG (N, 3) and of the gyroscope in rad/s (N, 3)."""
+    """Times (N,), readings of the magnetometer in mG and of the gyroscope in rad/s (N, 3)."""
     rng = np.random.default_rng(seed)
     swing, phase = np.radians(MOTIONS[motion]), rng.uniform(-np.pi, np.pi, 3)
     speed = rng.uniform([0.05, 0.1, 0.2], [0.08, 0.3, 0.4])
@@ -147,8 +147,8 @@ def measured(trial: str) -> str:
 
 
 def by_attitude(m: Array, attitude: Rotation) -> tuple[Array, Array]:
-    """Iron (3, 3) with one in the corner and offset, where the attitude is known: iron and the field
-    in turn by linear least squares."""
+    """Iron (3, 3) with one in the corner and offset, where the attitude is known: iron and the
+    field in turn by linear least squares."""
     turned, earth = attitude.inv().as_matrix(), np.array([1.0, 0.0, -1.0])
     for _ in range(300):
         rows = np.column_stack([turned @ earth, np.ones(len(m))])
@@ -179,13 +179,14 @@ def line(motion: str, rows: list[dict[str, Any]]) -> str:
 PAGE = """# A magnetometer and a gyroscope, moved without rests
 
 Made by `make study-mag-gyro` (`python studies/mag_gyro.py`). `mag-gyro` beside MAGYC 1.0.0 (batch
-factor graph, as its authors' notebook calls it) on the simulation that they describe: 600 s at 10 Hz,
-10 mG and 10 mrad/s of noise. Their records and the figures in their paper were not at hand; these
+factor graph, as its authors' notebook calls it) on the simulation that they describe: 600 s at 10
+Hz, 10 mG and 10 mrad/s of noise. Their records and the figures in their paper were not at hand;
+these
 records are ours, made by their description. Medians, casest / MAGYC; coverage is of casest's 95 %
 intervals of the {unknowns} constants; NIS one expected.
 
-| roll, pitch, heading ± deg | records | hard iron, mG | soft iron, geodesic | gyroscope's bias, mrad/s | \
-processor s | coverage | settled | NIS |
+| roll, pitch, heading ± deg | records | hard iron, mG | soft iron, geodesic | gyroscope's bias, \
+mrad/s | processor s | coverage | settled | NIS |
 | --- | --- | --- | --- | --- | --- | --- | --- | --- |
 {rows}
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from casest.errors import UsageError
+from casest.errors import UnitError, UsageError
 
 if TYPE_CHECKING:
     from casest.declaration.model import Model
@@ -28,13 +29,37 @@ class Assignment:
             raise self._malformed()
         return key, value
 
-    def number(self) -> tuple[str, float]:
-        """`name=number`."""
+    def number(
+        self, units: Mapping[str, str] | None = None, *, spread: bool = False
+    ) -> tuple[str, float]:
+        """`name=number`, or `name=number unit` in the unit that the name has in `units`.
+
+        `spread`: a standard deviation, of which 1 degC is 1 K.
+        """
         key, value = self.pair()
+        own = (units or {}).get(key)
         try:
             return key, float(value)
         except ValueError:
-            raise UsageError(f"{self.flag} {self.text}: {value!r} is no number") from None
+            if own is None:
+                raise UsageError(f"{self.flag} {self.text}: {value!r} is no number") from None
+        number, zero = self._in_unit(value, own)
+        return key, number if spread else number + zero
+
+    def _in_unit(self, text: str, own: str) -> tuple[float, float]:
+        from casest.units import conversion, parse_quantity
+
+        try:
+            number, unit = parse_quantity(text)
+            factor, offset = conversion(unit or own, own)
+            return factor * number, offset
+        except UnitError as error:
+            raise UsageError(f"{self.flag} {self.text}: {error}") from None
+        except UsageError:
+            raise UsageError(
+                f"{self.flag} {self.text}: {text!r} is no number; write it as 0.2 ({own}) or with "
+                "its unit"
+            ) from None
 
     def numbers(self) -> tuple[str, list[float]]:
         """`name=1,2,3`."""

@@ -160,11 +160,12 @@ def moving_model(name: str, constants: Assignments, options: MotionOptions) -> D
     moving = find_any(name)
     if not isinstance(moving, Dynamics):
         raise UsageError(f"{name} is no estimator in motion: casest calibrate, close or observe it")
-    moving = moving.having(**dict(given.number() for given in constants))
+    units = {c.name: c.unit for c in moving.constants} | {s.name: s.unit for s in moving.states}
+    moving = moving.having(**dict(given.number(units) for given in constants))
     intensities = dict(given.number() for given in options.intensities)
     sensed = {s.name: intensities.pop(s.name) for s in moving.signals if s.name in intensities}
     moving = moving.driven(**intensities).sensing(**sensed)
-    return moving.known_to(**dict(given.number() for given in options.stds))
+    return moving.known_to(**dict(given.number(units, spread=True) for given in options.stds))
 
 
 def trajectory(moving: Dynamics, name: str, data: Sequence[str], options: ReadingOptions) -> Run:

@@ -198,8 +198,9 @@ def _extended(model: Dynamics, run: Run, smooth: bool) -> Filtered:
     after = known(model, run, x, P)
     if not smooth:
         return Filtered(model, linearised(model, run, x), *after, *before, *after)
-    *both, settled = trajectory(model, run, x, P)
-    return Filtered(model, linearised(model, run, both[0]), *after, *before, *both, settled)
+    along, smooth_P, settled = trajectory(model, run, x, P)
+    both = along, smooth_P
+    return Filtered(model, linearised(model, run, along), *after, *before, *both, settled)
 
 
 def refuse_divergence(model: Dynamics, run: Run, x: Array) -> None:
