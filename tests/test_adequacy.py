@@ -11,6 +11,7 @@ from casest import Residual, Run, model, param, quantity, signal
 from casest.diagnose.cross_validation import folded
 from casest.diagnose.misfit.left import Misfit, left_over
 from casest.diagnose.noise.noise_model import equal_noise, lag_one, noise_model
+from casest.diagnose.noise.spectral_line import strongest_line
 from casest.diagnose.noise.tails import outlier_share, outliers_p_value, tails
 from casest.effects.placing import prepared
 from casest.estimate.correlation import correlation_time
@@ -170,6 +171,30 @@ def test_a_narrow_line_is_a_misfit_with_its_frequency():
     found = judged(record(white, 2, n=2000, positions=0, misfit=hum))
     assert found.significant
     assert "a line at 17 Hz" in found.where
+
+
+def in_bursts(run, size=7):
+    """Sampled evenly, stamped as a buffer of some samples is emptied, 0.9 ms apart."""
+    k = np.arange(len(run))
+    return replace(run, time=0.01 * size * (k // size) + 0.0009 * (k % size))
+
+
+def test_a_line_is_seen_though_time_stamps_come_in_bursts():
+    """As of a microcontroller behind a serial line: they lie on no grid, and the samples do."""
+
+    def hum(t, **_):
+        return 0.4 * np.sin(2 * np.pi * 17 * t)
+
+    found = judged(in_bursts(record(white, 2, n=2000, positions=0, misfit=hum)))
+    assert found.significant
+    assert "a line at 0.17 cycles per sample" in found.where
+    rng = np.random.default_rng(3)
+    alarms = 0
+    for seed in range(300):
+        run = in_bursts(record(white, seed, n=300, positions=0))
+        line = strongest_line([run], [rng.standard_normal((300, 1))])
+        alarms += line.p_value < 0.05
+    assert alarms < 30  # 15 are expected
 
 
 def test_a_jump_is_a_misfit():

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import casest
 from casest.diagnose.evidence.held_inputs import plateaus_of
 from casest.diagnose.evidence.linear import Linear, parts_of
 from casest.diagnose.evidence.score import Trial
@@ -77,6 +78,16 @@ def test_what_stands_out_of_the_weights_errors_is_said(missing, name):
     for _ in range(20):
         found += name in said(*on_a_cell(rng, 2.0, missing))
     assert found >= 18
+
+
+def test_a_formula_must_stand_out_of_the_plateaus_errors_too():
+    """A sensor whose lead was off in four baths of nine: four numbers fit that, and say nothing."""
+    bath = np.repeat([85.0, 80, 70, 60, 50, 40, 30, 20, 10], 20)
+    reading = 0.032 + 1.2e-4 * bath + 4e-4 * np.random.default_rng(5).standard_normal(len(bath))
+    reading[80:160] = 4.87
+    closing = casest.close("linear", {"reference": bath, "reading": reading})
+    assert closing.verdict == "unexplained"
+    assert [f.candidate.name for f in closing.effects] == []
 
 
 def test_plateaus_are_where_nothing_moves():

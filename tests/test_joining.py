@@ -169,6 +169,23 @@ def test_files_without_a_time_in_common_or_any_are_refused(tmp_path):
         read(f"{a}+{c}", named(signal("K"), "warmth"))
 
 
+def test_two_files_whose_times_have_other_names(tmp_path):
+    """As MATLAB's matrices: nothing in either is called a time."""
+    files, _ = two(tmp_path)
+    plain = load_runs([files], (W,), columns={"w": ("wx", "wy", "wz")})
+    for name in ("a", "b"):
+        text = (tmp_path / f"{name}.csv").read_text()
+        (tmp_path / f"{name}.csv").write_text(f"stamp{text[1:]}")
+    for time in (("stamp", "b.stamp"), ("0", "b.stamp")):
+        runs = load_runs([files], (W,), columns={"w": ("wx", "wy", "wz"), "t": time})
+        np.testing.assert_array_equal(runs[0].time, plain[0].time)
+        assert {"ox", "oy", "oz"} <= {*runs[0].elsewhere}
+        for name, series in runs[0].elsewhere.items():
+            np.testing.assert_array_equal(series.time, plain[0].elsewhere[name].time)
+    with pytest.raises(DataError, match=r"t=b\.NAME, or both as t=NAME,b\.NAME; it has stamp, ox"):
+        load_runs([files], (W,), columns={"w": ("wx", "wy", "wz"), "t": ("0",)})
+
+
 def test_one_rate_for_two_clocks_is_refused(tmp_path):
     pair, _ = two(tmp_path)
     with pytest.raises(UsageError, match="--rate 50: files joined by"):

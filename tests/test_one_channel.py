@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from nist import digits
 
-from casest import Run, UsageError, attempt, calibrate, constant
+from casest import Run, UsageError, attempt, calibrate, close, constant
 from casest.cli import run as casest
 from casest.effects import CATALOGUE
 from casest.effects.placing import placed_in
@@ -205,3 +205,18 @@ def test_readings_alone_are_corrected_by_command(name, tmp_path, capsys):
     kelvin = 273.15 if "temperature" in header else 0.0
     tolerance = 0.4 if name == "thermistor-beta" else 0.05
     np.testing.assert_allclose(table[:, -1], x + kelvin, atol=tolerance)
+
+
+def test_what_the_source_was_set_to_takes_no_gain_from_the_current_that_was_measured():
+    """A shunt that bends a little, its current read back by the source with noise of its own.
+
+    The set voltage goes with the current to 3e-4: an offset in proportion to it is a gain.
+    """
+    rng = np.random.default_rng(1)
+    set_to = np.repeat(np.linspace(0.1, 1, 18), 12)
+    current = 5e-4 * set_to
+    reading = -0.04 + 4900 * current - 0.004 * set_to**2 + rng.normal(0, 1e-4, len(current))
+    measured = current * (1 + rng.normal(0, 3e-4, len(current)))
+    closing = close("linear", {"reference": measured, "reading": reading, "setpoint": set_to})
+    assert closing.effects
+    assert closing.after.values["gain"] == pytest.approx(4900, rel=0.01)

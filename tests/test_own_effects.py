@@ -89,6 +89,21 @@ def test_an_angle_is_a_column_in_deg_or_rad_and_is_told_how_many_rad_that_is():
     assert numbers == pytest.approx([np.pi / 180, 1.0, 1.0])
 
 
+@model
+def encoder(shaft=signal("deg"), told=signal("deg"), *, gain=param(start=1.0)):
+    return Residual(measured=told, predicted=quantity("turned", gain * shaft, "deg"))
+
+
+def test_a_reading_is_no_angle_that_its_own_error_could_go_with():
+    """Its noise is in it, and in the residual: what the sensor met explains, not what it said."""
+    shaft = np.linspace(0, 700, 200)[:, None]
+    run = Run.raw(
+        "r", {"shaft": shaft, "told": 1.01 * shaft}, units={"shaft": "deg", "told": "deg"}
+    )
+    found, _ = candidates(encoder, prepared(encoder, [run]), [harmonic])
+    assert [c.label for c in found] == ["harmonic(shaft)"]
+
+
 def test_a_harmonic_of_a_column_without_a_unit_is_not_tried_and_says_why():
     run = recorded()
     run = replace(run, columns={**run.columns, "heading": np.arange(400.0)})

@@ -73,6 +73,17 @@ def test_delimiters_preambles_and_line_ends_do_not_change_the_table(
     assert table.n_rows == 3
 
 
+def test_tabs_below_and_spaces_above_are_one_table(tmp_path):
+    """Typed by hand: NumPy reads it, whatever stands in the middle."""
+    rows = [f"{x:.1f}{'    ' if k < 8 else chr(9)}{2 * x:g}" for k, x in enumerate(range(60))]
+    table = table_of(tmp_path, "\n".join(rows), "power.txt")
+    values = np.stack([column.values for column in table.columns.values()], axis=1)
+    np.testing.assert_array_equal(values, np.loadtxt(rows))
+    # Where the header's words have spaces, the tabs cut.
+    named = table_of(tmp_path, "\n".join(["laser current\tpower", *rows[8:]]), "named.txt")
+    assert list(named.columns) == ["laser current", "power"]
+
+
 @pytest.mark.parametrize("delimiter", [",", ";", "\t", " "])
 def test_a_file_without_header_has_columns_by_position(tmp_path: Path, delimiter: str) -> None:
     lines = [delimiter.join(str(x) for x in row) for row in ROWS]

@@ -18,7 +18,7 @@ from casest.cli import commands, run
 from casest.cli.waiting import Waiting
 from casest.report.next_command import following, typed_words
 from casest.report.text.layout import coloured
-from casest.results.rounding import rounded
+from casest.results.rounding import percent, rounded
 
 ROOT = Path(__file__).parents[1]
 WORDS = {
@@ -301,6 +301,11 @@ def test_the_line_is_wiped_away_before_an_error(impatient, monkeypatch, tmp_path
 )
 def test_digits_end_where_the_standard_deviation_or_the_double_does(value, std, text):
     assert rounded(value, std) == text
+
+
+def test_nearly_all_is_100_percent_and_no_power_of_ten():
+    shares = [0.9994, 0.995, 0.66, 0.0994, 0.0123, 0.0]
+    assert [percent(x) for x in shares] == ["100 %", "100 %", "66 %", "9.9 %", "1.2 %", "0 %"]
 
 
 PAIR = re.compile(r"(-?\d\S*) +± +(\d\S*)")

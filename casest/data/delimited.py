@@ -117,7 +117,7 @@ def _layout(lines: list[str]) -> Layout:
     """Choose the delimiter that cuts the middle of the file into rows of one width of numbers."""
     middle = min(len(lines) // 2, _HEAD)
     sample = lines[middle : middle + _SAMPLE]
-    best, best_score = Layout(",", False, 1), 0.0
+    best, best_score = Layout(",", False, 1), (0.0, 0.0)
     for delimiter in _DELIMITERS:
         decimal = _has_decimal_commas(sample, delimiter)
         cut = Layout(delimiter, decimal, 0).cells
@@ -129,9 +129,11 @@ def _layout(lines: list[str]) -> Layout:
         cells = [cell for row in rows for cell in row]
         right = sum(_rightness(cell) for cell in cells) / len(cells)
         score = right * agree / len(rows) * (1.0 if width > 1 else 0.5)
-        if score > best_score + 1e-9:
-            best, best_score = Layout(delimiter, decimal, width), score
-    return best if best_score > 0 else _layout_of_labels(lines)
+        # Tabs here and spaces there: of two that cut the middle alike, what cuts the top so too.
+        whole = round(score, 9), overall[width] / overall.total()
+        if score > 0 and whole > best_score:
+            best, best_score = Layout(delimiter, decimal, width), whole
+    return best if best_score[0] > 0 else _layout_of_labels(lines)
 
 
 def _rightness(cell: str) -> int:

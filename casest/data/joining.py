@@ -96,18 +96,27 @@ def _said(
     for name, choice in options.columns.items():
         columns = as_names(choice)
         mine = [c for c in columns if c.startswith(f"{stem}.")]
-        if mine and len(mine) < len(columns):
+        if mine and len(mine) < len(columns) and name != "t":  # each file has a time
             raise DataError(
                 f"--columns {name}={','.join(columns)} names columns of two files: what belongs "
                 "together is in one"
             )
+        theirs = [c for c in columns if any(c.startswith(f"{other}.") for other in others)]
         if mine:
             found[name] = tuple(c.removeprefix(f"{stem}.") for c in mine)
-        elif not any(c.startswith(f"{other}.") for c in columns for other in others) and (
-            name not in ("t", "run", "pose") or all(find_by_name(table, c) for c in columns)
+        elif name == "t":
+            free = [c for c in columns if c not in theirs]
+            found |= {"t": tuple(free)} if free and _has(table, free, tables) else {}
+        elif not theirs and (
+            name not in ("run", "pose") or all(find_by_name(table, c) for c in columns)
         ):
             found[name] = choice
     return found
+
+
+def _has(table: Table, columns: Sequence[str], tables: Sequence[Table]) -> bool:
+    """Does a file have these columns? Positions are those of the first."""
+    return all(find_by_name(table, c) or (c.isdigit() and table is tables[0]) for c in columns)
 
 
 def _holder(
@@ -172,7 +181,8 @@ def times_of(runs: Sequence[Run]) -> list[Array]:
         if run.time is None:
             raise DataError(
                 f"{run.file}: no time column: files joined by + need one each; give "
-                f"--columns t={file_and_topics(run.file)[0].stem}.NAME"
+                f"--columns t={file_and_topics(run.file)[0].stem}.NAME, or both as t=NAME,"
+                f"{file_and_topics(run.file)[0].stem}.NAME; it has {', '.join([*run.columns][:12])}"
             )
     return [np.asarray(run.time) for run in runs]
 

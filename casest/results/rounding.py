@@ -24,6 +24,12 @@ def rounded(value: float, std: float, missing: str = "not determined") -> tuple[
     return f"{value:.{places}e}", f"{std:.1e}"
 
 
+def percent(share: float) -> str:
+    """A share to two digits, or to whole percents: "0.75 %", "66 %", "100 %"."""
+    number = 100 * share
+    return f"{number:.0f} %" if abs(number) >= 9.95 else f"{number:.2g} %"
+
+
 def two_digits(std: float) -> float:
     """0.000996 is 0.0010, not 0.00100."""
     return float(f"{std:.1e}")

@@ -148,9 +148,8 @@ def candidates(
     found: list[Candidate] = []
     skipped: list[Skipped] = []
     measured, unusable = _channels(model, runs)
-    unfit = {s.name for s in unusable}
-    if model.traced.integrates:  # the state itself is there: its reading would follow the residual
-        unfit |= {*model.traced.readings}
+    # A reading follows its own residual: its noise is in both.
+    unfit = {*(s.name for s in unusable), *model.traced.readings}
     turning = [n for n in angles(model, runs) if n not in unfit]
     states = [s for s in model.rates.values() if not model.quantities[s].dims]
     skipped += unusable

@@ -18,11 +18,13 @@ from casest.diagnose.noise.noise_model import MIDDLE
 ENOUGH, LONGEST = 256, 1 << 18
 #: Frequencies on either side that the level is taken from, and those next to a line that are not.
 WIDE, NEXT = 40, 2
+#: Of a frequency where time stamps lie on no grid.
+UNEVEN = "cycles per sample (the stamps of time are uneven)"
 
 
 @dataclass(frozen=True)
 class Line:
-    """The strongest line: frequency (Hz; per sample without time) and p-value over all of them."""
+    """The strongest line: frequency (Hz; per sample where time is uneven), p-value over all."""
 
     frequency: float
     unit: str
@@ -43,18 +45,21 @@ def strongest_line(runs: Sequence[Run], residuals: Sequence[Array]) -> Line | No
 def _line(run: Run, r: Array) -> Line | None:
     if run.spread or len(r) < ENOUGH or run.time is None:
         return None
-    step = float(np.median(np.diff(run.time)))
+    step, unit = float(np.median(np.diff(run.time))), "Hz"
     if not step > 0:
         return None
     place = np.round((run.time - run.time[0]) / step).astype(int)
+    if np.any(np.diff(place) < 1) or place[-1] + 1 > 1.1 * len(r):
+        # Stamps that come in bursts say when a buffer was emptied: the samples may be even.
+        step, unit, place = 1.0, UNEVEN, np.arange(len(r))
     length = int(place[-1]) + 1
-    if np.any(np.diff(place) < 1) or length > 1.1 * len(r) or length > LONGEST:
+    if length > LONGEST:
         return None
     even = np.zeros((length, r.shape[1]))
     even[place] = r
     power = np.sum(np.abs(np.fft.rfft(even, axis=0)) ** 2, axis=1)[1:-1]
     p, k = _most_significant(power, r.shape[1])
-    return Line((k + 1) / (length * step), "Hz", p)
+    return Line((k + 1) / (length * step), unit, p)
 
 
 def _most_significant(power: Array, axes: int) -> tuple[float, int]:

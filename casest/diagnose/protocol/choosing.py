@@ -122,7 +122,7 @@ def _describes(
     causes.
     """
     best = max((r.evidence.score for r in names), default=0.0)
-    if formula.score < best + LEVELS.described:
+    if formula.score < best + LEVELS.described or not ranking.says(formula):
         return False
     seen = falls(ranking, formula)
     if any(f.ratio >= 1 or f.t < LEVELS.confirmed for f in seen.values()):

@@ -9,13 +9,16 @@ import numpy as np
 
 from casest.declaration.shapes import Array
 from casest.diagnose.evidence.likelihood import rises
-from casest.diagnose.evidence.score import Evidence, expected_loss, judged
+from casest.diagnose.evidence.score import Evidence, Trial, expected_loss, judged
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.noise.louder import louder
 from casest.diagnose.protocol.confirming import falls, falls_of_refit, holds_out
 from casest.diagnose.protocol.ranking import sharpened
 from casest.diagnose.protocol.state import F, Ranking, Refit, State
 from casest.diagnose.protocol.subject import Subject
+
+#: Why there is no refit of a cause.
+NO_SIZE = "what the declared unknowns can do as well has no size of its own"
 
 
 def refitted(
@@ -28,7 +31,8 @@ def refitted(
     fits: list[tuple[Evidence, F]] = []
     for evidence in _with_parts(options[: LEVELS.contenders], ranking):
         evidence = sharpened(subject, state.fit, ranking, evidence)
-        better = subject.refit(state.fit, evidence.trials)
+        sized = evidence.sized or subject.asked(evidence.trials[0].what)
+        better = subject.refit(state.fit, evidence.trials) if sized else NO_SIZE
         if isinstance(better, str):
             state = state.failing(evidence, better)
         else:
@@ -39,7 +43,7 @@ def refitted(
     found: list[Refit[F]] = []
     for (evidence, better), gain, least in zip(fits, gains, even, strict=True):
         kept = _gaining(evidence, gain)
-        enough = _enough(ranking, kept) and _strong(ranking, _gaining(evidence, least))
+        enough = beyond_courses(ranking, kept) and _strong(ranking, _gaining(evidence, least))
         if enough or subject.asked(evidence.trials[0].what):
             found.append(Refit(state.fit, better, kept))
     found.sort(key=lambda r: -r.evidence.score)
@@ -77,16 +81,35 @@ def _strong(ranking: Ranking, evidence: Evidence) -> bool:
     return evidence.score > (LEVELS.strong if ranking.linear.series else 0.0)
 
 
-def _enough(ranking: Ranking, evidence: Evidence) -> bool:
-    """Is it strong evidence, clearly more than a course of unknown cause has, or beside one?"""
+def beyond_courses(ranking: Ranking, evidence: Evidence) -> bool:
+    """Is it strong evidence, clearly more than a course of unknown cause has, or beside one?
+
+    Of a pair each is asked beside the other: what one explains is no merit of the other.
+    """
     if not _strong(ranking, evidence):
         return False
-    course = next(iter(ranking.descriptions), None)
-    if course is None or evidence.score > course.score + LEVELS.clear:
+    if len(evidence.trials) == 1:
+        return all(_more_than(c, evidence, ranking) for c in ranking.descriptions[:1])
+    for trial in evidence.trials:
+        others = [t for t in evidence.trials if t is not trial]
+        beside = (_together(c, others, ranking) for c in ranking.courses)
+        best = max((e for e in beside if e), key=lambda e: e.score, default=None)
+        if best is not None and not _more_than(best, evidence, ranking):
+            return False
+    return True
+
+
+def _more_than(course: Evidence, evidence: Evidence, ranking: Ranking) -> bool:
+    if evidence.score > course.score + LEVELS.clear:
         return True
-    both = judged([*course.trials, *evidence.trials], ranking.likelihood, ranking.none,
-                  start=course.explained, families=ranking.families)  # fmt: skip
+    own = [t for t in evidence.trials if not any(t is c for c in course.trials)]
+    both = _together(course, own, ranking)
     return both is not None and both.score > course.score + LEVELS.strong
+
+
+def _together(course: Evidence, trials: Sequence[Trial], ranking: Ranking) -> Evidence | None:
+    return judged([*course.trials, *trials], ranking.likelihood, ranking.none,
+                  start=course.explained, families=ranking.families)  # fmt: skip
 
 
 def _with_parts(options: Sequence[Evidence], ranking: Ranking) -> list[Evidence]:
@@ -187,6 +210,6 @@ def shown(
         gain, *_ = subject.rises(state.fit, [better, *(r.fit for r in beside)])
         kept = _gaining(evidence, gain)
         seen = falls_of_refit(ranking.linear, subject.linear(better))
-        if _enough(ranking, kept) and holds_out(seen, ranking.linear):
+        if beyond_courses(ranking, kept) and holds_out(seen, ranking.linear):
             found.append(Refit(state.fit, better, kept, seen))
     return state, found

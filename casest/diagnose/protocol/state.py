@@ -52,6 +52,12 @@ class Ranking:
         return tuple(e for e in described if self.says(e))
 
     @property
+    def courses(self) -> tuple[Evidence, ...]:
+        """Courses of unknown cause, whatever evidence there is for them."""
+        described = (e for e in self.found if e.trials[0].describes)
+        return tuple(e for e in described if not e.trials[0].what.column)
+
+    @property
     def descriptions(self) -> tuple[Evidence, ...]:
         """Courses of unknown cause that there is evidence for, and none for a better one."""
         found = [e for e in self.found if e.trials[0].describes and e.score > LEVELS.strong]

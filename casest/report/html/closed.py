@@ -27,7 +27,7 @@ from casest.report.html.residuals import convincing, residual_figures
 from casest.results.closing import Closed, Effect
 from casest.results.residuals import Residuals
 from casest.results.result import Parameter
-from casest.results.rounding import rounded
+from casest.results.rounding import percent, rounded
 from casest.results.verdict import consequence, instead, judged, sentence, undecided
 
 
@@ -144,7 +144,7 @@ def _effects(result: Closed) -> str:
         words = undecided(left, result.after.parameters)
         said += [
             tag("h3", "What is left unexplained"),
-            paragraph(f"{100 * left.fraction:.2g} % of the held-out variance: {left.where}."),
+            paragraph(f"{percent(left.fraction)} of the held-out variance: {left.where}."),
             *(paragraph(in_words(f"{w[0].upper()}{w[1:]}.")) for w in words),
         ]
     return section("effects", "Effects found", *said)

@@ -23,7 +23,7 @@ from casest.results.fitted import (
     WeakCombination,
 )
 from casest.results.result import Reproduced
-from casest.results.rounding import rounded
+from casest.results.rounding import percent, rounded
 from casest.results.values import Entry, Held
 
 #: Correlation from which on a pair is spoken of, and how many pairs and directions are.
@@ -112,7 +112,7 @@ def _known(c: Held) -> list[str]:
     if c.std is None:
         return ["not stated" if c.frozen else "exact", ""]
     std = ", ".join(f"{s:.2g}" for s in np.ravel(c.std))
-    return [printed(std), f"{printed(f'{100 * c.share:.2g}')} % of `{c.most}`"]
+    return [printed(std), f"{printed(percent(c.share))} of `{c.most}`"]
 
 
 # -- what is uncertain about them ------------------------------------------------------------------

@@ -11,6 +11,7 @@ from casest.data.logs import file_name
 from casest.report.next_command import following
 from casest.report.text.layout import WIDTH, held_lines, item, value_table
 from casest.results.closing import Closed
+from casest.results.rounding import percent
 from casest.results.verdict import instead, largest, of_the_user, refusals, sentence, undecided
 
 #: Lists longer than this are left to result.json.
@@ -125,8 +126,8 @@ def _invisible(result: Closed) -> Iterator[str]:
 def _unexplained(result: Closed) -> Iterator[str]:
     left = result.unexplained
     if result.verdict == "unexplained" and left.fraction is not None:
-        share = 100 * left.fraction
-        yield item(f"Unexplained: {share:.2g} % of the held-out variance, {left.where}")
+        share = percent(left.fraction)
+        yield item(f"Unexplained: {share} of the held-out variance, {left.where}")
         yield from (item(words) for words in undecided(left, result.after.parameters))
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from casest.report.text.layout import WIDTH, item
 from casest.results.fleet import COMMON, CommonEffect, FleetClosed, FleetResult
-from casest.results.rounding import rounded
+from casest.results.rounding import percent, rounded
 
 #: Kinds of what is rejected, in words for one and for several.
 KINDS = {
@@ -73,10 +73,10 @@ def _common_lines(e: CommonEffect) -> Iterator[str]:
     yield f"  {e.name} (chance {e.chance:.2g} where there is none):"
     for name, (value, std) in e.parameters.items():
         yield "    {}  {} ± {}".format(name, *rounded(value, std))
-    fallen = 100 * (1 - e.sigma_after / e.sigma_before)
+    fallen = percent(1 - e.sigma_after / e.sigma_before)
     yield item(
         f"sigma of sensors that had no part in that size: {e.sigma_before:.5g} before, "
-        f"{e.sigma_after:.5g} after ({fallen:.2g} % less)"
+        f"{e.sigma_after:.5g} after ({fallen} less)"
     )
     far = sorted(e.moved.items(), key=lambda pair: -abs(pair[1]))[:3]
     moves = ", ".join(f"{name} by {by:.2g}" for name, by in far)

@@ -9,6 +9,7 @@ from collections.abc import Iterator, Sequence
 from typing import TextIO
 
 from casest.declaration.shapes import in_digits
+from casest.results.rounding import percent
 from casest.results.values import Entry, Held
 
 WIDTH = 80
@@ -85,4 +86,4 @@ def _known(c: Held) -> str:
     """What is known of a constant's uncertainty, and how much of the values' that is."""
     if c.std is None:
         return "held"
-    return f"held; up to {100 * c.share:.2g} % of a variance above: that of {c.most}"
+    return f"held; up to {percent(c.share)} of a variance above: that of {c.most}"
