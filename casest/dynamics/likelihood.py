@@ -30,7 +30,7 @@ from casest.dynamics.transition import (
     linearised,
     lost,
     process_along,
-    process_noise,
+    stepped_with,
     usual,
 )
 from casest.engine import Recursion
@@ -71,6 +71,19 @@ class Prepared:
         """Names of the intensities: inputs and states, then outputs."""
         return (*self.units, *self.readings)
 
+    def driven(self, intensities: Mapping[str, float], process: Array) -> Linearised:
+        """The system with noise of these intensities, which is `process` between samples: of every
+        step the sum of what each of them makes of it."""
+        n = self.model.size
+        Q, place = np.zeros((len(self.numbers) - 1, n, n)), len(reach(self.model.traced.A)) + n
+        for name, pattern in self.units.items():
+            rows, columns = np.array(pattern, int).reshape(-1, 2).T
+            Q[:, rows, columns] += intensities[name] * self.numbers[1:, place : place + len(rows)]
+            place += len(rows)
+        upper = np.triu_indices(n, 1)
+        Q[:, upper[1], upper[0]] = Q[:, upper[0], upper[1]]
+        return self.system.driven(process, Q)
+
 
 def noiseless(model: Dynamics, run: Run) -> set[str]:
     """Inputs of which nobody stated a noise, and that show none: simulated, or known exactly."""
@@ -101,7 +114,7 @@ def reached(model: Dynamics, silent: Collection[str] = ()) -> tuple[list[str], l
 def prepared(model: Dynamics, run: Run, along: Array) -> Prepared:
     """Along states (N, n), where the model or its noise depends on them."""
     inputs, own = reached(model, noiseless(model, run))
-    silent = model.driven(**{s.name: 0.0 for s in model.states})
+    silent = model.without_intensities()
     checked_time(run)
     pace = Pace.of(model, run)
     shown = {
@@ -109,17 +122,18 @@ def prepared(model: Dynamics, run: Run, along: Array) -> Prepared:
         for name, std in unstated(model, run).items()
     }
     system = linearised(model.sensing(**shown), run, along)
-    Phi, forced = system.moved
     present = np.isfinite(system.y)
     t, count = model.traced, len(present)
     alone = [silent.sensing(**{name: 1.0}) for name in inputs]
     alone += [silent.driven(**{name: 1.0}) for name in own]
     units = {name: _spread(one) for name, one in zip((*inputs, *own), alone, strict=True)}
-    first = np.eye(model.size)[None]
+    first, none = np.eye(model.size)[None], np.zeros((model.size, model.size))
+    noises = [process_along(one, run, along) for one in alone] or [none]
+    moved = stepped_with(system, noises)
+    Phi, forced = system.__dict__["moved"] = moved[0].Phi, moved[0].forced
     parts = [_picked(np.concatenate([first, Phi]), reach(t.A)), _after(forced, count)]
-    for one, pattern in zip(alone, units.values(), strict=True):
-        Q = process_noise(system, process_along(one, run, along))
-        parts.append(_after(_picked(Q, pattern), count))
+    for own, pattern in zip(moved, units.values(), strict=bool(alone)):
+        parts.append(_after(_picked(own.Q, pattern), count))
     parts.append(_after(lost(model, system.steps, pace), count))
     parts.append(_picked(np.where(present[:, :, None], system.C, 0.0), entries(t.C)))
     parts.append(np.where(present, system.y - system.d, 0.0))
