@@ -29,7 +29,7 @@ from casest.dynamics.transition import (
     checked_time,
     linearised,
     lost,
-    process_along,
+    noises_along,
     stepped_with,
     usual,
 )
@@ -80,8 +80,8 @@ class Prepared:
             rows, columns = np.array(pattern, int).reshape(-1, 2).T
             Q[:, rows, columns] += intensities[name] * self.numbers[1:, place : place + len(rows)]
             place += len(rows)
-        upper = np.triu_indices(n, 1)
-        Q[:, upper[1], upper[0]] = Q[:, upper[0], upper[1]]
+        rows, columns = np.triu_indices(n, 1)
+        Q[:, columns, rows] = Q[:, rows, columns]
         return self.system.driven(process, Q)
 
 
@@ -102,7 +102,7 @@ def reached(model: Dynamics, silent: Collection[str] = ()) -> tuple[list[str], l
     inputs, touched = [], np.zeros(model.size, dtype=bool)
     noisy = [s for s in model.signals if s.name not in (*t.measured, *model.exact, *silent)]
     for s in noisy:
-        slope = ca.jacobian(t.f, flat(t.symbols[s.name]))
+        slope = model.slopes_in_signals[s.name]
         if slope.nnz():
             inputs.append(s.name)
             touched[list(set(slope.sparsity().get_triplet()[0]))] = True
@@ -124,16 +124,17 @@ def prepared(model: Dynamics, run: Run, along: Array) -> Prepared:
     system = linearised(model.sensing(**shown), run, along)
     present = np.isfinite(system.y)
     t, count = model.traced, len(present)
-    alone = [silent.sensing(**{name: 1.0}) for name in inputs]
-    alone += [silent.driven(**{name: 1.0}) for name in own]
-    units = {name: _spread(one) for name, one in zip((*inputs, *own), alone, strict=True)}
+    alone = {name: silent.sensing(**{name: 1.0}) for name in inputs}
+    alone |= {name: silent.driven(**{name: 1.0}) for name in own}
+    units = {name: _spread(one) for name, one in alone.items()}
     first, none = np.eye(model.size)[None], np.zeros((model.size, model.size))
-    noises = [process_along(one, run, along) for one in alone] or [none]
-    moved = stepped_with(system, noises)
+    noises = noises_along(model, inputs, run, along) if inputs else {}
+    noises |= {name: alone[name].process for name in own}
+    moved = stepped_with(system, list(noises.values()) or [none])
     Phi, forced = system.__dict__["moved"] = moved[0].Phi, moved[0].forced
     parts = [_picked(np.concatenate([first, Phi]), reach(t.A)), _after(forced, count)]
-    for own, pattern in zip(moved, units.values(), strict=bool(alone)):
-        parts.append(_after(_picked(own.Q, pattern), count))
+    for one, pattern in zip(moved, units.values(), strict=bool(alone)):
+        parts.append(_after(_picked(one.Q, pattern), count))
     parts.append(_after(lost(model, system.steps, pace), count))
     parts.append(_picked(np.where(present[:, :, None], system.C, 0.0), entries(t.C)))
     parts.append(np.where(present, system.y - system.d, 0.0))

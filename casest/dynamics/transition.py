@@ -191,21 +191,17 @@ def _along(model: Dynamics) -> Replay:
 
 @lru_cache(maxsize=8)
 def _noise_along(model: Dynamics, names: tuple[str, ...]) -> Replay:
-    """ΣG·q·Gᵀ of these inputs; their intensities q are its parameters."""
-    q, slopes = ca.SX.sym("q", len(names)), [model.slopes_in_signals[name] for name in names]
-    found = sum((q[k] * (G @ G.T) for k, G in enumerate(slopes)), ca.SX(model.size, model.size))
-    return _replay(model, [found], q=q)
+    """G·Gᵀ of each of these inputs."""
+    slopes = [model.slopes_in_signals[name] for name in names]
+    return _replay(model, [G @ G.T for G in slopes])
 
 
-def _replay(
-    model: Dynamics, expressions: list[Any], as_was: Sequence[Any] = (), q: Any = None
-) -> Replay:
+def _replay(model: Dynamics, expressions: list[Any], as_was: Sequence[Any] = ()) -> Replay:
     t = model.traced
     sample = ca.vertcat(t.x, *[flat(t.symbols[s.name]) for s in model.signals], *as_was)
     outputs = [ca.densify(e) for e in expressions]
     names = ["parameters", "sample"], [f"o{k}" for k in range(len(outputs))]
-    given = [ca.SX.sym("none", 0) if q is None else q, sample]
-    return Replay(ca.Function("along", given, outputs, *names))
+    return Replay(ca.Function("along", [ca.SX.sym("none", 0), sample], outputs, *names))
 
 
 def process_along(model: Dynamics, run: Run, along: Array, pace: Pace | None = None) -> Array:
@@ -213,11 +209,19 @@ def process_along(model: Dynamics, run: Run, along: Array, pace: Pace | None = N
     names = model.noisy_inputs
     if not names:
         return model.process
+    found = noises_along(model, names, run, along, pace)
+    return np.asarray(model.process + sum(model.sensors[name] * Xi for name, Xi in found.items()))
+
+
+def noises_along(
+    model: Dynamics, names: Sequence[str], run: Run, along: Array, pace: Pace | None = None
+) -> dict[str, Array]:
+    """What noise of intensity one of each of some inputs adds to Ξ along states, (N, n, n) each."""
     columns = Columns([np.ascontiguousarray(along), *(run.signals[s.name] for s in model.signals)])
-    replay = _noise_along(model.without_intensities(), names)
-    noise = evaluated(replay, np.array([model.sensors[name] for name in names]), columns)[0]
-    time = checked_time(run)
-    return np.asarray(model.process + _stood_for(time, pace or Pace.of(model, run)) * noise)
+    replay = _noise_along(model.without_intensities(), tuple(names))
+    share = _stood_for(checked_time(run), pace or Pace.of(model, run))
+    found = evaluated(replay, np.zeros(0), columns)
+    return {name: share * np.asarray(own) for name, own in zip(names, found, strict=True)}
 
 
 def acting(model: Dynamics, run: Run, along: Array, P: Array) -> Array:

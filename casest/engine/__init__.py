@@ -6,6 +6,7 @@ operations (`operations`): NumPy, C and exported programs read the same rows.
 
 from __future__ import annotations
 
+from casest.engine.chain import chained
 from casest.engine.kernel import by_workers, evaluated
 from casest.engine.normal import (
     Normal,
@@ -27,6 +28,7 @@ __all__ = [
     "Replay",
     "Samples",
     "by_workers",
+    "chained",
     "cost",
     "evaluated",
     "normal_equations",

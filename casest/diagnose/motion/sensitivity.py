@@ -19,10 +19,10 @@ from casest.data.run import Run
 from casest.declaration.shapes import Array
 from casest.diagnose.motion.slopes import batches, slopes
 from casest.dynamics.declare import Dynamics
-from casest.dynamics.discrete import linear_recursion
 from casest.dynamics.filter import Filtered
 from casest.dynamics.transition import variances
 from casest.effects.moving import Candidate
+from casest.engine import chained
 
 #: Numbers that are worked on at once, as values of slopes along a record.
 TOGETHER = 4_000_000
@@ -125,7 +125,7 @@ def _answers(g: Gains, F: Array, G: Array) -> tuple[Array, Array]:
     pushed = g.begun @ F[:-1] + g.ended @ F[1:] if F.any() else None
     if pushed is not None:
         met[1:] += g.left[1:] @ pushed
-    X = linear_recursion(g.later, met[1:], met[0])  # after each reading
+    X = chained(g.later, met[1:], met[0])  # after each reading
     before = g.Phi @ X[:-1]
     if pushed is not None:
         before += pushed
@@ -153,7 +153,7 @@ def pushes(
     through = (g.C[1:] @ g.Phi).transpose(0, 2, 1) @ said[1:]
     # λ: of the state after a reading; what comes after the last one is nothing.
     after = np.zeros((len(z), F.shape[1], z.shape[2]))
-    after[:-1] = linear_recursion(g.later[-2::-1].transpose(0, 2, 1), through[-2::-1], through[-1])[
+    after[:-1] = chained(g.later[-2::-1].transpose(0, 2, 1), through[-2::-1], through[-1])[
         ::-1
     ]
     on_step = g.C[1:].transpose(0, 2, 1) @ said[1:] + g.left[1:].transpose(0, 2, 1) @ after[1:]
