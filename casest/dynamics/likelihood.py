@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from casest.data.run import Run
 from casest.declaration.shapes import Array
-from casest.declaration.tracing import flat
 from casest.dynamics import factors
 from casest.dynamics.declare import Dynamics
 from casest.dynamics.inputs import scatter, unstated
@@ -71,9 +70,9 @@ class Prepared:
         """Names of the intensities: inputs and states, then outputs."""
         return (*self.units, *self.readings)
 
-    def driven(self, intensities: Mapping[str, float], process: Array) -> Linearised:
-        """The system with noise of these intensities, which is `process` between samples: of every
-        step the sum of what each of them makes of it."""
+    def driven(self, intensities: Mapping[str, float]) -> Linearised:
+        """The system with noise of these intensities: of every step the sum of what each of them
+        makes of it. Between samples it is not told again (`process` is that of `model`)."""
         n = self.model.size
         Q, place = np.zeros((len(self.numbers) - 1, n, n)), len(reach(self.model.traced.A)) + n
         for name, pattern in self.units.items():
@@ -82,7 +81,7 @@ class Prepared:
             place += len(rows)
         rows, columns = np.triu_indices(n, 1)
         Q[:, columns, rows] = Q[:, rows, columns]
-        return self.system.driven(process, Q)
+        return self.system.driven(self.system.process, Q)
 
 
 def noiseless(model: Dynamics, run: Run) -> set[str]:

@@ -1,22 +1,11 @@
-"""x(k+1) = M(k)x(k) + b(k) for matrices of any size: what a filter does to what it lacks.
-
-Compiled by the machine's C compiler it takes a tenth of what NumPy's calls take. Compiling is done
-once so much has been computed without; what is in the cache folder already is used at once.
-"""
+"""x(k+1) = M(k)x(k) + b(k) for matrices of any size: what a filter does to what it lacks."""
 
 from __future__ import annotations
 
-import ctypes
-import os
-
 import numpy as np
 
-from casest.engine.kernel import library
+from casest.engine.compiled import Compiled
 from casest.engine.operations import Floats
-
-#: Steps from which on a compiler is worthwhile.
-WORTHWHILE = 20_000
-_FLAGS = [["-O3", "-march=native", "-ffp-contract=off"], ["-O2", "-ffp-contract=off"]]
 
 _SOURCE = """
 void casest_chain(const double *M, const double *b, double *x, long count, long n, long p) {
@@ -31,42 +20,18 @@ void casest_chain(const double *M, const double *b, double *x, long count, long 
 """
 
 
-class _Chain:
-    """The compiled loop, once it is there."""
-
-    def __init__(self) -> None:
-        self.found: ctypes.CDLL | None = None
-        self.seen = 0
-        self.looked = self.built = False
-
-    def compiled(self, count: int) -> ctypes.CDLL | None:
-        wish = os.environ.get("CASEST_KERNEL", "auto")
-        if wish == "off":
-            return None
-        self.seen += count
-        due = wish == "always" or self.seen > WORTHWHILE
-        if self.found is None and (due > self.built or not self.looked):
-            self.looked, self.built = True, due
-            self.found = library(_SOURCE, _FLAGS, build=due)
-        return self.found
-
-
-_CHAIN = _Chain()
+_CHAIN = Compiled("casest_chain", _SOURCE)
 
 
 def chained(M: Floats, b: Floats, first: Floats) -> Floats:
     """All x, (K + 1, n, p), from x(0) = first (n, p); M (K, n, n) and b (K, n, p)."""
-    compiled = _CHAIN.compiled(len(b))
-    if compiled is None:
+    if not _CHAIN.ready(len(b)):
         return _in_stretches(M, b, first)
     M, b = (np.ascontiguousarray(part, float) for part in (M, b))
     count, n, p = b.shape
     found = np.empty((count + 1, n, p))
     found[0] = first
-    compiled.casest_chain(
-        *[ctypes.c_void_p(part.ctypes.data) for part in (M, b, found)],
-        *[ctypes.c_long(size) for size in (count, n, p)],
-    )
+    _CHAIN([M, b, found], [count, n, p])
     return found
 
 

@@ -183,8 +183,8 @@ def _most_likely(shapes: Array, mean: Array, count: Array) -> Array:
     """
     mean, count = mean.T, count.T
     small = 1e-9 * np.eye(shapes.shape[1])
-    about = (shapes.T @ (count[:, :, None] * shapes) + small, (count * np.log(mean)) @ shapes)
-    b = np.linalg.solve(about[0], about[1][:, :, None])
+    told = shapes.T @ (count[:, :, None] * shapes) + small
+    b: Array = np.linalg.solve(told, ((count * np.log(mean)) @ shapes)[:, :, None]).astype(float)
 
     def at(b: Array) -> tuple[Array, Array]:
         """The cost, and the means as shares of the curve."""

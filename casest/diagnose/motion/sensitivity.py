@@ -22,7 +22,7 @@ from casest.dynamics.declare import Dynamics
 from casest.dynamics.filter import Filtered
 from casest.dynamics.transition import variances
 from casest.effects.moving import Candidate
-from casest.engine import chained
+from casest.engine import Compiled, chained
 
 #: Numbers that are worked on at once, as values of slopes along a record.
 TOGETHER = 4_000_000
@@ -117,20 +117,61 @@ def sensitivity(
     return Sensitivity(g.z, H, g.L, moves, tuple(columns))
 
 
+#: before: what a number does to the state before a reading; X: after it.
+_SOURCE = """
+static void add(double *to, const double *M, const double *x, long r, long n, long p, int less) {
+  for (long i = 0; i < r; ++i)
+    for (long l = 0; l < n; ++l) {
+      const double own = less ? -M[i * n + l] : M[i * n + l];
+      for (long j = 0; j < p; ++j) to[i * p + j] += own * x[l * p + j];
+    }
+}
+void casest_answers(const double *Phi, const double *begun, const double *ended, const double *C,
+                    const double *K, const double *back, const double *F, const double *G,
+                    double *X, double *own, double *H, double *squares,
+                    long count, long n, long m, long p, long pushed, long first) {
+  for (long k = 0; k < count; ++k) {
+    double *before = X + (k + 1) % 2 * n * p, *after = X + k % 2 * n * p;
+    for (long i = 0; i < n * p; ++i) after[i] = 0;
+    if (k) {
+      add(after, Phi + (k - 1) * n * n, before, n, n, p, 0);
+      if (pushed) {
+        add(after, begun + (k - 1) * n * n, F + (k - 1) * n * p, n, n, p, 0);
+        add(after, ended + (k - 1) * n * n, F + k * n * p, n, n, p, 0);
+      }
+    }
+    for (long i = 0; i < m * p; ++i) own[i] = G[k * m * p + i];
+    add(own, C + k * m * n, after, m, n, p, 0);
+    for (long i = 0; i < m * p; ++i) H[k * m * p + i] = 0;
+    add(H + k * m * p, back + k * m * m, own, m, m, p, 0);
+    add(after, K + k * n * m, own, n, m, p, 1);
+    for (long i = 0; k >= first && i < n * p; ++i) squares[i] += after[i] * after[i];
+  }
+}
+"""
+_ANSWERS = Compiled("casest_answers", _SOURCE)
+
+
 def _answers(g: Gains, F: Array, G: Array) -> tuple[Array, Array]:
     """H (N, m, p), and what each number does to the states, rms (n, p), of F = ∂f/∂k (N, n, p) and
     G = ∂h/∂k (N, m, p)."""
     G = np.where(g.present[:, :, None], G, 0.0)
+    (count, m, p), n, pushed = G.shape, F.shape[1], bool(F.any())
+    first = count // 5
+    if _ANSWERS.ready(count):
+        H, squares = np.empty(G.shape), np.zeros((n, p))
+        given = [g.Phi, g.begun, g.ended, g.C, g.K, g.back, F, G]
+        room = [np.empty((2, n, p)), np.empty((m, p)), H, squares]
+        given = [np.ascontiguousarray(part, float) for part in given]
+        _ANSWERS([*given, *room], [count, n, m, p, int(pushed), first])
+        return H, np.sqrt(squares / (count - first))
     met = -(g.K @ G)
-    pushed = g.begun @ F[:-1] + g.ended @ F[1:] if F.any() else None
-    if pushed is not None:
-        met[1:] += g.left[1:] @ pushed
+    by_steps = g.begun @ F[:-1] + g.ended @ F[1:] if pushed else np.zeros((1, 1, 1))
+    if pushed:
+        met[1:] += g.left[1:] @ by_steps
     X = chained(g.later, met[1:], met[0])  # after each reading
-    before = g.Phi @ X[:-1]
-    if pushed is not None:
-        before += pushed
-    G[1:] += g.C[1:] @ before
-    return g.back @ G, np.sqrt(np.mean(X[len(X) // 5 :] ** 2, axis=0))
+    G[1:] += g.C[1:] @ (g.Phi @ X[:-1] + by_steps)
+    return g.back @ G, np.sqrt(np.mean(X[first:] ** 2, axis=0))
 
 
 def pushes(
@@ -153,9 +194,7 @@ def pushes(
     through = (g.C[1:] @ g.Phi).transpose(0, 2, 1) @ said[1:]
     # λ: of the state after a reading; what comes after the last one is nothing.
     after = np.zeros((len(z), F.shape[1], z.shape[2]))
-    after[:-1] = chained(g.later[-2::-1].transpose(0, 2, 1), through[-2::-1], through[-1])[
-        ::-1
-    ]
+    after[:-1] = chained(g.later[-2::-1].transpose(0, 2, 1), through[-2::-1], through[-1])[::-1]
     on_step = g.C[1:].transpose(0, 2, 1) @ said[1:] + g.left[1:].transpose(0, 2, 1) @ after[1:]
     own = G.transpose(0, 2, 1) @ (said - g.K.transpose(0, 2, 1) @ after)
     if F.any():

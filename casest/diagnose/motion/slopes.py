@@ -60,7 +60,9 @@ def slopes(
         if all(c is not w for w in wanted) and (c not in tried or np.any(v))
     ]
     assert len(several) in (0, len(wanted))
-    replay, grown = _function(model, *(tuple(map(_plain, g)) for g in ([c for c, _ in others], wanted)))
+    replay, grown = _function(
+        model, *(tuple(map(_plain, g)) for g in ([c for c, _ in others], wanted))
+    )
     held = [[float(v) for _, v in c.held] for c in (*(c for c, _ in others), *wanted)]
     numbers = np.concatenate([*(v for _, v in others), *own, *held])
     n, x = model.size, np.ascontiguousarray(along[:, : model.size])
