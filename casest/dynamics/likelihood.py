@@ -7,7 +7,7 @@ and nothing could be traced.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -173,16 +173,22 @@ def _spread(model: Dynamics) -> Pattern:
 
 def whitened(ready: Prepared, intensities: Mapping[str, float]) -> tuple[Array, Array]:
     """Innovations component by component (N, m), each given those before it, and variances."""
+    return several_whitened(ready, [intensities])[0]
+
+
+def several_whitened(
+    ready: Prepared, several: Sequence[Mapping[str, float]]
+) -> list[tuple[Array, Array]]:
+    """The same with each of several intensities."""
     t = ready.model.traced
     rows = tuple((r.start, r.stop) for r in ready.readings.values())
     patterns = reach(t.A), tuple(ready.units.values()), entries(t.C)
     step = _likelihood_step(ready.model.size, rows, *patterns)
-    given = np.array([intensities[name] for name in ready.names])
     n = ready.model.size
     first = [ready.model.start, np.diag(ready.model.start_covariance), np.zeros(n * (n - 1) // 2)]
-    state = np.concatenate([*first, given])
-    _, e, s = step(state, ready.numbers, keep=False)
-    return e, s
+    given = [np.array([own[name] for name in ready.names]) for own in several]
+    states = np.array([np.concatenate([*first, own]) for own in given])
+    return [(e, s) for _, e, s in step.beside(states, ready.numbers)]
 
 
 def likelihood(ready: Prepared, intensities: Mapping[str, float]) -> float:
@@ -214,19 +220,24 @@ def matched(
     top = np.minimum(middle + RANGE, np.log([(most or {}).get(n, np.inf) for n in names]))
     bottom = np.minimum(middle, top) - RANGE
 
-    def at(where: Array) -> tuple[Array, Array, float]:
-        e, s = whitened(ready, dict(zip(names, np.exp(where).tolist(), strict=True)))
-        return e, s, _log_density(ready, e, s)
+    def all_at(several: Sequence[Array]) -> list[tuple[Array, Array, float]]:
+        given = [dict(zip(names, np.exp(x).tolist(), strict=True)) for x in several]
+        return [(e, s, _log_density(ready, e, s)) for e, s in several_whitened(ready, given)]
 
-    tries = ((x, at(x)) for x in np.clip(starts, bottom, top))
+    def at(where: Array) -> tuple[Array, Array, float]:
+        return all_at([where])[0]
+
+    clipped = list(np.clip(starts, bottom, top))
+    tries = zip(clipped, all_at(clipped), strict=True)
     logs, found = max(tries, key=lambda pair: pair[1][2])
     damping = 1e-3
     for _ in range(rounds):
-        moved = [at(logs + STEP * unit) for unit in np.eye(len(names))]
+        moved = all_at([logs + STEP * unit for unit in np.eye(len(names))])
         gradient, information = _scoring(ready.present, found, moved)
         if exactly:
-            back = [at(logs - STEP * unit)[2] for unit in np.eye(len(names))]
-            gradient = (np.array([m[2] for m in moved]) - back) / (2 * STEP)
+            back = all_at([logs - STEP * unit for unit in np.eye(len(names))])
+            gradient = np.array([m[2] - b[2] for m, b in zip(moved, back, strict=True)])
+            gradient /= 2 * STEP
         held = ((logs >= top) & (gradient > 0)) | ((logs <= bottom) & (gradient < 0))
         gradient = np.where(held, 0.0, gradient)
         information[held] = information[:, held] = 0.0
