@@ -64,7 +64,8 @@ def with_noises(
     A1, c1 = ending or (A[1:], c[1:])
     ends = A[:-1], A1, c[:-1], c1
     noises = [(Xi[:-1], Xi[1:]) if Xi.ndim == 3 else (Xi, Xi) for Xi in Xis]
-    fast = balance(np.abs(A).max(axis=0))[1] * h
+    high, low = _range(A)
+    fast = balance(np.maximum(high, -low))[1] * h
     if fast.max(initial=0.0) <= _SLOW[-1]:
         return _slow(ends, noises, h, float(fast.max(initial=0.0)))
     with np.errstate(all="ignore"):
@@ -136,11 +137,11 @@ def _slow(
     A0, A1, c0, c1 = ends
     n, count = A0.shape[1], len(h)
     D = A1 - A0
-    of_A, of_D = (_pattern(M.any(axis=0)) for M in (A1, D))
+    of_A, of_D = (_pattern(_there(*_range(M))) for M in (A1, D))
     columns, given, of_X = [_picked(A1, of_A), _picked(D, of_D), c0, c1], [np.zeros(0)], []
     for X0, X1 in noises:
         even = X0.ndim == 2
-        there = np.asarray(X0 != 0 if even else ((X0 != 0) | (X1 != 0)).any(axis=0))
+        there = X0 != 0 if even else _there(*_range(X0)) | _there(*_range(X1))
         own = _pattern(np.triu(there))
         of_X.append((own, even))
         if even:
@@ -152,6 +153,16 @@ def _slow(
     Phi, forced, *Q = evaluated(replay, np.concatenate(given), Columns([*columns, h[:, None]]))
     Phi, forced = np.asarray(Phi), np.asarray(forced).reshape(count, n)
     return [Motions(Phi, forced, np.asarray(each)) for each in Q]
+
+
+def _range(matrices: Array) -> tuple[Array, Array]:
+    """Largest and smallest of every entry, (n, n) each."""
+    return matrices.max(axis=0, initial=0.0), matrices.min(axis=0, initial=0.0)
+
+
+def _there(high: Array, low: Array) -> Any:
+    """Which entries are anything but nothing; what is no number is something."""
+    return (high != 0) | (low != 0)
 
 
 def _pattern(there: Any) -> Pattern:
