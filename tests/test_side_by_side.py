@@ -1,136 +1,62 @@
-"""`casest report`: results side by side, what differs named, what agrees left in peace."""
+"""Loops over samples in C and in lanes: the same as one after the other, whatever the compiler."""
 
-from __future__ import annotations
-
-import json
-import re
-
+import casadi as ca
 import numpy as np
 import pytest
-import simulators as sim
-from scipy import stats
 
-from casest.cli import run
-from casest.results.side_by_side import welch
+from casest.engine import Recursion, chained
+from casest.engine.chain import _in_stretches
+from casest.engine.kernel import compiles
 
-
-@pytest.fixture(scope="module")
-def line(tmp_path_factory):
-    """One sensor on five days, whose third offset has moved on the last, and one record in g."""
-    folder, rng = tmp_path_factory.mktemp("line"), np.random.default_rng(12)
-    sensor = sim.accelerometer(rng, skew=False)
-    for day in range(1, 6):
-        v = sensor.read(sim.spread_poses(40, rng), 5e-3, rng)
-        v[:, 2] += 0.1 * (day == 5)
-        unit, scale = ("g", sim.GRAVITY) if day == 2 else ("m/s^2", 1.0)
-        file, names = folder / f"{day}.csv", ",".join(f"v{a} [{unit}]" for a in "xyz")
-        np.savetxt(file, v / scale, delimiter=",", header=names, comments="")
-        words = ["--set", "norm=9.80665 m/s^2", "-o", str(folder / f"2026-05-0{day}" / "fit")]
-        assert run(["calibrate", "norm-diagonal", str(file), *words]) == 0
-    return folder
+needs_a_compiler = pytest.mark.skipif(not compiles(), reason="no compiler here")
 
 
-def days(line, *chosen):
-    return [str(line / f"2026-05-0{k}" / "fit") for k in chosen]
+def one_by_one(M, b, first):
+    found = [first]
+    for own, pushed in zip(M, b, strict=True):
+        found.append(own @ found[-1] + pushed)
+    return np.array(found)
 
 
-def asked(capsys, *words):
-    capsys.readouterr()
-    assert run(["report", *words, "--json"]) == 0
-    return json.loads(capsys.readouterr().out)
+@pytest.mark.parametrize("kernel", ["off", pytest.param("always", marks=needs_a_compiler)])
+@pytest.mark.parametrize("size", [(1, 1, 1), (50, 4, 1), (401, 9, 7)])
+def test_a_chain_of_steps_is_that_of_numpy_step_by_step(kernel, size, monkeypatch):
+    monkeypatch.setenv("CASEST_KERNEL", kernel)
+    count, n, p = size
+    rng = np.random.default_rng(count)
+    M, b = 0.3 * rng.standard_normal((count, n, n)), rng.standard_normal((count, n, p))
+    first = rng.standard_normal((n, p))
+    expected = one_by_one(M, b, first)
+    np.testing.assert_allclose(chained(M, b, first), expected, rtol=1e-12, atol=1e-13)
+    # Views that run backwards, and turned ones, as a filter's adjoint hands them over.
+    turned = chained(M[::-1].transpose(0, 2, 1), b[::-1], first)
+    assert np.allclose(turned, one_by_one(M[::-1].transpose(0, 2, 1), b[::-1], first), 1e-12)
+    np.testing.assert_allclose(_in_stretches(M, b, first), expected, rtol=1e-12, atol=1e-13)
 
 
-def said(capsys, *words):
-    capsys.readouterr()
-    code = run(["report", *map(str, words)])
-    printed = capsys.readouterr()
-    return code, printed.out, printed.err
+def step(with_sine):
+    x, u = ca.SX.sym("x", 3), ca.SX.sym("u", 2)
+    pushed = ca.fmax(x[0], u[0]) / (2 + x[1] ** 2)
+    kept = ca.if_else(x[2] > u[1], x[2] / 3, -0.5 * x[0])
+    bent = ca.sin(x[1]) if with_sine else x[1] - 0.25 * x[0]
+    later = ca.vertcat(0.5 * pushed, bent, kept + 1e-3)
+    return ca.Function("step", [x, u], [later, ca.vertcat(pushed, kept), x[0] * u[0]])
 
 
-def test_the_test_of_agreement_is_welchs():
-    """Of plain means it is the Welch ANOVA that SciPy has."""
-    rng = np.random.default_rng(1)
-    groups = [rng.normal(0.4 * k, 1 + k, 6 + 3 * k) for k in range(4)]
-    x = np.array([g.mean() for g in groups])
-    std = np.array([g.std(ddof=1) / np.sqrt(len(g)) for g in groups])
-    freedom = np.array([len(g) - 1.0 for g in groups])
-    expected = stats.f_oneway(*groups, equal_var=False).pvalue
-    assert welch(x, std, freedom)[2] == pytest.approx(expected, rel=1e-9)
-
-
-def test_what_agrees_is_said_to_agree(line, capsys):
-    code, out, _ = said(capsys, *days(line, 1, 2, 3, 4))
-    assert code == 0
-    assert out.startswith("4 results of norm-diagonal agree in all 6 numbers that they share.")
-
-
-def test_the_number_that_has_changed_is_named_and_the_result_that_is_off(line, capsys):
-    found = asked(capsys, *days(line, 1, 3, 4, 5))
-    by_name = {n["name"]: n for n in found["numbers"]}
-    assert by_name["offset[2]"]["p_value"] < 1e-6
-    assert by_name["offset[2]"]["furthest"] == "2026-05-05"
-    assert by_name["offset[0]"]["p_value"] > 0.01
-    assert (
-        "differ in 1 of 6 numbers by more than chance:\noffset[2]."
-        in said(capsys, *days(line, 1, 3, 4, 5))[1]
-    )
-
-
-def test_results_in_other_units_are_converted(line, capsys):
-    found = asked(capsys, *days(line, 1, 2))
-    offset = next(n for n in found["numbers"] if n["name"] == "offset[0]")
-    assert offset["unit"] == "m/s^2"
-    one, other = (v["value"] for v in offset["values"])
-    assert other == pytest.approx(one, abs=6 * offset["mean_std"])
-
-
-def test_dates_and_numbers_in_the_names_order_the_results(line, capsys, tmp_path):
-    found = asked(capsys, *days(line, 4, 1, 3))
-    assert [r["label"] for r in found["results"]] == ["2026-05-01", "2026-05-03", "2026-05-04"]
-    assert [r["at"] for r in found["results"]] == [0.0, 2.0, 3.0]
-    for k, name in enumerate(("25C", "-10C", "60C"), 1):
-        (tmp_path / name).symlink_to(line / f"2026-05-0{k}" / "fit")
-    found = asked(capsys, *(str(tmp_path / name) for name in ("25C", "-10C", "60C")))
-    assert [r["at"] for r in found["results"]] == [-10.0, 25.0, 60.0]
-    assert found["over"] == "# in #C"
-
-
-def test_the_page_shows_what_differs_before_the_rest(line, tmp_path):
-    page = tmp_path / "page.html"
-    assert run(["report", *days(line, 1, 3, 4, 5), "-o", str(page)]) == 0
-    text = page.read_text(encoding="utf-8")
-    assert "<h1" in text
-    titles = re.findall(r"<h2>(.*?)</h2>", text)
-    assert titles == ["What differs", "All numbers", "Intervals", "The results"]
-    data = json.loads(re.search(r'id="data">(.*?)</script>', text, re.DOTALL)[1])
-    first, rest = data["figures"]
-    assert [p["title"].partition(" ")[0] for p in first["panels"]] == ["offset[2]"]
-    assert {p["y"]["label"] for p in first["panels"]} == {"value"}  # the title has the name
-    assert len(rest["panels"]) == 5
-    links = re.findall(r'<a href="([^"#]+report.html)"', text)
-    assert all((tmp_path / link).is_file() for link in links)
-    assert len(links) == 4
-
-
-def test_one_result_is_a_page_too(line, tmp_path, capsys):
-    assert run(["report", days(line, 1)[0], "-o", str(tmp_path / "new")]) == 0
-    assert "One result of norm-diagonal" in (tmp_path / "new" / "report.html").read_text()
-    assert capsys.readouterr().out.startswith("One result of norm-diagonal.\n")
-
-
-def test_a_refused_result_is_shown_and_not_counted(line, tmp_path, capsys):
-    poses = str(line / "1.csv")
-    assert run(["calibrate", "norm-full", poses, "-o", str(tmp_path)]) == 2
-    code, _, err = said(capsys, *days(line, 1), tmp_path)
-    assert code == 1
-    assert "have no number in common that two of them are sure of" in err
-    code, out, _ = said(capsys, *days(line, 1, 3), tmp_path)
-    assert code == 0
-    assert "NOT TRUSTED" in out
-
-
-def test_what_cannot_be_compared_is_said(line, tmp_path, capsys):
-    code, _, err = said(capsys, days(line, 1)[0], days(line, 1)[0])
-    assert (code, "given twice" in err) == (1, True)
-    code, _, err = said(capsys, days(line, 1)[0], tmp_path / "no")
-    assert (code, "no such result" in err) == (1, True)
+@needs_a_compiler
+@pytest.mark.parametrize("with_sine", [False, True])
+@pytest.mark.parametrize("several", [2, 4, 5, 11])
+def test_runs_in_lanes_have_the_digits_of_single_ones(with_sine, several, monkeypatch):
+    """A step with a sine cannot be turned into lanes, and runs one by one."""
+    rng = np.random.default_rng(several)
+    states, numbers = rng.standard_normal((several, 3)), rng.standard_normal((70, 2))
+    monkeypatch.setenv("CASEST_KERNEL", "off")
+    expected = [Recursion(step(with_sine))(s, numbers, keep=False) for s in states]
+    monkeypatch.setenv("CASEST_KERNEL", "always")
+    runs = Recursion(step(with_sine))
+    found = runs.beside(states, numbers)
+    (own,) = runs._beside.values()
+    assert (own["library"] is None) == with_sine
+    for own, other in zip(found, expected, strict=True):
+        for a, b in zip(own, other, strict=True):
+            assert np.array_equal(a, b)

@@ -50,13 +50,26 @@ def motions(
     c at the end of every step, where they jump there. Where a motion grows beyond what numbers
     hold, what is not finite is returned.
     """
+    return with_noises(A, c, [Xi], h, ending)[0]
+
+
+def with_noises(
+    A: Array,
+    c: Array,
+    Xis: Sequence[Array],
+    h: Array,
+    ending: tuple[Array, Array] | None = None,
+) -> list[Motions]:
+    """The same of one motion with each of several noises: Φ and forced step are found once."""
     A1, c1 = ending or (A[1:], c[1:])
-    ends = A[:-1], A1, c[:-1], c1, *((Xi[:-1], Xi[1:]) if Xi.ndim == 3 else (Xi, Xi))
-    fast = balance(np.abs(A).max(axis=0))[1] * h
+    ends = A[:-1], A1, c[:-1], c1
+    noises = [(Xi[:-1], Xi[1:]) if Xi.ndim == 3 else (Xi, Xi) for Xi in Xis]
+    high, low = _range(A)
+    fast = balance(np.maximum(high, -low))[1] * h
     if fast.max(initial=0.0) <= _SLOW[-1]:
-        return _slow(ends, h, float(fast.max(initial=0.0)))
+        return _slow(ends, noises, h, float(fast.max(initial=0.0)))
     with np.errstate(all="ignore"):
-        return _any(ends, h, fast)
+        return [_any((*ends, *noise), h, fast) for noise in noises]
 
 
 def _any(ends: Sequence[Array], h: Array, fast: Array) -> Motions:
@@ -92,7 +105,7 @@ def _doubled(piece: list[Array], h: Array, times: int) -> Motions:
         piece = [
             M for s, e in zip(piece[::2], piece[1::2], strict=True) for M in 2 * [0.5 * (s + e)]
         ]
-    own = _slow(piece, h / 2.0**times, _SLOW[-1])
+    (own,) = _slow(piece[:4], [(piece[4], piece[5])], h / 2.0**times, _SLOW[-1])
     for _ in range(min(times, DOUBLINGS)):
         own = _after(own, own)
     return own
@@ -118,22 +131,38 @@ def balance(size: Array) -> tuple[Array, float]:
     return np.asarray(units, float), float(even.sum(axis=1).max())
 
 
-def _slow(ends: Sequence[Array], h: Array, fast: float) -> Motions:
-    A0, A1, c0, c1, X0, X1 = ends
+def _slow(
+    ends: Sequence[Array], noises: Sequence[tuple[Array, Array]], h: Array, fast: float
+) -> list[Motions]:
+    A0, A1, c0, c1 = ends
     n, count = A0.shape[1], len(h)
     D = A1 - A0
-    of_A, of_D = (_pattern(M.any(axis=0)) for M in (A1, D))
-    even = X0.ndim == 2
-    there = np.asarray(X0 != 0 if even else ((X0 != 0) | (X1 != 0)).any(axis=0))
-    of_X = _pattern(np.triu(there))
-    columns = [_picked(A1, of_A), _picked(D, of_D), c0, c1]
-    if not even:
-        columns += [_picked(X0, of_X), _picked(X1, of_X)]
+    of_A, of_D = (_pattern(_there(*_range(M))) for M in (A1, D))
+    columns, given, of_X = [_picked(A1, of_A), _picked(D, of_D), c0, c1], [np.zeros(0)], []
+    for X0, X1 in noises:
+        even = X0.ndim == 2
+        there = X0 != 0 if even else _there(*_range(X0)) | _there(*_range(X1))
+        own = _pattern(np.triu(there))
+        of_X.append((own, even))
+        if even:
+            given.append(X0[tuple(np.array(own, int).reshape(-1, 2).T)])
+        else:
+            columns += [_picked(X0, own), _picked(X1, own)]
     order = _SERIES[int(fast > _SLOW[0])]
-    replay = _replay(n, of_A, of_D, of_X, even, order)
-    given = X0[tuple(np.array(of_X, int).reshape(-1, 2).T)] if even else np.zeros(0)
-    Phi, forced, Q = evaluated(replay, given, Columns([*columns, h[:, None]]))
-    return Motions(np.asarray(Phi), np.asarray(forced).reshape(count, n), np.asarray(Q))
+    replay = _replay(n, of_A, of_D, tuple(of_X), order)
+    Phi, forced, *Q = evaluated(replay, np.concatenate(given), Columns([*columns, h[:, None]]))
+    Phi, forced = np.asarray(Phi), np.asarray(forced).reshape(count, n)
+    return [Motions(Phi, forced, np.asarray(each)) for each in Q]
+
+
+def _range(matrices: Array) -> tuple[Array, Array]:
+    """Largest and smallest of every entry, (n, n) each."""
+    return matrices.max(axis=0, initial=0.0), matrices.min(axis=0, initial=0.0)
+
+
+def _there(high: Array, low: Array) -> Any:
+    """Which entries are anything but nothing; what is no number is something."""
+    return (high != 0) | (low != 0)
 
 
 def _pattern(there: Any) -> Pattern:
@@ -146,41 +175,50 @@ def _picked(matrices: Array, pattern: Pattern) -> Array:
 
 
 @lru_cache(maxsize=32)
-def _replay(n: int, of_A: Pattern, of_D: Pattern, of_X: Pattern, even: bool, order: int) -> Replay:
+def _replay(
+    n: int, of_A: Pattern, of_D: Pattern, of_X: tuple[tuple[Pattern, bool], ...], order: int
+) -> Replay:
+    """`of_X`: of every noise its pattern, and whether it is the same everywhere."""
     (a, A), (d, D) = (_symbols(name, n, p) for name, p in (("A", of_A), ("D", of_D)))
     c0, c1, h = ca.SX.sym("c0", n), ca.SX.sym("c1", n), ca.SX.sym("h")
-    (x0, X0), (x1, X1) = (_symbols(name, n, of_X, True) for name in ("X0", "X1"))
+    sample, known, noises = [a, d, c0, c1], [ca.SX(0, 1)], []
+    for pattern, even in of_X:
+        (x0, X0), (x1, X1) = (_symbols(name, n, pattern, True) for name in ("X0", "X1"))
+        known += [x0] if even else []
+        sample += [] if even else [x0, x1]
+        noises.append((X0, X0 if even else X1))
 
-    def at(tau: float) -> tuple[Any, Any]:
-        return c1 - tau * (c1 - c0), X0 if even else X1 - tau * (X1 - X0)
+    def at(tau: float) -> tuple[Any, list[Any]]:
+        each = [X1 if X0 is X1 else X1 - tau * (X1 - X0) for X0, X1 in noises]
+        return c1 - tau * (c1 - c0), each
 
     Phi, forced, Q = expressions(A, D, at, h, order)
-    sample = [a, d, c0, c1, *(() if even else (x0, x1)), h]
-    outputs = [ca.densify(e) for e in (Phi, forced, Q)]
-    names = ["parameters", "sample"], ["Phi", "forced", "Q"]
-    known = x0 if even else ca.SX.sym("none", 0)
-    return Replay(ca.Function("between", [known, ca.vertcat(*sample)], outputs, *names))
+    outputs = [ca.densify(e) for e in (Phi, forced, *Q)]
+    names = ["parameters", "sample"], [f"o{k}" for k in range(len(outputs))]
+    given = [ca.densify(ca.vertcat(*known)), ca.vertcat(*sample, h)]
+    return Replay(ca.Function("between", given, outputs, *names))
 
 
 def expressions(
-    A: Any, D: Any, at: Callable[[float], tuple[Any, Any]], h: Any, order: int
-) -> tuple[Any, Any, Any]:
-    """Φ, forced step and Q of one step in CasADi's symbols: A at its end, D what A has changed by,
-    c and Ξ at τ, which runs from the end, 0, back to the beginning, 1."""
+    A: Any, D: Any, at: Callable[[float], tuple[Any, list[Any]]], h: Any, order: int
+) -> tuple[Any, Any, list[Any]]:
+    """Φ, forced step and every Q of one step in CasADi's symbols: A at its end, D what A has
+    changed by, c and each Ξ at τ, which runs from the end, 0, back to the beginning, 1."""
     n = A.size1()
-    forced, Q = ca.SX(n, 1), ca.SX(n, n)
     *parts, (whole, _, _) = _parts(A, D, h, order)
+    forced, Q = ca.SX(n, 1), [ca.SX(n, n) for _ in at(0.0)[1]]
     for Phi, tau, weight in parts:
-        c, Xi = at(tau)
+        c, noises = at(tau)
         forced += weight * (Phi @ c)
-        Q += weight * ca.triu(Phi @ Xi @ Phi.T)
-    return whole, forced, Q + ca.triu(Q, False).T
+        Q = [own + weight * ca.triu(Phi @ Xi @ Phi.T) for own, Xi in zip(Q, noises, strict=True)]
+    return whole, forced, [own + ca.triu(own, False).T for own in Q]
 
 
 def noise_of(A: Any, D: Any, Xi: Callable[[float], Any], h: Any) -> Any:
     """Q alone of a step with ‖A‖h up to a half."""
     none = ca.SX(A.size1(), 1)
-    return expressions(A, D, lambda tau: (none, Xi(tau)), h, _SERIES[-1])[2]
+    (Q,) = expressions(A, D, lambda tau: (none, [Xi(tau)]), h, _SERIES[-1])[2]
+    return Q
 
 
 def _parts(A: Any, D: Any, h: Any, order: int) -> list[tuple[Any, float, Any]]:

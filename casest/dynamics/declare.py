@@ -292,7 +292,19 @@ class Dynamics:
             )
             if wrong:
                 raise UsageError(f"{self.name}: {name}: {wrong}")
-        return replace(self, sensors={**self.sensors, **intensities})
+        return self._alike(replace(self, sensors={**self.sensors, **intensities}))
+
+    def without_intensities(self) -> Dynamics:
+        """The same of which no noise is known but that of its outputs, if that is declared."""
+        states = tuple(replace(s, intensity=0.0) for s in self.states)
+        return self._alike(replace(self, states=states, sensors={}))
+
+    def _alike(self, other: Dynamics) -> Dynamics:
+        """Another one of the same equations, which are traced once."""
+        for name in ("traced", "slopes_in_signals"):
+            if name in self.__dict__:
+                other.__dict__[name] = self.__dict__[name]
+        return other
 
     def known_to(self, **stds: float) -> Dynamics:
         """The same with other standard deviations of the states at the beginning."""
@@ -318,7 +330,7 @@ class Dynamics:
         changed = tuple(
             replace(s, **{field: values[s.name]}) if s.name in values else s for s in self.states
         )
-        return replace(self, states=changed)
+        return self._alike(replace(self, states=changed))
 
     def __getitem__(self, name: str) -> State:
         """The state of that name."""
@@ -429,12 +441,21 @@ class Dynamics:
     @cached_property
     def input_noise(self) -> SX | None:
         """What the noise of the inputs adds to Ξ, ΣG·q·Gᵀ, as an expression; None: nothing."""
-        t = self.traced
-        slopes = [
-            (ca.jacobian(t.f, flat(t.symbols[name])), q) for name, q in self.sensors.items() if q
-        ]
-        found = [q * (G @ G.T) for G, q in slopes if G.nnz()]
+        found = [q * (G @ G.T) for G, q in ((self.slopes_in_signals[name], self.sensors[name])
+                 for name in self.noisy_inputs)]  # fmt: skip
         return sum(found[1:], found[0]) if found else None
+
+    @property
+    def noisy_inputs(self) -> tuple[str, ...]:
+        """Names of the signals whose noise drives the states."""
+        slopes = self.slopes_in_signals
+        return tuple(name for name, q in self.sensors.items() if q and slopes[name].nnz())
+
+    @cached_property
+    def slopes_in_signals(self) -> Mapping[str, SX]:
+        """∂f/∂signal of every signal."""
+        t = self.traced
+        return {s.name: ca.jacobian(t.f, flat(t.symbols[s.name])) for s in self.signals}
 
     # -- symbols -------------------------------------------------------------------------------
 

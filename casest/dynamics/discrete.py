@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from casest.declaration.shapes import Array
 from casest.dynamics.factors import size
 from casest.dynamics.stepping import Pattern, kalman_step, smoother_step, unpacked
+from casest.engine import chained
 
 
 @dataclass(frozen=True)
@@ -236,35 +237,6 @@ def _backwards(steps: Steps, factored: Array, told: Array, brief: bool) -> tuple
     return both[::-1], back[-1]
 
 
-def linear_recursion(M: Array, b: Array, first: Array) -> Array:
-    """x(k+1) = M(k)x(k) + b(k) from x(0) = first (n, p): all x, (K + 1, n, p).
-
-    M (K, n, n) and b (K, n, p); about √K stretches of √K steps go side by
-    side: first what each does to any beginning, then, the beginnings known, every step.
-    """
-    count, n, p = b.shape
-    length = max(1, int(np.sqrt(count)))
-    stretches = -(-count // length)
-    spare = stretches * length - count
-
-    def cut(parts: Array) -> Array:
-        padded = np.concatenate([parts, np.zeros((spare, *parts.shape[1:]))])
-        return padded.reshape(stretches, length, *parts.shape[1:])
-
-    M, b = cut(M), cut(b)
-    whole, ends = np.broadcast_to(np.eye(n), (stretches, n, n)), np.zeros((stretches, n, p))
-    for k in range(length):
-        whole, ends = M[:, k] @ whole, M[:, k] @ ends + b[:, k]
-    before = np.empty((stretches, n, p))
-    before[0] = first
-    for j in range(1, stretches):
-        before[j] = whole[j - 1] @ before[j - 1] + ends[j - 1]
-    found = np.empty((stretches, length, n, p))
-    for k in range(length):
-        found[:, k] = before = M[:, k] @ before + b[:, k]
-    return np.concatenate([first[None], found.reshape(-1, n, p)[:count]])
-
-
 def smoothed_states(steps: Steps, found: Estimates) -> Array:
     """The smoother's states alone, (N, n), for a fraction of the work (Bryson & Frazier 1963)."""
     m = steps.C.shape[1]
@@ -276,5 +248,5 @@ def smoothed_states(steps: Steps, found: Estimates) -> Array:
     # λ before a reading: what it says, and what is left of λ after it.
     left = np.eye(C.shape[2]) - told[:, :, 1:]
     M = left[:-1] @ steps.Phi.transpose(0, 2, 1)
-    back = linear_recursion(M[::-1], -told[-2::-1, :, :1], -told[-1, :, :1])[::-1]
+    back = chained(M[::-1], -told[-2::-1, :, :1], -told[-1, :, :1])[::-1]
     return np.asarray(found.predicted_x - (found.predicted_P @ back)[:, :, 0])

@@ -7,7 +7,7 @@ and nothing could be traced.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from casest.data.run import Run
 from casest.declaration.shapes import Array
-from casest.declaration.tracing import flat
 from casest.dynamics import factors
 from casest.dynamics.declare import Dynamics
 from casest.dynamics.inputs import scatter, unstated
@@ -29,8 +28,8 @@ from casest.dynamics.transition import (
     checked_time,
     linearised,
     lost,
-    process_along,
-    process_noise,
+    noises_along,
+    stepped_with,
     usual,
 )
 from casest.engine import Recursion
@@ -71,6 +70,19 @@ class Prepared:
         """Names of the intensities: inputs and states, then outputs."""
         return (*self.units, *self.readings)
 
+    def driven(self, intensities: Mapping[str, float]) -> Linearised:
+        """The system with noise of these intensities: of every step the sum of what each of them
+        makes of it. Between samples it is not told again (`process` is that of `model`)."""
+        n = self.model.size
+        Q, place = np.zeros((len(self.numbers) - 1, n, n)), len(reach(self.model.traced.A)) + n
+        for name, pattern in self.units.items():
+            rows, columns = np.array(pattern, int).reshape(-1, 2).T
+            Q[:, rows, columns] += intensities[name] * self.numbers[1:, place : place + len(rows)]
+            place += len(rows)
+        rows, columns = np.triu_indices(n, 1)
+        Q[:, columns, rows] = Q[:, rows, columns]
+        return self.system.driven(self.system.process, Q)
+
 
 def noiseless(model: Dynamics, run: Run) -> set[str]:
     """Inputs of which nobody stated a noise, and that show none: simulated, or known exactly."""
@@ -89,7 +101,7 @@ def reached(model: Dynamics, silent: Collection[str] = ()) -> tuple[list[str], l
     inputs, touched = [], np.zeros(model.size, dtype=bool)
     noisy = [s for s in model.signals if s.name not in (*t.measured, *model.exact, *silent)]
     for s in noisy:
-        slope = ca.jacobian(t.f, flat(t.symbols[s.name]))
+        slope = model.slopes_in_signals[s.name]
         if slope.nnz():
             inputs.append(s.name)
             touched[list(set(slope.sparsity().get_triplet()[0]))] = True
@@ -101,7 +113,7 @@ def reached(model: Dynamics, silent: Collection[str] = ()) -> tuple[list[str], l
 def prepared(model: Dynamics, run: Run, along: Array) -> Prepared:
     """Along states (N, n), where the model or its noise depends on them."""
     inputs, own = reached(model, noiseless(model, run))
-    silent = model.driven(**{s.name: 0.0 for s in model.states})
+    silent = model.without_intensities()
     checked_time(run)
     pace = Pace.of(model, run)
     shown = {
@@ -109,17 +121,19 @@ def prepared(model: Dynamics, run: Run, along: Array) -> Prepared:
         for name, std in unstated(model, run).items()
     }
     system = linearised(model.sensing(**shown), run, along)
-    Phi, forced = system.moved
     present = np.isfinite(system.y)
     t, count = model.traced, len(present)
-    alone = [silent.sensing(**{name: 1.0}) for name in inputs]
-    alone += [silent.driven(**{name: 1.0}) for name in own]
-    units = {name: _spread(one) for name, one in zip((*inputs, *own), alone, strict=True)}
-    first = np.eye(model.size)[None]
+    alone = {name: silent.sensing(**{name: 1.0}) for name in inputs}
+    alone |= {name: silent.driven(**{name: 1.0}) for name in own}
+    units = {name: _spread(one) for name, one in alone.items()}
+    first, none = np.eye(model.size)[None], np.zeros((model.size, model.size))
+    noises = noises_along(model, inputs, run, along) if inputs else {}
+    noises |= {name: alone[name].process for name in own}
+    moved = stepped_with(system, list(noises.values()) or [none])
+    Phi, forced = system.__dict__["moved"] = moved[0].Phi, moved[0].forced
     parts = [_picked(np.concatenate([first, Phi]), reach(t.A)), _after(forced, count)]
-    for one, pattern in zip(alone, units.values(), strict=True):
-        Q = process_noise(system, process_along(one, run, along))
-        parts.append(_after(_picked(Q, pattern), count))
+    for one, pattern in zip(moved, units.values(), strict=bool(alone)):
+        parts.append(_after(_picked(one.Q, pattern), count))
     parts.append(_after(lost(model, system.steps, pace), count))
     parts.append(_picked(np.where(present[:, :, None], system.C, 0.0), entries(t.C)))
     parts.append(np.where(present, system.y - system.d, 0.0))
@@ -159,16 +173,22 @@ def _spread(model: Dynamics) -> Pattern:
 
 def whitened(ready: Prepared, intensities: Mapping[str, float]) -> tuple[Array, Array]:
     """Innovations component by component (N, m), each given those before it, and variances."""
+    return several_whitened(ready, [intensities])[0]
+
+
+def several_whitened(
+    ready: Prepared, several: Sequence[Mapping[str, float]]
+) -> list[tuple[Array, Array]]:
+    """The same with each of several intensities."""
     t = ready.model.traced
     rows = tuple((r.start, r.stop) for r in ready.readings.values())
     patterns = reach(t.A), tuple(ready.units.values()), entries(t.C)
     step = _likelihood_step(ready.model.size, rows, *patterns)
-    given = np.array([intensities[name] for name in ready.names])
     n = ready.model.size
     first = [ready.model.start, np.diag(ready.model.start_covariance), np.zeros(n * (n - 1) // 2)]
-    state = np.concatenate([*first, given])
-    _, e, s = step(state, ready.numbers, keep=False)
-    return e, s
+    given = [np.array([own[name] for name in ready.names]) for own in several]
+    states = np.array([np.concatenate([*first, own]) for own in given])
+    return [(e, s) for _, e, s in step.beside(states, ready.numbers)]
 
 
 def likelihood(ready: Prepared, intensities: Mapping[str, float]) -> float:
@@ -200,19 +220,24 @@ def matched(
     top = np.minimum(middle + RANGE, np.log([(most or {}).get(n, np.inf) for n in names]))
     bottom = np.minimum(middle, top) - RANGE
 
-    def at(where: Array) -> tuple[Array, Array, float]:
-        e, s = whitened(ready, dict(zip(names, np.exp(where).tolist(), strict=True)))
-        return e, s, _log_density(ready, e, s)
+    def all_at(several: Sequence[Array]) -> list[tuple[Array, Array, float]]:
+        given = [dict(zip(names, np.exp(x).tolist(), strict=True)) for x in several]
+        return [(e, s, _log_density(ready, e, s)) for e, s in several_whitened(ready, given)]
 
-    tries = ((x, at(x)) for x in np.clip(starts, bottom, top))
+    def at(where: Array) -> tuple[Array, Array, float]:
+        return all_at([where])[0]
+
+    clipped = list(np.clip(starts, bottom, top))
+    tries = zip(clipped, all_at(clipped), strict=True)
     logs, found = max(tries, key=lambda pair: pair[1][2])
     damping = 1e-3
     for _ in range(rounds):
-        moved = [at(logs + STEP * unit) for unit in np.eye(len(names))]
+        moved = all_at([logs + STEP * unit for unit in np.eye(len(names))])
         gradient, information = _scoring(ready.present, found, moved)
         if exactly:
-            back = [at(logs - STEP * unit)[2] for unit in np.eye(len(names))]
-            gradient = (np.array([m[2] for m in moved]) - back) / (2 * STEP)
+            back = all_at([logs - STEP * unit for unit in np.eye(len(names))])
+            gradient = np.array([m[2] - b[2] for m, b in zip(moved, back, strict=True)])
+            gradient /= 2 * STEP
         held = ((logs >= top) & (gradient > 0)) | ((logs <= bottom) & (gradient < 0))
         gradient = np.where(held, 0.0, gradient)
         information[held] = information[:, held] = 0.0

@@ -20,10 +20,13 @@ Pattern = tuple[tuple[int, int], ...]
 
 def reach(A: Any) -> Pattern:
     """Which entries of Φ can differ from zero, given the pattern of A: (row, column)."""
-    n = A.size1()
-    rows, columns = A.sparsity().get_triplet()
+    return _reached(A.size1(), entries(A))
+
+
+@lru_cache(maxsize=64)
+def _reached(n: int, pattern: Pattern) -> Pattern:
     found = np.eye(n, dtype=bool)
-    found[rows, columns] = True
+    found[tuple(np.array(pattern, int).reshape(-1, 2).T)] = True
     for _ in range(n):
         found = found @ found
     return tuple((int(i), int(j)) for i, j in np.argwhere(found))

@@ -160,13 +160,13 @@ def _linear(model: Dynamics, pace: Pace) -> tuple[Any, Any, float, bool]:
               for x, s in ((along[:n], before), (along[n:], now)))  # fmt: skip
     a, b = ab[0], ab[1]
 
-    def at(tau: Any) -> tuple[Any, Any]:
+    def at(tau: Any) -> tuple[Any, list[Any]]:
         place = b - tau * (b - a)
-        return c0 + place * (c1 - c0), X0 + place * (X1 - X0)
+        return c0 + place * (c1 - c0), [X0 + place * (X1 - X0)]
 
     x, P = factors.unpacked(both, n)
     here, later = (A0 + place * (A1 - A0) for place in (a, b))
-    Phi, forced, Q = expressions(later, later - here, at, (b - a) * h, _TERMS)
+    Phi, forced, (Q,) = expressions(later, later - here, at, (b - a) * h, _TERMS)
     Q += Phi @ ca.diag(gap[:n]) @ Phi.T + ca.diag(gap[n:])
     moved = factors.packed(Phi @ x + forced, factors.moved(P, Phi, factors.factored(Q)))
     arguments = [both, before, now, h, gap, ab, *([along] if leads else [])]

@@ -21,7 +21,7 @@ from casest.data.run import Run
 from casest.data.timing import UNUSED, longest
 from casest.declaration.shapes import Array
 from casest.declaration.tracing import flat
-from casest.dynamics.between import Motions, motions
+from casest.dynamics.between import Motions, with_noises
 from casest.dynamics.declare import Dynamics
 from casest.dynamics.inputs import at_estimates, estimates, on_errors
 from casest.dynamics.stepping import reach
@@ -91,10 +91,14 @@ class Linearised:
         held = None if self.held is None else (self.held[0][inner], self.held[1][inner])
         return Linearised(time, A, c, C, d, y, process, pace, held)
 
-    def driven(self, process: Array) -> Linearised:
-        """The same motion with other process noise; what is known of its steps is kept."""
+    def driven(self, process: Array, Q: Array | None = None) -> Linearised:
+        """The same motion with other process noise; what is known of its steps is kept.
+
+        `Q`: what that noise makes of every step, (N − 1, n, n), where it is known."""
         other = replace(self, process=process)
         other.__dict__.update({k: v for k, v in self.__dict__.items() if k in _KEPT})
+        if Q is not None:
+            other.__dict__["sampled"] = Motions(*self.moved, Q)
         return other
 
 
@@ -186,8 +190,10 @@ def _along(model: Dynamics) -> Replay:
 
 
 @lru_cache(maxsize=8)
-def _noise_along(model: Dynamics) -> Replay:
-    return _replay(model, [model.input_noise])
+def _noise_along(model: Dynamics, names: tuple[str, ...]) -> Replay:
+    """G·Gᵀ of each of these inputs."""
+    slopes = [model.slopes_in_signals[name] for name in names]
+    return _replay(model, [G @ G.T for G in slopes])
 
 
 def _replay(model: Dynamics, expressions: list[Any], as_was: Sequence[Any] = ()) -> Replay:
@@ -200,12 +206,22 @@ def _replay(model: Dynamics, expressions: list[Any], as_was: Sequence[Any] = ())
 
 def process_along(model: Dynamics, run: Run, along: Array, pace: Pace | None = None) -> Array:
     """Process noise Ξ alone, (n, n), or along states (N, n) where inputs have noise: (N, n, n)."""
-    if model.input_noise is None:
+    names = model.noisy_inputs
+    if not names:
         return model.process
+    found = noises_along(model, names, run, along, pace)
+    return np.asarray(model.process + sum(model.sensors[name] * Xi for name, Xi in found.items()))
+
+
+def noises_along(
+    model: Dynamics, names: Sequence[str], run: Run, along: Array, pace: Pace | None = None
+) -> dict[str, Array]:
+    """What noise of intensity one of each of some inputs adds to Ξ along states, (N, n, n) each."""
     columns = Columns([np.ascontiguousarray(along), *(run.signals[s.name] for s in model.signals)])
-    noise = evaluated(_noise_along(model), np.zeros(0), columns)[0]
-    time = checked_time(run)
-    return np.asarray(model.process + _stood_for(time, pace or Pace.of(model, run)) * noise)
+    replay = _noise_along(model.without_intensities(), tuple(names))
+    share = _stood_for(checked_time(run), pace or Pace.of(model, run))
+    found = evaluated(replay, np.zeros(0), columns)
+    return {name: share * np.asarray(own) for name, own in zip(names, found, strict=True)}
 
 
 def acting(model: Dynamics, run: Run, along: Array, P: Array) -> Array:
@@ -242,9 +258,18 @@ def stepped(system: Linearised, intensity: Array) -> Motions:
 
     Raises DataError where a step leads beyond what numbers hold.
     """
-    found = motions(system.A, system.c, intensity, system.steps, system.held)
-    whole = np.isfinite(found.forced).all(axis=1) & np.isfinite(found.Q).all(axis=(1, 2))
-    bad = np.flatnonzero(~(whole & np.isfinite(found.Phi).all(axis=(1, 2))))
+    return stepped_with(system, [intensity])[0]
+
+
+def stepped_with(system: Linearised, intensities: Sequence[Array]) -> list[Motions]:
+    """The same with each of several noises."""
+    found = with_noises(system.A, system.c, intensities, system.steps, system.held)
+    if all(np.isfinite(part).all() for own in found for part in (own.Phi, own.forced, own.Q)):
+        return found
+    whole = np.isfinite(found[0].forced).all(axis=1) & np.isfinite(found[0].Phi).all(axis=(1, 2))
+    for own in found:
+        whole &= np.isfinite(own.Q).all(axis=(1, 2))
+    bad = np.flatnonzero(~whole)
     if bad.size:
         k = int(bad[0])
         raise DataError(

@@ -287,16 +287,19 @@ class Colour:
 
 
 def extended(
-    model: Dynamics, added: Sequence[tuple[Candidate, Array | None]], colour: Colour | None = None
+    model: Dynamics,
+    added: Sequence[tuple[Candidate, Array | SX | None]],
+    colour: Colour | None = None,
 ) -> Dynamics:
-    """The model with effects at given numbers; with None, as constant states to estimate."""
+    """The model with effects at given numbers, or symbols; with None, as constant states to
+    estimate."""
     # Inputs are corrected before anything, outputs among them, reads them.
     for candidate, value in sorted(added, key=lambda pair: pair[0].place, reverse=True):
         model = _with(model, candidate, value)
     return model if colour is None else _coloured(model, colour)
 
 
-def _with(model: Dynamics, candidate: Candidate, value: Array | None) -> Dynamics:
+def _with(model: Dynamics, candidate: Candidate, value: Array | SX | None) -> Dynamics:
     inner, name, there = model.function, candidate.state, {s.name for s in model.signals}
     more = [s for s in candidate.reads if s.name not in there]
     more += [Signal(candidate.moved, 1, "s")] if candidate.in_time else []
@@ -304,7 +307,7 @@ def _with(model: Dynamics, candidate: Candidate, value: Array | None) -> Dynamic
 
     @wraps(inner)
     def function(**given: Any) -> Motion:
-        k = given.pop(name) if value is None else ca.SX(ca.DM(value))
+        k = given.pop(name) if value is None else ca.SX(value)
         moved = given[candidate.moved] if candidate.in_time else 0.0
         left = {n: v for n, v in given.items() if n not in own}
         body = Body(turn=given.get(candidate.turn), moved=moved, read=given)

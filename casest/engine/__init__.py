@@ -6,6 +6,8 @@ operations (`operations`): NumPy, C and exported programs read the same rows.
 
 from __future__ import annotations
 
+from casest.engine.chain import chained
+from casest.engine.compiled import Compiled
 from casest.engine.kernel import by_workers, evaluated
 from casest.engine.normal import (
     Normal,
@@ -21,12 +23,14 @@ from casest.engine.replay import Columns, Plan, Replay, Samples
 
 __all__ = [
     "Columns",
+    "Compiled",
     "Normal",
     "Plan",
     "Recursion",
     "Replay",
     "Samples",
     "by_workers",
+    "chained",
     "cost",
     "evaluated",
     "normal_equations",

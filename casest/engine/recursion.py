@@ -17,6 +17,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from casest.engine import lanes
 from casest.engine.kernel import library
 from casest.engine.operations import Floats
 
@@ -70,6 +71,7 @@ class Recursion:
         self._library: ctypes.CDLL | None = None
         self._looked = self._built = False
         self._chunks: dict[int, Any] = {}
+        self._beside: dict[int, Any] = {}
 
     def __call__(
         self, state: Floats, numbers: Floats | Sequence[Floats], *, keep: bool = True
@@ -89,17 +91,40 @@ class Recursion:
             last = self._replay(state, parts, found, keep)
             self._replayed += count
             return found if keep else [last[None], *found[1:]]
-        sizes, steps = [p.shape[1] for p in parts], [p.strides[0] // 8 for p in parts]
-        compiled.casest_run(
-            ctypes.c_void_p(state.ctypes.data),
-            (ctypes.c_void_p * len(parts))(*[p.ctypes.data for p in parts]),
-            *[_longs(x) for x in (sizes, steps, [count - len(p) for p in parts])],
-            ctypes.c_long(len(parts)),
-            ctypes.c_long(count),
-            (ctypes.c_void_p * len(found))(*[f.ctypes.data for f in found]),
-            ctypes.c_int(keep),
-        )
+        compiled.casest_run(*_given(state, parts, count), _places(found), ctypes.c_int(keep))
         return found if keep else [found[0][[(count - 1) % 2]], *found[1:]]
+
+    def beside(self, states: Floats, numbers: Floats) -> list[list[Floats]]:
+        """Runs from several states (L, …) given the same numbers (N, …): what each gives, as the
+        call without `keep`."""
+        count = lanes.wide_enough(len(states))
+        compiled = self._in_lanes(count, len(numbers)) if len(states) > 1 else None
+        if compiled is None:
+            return [self(state, numbers, keep=False) for state in states]
+        several = []
+        for first in range(0, len(states), count):
+            own = states[first : first + count]
+            rows = [1, *[len(numbers)] * (len(self.sizes) - 1)]
+            found = [np.empty((r, s, count)) for r, s in zip(rows, self.sizes, strict=True)]
+            state = lanes.interleaved(own, count)
+            compiled.casest_lanes(*_given(state, [_rows(numbers)], len(numbers)), _places(found))
+            several += [[f[:, :, lane] for f in found] for lane in range(len(own))]
+        return several
+
+    def _in_lanes(self, count: int, steps: int) -> ctypes.CDLL | None:
+        """Where the step itself is compiled, and for as many steps as that takes."""
+        wish = os.environ.get("CASEST_KERNEL", "auto")
+        if wish == "off":
+            return None
+        own = self._beside.setdefault(count, {"seen": 0, "looked": False, "library": None})
+        own["seen"] += count * steps
+        due = wish == "always" or own["seen"] > WORTHWHILE
+        if own["library"] is None and own["looked"] is not due:
+            own["looked"] = due
+            text = lanes.source(self._source(), self.sizes, self._wide, count)
+            own["library"] = lanes.built(text, build=due)
+        found: ctypes.CDLL | None = own["library"]
+        return found
 
     def _compiled(self, count: int) -> ctypes.CDLL | None:
         wish = os.environ.get("CASEST_KERNEL", "auto")
@@ -187,6 +212,23 @@ def _side_by_side(parts: Sequence[Floats], first: int, count: int, whole: int) -
         numbers[count - len(own) :, place : place + p.shape[1]] = own
         place += p.shape[1]
     return numbers
+
+
+def _given(state: Floats, parts: Sequence[Floats], count: int) -> list[Any]:
+    """Where a compiled run begins, and what it is given: parts of rows, some of them late."""
+    sizes, steps = [p.shape[1] for p in parts], [p.strides[0] // 8 for p in parts]
+    late = [count - len(p) for p in parts]
+    return [
+        ctypes.c_void_p(state.ctypes.data),
+        _places(parts),
+        *[_longs(x) for x in (sizes, steps, late)],
+        ctypes.c_long(len(parts)),
+        ctypes.c_long(count),
+    ]
+
+
+def _places(arrays: Sequence[Floats]) -> Any:
+    return (ctypes.c_void_p * len(arrays))(*[array.ctypes.data for array in arrays])
 
 
 def _longs(numbers: Sequence[int]) -> Any:

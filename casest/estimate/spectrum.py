@@ -181,11 +181,10 @@ def _most_likely(shapes: Array, mean: Array, count: Array) -> Array:
 
     For several means and counts (B, m) at once, each by itself: b is (k, m).
     """
-    root = np.sqrt(count).T
-    A = shapes * root[:, :, None]
-    small = 1e-9 * np.eye(shapes.shape[1])
-    b = np.linalg.pinv(A) @ (np.log(mean.T) * root)[:, :, None]
     mean, count = mean.T, count.T
+    small = 1e-9 * np.eye(shapes.shape[1])
+    told = shapes.T @ (count[:, :, None] * shapes) + small
+    b: Array = np.linalg.solve(told, ((count * np.log(mean)) @ shapes)[:, :, None]).astype(float)
 
     def at(b: Array) -> tuple[Array, Array]:
         """The cost, and the means as shares of the curve."""

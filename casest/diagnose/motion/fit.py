@@ -180,8 +180,7 @@ def _tuned(
     most = plausible(base, ready, run) if bounded else None
     intensities, likelihood = matched(ready, run, known, most=most)
     model = applied(grown, intensities)
-    system = ready.system.driven(process_along(model, run, along))
-    found = filtered(model, run, system=system, spread=False)
+    found = filtered(model, run, system=ready.driven(intensities), spread=False)
     tried = [c for c, _ in added]
     answers = sensitivity(base, added, tried, run, found) if added else None
     fit = Fit(

@@ -61,8 +61,9 @@ class Innovations(Subject[Fit]):
 
     def _trials(self, fit: Fit, several: Sequence[Candidate]) -> list[Trial]:
         found, rows = sensitivity(fit.base, fit.added, several, fit.run, fit.found), _rows(fit)
+        H = -found.H[rows]
         return [
-            Trial(c, c.label, -found.H[rows][:, :, where], variants=c.trials)
+            Trial(c, c.label, H[:, :, where], variants=c.trials)
             for c, where in zip(several, found.columns, strict=True)
         ]
 

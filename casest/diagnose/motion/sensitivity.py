@@ -10,20 +10,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
-import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
 from casest.data.run import Run
 from casest.declaration.shapes import Array
-from casest.declaration.tracing import flat
+from casest.diagnose.motion.slopes import batches, slopes
 from casest.dynamics.declare import Dynamics
-from casest.dynamics.discrete import linear_recursion
 from casest.dynamics.filter import Filtered
-from casest.dynamics.transition import Linearised, variances
-from casest.effects.moving import Candidate, extended
-from casest.engine import Columns, Replay
+from casest.dynamics.transition import variances
+from casest.effects.moving import Candidate
+from casest.engine import Compiled, chained
+
+#: Numbers that are worked on at once, as values of slopes along a record.
+TOGETHER = 4_000_000
 
 
 @dataclass(frozen=True)
@@ -49,25 +51,36 @@ class Gains:
     `left` = I − KC (N, n, n) with the gain K (N, n, m); `later` what a step and the reading after
     it leave of a state (N − 1, n, n); `back` = L⁻¹ of the innovations' covariance LLᵀ (N, m, m); z
     their whitened values (N, m); C (N, m, n) and `present` (N, m) of the readings there are.
+    `begun` and `ended` (N − 1, n, n): what a push at the beginning and at the end of a step does by
+    its end, if it is a straight line between (Simpson's rule).
     """
 
-    system: Linearised
     C: Array
     K: Array
     L: Array
     left: Array
+    Phi: Array
     later: Array
+    begun: Array
+    ended: Array
     back: Array
     z: Array
     present: NDArray[np.bool_]
 
 
 def gains(found: Filtered) -> Gains:
-    """Of a filter."""
+    """Of a filter; computed once."""
+    kept: Gains | None = found.__dict__.get("gains")
+    if kept is None:
+        kept = found.__dict__["gains"] = _gains(found)
+    return kept
+
+
+def _gains(found: Filtered) -> Gains:
     system = found.system
     present = np.isfinite(system.y)
     C = np.where(present[:, :, None], system.C, 0.0)
-    m = C.shape[1]
+    m, n = C.shape[1:]
     R = variances(found.model, system.steps)
     PC = found.predicted_P @ C.transpose(0, 2, 1)
     S = C @ PC
@@ -77,8 +90,10 @@ def gains(found: Filtered) -> Gains:
     nu = np.where(present, found.innovations, 0.0)
     back = np.asarray(np.linalg.inv(L), float)
     z = np.asarray((back @ nu[:, :, None])[:, :, 0], float)
-    left = np.eye(C.shape[2]) - K @ C
-    return Gains(system, C, K, L, left, left[1:] @ system.moved[0], back, z, present)
+    left = np.eye(n) - K @ C
+    Phi, half, sixth = system.moved[0], 2 * system.later_half, system.steps[:, None, None] / 6
+    begun, ended = sixth * (Phi + half), sixth * (half + np.eye(n))
+    return Gains(C, K, L, left, Phi, left[1:] @ Phi, begun, ended, back, z, present)
 
 
 def sensitivity(
@@ -90,22 +105,73 @@ def sensitivity(
 ) -> Sensitivity:
     """Answers of the innovations of `found`, the filter of a model with effects `added`, to the
     numbers of `tried`: further candidates at zero, or those that are added at their values."""
-    g, count = gains(found), sum(c.size for c in tried)
-    H, moves = np.empty((*g.z.shape, count)), np.empty((g.C.shape[2], count))
-    columns, place = [], 0
-    for candidate in tried:  # one after the other: all at once would need much memory
-        where = slice(place, place + candidate.size)
-        F, G = _slopes(model, added, tried, candidate, run, found.smoothed)
-        G = np.where(g.present[:, :, None], G, 0.0)
-        pushed = _over_steps(g.system, F)
-        # After each reading, and before it.
-        X = linear_recursion(g.later, g.left[1:] @ pushed - g.K[1:] @ G[1:], -g.K[0] @ G[0])
-        G[1:] += g.C[1:] @ (g.system.moved[0] @ X[:-1] + pushed)
-        H[:, :, where] = g.back @ G
-        moves[:, where] = np.sqrt(np.mean(X[len(X) // 5 :] ** 2, axis=0))
-        columns.append(where)
-        place = where.stop
+    g, ends = gains(found), np.cumsum([0, *(c.size for c in tried)]).tolist()
+    count, n = ends[-1], g.C.shape[2]
+    H, moves = np.empty((*g.z.shape, count)), np.empty((n, count))
+    columns = [slice(a, b) for a, b in pairwise(ends)]
+    together = max(1, TOGETHER // (len(g.z) * n))
+    for several in batches(added, tried, together):
+        where = np.concatenate([np.arange(count)[columns[k]] for k in several])
+        F, G = slopes(model, added, [tried[k] for k in several], run, found.smoothed, list(tried))
+        H[:, :, where], moves[:, where] = _answers(g, F, G)
     return Sensitivity(g.z, H, g.L, moves, tuple(columns))
+
+
+#: before: what a number does to the state before a reading; X: after it.
+_SOURCE = """
+static void add(double *to, const double *M, const double *x, long r, long n, long p, int less) {
+  for (long i = 0; i < r; ++i)
+    for (long l = 0; l < n; ++l) {
+      const double own = less ? -M[i * n + l] : M[i * n + l];
+      for (long j = 0; j < p; ++j) to[i * p + j] += own * x[l * p + j];
+    }
+}
+void casest_answers(const double *Phi, const double *begun, const double *ended, const double *C,
+                    const double *K, const double *back, const double *F, const double *G,
+                    double *X, double *own, double *H, double *squares,
+                    long count, long n, long m, long p, long pushed, long first) {
+  for (long k = 0; k < count; ++k) {
+    double *before = X + (k + 1) % 2 * n * p, *after = X + k % 2 * n * p;
+    for (long i = 0; i < n * p; ++i) after[i] = 0;
+    if (k) {
+      add(after, Phi + (k - 1) * n * n, before, n, n, p, 0);
+      if (pushed) {
+        add(after, begun + (k - 1) * n * n, F + (k - 1) * n * p, n, n, p, 0);
+        add(after, ended + (k - 1) * n * n, F + k * n * p, n, n, p, 0);
+      }
+    }
+    for (long i = 0; i < m * p; ++i) own[i] = G[k * m * p + i];
+    add(own, C + k * m * n, after, m, n, p, 0);
+    for (long i = 0; i < m * p; ++i) H[k * m * p + i] = 0;
+    add(H + k * m * p, back + k * m * m, own, m, m, p, 0);
+    add(after, K + k * n * m, own, n, m, p, 1);
+    for (long i = 0; k >= first && i < n * p; ++i) squares[i] += after[i] * after[i];
+  }
+}
+"""
+_ANSWERS = Compiled("casest_answers", _SOURCE)
+
+
+def _answers(g: Gains, F: Array, G: Array) -> tuple[Array, Array]:
+    """H (N, m, p), and what each number does to the states, rms (n, p), of F = ∂f/∂k (N, n, p) and
+    G = ∂h/∂k (N, m, p)."""
+    G = np.where(g.present[:, :, None], G, 0.0)
+    (count, m, p), n, pushed = G.shape, F.shape[1], bool(F.any())
+    first = count // 5
+    if _ANSWERS.ready(count):
+        H, squares = np.empty(G.shape), np.zeros((n, p))
+        given = [g.Phi, g.begun, g.ended, g.C, g.K, g.back, F, G]
+        room = [np.empty((2, n, p)), np.empty((m, p)), H, squares]
+        given = [np.ascontiguousarray(part, float) for part in given]
+        _ANSWERS([*given, *room], [count, n, m, p, int(pushed), first])
+        return H, np.sqrt(squares / (count - first))
+    met = -(g.K @ G)
+    by_steps = g.begun @ F[:-1] + g.ended @ F[1:] if pushed else np.zeros((1, 1, 1))
+    if pushed:
+        met[1:] += g.left[1:] @ by_steps
+    X = chained(g.later, met[1:], met[0])  # after each reading
+    G[1:] += g.C[1:] @ (g.Phi @ X[:-1] + by_steps)
+    return g.back @ G, np.sqrt(np.mean(X[first:] ** 2, axis=0))
 
 
 def pushes(
@@ -122,53 +188,16 @@ def pushes(
     (the filter's adjoint). Of a step the sum from its sample on, of a line its transform.
     """
     g = gains(found)
-    F, G = _slopes(model, added, [], candidate, run, found.smoothed)
+    F, G = slopes(model, added, [candidate], run, found.smoothed)
     G = np.where(g.present[:, :, None], G, 0.0)
     said = g.back.transpose(0, 2, 1) @ z
-    through = (g.C[1:] @ g.system.moved[0]).transpose(0, 2, 1) @ said[1:]
+    through = (g.C[1:] @ g.Phi).transpose(0, 2, 1) @ said[1:]
     # λ: of the state after a reading; what comes after the last one is nothing.
     after = np.zeros((len(z), F.shape[1], z.shape[2]))
-    after[:-1] = linear_recursion(g.later[-2::-1].transpose(0, 2, 1), through[-2::-1], through[-1])[
-        ::-1
-    ]
+    after[:-1] = chained(g.later[-2::-1].transpose(0, 2, 1), through[-2::-1], through[-1])[::-1]
     on_step = g.C[1:].transpose(0, 2, 1) @ said[1:] + g.left[1:].transpose(0, 2, 1) @ after[1:]
     own = G.transpose(0, 2, 1) @ (said - g.K.transpose(0, 2, 1) @ after)
-    h = g.system.steps[:, None, None]
-    first = h / 6 * (g.system.moved[0] + 2 * g.system.later_half)
-    last = h / 6 * (2 * g.system.later_half + np.eye(F.shape[1]))
-    own[:-1] += F[:-1].transpose(0, 2, 1) @ (first.transpose(0, 2, 1) @ on_step)
-    own[1:] += F[1:].transpose(0, 2, 1) @ (last.transpose(0, 2, 1) @ on_step)
+    if F.any():
+        own[:-1] += F[:-1].transpose(0, 2, 1) @ (g.begun.transpose(0, 2, 1) @ on_step)
+        own[1:] += F[1:].transpose(0, 2, 1) @ (g.ended.transpose(0, 2, 1) @ on_step)
     return np.asarray(own)
-
-
-def _slopes(
-    model: Dynamics,
-    added: Sequence[tuple[Candidate, Array]],
-    tried: Sequence[Candidate],
-    candidate: Candidate,
-    run: Run,
-    along: Array,
-) -> tuple[Array, Array]:
-    """F = ∂f/∂k (N, n, p) and G = ∂h/∂k (N, m, p) along states of the filter (N, ≥ n)."""
-    n = model.size
-    value = next((v for c, v in added if c is candidate), np.zeros(candidate.size))
-    others = [(c, v) for c, v in added if c is not candidate and (c not in tried or np.any(v))]
-    free = extended(model, [*others, (candidate, None)])
-    t = free.traced
-    k = t.x[n:]
-    wanted = [ca.densify(ca.jacobian(e, k)) for e in (t.f[:n], t.h)]
-    sample = ca.vertcat(t.x, *[flat(t.symbols[s.name]) for s in free.signals])
-    function = ca.Function("slopes", [ca.SX.sym("none", 0), sample], wanted,
-                           ["parameters", "sample"], ["F", "G"])  # fmt: skip
-    x = np.hstack([along[:, :n], np.broadcast_to(value, (len(along), candidate.size))])
-    parts = Columns([np.ascontiguousarray(x), *(run.signals[s.name] for s in free.signals)])
-    F, G = Replay(function)(np.zeros(0), parts)
-    wide = along.shape[1] - n  # states of coloured noise, which nothing else drives
-    return np.pad(F, ((0, 0), (0, wide), (0, 0))), G
-
-
-def _over_steps(system: Linearised, F: Array) -> Array:
-    """∫Φ(t₁, s)F(s) ds of every step, (N − 1, n, p): Simpson's rule."""
-    h = system.steps[:, None, None]
-    Phi, half = system.moved[0], system.later_half
-    return np.asarray(h / 6 * (Phi @ F[:-1] + 2 * half @ (F[:-1] + F[1:]) + F[1:]))
