@@ -46,10 +46,9 @@ def separating(situation: Situation, options: PlanOptions) -> Plan:
     def make(rival: Rival) -> Candidates:
         return candidates(rival.model, rival.values, situation.noise, possible)
 
-    found = separation(rivals, situation.noise, make, situation.name, possible.rate)
+    found = separation(rivals, situation.noise, make, situation.name, possible.rate, options.most)
     planned = separated(found, options.count, options.most, situation.name)
-    named = {r.label for r in rivals}
-    left = [label for label in labels if label not in named]
+    left = [label for label in labels if label not in found.labels]
     return separation_result(
         situation.model,
         found,
