@@ -159,9 +159,8 @@ def recorded(sensor: Sensor, readings: Readings) -> Run:
     return replace(run, columns=columns, column_units={n: UNITS[n] for n in columns})
 
 
-def outcome(sensor: Sensor, run: Run) -> tuple[str, str]:
-    """What `close` says of a record (right, wider, open, wrong, none), and its words."""
-    closing = close(sensor.model, [run])
+def outcome(sensor: Sensor, closing: Any) -> tuple[str, str]:
+    """What `close` says (right, wider, open, wrong, none), and its words."""
     said = [(f.candidate.label, list(f.indistinguishable_from)) for f in closing.effects]
     if not said:
         labels = list(closing.undecided.names) if closing.undecided else []
@@ -196,7 +195,7 @@ def one(seed: int) -> dict[str, Any]:
         return row
     if not set(labels) - {sensor.cause, WIDER.get(sensor.cause)}:
         return row | {"labels": labels}  # named already, up to a wider form
-    row |= {"open": True, "labels": labels, "before": outcome(sensor, run)[0]}
+    row |= {"open": True, "labels": labels, "before": outcome(sensor, closing)[0]}
     return row | planned(sensor, closing, labels, before, rng)
 
 
@@ -225,8 +224,12 @@ def planned(
         more = sensor.read({**middle, **at}, rng)
         both = {n: np.concatenate([v.reshape(len(v), -1), more[n].reshape(len(places), -1)])
                 for n, v in before.items()}  # fmt: skip
-        row[name], row[f"{name} said"] = outcome(sensor, recorded(sensor, both))
-        row[f"power {name}"] = float(min(plan.powers(places)))
+        row[name], row[f"{name} said"] = outcome(
+            sensor, close(sensor.model, [recorded(sensor, both)])
+        )
+        own = [c for p, c in zip(plan.pairs, plan.powers(places), strict=True)
+               if p.true == sensor.cause]  # fmt: skip
+        row[f"power {name}"] = float(min(own)) if own else None
     return row
 
 
@@ -261,7 +264,7 @@ def table(rows: list[dict[str, Any]]) -> str:
         f"{np.median([r['count'] for r in done]):g}); of {len(own) - len(done)} the",
         "plan said that so many tell nothing apart. Named: `close` on all readings names the true",
         "cause and leaves nothing beside it but what contains it (a curve contains a line); told",
-        "apart: the chance that the plan states for the hardest pair, mean.",
+        "apart: the chance that the plan states, were the true cause the true one, mean.",
         "",
         "| | measured | named | alone | still open | wrong | none | told apart |",
         "| --- | --- | --- | --- | --- | --- | --- | --- |",
@@ -276,8 +279,9 @@ def table(rows: list[dict[str, Any]]) -> str:
                      for w in ("right", "wider", "open", "wrong", "none")}  # fmt: skip
             named = count["right"] + count["wider"]
             promise = ""
-            if how != "before":
-                promise = f"{100 * np.mean([r[f'power {how}'] for r in group]):.0f} %"
+            stated = [r[f"power {how}"] for r in group if r.get(f"power {how}") is not None]
+            if stated:
+                promise = f"{100 * np.mean(stated):.0f} %"
             lines.append(
                 f"| {title} | {how} | {named} of {len(group)} "
                 f"({100 * named / len(group):.0f} %) | {count['right']} | {count['open']} | "
