@@ -16,7 +16,7 @@ from casest.declaration.model import Model
 from casest.declaration.shapes import Array
 from casest.diagnose.levels import LEVELS
 from casest.plan.candidates.attitudes import words
-from casest.plan.candidates.candidates import Candidates, Noise
+from casest.plan.candidates.candidates import TIME, Candidates, Noise
 from casest.plan.goals import Goal
 from casest.plan.planning import Planned
 from casest.results.file import plain
@@ -150,7 +150,7 @@ class Plan(Result, frozen=True, kw_only=True, dict=True):
     @property
     def things(self) -> str:
         """What is planned, in the plural."""
-        return {"pose": "poses", "run": "runs"}.get(self.kind, "measurements")
+        return {"pose": "poses", "run": "runs", TIME: "readings"}.get(self.kind, "measurements")
 
 
 def plan_result(
@@ -303,7 +303,8 @@ def headline(result: Plan) -> str:
         chance = min(t.chance for t in result.separates)
         told = f"that tell {causes} in {100 * chance:.0f} %"
         return f"{result.declared}{after}: {result.count} {one} next {told}"
-    return f"{result.declared}{after}: {result.count} {one} next, those first that bring most"
+    order = "as time goes" if result.kind == TIME else "those first that bring most"
+    return f"{result.declared}{after}: {result.count} {one} next, {order}"
 
 
 def _groups(result: Plan) -> list[list[str]]:

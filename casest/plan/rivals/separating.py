@@ -155,7 +155,7 @@ def separation(
     return Separation(
         found[0],
         tuple(chosen.values()),
-        task(factors, information, names, what),
+        task(factors, information, names, what, found[0].once),
         tuple(amplitudes),
         tuple(t for key, t in together.items() if apart and planned_for.issuperset(key)),
     )
@@ -196,7 +196,7 @@ def _best_chance(pair: Pair, block: Array, information: Array, most: int) -> flo
     """An upper bound of the chance to tell one pair apart with so many measurements."""
     if not pair.needed:
         return 1.0
-    alone = task(*_side_by_side([block], [information])[:2], [""] * block.shape[2], "a pair")
+    alone = task(*_side_by_side([block], [information])[:2], [""] * block.shape[2], "")
     amplitude = np.zeros((block.shape[2], 1))
     amplitude[-1] = alone.scale[-1]
     floor = continuous(Trace(amplitude), alone.start, alone.factors, most, ROUGHLY).floor
