@@ -23,8 +23,9 @@ from casest.plan.motion.starts import random_inputs
 RANDOM = 20
 #: Steps of a search. It is at its optimum to some thousandths of a standard deviation by then.
 STEPS = 60
-#: Share by which a limit may be passed between two nodes; rounds in which it is narrowed.
-PASSED, ROUNDS = 1e-3, 8
+#: Share by which a limit may be passed between two nodes; rounds in which it is narrowed, and times
+#: the nodes at which it is kept in all but the first.
+PASSED, ROUNDS, FINER = 1e-3, 8, 3
 
 
 @dataclass(frozen=True)
@@ -114,7 +115,7 @@ def _worth(task: Task, u: Array, weights: Array, starts: Sequence[Array], worst:
 def _within(task: Task, u: Array, rate: float) -> tuple[Array, Flown]:
     """The motion, brought back to limits that it passes; UsageError where it cannot be."""
     narrow = task
-    for _ in range(ROUNDS):
+    for turn in range(ROUNDS):
         made = flown(task, u, rate)
         over = {name: share for name, share in made.shares.items() if not share <= 1 + PASSED}
         if not over:
@@ -126,6 +127,8 @@ def _within(task: Task, u: Array, rate: float) -> tuple[Array, Flown]:
             for limit in narrow.limits
         )
         narrow = replace(narrow, limits=limits)
+        if narrow.grid is task.grid and turn:  # what passes between two nodes needs nodes there
+            narrow = replace(narrow, grid=task.grid.finer(FINER))
         u = narrow.nearest(u)
     made = flown(task, u, rate)
     over = {name: share for name, share in made.shares.items() if not share <= 1 + PASSED}
