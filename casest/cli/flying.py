@@ -29,7 +29,7 @@ def flying(name: str, options: PlanOptions) -> int:
 
     refuse_others(name, options)
     model, rate = model_of(name, options)
-    goals = _goals(model, options)
+    goals = goals_of(model, options)
     found, shorter = _planned(name, model, rate, goals, options)
     result = motion_result(
         model,
@@ -86,19 +86,21 @@ def _planned(
     return shortest(lambda s: make(round(s * rate) / rate), goals, 2 * pieces / rate, duration)
 
 
-def _goals(model: Dynamics, options: PlanOptions) -> list[Goal]:
-    """Goals as they are typed, of states that are unknown at the beginning."""
+def goals_of(model: Dynamics, options: PlanOptions) -> list[Goal]:
+    """Goals as they are typed, of what is unknown at the beginning."""
     from casest.plan.goals import Measures
 
     if not options.until:
         return []
     if options.robust:
-        raise UsageError("--robust goes with a --duration, not with --until")
+        raise UsageError("--robust goes with a --duration or a --count, not with --until")
+    names = [s.name for s in model.states if not s.known for _ in range(s.size)]
+    if not names:
+        raise UsageError(f"{model.name}: every state is known: there is nothing to plan for")
     units = dict(zip(model.names, model.state_units, strict=True))
     goals = [Measures(model.names, units).goal(text) for text in options.until]
-    exact = [s.name for s in model.states if s.known]
     for goal in goals:
-        if goal.name.partition("[")[0] in exact:
+        if goal.name.partition("[")[0] not in names:
             raise UsageError(f"--until '{goal}': {goal.name} is known from the beginning")
     return goals
 
@@ -136,7 +138,6 @@ def refuse_others(name: str, options: PlanOptions, counted: bool = False) -> Non
         "--vary": options.possible.vary,
         "--reach": options.possible.reach,
         "--count": None if counted else options.count,
-        "--until": options.until if counted else (),
         "--budget": options.budget,
         "--separate": options.separate,
         "--live": options.live.source,

@@ -111,7 +111,7 @@ def motion_result(
         limits=[Kept(x.name, str(x), found.motion.shares[x.name]) for x in found.limits],
         std={name: Seen(plain(a), plain(b), unit) for name, a, b, unit in stds},
         ratio=plain(ratio),
-        goals=[Reached(g.name, g.limit, g.unit, None, std_of(found, g)) for g in goals],
+        goals=[Reached(g.name, g.limit, g.unit, None, std_of(planned.std, g)) for g in goals],
         too_short=shorter,
         elsewhere=list(found.elsewhere),
         notes=list(notes),
@@ -135,6 +135,13 @@ def motion_headline(result: PlannedMotion) -> str:
     )
 
 
+def goal_words(goals: Sequence[Reached]) -> Iterator[str]:
+    """What is asked, and what the plan leaves."""
+    for goal in goals:
+        unit = "" if goal.unit == "1" else f" {goal.unit}"
+        yield f"goal {goal.name} < {goal.limit:.4g}{unit}: {goal.after:.3g}{unit} after"
+
+
 def motion_words(result: PlannedMotion) -> Iterator[str]:
     """What is hidden, what the motion is beside a random one, what is no certificate, notes."""
     yield from result.unobservable
@@ -145,9 +152,7 @@ def motion_words(result: PlannedMotion) -> Iterator[str]:
         )
     elif result.random_rank < result.rank:
         yield f"a random motion in the same limits shows {result.random_rank} states"
-    for goal in result.goals:
-        unit = "" if goal.unit == "1" else f" {goal.unit}"
-        yield f"goal {goal.name} < {goal.limit:g}{unit}: {goal.after:.3g}{unit}"
+    yield from goal_words(result.goals)
     if result.goals:
         yield (
             f"no motion of {result.too_short:.3g} s was found that reaches "

@@ -101,7 +101,12 @@ def criterion_of(wanted: Wanted) -> Criterion:
         return Volume()
     if wanted.name == "A":
         return Trace(np.eye(f))
-    return Longest() if wanted.name == "E" else Largest(np.eye(f)[:, list(wanted.chosen)])
+    if wanted.name == "E":
+        return Longest()
+    columns = np.eye(f)[:, list(wanted.chosen)]
+    if wanted.asked:
+        columns = columns * wanted.scale[[wanted.free[k] for k in wanted.chosen]] / wanted.asked
+    return Largest(columns)
 
 
 def _joint(
