@@ -164,7 +164,10 @@ def outcome(sensor: Sensor, closing: Any) -> tuple[str, str]:
     said = [(f.candidate.label, list(f.indistinguishable_from)) for f in closing.effects]
     if not said:
         labels = list(closing.undecided.names) if closing.undecided else []
-        return ("open" if sensor.cause in labels else "none"), f"one of {labels}" if labels else ""
+        what = "open" if sensor.cause in labels else "none"
+        if what == "open" and not set(labels) - {sensor.cause, WIDER.get(sensor.cause)}:
+            what = "wider"
+        return what, f"one of {labels}" if labels else ""
     label, others = said[0]
     words = "; ".join(" or ".join([one, *rest]) for one, rest in said)
     if len(said) > 1:
@@ -247,7 +250,8 @@ def drawn(wanted: int) -> list[dict[str, Any]]:
     KEPT.parent.mkdir(exist_ok=True)
     with KEPT.open("a", encoding="utf-8") as file:
         while sum(row["open"] for row in rows) < wanted:
-            rows.append(one(len(rows)))
+            done = {row["seed"] for row in rows}
+            rows.append(one(next(seed for seed in range(len(rows) + 1) if seed not in done)))
             print(json.dumps(rows[-1]), file=file, flush=True)
     return rows
 

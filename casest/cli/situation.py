@@ -180,8 +180,11 @@ def covered(situation: Situation) -> Any:
         return None
 
 
-def records_of(situation: Situation) -> tuple[Run, ...] | None:
-    """The records that a result was made from, read as they were; None where they are gone."""
+def records_of(situation: Situation, model: Model | None = None) -> tuple[Run, ...] | None:
+    """The records that a result was made from, read as they were; None where they are gone.
+
+    For another `model`, what that one does not read stays a column.
+    """
     from casest.data import load_runs
     from casest.errors import CasestError
     from casest.report.next_command import typed_words
@@ -200,7 +203,7 @@ def records_of(situation: Situation) -> tuple[Run, ...] | None:
     )
     try:
         data = list(situation.content["data"])
-        return load_runs(data, situation.model.signals, **reading.keywords())
+        return load_runs(data, (model or situation.model).signals, **reading.keywords())
     except (CasestError, OSError, ValueError):  # moved or changed since
         return None
 

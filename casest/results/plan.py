@@ -301,7 +301,8 @@ def headline(result: Plan) -> str:
     if result.separates:
         causes = " from ".join(" or ".join(group) for group in _groups(result))
         chance = min(t.chance for t in result.separates)
-        told = f"that tell {causes} in {100 * chance:.0f} %"
+        tell = "tells" if result.count == 1 else "tell"
+        told = f"that {tell} {causes} in {100 * chance:.0f} %"
         return f"{result.declared}{after}: {result.count} {one} next {told}"
     order = "as time goes" if result.kind == TIME else "those first that bring most"
     return f"{result.declared}{after}: {result.count} {one} next, {order}"

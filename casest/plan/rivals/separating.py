@@ -61,23 +61,24 @@ class Pair:
 class Together:
     """Two rivals that stay one: the best chance of telling them apart, None of an exact alias.
 
-    wider: the one that contains the other, where one does.
+    wider: the one that contains the other, where one does. most: measurements that were allowed.
     """
 
     one: str
     other: str
     chance: float | None
     wider: str | None
+    most: int
 
     def __str__(self) -> str:
         """Why they are not told apart."""
         if self.chance is None:
             return f"{self.one} and {self.other} are one under all that can be measured here"
-        best = f"in {100 * self.chance:.0f} % at best"
+        best = f"{self.most} measurements for it alone: {100 * self.chance:.0f} % at best"
         if self.wider is None:
-            return f"{self.one} and {self.other} are not told apart: {best}"
+            return f"{self.one} and {self.other} stay together ({best})"
         narrow = self.one if self.wider == self.other else self.other
-        return f"{self.wider} contains {narrow}; what it has more would be told {best}"
+        return f"{self.wider} contains {narrow}: how much more it does stays open ({best})"
 
 
 @dataclass(frozen=True)
@@ -122,8 +123,8 @@ def separation(
 ) -> Separation:
     """The task of telling the rivals apart; `make` gives the candidates as one rival has them.
 
-    Two that `most` measurements do not tell apart are left together where others remain; UsageError
-    where two are one under all that can be measured, and there are no others.
+    Two that `most` measurements do not tell apart, or of which one contains the other, are left
+    together where others remain; UsageError where none can be refuted.
     """
     found = [make(rival) for rival in rivals]
     seen = {
@@ -179,16 +180,17 @@ def _together(
     pairs: Mapping[tuple[int, int], Pair],
     most: int,
 ) -> dict[tuple[int, int], Together]:
-    """Rivals that `most` measurements, chosen for them alone, do not tell apart."""
+    """Rivals that `most` measurements, chosen for them alone, do not tell apart, and those of which
+    one contains the other: how much it bends more is no question of which cause it is."""
     found = {}
     for i, j in combinations(range(len(rivals)), 2):
         ways = [key for key in ((i, j), (j, i)) if key in pairs]
         best = [_best_chance(pairs[key], seen[key], rivals[key[1]].information, most)
                 for key in ways]  # fmt: skip
-        if not best or min(best) < POWER:
+        if len(best) < 2 or min(best) < POWER:
             wider = rivals[ways[0][0]].label if len(ways) == 1 else None
             chance = min(best) if best else None
-            found[i, j] = Together(rivals[i].label, rivals[j].label, chance, wider)
+            found[i, j] = Together(rivals[i].label, rivals[j].label, chance, wider, most)
     return found
 
 
