@@ -142,7 +142,7 @@ def follow(session: Session, source: str, idle: float, baud: int) -> bool:
         if text and session.arrived(text):
             echo("reached: stop here")
             return True
-    echo(f"nothing more came; {session.counted}")
+    echo(f"nothing more came; {session.counted} {'was' if session.taken == 1 else 'were'} taken")
     return False
 
 
