@@ -11,7 +11,7 @@ USABLE := $(VENV)/.usable
 	study-motion study-flights study-inputs study-records study-halves study-asked study-slow study-coverage \
 	study-deceptive study-deceptive-many study-fleet study-mutation study-worlds study-noises \
 	study-structural study-check study-plans study-equations study-equations-coverage study-frictions \
-	study-told-apart study-mag-gyro \
+	study-told-apart study-sequential study-mag-gyro \
 	figures docs clean
 
 demo: $(USABLE)
@@ -133,6 +133,9 @@ study-structural: $(READY)
 
 study-plans: $(READY)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python studies/plans.py
+
+study-sequential: $(READY)
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python studies/sequential.py
 
 study-told-apart: $(READY)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python studies/told_apart.py

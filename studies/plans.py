@@ -28,14 +28,12 @@ from casest.plan.candidates.finding import Possible, candidates
 from casest.plan.candidates.runs import runs
 from casest.plan.design.continuous import continuous, information
 from casest.plan.design.criteria import Trace, Volume, inverse
-from casest.plan.design.several import Several, beside
 from casest.plan.motion.criteria import Wanted
 from casest.plan.motion.experiment import planned_experiment
 from casest.plan.motion.grid import Grid
 from casest.plan.motion.limits import limits_of
 from casest.plan.motion.planning import planned_motion
 from casest.plan.motion.program import Task as Motion
-from casest.plan.planning import Task as Poses
 from casest.plan.planning import criterion_of, planned, task
 from casest_problems.bias_gravity import bias_gravity
 from casest_problems.norm import norm_diagonal, norm_triangular
@@ -332,64 +330,6 @@ def exact_det(T: list[float]) -> float:
     return float(np.linalg.slogdet(PRIOR + J.T @ J)[1] / np.log(10))
 
 
-#: A decay exp(−kt) whose ln k is known to 0.7; noise of a reading, times at which one can read.
-SPREAD, NOISE, TIMES = 0.7, 0.05, np.arange(0.0, 20.05, 0.1)
-
-
-def sequential() -> Iterator[str]:
-    """Six readings of a decay: planned at once, averaged, for the worst, or two by two."""
-    rng = np.random.default_rng(11)
-    logs = np.log(0.5) + SPREAD * rng.standard_normal(SENSORS)
-    even = np.linspace(0, len(TIMES) - 1, 7).round().astype(int)[1:]
-    draws = np.log(0.5) + SPREAD * np.random.default_rng(5).standard_normal(16)
-    at_once = {
-        "evenly spread": even,
-        "at once, for the likeliest value": best_times([np.log(0.5)], 6, False, []),
-        "at once, averaged": best_times(draws, 6, False, []),
-        "at once, for the worst": best_times(draws, 6, True, []),
-    }
-    yield "| plan | rms error of ln k | 90 % of the errors below |"
-    yield "| --- | --- | --- |"
-    for name, chosen in at_once.items():
-        errors_ = [fit(x, chosen, np.random.default_rng(i)) - x for i, x in enumerate(logs)]
-        yield told_as(name, errors_)
-    for name, first in (("likeliest", [np.log(0.5)]), ("averaged", draws)):
-        errors_ = []
-        for i, x in enumerate(logs):
-            chosen = list(best_times(first, 2, False, []))
-            for _ in range(2):
-                now = fit(x, chosen, np.random.default_rng(i))
-                chosen += best_times([now], 2, False, chosen)
-            errors_.append(fit(x, chosen, np.random.default_rng(i)) - x)
-        yield told_as(f"two by two, the first {name}, each fitted before the next", errors_)
-
-
-def told_as(name: str, errors_: list[float]) -> str:
-    """A row of the table."""
-    size = np.abs(errors_)
-    return f"| {name} | {np.sqrt(np.mean(size**2)):.3f} | {np.quantile(size, 0.9):.3f} |"
-
-
-def best_times(logs: Any, count: int, worst: bool, before: list[int]) -> list[int]:
-    """Times for values of ln k, after readings that there are already."""
-    factors = [(-np.exp(x) * TIMES * np.exp(-np.exp(x) * TIMES) / NOISE)[:, None, None]
-               for x in logs]  # fmt: skip
-    known = [1 / SPREAD**2 + np.sum(F[before] ** 2) for F in factors]
-    names = tuple(f"ln k {i}" for i in range(len(known)))
-    given = Poses(beside(factors), np.diag(known), np.ones(len(known)), names)
-    return list(planned(given, Several(Volume(), len(known), worst), count).chosen)
-
-
-def fit(x: float, chosen: Any, rng: Any) -> float:
-    """ln k of readings of a decay, with what is known of it beforehand."""
-    t = TIMES[list(chosen)]
-    y = np.exp(-np.exp(x) * t) + NOISE * rng.standard_normal(len(t))
-    grid = np.linspace(np.log(0.5) - 4 * SPREAD, np.log(0.5) + 4 * SPREAD, 4001)
-    off = (y - np.exp(-np.exp(grid)[:, None] * t)) / NOISE
-    cost = np.sum(off**2, axis=1) + ((grid - np.log(0.5)) / SPREAD) ** 2
-    return float(grid[int(np.argmin(cost))])
-
-
 # -- what planned poses are worth ------------------------------------------------------------------
 
 
@@ -597,7 +537,6 @@ PARTS = {
     "Pyomo.DoE's reactor": pyomo,
     "A motion of 60 s": motion,
     "Pyomo.DoE's reactor as declared equations": experiment,
-    f"Robust and sequential: {SENSORS} decays": sequential,
     f"{POSES} poses, {SENSORS} simulated sensors (of two models {ALONE})": worth,
     "A wheel's second run": mountings,
     "Time of 24 of 2000 candidates, 22 unknowns": speed,

@@ -168,6 +168,18 @@ def test_a_robust_plan_is_the_best_for_the_values_that_were_drawn(folder, capsys
     assert found["robust"] == how
 
 
+def test_a_goal_takes_the_fewest_readings_that_reach_it(folder, capsys):
+    words = "eq.py:decay --duration 8 --rate 10 --until k<0.0025"
+    found = planned(folder, capsys, words)
+    t = np.arange(81) / 10
+    # of one unknown the readings add up: the best ones are those that tell most
+    told = np.cumsum(np.sort((2 * t * np.exp(-t / 2) / 0.01) ** 2)[::-1])
+    fewest = int(np.argmax(told >= 1 / 0.0025**2)) + 1
+    assert found["count"] == fewest > 1
+    assert found["too_few"] == fewest - 1
+    assert found["goals"][0]["after"] == pytest.approx(told[fewest - 1] ** -0.5, rel=1e-3)
+
+
 def test_after_a_fit_the_plan_goes_on_from_what_it_knows(folder, capsys, tmp_path):
     rng = np.random.default_rng(0)
     t = np.linspace(0, 5, 21)
@@ -193,6 +205,9 @@ REFUSED = {
     "eq.py:heated --duration 8 --rate 10": "say how large power may be, --limit 'power=MAX W'",
     "eq.py:heated --duration 8 --rate 1 --pieces 3 --limit power=1": "a whole number for each",
     "eq.py:decay --duration 8 --rate 10 --robust worst": "--std k=NUMBER",
+    "eq.py:decay --duration 8 --rate 10 --until k<1e-6": "k<1e-06 1/s cannot be reached with 81",
+    "eq.py:decay --duration 8 --rate 10 --until x<1": "x is known from the beginning",
+    "eq.py:decay --duration 8 --rate 10 --until k<1 --robust worst": "not with --until",
     "eq.py:decay --duration 8 --rate 10 --sensor-noise x=1": "decay reads y",
     "eq.py:decay --duration 8 --rate 10 --reach 30": "--reach is of measurements",
     "eq.py:decay --duration -8 --rate 10": "--duration -8: a number above zero",

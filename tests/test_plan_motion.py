@@ -10,14 +10,18 @@ import pytest
 from casadi import vertcat
 from scipy.integrate import solve_ivp
 
-from casest import cross, signal
+from casest import cross, signal, tanh
 from casest.cli import run
 from casest.dynamics import Motion, dynamics, measured, state
+from casest.errors import UsageError
+from casest.plan.goals import Measures
 from casest.plan.motion.criteria import Wanted
 from casest.plan.motion.grid import Grid
 from casest.plan.motion.limits import limits_of
-from casest.plan.motion.planning import planned_motion
+from casest.plan.motion.planning import bent, planned_motion
 from casest.plan.motion.program import NEAREST, Task
+from casest.plan.motion.until import shortest
+from casest_problems.bias_gravity import bias_gravity
 
 WORDS = ["bias-gravity", "--duration", "10", "--rate", "20", "--pieces", "6"]
 WORDS += ["--sensor-noise", "v=0.01", "--limit", "a=12", "--limit", "omega=30 deg/s"]
@@ -116,6 +120,64 @@ def test_of_a_scale_the_best_motion_leaves_as_fast_as_it_may_and_stays_away():
     assert abs(found.motion.states[-1, 0]) == pytest.approx(2, rel=0.01)
 
 
+def test_the_shortest_motion_that_reaches_a_goal_is_as_long_as_the_closed_form_says():
+    limits = [("push", "0.5 m/s"), ("place", "2 m")]
+    goal = Measures(rail.names, dict(zip(rail.names, rail.state_units, strict=True))).goal(
+        "scale<0.0025 1/m"
+    )
+    wanted = Wanted.for_goals(rail, [goal])
+
+    def make(duration):
+        grid = Grid.of(duration, 8, 16, False)
+        task = Task(rail, wanted, limits_of(rail, limits), grid, rail.noise_at(1 / 20))
+        return planned_motion(task, 20.0, np.random.default_rng(0))
+
+    found, shorter = shortest(make, [goal], 1.0, 12.0)
+    # 1e-4 / 0.0025² = 16 = 4³/12 + 4 (T − 4): position t/2 up to 2 m, then 2 m
+    needed = 4 + (16 - 4**3 / 12) / 4
+    assert found.motion.seen.std[1] <= 0.0025
+    assert needed * 0.98 < float(found.motion.run.time[-1]) < needed * 1.06
+    assert shorter < needed * 1.001
+    with pytest.raises(UsageError, match="cannot be reached in 6 s"):
+        shortest(make, [goal], 1.0, 6.0)
+
+
+@dynamics
+def seeker(
+    push=signal("m/s"),
+    read=signal("1"),
+    *,
+    place=state("m", known=True),
+    edge=state("m", start=0.0, std=1.0),
+):
+    """A reading that changes about an edge, which lies nobody knows exactly where."""
+    return Motion(
+        rates={"place": push}, outputs=(measured(read, tanh(place - edge), intensity=1e-4),)
+    )
+
+
+def test_for_the_worst_of_several_edges_one_goes_where_each_of_them_may_be(monkeypatch):
+    monkeypatch.setattr("casest.plan.motion.planning.RANDOM", 6)
+    assert bent(seeker)
+    assert not bent(bias_gravity)
+    limits = [("push", "1 m/s"), ("place", "3 m")]
+    edges = [1.5, -1.5]
+
+    def told(found):
+        # ∫ (∂tanh(p − e)/∂e)² dt / 1e-4 along the places of the motion, by hand
+        p = found.motion.states[:, 0]
+        return [np.sum(np.cosh(p - e) ** -4.0) / 20 / 1e-4 for e in [0.0, *edges]]
+
+    local = told(best(seeker, limits, 8.0, 10))
+    found = best(seeker, limits, 8.0, 10, starts=[np.array([0.0, e]) for e in edges], worst=True)
+    robust = told(found)
+    assert local[0] > robust[0]
+    assert min(robust) > 3 * min(local)
+    # of each other edge the standard deviation beside that of the likeliest, what is known included
+    expected = np.sqrt((1 + robust[0]) / (1 + np.array(robust[1:])))
+    assert found.elsewhere == pytest.approx(expected, rel=0.05)
+
+
 @dynamics
 def turntable(
     spin=signal("rad/s"),
@@ -155,7 +217,10 @@ REFUSED = {
     "--limit a=12 --limit omega=1 --criterion G": "one can ask for D, A, E or one of velocity",
     "--limit a=12 --limit omega=1 --count 3": "--count is of measurements that are counted",
     "--limit a=12 --limit omega=1 --budget 3": "--budget is of measurements that are counted",
-    "--limit a=12 --limit omega=1 --robust worst": "--robust: what a motion shows",
+    "--limit a=12 --limit omega=1 --robust worst": "is the same wherever its states begin",
+    "--limit a=12 --limit omega=1 --until bais<1": "there is velocity, gravity, bias",
+    "--limit a=12 --limit omega=1 --until 'bias<1 s'": "--until 'bias<1 s': ",
+    "--limit a=12 --limit omega=1 --until bias<1e-9": "cannot be reached in 5 s: the best motion",
     "--limit a=12 --limit omega=1 --pieces 0": "--pieces 0: from 1 to 400",
     "--limit a=12 --limit omega=1 --pieces 300": "samples for 300 pieces",
     "--limit a=12 --limit omega=1 --searches 0": "--searches 0: at least one",

@@ -145,3 +145,96 @@ def test_what_cannot_be_told_apart_is_one_sentence(closed, capsys, tmp_path):
     assert "2 measurements tell" in refused(closed, "--separate", "--most", 2)
     assert "leave --until" in refused(closed, "--separate", "--until", "offset<1")
     assert "give a result of close" in refused("norm-diagonal", "--separate")
+
+
+@model
+def other(
+    x=signal("m"), y=signal("m"), T=signal("K"), *, a=param("1"), b=param("m"), c=param("m/K")
+):
+    """A line that follows the temperature."""
+    return Residual(measured=y, predicted=a * x + b + c * T)
+
+
+@model
+def current(
+    x=signal("m"), y=signal("m"), amps=signal("A"), *, a=param("1"), b=param("m"), c=param("m/A")
+):
+    """A line that follows the current."""
+    return Residual(measured=y, predicted=a * x + b + c * amps)
+
+
+@model
+def curved(
+    x=signal("m"),
+    y=signal("m"),
+    T=signal("K"),
+    *,
+    a=param("1"),
+    b=param("m"),
+    c=param("m/K"),
+    d=param("m/K^2"),
+):
+    """A line that follows the temperature along a curve."""
+    return Residual(measured=y, predicted=a * x + b + c * T + d * T**2)
+
+
+def test_a_cause_that_contains_another_stays_beside_it_and_the_third_is_told_from_both():
+    x, T, amps = (g.ravel() for g in np.meshgrid([-1.0, 0, 1], [-1.0, 0, 1], [-1.0, 0, 1]))
+    noise = Noise(np.array([0.1]), {})
+
+    def make(one):
+        columns = {"x": x, "T": T, "amps": amps}
+        return settings(one.model, one.values, noise, {n: v[:, None] for n, v in columns.items()})
+
+    rivals = [
+        rival(other, a=1.0, b=0.0, c=0.2),
+        rival(curved, a=1.0, b=0.0, c=0.2, d=0.001),
+        rival(current, a=1.0, b=0.0, c=0.2),
+    ]
+    found = separation(rivals, noise, make, "line")
+    assert {(p.true, p.against) for p in found.pairs} == {
+        ("other", "current"), ("current", "other"), ("curved", "current"), ("current", "curved")
+    }  # fmt: skip
+    (left,) = found.together
+    assert (left.one, left.other, left.wider) == ("other", "curved", "curved")
+    planned = separated(found, None, 200, "line")
+    assert len(planned.chosen) < 12
+    # what the line with the current cannot take up of 0.2 m/K, by least squares
+    chosen = list(planned.chosen)
+    J = np.column_stack([x, np.ones(27), amps])[chosen] / 0.1
+    off = 0.2 * T[chosen] / 0.1
+    left_over = off - J @ np.linalg.lstsq(J, off, rcond=None)[0]
+    growth = dict(
+        zip(((p.true, p.against) for p in found.pairs), found.growths(chosen), strict=True)
+    )
+    assert growth["other", "current"] == pytest.approx(np.sum(left_over**2), rel=1e-4)
+    # what was asked of the curve alone would be out of reach
+    with pytest.raises(UsageError, match="curved from other, which curved contains, in"):
+        separated(separation(rivals[:2], noise, make, "line"), None, 200, "line")
+
+
+def test_columns_of_a_record_are_varied_in_the_plan_that_tells_their_causes_apart(
+    tmp_path, capsys, monkeypatch
+):
+    """By the command line: temperature and current rose together, one of them acts."""
+    monkeypatch.chdir(tmp_path)
+    rng = np.random.default_rng(1)
+    load, u = np.repeat(np.linspace(0, 100, 6), 5), rng.permutation(np.linspace(0, 1, 30))
+    T, amps = 20 + 10 * u + 0.3 * rng.standard_normal(30), 1 + 0.5 * u
+    amps = amps + 0.02 * rng.standard_normal(30)
+    y = 3 + 0.5 * load + 0.04 * (T - 25) + 0.05 * rng.standard_normal(30)
+    np.savetxt("bench.csv", np.column_stack([load, y, T, amps]), delimiter=",", comments="",
+               header="Weight (kg),Bridge (mV),Temp (degC),Heater (A)")  # fmt: skip
+    words = ["--columns", "load=Weight", "--columns", "reading=Bridge", "-o", "out"]
+    assert run(["close", "load-cell", "bench.csv", *words]) == 0
+    capsys.readouterr()
+    assert run(["plan", "out", "--separate", "--vary", "load=0:100:50", "-o", "next"]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "temperature_bias(Temp)" in said
+    assert "channel_bias(Heater)" in said
+    assert "append what is measured to the record" in said
+    head, first, *_ = (tmp_path / "next" / "plan.csv").read_text().splitlines()
+    assert {"load [kg]", "Temp [degC]", "Heater [A]"} <= set(head.split(","))
+    row = dict(zip(head.split(","), first.split(","), strict=True))
+    # together they rose, so that one goes up and the other down
+    assert (float(row["Temp [degC]"]) - 25) * (float(row["Heater [A]"]) - 1.25) < 0

@@ -9,6 +9,7 @@ import shutil
 import time
 from pathlib import Path
 
+import click
 import numpy as np
 import pytest
 import simulators as sim
@@ -140,6 +141,22 @@ def test_the_next_command_can_be_typed_as_it_stands(said, name, expected):
         for words in commands:
             if words[1:3] != ["close", "bias-gravity"]:  # has been run above
                 assert run(words[1:]) == 0, words
+
+
+def test_a_command_is_read_again_whichever_of_its_options_have_no_value():
+    context = click.Context(commands)
+    for name in commands.list_commands(context):
+        command = commands.get_command(context, name)
+        flags = {
+            word
+            for option in command.params
+            if isinstance(option, click.Option) and option.is_flag
+            for word in option.opts
+        }
+        for flag in flags:
+            typed = typed_words(f"casest {name} {flag} given")
+            assert typed.arguments == ("given",), f"{name} {flag}"
+            assert typed.options == ((flag, None),)
 
 
 def test_after_an_export_comes_its_self_test(said):

@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from casest.cli.flying import input_limits, refuse_others
+from casest.cli.flying import goals_of, input_limits, refuse_others
 from casest.cli.plan_options import PlanOptions
 from casest.cli.shared import echo, progress, typed, write
 from casest.errors import UsageError
@@ -14,7 +14,9 @@ from casest.errors import UsageError
 if TYPE_CHECKING:
     from casest.declaration.shapes import Array
     from casest.dynamics import Dynamics
+    from casest.plan.goals import Goal
     from casest.plan.motion.criteria import Wanted
+    from casest.plan.motion.experiment import Experiment
     from casest.plan.motion.program import Task
     from casest.saved.planning import Start
 
@@ -24,9 +26,6 @@ PIECES, DRAWN = 8, 8
 
 def experimenting(name: str, declared: Dynamics, start: Start | None, options: PlanOptions) -> int:
     """Inputs and times of readings of an experiment; exit code 0."""
-    import numpy as np
-
-    from casest.plan.motion.experiment import planned_experiment
     from casest.report.text.experiment import experiment_text
     from casest.results.experiment import experiment_result, experiment_rows
     from casest.results.file import as_json
@@ -35,12 +34,9 @@ def experimenting(name: str, declared: Dynamics, start: Start | None, options: P
     if options.flying.searches != 1:
         raise UsageError("--searches is of a motion; an experiment begins at the best of 20")
     model, known, noted = _known(declared, start, options)
-    task = _task(name, model, known, options, start)
-    rng = np.random.default_rng(options.flying.seed)
-    starts = _possible(task, options, rng)
-    count = options.count if options.count is not None else _count(task)
-    progress(f"planning an experiment for {name}")
-    found = planned_experiment(task, count, rng, starts, options.robust == "worst")
+    goals = goals_of(model, options)
+    task = _task(name, model, known, options, start, goals)
+    found, too_few = _planned(name, task, goals, options)
     result = experiment_result(
         found,
         model_name=name,
@@ -49,6 +45,8 @@ def experimenting(name: str, declared: Dynamics, start: Start | None, options: P
         robust=options.robust,
         notes=noted,
         command=typed(),
+        goals=goals,
+        too_few=too_few,
     )
     if options.output:
         from casest.report.html.experiment import experiment_page
@@ -63,6 +61,28 @@ def experimenting(name: str, declared: Dynamics, start: Start | None, options: P
     if options.output:
         echo(f"\nWritten: {options.output}/plan.html, plan.json, plan.csv")
     return 0
+
+
+def _planned(
+    name: str, task: Task, goals: list[Goal], options: PlanOptions
+) -> tuple[Experiment, int | None]:
+    """The experiment, and with goals so many readings that do not reach them."""
+    import numpy as np
+
+    from casest.plan.motion.experiment import planned_experiment
+    from casest.plan.motion.until import fewest
+
+    worst = options.robust == "worst"
+    starts = _possible(task, options, np.random.default_rng(options.flying.seed))
+
+    def make(count: int) -> Experiment:
+        progress(f"planning an experiment of {count} readings for {name}")
+        rng = np.random.default_rng(options.flying.seed)
+        return planned_experiment(task, count, rng, starts, worst)
+
+    if goals:
+        return fewest(make, goals, min(len(task.grid.time), options.most))
+    return make(options.count if options.count is not None else _count(task)), None
 
 
 def equations_of(given: Path, options: PlanOptions) -> tuple[Dynamics, Start | None] | None:
@@ -133,7 +153,12 @@ def _known(
 
 
 def _task(
-    name: str, model: Dynamics, known: Any, options: PlanOptions, start: Start | None
+    name: str,
+    model: Dynamics,
+    known: Any,
+    options: PlanOptions,
+    start: Start | None,
+    goals: list[Goal],
 ) -> Task:
     """Limits, grid and noise of the experiment."""
     from casest.plan.motion.grid import Grid
@@ -156,18 +181,18 @@ def _task(
             f"--duration {duration:g} --rate {rate:g}: {duration * rate:g} steps between readings "
             f"for {pieces} pieces of the inputs; a whole number for each (--pieces)"
         )
-    wanted = _wanted(model, options, known)
+    wanted = _wanted(model, options, known, goals)
     grid = Grid.of(duration, pieces, steps, True)
     return Task(model, wanted, limits, grid, _noise(model, options, start))
 
 
-def _wanted(model: Dynamics, options: PlanOptions, known: Any) -> Wanted:
+def _wanted(model: Dynamics, options: PlanOptions, known: Any, goals: list[Goal]) -> Wanted:
     """What is to be best, unknowns in units of what is known of them, else of their size."""
     import numpy as np
 
     from casest.plan.motion.criteria import VAGUE, Wanted
 
-    wanted = Wanted.of(model, options.criterion)
+    wanted = Wanted.for_goals(model, goals) if goals else Wanted.of(model, options.criterion)
     free = list(wanted.free)
     scaled = (known * np.outer(wanted.scale, wanted.scale))[np.ix_(free, free)]
     return replace(wanted, known=scaled + VAGUE * np.eye(len(free)))

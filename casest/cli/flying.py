@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 from casest.cli.loading import moving_model
 from casest.cli.plan_options import PlanOptions
@@ -11,7 +12,9 @@ from casest.errors import UsageError
 
 if TYPE_CHECKING:
     from casest.dynamics import Dynamics
+    from casest.plan.goals import Goal
     from casest.plan.motion.limits import Limit
+    from casest.plan.motion.planning import MotionPlan
     from casest.plan.motion.program import Task
 
 #: Pieces of an input, nodes of a motion at least, and pieces at most.
@@ -19,27 +22,24 @@ PIECES, NODES, MOST = 30, 30, 400
 
 
 def flying(name: str, options: PlanOptions) -> int:
-    """The motion that shows all states best; exit code 2 where none was found that shows them."""
-    import numpy as np
-
-    from casest.plan.motion.planning import planned_motion
+    """The motion that shows all states best, or the shortest that reaches a goal; exit code 0."""
     from casest.report.text.motion_plan import motion_text
     from casest.results.file import as_json
     from casest.results.motion_plan import motion_result, motion_rows
 
     refuse_others(name, options)
-    task, rate = task_of(name, options)
-    progress(f"planning a motion for {name}")
-    found = planned_motion(
-        task, rate, np.random.default_rng(options.flying.seed), searches=options.flying.searches
-    )
+    model, rate = model_of(name, options)
+    goals = goals_of(model, options)
+    found, shorter = _planned(name, model, rate, goals, options)
     result = motion_result(
-        task.model,
+        model,
         found,
         model_name=name,
         criterion=options.criterion,
-        robust=None,
+        robust=options.robust,
         rate=rate,
+        goals=goals,
+        shorter=shorter,
         notes=(),
         command=typed(),
     )
@@ -58,6 +58,79 @@ def flying(name: str, options: PlanOptions) -> int:
     return 0
 
 
+def _planned(
+    name: str, model: Dynamics, rate: float, goals: list[Goal], options: PlanOptions
+) -> tuple[MotionPlan, float | None]:
+    """The motion, and with goals a duration at which none was found that reaches them."""
+    import numpy as np
+
+    from casest.plan.motion.planning import planned_motion
+    from casest.plan.motion.until import shortest
+
+    duration, pieces = _checked(name, rate, options)
+    starts = _possible(model, options)
+
+    def make(seconds: float) -> MotionPlan:
+        progress(f"planning a motion of {seconds:.4g} s for {name}")
+        return planned_motion(
+            task_of(model, rate, seconds, pieces, goals, options),
+            rate,
+            np.random.default_rng(options.flying.seed),
+            starts=starts,
+            worst=options.robust == "worst",
+            searches=options.flying.searches,
+        )
+
+    if not goals:
+        return make(duration), None
+    return shortest(lambda s: make(round(s * rate) / rate), goals, 2 * pieces / rate, duration)
+
+
+def goals_of(model: Dynamics, options: PlanOptions) -> list[Goal]:
+    """Goals as they are typed, of what is unknown at the beginning."""
+    from casest.plan.goals import Measures
+
+    if not options.until:
+        return []
+    if options.robust:
+        raise UsageError("--robust goes with a --duration or a --count, not with --until")
+    names = [s.name for s in model.states if not s.known for _ in range(s.size)]
+    if not names:
+        raise UsageError(f"{model.name}: every state is known: there is nothing to plan for")
+    units = dict(zip(model.names, model.state_units, strict=True))
+    goals = [Measures(model.names, units).goal(text) for text in options.until]
+    for goal in goals:
+        if goal.name.partition("[")[0] not in names:
+            raise UsageError(f"--until '{goal}': {goal.name} is known from the beginning")
+    return goals
+
+
+#: Beginnings that are drawn for --robust, on both sides of the likeliest.
+DRAWN = 2
+
+
+def _possible(model: Dynamics, options: PlanOptions) -> list[Any]:
+    """Beginnings (n,) that the states may have beside the likeliest; none without --robust."""
+    import numpy as np
+
+    from casest.plan.motion.planning import bent
+
+    if options.robust is None:
+        return []
+    if not bent(model):
+        raise UsageError(
+            f"--robust: what a motion of {model.name} shows is the same wherever its states begin; "
+            "leave it out"
+        )
+    lower, upper = model.bounds
+    rng, found = np.random.default_rng(options.flying.seed), []
+    root = np.sqrt(np.diag(model.start_covariance))
+    for _ in range(DRAWN):
+        off = root * rng.standard_normal(len(root))
+        found += [np.clip(model.start + sign * off, lower, upper) for sign in (1, -1)]
+    return found
+
+
 def refuse_others(name: str, options: PlanOptions, counted: bool = False) -> None:
     """Refuse options of poses, runs and rows; `counted`: readings are counted all the same."""
     given = {
@@ -65,7 +138,6 @@ def refuse_others(name: str, options: PlanOptions, counted: bool = False) -> Non
         "--vary": options.possible.vary,
         "--reach": options.possible.reach,
         "--count": None if counted else options.count,
-        "--until": options.until,
         "--budget": options.budget,
         "--separate": options.separate,
         "--live": options.live.source,
@@ -77,8 +149,6 @@ def refuse_others(name: str, options: PlanOptions, counted: bool = False) -> Non
         "--effects": options.model.effects,
         "--prior": options.model.prior,
     }
-    if not counted and options.robust:
-        raise UsageError("--robust: what a motion shows is told for the states that it begins with")
     for flag, value in given.items():
         if value not in (None, (), False):
             raise UsageError(
@@ -87,19 +157,22 @@ def refuse_others(name: str, options: PlanOptions, counted: bool = False) -> Non
             )
 
 
-def task_of(name: str, options: PlanOptions) -> tuple[Task, float]:
-    """The model with its noise, limits, grid; and samples per second."""
-    from casest.plan.motion.criteria import Wanted
-    from casest.plan.motion.grid import Grid
-    from casest.plan.motion.program import Task
-
-    duration, rate = options.possible.duration, options.reading.rate
-    pieces = PIECES if options.flying.pieces is None else options.flying.pieces
-    if duration is None or rate is None:
+def model_of(name: str, options: PlanOptions) -> tuple[Dynamics, float]:
+    """The model with its noise and beginning, and samples per second."""
+    rate = options.reading.rate
+    if options.possible.duration is None or rate is None:
         raise UsageError(f"{name} is an estimator in motion: say --duration and --rate")
-    for flag, value in (("--duration", duration), ("--rate", rate)):
+    for flag, value in (("--duration", options.possible.duration), ("--rate", rate)):
         if not 0 < value < float("inf"):
             raise UsageError(f"{flag} {value:g}: a number above zero")
+    model = _noisy(moving_model(name, options.model.constants, options.motion), options, rate)
+    return model.beginning(**dict(given.numbers() for given in options.values)), rate
+
+
+def _checked(name: str, rate: float, options: PlanOptions) -> tuple[float, int]:
+    """Seconds and pieces of inputs."""
+    duration = float(options.possible.duration or 0.0)
+    pieces = PIECES if options.flying.pieces is None else options.flying.pieces
     if not 1 <= pieces <= MOST:
         raise UsageError(f"--pieces {pieces}: from 1 to {MOST}")
     if duration * rate < 2 * pieces:
@@ -109,14 +182,26 @@ def task_of(name: str, options: PlanOptions) -> tuple[Task, float]:
         )
     if options.flying.searches < 1:
         raise UsageError(f"--searches {options.flying.searches}: at least one")
-    model = _noisy(moving_model(name, options.model.constants, options.motion), options, rate)
-    values = dict(given.numbers() for given in options.values)
-    model = model.beginning(**values)
+    return duration, pieces
+
+
+def task_of(
+    model: Dynamics,
+    rate: float,
+    duration: float,
+    pieces: int,
+    goals: Sequence[Goal],
+    options: PlanOptions,
+) -> Task:
+    """The search for a motion of so many seconds."""
+    from casest.plan.motion.criteria import Wanted
+    from casest.plan.motion.grid import Grid
+    from casest.plan.motion.program import Task
+
     limits = input_limits(model, options)
-    held = _held(model)
-    grid = Grid.of(duration, pieces, NODES, held)
-    wanted = Wanted.of(model, options.criterion)
-    return Task(model, wanted, limits, grid, model.noise_at(1 / rate)), rate
+    grid = Grid.of(duration, pieces, NODES, _held(model))
+    wanted = Wanted.for_goals(model, goals) if goals else Wanted.of(model, options.criterion)
+    return Task(model, wanted, limits, grid, model.noise_at(1 / rate))
 
 
 def input_limits(model: Dynamics, options: PlanOptions) -> tuple[Limit, ...]:

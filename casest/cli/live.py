@@ -40,6 +40,12 @@ class Session:
     fits: bool
     taken: int = 0
     text: str = ""
+    thing: str = "pose"
+
+    @property
+    def counted(self) -> str:
+        """`24 poses`."""
+        return f"{self.taken} {self.thing}{'' if self.taken == 1 else 's'}"
 
     def arrived(self, text: str) -> bool:
         """Take in what has come; is the goal reached?"""
@@ -98,8 +104,13 @@ class Session:
         now = given.covariance(())
         done = bool(goals) and now is not None and all(g.std(now) <= g.limit for g in goals)
         best, ratio = _next(given, goals)
-        head = f"{self.taken} poses" if self.taken != 1 else "1 pose"
-        parts = [head, *(_reached(g, now) for g in goals)]
+        if found.kind not in ("pose", "sample"):
+            raise UsageError(
+                f"--live counts poses and rows; {self.model.name} is measured in runs: plan each "
+                "without --live"
+            )
+        self.thing = "pose" if found.up is not None else "reading"
+        parts = [self.counted, *(_reached(g, now) for g in goals)]
         if now is None:
             parts.append(f"{_rank(given)} of {n} unknowns determined")
         if not done:
@@ -131,7 +142,7 @@ def follow(session: Session, source: str, idle: float, baud: int) -> bool:
         if text and session.arrived(text):
             echo("reached: stop here")
             return True
-    echo(f"nothing more came; {session.taken} poses were taken")
+    echo(f"nothing more came; {session.counted} {'was' if session.taken == 1 else 'were'} taken")
     return False
 
 

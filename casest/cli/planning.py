@@ -96,7 +96,7 @@ def planned_result(situation: Situation, options: PlanOptions) -> Plan:
     if situation.information is not None:
         own = [found.names.index(name) for name in situation.names]
         known[np.ix_(own, own)] = situation.information
-    given = task(found.factors, known, found.names, situation.name)
+    given = task(found.factors, known, found.names, situation.name, found.once)
     _refuse_hidden(given, situation, found)
     goals, planned = _planned(given, found, options, situation)
     notes = (
@@ -158,6 +158,8 @@ def _planned(
     if options.budget is not None:
         if options.robust:
             raise UsageError("--robust goes with --count, not with --budget")
+        if given.once:
+            raise UsageError("--budget: each time can be read once; say how many (--count)")
         return [], bought(given, criterion, found.cost, options.budget)
     count = _count(given) if options.count is None else options.count
     if count < 1:

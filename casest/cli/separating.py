@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from casest.cli.plan_options import PlanOptions
@@ -10,14 +11,17 @@ from casest.cli.situation import Situation, covered, possible_of, records_of
 from casest.errors import UsageError
 
 if TYPE_CHECKING:
+    from casest.data.run import Run
+    from casest.declaration.model import Model
     from casest.plan.candidates.candidates import Candidates
+    from casest.plan.rivals.rivals import Rival
     from casest.results.plan import Plan
 
 
 def separating(situation: Situation, options: PlanOptions) -> Plan:
     """Candidates as each cause has them, and the plan that tells the causes apart."""
     from casest.plan.candidates.finding import candidates
-    from casest.plan.rivals.rivals import Rival, open_causes, refitted
+    from casest.plan.rivals.rivals import open_causes, refitted
     from casest.plan.rivals.separating import separated, separation
     from casest.results.plan import separation_result
 
@@ -33,7 +37,7 @@ def separating(situation: Situation, options: PlanOptions) -> Plan:
             f"{situation.after}: its record left no two causes open; plan for precision instead "
             "(without --separate)"
         )
-    runs = records_of(situation)
+    runs = records_of(situation, base)
     if runs is None:
         raise UsageError(
             f"{situation.after}: the record that it was made from is not where it was, and the "
@@ -41,15 +45,14 @@ def separating(situation: Situation, options: PlanOptions) -> Plan:
         )
     progress(f"fitting {', '.join(labels)}")
     rivals = refitted(base, situation.values, runs, labels, situation.noise.residual)
-    possible = _with_columns(possible_of(situation, options), situation, rivals, runs)
+    possible = _with_columns(possible_of(situation, options), base, rivals, runs)
 
     def make(rival: Rival) -> Candidates:
         return candidates(rival.model, rival.values, situation.noise, possible)
 
-    found = separation(rivals, situation.noise, make, situation.name, possible.rate)
+    found = separation(rivals, situation.noise, make, situation.name, possible.rate, options.most)
     planned = separated(found, options.count, options.most, situation.name)
-    named = {r.label for r in rivals}
-    left = [label for label in labels if label not in named]
+    left = [label for label in labels if label not in found.labels]
     return separation_result(
         situation.model,
         found,
@@ -57,14 +60,25 @@ def separating(situation: Situation, options: PlanOptions) -> Plan:
         model_name=situation.name,
         after=situation.after,
         noise=situation.noise,
-        units=situation.units,
-        notes=[f"not planned for: {', '.join(left)}"] if left else [],
+        units=_units(situation, rivals, runs),
+        notes=[*([f"not planned for: {', '.join(left)}"] if left else []), _AFTERWARDS],
         covered=covered(situation) if found.candidates.up is not None else None,
         command=typed(),
     )
 
 
-def _with_columns(possible: Any, situation: Situation, rivals: Any, runs: Any) -> Any:
+#: What to do with what is measured.
+_AFTERWARDS = "append what is measured to the record, as further rows, and close it again"
+
+
+def _units(situation: Situation, rivals: Sequence[Rival], runs: Sequence[Run]) -> dict[str, str]:
+    """Of signals, unknowns, and the columns that a cause reads."""
+    read = {s.name: s.unit or "" for r in rivals for s in r.model.signals}
+    logged = {name: unit for name, unit in runs[0].column_units.items() if unit and name in read}
+    return {**read, **logged, **situation.units}
+
+
+def _with_columns(possible: Any, base: Model, rivals: Any, runs: Any) -> Any:
     """Values of the columns that a rival reads: as typed, else as the record has them."""
     from dataclasses import replace
 
@@ -73,7 +87,7 @@ def _with_columns(possible: Any, situation: Situation, rivals: Any, runs: Any) -
     from casest.effects.placing import prepared
     from casest.plan.candidates.varied import values_of
 
-    own = {s.name for s in situation.model.signals}
+    own = {s.name for s in base.signals}
     extras = {s.name: s.unit for r in rivals for s in r.model.signals if s.name not in own}
     typed_ones = dict(possible.varied)
     also = {}
@@ -81,6 +95,6 @@ def _with_columns(possible: Any, situation: Situation, rivals: Any, runs: Any) -
         if name in typed_ones:
             also[name] = values_of(name, typed_ones.pop(name), unit)
             continue
-        seen = np.concatenate([run.signals[name][:, 0] for run in prepared(situation.model, runs)])
+        seen = np.concatenate([run.signals[name][:, 0] for run in prepared(base, runs)])
         also[name] = np.unique(np.quantile(seen, [0.0, 0.5, 1.0]))[:, None]
     return replace(possible, varied=typed_ones, also=also)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -161,11 +161,26 @@ def possible_of(situation: Situation, options: PlanOptions) -> Any:
 
 
 def _table(model: Model, file: str, reading: ReadingOptions) -> tuple[Run, ...]:
-    """Rows of a file with the signals that are not predicted."""
+    """Rows of a file with the signals that are not predicted, and what each costs."""
     from casest.data import load_runs
+    from casest.plan.candidates.rows import COST
 
     needed = [s for s in model.signals if s.name != model.traced.measured]
-    return load_runs([file], needed, **reading.keywords())
+    called = [given for given in reading.columns if given.pair()[0] == COST]
+    others = tuple(given for given in reading.columns if given not in called)
+    runs = load_runs([file], needed, **replace(reading, columns=others).keywords())
+    return tuple(_costing(run, given.pair()[1]) for given in called[-1:] for run in runs) or runs
+
+
+def _costing(run: Run, column: str) -> Run:
+    """The run with its costs where they are looked for."""
+    from casest.errors import DataError
+    from casest.plan.candidates.rows import COST
+
+    if column not in run.columns:
+        there = ", ".join(run.columns) or "no further columns"
+        raise DataError(f"--columns {COST}={column}: {run.file} has {there}")
+    return replace(run, columns={**run.columns, COST: run.columns[column]})
 
 
 def covered(situation: Situation) -> Any:
@@ -180,8 +195,11 @@ def covered(situation: Situation) -> Any:
         return None
 
 
-def records_of(situation: Situation) -> tuple[Run, ...] | None:
-    """The records that a result was made from, read as they were; None where they are gone."""
+def records_of(situation: Situation, model: Model | None = None) -> tuple[Run, ...] | None:
+    """The records that a result was made from, read as they were; None where they are gone.
+
+    For another `model`, what that one does not read stays a column.
+    """
     from casest.data import load_runs
     from casest.errors import CasestError
     from casest.report.next_command import typed_words
@@ -200,7 +218,7 @@ def records_of(situation: Situation) -> tuple[Run, ...] | None:
     )
     try:
         data = list(situation.content["data"])
-        return load_runs(data, situation.model.signals, **reading.keywords())
+        return load_runs(data, (model or situation.model).signals, **reading.keywords())
     except (CasestError, OSError, ValueError):  # moved or changed since
         return None
 

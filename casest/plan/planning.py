@@ -18,6 +18,7 @@ from casest.plan.design.criteria import (
     Volume,
     inverse,
 )
+from casest.plan.design.distinct import distinct, floor_of
 from casest.plan.design.exact import exchanged, in_order, rounded
 from casest.plan.goals import Goal
 
@@ -41,7 +42,7 @@ class Known:
 
 @dataclass(frozen=True)
 class Planned:
-    """The chosen candidates, those first that bring most.
+    """The chosen candidates, those first that bring most; of a run's times the earliest.
 
     covariances: before, and after each of them, (n, n), infinite where undetermined. value: of the
     criterion at the end; share: of its standard deviations that the best possible design of as many
@@ -58,13 +59,14 @@ class Planned:
 class Task:
     """Candidates' factors (N, k, n), what is known (n, n), and the criterion, in scaled unknowns.
 
-    `scale` (n,): the unknowns' own sizes.
+    `scale` (n,): the unknowns' own sizes. once: no candidate can be made again.
     """
 
     factors: Array
     known: Array
     scale: Array
     names: tuple[str, ...]
+    once: bool = False
 
     @property
     def start(self) -> Array:
@@ -85,7 +87,7 @@ class Task:
         return np.asarray(inverse(M) * np.outer(self.scale, self.scale))
 
 
-def task(factors: Array, known: Array, names: Sequence[str], what: str) -> Task:
+def task(factors: Array, known: Array, names: Sequence[str], what: str, once: bool = False) -> Task:
     """The task in unknowns whose sizes are what one average candidate says of each alone.
 
     UsageError where no candidate, nor what is known, says anything of an unknown, or of some
@@ -99,7 +101,7 @@ def task(factors: Array, known: Array, names: Sequence[str], what: str) -> Task:
         silent = ", ".join(name for name, a in zip(names, alone, strict=True) if not a > 0)
         raise UsageError(f"{what}: no candidate says anything of {silent}: vary what it depends on")
     scale = 1 / np.sqrt(alone)
-    scaled = Task(factors * scale, known * np.outer(scale, scale), scale, tuple(names))
+    scaled = Task(factors * scale, known * np.outer(scale, scale), scale, tuple(names), once)
     return scaled
 
 
@@ -140,20 +142,39 @@ def planned(given: Task, criterion: Criterion, count: int) -> Planned:
     """The best `count` candidates, each as often as it is worth."""
     if not count:
         return Planned((), (given.covariance(()),), 1.0, 0)
-    best = continuous(criterion, given.start, given.factors, count)
-    chosen = _whole(given, criterion, best.weights, count)
+    chosen, floor = _best(given, criterion, count)
     if given.covariance(chosen) is None:
         rank = np.linalg.matrix_rank(given.information(chosen), hermitian=True)
         raise UsageError(
             f"{count} measurements determine {rank} of {len(given.scale)} unknowns: plan more "
             "(--count)"
         )
-    chosen = in_order(criterion, given.start, given.factors, chosen)
+    if not given.once:
+        chosen = in_order(criterion, given.start, given.factors, chosen)
     steps = tuple(given.covariance(chosen[:k]) for k in range(count + 1))
-    weights = np.bincount(chosen, minlength=len(given.factors)) / count
-    value, floor = certified(criterion, given.start, given.factors, weights, count)
-    floor = max(floor, best.floor)
+    start = given.start + given.information(chosen) - given.known
+    value = criterion.value(inverse(start))
     return Planned(tuple(chosen), steps, criterion.ratio(floor, value, len(given.scale)))
+
+
+def _best(given: Task, criterion: Criterion, count: int) -> tuple[list[int], float]:
+    """The best candidates, and the least value of the criterion that so many can have."""
+    if given.once:
+        return _best_once(given, criterion, count)
+    best = continuous(criterion, given.start, given.factors, count)
+    chosen = _whole(given, criterion, best.weights, count)
+    weights = np.bincount(chosen, minlength=len(given.factors)) / count
+    floor = certified(criterion, given.start, given.factors, weights, count)[1]
+    return chosen, max(floor, best.floor)
+
+
+def _best_once(given: Task, criterion: Criterion, count: int) -> tuple[list[int], float]:
+    N = len(given.factors)
+    if count > N:
+        raise UsageError(f"--count {count}: there are {N} times at which one can read")
+    chosen = distinct(criterion, given.start, [given.factors], count, False)
+    C = inverse(given.start + given.information(chosen) - given.known)
+    return chosen, floor_of(criterion, C, given.factors, chosen)
 
 
 def _whole(given: Task, criterion: Criterion, weights: Array, count: int) -> list[int]:
@@ -175,6 +196,7 @@ def until(given: Task, goals: Sequence[Goal], most: int) -> Planned:
 
     UsageError with the best possible where it is not.
     """
+    most = min(most, len(given.factors)) if given.once else most
     criterion = Largest(np.hstack([goal.scaled * given.scale[:, None] for goal in goals]))
     if criterion.value(inverse(given.start)) <= 1:
         return Planned((), (given.covariance(()),), 1.0, 0)
@@ -236,7 +258,9 @@ def _unreachable(given: Task, goals: Sequence[Goal], best: Planned, most: int) -
         for goal in goals
     )
     asked = " and ".join(f"{goal}" for goal in goals)
+    out = "allow more (--most), or a sensor with less noise"
+    if given.once and most == len(given.factors):
+        out = "a longer run (--duration), a higher --rate, or a sensor with less noise"
     return (
-        f"{asked} cannot be reached with {most} measurements: the best possible are {said}; allow "
-        "more (--most), or a sensor with less noise"
+        f"{asked} cannot be reached with {most} measurements: the best possible are {said}; {out}"
     )

@@ -71,7 +71,7 @@ def planned_robustly(
     factors = beside([found.factors * nominal.scale for found in every])
     S = len(every)
     known = np.asarray(np.kron(np.eye(S), nominal.known), float)
-    blocks = Task(factors, known, np.tile(nominal.scale, S), nominal.names * S)
+    blocks = Task(factors, known, np.tile(nominal.scale, S), nominal.names * S, nominal.once)
     plan = planned(blocks, Several(criterion, S, worst), count)
     steps = tuple(nominal.covariance(plan.chosen[:k]) for k in range(count + 1))
     return Planned(plan.chosen, steps, plan.share)

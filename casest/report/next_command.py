@@ -12,7 +12,11 @@ from casest.results.written import apart
 WIDTH = 80
 
 _OUTPUT = ("-o", "--output")
-_FLAGS = ("--at-rest", "--json", "--force", "--float", "--with-std", "--validate", "--profile")
+#: Options without a value.
+_FLAGS = (
+    "--at-rest", "--json", "--force", "--float", "--with-std", "--validate", "--profile",
+    "--partitions", "--covariance", "--separate", "--help", "--version",
+)  # fmt: skip
 _READING = ("--columns", "--unit", "--scale", "--rate", "--time-zero")
 _MODEL = ("--set", "--free", "--fix", "--shared", "--per-run", "--effects", "--at-rest", "--prior")
 _FIT = ("--start", "--solver", "--seed", "--holdout", "--sensor-noise", "--noise-law")

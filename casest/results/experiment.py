@@ -5,17 +5,19 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from msgspec import Struct
 
 from casest.declaration.shapes import Array
+from casest.plan.goals import Goal
 from casest.plan.motion.experiment import Experiment
 from casest.plan.motion.planning import readings
+from casest.plan.motion.until import std_of, stds
 from casest.results.file import plain
-from casest.results.motion_plan import CRITERIA
-from casest.results.plan import BestPossible, Unknown
+from casest.results.motion_plan import CRITERIA, goal_words
+from casest.results.plan import BestPossible, Reached, Unknown
 from casest.results.result import Reproduced, Result, reproduced
 
 
@@ -32,7 +34,8 @@ class PlannedExperiment(Result, frozen=True, kw_only=True, dict=True):
 
     times, s: when to read; best_possible: of the standard deviations with other times and the same
     inputs. evenly: those of as many readings spread evenly, as a multiple. expected (N, m): the
-    readings that are to be expected, of the values that are thought likely.
+    readings that are to be expected, of the values that are thought likely. goals: of `--until`;
+    too_few: so many readings with which no plan was found that reaches them.
     """
 
     unwritten = ("columns",)
@@ -48,6 +51,8 @@ class PlannedExperiment(Result, frozen=True, kw_only=True, dict=True):
     inputs: dict[str, Held]
     unknowns: dict[str, Unknown]
     evenly: float
+    goals: list[Reached]
+    too_few: int | None
     best_possible: BestPossible
     notes: list[str]
     reproduce: Reproduced
@@ -63,6 +68,8 @@ def experiment_result(
     robust: str | None,
     notes: tuple[str, ...],
     command: str,
+    goals: Sequence[Goal] = (),
+    too_few: int | None = None,
 ) -> PlannedExperiment:
     """What `plan` of differential equations leaves."""
     task, time = found.task, found.task.grid.time
@@ -94,6 +101,8 @@ def experiment_result(
             for k, i in enumerate(free)
         },
         evenly=found.even,
+        goals=[Reached(g.name, g.limit, g.unit, None, std_of(stds(found), g)) for g in goals],
+        too_few=too_few,
         best_possible=BestPossible(found.share),
         notes=list(notes),
         reproduce=reproduced(command, ()),
@@ -156,7 +165,10 @@ def input_words(name: str, held: Held) -> str:
 
 def experiment_words(result: PlannedExperiment) -> Iterator[str]:
     """The certificate, what is none, notes."""
-    said = CRITERIA.get(result.criterion, result.criterion)
+    yield from goal_words(result.goals)
+    if result.too_few:
+        yield f"no plan of {result.too_few} readings was found that reaches this"
+    said = "what is asked" if result.goals else CRITERIA.get(result.criterion, result.criterion)
     share = 100 * result.best_possible.share_of_std
     yield (
         f"certified: with these inputs no {result.count} of the {result.candidates} times have "

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from msgspec import Struct
@@ -13,8 +13,11 @@ from msgspec import Struct
 from casest.data.run import Run
 from casest.declaration.shapes import Array
 from casest.dynamics.declare import Dynamics
+from casest.plan.goals import Goal
 from casest.plan.motion.planning import MotionPlan
+from casest.plan.motion.until import std_of
 from casest.results.file import plain
+from casest.results.plan import Reached
 from casest.results.result import Number, Reproduced, Result, reproduced
 
 #: What the criteria mean, of a motion.
@@ -46,7 +49,9 @@ class PlannedMotion(Result, frozen=True, kw_only=True, dict=True):
     """The content of `plan.json` of a motion; `run` and `states` are what is drawn and written.
 
     ratio: the geometric mean of the standard deviations over those of the random motion, null
-    where one of the two does not determine every state.
+    where one of the two does not determine every state. goals: of `--until`; too_short: a duration
+    at which no motion was found that reaches them. elsewhere: of each other beginning that it was
+    planned for (`--robust`), the geometric mean of the standard deviations as a multiple.
     """
 
     unwritten = ("run", "states", "names")
@@ -63,6 +68,9 @@ class PlannedMotion(Result, frozen=True, kw_only=True, dict=True):
     limits: list[Kept]
     std: dict[str, Seen]
     ratio: Number
+    goals: list[Reached]
+    too_short: Number
+    elsewhere: list[float]
     notes: list[str]
     reproduce: Reproduced
     run: Run
@@ -80,6 +88,8 @@ def motion_result(
     rate: float,
     notes: tuple[str, ...],
     command: str,
+    goals: Sequence[Goal] = (),
+    shorter: float | None = None,
 ) -> PlannedMotion:
     """What `plan` of an estimator in motion leaves."""
     planned, random = found.motion.seen, found.random.seen
@@ -101,6 +111,9 @@ def motion_result(
         limits=[Kept(x.name, str(x), found.motion.shares[x.name]) for x in found.limits],
         std={name: Seen(plain(a), plain(b), unit) for name, a, b, unit in stds},
         ratio=plain(ratio),
+        goals=[Reached(g.name, g.limit, g.unit, None, std_of(planned.std, g)) for g in goals],
+        too_short=shorter,
+        elsewhere=list(found.elsewhere),
         notes=list(notes),
         reproduce=reproduced(command, ()),
         run=found.motion.run,
@@ -122,6 +135,13 @@ def motion_headline(result: PlannedMotion) -> str:
     )
 
 
+def goal_words(goals: Sequence[Reached]) -> Iterator[str]:
+    """What is asked, and what the plan leaves."""
+    for goal in goals:
+        unit = "" if goal.unit == "1" else f" {goal.unit}"
+        yield f"goal {goal.name} < {goal.limit:.4g}{unit}: {goal.after:.3g}{unit} after"
+
+
 def motion_words(result: PlannedMotion) -> Iterator[str]:
     """What is hidden, what the motion is beside a random one, what is no certificate, notes."""
     yield from result.unobservable
@@ -132,8 +152,22 @@ def motion_words(result: PlannedMotion) -> Iterator[str]:
         )
     elif result.random_rank < result.rank:
         yield f"a random motion in the same limits shows {result.random_rank} states"
-    said = CRITERIA.get(result.criterion, result.criterion)
-    yield f"the best that a search found for {said}; another optimum may be better"
+    yield from goal_words(result.goals)
+    if result.goals:
+        yield (
+            f"no motion of {result.too_short:.3g} s was found that reaches "
+            f"{'it' if len(result.goals) == 1 else 'them'}; another search may find one"
+        )
+    else:
+        said = CRITERIA.get(result.criterion, result.criterion)
+        yield f"the best that a search found for {said}; another optimum may be better"
+    if result.elsewhere:
+        how = "averaged over" if result.robust == "average" else "for the worst of"
+        yield (
+            f"planned {how} {len(result.elsewhere) + 1} beginnings that the states may have: "
+            f"standard deviations are {min(result.elsewhere):.2g} to {max(result.elsewhere):.2g} "
+            "times those above at the others; limits are kept from the likeliest"
+        )
     yield from result.notes
 
 

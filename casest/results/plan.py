@@ -16,7 +16,7 @@ from casest.declaration.model import Model
 from casest.declaration.shapes import Array
 from casest.diagnose.levels import LEVELS
 from casest.plan.candidates.attitudes import words
-from casest.plan.candidates.candidates import Candidates, Noise
+from casest.plan.candidates.candidates import TIME, Candidates, Noise
 from casest.plan.goals import Goal
 from casest.plan.planning import Planned
 from casest.results.file import plain
@@ -88,6 +88,16 @@ class ToldApart(Struct, frozen=True):
     limit: float
 
 
+class NotToldApart(Struct, frozen=True):
+    """Two causes that the plan leaves one: `chance` of the best plan for them alone, null where
+    they are one under all that can be measured; `why`, a sentence."""
+
+    one: str
+    other: str
+    chance: Number
+    why: str
+
+
 class BestPossible(Struct, frozen=True):
     """Certificate: standard deviations (of the criterion) that no design of as many measurements
     goes below, as a share of the plan's; goals are never reached with fewer than `at_least`."""
@@ -125,6 +135,7 @@ class Plan(Result, frozen=True, kw_only=True, dict=True):
     measurements: list[Measurement]
     unknowns: dict[str, Unknown]
     separates: list[ToldApart] | UnsetType = UNSET
+    together: list[NotToldApart] | UnsetType = UNSET
     budget: float | UnsetType = UNSET
     robust: str | UnsetType = UNSET
     best_possible: BestPossible
@@ -139,7 +150,7 @@ class Plan(Result, frozen=True, kw_only=True, dict=True):
     @property
     def things(self) -> str:
         """What is planned, in the plural."""
-        return {"pose": "poses", "run": "runs"}.get(self.kind, "measurements")
+        return {"pose": "poses", "run": "runs", TIME: "readings"}.get(self.kind, "measurements")
 
 
 def plan_result(
@@ -235,7 +246,8 @@ def separation_result(
     measured = [
         replaced(m, told_apart=power) for m, power in zip(made.measurements, powers, strict=True)
     ]
-    return replaced(made, measurements=measured, separates=told)
+    together = [NotToldApart(t.one, t.other, t.chance, str(t)) for t in found.together]
+    return replaced(made, measurements=measured, separates=told, together=together)
 
 
 def _emptiest(found: Candidates, planned: Planned, covered: Array | None) -> str:
@@ -287,11 +299,27 @@ def headline(result: Plan) -> str:
         return f"{result.declared}{after}: nothing to measure: every goal is reached already"
     one = result.things[:-1] if result.count == 1 else result.things
     if result.separates:
-        causes = " from ".join(dict.fromkeys(t.true for t in result.separates))
+        causes = " from ".join(" or ".join(group) for group in _groups(result))
         chance = min(t.chance for t in result.separates)
-        told = f"that tell {causes} in {100 * chance:.0f} %"
+        tell = "tells" if result.count == 1 else "tell"
+        told = f"that {tell} {causes} in {100 * chance:.0f} %"
         return f"{result.declared}{after}: {result.count} {one} next {told}"
-    return f"{result.declared}{after}: {result.count} {one} next, those first that bring most"
+    order = "as time goes" if result.kind == TIME else "those first that bring most"
+    return f"{result.declared}{after}: {result.count} {one} next, {order}"
+
+
+def _groups(result: Plan) -> list[list[str]]:
+    """Causes that are told apart, those beside each other that stay one."""
+    told = [label for t in result.separates or () for label in (t.true, t.against)]
+    one = {frozenset((t.one, t.other)) for t in result.together or ()}
+    groups = list[list[str]]()
+    for label in dict.fromkeys(told):
+        own = next((g for g in groups if any(frozenset((label, x)) in one for x in g)), None)
+        if own is None:
+            groups.append([label])
+        else:
+            own.append(label)
+    return groups
 
 
 def plan_words(result: Plan) -> Iterator[str]:
@@ -301,6 +329,8 @@ def plan_words(result: Plan) -> Iterator[str]:
             f"were {told.true} the cause, {told.against} would be refuted in "
             f"{100 * told.chance:.0f} %"
         )
+    for both in result.together or ():
+        yield both.why
     for goal in result.goals:
         unit = "" if goal.unit == "1" else f" {goal.unit}"
         before = "undetermined" if goal.before is None else f"{goal.before:.3g}"

@@ -16,6 +16,9 @@ from casest.errors import UsageError
 from casest.leastsquares.per_sample import slope_in_sample
 from casest.leastsquares.problem import Problem
 
+#: Kind of candidates that are the times of one run.
+TIME = "time"
+
 
 @dataclass(frozen=True)
 class Noise:
@@ -53,6 +56,11 @@ class Candidates:
     def __len__(self) -> int:
         """How many there are."""
         return len(self.factors)
+
+    @property
+    def once(self) -> bool:
+        """Can each be made once only? A run is read once at each time."""
+        return self.kind == TIME
 
 
 def factors_of(model: Model, values: Mapping[str, Any], run: Run, noise: Noise) -> Array:

@@ -10,7 +10,7 @@ from casest.data.run import Run
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
 from casest.errors import UsageError
-from casest.plan.candidates import poses, rows, runs
+from casest.plan.candidates import poses, rows, runs, times
 from casest.plan.candidates.attitudes import STEP
 from casest.plan.candidates.candidates import Candidates, Noise, others
 from casest.plan.candidates.varied import combined, values_of
@@ -40,32 +40,18 @@ def candidates(
     """What could be measured next."""
     if not model.parameters:
         raise UsageError(f"{model.name}: every unknown is held: there is nothing to plan for")
-    if model.traced.integrates:
-        raise UsageError(
-            f"{model.name} follows differential equations: a plan is of rows that stand for "
-            "themselves. Simulate a record that could be taken (casest simulate) and calibrate it: "
-            "its standard deviations are what that record would bring"
-        )
     if not 1 <= possible.step <= 45:
         raise UsageError(f"--step {possible.step:g}: between 1 and 45 degrees")
     if possible.reach is not None and not 0 < possible.reach <= 180:
         raise UsageError(f"--reach {possible.reach:g}: an angle from upright, 0 to 180 degrees")
+    if model.traced.integrates and not any(p.scope == "run" for p in model.parameters):
+        return _times(model, values, noise, possible)
     if possible.table is not None:
         return rows.table(model, values, noise, possible.table)
     if _moves(model):
         return _runs(model, values, noise, possible)
     sizes = {s.name: (s.size, s.unit) for s in others(model)}
-    wrong = [name for name in possible.varied if name not in sizes]
-    if wrong:
-        there = ", ".join(sizes) or "nothing beside the pose"
-        raise UsageError(f"--vary {wrong[0]}=…: of {model.name} one can vary {there}")
-    varied = combined(
-        {
-            name: values_of(name, text, sizes[name][1], sizes[name][0])
-            for name, text in possible.varied.items()
-        }
-        | dict(possible.also)
-    )
+    varied = combined(_varied(model, possible, "nothing beside the pose"))
     turned = poses.rotation_signal(model) is not None
     if turned or poses.at_rest(model):
         missing = [name for name in sizes if name not in varied]
@@ -76,6 +62,33 @@ def candidates(
         make = poses.told_attitudes if turned else poses.poses
         return make(model, values, noise, step=possible.step, reach=possible.reach, others=varied)
     return rows.settings(model, values, noise, varied)
+
+
+def _varied(model: Model, possible: Possible, nothing: str) -> dict[str, Array]:
+    """Values of each signal that can be set."""
+    sizes = {s.name: (s.size, s.unit) for s in others(model)}
+    wrong = [name for name in possible.varied if name not in sizes]
+    if wrong:
+        there = ", ".join(sizes) or nothing
+        raise UsageError(f"--vary {wrong[0]}=…: of {model.name} one can vary {there}")
+    return {
+        name: values_of(name, text, sizes[name][1], sizes[name][0])
+        for name, text in possible.varied.items()
+    } | dict(possible.also)
+
+
+def _times(model: Model, values: Mapping[str, Any], noise: Noise, possible: Possible) -> Candidates:
+    """Of states that follow differential equations: when to read the run."""
+    if possible.table is not None:
+        return times.table(model, values, noise, possible.table)
+    if possible.duration is None or possible.rate is None:
+        raise UsageError(
+            f"{model.name} follows differential equations: say --duration, and with --rate how "
+            "often one can read"
+        )
+    held = _varied(model, possible, "nothing: only when it is read")
+    long, rate = possible.duration, possible.rate
+    return times.times(model, values, noise, held, duration=long, rate=rate)
 
 
 def _moves(model: Model) -> bool:

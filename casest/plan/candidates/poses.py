@@ -220,15 +220,15 @@ def _readings(
     model: Model, values: Mapping[str, Any], target: Array, beside: Mapping[str, Array]
 ) -> dict[str, Array]:
     """Readings (N, size) of each signal that correct to the targets."""
-    rows, tried, before = [], None, None
-    for i, wanted in enumerate(target):
-        here = {name: value[i] for name, value in beside.items()}
-        key = tuple(tuple(value) for value in here.values())
-        if tried is None or key != before:
-            tried, before = _Tried(model, values, here), key
-        rows.append(tried.reading(wanted))
+    alike: dict[tuple[float, ...], list[int]] = {}
+    for i in range(len(target)):
+        alike.setdefault(tuple(x for value in beside.values() for x in value[i]), []).append(i)
+    rows = np.zeros((len(target), sum(s.size for s in model.readings)))
+    for places in alike.values():
+        tried = _Tried(model, values, {name: value[places[0]] for name, value in beside.items()})
+        rows[places] = [tried.reading(target[i]) for i in places]
     ends = np.cumsum([s.size for s in model.readings])[:-1]
-    parts = np.split(np.array(rows), ends, axis=1)
+    parts = np.split(rows, ends, axis=1)
     return dict(zip((s.name for s in model.readings), parts, strict=True))
 
 

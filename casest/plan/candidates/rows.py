@@ -62,10 +62,11 @@ def table(model: Model, values: Mapping[str, Any], noise: Noise, runs: Sequence[
         + "; ".join(_said(model, n, run.signals[n][i]) for n in shown)
         for i in range(len(run))
     ]
-    return of_run(model, values, noise, run, said, _cost(runs[0]))
+    return of_run(model, values, noise, run, said, cost_of(runs[0]))
 
 
-def _cost(run: Run) -> Array:
+def cost_of(run: Run) -> Array:
+    """What each row costs: its column `cost`, else one."""
     if COST not in run.columns:
         return np.ones(len(run))
     try:

@@ -5,7 +5,8 @@ All are logarithms of standard deviations, so that a difference is a ratio of th
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import casadi as ca
@@ -14,6 +15,7 @@ import numpy as np
 from casest.declaration.shapes import Array
 from casest.dynamics.declare import Dynamics
 from casest.errors import UsageError
+from casest.plan.goals import Goal
 
 #: Power of the mean that stands for the largest, which has no slope: of 9 at most 15 % above it.
 DOUBLINGS = 4
@@ -26,7 +28,8 @@ class Wanted:
     """D, A, E or the entries of one state, of unknowns in units of `scale` (n,).
 
     free: which of the states are unknown. known (f, f): what is known of these beforehand, in
-    units of `scale`. chosen: of `free`, the entries that a name stands for.
+    units of `scale`. chosen: of `free`, the entries that a name stands for; asked: the standard
+    deviation that each is compared with, in its own unit (none: the unit of `scale`).
     """
 
     name: str
@@ -34,6 +37,7 @@ class Wanted:
     free: tuple[int, ...]
     known: Array
     chosen: tuple[int, ...] = ()
+    asked: tuple[float, ...] = ()
 
     @staticmethod
     def of(model: Dynamics, name: str, known: Array | None = None) -> Wanted:
@@ -52,6 +56,15 @@ class Wanted:
             known = np.diag([1.0 if stated[i] else VAGUE for i in free])
         chosen = _chosen(model, name, free)
         return Wanted(name, scale, free, np.asarray(known), chosen)
+
+    @staticmethod
+    def for_goals(model: Dynamics, goals: Sequence[Goal]) -> Wanted:
+        """The largest standard deviation over what is asked of it."""
+        wanted = Wanted.of(model, "D")
+        pairs = [(int(i), goal.limit) for goal in goals
+                 for i in np.flatnonzero(goal.columns.any(axis=1))]  # fmt: skip
+        chosen = tuple(wanted.free.index(i) for i, _ in pairs)
+        return replace(wanted, name="goals", chosen=chosen, asked=tuple(x for _, x in pairs))
 
     def covariance(self, W: Array) -> Array:
         """Of the free unknowns, in units of `scale`; W (n, n) as `Task.information` gives it."""
@@ -87,8 +100,15 @@ class Wanted:
             most = ca.log(ca.trace(power)) / 2**DOUBLINGS
         else:
             entries = ca.diag(C)[list(self.chosen)] / least
+            if self.asked:
+                entries = entries * ca.DM(self._over_asked())
             most = ca.log(ca.sum1(entries ** (2**DOUBLINGS))) / 2**DOUBLINGS
         return ca.Function("wanted", [W], [f / 2 * (most + np.log(least))])
+
+    def _over_asked(self) -> Array:
+        """Squares of what one of each entry's size is of what is asked, the largest one."""
+        own = self.scale[[self.free[k] for k in self.chosen]] / np.array(self.asked)
+        return np.asarray((own / own.max()) ** 2)
 
 
 def _chosen(model: Dynamics, name: str, free: tuple[int, ...]) -> tuple[int, ...]:

@@ -14,15 +14,15 @@ import numpy as np
 
 from casest.declaration.shapes import Array
 from casest.errors import UsageError
-from casest.plan.design.continuous import slopes
 from casest.plan.design.criteria import Criterion, Largest, Longest, Trace, Volume, inverse
+from casest.plan.design.distinct import distinct, floor_of
 from casest.plan.motion.criteria import Wanted
 from casest.plan.motion.program import Task
 from casest.plan.motion.starts import random_inputs
 
 #: Random inputs that are looked at, the best that a search begins at, turns of inputs and times,
-#: steps of a search, exchanges.
-RANDOM, SEARCHES, TURNS, STEPS, PASSES = 20, 3, 4, 60, 10
+#: steps of a search.
+RANDOM, SEARCHES, TURNS, STEPS = 20, 3, 4, 60
 #: Gain below which a turn was the last; change of standard deviations that finer steps may make.
 GAIN, FINE = 1e-4, 2e-4
 #: Information, as a share of what reading everywhere tells, below which nothing is told.
@@ -101,51 +101,12 @@ def criterion_of(wanted: Wanted) -> Criterion:
         return Volume()
     if wanted.name == "A":
         return Trace(np.eye(f))
-    return Longest() if wanted.name == "E" else Largest(np.eye(f)[:, list(wanted.chosen)])
-
-
-def distinct(
-    criterion: Criterion, known: Array, factors: Sequence[Array], count: int, worst: bool
-) -> list[int]:
-    """`count` different candidates, none of which another one should replace.
-
-    factors: of each possible beginning, (N, m, f).
-    """
-    chosen: list[int] = []
-    informations = [known.copy() for _ in factors]
-    while len(chosen) < count:
-        best = int(np.argmin(_after(criterion, informations, factors, chosen, worst)))
-        chosen.append(best)
-        informations = [M + _square(F[best]) for M, F in zip(informations, factors, strict=True)]
-    for _ in range(PASSES):
-        gained = False
-        for place, old in enumerate(chosen):
-            without = [M - _square(F[old]) for M, F in zip(informations, factors, strict=True)]
-            others = chosen[:place] + chosen[place + 1 :]
-            after = _after(criterion, without, factors, others, worst)
-            best = int(np.argmin(after))
-            if best != old and after[best] < after[old] - 1e-9:
-                chosen[place], gained = best, True
-                informations = [M + _square(F[best]) for M, F in zip(without, factors, strict=True)]
-        if not gained:
-            break
-    return sorted(chosen)
-
-
-def _after(
-    criterion: Criterion,
-    informations: Sequence[Array],
-    factors: Sequence[Array],
-    taken: Sequence[int],
-    worst: bool,
-) -> Array:
-    """What each candidate would make of it, infinite where it is taken."""
-    every = np.array([
-        criterion.after(inverse(M), F) for M, F in zip(informations, factors, strict=True)
-    ])  # fmt: skip
-    found = every.max(axis=0) if worst else every.mean(axis=0)
-    found[list(taken)] = np.inf
-    return np.asarray(found)
+    if wanted.name == "E":
+        return Longest()
+    columns = np.eye(f)[:, list(wanted.chosen)]
+    if wanted.asked:
+        columns = columns * wanted.scale[[wanted.free[k] for k in wanted.chosen]] / wanted.asked
+    return Largest(columns)
 
 
 def _joint(
@@ -167,10 +128,7 @@ def _judged(task: Task, u: Array, chosen: list[int], criterion: Criterion) -> Ex
             f"{task.model.name}: {len(chosen)} readings do not determine every unknown; {more}"
         )
     C = inverse(M)
-    s = slopes(C, criterion.weight(C), factors)
-    value = criterion.value(C)
-    floor = criterion.base(C, criterion.weight(C))
-    floor -= float(np.sort(s)[-len(chosen) :].sum() - s[chosen].sum())
+    value, floor = criterion.value(C), floor_of(criterion, C, factors, chosen)
     spread = np.unique(np.linspace(0, len(factors) - 1, len(chosen)).round().astype(int))
     E = wanted.known + _sum(factors, spread)
     even = criterion.ratio(value, criterion.value(inverse(E)), len(C))
@@ -220,7 +178,3 @@ def _worth(task: Task, u: Array, weights: Array, starts: Sequence[Array], worst:
 def _sum(factors: Array, chosen: Sequence[int] | Array | range) -> Array:
     own = factors[list(chosen)].reshape(-1, factors.shape[2])
     return np.asarray(own.T @ own)
-
-
-def _square(F: Array) -> Array:
-    return np.asarray(F.T @ F)

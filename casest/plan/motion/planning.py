@@ -23,8 +23,9 @@ from casest.plan.motion.starts import random_inputs
 RANDOM = 20
 #: Steps of a search. It is at its optimum to some thousandths of a standard deviation by then.
 STEPS = 60
-#: Share by which a limit may be passed between two nodes; rounds in which it is narrowed.
-PASSED, ROUNDS = 1e-3, 8
+#: Share by which a limit may be passed between two nodes; rounds in which it is narrowed, and times
+#: the nodes at which it is kept in all but the first.
+PASSED, ROUNDS, FINER = 1e-3, 8, 3
 
 
 @dataclass(frozen=True)
@@ -40,11 +41,16 @@ class Flown:
 
 @dataclass(frozen=True)
 class MotionPlan:
-    """The motion, and beside it the one of the random motions that is their median."""
+    """The motion, and beside it the one of the random motions that is their median.
+
+    elsewhere: of each other beginning that it was planned for, the geometric mean of the standard
+    deviations as a multiple of those at the likeliest.
+    """
 
     motion: Flown
     random: Flown
     limits: tuple[Limit, ...]
+    elsewhere: tuple[float, ...] = ()
 
 
 def planned_motion(
@@ -58,10 +64,12 @@ def planned_motion(
 ) -> MotionPlan:
     """The best motion that is found, sampled `rate` times a second.
 
-    `starts` (n,) of the states that are possible: averaged over, or their `worst`; `searches` are
-    begun at so many of the best random motions. UsageError where no motion keeps to the limits.
+    `starts` (n,) of the states that are possible beside the likeliest: averaged over, or the
+    `worst`; limits hold from the likeliest. `searches` are begun at so many of the best random
+    motions. UsageError where no motion keeps to the limits.
     """
     weights = _counted(task)
+    starts = [task.model.start, *starts]
     drawn = [random_inputs(task, rng) for _ in range(RANDOM)]
     drawn = [u for u in drawn if np.isfinite(task.states(u)).all()]
     if not drawn:
@@ -74,10 +82,19 @@ def planned_motion(
     middle = flown(task, drawn[int(order[len(order) // 2])], rate)
     found = []
     for i in order[:searches]:
-        u = task.solved(drawn[int(i)], weights, STEPS, starts, worst)
-        u, made = _within(task, u, rate, starts)
-        found.append((_worth(task, u, weights, starts, worst), made))
-    return MotionPlan(min(found, key=lambda one: one[0])[1], middle, task.limits)
+        u = task.solved(drawn[int(i)], weights, STEPS, starts, worst, limited=1)
+        u, made = _within(task, u, rate)
+        found.append((_worth(task, u, weights, starts, worst), u, made))
+    _, u, made = min(found, key=lambda one: one[0])
+    logs = [task.wanted.value(task.information(u, weights, start)) for start in starts]
+    elsewhere = np.exp((np.array(logs[1:]) - logs[0]) / len(task.wanted.free))
+    return MotionPlan(made, middle, task.limits, tuple(map(float, elsewhere)))
+
+
+def bent(model: Dynamics) -> bool:
+    """Does what a motion shows depend on where the states begin, beside the inputs?"""
+    t = model.traced
+    return bool(ca.depends_on(ca.vertcat(ca.vec(t.A), ca.vec(t.C)), t.x))
 
 
 def _counted(task: Task) -> Array:
@@ -90,18 +107,15 @@ def _counted(task: Task) -> Array:
 
 def _worth(task: Task, u: Array, weights: Array, starts: Sequence[Array], worst: bool) -> float:
     """What is to be least, infinite where it is no number."""
-    every = [
-        task.wanted.value(task.information(u, weights, start))
-        for start in starts or [task.model.start]
-    ]
+    every = [task.wanted.value(task.information(u, weights, start)) for start in starts]
     value = max(every) if worst else float(np.mean(every))
     return value if np.isfinite(value) else np.inf
 
 
-def _within(task: Task, u: Array, rate: float, starts: Sequence[Array]) -> tuple[Array, Flown]:
+def _within(task: Task, u: Array, rate: float) -> tuple[Array, Flown]:
     """The motion, brought back to limits that it passes; UsageError where it cannot be."""
     narrow = task
-    for _ in range(ROUNDS):
+    for turn in range(ROUNDS):
         made = flown(task, u, rate)
         over = {name: share for name, share in made.shares.items() if not share <= 1 + PASSED}
         if not over:
@@ -113,7 +127,9 @@ def _within(task: Task, u: Array, rate: float, starts: Sequence[Array]) -> tuple
             for limit in narrow.limits
         )
         narrow = replace(narrow, limits=limits)
-        u = narrow.nearest(u, starts)
+        if narrow.grid is task.grid and turn:  # what passes between two nodes needs nodes there
+            narrow = replace(narrow, grid=task.grid.finer(FINER))
+        u = narrow.nearest(u)
     made = flown(task, u, rate)
     over = {name: share for name, share in made.shares.items() if not share <= 1 + PASSED}
     if over:

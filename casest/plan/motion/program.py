@@ -229,15 +229,21 @@ class Task:
         most: int,
         starts: Sequence[Array] = (),
         worst: bool = False,
+        limited: int | None = None,
     ) -> Array:
         """Inputs (P, k) of the best motion that `most` steps lead to from u, within the limits.
 
         weights (K + 1,): how much the reading at each node counts. Where several `starts` (n,) are
-        possible, what is wanted is averaged over them, or of the `worst` of them.
+        possible, what is wanted is averaged over them, or of the `worst` of them; limits of states
+        hold from all of them, or from the first `limited`.
         """
         starts = list(starts) or [self.model.start]
         us, of_u = ca.MX.sym("u", self.wide, len(u)), self._input_sizes()
-        every = [self._scenario(us, of_u, u, start, weights) for start in starts]
+        bound = len(starts) if limited is None else limited
+        every = [
+            self._scenario(us, of_u, u, start, weights, limited=i < bound)
+            for i, start in enumerate(starts)
+        ]
         near = [self.information(u, weights, start) for start in starts]
         wanted = [self.wanted.function(W)(s.W) for s, W in zip(every, near, strict=True)]
         own = self._of_inputs(us, of_u)
@@ -254,10 +260,10 @@ class Task:
         more = largest, max(map(self.wanted.value, near))
         return _least(J + largest, every, us, u / of_u, both, settings, more) * of_u
 
-    def nearest(self, u: Array, starts: Sequence[Array] = ()) -> Array:
+    def nearest(self, u: Array) -> Array:
         """Inputs (P, k) nearest to u with which everything keeps to its limits."""
         us, of_u = ca.MX.sym("u", self.wide, len(u)), self._input_sizes()
-        every = [self._scenario(us, of_u, u, s) for s in list(starts) or [self.model.start]]
+        every = [self._scenario(us, of_u, u, self.model.start)]
         J = 0.5 * ca.sumsqr(us - ca.DM((u / of_u).T))
         return _least(J, every, us, u / of_u, [self._of_inputs(us, of_u)], NEAREST) * of_u
 
@@ -293,10 +299,18 @@ class Task:
         return _joined([self._limited(limit, None, us, None, None, of_u) for limit in own])
 
     def _scenario(
-        self, us: Any, of_u: Array, u: Array, start: Array, weights: Array | None = None
+        self,
+        us: Any,
+        of_u: Array,
+        u: Array,
+        start: Array,
+        weights: Array | None = None,
+        *,
+        limited: bool = True,
     ) -> Scenario:
         """States along inputs, from one beginning; about as large as along u (P, k)."""
-        x = self._kept(self.states(u, start))
+        x = self.states(u, start)
+        x = self._kept(x) if limited else np.where(np.isfinite(x), x, x[0])
         of_x = self._state_sizes(x)
         K, n = len(self.grid.time) - 1, self.model.size
         xs = ca.MX.sym("x", n, K + 1)
@@ -307,7 +321,7 @@ class Task:
         rates = self._scaled(self.rate, of_x, of_u, only=0).map(K + 1)(xs, at)
         parts = [(ca.vec(after - xs[:, 1:]), np.zeros(n * K), np.zeros(n * K))]
         where = self.model.slices()
-        for limit in (limit for limit in self.limits if limit.of in where):
+        for limit in (limit for limit in self.limits if limited and limit.of in where):
             parts.append(self._limited(limit, xs, us, rates, of_x, of_u))
         W = None
         if weights is not None:

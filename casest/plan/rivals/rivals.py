@@ -20,8 +20,8 @@ from casest.errors import UsageError
 from casest.leastsquares.problem import Problem
 from casest.plan.candidates.candidates import marginal, of_last_run
 
-#: Causes that are planned for, the most likely ones; values of a grid at which each is refitted.
-MOST, GRID = 3, 12
+#: Causes that are looked at, the most likely ones; values of a grid at which each is refitted.
+MOST, GRID = 5, 12
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,9 @@ to be expected, with a standard deviation of 2√λ.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from statistics import NormalDist
 
 import numpy as np
@@ -20,14 +21,17 @@ from casest.diagnose.levels import LEVELS
 from casest.errors import UsageError
 from casest.plan.candidates.candidates import Candidates, Noise, whitened
 from casest.plan.candidates.runs import off_by
+from casest.plan.design.continuous import continuous
+from casest.plan.design.criteria import Trace
 from casest.plan.goals import Goal
-from casest.plan.planning import Planned, Task, criterion_of, planned, task, until
+from casest.plan.planning import ROUGHLY, Planned, Task, criterion_of, planned, task, until
 from casest.plan.rivals.rivals import Rival
 
-#: Chance with which a plan is to tell them apart.
-POWER = 0.95
-#: Share of what tells two rivals apart, beside the unknowns, that is rounding.
-ALIAS = 1e-9
+#: Chance with which a plan is to tell them apart; groups of rivals that it is made for.
+POWER, GROUPS = 0.95, 3
+#: Share of what tells two rivals apart, beside the unknowns, that is rounding; and its size in
+#: the noise of one measurement, which no number of them shows.
+ALIAS, NOTHING = 1e-9, 1e-6
 
 
 @dataclass(frozen=True)
@@ -54,16 +58,47 @@ class Pair:
 
 
 @dataclass(frozen=True)
+class Together:
+    """Two rivals that stay one: the best chance of telling them apart, None of an exact alias.
+
+    wider: the one that contains the other, where one does. most: measurements that were allowed.
+    """
+
+    one: str
+    other: str
+    chance: float | None
+    wider: str | None
+    most: int
+
+    def __str__(self) -> str:
+        """Why they are not told apart."""
+        if self.chance is None:
+            return f"{self.one} and {self.other} are one under all that can be measured here"
+        best = f"{self.most} measurements for it alone: {100 * self.chance:.0f} % at best"
+        if self.wider is None:
+            return f"{self.one} and {self.other} stay together ({best})"
+        narrow = self.one if self.wider == self.other else self.other
+        return f"{self.wider} contains {narrow}: how much more it does stays open ({best})"
+
+
+@dataclass(frozen=True)
 class Separation:
     """Candidates as the first rival has them, and the task of telling all pairs apart.
 
-    `amplitudes`: the columns of the pairs' amplitudes among its unknowns.
+    `amplitudes`: the columns of the pairs' amplitudes among its unknowns. together: those that the
+    plan leaves one.
     """
 
     candidates: Candidates
     pairs: tuple[Pair, ...]
     task: Task
     amplitudes: tuple[int, ...]
+    together: tuple[Together, ...] = ()
+
+    @property
+    def labels(self) -> set[str]:
+        """The rivals that the plan is made for."""
+        return {label for p in self.pairs for label in (p.true, p.against)}
 
     def growths(self, chosen: Sequence[int]) -> Array:
         """λ of each pair after some of the candidates."""
@@ -84,30 +119,90 @@ def separation(
     make: Callable[[Rival], Candidates],
     what: str,
     rate: float | None = None,
+    most: int = 200,
 ) -> Separation:
     """The task of telling the rivals apart; `make` gives the candidates as one rival has them.
 
-    UsageError where two of them are one under all that can be measured.
+    Two that `most` measurements do not tell apart, or of which one contains the other, are left
+    together where others remain; UsageError where none can be refuted.
     """
     found = [make(rival) for rival in rivals]
-    blocks, known, pairs, aliases = [], [], [], list[tuple[str, str]]()
-    for a, truth in zip(rivals, found, strict=True):
-        for b in rivals:
-            if a is b:
-                continue
-            block = _seen(truth, a, b, noise, rate)
-            if _alias(block):  # b takes up all that a is: it cannot be refuted
-                _refuse_alias(a, b, rivals, aliases, what, len(block))
-                aliases.append((a.label, b.label))
-                continue
-            blocks.append(block)
-            known.append(b.information)
-            pairs.append(Pair(a.label, b.label, b.cost - a.cost))
-    factors, information, amplitudes = _side_by_side(blocks, known)
+    seen = {
+        (i, j): _seen(truth, rivals[i], rivals[j], noise, rate)
+        for i, truth in enumerate(found)
+        for j in range(len(rivals))
+        if i != j
+    }
+    aliases = {key for key, block in seen.items() if _alias(block)}  # b takes up all that a is
+    pairs = {
+        (i, j): Pair(rivals[i].label, rivals[j].label, rivals[j].cost - rivals[i].cost)
+        for i, j in seen
+        if (i, j) not in aliases
+    }
+    if not pairs:
+        _refuse_alias(rivals, what, len(found[0]))
+    together = _together(rivals, seen, pairs, most)
+    planned_for = _first_groups(len(rivals), list(together))
+    apart = {
+        key: pair
+        for key, pair in pairs.items()
+        if tuple(sorted(key)) not in together and planned_for.issuperset(key)
+    }
+    chosen = apart or pairs  # where none is in reach, what comes nearest
+    factors, information, amplitudes = _side_by_side(
+        [seen[key] for key in chosen], [rivals[j].information for _, j in chosen]
+    )
     names = [f"unknown {k}" for k in range(factors.shape[2])]
     return Separation(
-        found[0], tuple(pairs), task(factors, information, names, what), tuple(amplitudes)
+        found[0],
+        tuple(chosen.values()),
+        task(factors, information, names, what, found[0].once),
+        tuple(amplitudes),
+        tuple(t for key, t in together.items() if apart and planned_for.issuperset(key)),
     )
+
+
+def _first_groups(count: int, together: Sequence[tuple[int, int]]) -> set[int]:
+    """Rivals of the first GROUPS groups of those that stay one."""
+    groups = list[set[int]]()
+    for i in range(count):
+        own = next((g for g in groups if any((j, i) in together for j in g)), None)
+        if own is None:
+            groups.append({i})
+        else:
+            own.add(i)
+    return set().union(*groups[:GROUPS])
+
+
+def _together(
+    rivals: Sequence[Rival],
+    seen: Mapping[tuple[int, int], Array],
+    pairs: Mapping[tuple[int, int], Pair],
+    most: int,
+) -> dict[tuple[int, int], Together]:
+    """Rivals that `most` measurements, chosen for them alone, do not tell apart, and those of which
+    one contains the other: how much it bends more is no question of which cause it is."""
+    found = {}
+    for i, j in combinations(range(len(rivals)), 2):
+        ways = [key for key in ((i, j), (j, i)) if key in pairs]
+        best = [_best_chance(pairs[key], seen[key], rivals[key[1]].information, most)
+                for key in ways]  # fmt: skip
+        if len(best) < 2 or min(best) < POWER:
+            wider = rivals[ways[0][0]].label if len(ways) == 1 else None
+            chance = min(best) if best else None
+            found[i, j] = Together(rivals[i].label, rivals[j].label, chance, wider, most)
+    return found
+
+
+def _best_chance(pair: Pair, block: Array, information: Array, most: int) -> float:
+    """An upper bound of the chance to tell one pair apart with so many measurements."""
+    if not pair.needed:
+        return 1.0
+    alone = task(*_side_by_side([block], [information])[:2], [""] * block.shape[2], "")
+    amplitude = np.zeros((block.shape[2], 1))
+    amplitude[-1] = alone.scale[-1]
+    floor = continuous(Trace(amplitude), alone.start, alone.factors, most, ROUGHLY).floor
+    return pair.power(1 / max(floor, 1e-300))
 
 
 def _seen(truth: Candidates, a: Rival, b: Rival, noise: Noise, rate: float | None) -> Array:
@@ -127,24 +222,17 @@ def _alias(block: Array) -> bool:
     norms = np.linalg.norm(J, axis=0)
     J = J / np.where(norms > 0, norms, 1.0)
     left = r - J @ np.linalg.lstsq(J, r, rcond=None)[0]
-    return bool(np.linalg.norm(left) < ALIAS * max(float(np.linalg.norm(r)), ALIAS))
+    least = max(ALIAS * float(np.linalg.norm(r)), NOTHING * float(np.sqrt(len(r))))
+    return bool(np.linalg.norm(left) < least)
 
 
-def _refuse_alias(
-    a: Rival,
-    b: Rival,
-    rivals: Sequence[Rival],
-    aliases: Sequence[tuple[str, str]],
-    what: str,
-    count: int,
-) -> None:
-    """Where neither of two can be refuted."""
-    if (b.label, a.label) not in aliases:
-        return
-    others = [r.label for r in rivals if r is not a and r is not b]
-    beside = f" ({', '.join(others)} aside)" if others else ""
+def _refuse_alias(rivals: Sequence[Rival], what: str, count: int) -> None:
+    """Where none can be refuted."""
+    one, other = rivals[0].label, rivals[1].label
+    others = [r.label for r in rivals[2:]]
+    beside = f" (and so is {', '.join(others)})" if others else ""
     raise UsageError(
-        f"{what}: {b.label} and {a.label} are one under all {count} candidates{beside}: refitted, "
+        f"{what}: {one} and {other} are one under all {count} candidates{beside}: refitted, "
         f"either gives the readings of the other to {ALIAS:g}; only another kind of measurement "
         "tells them apart (--vary, --candidates)"
     )
@@ -183,8 +271,11 @@ def separated(found: Separation, count: int | None, most: int, what: str) -> Pla
         best = planned(found.task, criterion_of(found.task, "", columns), most)
         powers = found.powers(best.chosen)
         worst = found.pairs[int(np.argmin(powers))]
+        contains = ""
+        if not any(p.against == worst.true and p.true == worst.against for p in found.pairs):
+            contains = f", which {worst.true} contains,"
         raise UsageError(
-            f"{what}: {most} measurements tell {worst.true} from {worst.against} in "
+            f"{what}: {most} measurements tell {worst.true} from {worst.against}{contains} in "
             f"{100 * min(powers):.0f} % at best; allow more (--most), or another kind "
             "(--vary, --candidates)"
         ) from None

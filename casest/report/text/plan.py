@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import textwrap
+from collections import Counter
 from collections.abc import Iterator
 
 from msgspec import UNSET
 
 from casest.report.text.layout import WIDTH, item
 from casest.results.plan import Measurement, Plan, headline, plan_words
+
+#: Measurements from which on those that are the same are counted.
+LONG = 40
 
 
 def plan_text(result: Plan) -> str:
@@ -25,6 +29,9 @@ def plan_text(result: Plan) -> str:
 def _measurements(result: Plan) -> Iterator[str]:
     if not result.count:
         return
+    if result.count > LONG and len({m.words for m in result.measurements}) <= result.count // 2:
+        yield from _together(result)
+        return
     costs = len({m.cost for m in result.measurements}) > 1
     said = "told apart" if result.separates else "std"
     yield f"    #  {said:>5}  {'cost  ' if costs else ''}{result.things[:-1]}"
@@ -33,6 +40,13 @@ def _measurements(result: Plan) -> Iterator[str]:
         cost = f"{m.cost:>4.3g}  " if costs else ""
         line = f"  {m.number:>3}  {ratio:>5}  {cost}{m.words}"
         yield textwrap.fill(line, WIDTH, subsequent_indent=" " * 15)
+
+
+def _together(result: Plan) -> Iterator[str]:
+    """How often each of the same measurements, those of the most first."""
+    yield f"  times  {result.things[:-1]} (their order is in plan.csv)"
+    for words, times in Counter(m.words for m in result.measurements).most_common():
+        yield textwrap.fill(f"  {times:>5}  {words}", WIDTH, subsequent_indent=" " * 9)
 
 
 def _brings(m: Measurement) -> str:
