@@ -255,5 +255,5 @@ def step_of(name: str, options: StepOptions, single: bool) -> str:
     time = np.array([0.0, checked_period(moving, options.period)])
     blank = Run.raw("two samples", {"t": time[:, None]}, units={}, time=time)
     return filter_source(
-        stepwise(with_stated(moving, blank, options.sensors.stds()), options.period), single
+        stepwise(with_stated(moving, blank, options.sensors.stds(moving)), options.period), single
     )

@@ -252,7 +252,7 @@ def closing_in_motion(
             "clocks of their own: filter it (--noise ml matches the noise), or close a record in "
             "which every row has all inputs"
         )
-    moving = with_stated(moving, run, options.sensors.stds())
+    moving = with_stated(moving, run, options.sensors.stds(moving))
     progress(f"filtering {model_name}, looking for effects")
     found = loop.close_motion(moving, run, say=progress)
     result = motion_result(found, model_name=model_name, data=data, command=command)

@@ -120,7 +120,7 @@ def observe(model_name: str, data: tuple[str, ...], options: ObserveOptions) -> 
         moving = moving_model(model_name, options.model.constants, options.motion)
         if data:
             run = trajectory(moving, model_name, data, options.reading)
-            moving = with_stated(moving, run, options.sensors.stds())
+            moving = with_stated(moving, run, options.sensors.stds(moving))
             progress("what the trajectory shows")
             result = observe_motion(moving, run, options.window, data=data, command=typed())
         else:
@@ -221,7 +221,7 @@ def tuned_noise(moving: Dynamics, run: Run, options: FilterOptions) -> tuple[Tun
             raise UsageError("--noise ml finds every intensity: leave --sensor-noise, --rest out")
         progress("looking for the most likely noise intensities")
         return intensities.most_likely(moving, run), {}
-    stds = options.sensors.stds()
+    stds = options.sensors.stds(moving)
     stated = intensities.from_stated(moving, run, stds) if stds else None
     if options.rest is None:
         return stated, {}

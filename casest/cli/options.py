@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Container
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import click
 
@@ -13,6 +13,9 @@ from casest.cli.assignments import Assignment, Assignments
 from casest.cli.completing import ModelName, SolverName
 from casest.cli.flags import Kind, flag
 from casest.errors import CasestError
+
+if TYPE_CHECKING:
+    from casest.dynamics import Dynamics
 
 DATA = click.argument("data", nargs=-1, required=True, type=click.Path())
 RESULT = click.argument("result_path", metavar="RESULT", type=click.Path(path_type=Path))
@@ -187,9 +190,11 @@ class SensorOptions:
         help="Std of one reading: v=0.02 (model's unit), 'v=0.02 g', v=2%, v=u_x; x,y=… together.",
     )
 
-    def stds(self) -> dict[str, float]:
-        """Standard deviation of one reading by signal, in the model's unit."""
-        return dict(given.number() for given in self.stated)
+    def stds(self, moving: Dynamics) -> dict[str, float]:
+        """Standard deviation of one reading by signal of an estimator in motion, in its unit."""
+        from casest.interface.sensor_noise import one_number
+
+        return dict(one_number(given, moving.signals) for given in self.stated)
 
 
 @dataclass(frozen=True, slots=True)

@@ -104,7 +104,7 @@ def simulation_in_motion(model_name: str, options: SimulateOptions, command: str
 
     refuse(options, Kind.FITTED, "is no option of an estimator in motion")
     moving = moving_model(model_name, options.model.constants, options.motion)
-    stds = options.sensors.stds()
+    stds = options.sensors.stds(moving)
     values = dict(given.numbers() for given in options.values)
     inputs = None
     if options.given:
