@@ -73,7 +73,7 @@ def test_a_measured_record_gives_the_offset_that_cameras_give(shared_data):
     ("said", "because"),
     [
         ("w=0.2 uT", "uT does not convert to rad/s: one is a magnetic field, the other an angular"),
-        ("w=loud", "'loud' is no number; write it as 0.2 (rad/s) or with its unit"),
+        ("w=loud", "in motion a sensor's noise is one number for all its readings and axes"),
     ],
 )
 def test_a_noise_in_another_unit_is_named(tmp_path, capsys, said, because):

@@ -191,9 +191,10 @@ class SensorOptions:
     )
 
     def stds(self, moving: Dynamics) -> dict[str, float]:
-        """Standard deviation of one reading by signal, in the unit of an estimator in motion."""
-        units = {s.name: s.unit or "1" for s in moving.signals}
-        return dict(given.number(units, spread=True) for given in self.stated)
+        """Standard deviation of one reading by signal of an estimator in motion, in its unit."""
+        from casest.interface.sensor_noise import one_number
+
+        return dict(one_number(given, moving.signals) for given in self.stated)
 
 
 @dataclass(frozen=True, slots=True)

@@ -212,6 +212,29 @@ def _share(option: Option, share: Array, signal: Signal, run: Run) -> Array:
     return found
 
 
+def one_number(option: Option, signals: Sequence[Signal]) -> tuple[str, float]:
+    """A signal and its noise in motion: one number for all readings and axes, in its unit."""
+    name, text = option.pair()
+    own = next((s for s in signals if s.name == name), None)
+    of = (own and own.unit) or ""
+    try:
+        value, unit = units.parse_quantity(text)
+    except UsageError:
+        value, unit = np.nan, None
+    except CasestError as error:
+        raise type(error)(f"{option.flag} {option.text}: {error}") from None
+    if np.isnan(value) or (unit == "%" and of != "%"):
+        raise UsageError(
+            f"{option.flag} {option.text}: in motion a sensor's noise is one number for all its "
+            f"readings and axes, and {text!r} is none: write {name}=0.02"
+            + (f", or with a unit '{name}=0.02 {of}'" if of else "")
+        )
+    try:
+        return name, value * (units.conversion(unit, of)[0] if unit and of else 1.0)
+    except CasestError as error:
+        raise type(error)(f"{option.flag} {option.text}: {error}") from None
+
+
 def _numbers(words: Sequence[str]) -> tuple[Array, str | None]:
     """Numbers with one unit behind the last."""
     last, unit = units.parse_quantity(words[-1])

@@ -172,16 +172,16 @@ def exporting(result: str | Path) -> Typed:
 
 def _after_motion(typed: Typed, output: str | Path | None, complete: bool) -> _Steps:
     """After the loop of an estimator in motion: there is nothing to apply, but states."""
-    reading = (*_READING, "--set")
+    reading, noise = (*_READING, "--set"), "--sensor-noise"
     if output is None:
-        yield "keep the result", typed.keeping("close", reading).into("out").lines()
+        yield "keep the result", typed.keeping("close", (*reading, noise)).into("out").lines()
         return
     if complete:  # a filter whose model lacks something has no states to keep
         states = typed.keeping("filter", reading)
         states = replace(states, options=(*states.options, ("--noise", "ml")))
         into = Path(output) / "states"
         yield "the states, noise matched to the record", states.into(into).lines()
-    seen = typed.keeping("observe", reading).into(Path(output) / "seen")
+    seen = typed.keeping("observe", (*reading, noise)).into(Path(output) / "seen")
     yield "what can this trajectory see?", seen.lines()
 
 
@@ -189,14 +189,15 @@ def _after_look(typed: Typed, output: str | Path | None, trusted: bool, applies:
     """After observe, filter and compare; only estimators in motion have nothing to apply."""
     from casest.data.logs import parts_of  # imported late: it brings NumPy, which --help is without
 
-    motion = (*_READING, "--set", "--std", "--intensity")
+    reading = (*_READING, "--set", "--sensor-noise")
+    motion = (*reading, "--std", "--intensity")
     if typed.name == "filter":
         if output is None:
-            noise = ("--noise", "--sensor-noise", "--rest")
+            noise = ("--noise", "--rest")
             yield "keep the states", typed.keeping("filter", (*motion, *noise)).into("out").lines()
         yield "what can this trajectory see?", typed.keeping("observe", motion).lines()
         if len(parts_of(typed.arguments[-1])) == 1:  # the loop wants one clock
-            yield "is something missing?", typed.keeping("close", motion[:-2]).into("out").lines()
+            yield "is something missing?", typed.keeping("close", reading).into("out").lines()
     elif len(typed.arguments) < 2:
         return
     elif not applies:
@@ -222,7 +223,8 @@ def _after_flight(typed: Typed, file: str | Path) -> _Steps:
     noise = ("--set", "--std", "--intensity", "--sensor-noise")
     followed = typed.keeping("filter", noise, model, str(file)).into(folder / "states")
     yield "how well are the states found?", followed.lines()
-    closed = typed.keeping("close", ("--set",), model, str(file)).into(folder / "closed")
+    stated = ("--set", "--sensor-noise")
+    closed = typed.keeping("close", stated, model, str(file)).into(folder / "closed")
     yield "is something missing?", closed.lines()
 
 
