@@ -9,6 +9,9 @@ from scipy.spatial.transform import Rotation
 
 from casest import Run, signal
 from casest.cli import run as cli
+from casest.cli.assignments import Assignment
+from casest.cli.loading import moving_model
+from casest.cli.options import MotionOptions
 from casest.dynamics import Motion, constraint, dynamics, measured, state
 from casest.dynamics.filter import filtered
 
@@ -70,17 +73,42 @@ def test_a_measured_record_gives_the_offset_that_cameras_give(shared_data):
 
 
 @pytest.mark.parametrize(
-    ("said", "because"),
+    ("option", "said", "because"),
     [
-        ("w=0.2 uT", "uT does not convert to rad/s: one is a magnetic field, the other an angular"),
-        ("w=loud", "in motion a sensor's noise is one number for all its readings and axes"),
+        (
+            "--std",
+            "offset=2 s",
+            "s does not convert to uT: one is a time, the other a magnetic field",
+        ),
+        ("--std", "offset=wide", "'wide' is no number; write it as 0.2 (uT) or with its unit"),
+        (
+            "--sensor-noise",
+            "w=0.2 uT",
+            "uT does not convert to rad/s: one is a magnetic field, the other an angular",
+        ),
+        (
+            "--sensor-noise",
+            "w=loud",
+            "in motion a sensor's noise is one number for all its readings and axes",
+        ),
     ],
 )
-def test_a_noise_in_another_unit_is_named(tmp_path, capsys, said, because):
+def test_what_is_known_in_another_unit_is_named(tmp_path, capsys, option, said, because):
     record = waved(tmp_path / "waved.csv", seconds=1)
     words = ["--columns", "t=time", "--columns", "m=MagX,MagY,MagZ", "--columns", "w=gx,gy,gz"]
-    assert cli(["filter", "mag-gyro", str(record), *words, "--sensor-noise", said]) == 1
-    assert f"--sensor-noise {said}: {because}" in capsys.readouterr().err
+    assert cli(["filter", "mag-gyro", str(record), *words, option, said]) == 1
+    assert f"{option} {said}: {because}" in capsys.readouterr().err
+
+
+def test_what_is_known_takes_units():
+    moving = moving_model(
+        "bias-gravity-magnitude",
+        (Assignment("--set", "gravity_magnitude=981 cm/s^2"),),
+        MotionOptions(stds=(Assignment("--std", "velocity=36 km/h"),)),
+    )
+    assert moving["velocity"].std == pytest.approx(10)
+    (known,) = moving.constants
+    assert known.array == pytest.approx(9.81)
 
 
 @dynamics

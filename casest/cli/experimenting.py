@@ -202,8 +202,10 @@ def _noise(model: Dynamics, options: PlanOptions, start: Start | None) -> Any:
     """Covariance (m, m) of one reading of all outputs."""
     import numpy as np
 
+    from casest.interface.sensor_noise import one_number
+
     t = model.traced
-    stated: dict[str, float] = dict(given.number() for given in options.noise)
+    stated: dict[str, float] = dict(one_number(given, model.signals) for given in options.noise)
     for name, said in stated.items():
         if name not in t.measured:
             raise UsageError(f"--sensor-noise {name}=…: {model.name} reads {', '.join(t.measured)}")

@@ -237,9 +237,12 @@ def _noisy(model: Dynamics, options: PlanOptions, rate: float) -> Dynamics:
 
     from casest.data.run import Run
     from casest.dynamics.intensities import with_stated
+    from casest.interface.sensor_noise import one_number
 
     time = np.arange(3) / rate
     signals = {s.name: np.zeros((3, s.size)) for s in model.signals}
     units = {s.name: s.unit for s in model.signals}
     blank = Run.raw("planned", signals, units=units, time=time)
-    return with_stated(model, blank, dict(given.number() for given in options.noise))
+    return with_stated(
+        model, blank, dict(one_number(given, model.signals) for given in options.noise)
+    )
