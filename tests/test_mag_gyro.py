@@ -13,6 +13,7 @@ from casest.cli.assignments import Assignment
 from casest.cli.loading import moving_model
 from casest.cli.options import MotionOptions
 from casest.dynamics import Motion, constraint, dynamics, measured, state
+from casest.dynamics.course import followed
 from casest.dynamics.filter import filtered
 
 EARTH = np.array([18.0, -4.0, 43.0])
@@ -126,8 +127,8 @@ def test_what_is_known_exactly_holds_from_afar():
     rng, n = np.random.default_rng(0), 400
     y = 6 + 0.01 * rng.standard_normal((n, 1))
     run = Run.raw("read", {"y": y}, units={"y": "1"}, time=np.arange(n) * 0.1)
-    found = filtered(product, run)
-    gain, level = found.smoothed[-1]
-    assert level == pytest.approx(2, abs=1e-9)
-    assert gain == pytest.approx(y.mean() / 2, abs=2e-5)
-    assert found.settled
+    for found in (filtered(product, run), followed(product, run)):
+        gain, level = found.smoothed[-1]
+        assert level == pytest.approx(2, abs=1e-9)
+        assert gain == pytest.approx(y.mean() / 2, abs=2e-5)
+        assert found.settled

@@ -145,9 +145,10 @@ def _nonlinear(pieces: Pieces, smooth: bool) -> Course:
         change, later = 0.0, np.empty_like(along)
         for where, x, P in rounds.smoothed(model, run, pace, longer, along):
             std = np.sqrt(np.maximum(np.diagonal(P, axis1=1, axis2=2), 1e-300))
-            change = max(change, float(np.max(np.abs(x - along[where]) / std)))
-            later[where] = x
-            found.smoothed[where], found.smoothed_std[where] = pieces.known(where, x, P)
+            # What is known exactly is put in here, too: from afar its slope leads astray.
+            later[where], found.smoothed_std[where] = pieces.known(where, x, P)
+            change = max(change, float(np.max(np.abs(later[where] - along[where]) / std)))
+        found.smoothed[:] = later
         along, first = later, first or (found.smoothed.copy(), found.smoothed_std.copy())
         if change < SETTLED:
             return found
@@ -225,7 +226,8 @@ class Pieces:
     def known(self, where: slice, x: Array, P: Array) -> tuple[Array, Array]:
         """With what is known exactly put in: states and their standard deviations."""
         x, P = known(self.model, self.run.take(where), x, P)
-        return x, std_of(P)
+        # What is known exactly has a variance of zero, but for rounding.
+        return x, np.sqrt(np.maximum(np.diagonal(P, axis1=1, axis2=2), 0.0))
 
 
 def _back(found: Course, pieces: Pieces, begun: list[States]) -> None:

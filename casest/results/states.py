@@ -318,7 +318,10 @@ def verdict_words(result: States) -> str:
     if result.as_expected:
         return "as large as the noise intensities say"
     mean = result.innovations.normalised_mean or float("nan")
-    return (
-        f"{mean / result.innovations.expected:.2g} times as large (squared) as the noise "
-        "intensities say: match them (--sensor-noise, --rest or --noise ml)"
-    )
+    times = f"{mean / result.innovations.expected:.2g} times as large (squared) as the noise "
+    if _parted(result.filtered):
+        return (
+            f"{times}intensities say; that the filter linearised away from where the record leads "
+            "may be all there is to it"
+        )
+    return f"{times}intensities say: match them (--sensor-noise, --rest or --noise ml)"
