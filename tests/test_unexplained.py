@@ -51,7 +51,11 @@ def test_of_causes_of_which_none_is_added_it_is_said_how_far_each_moves_the_para
     left = closed(tmp_path, REST, names, t, v)["unexplained"]
     assert sorted(left["one_of"]) == ["bias_drift", "warm_up"]
     assert set(left["would_move"]) == {"bias_drift", "warm_up"}
-    begins = np.polyfit(t, v[:, 0], 1)[1] - v[:, 0].mean()
+    line = np.polyfit(t, v[:, 0], 1)
+    squares = np.sum((v - v.mean(axis=0)) ** 2)
+    taken = np.sum((np.polyval(line, t) - v[:, 0].mean()) ** 2)
+    assert left["fraction"] == pytest.approx(taken / squares, rel=0.1)  # a likelihood says 0.0015
+    begins = line[1] - v[:, 0].mean()
     np.testing.assert_allclose(left["would_move"]["bias_drift"]["bias"], -begins, rtol=1e-3)
     printed = " ".join(capsys.readouterr().out.split())
     assert "bias_drift would move the parameters: bias by 0.0029 m/s^2" in printed

@@ -17,6 +17,7 @@ from casest.diagnose.candidates.candidates import Candidate, Skipped
 from casest.diagnose.closing import Closing
 from casest.diagnose.cross_validation import Folds, check_folds, cross_fitted, folded, rms
 from casest.diagnose.evidence.linear import robust_sd
+from casest.diagnose.evidence.score import Evidence
 from casest.diagnose.found import HELD_OUT_DATA, Found, Undecided
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.misfit.left import predictions
@@ -317,14 +318,20 @@ def _undecided(sensor: Sensor, state: State[Fit]) -> Undecided | None:
         return None
     best = state.open[0]
     names = tuple(dict.fromkeys(label for e in state.open for label in e.families))
-    ranking = state.last
-    count = len(ranking.likelihood.residual) if ranking else 1
     moves = {
         r.evidence.families[0]: sensor.moved_by(r.before, r.fit)
         for r in state.torn
         if len(r.evidence.families) == 1  # of a pair none moves them alone
     }
-    return Undecided(names, float(-np.expm1(-best.gain / count)), moves)
+    return Undecided(names, _share(best, state), moves)
+
+
+def _share(best: Evidence, state: State[Fit]) -> float:
+    """Of the mean square, that a cause takes away: in coloured noise its likelihood is no share."""
+    if state.last is None:
+        return 0.0
+    left = float(np.sum(best.explained.left**2))
+    return max(0.0, 1 - left / float(np.sum(state.last.none.left**2)))
 
 
 __all__ = ["Closing", "Found", "close", "rms"]

@@ -59,15 +59,6 @@ class Evidence:
         return tuple(t.family for t in self.trials)
 
     @property
-    def sized(self) -> bool:
-        """Is it judged by all its unknowns? (Of a pair that is not asked.)
-
-        What the declared unknowns can do as well is not in the evidence: a refit would free it all
-        the same, and take the declared ones anywhere.
-        """
-        return len(self.trials) > 1 or self.freedom == self.trials[0].columns.shape[2]
-
-    @property
     def columns(self) -> list[Array]:
         """(N, m, k) of each trial."""
         return [t.columns for t in self.trials]

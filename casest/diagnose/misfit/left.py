@@ -109,7 +109,10 @@ def left_over(
     if undecided is not None:
         fraction = max(fraction, undecided.share)
         several = " and other shapes" if len(undecided.names) == 1 else ""
-        where = [f"which {' or '.join(undecided.names[:3])}{several} explain alike", *where]
+        they = f"{' or '.join(undecided.names[:3])}{several} explain"
+        most = undecided.share > (1 - LEVELS.alike) * fraction
+        part = f"{100 * undecided.share:.2g} %"
+        where = [f"which {they} alike" if most else f"of which {they} {part}, alike", *where]
     share = 0.0 if wanders else max((c.share for c in described), default=0.0)
     if share > LEVELS.share and not any(f.slow for f in found):
         # Slow is what it goes with, not what it looks like where the motion is quick.

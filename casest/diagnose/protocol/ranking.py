@@ -64,8 +64,8 @@ def _on_its_axes(subject: Subject[F], fit: F, evidence: Evidence, ranking: Ranki
     trial = subject.on_axes(fit, evidence.trials[0], axes)
     less = judged([trial], ranking.likelihood, ranking.none, start=evidence.explained,
                   families=ranking.families)  # fmt: skip
-    better = less is not None and (less.score > evidence.score or not evidence.sized)
-    return less if less is not None and better else evidence
+    whole = evidence.freedom == evidence.trials[0].columns.shape[2]  # else no size of its own
+    return less if less is not None and (less.score > evidence.score or not whole) else evidence
 
 
 def _about_the_best(ranking: Ranking) -> Ranking:

@@ -17,9 +17,6 @@ from casest.diagnose.protocol.ranking import sharpened
 from casest.diagnose.protocol.state import F, Ranking, Refit, State
 from casest.diagnose.protocol.subject import Subject
 
-#: Why there is no refit of a cause.
-NO_SIZE = "what the declared unknowns can do as well has no size of its own"
-
 
 def refitted(
     subject: Subject[F], state: State[F], ranking: Ranking, options: Sequence[Evidence]
@@ -31,8 +28,7 @@ def refitted(
     fits: list[tuple[Evidence, F]] = []
     for evidence in _with_parts(options[: LEVELS.contenders], ranking):
         evidence = sharpened(subject, state.fit, ranking, evidence)
-        sized = evidence.sized or subject.asked(evidence.trials[0].what)
-        better = subject.refit(state.fit, evidence.trials) if sized else NO_SIZE
+        better = subject.refit(state.fit, evidence.trials)
         if isinstance(better, str):
             state = state.failing(evidence, better)
         else:

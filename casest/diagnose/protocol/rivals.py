@@ -44,8 +44,6 @@ def _rivals(subject: Subject[F], state: State[F], kept: Kept) -> tuple[State[F],
     for e in ranking.causes:
         if e is mine[0] or e.score < LEVELS.strong or len(rivals) == 2 * LEVELS.contenders:
             continue
-        if not e.sized:
-            continue
         lost = squares(linear, [_in_time(ranking, e)], stretches) - best
         if _as_well(mine[0].score - e.score, lost, without - best, best):
             rivals.append(e)
