@@ -208,3 +208,44 @@ def test_the_command_line_writes_it(tmp_path, capsys):
     ):
         assert command(wrong) == 1
         assert said in capsys.readouterr().err
+
+
+def test_the_folder_of_a_filter_exports_the_very_step_that_it_took(tmp_path, capsys):
+    """Constants, start and noise as they were typed for the record; nothing is typed again."""
+    (tmp_path / "sledge.py").write_text(MODEL)
+    rng, t = np.random.default_rng(4), np.arange(0, 3, STEP)
+    a, x = np.cos(t) + 0.02 * rng.standard_normal(len(t)), 1 - np.cos(t)
+    x += 0.2 * rng.standard_normal(len(t))
+    data, out = tmp_path / "record.csv", tmp_path / "out"
+    np.savetxt(data, np.c_[t, a, x], delimiter=",", header="t,a,x", comments="", fmt="%.17g")
+    words = ["filter", f"{tmp_path / 'sledge.py'}:sledge", str(data), "--std", "velocity=1"]
+    words += ["--sensor-noise", "a=0.02", "--sensor-noise", "x=20 cm", "-o", str(out)]
+    assert command(words) == 0
+    assert command(["export", str(out), "--to", "c", "-o", str(tmp_path / "step.c")]) == 0
+    model = stepwise_model(tmp_path)
+    device = Compiled((tmp_path / "step.c").read_text(encoding="utf-8"), model, tmp_path)
+    table = np.loadtxt(out / "states.csv", delimiter=",", skiprows=1)  # time, states, their std
+    for k in range(len(t)):
+        _, states, P = device.step({"a": a[k], "x": x[k]}, t[k])
+        np.testing.assert_allclose(states, table[k, 1:4], rtol=1e-7, atol=1e-9)
+        np.testing.assert_allclose(np.sqrt(np.diag(P)), table[k, 4:7], rtol=1e-7)
+    capsys.readouterr()
+    for wrong, said in (
+        (["export", str(out), "--to", "json"], "--to c alone"),
+        (["export", str(out), "--to", "c", "--period", "1"], "says what its filter used"),
+    ):
+        assert command(wrong) == 1
+        assert said in capsys.readouterr().err
+    with (tmp_path / "sledge.py").open("a", encoding="utf-8") as file:
+        file.write("raise SystemExit('run')\n")
+    assert command(["export", str(out), "--to", "c"]) == 1
+    assert "sledge.py has changed since the result was made: filter" in capsys.readouterr().err
+    (out / "filter.json").write_text("{}")
+    assert command(["export", str(out), "--to", "c"]) == 1
+    assert "does not say what step its filter took" in capsys.readouterr().err
+
+
+def stepwise_model(folder):
+    from casest.results.find import find_any
+
+    return find_any(f"{folder / 'sledge.py'}:sledge")

@@ -8,10 +8,9 @@ from typing import Literal
 
 import click
 
-from casest.cli.assignments import Assignment, Assignments
+from casest.cli.filter_step import StepOptions, is_filtered, step_of, step_of_folder
 from casest.cli.flags import Kind, flag, refuse, taking
-from casest.cli.loading import moving_model
-from casest.cli.options import RESULT, MotionOptions, ReadingOptions, SensorOptions
+from casest.cli.options import RESULT, ReadingOptions
 from casest.cli.shared import commands, echo, progress, shown, typed, write
 from casest.errors import UsageError
 
@@ -91,30 +90,6 @@ def apply(result_path: Path, data: str, options: ApplyOptions) -> None:
     echo(f"\n{following(typed(), file=path)}")
 
 
-@dataclass(frozen=True, slots=True)
-class StepOptions:
-    """Options of `export` of an estimator in motion."""
-
-    period: float | None = flag(
-        None,
-        "--period",
-        only=Kind.MOVING,
-        type=float,
-        metavar="SECONDS",
-        help="Of an estimator in motion: the usual time between two samples.",
-    )
-    constants: Assignments = flag(
-        (),
-        "--set",
-        only=Kind.MOVING,
-        of=Assignment,
-        metavar="NAME=VALUE",
-        help="Set a constant of the estimator.",
-    )
-    motion: MotionOptions = field(default_factory=MotionOptions)
-    sensors: SensorOptions = field(default_factory=SensorOptions)
-
-
 @commands.command()
 @click.argument("result_path", metavar="RESULT|MODEL", type=click.Path(path_type=Path))
 @click.option(
@@ -165,7 +140,8 @@ def export(
 ) -> None:
     """The correction of a saved RESULT, or a filter's step, ready to run on the device.
 
-    Of an estimator in motion, MODEL is its name or file, and --to c writes one step of its filter.
+    Of an estimator in motion, MODEL is its name or file, or the folder that `casest filter` wrote,
+    and --to c writes one step of its filter.
     """
     from casest.correction.inverse import ONCE, TIMED
     from casest.report.next_command import following
@@ -183,6 +159,15 @@ def export(
                 "--with-std: in Python the step is casest.dynamics.Estimator"
             )
         saved(step_of(str(result_path), options, single), output)
+        return
+    if is_filtered(result_path):
+        if run or force or std or to != "c":
+            raise UsageError(
+                f"{result_path}: of a filter --to c alone is written, without --run, --force and "
+                "--with-std: in Python the step is casest.dynamics.Estimator"
+            )
+        refuse(options, Kind.MOVING, f"is for a model; {result_path} says what its filter used")
+        saved(step_of_folder(result_path, single), output)
         return
     refuse(options, Kind.MOVING, f"is for estimators in motion; {result_path} is a saved result")
     if certificate is not None and to != "dcc":
@@ -238,22 +223,3 @@ def names_a_model(given: Path) -> bool:
 
     own = str(given).partition(":")[0]
     return not given.is_dir() and (own.endswith(".py") or own in {*MOVING, *SHIPPED})
-
-
-def step_of(name: str, options: StepOptions, single: bool) -> str:
-    """C source of the filter's step of the estimator in motion called `name`."""
-    import numpy as np
-
-    from casest.correction.filter_c import filter_source
-    from casest.data.run import Run
-    from casest.dynamics.intensities import with_stated
-    from casest.dynamics.stepwise import checked_period, stepwise
-
-    moving = moving_model(name, options.constants, options.motion)
-    if options.period is None:
-        raise UsageError(f"{name}: give the usual time between two samples: --period SECONDS")
-    time = np.array([0.0, checked_period(moving, options.period)])
-    blank = Run.raw("two samples", {"t": time[:, None]}, units={}, time=time)
-    return filter_source(
-        stepwise(with_stated(moving, blank, options.sensors.stds(moving)), options.period), single
-    )

@@ -20,6 +20,7 @@ from casest.data.matching import find_by_name
 from casest.data.options import Options
 from casest.data.run import Array, Run, Series
 from casest.data.table import Table
+from casest.data.timing import UNUSED
 from casest.declaration.symbols import Signal
 from casest.errors import DataError, UsageError
 from casest.units import conversion
@@ -179,6 +180,9 @@ def times_of(runs: Sequence[Run]) -> list[Array]:
     """The time of each file. Raises DataError where one has none."""
     for run in runs:
         if run.time is None:
+            why = [note for note in run.notes if note.startswith(UNUSED)]
+            if why:
+                raise DataError(why[0].removeprefix(UNUSED))
             raise DataError(
                 f"{run.file}: no time column: files joined by + need one each; give "
                 f"--columns t={file_and_topics(run.file)[0].stem}.NAME, or both as t=NAME,"

@@ -22,6 +22,7 @@ from casest.declaration.effect import Attached
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
 from casest.declaration.symbols import Constant
+from casest.dynamics.declare import Dynamics
 from casest.errors import CasestError
 from casest.estimate.estimate import Estimate
 from casest.leastsquares.agreement import between_runs
@@ -312,7 +313,7 @@ def fitted_content(
         ],
         "notes": [note for run in problem.runs for note in run.notes] + list(estimate.notes),
         "convention": inspect.getdoc(problem.model.function) or "",
-        "declared_in": _declared_in(problem.model),
+        "declared_in": declared_in(problem.model),
         "reproduce": reproduced(command, data),
         **_correction(estimate, units, corrected),
         "declared": estimate.model.name,
@@ -484,7 +485,8 @@ def _solver(estimate: Estimate) -> Solver:
     )
 
 
-def _declared_in(model: Model) -> DeclaredIn:
+def declared_in(model: Model | Dynamics) -> DeclaredIn:
+    """The file that declares a model, and its SHA-256 as it is now."""
     path = Path(inspect.unwrap(model.function).__code__.co_filename).resolve()
     if not path.exists():
         return DeclaredIn()

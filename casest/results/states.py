@@ -17,7 +17,9 @@ from casest.dynamics.course import Course, followed
 from casest.dynamics.inputs import uncertain, unstated
 from casest.dynamics.intensities import Tuned, intensities, units
 from casest.dynamics.moving_horizon import Horizon, moving_horizon
+from casest.dynamics.transition import Pace
 from casest.results.file import plain
+from casest.results.fitted import DeclaredIn, declared_in
 from casest.results.observability import assumed, too_short
 from casest.results.result import Number, Reproduced, Result, reproduced
 from casest.results.trajectory import Innovations, Trajectory, trajectory_of, weakly_told
@@ -53,6 +55,14 @@ class UsedIntensities(Struct, frozen=True):
     declared_normalised_mean: Number
 
 
+class UsedStep(Struct, frozen=True):
+    """What a filter's step on a device takes: the usual time between two samples of the record, s,
+    and the noise intensities that go with it."""
+
+    period: Number
+    intensities: dict[str, Number]
+
+
 class UsedHorizon(Struct, frozen=True):
     """A moving horizon: its steps; at how many samples the bound of each number acts; windows that
     did not settle, and the rounds that a window takes, on average."""
@@ -78,6 +88,8 @@ class States(Result, frozen=True, kw_only=True, dict=True):
     states: dict[str, FinalState]
     intensities: UsedIntensities
     innovations: Innovations
+    step: UsedStep
+    declared_in: DeclaredIn
     allan: Mapping[str, Any] | UnsetType = UNSET
     horizon: UsedHorizon | UnsetType = UNSET
     data: list[str]
@@ -140,6 +152,8 @@ def follow(
             int(np.sum(~np.isfinite(found.normalised_innovations))),
             plain(_lag1(found.innovations)),
         ),
+        step=_step(found.model, run),
+        declared_in=declared_in(model),
         allan=allan or UNSET,
         horizon=_used(found) if isinstance(found, Horizon) else UNSET,
         data=list(data),
@@ -147,6 +161,16 @@ def follow(
         as_expected=bool(SMALLEST < mean / m < LARGEST),
         filtered=found,
     )
+
+
+def _step(model: Dynamics, run: Run) -> UsedStep:
+    """A reading's variance is its intensity over the time between two: of one with a clock of its
+    own that is not the time between two samples."""
+    pace = Pace.of(model, run)
+    used = intensities(model, run)
+    for name in model.measured_signals:
+        used[name] *= pace.usual / pace.periods.get(name, pace.usual)
+    return UsedStep(plain(pace.usual), _plain_values(used))
 
 
 def _final(found: Course) -> dict[str, FinalState]:

@@ -73,7 +73,7 @@ def _found_model(result: Mapping[str, Any]) -> Model:
     if not path.endswith(".py"):
         return find_model(name)
     file = Path(declared.get("file", path))
-    _refuse_changed(file, declared.get("sha256"))
+    refuse_changed(file, declared.get("sha256"))
     return find_model(f"{file}{colon}{own}")
 
 
@@ -83,7 +83,7 @@ def _found_effect(saved: Mapping[str, Any]) -> Effect:
     try:
         if file.parent == shipped:
             return next(e for e in (*effects.CATALOGUE, *effects.ASKED) if e.name == saved["name"])
-        _refuse_changed(file, saved.get("sha256"))
+        refuse_changed(file, saved.get("sha256"))
         return find_effects(f"{file}:{saved['name']}")[0]
     except (UsageError, StopIteration) as error:
         raise UsageError(
@@ -91,12 +91,12 @@ def _found_effect(saved: Mapping[str, Any]) -> Effect:
         ) from None
 
 
-def _refuse_changed(source: Path, recorded: str | None) -> None:
+def refuse_changed(source: Path, recorded: str | None, again: str = "calibrate") -> None:
     """Refuse a file of declarations that is not the one that the result was made with, unrun."""
     if source.is_file() and hashlib.sha256(source.read_bytes()).hexdigest() != recorded:
         raise UsageError(
-            f"{source} has changed since the result was made: calibrate again (the parameters "
-            "belong to the old declaration)"
+            f"{source} has changed since the result was made: {again} again (the numbers belong to "
+            "the old declaration)"
         )
 
 
