@@ -220,8 +220,8 @@ def test_columns_of_a_record_are_varied_in_the_plan_that_tells_their_causes_apar
     monkeypatch.chdir(tmp_path)
     rng = np.random.default_rng(1)
     load, u = np.repeat(np.linspace(0, 100, 6), 5), rng.permutation(np.linspace(0, 1, 30))
-    T, amps = 20 + 10 * u + 0.3 * rng.standard_normal(30), 1 + 0.5 * u
-    amps = amps + 0.02 * rng.standard_normal(30)
+    T = 20 + 10 * u + 0.3 * rng.standard_normal(30)
+    amps = 1 + 0.5 * u + 0.02 * rng.standard_normal(30)
     y = 3 + 0.5 * load + 0.04 * (T - 25) + 0.05 * rng.standard_normal(30)
     np.savetxt("bench.csv", np.column_stack([load, y, T, amps]), delimiter=",", comments="",
                header="Weight (kg),Bridge (mV),Temp (degC),Heater (A)")  # fmt: skip
@@ -238,3 +238,43 @@ def test_columns_of_a_record_are_varied_in_the_plan_that_tells_their_causes_apar
     row = dict(zip(head.split(","), first.split(","), strict=True))
     # together they rose, so that one goes up and the other down
     assert (float(row["Temp [degC]"]) - 25) * (float(row["Heater [A]"]) - 1.25) < 0
+
+
+def test_what_stayed_invisible_is_shown_by_a_plan_or_proved_to_be_hidden(
+    tmp_path, capsys, monkeypatch
+):
+    """A cell that is only pressed cannot show another gain for pulling."""
+    monkeypatch.chdir(tmp_path)
+    rng = np.random.default_rng(3)
+    load = np.repeat(np.linspace(0, 100, 6), 5)
+    y = 3 + 0.5 * load + 0.05 * rng.standard_normal(30)
+    table = np.column_stack([load, y])
+    np.savetxt("cell.csv", table, delimiter=",", header="load (kg),reading (mV)", comments="")
+    assert run(["calibrate", "load-cell", "cell.csv", "-o", "out"]) == 0
+
+    def plan(*words):
+        capsys.readouterr()
+        code = run(["plan", "out", "--show", *words])
+        said = capsys.readouterr()
+        return code, said.out or said.err
+
+    code, said = plan("gain_by_sign", "--vary", "load=0:100:20")
+    assert code == 1
+    assert "gain_by_sign (k = 0.001) and the model alone are one under all 6 candidates" in said
+    code, said = plan("gain_by_sign", "--vary", "load=-100:100:50", "--json")
+    assert code == 0
+    found = json.loads(said)
+    own = next(t for t in found["separates"] if t["true"].startswith("gain_by_sign"))
+    assert own["chance"] >= 0.95
+    # a gain of 1.001 above zero and 0.999 below (IEEE Std 528): what a straight line leaves of it
+    slope = np.polyfit(load, y, 1)[0]
+    sigma = float(found["noise"]["sigma"][0])
+    planned = np.array([m["signals"]["load"] for m in found["measurements"]])
+    every = np.concatenate([load, planned])
+    off = np.where(every < 0, 0.002 * slope * every, 0.0)
+    off[:30] = 0.0
+    J = np.column_stack([np.ones(len(every)), every])
+    left = (off - J @ np.linalg.lstsq(J, off, rcond=None)[0]) / sigma
+    assert own["growth"] == pytest.approx(np.sum(left**2), rel=0.01)
+    assert plan("gain_by_sing", "--vary", "load=0:100:20")[1].startswith("casest: --show gain_by")
+    assert "leave --until" in plan("cubic", "--until", "zero<1")[1]

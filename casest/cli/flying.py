@@ -140,6 +140,7 @@ def refuse_others(name: str, options: PlanOptions, counted: bool = False) -> Non
         "--count": None if counted else options.count,
         "--budget": options.budget,
         "--separate": options.separate,
+        "--show": options.show,
         "--live": options.live.source,
         "--columns": options.reading.columns,
         "--unit": options.reading.units,

@@ -186,7 +186,13 @@ def living(situation: Situation, options: PlanOptions, source: str) -> int:
     """Which pose is next while one measures; exit code 0 where it ends, reached or not."""
     if options.robust or options.budget is not None:
         raise UsageError("--live says what is next as it comes: leave --robust and --budget out")
-    if options.separate or options.count is not None or options.output or options.as_json:
+    if (
+        options.separate
+        or options.show
+        or options.count is not None
+        or options.output
+        or options.as_json
+    ):
         raise UsageError("--live says what is next as it comes: leave --count, -o and --json out")
     if options.until and not situation.noise.known:
         name = situation.model.readings[0].name

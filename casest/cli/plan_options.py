@@ -104,6 +104,12 @@ class PlanOptions:
     separate: bool = flag(
         False, "--separate", help="After close: what tells the causes apart that it left open."
     )
+    show: str | None = flag(
+        None,
+        "--show",
+        metavar="EFFECT",
+        help="After close: what shows an effect of typical size that stayed invisible.",
+    )
     count: int | None = flag(None, "--count", type=int, metavar="N", help="How many to plan.")
     budget: float | None = flag(
         None,

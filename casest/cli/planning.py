@@ -65,7 +65,7 @@ def plan(given: Path, options: PlanOptions) -> int:
     situation = of_model(str(given), options) if names_a_model(given) else of_result(given, options)
     if options.live.source:
         return living(situation, options, options.live.source)
-    make = separating if options.separate else planned_result
+    make = separating if options.separate or options.show else planned_result
     result = make(situation, options)
     if options.output:
         from casest.report.html.plan import plan_page

@@ -21,30 +21,14 @@ if TYPE_CHECKING:
 def separating(situation: Situation, options: PlanOptions) -> Plan:
     """Candidates as each cause has them, and the plan that tells the causes apart."""
     from casest.plan.candidates.finding import candidates
-    from casest.plan.rivals.rivals import open_causes, refitted
     from casest.plan.rivals.separating import separated, separation
     from casest.results.plan import separation_result
 
-    if options.until or options.criterion != "D":
-        raise UsageError("--separate has a goal of its own: leave --until and --criterion out")
-    if options.robust or options.budget is not None:
-        raise UsageError("--separate tells causes apart: leave --robust and --budget out")
-    if situation.after is None:
-        raise UsageError(f"--separate: {situation.name} is a model; give a result of close")
-    base, labels = open_causes(situation.content, situation.model)
-    if len(labels) < 2:
-        raise UsageError(
-            f"{situation.after}: its record left no two causes open; plan for precision instead "
-            "(without --separate)"
-        )
-    runs = records_of(situation, base)
-    if runs is None:
-        raise UsageError(
-            f"{situation.after}: the record that it was made from is not where it was, and the "
-            "causes are fitted to it again"
-        )
-    progress(f"fitting {', '.join(labels)}")
-    rivals = refitted(base, situation.values, runs, labels, situation.noise.residual)
+    after = situation.after
+    if after is None:
+        asked = "--separate" if options.separate else "--show"
+        raise UsageError(f"{asked}: {situation.name} is a model; give a result of close")
+    base, labels, rivals, runs = _rivals(situation, options)
     possible = _with_columns(possible_of(situation, options), base, rivals, runs)
 
     def make(rival: Rival) -> Candidates:
@@ -58,13 +42,48 @@ def separating(situation: Situation, options: PlanOptions) -> Plan:
         found,
         planned,
         model_name=situation.name,
-        after=situation.after,
+        after=after,
         noise=situation.noise,
         units=_units(situation, rivals, runs),
         notes=[*([f"not planned for: {', '.join(left)}"] if left else []), _AFTERWARDS],
         covered=covered(situation) if found.candidates.up is not None else None,
         command=typed(),
     )
+
+
+def _rivals(
+    situation: Situation, options: PlanOptions
+) -> tuple[Model, list[str], list[Rival], tuple[Run, ...]]:
+    """The model without what is in doubt, the causes by name, each fitted to the record."""
+    from casest.plan.rivals.rivals import open_causes, refitted
+    from casest.plan.rivals.shown import shown_or_not
+
+    asked = "--separate" if options.separate else "--show"
+    if options.separate and options.show:
+        raise UsageError("--separate and --show: one of the two says what is told apart")
+    if options.until or options.criterion != "D":
+        raise UsageError(f"{asked} has a goal of its own: leave --until and --criterion out")
+    if options.robust or options.budget is not None:
+        raise UsageError(f"{asked} tells causes apart: leave --robust and --budget out")
+    base, labels = (situation.model, []) if options.show else open_causes(
+        situation.content, situation.model
+    )  # fmt: skip
+    if options.separate and len(labels) < 2:
+        raise UsageError(
+            f"{situation.after}: its record left no two causes open; plan for precision instead "
+            "(without --separate)"
+        )
+    runs = records_of(situation, base)
+    if runs is None:
+        raise UsageError(
+            f"{situation.after}: the record that it was made from is not where it was, and the "
+            "causes are fitted to it again"
+        )
+    values, sigma = situation.values, situation.noise.residual
+    progress(f"fitting {', '.join(labels) or options.show}")
+    if options.show:
+        return base, labels, shown_or_not(base, values, runs, options.show, sigma), runs
+    return base, labels, refitted(base, values, runs, labels, sigma), runs
 
 
 #: What to do with what is measured.
@@ -87,7 +106,7 @@ def _with_columns(possible: Any, base: Model, rivals: Any, runs: Any) -> Any:
     from casest.effects.placing import prepared
     from casest.plan.candidates.varied import values_of
 
-    own = {s.name for s in base.signals}
+    own = {s.name for s in replace(base, effects=()).signals}
     extras = {s.name: s.unit for r in rivals for s in r.model.signals if s.name not in own}
     typed_ones = dict(possible.varied)
     also = {}

@@ -13,7 +13,7 @@ import numpy as np
 
 from casest.data.run import Index
 from casest.declaration.shapes import Array
-from casest.plan.design.criteria import Criterion, Longest, Volume, inverse
+from casest.plan.design.criteria import Criterion, Largest, Longest, Volume, inverse
 from casest.plan.design.newton import newton
 
 #: Share of the standard deviations by which a certified design may be worse than the best.
@@ -48,6 +48,13 @@ def slopes(C: Array, L: Array, factors: Array) -> Array:
     """By how much Φ falls with each candidate, (N,), to first order; L as of `Criterion.weight`."""
     S = C @ L @ C
     return np.asarray(np.sum((factors @ S) * factors, axis=(1, 2)))
+
+
+def steepness(criterion: Criterion, C: Array, factors: Array) -> Array:
+    """The same with the criterion's own weight; of few combinations without its n×n matrices."""
+    if isinstance(criterion, Largest):
+        return np.asarray(np.sum((factors @ (C @ criterion.root(C))) ** 2, axis=(1, 2)))
+    return slopes(C, criterion.weight(C), factors)
 
 
 def certified(
@@ -104,7 +111,7 @@ def _steps(
     C = inverse(information(known, factors, total * weights))
     value = criterion.value(C)
     for _ in range(count):
-        s = np.maximum(slopes(C, criterion.weight(C), factors), 0.0)
+        s = np.maximum(steepness(criterion, C, factors), 0.0)
         ratio = s / (weights @ s)
         while power > 1e-3:
             trial = weights * ratio**power

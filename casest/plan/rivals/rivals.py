@@ -86,7 +86,7 @@ def refitted(
         if any(a.kind in OVER_TIME for a in best.model.effects):
             why.append(f"{label} (it acts on the sequence of samples, and one shows none of it)")
             continue
-        found.append(_rival(label, best, sensor.runs, sigma))
+        found.append(rival_of(label, best, sensor.runs, sigma))
     if len(found) < 2:
         said = "; ".join(why) or "none is named"
         raise UsageError(f"{model.name}: no two causes can be planned for: {said}")
@@ -97,7 +97,8 @@ def _squares(fit: Fit) -> float:
     return float(sum(np.sum(r**2) for r in fit.residuals))
 
 
-def _rival(label: str, fit: Fit, runs: tuple[Run, ...], sigma: Array) -> Rival:
+def rival_of(label: str, fit: Fit, runs: tuple[Run, ...], sigma: Array) -> Rival:
+    """A fit as a rival."""
     weights = tuple(np.broadcast_to(1 / sigma**2, (len(run), len(sigma))) for run in runs)
     problem = Problem(fit.model, runs, weights)
     normal = problem.normal(problem.point(fit.values))
