@@ -1,6 +1,6 @@
 """Does the loop in motion find what is missing, and nothing else? Simulated flights of 60 s.
 
-    make study-flights                        # 200 of each kind: days on one core
+    make study-flights                        # 200 of each kind: a day on one core
     python studies/flight_loop.py --only null # worlds whose names match this pattern
     python studies/flight_loop.py --table     # of what is there so far
 

@@ -8,7 +8,8 @@ which the states are already marginal: its score test is exact (Willsky & Jones 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import weakref
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -68,12 +69,18 @@ class Gains:
     present: NDArray[np.bool_]
 
 
+#: Of the filter that was looked at last: all candidates are, one after the other.
+_LATEST: list[tuple[Callable[[], Filtered | None], Gains]] = []
+
+
 def gains(found: Filtered) -> Gains:
-    """Of a filter; computed once."""
-    kept: Gains | None = found.__dict__.get("gains")
-    if kept is None:
-        kept = found.__dict__["gains"] = _gains(found)
-    return kept
+    """Of a filter; kept until another one is looked at, or it is no more."""
+    for filter_of, known in _LATEST:
+        if filter_of() is found:
+            return known
+    own = _gains(found)
+    _LATEST[:] = [(weakref.ref(found, lambda _: _LATEST.clear()), own)]
+    return own
 
 
 def _gains(found: Filtered) -> Gains:
