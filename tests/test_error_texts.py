@@ -291,7 +291,10 @@ def test_a_value_of_a_result_of_another_form_names_both_and_the_way_out(
             "takes a 3 by 3 matrix (1,0,0;0,1,0;0,0,1), and a list of 2 is given",
         ),
         (["--start", "offset=1,2,3,4"], "takes a list of 3 (1,2,3), and a list of 4 is given"),
-        (["--set", "norm=1,2"], "norm of model norm-triangular is one number, and a list of 2 is"),
+        (
+            ["--set", "norm=1,2,3"],
+            "norm of model norm-triangular is one number, and a list of 3 is",
+        ),
     ],
 )
 def test_a_typed_value_of_the_wrong_form_shows_how_it_is_written(readings, capsys, words, said):

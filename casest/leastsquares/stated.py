@@ -25,7 +25,7 @@ from casest.declaration.noise import (
     slope_in_noisy,
 )
 from casest.declaration.shapes import Array
-from casest.declaration.tracing import function_of, trace
+from casest.declaration.tracing import flat, function_of, trace
 from casest.declaration.uncertainty import checked
 from casest.engine import Columns, Replay
 from casest.errors import DeclarationError, UsageError
@@ -34,6 +34,8 @@ from casest.leastsquares.problem import Point, Problem
 
 #: Probability below which a sum of squares is no chance.
 UNLIKELY = 1e-3
+#: Samples at once, so that what is found of them on the way stays in the processor's cache.
+PIECE = 4096
 #: Rounds in which true values are sought at one point, the share of their noise by which they may
 #: still move after the last, and the share of a step that the next one may have.
 ROUNDS, STILL, SHRINKS = 60, 1e-9, 0.8
@@ -261,6 +263,14 @@ def _steepness_varies(model: Model, noise: Stated) -> bool:
     return bool(ca.symvar(slope)) or noise.signals != (plain.measured,)
 
 
+@lru_cache(maxsize=64)
+def _straight(model: Model, names: tuple[str, ...]) -> bool:
+    """Is the residual of a model without stated noise linear in its noisy signals?"""
+    plain = trace(model)
+    noisy = ca.vertcat(*[flat(plain.symbols[name]) for name in names])
+    return not ca.depends_on(slope_in_noisy(plain, names), noisy)
+
+
 def at_true_values(problem: Problem, point: Point) -> Problem:
     """The problem with ξ, G, V and b as they are at a point, ξ as likely as can be."""
     model, noise = replace(problem.model, noise=None), problem.model.noise
@@ -268,7 +278,9 @@ def at_true_values(problem: Problem, point: Point) -> Problem:
     runs = []
     for r, run in enumerate(problem.runs):
         parameters = problem.parameters(point, r)
-        true = _likeliest(model, parameters, run, noise)
+        pieces = [slice(i, i + PIECE) for i in range(0, len(run), PIECE)]
+        found = [_likeliest(model, parameters, run.take(own), noise) for own in pieces]
+        true = np.concatenate(found)
         run = replace(run, signals={**run.signals, TRUE: true})
         part = _linearised(model, parameters, run, noise)
         mean = _mean(model, parameters, run, part) if problem.model.implicit else None
@@ -279,8 +291,11 @@ def at_true_values(problem: Problem, point: Point) -> Problem:
 def _likeliest(model: Model, parameters: Array, run: Run, noise: Stated) -> Array:
     """ξ (N, k) = s - CGᵀV⁻¹w, with G and w where it is itself.
 
-    Step by step, each sample for itself: where steps do not shrink, shorter ones are taken.
+    Step by step, each sample for itself: where steps do not shrink, shorter ones are taken. Where
+    the residual is straight in the noisy signals the first step leads there.
     """
+    if _straight(model, noise.signals):
+        return run.signals[TRUE] + _step(_linearised(model, parameters, run, noise), run, noise)[0]
     true, moving = run.signals[TRUE].copy(), np.arange(len(run))
     share, before = np.ones(len(run)), np.full(len(run), np.inf)
     for _ in range(ROUNDS):
@@ -323,7 +338,11 @@ def shifts_of_curvature(problem: Problem, point: Point) -> Iterator[Array]:
     """Mean of each residual that comes of curvature, in units of the noise, (N, m) of each run."""
     model, noise = replace(problem.model, noise=None), problem.model.noise
     assert noise is not None
+    straight = _straight(model, noise.signals)
     for r, run in enumerate(problem.runs):
+        if straight:
+            yield np.zeros_like(run.signals[MEAN])
+            continue
         parameters = problem.parameters(point, r)
         mean = _mean(model, parameters, run, _linearised(model, parameters, run, noise))
         whitening = run.signals[WHITENING].reshape(*mean.shape, -1)
