@@ -59,12 +59,14 @@ class Wanted:
 
     @staticmethod
     def for_goals(model: Dynamics, goals: Sequence[Goal]) -> Wanted:
-        """The largest standard deviation over what is asked of it."""
+        """The largest standard deviation over what is asked of it, as the readings alone allow."""
         wanted = Wanted.of(model, "D")
         pairs = [(int(i), goal.limit) for goal in goals
                  for i in np.flatnonzero(goal.columns.any(axis=1))]  # fmt: skip
         chosen = tuple(wanted.free.index(i) for i, _ in pairs)
-        return replace(wanted, name="goals", chosen=chosen, asked=tuple(x for _, x in pairs))
+        known = VAGUE * np.eye(len(wanted.free))
+        asked = tuple(x for _, x in pairs)
+        return replace(wanted, name="goals", known=known, chosen=chosen, asked=asked)
 
     def covariance(self, W: Array) -> Array:
         """Of the free unknowns, in units of `scale`; W (n, n) as `Task.information` gives it."""
