@@ -6,10 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from casest import Residual, Run, model, param, quantity, signal
 from casest.diagnose.cross_validation import folded
-from casest.diagnose.misfit.left import Misfit, left_over
+from casest.diagnose.misfit.left import Misfit, findings, left_over
 from casest.diagnose.noise.noise_model import equal_noise, lag_one, noise_model
 from casest.diagnose.noise.spectral_line import strongest_line
 from casest.diagnose.noise.tails import outlier_share, outliers_p_value, tails
@@ -315,3 +316,41 @@ def test_samples_far_off_at_large_readings_are_no_outliers():
     e[level > 2.5] -= 12
     assert outlier_share([e], first_of(2000)) > 0
     assert outlier_share([e], first_of(2000), [level]) == 0.0
+
+
+@model
+def compass(b=signal(3, "uT"), m=signal(3, "uT"), *, hard=param(3, "uT")):
+    """A magnetometer in a known field."""
+    field = quantity("field", b, "uT")
+    return Residual(measured=m, predicted=quantity("reading", field + hard, "uT"), corrected=field)
+
+
+def of_the_reference(rng, sway, n=2000):
+    """What is significant of a compass that turns within some 30 samples, its field in a sway."""
+    t = np.arange(n) / 10
+    turn = Rotation.from_euler("ZYX", np.column_stack([2.3 * t, np.sin(1.7 * t), 1.3 * t]))
+    b = turn.inv().apply([20.0, 0.0, -43.0])
+    m = b * (1 + sway)[:, None] + [3, -2, 1] + 0.5 * rng.standard_normal((n, 3))
+    run = Run.raw("r", {"b": b, "m": m}, units={"b": "uT", "m": "uT"}, time=t)
+    problem = Problem(compass, prepared(compass, (run,)))
+    return findings(problem, trust_region(problem, problem.start()).point)
+
+
+def test_a_reference_that_sways_while_the_body_turns_is_no_noise():
+    """By 0.4 %, sixty times: as large as 0.4 of the noise along the field, slow in no axis."""
+    rng = np.random.default_rng(11)
+    share = np.linspace(0, 1, 2000)[:, None]
+    sway = np.cos(np.pi * share * np.arange(30, 61)) @ rng.standard_normal(31)
+    found = of_the_reference(rng, 0.004 * sway / sway.std())
+    assert [f.slow for f in found] == [True]
+    assert "of what of it goes with the size of the input is a slow course" in found[0].where
+    assert found[0].share == pytest.approx(0.14, abs=0.05)  # 0.16 of 1.16
+
+
+@pytest.mark.parametrize(
+    "seeds", [range(20), pytest.param(range(20, 1000), marks=pytest.mark.long)]
+)
+def test_a_reference_that_stays_gives_no_alarm(seeds):
+    """At most as often as the level of a kind of misfit, 0.001, allows: of 980 four (99.6 %)."""
+    alarms = sum(bool(of_the_reference(np.random.default_rng(s), np.zeros(2000))) for s in seeds)
+    assert alarms <= (0 if len(seeds) == 20 else 4)

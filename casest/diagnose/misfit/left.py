@@ -19,6 +19,7 @@ from casest.diagnose.candidates.candidates import Candidate, usable_columns
 from casest.diagnose.found import Course, Undecided
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.misfit.pure_error import pure_error
+from casest.diagnose.misfit.reference import along_reference
 from casest.diagnose.misfit.structure import structures
 from casest.diagnose.misfit.variables import variables
 from casest.diagnose.noise.noise_model import noise_model, step_of
@@ -155,7 +156,7 @@ def findings(
     sigma = robust_scale(residuals) * float(np.sqrt(problem.residual_count / freedom))
     clipped = _clipped(problem, residuals, sigma)
     found = _before(problem, point) + _repeats(problem, point, clipped) + _stated(problem, point)
-    slow = [] if wanders else _slow(problem, clipped, sigma)
+    slow = [] if wanders else _slow(problem, point, clipped, sigma)
     follows = _follows(problem, point, clipped, sigma, in_time=not (slow or wanders))
     found += follows + slow
     line = strongest_line(problem.runs, clipped)
@@ -204,15 +205,22 @@ def _stated(problem: Problem, point: Point) -> list[Finding]:
     return [Finding(where, found.larger, scale)]
 
 
-def _slow(problem: Problem, clipped: Sequence[Array], sigma: float) -> list[Finding]:
-    """A slow course of unknown cause. What rounding to a step leaves of a slow input is known."""
+def _slow(problem: Problem, point: Point, clipped: Sequence[Array], sigma: float) -> list[Finding]:
+    """A slow course of unknown cause, of an axis or along the reference.
+
+    What rounding to a step leaves of a slow input is known.
+    """
+    along = along_reference(problem, point, clipped)
+    if along:
+        clipped = [np.hstack(both) for both in zip(clipped, along, strict=True)]
     found = slow_course(problem.runs, clipped)
     if found is None or found.p_value >= LEVELS.misfit or found.share < LEVELS.share:
         return []
     if sigma < LEVELS.rounded * step_of(problem.runs, problem.model.traced.measured):
         return []
+    it = "what of it goes with the size of the input" if along and found.last else "it"
     where = (
-        f"{100 * found.share:.0f} % of it is a slow course over about {found.samples} samples"
+        f"{100 * found.share:.0f} % of {it} is a slow course over about {found.samples} samples"
         f"{_when(problem, clipped, found.samples)}, of unknown cause"
     )
     left = sigma * float(np.sqrt(1 - min(found.share, 1)))

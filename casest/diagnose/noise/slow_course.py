@@ -9,7 +9,7 @@ a residual with a wave in it, it would explain the wave.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -34,12 +34,14 @@ LEAST_CHANCE = 1e-16
 class SlowCourse:
     """share: of the residual's variance; samples: about those from a high to the next low of it.
 
-    p_value: chance of as much in coloured noise, all octaves and axes counted.
+    p_value: chance of as much in coloured noise, all octaves and axes counted. last: it is of the
+    last axis.
     """
 
     share: float
     samples: int
     p_value: float
+    last: bool = False
 
 
 def slow_course(runs: Sequence[Run], residuals: Sequence[Array]) -> SlowCourse | None:
@@ -55,6 +57,7 @@ def slow_course(runs: Sequence[Run], residuals: Sequence[Array]) -> SlowCourse |
     frequency = np.concatenate([np.arange(1, len(r)) / (2 * len(r)) for r in series])
     power = np.concatenate([_power(r) for r in series])
     found = [_of_axis(frequency, power[:, a], power.shape[1]) for a in range(power.shape[1])]
+    found[-1] = replace(found[-1], last=True)
     large = [f for f in found if f.share >= LEVELS.share]
     return min(large or found, key=lambda f: (f.p_value, -f.share))
 

@@ -7,15 +7,13 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from casest.data.run import Run
-from casest.declaration.effect import effect
-from casest.declaration.physics import SX
 from casest.declaration.shapes import Array
-from casest.declaration.symbols import param
 from casest.diagnose.candidates.candidates import Candidate
 from casest.diagnose.evidence.linear import Index
 from casest.diagnose.evidence.score import Evidence, Trial, judged
 from casest.diagnose.found import Course
 from casest.diagnose.levels import LEVELS
+from casest.diagnose.misfit.reference import swell
 from casest.diagnose.protocol.state import Ranking
 from casest.diagnose.sensor.fits import Fit
 from casest.diagnose.sensor.sensor import Sensor
@@ -24,12 +22,6 @@ from casest.effects.course import bias_course, reference_wander
 
 #: Half waves over a run that a course is made of; residuals for each that it costs, at least.
 WAVES, RESIDUALS = (6, 12, 24, 48), 10
-
-
-@effect(on="input")
-def _swell(u: SX, *, k: SX = param()) -> SX:
-    """A reference of another size: its slope is that of the residual in it."""
-    return u * (1 + k)
 
 
 def courses(sensor: Sensor, fit: Fit, ranking: Ranking) -> tuple[Course, ...]:
@@ -44,7 +36,7 @@ def courses(sensor: Sensor, fit: Fit, ranking: Ranking) -> tuple[Course, ...]:
         return slow
     best: dict[str, Evidence] = {}
     every = {c.name: c for c in sensor.tried.found(fit)[0]}
-    for course, probe in ((reference_wander, _swell), (bias_course, offset)):
+    for course, probe in ((reference_wander, swell), (bias_course, offset)):
         what, slope = every.get(course.name), sensor.tried.slope(fit, probe)
         if what is None or slope is None:
             continue
