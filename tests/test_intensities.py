@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 
 import flights
@@ -16,6 +17,7 @@ from casest.dynamics import Motion, dynamics, measured, state
 from casest.dynamics.allan import allan
 from casest.dynamics.filter import filtered
 from casest.dynamics.intensities import from_rest, from_stated, intensities, most_likely
+from casest.errors import CasestError
 from casest.results.observability import assumed
 from casest_problems.bias_gravity import bias_gravity
 
@@ -278,3 +280,24 @@ def test_two_ways_at_once_are_refused(files, capsys):
     words = ["filter", "bias-gravity", str(files / "flight.csv"), "--noise", "ml", *VELOCITY]
     assert run(words) == 1
     assert "--noise ml finds every intensity: leave" in capsys.readouterr().err
+
+
+def test_stated_noise_takes_a_unit_in_motion_and_nothing_but_one_number():
+    from casest.cli.assignments import Assignment
+    from casest.interface.sensor_noise import one_number
+
+    def std(text):
+        return one_number(Assignment("--sensor-noise", text), bias_gravity.signals)
+
+    assert std("omega=0.05 deg/s") == ("omega", pytest.approx(0.05 * np.pi / 180, rel=1e-15))
+    assert std("v=2 cm/s") == ("v", pytest.approx(0.02, rel=1e-15))
+    assert std("a=0.0013") == ("a", 0.0013)
+    for wrong, said in (
+        ("v=2%", "one number for all its readings and axes, and '2%' is none: write v=0.02, or"),
+        ("v=u_v", "'u_v' is none"),
+        ("v=nan", "'nan' is none"),
+        ("v=2 kg", "kg does not convert to m/s"),
+        ("omega=3 bananas", "unknown unit 'bananas'"),
+    ):
+        with pytest.raises(CasestError, match=re.escape(said)):
+            std(wrong)
