@@ -24,10 +24,7 @@ def separating(situation: Situation, options: PlanOptions) -> Plan:
     from casest.plan.rivals.separating import separated, separation
     from casest.results.plan import separation_result
 
-    after = situation.after
-    if after is None:
-        asked = "--separate" if options.separate else "--show"
-        raise UsageError(f"{asked}: {situation.name} is a model; give a result of close")
+    after = _result_of(situation, options)
     base, labels, rivals, runs = _rivals(situation, options)
     possible = _with_columns(possible_of(situation, options), base, rivals, runs)
 
@@ -51,13 +48,8 @@ def separating(situation: Situation, options: PlanOptions) -> Plan:
     )
 
 
-def _rivals(
-    situation: Situation, options: PlanOptions
-) -> tuple[Model, list[str], list[Rival], tuple[Run, ...]]:
-    """The model without what is in doubt, the causes by name, each fitted to the record."""
-    from casest.plan.rivals.rivals import open_causes, refitted
-    from casest.plan.rivals.shown import shown_or_not
-
+def _result_of(situation: Situation, options: PlanOptions) -> str:
+    """The result that is planned after; UsageError where there is none, or what else is asked."""
     asked = "--separate" if options.separate else "--show"
     if options.separate and options.show:
         raise UsageError("--separate and --show: one of the two says what is told apart")
@@ -65,6 +57,18 @@ def _rivals(
         raise UsageError(f"{asked} has a goal of its own: leave --until and --criterion out")
     if options.robust or options.budget is not None:
         raise UsageError(f"{asked} tells causes apart: leave --robust and --budget out")
+    if situation.after is None:
+        raise UsageError(f"{asked}: {situation.name} is a model; give a result of close")
+    return situation.after
+
+
+def _rivals(
+    situation: Situation, options: PlanOptions
+) -> tuple[Model, list[str], list[Rival], tuple[Run, ...]]:
+    """The model without what is in doubt, the causes by name, each fitted to the record."""
+    from casest.plan.rivals.rivals import open_causes, refitted
+    from casest.plan.rivals.shown import shown_or_not
+
     base, labels = (situation.model, []) if options.show else open_causes(
         situation.content, situation.model
     )  # fmt: skip
