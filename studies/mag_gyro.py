@@ -181,12 +181,12 @@ PAGE = """# A magnetometer and a gyroscope, moved without rests
 Made by `make study-mag-gyro` (`python studies/mag_gyro.py`). `mag-gyro` beside MAGYC 1.0.0 (batch
 factor graph, as its authors' notebook calls it) on the simulation that they describe: 600 s at 10
 Hz, 10 mG and 10 mrad/s of noise. Their records and the figures in their paper were not at hand;
-these
-records are ours, made by their description. Medians, casest / MAGYC; coverage is of casest's 95 %
-intervals of the {unknowns} constants; NIS one expected.
+these records are ours, made by their description. Medians, casest / MAGYC (of fewer records, since
+one may take it minutes); coverage is of casest's 95 % intervals of the {unknowns} constants; NIS of
+the filter along its own states, one expected.
 
-| roll, pitch, heading ± deg | records | hard iron, mG | soft iron, geodesic | gyroscope's bias, \
-mrad/s | processor s | coverage | settled | NIS |
+| roll, pitch, heading ± deg | records (with MAGYC) | hard iron, mG | soft iron, geodesic | \
+gyroscope's bias, mrad/s | processor s | coverage | settled | NIS |
 | --- | --- | --- | --- | --- | --- | --- | --- | --- |
 {rows}
 
