@@ -170,9 +170,9 @@ def test_six_orientations_have_none_to_spare(closed):
 def test_four_plateaus_of_a_load_cell_are_a_straight_line(shared_data, tmp_path):
     """A pair of causes was strong evidence, and each alone is none.
 
-    By NumPy from the means of the plateaus: a quadratic term has F(1, 1) = 0.39. What is left is no
-    noise: on the last plateau the load swings at 2.8 Hz, 17.6 times the mean power of 58 frequencies
-    (chance 1e-6).
+    By NumPy from the means of the plateaus: a quadratic term has F(1, 1) = 0.39. What is left is
+    no noise: on the last plateau the load swings at 2.8 Hz, with 17.6 times the mean power of 58
+    frequencies (chance 1e-6).
     """
     lines = (shared_data / "swing-project/loadcell_swing.csv").read_text("utf-8").splitlines()
     half = tmp_path / "half.csv"
