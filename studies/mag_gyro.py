@@ -45,7 +45,7 @@ MOTIONS = {"wide": (5, 45, 360), "mid": (5, 5, 360), "low": (5, 45, 90), "tiny":
 IRON = np.array([[1.10, 0.10, 0.04], [0.10, 0.88, 0.02], [0.04, 0.02, 1.22]])
 OFFSET, DRIFT = np.array([20.0, 120.0, 90.0]), np.array([0.004, -0.005, 0.002])
 EARTH = np.array([227.207, 51.796, 411.731])
-COUNT, FIRST = 100, 90_000
+COUNT, FIRST = 40, 90_000
 
 
 def record(motion: str, seed: int) -> tuple[Array, Array, Array]:

@@ -218,7 +218,11 @@ def _slow(problem: Problem, point: Point, clipped: Sequence[Array], sigma: float
         return []
     if sigma < LEVELS.rounded * step_of(problem.runs, problem.model.traced.measured):
         return []
-    it = "what of it goes with the size of the input" if along and found.last else "it"
+    it = (
+        "what of it goes with the size of the input"
+        if found.axis == len(problem.model.axes)
+        else "it"
+    )
     where = (
         f"{100 * found.share:.0f} % of {it} is a slow course over about {found.samples} samples"
         f"{_when(problem, clipped, found.samples)}, of unknown cause"

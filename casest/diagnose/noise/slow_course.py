@@ -9,7 +9,7 @@ a residual with a wave in it, it would explain the wave.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -34,14 +34,13 @@ LEAST_CHANCE = 1e-16
 class SlowCourse:
     """share: of the residual's variance; samples: about those from a high to the next low of it.
 
-    p_value: chance of as much in coloured noise, all octaves and axes counted. last: it is of the
-    last axis.
+    p_value: chance of as much in coloured noise, all octaves and axes counted; axis: its number.
     """
 
     share: float
     samples: int
     p_value: float
-    last: bool = False
+    axis: int
 
 
 def slow_course(runs: Sequence[Run], residuals: Sequence[Array]) -> SlowCourse | None:
@@ -56,8 +55,7 @@ def slow_course(runs: Sequence[Run], residuals: Sequence[Array]) -> SlowCourse |
         return None
     frequency = np.concatenate([np.arange(1, len(r)) / (2 * len(r)) for r in series])
     power = np.concatenate([_power(r) for r in series])
-    found = [_of_axis(frequency, power[:, a], power.shape[1]) for a in range(power.shape[1])]
-    found[-1] = replace(found[-1], last=True)
+    found = [_of_axis(frequency, power, a) for a in range(power.shape[1])]
     large = [f for f in found if f.share >= LEVELS.share]
     return min(large or found, key=lambda f: (f.p_value, -f.share))
 
@@ -68,11 +66,11 @@ def _power(r: Array) -> Array:
     return np.asarray(np.abs(np.fft.rfft(mirrored, axis=0)[1 : len(r)]) ** 2 / (2 * len(r)))
 
 
-def _of_axis(frequency: Array, power: Array, axes: int) -> SlowCourse:
+def _of_axis(frequency: Array, every: Array, axis: int) -> SlowCourse:
     """Octaves of the slow periods against the fast ones, by F tests."""
     from scipy.special import fdtrc
 
-    slow = frequency < 1 / SLOW
+    power, slow = every[:, axis], frequency < 1 / SLOW
     level = power[~slow & (frequency < 1 / FAST)]
     least, chance, octaves = float(frequency.min()), 1.0, 0
     while least < 1 / SLOW:
@@ -84,8 +82,8 @@ def _of_axis(frequency: Array, power: Array, axes: int) -> SlowCourse:
         least *= 2
     share = float(power[slow].sum() - slow.sum() * level.mean()) / max(power.sum(), 1e-300)
     middle = _median(frequency[slow], np.maximum(power[slow] - level.mean(), 0.0))
-    chance = min(1.0, max(chance, LEAST_CHANCE) * octaves * axes)
-    return SlowCourse(max(share, 0.0), int(float(f"{0.5 / middle:.2g}")), chance)
+    chance = min(1.0, max(chance, LEAST_CHANCE) * octaves * every.shape[1])
+    return SlowCourse(max(share, 0.0), int(float(f"{0.5 / middle:.2g}")), chance, axis)
 
 
 def _median(frequency: Array, weight: Array) -> float:
