@@ -74,8 +74,26 @@ def content(folder):
     return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
-def command(*words, numbers=None):
+#: A partition is handed out every PAUSE seconds: whoever watches sees some done, and some not yet.
+PAUSE = 0.2
+SLOWLY = f"""
+import time
+import casest.tasks.folder as folder
+
+class Slowly(list):
+    def __iter__(self):
+        for one in list.__iter__(self):
+            time.sleep({PAUSE})
+            yield one
+
+missing = folder.missing
+folder.missing = lambda *given: Slowly(missing(*given))
+"""
+
+
+def command(*words, numbers=None, slowly=False):
     """A command line in a process of its own; `numbers` in a partition, where they matter."""
-    small = f"import casest.dataset.partitions as p; p.NUMBERS = {numbers}; " if numbers else ""
-    code = f"{small}from casest.cli import main; main({[str(w) for w in words]!r})"
+    small = f"import casest.dataset.partitions as p; p.NUMBERS = {numbers}\n" if numbers else ""
+    paused = SLOWLY if slowly else ""
+    code = f"{small}{paused}\nfrom casest.cli import main; main({[str(w) for w in words]!r})"
     return [sys.executable, "-c", code]

@@ -41,7 +41,8 @@ def words(dataset, out, *more):
 
 
 def started(dataset, out, *more):
-    told = fleets.command(*words(dataset, out, *more), numbers=SMALL)
+    """Begin the command in a process of its own, which hands its partitions out slowly."""
+    told = fleets.command(*words(dataset, out, *more), numbers=SMALL, slowly=True)
     return subprocess.Popen(told, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
