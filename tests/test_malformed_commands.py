@@ -177,3 +177,17 @@ def test_malformed_words_are_one_line(part, ends):
         else:
             words = chance.choices(WORDS, k=chance.randint(1, 6))
         ends(words)
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "name"),
+    [
+        (["--columns", "reading=a"], ["--columns", "reading=b"], "reading"),
+        (["--unit", "reading=V"], ["--unit=reading=mV"], "reading"),
+    ],
+)
+def test_two_values_for_one_name_are_refused(tmp_path, capsys, first, second, name):
+    """One of them was left out without a word."""
+    (tmp_path / "d.csv").write_text("a,b,reference\n1,2,3\n2,3,4\n3,4,5\n")
+    assert run(["calibrate", "linear", str(tmp_path / "d.csv"), *first, *second]) == 1
+    assert f"{name} has one value" in capsys.readouterr().err

@@ -207,12 +207,6 @@ def test_readings_alone_are_corrected_by_command(name, tmp_path, capsys):
     np.testing.assert_allclose(table[:, -1], x + kelvin, atol=tolerance)
 
 
-@pytest.mark.long
-@pytest.mark.xfail(
-    strict=True,
-    reason="channel_curve(setpoint) is judged by its bend alone (its slope is a gain, up to the "
-    "noise), and refitted with both: 'extended', a gain of 43 ± 74",
-)
 def test_what_the_source_was_set_to_takes_no_gain_from_the_current_that_was_measured():
     """A shunt that bends a little, its current read back by the source with noise of its own."""
     rng = np.random.default_rng(1)

@@ -6,7 +6,7 @@ of options. Their order is that of `--help`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import Field, field, fields
 from enum import Enum
 from functools import wraps
@@ -91,7 +91,20 @@ def _value(option: Field[Any], words: dict[str, Any]) -> Any:
     if not option.metadata:
         return built(option.default_factory, words)
     found, of = words.pop(option.name), option.metadata["of"]
-    return tuple(of(option.metadata["flags"][-1], word) for word in found) if of else found
+    if not of:
+        return found
+    long = option.metadata["flags"][-1]
+    _refuse_two_values(long, found)
+    return tuple(of(long, word) for word in found)
+
+
+def _refuse_two_values(option: str, given: Sequence[str]) -> None:
+    """UsageError where a name is given two values: one of them would be left out without a word."""
+    first: dict[str, str] = {}
+    for word in given:
+        name = word.partition("=")[0]
+        if first.setdefault(name, word) != word:
+            raise UsageError(f"{option} {first[name]} and {option} {word}: {name} has one value")
 
 
 def _given(group: Any, kind: Kind) -> Iterator[str]:

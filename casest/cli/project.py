@@ -1,14 +1,15 @@
 """`--project FILE`: what a TOML file says of a bench, as the words that one would have typed.
 
 The words come before those that were typed, so that these override: of an option that is given
-twice the last counts, of `name=value` the last for each name.
+twice the last counts; a `name=value` is left out where that name is given another one.
 """
 
 from __future__ import annotations
 
 import difflib
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -38,8 +39,28 @@ def expanded(words: Sequence[str], group: click.Group) -> list[str]:
     _refuse_unknown(project, content, group)
     own = content.get(words[0], {}) if isinstance(content.get(words[0]), dict) else {}
     placed = _Placed(Path(project).parent)
-    said = [*_options(content, command, placed), *_options(own, command, placed)]
-    return [words[0], *_arguments(arguments, content, command, placed), *said, *options]
+    own_words = _without(_options(own, command, placed), _names(options))
+    said = _without(_options(content, command, placed), _names([*own_words, *options]))
+    found = _arguments(arguments, content, command, placed)
+    return [words[0], *found, *said, *own_words, *options]
+
+
+def _names(words: Sequence[str]) -> set[tuple[str, str]]:
+    """Options and the names that are given a value behind them."""
+    split = [w.partition("=")[::2] if w.startswith("--") and "=" in w else (w,) for w in words]
+    flat = [part for parts in split for part in parts]
+    return {(o, w.partition("=")[0]) for o, w in pairwise(flat) if o.startswith("--") and "=" in w}
+
+
+def _without(words: Iterable[str], later: set[tuple[str, str]]) -> list[str]:
+    """Words of options but for names that are given another value later."""
+    kept = list[str]()
+    for word in words:
+        if not word.startswith("--") and (kept[-1], word.partition("=")[0]) in later:
+            kept.pop()
+        else:
+            kept.append(word)
+    return kept
 
 
 class _Placed:

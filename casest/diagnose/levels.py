@@ -32,6 +32,8 @@ class Levels:
         which on it does not count in a share of the variance.
     told: share of what the record says of a direction that the rest of it must say.
     uncertain: variance that a fit to the rest may leave of a part, in those of the noise.
+    repeated: share of a column's deviation that a signal does not tell, up to which the column is
+        that signal once more: two meters of one quantity agree so far, an influence does not.
     fades: time constants that a record must span for a memory to be seen to fade.
     survives: share of a cause's length that the declared unknowns must leave; over_noise: an
         implicit residual's slopes contain its noise, of which so many must survive.
@@ -80,6 +82,7 @@ class Levels:
     beyond: float = 6.0
     told: float = 0.2
     uncertain: float = 10.0
+    repeated: float = 0.01
     fades: float = 2.0
     survives: float = 1e-3
     over_noise: float = 5.0

@@ -132,7 +132,7 @@ def cross_quadratic(u: SX, *, k: SX = param(3, "1/[u]")) -> SX:
     shown_by="readings that reach the end of the range",
     formula="y − share·sign(y)·max(|y| − level, 0)",
 )
-def saturation(y: SX, *, share: SX = param(each), level: SX = param("[y]")) -> SX:
+def saturation(y: SX, *, share: SX = param(each, bounds=(0, None)), level: SX = param("[y]")) -> SX:
     """Readings beyond ±level are cut off (share 1), or compressed (share below 1)."""
     return y - share * sign(y) * fmax(fabs(y) - level, 0)
 

@@ -17,6 +17,7 @@ from casest.declaration.model import Model
 from casest.declaration.shapes import Array
 from casest.declaration.symbols import Constant, Parameter
 from casest.declaration.tracing import reached_parameters
+from casest.diagnose.candidates.repeated import Reads, reads_of
 from casest.effects import shipped
 from casest.effects.placing import angles, placed_in, with_numbers
 from casest.errors import CasestError, UsageError
@@ -255,11 +256,14 @@ def _channels(model: Model, runs: Sequence[Run]) -> tuple[dict[str, bool], list[
     """Columns that measure something (is it a temperature?), and those that cannot be used."""
     # A column that an effect reads already may be the cause of another one as well.
     read = {column for attached in model.effects for _, column in dict(attached.columns).items()}
-    return channels({s.name for s in model.signals} - read | {"t"}, runs)
+    used = {s.name for s in model.signals} - read | {"t"}
+    return channels(used, runs, reads_of(model, runs))
 
 
-def channels(used: Collection[str], runs: Sequence[Run]) -> tuple[dict[str, bool], list[Skipped]]:
-    """The same of columns that are not `used`."""
+def channels(
+    used: Collection[str], runs: Sequence[Run], reads: Reads
+) -> tuple[dict[str, bool], list[Skipped]]:
+    """The same of columns that are not `used`, and are nothing once more that is read."""
     found: dict[str, bool] = {}
     skipped: list[Skipped] = []
     values: dict[str, Array] = {}
@@ -270,7 +274,7 @@ def channels(used: Collection[str], runs: Sequence[Run]) -> tuple[dict[str, bool
             skipped.append(Skipped(name, "column is not numeric in every file"))
             continue
         x = np.concatenate([run.signals[name][:, 0] for run in runs])
-        why = _useless(x, values)
+        why = _useless(x, values) or reads.again(x)
         if why:
             skipped.append(Skipped(name, why))
             continue

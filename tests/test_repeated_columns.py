@@ -1,0 +1,65 @@
+"""Columns that record once more what the model reads name no cause; an influence still does."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from casest import close
+
+ROWS = 600
+
+
+@pytest.fixture
+def record():
+    """A load that sways, and its reading: 0.2 + 3 x, noise 0.05; nothing is missing."""
+    rng = np.random.default_rng(20261123)
+    t = np.arange(ROWS) / 10
+    reference = 5 * np.sin(t / 3) + 0.05 * rng.normal(size=ROWS).cumsum()
+    reading = 0.2 + 3 * reference + rng.normal(0, 0.05, ROWS)
+    return {"t": t, "reference": reference, "reading": reading}
+
+
+def warm(t):
+    return 25 + 4 * np.sin(0.11 * t) + 2 * np.sin(0.31 * t)
+
+
+def skipped(closing):
+    return {s.name: s.reason for s in closing.skipped}
+
+
+@pytest.mark.parametrize("step", [1000, 20])
+def test_raw_counts_of_the_reading_explain_nothing(record, step):
+    """A gain of nothing, and all of the reading explained by itself, is no calibration."""
+    closing = close("linear", {**record, "raw": np.round((record["reading"] - 1) * step)})
+    assert not closing.effects
+    assert closing.after.values["gain"] == pytest.approx(3, abs=0.005)
+    assert "once more" in skipped(closing)["raw"]
+
+
+def test_a_second_meter_of_the_reference_explains_nothing(record):
+    meter = 0.1 + record["reference"] * (1 + np.random.default_rng(1).normal(0, 1e-3, ROWS))
+    closing = close("linear", {**record, "meter": meter})
+    assert not closing.effects
+    assert "column is reference once more" in skipped(closing)["meter"]
+
+
+def test_a_temperature_that_is_most_of_the_reading_is_found_where_the_load_hardly_moves(record):
+    """Then the reading follows it within a part in a thousand, and is not that temperature."""
+    still = 0.01 * record["reference"]
+    temperature = warm(record["t"])
+    noise = record["reading"] - 0.2 - 3 * record["reference"]
+    reading = 0.2 + 3 * still + 2 * (temperature - 25) + 0.05 * noise
+    given = {**record, "reference": still, "reading": reading, "temperature": temperature}
+    closing = close("linear", given)
+    assert [e.candidate.label for e in closing.effects] == ["temperature_bias(temperature)"]
+    assert closing.after.values["gain"] == pytest.approx(3, abs=0.05)
+
+
+def test_raw_counts_of_a_reading_that_no_input_tells_explain_nothing(record):
+    """Its noise is theirs."""
+    rng = np.random.default_rng(2)
+    quiet = np.full(ROWS, 1.0) + rng.normal(0, 1e-3, ROWS)
+    reading = 0.2 + 3 * quiet + rng.normal(0, 0.05, ROWS)
+    given = {**record, "reference": quiet, "reading": reading, "raw": np.round(1e4 * reading)}
+    assert not close("linear", given).effects
