@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from casest import close
+from casest.results.find import find_model
 
 ROWS = 600
 
@@ -63,3 +64,18 @@ def test_raw_counts_of_a_reading_that_no_input_tells_explain_nothing(record):
     reading = 0.2 + 3 * quiet + rng.normal(0, 0.05, ROWS)
     given = {**record, "reference": quiet, "reading": reading, "raw": np.round(1e4 * reading)}
     assert not close("linear", given).effects
+
+
+@pytest.mark.parametrize("digits", [6, 2])
+def test_a_magnitude_that_was_computed_from_the_axes_explains_nothing(digits):
+    """As telephones log it."""
+    rng = np.random.default_rng(4)
+    d = rng.normal(size=(300, 3))
+    d /= np.linalg.norm(d, axis=1)[:, None]
+    v = 9.81 * d * [1, 1.01, 0.99] + [0.1, 0.2, 0.3] + rng.normal(0, 0.02, (300, 3))
+    total = np.round(np.linalg.norm(v, axis=1), digits)
+    model = find_model("norm-diagonal").having(norm=9.81)
+    closing = close(model, {"v": v, "absolute": total})
+    assert not closing.effects
+    assert closing.result.verdict == "adequate"
+    np.testing.assert_allclose(closing.after.values["offset"], [0.1, 0.2, 0.3], atol=0.01)

@@ -1,4 +1,5 @@
-"""Columns that record once more what the model reads: raw counts, a second meter, a set value.
+"""Columns that record once more what the model reads: raw counts, a second meter, a set value, a
+magnitude that was computed from the axes.
 
 Such a column differs from the signal by the noise of the one or the other. A cause that follows it
 would take the place of the declared response, and explain the noise of a reading by that reading.
@@ -8,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
+from itertools import combinations_with_replacement
 
 import numpy as np
 
@@ -18,64 +20,111 @@ from casest.diagnose.levels import LEVELS
 
 
 @dataclass(frozen=True)
-class Reads:
-    """Elements (N,) of a model's signals by name: of its `inputs`, and of `readings` with whether
-    the inputs tell them."""
+class Signal:
+    """What is computed from a signal: an orthonormal basis (N, p) of its elements, their products
+    and its length; `noise` are the elements (N, q) of a reading that the inputs do not tell."""
 
-    inputs: dict[str, Array] = field(default_factory=dict, repr=False)
-    readings: dict[str, tuple[Array, bool]] = field(default_factory=dict, repr=False)
+    name: str
+    basis: Array = field(repr=False)
+    noise: Array | None = field(default=None, repr=False)
 
-    def again(self, x: Array) -> str:
-        """Which of them a column (N,) is once more, in words; else empty.
+    def apart(self, x: Array) -> float:
+        """Share of a column's squares (N,) that is not computed from it; inf where more is left
+        than its rounding.
 
         Of a reading that the inputs do not tell, all may be what the column does to it: there the
         column must have its noise as well.
         """
-        several = [*self.inputs.items()]
-        several += [(n, y) for n, (y, told) in self.readings.items() if told or _one_noise(x, y)]
-        for name, y in several:
-            share = 1 - float(_scaled(x) @ _scaled(y)) ** 2
-            if share < LEVELS.repeated**2:
-                size = f"{100 * max(share, 0.0) ** 0.5:.1g} %"
-                return f"column is {name} once more (up to scale and offset, to {size})"
-        return ""
+        N, p = self.basis.shape
+        unit = _scaled(x)
+        left = (1 - float(np.sum((self.basis.T @ unit) ** 2))) * N / (N - p)
+        own = self.noise is None or any(_one_noise(x, y) for y in self.noise.T)
+        return left if own and left < LEVELS.repeated**2 + _rounding(unit) else np.inf
+
+
+@dataclass(frozen=True)
+class Reads:
+    """The signals of a model in so many rows of a record, evenly chosen."""
+
+    signals: tuple[Signal, ...]
+    rows: slice
+
+    def again(self, x: Array) -> str:
+        """Which of them a column (N,) is once more, in words; else empty."""
+        x = x[self.rows]
+        near = {s.name: s.apart(x) for s in self.signals if np.ptp(x) > 0}
+        name = min(near, key=lambda n: near[n], default="")
+        found = bool(name) and np.isfinite(near[name])
+        return f"column is {name} once more, or computed from it" if found else ""
 
 
 def reads_of(model: Model, runs: Sequence[Run]) -> Reads:
     """What a column of these runs (prepared) may be once more."""
     declared = {s.name for s in model.declared if s.name != "t"}
     measured = declared & {*model.traced.readings} if model.traced.predicted is not None else set()
-    inputs, readings = elements(declared - measured, runs), elements(measured, runs)
-    return Reads(inputs, {n: (x, _told(x, [*inputs.values()])) for n, x in readings.items()})
+    return signals_of(declared - measured, measured, runs)
 
 
-def elements(names: Collection[str], runs: Sequence[Run]) -> dict[str, Array]:
-    """What varies of these signals, element by element (N,)."""
-    found = {}
-    for name in sorted(n for n in names if all(n in run.signals for run in runs)):
-        values = np.concatenate([run.signals[name] for run in runs])
-        for k, x in enumerate(values.T):
-            if np.all(np.isfinite(x)) and np.ptp(x) > 0:
-                found[f"{name}[{k}]" if values.shape[1] > 1 else name] = x
-    return found
+def signals_of(inputs: Collection[str], readings: Collection[str], runs: Sequence[Run]) -> Reads:
+    """The same of these signals, as far as the runs have them."""
+    rows = slice(None, None, -(-sum(map(len, runs)) // LEVELS.rows) or 1)
+    each = {}
+    for name in sorted({*inputs, *readings}):
+        if all(name in run.signals for run in runs):
+            x = np.concatenate([run.signals[name] for run in runs])[rows]
+            each[name] = x[:, np.all(np.isfinite(x), axis=0) & (np.ptp(x, axis=0) > 0)]
+    driving = [column for n, x in each.items() if n not in readings for column in x.T]
+    found = []
+    for name, x in each.items():
+        basis = _computed(x)
+        if basis is not None:
+            noise = x if name in readings and not _told(x, driving) else None
+            found.append(Signal(name, basis, noise))
+    return Reads(tuple(found), rows)
+
+
+def _computed(x: Array) -> Array | None:
+    """Orthonormal columns of what is computed from elements (N, q); None where rows are few."""
+    N, q = x.shape
+    if not q:
+        return None
+    parts = [np.ones(N), *(_scaled(column) for column in x.T)]
+    size = np.abs(x).max()
+    raw = x.T / size
+    more = [raw[i] * raw[j] for i, j in combinations_with_replacement(range(q), 2)] if q < 4 else []
+    more.append(np.linalg.norm(raw, axis=0))
+    whole = [*parts, *(_scaled(column) for column in more)]
+    chosen = whole if 2 * len(whole) <= N else parts
+    if 2 * len(chosen) > N:
+        return None
+    left, values, _ = np.linalg.svd(np.column_stack(chosen), full_matrices=False)
+    return np.asarray(left[:, values > 1e-9 * values[0]])
 
 
 def _scaled(x: Array) -> Array:
     """About its mean, of length one; first by its range: the squares of 1e300 are no numbers."""
-    x = x / np.abs(x).max()
+    x = x / max(float(np.abs(x).max()), 1e-300)
     x -= x.mean()
     return np.asarray(x / max(float(np.linalg.norm(x)), 1e-300))
 
 
+def _rounding(unit: Array) -> float:
+    """Share of its rounding in a column's squares, with room; 0 where it is most of a step."""
+    steps = np.diff(np.unique(unit))
+    share = 1.5 * len(unit) * float(steps.min()) ** 2 / 12 if steps.size else 0.0
+    return share if share < 0.01 else 0.0
+
+
 def _told(reading: Array, inputs: Sequence[Array]) -> bool:
-    """Do the inputs and their squares tell at least half of a reading's variance?"""
-    scaled, reading = [_scaled(x) for x in inputs], _scaled(reading)
+    """Do the inputs and their squares tell at least half of a reading's (N, q) variance?"""
+    scaled = [_scaled(x) for x in inputs]
     columns = np.column_stack([np.ones(len(reading)), *scaled, *(x**2 for x in scaled)])
     freedom = len(reading) - columns.shape[1]
-    if not inputs or freedom < 1:
+    if not inputs or freedom < 1 or not reading.size:
         return False
-    left = reading - columns @ np.linalg.lstsq(columns, reading, rcond=None)[0]
-    return bool(left @ left / freedom < 0.5 / len(reading))
+    units = np.column_stack([_scaled(y) for y in reading.T])
+    left = units - columns @ np.linalg.lstsq(columns, units, rcond=None)[0]
+    return bool(np.sum(left**2) / freedom < 0.5 * units.shape[1] / len(reading))
 
 
 def _one_noise(x: Array, y: Array) -> bool:

@@ -14,7 +14,7 @@ from casest.declaration.effect import Effect, attach
 from casest.declaration.shapes import Array
 from casest.declaration.symbols import Signal
 from casest.diagnose.candidates.candidates import WARM, channels
-from casest.diagnose.candidates.repeated import Reads, elements
+from casest.diagnose.candidates.repeated import signals_of
 from casest.dynamics.declare import Dynamics
 from casest.effects.moving import (
     CATALOGUE,
@@ -50,7 +50,7 @@ def candidates(model: Dynamics, run: Run) -> list[Candidate]:
         for s in model.signals:
             found += _of_motion(model, run, own, s)
     used = {s.name for s in model.signals} | {s.name for s in model.states} | {"t"}
-    warm, _ = channels(used, [run], Reads(elements({s.name for s in model.signals}, [run])))
+    warm, _ = channels(used, [run], signals_of({s.name for s in model.signals}, (), [run]))
     for effect in of_sensors():
         for s in model.signals:
             found += _of_sensor(model, run, effect, s, warm)
