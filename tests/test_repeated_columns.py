@@ -79,3 +79,12 @@ def test_a_magnitude_that_was_computed_from_the_axes_explains_nothing(digits):
     assert not closing.effects
     assert closing.result.verdict == "adequate"
     np.testing.assert_allclose(closing.after.values["offset"], [0.1, 0.2, 0.3], atol=0.01)
+
+
+def test_a_second_clock_is_the_time(record):
+    """What goes with it goes with time."""
+    drifting = record["reading"] + 0.004 * record["t"]
+    clock = np.round(1000 * record["t"]) + 123456
+    closing = close("linear", {**record, "reading": drifting, "millis": clock})
+    assert [e.candidate.label for e in closing.effects] == ["bias_drift"]
+    assert "copy of t" in skipped(closing)["millis"]

@@ -266,7 +266,8 @@ def channels(
     """The same of columns that are not `used`, and are nothing once more that is read."""
     found: dict[str, bool] = {}
     skipped: list[Skipped] = []
-    values: dict[str, Array] = {}
+    times = [run.time for run in runs if run.time is not None]
+    values = {"t": np.concatenate(times)} if len(times) == len(runs) > 0 else {}
     for name in runs[0].columns if runs else ():
         if name in used or _LABELS.match(name):
             continue
@@ -291,7 +292,7 @@ def _useless(x: Array, others: Mapping[str, Array]) -> str:
     if np.ptp(x) <= 1e-12 * np.abs(x).max(initial=1e-300):
         return "column is constant"
     for other, y in others.items():
-        if abs(np.corrcoef(x, y)[0, 1]) > 1 - 1e-10:
+        if np.ptp(y) > 0 and abs(np.corrcoef(x, y)[0, 1]) > 1 - 1e-10:
             return f"column is a copy of {other} (up to scale and offset)"
     return ""
 
