@@ -98,7 +98,7 @@ def close(
     at_rest: bool | Sequence[str] = False,
     time_zero: Literal["first", "column"] = "first",
     sensor_noise: SensorNoise | None = None,
-    catalogue: Sequence[Effect] = CATALOGUE,
+    catalogue: Sequence[Effect] | None = None,
     start: Mapping[str, Any] | None = None,
     known: Collection[str] = (),
     seed: int = 0,
@@ -108,16 +108,17 @@ def close(
 
     `model`, `data` and how they are read: as in `calibrate`. Where several causes explain the data
     alike, those that are `known` to be there come first: by name, or as `temperature_bias(temp)`.
-    Where nothing can be held out, nothing is added, and `refused` says so. Raises NotTrusted, with
-    the refused estimate, where the declared model itself has no trustworthy fit, and what it lacks
-    is not found either.
+    `catalogue`: effects to be tried, if not all that are shipped. Where nothing can be held out,
+    nothing is added, and `refused` says so. Raises NotTrusted, with the refused estimate, where the
+    declared model itself has no trustworthy fit, and what it lacks is not found either.
     """
     reading = Reading(columns=columns, units=units, scales=scales, rate=rate, at_rest=at_rest,
                       time_zero=time_zero)  # fmt: skip
     with _told(reading):
         found, runs = model_and_runs(model, data, reading, sensor_noise)
+        tried = CATALOGUE if catalogue is None else catalogue
         closed = loop.close(
-            found, runs, catalogue=catalogue, start=start, known=known, seed=seed, say=say
+            found, runs, catalogue=tried, start=start, known=known, seed=seed, say=say
         )
         return Closing.of(closed, reading)
 
