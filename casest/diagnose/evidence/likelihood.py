@@ -111,15 +111,24 @@ class Likelihood:
 
     def beyond(self, columns: Array) -> Array:
         """Orthonormal (N·m, k) of what columns (N, m, q) do that the unknowns cannot."""
+        left = self.remainder(columns)
+        return np.asarray(left @ self.orthonormal(left))
+
+    def remainder(self, columns: Array) -> Array:
+        """(N·m, q): columns (N, m, q), each of length one, without what the unknowns can do."""
         flat = columns.reshape(self.residual.size, -1)
-        size = np.linalg.norm(flat, axis=0)
-        flat = self.by_frequency((flat[:, size > 0] / size[size > 0]).reshape(*self.shape, -1))
+        size = np.maximum(np.linalg.norm(flat, axis=0), 1e-300)
+        flat = self.by_frequency((flat / size).reshape(*self.shape, -1))
         Q = self.declared
         left = flat - Q @ (Q.T @ flat)
         left -= Q @ (Q.T @ left)
+        return np.asarray(left)
+
+    def orthonormal(self, left: Array) -> Array:
+        """(q, k): combinations of such remainders that are orthonormal, where enough is left."""
         values, vectors = np.linalg.eigh(left.T @ left)
         kept = values > max(self.linear.least**2, 1e-8 * values.max(initial=0.0))
-        return np.asarray(left @ (vectors[:, kept] / np.sqrt(values[kept])))
+        return np.asarray(vectors[:, kept] / np.sqrt(values[kept]))
 
     def beside(
         self, columns: Sequence[Array] = (), start: Array | None = None, rounds: int = REWEIGHTED

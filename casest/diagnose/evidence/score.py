@@ -26,7 +26,8 @@ class Trial:
 
     `what` it is to whom asks; `family` its name for all that is a variant of it; `variants`: how
     many were looked through; `axes` (k,): the axis that each column belongs to, where that is a
-    matter of axes; `describes`: it is no cause, but what a cause must explain more than.
+    matter of axes; `describes`: it is no cause, but what a cause must explain more than; `feigned`:
+    gain that noise of the inputs alone may give it.
     """
 
     what: Any
@@ -35,14 +36,15 @@ class Trial:
     variants: float = 1.0
     axes: Index | None = None
     describes: bool = False
+    feigned: float = 0.0
 
 
 @dataclass(frozen=True)
 class Evidence:
     """A trial (several, if they come together) with what it is worth.
 
-    gain: 2 log L over none; freedom: unknowns; score: gain less the price; `basis` orthonormal
-    columns (N·m, k) by frequency.
+    gain: 2 log L over none, less what is feigned; freedom: unknowns; score: gain less the price;
+    `basis` orthonormal columns (N·m, k) by frequency.
     """
 
     trials: tuple[Trial, ...]
@@ -57,6 +59,11 @@ class Evidence:
     def families(self) -> tuple[str, ...]:
         """Of its trials."""
         return tuple(t.family for t in self.trials)
+
+    @property
+    def feigned(self) -> float:
+        """Gain that noise of the inputs alone may give it."""
+        return sum(t.feigned for t in self.trials)
 
     @property
     def columns(self) -> list[Array]:
@@ -149,10 +156,20 @@ def again(
 ) -> Evidence:
     """The same where the likelihood has changed."""
     found = likelihood.beside([evidence.basis], evidence.explained.spectrum, rounds)
-    gain, freedom = none.cost - found.cost, evidence.basis.shape[1]
+    gain, freedom = none.cost - found.cost - evidence.feigned, evidence.basis.shape[1]
     searched = _searched(evidence.trials, families)
     score = worth(gain, freedom, searched, likelihood)
     return replace(evidence, explained=found, gain=gain, freedom=freedom, score=score,
+                   p_value=p_value(gain, freedom, searched, likelihood))  # fmt: skip
+
+
+def less(evidence: Evidence, gain: float, likelihood: Likelihood, families: int) -> Evidence:
+    """The same with so much less gain, which is feigned."""
+    trials = tuple(replace(t, feigned=gain / len(evidence.trials)) for t in evidence.trials)
+    gain, freedom = evidence.gain + evidence.feigned - gain, evidence.freedom
+    searched = _searched(trials, families)
+    return replace(evidence, trials=trials, gain=gain,
+                   score=worth(gain, freedom, searched, likelihood),
                    p_value=p_value(gain, freedom, searched, likelihood))  # fmt: skip
 
 

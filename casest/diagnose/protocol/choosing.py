@@ -9,7 +9,7 @@ from math import inf
 from casest.diagnose.evidence.score import Evidence, again, judged
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.protocol.confirming import FAR_AWAY, falls, passing
-from casest.diagnose.protocol.ranking import pairs, ranked
+from casest.diagnose.protocol.ranking import pairs, ranked, without_feigned
 from casest.diagnose.protocol.refits import best_refits, refitted, shown, torn_between
 from casest.diagnose.protocol.state import F, Kept, Ranking, Refit, State
 from casest.diagnose.protocol.subject import Subject
@@ -25,10 +25,11 @@ def with_the_best(
 ) -> State[F]:
     """The state with the best cause that held-out parts confirm; as it is if none is."""
     state, asked = _hypotheses(subject, state, ranking)
-    every = (*ranking.causes, *pairs(ranking))
-    options = [e for e in every if ranking.says(e)]
+    options = [e for e in ranking.causes if ranking.says(e)]
+    options += _without_noise(subject, state.fit, ranking, pairs(ranking))
     options.sort(key=lambda e: -e.score)
-    described = None if asked else subject.formula(state.fit, ranking)
+    formulas = [] if asked else [subject.formula(state.fit, ranking)]
+    described = next(iter(_without_noise(subject, state.fit, ranking, formulas)), None)
     beyond = _beyond_columns(ranking, options)
     left, tried = beyond, list[Evidence]()
     while True:
@@ -57,6 +58,15 @@ def with_the_best(
         state = state.refusing(evidence.trials[0].what, why)
     missing = sorted([*options, *ranking.followed], key=lambda e: -e.score)
     return replace(state, open=tuple(missing[: LEVELS.contenders]))
+
+
+def _without_noise(
+    subject: Subject[F], fit: F, ranking: Ranking, several: Sequence[Evidence | None]
+) -> list[Evidence]:
+    """Those that say something also without what noise of the inputs may feign."""
+    given = [e for e in several if e is not None and ranking.says(e)]
+    found = without_feigned(subject, fit, ranking.likelihood, given, ranking.families)
+    return [e for e in found if ranking.says(e)]
 
 
 def _beyond_columns(ranking: Ranking, options: Sequence[Evidence]) -> list[Evidence]:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
 
+from casest.declaration.shapes import Array
+from casest.diagnose.evidence.input_noise import feigned
 from casest.diagnose.evidence.likelihood import Likelihood, far_out
 from casest.diagnose.evidence.linear import Linear
 from casest.diagnose.evidence.score import (
@@ -15,6 +17,7 @@ from casest.diagnose.evidence.score import (
     Trial,
     again,
     judged,
+    less,
     on_fewer_axes,
     screened,
     whitened,
@@ -32,7 +35,38 @@ def ranked(subject: Subject[F], fit: F) -> Ranking:
     near = [e for e in ranking.causes[: LEVELS.contenders] if e.score > -LEVELS.clear]
     finer = {e.trials[0].family: sharpened(subject, fit, ranking, e) for e in near}
     found = tuple(finer.get(e.trials[0].family, e) for e in ranking.found)
+    found = without_feigned(subject, fit, ranking.likelihood, found, ranking.families)
     return replace(ranking, found=_best_first(found))
+
+
+def without_feigned(
+    subject: Subject[F],
+    fit: F,
+    likelihood: Likelihood,
+    found: Sequence[Evidence],
+    families: int,
+) -> tuple[Evidence, ...]:
+    """The same without the gain that noise of the inputs alone may give."""
+    asked = [e for e in found if e.score > 0]
+    noisy = subject.jittered(fit, [t for e in asked for t in e.trials]) if asked else ()
+    inputs = [[(Likelihood(linear), columns) for linear, columns in draws] for draws in noisy]
+    charged: dict[int, Evidence] = {}
+    for e in asked:
+        gains = [feigned(e, likelihood, _columns(e, draws)) for draws in inputs]
+        charged[id(e)] = less(e, max(gains, default=0.0), likelihood, families)
+    return tuple(charged.get(id(e), e) for e in found)
+
+
+def _columns(
+    evidence: Evidence, draws: Sequence[tuple[Likelihood, Mapping[int, Array]]]
+) -> list[tuple[Likelihood, Array]]:
+    """Those of the evidence's trials, side by side, in every draw that has them."""
+    own = [id(t) for t in evidence.trials]
+    return [
+        (likelihood, np.concatenate([columns[k] for k in own], axis=2))
+        for likelihood, columns in draws
+        if columns.keys() >= set(own)
+    ]
 
 
 def ranked_of(linear: Linear, trials: Sequence[Trial]) -> Ranking:
@@ -89,6 +123,7 @@ def sharpened(subject: Subject[F], fit: F, ranking: Ranking, evidence: Evidence)
         others = [t for t in evidence.trials if t is not trial]
         for scale in (1.0, 0.3, 0.1):
             for moved in subject.nearer(fit, evidence.trials[k], scale):
+                moved = replace(moved, feigned=trial.feigned)
                 both = [*others[:k], moved, *others[k:]]
                 found = judged(both, ranking.likelihood, ranking.none, start=evidence.explained,
                                families=ranking.families, rounds=1)  # fmt: skip

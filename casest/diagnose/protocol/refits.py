@@ -13,7 +13,7 @@ from casest.diagnose.evidence.score import Evidence, Trial, expected_loss, judge
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.noise.louder import louder
 from casest.diagnose.protocol.confirming import falls, falls_of_refit, holds_out
-from casest.diagnose.protocol.ranking import sharpened
+from casest.diagnose.protocol.ranking import sharpened, without_feigned
 from casest.diagnose.protocol.state import F, Ranking, Refit, State
 from casest.diagnose.protocol.subject import Subject
 
@@ -56,6 +56,7 @@ def refitted(
 
 def _gaining(evidence: Evidence, gain: float) -> Evidence:
     """With what its refit gains."""
+    gain -= evidence.feigned
     return replace(evidence, gain=gain, score=evidence.score - evidence.gain + gain)
 
 
@@ -199,6 +200,10 @@ def shown(
     found = []
     for trial in subject.shown(state.fit):
         evidence = judged([trial], ranking.likelihood, ranking.none, families=ranking.families)
+        if evidence is not None:
+            (evidence,) = without_feigned(
+                subject, state.fit, ranking.likelihood, [evidence], ranking.families
+            )
         better = subject.refit(state.fit, [trial])
         if evidence is None or isinstance(better, str):
             state = state if evidence is None else state.failing(evidence, str(better))

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
 
+from casest.declaration.shapes import Array
 from casest.diagnose.evidence.linear import Linear
 from casest.diagnose.evidence.score import Evidence, Trial
 from casest.diagnose.protocol.state import F, Kept, Ranking
@@ -26,6 +27,13 @@ class Subject(Protocol[F]):
 
     def shown(self, fit: F) -> Sequence[Trial]:
         """What is refitted whatever its columns promise."""
+        return ()
+
+    def jittered(
+        self, fit: F, trials: Sequence[Trial]
+    ) -> Sequence[Sequence[tuple[Linear, Mapping[int, Array]]]]:
+        """For each noisy input a few draws: the fit as a linear problem, and the trials' columns by
+        their identity, where the input has as much more noise as would be all of the residual's."""
         return ()
 
     def nearer(self, fit: F, trial: Trial, scale: float) -> Sequence[Trial]:

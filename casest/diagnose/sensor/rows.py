@@ -17,7 +17,6 @@ from casest.diagnose.evidence.linear import Index, Linear, parts_of, spans_of
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.sensor.fits import Fit, problem_of
 from casest.diagnose.sensor.recent import Recent
-from casest.leastsquares.kinds import noises
 from casest.leastsquares.problem import Point, Problem
 
 
@@ -33,10 +32,10 @@ class Rows:
         return self._linears.of(fit, lambda: self._linear(fit))
 
     def _linear(self, fit: Fit) -> Linear:
-        residual, J = self._slopes(*problem_of(fit, self.runs))
+        residual, J = self.slopes(*problem_of(fit, self.runs))
         met = self._met(fit)
         parts, held = parts_of(*self._numbers, met), plateaus_of(met, self._spans)
-        return Linear(residual, J, self._spans, parts, self._least(fit), held)
+        return Linear(residual, J, self._spans, parts, plateaus=held)
 
     def of(self, values: Sequence[Array]) -> Array:
         """Values of each run (N, …) in the rows that are looked at, one run after the other."""
@@ -47,7 +46,8 @@ class Rows:
         """Rows of each run that are looked at."""
         return rows_of(self.runs, LEVELS.rows)
 
-    def _slopes(self, problem: Problem, point: Point) -> tuple[Array, Array]:
+    def slopes(self, problem: Problem, point: Point) -> tuple[Array, Array]:
+        """Residuals (N, m) and their slopes (N, m, p) in these rows."""
         axes = len(problem.model.axes)
         offsets = np.cumsum([0, *map(len, self.index)])
         r, J = np.zeros((offsets[-1], axes)), np.zeros((offsets[-1], axes, problem.unknowns))
@@ -77,22 +77,6 @@ class Rows:
         in_time = all(run.time is not None and not run.spread for run in self.runs)
         return spans_of(*self._numbers) if in_time and total >= LEVELS.series else ()
 
-    def _least(self, fit: Fit) -> float:
-        """Slopes of an implicit residual contain the residual: what survives must be more."""
-        if not fit.model.implicit or noises(fit.model):  # or is counted in deviations
-            return LEVELS.survives
-        names = [
-            s.name
-            for s in fit.model.signals
-            if s.name != "t" and s.kind == "plain" and s.name not in self.runs[0].columns
-        ]
-        sizes = [
-            float(np.sqrt(np.mean(np.concatenate([r.signals[n] for r in self.runs]) ** 2)))
-            for n in names
-        ]
-        noise = fit.noise / max(min(sizes, default=np.inf), 1e-300)
-        return max(LEVELS.survives, LEVELS.over_noise * noise)
-
     def _met(self, fit: Fit) -> Array:
         """What the sensor met in each row (N, q): the corrected quantity, or the prediction."""
         traced = fit.model.along
@@ -103,12 +87,12 @@ class Rows:
         problem, point = problem_of(fit, self.runs)
         over_time = any(a.kind in OVER_TIME for a in fit.model.effects)
         if over_time and not traced.integrates:
-            return self._met(_instant(fit))  # what it met is that without a memory as well
+            return self._met(instant(fit))  # what it met is that without a memory as well
         found = problem.evaluate(point, {"q": value})
         return np.nan_to_num(self.of([f[0].reshape(len(f[0]), -1) for f in found]))
 
 
-def _instant(fit: Fit) -> Fit:
+def instant(fit: Fit) -> Fit:
     """The fit without what looks at other samples."""
     kept = tuple(a for a in fit.model.effects if a.kind not in OVER_TIME)
     model = replace(fit.model, effects=kept)

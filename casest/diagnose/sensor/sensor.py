@@ -20,6 +20,7 @@ from casest.diagnose.formula.search import NAME, described, readable, with_sizes
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.protocol import Kept, Ranking, Subject
 from casest.diagnose.sensor.fits import Fit, certified, fitted, problem_of, simpler, starts
+from casest.diagnose.sensor.jitter import Draw, jittered
 from casest.diagnose.sensor.recent import Recent
 from casest.diagnose.sensor.rows import Rows
 from casest.diagnose.sensor.tried import Tried, on_axes
@@ -88,6 +89,10 @@ class Sensor(Subject[Fit]):
         what rates may lack, since a trajectory bends in it."""
         rates = [t for t in self.trials(fit) if _on_rate(t.what)]
         return [*self.tried.shown(fit), *rates]
+
+    def jittered(self, fit: Fit, trials: Sequence[Trial]) -> Sequence[Sequence[Draw]]:
+        """The same where inputs have more noise."""
+        return jittered(self.rows, fit, trials)
 
     def nearer(self, fit: Fit, trial: Trial, scale: float) -> list[Trial]:
         """Values of a grid around the trial's."""

@@ -1,0 +1,45 @@
+"""What noise of the inputs alone may feign.
+
+Slopes are taken at inputs as they were recorded. Noise of an input is in the residual and in the
+slopes: a column that would be none beside the unknowns is that noise there, and explains it. (In a
+ramp at an even pace time tells the reference better than a noisy meter did.) So the same columns
+are looked at with so much noise more: of the squares that a cause explains, the share that changes
+may be noise that goes with the residual's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from casest.declaration.shapes import Array
+from casest.diagnose.evidence.likelihood import Likelihood
+from casest.diagnose.evidence.score import Evidence
+from casest.diagnose.levels import LEVELS
+
+#: Twice the log of a ratio of likelihoods, for each residual, that no cause reaches.
+MOST = 20.0
+
+
+def feigned(
+    evidence: Evidence, likelihood: Likelihood, draws: Sequence[tuple[Likelihood, Array]]
+) -> float:
+    """Gain that noise of an input may give at most (Cauchy and Schwarz): MOST of each residual
+    where a cause is all noise.
+
+    `draws`: the problem and the evidence's columns (N, m, k) with noise added to that input.
+    """
+    columns = np.concatenate(evidence.columns, axis=2)
+    left = likelihood.remainder(columns)
+    values = likelihood.orthonormal(left) @ evidence.explained.values[-evidence.freedom :]
+    root = 1 / np.sqrt(evidence.explained.spectrum)
+    whole = float(np.sum((root * (left @ values)) ** 2))
+    size = np.linalg.norm(columns.reshape(len(root), -1), axis=0)
+    changes = []
+    for noisy, moved in draws:
+        own = np.linalg.norm(moved.reshape(len(root), -1), axis=0) / np.maximum(size, 1e-300)
+        change = noisy.remainder(moved) * own - left
+        changes.append(float(np.sum((root * (change @ values)) ** 2)))
+    share = LEVELS.jitter * float(np.mean(changes or [0.0])) / max(whole, 1e-300)
+    return len(root) * min(MOST, -float(np.log1p(-min(share, 1 - 1e-12))))

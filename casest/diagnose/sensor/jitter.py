@@ -1,0 +1,90 @@
+"""A fit with noise added to what its model reads beside the reading: an input is recorded too."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from casest.data.run import Run
+from casest.declaration.shapes import Array
+from casest.diagnose.candidates.slopes import slopes
+from casest.diagnose.evidence.linear import Linear
+from casest.diagnose.evidence.score import Trial
+from casest.diagnose.levels import LEVELS
+from casest.diagnose.sensor.fits import Fit, problem_of
+from casest.diagnose.sensor.rows import Rows, instant
+from casest.errors import CasestError
+from casest.leastsquares.kinds import noises
+from casest.leastsquares.per_sample import slope_in_sample
+from casest.leastsquares.problem import Problem
+
+#: Draws of noise at most: of few rows one says little of its size.
+DRAWS = 8
+Draw = tuple[Linear, Mapping[int, Array]]
+
+
+def jittered(rows: Rows, fit: Fit, trials: Sequence[Trial]) -> list[list[Draw]]:
+    """For each input a few draws: the linear problem, and the trials' columns by their identity,
+    where the input has as much more noise as would be all of the residual's.
+
+    Of an implicit model each signal may be the one with the noise.
+    """
+    rng = np.random.default_rng(0)
+    count = int(np.clip(-(-2 * LEVELS.series // sum(map(len, rows.index))), 1, DRAWS))
+    return [
+        [_draw(rows, fit, trials, name, size, rng) for _ in range(count)]
+        for name, size in _inputs(rows, fit)
+    ]
+
+
+def _inputs(rows: Rows, fit: Fit) -> Iterator[tuple[str, float]]:
+    """Inputs, and the noise of each that would be all of the residual's."""
+    model, traced = fit.model, fit.model.along
+    if model.resting or traced.integrates or noises(model):
+        return
+    plain = instant(fit)
+    problem, point = problem_of(plain, rows.runs)
+    declared = {s.name for s in model.declared}
+    readings = {*traced.readings} if traced.predicted is not None else set()
+    squares = dict[str, float]()
+    for r in range(len(rows.runs)):
+        given = problem.parameters(point, r), problem.samples[r]
+        G, first = slope_in_sample(plain.model)(*given)[0], 0
+        for s in plain.model.signals:
+            own, first = G[:, :, first : first + s.size], first + s.size
+            if s.kind == "plain" and s.name != "t" and s.name in declared - readings:
+                squares[s.name] = squares.get(s.name, 0.0) + float(np.sum(own**2))
+    for name, square in squares.items():
+        if np.isfinite(square) and square > 0:
+            yield name, fit.noise * float(np.sqrt(problem.residual_count / square))
+
+
+def _draw(
+    rows: Rows,
+    fit: Fit,
+    trials: Sequence[Trial],
+    name: str,
+    size: float,
+    rng: np.random.Generator,
+) -> Draw:
+    runs = tuple(_noisier(run, name, size, rng) for run in rows.runs)
+    whole, _ = problem_of(fit, rows.runs)
+    problem = Problem(fit.model, runs)
+    if whole.weights is not None:
+        problem = problem.with_weights(whole.weights)
+    point = problem.point(fit.values)
+    linear = replace(rows.linear(fit), slopes=rows.slopes(problem, point)[1])
+    found = {
+        id(what): columns
+        for what, columns in slopes(problem, point, [t.what for t in trials], rows.index)
+        if not isinstance(columns, CasestError)
+    }
+    return linear, {id(t): found[id(t.what)] for t in trials if id(t.what) in found}
+
+
+def _noisier(run: Run, name: str, size: float, rng: np.random.Generator) -> Run:
+    values = run.signals[name]
+    noise = size * rng.standard_normal(values.shape)
+    return replace(run, signals={**run.signals, name: values + noise})
