@@ -66,7 +66,7 @@ def _better_than_its_parts(both: Evidence, seen: dict[str, Fall], ranking: Ranki
     """
     names = FAR_AWAY if ranking.linear.series else ("pieces",)
     for trial in both.trials:
-        (one,) = [e for e in ranking.found if e.trials[0] is trial]
+        (one,) = [e for e in ranking.found if e.trials[0].family == trial.family]
         if one.score > both.score - LEVELS.strong:
             return False
         alone = falls(ranking, one)
