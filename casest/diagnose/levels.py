@@ -35,8 +35,9 @@ class Levels:
     repeated: share of a column's deviation that a signal does not tell, up to which the column is
         that signal once more: two meters of one quantity agree so far, an influence does not.
     fades: time constants that a record must span for a memory to be seen to fade.
-    survives: share of a cause's length that the declared unknowns must leave. jitter: times that
-        noise of an input counts, since a few draws tell its size.
+    survives: share of a cause's length that the declared unknowns must leave; over_noise: an
+        implicit residual's slopes contain its noise, of which so many must survive. jitter: times
+        that noise of an input counts, since a few draws tell its size.
     seen, unseen: noncentrality of the score from which on an effect is found nearly always, and
         below which (three standard deviations) nobody could.
     misfit: chance of each kind of misfit, or of a colour of noise, where there is none; share: of
@@ -85,6 +86,7 @@ class Levels:
     repeated: float = 0.01
     fades: float = 2.0
     survives: float = 1e-3
+    over_noise: float = 5.0
     jitter: float = 2.0
     seen: float = 45.0
     unseen: float = 9.0

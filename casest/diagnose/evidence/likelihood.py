@@ -163,9 +163,12 @@ class Likelihood:
 
 
 def far_out(residual: Array) -> Array:
-    """(N, m): what residuals have beyond some robust standard deviations."""
-    far = LEVELS.clip * robust_sd(residual)
-    return np.asarray(residual - np.clip(residual, -far, far))
+    """(N, m): what residuals have beyond some robust standard deviations from their middle.
+
+    Beside a course that coloured noise leaves free to be anywhere on average, they have one.
+    """
+    far, middle = LEVELS.clip * robust_sd(residual), np.median(residual, axis=0)
+    return np.asarray(residual - np.clip(residual, middle - far, middle + far))
 
 
 def rises(less: Linear, fits: Sequence[Linear]) -> list[float]:

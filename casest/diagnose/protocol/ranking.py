@@ -30,8 +30,9 @@ from casest.diagnose.protocol.subject import Subject
 def ranked(subject: Subject[F], fit: F) -> Ranking:
     """Every cause beside a fit: the best variants of each family, each with a noise of its own."""
     ranking = ranked_of(subject.linear(fit), list(subject.trials(fit)))
-    found = _best_first([_on_its_axes(subject, fit, e, ranking) for e in ranking.found])
-    ranking = _about_the_best(replace(ranking, found=found))
+    found = tuple(_on_its_axes(subject, fit, e, ranking) for e in ranking.found)
+    found = without_feigned(subject, fit, ranking.likelihood, found, ranking.families)
+    ranking = _about_the_best(replace(ranking, found=_best_first(found)))
     near = [e for e in ranking.causes[: LEVELS.contenders] if e.score > -LEVELS.clear]
     finer = {e.trials[0].family: sharpened(subject, fit, ranking, e) for e in near}
     found = tuple(finer.get(e.trials[0].family, e) for e in ranking.found)

@@ -19,6 +19,7 @@ from casest.errors import CasestError
 from casest.leastsquares.kinds import noises
 from casest.leastsquares.per_sample import slope_in_sample
 from casest.leastsquares.problem import Problem
+from casest.leastsquares.weights import robust_scale
 
 #: Draws of noise at most: of few rows one says little of its size.
 DRAWS = 8
@@ -50,15 +51,30 @@ def _inputs(rows: Rows, fit: Fit) -> Iterator[tuple[str, float]]:
     readings = {*traced.readings} if traced.predicted is not None else set()
     squares = dict[str, float]()
     for r in range(len(rows.runs)):
-        given = problem.parameters(point, r), problem.samples[r]
-        G, first = slope_in_sample(plain.model)(*given)[0], 0
+        G = slope_in_sample(plain.model)(problem.parameters(point, r), problem.samples[r])[0]
+        first = 0
         for s in plain.model.signals:
             own, first = G[:, :, first : first + s.size], first + s.size
             if s.kind == "plain" and s.name != "t" and s.name in declared - readings:
                 squares[s.name] = squares.get(s.name, 0.0) + float(np.sum(own**2))
+    spans = rows.linear(fit).spans
+    noise = _white(rows.linear(fit).residual, spans, fit.noise)
     for name, square in squares.items():
         if np.isfinite(square) and square > 0:
-            yield name, fit.noise * float(np.sqrt(problem.residual_count / square))
+            size = noise * float(np.sqrt(problem.residual_count / square))
+            given = rows.of([run.signals[name] for run in rows.runs])
+            yield name, _white(given, spans, size)
+
+
+def _white(values: Array, spans: Sequence[slice], most: float) -> float:
+    """The noise of a series by its third differences, in which what is slower has little part.
+
+    Of few rows, or none in time, as much as it may be at most.
+    """
+    third = [np.diff(values[span], 3, axis=0) for span in spans]
+    if sum(map(len, third)) < LEVELS.series:
+        return most
+    return min(most, robust_scale(third) / float(np.sqrt(20)))
 
 
 def _draw(

@@ -17,6 +17,7 @@ from casest.diagnose.evidence.linear import Index, Linear, parts_of, spans_of
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.sensor.fits import Fit, problem_of
 from casest.diagnose.sensor.recent import Recent
+from casest.leastsquares.kinds import noises
 from casest.leastsquares.problem import Point, Problem
 
 
@@ -35,7 +36,7 @@ class Rows:
         residual, J = self.slopes(*problem_of(fit, self.runs))
         met = self._met(fit)
         parts, held = parts_of(*self._numbers, met), plateaus_of(met, self._spans)
-        return Linear(residual, J, self._spans, parts, plateaus=held)
+        return Linear(residual, J, self._spans, parts, self._least(fit), held)
 
     def of(self, values: Sequence[Array]) -> Array:
         """Values of each run (N, …) in the rows that are looked at, one run after the other."""
@@ -76,6 +77,22 @@ class Rows:
         total = sum(map(len, self.index))
         in_time = all(run.time is not None and not run.spread for run in self.runs)
         return spans_of(*self._numbers) if in_time and total >= LEVELS.series else ()
+
+    def _least(self, fit: Fit) -> float:
+        """Slopes of an implicit residual contain the residual: what survives must be more."""
+        if not fit.model.implicit or noises(fit.model):  # or is counted in deviations
+            return LEVELS.survives
+        names = [
+            s.name
+            for s in fit.model.signals
+            if s.name != "t" and s.kind == "plain" and s.name not in self.runs[0].columns
+        ]
+        sizes = [
+            float(np.sqrt(np.mean(np.concatenate([r.signals[n] for r in self.runs]) ** 2)))
+            for n in names
+        ]
+        noise = fit.noise / max(min(sizes, default=np.inf), 1e-300)
+        return max(LEVELS.survives, LEVELS.over_noise * noise)
 
     def _met(self, fit: Fit) -> Array:
         """What the sensor met in each row (N, q): the corrected quantity, or the prediction."""
