@@ -17,6 +17,7 @@ from casest.data.run import Run
 from casest.declaration.shapes import Array
 from casest.dynamics.between import motions
 from casest.dynamics.declare import Dynamics
+from casest.dynamics.path import Parts, Path
 from casest.dynamics.transition import (
     Linearised,
     Pace,
@@ -71,10 +72,6 @@ def gramian(model: Dynamics, system: Linearised) -> Array:
     state at the first sample is not counted. Other driving noise is no matter of the trajectory.
     """
     return _reduced(*_of_steps(model, system))[1]
-
-
-#: Φ and W of steps, and the covariance of the motion that nobody knows, where there is one.
-Parts = tuple[Array, Array, Array | None]
 
 
 def _unknown_motion(model: Dynamics, system: Linearised) -> Array | None:
@@ -146,12 +143,13 @@ def _even(M: Array) -> Array:
 class Products:
     """A model along a record of any length, chunk by chunk: Φ and W of each, (K, n, n); and Q.
 
-    `system`: the model along all of it, where it is known already.
+    `along`: where a nonlinear one goes; `system`: a linear one along all of it, where it is known
+    already.
     """
 
     model: Dynamics
     run: Run
-    along: Array | None
+    along: Path | None
     pace: Pace
     system: Linearised | None
     Phi: Array
@@ -161,14 +159,15 @@ class Products:
 
     @staticmethod
     def of(
-        model: Dynamics, run: Run, along: Array | None = None, system: Linearised | None = None
+        model: Dynamics, run: Run, along: Path | None = None, system: Linearised | None = None
     ) -> Products:
-        """`along`: states (N, n) along which a nonlinear model is linearised."""
+        """`along`: where a nonlinear model goes."""
         step, n = np.diff(checked_record(model, run)), model.size
         holed = any(not np.isfinite(run.signals[name]).all() for name in model.measured_signals)
         none = np.zeros((-(-len(step) // CHUNK), n, n))
         pace = replace(Pace.of(model, run), holed=holed)
-        Q = none.copy() if system is not None and system.process.ndim == 3 else None
+        noisy = along.noisy if along else system is not None and system.process.ndim == 3
+        Q = none.copy() if noisy else None
         found = Products(model, run, along, pace, system, none, none.copy(), Q)
         for k in range(0, len(step), PIECE):
             Phi, W, noise = found._steps(k, min(k + PIECE, len(step)))
@@ -184,11 +183,12 @@ class Products:
             self.Q[k] = Q
 
     def _steps(self, first: int, last: int) -> Parts:
+        if self.along is not None:
+            return self.along.steps(first, last)
         where = slice(first, last + 1)
         if self.system is not None:
             return _of_steps(self.model, self.system.part(where, self.pace.part(where)))
-        along = None if self.along is None else self.along[where]
-        system = linearised(self.model, self.run.take(where), along, self.pace.part(where))
+        system = linearised(self.model, self.run.take(where), None, self.pace.part(where))
         return _of_steps(self.model, system)
 
     def gramian(self, first: int = 0, last: int | None = None) -> Array:

@@ -18,8 +18,8 @@ from casest.dynamics.gramian import Products, observed, over_windows
 from casest.dynamics.gramian import Windows as Over
 from casest.dynamics.inputs import smallest, uncertain, unstated
 from casest.dynamics.intensities import period, with_stated
+from casest.dynamics.path import Path
 from casest.dynamics.structural import Structure, structure
-from casest.dynamics.transition import linearised
 from casest.errors import DeclarationError, UsageError
 from casest.estimate.calibrate import attempt
 from casest.results.file import plain
@@ -222,7 +222,7 @@ def observe_motion(
     """What a trajectory makes observable, by the Gramian over the whole record and over windows.
 
     `std` is what the readings alone allow at the beginning of the record, per state. A nonlinear
-    model is linearised along its smoothed states.
+    model is linearised along a trajectory of its own (`path`).
     """
     noisy = unstated(model, run)
     model = with_stated(model, run, noisy)
@@ -311,13 +311,12 @@ def _gaps(time: Array, rows: Array, where: str) -> list[str]:
 
 def _products(model: Dynamics, run: Run) -> Products:
     """In pieces; at once where the noise of inputs is known, as its estimates are of the whole."""
-    along = None if model.linear else filtered(model, run).smoothed
-    if model.input_noise is None:
-        return Products.of(model, run, along)
     if not model.linear:
-        system = linearised(model, run, along)
-    else:  # as the filter goes, which no bound may be above
-        system = filtered(model, run).system if uncertain(model) else coefficients(model, run)
+        return Products.of(model, run, Path.of(model, run))
+    if model.input_noise is None:
+        return Products.of(model, run)
+    # As the filter goes, which no bound may be above.
+    system = filtered(model, run).system if uncertain(model) else coefficients(model, run)
     return Products.of(model, run, system=system)
 
 

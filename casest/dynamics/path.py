@@ -1,0 +1,81 @@
+"""The trajectory along which a nonlinear record is judged: one that the model can go.
+
+Smoothed states are moved by noise too. A Gramian along them takes that motion for known, and what
+the model cannot show becomes visible by it: the false observability of an extended filter whose
+Jacobians lie along states that no motion connects (Huang, Mourikis & Roumeliotis 2010). Where one
+beginning and the inputs alone lead through the readings, the states that follow from them are taken
+in place of the smoothed ones, and Φ is the Jacobian of the very map that they follow.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from casest.data.run import Run
+from casest.declaration.shapes import Array
+from casest.dynamics.declare import Dynamics
+from casest.dynamics.extended import Sampled
+from casest.dynamics.filter import filtered
+from casest.dynamics.inputs import estimates
+
+#: What readings foretold along both may differ by, rms, in standard deviations of one reading, for
+#: the record to be led through by its inputs alone.
+NEAR = 1.0
+
+#: Φ and W of steps, and the covariance of the motion that nobody knows, where there is one.
+Parts = tuple[Array, Array, Array | None]
+#: At a state (n,) the directions (n, k) that no record shows.
+Hidden = Callable[[Array], Array]
+
+
+@dataclass(frozen=True)
+class Path:
+    """A nonlinear model along states x (N, n), its inputs as they most likely were.
+
+    `noisy`: is the noise of inputs known? Other driving noise is no matter of a trajectory.
+    """
+
+    sampled: Sampled
+    x: Array
+    noisy: bool
+
+    @staticmethod
+    def of(model: Dynamics, run: Run) -> Path:
+        """From the smoothed state at the first sample on, or along the smoothed states where the
+        record leaves what follows from that."""
+        smoothed = filtered(model, run).smoothed
+        along = Path.along(model, run, smoothed)
+        own = along.sampled.followed(smoothed[0])
+        return replace(along, x=own) if along.near(own) else along
+
+    @staticmethod
+    def along(model: Dynamics, run: Run, x: Array) -> Path:
+        """Along states (N, n)."""
+        calm = estimates(model, run)
+        quiet = replace(run, signals={**run.signals, **calm})
+        alone = model.driven(**{s.name: 0.0 for s in model.states})
+        return Path(Sampled.of(alone, quiet, calm=calm), x, model.input_noise is not None)
+
+    def near(self, other: Array) -> bool:
+        """Do readings along `other` (N, n) differ less than those of a sensor do by their noise?"""
+        if not np.isfinite(other).all():
+            return False
+        (C, d, y), (C2, d2, y2) = self.sampled.read(self.x), self.sampled.read(other)
+        apart = _read(C2, d2, other) - y2 - _read(C, d, self.x) + y
+        return bool(np.nanmean(apart**2 / self.sampled.R) <= NEAR**2)
+
+    def steps(self, first: int, last: int) -> Parts:
+        """Φ, W and Q of the single steps from sample `first` to `last`, (last − first, n, n)."""
+        Phi, _, Q = self.sampled.moved(self.x[first:last], first)
+        C, _, y = self.sampled.read(self.x[first : last + 1], first)
+        rows = np.where(np.isfinite(y), 1 / self.sampled.R[first : last + 1], 0.0)
+        told = C.transpose(0, 2, 1) @ (rows[:, :, None] * C)
+        W = 0.5 * (told[:-1] + Phi.transpose(0, 2, 1) @ told[1:] @ Phi)
+        return Phi, W, Q if self.noisy else None
+
+
+def _read(C: Array, d: Array, x: Array) -> Array:
+    return (C @ x[:, :, None])[:, :, 0] + d
