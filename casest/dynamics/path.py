@@ -9,7 +9,7 @@ in place of the smoothed ones, and Φ is the Jacobian of the very map that they 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,7 +18,7 @@ from casest.data.run import Run
 from casest.declaration.shapes import Array
 from casest.dynamics.declare import Dynamics
 from casest.dynamics.extended import Sampled
-from casest.dynamics.filter import filtered
+from casest.dynamics.filter import filtered, trajectory
 from casest.dynamics.inputs import estimates
 
 #: What readings foretold along both may differ by, rms, in standard deviations of one reading, for
@@ -27,8 +27,6 @@ NEAR = 1.0
 
 #: Φ and W of steps, and the covariance of the motion that nobody knows, where there is one.
 Parts = tuple[Array, Array, Array | None]
-#: At a state (n,) the directions (n, k) that no record shows.
-Hidden = Callable[[Array], Array]
 
 
 @dataclass(frozen=True)
@@ -44,12 +42,14 @@ class Path:
 
     @staticmethod
     def of(model: Dynamics, run: Run) -> Path:
-        """From the smoothed state at the first sample on, or along the smoothed states where the
-        record leaves what follows from that."""
-        smoothed = filtered(model, run).smoothed
-        along = Path.along(model, run, smoothed)
-        own = along.sampled.followed(smoothed[0])
-        return replace(along, x=own) if along.near(own) else along
+        """Without driving noise from one beginning on: that of the smoothed states, or the most
+        likely one; the smoothed states themselves where the record leaves both."""
+        along = Path.along(model, run, filtered(model, run).smoothed)
+        for begun in along.beginnings(run):
+            own = along.sampled.followed(begun)
+            if along.near(own):
+                return replace(along, x=own)
+        return along
 
     @staticmethod
     def along(model: Dynamics, run: Run, x: Array) -> Path:
@@ -58,6 +58,14 @@ class Path:
         quiet = replace(run, signals={**run.signals, **calm})
         alone = model.driven(**{s.name: 0.0 for s in model.states})
         return Path(Sampled.of(alone, quiet, calm=calm), x, model.input_noise is not None)
+
+    def beginnings(self, run: Run) -> Iterator[Array]:
+        """States (n,) at the first sample, the next one where that before leads astray."""
+        yield self.x[0]
+        model = self.sampled.model
+        model = model.sensing(**{name: 0.0 for name in model.noisy_inputs})
+        calm = {s.name: own for s, own in zip(model.signals, self.sampled.signals, strict=False)}
+        yield trajectory(model, replace(run, signals={**run.signals, **calm}), self.x)[0][0]
 
     def near(self, other: Array) -> bool:
         """Do readings along `other` (N, n) differ less than those of a sensor do by their noise?"""

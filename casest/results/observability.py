@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from msgspec import UNSET, Struct, UnsetType
@@ -20,6 +21,7 @@ from casest.dynamics.inputs import smallest, uncertain, unstated
 from casest.dynamics.intensities import period, with_stated
 from casest.dynamics.path import Path
 from casest.dynamics.structural import Structure, structure
+from casest.dynamics.structural.unseen import Unseen
 from casest.errors import DeclarationError, UsageError
 from casest.estimate.calibrate import attempt
 from casest.results.file import plain
@@ -203,10 +205,10 @@ def _structural(found: Structure) -> Structural:
     )
 
 
-def _structural_rank(model: Dynamics) -> int | None:
+def _structure(model: Dynamics) -> Structure | None:
     """What a better record could reach; None where it cannot be said."""
     try:
-        return structure(model).rank
+        return structure(model)
     except DeclarationError:
         return None
 
@@ -226,7 +228,8 @@ def observe_motion(
     """
     noisy = unstated(model, run)
     model = with_stated(model, run, noisy)
-    products = _products(model, run)
+    most = _structure(model)
+    products = _products(model, run, most)
     seen = observed(model, products.gramian())
     time = np.asarray(run.time, float)
     duration, step = float(time[-1] - time[0]), float(np.median(np.diff(time)))
@@ -248,7 +251,7 @@ def observe_motion(
         ],
         rank=seen.rank,
         unknowns=seen.unknowns,
-        structural_rank=_structural_rank(model),
+        structural_rank=most.rank if most else None,
         unobservable=list(seen.unobservable),
         weak=list(seen.weak),
         std=std,
@@ -309,10 +312,16 @@ def _gaps(time: Array, rows: Array, where: str) -> list[str]:
     ]
 
 
-def _products(model: Dynamics, run: Run) -> Products:
-    """In pieces; at once where the noise of inputs is known, as its estimates are of the whole."""
+def _products(model: Dynamics, run: Run, most: Structure | None) -> Products:
+    """In pieces; at once where the noise of inputs is known, as its estimates are of the whole.
+
+    Of a nonlinear model never more than `most`, what any record could show: it is linearised where
+    its states are thought to be, and what is wrong with that may show what they cannot.
+    """
     if not model.linear:
-        return Products.of(model, run, Path.of(model, run))
+        path, unseen = Path.of(model, run), Unseen.of(most, run) if most else None
+        hidden = None if unseen is None else lambda k: unseen.at(path.x[k], k)
+        return replace(Products.of(model, run, path), unseen=hidden)
     if model.input_noise is None:
         return Products.of(model, run)
     # As the filter goes, which no bound may be above.
