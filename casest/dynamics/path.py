@@ -21,8 +21,8 @@ from casest.dynamics.extended import Sampled
 from casest.dynamics.filter import filtered, trajectory
 from casest.dynamics.inputs import estimates
 
-#: What readings foretold along both may differ by, rms, in standard deviations of one reading, for
-#: the record to be led through by its inputs alone.
+#: By how much of their variance readings may be further from what is foretold without driving noise
+#: than from what is foretold with it, for the record to be led through by its inputs alone.
 NEAR = 1.0
 
 #: Φ and W of steps, and the covariance of the motion that nobody knows, where there is one.
@@ -31,12 +31,13 @@ Parts = tuple[Array, Array, Array | None]
 
 @dataclass(frozen=True)
 class Path:
-    """A nonlinear model along states x (N, n), its inputs as they most likely were.
+    """A nonlinear model along states x (N, n), inputs of the `run` as they most likely were.
 
     `noisy`: is the noise of inputs known? Other driving noise is no matter of a trajectory.
     """
 
     sampled: Sampled
+    run: Run
     x: Array
     noisy: bool
 
@@ -45,10 +46,11 @@ class Path:
         """Without driving noise from one beginning on: that of the smoothed states, or the most
         likely one; the smoothed states themselves where the record leaves both."""
         along = Path.along(model, run, filtered(model, run).smoothed)
-        for begun in along.beginnings(run):
-            own = along.sampled.followed(begun)
-            if along.near(own):
-                return replace(along, x=own)
+        with np.errstate(all="ignore"):
+            for begun in along.beginnings():
+                own = along.sampled.followed(begun)
+                if along.near(own):
+                    return replace(along, x=own)
         return along
 
     @staticmethod
@@ -57,23 +59,26 @@ class Path:
         calm = estimates(model, run)
         quiet = replace(run, signals={**run.signals, **calm})
         alone = model.driven(**{s.name: 0.0 for s in model.states})
-        return Path(Sampled.of(alone, quiet, calm=calm), x, model.input_noise is not None)
+        noisy = model.input_noise is not None
+        return Path(Sampled.of(alone, quiet, calm=calm), quiet, x, noisy)
 
-    def beginnings(self, run: Run) -> Iterator[Array]:
+    def beginnings(self) -> Iterator[Array]:
         """States (n,) at the first sample, the next one where that before leads astray."""
         yield self.x[0]
         model = self.sampled.model
-        model = model.sensing(**{name: 0.0 for name in model.noisy_inputs})
-        calm = {s.name: own for s, own in zip(model.signals, self.sampled.signals, strict=False)}
-        yield trajectory(model, replace(run, signals={**run.signals, **calm}), self.x)[0][0]
+        quiet = model.sensing(**{name: 0.0 for name in model.noisy_inputs})
+        yield trajectory(quiet, self.run, self.x)[0][0]
 
     def near(self, other: Array) -> bool:
-        """Do readings along `other` (N, n) differ less than those of a sensor do by their noise?"""
+        """Do states `other` (N, n) lead through the readings too?"""
         if not np.isfinite(other).all():
             return False
-        (C, d, y), (C2, d2, y2) = self.sampled.read(self.x), self.sampled.read(other)
-        apart = _read(C2, d2, other) - y2 - _read(C, d, self.x) + y
-        return bool(np.nanmean(apart**2 / self.sampled.R) <= NEAR**2)
+        return self._left(other) <= max(self._left(self.x), 1.0) + NEAR
+
+    def _left(self, x: Array) -> float:
+        """Mean square of the readings less what states (N, n) foretell, in their variances."""
+        C, d, y = self.sampled.read(x)
+        return float(np.nanmean((y - d - (C @ x[:, :, None])[:, :, 0]) ** 2 / self.sampled.R))
 
     def steps(self, first: int, last: int) -> Parts:
         """Φ, W and Q of the single steps from sample `first` to `last`, (last − first, n, n)."""
@@ -83,7 +88,3 @@ class Path:
         told = C.transpose(0, 2, 1) @ (rows[:, :, None] * C)
         W = 0.5 * (told[:-1] + Phi.transpose(0, 2, 1) @ told[1:] @ Phi)
         return Phi, W, Q if self.noisy else None
-
-
-def _read(C: Array, d: Array, x: Array) -> Array:
-    return (C @ x[:, :, None])[:, :, 0] + d
