@@ -80,4 +80,5 @@ def _function(lie: Lie, model: Dynamics, order: int) -> Callable[[Array], Any] |
     for k in range(order + 1):
         if lie.operations(k) > LARGEST:
             return None
-    return lie.function(order)
+    found: Callable[[Array], Any] = lie.function(order)
+    return found
