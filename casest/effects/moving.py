@@ -123,8 +123,10 @@ CATALOGUE = (
 COLOURED = "coloured_noise"
 #: What an effect of a sensor may be searched over here.
 SEARCHED: tuple[set[str], ...] = (set(), {"time"}, {"frequency"})
-#: Rounds that find the true input from its reading: each leaves the square of the effect's size.
+#: Rounds that find the true input from its reading: each leaves the square of what was wrong.
 ROUNDS = 3
+#: Samples at which it is looked at what an effect leaves of its signal.
+SAMPLES = 500
 
 
 def of_sensors() -> list[Effect]:
@@ -236,10 +238,30 @@ class Candidate:
             return self.effect.changed(value, k, body)
         if self.place == "output":
             return self.sensed(value, k, body)
+        # Newton's steps, axis by axis: without the slope they would lead astray where an effect is
+        # as large as the signal, and a factor of two be taken for one of zero.
+        quantity = ca.SX.sym("quantity", value.numel())
+        read = self.sensed(quantity, k, body)
+        step = (read - value) / ca.diag(ca.jacobian(read, quantity))
         true = value
         for _ in range(ROUNDS):
-            true = value - (self.sensed(true, k, body) - true)
+            true -= ca.substitute(step, quantity, true)
         return true
+
+    def left_of(self, k: Array, signals: Mapping[str, Array]) -> float:
+        """What share of its signal the effect leaves, of the axis that it takes most of.
+
+        The slope of what `changed` makes of a value, the median over samples of `signals` (N, …).
+        """
+        values = {s.name: ca.SX.sym(s.name, s.size) for s in self.reads}
+        value = values.setdefault(self.on, ca.SX.sym("value", signals[self.on].shape[1]))
+        none = ca.SX.zeros(value.numel())
+        body = Body(rate=none, turn=none, read=values)
+        slope = ca.diag(ca.jacobian(self.changed(value, ca.SX(k), body), value))
+        found = ca.Function("slope", [*values.values()], [ca.densify(slope)])
+        every = slice(None, None, max(1, len(signals[self.on]) // SAMPLES))
+        rows = found.map(len(signals[self.on][every]))(*(signals[n][every].T for n in values))
+        return float(np.nanmin(np.nanmedian(np.abs(np.asarray(rows)), axis=1)))
 
     def sensed(self, value: SX, k: SX, body: Body) -> SX:
         """What a sensor with an effect of the sensors' catalogue reads."""
