@@ -121,6 +121,8 @@ CATALOGUE = (
 
 #: Name of what belongs to the noise of a signal rather than to its mean.
 COLOURED = "coloured_noise"
+#: What is added to the name of an input for what it most likely was, without its noise.
+CALM = "_calm"
 #: What an effect of a sensor may be searched over here.
 SEARCHED: tuple[set[str], ...] = (set(), {"time"}, {"frequency"})
 #: Rounds that find the true input from its reading: each leaves the square of what was wrong.
@@ -220,6 +222,11 @@ class Candidate:
         return f"{self.on}_moved"
 
     @property
+    def calm(self) -> str:
+        """Name of the signal without its noise, as it most likely was: `a_calm`."""
+        return f"{self.on}{CALM}"
+
+    @property
     def in_time(self) -> bool:
         """Is its one number how late the reading is?"""
         return isinstance(self.effect, MotionEffect) and self.effect.in_time
@@ -251,13 +258,19 @@ class Candidate:
     def left_of(self, k: Array, signals: Mapping[str, Array]) -> float:
         """What share of its signal the effect leaves, of the axis that it takes most of.
 
-        The slope of what `changed` makes of a value, the median over samples of `signals` (N, …).
+        Of an input the slope of the true one in its reading, of an output that of the reading in
+        its prediction; the median over samples of `signals` (N, …).
         """
         values = {s.name: ca.SX.sym(s.name, s.size) for s in self.reads}
         value = values.setdefault(self.on, ca.SX.sym("value", signals[self.on].shape[1]))
-        none = ca.SX.zeros(value.numel())
+        none, own = ca.SX.zeros(value.numel()), ca.SX(k)
         body = Body(rate=none, turn=none, read=values)
-        slope = ca.diag(ca.jacobian(self.changed(value, ca.SX(k), body), value))
+        changed = self.changed(value, own, body)
+        slope = ca.diag(ca.jacobian(changed, value))
+        if self.attached is not None and self.place == "input":
+            # Far from the reading its steps do not find it: where they end, the sensor's own slope.
+            read = ca.diag(ca.jacobian(self.sensed(value, own, body), value))
+            slope = 1 / ca.substitute(read, value, changed)
         found = ca.Function("slope", [*values.values()], [ca.densify(slope)])
         every = slice(None, None, max(1, len(signals[self.on]) // SAMPLES))
         rows = found.map(len(signals[self.on][every]))(*(signals[n][every].T for n in values))
@@ -325,17 +338,24 @@ def _with(model: Dynamics, candidate: Candidate, value: Array | SX | None) -> Dy
     inner, name, there = model.function, candidate.state, {s.name for s in model.signals}
     more = [s for s in candidate.reads if s.name not in there]
     more += [Signal(candidate.moved, 1, "s")] if candidate.in_time else []
+    if candidate.place == "input" and candidate.calm not in there:
+        on = next(s for s in model.signals if s.name == candidate.on)
+        more += [replace(on, name=candidate.calm)]
     own = {s.name for s in more}
 
     @wraps(inner)
     def function(**given: Any) -> Motion:
         k = given.pop(name) if value is None else ca.SX(value)
         moved = given[candidate.moved] if candidate.in_time else 0.0
-        left = {n: v for n, v in given.items() if n not in own}
+        left = {n: v for n, v in given.items() if n not in own and n != candidate.calm}
         body = Body(turn=given.get(candidate.turn), moved=moved, read=given)
         if candidate.place == "input":
-            corrected = candidate.changed(given[candidate.on], k, body)
-            return inner(**{**left, candidate.on: corrected})
+            # Of what the sensor met, not of its noise: with that the noise would be scaled too, and
+            # what takes most of it away would foretell readings best.
+            calm = given[candidate.calm]
+            true = candidate.changed(calm, k, replace(body, read={**given, candidate.on: calm}))
+            left[candidate.on] = given[candidate.on] + true - calm
+            return inner(**left, **({} if candidate.calm in own else {candidate.calm: true}))
         return _reading(inner(**left), given, candidate, k, body)
 
     grown = replace(model, function=function, signals=(*model.signals, *more))

@@ -17,6 +17,7 @@ from casest.diagnose.motion.fit import Fit, fitted, rise
 from casest.diagnose.motion.sensitivity import sensitivity
 from casest.diagnose.protocol import Kept, Subject
 from casest.effects.moving import Candidate
+from casest.errors import DataError
 
 #: Share of its signal that an effect has to leave.
 LEFT = 0.1
@@ -83,7 +84,7 @@ class Innovations(Subject[Fit]):
                     fit.base, self.run, along, added=numbers, colour=fit.colour, start=start,
                     bounded=fit.bounded,
                 )  # fmt: skip
-            except np.linalg.LinAlgError as error:
+            except (np.linalg.LinAlgError, DataError) as error:
                 return f"its refit fails: {error}"
             if not np.isfinite(found.likelihood):
                 return "its refit fails"
