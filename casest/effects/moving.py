@@ -122,7 +122,7 @@ CATALOGUE = (
 #: Name of what belongs to the noise of a signal rather than to its mean.
 COLOURED = "coloured_noise"
 #: What is added to the name of an input for what it most likely was, without its noise.
-CALM = "_calm"
+CALM = " (calm)"
 #: What an effect of a sensor may be searched over here.
 SEARCHED: tuple[set[str], ...] = (set(), {"time"}, {"frequency"})
 #: Rounds that find the true input from its reading: each leaves the square of what was wrong.
@@ -223,7 +223,7 @@ class Candidate:
 
     @property
     def calm(self) -> str:
-        """Name of the signal without its noise, as it most likely was: `a_calm`."""
+        """Name of the signal without its noise, as it most likely was: `a (calm)`."""
         return f"{self.on}{CALM}"
 
     @property
@@ -259,7 +259,7 @@ class Candidate:
         """What share of its signal the effect leaves, of the axis that it takes most of.
 
         Of an input the slope of the true one in its reading, of an output that of the reading in
-        its prediction; the median over samples of `signals` (N, …).
+        its prediction; no more than that at nine tenths of the samples of `signals` (N, …).
         """
         values = {s.name: ca.SX.sym(s.name, s.size) for s in self.reads}
         value = values.setdefault(self.on, ca.SX.sym("value", signals[self.on].shape[1]))
@@ -274,7 +274,7 @@ class Candidate:
         found = ca.Function("slope", [*values.values()], [ca.densify(slope)])
         every = slice(None, None, max(1, len(signals[self.on]) // SAMPLES))
         rows = found.map(len(signals[self.on][every]))(*(signals[n][every].T for n in values))
-        return float(np.nanmin(np.nanmedian(np.abs(np.asarray(rows)), axis=1)))
+        return float(np.nanmin(np.nanquantile(np.abs(np.asarray(rows)), 0.9, axis=1)))
 
     def sensed(self, value: SX, k: SX, body: Body) -> SX:
         """What a sensor with an effect of the sensors' catalogue reads."""
