@@ -204,6 +204,35 @@ def test_from_a_ship_that_keeps_its_course_a_target_may_be_near_and_slow_or_far_
     assert told.rank == 4
 
 
+@dynamics
+def pond(
+    counted=signal("1"),
+    *,
+    fish=state(start=100.0),
+    seen=state(start=0.1),
+    death=state("1/s", start=0.1),
+    catch=state("1/s", start=0.1),
+):
+    """Fish of which a share is counted."""
+    rates = {"fish": -(death + catch) * fish}
+    return Motion(rates=rates, outputs=(measured(counted, seen * fish, std=0.05),))
+
+
+def test_what_one_hidden_number_takes_along_is_not_determined_either():
+    """More fish and a smaller share are counted alike, and so are deaths and a catch: four numbers,
+    and a fish more moves the share by a thousandth, which is more than the count would allow."""
+    counts = 0.1 * 100 * np.exp(-0.2 * T)
+    assert np.allclose(counts, 0.05 * 200 * np.exp(-(0.13 + 0.07) * T))
+    noisy = counts + 0.05 * np.random.default_rng(0).standard_normal(len(T))
+    told = observe_motion(pond, Run.raw("r", {"counted": noisy[:, None]}, units={}, time=T))
+    assert told.rank == 2
+    assert told.std == {name: [None] for name in ("fish", "seen", "death", "catch")}
+    product, rates = told.unobservable
+    assert product.startswith("fish +1, seen -")
+    assert float(re.findall(r"-[0-9.]+", product)[0]) == pytest.approx(-0.001, rel=0.02)
+    assert rates == "death +1, catch -1 together change no reading"
+
+
 def test_what_is_told_whatever_some_directions_are_is_the_inverse_of_the_others_covariance():
     M = np.random.default_rng(0).standard_normal((6, 6))
     M[:, 3] *= 1e5

@@ -279,16 +279,20 @@ def observed(model: Dynamics, W: Array) -> Observed:
     null = null / np.maximum(np.linalg.norm(null, axis=0), 1e-300)
     kept = vectors[:, :rank] / np.sqrt(np.maximum(values[:rank], 1e-300))
     std = np.sqrt(np.sum(kept**2, axis=1)) / scale
-    hidden = np.abs(null / prior[:, None])
-    touched = (hidden > RESIDUE * hidden.max(axis=0, initial=0.0)).any(axis=1)
-    words, weak = tuple(_words(model, null)), tuple(_weak(model, W, rank))
+    basis = sparsest(null).T
+    touched = np.array([_parts(model, n, RESIDUE, std) for n in basis]).any(axis=0)
+    words = tuple(sentence(model, n, std) for n in basis)
+    weak = tuple(_weak(model, W, rank))
     return Observed(rank, model.size, values, words, weak, null, np.where(touched, np.nan, std), W)
 
 
-def _words(model: Dynamics, null: Array) -> Sequence[str]:
-    """Each unobservable direction as a sentence."""
-    basis = sparsest(null)
-    return [sentence(model, basis[:, k]) for k in range(basis.shape[1])]
+def _parts(model: Dynamics, direction: Array, residue: float, std: Array) -> Array:
+    """Which numbers (n,) a direction touches: those that it moves by a share `residue` of what was
+    known beforehand where the most is moved by all of that, or else by more than their `std`."""
+    prior = np.sqrt(np.diag(model.start_covariance))
+    share = np.abs(direction / prior)
+    most = share.max(initial=1e-300)
+    return np.asarray((share > residue * most) | (np.abs(direction) > std * most))
 
 
 def _weak(model: Dynamics, W: Array, rank: int) -> Iterator[str]:
@@ -314,20 +318,21 @@ def _clear(model: Dynamics, direction: Array) -> Array:
     return found
 
 
-def sentence(model: Dynamics, direction: Array) -> str:
-    """ "gravity and bias along (0.27, 0.53, 0.80) move together: no reading changes" """
-    subject, alone = _subject(model, direction)
+def sentence(model: Dynamics, direction: Array, std: Array | float = np.inf) -> str:
+    """ "gravity and bias along (0.27, 0.53, 0.80) move together: no reading changes"
+
+    `std`: what else is told of each number."""
+    subject, alone = _subject(model, direction, std=std)
     if " along the body axis " in subject:
         return f"{subject}: no reading changes"
     return f"{subject} changes no reading" if alone else f"{subject} together change no reading"
 
 
-def _subject(model: Dynamics, direction: Array, residue: float = RESIDUE) -> tuple[str, bool]:
-    """What moves in a direction, in words, without what is below a share `residue` of it; is it a
-    single number?"""
-    prior = np.sqrt(np.diag(model.start_covariance))
-    share = np.abs(direction / prior)
-    direction = np.where(share > residue * share.max(), direction, 0.0)
+def _subject(
+    model: Dynamics, direction: Array, residue: float = RESIDUE, std: Array | float = np.inf
+) -> tuple[str, bool]:
+    """What moves in a direction, in words, as far as it touches it; is it a single number?"""
+    direction = np.where(_parts(model, direction, residue, np.asarray(std)), direction, 0.0)
     parts = [(name, direction[where]) for name, where in model.slices().items()
              if np.any(direction[where])]  # fmt: skip
     if len(parts) > 1 and all(len(v) == 3 for _, v in parts):
