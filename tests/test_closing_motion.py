@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 
+import casadi as ca
 import flights
 import numpy as np
 import pytest
@@ -24,7 +25,7 @@ from casest.diagnose.protocol import ranked
 from casest.dynamics import Motion, constraint, dynamics, measured, state
 from casest.dynamics.filter import filtered
 from casest.dynamics.likelihood import first_guess, likelihood, matched, prepared
-from casest.effects.moving import Colour, extended
+from casest.effects.moving import Body, Colour, extended
 from casest.results.motion import motion_result, rms_settled, sentence
 from casest_problems.bias_gravity import bias_gravity, bias_gravity_position
 
@@ -53,6 +54,24 @@ def test_a_flight_that_lacks_nothing_is_adequate():
     result = motion_result(closing, model_name="bias-gravity", data=[])
     assert result.verdict == "adequate"
     assert result.before.rmse_holdout == result.after.rmse_holdout
+
+
+@pytest.mark.long
+def test_a_body_in_its_place_beside_a_noisy_gyro_lacks_nothing():
+    """A factor that took the accelerometer away, and with it its noise, explained zero best."""
+    t = np.arange(0, 60, 0.02)
+    rate, _ = flights.SPINS["all axes, 1 °/s"]
+    rng, sigma = np.random.default_rng(0), {"a": 0.02, "omega": np.radians(1.0), "v": 0.01}
+    exact = {
+        "a": flights.BIAS - flights.spun(rate, t),
+        "omega": rate(t),
+        "v": np.zeros((len(t), 3)),
+    }
+    signals = {n: x + sigma[n] * rng.standard_normal(x.shape) for n, x in exact.items()}
+    run = Run.raw("spun", signals, units=flights.UNITS, time=t)
+    model = bias_gravity.sensing(**{n: s**2 * 0.02 for n, s in sigma.items()})
+    closing = close_motion(model, run)
+    assert (closing.verdict, names(closing)) == ("adequate", [])
 
 
 @pytest.mark.long
@@ -225,6 +244,71 @@ def test_readings_that_were_moved_are_given_back_in_their_rows():
 
 
 # -- its parts ---------------------------------------------------------------------------------
+
+
+@dynamics
+def sledge(
+    a=signal("m/s^2"),
+    v=signal("m/s"),
+    *,
+    speed=state("m/s", std=1.0),
+    bias=state("m/s^2", std=1.0),
+):
+    """On rails: an accelerometer with a bias, and a speed."""
+    return Motion(rates={"speed": a - bias}, outputs=(measured(v, speed, std=0.01),))
+
+
+def standing(std):
+    """A record of the sledge in its place, an accelerometer with a bias and so much noise."""
+    t, rng = np.arange(0, 20, 0.02), np.random.default_rng(0)
+    a = 0.3 + std * rng.standard_normal((len(t), 1))
+    v = 0.01 * rng.standard_normal((len(t), 1))
+    return Run.raw("r", {"a": a, "v": v}, units={"a": "m/s^2", "v": "m/s"}, time=t)
+
+
+@pytest.mark.parametrize("std", [0.05, 0.5])
+def test_noise_that_an_effect_would_take_away_is_no_evidence_for_it(std):
+    """A reading of noise about a constant says nothing of a factor: the bias may follow any."""
+    model = sledge.sensing(a=std**2 * 0.02)
+    run = with_columns(model, standing(std))
+    fit = fitted(model, run, filtered(model, run).smoothed)
+    labels = ("gain of a", "gain_by_sign of a", "quadratic of a", "cubic of a")
+    subject = Innovations(run, tuple(c for c in candidates(model, run) if c.label in labels))
+    trials = subject.trials(fit)
+    assert len(trials) == len(labels)
+    for trial in trials:
+        better = subject.refit(fit, [trial])
+        if isinstance(better, str):
+            assert better.startswith("it would leave 0.0")
+        else:
+            assert abs(rise(better, fit)) < 0.5
+
+
+def test_a_true_input_is_found_from_its_reading_however_large_the_effect_is():
+    found = {c.label: c for c in candidates(sledge, with_columns(sledge, standing(0.05)))}
+    reading, k = np.array([[2.0], [-2.0]]), ca.SX.sym("k")
+
+    def true(label, value):
+        y = ca.SX.sym("y")
+        changed = found[label].changed(y, k, Body(read={"a": y}))
+        function = ca.Function("true", [y, k], [changed])
+        return np.array([float(function(r, value)) for r in reading[:, 0]])
+
+    for value in (0.98, -0.98):  # 1 + k above zero, 1 - k below
+        expected = reading[:, 0] / (1 + value * np.sign(reading[:, 0]))
+        np.testing.assert_allclose(true("gain_by_sign of a", value), expected, rtol=1e-12)
+    root = (np.sqrt(1 + 4 * 0.05 * reading[:, 0]) - 1) / (2 * 0.05)
+    np.testing.assert_allclose(true("quadratic of a", 0.05), root, rtol=1e-9)
+
+
+def test_what_an_effect_leaves_of_its_signal():
+    found = {c.label: c for c in candidates(sledge, with_columns(sledge, standing(0.05)))}
+    signals = {"a": np.full((3, 1), 2.0), "v": np.array([[3.0], [np.nan], [3.0]])}
+    left = {("gain of a", 3.0): 0.25, ("gain of v", -0.9): 0.1, ("bias of v", 7.0): 1.0,
+            ("time_delay of v", 0.3): 1.0, ("dead_zone of v", 4.0): 0.0}  # fmt: skip
+    for (label, k), share in left.items():
+        assert found[label].left_of(np.array([k]), signals) == pytest.approx(share)
+    assert found["quadratic of a"].left_of(np.array([1e7]), signals) < 1e-3
 
 
 def test_readings_slower_than_the_inputs_are_enough():

@@ -75,9 +75,16 @@ class Sampled:
     parts: int
 
     @classmethod
-    def of(cls, model: Dynamics, run: Run, pace: Pace | None = None) -> Sampled:
-        """`pace`: how the whole record is read where this is a part of it."""
-        time, calm = checked_record(model, run), estimates(model, run)
+    def of(
+        cls,
+        model: Dynamics,
+        run: Run,
+        pace: Pace | None = None,
+        calm: Mapping[str, Array] | None = None,
+    ) -> Sampled:
+        """`pace`: how the whole record is read where this is a part of it; `calm`: the estimates of
+        uncertain inputs, where they are known already."""
+        time, calm = checked_record(model, run), estimates(model, run) if calm is None else calm
         u, step, pace = _inputs(model, run, calm), np.diff(time), pace or Pace.of(model, run)
         signals = (*(run.signals[s.name] for s in model.signals), *calm.values())
         return cls(
@@ -103,6 +110,11 @@ class Sampled:
         """The state a step after x (n,) at a sample."""
         given = [part[sample] for part in (*self.ends, self.steps, self.shares)]
         return np.array(_motion(self.model, self.parts)(x, *given)[0], float).ravel()
+
+    def followed(self, x: Array) -> Array:
+        """States (N, n) without noise from x (n,) at the first sample."""
+        (after,) = _following(self.model, self.parts)(x, [*self.ends, self.steps, self.shares])
+        return np.vstack([x, after])
 
     def read(self, along: Array, first: int = 0) -> tuple[Array, Array, Array]:
         """C, d and y at states (K, n), that of sample `first` before."""
@@ -152,6 +164,14 @@ def _step(model: Dynamics, count: int) -> AtSamples:
     x, (u, v, h, share) = model.traced.x, _two_samples(model)
     end, Phi, Q = _motion(model, count)(x, u, v, h, share)
     return AtSamples(ca.vertcat(x, u, v, h, share), [Phi, end - Phi @ x, Q])
+
+
+@lru_cache(maxsize=8)
+def _following(model: Dynamics, count: int) -> Recursion:
+    """(x, numbers of one step) -> x after it."""
+    x, numbers = ca.SX.sym("x", model.size), _two_samples(model)
+    after = _motion(model, count)(x, *numbers)[0]
+    return Recursion(ca.Function("follow", [x, ca.vertcat(*numbers)], [after], {"cse": True}))
 
 
 @lru_cache(maxsize=8)

@@ -7,7 +7,7 @@ products of transition matrices, and the ODE −Ẇ = AᵀW + WA + CᵀΘ⁻¹C,
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import casadi as ca
@@ -17,6 +17,8 @@ from casest.data.run import Run
 from casest.declaration.shapes import Array
 from casest.dynamics.between import motions
 from casest.dynamics.declare import Dynamics
+from casest.dynamics.information import even, rank_of, spectrum, without
+from casest.dynamics.path import Parts, Path
 from casest.dynamics.transition import (
     Linearised,
     Pace,
@@ -35,9 +37,6 @@ RESIDUE = 5e-3
 #: The same in a direction that is told badly, which has no exact shape: of all states, and within
 #: one of them.
 BLURRED, WITHIN = 0.02, 0.1
-#: A direction counts as observable from this share of the largest scaled eigenvalue on. Rounding
-#: and the error of a fourth-order step stay below 1e-13.
-NULL = 1e-11
 #: Steps whose product is kept, and samples that are worked on at once.
 CHUNK, PIECE = 256, 4096
 #: Chunks whose single steps are kept: windows that overlap begin and end in the same ones.
@@ -73,10 +72,6 @@ def gramian(model: Dynamics, system: Linearised) -> Array:
     return _reduced(*_of_steps(model, system))[1]
 
 
-#: Φ and W of steps, and the covariance of the motion that nobody knows, where there is one.
-Parts = tuple[Array, Array, Array | None]
-
-
 def _unknown_motion(model: Dynamics, system: Linearised) -> Array | None:
     """Covariance that the noise of inputs adds in every step, (N − 1, n, n)."""
     if system.process.ndim == 2:
@@ -110,22 +105,22 @@ def _reduced(Phi: Array, W: Array, Q: Array | None = None) -> Parts:
     and Φ and Q are those given the readings in between (Särkkä & García-Fernández 2021).
     """
     while len(Phi) > 1:
-        even = len(Phi) // 2 * 2
-        first, second = slice(0, even, 2), slice(1, even, 2)
+        whole = len(Phi) // 2 * 2
+        first, second = slice(0, whole, 2), slice(1, whole, 2)
         later, told = Phi[second], W[second]
         if Q is not None:
             both = _over_noise(Q[first], np.concatenate([Phi[first], Q[first]], axis=2), told)
             n = Phi.shape[1]
             W1 = W[first] + Phi[first].transpose(0, 2, 1) @ told @ both[:, :, :n]
             noise = later @ both[:, :, n:] @ later.transpose(0, 2, 1) + Q[second]
-            Q = np.concatenate([_even(noise), Q[even:]])
+            Q = np.concatenate([even(noise), Q[whole:]])
             products = later @ both[:, :, :n]
         else:
             W1 = W[first] + Phi[first].transpose(0, 2, 1) @ told @ Phi[first]
             products = later @ Phi[first]
-        W = np.concatenate([_even(W1), W[even:]])
-        Phi = np.concatenate([products, Phi[even:]])
-    return Phi[0], _even(W)[0], None if Q is None else Q[0]
+        W = np.concatenate([even(W1), W[whole:]])
+        Phi = np.concatenate([products, Phi[whole:]])
+    return Phi[0], even(W)[0], None if Q is None else Q[0]
 
 
 def _over_noise(Q: Array, right: Array, W: Array) -> Array:
@@ -138,37 +133,37 @@ def _over_noise(Q: Array, right: Array, W: Array) -> Array:
     )
 
 
-def _even(M: Array) -> Array:
-    return np.asarray(0.5 * (M + np.swapaxes(M, -1, -2)))
-
-
 @dataclass(frozen=True)
 class Products:
     """A model along a record of any length, chunk by chunk: Φ and W of each, (K, n, n); and Q.
 
-    `system`: the model along all of it, where it is known already.
+    `along`: where a nonlinear one goes; `system`: a linear one along all of it, where it is known
+    already; `unseen`: at a sample the directions (n, k) that no record shows, so that this does not
+    either, or how many of n can be seen at most.
     """
 
     model: Dynamics
     run: Run
-    along: Array | None
+    along: Path | None
     pace: Pace
     system: Linearised | None
     Phi: Array
     W: Array
     Q: Array | None
+    unseen: Callable[[int], Array | int] | None = None
     recent: dict[int, Parts] = field(default_factory=dict, compare=False, repr=False)
 
     @staticmethod
     def of(
-        model: Dynamics, run: Run, along: Array | None = None, system: Linearised | None = None
+        model: Dynamics, run: Run, along: Path | None = None, system: Linearised | None = None
     ) -> Products:
-        """`along`: states (N, n) along which a nonlinear model is linearised."""
+        """`along`: where a nonlinear model goes."""
         step, n = np.diff(checked_record(model, run)), model.size
         holed = any(not np.isfinite(run.signals[name]).all() for name in model.measured_signals)
         none = np.zeros((-(-len(step) // CHUNK), n, n))
         pace = replace(Pace.of(model, run), holed=holed)
-        Q = none.copy() if system is not None and system.process.ndim == 3 else None
+        noisy = along.noisy if along else system is not None and system.process.ndim == 3
+        Q = none.copy() if noisy else None
         found = Products(model, run, along, pace, system, none, none.copy(), Q)
         for k in range(0, len(step), PIECE):
             Phi, W, noise = found._steps(k, min(k + PIECE, len(step)))
@@ -184,16 +179,20 @@ class Products:
             self.Q[k] = Q
 
     def _steps(self, first: int, last: int) -> Parts:
+        if self.along is not None:
+            return self.along.steps(first, last)
         where = slice(first, last + 1)
         if self.system is not None:
             return _of_steps(self.model, self.system.part(where, self.pace.part(where)))
-        along = None if self.along is None else self.along[where]
-        system = linearised(self.model, self.run.take(where), along, self.pace.part(where))
+        system = linearised(self.model, self.run.take(where), None, self.pace.part(where))
         return _of_steps(self.model, system)
 
     def gramian(self, first: int = 0, last: int | None = None) -> Array:
         """W (n, n) of the samples from `first` to `last`, at the first; of all unless told."""
-        last = len(self.run) - 1 if last is None else last
+        W = self._told(first, len(self.run) - 1 if last is None else last)
+        return W if self.unseen is None else without(W, self.unseen(first))
+
+    def _told(self, first: int, last: int) -> Array:
         begin, end = -(-first // CHUNK), last // CHUNK
         if begin >= end:
             return _reduced(*_joined(self._singles(first, last)))[1]
@@ -274,35 +273,26 @@ def _entries(matrices: Array, like: ca.SX) -> Array:
 def observed(model: Dynamics, W: Array) -> Observed:
     """Rank, unobservable directions in words, and the standard deviations that the data allow."""
     prior = np.sqrt(np.diag(model.start_covariance))
-    values, vectors, scale = _spectrum(W, prior)
-    rank = _rank(values)
+    values, vectors, scale = spectrum(W, prior)
+    rank = rank_of(values)
     null = vectors[:, rank:] / scale[:, None]
     null = null / np.maximum(np.linalg.norm(null, axis=0), 1e-300)
     kept = vectors[:, :rank] / np.sqrt(np.maximum(values[:rank], 1e-300))
     std = np.sqrt(np.sum(kept**2, axis=1)) / scale
-    hidden = np.abs(null / prior[:, None])
-    touched = (hidden > RESIDUE * hidden.max(axis=0, initial=0.0)).any(axis=1)
-    words, weak = tuple(_words(model, null)), tuple(_weak(model, W, rank))
+    basis = sparsest(null).T
+    touched = np.array([_parts(model, n, RESIDUE, std) for n in basis]).any(axis=0)
+    words = tuple(sentence(model, n, std) for n in basis)
+    weak = tuple(_weak(model, W, rank))
     return Observed(rank, model.size, values, words, weak, null, np.where(touched, np.nan, std), W)
 
 
-def _spectrum(W: Array, prior: Array) -> tuple[Array, Array, Array]:
-    """Eigenvalues, largest first, and vectors of W scaled to a unit diagonal, and that scale; where
-    the diagonal is zero, what is known beforehand is."""
-    told = np.diag(W) > 0
-    scale = np.where(told, np.sqrt(np.where(told, np.diag(W), 1.0)), 1 / prior)
-    values, vectors = np.linalg.eigh(W / np.outer(scale, scale))
-    return values[::-1], vectors[:, ::-1], scale
-
-
-def _rank(values: Array) -> int:
-    return int(np.sum(values > NULL * values[0])) if values[0] > 0 else 0
-
-
-def _words(model: Dynamics, null: Array) -> Sequence[str]:
-    """Each unobservable direction as a sentence."""
-    basis = sparsest(null)
-    return [sentence(model, basis[:, k]) for k in range(basis.shape[1])]
+def _parts(model: Dynamics, direction: Array, residue: float, std: Array) -> Array:
+    """Which numbers (n,) a direction touches: those that it moves by a share `residue` of what was
+    known beforehand where the most is moved by all of that, or else by more than their `std`."""
+    prior = np.sqrt(np.diag(model.start_covariance))
+    share = np.abs(direction / prior)
+    most = share.max(initial=1e-300)
+    return np.asarray((share > residue * most) | (np.abs(direction) > std * most))
 
 
 def _weak(model: Dynamics, W: Array, rank: int) -> Iterator[str]:
@@ -328,20 +318,21 @@ def _clear(model: Dynamics, direction: Array) -> Array:
     return found
 
 
-def sentence(model: Dynamics, direction: Array) -> str:
-    """ "gravity and bias along (0.27, 0.53, 0.80) move together: no reading changes" """
-    subject, alone = _subject(model, direction)
+def sentence(model: Dynamics, direction: Array, std: Array | float = np.inf) -> str:
+    """ "gravity and bias along (0.27, 0.53, 0.80) move together: no reading changes"
+
+    `std`: what else is told of each number."""
+    subject, alone = _subject(model, direction, std=std)
     if " along the body axis " in subject:
         return f"{subject}: no reading changes"
     return f"{subject} changes no reading" if alone else f"{subject} together change no reading"
 
 
-def _subject(model: Dynamics, direction: Array, residue: float = RESIDUE) -> tuple[str, bool]:
-    """What moves in a direction, in words, without what is below a share `residue` of it; is it a
-    single number?"""
-    prior = np.sqrt(np.diag(model.start_covariance))
-    share = np.abs(direction / prior)
-    direction = np.where(share > residue * share.max(), direction, 0.0)
+def _subject(
+    model: Dynamics, direction: Array, residue: float = RESIDUE, std: Array | float = np.inf
+) -> tuple[str, bool]:
+    """What moves in a direction, in words, as far as it touches it; is it a single number?"""
+    direction = np.where(_parts(model, direction, residue, np.asarray(std)), direction, 0.0)
     parts = [(name, direction[where]) for name, where in model.slices().items()
              if np.any(direction[where])]  # fmt: skip
     if len(parts) > 1 and all(len(v) == 3 for _, v in parts):
@@ -403,7 +394,7 @@ def over_windows(products: Products, window: float, count: int = 60) -> Windows:
         last = max(int(np.searchsorted(time, end + 1e-12)) - 1, first + 1)
         W = products.gramian(first, last)
         values, axes = np.linalg.eigh(W * np.outer(prior, prior))
-        values[: len(values) - _rank(_spectrum(W, prior)[0])] = 0.0  # rounding
+        values[: len(values) - rank_of(spectrum(W, prior)[0])] = 0.0  # rounding
         found.append(values)
         stds.append(prior * np.sqrt(axes**2 @ (1 / (1 + np.maximum(values, 0.0)))))
     return Windows(np.asarray(ends, float), np.array(found), np.array(stds))

@@ -60,17 +60,19 @@ def uncertain(model: Dynamics) -> tuple[str, ...]:
 
 
 def estimates(model: Dynamics, run: Run) -> dict[str, Array]:
-    """Every uncertain input as it most likely was, (N, k), by name; on each side of a gap apart."""
-    found = {}
-    for name in uncertain(model):
-        time, values = run.clock(name), run.recorded(name)
-        step = np.diff(time)
-        gap = longest(step)
-        usual, gaps = float(np.mean(step[step <= gap])), np.flatnonzero(step > gap) + 1
-        variance = model.sensors[name] / usual
-        own = np.concatenate([estimate(part, variance) for part in np.split(values, gaps)])
-        found[name] = own if len(own) == len(run) else _between(model, name, run, time, own)
-    return found
+    """Every uncertain input as it most likely was, (N, k), by name."""
+    return {name: estimated(model, run, name) for name in uncertain(model)}
+
+
+def estimated(model: Dynamics, run: Run, name: str) -> Array:
+    """An input as it most likely was, (N, k); on each side of a gap apart."""
+    time, values = run.clock(name), run.recorded(name)
+    step = np.diff(time)
+    gap = longest(step)
+    usual, gaps = float(np.mean(step[step <= gap])), np.flatnonzero(step > gap) + 1
+    variance = model.sensors.get(name, 0.0) / usual
+    own = np.concatenate([estimate(part, variance) for part in np.split(values, gaps)])
+    return own if len(own) == len(run) else _between(model, name, run, time, own)
 
 
 def _between(model: Dynamics, name: str, run: Run, time: Array, values: Array) -> Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from msgspec import UNSET, Struct, UnsetType
@@ -18,8 +19,9 @@ from casest.dynamics.gramian import Products, observed, over_windows
 from casest.dynamics.gramian import Windows as Over
 from casest.dynamics.inputs import smallest, uncertain, unstated
 from casest.dynamics.intensities import period, with_stated
+from casest.dynamics.path import Path
 from casest.dynamics.structural import Structure, structure
-from casest.dynamics.transition import linearised
+from casest.dynamics.structural.unseen import Unseen
 from casest.errors import DeclarationError, UsageError
 from casest.estimate.calibrate import attempt
 from casest.results.file import plain
@@ -203,10 +205,10 @@ def _structural(found: Structure) -> Structural:
     )
 
 
-def _structural_rank(model: Dynamics) -> int | None:
+def _structure(model: Dynamics) -> Structure | None:
     """What a better record could reach; None where it cannot be said."""
     try:
-        return structure(model).rank
+        return structure(model)
     except DeclarationError:
         return None
 
@@ -222,11 +224,12 @@ def observe_motion(
     """What a trajectory makes observable, by the Gramian over the whole record and over windows.
 
     `std` is what the readings alone allow at the beginning of the record, per state. A nonlinear
-    model is linearised along its smoothed states.
+    model is linearised along a trajectory of its own (`path`).
     """
     noisy = unstated(model, run)
     model = with_stated(model, run, noisy)
-    products = _products(model, run)
+    most = _structure(model)
+    products = _products(model, run, most)
     seen = observed(model, products.gramian())
     time = np.asarray(run.time, float)
     duration, step = float(time[-1] - time[0]), float(np.median(np.diff(time)))
@@ -248,7 +251,7 @@ def observe_motion(
         ],
         rank=seen.rank,
         unknowns=seen.unknowns,
-        structural_rank=_structural_rank(model),
+        structural_rank=most.rank if most else None,
         unobservable=list(seen.unobservable),
         weak=list(seen.weak),
         std=std,
@@ -309,15 +312,20 @@ def _gaps(time: Array, rows: Array, where: str) -> list[str]:
     ]
 
 
-def _products(model: Dynamics, run: Run) -> Products:
-    """In pieces; at once where the noise of inputs is known, as its estimates are of the whole."""
-    along = None if model.linear else filtered(model, run).smoothed
-    if model.input_noise is None:
-        return Products.of(model, run, along)
+def _products(model: Dynamics, run: Run, most: Structure | None) -> Products:
+    """In pieces; at once where the noise of inputs is known, as its estimates are of the whole.
+
+    Of a nonlinear model never more than `most`, what any record could show: it is linearised where
+    its states are thought to be, and what is wrong with that may show what they cannot.
+    """
     if not model.linear:
-        system = linearised(model, run, along)
-    else:  # as the filter goes, which no bound may be above
-        system = filtered(model, run).system if uncertain(model) else coefficients(model, run)
+        path, unseen = Path.of(model, run), Unseen.of(most, run) if most else None
+        hidden = None if unseen is None else lambda k: unseen.at(path.x[k], k)
+        return replace(Products.of(model, run, path), unseen=hidden)
+    if model.input_noise is None:
+        return Products.of(model, run)
+    # As the filter goes, which no bound may be above.
+    system = filtered(model, run).system if uncertain(model) else coefficients(model, run)
     return Products.of(model, run, system=system)
 
 

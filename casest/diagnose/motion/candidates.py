@@ -16,7 +16,9 @@ from casest.declaration.symbols import Signal
 from casest.diagnose.candidates.candidates import WARM, channels
 from casest.diagnose.candidates.repeated import signals_of
 from casest.dynamics.declare import Dynamics
+from casest.dynamics.inputs import estimated
 from casest.effects.moving import (
+    CALM,
     CATALOGUE,
     Body,
     Candidate,
@@ -30,7 +32,8 @@ from casest.errors import CasestError
 
 
 def prepared(model: Dynamics, run: Run) -> Run:
-    """The run with its time, from its first sample on, and usable columns as signals.
+    """The run with its time, from its first sample on, usable columns as signals, and inputs
+    without their noise.
 
     Not a column that is called as a state is.
     """
@@ -40,7 +43,12 @@ def prepared(model: Dynamics, run: Run) -> Run:
     signals = {n: v for n, v in found.signals.items() if n in own or n not in taken}
     if "t" not in own and run.time is not None:
         signals["t"] = (np.asarray(run.time, float) - float(run.time[0]))[:, None]
+    signals |= {f"{n}{CALM}": estimated(model, run, n) for n in _inputs(model)}
     return replace(found, signals=signals)
+
+
+def _inputs(model: Dynamics) -> list[str]:
+    return [s.name for s in model.signals if _place(model, s) == "input" and s.name != "t"]
 
 
 def candidates(model: Dynamics, run: Run) -> list[Candidate]:
@@ -50,6 +58,7 @@ def candidates(model: Dynamics, run: Run) -> list[Candidate]:
         for s in model.signals:
             found += _of_motion(model, run, own, s)
     used = {s.name for s in model.signals} | {s.name for s in model.states} | {"t"}
+    used |= {f"{n}{CALM}" for n in _inputs(model)}
     warm, _ = channels(used, [run], signals_of({s.name for s in model.signals}, (), [run]))
     for effect in of_sensors():
         for s in model.signals:

@@ -17,7 +17,10 @@ from casest.diagnose.motion.fit import Fit, fitted, rise
 from casest.diagnose.motion.sensitivity import sensitivity
 from casest.diagnose.protocol import Kept, Subject
 from casest.effects.moving import Candidate
+from casest.errors import DataError
 
+#: Share of its signal that an effect has to leave.
+LEFT = 0.1
 #: Times that a refit goes on where its scoring has not come to an end.
 AGAIN = 3
 
@@ -81,12 +84,12 @@ class Innovations(Subject[Fit]):
                     fit.base, self.run, along, added=numbers, colour=fit.colour, start=start,
                     bounded=fit.bounded,
                 )  # fmt: skip
-            except np.linalg.LinAlgError as error:
+            except (np.linalg.LinAlgError, DataError) as error:
                 return f"its refit fails: {error}"
             if not np.isfinite(found.likelihood):
                 return "its refit fails"
             if found.trusted:
-                return found
+                return _taken_away(found) or found
             numbers, along, start = found.added, found.found.smoothed, found.intensities
         return "its refit does not come to an end"
 
@@ -111,6 +114,16 @@ class Innovations(Subject[Fit]):
         return linear.without(others, -(columns @ value)), Trial(
             kept.what, kept.what.label, columns
         )
+
+
+def _taken_away(fit: Fit) -> str:
+    """Which effect leaves nothing of its signal: what is taken away explains readings of zero, and
+    is no error of a sensor."""
+    for candidate, numbers in fit.added:
+        left = candidate.left_of(numbers, fit.run.signals)
+        if left < LEFT:
+            return f"it would leave {left:.2g} of {candidate.on}"
+    return ""
 
 
 def _rows(fit: Fit) -> NDArray[np.int_]:

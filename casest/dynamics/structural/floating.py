@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -44,7 +45,7 @@ class Ranked:
 
 def finite(model: Dynamics) -> None:
     """Raise DeclarationError where no point is found at which rates and outputs are finite."""
-    _Lie(model, varying=True).points(np.random.default_rng(0), 1)
+    Lie(model, varying=True).points(np.random.default_rng(0), 1)
 
 
 def ranked(model: Dynamics, varying: bool, seed: int, known: Sequence[int] = ()) -> Ranked:
@@ -52,12 +53,12 @@ def ranked(model: Dynamics, varying: bool, seed: int, known: Sequence[int] = ())
 
     `known` are the places of states whose value at the beginning is known.
     """
-    lie = _Lie(model, varying)
+    lie = Lie(model, varying)
     points = lie.points(np.random.default_rng(seed), POINTS)
     rank, order = 0, -1
     while True:
         order += 1
-        found = [_ranked(lie.jacobian(order, point)) for point in points]
+        found = [null_space(lie.jacobian(order, point)) for point in points]
         before, rank = rank, max(r for r, _, _ in found)
         # Once an order adds nothing, none after it does: each derivative of the Jacobian's rows is
         # then a combination of those before it.
@@ -66,7 +67,7 @@ def ranked(model: Dynamics, varying: bool, seed: int, known: Sequence[int] = ())
     if known:  # each is one more reading, at the beginning alone
         beside = np.eye(model.size)[list(known)]
         stacked = [np.vstack([lie.jacobian(order, point), beside]) for point in points]
-        found = [_ranked(one) for one in stacked]
+        found = [null_space(one) for one in stacked]
         rank = max(r for r, _, _ in found)
     best = [k for k, (r, _, _) in enumerate(found) if r == rank]
     nulls = [found[k][2] for k in best]
@@ -82,7 +83,7 @@ def ranked(model: Dynamics, varying: bool, seed: int, known: Sequence[int] = ())
     )
 
 
-class _Lie:
+class Lie:
     """Derivatives of the readings along the motion, as far as they are asked for."""
 
     def __init__(self, model: Dynamics, varying: bool) -> None:
@@ -109,6 +110,11 @@ class _Lie:
         symbols = self.model.traced.symbols
         return [symbols[n].numel() for n in self.inputs]
 
+    @cached_property
+    def clocks(self) -> Array:
+        """Which numbers of the inputs are time itself."""
+        return np.repeat(self.clock, self._sizes).astype(bool)
+
     def vectors(self, point: Array) -> dict[str, Array]:
         """The inputs of three components at a point."""
         found, place = {}, self.model.size
@@ -129,8 +135,7 @@ class _Lie:
                 x = self.model.start + spread * rng.uniform(-1, 1, n)
             inputs = rng.uniform(0.5, 1.5, (n + 1, size))
             inputs[1:] *= self.varying * rng.choice([-1.0, 1.0], (n, size))
-            clocks = np.repeat(self.clock, self._sizes).astype(bool)
-            inputs[1, clocks], inputs[2:, clocks] = 1.0, 0.0
+            inputs[1, self.clocks], inputs[2:, self.clocks] = 1.0, 0.0
             point = np.concatenate([x, inputs.ravel()])
             if self._holds(point):
                 found.append(point)
@@ -150,17 +155,30 @@ class _Lie:
 
     def jacobian(self, order: int, point: Array) -> Array:
         """Jacobian of all derivatives up to `order` by the state, at a point."""
-        while len(self.derivatives) <= order:
-            self._next()
+        function = self.function(order)
+        return np.asarray(function(point[: function.numel_in(0)]), float)
+
+    def function(self, order: int) -> Any:
+        """The same as a function of the point."""
+        self._reach(order)
         t, links = self.model.traced, self.chain[: order + 1]
         stacked = ca.jacobian(ca.vertcat(*self.derivatives[: order + 1]), t.x)
-        arguments = ca.vertcat(t.x, *links)
-        function = ca.Function("lie", [arguments], [stacked], {"cse": True})
-        return np.asarray(function(point[: arguments.numel()]), float)
+        return ca.Function("lie", [ca.vertcat(t.x, *links)], [stacked], {"cse": True})
+
+    def operations(self, order: int) -> int:
+        """Of the derivative of that order."""
+        self._reach(order)
+        where = ca.vertcat(self.model.traced.x, *self.chain)
+        return int(ca.Function("last", [where], [self.derivatives[order]]).n_instructions())
+
+    def _reach(self, order: int) -> None:
+        while len(self.derivatives) <= order:
+            self._next()
 
 
-def _ranked(jacobian: Array) -> tuple[int, float, Array]:
-    """Rank, gap and null space (n, k) of a Jacobian, whatever the units of rows and columns."""
+def null_space(jacobian: Array, known: int | None = None) -> tuple[int, float, Array]:
+    """Rank (unless it is `known`), gap and null space (n, k) of a Jacobian, whatever the units of
+    rows and columns."""
     n = jacobian.shape[1]
     if not np.all(np.isfinite(jacobian)):
         return 0, 0.0, np.eye(n)
@@ -174,6 +192,7 @@ def _ranked(jacobian: Array) -> tuple[int, float, Array]:
     _, found, right = np.linalg.svd(even)
     values = np.concatenate([found, np.zeros(n - len(found))])
     rank = int(np.sum(values > NULL * values[0])) if values[0] > 0 else 0
+    rank = rank if known is None else known
     rest = max(values[rank] if rank < n else 0.0, 1e-16 * max(values[0], 1e-300))
     null = columns[:, None] * right[rank:].T
     null = null / np.maximum(np.linalg.norm(null, axis=0), 1e-300)

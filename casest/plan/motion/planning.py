@@ -12,8 +12,8 @@ from casest.data.run import Run
 from casest.declaration.shapes import Array
 from casest.declaration.tracing import flat
 from casest.dynamics.declare import Dynamics
-from casest.dynamics.gramian import Observed, gramian, observed
-from casest.dynamics.transition import linearised
+from casest.dynamics.gramian import Observed, Products, observed
+from casest.dynamics.path import Path
 from casest.errors import UsageError
 from casest.plan.motion.limits import Limit
 from casest.plan.motion.program import Task
@@ -155,7 +155,8 @@ def flown(task: Task, u: Array, rate: float) -> Flown:
     units = {s.name: s.unit for s in model.signals}
     run = Run.raw("planned", every, units=units, time=time)
     exact = [1 / s.std**2 if s.known else 0.0 for s in model.states for _ in range(s.size)]
-    W = gramian(model, linearised(model, run, x)) + np.diag(exact)
+    along = None if model.linear else Path.along(model, run, x)
+    W = Products.of(model, run, along).gramian() + np.diag(exact)
     return Flown(run, x, observed(model, W), _shares(task, x, inputs, rate))
 
 
