@@ -1,6 +1,6 @@
 """Pure error: what repeats of one condition scatter, against what is left of their means.
 
-Samples for which the model predicts one value are repeats; so are the samples within a rest
+Samples for which the model predicts one level are repeats; so are the samples within a rest
 interval. The scatter among them is noise whatever the model; means that are further from the model
 than that scatter allows are a misfit (Draper & Smith, Applied Regression Analysis, 1.5).
 """
@@ -15,6 +15,7 @@ import numpy as np
 
 from casest.data.run import Run
 from casest.declaration.shapes import Array
+from casest.diagnose.evidence.held_inputs import held_stretches
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.noise.noise_model import likelihood_of_walk, likelihood_of_white, power
 from casest.leastsquares.per_sample import slope_in_sample
@@ -24,8 +25,8 @@ from casest.leastsquares.problem import Point, Problem
 WITHIN = 10
 #: Neighbours that are looked at for correlation among repeats, at most.
 LAGS = 100
-#: Groups of repeats, and samples in each, below which nothing is said.
-GROUPS, REPEATS = 5, 4
+#: Groups of repeats below which nothing is said.
+GROUPS = 5
 
 
 @dataclass(frozen=True)
@@ -95,20 +96,19 @@ def _between_repeats(
     groups = [
         r[a:b]
         for run, r, level in zip(problem.runs, residuals, levels, strict=True)
-        for a, b in _repeats(run, level, r)
+        for a, b in _repeats(run, level)
     ]
     if len(groups) < GROUPS:
         return None
     return _lack_of_fit(groups, rank)
 
 
-def _repeats(run: Run, level: Array, residual: Array) -> Iterator[tuple[int, int]]:
-    """First and last sample of stretches in one block for which the prediction stays."""
-    still = np.abs(np.diff(level, axis=0)).max(axis=1) <= 1e-6 * max(residual.std(), 1e-300)
-    still &= run.block[1:] == run.block[:-1]
-    edges = np.concatenate([[0], np.flatnonzero(~still) + 1, [len(run)]])
+def _repeats(run: Run, level: Array) -> Iterator[tuple[int, int]]:
+    """First and last sample of stretches in one block over which the prediction is held."""
+    held = held_stretches(level, run.block[1:] != run.block[:-1])
+    edges = np.concatenate([[0], np.flatnonzero(np.diff(held)) + 1, [len(run)]])
     for a, b in pairwise(edges):
-        if b - a >= REPEATS:
+        if held[a] >= 0:
             yield int(a), int(b)
 
 
