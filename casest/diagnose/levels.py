@@ -48,9 +48,10 @@ class Levels:
         3 to 6 degrees of freedom gets there in less than one of a hundred records.
     louder: median third difference, in that of three quarters of the blocks, from which on
         the noise of a block counts as louder: none of 20 000 blocks of white noise on one axis did.
-    jump: by how many times what is held jumps between two levels, in what it jitters there from
-        lowest to highest, and jitters: rows in a stretch that does: of 120 000 rows of noise or of a
-        random walk no more than six stretches of five rows pass. repeats: rows that are the same.
+    jump: by how many times what is held jumps at both ends of a level, in what it jitters there
+        from lowest to highest; jitters: rows of such a level at least. In 120 000 rows of white or
+        coloured noise, of heavy tails or a random walk six levels pass at most. repeats: rows that
+        are the same, at least.
     rows: of a longer record so many, evenly chosen, are looked at.
 
     In motion: suspect: whiteness below which noise with a colour is tried, and insists: gain of
