@@ -1,8 +1,10 @@
 """Pure error: what repeats of one condition scatter, against what is left of their means.
 
-Samples for which the model predicts one level are repeats; so are the samples within a rest
-interval. The scatter among them is noise whatever the model; means that are further from the model
-than that scatter allows are a misfit (Draper & Smith, Applied Regression Analysis, 1.5).
+Samples for which the model predicts one level, or corrects to one, are repeats; so are the samples
+within a rest interval. The scatter among them is noise whatever the model; means that are further
+from the model than that scatter allows are a misfit (Draper & Smith, Applied Regression Analysis,
+1.5). Where a reference is read back, its noise is in both: means of residuals are means of the
+reading less means of the prediction.
 """
 
 from __future__ import annotations
@@ -26,7 +28,7 @@ from casest.leastsquares.problem import Point, Problem
 #: Independent samples that a rest interval's own scatter is known by, at most.
 WITHIN = 10
 #: Samples whose kinship is looked at together, at most.
-PIECE = 32
+PIECE = 64
 #: Colours that are tried: correlation of neighbours, and its share of the variance.
 RHO = (0.3, 0.5, 0.7, 0.8, 0.9, 0.95, 0.98)
 SHARES = (0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 1.0)
@@ -104,10 +106,13 @@ def _between_repeats(
     problem: Problem, point: Point, residuals: Sequence[Array], rank: int
 ) -> PureError | None:
     """Means of repeats against the scatter among them, its colour counted."""
-    predicted = problem.model.traced.predicted
-    if predicted is None or problem.sequential:
+    traced = problem.model.traced
+    met = traced.predicted
+    if met is None and traced.corrected:
+        met = traced.quantities[traced.corrected].value
+    if met is None or problem.sequential:
         return None
-    levels = [v[0][:, :, 0] for v in problem.evaluate(point, {"p": predicted})]
+    levels = [v[0].reshape(len(v[0]), -1) for v in problem.evaluate(point, {"met": met})]
     groups = [
         r[a:b]
         for run, r, level in zip(problem.runs, residuals, levels, strict=True)
@@ -119,7 +124,7 @@ def _between_repeats(
 
 
 def _repeats(run: Run, level: Array) -> Iterator[tuple[int, int]]:
-    """First and last sample of stretches in one block over which the prediction is held."""
+    """First and last sample of stretches in one block over which what is met is held."""
     held = held_stretches(level, run.block[1:] != run.block[:-1])
     edges = np.concatenate([[0], np.flatnonzero(np.diff(held)) + 1, [len(run)]])
     for a, b in pairwise(edges):
@@ -149,13 +154,15 @@ def _inflation(groups: Sequence[Array], series: bool) -> Array:
 
     The noise is white and AR(1) together. In a series memories no longer than a colour's are usual,
     and those count whose likelihood is within a standard deviation of the likeliest; in a table,
-    whose order is nobody's, none is. Any other counts if it shows within the groups.
+    whose order is nobody's, none is. Any other counts if it shows within the groups, and fades
+    there: one that reaches from group to group is a slow course.
     """
     sizes = np.array([len(g) for g in groups])
-    pieces = _pieces(groups, int(np.clip(np.median(sizes), LEVELS.repeats, PIECE)))
-    tried = [(0.0, 0.0), *((rho, share) for rho in RHO for share in SHARES)]
-    likelihood = _likelihood(pieces, tried)
-    usual = np.array([rho for rho, _ in tried]) <= (np.exp(-1 / MEMORY) if series else 0.0)
+    size = int(np.clip(np.median(sizes), LEVELS.repeats, PIECE))
+    longest = np.exp(-LEVELS.fades / max(size, LEVELS.fades * MEMORY))
+    tried = [(0.0, 0.0), *((rho, share) for rho in RHO for share in SHARES if rho < longest)]
+    likelihood = _likelihood(_pieces(groups, size), tried)
+    usual = np.array([rho for rho, _ in tried]) < (np.exp(-1 / MEMORY) if series else 0.01)
     likely = float(likelihood[usual].max())
     allowed = usual & (likelihood >= likely - NEAR)
     allowed |= (likelihood == likelihood.max()) & (likelihood > likely + SHOWS)
