@@ -32,8 +32,8 @@ PIECE = 64
 #: Colours that are tried: correlation of neighbours, and its share of the variance.
 RHO = (0.3, 0.5, 0.7, 0.8, 0.9, 0.95, 0.98)
 SHARES = (0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 1.0)
-#: Log-likelihood of a standard deviation, and of one chance in a hundred.
-NEAR, SHOWS = 0.5, 2.33**2 / 2
+#: Log-likelihood of a standard deviation.
+NEAR = 0.5
 #: Groups of repeats below which nothing is said.
 GROUPS = 5
 
@@ -154,8 +154,8 @@ def _inflation(groups: Sequence[Array], series: bool) -> Array:
 
     The noise is white and AR(1) together. In a series memories no longer than a colour's are usual,
     and those count whose likelihood is within a standard deviation of the likeliest; in a table,
-    whose order is nobody's, none is. Any other counts if it shows within the groups, and fades
-    there: one that reaches from group to group is a slow course.
+    whose order is nobody's, none is. Another one counts if it is likelier by as much, and fades
+    within the groups: what reaches from group to group is a slow course.
     """
     sizes = np.array([len(g) for g in groups])
     size = int(np.clip(np.median(sizes), LEVELS.repeats, PIECE))
@@ -165,7 +165,7 @@ def _inflation(groups: Sequence[Array], series: bool) -> Array:
     usual = np.array([rho for rho, _ in tried]) < (np.exp(-1 / MEMORY) if series else 0.01)
     likely = float(likelihood[usual].max())
     allowed = usual & (likelihood >= likely - NEAR)
-    allowed |= (likelihood == likelihood.max()) & (likelihood > likely + SHOWS)
+    allowed |= (likelihood == likelihood.max()) & (likelihood > likely + NEAR)
     found = [_of_mean(sizes, *tried[k]) for k in np.flatnonzero(allowed)]
     return np.asarray(np.max(found, axis=0))
 
