@@ -80,14 +80,6 @@ def plateaus_of(met: Array, spans: Sequence[slice]) -> Index | None:
     return number if few else None
 
 
-def means(values: Array, plateaus: Index) -> Array:
-    """Of rows (N, …) on each plateau (U, …)."""
-    count = np.bincount(plateaus)
-    flat = values.reshape(len(values), -1)
-    sums = np.stack([np.bincount(plateaus, column) for column in flat.T], axis=1)
-    return np.asarray(sums / count[:, None]).reshape(len(count), *values.shape[1:])
-
-
 @dataclass(frozen=True)
 class Held:
     """A fit to a record with plateaus; causes are of so many `families`."""
