@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from casest import Residual, Run, model, param, quantity, signal
 from casest.diagnose.cross_validation import folded
 from casest.diagnose.misfit.left import Misfit, findings, left_over
+from casest.diagnose.misfit.pure_error import pure_error
 from casest.diagnose.noise.noise_model import equal_noise, lag_one, noise_model
 from casest.diagnose.noise.spectral_line import strongest_line
 from casest.diagnose.noise.tails import outlier_share, outliers_p_value, tails
@@ -163,6 +164,53 @@ def test_positions_that_are_off_by_more_than_their_repeats_scatter_are_a_misfit(
     assert found.where.startswith("between positions: the residual is ")
     # Variance 1 within positions, about 1 between them.
     assert found.fraction == pytest.approx(0.5, abs=0.2)
+
+
+@model
+def one_channel(x=signal("V"), y=signal("V"), *, a=param("V"), b=param()):
+    """A line."""
+    return Residual(measured=y, predicted=a + b * x)
+
+
+def lack_of_fit(rng, jitter, bend=0.0, *, rows=20, timed=True):
+    """Twelve levels one above the other, read back with noise of their own: the test's p-value.
+
+    `bend` is that of the levels beside a line, in standard errors of a level's mean.
+    """
+    level = np.linspace(-1, 1, 12)
+    bent = level**2 - np.mean(level**2)
+    beside = bend / np.sqrt(rows) * bent / bent.std()
+    x = 1000 * np.repeat(level, rows)
+    y = x + np.repeat(beside, rows) + rng.standard_normal(len(x))
+    signals = {"x": (x + jitter(rng, len(x)))[:, None], "y": y[:, None]}
+    run = Run.raw("r", signals, units={}, time=0.1 * np.arange(len(x)) if timed else None)
+    problem = Problem(one_channel, prepared(one_channel, [run]))
+    point = trust_region(problem, problem.start()).point
+    found = pure_error(problem, point, problem.residuals(point), problem.unknowns)
+    return found.p_value
+
+
+JITTER = {
+    "exact": lambda rng, n: 0.0,
+    "small": lambda rng, n: 0.1 * rng.standard_normal(n),
+    "as large as the noise": lambda rng, n: rng.standard_normal(n),
+    "AR(1)": lambda rng, n: 0.7 * autoregressive(n, rng, None)[:, 0],
+}
+
+
+@pytest.mark.parametrize("jitter", JITTER.values(), ids=JITTER)
+def test_levels_that_are_read_back_do_not_lack_fit(jitter):
+    rng = np.random.default_rng(1)
+    p = np.array([lack_of_fit(rng, jitter) for _ in range(40)])
+    assert np.sum(p < 0.01) <= 3  # 0.4 are expected; four come once in a thousand tries
+
+
+@pytest.mark.parametrize(("bend", "timed"), [(3, False), (10, True), (10, False)])
+def test_a_bend_over_levels_that_follow_each_other_is_a_lack_of_fit(bend, timed):
+    """It looks like a slow walk too, and neither is noise."""
+    rng = np.random.default_rng(2)
+    p = [lack_of_fit(rng, JITTER["small"], bend, timed=timed) for _ in range(10)]
+    assert np.sum(np.array(p) < 0.001) >= 9
 
 
 def test_a_narrow_line_is_a_misfit_with_its_frequency():

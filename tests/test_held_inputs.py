@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import casest
-from casest.diagnose.evidence.held_inputs import plateaus_of
+from casest.diagnose.evidence.held_inputs import held_stretches, plateaus_of
 from casest.diagnose.evidence.linear import Linear, parts_of
 from casest.diagnose.evidence.score import Trial
 from casest.diagnose.protocol import ranked_of
@@ -99,3 +99,93 @@ def test_plateaus_are_where_nothing_moves():
     np.testing.assert_array_equal(plateaus_of(held, two), np.repeat([0, 1, 2, 3], 100))
     assert plateaus_of(np.arange(400.0)[:, None], one) is None
     assert plateaus_of(np.zeros((400, 1)), one) is None
+
+
+# -- levels that are read back ---------------------------------------------------------------------
+
+
+def read_back(levels, rows, jitter, rng):
+    return (np.repeat(levels, rows) + jitter * rng.standard_normal(len(levels) * rows))[:, None]
+
+
+def stretches(values, breaks=()):
+    """First row and length of each that is held."""
+    cut = np.zeros(len(values) - 1, dtype=bool)
+    cut[list(breaks)] = True
+    held = held_stretches(values, cut)
+    first, count = np.unique(held[held >= 0], return_counts=True)
+    return list(zip(first.tolist(), count.tolist(), strict=True))
+
+
+@pytest.mark.parametrize("rows", [5, 10, 200])
+def test_levels_that_are_read_back_are_held(rows):
+    """A supply at 5 to 90 V, as a multimeter reads it: 10 or more from lowest to highest."""
+    rng = np.random.default_rng(rows)
+    levels = rng.permutation(np.arange(5.0, 95, 5))
+    found = stretches(read_back(levels, rows, 0.05, rng))
+    assert found == [(k * rows, rows) for k in range(18)]
+
+
+def test_a_reading_that_toggles_between_two_steps_is_held():
+    rng = np.random.default_rng(1)
+    toggles = np.round(read_back(np.arange(0.0, 900, 100), 20, 0.7, rng))
+    assert stretches(toggles) == [(20 * k, 20) for k in range(9)]
+
+
+def test_levels_over_decades_jitter_each_by_its_own():
+    """A microampere to an ampere, good to a ten-thousandth."""
+    rng = np.random.default_rng(2)
+    current = np.repeat(np.logspace(-6, 0, 7), 8) * (1 + 1e-4 * rng.standard_normal(56))
+    assert stretches(current[:, None]) == [(8 * k, 8) for k in range(7)]
+
+
+def test_what_is_on_its_way_from_level_to_level_is_not_held():
+    rng = np.random.default_rng(3)
+    rest, way = read_back([0.0, 100.0], 30, 0.05, rng), np.linspace(0, 100, 22)[1:-1, None]
+    found = stretches(np.concatenate([rest[:30], way, rest[30:]]))
+    assert found == [(0, 30), (50, 30)]
+
+
+def test_a_weight_that_is_put_on_again_is_held_twice():
+    rng = np.random.default_rng(4)
+    found = stretches(read_back([0.0, 50.0, 50.0, 0.0], 30, 0.1, rng), breaks=[29, 59, 89])
+    assert found == [(30 * k, 30) for k in range(4)]
+
+
+def waved(rng):
+    """A compass in the hand: the field turns about three axes, and is noisy."""
+    t = np.arange(3000) / 50
+    a = rng.uniform(0.3, 2, 3) * t[:, None] + rng.uniform(0, 6, 3)
+    x, y = np.cos(a[:, 0]) * np.cos(a[:, 1]), np.sin(a[:, 0]) * np.cos(a[:, 1])
+    return np.stack([x, y, np.sin(a[:, 1])], axis=1) * 50 + 0.3 * rng.standard_normal((3000, 3))
+
+
+@pytest.mark.parametrize(
+    "moving",
+    [
+        lambda rng: np.arange(3000.0)[:, None],
+        lambda rng: np.arange(3000.0)[:, None] + rng.standard_normal((3000, 1)),
+        lambda rng: np.sin(np.arange(3000) / rng.uniform(1, 300))[:, None],
+        lambda rng: np.cumsum(rng.standard_normal((3000, 1)), axis=0),
+        lambda rng: rng.standard_normal((3000, 1)),
+        waved,
+    ],
+    ids=["ramp", "ramp with noise", "sine", "random walk", "white", "waved"],
+)
+def test_what_moves_is_never_cut_into_levels(moving):
+    rng = np.random.default_rng(5)
+    assert sum(len(stretches(moving(rng))) for _ in range(30)) <= 1
+
+
+def test_levels_read_back_that_are_off_are_unexplained():
+    """A supply at eighteen levels, ten readings at each; each level is off by five standard errors.
+
+    So was a power meter of a public record (studies/strangers.md): "what is left is noise".
+    """
+    rng = np.random.default_rng(6)
+    reference = read_back(np.arange(0.1, 1.0, 0.05), 10, 1e-6, rng)[:, 0]
+    off = np.repeat(5 / np.sqrt(10) * rng.standard_normal(18), 10)
+    reading = 0.005 + 2 * reference + 5e-5 * (off + rng.standard_normal(180))
+    closing = casest.close("linear", {"reference": reference, "reading": reading})
+    assert closing.verdict == "unexplained"
+    assert "between positions: the residual is" in closing.misfit.where

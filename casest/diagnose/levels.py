@@ -51,6 +51,10 @@ class Levels:
         3 to 6 degrees of freedom gets there in less than one of a hundred records.
     louder: median third difference, in that of three quarters of the blocks, from which on
         the noise of a block counts as louder: none of 20 000 blocks of white noise on one axis did.
+    jump: by how many times what is held jumps at both ends of a level, in what it jitters there
+        from lowest to highest; jitters: rows of such a level at least. In 120 000 rows of white or
+        coloured noise, of heavy tails or a random walk six levels pass at most. repeats: rows that
+        are the same, at least.
     rows: of a longer record so many, evenly chosen, are looked at.
 
     In motion: suspect: whiteness below which noise with a colour is tried, and insists: gain of
@@ -98,6 +102,9 @@ class Levels:
     rounded: float = 0.45
     outliers: float = 4.0
     louder: float = 2.0
+    jump: float = 10.0
+    jitters: int = 5
+    repeats: int = 4
     rows: int = 12_000
     suspect: float = 0.05
     insists: float = 10.0

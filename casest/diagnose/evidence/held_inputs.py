@@ -7,11 +7,12 @@ plateau to plateau by the F test of their means, as poses are, and within the pl
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from casest.declaration.shapes import Array
 from casest.diagnose.evidence.held_out import clipped
@@ -21,25 +22,62 @@ from casest.diagnose.evidence.score import Trial, judged
 from casest.diagnose.levels import LEVELS
 
 
+def held_stretches(values: Array, breaks: NDArray[np.bool_]) -> Index:
+    """Number of the stretch (N,) over which values (N, q) are held, −1 where they are not.
+
+    They are held where they stay the same, or jitter far less than they jump at both ends; `breaks`
+    (N − 1,) are ends too, whatever the values do there. Stretches that jump among themselves are
+    taken one by one if no row is left out, else as one: a reading that toggles between two steps is
+    held all the same. Thresholds are tried by factors of `LEVELS.jump`, so that none is missed.
+    """
+    steps = np.abs(np.diff(values, axis=0)).max(axis=1)
+    rounding = 1e-9 * float(np.ptp(values, axis=0).max())
+    found = np.full(len(values), -1)
+    for threshold in _thresholds(steps[steps > rounding], rounding):
+        starts = np.concatenate([[0], np.flatnonzero((steps > threshold) | breaks) + 1])
+        sizes = np.diff(np.append(starts, len(values)))
+        top, bottom = np.maximum.reduceat(values, starts), np.minimum.reduceat(values, starts)
+        reach = (top - bottom).max(axis=1)
+        same = (reach <= rounding) & (sizes >= LEVELS.repeats)
+        jitters = (sizes >= LEVELS.jitters) & (LEVELS.jump * reach < _leaps(starts, steps, breaks))
+        wider = (same | jitters) & ~np.logical_and.reduceat(found >= 0, starts)
+        rows = np.repeat(wider, sizes)
+        found[rows] = np.repeat(starts, sizes)[rows]
+    return found
+
+
+def _thresholds(steps: Array, rounding: float) -> Iterator[float]:
+    """From none on, up to the largest of the steps."""
+    yield rounding
+    threshold, largest = steps.min(initial=np.inf), steps.max(initial=0.0)
+    while threshold < largest:
+        yield float(threshold)
+        threshold *= LEVELS.jump
+
+
+def _leaps(starts: Index, steps: Array, breaks: NDArray[np.bool_]) -> Array:
+    """The smaller jump at the ends of each stretch; the larger where both ends are breaks."""
+    inner = starts[1:] - 1
+    size = np.concatenate([[0.0], steps[inner], [0.0]])
+    free = np.concatenate([[True], breaks[inner], [True]])
+    jump = np.where(free, np.inf, size)
+    least = np.minimum(jump[:-1], jump[1:])
+    return np.where(np.isinf(least), np.maximum(size[:-1], size[1:]), least)
+
+
 def plateaus_of(met: Array, spans: Sequence[slice]) -> Index | None:
     """Number of each row's plateau (N,), where what the sensor met (N, q) is held; else None.
 
     Where plateaus are many, their errors are a noise as any other.
     """
-    change = np.any(np.diff(met, axis=0) != 0, axis=1)
-    change[[span.start - 1 for span in spans if span.start]] = True
-    number = np.concatenate([[0], np.cumsum(change)])
+    breaks = np.zeros(len(met) - 1, dtype=bool)
+    breaks[[span.start - 1 for span in spans if span.start]] = True
+    held = held_stretches(met, breaks)
+    moves = (held[1:] < 0) & np.any(np.diff(met, axis=0) != 0, axis=1)
+    number = np.concatenate([[0], np.cumsum(breaks | moves | (np.diff(held) != 0))])
     count = int(number[-1]) + 1
-    few = 1 < count < LEVELS.series and count * LEVELS.block <= len(met)
+    few = 1 < count < LEVELS.series and count * LEVELS.jitters <= len(met)
     return number if few else None
-
-
-def means(values: Array, plateaus: Index) -> Array:
-    """Of rows (N, …) on each plateau (U, …)."""
-    count = np.bincount(plateaus)
-    flat = values.reshape(len(values), -1)
-    sums = np.stack([np.bincount(plateaus, column) for column in flat.T], axis=1)
-    return np.asarray(sums / count[:, None]).reshape(len(count), *values.shape[1:])
 
 
 @dataclass(frozen=True)

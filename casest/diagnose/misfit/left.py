@@ -148,14 +148,15 @@ def findings(
 ) -> list[Finding]:
     """All that is significant: between repeats, in time, over what is recorded, between runs.
 
-    Of noise that was declared to wander no slow course is asked.
+    Of noise that was declared to wander no slow course is asked, and none from repeat to repeat.
     """
     residuals = problem.residuals(point)
     problem = weighted(problem, problem.values(point))
     freedom = max(problem.residual_count - problem.unknowns, 1)
     sigma = robust_scale(residuals) * float(np.sqrt(problem.residual_count / freedom))
     clipped = _clipped(problem, residuals, sigma)
-    found = _before(problem, point) + _repeats(problem, point, clipped) + _stated(problem, point)
+    found = _before(problem, point) + _stated(problem, point)
+    found += _repeats(problem, point, clipped, wanders=wanders)
     slow = [] if wanders else _slow(problem, point, clipped, sigma)
     follows = _follows(problem, point, clipped, sigma, in_time=not (slow or wanders))
     found += follows + slow
@@ -174,8 +175,10 @@ def _clipped(problem: Problem, residuals: Sequence[Array], sigma: float) -> list
     return found if kept is None else [r * w for r, w in zip(found, kept, strict=True)]
 
 
-def _repeats(problem: Problem, point: Point, clipped: Sequence[Array]) -> list[Finding]:
-    tested = pure_error(problem, point, clipped, problem.unknowns)
+def _repeats(
+    problem: Problem, point: Point, clipped: Sequence[Array], *, wanders: bool
+) -> list[Finding]:
+    tested = pure_error(problem, point, clipped, problem.unknowns, wanders=wanders)
     if tested is None or tested.p_value >= LEVELS.misfit:
         return []
     where = (

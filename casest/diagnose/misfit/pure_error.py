@@ -1,8 +1,10 @@
 """Pure error: what repeats of one condition scatter, against what is left of their means.
 
-Samples for which the model predicts one value are repeats; so are the samples within a rest
-interval. The scatter among them is noise whatever the model; means that are further from the model
-than that scatter allows are a misfit (Draper & Smith, Applied Regression Analysis, 1.5).
+Samples for which the model predicts one level, or corrects to one, are repeats; so are the samples
+within a rest interval. The scatter among them is noise whatever the model; means that are further
+from the model than that scatter allows are a misfit (Draper & Smith, Applied Regression Analysis,
+1.5). Where a reference is read back, its noise is in both: means of residuals are means of the
+reading less means of the prediction.
 """
 
 from __future__ import annotations
@@ -15,17 +17,25 @@ import numpy as np
 
 from casest.data.run import Run
 from casest.declaration.shapes import Array
+from casest.diagnose.evidence.held_inputs import held_stretches
+from casest.diagnose.evidence.linear import Index
 from casest.diagnose.levels import LEVELS
-from casest.diagnose.noise.noise_model import likelihood_of_walk, likelihood_of_white, power
+from casest.diagnose.noise.slow_course import MEMORY
+from casest.estimate.correlation import is_series
 from casest.leastsquares.per_sample import slope_in_sample
 from casest.leastsquares.problem import Point, Problem
 
 #: Independent samples that a rest interval's own scatter is known by, at most.
 WITHIN = 10
-#: Neighbours that are looked at for correlation among repeats, at most.
-LAGS = 100
-#: Groups of repeats, and samples in each, below which nothing is said.
-GROUPS, REPEATS = 5, 4
+#: Samples whose kinship is looked at together, at most.
+PIECE = 64
+#: Colours that are tried: correlation of neighbours, and its share of the variance.
+RHO = (0.3, 0.5, 0.7, 0.8, 0.9, 0.95, 0.98)
+SHARES = (0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 1.0)
+#: Log-likelihood of a standard deviation.
+NEAR = 0.5
+#: Groups of repeats below which nothing is said.
+GROUPS = 5
 
 
 @dataclass(frozen=True)
@@ -42,12 +52,20 @@ class PureError:
 
 
 def pure_error(
-    problem: Problem, point: Point, residuals: Sequence[Array], rank: int
+    problem: Problem,
+    point: Point,
+    residuals: Sequence[Array],
+    rank: int,
+    *,
+    wanders: bool = False,
 ) -> PureError | None:
-    """The test, where there are rest intervals or repeats; `residuals` (N, m) per run, clipped."""
+    """The test, where there are rest intervals or repeats; `residuals` (N, m) per run, clipped.
+
+    Of noise that wanders repeats are none: it is larger between them than within.
+    """
     if any(run.spread for run in problem.runs):
         return _between_rests(problem, point, residuals, rank)
-    return _between_repeats(problem, point, residuals, rank)
+    return None if wanders else _between_repeats(problem, point, residuals, rank)
 
 
 def _between_rests(
@@ -87,102 +105,101 @@ def _equivalent(variances: Array) -> float:
 def _between_repeats(
     problem: Problem, point: Point, residuals: Sequence[Array], rank: int
 ) -> PureError | None:
-    """Means of repeats against the scatter among them, neighbours' correlation counted."""
-    predicted = problem.model.traced.predicted
-    if predicted is None or problem.sequential:
+    """Means of repeats against the scatter among them, its colour counted."""
+    traced = problem.model.traced
+    met = traced.predicted
+    if met is None and traced.corrected:
+        met = traced.quantities[traced.corrected].value
+    if met is None or problem.sequential:
         return None
-    levels = [v[0][:, :, 0] for v in problem.evaluate(point, {"p": predicted})]
+    levels = [v[0].reshape(len(v[0]), -1) for v in problem.evaluate(point, {"met": met})]
     groups = [
         r[a:b]
         for run, r, level in zip(problem.runs, residuals, levels, strict=True)
-        for a, b in _repeats(run, level, r)
+        for a, b in _repeats(run, level)
     ]
     if len(groups) < GROUPS:
         return None
-    return _lack_of_fit(groups, rank)
+    return _lack_of_fit(groups, rank, any(is_series(run) for run in problem.runs))
 
 
-def _repeats(run: Run, level: Array, residual: Array) -> Iterator[tuple[int, int]]:
-    """First and last sample of stretches in one block for which the prediction stays."""
-    still = np.abs(np.diff(level, axis=0)).max(axis=1) <= 1e-6 * max(residual.std(), 1e-300)
-    still &= run.block[1:] == run.block[:-1]
-    edges = np.concatenate([[0], np.flatnonzero(~still) + 1, [len(run)]])
+def _repeats(run: Run, level: Array) -> Iterator[tuple[int, int]]:
+    """First and last sample of stretches in one block over which what is met is held."""
+    held = held_stretches(level, run.block[1:] != run.block[:-1])
+    edges = np.concatenate([[0], np.flatnonzero(np.diff(held)) + 1, [len(run)]])
     for a, b in pairwise(edges):
-        if b - a >= REPEATS:
+        if held[a] >= 0:
             yield int(a), int(b)
 
 
-def _lack_of_fit(groups: Sequence[Array], rank: int) -> PureError | None:
+def _lack_of_fit(groups: Sequence[Array], rank: int, series: bool) -> PureError | None:
     axes, sizes = groups[0].shape[1], np.array([len(g) for g in groups], float)
     means = np.array([g.mean(axis=0) for g in groups])
     within = np.array([np.sum((g - g.mean(axis=0)) ** 2) for g in groups])
     dof = len(groups) * axes - rank
     if dof < GROUPS or not within.sum() > 0:
         return None
-    inflation = _correlation(groups)
+    inflation = _inflation(groups, series)
     pooled = within.sum() / ((sizes.sum() - len(groups)) * axes)
     own = within / ((sizes - 1) * axes)
     squares = float(np.sum(sizes[:, None] * means**2))
-    # A slow wander moves neighbours alike: their differences show what is left of it.
-    steps = np.diff(np.sqrt(sizes)[:, None] * means, axis=0)
-    alternating = float(np.sum(steps**2)) / 2 * len(groups) / (len(groups) - 1)
-    expected = float(own.sum()) * axes * dof / (len(groups) * axes) * inflation
-    F = min(squares, alternating) / expected
-    if F > 1 and _walks(np.sqrt(sizes)[:, None] * means, inflation * pooled):
-        return None
+    F = squares / (float(np.sum(own * inflation)) * dof / len(groups))
     first = dof / len(groups) * _equivalent(own)
-    second = float(np.mean(sizes - 1)) * axes * _equivalent(own) / inflation
+    second = float(np.mean((sizes - 1) / inflation)) * axes * _equivalent(own)
     return PureError(F, _tail(F, first, second), float(np.sqrt(pooled)), "positions")
 
 
-def _walks(means: Array, variance: float) -> bool:
-    """Do means in their order look like a random walk above their noise, not like scatter?"""
-    squares = power(means)
-    walk = likelihood_of_walk(squares, np.full(means.shape[1], variance))
-    return walk > likelihood_of_white(squares)
+def _inflation(groups: Sequence[Array], series: bool) -> Array:
+    """Variance of each group's mean over s²/n: the largest that the scatter within them allows.
 
-
-def _correlation(groups: Sequence[Array]) -> float:
-    """Variance of a mean of repeats over s²/n: 1 + 2·Σρ, at least as for AR(1) noise."""
-    centred = [g - g.mean(axis=0) for g in groups]
-    longest = max(min(map(len, groups)) - 1, 1)
-    total = 0.0
-    for lag in range(1, min(longest, LAGS)):
-        rho, pairs = _at_lag(centred, lag)
-        if rho < 2.33 / np.sqrt(pairs):
-            break
-        total += rho
-    decaying = _decaying(*_at_lag(centred, 1), int(np.median([len(g) for g in groups])))
-    return max(1 + 2 * total, decaying)
-
-
-def _at_lag(centred: Sequence[Array], lag: int) -> tuple[float, int]:
-    """Correlation at a lag within the groups, and the pairs that it comes from."""
-    pairs = sum(c[lag:].size for c in centred)
-    products = sum(float(np.sum(c[lag:] * c[:-lag])) for c in centred)
-    variance = sum(float(np.sum(c**2)) for c in centred) / sum(c.size for c in centred)
-    return products / max(pairs, 1) / max(variance, 1e-300), max(pairs, 1)
-
-
-def _decaying(rho: float, pairs: int, n: int) -> float:
-    """The same of AR(1) noise whose neighbours correlate so in groups of n about their mean.
-
-    Taking the mean off lowers both the correlation and s²: both are computed, not neglected.
+    The noise is white and AR(1) together. In a series memories no longer than a colour's are usual,
+    and those count whose likelihood is within a standard deviation of the likeliest; in a table,
+    whose order is nobody's, none is. Another one counts if it is likelier by as much, and fades
+    within the groups: what reaches from group to group is a slow course.
     """
-    n = min(n, LAGS)
+    sizes = np.array([len(g) for g in groups])
+    size = int(np.clip(np.median(sizes), LEVELS.repeats, PIECE))
+    longest = np.exp(-LEVELS.fades / max(size, LEVELS.fades * MEMORY))
+    tried = [(0.0, 0.0), *((rho, share) for rho in RHO for share in SHARES if rho < longest)]
+    likelihood = _likelihood(_pieces(groups, size), tried)
+    usual = np.array([rho for rho, _ in tried]) < (np.exp(-1 / MEMORY) if series else 0.01)
+    likely = float(likelihood[usual].max())
+    allowed = usual & (likelihood >= likely - NEAR)
+    allowed |= (likelihood == likelihood.max()) & (likelihood > likely + NEAR)
+    found = [_of_mean(sizes, *tried[k]) for k in np.flatnonzero(allowed)]
+    return np.asarray(np.max(found, axis=0))
+
+
+def _pieces(groups: Sequence[Array], size: int) -> Array:
+    """Consecutive samples of an axis, (K, size), those left away that stay the same."""
+    cut = [
+        g[: len(g) // size * size].reshape(-1, size, g.shape[1]).swapaxes(1, 2).reshape(-1, size)
+        for g in groups
+    ]
+    rows = np.concatenate(cut)
+    return np.asarray(rows[np.ptp(rows, axis=1) > 0])
+
+
+def _likelihood(pieces: Array, tried: Sequence[tuple[float, float]]) -> Array:
+    """Log-likelihood of pieces (K, n), each with a mean and a size of its own, in each noise."""
+    n, found = pieces.shape[1], []
     lags = np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
-    centre = np.eye(n) - 1 / n
-    factor = 1.0
-    for true in np.arange(0.0, 0.96, 0.05):
-        covariance = true**lags
-        seen = centre @ covariance @ centre
-        expected = np.diag(seen, 1).mean() / np.diag(seen).mean()
-        if true == 0.0 and rho < expected + 2.33 / np.sqrt(pairs):
-            return 1.0
-        factor = float(covariance.sum() / n / (np.trace(seen) / (n - 1)))
-        if expected >= rho:
-            break
-    return factor
+    contrasts = np.linalg.qr(np.column_stack([np.ones(n), np.eye(n)[:, 1:]]))[0][:, 1:]
+    differences = contrasts.T @ pieces.T
+    for rho, share in tried:
+        covariance = (1 - share) * np.eye(n) + share * rho**lags
+        L = np.linalg.cholesky(contrasts.T @ covariance @ contrasts)
+        squares = np.sum(np.linalg.solve(L, differences) ** 2, axis=0)
+        volume = 2 * len(pieces) * np.log(np.diag(L)).sum()
+        found.append(-0.5 * ((n - 1) * np.log(squares).sum() + volume))
+    return np.array(found)
+
+
+def _of_mean(n: Index, rho: float, share: float) -> Array:
+    """Variance of a mean of n over s²/n, s² being about that mean."""
+    kin = rho * (n * (1 - rho) - (1 - rho**n)) / (1 - rho) ** 2
+    total = 1 + 2 * share * kin / n
+    return np.asarray(total * (n - 1) / (n - total))
 
 
 def _tail(F: float, first: float, second: float) -> float:

@@ -191,28 +191,6 @@ def power(means: Array) -> Array:
     return np.asarray((np.sqrt(2 / n) * cosines @ means) ** 2)
 
 
-def likelihood_of_walk(squares: Array, floor: Array | None = None) -> float:
-    """Largest log-likelihood of powers (n, m) under white noise and a random walk.
-
-    `floor` (m,) is the level of the white noise where it is known.
-    """
-    n, total = len(squares), 0.0
-    shape = (n / (np.pi * np.arange(1, n))) ** 2
-    rise = 1 + np.outer(np.append(0.0, np.logspace(-5, 4, 60)), shape)
-    for a in range(squares.shape[1]):
-        own = squares[1:, a]
-        level = np.mean(own / rise, axis=1, keepdims=True) if floor is None else floor[a]
-        variance = np.maximum(level * rise, 1e-300)
-        total += float(np.max(-0.5 * np.sum(np.log(variance) + own / variance, axis=1)))
-    return total
-
-
-def likelihood_of_white(squares: Array) -> float:
-    """Largest log-likelihood of powers (n, m) under white noise alone."""
-    level = np.maximum(np.mean(squares[1:], axis=0), 1e-300)
-    return float(-0.5 * (len(squares) - 1) * np.sum(np.log(level) + 1))
-
-
 def wander_p_value(powers: Sequence[Array]) -> float:
     """Is there more power at the slow end than at the fast one? F test."""
     from scipy.special import fdtrc
