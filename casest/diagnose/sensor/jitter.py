@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -57,7 +58,8 @@ def _inputs(rows: Rows, fit: Fit) -> Iterator[tuple[str, float]]:
             own, first = G[:, :, first : first + s.size], first + s.size
             if s.kind == "plain" and s.name != "t" and s.name in declared - readings:
                 squares[s.name] = squares.get(s.name, 0.0) + float(np.sum(own**2))
-    spans = rows.linear(fit).spans
+    ends = np.cumsum([0, *map(len, rows.index)]).tolist()
+    spans = rows.linear(fit).spans or [slice(a, b) for a, b in pairwise(ends)]
     noise = _white(rows.linear(fit).residual, spans, fit.noise)
     for name, square in squares.items():
         if np.isfinite(square) and square > 0:
@@ -67,9 +69,8 @@ def _inputs(rows: Rows, fit: Fit) -> Iterator[tuple[str, float]]:
 
 
 def _white(values: Array, spans: Sequence[slice], most: float) -> float:
-    """The noise of a series by its third differences, in which what is slower has little part.
-
-    Of few rows, or none in time, as much as it may be at most.
+    """The noise of rows by their third differences, in which what is slower has little part, and
+    jumps count little; of few rows as much as it may be at most.
     """
     third = [np.diff(values[span], 3, axis=0) for span in spans]
     if sum(map(len, third)) < LEVELS.series:
