@@ -1027,3 +1027,11 @@ def test_measured_records_within_their_range_raise_no_clipping_note(
 ) -> None:
     (run,) = load_runs([shared_data / name], [ANY], columns={"v": columns})
     assert not [note for note in run.notes if "clipped" in note]
+
+
+def test_the_unit_1_stands_behind_a_space_and_an_index_does_not(tmp_path: Path) -> None:
+    """As SI writes the unit of a number; `casest simulate` heads such a column so."""
+    count = Signal("counted", 1, "1")
+    run = run_of(tmp_path, "counted [1],v[1]\n1,2\n2,5\n", [count])
+    assert run.signals["counted"][:, 0].tolist() == [1.0, 2.0]
+    assert "v[1]" in run.columns

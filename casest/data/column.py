@@ -97,13 +97,14 @@ def _cut(text: str, longest: int) -> str:
 def name_and_unit(header: str) -> tuple[str, str | None]:
     """Split `vx [m/s^2]`, `time (ms)`, `Kraft in N`, `F/kN` or `gyrox rad/s` into name and unit.
 
-    Square brackets hold a unit unless they hold an index (`v[0]`, `v[x]`); round brackets and a
-    last word hold one only where it is a familiar unit (`value (left)` is a name).
+    Square brackets hold a unit unless they hold an index (`v[0]`, `v[x]`; `n [1]` has the unit 1);
+    round brackets and a last word hold one only where it is a familiar unit (`value (left)` is a
+    name).
     """
     text = _cut(header, LONGEST)
-    if found := re.fullmatch(r"(.+?)\s*\[([^\[\]]*)\]", text):
-        name, inside = found[1], found[2].strip()
-        if not re.fullmatch(r"\d*|[xyzXYZ]", inside):
+    if found := re.fullmatch(r"(.+?)(\s*)\[([^\[\]]*)\]", text):
+        name, inside = found[1], found[3].strip()
+        if (found[2] and inside == "1") or not re.fullmatch(r"\d*|[xyzXYZ]", inside):
             return _bare(name), inside
     if (found := re.fullmatch(r"(.+?)\s*\((.*)\)", text)) and units.familiar(found[2]):
         return _bare(found[1]), found[2].strip()
