@@ -221,14 +221,16 @@ def cut(shared_data, tmp_path_factory):
 def test_behind_a_lag_of_a_third_of_a_second_nothing_stands_in_for_what_nobody_recorded(
     closed, cut
 ):
-    """By NumPy: 0.3268 s, 0.0022 rad/s left, 0.0018 with two derivatives; an offset during any part
-    of the record changes the fourth digit."""
+    """By NumPy: 0.3268 s; 0.0022 rad/s left with cubic splines between the samples of the other
+    gyro, 0.0020 with lines, 0.0018 with two derivatives: what smooths its noise (0.0006 by third
+    differences) leaves less, and is no cause. An offset during any part of the record changes the
+    fourth digit."""
     result = closed(f"{MODELS}:two_gyros", cut / "twist.csv")
     assert not {"pulse", "bias_step"} & {e["name"] for e in result["effects"]}
     late = [e for e in result["effects"] if e["name"] in ("signal_lag", "low_pass")]
     values = [np.ravel(p["value"])[0] for e in late for p in e["parameters"].values()]
     assert sum(values) == pytest.approx(0.3268, abs=5e-4)
-    assert result["after"]["rmse_fit"] < 0.00225
+    assert result["after"]["rmse_fit"] < 0.0025
 
 
 @pytest.mark.long
