@@ -81,7 +81,8 @@ def test_before_calibration_a_first_harmonic_explains_half_of_the_headings_error
 
 
 def test_before_calibration_closing_the_loop_traces_the_first_harmonic(headings):
-    """Asked for, among nothing else: the F test of ordinary least squares, by hand."""
+    """Asked for, among nothing else: the F test of ordinary least squares, by hand, but for what
+    noise of the table's angle may feign: a twentieth of the chance at most."""
     result = headings("close", "before", "--effects", "compass.py")
     off, angle = np.array(HEADINGS["before"]) - TABLE, np.radians(TABLE)
     swings = np.stack([np.ones(9), np.sin(angle), np.cos(angle)], axis=1)
@@ -89,7 +90,7 @@ def test_before_calibration_closing_the_loop_traces_the_first_harmonic(headings)
     F = ((off - off.mean()) @ (off - off.mean()) - left @ left) / 2 / (left @ left / 6)
     (found,) = result["effects"]
     assert found["name"] == "deviation"
-    assert found["p_value"] == pytest.approx(f.sf(F, 2, 6), rel=0.01)
+    assert 0.99 * f.sf(F, 2, 6) < found["p_value"] < 1.05 * f.sf(F, 2, 6)
     assert result["verdict"] == "extended"
     assert result["after"]["rmse_holdout"] < 0.6 * result["before"]["rmse_holdout"]
     assert result["before"]["rmse_holdout"] == pytest.approx(4.62, abs=0.01)

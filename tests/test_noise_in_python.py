@@ -88,4 +88,7 @@ def test_columns_of_a_frame_are_found_by_their_names(poses):
 def test_noise_that_is_stated_twice_is_refused(poses, capsys):
     said = ["calibrate", "norm-diagonal", str(poses[0]), "--columns", "v=ax,ay,az", "--unit", "v=g"]
     assert run([*said, "--sensor-noise", "v=0.02", "--sensor-noise", "v=0.03"]) == 1
-    assert "v=0.03: the noise of v is stated twice" in capsys.readouterr().err
+    assert (
+        "--sensor-noise v=0.02 and --sensor-noise v=0.03: v has one value"
+        in capsys.readouterr().err
+    )

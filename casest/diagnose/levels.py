@@ -91,7 +91,7 @@ class Levels:
     fades: float = 2.0
     survives: float = 1e-3
     over_noise: float = 5.0
-    jitter: float = 2.0
+    jitter: float = 3.0
     seen: float = 45.0
     unseen: float = 9.0
     share: float = 0.02

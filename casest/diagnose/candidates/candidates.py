@@ -36,6 +36,10 @@ WARM = {"temperature": (True,), "other": (False,), "any": (True, False)}
 _LABELS = re.compile(
     r"^(run|pose|index|(first_|last_)?row|count|sample|seq|id|nr|no)$", re.IGNORECASE
 )
+#: Columns that are called as a clock is.
+_CLOCK = re.compile(
+    r"time|clock|tick|epoch|utc|milli|micro|(^|_)(t|s|sec|seconds|ms|us|ns)$", re.IGNORECASE
+)
 
 
 @dataclass(frozen=True)
@@ -267,7 +271,8 @@ def channels(
     found: dict[str, bool] = {}
     skipped: list[Skipped] = []
     times = [run.time for run in runs if run.time is not None]
-    values = {"t": np.concatenate(times)} if len(times) == len(runs) > 0 else {}
+    clock = {"t": np.concatenate(times)} if len(times) == len(runs) > 0 else {}
+    values: dict[str, Array] = {}
     for name in runs[0].columns if runs else ():
         if name in used or _LABELS.match(name):
             continue
@@ -275,7 +280,9 @@ def channels(
             skipped.append(Skipped(name, "column is not numeric in every file"))
             continue
         x = np.concatenate([run.signals[name][:, 0] for run in runs])
-        why = _useless(x, values) or reads.again(x)
+        # An angle that grows with time still turns.
+        others = {**clock, **values} if _CLOCK.search(name) else values
+        why = _useless(x, others) or reads.again(x)
         if why:
             skipped.append(Skipped(name, why))
             continue

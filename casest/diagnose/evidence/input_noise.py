@@ -4,7 +4,7 @@ Slopes are taken at inputs as they were recorded. Noise of an input is in the re
 slopes: a column that would be none beside the unknowns is that noise there, and explains it. (In a
 ramp at an even pace time tells the reference better than a noisy meter did.) So the same columns
 are looked at with so much noise more: of the squares that a cause explains, the share that changes
-may be noise that goes with the residual's.
+may be noise that goes with the residual's, of which no more is noise than what was added there.
 """
 
 from __future__ import annotations
@@ -34,12 +34,15 @@ def feigned(
     left = likelihood.remainder(columns)
     values = likelihood.orthonormal(left) @ evidence.explained.values[-evidence.freedom :]
     root = 1 / np.sqrt(evidence.explained.spectrum)
-    whole = float(np.sum((root * (left @ values)) ** 2))
     size = np.linalg.norm(columns.reshape(len(root), -1), axis=0)
-    changes = []
+    all_there = float(np.sum((root * likelihood.residual) ** 2))
+    shares = [0.0]
     for noisy, moved in draws:
         own = np.linalg.norm(moved.reshape(len(root), -1), axis=0) / np.maximum(size, 1e-300)
-        change = noisy.remainder(moved) * own - left
-        changes.append(float(np.sum((root * (change @ values)) ** 2)))
-    share = LEVELS.jitter * float(np.mean(changes or [0.0])) / max(whole, 1e-300)
+        change = float(np.sum((root * ((noisy.remainder(moved) * own - left) @ values)) ** 2))
+        more = (noisy.linear.residual - likelihood.linear.residual)[:, :, None]
+        noise = float(np.sum((root * likelihood.by_frequency(more)[:, 0]) ** 2))
+        shares.append(change * min(1.0, noise / max(all_there, 1e-300)))
+    whole = float(np.sum((root * (left @ values)) ** 2))
+    share = LEVELS.jitter * sum(shares) / max(len(draws), 1) / max(whole, 1e-300)
     return len(root) * min(MOST, -float(np.log1p(-min(share, 1 - 1e-12))))

@@ -60,7 +60,8 @@ def _inputs(rows: Rows, fit: Fit) -> Iterator[tuple[str, float]]:
                 squares[s.name] = squares.get(s.name, 0.0) + float(np.sum(own**2))
     ends = np.cumsum([0, *map(len, rows.index)]).tolist()
     spans = rows.linear(fit).spans or [slice(a, b) for a, b in pairwise(ends)]
-    noise = _white(rows.linear(fit).residual, spans, fit.noise)
+    residual = rows.linear(fit).residual
+    noise = _white(residual, spans, float(np.sqrt(np.mean(residual**2))))
     for name, square in squares.items():
         if np.isfinite(square) and square > 0:
             size = noise * float(np.sqrt(problem.residual_count / square))
@@ -69,13 +70,16 @@ def _inputs(rows: Rows, fit: Fit) -> Iterator[tuple[str, float]]:
 
 
 def _white(values: Array, spans: Sequence[slice], most: float) -> float:
-    """The noise of rows by their third differences, in which what is slower has little part, and
-    jumps count little; of few rows as much as it may be at most.
+    """The noise of rows by their third differences, in which what is slower has little part, in the
+    calmest quarter of the record: elsewhere a quick motion is in them. Of few rows as much as it
+    may be at most.
     """
     third = [np.diff(values[span], 3, axis=0) for span in spans]
     if sum(map(len, third)) < LEVELS.series:
         return most
-    return min(most, robust_scale(third) / float(np.sqrt(20)))
+    blocks = [b for d in third for b in np.array_split(d, max(1, len(d) // LEVELS.series))]
+    calm = np.quantile([robust_scale([b]) for b in blocks if len(b)], 0.25)
+    return min(most, float(calm) / float(np.sqrt(20)))
 
 
 def _draw(
@@ -92,7 +96,8 @@ def _draw(
     if whole.weights is not None:
         problem = problem.with_weights(whole.weights)
     point = problem.point(fit.values)
-    linear = replace(rows.linear(fit), slopes=rows.slopes(problem, point)[1])
+    residual, J = rows.slopes(problem, point)
+    linear = replace(rows.linear(fit), residual=residual, slopes=J)
     found = {
         id(what): columns
         for what, columns in slopes(problem, point, [t.what for t in trials], rows.index)
