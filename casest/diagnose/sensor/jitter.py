@@ -71,15 +71,15 @@ def _inputs(rows: Rows, fit: Fit) -> Iterator[tuple[str, float]]:
 
 def _white(values: Array, spans: Sequence[slice], most: float) -> float:
     """The noise of rows by their third differences, in which what is slower has little part, in the
-    calmest quarter of the record: elsewhere a quick motion is in them. Of few rows as much as it
-    may be at most.
+    calmest quarter of the record: elsewhere a quick motion is in them. Of few rows by all of them.
     """
-    third = [np.diff(values[span], 3, axis=0) for span in spans]
+    third = [d for span in spans if len(d := np.diff(values[span], 3, axis=0))]
     if sum(map(len, third)) < LEVELS.series:
-        return most
-    blocks = [b for d in third for b in np.array_split(d, max(1, len(d) // LEVELS.series))]
-    calm = np.quantile([robust_scale([b]) for b in blocks if len(b)], 0.25)
-    return min(most, float(calm) / float(np.sqrt(20)))
+        noise = np.sqrt(np.mean(np.concatenate(third) ** 2)) if third else np.inf
+    else:
+        blocks = [b for d in third for b in np.array_split(d, max(1, len(d) // LEVELS.series))]
+        noise = np.quantile([robust_scale([b]) for b in blocks], 0.25)
+    return min(most, float(noise) / float(np.sqrt(20)))
 
 
 def _draw(
