@@ -14,6 +14,7 @@ import pytest
 
 import casest
 from casest import Residual, Run, model, param
+from casest.cli import run
 from casest.comparison.judge import SOLVERS, compare
 from casest.data import write_atomically, written_together
 from casest.data.write import make_folder
@@ -242,3 +243,14 @@ def test_ctrl_c_while_files_get_their_names_waits_until_all_have_them(tmp_path, 
     with pytest.raises(KeyboardInterrupt):
         two_texts_and_bytes(tmp_path)
     assert sorted(os.listdir(tmp_path)) == ["a.txt", "b.bin"]
+
+
+def test_what_python_makes_of_ctrl_c_is_ctrl_c(monkeypatch, capsys):
+    """In a class that is being made, Python 3.11 raises a RuntimeError from it."""
+
+    def pressed(*_, **__):
+        raise RuntimeError("Error calling __set_name__") from KeyboardInterrupt()
+
+    monkeypatch.setattr("casest.cli.commands.main", pressed)
+    assert run(["list"]) == 130
+    assert "interrupted; nothing was written" in capsys.readouterr().err

@@ -83,7 +83,7 @@ def _said(error: BaseException) -> tuple[str, int]:
         return str(error), error.exit_code
     if isinstance(error, click.Abort) and isinstance(error.__cause__, EOFError):
         error = error.__cause__  # click takes an end of anything for Ctrl-C
-    if isinstance(error, click.Abort | KeyboardInterrupt):
+    if isinstance(error, click.Abort) or _is_of_ctrl_c(error):
         return "interrupted; nothing was written", INTERRUPTED
     if isinstance(error, click.ClickException):
         return error.format_message(), 1
@@ -97,6 +97,13 @@ def _said(error: BaseException) -> tuple[str, int]:
         "with the command and `casest --version`; CASEST_TRACEBACK=1 shows where",
         INTERNAL,
     )
+
+
+def _is_of_ctrl_c(error: BaseException | None) -> bool:
+    """Is it Ctrl-C, or was it made of it? Python 3.11 wraps what is raised in `__set_name__`."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__
+    return error is not None
 
 
 def _close_output() -> None:
