@@ -3,8 +3,8 @@
 Slopes are taken at inputs as they were recorded. Noise of an input is in the residual and in the
 slopes: a column that would be none beside the unknowns is that noise there, and explains it. (In a
 ramp at an even pace time tells the reference better than a noisy meter did.) So the same columns
-are looked at with so much noise more: of the squares that a cause explains, the share that changes
-may be noise that goes with the residual's, of which no more is noise than what was added there.
+are looked at with so much noise more: as far as what changes in them goes with what was added to
+the residual, that column explains noise of that input, and as much of it may be its whole gain.
 """
 
 from __future__ import annotations
@@ -25,8 +25,7 @@ MOST = 20.0
 def feigned(
     evidence: Evidence, likelihood: Likelihood, draws: Sequence[tuple[Likelihood, Array]]
 ) -> float:
-    """Gain that noise of an input may give at most (Cauchy and Schwarz): MOST of each residual
-    where a cause is all noise.
+    """Gain that noise of an input may give: MOST of each residual where a cause is all noise.
 
     `draws`: the problem and the evidence's columns (N, m, k) with noise added to that input.
     """
@@ -35,14 +34,15 @@ def feigned(
     values = likelihood.orthonormal(left) @ evidence.explained.values[-evidence.freedom :]
     root = 1 / np.sqrt(evidence.explained.spectrum)
     size = np.linalg.norm(columns.reshape(len(root), -1), axis=0)
-    all_there = float(np.sum((root * likelihood.residual) ** 2))
-    shares = [0.0]
+    explained = float(np.sum((root * (left @ values)) ** 2))
+    together = []
     for noisy, moved in draws:
         own = np.linalg.norm(moved.reshape(len(root), -1), axis=0) / np.maximum(size, 1e-300)
-        change = float(np.sum((root * ((noisy.remainder(moved) * own - left) @ values)) ** 2))
+        change = root * ((noisy.remainder(moved) * own - left) @ values)
         more = (noisy.linear.residual - likelihood.linear.residual)[:, :, None]
-        noise = float(np.sum((root * likelihood.by_frequency(more)[:, 0]) ** 2))
-        shares.append(change * min(1.0, noise / max(all_there, 1e-300)))
-    whole = float(np.sum((root * (left @ values)) ** 2))
-    share = LEVELS.jitter * sum(shares) / max(len(draws), 1) / max(whole, 1e-300)
+        added = root * likelihood.by_frequency(more)[:, 0]
+        together.append(float(change @ added))
+    both = max(float(np.mean(together)) if together else 0.0, 0.0)
+    all_there = float(np.sum((root * likelihood.residual) ** 2))
+    share = LEVELS.jitter * both**2 / max(explained * all_there, 1e-300)
     return len(root) * min(MOST, -float(np.log1p(-min(share, 1 - 1e-12))))

@@ -24,6 +24,10 @@ from casest.leastsquares.weights import robust_scale
 
 #: Draws of noise at most: of few rows one says little of its size.
 DRAWS = 8
+#: Third differences of white noise that say no more than one that stands alone: 1 + 2 Σ ρ².
+ALIKE = 1 + 2 * (15**2 + 6**2 + 1) / 20**2
+#: Chance that the noise of few rows is less than the bound that is taken.
+SURE = 0.95
 Draw = tuple[Linear, Mapping[int, Array]]
 
 
@@ -71,11 +75,15 @@ def _inputs(rows: Rows, fit: Fit) -> Iterator[tuple[str, float]]:
 
 def _white(values: Array, spans: Sequence[slice], most: float) -> float:
     """The noise of rows by their third differences, in which what is slower has little part, in the
-    calmest quarter of the record: elsewhere a quick motion is in them. Of few rows by all of them.
+    calmest quarter of the record: elsewhere a quick motion is in them. Of few rows by all of them,
+    and as much as it may be.
     """
+    from scipy.special import chdtri
+
     third = [d for span in spans if len(d := np.diff(values[span], 3, axis=0))]
     if sum(map(len, third)) < LEVELS.series:
-        noise = np.sqrt(np.mean(np.concatenate(third) ** 2)) if third else np.inf
+        squares = np.concatenate(third) ** 2 if third else np.full(1, np.inf)
+        noise = np.sqrt(squares.sum() / chdtri(squares.size / ALIKE, SURE) / ALIKE)
     else:
         blocks = [b for d in third for b in np.array_split(d, max(1, len(d) // LEVELS.series))]
         noise = np.quantile([robust_scale([b]) for b in blocks], 0.25)
