@@ -38,7 +38,7 @@ FIELD, DIP = 48.0, 1.1
 #: World -> model, what its sensors have besides, how its motion is, and how many records.
 WORLDS: dict[str, tuple[str, dict[str, Any], dict[str, Any], int]] = {
     "gyro-rests": ("gyro-rests", {"walk": 2e-4, "late": 0.004}, {}, 1000),
-    "imu": ("imu", {"walk": 2e-4, "late": 0.004}, {}, 400),
+    "imu": ("imu", {"walk": 2e-4, "late": 0.004}, {}, 1000),
     "gyro-rests, no drift, one clock": ("gyro-rests", {}, {}, 200),
     "imu, 48 rests": ("imu", {"walk": 2e-4, "late": 0.004}, {"rests": 48}, 50),
 }
