@@ -36,6 +36,8 @@ def bench(seed, kind, rows, added=0.0):
         ("ramp", 15, 2),
         ("ramp", 600, 2),
         ("sine", 600, 1),
+        pytest.param("ramp", 15, 8, marks=pytest.mark.long),
+        pytest.param("ramp", 30, 8, marks=pytest.mark.long),
         pytest.param("ramp", 60, 8, marks=pytest.mark.long),
         pytest.param("ramp", 600, 8, marks=pytest.mark.long),
         pytest.param("sine", 600, 8, marks=pytest.mark.long),
@@ -47,6 +49,12 @@ def test_noise_of_the_reference_is_no_cause(kind, rows, records):
         closing = close("linear", bench(seed, kind, rows))
         assert not closing.effects
         assert closing.after.values["gain"] == pytest.approx(GAIN, rel=0.01)
+
+
+@pytest.mark.parametrize("seed", [5000, 5009])
+def test_a_long_lag_that_averages_noise_is_no_cause(seed):
+    """Half a sample late is the mean of two readings, of half the noise; on a ramp any lag fits."""
+    assert close("linear", bench(seed, "ramp", 60)).result.verdict == "adequate"
 
 
 def test_what_is_more_than_that_noise_is_found():

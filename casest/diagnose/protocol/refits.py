@@ -204,6 +204,8 @@ def shown(
             (evidence,) = without_feigned(
                 subject, state.fit, ranking.likelihood, [evidence], ranking.families
             )
+        if trial.what.held and (evidence is None or evidence.score <= 0):
+            continue  # its columns are those of that very value: nothing to wait for from a refit
         better = subject.refit(state.fit, [trial])
         if evidence is None or isinstance(better, str):
             state = state if evidence is None else state.failing(evidence, str(better))
