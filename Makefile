@@ -11,7 +11,7 @@ USABLE := $(VENV)/.usable
 	study-motion study-flights study-inputs study-records study-halves study-asked study-slow study-coverage \
 	study-deceptive study-deceptive-many study-fleet study-mutation study-worlds study-noises \
 	study-structural study-check study-plans study-equations study-equations-coverage study-frictions \
-	study-told-apart study-sequential study-mag-gyro \
+	study-told-apart study-sequential study-mag-gyro study-mag-imu \
 	figures docs clean
 
 demo: $(USABLE)
@@ -89,6 +89,9 @@ study-flights: $(READY)
 
 study-mag-gyro: $(READY)
 	$(BIN)/python studies/mag_gyro.py
+
+study-mag-imu: $(READY)
+	$(BIN)/python studies/mag_imu.py
 
 study-inputs: $(READY)
 	$(BIN)/python studies/inputs.py

@@ -45,8 +45,6 @@ Array = NDArray[np.float64]
 TABLE = Path(__file__).resolve().parent / "plans.md"
 #: Sensors of each model, poses of each plan, noise in the model's unit.
 SENSORS, POSES = 200, 24
-#: So many of those that are fitted one by one.
-ALONE = 40
 
 
 # -- known optima ----------------------------------------------------------------------------------
@@ -447,7 +445,7 @@ def fitted(model: Any, readings: dict[str, Array]) -> tuple[dict[str, Array], Ar
         fits = calibrate_many(model, readings)
         return {n: np.asarray(v) for n, v in fits.values.items()}, np.asarray(fits.trusted)
     found = []
-    for s in range(ALONE):
+    for s in range(SENSORS):
         own = {name: value[s] for name, value in readings.items()}
         units = {"a": "m/s^2", "m": "uT", "attitude": None}
         run = Run.raw("r", own, units={n: units[n] for n in own})
@@ -478,13 +476,12 @@ def worth() -> Iterator[str]:
         random = Rotation.random(SENSORS * POSES, random_state=rng).as_matrix()
         random = random.reshape(SENSORS, POSES, 3, 3)
         result = [errors(model, make, R) for R in (best, random, usual(side))]
-        total = SENSORS if len(model.axes) == 1 else ALONE
-        counts = ", ".join(str(n) for _, n in result) + f" of {total}"
+        counts = ", ".join(str(n) for _, n in result) + f" of {SENSORS}"
         for i, name in enumerate(result[0][0]):
             over = []
             for other in (1, 2):
                 theirs = result[other][0][name]
-                same = len(theirs) == len(result[0][0][name]) and result[other][1] > total // 2
+                same = len(theirs) == len(result[0][0][name]) and result[other][1] > SENSORS // 2
                 ratio = np.exp(np.mean(np.log(result[0][0][name] / theirs))) if same else np.nan
                 over.append(f"{ratio:.2f}" if np.isfinite(ratio) else "not determined")
             tail = f"{counts} | {seconds:.2f}" if i == 0 else " | "
@@ -537,7 +534,7 @@ PARTS = {
     "Pyomo.DoE's reactor": pyomo,
     "A motion of 60 s": motion,
     "Pyomo.DoE's reactor as declared equations": experiment,
-    f"{POSES} poses, {SENSORS} simulated sensors (of two models {ALONE})": worth,
+    f"{POSES} poses, {SENSORS} simulated sensors of each model": worth,
     "A wheel's second run": mountings,
     "Time of 24 of 2000 candidates, 22 unknowns": speed,
 }

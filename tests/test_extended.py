@@ -16,6 +16,7 @@ from casest.cli import run as cli
 from casest.dynamics import Motion, angle, constraint, dynamics, measured, state
 from casest.dynamics.filter import filtered
 from casest.dynamics.record import least_squares as at_once_of
+from casest.report.text.states import filter_text
 from casest.results.observability import observe_motion
 from casest.results.states import follow
 from casest_problems.bias_gravity import bias_gravity, bias_gravity_magnitude
@@ -387,6 +388,8 @@ def test_a_smoother_that_does_not_settle_says_so(monkeypatch):
     result = follow(pendulum_of(), swing()[0])
     assert not result.filtered.settled
     assert "the smoother's rounds did not settle" in " ".join(result.notes)
+    assert not result.settled
+    assert "not settled: ± is too small" in filter_text(result)
 
 
 @pytest.mark.long

@@ -276,6 +276,56 @@ def test_declared_and_matched_stand_side_by_side(files, capsys, monkeypatch, opt
     assert "Noise intensities" in (files / "out" / "report.html").read_text("utf-8")
 
 
+CART = """
+from casest import signal
+from casest.dynamics import Motion, dynamics, measured, state
+
+
+@dynamics
+def cart(y=signal("m"), a=signal("m/s^2"), *, x=state("m", std=1.0), v=state("m/s", std=1.0)):
+    return Motion(rates={"x": v, "v": a}, outputs=(measured(y, x),))
+"""
+
+
+@pytest.fixture
+def cart(tmp_path):
+    """A declaration that says nothing of noise, and a record of a cart that swings."""
+    rng, t = np.random.default_rng(1), np.arange(0, 20, 0.05)
+    read = 1 + t - np.sin(t) + rng.normal(0, 0.05, len(t)), np.sin(t) + rng.normal(0, 0.02, len(t))
+    (tmp_path / "cart.py").write_text(CART, encoding="utf-8")
+    named = {"delimiter": ",", "header": "t [s],y [m],a [m/s^2]", "comments": ""}
+    np.savetxt(tmp_path / "cart.csv", np.column_stack([t, *read]), **named)
+    return [str(tmp_path / "cart.py"), str(tmp_path / "cart.csv")]
+
+
+OF_CART = ["--sensor-noise", "y=0.05", "--sensor-noise", "a=0.02"]
+
+
+def test_noise_that_is_only_stated_is_enough_for_a_filter(cart, capsys):
+    """It was refused with the advice to state it."""
+    assert run(["filter", *cart, *OF_CART, "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said["intensities"]["declared"] == {}
+    assert said["intensities"]["used"]["y"] == pytest.approx(0.05**2 * 0.05)
+    assert abs(said["states"]["x"]["value"][0] - 20.037) < 4 * said["states"]["x"]["std"][0]
+    assert run(["filter", *cart, *OF_CART[2:]]) == 1
+    assert "y has no noise" in capsys.readouterr().err
+
+
+def test_stated_noise_of_an_input_moves_the_states(cart, capsys):
+    """In `observe` and `close` it was accepted and did nothing; a calibration takes it as exact."""
+    assert run(["observe", *cart, *OF_CART, "--json"]) == 0
+    moving = json.loads(capsys.readouterr().out)
+    # The stationary solution of the Riccati equation of a double integrator, of both intensities.
+    q, r = 0.02**2 * 0.05, 0.05**2 * 0.05
+    expected = np.sqrt([2**0.5 * q**0.25 * r**0.75, 2**0.5 * q**0.75 * r**0.25])
+    assert [moving["std"][n][0] for n in ("x", "v")] == pytest.approx(expected, rel=0.05)
+    assert run(["close", *cart, *OF_CART]) == 0
+    assert "adequate" in capsys.readouterr().out
+    assert run(["calibrate", *cart, *OF_CART]) == 1
+    assert "noise of a: it drives the states of cart" in capsys.readouterr().err
+
+
 def test_two_ways_at_once_are_refused(files, capsys):
     words = ["filter", "bias-gravity", str(files / "flight.csv"), "--noise", "ml", *VELOCITY]
     assert run(words) == 1

@@ -153,7 +153,7 @@ def close(model_name: str, data: tuple[str, ...], options: CloseOptions) -> int:
     Of an estimator in motion the one-step innovations are diagnosed; with --sensor the effects
     that many sensors have in common.
     """
-    if in_motion(model_name):
+    if in_motion(model_name, options.sensors):
         return closing_in_motion(model_name, data, options, typed())
     if options.sensor:
         return fleet_closing(model_name, data, options)

@@ -143,13 +143,19 @@ def held_out(
     return records(model, apart, options, followed) if apart else ()
 
 
-def in_motion(name: str) -> bool:
-    """Is it an estimator in motion, driven by noise? Without it equations are a calibration."""
+def in_motion(name: str, sensors: SensorOptions | None = None) -> bool:
+    """Is it an estimator in motion, driven by noise? Without it equations are a calibration.
+
+    With what `sensors` state: noise of an input drives the states.
+    """
     from casest.dynamics import Dynamics
     from casest.results.find import find_any
 
     found = find_any(name)
-    return isinstance(found, Dynamics) and found.driven_by_noise
+    if not isinstance(found, Dynamics):
+        return False
+    stated = {given.pair()[0].strip() for given in sensors.stated} if sensors else set()
+    return found.driven_by_noise or not found.driving.isdisjoint(stated)
 
 
 def moving_model(name: str, constants: Assignments, options: MotionOptions) -> Dynamics:

@@ -10,7 +10,7 @@ import click
 
 from casest.cli.assignments import Assignment, Assignments
 from casest.cli.flags import Kind, flag, refuse, taking
-from casest.cli.loading import model_and_records, moving_model, trajectory
+from casest.cli.loading import in_motion, model_and_records, moving_model, trajectory
 from casest.cli.options import (
     DATA,
     FOLDER,
@@ -103,7 +103,8 @@ def observe(model_name: str, data: tuple[str, ...], options: ObserveOptions) -> 
     )
 
     found = find_any(model_name)
-    fits = isinstance(found, Model) or (bool(data) and found.without_noise)
+    moves = in_motion(model_name, options.sensors)
+    fits = isinstance(found, Model) or (bool(data) and found.without_noise and not moves)
     if fits or data:
         why = "is a question about an estimator in motion without DATA"
         refuse(options.structural, Kind.MOVING, why)

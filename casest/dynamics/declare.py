@@ -472,6 +472,20 @@ class Dynamics:
         return any(s.intensity for s in self.states) or bool(inputs)
 
     @property
+    def driving(self) -> frozenset[str]:
+        """Names of the signals that drive the states."""
+        return frozenset(name for name, G in self.slopes_in_signals.items() if G.nnz())
+
+    @property
+    def says_noise(self) -> bool:
+        """Has every output a noise that a filter can take?"""
+        t = self.traced
+        return all(
+            name in self.sensors or o.intensity is not None or isinstance(o.std, float)
+            for name, o in zip(t.measured, t.outputs, strict=True)
+        )
+
+    @property
     def without_noise(self) -> bool:
         """Is nothing said of any noise, so that it can be nothing but a calibration?"""
         silent = all(o.std is None and o.intensity is None for o in self.traced.outputs)

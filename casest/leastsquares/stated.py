@@ -14,6 +14,7 @@ import casadi as ca
 import numpy as np
 
 from casest.data.run import Run
+from casest.declaration.flow import Flow
 from casest.declaration.model import Model
 from casest.declaration.noise import (
     MEAN,
@@ -89,6 +90,7 @@ def stated_noise(
     if not noise:
         return model, tuple(runs)
     groups = _groups(model, noise)
+    _refuse_of_equations(model, [name for group in groups for name in group])
     names = tuple(name for group in groups for name in group)
     form = Stated(names, len(model.axes), groups=groups if len(names) > len(groups) else ())
     held = []
@@ -98,6 +100,19 @@ def stated_noise(
         held.append(replace(run, signals={**run.signals, **flat}))
     problem = _begun(Problem(replace(model, noise=form), tuple(held)))
     return problem.model, problem.runs
+
+
+def _refuse_of_equations(model: Model, names: Sequence[str]) -> None:
+    """UsageError where noise would bend the course of states, which here follow exact inputs."""
+    flows = [stage for stage in model.staged.stages if isinstance(stage, Flow)]
+    for name in names:
+        own = flat(model.staged.symbols[name])
+        if any(ca.depends_on(flow.taken, own) for flow in flows):
+            raise UsageError(
+                f"noise of {name}: it drives the states of {model.name}, and a calibration takes "
+                "what drives them as exact: with it this is an estimator in motion (casest filter, "
+                f"observe or close with the noise of every reading); else leave that of {name} out"
+            )
 
 
 def _groups(model: Model, noise: Mapping[str, object]) -> tuple[tuple[str, ...], ...]:

@@ -77,14 +77,15 @@ class UsedHorizon(Struct, frozen=True):
 class States(Result, frozen=True, kw_only=True, dict=True):
     """The content of `filter.json`; `filtered`: states and covariances.
 
-    `allan`: what a record at rest said, per signal. `as_expected`: are the innovations as large as
-    the noise intensities say?
+    `allan`: what a record at rest said, per signal. `settled`: else the states are approximate, and
+    their std too small. `as_expected`: are the innovations as large as the noise intensities say?
     """
 
     unwritten = ("as_expected", "filtered")
 
     notes: list[str]
     samples: int
+    settled: bool
     states: dict[str, FinalState]
     intensities: UsedIntensities
     innovations: Innovations
@@ -123,8 +124,10 @@ def follow(
     def states(of: Dynamics, smooth: bool = True) -> Course:
         return moving_horizon(of, run, horizon) if horizon else followed(of, run, smooth=smooth)
 
-    declared = states(model, smooth=tuned is None)
+    # Noise that is only stated (--sensor-noise) leaves nothing to show beside it.
+    declared = states(model, smooth=tuned is None) if model.says_noise or not tuned else None
     found = states(tuned.model) if tuned else declared
+    assert found is not None
     mean, m = _normalised_mean(found), found.innovations.shape[1]
     return States(
         model=found.model.name,
@@ -136,14 +139,15 @@ def follow(
             *(_too_short(run, found.model.size) or weakly_told(found)),
         ],
         samples=len(found.time),
+        settled=found.settled,
         states=_final(found),
         intensities=UsedIntensities(
             tuned.how if tuned else "as declared",
-            _plain_values(intensities(model, run)),
+            _plain_values(intensities(model, run)) if declared else {},
             _plain_values(intensities(found.model, run)),
             _plain_values(tuned.spread) if tuned else {},
             units(found.model),
-            plain(_normalised_mean(declared)),
+            plain(_normalised_mean(declared)) if declared else None,
         ),
         innovations=Innovations(
             plain(np.sqrt(np.nanmean(found.innovations**2, axis=0))),

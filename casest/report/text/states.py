@@ -10,7 +10,9 @@ from casest.results.states import States, intensity_spread, verdict_words
 
 def filter_text(result: States) -> str:
     """Final states and the innovations' verdict."""
-    lines = [f"{result.model}: {result.samples} samples", "", "  at the end of the record:"]
+    lines = [f"{result.model}: {result.samples} samples"]
+    lines += [] if result.settled else ["", "  not settled: ± is too small, and may be by far"]
+    lines += ["", "  at the end of the record:"]
     for name, s in result.states.items():
         for k, (x, spread) in enumerate(zip(s.value, s.std, strict=True)):
             label = name if len(s.value) == 1 else f"{name}[{k}]"
