@@ -89,6 +89,8 @@ def _symmetric(x: Array) -> bool:
 
 def _suspect(x: Array, others: Array) -> tuple[int, bool]:
     """Return how many readings crowd at the largest value, and whether that was in motion."""
+    if np.count_nonzero(x == x.max()) < _FEWEST:  # long before all are put in order
+        return 0, False
     levels, counts = np.unique(x, return_counts=True)
     if len(levels) < 5 or counts[-1] < max(_FEWEST, _CROWDING * float(counts[-4:-1].mean())):
         return 0, False
