@@ -12,6 +12,7 @@ from casest.declaration.shapes import Array
 from casest.errors import NotTrusted
 from casest.leastsquares.problem import Point, Problem
 from casest.leastsquares.stated import at_true_values, settles
+from casest.leastsquares.weights import has_noise_effects
 from casest.solve.outcome import Outcome
 from casest.solve.strategy import best_of, solve
 from casest.solve.trust_region import LITTLE, trust_region
@@ -20,6 +21,16 @@ from casest.solve.trust_region import LITTLE, trust_region
 TURNS, STILL = 60, 1e-6
 #: Turns that are looked back at to see where they lead (Anderson 1965).
 MEMORY = 5
+
+
+def solved(
+    problem: Problem, first: Point, *, solver: str, seed: int, automatic: bool
+) -> tuple[Problem, tuple[Outcome, ...]]:
+    """As `solve` has it; where that only says where the turns begin and there is one valley, which
+    every way leads into, the quickest way alone."""
+    if settles(problem.model) and problem.parabolic and not has_noise_effects(problem.model):
+        return problem, (trust_region(problem, first),)
+    return solve(problem, first, solver=solver, seed=seed, automatic=automatic)
 
 
 def with_errors_of_inputs(

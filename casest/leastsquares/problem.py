@@ -36,7 +36,7 @@ from casest.engine import (
 )
 from casest.errors import DataError, NotTrusted, UsageError
 from casest.leastsquares.constrained import FIRST, Constraints, Force, constraints_of
-from casest.leastsquares.per_sample import residual_and_jacobian
+from casest.leastsquares.per_sample import linear, residual_and_jacobian
 from casest.leastsquares.sequence import Staged
 
 
@@ -84,6 +84,10 @@ class Block(NamedTuple):
 NUDGE = 1e-3
 #: Points whose normal equations are kept: a solution is asked for again by who judges it.
 LATEST = 16
+#: Fall of the cost of a linear problem, as a factor, up to which it is told from elsewhere.
+NEAR = 4.0
+#: Residual beside what the unknowns contribute to it below which it may be rounding.
+ROUNDING = 1e-10
 #: Samples that are evaluated at once where every residual is looked at on its own.
 BLOCK = 32_768
 #: Samples of a run that a model's own functions (a start, bounds from data) look at.
@@ -637,6 +641,8 @@ class Problem:
 
     def cost(self, point: Point) -> float:
         """½ Σ w r²."""
+        if self.parabolic and (known := self._on_the_parabola(point)) is not None:
+            return known.cost
         own = sum(self._run_cost(point, r) for r in range(len(self.runs)))
         if self._bare:
             return own
@@ -648,13 +654,44 @@ class Problem:
         for known, normal in self._latest:
             if known is point:
                 return normal
+        told = self._on_the_parabola(point) if self.parabolic else None
+        if told is None:
+            return self.looked_at(point)
+        self._latest.append((point, told))
+        return told
+
+    def looked_at(self, point: Point) -> Normal:
+        """The same from all samples, whatever follows from what was seen elsewhere."""
         normal = self._normal(point)
+        if self.parabolic:
+            self._seen[:] = [(point, normal)] if _tells_more(point, normal) else []
         self._latest.append((point, normal))
         return normal
 
     @cached_property
     def _latest(self) -> deque[tuple[Point, Normal]]:
         return deque(maxlen=LATEST)
+
+    @cached_property
+    def parabolic(self) -> bool:
+        """Is the cost a parabola in the unknowns, which one look at the samples tells?"""
+        return linear(self.model) and self.constraints is None
+
+    @cached_property
+    def _seen(self) -> list[tuple[Point, Normal]]:
+        """Where all samples were last looked at, of a parabola, if that tells of other places."""
+        return []
+
+    def _on_the_parabola(self, point: Point) -> Normal | None:
+        """What follows from the last look, as long as it is as near as the residual is large:
+        further away digits would be lost."""
+        for seen, (cost, gradient, matrix) in self._seen:
+            step = point.x - seen.x
+            change = matrix @ step
+            curved, there = 0.5 * float(step @ change), cost + float(step @ gradient)
+            if curved <= cost <= NEAR * (there + curved):
+                return Normal(there + curved, gradient + change, matrix)
+        return None
 
     def _normal(self, point: Point) -> Normal:
         own = self.of_runs(point)
@@ -713,6 +750,8 @@ class Problem:
     def hessian(self, point: Point) -> Array:
         """Exact second derivative of the cost, (n, n); Gauss-Newton where effects have a memory."""
         matrix = self.normal(point).matrix.copy()
+        if self.parabolic:
+            return matrix
         if self._staged is not None or self.constraints is not None:
             return self._differences(point, matrix) if self.smooth else matrix
         for r, samples in enumerate(self.samples):
@@ -863,6 +902,13 @@ def _bend(model: Model) -> Replay:
     sample = ca.vertcat(sample_symbol(model), w)
     parameters = ca.vertcat(t.coordinates, t.references)
     return Replay(ca.Function("h", [parameters, sample], [bend], ["parameters", "sample"], ["H"]))
+
+
+def _tells_more(point: Point, normal: Normal) -> bool:
+    """Have normal equations the digits for other points: well conditioned, no residual of rounding
+    alone?"""
+    size = float(point.x @ (np.diag(normal.matrix) * point.x))
+    return normal.cost > ROUNDING**2 * size and factored(normal) is not None
 
 
 def factored(normal: Normal) -> tuple[Array, Array, float] | None:

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import pairwise
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -368,7 +369,7 @@ def _lower(variance: Array) -> Array:
     return np.sqrt(variance) if len(variance) == 1 else _each(np.linalg.cholesky, variance)
 
 
-def _each(function: Callable[[Array], Array], matrices: Array) -> Array:
+def _each(function: Callable[[Any], Any], matrices: Array) -> Array:
     """What a function of (N, m, m) makes of (m, m, N)."""
     try:
         return np.ascontiguousarray(np.moveaxis(function(np.moveaxis(matrices, -1, 0)), 0, -1))
