@@ -73,6 +73,9 @@ class Declared(Protocol):
     def __getitem__(self, name: str) -> Any:
         """A symbol by name."""
 
+    def __hash__(self) -> int:
+        """Equal ones have the same: what is built of one is kept for all."""
+
 
 @dataclass(frozen=True)
 class Traced:

@@ -651,7 +651,7 @@ class Problem:
 
     def normal(self, point: Point) -> Normal:
         """Cost, gradient (n,) and Gauss-Newton matrix (n, n); those of the last points are kept."""
-        for known, normal in self._latest:
+        for known, normal in reversed(self._latest):
             if known is point:
                 return normal
         told = self._on_the_parabola(point) if self.parabolic else None
@@ -665,6 +665,7 @@ class Problem:
         normal = self._normal(point)
         if self.parabolic:
             self._seen[:] = [(point, normal)] if _tells_more(point, normal) else []
+            self._factors.clear()
         self._latest.append((point, normal))
         return normal
 
@@ -676,6 +677,11 @@ class Problem:
     def parabolic(self) -> bool:
         """Is the cost a parabola in the unknowns, which one look at the samples tells?"""
         return linear(self.model) and self.constraints is None
+
+    @property
+    def told(self) -> bool:
+        """Has one look at the samples told what the cost is around there?"""
+        return bool(self._seen)
 
     @cached_property
     def _seen(self) -> list[tuple[Point, Normal]]:
@@ -726,9 +732,19 @@ class Problem:
         """Triangular factor of J, Qᵀr (n,), and the norm of the rest of r.
 
         JᵀJ = RᵀR, Jᵀr = Rᵀ(Qᵀr), ‖r‖² = ‖Qᵀr‖² + rest². From the normal equations where the
-        squared condition number leaves eight digits, else from the rows.
+        squared condition number leaves eight digits, else from the rows. Those of the last points
+        are kept.
         """
-        return factored(self.normal(point)) or self._factor_of_rows(point)
+        for known, factor in self._factors:
+            if known is point:
+                return factor
+        found = factored(self.normal(point)) or self._factor_of_rows(point)
+        self._factors.append((point, found))
+        return found
+
+    @cached_property
+    def _factors(self) -> deque[tuple[Point, tuple[Array, Array, float]]]:
+        return deque(maxlen=LATEST)
 
     def _factor_of_rows(self, point: Point) -> tuple[Array, Array, float]:
         n, blocks = self.unknowns, []
