@@ -46,7 +46,7 @@ def with_errors_of_inputs(
     point, steps, ends, size = best_of(outcomes).point, list[Array](), list[Point](), np.inf
     for _ in range(TURNS):
         problem = at_true_values(problem, point)
-        end = trust_region(problem, point, damping=LITTLE).point
+        end = _end(problem, point)
         step = problem.difference(end, point)
         size = float(np.linalg.norm(problem.factor(end)[0] @ step) / noise.scale)
         if size <= STILL:
@@ -58,6 +58,17 @@ def with_errors_of_inputs(
         f"unknowns still move by {size:.1g} standard deviations): the noise is as large as what "
         "the model bends over; average readings, or state less noise"
     )
+
+
+def _end(problem: Problem, point: Point) -> Point:
+    """Where a turn ends: of a parabola that a look at the samples tells, a step away."""
+    R, t, _ = problem.factor(point)
+    if problem.told:
+        end = problem.moved(point, -np.asarray(np.linalg.solve(R, t)))
+        lower, upper = problem.bounds
+        if np.all((end.x >= lower) & (end.x <= upper)):
+            return end
+    return trust_region(problem, point, damping=LITTLE).point
 
 
 def _ahead(problem: Problem, steps: list[Array], ends: list[Point]) -> Point:

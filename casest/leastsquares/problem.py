@@ -87,7 +87,7 @@ LATEST = 16
 #: Fall of the cost of a linear problem, as a factor, up to which it is told from elsewhere.
 NEAR = 4.0
 #: Residual beside what the unknowns contribute to it below which it may be rounding.
-ROUNDING = 1e-10
+ROUNDING = 1e-6
 #: Samples that are evaluated at once where every residual is looked at on its own.
 BLOCK = 32_768
 #: Samples of a run that a model's own functions (a start, bounds from data) look at.
@@ -664,8 +664,10 @@ class Problem:
         """The same from all samples, whatever follows from what was seen elsewhere."""
         normal = self._normal(point)
         if self.parabolic:
-            self._seen[:] = [(point, normal)] if _tells_more(point, normal) else []
+            factor = factored(normal) if _tells_more(point, normal) else None
+            self._seen[:] = [] if factor is None else [(point, normal)]
             self._factors.clear()
+            self._factors.extend([] if factor is None else [(point, factor)])
         self._latest.append((point, normal))
         return normal
 
@@ -691,12 +693,13 @@ class Problem:
     def _on_the_parabola(self, point: Point) -> Normal | None:
         """What follows from the last look, as long as it is as near as the residual is large:
         further away digits would be lost."""
-        for seen, (cost, gradient, matrix) in self._seen:
+        for seen, normal in self._seen:
             step = point.x - seen.x
-            change = matrix @ step
-            curved, there = 0.5 * float(step @ change), cost + float(step @ gradient)
-            if curved <= cost <= NEAR * (there + curved):
-                return Normal(there + curved, gradient + change, matrix)
+            change = normal.matrix @ step
+            curved = 0.5 * float(step @ change)
+            there = normal.cost + float(step @ normal.gradient) + curved
+            if curved <= normal.cost <= NEAR * there:
+                return Normal(there, normal.gradient + change, normal.matrix)
         return None
 
     def _normal(self, point: Point) -> Normal:
@@ -921,10 +924,9 @@ def _bend(model: Model) -> Replay:
 
 
 def _tells_more(point: Point, normal: Normal) -> bool:
-    """Have normal equations the digits for other points: well conditioned, no residual of rounding
-    alone?"""
+    """Is the residual more than rounding, so that normal equations tell of other points?"""
     size = float(point.x @ (np.diag(normal.matrix) * point.x))
-    return normal.cost > ROUNDING**2 * size and factored(normal) is not None
+    return normal.cost > ROUNDING**2 * size
 
 
 def factored(normal: Normal) -> tuple[Array, Array, float] | None:
