@@ -84,6 +84,8 @@ class Block(NamedTuple):
 NUDGE = 1e-3
 #: Points whose normal equations are kept: a solution is asked for again by who judges it.
 LATEST = 16
+#: The same of triangular factors, which are asked for again at the point last reached.
+FACTORS = 4
 #: Fall of the cost of a linear problem, as a factor, up to which it is told from elsewhere.
 NEAR = 4.0
 #: Residual beside what the unknowns contribute to it below which it may be rounding.
@@ -747,7 +749,7 @@ class Problem:
 
     @cached_property
     def _factors(self) -> deque[tuple[Point, tuple[Array, Array, float]]]:
-        return deque(maxlen=LATEST)
+        return deque(maxlen=FACTORS)
 
     def _factor_of_rows(self, point: Point) -> tuple[Array, Array, float]:
         n, blocks = self.unknowns, []
