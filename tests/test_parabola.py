@@ -61,7 +61,7 @@ def test_what_follows_from_one_look_is_what_the_samples_say(best, away, monkeypa
     problem, optimum = best
     problem.normal(optimum)
     at = looks(monkeypatch)
-    point = Point(optimum.x + [away, -2 * away], optimum.references)
+    point = Point(optimum.x + away * np.array([1.0, -2.0]), optimum.references)
     found, (cost, slope, curvature) = problem.normal(point), of_numpy(problem.runs[0], point)
     assert not at
     assert found.cost == pytest.approx(cost, rel=1e-13)
@@ -69,6 +69,10 @@ def test_what_follows_from_one_look_is_what_the_samples_say(best, away, monkeypa
     scale = np.sqrt(2 * cost * np.diag(curvature))
     assert found.gradient / scale == pytest.approx(slope / scale, abs=1e-13)
     assert found.matrix == pytest.approx(curvature, rel=1e-13)
+    R, t, rest = problem.factor(point)
+    assert pytest.approx(curvature, rel=1e-13) == R.T @ R
+    assert R.T @ t / scale == pytest.approx(slope / scale, abs=1e-13)
+    assert t @ t + rest**2 == pytest.approx(2 * cost, rel=1e-13)
 
 
 def test_the_samples_are_looked_at_again_where_digits_would_be_lost(best, monkeypatch):

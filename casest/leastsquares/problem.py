@@ -36,6 +36,7 @@ from casest.engine import (
 )
 from casest.errors import DataError, NotTrusted, UsageError
 from casest.leastsquares.constrained import FIRST, Constraints, Force, constraints_of
+from casest.leastsquares.parabola import Factor, Look, factored, look_at
 from casest.leastsquares.per_sample import linear, residual_and_jacobian
 from casest.leastsquares.sequence import Staged
 
@@ -86,18 +87,12 @@ NUDGE = 1e-3
 LATEST = 16
 #: The same of triangular factors, which are asked for again at the point last reached.
 FACTORS = 4
-#: Fall of the cost of a linear problem, as a factor, up to which it is told from elsewhere.
-NEAR = 4.0
-#: Residual beside what the unknowns contribute to it below which it may be rounding.
-ROUNDING = 1e-6
 #: Samples that are evaluated at once where every residual is looked at on its own.
 BLOCK = 32_768
 #: Samples of a run that a model's own functions (a start, bounds from data) look at.
 LOOKED = 1_000_000
 #: Records smaller than this (numbers) are copied once into columns, which are quicker to read.
 COPIED = 4_000_000
-#: From this condition of the scaled Jacobian on a triangular factor is computed from the rows.
-ROUGH = 1e4
 
 
 @dataclass(frozen=True)
@@ -643,8 +638,8 @@ class Problem:
 
     def cost(self, point: Point) -> float:
         """½ Σ w r²."""
-        if self.parabolic and (known := self._on_the_parabola(point)) is not None:
-            return known.cost
+        if (told := self._told(point)) is not None:
+            return told.cost
         own = sum(self._run_cost(point, r) for r in range(len(self.runs)))
         if self._bare:
             return own
@@ -656,7 +651,7 @@ class Problem:
         for known, normal in reversed(self._latest):
             if known is point:
                 return normal
-        told = self._on_the_parabola(point) if self.parabolic else None
+        told = self._told(point)
         if told is None:
             return self.looked_at(point)
         self._latest.append((point, told))
@@ -666,10 +661,9 @@ class Problem:
         """The same from all samples, whatever follows from what was seen elsewhere."""
         normal = self._normal(point)
         if self.parabolic:
-            factor = factored(normal) if _tells_more(point, normal) else None
-            self._seen[:] = [] if factor is None else [(point, normal)]
+            look = look_at(point.x, normal)
+            self._looks[:] = [] if look is None else [look]
             self._factors.clear()
-            self._factors.extend([] if factor is None else [(point, factor)])
         self._latest.append((point, normal))
         return normal
 
@@ -685,24 +679,16 @@ class Problem:
     @property
     def told(self) -> bool:
         """Has one look at the samples told what the cost is around there?"""
-        return bool(self._seen)
+        return bool(self._looks)
 
     @cached_property
-    def _seen(self) -> list[tuple[Point, Normal]]:
-        """Where all samples were last looked at, of a parabola, if that tells of other places."""
+    def _looks(self) -> list[Look]:
+        """The last look at all samples, of a parabola, if it tells of other places."""
         return []
 
-    def _on_the_parabola(self, point: Point) -> Normal | None:
-        """What follows from the last look, as long as it is as near as the residual is large:
-        further away digits would be lost."""
-        for seen, normal in self._seen:
-            step = point.x - seen.x
-            change = normal.matrix @ step
-            curved = 0.5 * float(step @ change)
-            there = normal.cost + float(step @ normal.gradient) + curved
-            if curved <= normal.cost <= NEAR * there:
-                return Normal(there, normal.gradient + change, normal.matrix)
-        return None
+    def _told(self, point: Point) -> Normal | None:
+        """What follows from the last look."""
+        return self._looks[0].normal_at(point.x) if self.parabolic and self._looks else None
 
     def _normal(self, point: Point) -> Normal:
         own = self.of_runs(point)
@@ -733,7 +719,7 @@ class Problem:
         """For each run the unknowns it sees and its own normal equations in them."""
         return [(self._selections[r][0], self._run_normal(point, r)) for r in range(len(self.runs))]
 
-    def factor(self, point: Point) -> tuple[Array, Array, float]:
+    def factor(self, point: Point) -> Factor:
         """Triangular factor of J, Qᵀr (n,), and the norm of the rest of r.
 
         JᵀJ = RᵀR, Jᵀr = Rᵀ(Qᵀr), ‖r‖² = ‖Qᵀr‖² + rest². From the normal equations where the
@@ -743,15 +729,21 @@ class Problem:
         for known, factor in self._factors:
             if known is point:
                 return factor
-        found = factored(self.normal(point)) or self._factor_of_rows(point)
+        found = self._factor(point)
         self._factors.append((point, found))
         return found
 
     @cached_property
-    def _factors(self) -> deque[tuple[Point, tuple[Array, Array, float]]]:
+    def _factors(self) -> deque[tuple[Point, Factor]]:
         return deque(maxlen=FACTORS)
 
-    def _factor_of_rows(self, point: Point) -> tuple[Array, Array, float]:
+    def _factor(self, point: Point) -> Factor:
+        normal = self.normal(point)
+        if self.told and self._looks[0].normal_at(point.x) is not None:
+            return self._looks[0].factor_at(point.x)
+        return factored(normal) or self._factor_of_rows(point)
+
+    def _factor_of_rows(self, point: Point) -> Factor:
         n, blocks = self.unknowns, []
         for r in range(len(self.runs)):
             x = self._selections[r][0]
@@ -923,26 +915,6 @@ def _bend(model: Model) -> Replay:
     sample = ca.vertcat(sample_symbol(model), w)
     parameters = ca.vertcat(t.coordinates, t.references)
     return Replay(ca.Function("h", [parameters, sample], [bend], ["parameters", "sample"], ["H"]))
-
-
-def _tells_more(point: Point, normal: Normal) -> bool:
-    """Is the residual more than rounding, so that normal equations tell of other points?"""
-    size = float(point.x @ (np.diag(normal.matrix) * point.x))
-    return normal.cost > ROUNDING**2 * size
-
-
-def factored(normal: Normal) -> tuple[Array, Array, float] | None:
-    """R, Qᵀr and the norm of the rest of r from normal equations; None where they are too rough."""
-    scale = np.sqrt(np.where(np.diag(normal.matrix) > 0, np.diag(normal.matrix), 1.0))
-    try:
-        lower = np.linalg.cholesky(normal.matrix / np.outer(scale, scale))
-        t = np.linalg.solve(lower, normal.gradient / scale)
-    except np.linalg.LinAlgError:
-        return None
-    rest = 2 * normal.cost - float(t @ t)
-    # A residual that the Jacobian nearly explains loses its digits in the difference.
-    rough = not np.diag(lower).min(initial=1.0) > 1 / ROUGH or not rest > 1e-6 * normal.cost
-    return None if rough else (np.asarray(lower.T * scale), np.asarray(t), float(np.sqrt(rest)))
 
 
 def _root(variance: Array) -> Array:
