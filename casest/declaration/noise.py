@@ -40,7 +40,7 @@ class Stated:
 
     signals: tuple[str, ...]
     residuals: int
-    # No part of the relation: what was built for one record serves the next of as much noise.
+    # No part of the relation: what was built for one record serves the next, of other noise.
     scale: float = field(default=1.0, compare=False)
     groups: tuple[tuple[str, ...], ...] = ()
 

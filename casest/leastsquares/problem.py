@@ -688,7 +688,7 @@ class Problem:
 
     def _told(self, point: Point) -> Normal | None:
         """What follows from the last look."""
-        return self._looks[0].normal_at(point.x) if self.parabolic and self._looks else None
+        return next((look.normal_at(point.x) for look in self._looks), None)
 
     def _normal(self, point: Point) -> Normal:
         own = self.of_runs(point)
@@ -739,8 +739,9 @@ class Problem:
 
     def _factor(self, point: Point) -> Factor:
         normal = self.normal(point)
-        if self.told and self._looks[0].normal_at(point.x) is not None:
-            return self._looks[0].factor_at(point.x)
+        for look in self._looks:
+            if look.normal_at(point.x) is not None:
+                return look.factor_at(point.x)
         return factored(normal) or self._factor_of_rows(point)
 
     def _factor_of_rows(self, point: Point) -> Factor:

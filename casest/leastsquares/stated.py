@@ -247,7 +247,8 @@ def _times_covariance(root: Array, slope: Array) -> Array:
     if root.shape[1] == k:
         return np.asarray(root.T[:, None] ** 2 * transposed)
     matrix = root.T.reshape(k, k, -1)
-    return np.asarray(np.einsum("ijn,ljn,lmn->imn", matrix, matrix, transposed))
+    half = np.einsum("lin,lmn->imn", matrix, transposed)
+    return np.asarray(np.einsum("iln,lmn->imn", matrix, half))
 
 
 def _with(
