@@ -29,7 +29,8 @@ def solved(
     """As `solve` has it; where that only says where the turns begin and there is one valley, which
     every way leads into, the quickest way alone."""
     if settles(problem.model) and problem.parabolic and not has_noise_effects(problem.model):
-        return problem, (trust_region(problem, first),)
+        near = 1e-6 / problem.residual_count  # the turns go on from there
+        return problem, (trust_region(problem, first, tolerance=near),)
     return solve(problem, first, solver=solver, seed=seed, automatic=automatic)
 
 
