@@ -127,7 +127,8 @@ def _without(basis: Array, direction: Array) -> Array:
 
 def _combination(problem: Problem, scaled: Array, scale: Array) -> str:
     """The unknowns that move together, the largest movers first, in their own units."""
-    order = np.argsort(-np.abs(scaled))
+    # Those that move alike in the model's order, whatever their last digits.
+    order = np.argsort(-np.abs(scaled).round(9), kind="stable")
     movers = [int(i) for i in order if abs(scaled[i]) > 0.02]
     names = [problem.names[i] for i in movers]
     if len(movers) == 1:
