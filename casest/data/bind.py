@@ -467,7 +467,7 @@ def _checked(run: Run, signals: Sequence[Signal], sources: Mapping[str, tuple[st
         if is_time(signal) or signal.kind == "rotation":
             continue
         values, columns = run.signals[signal.name], sources[signal.name]
-        values = values[np.isfinite(values).all(axis=1)]
+        values = checks.without_gaps(values)
         checks.refuse_constant(run.file, signal.name, values, columns)
         notes += checks.constant_columns(values, columns) + checks.clipped(values, columns)
     return replace(run, notes=(*run.notes, *notes))

@@ -15,6 +15,12 @@ _CROWDING = 5.0  # times as many as on the levels next to it (a smooth crest giv
 _STEEP = 3.0  # resolutions jumped on the way in (rest toggles by one)
 
 
+def without_gaps(values: Array) -> Array:
+    """Return the samples of (N, size) all of whose numbers are finite; itself where all are."""
+    whole = np.isfinite(values).all(axis=1)
+    return values if whole.all() else values[whole]
+
+
 def refuse_constant(file: str, name: str, values: Array, columns: tuple[str, ...]) -> None:
     """Raise DataError where all samples of a signal (N, size) are identical."""
     if len(values) > 1 and bool((values == values[0]).all()):
@@ -89,6 +95,8 @@ def _symmetric(x: Array) -> bool:
 
 def _suspect(x: Array, others: Array) -> tuple[int, bool]:
     """Return how many readings crowd at the largest value, and whether that was in motion."""
+    if np.count_nonzero(x == x.max()) < _FEWEST:  # long before all are put in order
+        return 0, False
     levels, counts = np.unique(x, return_counts=True)
     if len(levels) < 5 or counts[-1] < max(_FEWEST, _CROWDING * float(counts[-4:-1].mean())):
         return 0, False

@@ -28,7 +28,7 @@ def vector(
     notes = [*_overruled(table, signal, names, options), *_missing(table, signal, values, options)]
     if target is not None and None in stated:
         silent = " ".join(n for n, u in zip(names, stated, strict=True) if u is None)
-        whole = values[np.isfinite(values).all(axis=1)]
+        whole = checks.without_gaps(values)
         with np.errstate(over="ignore"):
             length = np.median(np.linalg.norm(whole, axis=1)) if len(whole) else 0
         size = f"median length {length:.4g}"

@@ -5,8 +5,8 @@ from __future__ import annotations
 import difflib
 import inspect
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass, fields, replace
+from functools import cached_property, lru_cache
 from typing import Any
 
 import casadi as ca
@@ -73,6 +73,14 @@ class Model:
     noise: Stated | None = None
     prior: Prior | None = None
 
+    def __hash__(self) -> int:
+        """As a dataclass has it, computed once: all that is kept for a model is found by it."""
+        return self._hash
+
+    @cached_property
+    def _hash(self) -> int:
+        return hash(tuple(getattr(self, field.name) for field in fields(self)))
+
     def __reduce__(self) -> tuple[Any, ...]:
         """To pickle: the declaration alone; it is traced anew where it arrives."""
         return reduced(self)
@@ -114,7 +122,7 @@ class Model:
         names = {p.name for p in self.parameters}
         return {name: value for name, value in values.items() if name in names}
 
-    @property
+    @cached_property
     def without_noise(self) -> Model:
         """The same relation, its residual in its own unit; itself where no noise was stated."""
         return self if self.noise is None else replace(self, noise=None)
@@ -489,19 +497,12 @@ class Model:
     @cached_property
     def traced(self) -> Traced:
         """The body in CasADi symbols, with every effect in place."""
-        found = trace(self)
-        if self.noise is not None:
-            return in_units_of_noise(found, self.noise)
-        acting = any(a.kind in ("quantity", "signal") for a in self.effects)
-        if found.residual.implicit is None or not acting:
-            return found
-        return sampson(self, found, trace(self, straight=True))
+        return _traced(self)
 
     @cached_property
     def staged(self) -> Traced:
         """The body with a symbol in the place of what each effect gives that looks at others."""
-        found = trace(self, staged=True)
-        return found if self.noise is None else in_units_of_noise(found, self.noise)
+        return _staged(self)
 
     @property
     def along(self) -> Traced:
@@ -604,6 +605,23 @@ def model(function: Callable[..., Residual]) -> Model:
     made = Model(name, function, tuple(declared))
     check_units_known(made.name, made.declared)
     return made
+
+
+@lru_cache(maxsize=64)
+def _traced(made: Model) -> Traced:
+    found = trace(made)
+    if made.noise is not None:
+        return in_units_of_noise(found, made.noise)
+    acting = any(a.kind in ("quantity", "signal") for a in made.effects)
+    if found.residual.implicit is None or not acting:
+        return found
+    return sampson(made, found, trace(made, straight=True))
+
+
+@lru_cache(maxsize=64)
+def _staged(made: Model) -> Traced:
+    found = trace(made, staged=True)
+    return found if made.noise is None else in_units_of_noise(found, made.noise)
 
 
 def _declared(model_name: str, argument: inspect.Parameter) -> Symbol:

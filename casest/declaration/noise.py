@@ -16,7 +16,7 @@ readings is too long): it is taken off, so that the estimate is right to second 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import casadi as ca
 
@@ -40,7 +40,8 @@ class Stated:
 
     signals: tuple[str, ...]
     residuals: int
-    scale: float = 1.0
+    # No part of the relation: what was built for one record serves the next, of other noise.
+    scale: float = field(default=1.0, compare=False)
     groups: tuple[tuple[str, ...], ...] = ()
 
     @property

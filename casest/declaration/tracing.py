@@ -11,6 +11,7 @@ import warnings
 from collections.abc import Callable, Mapping
 from copy import copy
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any, Literal, Protocol
 
 import casadi as ca
@@ -72,6 +73,9 @@ class Declared(Protocol):
     def __getitem__(self, name: str) -> Any:
         """A symbol by name."""
 
+    def __hash__(self) -> int:
+        """Equal ones have the same: what is built of one is kept for all."""
+
 
 @dataclass(frozen=True)
 class Traced:
@@ -128,6 +132,7 @@ class Stage:
         return self.taken
 
 
+@lru_cache(maxsize=64)
 def trace(
     model: Declared,
     cut: str | None = None,
@@ -142,6 +147,8 @@ def trace(
     symbol in the place of what each effect adds, listed in `steps` with what it stands for;
     `staged` one in the place of what each effect that looks at other samples gives, listed in
     `stages`. Without it those effects are left out.
+
+    Kept, for every fit has a model of its own (noise, effects), and most equal one before.
     """
     symbols, coordinates, references = _symbols(model)
     running = Trace(

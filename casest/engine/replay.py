@@ -294,6 +294,14 @@ class Replay:
                 [values[end - count : end] for end, count in zip(ends, counts, strict=True)],
             )
 
+    def by_entry(self, parameters: Floats, samples: Samples) -> list[Floats]:
+        """Each output of every sample, dense, samples along the last axis: (rows, columns, N)."""
+        results = [np.zeros((*shape, len(samples))) for shape in self.shapes]
+        for span, outputs in self.blocks(parameters, samples):
+            for result, values, (row, column) in zip(results, outputs, self.sparsity, strict=True):
+                result[row, column, span] = values
+        return results
+
     def __call__(self, parameters: Floats, samples: Samples) -> list[Floats]:
         """Each output of every sample, dense: (N, rows, columns)."""
         results = [np.zeros((len(samples), *shape)) for shape in self.shapes]

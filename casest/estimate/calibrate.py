@@ -19,7 +19,7 @@ from casest.estimate.by_estimator import by_estimator
 from casest.estimate.certificate import Certificate, certify
 from casest.estimate.correlation import correlation_time
 from casest.estimate.covariance import as_stated, covariance_of, inverse_normal
-from casest.estimate.errors_of_inputs import with_errors_of_inputs
+from casest.estimate.errors_of_inputs import solved, with_errors_of_inputs
 from casest.estimate.estimate import Estimate as Estimate
 from casest.estimate.estimate import Noise
 from casest.estimate.evidence import judged
@@ -36,7 +36,7 @@ from casest.leastsquares.stated import chi_square
 from casest.leastsquares.sums import repeat_noise, second_order_bias
 from casest.solve.horizon import grown
 from casest.solve.outcome import Outcome
-from casest.solve.strategy import SOLVERS, best_of, solve, valleys
+from casest.solve.strategy import SOLVERS, best_of, valleys
 from casest.solve.trust_region import trust_region
 
 #: From this many degrees of freedom on the residual alone says how large the noise is.
@@ -105,7 +105,7 @@ def _attempt(
     if nowhere:
         return _refused(problem, first, Code.NOT_FINITE, nowhere, began)
     problem = in_deviations(problem, first, _fitted)
-    problem, outcomes = solve(
+    problem, outcomes = solved(
         problem,
         first,
         solver="ipopt" if solver in own else solver,
@@ -214,6 +214,8 @@ def _estimate(
         best if o is found else o if _beside(o, best) else _canonical(problem, o) for o in outcomes
     ]
     point = best.point
+    if problem.parabolic:
+        problem.looked_at(point)  # judged by the samples there, not by what follows from elsewhere
     factor = problem.factor(point)
     R, _, rest = factor
     if not np.isfinite(R).all():

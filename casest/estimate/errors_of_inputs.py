@@ -12,6 +12,7 @@ from casest.declaration.shapes import Array
 from casest.errors import NotTrusted
 from casest.leastsquares.problem import Point, Problem
 from casest.leastsquares.stated import at_true_values, settles
+from casest.leastsquares.weights import has_noise_effects
 from casest.solve.outcome import Outcome
 from casest.solve.strategy import best_of, solve
 from casest.solve.trust_region import LITTLE, trust_region
@@ -20,6 +21,17 @@ from casest.solve.trust_region import LITTLE, trust_region
 TURNS, STILL = 60, 1e-6
 #: Turns that are looked back at to see where they lead (Anderson 1965).
 MEMORY = 5
+
+
+def solved(
+    problem: Problem, first: Point, *, solver: str, seed: int, automatic: bool
+) -> tuple[Problem, tuple[Outcome, ...]]:
+    """As `solve` has it; where that only says where the turns begin and there is one valley, which
+    every way leads into, the quickest way alone."""
+    if settles(problem.model) and problem.parabolic and not has_noise_effects(problem.model):
+        near = 1e-6 / problem.residual_count  # the turns go on from there
+        return problem, (trust_region(problem, first, tolerance=near),)
+    return solve(problem, first, solver=solver, seed=seed, automatic=automatic)
 
 
 def with_errors_of_inputs(
@@ -35,7 +47,7 @@ def with_errors_of_inputs(
     point, steps, ends, size = best_of(outcomes).point, list[Array](), list[Point](), np.inf
     for _ in range(TURNS):
         problem = at_true_values(problem, point)
-        end = trust_region(problem, point, damping=LITTLE).point
+        end = _end(problem, point)
         step = problem.difference(end, point)
         size = float(np.linalg.norm(problem.factor(end)[0] @ step) / noise.scale)
         if size <= STILL:
@@ -47,6 +59,17 @@ def with_errors_of_inputs(
         f"unknowns still move by {size:.1g} standard deviations): the noise is as large as what "
         "the model bends over; average readings, or state less noise"
     )
+
+
+def _end(problem: Problem, point: Point) -> Point:
+    """Where a turn ends: of a parabola that a look at the samples tells, a step away."""
+    R, t, _ = problem.factor(point)
+    if problem.told:
+        end = problem.moved(point, -np.asarray(np.linalg.solve(R, t)))
+        lower, upper = problem.bounds
+        if np.all((end.x >= lower) & (end.x <= upper)):
+            return end
+    return trust_region(problem, point, damping=LITTLE).point
 
 
 def _ahead(problem: Problem, steps: list[Array], ends: list[Point]) -> Point:

@@ -18,9 +18,12 @@ NEARBY, IN_A_ROW = 2000, 1000
 def few_of(problem: Problem) -> Problem | None:
     """The problem on as few of its samples as are enough to come near the solution of all.
 
-    None where it has no more than that, or where its samples need all the others: equations are
-    integrated from the record's beginning, turns from rest to rest.
+    None where it has no more than that, where a look at all of them has told more, or where its
+    samples need all the others: equations are integrated from the record's beginning, turns from
+    rest to rest.
     """
+    if problem.told:
+        return None
     axes, runs = len(problem.model.axes), len(problem.runs)
     if not problem.sequential:
         every = problem.residual_count // (NEARBY * axes * runs)

@@ -51,15 +51,26 @@ class Identifiability:
     weakest: str
 
 
+def rank(R: Array) -> int:
+    """How many directions a triangular factor (n, n) tells, its columns scaled to unit length."""
+    norms = np.linalg.norm(R, axis=0)
+    scaled = R / np.where(norms > 0, norms, 1.0)
+    return _told(np.asarray(np.linalg.svd(scaled, compute_uv=False)))
+
+
+def _told(singular: Array) -> int:
+    largest = singular.max(initial=0.0)
+    # A zero column keeps norm zero: its unit vector is a null direction as it stands.
+    return int(np.sum(singular > NULL * largest)) if largest > 0 else 0
+
+
 def identify(problem: Problem, point: Point, R: Array | None = None) -> Identifiability:
     """Rank and null directions, named, at a point."""
     R = problem.factor(point)[0] if R is None else R
     norms = np.linalg.norm(R, axis=0)
     scale = np.where(norms > 0, norms, 1.0)
     _, singular, Vt = np.linalg.svd(R / scale)
-    largest = singular.max(initial=0.0)
-    # A zero column keeps norm zero: its unit vector is a null direction as it stands.
-    rank = int(np.sum(singular > NULL * largest)) if largest > 0 else 0
+    rank = _told(singular)
     null = Vt[rank:].T
     words = tuple(_null_words(problem, point, null, scale))
     unscaled = null / scale[:, None]
@@ -116,7 +127,8 @@ def _without(basis: Array, direction: Array) -> Array:
 
 def _combination(problem: Problem, scaled: Array, scale: Array) -> str:
     """The unknowns that move together, the largest movers first, in their own units."""
-    order = np.argsort(-np.abs(scaled))
+    # Those that move alike in the model's order, whatever their last digits.
+    order = np.argsort(-np.abs(scaled).round(9), kind="stable")
     movers = [int(i) for i in order if abs(scaled[i]) > 0.02]
     names = [problem.names[i] for i in movers]
     if len(movers) == 1:

@@ -36,7 +36,8 @@ from casest.engine import (
 )
 from casest.errors import DataError, NotTrusted, UsageError
 from casest.leastsquares.constrained import FIRST, Constraints, Force, constraints_of
-from casest.leastsquares.per_sample import residual_and_jacobian
+from casest.leastsquares.parabola import Factor, Look, factored, look_at
+from casest.leastsquares.per_sample import linear, residual_and_jacobian
 from casest.leastsquares.sequence import Staged
 
 
@@ -84,14 +85,14 @@ class Block(NamedTuple):
 NUDGE = 1e-3
 #: Points whose normal equations are kept: a solution is asked for again by who judges it.
 LATEST = 16
+#: The same of triangular factors, which are asked for again at the point last reached.
+FACTORS = 4
 #: Samples that are evaluated at once where every residual is looked at on its own.
 BLOCK = 32_768
 #: Samples of a run that a model's own functions (a start, bounds from data) look at.
 LOOKED = 1_000_000
 #: Records smaller than this (numbers) are copied once into columns, which are quicker to read.
 COPIED = 4_000_000
-#: From this condition of the scaled Jacobian on a triangular factor is computed from the rows.
-ROUGH = 1e4
 
 
 @dataclass(frozen=True)
@@ -637,6 +638,8 @@ class Problem:
 
     def cost(self, point: Point) -> float:
         """½ Σ w r²."""
+        if (told := self._told(point)) is not None:
+            return told.cost
         own = sum(self._run_cost(point, r) for r in range(len(self.runs)))
         if self._bare:
             return own
@@ -645,16 +648,47 @@ class Problem:
 
     def normal(self, point: Point) -> Normal:
         """Cost, gradient (n,) and Gauss-Newton matrix (n, n); those of the last points are kept."""
-        for known, normal in self._latest:
+        for known, normal in reversed(self._latest):
             if known is point:
                 return normal
+        told = self._told(point)
+        if told is None:
+            return self.looked_at(point)
+        self._latest.append((point, told))
+        return told
+
+    def looked_at(self, point: Point) -> Normal:
+        """The same from all samples, whatever follows from what was seen elsewhere."""
         normal = self._normal(point)
+        if self.parabolic:
+            look = look_at(point.x, normal)
+            self._looks[:] = [] if look is None else [look]
+            self._factors.clear()
         self._latest.append((point, normal))
         return normal
 
     @cached_property
     def _latest(self) -> deque[tuple[Point, Normal]]:
         return deque(maxlen=LATEST)
+
+    @cached_property
+    def parabolic(self) -> bool:
+        """Is the cost a parabola in the unknowns, which one look at the samples tells?"""
+        return linear(self.model) and self.constraints is None
+
+    @property
+    def told(self) -> bool:
+        """Has one look at the samples told what the cost is around there?"""
+        return bool(self._looks)
+
+    @cached_property
+    def _looks(self) -> list[Look]:
+        """The last look at all samples, of a parabola, if it tells of other places."""
+        return []
+
+    def _told(self, point: Point) -> Normal | None:
+        """What follows from the last look."""
+        return next((look.normal_at(point.x) for look in self._looks), None)
 
     def _normal(self, point: Point) -> Normal:
         own = self.of_runs(point)
@@ -685,15 +719,32 @@ class Problem:
         """For each run the unknowns it sees and its own normal equations in them."""
         return [(self._selections[r][0], self._run_normal(point, r)) for r in range(len(self.runs))]
 
-    def factor(self, point: Point) -> tuple[Array, Array, float]:
+    def factor(self, point: Point) -> Factor:
         """Triangular factor of J, Qᵀr (n,), and the norm of the rest of r.
 
         JᵀJ = RᵀR, Jᵀr = Rᵀ(Qᵀr), ‖r‖² = ‖Qᵀr‖² + rest². From the normal equations where the
-        squared condition number leaves eight digits, else from the rows.
+        squared condition number leaves eight digits, else from the rows. Those of the last points
+        are kept.
         """
-        return factored(self.normal(point)) or self._factor_of_rows(point)
+        for known, factor in self._factors:
+            if known is point:
+                return factor
+        found = self._factor(point)
+        self._factors.append((point, found))
+        return found
 
-    def _factor_of_rows(self, point: Point) -> tuple[Array, Array, float]:
+    @cached_property
+    def _factors(self) -> deque[tuple[Point, Factor]]:
+        return deque(maxlen=FACTORS)
+
+    def _factor(self, point: Point) -> Factor:
+        normal = self.normal(point)
+        for look in self._looks:
+            if look.normal_at(point.x) is not None:
+                return look.factor_at(point.x)
+        return factored(normal) or self._factor_of_rows(point)
+
+    def _factor_of_rows(self, point: Point) -> Factor:
         n, blocks = self.unknowns, []
         for r in range(len(self.runs)):
             x = self._selections[r][0]
@@ -713,6 +764,8 @@ class Problem:
     def hessian(self, point: Point) -> Array:
         """Exact second derivative of the cost, (n, n); Gauss-Newton where effects have a memory."""
         matrix = self.normal(point).matrix.copy()
+        if self.parabolic:
+            return matrix
         if self._staged is not None or self.constraints is not None:
             return self._differences(point, matrix) if self.smooth else matrix
         for r, samples in enumerate(self.samples):
@@ -863,20 +916,6 @@ def _bend(model: Model) -> Replay:
     sample = ca.vertcat(sample_symbol(model), w)
     parameters = ca.vertcat(t.coordinates, t.references)
     return Replay(ca.Function("h", [parameters, sample], [bend], ["parameters", "sample"], ["H"]))
-
-
-def factored(normal: Normal) -> tuple[Array, Array, float] | None:
-    """R, Qᵀr and the norm of the rest of r from normal equations; None where they are too rough."""
-    scale = np.sqrt(np.where(np.diag(normal.matrix) > 0, np.diag(normal.matrix), 1.0))
-    try:
-        lower = np.linalg.cholesky(normal.matrix / np.outer(scale, scale))
-        t = np.linalg.solve(lower, normal.gradient / scale)
-    except np.linalg.LinAlgError:
-        return None
-    rest = 2 * normal.cost - float(t @ t)
-    # A residual that the Jacobian nearly explains loses its digits in the difference.
-    rough = not np.diag(lower).min(initial=1.0) > 1 / ROUGH or not rest > 1e-6 * normal.cost
-    return None if rough else (np.asarray(lower.T * scale), np.asarray(t), float(np.sqrt(rest)))
 
 
 def _root(variance: Array) -> Array:

@@ -6,9 +6,11 @@ expected as there are degrees of freedom.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import pairwise
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -182,34 +184,41 @@ def _begun(problem: Problem) -> Problem:
     """
     model, noise = problem.model, problem.model.noise
     assert noise is not None
-    bare, alone = Problem(replace(model, noise=None), problem.runs), model.traced.measured
+    bare, alone = Problem(model.without_noise, problem.runs), model.traced.measured
     parts = [
         _linearised(bare.model, bare.parameters(bare.start(), r), run, noise, noisy=alone)
         for r, run in enumerate(bare.runs)
     ]
-    variance = np.concatenate([np.diagonal(p.variance, axis1=1, axis2=2) for p in parts])
+    variance = np.concatenate([np.diagonal(p.variance) for p in parts])
     for k, axis in enumerate(model.axes):
         if not (variance[:, k] > 0).all():
             missing = [s.name for s in model.readings if s.name not in noise.signals]
             also = f": say that of {' and '.join(missing)} too" if missing else ""
             raise UsageError(f"the residual {axis} of {model.name} has no stated noise{also}")
     noise = replace(noise, scale=float(np.sqrt(np.median(variance))))
-    runs = [
-        _with(p, run, noise, true=p.reading) for p, run in zip(parts, problem.runs, strict=True)
-    ]
+    runs = [_with(p, run, noise, p.reading) for p, run in zip(parts, problem.runs, strict=True)]
     return Problem(replace(model, noise=noise), tuple(runs))
 
 
 @dataclass(frozen=True)
 class _Linear:
-    """One run around estimates of its true values: reading (N, k), residual at them (N, m), slope
-    G (N, m, k), CGᵀ (N, k, m), variance V (N, m, m)."""
+    """One run around estimates of its true values, sample by sample along the last axis, which is
+    how they are computed: reading and true values (k, N), residual at these (m, N), slope G
+    (m, k, N), CGᵀ (k, m, N), variance V (m, m, N)."""
 
     reading: Array
+    true: Array
     residual: Array
     slope: Array
     pull: Array
     variance: Array
+
+    @property
+    def likeliest(self) -> Array:
+        """ξ (k, N) = s - CGᵀV⁻¹w."""
+        w = self.residual + np.einsum("mkn,kn->mn", self.slope, self.reading - self.true)
+        pulled = np.einsum("abn,bn->an", _inverse(self.variance), w)
+        return np.asarray(self.reading - np.einsum("kmn,mn->kn", self.pull, pulled))
 
 
 def _linearised(
@@ -220,20 +229,22 @@ def _linearised(
     Of the noise of one signal alone, if `noisy` names it. The model is without stated noise.
     """
     sizes = [run.signals[name].shape[1] for name in noise.signals]
-    widths = dict(zip(noise.signals, sizes, strict=True))
-    reading = np.concatenate([run.signals[name] for name in noise.signals], axis=1)
-    true = run.signals.get(TRUE, reading)
-    at = dict(zip(noise.signals, np.split(true, np.cumsum(sizes)[:-1], axis=1), strict=True))
-    samples = Columns([at.get(s.name, run.signals[s.name]) for s in model.signals])
-    residual, slope = _residual_and_slope(model, noise.signals)(parameters, samples)
-    pulls, first = [], 0
+    first = np.cumsum([0, *sizes])
+    places = {name: slice(*ends) for name, ends in zip(noise.signals, pairwise(first), strict=True)}
+    reading = np.concatenate([run.signals[name].T for name in noise.signals])
+    true = run.signals[TRUE].T if TRUE in run.signals else reading
+    at = [
+        true[places[s.name]].T if s.name in places else run.signals[s.name] for s in model.signals
+    ]
+    residual, slope = _residual_and_slope(model, noise.signals).by_entry(parameters, Columns(at))
+    pulls = []
     for group in noise.together:
-        last = first + sum(widths[name] for name in group)
-        pull = _times_covariance(run.signals[root_of(group)], slope[:, :, first:last])
-        pulls.append(pull * (noisy is None or noisy in group))
-        first = last
-    pull = np.concatenate(pulls, axis=1)
-    return _Linear(reading, residual[:, :, 0], slope, pull, slope @ pull)
+        own = slice(places[group[0]].start, places[group[-1]].stop)
+        pull = _times_covariance(run.signals[root_of(group)], slope[:, own])
+        pulls.append(pull if noisy is None or noisy in group else np.zeros_like(pull))
+    pull = np.concatenate(pulls)
+    variance = np.einsum("akn,kbn->abn", slope, pull)
+    return _Linear(reading, true, residual[:, 0], slope, pull, variance)
 
 
 @lru_cache(maxsize=64)
@@ -245,22 +256,27 @@ def _residual_and_slope(model: Model, names: tuple[str, ...]) -> Replay:
 
 
 def _times_covariance(root: Array, slope: Array) -> Array:
-    """CGᵀ (N, k, m) of signals together, from standard deviations (N, k) or roots (N, k²)."""
-    k = slope.shape[2]
-    transposed = np.swapaxes(slope, 1, 2)
+    """CGᵀ (k, m, N) of signals together, from standard deviations (N, k) or roots (N, k²)."""
+    k = slope.shape[1]
+    transposed = np.swapaxes(slope, 0, 1)
     if root.shape[1] == k:
-        return np.asarray(root[:, :, None] ** 2 * transposed)
-    matrix = root.reshape(-1, k, k)
-    return np.asarray(matrix @ np.swapaxes(matrix, 1, 2) @ transposed)
+        return np.asarray(root.T[:, None] ** 2 * transposed)
+    matrix = root.T.reshape(k, k, -1)
+    half = np.einsum("lin,lmn->imn", matrix, transposed)
+    return np.asarray(np.einsum("iln,lmn->imn", matrix, half))
 
 
-def _with(part: _Linear, run: Run, noise: Stated, true: Array, mean: Array | None = None) -> Run:
-    """The run with whitening, slope, true values and the residual's mean beside its signals."""
-    n, m = part.residual.shape
-    mean = np.zeros((n, m)) if mean is None else mean
+def _with(
+    part: _Linear, run: Run, noise: Stated, true: Array | None = None, mean: Array | None = None
+) -> Run:
+    """The run with whitening, slope, true values (k, N) and the residual's mean (N, m) beside its
+    signals."""
+    m, k, n = part.slope.shape
+    true = part.true if true is None else true
+    mean = np.zeros((m, n)).T if mean is None else mean
     whitening = noise.scale * _inverse(_lower(part.variance))
-    held = {WHITENING: whitening.reshape(n, -1), SLOPE: part.slope.reshape(n, -1)}
-    return replace(run, signals={**run.signals, **held, TRUE: true, MEAN: mean})
+    held = {WHITENING: whitening.reshape(m * m, n).T, SLOPE: part.slope.reshape(m * k, n).T}
+    return replace(run, signals={**run.signals, **held, TRUE: true.T, MEAN: mean})
 
 
 def settles(model: Model) -> bool:
@@ -268,7 +284,7 @@ def settles(model: Model) -> bool:
 
     It need not where the residual is as steep in the noisy signals everywhere.
     """
-    return model.noise is not None and _steepness_varies(replace(model, noise=None), model.noise)
+    return model.noise is not None and _steepness_varies(model.without_noise, model.noise)
 
 
 @lru_cache(maxsize=64)
@@ -288,37 +304,41 @@ def _straight(model: Model, names: tuple[str, ...]) -> bool:
 
 def at_true_values(problem: Problem, point: Point) -> Problem:
     """The problem with ξ, G, V and b as they are at a point, ξ as likely as can be."""
-    model, noise = replace(problem.model, noise=None), problem.model.noise
+    model, noise = problem.model.without_noise, problem.model.noise
     assert noise is not None
     runs = []
     for r, run in enumerate(problem.runs):
         parameters = problem.parameters(point, r)
+        if _straight(model, noise.signals):
+            # One step leads there, G and V are the same there, and b is zero.
+            part = _linearised(model, parameters, run, noise)
+            runs.append(_with(part, run, noise, part.likeliest))
+            continue
         pieces = [slice(i, i + PIECE) for i in range(0, len(run), PIECE)]
         found = [_likeliest(model, parameters, run.take(own), noise) for own in pieces]
-        true = np.concatenate(found)
-        run = replace(run, signals={**run.signals, TRUE: true})
+        run = replace(run, signals={**run.signals, TRUE: np.concatenate(found, axis=1).T})
         part = _linearised(model, parameters, run, noise)
         mean = _mean(model, parameters, run, part) if problem.model.implicit else None
-        runs.append(_with(part, run, noise, true, mean))
+        runs.append(_with(part, run, noise, mean=mean))
     return replace(problem, runs=tuple(runs))
 
 
 def _likeliest(model: Model, parameters: Array, run: Run, noise: Stated) -> Array:
-    """ξ (N, k) = s - CGᵀV⁻¹w, with G and w where it is itself.
+    """ξ (k, N) = s - CGᵀV⁻¹w, with G and w where it is itself.
 
-    Step by step, each sample for itself: where steps do not shrink, shorter ones are taken. Where
-    the residual is straight in the noisy signals the first step leads there.
+    Step by step, each sample for itself: where steps do not shrink, shorter ones are taken.
     """
-    if _straight(model, noise.signals):
-        return run.signals[TRUE] + _step(_linearised(model, parameters, run, noise), run, noise)[0]
-    true, moving = run.signals[TRUE].copy(), np.arange(len(run))
+    true, moving = run.signals[TRUE].T.copy(), np.arange(len(run))
     share, before = np.ones(len(run)), np.full(len(run), np.inf)
+    spread = _deviations(run, noise)
     for _ in range(ROUNDS):
         own = run if len(moving) == len(run) else run.take(moving)
-        own = replace(own, signals={**own.signals, TRUE: true[moving]})
-        step, size = _step(_linearised(model, parameters, own, noise), own, noise)
+        own = replace(own, signals={**own.signals, TRUE: true[:, moving].T})
+        part = _linearised(model, parameters, own, noise)
+        step = part.likeliest - part.true
+        size = np.max(np.abs(step) / spread[:, moving], axis=0)
         share[moving] *= np.where(size > SHRINKS * before[moving], 0.5, 1.0)
-        true[moving] += share[moving, None] * step
+        true[:, moving] += share[moving] * step
         before[moving] = size
         moving = moving[size > STILL]
         if not len(moving):
@@ -326,32 +346,24 @@ def _likeliest(model: Model, parameters: Array, run: Run, noise: Stated) -> Arra
     return true
 
 
-def _step(part: _Linear, run: Run, noise: Stated) -> tuple[Array, Array]:
-    """Step (N, k) of ξ, and its length (N,) in standard deviations of a reading."""
-    true = run.signals[TRUE]
-    w = part.residual + np.einsum("nmk,nk->nm", part.slope, part.reading - true)
-    pulled = _inverse(part.variance) @ w[:, :, None]
-    step = part.reading - (part.pull @ pulled)[:, :, 0] - true
-    roots = [
-        (run.signals[root_of(group)], sum(run.signals[n].shape[1] for n in group))
-        for group in noise.together
-    ]
-    spread = np.concatenate([_deviations(*of) for of in roots], axis=1)
-    return step, np.max(np.abs(step) / spread, axis=1)
-
-
-def _deviations(root: Array, k: int) -> Array:
-    """Standard deviations (N, k) from themselves, or from roots (N, k²)."""
-    return root if root.shape[1] == k else np.sqrt(np.sum(root.reshape(-1, k, k) ** 2, axis=2))
+def _deviations(run: Run, noise: Stated) -> Array:
+    """Standard deviations (k, N) of one reading of all noisy signals."""
+    found = []
+    for group in noise.together:
+        root, k = run.signals[root_of(group)].T, sum(run.signals[n].shape[1] for n in group)
+        matrix = None if len(root) == k else root.reshape(k, k, -1)
+        found.append(root if matrix is None else np.sqrt(np.sum(matrix**2, axis=1)))
+    return np.concatenate(found)
 
 
 def _mean(model: Model, parameters: Array, run: Run, part: _Linear) -> Array:
-    return bent(model, parameters, run, part.pull, _inverse(part.variance))
+    pull, inverse = (np.moveaxis(a, -1, 0) for a in (part.pull, _inverse(part.variance)))
+    return bent(model, parameters, run, pull, inverse)
 
 
 def shifts_of_curvature(problem: Problem, point: Point) -> Iterator[Array]:
     """Mean of each residual that comes of curvature, in units of the noise, (N, m) of each run."""
-    model, noise = replace(problem.model, noise=None), problem.model.noise
+    model, noise = problem.model.without_noise, problem.model.noise
     assert noise is not None
     straight = _straight(model, noise.signals)
     for r, run in enumerate(problem.runs):
@@ -365,18 +377,18 @@ def shifts_of_curvature(problem: Problem, point: Point) -> Iterator[Array]:
 
 
 def _inverse(matrices: Array) -> Array:
-    """Inverse of each of (N, m, m); of single numbers quickly."""
-    try:
-        return np.asarray(1 / matrices if matrices.shape[1] == 1 else np.linalg.inv(matrices))
-    except np.linalg.LinAlgError:
-        raise UsageError(_DEPENDENT) from None
+    """Inverse of each of (m, m, N); of single numbers quickly."""
+    return np.asarray(1 / matrices) if len(matrices) == 1 else _each(np.linalg.inv, matrices)
 
 
 def _lower(variance: Array) -> Array:
+    return np.sqrt(variance) if len(variance) == 1 else _each(np.linalg.cholesky, variance)
+
+
+def _each(function: Callable[[Any], Any], matrices: Array) -> Array:
+    """What a function of (N, m, m) makes of (m, m, N)."""
     try:
-        return np.asarray(
-            np.sqrt(variance) if variance.shape[1] == 1 else np.linalg.cholesky(variance)
-        )
+        return np.ascontiguousarray(np.moveaxis(function(np.moveaxis(matrices, -1, 0)), 0, -1))
     except np.linalg.LinAlgError:
         raise UsageError(_DEPENDENT) from None
 

@@ -151,6 +151,8 @@ def second_order_bias(problem: Problem, point: Point, sigma: float, bread: Array
     slope = np.zeros(problem.unknowns)
     if settles(problem.model) and not problem.model.implicit:
         shifts = tuple(shifts_of_curvature(problem, point))
+        if not any(shift.any() for shift in shifts):
+            return slope
         for block in problem.blocks(point):
             own = shifts[block.run][block.span]
             np.add.at(slope, block.x, np.einsum("nm,nmk->k", own, block.jacobian))

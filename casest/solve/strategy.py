@@ -20,7 +20,7 @@ from casest.declaration.shapes import Array
 from casest.errors import UsageError
 from casest.leastsquares.fewer import few_of
 from casest.leastsquares.flow import GivenUp, for_seconds
-from casest.leastsquares.identifiability import identify
+from casest.leastsquares.identifiability import rank
 from casest.leastsquares.per_sample import linear
 from casest.leastsquares.problem import Point, Problem
 from casest.leastsquares.weights import has_noise_effects, weights
@@ -304,12 +304,12 @@ def _wary(problem: Problem, start: Point) -> Outcome:
 
 def _singular(problem: Problem, first: Point) -> bool:
     """Is a direction undetermined at the start and at what damped steps reach from there?"""
-    if identify(problem, first).rank == problem.unknowns:
+    if rank(problem.factor(first)[0]) == problem.unknowns:
         return False
     reached = trust_region(problem, first, max_iterations=OPINION).point
     R = problem.factor(reached)[0]
     # Where a derivative overflows nothing is determined.
-    return not np.isfinite(R).all() or identify(problem, reached, R).rank < problem.unknowns
+    return not np.isfinite(R).all() or rank(R) < problem.unknowns
 
 
 def _fine(problem: Problem) -> float:

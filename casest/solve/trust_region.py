@@ -24,6 +24,8 @@ LITTLE = 1e-7
 LONG = 5000
 #: Share of the residual in the Jacobian's reach that is left to rounding.
 SETTLED = 1e-12
+#: Share of the cost below which no gain shows in it: whether it was one nobody can tell.
+HIDDEN = 1e-16
 #: Range of dampings in which a wary run looks for that of its radius.
 DAMPINGS = (1e-24, 1e24)
 
@@ -157,6 +159,9 @@ def trust_region(
             growth = 2.0
         else:
             damping, growth = damping * growth, growth * 2
+            if gain <= HIDDEN * here.cost:
+                status = "converged"
+                break
             if damping > 1e20:
                 status = "no descent"
                 break
