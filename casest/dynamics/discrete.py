@@ -15,8 +15,11 @@ from numpy.typing import NDArray
 
 from casest.declaration.shapes import Array
 from casest.dynamics.factors import size
-from casest.dynamics.stepping import Pattern, kalman_step, smoother_step, unpacked
-from casest.engine import chained
+from casest.dynamics.stepping import Pattern, both_ways, kalman_step, told_step, unpacked
+from casest.engine import Columns, chained, evaluated
+
+#: Samples of a record of which what is told of them is held at once.
+TOLD = 4096
 
 
 @dataclass(frozen=True)
@@ -217,24 +220,32 @@ def smoothed_before(steps: Steps, factored: Array, told: Array) -> tuple[Array, 
 
     `factored` (N − 1, …) by the filter; also returned: what is told of the first sample.
     """
-    both, back = _backwards(steps, factored, told, brief=False)
-    return *unpacked(both, steps.C.shape[2]), back
+    x, P, back = _backwards(steps, factored, told, brief=False)
+    return x, P, back
 
 
 def smoothed_brief(steps: Steps, factored: Array, told: Array) -> tuple[Array, Array, Array]:
     """The same with standard deviations (N − 1, n) in place of covariances."""
-    both, back = _backwards(steps, factored, told, brief=True)
-    n = steps.C.shape[2]
-    return both[:, :n], both[:, n:], back
+    x, std, back = _backwards(steps, factored, told, brief=True)
+    return x, std, back
 
 
-def _backwards(steps: Steps, factored: Array, told: Array, brief: bool) -> tuple[Array, Array]:
+def _backwards(steps: Steps, factored: Array, told: Array, brief: bool) -> list[Array]:
+    """States, what is shown beside them, and what is told of the first sample."""
     m, n = steps.C.shape[1:]
-    step, later = smoother_step(n, m, *steps.patterns, brief=brief), slice(None, 0, -1)
-    parts = [p[::-1] for p in (steps.Phi, steps.forced, steps.Q)]
-    parts += [p[later] for p in (steps.seen, steps.R, steps.read)] + [factored[::-1]]
-    back, both = step(told, parts, keep=False)
-    return both[::-1], back[-1]
+    step, replay, count = told_step(n, m, *steps.patterns), both_ways(n, brief), len(factored)
+    found = [np.empty((count, n)), np.empty((count, n) if brief else (count, n, n))]
+    for stop in range(count, 0, -TOLD):
+        own = slice(max(stop - TOLD, 0), stop)
+        after = slice(own.start + 1, stop + 1)
+        parts = [steps.Phi[own], steps.forced[own], steps.Q[own]]
+        parts += [steps.seen[after], steps.R[after], steps.read[after]]
+        (back,) = step(told, [p[::-1] for p in parts])
+        each = evaluated(replay, np.zeros(0), Columns([back[::-1], factored[own]]))
+        for whole, part in zip(found, each, strict=True):
+            whole[own] = part.reshape(whole[own].shape)
+        told = back[-1].copy()
+    return [*found, told]
 
 
 def smoothed_states(steps: Steps, found: Estimates) -> Array:

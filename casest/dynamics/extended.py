@@ -287,14 +287,14 @@ def extended_step(model: Dynamics, count: int) -> Recursion:
     after_x, after = factors.unpacked(found, n)
     said, C = _extended_outputs(model)(before_x, signals)
     told = ca.vertcat(t.wrapped(y - said), ca.vec(ca.densify(C @ before_P @ C.T + ca.diag(R))))
-    numbers = ca.vertcat(u, v, h, share, gap, signals, R, y, there)
+    numbers = [u, v, h, share, gap, signals, R, y, there]
     outputs = [
         found,
         packed(after_x, factors.multiplied(after)),
         packed(before_x, before_P),
         told,
     ]
-    return Recursion(ca.Function("step", [both, numbers], outputs, {"cse": True}))
+    return Recursion(ca.Function("step", [both, *numbers], outputs, {"cse": True}))
 
 
 @lru_cache(maxsize=8)

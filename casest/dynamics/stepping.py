@@ -13,7 +13,7 @@ import numpy as np
 
 from casest.declaration.shapes import Array
 from casest.dynamics import factors
-from casest.engine import Recursion
+from casest.engine import Recursion, Replay
 
 Pattern = tuple[tuple[int, int], ...]
 
@@ -53,9 +53,9 @@ Give = Literal["end", "after", "all", "brief"]
 
 @lru_cache(maxsize=16)
 def kalman_step(n: int, m: int, of_Phi: Pattern, of_C: Pattern, give: Give = "all") -> Recursion:
-    """(state, numbers of one sample) -> state, and what is asked for.
+    """(state; Φ, forced step, Q, C, diagonal of R, y of one sample) -> state, and what is asked for.
 
-    state: x with the factors of P; numbers: Φ, forced step, Q, C, diagonal of R, y. Readings are
+    state: x with the factors of P. Readings are
     taken one component after the other, which needs no inverse (their noise is independent).
     after: x and P after the reading; all: and before it. brief: x and std after the reading;
     innovations, the std expected of them, and νᵀS⁻¹ν.
@@ -74,7 +74,7 @@ def kalman_step(n: int, m: int, of_Phi: Pattern, of_C: Pattern, give: Give = "al
         after, gain, variance = factors.read_with(after, c, R[i])
         after_x = after_x + gain * innovation
         squares += factors.over(innovation**2, variance)
-    numbers = ca.vertcat(*[by_rows(e) for e in (full, u, Q, whole, R, y)])
+    numbers = [by_rows(e) for e in (full, u, Q, whole, R, y)]
     outputs = [factors.packed(after_x, after)]
     if give in ("after", "all"):
         outputs.append(packed(after_x, factors.multiplied(after)))
@@ -85,22 +85,20 @@ def kalman_step(n: int, m: int, of_Phi: Pattern, of_C: Pattern, give: Give = "al
         outputs.append(ca.vertcat(after_x, factors.std(after)))
         outputs.append(ca.vertcat(y - C @ before_x, *expected, squares))
     outputs = [ca.densify(e) for e in outputs]
-    return Recursion(ca.Function("step", [both, numbers], outputs))
+    return Recursion(ca.Function("step", [both, *numbers], outputs))
 
 
 @lru_cache(maxsize=16)
-def smoother_step(n: int, m: int, of_Phi: Pattern, of_C: Pattern, brief: bool = False) -> Recursion:
-    """(what is read after a sample; numbers) -> (what is read after the sample before it; x and P,
-    or in `brief` x and std).
+def told_step(n: int, m: int, of_Phi: Pattern, of_C: Pattern) -> Recursion:
+    """(what is read after a sample; numbers) -> what is read after the sample before it.
 
-    What later readings say of a sample are n readings of it, with gradients B, weights and values,
-    which the filter's state there takes like its own (two filters: Mayne 1966; Fraser & Potter
-    1969). A step back is the filter's with Φᵀ, readings and noise having changed their parts; the
-    values go along as one more row. numbers: Φ, forced step and Q of the step; C, R and y of the
-    sample after it; x and the factors of P of the filter before it.
+    What later readings say of a sample are n readings of it, with gradients B, weights and values.
+    A step back is the filter's with Φᵀ, readings and noise having changed their parts; the values
+    go along as one more row. numbers: Φ, forced step and Q of the step; C, R and y of the sample
+    after it.
     """
-    later, own = ca.SX.sym("later", n * n + 2 * n), ca.SX.sym("own", factors.size(n))
-    B, weight, value = ca.reshape(later[: n * n], n, n), later[-2 * n : -n], later[-n:]
+    later = ca.SX.sym("later", n * n + 2 * n)
+    B, weight, value = _told(later, n)
     full, Phi = _matrix("Phi", (n, n), of_Phi)
     whole, C = _matrix("C", (m, n), of_C)
     u, Q = ca.SX.sym("u", n), ca.SX.sym("Q", n, n)
@@ -112,15 +110,34 @@ def smoother_step(n: int, m: int, of_Phi: Pattern, of_C: Pattern, brief: bool = 
         told, _ = factors.read(told, ca.vertcat(0, Uq[:, j]), 1, Dq[j])
     U, weight = told[0][1:, 1:], told[1][1:]
     B, value = Phi.T @ U, told[0][0, 1:].T - U.T @ u
+    numbers = [by_rows(e) for e in (full, u, Q, whole, R, y)]
+    back = ca.vertcat(*[ca.vec(ca.densify(e)) for e in (B, weight, value)])
+    return Recursion(ca.Function("step", [later, *numbers], [back]))
+
+
+@lru_cache(maxsize=16)
+def both_ways(n: int, brief: bool) -> Replay:
+    """(what is read after a sample, x and the factors of P of the filter at it) -> x and P by all
+    readings, or in `brief` x and std.
+
+    The filter's state takes what it is told like readings of its own (two filters: Mayne 1966;
+    Fraser & Potter 1969).
+    """
+    later, own = ca.SX.sym("later", n * n + 2 * n), ca.SX.sym("own", factors.size(n))
+    B, weight, value = _told(later, n)
     x, found = factors.unpacked(own, n)
     for j in range(n):
         found, gain = factors.read(found, B[:, j], 1, weight[j])
         x = x + gain * (value[j] - ca.dot(B[:, j], x))
-    numbers = ca.vertcat(*[by_rows(e) for e in (full, u, Q, whole, R, y, own)])
-    back = ca.vertcat(*[ca.vec(ca.densify(e)) for e in (B, weight, value)])
-    shown = ca.vertcat(x, factors.std(found)) if brief else packed(x, factors.multiplied(found))
-    outputs = [back, ca.densify(shown)]
-    return Recursion(ca.Function("step", [later, numbers], outputs))
+    shown = factors.std(found) if brief else ca.densify(factors.multiplied(found))
+    given = [ca.SX.sym("none", 0), ca.vertcat(later, own)]
+    names = ["parameters", "sample"], ["x", "shown"]
+    return Replay(ca.Function("both_ways", given, [ca.densify(x), shown], *names))
+
+
+def _told(later: Any, n: int) -> tuple[Any, Any, Any]:
+    """Gradients (n, n), weights and values of what is read after a sample."""
+    return ca.reshape(later[: n * n], n, n), later[-2 * n : -n], later[-n:]
 
 
 def by_rows(matrix: Any) -> Any:
