@@ -111,7 +111,9 @@ class Recursion:
             several += [[f[:, :, lane] for f in found] for lane in range(len(own))]
         return several
 
-    def along(self, states: Floats, begin: NDArray[np.intp], numbers: Sequence[Floats]) -> list[Floats]:
+    def along(
+        self, states: Floats, begin: NDArray[np.intp], numbers: Sequence[Floats]
+    ) -> list[Floats]:
         """The call from states[0], where the states (L, …) at some more steps are known already:
         before steps `begin` (L,) as `lanes.stretches` lays them. The same digits, in lanes."""
         parts, count = [_rows(p) for p in numbers], len(numbers[0])
@@ -184,8 +186,10 @@ class Recursion:
             buffer.set_res(i, memoryview(part))  # type: ignore[arg-type]
         for k in range(0, count, chunk):
             size = min(chunk, count - k)
-            for i, array in enumerate([state, *(_of_chunk(p, k, chunk, count) for p in given)]):
-                buffer.set_arg(i, memoryview(array))  # type: ignore[arg-type]
+            own = [state, *(_of_chunk(p, k, chunk, count) for p in given)]
+            for i, array in enumerate(own):
+                if array.size:  # a view of nothing has no address
+                    buffer.set_arg(i, memoryview(array))  # type: ignore[arg-type]
             run()
             for i, part in enumerate(parts):
                 if keep or i:
