@@ -171,7 +171,7 @@ def _following(model: Dynamics, count: int) -> Recursion:
     """(x, numbers of one step) -> x after it."""
     x, numbers = ca.SX.sym("x", model.size), _two_samples(model)
     after = _motion(model, count)(x, *numbers)[0]
-    return Recursion(ca.Function("follow", [x, ca.vertcat(*numbers)], [after], {"cse": True}))
+    return Recursion(ca.Function("follow", [x, *numbers], [after], {"cse": True}))
 
 
 @lru_cache(maxsize=8)

@@ -228,7 +228,9 @@ def _rows(part: Floats) -> Floats:
 def _of_chunk(part: Floats, first: int, chunk: int, count: int) -> Floats:
     """What `chunk` of `count` steps are given of a part; those beyond the last what that is."""
     steps = np.minimum(np.arange(first, first + chunk), count - 1) - (count - len(part))
-    return np.where(steps[:, None] < 0, 0.0, part[np.maximum(steps, 0)])
+    found = np.zeros((chunk, part.shape[1]))
+    found[steps >= 0] = part[steps[steps >= 0]]
+    return found
 
 
 def _given(state: Floats, parts: Sequence[Floats], count: int) -> list[Any]:
