@@ -18,12 +18,12 @@ from casest.dynamics.declare import Dynamics
 from casest.dynamics.discrete import (
     Brief,
     Steps,
-    ended,
     normalised,
     smoothed_before,
     smoothed_brief,
     states,
     std_of,
+    stopped,
 )
 from casest.dynamics.filter import (
     ALIKE,
@@ -97,13 +97,13 @@ def followed(model: Dynamics, run: Run, *, smooth: bool = True) -> Course:
         return _in_hindsight(pieces, smooth)
     if not model.linear:
         return _nonlinear(pieces, smooth)
-    found, begun = _empty(pieces, smooth), [pieces.start]
+    found, begun, state = _empty(pieces, smooth), list[States](), pieces.start
     if smooth:
         for where in pieces.every[:-1]:
-            begun.append(pieces.ahead(where, begun[-1]))
-        _back(found, pieces, begun)
+            along, state = pieces.ahead(where, state)
+            begun.append(along)
+        _back(found, pieces, [*begun, state])
         return found
-    state = pieces.start
     for where in pieces.every:
         _, own, state = pieces.filtered(where, state)
         _put(found, slice(where.stop - len(own.x), where.stop), own)
@@ -197,10 +197,11 @@ class Pieces:
         # Copied: a view would keep the whole piece.
         return steps, found, (first, found.factored[-1].copy())
 
-    def ahead(self, where: slice, begun: States) -> States:
-        """Where the filter comes to alone, for half of the work."""
+    def ahead(self, where: slice, begun: States) -> tuple[States, States]:
+        """Where the filter comes to alone, along the piece and at its end: half of the work."""
         (steps, first), model = self._steps(where, begun), self.model
-        return first, ended(steps, begun[1], model.start, model.start_covariance)
+        along, end = stopped(steps, begun[1], model.start, model.start_covariance)
+        return (begun[0], along), (first, end)
 
     def smoothed(
         self, where: slice, steps: Steps, factored: Array, told: Array
@@ -236,7 +237,9 @@ def _back(found: Course, pieces: Pieces, begun: list[States]) -> None:
     for where, state in zip(pieces.every[::-1], begun[::-1], strict=True):
         steps, own, _ = pieces.filtered(where, state)
         _put(found, slice(where.stop - len(own.x), where.stop), own)
-        factored = own.factored if state[1] is None else np.vstack([state[1], own.factored])
+        factored = own.factored
+        if state[1] is not None:
+            factored = np.vstack([np.atleast_2d(state[1])[0], factored])
         x, std, told = pieces.smoothed(where, steps, factored[:-1], told)
         before = slice(where.start, where.stop - 1)
         found.smoothed[before], found.smoothed_std[before] = x, std

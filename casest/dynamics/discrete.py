@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from casest.declaration.shapes import Array
 from casest.dynamics.factors import size
 from casest.dynamics.stepping import Pattern, both_ways, kalman_step, told_step, unpacked
-from casest.engine import Columns, chained, evaluated
+from casest.engine import Columns, chained, evaluated, stretches
 
 #: Samples of a record of which what is told of them is held at once.
 TOLD = 4096
@@ -108,10 +108,14 @@ class Brief:
 
 
 def brief(steps: Steps, state: Array | None, start: Array, covariance: Array) -> Brief:
-    """The filter from `state` (None: from the start), without covariances: half of the work."""
+    """The filter from `state` (None: from the start), without covariances: half of the work.
+
+    Of `stopped` states (L, …) along the way: several times as fast."""
+    several = state is not None and state.ndim > 1
     samples, parts, begun = _begun(steps, state, start, covariance)
     m, n = samples.C.shape[1:]
-    factored, own, said = kalman_step(n, m, *samples.patterns, give="brief")(begun, parts)
+    step = kalman_step(n, m, *samples.patterns, give="brief")
+    factored, own, said = step.along(begun, parts) if several else step(begun, parts)
     if not samples.present.all():
         said[:, : 2 * m][~np.tile(samples.present, 2)] = np.nan
         said[~samples.present.all(axis=1), -1] = np.nan
@@ -123,6 +127,16 @@ def states(steps: Steps, state: Array | None, start: Array, covariance: Array) -
     samples, parts, begun = _begun(steps, state, start, covariance)
     m, n = samples.C.shape[1:]
     return kalman_step(n, m, *samples.patterns, give="end")(begun, parts)[0]
+
+
+def stopped(
+    steps: Steps, state: Array | None, start: Array, covariance: Array
+) -> tuple[Array | None, Array]:
+    """Where the filter has come to, as factored, along the way from `state`, and at the end."""
+    passed = states(steps, state, start, covariance)
+    if state is None:
+        return None, passed[-1].copy()
+    return np.vstack([state, passed[stretches(len(passed))[1:] - 1]]), passed[-1].copy()
 
 
 def after_readings(

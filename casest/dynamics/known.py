@@ -71,14 +71,15 @@ def known(model: Dynamics, run: Run, x: Array, P: Array) -> tuple[Array, Array]:
 def shown(model: Dynamics, run: Run, where: slice, steps: Steps, state: Array | None) -> Brief:
     """What is shown of the filter over a piece of the record, with what is known put in.
 
-    From `state` of the piece's first sample, which is left out; None: from the start.
+    From `state` of the piece's first sample, which is left out (and more along the way: `brief`);
+    None: from the start.
     """
     if not model.traced.g.numel():
         return brief(steps, state, model.start, model.start_covariance)
     if state is None:
         own = kalman(steps, model.start, model.start_covariance)
     else:
-        own = continued(steps, state)
+        own = continued(steps, state if state.ndim == 1 else state[0])
     x, P = known(model, run.take(slice(where.stop - len(own.x), where.stop)), own.x, own.P)
     squares = normalised(own.innovations, own.S)
     return Brief(x, std_of(P), own.innovations, std_of(own.S), squares, own.factored)

@@ -53,7 +53,7 @@ Give = Literal["end", "after", "all", "brief"]
 
 @lru_cache(maxsize=16)
 def kalman_step(n: int, m: int, of_Phi: Pattern, of_C: Pattern, give: Give = "all") -> Recursion:
-    """(state; Φ, forced step, Q, C, diagonal of R, y of one sample) -> state, and what is asked for.
+    """(state; Φ, forced step, Q, C, diagonal of R, y of a sample) -> state, and what is asked for.
 
     state: x with the factors of P. Readings are
     taken one component after the other, which needs no inverse (their noise is independent).

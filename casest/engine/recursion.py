@@ -16,7 +16,6 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from casest.engine import lanes
 from casest.engine.kernel import library
@@ -82,6 +81,7 @@ class Recursion:
         array a part; a shorter one is zero at the first steps.
         """
         parts = [_rows(p) for p in ([numbers] if isinstance(numbers, np.ndarray) else numbers)]
+        assert [p.shape[1] for p in parts] == self._widths
         count = max(map(len, parts))
         state = np.ascontiguousarray(state, float).ravel()
         rows = [count if keep or i else 2 for i in range(len(self.sizes))]
@@ -111,12 +111,12 @@ class Recursion:
             several += [[f[:, :, lane] for f in found] for lane in range(len(own))]
         return several
 
-    def along(
-        self, states: Floats, begin: NDArray[np.intp], numbers: Sequence[Floats]
-    ) -> list[Floats]:
-        """The call from states[0], where the states (L, …) at some more steps are known already:
-        before steps `begin` (L,) as `lanes.stretches` lays them. The same digits, in lanes."""
+    def along(self, states: Floats, numbers: Sequence[Floats]) -> list[Floats]:
+        """The call from states[0], where others are known already: states (L, …) before the steps
+        that `stretches` names. The same digits, the stretches side by side."""
         parts, count = [_rows(p) for p in numbers], len(numbers[0])
+        assert [p.shape[1] for p in parts] == self._widths
+        begin = lanes.stretches(count)
         compiled = self._in_lanes(len(begin), count, apart=True) if len(begin) > 1 else None
         if compiled is None:
             return self(states[0], numbers)
