@@ -38,12 +38,34 @@ def entries(matrix: Any) -> Pattern:
     return tuple(zip(map(int, rows), map(int, columns), strict=True))
 
 
+def upper(n: int) -> Pattern:
+    """On and above the diagonal, row by row: what a covariance is handed over as."""
+    return tuple((i, j) for i in range(n) for j in range(i, n))
+
+
+def picked(matrices: Array, pattern: Pattern) -> Array:
+    """Entries of matrices (N, …, …), as they are handed over, (N, k)."""
+    rows = matrices.reshape(len(matrices), -1)
+    columns = matrices.shape[2]
+    if len(pattern) == rows.shape[1]:
+        return rows
+    return rows[:, [i * columns + j for i, j in pattern]]
+
+
 def _matrix(name: str, shape: tuple[int, int], pattern: Pattern) -> tuple[Any, Any]:
-    """A full matrix of symbols, as it is handed over, and what can differ from zero of it."""
-    full, used = ca.SX.sym(name, *shape), ca.SX(*shape)
-    for i, j in pattern:
-        used[i, j] = full[i, j]
-    return full, used
+    """Symbols for the entries of a pattern, and the matrix of them."""
+    symbols, matrix = ca.SX.sym(name, len(pattern)), ca.SX(*shape)
+    for k, (i, j) in enumerate(pattern):
+        matrix[i, j] = symbols[k]
+    return symbols, matrix
+
+
+def _step_of(n: int, m: int, of_Phi: Pattern, of_C: Pattern) -> tuple[list[Any], list[Any]]:
+    """Symbols for what a step is given, and Φ, forced step, factors of Q, C, R and y of them."""
+    of_all = ("Phi", (n, n), of_Phi), ("Q", (n, n), upper(n)), ("C", (m, n), of_C)
+    (Phi, own_Phi), (Q, own_Q), (C, own_C) = (_matrix(*each) for each in of_all)
+    u, R, y = ca.SX.sym("u", n), ca.SX.sym("R", m), ca.SX.sym("y", m)
+    return [Phi, u, Q, C, R, y], [own_Phi, u, factors.factored(own_Q), own_C, R, y]
 
 
 #: What a step gives beside the state after it: nothing; states and covariances, after the reading
@@ -55,6 +77,8 @@ Give = Literal["end", "after", "all", "brief"]
 def kalman_step(n: int, m: int, of_Phi: Pattern, of_C: Pattern, give: Give = "all") -> Recursion:
     """(state; Φ, forced step, Q, C, diagonal of R, y of a sample) -> state, and what is asked for.
 
+    Of Φ and C the entries of their patterns are given, of Q those `upper`.
+
     state: x with the factors of P. Readings are
     taken one component after the other, which needs no inverse (their noise is independent).
     after: x and P after the reading; all: and before it. brief: x and std after the reading;
@@ -62,11 +86,8 @@ def kalman_step(n: int, m: int, of_Phi: Pattern, of_C: Pattern, give: Give = "al
     """
     both = ca.SX.sym("both", factors.size(n))
     x, (U, D) = factors.unpacked(both, n)
-    full, Phi = _matrix("Phi", (n, n), of_Phi)
-    whole, C = _matrix("C", (m, n), of_C)
-    u, Q = ca.SX.sym("u", n), ca.SX.sym("Q", n, n)
-    R, y = ca.SX.sym("R", m), ca.SX.sym("y", m)
-    before_x, before = Phi @ x + u, factors.moved((U, D), Phi, factors.factored(Q))
+    numbers, (Phi, u, noise, C, R, y) = _step_of(n, m, of_Phi, of_C)
+    before_x, before = Phi @ x + u, factors.moved((U, D), Phi, noise)
     after_x, after, squares = before_x, before, ca.SX(0)
     for i in range(m):
         c = C[i, :].T
@@ -74,7 +95,6 @@ def kalman_step(n: int, m: int, of_Phi: Pattern, of_C: Pattern, give: Give = "al
         after, gain, variance = factors.read_with(after, c, R[i])
         after_x = after_x + gain * innovation
         squares += factors.over(innovation**2, variance)
-    numbers = [by_rows(e) for e in (full, u, Q, whole, R, y)]
     outputs = [factors.packed(after_x, after)]
     if give in ("after", "all"):
         outputs.append(packed(after_x, factors.multiplied(after)))
@@ -99,18 +119,13 @@ def told_step(n: int, m: int, of_Phi: Pattern, of_C: Pattern) -> Recursion:
     """
     later = ca.SX.sym("later", n * n + 2 * n)
     B, weight, value = _told(later, n)
-    full, Phi = _matrix("Phi", (n, n), of_Phi)
-    whole, C = _matrix("C", (m, n), of_C)
-    u, Q = ca.SX.sym("u", n), ca.SX.sym("Q", n, n)
-    R, y = ca.SX.sym("R", m), ca.SX.sym("y", m)
+    numbers, (Phi, u, (Uq, Dq), C, R, y) = _step_of(n, m, of_Phi, of_C)
     rows = ca.vertcat(ca.horzcat(value.T, y.T), ca.horzcat(B, C.T))
     told = factors.orthogonal(rows, ca.vertcat(weight, 1 / R))
-    Uq, Dq = factors.factored(Q)
     for j in range(n):
         told, _ = factors.read(told, ca.vertcat(0, Uq[:, j]), 1, Dq[j])
     U, weight = told[0][1:, 1:], told[1][1:]
     B, value = Phi.T @ U, told[0][0, 1:].T - U.T @ u
-    numbers = [by_rows(e) for e in (full, u, Q, whole, R, y)]
     back = ca.vertcat(*[ca.vec(ca.densify(e)) for e in (B, weight, value)])
     return Recursion(ca.Function("step", [later, *numbers], [back]))
 
