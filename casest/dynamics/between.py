@@ -73,6 +73,12 @@ def with_noises(
         return [_any((*ends, *noise), h, fast) for noise in noises]
 
 
+def order_of(size: Array, h: Array) -> int | None:
+    """Terms of the series for a motion whose A is at most `size` (n, n); None where it is fast."""
+    fast = balance(size)[1] * float(h.max(initial=0.0))
+    return _SERIES[int(fast > _SLOW[0])] if fast <= _SLOW[-1] else None
+
+
 def _any(ends: Sequence[Array], h: Array, fast: Array) -> Motions:
     """Slow steps at once, faster ones in as many pieces as they need."""
     n = ends[0].shape[1]

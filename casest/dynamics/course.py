@@ -17,6 +17,7 @@ from casest.dynamics import rounds
 from casest.dynamics.declare import Dynamics
 from casest.dynamics.discrete import (
     Brief,
+    Packed,
     Steps,
     normalised,
     smoothed_before,
@@ -38,6 +39,7 @@ from casest.dynamics.filter import (
 from casest.dynamics.hindsight import Passes
 from casest.dynamics.inputs import as_read, uncertain
 from casest.dynamics.known import known, shown
+from casest.dynamics.packing import packed
 from casest.dynamics.riccati import check_covariance
 from casest.dynamics.transition import (
     Pace,
@@ -187,7 +189,7 @@ class Pieces:
         pace = replace(pace, share=shares(np.diff(time), pace))
         return Pieces(model, run, pace, time, cuts(len(time), PIECE))
 
-    def filtered(self, where: slice, begun: States) -> tuple[Steps, Brief, States]:
+    def filtered(self, where: slice, begun: States) -> tuple[Steps | Packed, Brief, States]:
         """The steps of a piece, the filter at every sample after its first, and where it came to.
 
         At the beginning of the record: at its first sample too.
@@ -204,7 +206,7 @@ class Pieces:
         return (begun[0], along), (first, end)
 
     def smoothed(
-        self, where: slice, steps: Steps, factored: Array, told: Array
+        self, where: slice, steps: Steps | Packed, factored: Array, told: Array
     ) -> tuple[Array, Array, Array]:
         """States and std of all samples but the last, and what is told of the first."""
         if not self.model.traced.g.numel():
@@ -212,9 +214,11 @@ class Pieces:
         x, P, told = smoothed_before(steps, factored, told)
         return *self.known(slice(where.start, where.stop - 1), x, P), told
 
-    def _steps(self, where: slice, begun: States) -> tuple[Steps, Array | None]:
+    def _steps(self, where: slice, begun: States) -> tuple[Steps | Packed, Array | None]:
         model, own = self.model, self.run.take(where)
         pace = self.pace.part(where)
+        if begun[1] is not None and (found := packed(model, own, pace)) is not None:
+            return found, None
         system, first = linearised(model, own, pace=pace, calm=as_read(model, own)), None
         if model.input_noise is not None:
             early = states(discretised(model, system), begun[0], model.start,

@@ -19,6 +19,7 @@ from casest.declaration.tracing import flat
 from casest.dynamics.declare import Dynamics
 from casest.dynamics.discrete import (
     Brief,
+    Packed,
     Steps,
     brief,
     continued,
@@ -68,7 +69,9 @@ def known(model: Dynamics, run: Run, x: Array, P: Array) -> tuple[Array, Array]:
     return at, 0.5 * (after + after.transpose(0, 2, 1))
 
 
-def shown(model: Dynamics, run: Run, where: slice, steps: Steps, state: Array | None) -> Brief:
+def shown(
+    model: Dynamics, run: Run, where: slice, steps: Steps | Packed, state: Array | None
+) -> Brief:
     """What is shown of the filter over a piece of the record, with what is known put in.
 
     From `state` of the piece's first sample, which is left out (and more along the way: `brief`);
@@ -76,6 +79,7 @@ def shown(model: Dynamics, run: Run, where: slice, steps: Steps, state: Array | 
     """
     if not model.traced.g.numel():
         return brief(steps, state, model.start, model.start_covariance)
+    assert isinstance(steps, Steps)
     if state is None:
         own = kalman(steps, model.start, model.start_covariance)
     else:

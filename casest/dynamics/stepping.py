@@ -47,7 +47,7 @@ def picked(matrices: Array, pattern: Pattern) -> Array:
     """Entries of matrices (N, …, …), as they are handed over, (N, k)."""
     rows = matrices.reshape(len(matrices), -1)
     columns = matrices.shape[2]
-    if len(pattern) == rows.shape[1]:
+    if pattern == tuple(np.ndindex(matrices.shape[1:])):
         return rows
     return rows[:, [i * columns + j for i, j in pattern]]
 
