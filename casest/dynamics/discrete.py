@@ -18,6 +18,7 @@ from casest.dynamics.stepping import (
     Pattern,
     both_ways,
     kalman_step,
+    noise_factors,
     picked,
     told_step,
     unpacked,
@@ -78,13 +79,13 @@ class Steps:
 class Packed:
     """Steps as recursions take them, each with the sample that it leads to.
 
-    Phi (K, …), Q (K, …) and C (K, …): entries of their patterns, of Q those on and above the
-    diagonal; forced (K, n), R and read (K, m), and which readings there are.
+    Phi and C (K, …): entries of their patterns; forced (K, n); noise (K, …): Q's factors; R and
+    read (K, m), and which readings there are.
     """
 
     Phi: Array
     forced: Array
-    Q: Array
+    noise: Array
     C: Array
     R: Array
     read: Array
@@ -96,14 +97,14 @@ class Packed:
         """Of steps as matrices."""
         if isinstance(steps, Packed):
             return steps
-        n, (of_Phi, of_C) = steps.C.shape[2], steps.patterns
-        Phi, Q = picked(steps.Phi, of_Phi), picked(steps.Q, upper(n))
+        of_Phi, of_C = steps.patterns
+        Phi, noise = picked(steps.Phi, of_Phi), _factored(steps.Q)
         own = (picked(steps.seen, of_C), steps.R, steps.read, steps.present)
-        return Packed(Phi, steps.forced, Q, *(part[1:] for part in own), steps.patterns)
+        return Packed(Phi, steps.forced, noise, *(part[1:] for part in own), steps.patterns)
 
     def parts(self, where: slice = slice(None)) -> list[Array]:
         """What some of the steps are given."""
-        every = (self.Phi, self.forced, self.Q, self.C, self.R, self.read)
+        every = (self.Phi, self.forced, self.noise, self.C, self.R, self.read)
         return [part[where] for part in every]
 
     @property
@@ -240,10 +241,16 @@ def _from_start(steps: Steps, start: Array, covariance: Array) -> Given:
     n, (of_Phi, of_C) = steps.C.shape[2], steps.patterns
     # No step leads to the first sample: Φ = 0 from an empty state, and what is known beforehand.
     forced = np.concatenate([start[None], steps.forced])
-    Q = np.concatenate([picked(covariance[None], upper(n)), picked(steps.Q, upper(n))])
+    noise = _factored(np.concatenate([covariance[None], steps.Q]))
     Phi, C = picked(steps.Phi, of_Phi), picked(steps.seen, of_C)
-    found = Packed(Phi, forced, Q, C, steps.R, steps.read, steps.present, steps.patterns)
+    found = Packed(Phi, forced, noise, C, steps.R, steps.read, steps.present, steps.patterns)
     return found, np.zeros(size(n))
+
+
+def _factored(Q: Array) -> Array:
+    n = Q.shape[1]
+    (found,) = evaluated(noise_factors(n), np.zeros(0), Columns([picked(Q, upper(n))]))
+    return found[:, :, 0]
 
 
 def _followed(samples: Steps, packed: Packed, state: Array) -> Estimates:

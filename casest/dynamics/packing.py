@@ -20,7 +20,7 @@ from casest.dynamics import between
 from casest.dynamics.declare import Dynamics
 from casest.dynamics.discrete import Packed
 from casest.dynamics.inputs import uncertain
-from casest.dynamics.stepping import Pattern, entries, reach, upper
+from casest.dynamics.stepping import Pattern, entries, own_factors, reach
 from casest.dynamics.transition import Pace, finite, lost, variances
 from casest.engine import Columns, Replay, evaluated
 
@@ -38,8 +38,8 @@ def packed(model: Dynamics, run: Run, pace: Pace) -> Packed | None:
         return None
     columns = Columns([*(s[:-1] for s in signals), *(s[1:] for s in signals), steps[:, None]])
     found = evaluated(_step(model, order), np.zeros(0), columns)
-    Phi, forced, Q, C, d, y = (part[:, :, 0] for part in found)
-    if not all(map(finite, (Phi, forced, Q))):
+    Phi, forced, noise, C, d, y = (part[:, :, 0] for part in found)
+    if not all(map(finite, (Phi, forced, noise))):
         return None
     patterns = reach(model.traced.A), entries(model.traced.C)
     present, read = np.isfinite(y), y - d
@@ -47,7 +47,7 @@ def packed(model: Dynamics, run: Run, pace: Pace) -> Packed | None:
         read = np.where(present, read, 0.0)
         C = np.where(present[:, [i for i, _ in patterns[1]]], C, 0.0)
     R = np.broadcast_to(variances(model, steps[:1], pace)[0], y.shape)
-    return Packed(Phi, forced, Q, C, R, read, present, patterns)
+    return Packed(Phi, forced, noise, C, R, read, present, patterns)
 
 
 @lru_cache(maxsize=8)
@@ -93,8 +93,8 @@ def _slopes(model: Dynamics) -> Replay:
 
 @lru_cache(maxsize=8)
 def _step(model: Dynamics, order: int) -> Replay:
-    """(signals at both samples, h) -> Φ, forced step, Q; C, d and the reading of the second."""
-    t, h, n = model.traced, ca.SX.sym("h"), model.size
+    """(signals at both samples, h) -> Φ, forced step, factors of Q; C, d and y of the second."""
+    t, h = model.traced, ca.SX.sym("h")
     own, first, last = _symbols(model), _symbols(model, "first"), _symbols(model, "last")
     ends = [f if s.held else e for s, f, e in zip(model.signals, first, last, strict=True)]
     c, d = ca.substitute([t.f - t.A @ t.x, t.h - t.C @ t.x], [t.x], [ca.SX(ca.DM(model.start))])
@@ -108,6 +108,6 @@ def _step(model: Dynamics, order: int) -> Replay:
 
     D = ca.sparsify(A1 - A0)
     Phi, forced, (Q,) = between.expressions(ca.sparsify(A1), D, at, h, order)
-    matrices = [_picked(Phi, reach(t.A)), _picked(Q, upper(n)), _picked(C, entries(t.C))]
-    outputs = [matrices[0], forced, matrices[1], matrices[2], d, y]
+    of_Phi, of_C = reach(t.A), entries(t.C)
+    outputs = [_picked(Phi, of_Phi), forced, own_factors(Q), _picked(C, of_C), d, y]
     return _replay([*first, *last, h], [ca.densify(e) for e in outputs])

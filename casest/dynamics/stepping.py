@@ -62,10 +62,15 @@ def _matrix(name: str, shape: tuple[int, int], pattern: Pattern) -> tuple[Any, A
 
 def _step_of(n: int, m: int, of_Phi: Pattern, of_C: Pattern) -> tuple[list[Any], list[Any]]:
     """Symbols for what a step is given, and Φ, forced step, factors of Q, C, R and y of them."""
-    of_all = ("Phi", (n, n), of_Phi), ("Q", (n, n), upper(n)), ("C", (m, n), of_C)
-    (Phi, own_Phi), (Q, own_Q), (C, own_C) = (_matrix(*each) for each in of_all)
+    (Phi, own_Phi), (C, own_C) = _matrix("Phi", (n, n), of_Phi), _matrix("C", (m, n), of_C)
+    noise, (U, D) = ca.SX.sym("noise", len(upper(n))), (ca.SX.eye(n), ca.SX(n, 1))
+    for k, (i, j) in enumerate(upper(n)):
+        if i == j:
+            D[i] = noise[k]
+        else:
+            U[i, j] = noise[k]
     u, R, y = ca.SX.sym("u", n), ca.SX.sym("R", m), ca.SX.sym("y", m)
-    return [Phi, u, Q, C, R, y], [own_Phi, u, factors.factored(own_Q), own_C, R, y]
+    return [Phi, u, noise, C, R, y], [own_Phi, u, (U, D), own_C, R, y]
 
 
 #: What a step gives beside the state after it: nothing; states and covariances, after the reading
@@ -77,7 +82,7 @@ Give = Literal["end", "after", "all", "brief"]
 def kalman_step(n: int, m: int, of_Phi: Pattern, of_C: Pattern, give: Give = "all") -> Recursion:
     """(state; Φ, forced step, Q, C, diagonal of R, y of a sample) -> state, and what is asked for.
 
-    Of Φ and C the entries of their patterns are given, of Q those `upper`.
+    Of Φ and C the entries of their patterns are given, of Q its `noise_factors`.
 
     state: x with the factors of P. Readings are
     taken one component after the other, which needs no inverse (their noise is independent).
@@ -115,7 +120,7 @@ def told_step(n: int, m: int, of_Phi: Pattern, of_C: Pattern) -> Recursion:
     What later readings say of a sample are n readings of it, with gradients B, weights and values.
     A step back is the filter's with Φᵀ, readings and noise having changed their parts; the values
     go along as one more row. numbers: Φ, forced step and Q of the step; C, R and y of the sample
-    after it.
+    after it, as in `kalman_step`.
     """
     later = ca.SX.sym("later", n * n + 2 * n)
     B, weight, value = _told(later, n)
@@ -128,6 +133,21 @@ def told_step(n: int, m: int, of_Phi: Pattern, of_C: Pattern) -> Recursion:
     B, value = Phi.T @ U, told[0][0, 1:].T - U.T @ u
     back = ca.vertcat(*[ca.vec(ca.densify(e)) for e in (B, weight, value)])
     return Recursion(ca.Function("step", [later, *numbers], [back]))
+
+
+@lru_cache(maxsize=16)
+def noise_factors(n: int) -> Replay:
+    """Entries of Q on and above the diagonal -> those of its U, with D in the place of the ones."""
+    Q, matrix = _matrix("Q", (n, n), upper(n))
+    outputs = [own_factors(matrix)]
+    names = ["parameters", "sample"], ["factors"]
+    return Replay(ca.Function("noise", [ca.SX.sym("none", 0), Q], outputs, *names))
+
+
+def own_factors(Q: Any) -> Any:
+    """U of Q above the diagonal, and D on it, row by row."""
+    U, D = factors.factored(Q)
+    return ca.densify(ca.vertcat(*[D[i] if i == j else U[i, j] for i, j in upper(Q.size1())]))
 
 
 @lru_cache(maxsize=16)
