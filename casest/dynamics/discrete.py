@@ -99,8 +99,9 @@ class Packed:
             return steps
         of_Phi, of_C = steps.patterns
         Phi, noise = picked(steps.Phi, of_Phi), _factored(steps.Q)
-        own = (picked(steps.seen, of_C), steps.R, steps.read, steps.present)
-        return Packed(Phi, steps.forced, noise, *(part[1:] for part in own), steps.patterns)
+        own = (picked(steps.seen, of_C), steps.R, steps.read)
+        C, R, read = (part[1:] for part in own)
+        return Packed(Phi, steps.forced, noise, C, R, read, steps.present[1:], steps.patterns)
 
     def parts(self, where: slice = slice(None)) -> list[Array]:
         """What some of the steps are given."""
@@ -300,7 +301,7 @@ def _backwards(steps: Steps | Packed, factored: Array, told: Array, brief: bool)
     """States, what is shown beside them, and what is told of the first sample."""
     packed, count = Packed.of(steps), len(factored)
     n, m = packed.sizes
-    step, replay = told_step(n, m, *packed.patterns), both_ways(n, brief)
+    step, replay = told_step(n, m, *packed.patterns), both_ways(n, packed.patterns[0], brief)
     found = [np.empty((count, n)), np.empty((count, n) if brief else (count, n, n))]
     for stop in range(count, 0, -TOLD):
         own = slice(max(stop - TOLD, 0), stop)

@@ -21,7 +21,7 @@ from casest.dynamics.declare import Dynamics
 from casest.dynamics.discrete import Packed
 from casest.dynamics.inputs import uncertain
 from casest.dynamics.stepping import Pattern, entries, own_factors, reach
-from casest.dynamics.transition import Pace, finite, lost, variances
+from casest.dynamics.transition import Pace, lost, variances
 from casest.engine import Columns, Replay, evaluated
 
 
@@ -38,8 +38,8 @@ def packed(model: Dynamics, run: Run, pace: Pace) -> Packed | None:
         return None
     columns = Columns([*(s[:-1] for s in signals), *(s[1:] for s in signals), steps[:, None]])
     found = evaluated(_step(model, order), np.zeros(0), columns)
-    Phi, forced, noise, C, d, y = (part[:, :, 0] for part in found)
-    if not all(map(finite, (Phi, forced, noise))):
+    Phi, forced, noise, C, d, y, total = (part[:, :, 0] for part in found)
+    if not np.isfinite(total).all():
         return None
     patterns = reach(model.traced.A), entries(model.traced.C)
     present, read = np.isfinite(y), y - d
@@ -93,7 +93,8 @@ def _slopes(model: Dynamics) -> Replay:
 
 @lru_cache(maxsize=8)
 def _step(model: Dynamics, order: int) -> Replay:
-    """(signals at both samples, h) -> Φ, forced step, factors of Q; C, d and y of the second."""
+    """(signals at both samples, h) -> Φ, forced step, factors of Q; C, d and y of the second;
+    the sum of all that the motion is."""
     t, h = model.traced, ca.SX.sym("h")
     own, first, last = _symbols(model), _symbols(model, "first"), _symbols(model, "last")
     ends = [f if s.held else e for s, f, e in zip(model.signals, first, last, strict=True)]
@@ -109,5 +110,7 @@ def _step(model: Dynamics, order: int) -> Replay:
     D = ca.sparsify(A1 - A0)
     Phi, forced, (Q,) = between.expressions(ca.sparsify(A1), D, at, h, order)
     of_Phi, of_C = reach(t.A), entries(t.C)
-    outputs = [_picked(Phi, of_Phi), forced, own_factors(Q), _picked(C, of_C), d, y]
+    motion = [_picked(Phi, of_Phi), ca.densify(forced), own_factors(Q)]
+    total = ca.sum1(ca.vertcat(*motion))  # finite, if and only if they are and nothing overflows
+    outputs = [*motion, _picked(C, of_C), d, y, total]
     return _replay([*first, *last, h], [ca.densify(e) for e in outputs])

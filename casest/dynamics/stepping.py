@@ -123,14 +123,14 @@ def told_step(n: int, m: int, of_Phi: Pattern, of_C: Pattern) -> Recursion:
     after it, as in `kalman_step`.
     """
     later = ca.SX.sym("later", n * n + 2 * n)
-    B, weight, value = _told(later, n)
+    order, (B, weight, value) = _causes_first(n, of_Phi), _told(later, n, of_Phi)
     numbers, (Phi, u, (Uq, Dq), C, R, y) = _step_of(n, m, of_Phi, of_C)
-    rows = ca.vertcat(ca.horzcat(value.T, y.T), ca.horzcat(B, C.T))
+    rows = ca.vertcat(ca.horzcat(value.T, y.T), ca.horzcat(B, C.T[order, :]))
     told = factors.orthogonal(rows, ca.vertcat(weight, 1 / R))
     for j in range(n):
-        told, _ = factors.read(told, ca.vertcat(0, Uq[:, j]), 1, Dq[j])
+        told, _ = factors.read(told, ca.vertcat(0, Uq[order, j]), 1, Dq[j])
     U, weight = told[0][1:, 1:], told[1][1:]
-    B, value = Phi.T @ U, told[0][0, 1:].T - U.T @ u
+    B, value = Phi.T[order, order] @ U, told[0][0, 1:].T - U.T @ u[order]
     back = ca.vertcat(*[ca.vec(ca.densify(e)) for e in (B, weight, value)])
     return Recursion(ca.Function("step", [later, *numbers], [back]))
 
@@ -151,7 +151,7 @@ def own_factors(Q: Any) -> Any:
 
 
 @lru_cache(maxsize=16)
-def both_ways(n: int, brief: bool) -> Replay:
+def both_ways(n: int, of_Phi: Pattern, brief: bool) -> Replay:
     """(what is read after a sample, x and the factors of P of the filter at it) -> x and P by all
     readings, or in `brief` x and std.
 
@@ -159,7 +159,8 @@ def both_ways(n: int, brief: bool) -> Replay:
     Fraser & Potter 1969).
     """
     later, own = ca.SX.sym("later", n * n + 2 * n), ca.SX.sym("own", factors.size(n))
-    B, weight, value = _told(later, n)
+    B, weight, value = _told(later, n, of_Phi)
+    B = B[np.argsort(_causes_first(n, of_Phi)).tolist(), :]
     x, found = factors.unpacked(own, n)
     for j in range(n):
         found, gain = factors.read(found, B[:, j], 1, weight[j])
@@ -170,9 +171,22 @@ def both_ways(n: int, brief: bool) -> Replay:
     return Replay(ca.Function("both_ways", given, [ca.densify(x), shown], *names))
 
 
-def _told(later: Any, n: int) -> tuple[Any, Any, Any]:
-    """Gradients (n, n), weights and values of what is read after a sample."""
-    return ca.reshape(later[: n * n], n, n), later[-2 * n : -n], later[-n:]
+def _causes_first(n: int, of_Phi: Pattern) -> list[int]:
+    """States in an order in which Φᵀ is upper triangular, as far as it can be: each before those
+    that it moves, so that little has to be made triangular again."""
+    moves = np.bincount([j for _, j in of_Phi], minlength=n)
+    return [int(i) for i in np.argsort(-moves, kind="stable")]
+
+
+def _told(later: Any, n: int, of_Phi: Pattern) -> tuple[Any, Any, Any]:
+    """Gradients (n, n), states in the order of `_causes_first`, weights and values of what is read
+    after a sample."""
+    there, order = np.zeros((n, n), bool), _causes_first(n, of_Phi)
+    there[tuple(np.array(of_Phi, int).reshape(-1, 2).T)] = True
+    B = ca.SX(n, n)
+    for i, j in np.argwhere(there.T[np.ix_(order, order)] @ np.triu(np.ones((n, n), bool))):
+        B[int(i), int(j)] = later[int(j * n + i)]
+    return B, later[-2 * n : -n], later[-n:]
 
 
 def by_rows(matrix: Any) -> Any:

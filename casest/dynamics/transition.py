@@ -264,7 +264,7 @@ def stepped(system: Linearised, intensity: Array) -> Motions:
 def stepped_with(system: Linearised, intensities: Sequence[Array]) -> list[Motions]:
     """The same with each of several noises."""
     found = with_noises(system.A, system.c, intensities, system.steps, system.held)
-    if all(finite(part) for own in found for part in (own.Phi, own.forced, own.Q)):
+    if all(_finite(part) for own in found for part in (own.Phi, own.forced, own.Q)):
         return found
     whole = np.isfinite(found[0].forced).all(axis=1) & np.isfinite(found[0].Phi).all(axis=(1, 2))
     for own in found:
@@ -280,8 +280,7 @@ def stepped_with(system: Linearised, intensities: Sequence[Array]) -> list[Motio
     return found
 
 
-def finite(numbers: Array) -> bool:
-    """Is every one of them a number?"""
+def _finite(numbers: Array) -> bool:
     with np.errstate(over="ignore", invalid="ignore"):
         total = np.sum(numbers)  # cheaper, and of finite numbers rarely anything else
     return bool(np.isfinite(total) or np.isfinite(numbers).all())
