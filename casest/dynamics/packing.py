@@ -27,7 +27,7 @@ from casest.engine import Columns, Replay, evaluated
 
 def packed(model: Dynamics, run: Run, pace: Pace) -> Packed | None:
     """The steps of a checked record, read at this pace; None where they have to be made in full."""
-    if not _even(model):
+    if not _plain(model):
         return None
     steps = np.diff(np.asarray(run.time, float))
     if lost(model, steps, pace).any():
@@ -51,7 +51,7 @@ def packed(model: Dynamics, run: Run, pace: Pace) -> Packed | None:
 
 
 @lru_cache(maxsize=8)
-def _even(model: Dynamics) -> bool:
+def _plain(model: Dynamics) -> bool:
     """Does noise depend on nothing but time, and can readings be taken as they are?"""
     t = model.traced
     along_states = uncertain(model) or model.input_noise is not None

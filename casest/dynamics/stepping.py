@@ -45,8 +45,8 @@ def upper(n: int) -> Pattern:
 
 def picked(matrices: Array, pattern: Pattern) -> Array:
     """Entries of matrices (N, …, …), as they are handed over, (N, k)."""
-    rows = matrices.reshape(len(matrices), -1)
     columns = matrices.shape[2]
+    rows = matrices.reshape(len(matrices), matrices.shape[1] * columns)
     if pattern == tuple(np.ndindex(matrices.shape[1:])):
         return rows
     return rows[:, [i * columns + j for i, j in pattern]]
