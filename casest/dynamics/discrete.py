@@ -24,7 +24,7 @@ from casest.dynamics.stepping import (
     unpacked,
     upper,
 )
-from casest.engine import Columns, chained, evaluated, stretches
+from casest.engine import chained, stretches
 
 #: Samples of a record of which what is told of them is held at once.
 TOLD = 4096
@@ -250,7 +250,7 @@ def _from_start(steps: Steps, start: Array, covariance: Array) -> Given:
 
 def _factored(Q: Array) -> Array:
     n = Q.shape[1]
-    (found,) = evaluated(noise_factors(n), np.zeros(0), Columns([picked(Q, upper(n))]))
+    (found,) = noise_factors(n)([picked(Q, upper(n))])
     return found[:, :, 0]
 
 
@@ -301,12 +301,12 @@ def _backwards(steps: Steps | Packed, factored: Array, told: Array, brief: bool)
     """States, what is shown beside them, and what is told of the first sample."""
     packed, count = Packed.of(steps), len(factored)
     n, m = packed.sizes
-    step, replay = told_step(n, m, *packed.patterns), both_ways(n, packed.patterns[0], brief)
+    step, combined = told_step(n, m, *packed.patterns), both_ways(n, packed.patterns[0], brief)
     found = [np.empty((count, n)), np.empty((count, n) if brief else (count, n, n))]
     for stop in range(count, 0, -TOLD):
         own = slice(max(stop - TOLD, 0), stop)
         (back,) = step(told, [p[::-1] for p in packed.parts(own)])
-        each = evaluated(replay, np.zeros(0), Columns([back[::-1], factored[own]]))
+        each = combined([back[::-1], factored[own]])
         for whole, part in zip(found, each, strict=True):
             whole[own] = part.reshape(whole[own].shape)
         told = back[-1].copy()

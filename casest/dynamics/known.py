@@ -27,7 +27,7 @@ from casest.dynamics.discrete import (
     normalised,
     std_of,
 )
-from casest.dynamics.extended import over_samples, replay
+from casest.dynamics.samples import over_samples, replay
 from casest.engine import Replay
 from casest.errors import UsageError
 

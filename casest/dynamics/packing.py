@@ -20,9 +20,9 @@ from casest.dynamics import between
 from casest.dynamics.declare import Dynamics
 from casest.dynamics.discrete import Packed
 from casest.dynamics.inputs import uncertain
+from casest.dynamics.samples import AtSamples
 from casest.dynamics.stepping import Pattern, entries, own_factors, reach
 from casest.dynamics.transition import Pace, lost, variances
-from casest.engine import Columns, Replay, evaluated
 
 
 def packed(model: Dynamics, run: Run, pace: Pace) -> Packed | None:
@@ -36,8 +36,9 @@ def packed(model: Dynamics, run: Run, pace: Pace) -> Packed | None:
     order = between.order_of(_size(model, signals), steps)
     if order is None:
         return None
-    columns = Columns([*(s[:-1] for s in signals), *(s[1:] for s in signals), steps[:, None]])
-    found = evaluated(_step(model, order), np.zeros(0), columns)
+    found = _step(model, order)(
+        [*(s[:-1] for s in signals), *(s[1:] for s in signals), steps[:, None]]
+    )
     Phi, forced, noise, C, d, y, total = (part[:, :, 0] for part in found)
     if not np.isfinite(total).all():
         return None
@@ -63,7 +64,7 @@ def _size(model: Dynamics, signals: list[Array]) -> Array:
     found = np.zeros((model.size, model.size))
     pattern = entries(model.traced.A)
     if pattern:
-        (values,) = evaluated(_slopes(model), np.zeros(0), Columns(signals))
+        (values,) = _slopes(model)(signals)
         largest = np.maximum(values.max(axis=0), -values.min(axis=0))[:, 0]
         found[tuple(np.array(pattern).T)] = largest
     return found
@@ -79,20 +80,14 @@ def _symbols(model: Dynamics, when: str = "") -> list[SX]:
     return [ca.SX.sym(f"{when}{k}", e.numel()) for k, e in enumerate(own)] if when else own
 
 
-def _replay(sample: list[SX], outputs: list[SX]) -> Replay:
-    names = ["parameters", "sample"], [f"o{k}" for k in range(len(outputs))]
-    none = ca.SX.sym("none", 0)
-    return Replay(ca.Function("packed", [none, ca.vertcat(*sample)], outputs, *names))
-
-
 @lru_cache(maxsize=8)
-def _slopes(model: Dynamics) -> Replay:
+def _slopes(model: Dynamics) -> AtSamples:
     t = model.traced
-    return _replay(_symbols(model), [_picked(t.A, entries(t.A))])
+    return AtSamples(ca.vertcat(*_symbols(model)), [_picked(t.A, entries(t.A))])
 
 
 @lru_cache(maxsize=8)
-def _step(model: Dynamics, order: int) -> Replay:
+def _step(model: Dynamics, order: int) -> AtSamples:
     """(signals at both samples, h) -> Φ, forced step, factors of Q; C, d and y of the second;
     the sum of all that the motion is."""
     t, h = model.traced, ca.SX.sym("h")
@@ -113,4 +108,4 @@ def _step(model: Dynamics, order: int) -> Replay:
     motion = [_picked(Phi, of_Phi), ca.densify(forced), own_factors(Q)]
     total = ca.sum1(ca.vertcat(*motion))  # finite, if and only if they are and nothing overflows
     outputs = [*motion, _picked(C, of_C), d, y, total]
-    return _replay([*first, *last, h], [ca.densify(e) for e in outputs])
+    return AtSamples(ca.vertcat(*first, *last, h), outputs)

@@ -18,7 +18,7 @@ from casest.declaration.shapes import Array
 from casest.dynamics import factors
 from casest.dynamics.between import DOUBLINGS, balance
 from casest.dynamics.declare import Dynamics
-from casest.dynamics.stepping import by_rows
+from casest.dynamics.samples import by_rows
 from casest.dynamics.transition import Linearised, exponential, magnus, usual
 from casest.engine import Recursion
 from casest.errors import DataError

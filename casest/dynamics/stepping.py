@@ -13,7 +13,8 @@ import numpy as np
 
 from casest.declaration.shapes import Array
 from casest.dynamics import factors
-from casest.engine import Recursion, Replay
+from casest.dynamics.samples import AtSamples
+from casest.engine import Recursion
 
 Pattern = tuple[tuple[int, int], ...]
 
@@ -136,12 +137,10 @@ def told_step(n: int, m: int, of_Phi: Pattern, of_C: Pattern) -> Recursion:
 
 
 @lru_cache(maxsize=16)
-def noise_factors(n: int) -> Replay:
+def noise_factors(n: int) -> AtSamples:
     """Entries of Q on and above the diagonal -> those of its U, with D in the place of the ones."""
     Q, matrix = _matrix("Q", (n, n), upper(n))
-    outputs = [own_factors(matrix)]
-    names = ["parameters", "sample"], ["factors"]
-    return Replay(ca.Function("noise", [ca.SX.sym("none", 0), Q], outputs, *names))
+    return AtSamples(Q, [own_factors(matrix)])
 
 
 def own_factors(Q: Any) -> Any:
@@ -151,7 +150,7 @@ def own_factors(Q: Any) -> Any:
 
 
 @lru_cache(maxsize=16)
-def both_ways(n: int, of_Phi: Pattern, brief: bool) -> Replay:
+def both_ways(n: int, of_Phi: Pattern, brief: bool) -> AtSamples:
     """(what is read after a sample, x and the factors of P of the filter at it) -> x and P by all
     readings, or in `brief` x and std.
 
@@ -165,10 +164,8 @@ def both_ways(n: int, of_Phi: Pattern, brief: bool) -> Replay:
     for j in range(n):
         found, gain = factors.read(found, B[:, j], 1, weight[j])
         x = x + gain * (value[j] - ca.dot(B[:, j], x))
-    shown = factors.std(found) if brief else ca.densify(factors.multiplied(found))
-    given = [ca.SX.sym("none", 0), ca.vertcat(later, own)]
-    names = ["parameters", "sample"], ["x", "shown"]
-    return Replay(ca.Function("both_ways", given, [ca.densify(x), shown], *names))
+    shown = factors.std(found) if brief else factors.multiplied(found)
+    return AtSamples(ca.vertcat(later, own), [x, shown])
 
 
 def _causes_first(n: int, of_Phi: Pattern) -> list[int]:
@@ -187,11 +184,6 @@ def _told(later: Any, n: int, of_Phi: Pattern) -> tuple[Any, Any, Any]:
     for i, j in np.argwhere(there.T[np.ix_(order, order)] @ np.triu(np.ones((n, n), bool))):
         B[int(i), int(j)] = later[int(j * n + i)]
     return B, later[-2 * n : -n], later[-n:]
-
-
-def by_rows(matrix: Any) -> Any:
-    """The entries of a matrix row by row, as they lie in an array."""
-    return ca.vec(ca.densify(matrix).T)
 
 
 def packed(x: Any, P: Any) -> Any:

@@ -18,7 +18,7 @@ from casest.declaration.physics import SX
 from casest.declaration.shapes import Array
 from casest.declaration.tracing import flat
 from casest.dynamics.declare import Dynamics
-from casest.dynamics.extended import over_samples, replay
+from casest.dynamics.samples import over_samples, replay
 from casest.engine import Recursion
 from casest.errors import CasestError, UsageError
 
