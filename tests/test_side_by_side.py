@@ -4,7 +4,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from casest.engine import Recursion, chained
+from casest.engine import Recursion, chained, stretches
 from casest.engine.chain import _in_stretches
 from casest.engine.kernel import compiles
 
@@ -60,3 +60,20 @@ def test_runs_in_lanes_have_the_digits_of_single_ones(with_sine, several, monkey
     for own, other in zip(found, expected, strict=True):
         for a, b in zip(own, other, strict=True):
             assert np.array_equal(a, b)
+
+
+@needs_a_compiler
+@pytest.mark.parametrize("count", [63, 64, 71, 400])
+def test_stretches_from_known_states_have_the_digits_of_the_whole(count, monkeypatch):
+    """A record too short for lanes is run as a whole, too."""
+    rng = np.random.default_rng(count)
+    state, numbers = rng.standard_normal(3), rng.standard_normal((count + 3, 2))[3:]
+    monkeypatch.setenv("CASEST_KERNEL", "off")
+    expected = Recursion(step(False))(state, numbers)
+    monkeypatch.setenv("CASEST_KERNEL", "always")
+    runs, begin = Recursion(step(False)), stretches(count)
+    assert len(begin) == (1 if count < 64 else 8)
+    known = np.vstack([state, expected[0][begin[1:] - 1]])
+    for a, b in zip(runs.along(known, [numbers]), expected, strict=True):
+        assert np.array_equal(a, b)
+    assert any(own["library"] for own in runs._beside.values()) == (len(begin) > 1)

@@ -67,9 +67,16 @@ def with_noises(
     high, low = _range(A)
     fast = balance(np.maximum(high, -low))[1] * h
     if fast.max(initial=0.0) <= _SLOW[-1]:
-        return _slow(ends, noises, h, float(fast.max(initial=0.0)))
+        there = _there(high, low) if ending is None else None
+        return _slow(ends, noises, h, float(fast.max(initial=0.0)), there)
     with np.errstate(all="ignore"):
         return [_any((*ends, *noise), h, fast) for noise in noises]
+
+
+def order_of(size: Array, h: Array) -> int | None:
+    """Terms of the series for a motion whose A is at most `size` (n, n); None where it is fast."""
+    fast = balance(size)[1] * float(h.max(initial=0.0))
+    return _SERIES[int(fast > _SLOW[0])] if fast <= _SLOW[-1] else None
 
 
 def _any(ends: Sequence[Array], h: Array, fast: Array) -> Motions:
@@ -132,13 +139,21 @@ def balance(size: Array) -> tuple[Array, float]:
 
 
 def _slow(
-    ends: Sequence[Array], noises: Sequence[tuple[Array, Array]], h: Array, fast: float
+    ends: Sequence[Array],
+    noises: Sequence[tuple[Array, Array]],
+    h: Array,
+    fast: float,
+    there: Any = None,
 ) -> list[Motions]:
+    """`there`: which entries of A are anything but nothing, where that is known."""
     A0, A1, c0, c1 = ends
     n, count = A0.shape[1], len(h)
-    D = A1 - A0
-    of_A, of_D = (_pattern(_there(*_range(M))) for M in (A1, D))
-    columns, given, of_X = [_picked(A1, of_A), _picked(D, of_D), c0, c1], [np.zeros(0)], []
+    of_A = _pattern(_there(*_range(A0)) | _there(*_range(A1)) if there is None else there)
+    a = _picked(A1, of_A)
+    d = a - _picked(A0, of_A)
+    changing = np.flatnonzero(_there(*_range(d)))
+    of_D = tuple(of_A[k] for k in changing)
+    columns, given, of_X = [a, d[:, changing], c0, c1], [np.zeros(0)], []
     for X0, X1 in noises:
         even = X0.ndim == 2
         there = X0 != 0 if even else _there(*_range(X0)) | _there(*_range(X1))

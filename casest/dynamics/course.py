@@ -17,13 +17,14 @@ from casest.dynamics import rounds
 from casest.dynamics.declare import Dynamics
 from casest.dynamics.discrete import (
     Brief,
+    Packed,
     Steps,
-    ended,
     normalised,
     smoothed_before,
     smoothed_brief,
     states,
     std_of,
+    stopped,
 )
 from casest.dynamics.filter import (
     ALIKE,
@@ -38,6 +39,7 @@ from casest.dynamics.filter import (
 from casest.dynamics.hindsight import Passes
 from casest.dynamics.inputs import as_read, uncertain
 from casest.dynamics.known import known, shown
+from casest.dynamics.packing import packed
 from casest.dynamics.riccati import check_covariance
 from casest.dynamics.transition import (
     Pace,
@@ -97,13 +99,13 @@ def followed(model: Dynamics, run: Run, *, smooth: bool = True) -> Course:
         return _in_hindsight(pieces, smooth)
     if not model.linear:
         return _nonlinear(pieces, smooth)
-    found, begun = _empty(pieces, smooth), [pieces.start]
+    found, begun, state = _empty(pieces, smooth), list[States](), pieces.start
     if smooth:
         for where in pieces.every[:-1]:
-            begun.append(pieces.ahead(where, begun[-1]))
-        _back(found, pieces, begun)
+            along, state = pieces.ahead(where, state)
+            begun.append(along)
+        _back(found, pieces, [*begun, state])
         return found
-    state = pieces.start
     for where in pieces.every:
         _, own, state = pieces.filtered(where, state)
         _put(found, slice(where.stop - len(own.x), where.stop), own)
@@ -187,7 +189,7 @@ class Pieces:
         pace = replace(pace, share=shares(np.diff(time), pace))
         return Pieces(model, run, pace, time, cuts(len(time), PIECE))
 
-    def filtered(self, where: slice, begun: States) -> tuple[Steps, Brief, States]:
+    def filtered(self, where: slice, begun: States) -> tuple[Steps | Packed, Brief, States]:
         """The steps of a piece, the filter at every sample after its first, and where it came to.
 
         At the beginning of the record: at its first sample too.
@@ -197,13 +199,14 @@ class Pieces:
         # Copied: a view would keep the whole piece.
         return steps, found, (first, found.factored[-1].copy())
 
-    def ahead(self, where: slice, begun: States) -> States:
-        """Where the filter comes to alone, for half of the work."""
+    def ahead(self, where: slice, begun: States) -> tuple[States, States]:
+        """Where the filter comes to alone, along the piece and at its end: half of the work."""
         (steps, first), model = self._steps(where, begun), self.model
-        return first, ended(steps, begun[1], model.start, model.start_covariance)
+        along, end = stopped(steps, begun[1], model.start, model.start_covariance)
+        return (begun[0], along), (first, end)
 
     def smoothed(
-        self, where: slice, steps: Steps, factored: Array, told: Array
+        self, where: slice, steps: Steps | Packed, factored: Array, told: Array
     ) -> tuple[Array, Array, Array]:
         """States and std of all samples but the last, and what is told of the first."""
         if not self.model.traced.g.numel():
@@ -211,9 +214,11 @@ class Pieces:
         x, P, told = smoothed_before(steps, factored, told)
         return *self.known(slice(where.start, where.stop - 1), x, P), told
 
-    def _steps(self, where: slice, begun: States) -> tuple[Steps, Array | None]:
+    def _steps(self, where: slice, begun: States) -> tuple[Steps | Packed, Array | None]:
         model, own = self.model, self.run.take(where)
         pace = self.pace.part(where)
+        if begun[1] is not None and (found := packed(model, own, pace)) is not None:
+            return found, None
         system, first = linearised(model, own, pace=pace, calm=as_read(model, own)), None
         if model.input_noise is not None:
             early = states(discretised(model, system), begun[0], model.start,
@@ -236,7 +241,9 @@ def _back(found: Course, pieces: Pieces, begun: list[States]) -> None:
     for where, state in zip(pieces.every[::-1], begun[::-1], strict=True):
         steps, own, _ = pieces.filtered(where, state)
         _put(found, slice(where.stop - len(own.x), where.stop), own)
-        factored = own.factored if state[1] is None else np.vstack([state[1], own.factored])
+        factored = own.factored
+        if state[1] is not None:
+            factored = np.vstack([np.atleast_2d(state[1])[0], factored])
         x, std, told = pieces.smoothed(where, steps, factored[:-1], told)
         before = slice(where.start, where.stop - 1)
         found.smoothed[before], found.smoothed_std[before] = x, std

@@ -6,7 +6,6 @@ that is discrete from the beginning.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -15,8 +14,20 @@ from numpy.typing import NDArray
 
 from casest.declaration.shapes import Array
 from casest.dynamics.factors import size
-from casest.dynamics.stepping import Pattern, kalman_step, smoother_step, unpacked
-from casest.engine import chained
+from casest.dynamics.stepping import (
+    Pattern,
+    both_ways,
+    kalman_step,
+    noise_factors,
+    picked,
+    told_step,
+    unpacked,
+    upper,
+)
+from casest.engine import chained, stretches
+
+#: Samples of a record of which what is told of them is held at once.
+TOLD = 4096
 
 
 @dataclass(frozen=True)
@@ -65,6 +76,45 @@ class Steps:
 
 
 @dataclass(frozen=True)
+class Packed:
+    """Steps as recursions take them, each with the sample that it leads to.
+
+    Phi and C (K, …): entries of their patterns; forced (K, n); noise (K, …): Q's factors; R and
+    read (K, m), and which readings there are.
+    """
+
+    Phi: Array
+    forced: Array
+    noise: Array
+    C: Array
+    R: Array
+    read: Array
+    present: NDArray[np.bool_]
+    patterns: tuple[Pattern, Pattern]
+
+    @staticmethod
+    def of(steps: Steps | Packed) -> Packed:
+        """Of steps as matrices."""
+        if isinstance(steps, Packed):
+            return steps
+        of_Phi, of_C = steps.patterns
+        Phi, noise = picked(steps.Phi, of_Phi), _factored(steps.Q)
+        own = (picked(steps.seen, of_C), steps.R, steps.read)
+        C, R, read = (part[1:] for part in own)
+        return Packed(Phi, steps.forced, noise, C, R, read, steps.present[1:], steps.patterns)
+
+    def parts(self, where: slice = slice(None)) -> list[Array]:
+        """What some of the steps are given."""
+        every = (self.Phi, self.forced, self.noise, self.C, self.R, self.read)
+        return [part[where] for part in every]
+
+    @property
+    def sizes(self) -> tuple[int, int]:
+        """Numbers of states and readings."""
+        return self.forced.shape[1], self.R.shape[1]
+
+
+@dataclass(frozen=True)
 class Estimates:
     """States x (N, n) and covariances P (N, n, n) after each reading and before it.
 
@@ -83,12 +133,13 @@ class Estimates:
 
 def kalman(steps: Steps, start: Array, covariance: Array) -> Estimates:
     """Kalman filter; `start` (n,) and `covariance` (n, n) hold before the first reading."""
-    return _followed(*_from_start(steps, start, covariance))
+    return _followed(steps, *_from_start(steps, start, covariance))
 
 
 def continued(steps: Steps, state: Array) -> Estimates:
     """The same at every sample but the first, where the filter has come to `state`, as factored."""
-    return _followed(*_from_state(steps, state))
+    parts = {name: getattr(steps, name)[1:] for name in ("C", "d", "R", "y")}
+    return _followed(replace(steps, **parts), Packed.of(steps), state)
 
 
 @dataclass(frozen=True)
@@ -104,41 +155,54 @@ class Brief:
     factored: Array
 
 
-def brief(steps: Steps, state: Array | None, start: Array, covariance: Array) -> Brief:
-    """The filter from `state` (None: from the start), without covariances: half of the work."""
-    samples, parts, begun = _begun(steps, state, start, covariance)
-    m, n = samples.C.shape[1:]
-    factored, own, said = kalman_step(n, m, *samples.patterns, give="brief")(begun, parts)
+def brief(steps: Steps | Packed, state: Array | None, start: Array, covariance: Array) -> Brief:
+    """The filter from `state` (None: from the start), without covariances: half of the work.
+
+    Of `stopped` states (L, …) along the way: several times as fast."""
+    several = state is not None and state.ndim > 1
+    samples, begun = _begun(steps, state, start, covariance)
+    (n, m), parts = samples.sizes, samples.parts()
+    step = kalman_step(n, m, *samples.patterns, give="brief")
+    factored, own, said = step.along(begun, parts) if several else step(begun, parts)
     if not samples.present.all():
         said[:, : 2 * m][~np.tile(samples.present, 2)] = np.nan
         said[~samples.present.all(axis=1), -1] = np.nan
     return Brief(own[:, :n], own[:, n:], said[:, :m], said[:, m:-1], said[:, -1], factored)
 
 
-def states(steps: Steps, state: Array | None, start: Array, covariance: Array) -> Array:
+def states(steps: Steps | Packed, state: Array | None, start: Array, covariance: Array) -> Array:
     """States alone, as factored, from `state`, or from the start where it is None."""
-    samples, parts, begun = _begun(steps, state, start, covariance)
-    m, n = samples.C.shape[1:]
-    return kalman_step(n, m, *samples.patterns, give="end")(begun, parts)[0]
+    samples, begun = _begun(steps, state, start, covariance)
+    step = kalman_step(*samples.sizes, *samples.patterns, give="end")
+    return step(begun, samples.parts())[0]
+
+
+def stopped(
+    steps: Steps | Packed, state: Array | None, start: Array, covariance: Array
+) -> tuple[Array | None, Array]:
+    """Where the filter has come to, as factored, along the way from `state`, and at the end."""
+    passed = states(steps, state, start, covariance)
+    if state is None:
+        return None, passed[-1].copy()
+    return np.vstack([state, passed[stretches(len(passed))[1:] - 1]]), passed[-1].copy()
 
 
 def after_readings(
     steps: Steps, state: Array | None, start: Array, covariance: Array
 ) -> tuple[Array, Array, Array]:
     """The same as states (N, n) and covariances (N, n, n), and the last one as factored."""
-    samples, parts, begun = _begun(steps, state, start, covariance)
-    m, n = samples.C.shape[1:]
+    samples, begun = _begun(steps, state, start, covariance)
+    n, m = samples.sizes
     step = kalman_step(n, m, *samples.patterns, give="after")
-    last, both = step(begun, parts, keep=False)
+    last, both = step(begun, samples.parts(), keep=False)
     return *unpacked(both, n), last[-1]
 
 
 def ended(steps: Steps, state: Array | None, start: Array, covariance: Array) -> Array:
     """Where the filter comes to, as factored, from `state`, or from the start where it is None."""
-    samples, parts, begun = _begun(steps, state, start, covariance)
-    m, n = samples.C.shape[1:]
-    step = kalman_step(n, m, *samples.patterns, give="end")
-    return np.asarray(step(begun, parts, keep=False)[0][-1])
+    samples, begun = _begun(steps, state, start, covariance)
+    step = kalman_step(*samples.sizes, *samples.patterns, give="end")
+    return np.asarray(step(begun, samples.parts(), keep=False)[0][-1])
 
 
 def unfactored(factored: Array, n: int) -> tuple[Array, Array]:
@@ -163,34 +227,36 @@ def normalised(innovations: Array, S: Array) -> Array:
     return found
 
 
-#: Samples, what is given of each, and the state before the first.
-Given = tuple[Steps, Sequence[Array], Array]
+#: Steps, and the state before the first.
+Given = tuple[Packed, Array]
 
 
-def _begun(steps: Steps, state: Array | None, start: Array, covariance: Array) -> Given:
-    if state is None:
-        return _from_start(steps, start, covariance)
-    return _from_state(steps, state)
+def _begun(steps: Steps | Packed, state: Array | None, start: Array, covariance: Array) -> Given:
+    if state is not None:
+        return Packed.of(steps), state
+    assert isinstance(steps, Steps)
+    return _from_start(steps, start, covariance)
 
 
 def _from_start(steps: Steps, start: Array, covariance: Array) -> Given:
-    n = steps.C.shape[2]
+    n, (of_Phi, of_C) = steps.C.shape[2], steps.patterns
     # No step leads to the first sample: Φ = 0 from an empty state, and what is known beforehand.
-    forced, Q = np.concatenate([start[None], steps.forced]), np.empty((len(steps.y), n, n))
-    Q[0], Q[1:] = covariance, steps.Q
-    return steps, [steps.Phi, forced, Q, steps.seen, steps.R, steps.read], np.zeros(size(n))
+    forced = np.concatenate([start[None], steps.forced])
+    noise = _factored(np.concatenate([covariance[None], steps.Q]))
+    Phi, C = picked(steps.Phi, of_Phi), picked(steps.seen, of_C)
+    found = Packed(Phi, forced, noise, C, steps.R, steps.read, steps.present, steps.patterns)
+    return found, np.zeros(size(n))
 
 
-def _from_state(steps: Steps, state: Array) -> Given:
-    parts = {name: getattr(steps, name)[1:] for name in ("C", "d", "R", "y")}
-    samples = replace(steps, **parts)
-    motion = [steps.Phi, steps.forced, steps.Q]
-    return samples, [*motion, samples.seen, samples.R, samples.read], state
+def _factored(Q: Array) -> Array:
+    n = Q.shape[1]
+    (found,) = noise_factors(n)([picked(Q, upper(n))])
+    return found[:, :, 0]
 
 
-def _followed(samples: Steps, parts: Sequence[Array], state: Array) -> Estimates:
-    m, n = samples.C.shape[1:]
-    factored, *both = kalman_step(n, m, *samples.patterns)(state, parts)
+def _followed(samples: Steps, packed: Packed, state: Array) -> Estimates:
+    n, m = packed.sizes
+    factored, *both = kalman_step(n, m, *packed.patterns)(state, packed.parts())
     (x, P), before = (unpacked(part, n) for part in both)
     return Estimates(x, P, *before, *_innovations(samples, *before), factored)
 
@@ -212,29 +278,39 @@ def smoothed(steps: Steps, found: Estimates) -> tuple[Array, Array]:
     return np.concatenate([x, found.x[-1:]]), np.concatenate([P, found.P[-1:]])
 
 
-def smoothed_before(steps: Steps, factored: Array, told: Array) -> tuple[Array, Array, Array]:
+def smoothed_before(
+    steps: Steps | Packed, factored: Array, told: Array
+) -> tuple[Array, Array, Array]:
     """The same at every sample but the last, of which what is `told` by readings after it is known.
 
     `factored` (N − 1, …) by the filter; also returned: what is told of the first sample.
     """
-    both, back = _backwards(steps, factored, told, brief=False)
-    return *unpacked(both, steps.C.shape[2]), back
+    x, P, back = _backwards(steps, factored, told, brief=False)
+    return x, P, back
 
 
-def smoothed_brief(steps: Steps, factored: Array, told: Array) -> tuple[Array, Array, Array]:
+def smoothed_brief(
+    steps: Steps | Packed, factored: Array, told: Array
+) -> tuple[Array, Array, Array]:
     """The same with standard deviations (N − 1, n) in place of covariances."""
-    both, back = _backwards(steps, factored, told, brief=True)
-    n = steps.C.shape[2]
-    return both[:, :n], both[:, n:], back
+    x, std, back = _backwards(steps, factored, told, brief=True)
+    return x, std, back
 
 
-def _backwards(steps: Steps, factored: Array, told: Array, brief: bool) -> tuple[Array, Array]:
-    m, n = steps.C.shape[1:]
-    step, later = smoother_step(n, m, *steps.patterns, brief=brief), slice(None, 0, -1)
-    parts = [p[::-1] for p in (steps.Phi, steps.forced, steps.Q)]
-    parts += [p[later] for p in (steps.seen, steps.R, steps.read)] + [factored[::-1]]
-    back, both = step(told, parts, keep=False)
-    return both[::-1], back[-1]
+def _backwards(steps: Steps | Packed, factored: Array, told: Array, brief: bool) -> list[Array]:
+    """States, what is shown beside them, and what is told of the first sample."""
+    packed, count = Packed.of(steps), len(factored)
+    n, m = packed.sizes
+    step, combined = told_step(n, m, *packed.patterns), both_ways(n, packed.patterns[0], brief)
+    found = [np.empty((count, n)), np.empty((count, n) if brief else (count, n, n))]
+    for stop in range(count, 0, -TOLD):
+        own = slice(max(stop - TOLD, 0), stop)
+        (back,) = step(told, [p[::-1] for p in packed.parts(own)])
+        each = combined([back[::-1], factored[own]])
+        for whole, part in zip(found, each, strict=True):
+            whole[own] = part.reshape(whole[own].shape)
+        told = back[-1].copy()
+    return [*found, told]
 
 
 def smoothed_states(steps: Steps, found: Estimates) -> Array:

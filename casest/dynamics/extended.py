@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from typing import Any
 
 import casadi as ca
@@ -27,7 +27,8 @@ from casest.dynamics.declare import Dynamics
 from casest.dynamics.discrete import Steps
 from casest.dynamics.factors import Factors
 from casest.dynamics.inputs import as_read, at_estimates, estimates, slopes, uncertain
-from casest.dynamics.stepping import by_rows, entries, packed, reach, unpacked
+from casest.dynamics.samples import AtSamples
+from casest.dynamics.stepping import entries, packed, reach, unpacked
 from casest.dynamics.transition import (
     Pace,
     acting,
@@ -39,7 +40,7 @@ from casest.dynamics.transition import (
     variances,
     with_lost,
 )
-from casest.engine import Columns, Recursion, Replay, evaluated
+from casest.engine import Recursion
 from casest.errors import DataError
 
 #: ‖A‖h of a piece that Runge-Kutta follows well, pieces at least and at most, and ‖A‖h that it
@@ -48,9 +49,6 @@ PIECE, FEWEST, MOST, UNSTABLE = 0.5, 2, 16, 2.5
 
 #: Samples that are linearised at once.
 _BLOCK = 4096
-
-#: Samples that are evaluated one after the other.
-FEW = 200
 
 #: Rounds of the filter's update where a reading is no linear function of the state.
 ITERATIONS = 4
@@ -171,7 +169,7 @@ def _following(model: Dynamics, count: int) -> Recursion:
     """(x, numbers of one step) -> x after it."""
     x, numbers = ca.SX.sym("x", model.size), _two_samples(model)
     after = _motion(model, count)(x, *numbers)[0]
-    return Recursion(ca.Function("follow", [x, ca.vertcat(*numbers)], [after], {"cse": True}))
+    return Recursion(ca.Function("follow", [x, *numbers], [after], {"cse": True}))
 
 
 @lru_cache(maxsize=8)
@@ -180,45 +178,6 @@ def _outputs(model: Dynamics) -> AtSamples:
     signals = [flat(t.symbols[s.name]) for s in model.signals]
     (C,), as_was = at_estimates(model, [t.C])
     return AtSamples(ca.vertcat(t.x, *signals, *as_was), [C, t.h - C @ t.x, t.reading])
-
-
-class AtSamples:
-    """Expressions of one sample, evaluated at many: over blocks of them at once, or of a `FEW` one
-    after the other, for which a call of NumPy an operation takes longer."""
-
-    def __init__(self, sample: SX, outputs: list[SX]) -> None:
-        self.sample, self.outputs = sample, [ca.densify(e) for e in outputs]
-
-    def __call__(self, columns: list[Array]) -> list[Array]:
-        """Each expression at every sample, (N, …)."""
-        if len(columns[0]) > FEW:
-            return over_samples(self._blocks, columns)
-        _, *found = self._singly(np.zeros(1), np.hstack(columns))
-        shapes = [e.shape for e in self.outputs]
-        return [part.reshape(-1, *shape) for part, shape in zip(found, shapes, strict=True)]
-
-    @cached_property
-    def _blocks(self) -> Replay:
-        return replay(self.sample, self.outputs)
-
-    @cached_property
-    def _singly(self) -> Recursion:
-        nothing = ca.SX.sym("nothing")
-        rows = [by_rows(e) for e in self.outputs]
-        return Recursion(ca.Function("at", [nothing, self.sample], [nothing, *rows]))
-
-
-def replay(sample: SX, outputs: list[SX]) -> Replay:
-    """Expressions of one sample, to be evaluated over many."""
-    none = ca.SX.sym("none", 0)
-    names = ["parameters", "sample"], [f"o{k}" for k in range(len(outputs))]
-    dense = [ca.densify(e) for e in outputs]
-    return Replay(ca.Function("replayed", [none, sample], dense, *names))
-
-
-def over_samples(expressions: Replay, columns: list[Array]) -> list[Array]:
-    """Each expression at every sample, (N, …)."""
-    return evaluated(expressions, np.zeros(0), Columns(columns))
 
 
 def extended(model: Dynamics, run: Run) -> tuple[Array, Array, Array, Array, Array, Array]:
@@ -287,14 +246,14 @@ def extended_step(model: Dynamics, count: int) -> Recursion:
     after_x, after = factors.unpacked(found, n)
     said, C = _extended_outputs(model)(before_x, signals)
     told = ca.vertcat(t.wrapped(y - said), ca.vec(ca.densify(C @ before_P @ C.T + ca.diag(R))))
-    numbers = ca.vertcat(u, v, h, share, gap, signals, R, y, there)
+    numbers = [u, v, h, share, gap, signals, R, y, there]
     outputs = [
         found,
         packed(after_x, factors.multiplied(after)),
         packed(before_x, before_P),
         told,
     ]
-    return Recursion(ca.Function("step", [both, numbers], outputs, {"cse": True}))
+    return Recursion(ca.Function("step", [both, *numbers], outputs, {"cse": True}))
 
 
 @lru_cache(maxsize=8)

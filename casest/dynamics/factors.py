@@ -17,8 +17,10 @@ Factors = tuple[Any, Any]
 
 
 def over(a: Any, b: Any) -> Any:
-    """a/b, and nothing where b is: what is certain teaches nothing."""
-    return ca.if_else(b > 0, a / b, 0)
+    """a/b, and nothing where b is: what is certain teaches nothing.
+
+    Not by if_else, which CasADi draws out of every product that follows: a branch each."""
+    return a * (b > 0) / (b + (b <= 0))
 
 
 def multiplied(factors: Factors) -> Any:
@@ -89,17 +91,17 @@ def read_with(factors: Factors, c: Any, variance: Any, weight: Any = 1) -> tuple
     n = D.numel()
     f = U.T @ c
     g, f = D * f, weight * f
-    after_U, after_D, gain, before = ca.SX(U), ca.SX.zeros(n), ca.SX.zeros(n), variance
+    after_U, after_D, gain = ca.SX(U), ca.SX.zeros(n), ca.SX.zeros(n)
+    before, one_over = variance, None
     for j in range(n):
         s = before + f[j] * g[j]
-        after_D[j] = D[j] * (before / s)
-        share = -f[j] / before
         for i in range(j):
-            after_U[i, j] = U[i, j] + gain[i] * share
+            after_U[i, j] = U[i, j] - gain[i] * (f[j] * one_over)
             gain[i] += U[i, j] * g[j]
         gain[j] = g[j]
-        before = s
-    return (after_U, after_D), gain * (weight / before), before
+        last, before, one_over = before, s, 1 / s  # a division takes as long as many products
+        after_D[j] = D[j] * (last * one_over)
+    return (after_U, after_D), gain * (weight * one_over), before
 
 
 def packed(x: Any, factors: Factors) -> Any:

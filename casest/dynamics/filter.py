@@ -246,7 +246,7 @@ def discretised(model: Dynamics, system: Linearised) -> Steps:
     """The record in discrete time: exact transitions, and every reading with its variance."""
     moved = system.sampled
     Phi, forced = moved.Phi, moved.forced
-    Q = with_lost(model, system.steps, Phi, moved.Q.copy(), system.pace)
+    Q = with_lost(model, system.steps, Phi, moved.Q, system.pace)
     R = variances(model, system.steps, system.pace)
     t = model.traced
     return Steps(Phi, forced, Q, system.C, system.d, R, system.y, reach(t.A), entries(t.C))

@@ -27,7 +27,8 @@ from casest.declaration.physics import SX
 from casest.declaration.shapes import Array
 from casest.declaration.tracing import flat
 from casest.dynamics.declare import Dynamics
-from casest.dynamics.stepping import Pattern, by_rows, entries
+from casest.dynamics.samples import by_rows
+from casest.dynamics.stepping import Pattern, entries
 from casest.engine import Columns, Replay, evaluated
 
 #: Chance that noise alone stands out, for each octave of each direction.

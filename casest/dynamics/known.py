@@ -19,6 +19,7 @@ from casest.declaration.tracing import flat
 from casest.dynamics.declare import Dynamics
 from casest.dynamics.discrete import (
     Brief,
+    Packed,
     Steps,
     brief,
     continued,
@@ -26,7 +27,7 @@ from casest.dynamics.discrete import (
     normalised,
     std_of,
 )
-from casest.dynamics.extended import over_samples, replay
+from casest.dynamics.samples import over_samples, replay
 from casest.engine import Replay
 from casest.errors import UsageError
 
@@ -68,17 +69,21 @@ def known(model: Dynamics, run: Run, x: Array, P: Array) -> tuple[Array, Array]:
     return at, 0.5 * (after + after.transpose(0, 2, 1))
 
 
-def shown(model: Dynamics, run: Run, where: slice, steps: Steps, state: Array | None) -> Brief:
+def shown(
+    model: Dynamics, run: Run, where: slice, steps: Steps | Packed, state: Array | None
+) -> Brief:
     """What is shown of the filter over a piece of the record, with what is known put in.
 
-    From `state` of the piece's first sample, which is left out; None: from the start.
+    From `state` of the piece's first sample, which is left out (and more along the way: `brief`);
+    None: from the start.
     """
     if not model.traced.g.numel():
         return brief(steps, state, model.start, model.start_covariance)
+    assert isinstance(steps, Steps)
     if state is None:
         own = kalman(steps, model.start, model.start_covariance)
     else:
-        own = continued(steps, state)
+        own = continued(steps, state if state.ndim == 1 else state[0])
     x, P = known(model, run.take(slice(where.stop - len(own.x), where.stop)), own.x, own.P)
     squares = normalised(own.innovations, own.S)
     return Brief(x, std_of(P), own.innovations, std_of(own.S), squares, own.factored)

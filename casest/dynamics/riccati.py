@@ -18,7 +18,7 @@ from casest.declaration.shapes import Array
 from casest.dynamics import factors
 from casest.dynamics.between import DOUBLINGS, balance
 from casest.dynamics.declare import Dynamics
-from casest.dynamics.stepping import by_rows
+from casest.dynamics.samples import by_rows
 from casest.dynamics.transition import Linearised, exponential, magnus, usual
 from casest.engine import Recursion
 from casest.errors import DataError
@@ -43,7 +43,7 @@ def riccati(model: Dynamics, system: Linearised, start: Array | None = None) -> 
     for k in range(0, count - 1, _BLOCK):
         where = slice(k, min(k + _BLOCK, count - 1))
         parts = _over_steps(model, system, where)
-        states, own = _riccati_step(n)(state, list(parts))
+        states, own = _riccati_step(n)(state, parts)
         state, found[where.start + 1 : where.stop + 1] = states[-1], own.reshape(-1, n, n)
     bad = np.flatnonzero(~np.isfinite(found).all(axis=(1, 2)))
     if bad.size:
@@ -64,9 +64,9 @@ def _riccati_step(n: int) -> Recursion:
     for j in range(n):
         P, _ = factors.read(P, U[:, j], 1, D[j])
     P = factors.moved(P, Phi, factors.factored(Q))
-    numbers = ca.vertcat(*[by_rows(e) for e in (Phi, Q, W)])
+    numbers = [by_rows(e) for e in (Phi, Q, W)]
     outputs = [factors.packed(x, P), ca.vec(factors.multiplied(P))]
-    return Recursion(ca.Function("step", [both, numbers], outputs, {"cse": True}))
+    return Recursion(ca.Function("step", [both, *numbers], outputs, {"cse": True}))
 
 
 def _over_steps(model: Dynamics, system: Linearised, where: slice) -> tuple[Array, Array, Array]:

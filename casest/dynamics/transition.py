@@ -264,7 +264,7 @@ def stepped(system: Linearised, intensity: Array) -> Motions:
 def stepped_with(system: Linearised, intensities: Sequence[Array]) -> list[Motions]:
     """The same with each of several noises."""
     found = with_noises(system.A, system.c, intensities, system.steps, system.held)
-    if all(np.isfinite(part).all() for own in found for part in (own.Phi, own.forced, own.Q)):
+    if all(_finite(part) for own in found for part in (own.Phi, own.forced, own.Q)):
         return found
     whole = np.isfinite(found[0].forced).all(axis=1) & np.isfinite(found[0].Phi).all(axis=(1, 2))
     for own in found:
@@ -278,6 +278,12 @@ def stepped_with(system: Linearised, intensities: Sequence[Array]) -> list[Motio
             "sample faster, or leave the fast state out"
         )
     return found
+
+
+def _finite(numbers: Array) -> bool:
+    with np.errstate(over="ignore", invalid="ignore"):
+        total = np.sum(numbers)  # cheaper, and of finite numbers rarely anything else
+    return bool(np.isfinite(total) or np.isfinite(numbers).all())
 
 
 def half_transitions(system: Linearised, part: tuple[float, float]) -> Array:
@@ -359,6 +365,9 @@ def with_lost(
     """The noise Q (N − 1, n, n) of steps, gaps included."""
     added, i = lost(model, steps, pace), np.arange(model.size)
     wide = np.flatnonzero(added.any(axis=1))
+    if not wide.size:
+        return Q
+    Q = Q.copy()
     own = np.zeros((len(wide), model.size, model.size))
     own[:, i, i] = added[wide]
     Q[wide] += Phi[wide] @ own @ Phi[wide].transpose(0, 2, 1) + own

@@ -9,6 +9,7 @@ from __future__ import annotations
 from casest.engine.chain import chained
 from casest.engine.compiled import Compiled
 from casest.engine.kernel import by_workers, evaluated
+from casest.engine.lanes import stretches
 from casest.engine.normal import (
     Normal,
     cost,
@@ -36,6 +37,7 @@ __all__ = [
     "normal_equations",
     "residuals",
     "rows",
+    "stretches",
     "summed",
     "triangular_factor",
 ]

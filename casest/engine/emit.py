@@ -91,9 +91,11 @@ def source_of_values(replay: Replay) -> str:
     """C source with `casest_records`: all outputs of every sample, one dense after the other."""
     outputs = range(len(replay.shapes))
     entries = [entry for i in outputs for entry in replay.entries(i)]
-    chunk = max(16, min(128, _CACHE // (8 * max(len(entries), 1)) // 8 * 8))
+    plan = replay.plan(entries)
+    rows = len(entries) + len(plan.inputs) + _loops(plan, _places_of(plan.scalars))[1]
+    chunk = max(16, min(128, _CACHE // (8 * max(rows, 1)) // 8 * 8))
     parts = [_HEAD.replace("{chunk}", str(chunk))]
-    parts += _block("all", replay.plan(entries), len(entries))
+    parts += _block("all", plan, len(entries))
     parts.append(_records(replay, len(entries)))
     return "\n".join(parts)
 
@@ -125,7 +127,7 @@ def _records(replay: Replay, count: int) -> str:
 def _block(name: str, plan: Plan, wanted: int) -> Iterator[str]:
     """A function for what depends on parameters only, and one for the entries of a chunk."""
     values = plan.graph.values
-    scalars = {i: k for k, i in enumerate(plan.scalars)}
+    scalars = _places_of(plan.scalars)
     lines = [f"static void scalars_{name}(const double *p, double *c) {{"]
     for i, k in scalars.items():
         lines.append(f"  c[{k}] = {_scalar(values[i], scalars)};")
@@ -160,6 +162,10 @@ _PLACES = (
     "const double *restrict c, const double (*restrict in)[B], double (*restrict kept)[B], "
     "double (*restrict out)[B]"
 )
+
+
+def _places_of(values: list[int]) -> dict[int, int]:
+    return {i: k for k, i in enumerate(values)}
 
 
 def _scalar(value: object, place: dict[int, int]) -> str:

@@ -110,9 +110,12 @@ class Kernel:
         """Every residual of every sample, (count, N)."""
         return self._each("casest_values_residual", parameters, samples, count)
 
-    def records(self, parameters: Floats, samples: Columns, width: int) -> Floats:
-        """All outputs of every sample, (N, width), as dense ones one after the other."""
-        result = np.zeros((len(samples), width))
+    def records(
+        self, parameters: Floats, samples: Columns, width: int, *, full: bool = False
+    ) -> Floats:
+        """All outputs of every sample, (N, width), as dense ones one after the other; `full`: is
+        none of their entries zero for good?"""
+        result = (np.empty if full else np.zeros)((len(samples), width))
         self._call("casest_records", parameters, samples, slice(0, len(samples)), None, result)
         return result
 
@@ -238,7 +241,8 @@ def evaluated(replay: Replay, parameters: Floats, samples: Columns) -> list[Floa
         return replay(parameters, samples)
     parameters, samples = replay.check(parameters, samples)
     ends = np.cumsum([0, *(rows * columns for rows, columns in replay.shapes)]).tolist()
-    whole = kernel.records(parameters, samples, ends[-1])
+    full = sum(len(rows) for rows, _ in replay.sparsity) == ends[-1]
+    whole = kernel.records(parameters, samples, ends[-1], full=full)
     places = zip(pairwise(ends), replay.shapes, strict=True)
     return [whole[:, a:b].reshape(-1, *shape) for (a, b), shape in places]
 

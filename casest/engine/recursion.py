@@ -26,26 +26,25 @@ CHUNK = 500
 #: Steps from which on the cache is looked at, and from which on a compiler is worthwhile.
 LOOK, WORTHWHILE = 5_000, 60_000
 #: No contraction: the digits are those of the virtual machine.
-_FLAGS = [["-O2", "-ffp-contract=off", "-fno-math-errno"]]
+_FLAGS = [
+    ["-O2", "-march=native", "-ffp-contract=off", "-fno-math-errno"],
+    ["-O2", "-ffp-contract=off", "-fno-math-errno"],
+]
 
-#: Part p of what a step is given lies at part[p] + k·step[p], from k = late[p] on.
+#: Part p of what a step is given lies at part[p] + k·step[p], from k = late[p] on: read in place.
 _LOOP = """
-void casest_run(const double *state, const double **part, const long *own, const long *step,
-                const long *late, long parts, long n, double **out, int keep) {
+void casest_run(const double *state, const double **part, const long *step, const long *late,
+                long n, double **out, int keep) {
+  static const double none[%(wide)d];
   const double *from = state;
-  double given[%(wide)d];
   const double *arg[%(arg)d];
   double *res[%(res)d], w[%(w)d];
   casadi_int iw[%(iw)d];
   static const long size[] = {%(sizes)s};
   for (long k = 0; k < n; ++k) {
-    double *to = given;
-    for (long p = 0; p < parts; ++p) {
-      const double *at = part[p] + (k - late[p]) * step[p];
-      for (long i = 0; i < own[p]; ++i) *to++ = k < late[p] ? 0.0 : at[i];
-    }
     arg[0] = from;
-    arg[1] = given;
+    for (long p = 0; p < %(parts)d; ++p)
+      arg[1 + p] = k < late[p] ? none : part[p] + (k - late[p]) * step[p];
     res[0] = out[0] + (keep ? k : k %% 2) * size[0];
     for (int i = 1; i < %(outputs)d; ++i) res[i] = out[i] + k * size[i];
     casest_step(arg, res, iw, w, 0);
@@ -56,7 +55,7 @@ void casest_run(const double *state, const double **part, const long *own, const
 
 
 class Recursion:
-    """`step`: (state, numbers of one sample) -> (state, …), both vectors.
+    """`step`: (state, numbers of one sample) -> (state, …), vectors; numbers in one or more parts.
 
     `instead`: a dearer step that is made where the last number of what `step` gives is above zero.
     """
@@ -66,22 +65,23 @@ class Recursion:
         if instead is not None:
             self._step = _either(self._step, _shared(instead, "instead"))
         self.sizes = [int(step.numel_out(i)) for i in range(step.n_out())]
-        self._wide = int(step.numel_in(1))
+        self._widths = [int(step.numel_in(i)) for i in range(1, step.n_in())]
         self._replayed = 0
         self._library: ctypes.CDLL | None = None
         self._looked = self._built = False
         self._chunks: dict[int, Any] = {}
-        self._beside: dict[int, Any] = {}
+        self._beside: dict[tuple[int, bool], Any] = {}
 
     def __call__(
         self, state: Floats, numbers: Floats | Sequence[Floats], *, keep: bool = True
     ) -> list[Floats]:
         """Every output of every step, (N, …) each; without `keep` the last state alone.
 
-        `state`: what the first step begins from; `numbers` (N, …): what each step is given, or
-        parts of it, arrays (N, …) one after the other; a shorter one is zero at the first steps.
+        `state`: what the first step begins from; `numbers` (N, …): what each step is given, an
+        array a part; a shorter one is zero at the first steps.
         """
         parts = [_rows(p) for p in ([numbers] if isinstance(numbers, np.ndarray) else numbers)]
+        assert [p.shape[1] for p in parts] == self._widths
         count = max(map(len, parts))
         state = np.ascontiguousarray(state, float).ravel()
         rows = [count if keep or i else 2 for i in range(len(self.sizes))]
@@ -111,17 +111,40 @@ class Recursion:
             several += [[f[:, :, lane] for f in found] for lane in range(len(own))]
         return several
 
-    def _in_lanes(self, count: int, steps: int) -> ctypes.CDLL | None:
+    def along(self, states: Floats, numbers: Sequence[Floats]) -> list[Floats]:
+        """The call from states[0], where others are known already: states (L, …) before the steps
+        that `stretches` names. The same digits, the stretches side by side."""
+        parts, count = [_rows(p) for p in numbers], len(numbers[0])
+        assert [p.shape[1] for p in parts] == self._widths
+        begin = lanes.stretches(count)
+        compiled = self._in_lanes(len(begin), count, apart=True) if len(begin) > 1 else None
+        if compiled is None:
+            return self(states[0], numbers)
+        found = [np.empty((count, size)) for size in self.sizes]
+        state, steps = lanes.interleaved(states, len(begin)), [p.strides[0] // 8 for p in parts]
+        compiled.casest_lanes(
+            ctypes.c_void_p(state.ctypes.data),
+            _places(parts),
+            _longs(steps),
+            _longs(begin.tolist()),
+            ctypes.c_long(count - int(begin[-1])),
+            _places(found),
+        )
+        return found
+
+    def _in_lanes(self, count: int, steps: int, *, apart: bool = False) -> ctypes.CDLL | None:
         """Where the step itself is compiled, and for as many steps as that takes."""
         wish = os.environ.get("CASEST_KERNEL", "auto")
         if wish == "off":
             return None
-        own = self._beside.setdefault(count, {"seen": 0, "looked": False, "library": None})
-        own["seen"] += count * steps
+        nothing = {"seen": 0, "looked": False, "library": None}
+        own = self._beside.setdefault((count, apart), nothing)
+        own["seen"] += steps if apart else count * steps
         due = wish == "always" or own["seen"] > WORTHWHILE
         if own["library"] is None and own["looked"] is not due:
             own["looked"] = due
-            text = lanes.source(self._source(), self.sizes, self._wide, count)
+            parts = len(self._widths)
+            text = lanes.source(self._source(), self.sizes, parts, count, apart=apart)
             own["library"] = lanes.built(text, build=due)
         found: ctypes.CDLL | None = own["library"]
         return found
@@ -145,7 +168,8 @@ class Recursion:
         sizes: dict[str, Any] = {name: getattr(self._step, f"sz_{name}")() + 1
                                  for name in ("arg", "res", "iw", "w")}  # fmt: skip
         sizes |= {"outputs": len(self.sizes), "sizes": ", ".join(map(str, self.sizes))}
-        return str(generator.dump()) + _LOOP % {**sizes, "wide": max(self._wide, 1)}
+        sizes |= {"parts": len(self._widths), "wide": max(self._widths, default=0) + 1}
+        return str(generator.dump()) + _LOOP % sizes
 
     def _replay(
         self, state: Floats, given: Sequence[Floats], found: list[Floats], keep: bool
@@ -162,11 +186,10 @@ class Recursion:
             buffer.set_res(i, memoryview(part))  # type: ignore[arg-type]
         for k in range(0, count, chunk):
             size = min(chunk, count - k)
-            numbers = _side_by_side(given, k, size, count)
-            if size < chunk:
-                numbers = np.concatenate([numbers, np.repeat(numbers[-1:], chunk - size, axis=0)])
-            for i, array in enumerate((state, numbers)):
-                buffer.set_arg(i, memoryview(array))  # type: ignore[arg-type]
+            own = [state, *(_of_chunk(p, k, chunk, count) for p in given)]
+            for i, array in enumerate(own):
+                if array.size:  # a view of nothing has no address
+                    buffer.set_arg(i, memoryview(array))  # type: ignore[arg-type]
             run()
             for i, part in enumerate(parts):
                 if keep or i:
@@ -202,27 +225,22 @@ def _rows(part: Floats) -> Floats:
     return rows if even else np.ascontiguousarray(rows)
 
 
-def _side_by_side(parts: Sequence[Floats], first: int, count: int, whole: int) -> Floats:
-    """What so many steps are given, (count, …)."""
-    numbers = np.zeros((count, sum(p.shape[1] for p in parts)))
-    place = 0
-    for p in parts:
-        late = whole - len(p)
-        own = p[max(first - late, 0) : max(first + count - late, 0)]
-        numbers[count - len(own) :, place : place + p.shape[1]] = own
-        place += p.shape[1]
-    return numbers
+def _of_chunk(part: Floats, first: int, chunk: int, count: int) -> Floats:
+    """What `chunk` of `count` steps are given of a part; those beyond the last what that is."""
+    steps = np.minimum(np.arange(first, first + chunk), count - 1) - (count - len(part))
+    found = np.zeros((chunk, part.shape[1]))
+    found[steps >= 0] = part[steps[steps >= 0]]
+    return found
 
 
 def _given(state: Floats, parts: Sequence[Floats], count: int) -> list[Any]:
     """Where a compiled run begins, and what it is given: parts of rows, some of them late."""
-    sizes, steps = [p.shape[1] for p in parts], [p.strides[0] // 8 for p in parts]
-    late = [count - len(p) for p in parts]
+    steps, late = [p.strides[0] // 8 for p in parts], [count - len(p) for p in parts]
     return [
         ctypes.c_void_p(state.ctypes.data),
         _places(parts),
-        *[_longs(x) for x in (sizes, steps, late)],
-        ctypes.c_long(len(parts)),
+        _longs(steps),
+        _longs(late),
         ctypes.c_long(count),
     ]
 

@@ -24,7 +24,7 @@ from casest.declaration.shapes import Array
 from casest.declaration.tracing import flat
 from casest.diagnose.motion.candidates import candidates, prepared
 from casest.dynamics.declare import Dynamics
-from casest.dynamics.extended import over_samples, replay
+from casest.dynamics.samples import over_samples, replay
 from casest.dynamics.transition import checked_time, usual
 from casest.effects.moving import COLOURED, TIME_DELAY, Body, Candidate, Colour, Numbers, extended
 from casest.errors import UsageError

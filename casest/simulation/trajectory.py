@@ -18,7 +18,7 @@ from casest.declaration.physics import SX
 from casest.declaration.shapes import Array
 from casest.declaration.tracing import flat
 from casest.dynamics.declare import Dynamics
-from casest.dynamics.extended import over_samples, replay
+from casest.dynamics.samples import over_samples, replay
 from casest.engine import Recursion
 from casest.errors import CasestError, UsageError
 
@@ -199,7 +199,7 @@ def _way(step: Recursion, given: Curve, start: Array, time: Array, noise: Array)
 
 
 def _step(model: Dynamics, leads: Mapping[str, str]) -> Recursion:
-    """(x, [inputs at the beginning, middle and end; h; noise]) -> x after it."""
+    """(x; inputs at the beginning, middle and end, h, noise) -> x after it."""
     rate, wide = _rate(model, leads)
     x, h = ca.SX.sym("x", model.size), ca.SX.sym("h")
     u, middle, v = (ca.SX.sym(name, wide) for name in "umv")
@@ -209,8 +209,8 @@ def _step(model: Dynamics, leads: Mapping[str, str]) -> Recursion:
     c = rate(x + 0.5 * h * b, middle)[0]
     d = rate(x + h * c, v)[0]
     after = x + h / 6 * (a + 2 * b + 2 * c + d) + noise
-    numbers = ca.vertcat(u, middle, v, h, noise)
-    return Recursion(ca.Function("step", [x, numbers], [after], {"cse": True}))
+    numbers = [u, middle, v, h, noise]
+    return Recursion(ca.Function("step", [x, *numbers], [after], {"cse": True}))
 
 
 def _rate(model: Dynamics, leads: Mapping[str, str]) -> tuple[Any, int]:
