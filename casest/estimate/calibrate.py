@@ -18,7 +18,7 @@ from casest.estimate import reasons as words
 from casest.estimate.by_estimator import by_estimator
 from casest.estimate.certificate import Certificate, certify
 from casest.estimate.correlation import correlation_time
-from casest.estimate.covariance import as_stated, covariance_of, inverse_normal
+from casest.estimate.covariance import as_stated, covariance_of, inverse_normal, no_less
 from casest.estimate.errors_of_inputs import solved, with_errors_of_inputs
 from casest.estimate.estimate import Estimate as Estimate
 from casest.estimate.estimate import Noise
@@ -229,6 +229,9 @@ def _estimate(
     normal = problem.model.prior is not None or (noise.known and correlated <= 1)
     by = as_stated if normal else covariance_of
     covariance = by(problem, point, R, noise.sigma, correlated, free)
+    if noise.known and not normal:
+        known = as_stated(problem, point, R, noise.sigma, correlated, free)
+        covariance = no_less(covariance, known)
     bias = second_order_bias(problem, point, noise.sigma, inverse_normal(R, free))
     relative = float(np.max(np.abs(bias[free]) / np.sqrt(np.diag(covariance)[free]), initial=0.0))
     shift = np.outer(bias, bias) if relative > NOTABLE_BIAS else 0.0

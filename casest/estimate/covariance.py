@@ -69,6 +69,13 @@ def as_stated(
     return np.asarray(sigma**2 * inverse_normal(R, free))
 
 
+def no_less(robust: Array, stated: Array) -> Array:
+    """The robust covariance (n, n), no variance below that of the noise that was stated: where
+    residuals look correlated by chance, their batches know less of it than who stated it."""
+    own = np.diag(stated)
+    return as_plain(robust, own, np.diag(robust) < own)
+
+
 def inverse_normal(R: Array, free: NDArray[np.bool_] | None = None) -> Array:
     """(JᵀJ)⁻¹ from the triangular factor, with unit columns inside; pseudo-inverse if singular.
 
