@@ -87,7 +87,7 @@ def test_errors_of_inputs_are_those_of_odrpack(size):
 
 @pytest.mark.parametrize("seed", [5, 6])
 def test_residuals_that_look_correlated_by_chance_know_no_better(seed):
-    """Of seed 6 they do, at 1 %, and standard deviations were 17 and 22 % below the stated noise's."""
+    """Of seed 6 they do, and standard deviations were 17 and 22 % below the stated noise's."""
     rng = np.random.default_rng(seed)
     x, n = np.linspace(0, 3, 10_000), 10_000
     ux, uy = 0.05 + 0.05 * rng.random(n), 0.1 + 0.1 * rng.random(n)
