@@ -57,12 +57,13 @@ class Memory:
         """What it gives (N, m) and its slopes (N, m, n), of what it takes (N, k) and its slopes."""
         count, m, n = len(x), self.size, self.unknowns
         first = np.r_[True, block[1:] != block[:-1]]
-        columns = [x, _flat(X), _steps(time, first)[:, None], first[:, None]]
+        parts = [x, X, _steps(time, first), first.astype(float)]
+        of_all = [parameters]
         if self.attached.spanned:
-            columns += [np.repeat(part[None], count, axis=0) for part in _span(x[:, :m], X[:, :m])]
-        columns.append(np.repeat(parameters[None], count, axis=0))
+            of_all = [*_span(x[:, :m], X[:, :m]), parameters]
+        parts += [np.broadcast_to(part, (count, len(part))) for part in of_all]
         start = np.zeros(self._recursion.sizes[0])
-        found = self._recursion(start, np.hstack(columns), keep=False)[1]
+        found = self._recursion(start, parts, keep=False)[1]
         return found[:, :m], found[:, m:].reshape(count, n, m).transpose(0, 2, 1)
 
     @cached_property
@@ -72,7 +73,9 @@ class Memory:
         s = ca.SX.sym("s", m * len(self.attached.keeps))
         x, span = ca.SX.sym("x", self.stage.taken.numel()), ca.SX.sym("span", m)
         dt, first = ca.SX.sym("dt"), ca.SX.sym("first")
-        S, X, Y = (ca.SX.sym(name, of.numel(), n) for name, of in (("S", s), ("X", x), ("Y", span)))
+        S, Y = (ca.SX.sym(name, of.numel(), n) for name, of in (("S", s), ("Y", span)))
+        rows = ca.SX.sym("X", n, x.numel())  # as NumPy holds slopes: row by row
+        X = rows.T
         begin = self._beginning(x)
         # Where a stretch begins, s and S are its own; slopes are those of the function of s.
         slopes = ca.if_else(first, ca.jacobian(begin, x) @ X, S)
@@ -84,8 +87,9 @@ class Memory:
             outputs.append(ca.densify(ca.vertcat(found, ca.vec(ca.densify(slope)))))
         outputs = ca.substitute(outputs, [s], [ca.if_else(first, begin, s)])
         reach = [span, ca.vec(Y)] if self.attached.spanned else []
-        numbers = ca.vertcat(x, ca.vec(X), dt, first, *reach, traced.coordinates, traced.references)
-        return Recursion(ca.Function("step", [ca.vertcat(s, ca.vec(S)), numbers], outputs))
+        parameters = ca.vertcat(traced.coordinates, traced.references)
+        numbers = [x, ca.vec(rows), dt, first, *reach, parameters]
+        return Recursion(ca.Function("step", [ca.vertcat(s, ca.vec(S)), *numbers], outputs))
 
     def _beginning(self, x: SX) -> SX:
         """What is kept before the first sample of a stretch: as if it had always been like that."""
@@ -110,11 +114,6 @@ class Memory:
         value, reach = ca.reshape(x[:m], *shape), ca.reshape(span, *shape)
         given, *after = attached.step(value, symbols, kept, dt, reach)
         return ca.vec(given), ca.vertcat(*map(ca.vec, after))
-
-
-def _flat(slopes: Array) -> Array:
-    """(N, k, n) as CasADi holds a matrix: column by column, (N, k·n)."""
-    return slopes.transpose(0, 2, 1).reshape(len(slopes), -1)
 
 
 def _steps(time: Array, first: NDArray[np.bool_]) -> Array:
