@@ -52,7 +52,7 @@ PUBLISHED = {
         "D": (0.0131, 0.219, 0.185),
     },
 }
-COUNTS, FIRST = {10: 10}, 95_000
+COUNTS, FIRST = {10: 40, 80: 10}, 95_000
 
 
 @dynamics

@@ -22,9 +22,10 @@ from casest.dynamics.discrete import (
     smoothed_states,
     std_of,
 )
-from casest.dynamics.extended import extended, relinearised
+from casest.dynamics.extended import Sampled, extended, with_errors
 from casest.dynamics.inputs import uncertain
 from casest.dynamics.known import known
+from casest.dynamics.likely import about_noise
 from casest.dynamics.riccati import check_covariance
 from casest.dynamics.stepping import entries, reach
 from casest.dynamics.transition import (
@@ -219,13 +220,20 @@ def trajectory(
 ) -> tuple[Array, Array, bool]:
     """The most probable states (N, n), their covariances, and whether they settled.
 
-    Gauss-Newton on all states of the record, from states `along` of a filter with covariances
-    `errors`, by smoothing again and again.
+    Gauss-Newton on all states of the record, and on the noise of uncertain inputs, from states
+    `along` of a filter with covariances `errors`, by smoothing again and again.
     Where the rounds do not settle, the first one's states.
     """
     first: tuple[Array, Array] | None = None
+    sampled, noisy = Sampled.of(model, run), errors is not None and bool(uncertain(model))
+    P = np.empty(0) if errors is None else errors
     for _ in range(ROUNDS):
-        steps = relinearised(model, run, along, errors)
+        if not noisy:
+            steps = sampled.along(along)
+        elif first is None:
+            steps = with_errors(sampled.along(along), model, run, along, P)
+        else:
+            steps = about_noise(sampled, run, along, P)
         before = along
         # What is known exactly is put in here, too: from afar its slope leads astray.
         along, P = known(
