@@ -7,10 +7,13 @@ unknowns of one least-squares problem.
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from scipy.optimize import least_squares as minimised
 
 from casest import Run, signal, vertcat
-from casest.dynamics import Motion, dynamics, least_squares, measured, state
+from casest.dynamics import Motion, dynamics, least_squares, measured, rounds, state
+from casest.dynamics import filter as filtering
+from casest.dynamics.course import followed
 from casest.dynamics.filter import filtered
 
 STEP, GYRO, COMPASS = 0.1, 0.02, 1e-3
@@ -41,10 +44,10 @@ def turn(angle, field):
     return np.array([c * field[0] + s * field[1], c * field[1] - s * field[0]])
 
 
-def record(seed, rates):
+def record(seed, rates, field=(0.8, 0.3), drift=0.05):
     """A record whose rates are read with noise, and the five unknowns at its beginning."""
     rng = np.random.default_rng(seed)
-    field, offset, drift = np.array([0.8, 0.3]), 0.2 * rng.standard_normal(2), 0.05
+    field, offset = np.array(field), 0.2 * rng.standard_normal(2)
     angles = np.concatenate([[0.0], np.cumsum(rates[:-1]) * STEP])
     m = turn(angles, field).T + offset + COMPASS * rng.standard_normal((len(rates), 2))
     read = rates + drift + GYRO * rng.standard_normal(len(rates))
@@ -98,3 +101,49 @@ def test_at_rest_the_noise_of_the_rate_tells_the_field_and_the_offset_not_apart(
     # What the drift is wrong by turns both a little, and tells some of it.
     assert np.all(found.smoothed_std[0, 2:4] > 0.85 * prior)
     assert np.all(np.abs(found.smoothed[0, :4] - truth[:4]) < 4 * prior)
+
+
+@pytest.mark.parametrize("seed", [37, 104, 125])
+def test_rounds_settle_where_noise_moves_a_state_by_its_square_alone(seed):
+    """Little motion: again and again one number of the field is nothing."""
+    rng = np.random.default_rng(seed)
+    rates = 0.05 * rng.standard_normal(150) + 0.1 * np.sin(0.03 * np.arange(150))
+    run, truth = record(seed, rates, field=(-1.6, -0.6), drift=0.25)
+    found = filtered(MODEL, run)
+    assert found.settled
+    assert np.all(np.abs(found.smoothed[0] - truth) < 4 * found.smoothed_std[0])
+
+
+def astray(x):
+    """States of a filter gone astray."""
+    return 1e3 * np.random.default_rng(4).standard_normal(x.shape)
+
+
+def test_where_the_filter_goes_astray_rounds_begin_again_at_the_declared_start(monkeypatch):
+    run, _ = record(5, 0.5 * np.random.default_rng(4).standard_normal(150))
+    right, straight = filtered(MODEL, run), filtering.extended
+
+    def off(*given):
+        x, *others = straight(*given)
+        return astray(x), *others
+
+    monkeypatch.setattr(filtering, "extended", off)
+    found = filtered(MODEL, run)
+    assert right.settled
+    assert found.settled
+    assert np.max(np.abs(found.smoothed - right.smoothed) / right.smoothed_std) < 0.01
+
+
+def test_the_same_in_pieces(monkeypatch):
+    run, _ = record(5, 0.5 * np.random.default_rng(4).standard_normal(150))
+    right, straight = followed(turned, run), rounds.filtered
+
+    def off(*given):
+        for where, x, *others in straight(*given):
+            yield where, astray(x), *others
+
+    monkeypatch.setattr(rounds, "filtered", off)
+    found = followed(turned, run)
+    assert right.settled
+    assert found.settled
+    np.testing.assert_allclose(found.smoothed, right.smoothed, atol=1e-6)

@@ -25,7 +25,7 @@ from casest.dynamics.discrete import (
 from casest.dynamics.extended import Sampled, extended, with_errors
 from casest.dynamics.inputs import uncertain
 from casest.dynamics.known import known
-from casest.dynamics.likely import about_noise
+from casest.dynamics.likely import Inputs
 from casest.dynamics.riccati import check_covariance
 from casest.dynamics.stepping import entries, reach
 from casest.dynamics.transition import (
@@ -200,8 +200,19 @@ def _extended(model: Dynamics, run: Run, smooth: bool) -> Filtered:
     if not smooth:
         return Filtered(model, linearised(model, run, x), *after, *before, *after)
     along, smooth_P, settled = trajectory(model, run, x, P)
+    begun = x if settled else unmoved(model, run)
+    if not settled and np.isfinite(begun).all():
+        other = trajectory(model, run, begun, np.zeros_like(P))
+        along, smooth_P, settled = other if other[2] else (along, smooth_P, settled)
     both = along, smooth_P
     return Filtered(model, linearised(model, run, along), *after, *before, *both, settled)
+
+
+def unmoved(model: Dynamics, run: Run) -> Array:
+    """States (N, n) from the declared start on, by the inputs alone: where rounds begin again that
+    did not settle from states of a filter gone astray."""
+    with np.errstate(all="ignore"):
+        return Sampled.of(model, run).followed(model.start)
 
 
 def refuse_divergence(model: Dynamics, run: Run, x: Array) -> None:
@@ -226,14 +237,17 @@ def trajectory(
     """
     first: tuple[Array, Array] | None = None
     sampled, noisy = Sampled.of(model, run), errors is not None and bool(uncertain(model))
-    P = np.empty(0) if errors is None else errors
+    P, change = np.empty(0) if errors is None else errors, np.inf
+    inputs: Inputs | None = None
     for _ in range(ROUNDS):
         if not noisy:
             steps = sampled.along(along)
         elif first is None:
             steps = with_errors(sampled.along(along), model, run, along, P)
         else:
-            steps = about_noise(sampled, run, along, P)
+            kept = inputs if change < ALIKE else None
+            inputs = Inputs.of(sampled, run, along, P, kept)
+            steps = inputs.steps(sampled, run, along)
         before = along
         # What is known exactly is put in here, too: from afar its slope leads astray.
         along, P = known(
@@ -241,7 +255,7 @@ def trajectory(
         )
         first = first or (along, P)
         std = np.sqrt(np.maximum(np.diagonal(P, axis1=1, axis2=2), 1e-300))
-        change = np.max(np.abs(along - before) / std)
+        change = float(np.max(np.abs(along - before) / std))
         if change < SETTLED:
             return along, P, True
         if not np.isfinite(change):

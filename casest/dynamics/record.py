@@ -25,7 +25,7 @@ from casest.dynamics.filter import (
     filtered,
 )
 from casest.dynamics.inputs import uncertain
-from casest.dynamics.likely import about_noise
+from casest.dynamics.likely import Inputs
 from casest.dynamics.riccati import check_covariance
 
 
@@ -50,9 +50,9 @@ def least_squares(model: Dynamics, run: Run) -> Record:
         system = filtered(model, run).system if noisy else coefficients(model, run)
         return _solved(model, discretised(model, system))
     if uncertain(model):
-        own = filtered(model, run)
-        sampled = Sampled.of(model, run)
-        return _solved(model, about_noise(sampled, run, own.smoothed, own.smoothed_P))
+        own, sampled = filtered(model, run), Sampled.of(model, run)
+        inputs = Inputs.of(sampled, run, own.smoothed, own.smoothed_P)
+        return _solved(model, inputs.steps(sampled, run, own.smoothed))
     x = extended(model, run)[0]
     for _ in range(ROUNDS):
         found = _solved(model, relinearised(model, run, x))
