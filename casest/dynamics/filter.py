@@ -42,7 +42,7 @@ from casest.errors import DataError
 #: standard deviation ends them.
 ROUNDS, SETTLED = 30, 1e-5
 #: Passes of a filter with noisy coefficients; a change of this share of every standard deviation
-#: ends them.
+#: ends them, and rounds about noise of inputs that come no nearer.
 PASSES, ALIKE = 8, 0.01
 
 
@@ -255,8 +255,9 @@ def trajectory(
         )
         first = first or (along, P)
         std = np.sqrt(np.maximum(np.diagonal(P, axis1=1, axis2=2), 1e-300))
-        change = float(np.max(np.abs(along - before) / std))
-        if change < SETTLED:
+        earlier, change = change, float(np.max(np.abs(along - before) / std))
+        # Next to a reading that is far off, rounds about its noise may come no nearer.
+        if change < SETTLED or (noisy and earlier <= change < ALIKE):
             return along, P, True
         if not np.isfinite(change):
             break
