@@ -197,6 +197,14 @@ class Staged:
         What compares a rest with the one before has nothing to say of a first one, and what follows
         a late signal nothing of times at which nobody recorded that.
         """
+        return self._present[r]
+
+    @cached_property
+    def _present(self) -> tuple[NDArray[np.bool_] | None, ...]:
+        """The same of each run: no parameter changes it."""
+        return tuple(self._present_in(r) for r in range(len(self.runs)))
+
+    def _present_in(self, r: int) -> NDArray[np.bool_] | None:
         record, axes = self._records[r], len(self.model.axes)
         there = np.repeat(self._told(record)[:, None], axes, axis=1)
         if record.rests is not None:
