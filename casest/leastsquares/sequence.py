@@ -366,8 +366,8 @@ class Program:
 
     Of an effect on a signal's time that is the time asked for. The last of a model's is its
     residual, with no effect behind it. A `word` of the body has no effect either; `columns` are the
-    coordinates in which a turn has slopes, `turning` the parameters that it depends on. `read`: from
-    where to where it reads what the stages before give.
+    coordinates in which a turn has slopes, `turning` the parameters that it depends on. `read`:
+    from where to where it reads what the stages before give.
     """
 
     attached: Attached | None
