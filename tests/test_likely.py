@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares as minimised
 
-from casest import Run, signal, vertcat
+from casest import Run, signal, sin, vertcat
 from casest.dynamics import Motion, dynamics, least_squares, measured, rounds, state
 from casest.dynamics import filter as filtering
 from casest.dynamics.course import followed
@@ -35,6 +35,20 @@ def turned(
     return Motion(
         rates={"field": w * vertcat(field[1], -field[0])},
         outputs=(measured(m, field + offset, std=COMPASS),),
+    )
+
+
+@dynamics
+def lit(
+    light=signal("1"),
+    y=signal("1"),
+    *,
+    level=state(intensity=0.01),
+    share=state(std=0.3),
+):
+    """A noisy input that only the reading knows."""
+    return Motion(
+        rates={"level": -sin(level)}, outputs=(measured(y, level + share * light, std=0.05),)
     )
 
 
@@ -112,6 +126,19 @@ def test_rounds_settle_where_noise_moves_a_state_by_its_square_alone(seed):
     found = filtered(MODEL, run)
     assert found.settled
     assert np.all(np.abs(found.smoothed[0] - truth) < 4 * found.smoothed_std[0])
+
+
+def test_an_input_that_only_the_reading_knows_moves_no_state():
+    rng, t = np.random.default_rng(0), np.arange(0, 10, 0.05)
+    light = np.sin(t)[:, None]
+    y = 0.2 * light + 0.05 * rng.standard_normal(light.shape)
+    read = {"light": light + 0.01 * rng.standard_normal(light.shape), "y": y}
+    run = Run.raw("lit", read, units={"light": "1", "y": "1"}, time=t)
+    model = lit.sensing(light=0.01**2 * 0.05)
+    found = filtered(model, run)
+    assert found.settled
+    assert abs(found.smoothed[-1, 1] - 0.2) < 4 * found.smoothed_std[-1, 1]
+    np.testing.assert_allclose(least_squares(model, run).x, found.smoothed, atol=1e-4)
 
 
 def astray(x):

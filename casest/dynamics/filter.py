@@ -22,7 +22,7 @@ from casest.dynamics.discrete import (
     smoothed_states,
     std_of,
 )
-from casest.dynamics.extended import Sampled, extended, with_errors
+from casest.dynamics.extended import Sampled, extended, shifted, with_errors
 from casest.dynamics.inputs import uncertain
 from casest.dynamics.known import known
 from casest.dynamics.likely import Inputs
@@ -236,7 +236,7 @@ def trajectory(
     Where the rounds do not settle, the first one's states.
     """
     first: tuple[Array, Array] | None = None
-    sampled, noisy = Sampled.of(model, run), errors is not None and bool(uncertain(model))
+    sampled, noisy = Sampled.of(model, run), errors is not None and bool(shifted(model))
     P, change = np.empty(0) if errors is None else errors, np.inf
     inputs: Inputs | None = None
     for _ in range(ROUNDS):

@@ -64,11 +64,10 @@ class Inputs:
         noise, model = likely(sampled, along, errors), sampled.model
         if before is not None:
             return replace(before, noise=noise)
-        at_samples, each, k = np.vstack([noise, noise[-1:]]), dict[str, Array](), 0
-        for name in input_names(model):
-            if name in uncertain(model):
-                size = int(model.traced.symbols[name].numel())
-                each[name], k = at_samples[:, k : k + size], k + size
+        at_samples = np.vstack([noise, noise[-1:]])
+        names, sizes = [name for name, _ in _noisy(model)], [size for _, size in _noisy(model)]
+        parts = np.split(at_samples, np.cumsum(sizes[:-1]), axis=1)
+        each = dict(zip(names, parts, strict=True))
         return Inputs(noise, estimates(model, run, each), errors)
 
     def steps(self, sampled: Sampled, run: Run, along: Array) -> Steps:
@@ -108,12 +107,10 @@ def _likely(model: Dynamics, count: int) -> AtSamples:
 
 
 def _intensities(model: Dynamics) -> ca.DM:
-    noisy = uncertain(model)
-    return ca.DM(
-        [
-            model.sensors[name]
-            for name in input_names(model)
-            if name in noisy
-            for _ in range(model.traced.symbols[name].numel())
-        ]
-    )
+    return ca.DM([model.sensors[name] for name, size in _noisy(model) for _ in range(size)])
+
+
+def _noisy(model: Dynamics) -> list[tuple[str, int]]:
+    """The uncertain inputs that drive the rates, and their sizes, in the order of their noise."""
+    noisy, symbols = uncertain(model), model.traced.symbols
+    return [(name, symbols[name].numel()) for name in input_names(model) if name in noisy]

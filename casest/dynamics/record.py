@@ -16,7 +16,7 @@ from casest.data.run import Run
 from casest.declaration.shapes import Array
 from casest.dynamics.declare import Dynamics
 from casest.dynamics.discrete import Steps
-from casest.dynamics.extended import Sampled, extended, relinearised
+from casest.dynamics.extended import Sampled, extended, relinearised, shifted
 from casest.dynamics.filter import (
     ROUNDS,
     SETTLED,
@@ -49,7 +49,7 @@ def least_squares(model: Dynamics, run: Run) -> Record:
         noisy = uncertain(model)
         system = filtered(model, run).system if noisy else coefficients(model, run)
         return _solved(model, discretised(model, system))
-    if uncertain(model):
+    if shifted(model):
         own, sampled = filtered(model, run), Sampled.of(model, run)
         inputs = Inputs.of(sampled, run, own.smoothed, own.smoothed_P)
         return _solved(model, inputs.steps(sampled, run, own.smoothed))
