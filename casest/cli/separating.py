@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 def separating(situation: Situation, options: PlanOptions) -> Plan:
     """Candidates as each cause has them, and the plan that tells the causes apart."""
+    from casest.diagnose.levels import LEVELS
     from casest.plan.candidates.finding import candidates
     from casest.plan.rivals.separating import separated, separation
     from casest.results.plan import separation_result
@@ -31,7 +32,10 @@ def separating(situation: Situation, options: PlanOptions) -> Plan:
     def make(rival: Rival) -> Candidates:
         return candidates(rival.model, rival.values, situation.noise, possible)
 
-    found = separation(rivals, situation.noise, make, situation.name, possible.rate, options.most)
+    apart = 0.0 if options.show else LEVELS.apart
+    found = separation(
+        rivals, situation.noise, make, situation.name, possible.rate, options.most, apart
+    )
     planned = separated(found, options.count, options.most, situation.name)
     left = [label for label in labels if label not in found.labels]
     return separation_result(

@@ -14,7 +14,6 @@ from msgspec.structs import replace as replaced
 
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
-from casest.diagnose.levels import LEVELS
 from casest.plan.candidates.attitudes import words
 from casest.plan.candidates.candidates import TIME, Candidates, Noise
 from casest.plan.goals import Goal
@@ -240,7 +239,7 @@ def separation_result(
     powers = [min(found.powers(chosen[: k + 1])) for k in range(len(chosen))]
     growths, last = found.growths(chosen), found.powers(chosen)
     told = [
-        ToldApart(p.true, p.against, chance, float(growth), p.lead, LEVELS.clear)
+        ToldApart(p.true, p.against, chance, float(growth), p.lead, p.limit(growth))
         for p, chance, growth in zip(found.pairs, last, growths, strict=True)
     ]
     measured = [

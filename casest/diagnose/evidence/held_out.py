@@ -14,16 +14,16 @@ from casest.diagnose.levels import LEVELS
 
 @dataclass(frozen=True)
 class Fall:
-    """Of held-out squares by columns: ratio after over before, and t from part to part."""
+    """Of held-out squares: what was gained, what is left, and t from part to part."""
 
-    ratio: float
+    gained: float
+    left: float
     t: float
 
-
-def squares(linear: Linear, columns: Sequence[Array], parts: Index) -> Array:
-    """Held-out squares of every part (parts,), each by a fit to the others; columns (N, m, k)."""
-    e = _near(linear, foretold(linear, columns, parts))
-    return np.asarray(np.bincount(parts, np.sum(e**2, axis=1)), float)
+    @property
+    def ratio(self) -> float:
+        """Of the squares, after over before."""
+        return float(self.left / max(self.left + self.gained, 1e-300))
 
 
 def foretold(linear: Linear, columns: Sequence[Array], parts: Index) -> Array:
@@ -70,31 +70,33 @@ def _beyond(A: Array, p: int) -> Array:
 
 def fall(linear: Linear, columns: Sequence[Array], parts: Index) -> Fall:
     """Of the squares by columns."""
-    return _fall(linear, *(foretold(linear, c, parts) for c in ((), columns)))
+    return fall_of(linear, foretold(linear, [], parts), foretold(linear, columns, parts))
 
 
 def fall_between(before: Linear, after: Linear, parts: Index) -> Fall:
     """Of the squares from one fit to another, each near its own optimum."""
-    return _fall(before, *(foretold(fit, [], parts) for fit in (before, after)))
+    return fall_of(before, foretold(before, [], parts), foretold(after, [], parts))
 
 
-def _fall(linear: Linear, b: Array, a: Array) -> Fall:
+def fall_of(linear: Linear, b: Array, a: Array, batches: Index | None = None) -> Fall:
     """Of the squares from errors b to errors a, (N, m) each.
 
     Were the second ones right, with predictions that differ by δ, the squares would fall by
-    Σ(δ² + 2aδ): the error of the fall is that of 2Σaδ, from batch to batch of the record, and not
-    below that of white noise. So what is gained in a few places only is a gain as well.
+    Σ(δ² + 2aδ): the error of the fall is that of 2Σaδ, from batch to batch of the record (its own,
+    or those given), and not below that of white noise. So what is gained in a few places only is a
+    gain as well.
     """
     moved, nearer = b - a, np.abs(a) < np.abs(b)
     # What is far from both is neither's; what one of them is far from counts in full.
     least = _near(linear, np.where(nearer, a, b))
     a, b = np.where(nearer, least, least - moved), np.where(nearer, least + moved, least)
-    gained = float(np.sum(b**2) - np.sum(a**2))
-    wide = np.bincount(linear.parts.batches, np.sum(2 * a * moved, axis=1))
+    left = float(np.sum(a**2))
+    gained = float(np.sum(b**2)) - left
+    of = linear.parts.batches if batches is None else batches
+    wide = np.bincount(of, np.sum(2 * a * moved, axis=1))
     white = 4 * float(np.mean(a**2)) * float(np.sum(moved**2))
     spread = np.sqrt(max(float(np.sum(wide**2)), white))
-    ratio = float(np.sum(a**2) / max(np.sum(b**2), 1e-300))
-    return Fall(ratio, float(gained / max(spread, 1e-300)))
+    return Fall(gained, left, float(gained / max(spread, 1e-300)))
 
 
 def standard_errors(gained: Array) -> float:

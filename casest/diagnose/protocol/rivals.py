@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
-
 from casest.declaration.shapes import Array
-from casest.diagnose.evidence.held_out import squares, standard_errors
+from casest.diagnose.evidence.held_out import Fall, fall_of, foretold
 from casest.diagnose.evidence.linear import alike
 from casest.diagnose.evidence.score import Evidence
 from casest.diagnose.levels import LEVELS
@@ -39,13 +37,14 @@ def _rivals(subject: Subject[F], state: State[F], kept: Kept) -> tuple[State[F],
     if not mine:
         return state, []
     stretches = linear.parts.stretches
-    without, best = (squares(linear, c, stretches) for c in ([], [_in_time(ranking, mine[0])]))
+    without, best = (foretold(linear, c, stretches) for c in ([], [_in_time(ranking, mine[0])]))
+    gained = fall_of(linear, without, best).gained
     rivals = list[Evidence]()
     for e in ranking.causes:
         if e is mine[0] or e.score < LEVELS.strong or len(rivals) == 2 * LEVELS.contenders:
             continue
-        lost = squares(linear, [_in_time(ranking, e)], stretches) - best
-        if _as_well(mine[0].score - e.score, lost, without - best, best):
+        its = foretold(linear, [_in_time(ranking, e)], stretches)
+        if _as_well(mine[0].score - e.score, fall_of(linear, its, best, stretches), gained):
             rivals.append(e)
     after = subject.linear(state.fit)
     found = list[Rival]()
@@ -54,14 +53,14 @@ def _rivals(subject: Subject[F], state: State[F], kept: Kept) -> tuple[State[F],
         if isinstance(fit, str):
             state = state.failing(e, f"in the place of {own.family} {fit}")
             continue
-        ours, its = subject.rises(base, [state.fit, fit])
-        behind = (mine[0].score - mine[0].gain + ours) - (e.score - e.gain + its)
+        ours, theirs = subject.rises(base, [state.fit, fit])
+        behind = (mine[0].score - mine[0].gain + ours) - (e.score - e.gain + theirs)
         other = subject.linear(fit)
-        lost, left = np.zeros(1), best
+        lost: Fall | None = None
         if {x.residual.shape for x in (linear, after, other)} == {linear.residual.shape}:
-            left, worse = (squares(x, [], stretches) for x in alike([after, other]))
-            lost = worse - left
-        if _as_well(behind, lost, without - left, left):
+            own_errors, its_errors = (foretold(x, [], stretches) for x in alike([after, other]))
+            lost = fall_of(after, its_errors, own_errors, stretches)
+        if _as_well(behind, lost, gained):
             found.append(Rival(e.trials[0].what, fit))
     return state, found
 
@@ -86,11 +85,13 @@ def _in_time(ranking: Ranking, evidence: Evidence) -> Array:
     return ranking.likelihood.in_time(evidence.basis)
 
 
-def _as_well(behind: float, lost: Array, gained: Array, left: Array) -> bool:
+def _as_well(behind: float, lost: Fall | None, gained: float) -> bool:
     """Not clearly less evidence, or what was held out is foretold as well.
 
-    A cause may gain so much that a tenth of it is many times what it leaves: that is not as well.
+    lost: of held-out squares, from the other's to its own. A cause may gain so much that a tenth of
+    it is many times what it leaves: that is not as well.
     """
-    little = float(lost.sum()) < min(LEVELS.alike * float(gained.sum()), float(left.sum()))
-    alike = len(lost) > 1 and standard_errors(lost) < LEVELS.apart and little
-    return behind < LEVELS.clear or alike
+    if behind < LEVELS.clear or lost is None:
+        return behind < LEVELS.clear
+    little = lost.gained < min(LEVELS.alike * gained, lost.left)
+    return lost.t < LEVELS.apart and little

@@ -36,25 +36,44 @@ ALIAS, NOTHING = 1e-9, 1e-6
 
 @dataclass(frozen=True)
 class Pair:
-    """Were `true` the cause, `against` would be refuted: λ needed, given the lead there is."""
+    """Were `true` the cause, `against` would be refuted: given the lead there is.
+
+    apart: standard errors that what the two foretell must be apart by, as `close` asks of rivals.
+    """
 
     true: str
     against: str
     lead: float
+    apart: float = LEVELS.apart
 
     @property
     def needed(self) -> float:
-        """λ with which 2 log of the likelihood ratio is beyond the limit with chance POWER."""
-        missing, z = LEVELS.clear - self.lead, NormalDist().inv_cdf(POWER)
-        if missing <= -z * z:
-            return 0.0
-        return float((z + np.sqrt(max(z * z + missing, 0.0))) ** 2)
+        """λ with which the pair is told apart with chance POWER."""
+        low, high = 0.0, 1.0
+        if self.power(low) >= POWER:
+            return low
+        while self.power(high) < POWER:
+            low, high = high, 2 * high
+        for _ in range(40):
+            middle = 0.5 * (low + high)
+            low, high = (low, middle) if self.power(middle) >= POWER else (middle, high)
+        return high
+
+    def limit(self, growth: float) -> float:
+        """2 log of the likelihoods' ratio from which on the pair is told apart after this growth.
+
+        What is clear; and `apart` standard errors of what the two foretell of old and new readings,
+        whose squares differ by a λ with a variance of 4λ.
+        """
+        errors = 2 * float(np.sqrt(growth + max(self.lead, 0.0)))
+        return max(LEVELS.clear, self.apart * errors)
 
     def power(self, growth: float) -> float:
         """The chance with which the pair is told apart after this growth."""
+        beyond = growth + self.lead - self.limit(growth)
         if growth <= 0:
-            return float(self.lead >= LEVELS.clear)
-        return NormalDist().cdf((growth + self.lead - LEVELS.clear) / (2 * float(np.sqrt(growth))))
+            return float(beyond >= 0)
+        return NormalDist().cdf(beyond / (2 * float(np.sqrt(growth))))
 
 
 @dataclass(frozen=True)
@@ -120,9 +139,12 @@ def separation(
     what: str,
     rate: float | None = None,
     most: int = 200,
+    apart: float = LEVELS.apart,
 ) -> Separation:
     """The task of telling the rivals apart; `make` gives the candidates as one rival has them.
 
+    apart: standard errors that `close` asks for between two causes; of a cause and none it asks for
+    0.
     Two that `most` measurements do not tell apart, or of which one contains the other, are left
     together where others remain; UsageError where none can be refuted.
     """
@@ -135,7 +157,7 @@ def separation(
     }
     aliases = {key for key, block in seen.items() if _alias(block)}  # b takes up all that a is
     pairs = {
-        (i, j): Pair(rivals[i].label, rivals[j].label, rivals[j].cost - rivals[i].cost)
+        (i, j): Pair(rivals[i].label, rivals[j].label, rivals[j].cost - rivals[i].cost, apart)
         for i, j in seen
         if (i, j) not in aliases
     }
@@ -143,12 +165,12 @@ def separation(
         _refuse_alias(rivals, what, len(found[0]))
     together = _together(rivals, seen, pairs, most)
     planned_for = _first_groups(len(rivals), list(together))
-    apart = {
+    asked = {
         key: pair
         for key, pair in pairs.items()
         if tuple(sorted(key)) not in together and planned_for.issuperset(key)
     }
-    chosen = apart or pairs  # where none is in reach, what comes nearest
+    chosen = asked or pairs  # where none is in reach, what comes nearest
     factors, information, amplitudes = _side_by_side(
         [seen[key] for key in chosen], [rivals[j].information for _, j in chosen]
     )
@@ -158,7 +180,7 @@ def separation(
         tuple(chosen.values()),
         task(factors, information, names, what, found[0].once),
         tuple(amplitudes),
-        tuple(t for key, t in together.items() if apart and planned_for.issuperset(key)),
+        tuple(t for key, t in together.items() if asked and planned_for.issuperset(key)),
     )
 
 
