@@ -11,7 +11,7 @@ from casest.declaration.shapes import Array
 from casest.estimate.correlation import batches
 from casest.estimate.spectrum import Stretch, by_frequency, noise_spectrum
 from casest.leastsquares.problem import Point, Problem
-from casest.leastsquares.sums import squares_of_gradients, told_by
+from casest.leastsquares.sums import squares_of_batches, squares_of_gradients
 from casest.leastsquares.weights import has_noise_effects, variance_factor
 
 #: Batches per unknown from which on those say enough of correlated noise by themselves; and of all,
@@ -39,12 +39,11 @@ def covariance_of(
         return np.asarray(variance_factor(problem, point) * inverse_normal(plain, free))
     many = problem.residual_count >= MANY_RESIDUALS * problem.unknowns
     if correlated_over > 1 or many:
-        robust = sandwich(problem, point, R, correlated_over, free)
-        if correlated_over > 1:
+        robust, told_by = _sandwich(problem, point, R, correlated_over, free)
+        if told_by is None:
             return robust
-        bread = inverse_normal(R, free)
-        few = told_by(problem, point, bread) < MANY_RESIDUALS
-        return as_plain(robust, sigma**2 * np.diag(bread), few)
+        plain = sigma**2 * np.diag(inverse_normal(R, free))
+        return as_plain(robust, plain, told_by < MANY_RESIDUALS)
     return np.asarray(sigma**2 * inverse_normal(R, free))
 
 
@@ -104,20 +103,46 @@ def sandwich(
     correlation times long (Liang & Zeger 1986); where there are too few of those for n² numbers,
     JᵀSJ by frequencies, with a smooth spectrum S of the noise.
     """
-    bread = inverse_normal(R, free)
+    return _sandwich(problem, point, R, correlated_over, free)[0]
+
+
+def _sandwich(
+    problem: Problem,
+    point: Point,
+    R: Array,
+    correlated_over: float,
+    free: NDArray[np.bool_] | None,
+) -> tuple[Array, Array | None]:
+    """The same, and of independent residuals how many say what each unknown is.
+
+    It takes a look at every residual, and who prints it asks again: the last one is kept.
+    """
+    asked = (correlated_over, None if free is None else free.tobytes())
+    if problem.judged and problem.judged[0] is point and problem.judged[1] == asked:
+        robust, told_by = problem.judged[2]
+        return robust, told_by
+    robust, told_by = _baked(problem, point, inverse_normal(R, free), correlated_over)
+    problem.judged[:] = [point, asked, (robust, told_by)]
+    return robust, told_by
+
+
+def _baked(
+    problem: Problem, point: Point, bread: Array, correlated_over: float
+) -> tuple[Array, Array | None]:
     if correlated_over <= 1:
-        return np.asarray(bread @ squares_of_gradients(problem, point, bread=bread) @ bread)
+        middle, told_by = squares_of_gradients(problem, point, bread)
+        return np.asarray(bread @ middle @ bread), told_by
     least, enough = 10 * correlated_over, MANY_BATCHES * problem.unknowns
     longest = min(len(run) for run in problem.runs) * len(problem.runs) / (2 * enough)
     firsts = [batches(run, int(np.ceil(max(least, longest)))) for run in problem.runs]
     groups = sum(len(first) for first in firsts)
     if groups >= enough:
-        middle = groups / (groups - 1) * squares_of_gradients(problem, point, firsts)
-        return np.asarray(bread @ middle @ bread)
+        middle = groups / (groups - 1) * squares_of_batches(problem, point, firsts)
+        return np.asarray(bread @ middle @ bread), None
     if groups < FEWEST_BATCHES:
         plain = 2 * problem.cost(point) / max(problem.residual_count - problem.unknowns, 1)
-        return np.asarray(correlated_over * plain * bread)
-    return np.asarray(bread @ _by_frequencies(problem, point, bread) @ bread)
+        return np.asarray(correlated_over * plain * bread), None
+    return np.asarray(bread @ _by_frequencies(problem, point, bread) @ bread), None
 
 
 def _by_frequencies(problem: Problem, point: Point, bread: Array) -> Array:

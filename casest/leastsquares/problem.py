@@ -672,6 +672,11 @@ class Problem:
         return deque(maxlen=LATEST)
 
     @cached_property
+    def judged(self) -> list[Any]:
+        """What was asked last of all residuals, a point first, and what was found there."""
+        return []
+
+    @cached_property
     def parabolic(self) -> bool:
         """Is the cost a parabola in the unknowns, which one look at the samples tells?"""
         return linear(self.model) and self.constraints is None

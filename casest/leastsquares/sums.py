@@ -22,72 +22,75 @@ SAMPLED = 1_000_000
 FEW = 600
 
 
-def squares_of_gradients(
-    problem: Problem,
-    point: Point,
-    batches: Sequence[NDArray[np.int_]] | None = None,
-    bread: Array | None = None,
-) -> Array:
-    """Σ_batch (Σ w r ∂r)(Σ w r ∂r)ᵀ: the middle of the sandwich covariance, (n, n).
+def squares_of_gradients(problem: Problem, point: Point, bread: Array) -> tuple[Array, Array]:
+    """Σ(w r ∂r)(w r ∂r)ᵀ over the samples, (n, n): the middle of the sandwich covariance.
 
-    `batches` holds the first sample of every batch of each run (None: each sample alone); those of
-    one batch may be correlated. With `bread` = (JᵀWJ)⁻¹ every residual is first divided by what
-    the fit leaves of it, 1 − h.
+    Every residual is first divided by what the fit leaves of it, 1 − h; `bread` = (JᵀWJ)⁻¹. Second,
+    how many residuals say what each unknown is, (n,): (Σl²)²/Σl⁴ of their pulls l on it. As many
+    as there are where all pull alike, one where one tells it alone.
     """
     middle = np.zeros((problem.unknowns, problem.unknowns))
-    sums = [np.zeros((len(b), problem.unknowns)) for b in batches or ()]
+    second, fourth = np.zeros((2, problem.unknowns))
     for block in problem.blocks(point):
-        residual = block.residual
-        if bread is not None:
-            residual = _without_leverage(block, bread[np.ix_(block.x, block.x)])
-        if block.weights is not None:
-            residual = residual * block.weights
-        scores = np.einsum("nm,nmk->nk", residual, block.jacobian)
-        if batches is None:
-            middle[np.ix_(block.x, block.x)] += scores.T @ scores
-        else:
-            own = np.arange(block.span.start, block.span.stop)
-            number = np.searchsorted(batches[block.run], own, side="right") - 1
-            first = np.flatnonzero(np.diff(number, prepend=-1))
-            sums[block.run][np.ix_(number[first], block.x)] += np.add.reduceat(scores, first)
-    for each in sums:
-        middle += each.T @ each
-    return middle
+        J, weights = block.jacobian, block.weights
+        pulls = J.reshape(-1, J.shape[2]) @ bread[block.x]
+        moved = pulls[:, block.x].reshape(J.shape)
+        residual = _without_leverage(block, moved)
+        if weights is not None:
+            residual = residual * weights
+        scores = np.einsum("nm,nmk->nk", residual, J)
+        middle[np.ix_(block.x, block.x)] += scores.T @ scores
+        np.square(pulls, out=pulls)
+        weight = (
+            np.ones(len(pulls))
+            if weights is None
+            else np.broadcast_to(weights, residual.shape).ravel()
+        )
+        second += weight @ pulls
+        np.square(pulls, out=pulls)
+        fourth += weight**2 @ pulls
+    return middle, np.asarray(second**2 / np.maximum(fourth, 1e-300))
 
 
-def told_by(problem: Problem, point: Point, bread: Array) -> Array:
-    """How many residuals say what each unknown is, (n,): (Σl²)²/Σl⁴ of their pulls l on it.
+def squares_of_batches(
+    problem: Problem, point: Point, batches: Sequence[NDArray[np.int_]]
+) -> Array:
+    """Σ_batch (Σ w r ∂r)(Σ w r ∂r)ᵀ, (n, n), where the samples of one batch may be correlated.
 
-    As many as there are where all pull alike, one where one tells it alone. `bread` = (JᵀWJ)⁻¹.
+    `batches` holds the first sample of every batch of each run.
     """
-    second, fourth = np.zeros(problem.unknowns), np.zeros(problem.unknowns)
+    sums = [np.zeros((len(b), problem.unknowns)) for b in batches]
     for block in problem.blocks(point):
-        root = np.ones((1, 1)) if block.weights is None else np.sqrt(block.weights)
-        rows = (block.jacobian * root[:, :, None]).reshape(-1, block.jacobian.shape[2])
-        pulls = (rows @ bread[block.x]) ** 2
-        second += pulls.sum(axis=0)
-        fourth += (pulls**2).sum(axis=0)
-    return np.asarray(second**2 / np.maximum(fourth, 1e-300))
+        residual = block.residual if block.weights is None else block.residual * block.weights
+        scores = np.einsum("nm,nmk->nk", residual, block.jacobian)
+        own = np.arange(block.span.start, block.span.stop)
+        number = np.searchsorted(batches[block.run], own, side="right") - 1
+        first = np.flatnonzero(np.diff(number, prepend=-1))
+        sums[block.run][np.ix_(number[first], block.x)] += np.add.reduceat(scores, first)
+    return np.asarray(sum(each.T @ each for each in sums))
 
 
-def _without_leverage(block: Block, bread: Array) -> Array:
-    """(I − H)⁻¹r sample by sample: what the residual would be had the fit not seen it."""
-    J, root = block.jacobian, block.weights
-    moved = (J.reshape(-1, J.shape[2]) @ bread).reshape(J.shape)
-    own = np.einsum("nmk,nmk->nm", moved, J)
-    most = float(np.nanmax(np.sum(own if root is None else own * root, axis=1), initial=0.0))
-    residual = block.residual
+def _without_leverage(block: Block, moved: Array) -> Array:
+    """(I − H)⁻¹r sample by sample: what the residual would be had the fit not seen it.
+
+    `moved` (N, m, k): the Jacobian times (JᵀWJ)⁻¹.
+    """
+    J, root, residual = block.jacobian, block.weights, block.residual
+    leverage = np.empty((*residual.shape, residual.shape[1]))
+    for i in range(residual.shape[1]):
+        for j in range(i + 1):
+            own = np.einsum("nk,nk->n", moved[:, i], J[:, j])
+            leverage[:, i, j] = leverage[:, j, i] = own
+    if root is not None:
+        leverage *= root[:, None, :]
+    most = float(np.nanmax(np.einsum("nii->n", leverage), initial=0.0))
     if most < 0.01:
         # The geometric series Σ HᵏR: what is left out is below 1e-12.
         term = residual
         for _ in range(_terms(most)):
-            pull = np.einsum("nm,nmk->nk", term if root is None else term * root, J)
-            term = np.einsum("nmk,nk->nm", moved, pull)
+            term = np.einsum("nij,nj->ni", leverage, term)
             residual = residual + term
         return np.asarray(residual)
-    leverage = moved @ J.transpose(0, 2, 1)
-    if root is not None:
-        leverage = leverage * root[:, None, :]
     left = np.eye(residual.shape[1]) - np.where(np.isfinite(leverage), leverage, 0.0)
     # A residual that the fit follows entirely says nothing: keep the inverse finite.
     values, vectors = np.linalg.eigh(0.5 * (left + left.transpose(0, 2, 1)))
