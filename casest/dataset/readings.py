@@ -111,15 +111,20 @@ def _batches(layout: Layout, piece: Piece, rows: int) -> Iterator[tuple[int, Any
 
 def _wide(layout: Layout, piece: Piece) -> Iterator[Block]:
     """One row for each sensor."""
-    each = 0.0
-    for _, batch in _batches(layout, piece, FEWEST):
-        each = len(_flat(batch.column(layout.readings[0].field), layout.readings[0])) / len(batch)
-        break
-    width = sum(max(r.size, 1) for r in layout.readings)
-    size = max(1, max(r.size for r in layout.readings))
-    rows = max(FEWEST, round(HELD / max(each / size * width, 1.0)) // FEWEST * FEWEST)
+    rows = max(FEWEST, round(HELD / _numbers_each(layout, piece)) // FEWEST * FEWEST)
     for row, batch in _batches(layout, piece, min(rows, 1 << 16)):
         yield wide_block(layout, piece, row, batch)
+
+
+def _numbers_each(layout: Layout, piece: Piece) -> float:
+    """Numbers of readings that a row of the file has, mean, by what the file says of itself."""
+    about, fields = opened(piece.file).metadata, {r.field for r in layout.readings}
+    numbers = 0
+    for k in range(about.num_row_groups):
+        group = about.row_group(k)
+        columns = (group.column(j) for j in range(group.num_columns))
+        numbers += sum(c.num_values for c in columns if c.path_in_schema.split(".")[0] in fields)
+    return float(max(numbers / max(about.num_rows, 1), 1.0))
 
 
 def wide_block(layout: Layout, piece: Piece, row: int, batch: Any) -> Block:

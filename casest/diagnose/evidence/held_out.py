@@ -78,13 +78,12 @@ def fall_between(before: Linear, after: Linear, parts: Index) -> Fall:
     return fall_of(before, foretold(before, [], parts), foretold(after, [], parts))
 
 
-def fall_of(linear: Linear, b: Array, a: Array, batches: Index | None = None) -> Fall:
+def fall_of(linear: Linear, b: Array, a: Array) -> Fall:
     """Of the squares from errors b to errors a, (N, m) each.
 
     Were the second ones right, with predictions that differ by δ, the squares would fall by
-    Σ(δ² + 2aδ): the error of the fall is that of 2Σaδ, from batch to batch of the record (its own,
-    or those given), and not below that of white noise. So what is gained in a few places only is a
-    gain as well.
+    Σ(δ² + 2aδ): the error of the fall is that of 2Σaδ, from batch to batch of the record, and not
+    below that of white noise. So what is gained in a few places only is a gain as well.
     """
     moved, nearer = b - a, np.abs(a) < np.abs(b)
     # What is far from both is neither's; what one of them is far from counts in full.
@@ -92,11 +91,24 @@ def fall_of(linear: Linear, b: Array, a: Array, batches: Index | None = None) ->
     a, b = np.where(nearer, least, least - moved), np.where(nearer, least + moved, least)
     left = float(np.sum(a**2))
     gained = float(np.sum(b**2)) - left
-    of = linear.parts.batches if batches is None else batches
-    wide = np.bincount(of, np.sum(2 * a * moved, axis=1))
+    wide = np.bincount(linear.parts.batches, np.sum(2 * a * moved, axis=1))
     white = 4 * float(np.mean(a**2)) * float(np.sum(moved**2))
     spread = np.sqrt(max(float(np.sum(wide**2)), white))
     return Fall(gained, left, float(gained / max(spread, 1e-300)))
+
+
+def fall_between_causes(linear: Linear, b: Array, a: Array) -> Fall:
+    """Of the squares from errors b of one cause to those of another, a (N, m).
+
+    What a series leaves of both may be more that is missing, no noise: the error is the scatter
+    of the fall itself, from stretch to stretch (Q. Vuong, Econometrica 57 (1989) 307). What poses
+    leave is white, and what tells two causes apart may be in a few of them.
+    """
+    if not linear.coloured:
+        return fall_of(linear, b, a)
+    before, after = (np.sum(_near(linear, e) ** 2, axis=1) for e in (b, a))
+    fallen = np.asarray(np.bincount(linear.parts.stretches, before - after), float)
+    return Fall(float(fallen.sum()), float(after.sum()), standard_errors(fallen))
 
 
 def standard_errors(gained: Array) -> float:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from casest.declaration.shapes import Array
-from casest.diagnose.evidence.held_out import Fall, fall_of, foretold
+from casest.diagnose.evidence.held_out import Fall, fall_between_causes, foretold
 from casest.diagnose.evidence.linear import alike
 from casest.diagnose.evidence.score import Evidence
 from casest.diagnose.levels import LEVELS
@@ -38,13 +38,14 @@ def _rivals(subject: Subject[F], state: State[F], kept: Kept) -> tuple[State[F],
         return state, []
     stretches = linear.parts.stretches
     without, best = (foretold(linear, c, stretches) for c in ([], [_in_time(ranking, mine[0])]))
-    gained = fall_of(linear, without, best).gained
+    gained = fall_between_causes(linear, without, best).gained
     rivals = list[Evidence]()
     for e in ranking.causes:
         if e is mine[0] or e.score < LEVELS.strong or len(rivals) == 2 * LEVELS.contenders:
             continue
         its = foretold(linear, [_in_time(ranking, e)], stretches)
-        if _as_well(mine[0].score - e.score, fall_of(linear, its, best, stretches), gained):
+        lost = fall_between_causes(linear, its, best)
+        if _as_well(mine[0].score - e.score, lost, gained):
             rivals.append(e)
     after = subject.linear(state.fit)
     found = list[Rival]()
@@ -56,11 +57,11 @@ def _rivals(subject: Subject[F], state: State[F], kept: Kept) -> tuple[State[F],
         ours, theirs = subject.rises(base, [state.fit, fit])
         behind = (mine[0].score - mine[0].gain + ours) - (e.score - e.gain + theirs)
         other = subject.linear(fit)
-        lost: Fall | None = None
+        again: Fall | None = None
         if {x.residual.shape for x in (linear, after, other)} == {linear.residual.shape}:
             own_errors, its_errors = (foretold(x, [], stretches) for x in alike([after, other]))
-            lost = fall_of(after, its_errors, own_errors, stretches)
-        if _as_well(behind, lost, gained):
+            again = fall_between_causes(after, its_errors, own_errors)
+        if _as_well(behind, again, gained):
             found.append(Rival(e.trials[0].what, fit))
     return state, found
 
