@@ -38,14 +38,15 @@ def _rivals(subject: Subject[F], state: State[F], kept: Kept) -> tuple[State[F],
         return state, []
     stretches = linear.parts.stretches
     without, best = (foretold(linear, c, stretches) for c in ([], [_in_time(ranking, mine[0])]))
-    gained = fall_between_causes(linear, without, best).gained
+    fall = fall_between_causes(linear, without, best)
+    nothing = fall.left + fall.gained  # squares without any of them
     rivals = list[Evidence]()
     for e in ranking.causes:
         if e is mine[0] or e.score < LEVELS.strong or len(rivals) == 2 * LEVELS.contenders:
             continue
         its = foretold(linear, [_in_time(ranking, e)], stretches)
         lost = fall_between_causes(linear, its, best)
-        if _as_well(mine[0].score - e.score, lost, gained):
+        if _as_well(mine[0].score - e.score, lost, nothing):
             rivals.append(e)
     after = subject.linear(state.fit)
     found = list[Rival]()
@@ -61,7 +62,7 @@ def _rivals(subject: Subject[F], state: State[F], kept: Kept) -> tuple[State[F],
         if {x.residual.shape for x in (linear, after, other)} == {linear.residual.shape}:
             own_errors, its_errors = (foretold(x, [], stretches) for x in alike([after, other]))
             again = fall_between_causes(after, its_errors, own_errors)
-        if _as_well(behind, again, gained):
+        if _as_well(behind, again, nothing):
             found.append(Rival(e.trials[0].what, fit))
     return state, found
 
@@ -86,13 +87,13 @@ def _in_time(ranking: Ranking, evidence: Evidence) -> Array:
     return ranking.likelihood.in_time(evidence.basis)
 
 
-def _as_well(behind: float, lost: Fall | None, gained: float) -> bool:
+def _as_well(behind: float, lost: Fall | None, nothing: float) -> bool:
     """Not clearly less evidence, or what was held out is foretold as well.
 
-    lost: of held-out squares, from the other's to its own. A cause may gain so much that a tenth of
-    it is many times what it leaves: that is not as well.
+    lost: of held-out squares, from the other's to its own; `nothing`: those without either. A cause
+    may gain so much that a tenth of it is many times what it leaves: that is not as well.
     """
     if behind < LEVELS.clear or lost is None:
         return behind < LEVELS.clear
-    little = lost.gained < min(LEVELS.alike * gained, lost.left)
+    little = lost.gained < min(LEVELS.alike * (nothing - lost.left), lost.left)
     return lost.t < LEVELS.apart and little
