@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from functools import lru_cache
 from itertools import combinations
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -35,6 +35,15 @@ class Normals(NamedTuple):
     cost: Array
     slope: Array
     matrix: Array
+
+    def at(self, places: Any) -> Normals:
+        """Those of some of the points."""
+        return Normals(*(each[places] for each in self))
+
+    def put(self, places: Any, others: Normals) -> None:
+        """Others in their place."""
+        for each, other in zip(self, others, strict=True):
+            each[places] = other
 
 
 def normals(problem: Problem, references: Array, x: Array, of: Index) -> Iterator[Normals]:

@@ -9,8 +9,8 @@ from casest.declaration.shapes import Array
 from casest.leastsquares.many_points import Normals, normals
 from casest.leastsquares.problem import Point, Problem
 
-#: Damped steps of each.
-STEPS = 16
+#: Damped steps of each; share of the cost below which what is left to gain ends them.
+STEPS, ENOUGH = 16, 1e-7
 
 
 def projected(problem: Problem, first: Point, x: Array, linear: Index) -> tuple[Array, Array]:
@@ -31,22 +31,30 @@ def projected(problem: Problem, first: Point, x: Array, linear: Index) -> tuple[
 
 
 def followed(problem: Problem, first: Point, x: Array) -> tuple[Array, Array]:
-    """Where STEPS damped Gauss-Newton steps lead from every place; costs there."""
+    """Where STEPS damped Gauss-Newton steps lead from every place, or as many as gain; costs."""
     lower, upper = problem.bounds
-    here = _all_normals(problem, first, x)
-    damping = np.full(len(x), 1e-2)
+    x, here = x.copy(), _all_normals(problem, first, x)
+    damping, going = np.full(len(x), 1e-2), np.arange(len(x))
     for _ in range(STEPS):
-        trial = np.clip(x + _damped_steps(here, damping), lower, upper)
+        going = going[_to_gain(here.at(going)) > ENOUGH * here.cost[going]]
+        if not len(going):
+            break
+        own = here.at(going)
+        trial = np.clip(x[going] + _damped_steps(own, damping[going]), lower, upper)
         there = _all_normals(problem, first, trial)
-        better = there.cost < here.cost
-        x = np.where(better[:, None], trial, x)
-        here = Normals(
-            np.where(better, there.cost, here.cost),
-            np.where(better[:, None], there.slope, here.slope),
-            np.where(better[:, None, None], there.matrix, here.matrix),
+        better = there.cost < own.cost
+        x[going[better]] = trial[better]
+        here.put(going[better], there.at(better))
+        damping[going] = np.where(
+            better, np.maximum(damping[going] * 0.2, 1e-9), damping[going] * 8
         )
-        damping = np.where(better, np.maximum(damping * 0.2, 1e-9), damping * 8)
     return x, np.where(np.isfinite(here.cost), here.cost, np.inf)
+
+
+def _to_gain(here: Normals) -> Array:
+    """What a step without damping would take off the cost, were the residual linear, (P,)."""
+    step = _damped_steps(here, np.full(len(here.cost), 1e-9))
+    return np.asarray(-0.5 * np.einsum("pi,pi->p", step, here.slope))
 
 
 def _all_normals(problem: Problem, first: Point, x: Array) -> Normals:
