@@ -14,7 +14,7 @@ WORDS = ["fleet", "norm-triangular"]
 NORM = ["--set", f"norm={GRAVITY} m/s^2"]
 
 
-def readings(count, seed=0, poses=POSES):
+def readings(count, seed=0, poses=POSES, noise=SIGMA):
     """Readings (S, N, 3) of sensors with offsets of ±0.5, gains ±3 %, skew ±1°."""
     rng = np.random.default_rng(seed)
     u = rng.standard_normal((count, poses, 3))
@@ -22,7 +22,7 @@ def readings(count, seed=0, poses=POSES):
     M = np.eye(3) + rng.uniform(-0.03, 0.03, (count, 3, 1)) * np.eye(3)
     M += np.tril(rng.uniform(-0.017, 0.017, (count, 3, 3)), -1)
     v = np.einsum("sij,snj->sni", M, u) + rng.uniform(-0.5, 0.5, (count, 1, 3))
-    return v + SIGMA * rng.standard_normal(v.shape)
+    return v + noise * rng.standard_normal(v.shape)
 
 
 def names(count, first=0):

@@ -27,6 +27,7 @@ def fleet_closing(model_name: str, data: Sequence[str], options: CloseOptions) -
     from casest.results.file import as_json
     from casest.results.fleet import COMMON, common_result
     from casest.tasks.common import common
+    from casest.tasks.spread import own_sizes
 
     if len(data) != 1 or options.holdout or options.starts:
         raise UsageError(
@@ -43,15 +44,19 @@ def fleet_closing(model_name: str, data: Sequence[str], options: CloseOptions) -
         output=options.output or Path("out"),
     )
     plan, job = planned(model, data[0], asked)
-    told = common(
+    catalogue = (*CATALOGUE, *own)
+    told = common(job, plan.partitions, catalogue, chance=CHANCE, clear=LEVELS.clear, say=progress)
+    unseen = {name for name, _, seen in told.tried if not seen}
+    spreads = own_sizes(
         job,
         plan.partitions,
-        (*CATALOGUE, *own),
+        [e for e in catalogue if e.name not in unseen],
+        told.effects,
         chance=CHANCE,
-        clear=LEVELS.clear,
+        apart=LEVELS.apart,
         say=progress,
     )
-    result = common_result(job, told, data[0])
+    result = common_result(job, told, spreads, data[0])
     if options.output:
         write(options.output / COMMON, as_json(result.content()))
         write(options.output / PAGE, common_page(result))

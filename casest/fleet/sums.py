@@ -255,6 +255,18 @@ class Squares:
                 whole[i:, i] += entries[i:] * entries[i]
         return Normals(0.5 * whole[n, n], whole[:, :n])
 
+    def each(self, x: Array, sensors: Sensors) -> Array:
+        """[J r] of every reading of every sensor at its own x, (W, N, m, n + 1)."""
+        total, width = sensors.samples.shape[1:]
+        found = np.zeros((width, total, self.residual_count, self.n + 1))
+        for span, s, values in self._all.chunks(x, sensors):
+            first = 0
+            for i, columns in enumerate(self._columns):
+                own = values[first : first + len(columns)]
+                first += len(columns)
+                found[s, span, i, columns] = own.transpose(2, 1, 0)
+        return found
+
     def slope(self, x: Array, sensors: Sensors) -> tuple[Array, Array]:
         """½Σr² of every sensor, (W,), and Jᵀr, (n, W)."""
         total = np.zeros((self.n + 1, x.shape[1]))

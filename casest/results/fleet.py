@@ -17,6 +17,7 @@ from casest.results.file import load_json
 from casest.results.result import Result
 from casest.tasks.common import Common, Told
 from casest.tasks.job import Job
+from casest.tasks.spread import OwnSize, Spreads
 from casest.tasks.tally import Moments, Total
 
 FLEET, COMMON = "fleet.json", "common.json"
@@ -175,11 +176,28 @@ class CommonEffect(Struct, frozen=True, kw_only=True):
     moved: dict[str, float]
 
 
+class OwnEffect(Struct, frozen=True, kw_only=True):
+    """An effect of which each of so many sensors has a size of its own.
+
+    parameters: root mean square over sensors, with its error; sigma: over degrees of freedom,
+    before and with the effect in each.
+    """
+
+    name: str
+    parameters: dict[str, list[float]]
+    chance: float
+    sensors: int
+    indistinguishable_from: list[str]
+    sigma_before: float
+    sigma_after: float
+
+
 class FleetClosed(Result, frozen=True, kw_only=True):
     """The content of `common.json`.
 
     `parameters` of an effect hold value and standard deviation; `moved` the mean move of each
-    declared unknown in its own standard deviations.
+    declared unknown in its own standard deviations. `own`: what each sensor has in a size of its
+    own; `own_tried`: the chance of as much where no effect has a spread.
     """
 
     dataset: str
@@ -187,9 +205,21 @@ class FleetClosed(Result, frozen=True, kw_only=True):
     effects: list[CommonEffect]
     tried: dict[str, float]
     invisible: list[str]
+    own: OwnEffect | None
+    own_tried: dict[str, float]
+
+    @property
+    def said(self) -> str:
+        """What the sensors have, in words."""
+        names = ", ".join(e.name for e in self.effects)
+        common = f"{names} in common" if names else "nothing in common that their model lacks"
+        if self.own is None:
+            return common
+        joined = "and" if names else "but"
+        return f"{common}, {joined} {self.own.name} each in a size of its own"
 
 
-def common_result(job: Job, told: Told, dataset: str) -> FleetClosed:
+def common_result(job: Job, told: Told, spreads: Spreads, dataset: str) -> FleetClosed:
     """What was asked of a fleet, and what it said."""
     return FleetClosed(
         model=job.model.name,
@@ -198,6 +228,21 @@ def common_result(job: Job, told: Told, dataset: str) -> FleetClosed:
         effects=[_effect(e) for e in told.effects],
         tried={name: chance for name, chance, visible in told.tried if visible},
         invisible=[name for name, _, visible in told.tried if not visible],
+        own=None if spreads.found is None else _own(spreads.found),
+        own_tried=dict(spreads.tried),
+    )
+
+
+def _own(e: OwnSize) -> OwnEffect:
+    sizes = zip(e.names, e.size, e.error, strict=True)
+    return OwnEffect(
+        name=e.effect.name,
+        parameters={name: [float(v), float(s)] for name, v, s in sizes},
+        chance=e.chance,
+        sensors=e.sensors,
+        indistinguishable_from=list(e.rivals),
+        sigma_before=e.before,
+        sigma_after=e.after,
     )
 
 

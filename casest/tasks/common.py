@@ -163,12 +163,12 @@ def _ask(job: Job, partitions: Sequence[Partition], model: Model, asked: Sequenc
             labels = {n: [v for v, g in zip(own, good, strict=True) if g]
                       for n, own in group.labels.items()}  # fmt: skip
             for trial in asked if good.any() else ():
-                added(trial, _unknowns(found)[good], readings, group.fold[good], labels)
+                added(trial, unknowns(found)[good], readings, group.fold[good], labels)
     return total
 
 
-def _unknowns(found: Batch) -> Array:
-    """Unknowns (S, n) of a batch."""
+def unknowns(found: Batch) -> Array:
+    """Fitted unknowns (S, n) of a batch."""
     rows = []
     for p in found.model.parameters:
         for index in p.shape.entries:
@@ -199,7 +199,7 @@ def _judged(
                 before += float(np.sum(one.sigma[good] ** 2))
                 after += float(np.sum(other.sigma[good] ** 2))
                 std = np.sqrt(np.einsum("sii->si", one.covariance[good]))
-                moves += ((_unknowns(other) - _unknowns(one))[good] / std).sum(axis=0)
+                moves += ((unknowns(other) - unknowns(one))[good] / std).sum(axis=0)
                 count += int(good.sum())
     size, covariance = trial.whole.size
     statistic, chance = trial.whole.chance()

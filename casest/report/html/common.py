@@ -6,7 +6,7 @@ from casest.report.html.figures import Figures
 from casest.report.html.frame import whole
 from casest.report.html.numbers import number, printed
 from casest.report.html.page import details, paragraph, points, section, table
-from casest.results.fleet import CommonEffect, FleetClosed
+from casest.results.fleet import CommonEffect, FleetClosed, OwnEffect
 from casest.results.rounding import rounded
 
 PAGE = "common.html"
@@ -16,17 +16,16 @@ DIFFERS = 0.001
 
 def common_page(result: FleetClosed) -> str:
     """The page of what a fleet was asked."""
-    names = ", ".join(e.name for e in result.effects)
-    said = f"{names} in common" if names else "nothing in common that their model lacks"
     under = (
         "Error before and after is that of sensors that had no part in the size of the effect."
-        if names
+        if result.effects
         else "No effect that poses can show has a mean over the sensors that chance would not make."
     )
-    body = [*map(_effect, result.effects), _tried(result)]
-    verdict = f"{result.sensors:,} sensors have {said}."
+    own = [] if result.own is None else [_own(result.own)]
+    body = [*map(_effect, result.effects), *own, _tried(result)]
+    verdict = f"{result.sensors:,} sensors have {result.said}."
     return whole(result.model, verdict, under, body, Figures(), [result.dataset],
-                 trusted=True, look="doubtful" if names else "good")  # fmt: skip
+                 trusted=True, look="doubtful" if result.effects or own else "good")  # fmt: skip
 
 
 def _effect(e: CommonEffect) -> str:
@@ -54,9 +53,34 @@ def _effect(e: CommonEffect) -> str:
     )
 
 
+def _own(e: OwnEffect) -> str:
+    sizes = [
+        [f"`{name}`", *map(printed, rounded(value, error))]
+        for name, (value, error) in e.parameters.items()
+    ]
+    sigmas = [[number(e.sigma_before, 5), number(e.sigma_after, 5)]]
+    said = [f"Chance of as much where no effect has a spread: {number(e.chance, 2)}."]
+    if e.indistinguishable_from:
+        rivals = ", ".join(f"`{name}`" for name in e.indistinguishable_from)
+        said.append(f"As much is explained by {rivals}.")
+    return section(
+        f"own-{e.name}",
+        f"{e.name}, each in a size of its own",
+        paragraph(f"Asked of {e.sensors:,} sensors."),
+        table(["parameter", "root mean square", "± error"], sizes, [1, 2]),
+        table(["sigma over degrees of freedom", "with it in each"], sigmas, [0, 1]),
+        points(said),
+    )
+
+
 def _tried(result: FleetClosed) -> str:
-    rows = [[f"`{name}`", number(chance, 2)] for name, chance in result.tried.items()]
-    parts = [table(["effect", "chance of its mean where there is none"], rows, [1])]
+    both = result.tried, result.own_tried
+    rows = [
+        [f"`{name}`", *(number(said[name], 2) if name in said else "–" for said in both)]
+        for name in dict.fromkeys([*result.tried, *result.own_tried])
+    ]
+    heads = ["effect", "chance of its mean where there is none", "of its spread"]
+    parts = [table(heads, rows, [1, 2])]
     if result.invisible:
         names = ", ".join(f"`{name}`" for name in result.invisible)
         parts.append(paragraph(f"No pose could show {names}."))

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from casest.report.text.layout import WIDTH, item
-from casest.results.fleet import COMMON, CommonEffect, FleetClosed, FleetResult
+from casest.results.fleet import COMMON, CommonEffect, FleetClosed, FleetResult, OwnEffect
 from casest.results.rounding import percent, rounded
 
 #: Kinds of what is rejected, in words for one and for several.
@@ -56,12 +56,12 @@ def _table(result: FleetResult) -> Iterator[str]:
 
 def common_text(result: FleetClosed, folder: Path | None) -> str:
     """What the sensors have in common: each effect with its size, before and after."""
-    names = ", ".join(e.name for e in result.effects)
-    said = f"{names} in common" if names else "nothing in common that their model lacks"
-    head = f"{result.model} on {result.dataset}: {result.sensors} sensors have {said}"
+    head = f"{result.model} on {result.dataset}: {result.sensors} sensors have {result.said}"
     lines = [textwrap.fill(head, WIDTH)]
     for e in result.effects:
         lines += ["", *_common_lines(e)]
+    if result.own is not None:
+        lines += ["", *_own_lines(result.own)]
     if result.invisible:
         lines += ["", item(f"no pose could show: {', '.join(result.invisible)}")]
     if folder is not None:
@@ -86,3 +86,15 @@ def _common_lines(e: CommonEffect) -> Iterator[str]:
     for column, chance in e.follows.items():
         differs = "differs with" if chance < 0.001 else "does not differ with"
         yield item(f"its size {differs} {column} (chance {chance:.2g})")
+
+
+def _own_lines(e: OwnEffect) -> Iterator[str]:
+    yield f"  {e.name}, its spread over {e.sensors} sensors (chance {e.chance:.2g} without):"
+    for name, (value, error) in e.parameters.items():
+        yield "    {}  rms {} ± {}".format(name, *rounded(value, error))
+    yield item(
+        f"sigma over degrees of freedom: {e.sigma_before:.5g} before, {e.sigma_after:.5g} with it "
+        "in each"
+    )
+    if e.indistinguishable_from:
+        yield item(f"explains as much: {', '.join(e.indistinguishable_from)}")
