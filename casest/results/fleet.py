@@ -179,8 +179,8 @@ class CommonEffect(Struct, frozen=True, kw_only=True):
 class OwnEffect(Struct, frozen=True, kw_only=True):
     """An effect of which each of so many sensors has a size of its own.
 
-    parameters: root mean square over sensors, with its error; sigma: over degrees of freedom,
-    before and with the effect in each.
+    parameters: root mean square over sensors, around what they have in common, with its error;
+    sigma: over degrees of freedom, before and with the effect in each.
     """
 
     name: str
@@ -215,8 +215,9 @@ class FleetClosed(Result, frozen=True, kw_only=True):
         common = f"{names} in common" if names else "nothing in common that their model lacks"
         if self.own is None:
             return common
-        joined = "and" if names else "but"
-        return f"{common}, {joined} {self.own.name} each in a size of its own"
+        own = "" if self.own.name in names.split(", ") else f"{self.own.name} "
+        joined = "" if not own else "and " if names else "but "
+        return f"{common}, {joined}{own}each in a size of its own"
 
 
 def common_result(job: Job, told: Told, spreads: Spreads, dataset: str) -> FleetClosed:

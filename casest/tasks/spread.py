@@ -75,12 +75,13 @@ def own_sizes(
     best = min(chances, key=lambda name: chances[name], default=None)
     if best is None or chances[best] * len(chances) > chance:
         return Spreads(chances)
-    own = told[best]
-    trial = next(t for t in asked if t.effect.name == best)
-    size, error = own.size
-    rivals = [n for n, e in told.items() if n != best and in_errors(own.over - e.over) < apart]
+    alike = [n for n, e in told.items() if in_errors(told[best].over - e.over) < apart]
+    common = [k.effect.name for k in known if k.effect.name in alike]
+    name = common[0] if common else best  # what is there anyway, and differs, is one cause, not two
+    own, rivals = told[name], tuple(n for n in alike if n != name)
+    trial = next(t for t in asked if t.effect.name == name)
     found = OwnSize(
-        trial.effect, trial.names, size, error, chances[best], own.told, *own.sigma, tuple(rivals)
+        trial.effect, trial.names, *own.size, chances[name], own.told, *own.sigma, rivals
     )
     return Spreads(chances, found)
 

@@ -64,7 +64,7 @@ def _own(e: OwnEffect) -> str:
         rivals = ", ".join(f"`{name}`" for name in e.indistinguishable_from)
         said.append(f"As much is explained by {rivals}.")
     return section(
-        f"own-{e.name}",
+        "own",
         f"{e.name}, each in a size of its own",
         paragraph(f"Asked of {e.sensors:,} sensors."),
         table(["parameter", "root mean square", "± error"], sizes, [1, 2]),
