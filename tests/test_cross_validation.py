@@ -7,10 +7,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 from casest import Residual, Run, effect, model, param, quantity, signal
 from casest.diagnose.cross_validation import check_folds, cross_fitted, folded
-from casest.diagnose.evidence.held_out import fall, foretold
+from casest.diagnose.evidence.held_out import fall, fall_between_causes, foretold
 from casest.diagnose.evidence.linear import Linear, parts_of
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.loop import close
@@ -313,6 +314,49 @@ def test_one_wild_reading_neither_makes_nor_breaks_a_cause():
         before, after = (fall(p, [column[:, :, None]], p.parts.stretches) for p in (plain, far))
         assert after.ratio == pytest.approx(before.ratio, abs=0.05)
         assert (after.t > LEVELS.confirmed) == (before.t > LEVELS.confirmed) == bool(size)
+
+
+# -- one cause or another --------------------------------------------------------------------------
+
+
+def of_two_causes(rng, few, told, middle, series):
+    """Errors of two causes: of `few` rows at the end they foretell what differs by λ = `told`.
+
+    The second is right, or the truth lies in the middle between them.
+    """
+    n = 24 + few
+    apart = np.zeros((n, 1))
+    apart[24:] = np.sqrt(told / few)
+    noise = rng.standard_normal((n, 1))
+    linear = problem_of(rng, noise)
+    if not series:
+        linear = replace(linear, spans=())
+    a = noise - 0.5 * apart if middle else noise
+    return linear, a + apart, a
+
+
+@pytest.mark.parametrize("few", [3, 12])
+def test_poses_that_were_measured_last_tell_two_causes_apart(few):
+    """As often as squares whose difference is normal, N(λ, 4λ), are two errors apart, or less, since
+    the errors of few are counted as what they are by chance, if that is more."""
+    rng, told = np.random.default_rng(few), 45.0
+
+    def far(middle):
+        ways = (of_two_causes(rng, few, told, middle, series=False) for _ in range(800))
+        return np.mean([fall_between_causes(*way).t >= LEVELS.apart for way in ways])
+
+    power = norm.cdf((told - LEVELS.apart * 2 * np.sqrt(told)) / (2 * np.sqrt(told)))
+    assert power - 0.08 < far(middle=False) < power + 0.02
+    assert far(middle=True) < 0.03
+
+
+def test_one_stretch_of_a_series_tells_no_two_causes_apart():
+    """What it leaves may be more that is missing: there a single stretch is one reading (Vuong)."""
+    rng = np.random.default_rng(1)
+    found = [
+        fall_between_causes(*of_two_causes(rng, 3, 45.0, False, series=True)).t for _ in range(100)
+    ]
+    assert max(found) < 2
 
 
 # -- whole stretches and regions -------------------------------------------------------------------
