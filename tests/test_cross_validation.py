@@ -337,8 +337,8 @@ def of_two_causes(rng, few, told, middle, series):
 
 @pytest.mark.parametrize("few", [3, 12])
 def test_poses_that_were_measured_last_tell_two_causes_apart(few):
-    """As often as squares whose difference is normal, N(λ, 4λ), are two errors apart, or less, since
-    the errors of few are counted as what they are by chance, if that is more."""
+    """As often as squares whose difference is normal, N(λ, 4λ), are two errors apart, or less:
+    the errors of few rows count as what they are by chance, if that is more."""
     rng, told = np.random.default_rng(few), 45.0
 
     def far(middle):
