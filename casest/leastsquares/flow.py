@@ -24,7 +24,7 @@ from casest.declaration.flow import Flow
 from casest.declaration.physics import SX
 from casest.declaration.shapes import Array
 from casest.declaration.tracing import Traced
-from casest.engine import Recursion
+from casest.engine import Direct, Recursion
 from casest.engine.runge_kutta import ORDER, error
 from casest.leastsquares.stepping import HELD, Inputs, Switched, Way, numbers, switched
 from casest.leastsquares.stiff import Stiff
@@ -72,6 +72,33 @@ class Mesh:
 
     counts: Index | None = None
     stiff: bool = False
+    _laid: Laid | None = None
+
+    def laid(self, counts: Index, time: Array) -> Laid:
+        """Where so many steps lie; what was asked for last is kept."""
+        if self._laid is None or self._laid.counts is not counts:
+            self._laid = Laid.of(counts, time)
+        return self._laid
+
+
+@dataclass(frozen=True)
+class Laid:
+    """Steps (S,) one after the other: the interval of each, its place there and its width as shares
+    of that, its length in s."""
+
+    counts: Index
+    place: Index
+    part: Array
+    width: Array
+    length: Array
+
+    @classmethod
+    def of(cls, counts: Index, time: Array) -> Laid:
+        """So many steps in each interval between times (N,)."""
+        place = np.repeat(np.arange(len(counts)), counts)
+        first = np.repeat(np.cumsum(counts) - counts, counts)
+        part, width = (np.arange(len(place)) - first) / counts[place], 1.0 / counts[place]
+        return cls(counts, place, part, width, np.diff(time)[place] * width)
 
 
 @dataclass(frozen=True)
@@ -116,7 +143,7 @@ class Integrator:
         course = self._from_zero(course) if leads else course
         if mesh.counts is None:
             mesh.counts = np.ones(len(course.time) - 1, dtype=int)
-        start = np.array(self._start(parameters)).ravel()
+        (start,) = self._start(parameters)
         if mesh.stiff:
             found = self._implicit(start, parameters, course)
             mesh.stiff = not self._mild(found[:, :n], parameters, course)
@@ -124,8 +151,9 @@ class Integrator:
                 return self._unpacked(found[int(leads) :])
             mesh.counts = np.ones_like(mesh.counts)
         for _ in range(ROUNDS):
-            counts = mesh.counts * finer
-            states, errors, held = self._run(start, parameters, course, counts)
+            counts = mesh.counts if finer == 1 else mesh.counts * finer
+            laid = mesh.laid(counts, course.time)
+            states, errors, held = self._run(start, parameters, course, laid)
             if finer > 1:
                 break
             x = np.vstack([start[None, :n], states[:, :n]])
@@ -210,26 +238,21 @@ class Integrator:
         )
 
     def _run(
-        self, start: Array, parameters: Array, course: Course, counts: Index
+        self, start: Array, parameters: Array, course: Course, laid: Laid
     ) -> tuple[Array, tuple[Array, Array], NDArray[np.bool_]]:
         """[x, X] after every step, its fifth- and third-order differences, and was it held?"""
+        n, _, p = self.sizes
         held = np.array(self.flow.held, dtype=bool)
-        place = np.repeat(np.arange(len(counts)), counts)
-        part = (np.arange(len(place)) - np.repeat(np.cumsum(counts) - counts, counts)) / counts[
-            place
-        ]
-        width = 1.0 / counts[place]
-        columns = []
-        for values, keep in (
-            (course.inputs, held),
-            (course.slopes.reshape(len(course.time), -1), np.repeat(held, self.sizes[2])),
-        ):
-            if values is course.inputs or self.fed:
-                rise = np.where(keep, 0.0, np.diff(values, axis=0))[place]
-                columns += [values[place] + rise * part[:, None], rise * width[:, None]]
-        h = np.diff(course.time)[place] * width
-        columns += [h[:, None], np.broadcast_to(parameters, (len(place), len(parameters)))]
-        n, rows = self.sizes[0], np.hstack(columns)
+        columns, kinds = [laid.length[:, None]], []
+        if held.size:
+            kinds.append((course.inputs, held))
+        if self.fed:
+            kinds.append((course.slopes.reshape(len(course.time), -1), np.repeat(held, p)))
+        for values, keep in kinds:
+            rise = np.where(keep, 0.0, np.diff(values, axis=0))[laid.place]
+            columns += [values[laid.place] + rise * laid.part[:, None], rise * laid.width[:, None]]
+        given = np.hstack(columns) if len(columns) > 1 else columns[0]
+        rows = [given, np.broadcast_to(parameters, (len(given), len(parameters)))]
         with np.errstate(all="ignore"):
             crosses = "_crossing" in vars(self)
             if not crosses:
@@ -251,9 +274,9 @@ class Integrator:
         allowed = TOLERANCE * np.where(size > 0, size, 1.0)
         ends = np.cumsum(counts)
         share = error(errors[0][:steps], errors[1][:steps], allowed)
-        worst = np.zeros(len(counts))
-        place = np.repeat(np.arange(len(counts)), counts)[:steps]
-        np.maximum.at(worst, place, share)
+        if bad.size:
+            share = np.concatenate([share, np.zeros(len(x) - 1 - steps)])
+        worst = np.maximum.reduceat(share, ends - counts)
         cut = np.clip(MARGIN * worst ** (1 / ORDER), 0.0, CUT)
         wanted: Index = np.maximum(np.ceil(counts * cut - 1e-9).astype(int), 1)
         if bad.size:
@@ -273,12 +296,12 @@ class Integrator:
         return states
 
     @cached_property
-    def _start(self) -> ca.Function:
+    def _start(self) -> Direct:
         """θ -> [x, X] at the beginning."""
         both = [self.flow.start, ca.jacobian(self.flow.start, self._coordinates)]
         whole = ca.vertcat(*(ca.vec(ca.densify(part)) for part in both))
         parameters = ca.vertcat(self.traced.coordinates, self.traced.references)
-        return ca.Function("start", [parameters], [ca.densify(whole)])
+        return Direct(ca.Function("start", [parameters], [ca.densify(whole)]))
 
     @cached_property
     def _held(self) -> Switched:
@@ -311,9 +334,9 @@ class Integrator:
         # Slopes of inputs lie row by row, as arrays do.
         fed = [ca.vec(given.U.T), ca.vec(given.faster.T)] if self.fed else []
         parameters = ca.vertcat(self.traced.coordinates, self.traced.references)
-        row = ca.vertcat(given.u, given.du, *fed, h, parameters)
+        row = ca.vertcat(h, given.u, given.du, *fed)
         outputs = [ca.densify(after), ca.densify(ca.vertcat(differences, mark))]
-        return ca.Function("step", [y, row], outputs)
+        return ca.Function("step", [y, row, parameters], outputs)
 
 
 def flows(stages: Sequence[object]) -> list[Flow]:

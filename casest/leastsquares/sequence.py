@@ -197,6 +197,15 @@ class Staged:
         What compares a rest with the one before has nothing to say of a first one, and what follows
         a late signal nothing of times at which nobody recorded that.
         """
+        if r not in self._present:
+            self._present[r] = self._there(r)
+        return self._present[r]
+
+    @cached_property
+    def _present(self) -> dict[int, NDArray[np.bool_] | None]:
+        return {}
+
+    def _there(self, r: int) -> NDArray[np.bool_] | None:
         record, axes = self._records[r], len(self.model.axes)
         there = np.repeat(self._told(record)[:, None], axes, axis=1)
         if record.rests is not None:
