@@ -12,6 +12,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -27,7 +28,7 @@ from casest.leastsquares.weights import has_noise_effects, weights
 from casest.solve.equations import OPINION as OPINIONS
 from casest.solve.equations import allowed, by_equations, by_shooting
 from casest.solve.ipopt import PATIENCE as EVALUATIONS
-from casest.solve.ipopt import STANDSTILL, ipopt
+from casest.solve.ipopt import CLOSE_BY, STANDSTILL, ipopt
 from casest.solve.multipliers import kept
 from casest.solve.outcome import Outcome
 from casest.solve.trust_region import LITTLE, trust_region
@@ -38,7 +39,7 @@ OPINION = 50
 PATIENCE = 1000
 #: Evaluations by IPOPT where equations have been fitted already: where steps are chosen anew at
 #: every point (`leastsquares.stiff`) its line search would fight their rounding.
-CLOSE_BY = 60
+LITTLE_LEFT = 60
 #: More starts, and their spread as a share of each unknown: what reveals 19 of 20 false optima of
 #: NIST's problems (studies/nist.md).
 STARTS, SPREAD = 8, 0.3
@@ -158,7 +159,7 @@ def _asked_for(problem: Problem, near: Outcome, solver: str) -> Outcome:
     """The solver asked for, from where other ways have led."""
     if solver == "trust-region" or not np.isfinite(near.cost) or _singular(problem, near.point):
         return trust_region(problem, near.point, damping=LITTLE)
-    return _ipopt(problem, near.point, solver, patience=CLOSE_BY)
+    return _ipopt(problem, near.point, solver, CLOSE_BY, LITTLE_LEFT)
 
 
 def _other_starts(problem: Problem, first: Point, automatic: bool) -> Sequence[Point]:
@@ -200,10 +201,16 @@ def valleys(outcomes: Sequence[Outcome]) -> int:
     return 1 + sum(apart)
 
 
-def _ipopt(problem: Problem, start: Point, solver: str, patience: int = EVALUATIONS) -> Outcome:
+def _ipopt(
+    problem: Problem,
+    start: Point,
+    solver: str,
+    options: dict[str, Any] = STANDSTILL,
+    patience: int = EVALUATIONS,
+) -> Outcome:
     """Where IPOPT ends from there, polished."""
     exact = solver == "ipopt-exact"
-    found = ipopt(problem, start, exact=exact, options=STANDSTILL, patience=patience)
+    found = ipopt(problem, start, exact=exact, options=options, patience=patience)
     return _polished(problem, found)
 
 
