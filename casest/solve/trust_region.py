@@ -175,6 +175,11 @@ def trust_region(
     )
 
 
+def slight(problem: LeastSquares) -> float:
+    """Gain over cost from which on a step is below 0.001 standard deviations: a `tolerance`."""
+    return 1e-6 / max(problem.residual_count, 1)
+
+
 def _damping_within(
     problem: LeastSquares, point: Point, here: _Local, scale: Array, radius: float
 ) -> float:
