@@ -268,4 +268,4 @@ def _longs(numbers: Sequence[int]) -> Any:
 
 def _length(left: int) -> int:
     """Steps in one call where so many are left: a power of two, so that few kinds are made."""
-    return min(CHUNK, 1 << max(left.bit_length() - 1, 3))
+    return min(CHUNK, 1 << max(left.bit_length() - 1, 2))

@@ -22,6 +22,8 @@ ROUGH = 1e-5
 LITTLE = 1e-7
 #: Residuals from which on a QR factor is too dear for a step far away.
 LONG = 5000
+#: Residuals up to which their cost alone takes as long as with slopes.
+BRIEF = 500
 #: Share of the residual in the Jacobian's reach that is left to rounding.
 SETTLED = 1e-12
 #: Share of the cost below which no gain shows in it: whether it was one nobody can tell.
@@ -120,6 +122,7 @@ def trust_region(
     size = float(np.linalg.norm(scale * start.x)) or float(np.sqrt(2 * here.cost))
     radius = size if wary else np.inf
     growth, evaluations, status = 2.0, 1, "iteration limit"
+    brief = problem.residual_count <= BRIEF
     iterations = 0
     while iterations < max_iterations:
         iterations += 1
@@ -143,8 +146,9 @@ def trust_region(
             status = "converged"
             break
         trial = problem.moved(point, step)
-        # Far away most steps descend, and their slope is wanted with the cost.
-        normal = None if precise else problem.normal(trial)
+        # Most steps descend, and their slope is wanted with the cost: far away in any case, near
+        # the end where that takes hardly longer.
+        normal = problem.normal(trial) if brief or not precise else None
         there = problem.cost(trial) if normal is None else normal.cost
         evaluations += 1
         ratio = (here.cost - there) / max(gain, 1e-300) if np.isfinite(there) else -1.0
