@@ -84,9 +84,10 @@ class Mesh:
 @dataclass(frozen=True)
 class Laid:
     """Steps (S,) one after the other: the interval of each, its place there and its width as shares
-    of that, its length in s."""
+    of that, its length in s; after how many of them each time (N,) is reached."""
 
     counts: Index
+    reached: Index
     place: Index
     part: Array
     width: Array
@@ -95,10 +96,11 @@ class Laid:
     @classmethod
     def of(cls, counts: Index, time: Array) -> Laid:
         """So many steps in each interval between times (N,)."""
+        reached = np.concatenate([[0], np.cumsum(counts)])
         place = np.repeat(np.arange(len(counts)), counts)
-        first = np.repeat(np.cumsum(counts) - counts, counts)
-        part, width = (np.arange(len(place)) - first) / counts[place], 1.0 / counts[place]
-        return cls(counts, place, part, width, np.diff(time)[place] * width)
+        part = (np.arange(len(place)) - reached[place]) / counts[place]
+        width = 1.0 / counts[place]
+        return cls(counts, reached, place, part, width, np.diff(time)[place] * width)
 
 
 @dataclass(frozen=True)
@@ -156,24 +158,22 @@ class Integrator:
             states, errors, held = self._run(start, parameters, course, laid)
             if finer > 1:
                 break
-            x = np.vstack([start[None, :n], states[:, :n]])
-            wanted = self._wanted(x, errors, held, counts)
-            settled = bool(np.all(wanted <= counts))
-            if settled and np.sum(wanted) > 0.8 * np.sum(counts):
+            wanted = self._wanted(states[:, :n], errors, held, laid)
+            settled, many = bool((wanted <= counts).all()), int(wanted.sum())
+            if settled and many > 0.8 * (len(states) - 1):
                 break
-            if np.sum(wanted) > MANY + 4 * len(counts) and self._stiff is not None:
+            if many > MANY + 4 * len(counts) and self._stiff is not None:
                 found = self._implicit(start, parameters, course)
                 mesh.stiff = bool(np.isfinite(found).all())
                 if mesh.stiff:
                     return self._unpacked(found[int(leads) :])
-            if np.sum(wanted) > MOST + len(counts):
-                states = self._cut_off(states, counts, wanted)
+            if many > MOST + len(counts):
+                states = self._cut_off(states, laid, wanted)
                 break
             mesh.counts = wanted
             if settled:
                 break  # the next time with fewer
-        ends = np.cumsum(counts) - 1
-        return self._unpacked(np.vstack([start[None], states[ends]])[int(leads) :])
+        return self._unpacked(states[laid.reached[int(leads) :]])
 
     def _unpacked(self, found: Array) -> tuple[Array, Array]:
         """States (N, n) and slopes (N, n, p) of [x, X] (N, n + n·p)."""
@@ -240,7 +240,8 @@ class Integrator:
     def _run(
         self, start: Array, parameters: Array, course: Course, laid: Laid
     ) -> tuple[Array, tuple[Array, Array], NDArray[np.bool_]]:
-        """[x, X] after every step, its fifth- and third-order differences, and was it held?"""
+        """[x, X] at the start and after every step, of each its fifth- and third-order differences,
+        and was it held?"""
         n, _, p = self.sizes
         held = np.array(self.flow.held, dtype=bool)
         columns, kinds = [laid.length[:, None]], []
@@ -261,23 +262,23 @@ class Integrator:
             if crosses:
                 states, errors = self._crossing(start, rows)
                 errors[errors[:, 2 * n] == 1, :n] = FAILED
+        states = np.concatenate([start[None], states])
         return states, (errors[:, :n], errors[:, n : 2 * n]), errors[:, 2 * n] == HELD
 
     def _wanted(
-        self, x: Array, errors: tuple[Array, Array], held: NDArray[np.bool_], counts: Index
+        self, x: Array, errors: tuple[Array, Array], held: NDArray[np.bool_], laid: Laid
     ) -> Index:
         """Steps for each interval by which errors are as large as allowed, at least one."""
-        good = np.isfinite(x).all(axis=1)
-        bad = np.flatnonzero(~good)
+        counts, ends, finite = laid.counts, laid.reached[1:], np.isfinite(x)
+        bad = np.flatnonzero(~finite.all(axis=1)) if not finite.all() else np.zeros(0, int)
         steps = len(x) - 1 if not bad.size else int(bad[0]) - 1
-        size = np.max(np.abs(x[: steps + 1]), axis=0)
+        size = np.abs(x[: steps + 1]).max(axis=0)
         allowed = TOLERANCE * np.where(size > 0, size, 1.0)
-        ends = np.cumsum(counts)
         share = error(errors[0][:steps], errors[1][:steps], allowed)
         if bad.size:
             share = np.concatenate([share, np.zeros(len(x) - 1 - steps)])
-        worst = np.maximum.reduceat(share, ends - counts)
-        cut = np.clip(MARGIN * worst ** (1 / ORDER), 0.0, CUT)
+        worst = np.maximum.reduceat(share, laid.reached[:-1])
+        cut = np.minimum(MARGIN * worst ** (1 / ORDER), CUT)
         wanted: Index = np.maximum(np.ceil(counts * cut - 1e-9).astype(int), 1)
         if bad.size:
             first = int(np.searchsorted(ends, steps, side="right"))
@@ -288,11 +289,11 @@ class Integrator:
         return wanted
 
     @staticmethod
-    def _cut_off(states: Array, counts: Index, wanted: Index) -> Array:
+    def _cut_off(states: Array, laid: Laid, wanted: Index) -> Array:
         """Nothing from the first interval on that would take too many steps."""
         states = states.copy()
-        first = int(np.argmax(wanted > counts))
-        states[int(np.cumsum(counts)[first] - counts[first]) :] = np.nan
+        first = int(np.argmax(wanted > laid.counts))
+        states[int(laid.reached[first]) + 1 :] = np.nan
         return states
 
     @cached_property
