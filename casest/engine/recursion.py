@@ -10,6 +10,7 @@ Environment: as for the kernels.
 from __future__ import annotations
 
 import ctypes
+import math
 import os
 from collections.abc import Sequence
 from typing import Any
@@ -240,7 +241,7 @@ def _either(step: ca.Function, instead: ca.Function) -> ca.Function:
 def _rows(part: Floats) -> Floats:
     """An array (N, …) as rows of numbers that lie one after the other; how far apart they are is of
     no matter."""
-    size = int(np.prod(part.shape[1:]))
+    size = math.prod(part.shape[1:])
     rows = np.asarray(part, float).reshape(len(part), size)
     even = rows.strides[0] % 8 == 0 and (size < 2 or rows.strides[1] == 8)
     return rows if even else np.ascontiguousarray(rows)
