@@ -29,7 +29,7 @@ from casest.leastsquares.problem import Point, Problem
 from casest.solve.outcome import Outcome
 
 #: Points of a polynomial piece (Radau), and pieces of all runs at least and at most.
-DEGREE, FEWEST, MOST = 4, 30, 1500
+DEGREE, FEWEST, MOST = 4, 60, 1500
 #: Iterations, and seconds that a start may take at most.
 ITERATIONS, SECONDS = 400, 30.0
 #: Programs kept for the next problem of their kind.
@@ -94,7 +94,7 @@ def collocated(problem: Problem, start: Point, seconds: float = SECONDS) -> Outc
     return Outcome(
         "collocation",
         point,
-        problem.normal(point).cost,  # kept for the polish that follows
+        problem.cost(point),  # where slopes are too large for numbers there still is one
         found.iterations,
         found.iterations,
         found.success,
