@@ -114,7 +114,7 @@ def _ends(
         if short and k % 4 == 3:
             yield list(by_collocation(problem, start, allowed(known, COLLOCATED)))
         else:
-            yield [grown(problem, start, slight(problem))]
+            yield [grown(problem, start)]
 
 
 def arrived(best: Outcome, others: list[Outcome]) -> int:

@@ -29,9 +29,8 @@ STEPS, GAIN = 30, 1e-6
 SECONDS = 300.0
 
 
-def grown(problem: Problem, start: Point, tolerance: float = 0.0) -> Outcome:
-    """Where a trust region ends, to the tolerance, that has followed the records from their
-    beginnings.
+def grown(problem: Problem, start: Point) -> Outcome:
+    """Where a trust region ends that has followed the records from their beginnings.
 
     Where equations are so stiff that this takes longer than SECONDS, the best point until then.
     """
@@ -44,9 +43,7 @@ def grown(problem: Problem, start: Point, tolerance: float = 0.0) -> Outcome:
                 count += found.iterations
                 if np.isfinite(found.cost):
                     point = found.point
-            found = trust_region(
-                problem, point, max_iterations=100, tolerance=tolerance, damping=LITTLE
-            )
+            found = trust_region(problem, point, max_iterations=100, damping=LITTLE)
     except GivenUp:
         if left() <= 0:  # the time of all ways together is over
             raise
