@@ -144,11 +144,13 @@ def main() -> None:
             write(dataset, size)
             turns = TURNS if size <= EACH else 1
             rates = [[], [], []]
-            for _ in range(turns):
-                rates[0].append(in_memory(v, False))
-                rates[1].append(in_memory(v, True))
-                spent, took, memory = command(dataset, out, 1)
-                rates[2].append(size / spent)
+            for turn in range(turns + 1):
+                for _ in range(TURNS):
+                    rates[0].append(in_memory(v, False))
+                    rates[1].append(in_memory(v, True))
+                if turn < turns:
+                    spent, took, memory = command(dataset, out, 1)
+                    rates[2].append(size / spent)
             plain, asked, fleet = (float(np.median(r)) for r in rates)
             print(
                 f"{size} sensors: in memory {plain:.0f}/s, with misfit {asked:.0f}/s; Parquet to "

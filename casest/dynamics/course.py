@@ -7,6 +7,7 @@ piece tell of its end is all that goes from one to the next. Numbers are those o
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -35,6 +36,7 @@ from casest.dynamics.filter import (
     discretised,
     filtered,
     refuse_divergence,
+    unmoved,
 )
 from casest.dynamics.hindsight import Passes
 from casest.dynamics.inputs import as_read, uncertain
@@ -142,22 +144,36 @@ def _nonlinear(pieces: Pieces, smooth: bool) -> Course:
         found.normalised_innovations[where] = normalised(innovations, S)
     if not smooth:
         return found
+    first = _settled(found, pieces, longer, along)
+    if first is None:
+        return found
+    again = unmoved(model, run)
+    if np.isfinite(again).all() and _settled(found, pieces, longer, again) is None:
+        return found
+    return replace(found, smoothed=first[0], smoothed_std=first[1], settled=False)
+
+
+def _settled(
+    found: Course, pieces: Pieces, longer: Sequence[slice], along: Array
+) -> tuple[Array, Array] | None:
+    """Rounds from states `along` until they stay, into `found`; where they do not, the states and
+    standard deviations of the first."""
     first: tuple[Array, Array] | None = None
     for _ in range(ROUNDS):
         change, later = 0.0, np.empty_like(along)
-        for where, x, P in rounds.smoothed(model, run, pace, longer, along):
+        for where, x, P in rounds.smoothed(pieces.model, pieces.run, pieces.pace, longer, along):
             std = np.sqrt(np.maximum(np.diagonal(P, axis1=1, axis2=2), 1e-300))
             # What is known exactly is put in here, too: from afar its slope leads astray.
             later[where], found.smoothed_std[where] = pieces.known(where, x, P)
-            change = max(change, float(np.max(np.abs(later[where] - along[where]) / std)))
+            own = np.max(np.abs(later[where] - along[where]) / std)
+            change = float(np.maximum(change, own))  # what is no number stays so
         found.smoothed[:] = later
         along, first = later, first or (found.smoothed.copy(), found.smoothed_std.copy())
         if change < SETTLED:
-            return found
+            return None
         if not np.isfinite(change):
             break
-    assert first is not None
-    return replace(found, smoothed=first[0], smoothed_std=first[1], settled=False)
+    return first
 
 
 #: Where the filter has come to, as factored: with noise along the start, and along its own states.

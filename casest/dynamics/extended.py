@@ -60,7 +60,8 @@ class Sampled:
 
     `ends`: inputs at both ends of every step; `steps` (N − 1, 1) their lengths, `shares` what part
     of the usual one the readings there stand for; `R` (N, m); `signals`: (N, …) each, uncertain
-    ones as estimated behind; `parts`: into how many pieces a step is cut.
+    ones as estimated behind; `parts`: into how many pieces a step is cut; `noise` (N − 1, k): what
+    uncertain inputs are more than they were read, in each step, about which they are linearised.
     """
 
     model: Dynamics
@@ -71,6 +72,7 @@ class Sampled:
     R: Array
     signals: tuple[Array, ...]
     parts: int
+    noise: Array
 
     @classmethod
     def of(
@@ -94,12 +96,20 @@ class Sampled:
             variances(model, step, pace),
             signals,
             pieces(model, run, pace),
+            np.zeros((len(step), len(shifted(model)))),
         )
+
+    def at(self, run: Run, noise: Array, calm: Mapping[str, Array]) -> Sampled:
+        """The same linearised about other noise and estimates of uncertain inputs."""
+        u = _inputs(self.model, run, calm)
+        signals = (*(run.signals[s.name] for s in self.model.signals), *calm.values())
+        ends = u[:-1], _at_ends(self.model, u)
+        return replace(self, ends=ends, signals=signals, noise=noise)
 
     def moved(self, along: Array, first: int = 0) -> tuple[Array, Array, Array]:
         """Φ, forced step and Q of the steps from states (K, n), that of sample `first` before."""
         where = slice(first, first + len(along))
-        given = [part[where] for part in (*self.ends, self.steps, self.shares)]
+        given = [part[where] for part in (*self.ends, self.steps, self.shares, self.noise)]
         step = _step(self.model, self.parts)
         Phi, forced, Q = step([np.ascontiguousarray(along), *given])
         return Phi, forced[:, :, 0], Q
@@ -107,7 +117,7 @@ class Sampled:
     def after(self, x: Array, sample: int) -> Array:
         """The state a step after x (n,) at a sample."""
         given = [part[sample] for part in (*self.ends, self.steps, self.shares)]
-        return np.array(_motion(self.model, self.parts)(x, *given)[0], float).ravel()
+        return np.array(motion(self.model, self.parts)(x, *given)[0], float).ravel()
 
     def followed(self, x: Array) -> Array:
         """States (N, n) without noise from x (n,) at the first sample."""
@@ -130,24 +140,19 @@ class Sampled:
         return Steps(Phi, forced, Q, C, d, R, y, reach(self.model.traced.A), of_C)
 
 
-def relinearised(
-    model: Dynamics,
-    run: Run,
-    along: Array,
-    errors: Array | None = None,
-    pace: Pace | None = None,
-) -> Steps:
+def relinearised(model: Dynamics, run: Run, along: Array, pace: Pace | None = None) -> Steps:
     """The record in discrete time, linearised along states (N, n).
 
-    `errors` (N, n, n): covariances of what these are wrong by, on which noise of inputs acts;
     `pace`: how the whole record is read where this is a part of it.
     """
-    steps = Sampled.of(model, run, pace).along(along)
-    if errors is not None and uncertain(model):
-        added = acting(model, run, along, errors)
-        step = np.diff(np.asarray(run.time, float))[:, None, None]
-        return replace(steps, Q=steps.Q + 0.5 * step * (added[1:] + added[:-1]))
-    return steps
+    return Sampled.of(model, run, pace).along(along)
+
+
+def with_errors(steps: Steps, model: Dynamics, run: Run, along: Array, errors: Array) -> Steps:
+    """Steps along states (N, n) on whose errors, of covariances (N, n, n), noise of inputs acts."""
+    added = acting(model, run, along, errors)
+    step = np.diff(np.asarray(run.time, float))[:, None, None]
+    return replace(steps, Q=steps.Q + 0.5 * step * (added[1:] + added[:-1]))
 
 
 def _rows(model: Dynamics, signals: Sequence[Array], along: Array) -> tuple[Array, Array, Array]:
@@ -159,16 +164,18 @@ def _rows(model: Dynamics, signals: Sequence[Array], along: Array) -> tuple[Arra
 
 @lru_cache(maxsize=8)
 def _step(model: Dynamics, count: int) -> AtSamples:
-    x, (u, v, h, share) = model.traced.x, _two_samples(model)
-    end, Phi, Q = _motion(model, count)(x, u, v, h, share)
-    return AtSamples(ca.vertcat(x, u, v, h, share), [Phi, end - Phi @ x, Q])
+    x, (u, v, h, share) = model.traced.x, two_samples(model)
+    w = ca.SX.sym("w", len(shifted(model)))
+    end, Phi, Q = motion(model, count)(x, *at_noise(model, u, v, w), h, share)
+    forced = end - Phi @ x - ca.jacobian(end, w) @ w
+    return AtSamples(ca.vertcat(x, u, v, h, share, w), [Phi, forced, Q])
 
 
 @lru_cache(maxsize=8)
 def _following(model: Dynamics, count: int) -> Recursion:
     """(x, numbers of one step) -> x after it."""
-    x, numbers = ca.SX.sym("x", model.size), _two_samples(model)
-    after = _motion(model, count)(x, *numbers)[0]
+    x, numbers = ca.SX.sym("x", model.size), two_samples(model)
+    after = motion(model, count)(x, *numbers)[0]
     return Recursion(ca.Function("follow", [x, *numbers], [after], {"cse": True}))
 
 
@@ -235,7 +242,7 @@ def extended_step(model: Dynamics, count: int) -> Recursion:
     """(x and factors of P, numbers of one sample) -> (the same; x and P; and before the reading;
     innovation and S)."""
     t, n = model.traced, model.size
-    u, v, h, share = _two_samples(model)
+    u, v, h, share = two_samples(model)
     both, gap = ca.SX.sym("both", factors.size(n)), ca.SX.sym("gap", n)
     signals = ca.SX.sym("signals", _extended_outputs(model).numel_in(1))
     R, y, there = (ca.SX.sym(name, t.h.numel()) for name in ("R", "y", "there"))
@@ -259,10 +266,10 @@ def extended_step(model: Dynamics, count: int) -> Recursion:
 @lru_cache(maxsize=8)
 def extended_move(model: Dynamics, count: int) -> Any:
     """(x and factors of P, inputs at both ends, h, share, variances of a gap) -> (the same)."""
-    n, (u, v, h, share) = model.size, _two_samples(model)
+    n, (u, v, h, share) = model.size, two_samples(model)
     both, gap = ca.SX.sym("both", factors.size(n)), ca.SX.sym("gap", n)
     x, P = factors.unpacked(both, n)
-    end, Phi, Q = _motion(model, count)(x, u, v, h, share)
+    end, Phi, Q = motion(model, count)(x, u, v, h, share)
     Q += h * share * _acting(model, x, u, factors.multiplied(P))
     lost = ca.diag(gap)
     before = factors.moved(P, Phi, factors.factored(Phi @ lost @ Phi.T + Q + lost))
@@ -335,7 +342,7 @@ class _Reading:
 
 
 @lru_cache(maxsize=8)
-def _motion(model: Dynamics, count: int) -> Any:
+def motion(model: Dynamics, count: int) -> Any:
     """(x, inputs at both ends, h, share of the usual step) -> (x after it, Φ, Q), as a function of
     symbols, in `count` pieces.
 
@@ -343,13 +350,13 @@ def _motion(model: Dynamics, count: int) -> Any:
     and noise moves along the inputs as they were read.
     """
     t, n = model.traced, model.size
-    x, (u, v, h, share) = ca.SX.sym("x", n), _two_samples(model)
+    x, (u, v, h, share) = ca.SX.sym("x", n), two_samples(model)
     own = ca.vertcat(*[flat(t.symbols[name]) for name in input_names(model)])
     rate = ca.Function("rate", [t.x, own], [t.f])
     noise = ca.SX(ca.DM(model.process))
     noise = noise if model.input_noise is None else noise + share * model.input_noise
     slope, driven = (ca.Function("of", [t.x, own, share], [e]) for e in (t.A, noise))
-    read, estimated = _both_of(model)
+    read, estimated = both_of(model)
     a, b = (ca.SX.sym(name, own.numel()) for name in "ab")
     piece = ca.Function("piece", [x, a, b, h], _with_jacobian(_runge_kutta(rate, x, a, b, h), x))
     end, Phi, Q, h_piece = x, ca.SX.eye(n), ca.SX(n, n), h / count
@@ -408,7 +415,7 @@ def _acting(model: Dynamics, x: SX, u: SX, P: SX) -> Any:
     own = ca.vertcat(*[flat(t.symbols[name]) for name in input_names(model)])
     found = ca.SX(n, n)
     for name, slope in slopes(model):
-        N = ca.Function("slope", [t.x, own], [slope])(x, u[_both_of(model)[0]])
+        N = ca.Function("slope", [t.x, own], [slope])(x, u[both_of(model)[0]])
         found += model.sensors[name] * (N @ P @ N.T)
     return found
 
@@ -455,7 +462,7 @@ def _at_ends(model: Dynamics, u: Array) -> Array:
     return np.where(held, u[:-1], u[1:]) if any(held) else u[1:]
 
 
-def _both_of(model: Dynamics) -> tuple[list[int], list[int]]:
+def both_of(model: Dynamics) -> tuple[list[int], list[int]]:
     """Where the inputs as they were read are in `_inputs`, and those to be linearised at."""
     noisy, names = uncertain(model), input_names(model)
     sizes = [int(model.traced.symbols[name].numel()) for name in names]
@@ -470,7 +477,21 @@ def _both_of(model: Dynamics) -> tuple[list[int], list[int]]:
     return read, estimated
 
 
-def _two_samples(model: Dynamics) -> tuple[SX, SX, SX, SX]:
+def shifted(model: Dynamics) -> list[int]:
+    """Where in `_inputs` the uncertain ones are, as they were read."""
+    noisy, names = uncertain(model), input_names(model)
+    every = [name for name in names for _ in range(model.traced.symbols[name].numel())]
+    return [k for k, name in enumerate(every) if name in noisy]
+
+
+def at_noise(model: Dynamics, u: SX, v: SX, w: SX) -> tuple[SX, SX]:
+    """Inputs at both ends of a step, the uncertain ones `w` more than they were read."""
+    more = ca.SX(u.numel(), 1)
+    more[shifted(model)] = w
+    return u + more, v + more
+
+
+def two_samples(model: Dynamics) -> tuple[SX, SX, SX, SX]:
     """Inputs at both ends of a step, its length, and what share of the usual one they stand for."""
-    size = len({i for part in _both_of(model) for i in part})
+    size = len({i for part in both_of(model) for i in part})
     return ca.SX.sym("u", size), ca.SX.sym("v", size), ca.SX.sym("h"), ca.SX.sym("share")

@@ -22,9 +22,10 @@ from casest.dynamics.discrete import (
     smoothed_states,
     std_of,
 )
-from casest.dynamics.extended import extended, relinearised
+from casest.dynamics.extended import Sampled, extended, shifted, with_errors
 from casest.dynamics.inputs import uncertain
 from casest.dynamics.known import known
+from casest.dynamics.likely import Inputs
 from casest.dynamics.riccati import check_covariance
 from casest.dynamics.stepping import entries, reach
 from casest.dynamics.transition import (
@@ -41,7 +42,7 @@ from casest.errors import DataError
 #: standard deviation ends them.
 ROUNDS, SETTLED = 30, 1e-5
 #: Passes of a filter with noisy coefficients; a change of this share of every standard deviation
-#: ends them.
+#: ends them, and rounds about noise of inputs that come no nearer.
 PASSES, ALIKE = 8, 0.01
 
 
@@ -199,8 +200,19 @@ def _extended(model: Dynamics, run: Run, smooth: bool) -> Filtered:
     if not smooth:
         return Filtered(model, linearised(model, run, x), *after, *before, *after)
     along, smooth_P, settled = trajectory(model, run, x, P)
+    begun = x if settled else unmoved(model, run)
+    if not settled and np.isfinite(begun).all():
+        other = trajectory(model, run, begun, np.zeros_like(P))
+        along, smooth_P, settled = other if other[2] else (along, smooth_P, settled)
     both = along, smooth_P
     return Filtered(model, linearised(model, run, along), *after, *before, *both, settled)
+
+
+def unmoved(model: Dynamics, run: Run) -> Array:
+    """States (N, n) from the declared start on, by the inputs alone: where rounds begin again that
+    did not settle from states of a filter gone astray."""
+    with np.errstate(all="ignore"):
+        return Sampled.of(model, run).followed(model.start)
 
 
 def refuse_divergence(model: Dynamics, run: Run, x: Array) -> None:
@@ -219,13 +231,23 @@ def trajectory(
 ) -> tuple[Array, Array, bool]:
     """The most probable states (N, n), their covariances, and whether they settled.
 
-    Gauss-Newton on all states of the record, from states `along` of a filter with covariances
-    `errors`, by smoothing again and again.
+    Gauss-Newton on all states of the record, and on the noise of uncertain inputs, from states
+    `along` of a filter with covariances `errors`, by smoothing again and again.
     Where the rounds do not settle, the first one's states.
     """
     first: tuple[Array, Array] | None = None
+    sampled, noisy = Sampled.of(model, run), errors is not None and bool(shifted(model))
+    P, change = np.empty(0) if errors is None else errors, np.inf
+    inputs: Inputs | None = None
     for _ in range(ROUNDS):
-        steps = relinearised(model, run, along, errors)
+        if not noisy:
+            steps = sampled.along(along)
+        elif first is None:
+            steps = with_errors(sampled.along(along), model, run, along, P)
+        else:
+            kept = inputs if change < ALIKE else None
+            inputs = Inputs.of(sampled, run, along, P, kept)
+            steps = inputs.steps(sampled, run, along)
         before = along
         # What is known exactly is put in here, too: from afar its slope leads astray.
         along, P = known(
@@ -233,8 +255,9 @@ def trajectory(
         )
         first = first or (along, P)
         std = np.sqrt(np.maximum(np.diagonal(P, axis1=1, axis2=2), 1e-300))
-        change = np.max(np.abs(along - before) / std)
-        if change < SETTLED:
+        earlier, change = change, float(np.max(np.abs(along - before) / std))
+        # Next to a reading that is far off, rounds about its noise may come no nearer.
+        if change < SETTLED or (noisy and earlier <= change < ALIKE):
             return along, P, True
         if not np.isfinite(change):
             break

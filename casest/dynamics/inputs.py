@@ -14,7 +14,7 @@ octave of its frequencies, shrunk by what noise adds to it (James & Stein 1961; 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from functools import lru_cache
 from itertools import pairwise
 
@@ -60,19 +60,31 @@ def uncertain(model: Dynamics) -> tuple[str, ...]:
     return tuple(n for n in coefficients_of(model) if model.sensors.get(n))
 
 
-def estimates(model: Dynamics, run: Run) -> dict[str, Array]:
-    """Every uncertain input as it most likely was, (N, k), by name."""
-    return {name: estimated(model, run, name) for name in uncertain(model)}
+def estimates(
+    model: Dynamics, run: Run, noise: Mapping[str, Array] | None = None
+) -> dict[str, Array]:
+    """Every uncertain input as it most likely was, (N, k), by name.
+
+    `noise`: what all readings say that each was more than it was read, (N, k); no more noise is
+    then looked for in it than was stated.
+    """
+    noise = noise or {}
+    return {name: estimated(model, run, name, noise.get(name)) for name in uncertain(model)}
 
 
-def estimated(model: Dynamics, run: Run, name: str) -> Array:
-    """An input as it most likely was, (N, k); on each side of a gap apart."""
+def estimated(model: Dynamics, run: Run, name: str, noise: Array | None = None) -> Array:
+    """An input as it most likely was, (N, k); on each side of a gap apart. See `estimates`."""
     time, values = run.clock(name), run.recorded(name)
+    if noise is not None:
+        every = np.asarray(run.time, float)
+        values = values + np.column_stack([np.interp(time, every, part) for part in noise.T])
     step = np.diff(time)
     gap = longest(step)
     usual, gaps = float(np.mean(step[step <= gap])), np.flatnonzero(step > gap) + 1
     variance = model.sensors.get(name, 0.0) / usual
-    own = np.concatenate([estimate(part, variance) for part in np.split(values, gaps)])
+    own = np.concatenate(
+        [estimate(part, variance, shown=noise is None) for part in np.split(values, gaps)]
+    )
     return own if len(own) == len(run) else _between(model, name, run, time, own)
 
 
@@ -89,12 +101,13 @@ def as_read(model: Dynamics, run: Run) -> dict[str, Array]:
     return {name: run.signals[name] for name in uncertain(model)}
 
 
-def estimate(values: Array, variance: float = 0.0) -> Array:
-    """Readings (N, k) without their white noise: of that `variance`, or what they show if more."""
+def estimate(values: Array, variance: float = 0.0, *, shown: bool = True) -> Array:
+    """Readings (N, k) without their white noise: of that `variance`, or what they show if more,
+    if what is `shown` is to be taken for noise."""
     from scipy.fft import dct, idct
 
     c = np.asarray(dct(values, axis=0, norm="ortho"), float)
-    size = max(variance, scatter(values) ** 2)
+    size = max(variance, scatter(values) ** 2 if shown else 0.0)
     if not size > 0:
         return values
     octaves, kept = _octaves(len(c)), np.zeros(len(c), dtype=bool)

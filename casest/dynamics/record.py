@@ -16,7 +16,7 @@ from casest.data.run import Run
 from casest.declaration.shapes import Array
 from casest.dynamics.declare import Dynamics
 from casest.dynamics.discrete import Steps
-from casest.dynamics.extended import extended, relinearised
+from casest.dynamics.extended import Sampled, extended, relinearised, shifted
 from casest.dynamics.filter import (
     ROUNDS,
     SETTLED,
@@ -25,6 +25,7 @@ from casest.dynamics.filter import (
     filtered,
 )
 from casest.dynamics.inputs import uncertain
+from casest.dynamics.likely import Inputs
 from casest.dynamics.riccati import check_covariance
 
 
@@ -48,9 +49,13 @@ def least_squares(model: Dynamics, run: Run) -> Record:
         noisy = uncertain(model)
         system = filtered(model, run).system if noisy else coefficients(model, run)
         return _solved(model, discretised(model, system))
-    x, P = extended(model, run)[:2]
+    if shifted(model):
+        own, sampled = filtered(model, run), Sampled.of(model, run)
+        inputs = Inputs.of(sampled, run, own.smoothed, own.smoothed_P)
+        return _solved(model, inputs.steps(sampled, run, own.smoothed))
+    x = extended(model, run)[0]
     for _ in range(ROUNDS):
-        found = _solved(model, relinearised(model, run, x, P))
+        found = _solved(model, relinearised(model, run, x))
         change = np.abs(found.x - x) / np.sqrt(np.diag(found.P_end))
         x = found.x
         if np.max(change) < SETTLED:

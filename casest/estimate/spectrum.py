@@ -74,8 +74,10 @@ class Bands:
     """Frequencies (N,) in cycles per sample, put together in bands once for all curves."""
 
     def __init__(self, frequency: Array) -> None:
-        self._order = np.argsort(frequency, kind="stable")
-        log = np.log(frequency[self._order])
+        order = np.argsort(frequency, kind="stable")
+        log = np.log(frequency[order])
+        # Of one stretch they are in order: no copies then.
+        self._order: Any = slice(None) if np.all(np.diff(frequency) >= 0) else order
         edges = np.unique(np.round(np.geomspace(FIRST, max(len(log), FIRST), BANDS)).astype(int))
         self._edges = np.concatenate([[0], edges[edges < len(log)]])
         self._size = np.diff(np.append(self._edges, len(log)))
@@ -84,13 +86,18 @@ class Bands:
         # Flat to the first band's end: nothing holds a curve between its middle and there.
         middle[0] = max(float(log[min(FIRST, len(log)) - 1]), middle[0])
         self._middle = middle
-        self._slow = np.minimum(self._log - middle[0], 0.0)
+        self._first = np.flatnonzero(self._log < middle[0])
+        self._slow = self._log[self._first] - middle[0]
         self._beyond = np.flatnonzero(middle < middle[0] + np.log(BEYOND))[1:]
 
     def curves(self, power: Array, left: Array) -> Array:
         """The most likely smooth spectra (N, m) of powers (N, m), of which a fit left a share."""
         shape = np.exp(-np.outer(self._slow, self._falls(power, left)))
-        return np.asarray(shape * self._flat(power / shape, left))
+        power = power.copy()
+        power[self._first] /= shape
+        found = self._flat(power, left)
+        found[self._first] *= shape
+        return found
 
     def _falls(self, power: Array, left: Array) -> Array:
         """The powers (m,) of the frequency by which these fall beyond the first band."""

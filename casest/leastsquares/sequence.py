@@ -26,7 +26,7 @@ from casest.declaration.model import Model
 from casest.declaration.physics import SX
 from casest.declaration.shapes import Array
 from casest.declaration.tracing import ON_THE_WAY, Word, sample_symbol
-from casest.engine import Replay
+from casest.engine import Columns, Replay
 from casest.errors import DataError, DeclarationError
 from casest.leastsquares.flow import Course, Integrator, Mesh
 from casest.leastsquares.memory import Memory
@@ -148,7 +148,7 @@ class Staged:
         coordinates that slopes are taken in, where not in all.
         """
         last = _programs(self.model, own)[-1]
-        found = _chained(last.taken, parameters, samples, *self.given(parameters, r, own))
+        found = _chained(last, parameters, samples, *self.given(parameters, r, own))
         present = self.present(r)
         if present is not None:
             for part in found:
@@ -287,10 +287,12 @@ class Staged:
     ) -> tuple[Array, Array]:
         *stages, _ = _programs(self.model, own)
         record, followed = self._records[r], 0
-        given = np.zeros((len(record.samples), 0))
         count = self.model.staged.coordinates.numel() if own is None else len(own)
-        slopes = np.zeros((len(given), 0, count))
+        ends = np.cumsum([0, *(int(stage.given.numel()) for stage in self.model.staged.stages)])
+        found = np.empty((len(record.samples), ends[-1]))
+        moved = np.empty((*found.shape, count))
         for k, stage in enumerate(stages):
+            given, slopes = found[:, : ends[k]], moved[:, : ends[k]]
             if stage.word:
                 more = self._of_word(stage, parameters, record, given, slopes)
             elif stage.flow is not None and self.states is not None:
@@ -299,17 +301,16 @@ class Staged:
             elif stage.flow is not None:
                 taken = given[:, :0], slopes[:, :0]
                 if stage.flow.sizes[1]:
-                    taken = _chained(stage.taken, parameters, record.samples, given, slopes)
+                    taken = _chained(stage, parameters, record.samples, given, slopes)
                 mesh = self._meshes.setdefault((r, k), Mesh())
                 more = stage.flow.along(parameters, Course(record.time, *taken), mesh)
             elif stage.memory is None:
                 more = self._late(stage, parameters, record)
             else:
-                taken = _chained(stage.taken, parameters, record.samples, given, slopes)
+                taken = _chained(stage, parameters, record.samples, given, slopes)
                 more = stage.memory.along(parameters, *taken, record.time, record.run.block)
-            given = np.concatenate([given, more[0]], axis=1)
-            slopes = np.concatenate([slopes, more[1]], axis=1)
-        return given, slopes
+            found[:, ends[k] : ends[k + 1]], moved[:, ends[k] : ends[k + 1]] = more
+        return found, moved
 
     def _of_word(
         self, stage: Program, parameters: Array, record: Record, given: Array, slopes: Array
@@ -317,7 +318,7 @@ class Staged:
         """What a word of the body gives at every rest, and its slopes."""
         assert record.rests is not None
         if stage.word == "before":
-            return before(*_chained(stage.taken, parameters, record.samples, given, slopes))
+            return before(*_chained(stage, parameters, record.samples, given, slopes))
         asked = id(record), stage.columns, parameters[list(stage.turning)].tobytes()
         last = self._turns[stage.word]
         if last.asked != asked:
@@ -365,11 +366,13 @@ class Program:
 
     Of an effect on a signal's time that is the time asked for. The last of a model's is its
     residual, with no effect behind it. A `word` of the body has no effect either; `columns` are the
-    coordinates in which a turn has slopes, `turning` the parameters that it depends on.
+    coordinates in which a turn has slopes, `turning` the parameters that it depends on. `read`:
+    from where to where it reads what the stages before give.
     """
 
     attached: Attached | None
     taken: Replay
+    read: tuple[int, int] = (0, 0)
     memory: Memory | None = None
     word: Word = ""
     columns: tuple[int, ...] = ()
@@ -386,16 +389,18 @@ def _programs(model: Model, own: tuple[int, ...] | None = None) -> tuple[Program
     def slopes(expression: SX, *of: SX) -> list[SX]:
         return [ca.densify(expression), *(ca.jacobian(expression, x) for x in of)]
 
-    def replay(expression: SX) -> Replay:
+    def replay(expression: SX) -> tuple[Replay, tuple[int, int]]:
         sample = ca.vertcat(sample_symbol(model, traced), given)
-        outputs = slopes(expression, coordinates, given)
-        return _replay("stage", [parameters, sample], outputs)
+        reached = _reaching(expression, given) if coordinates.numel() else ()
+        read = (min(reached), max(reached) + 1) if reached else (0, 0)
+        outputs = slopes(expression, coordinates, given[slice(*read)])
+        return _replay("stage", [parameters, sample], outputs), read
 
     for stage in traced.stages:
         if isinstance(stage, Flow):
             fed = ca.depends_on(stage.taken, ca.vertcat(coordinates, given))
             flow = Integrator(traced, stage, own, fed)
-            found.append(Program(None, replay(stage.taken), flow=flow))
+            found.append(Program(None, *replay(stage.taken), flow=flow))
         elif stage.word in ON_THE_WAY:
             if ca.depends_on(stage.taken, ca.vertcat(given, ca.SX.sym("none"))):
                 raise DeclarationError(
@@ -407,7 +412,7 @@ def _programs(model: Model, own: tuple[int, ...] | None = None) -> tuple[Program
             rate = _replay("rate", [parameters, sample], outputs)
             found.append(Program(None, rate, word=stage.word, columns=columns, turning=turning))
         elif stage.word:
-            found.append(Program(None, replay(stage.taken), word=stage.word))
+            found.append(Program(None, *replay(stage.taken), word=stage.word))
         elif stage.attached is not None and stage.attached.kind == "time":
             t = ca.SX.sym("t")
             moment = ca.SX(stage.attached.apply(t, traced.symbols))
@@ -416,9 +421,9 @@ def _programs(model: Model, own: tuple[int, ...] | None = None) -> tuple[Program
             found.append(Program(stage.attached, f))
         else:
             memory = Memory(model, stage, own)
-            found.append(Program(stage.attached, replay(stage.taken), memory=memory))
+            found.append(Program(stage.attached, *replay(stage.taken), memory=memory))
         given = ca.vertcat(given, stage.given)
-    return (*found, Program(traced.stages[-1].attached, replay(traced.expression)))
+    return (*found, Program(traced.stages[-1].attached, *replay(traced.expression)))
 
 
 def _reaching(expression: SX, variables: SX) -> tuple[int, ...]:
@@ -470,8 +475,10 @@ def _replay(name: str, inputs: list[SX], outputs: list[SX]) -> Replay:
 
 
 def _chained(
-    taken: Replay, parameters: Array, samples: Array, given: Array, slopes: Array
+    stage: Program, parameters: Array, samples: Array, given: Array, slopes: Array
 ) -> tuple[Array, Array]:
     """Values (N, m) and slopes in the parameters (N, m, n), also by way of the stages before."""
-    value, direct, through = taken(parameters, np.hstack([samples, given]))
-    return value[:, :, 0], direct + through @ slopes if given.size else direct
+    value, direct, through = stage.taken(parameters, Columns([samples, given]))
+    if through.size:
+        direct += through @ slopes[:, slice(*stage.read)]
+    return value[:, :, 0], direct

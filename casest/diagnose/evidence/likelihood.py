@@ -87,11 +87,14 @@ class Likelihood:
         from scipy.fft import dct
 
         if self.linear.coloured:
-            found = np.empty(columns.shape)
+            flat = columns.reshape(len(columns), -1)
+            told = flat.any(axis=0)  # what acts on one axis is nothing on the others
+            flat, found = flat[:, told], np.zeros(columns.shape)
             for span in self.linear.spans:
-                found[span] = dct(columns[span], axis=0, norm="ortho")
+                flat[span] = dct(flat[span], axis=0, norm="ortho")
             if len(self._means):
-                found[self._means] = dct(found[self._means], axis=0, norm="ortho")
+                flat[self._means] = dct(flat[self._means], axis=0, norm="ortho")
+            found.reshape(flat.shape[0], -1)[:, told] = flat
             columns = found
         return columns.reshape(columns.shape[0] * columns.shape[1], -1)
 

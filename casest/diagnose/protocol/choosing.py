@@ -66,7 +66,9 @@ def _without_noise(
     """Those that say something also without what noise of the inputs may feign."""
     given = [e for e in several if e is not None and ranking.says(e)]
     found = without_feigned(subject, fit, ranking.likelihood, given, ranking.families)
-    return [e for e in found if ranking.says(e)]
+    # What feigns no more than before says what it said.
+    both = zip(given, found, strict=True)
+    return [e for before, e in both if e.feigned == before.feigned or ranking.says(e)]
 
 
 def _beyond_columns(ranking: Ranking, options: Sequence[Evidence]) -> list[Evidence]:

@@ -44,7 +44,7 @@ class Ranking:
         """Those that have a name of their own."""
         return tuple(e for e in self.found if not e.trials[0].describes)
 
-    @property
+    @cached_property
     def followed(self) -> tuple[Evidence, ...]:
         """What follows a column that is no cause by itself: something there is missing all the
         same."""

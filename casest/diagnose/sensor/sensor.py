@@ -64,6 +64,14 @@ class Sensor(Subject[Fit]):
         return Recent(2)
 
     @cached_property
+    def _widened(self) -> Recent[Fit, dict[tuple[str, bool], tuple[Candidate, Fit] | None]]:
+        return Recent()
+
+    @cached_property
+    def _certified(self) -> Recent[Fit, Fit | str]:
+        return Recent(16)
+
+    @cached_property
     def _on_rates(self) -> Recent[Fit, dict[str, Fit | str]]:
         return Recent()
 
@@ -158,7 +166,7 @@ class Sensor(Subject[Fit]):
 
     def certified(self, fit: Fit) -> Fit | str:
         """The fit, if the data determine it and it is at rest; or why it is refused."""
-        return certified(fit, self.runs)
+        return self._certified.of(fit, lambda: certified(fit, self.runs))
 
     def without(self, fit: Fit, what: Candidate) -> Fit | None:
         """The fit without an effect that was added."""
@@ -180,6 +188,13 @@ class Sensor(Subject[Fit]):
 
         If the data determine each of them there: what they do not would lead the fit anywhere.
         """
+        # Asked for after every round, though most rounds leave the fit as it is.
+        known = self._widened.of(fit, dict)
+        if (what.label, True) not in known:
+            known[what.label, True] = self._wider(fit, what)
+        return known[what.label, True]
+
+    def _wider(self, fit: Fit, what: Candidate) -> tuple[Candidate, Fit] | None:
         found = self._anew(fit, what)
         if found is None:
             return None
@@ -191,6 +206,12 @@ class Sensor(Subject[Fit]):
 
     def better_axes(self, fit: Fit, what: Candidate) -> tuple[Candidate, Fit] | None:
         """The same where it cannot be on all of them: on those that are worth it by now."""
+        known = self._widened.of(fit, dict)
+        if (what.label, False) not in known:
+            known[what.label, False] = self._on_better_axes(fit, what)
+        return known[what.label, False]
+
+    def _on_better_axes(self, fit: Fit, what: Candidate) -> tuple[Candidate, Fit] | None:
         found = self._anew(fit, what)
         if found is None:
             return None
