@@ -28,6 +28,9 @@ BRIEF = 500
 SETTLED = 1e-12
 #: Share of the cost below which no gain shows in it: whether it was one nobody can tell.
 HIDDEN = 1e-16
+#: Share of the cost that integration moves it by where steps are chosen anew at every point: lower
+#: by less than this is no better than where the slope ends.
+ASTRAY = 1e-8
 #: Range of dampings in which a wary run looks for that of its radius.
 DAMPINGS = (1e-24, 1e24)
 
@@ -298,8 +301,7 @@ def _refine(problem: LeastSquares, point: Point, here: _Fine, scale: Array) -> t
             break
         trial = problem.moved(point, step)
         there = _fine(problem, trial)
-        # Where residuals are small beside the readings, rounding moves the cost by 1e-11 of itself.
-        better = _slope(there) < _slope(here) and there.cost <= here.cost * (1 + 1e-10)
+        better = _slope(there) < _slope(here) and there.cost <= here.cost * (1 + ASTRAY)
         if not (np.isfinite(there.cost) and better):
             break
         point, here = trial, there
