@@ -187,6 +187,15 @@ def slight(problem: LeastSquares) -> float:
     return 1e-6 / max(problem.residual_count, 1)
 
 
+def settled(problem: LeastSquares, point: Point) -> bool:
+    """Is an undamped step from there, within bounds, below 0.01 standard deviations?"""
+    here = _fine(problem, point)
+    if not here.finite():
+        return False
+    gain = here.gain(_bounded_step(problem, point, here, here.norms(), 0.0))
+    return bool(gain <= 100 * slight(problem) * here.cost)
+
+
 def _damping_within(
     problem: LeastSquares, point: Point, here: _Local, scale: Array, radius: float
 ) -> float:
