@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.optimize import least_squares
 
 from casest import (
     Residual,
@@ -380,3 +381,28 @@ def test_a_cost_that_is_low_by_its_error_alone_holds_no_search_back_from_where_s
     np.testing.assert_allclose(
         end.point.x, problem.point({"zero": zero, "slope": slope}).x, rtol=1e-10
     )
+
+
+@model
+def decays(t=signal(), y=signal(), *, size=param(3, start=[0.5, 0.7, 1.0]),
+           rate=param(3, start=[0.7, 4.2, 6.2], bounds=(0, None))):  # fmt: skip
+    return Residual(measured=y, predicted=size.T @ exp(-rate * t))
+
+
+def test_ipopt_ends_at_the_optimum_also_where_the_cost_falls_ten_million_times():
+    """Lanczos' three exponentials (1956), in four decimals; SciPy says where the least cost is."""
+    t = np.arange(24) / 20
+    y = np.round(np.exp(-np.outer(t, [1, 3, 5])) @ [0.0951, 0.8607, 1.5576], 4)
+    problem = Problem(decays, (as_run(t=t, y=y),))
+    found = ipopt(problem, problem.start(), exact=True)
+    assert found.claims_success
+
+    def residual(x):
+        return np.exp(-np.outer(t, x[3:])) @ x[:3] - y
+
+    best = least_squares(
+        residual, [0.1, 0.9, 1.6, 1, 3, 5], "3-point", xtol=1e-15, ftol=1e-15, gtol=1e-15
+    )
+    assert best.cost < 1e-7 * problem.cost(problem.start())
+    # A hundredth of a standard deviation.
+    assert found.cost - best.cost < 0.5e-4 * 2 * best.cost / (len(t) - 6)

@@ -34,6 +34,8 @@ CLOSE_BY = STANDSTILL | {
     "bound_push": 1e-9,
     "bound_frac": 1e-9,
 }
+#: Share of the first cost below which tolerance and barrier, shares of that, are too large.
+FALLEN = 1e-4
 #: Evaluations after which a search is given up: three for each iteration allowed. From wild starts
 #: the line search may halve its step thirty times in every iteration, and get nowhere.
 PATIENCE = 1500
@@ -50,7 +52,7 @@ def ipopt(
     """Minimise the cost from `start`. `exact` uses the exact Hessian instead of JᵀJ.
 
     Unknowns are scaled by their Jacobian columns and the cost by its start value. `options` are
-    IPOPT's own; after so many evaluations as `patience` it is given up.
+    IPOPT's own, where a polish follows; after so many evaluations as `patience` it is given up.
     """
     settings = {
         "print_level": 0,
@@ -65,7 +67,26 @@ def ipopt(
         **(options or {}),
     }
     found = run_nlpsol("ipopt", problem, start, settings, exact=exact, patience=patience)
+    if options is None and found.claims_success and 0 < found.cost < FALLEN * problem.cost(start):
+        found = _closer(problem, found, settings, exact, patience - found.evaluations)
     return replace(found, solver="ipopt-exact") if exact else found
+
+
+def _closer(
+    problem: Problem, end: Outcome, settings: dict[str, Any], exact: bool, patience: int
+) -> Outcome:
+    """Where it goes on to from its end: tolerance and barrier are shares of the cost at the start.
+
+    At rounding it may not go on, and the end stays.
+    """
+    found = run_nlpsol("ipopt", problem, end.point, settings, exact=exact, patience=patience)
+    better = found.claims_success and found.cost <= end.cost
+    return replace(
+        found if better else end,
+        iterations=end.iterations + found.iterations,
+        evaluations=end.evaluations + found.evaluations,
+        seconds=end.seconds + found.seconds,
+    )
 
 
 def run_nlpsol(
