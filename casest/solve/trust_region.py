@@ -31,6 +31,8 @@ HIDDEN = 1e-16
 #: Share of the cost that integration moves it by where steps are chosen anew at every point: lower
 #: by less than this is no better than where the slope ends.
 ASTRAY = 1e-8
+#: Dampings of the steps from a place that is asked whether it has settled.
+DAMPED = (0.0, 1e-8, 1e-6, 1e-4, 1e-2, 1.0)
 #: Range of dampings in which a wary run looks for that of its radius.
 DAMPINGS = (1e-24, 1e24)
 
@@ -188,12 +190,16 @@ def slight(problem: LeastSquares) -> float:
 
 
 def settled(problem: LeastSquares, point: Point) -> bool:
-    """Is an undamped step from there, within bounds, below 0.01 standard deviations?"""
+    """Does no step from there, within bounds, promise what one of 0.01 standard deviations does?
+
+    Steps are damped more and more: an undamped one that ends at a bound may promise nothing.
+    """
     here = _fine(problem, point)
     if not here.finite():
         return False
-    gain = here.gain(_bounded_step(problem, point, here, here.norms(), 0.0))
-    return bool(gain <= 100 * slight(problem) * here.cost)
+    scale = here.norms()
+    steps = (_bounded_step(problem, point, here, scale, damping) for damping in DAMPED)
+    return max(map(here.gain, steps)) <= 100 * slight(problem) * here.cost
 
 
 def _damping_within(
