@@ -6,8 +6,9 @@ The certified problems, from their declared starts, in one process, medians of 5
 turn, seconds of the processor. SciPy's `least_squares` (trf, scaled by the Jacobian) is given the
 same equations three times: integrated by CVODES (CasADi) to 1e-10 with forward sensitivities; the
 same with differences; and as most write it, by `solve_ivp` (LSODA, 1e-10) with differences. casest
-twice: its solver alone, and the whole fit with second ways and certificate. acados and do-mpc
-cannot be installed where this was made, and are not compared.
+three times: its solver alone; with second ways and certificate; and all that `calibrate` does, with
+the intervals of the likelihood and, where readings do not vouch for the fit, starts elsewhere.
+acados and do-mpc cannot be installed where this was made, and are not compared.
 """
 
 from __future__ import annotations
@@ -116,7 +117,8 @@ def ways(case: Case) -> dict[str, Callable[[], Any]]:
 
     return {
         "casest, the solver": alone,
-        "casest, the whole fit": lambda: attempt(model, runs, intervals=False).point.x,
+        "casest, second ways": lambda: attempt(model, runs, intervals=False).point.x,
+        "casest, the whole fit": lambda: attempt(model, runs).point.x,
         "SciPy, sensitivities": lambda: least_squares(residual, begun, jac=slope, **fine).x,
         "SciPy, differences": lambda: least_squares(residual, begun, **fine).x,
         "SciPy, solve_ivp": lambda: least_squares(by_hand, begun, **fine).x,

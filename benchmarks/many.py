@@ -83,7 +83,7 @@ def ways(v: Any) -> dict[str, tuple[int, Callable[[], Any]]]:
 
     def casest_ipopt(own: Any) -> Any:
         problem = Problem(MODEL, recorded(own))
-        return ipopt(problem, problem.start())
+        return ipopt(problem, problem.start(), options={})
 
     many, few = v[:ONE_BY_ONE], v[:SLOW]
     line = {"v": v}

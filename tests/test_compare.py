@@ -14,6 +14,7 @@ from casest import NotTrusted, Residual, Run, UsageError, attitude, model, param
 from casest.cli import run
 from casest.comparison.judge import SOLVERS, compare
 from casest.declaration.prior import Prior
+from casest.dynamics import Motion, dynamics, measured, state
 from casest.leastsquares.problem import Problem
 from casest.report.picture import draw
 from casest.report.text.comparison import comparison_text
@@ -178,6 +179,29 @@ def test_a_claim_in_the_wrong_valley_is_a_false_success(waves):
         assert all(t.excess > 0.1 * waves.best for t in wrong)
     # 30 % of the rate is six turns over the record: most starts lie in other valleys
     assert row(waves, "trust-region").false_successes >= 3
+
+
+@dynamics
+def decays(
+    y=casest.signal(), *, z=state(3, start=[0.5, 0.7, 1.0]), k=param(3, start=1.0, bounds=(0, None))
+):
+    """A sum of three exponentials."""
+    outputs = (measured(y, casest.sum1(z)),)
+    return Motion(rates={"z": -k * z}, outputs=outputs)
+
+
+def test_what_has_not_settled_in_the_integrated_equations_claims_no_success():
+    """Lanczos' three exponentials (1956), in four decimals: parts of the record come together long
+    before rates that are so nearly alike are told apart."""
+    t = np.arange(24) / 20
+    y = np.round(np.exp(-np.outer(t, [1, 3, 5])) @ [0.0951, 0.8607, 1.5576], 4)
+    run = Run.raw("decays", {"y": y[:, None]}, units={}, time=t)
+    model = decays.calibration.having(k=param(3, start=[0.3, 3.0, 5.5], bounds=(0, None)))
+    found = compare(model, [run], starts=0, solvers=["multiple-shooting"])
+    ended = row(found, "multiple-shooting").first
+    assert not ended.right
+    assert ended.claims is False
+    assert "not settled in the integrated equations" in ended.status
 
 
 def test_an_optimum_that_is_reported_as_a_failure_is_a_false_failure(monkeypatch):

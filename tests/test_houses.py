@@ -55,12 +55,21 @@ def fitted(shared_data, number):
     return attempt(model, runs)
 
 
+#: What is said first: of the second house that its cost is no parabola (one resistance may be
+#: nothing), before the variance that all three leave is looked at.
+SAID = {
+    1: "of the readings' variance",
+    2: "too uncertain for its intervals",
+    3: "of the readings' variance",
+}
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("number", [1, 2, 3])
 def test_no_resistance_is_given_for_true(shared_data, number):
     certificate = fitted(shared_data, number).certificate
     assert not certificate.trusted
-    assert "of the readings' variance" in certificate.reasons[0]
+    assert SAID[number] in certificate.reasons[0]
 
 
 def test_a_room_whose_heating_nobody_declared_is_refused_and_trusted_where_it_is():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import optimize, stats
 
-from casest import Residual, Run, attempt, exp, inf, model, param, quantity, signal
+from casest import Residual, Run, attempt, cos, exp, inf, model, param, quantity, signal, sin
 from casest.report.text.layout import value_table
 from casest.results.observability import observe_parameters
 from casest.results.values import entries
@@ -62,6 +62,29 @@ def test_the_others_have_the_spread_that_they_have_with_the_bound_held():
     for name in ("first", "third"):
         # The degree of freedom is counted where the unknown was asked for.
         assert float(found.plain[name]) == pytest.approx(float(held.plain[name]), rel=0.01)
+
+
+@model
+def decaying(
+    t=signal(), y=signal(), *,
+    rest=param(start=0.2, bounds=(0, inf)), size=param(start=1.0), rate=param(start=1.0),
+    wave=param(2),
+):  # fmt: skip
+    waves = wave[0] * sin(6 * t) + wave[1] * cos(6 * t)
+    predicted = size * exp(-rate * t) + rest + waves
+    return Residual(measured=y, predicted=quantity("reading", predicted))
+
+
+@pytest.mark.parametrize("seed", [1, 2, 4, 5, 6, 7])
+def test_the_cost_is_walked_along_in_all_directions_that_a_held_bound_leaves(seed):
+    """By the rounding of a direction half of them led beyond the bound, and were left out."""
+    t = np.linspace(0, 2, 30)
+    noise = 0.02 * np.random.default_rng(seed).standard_normal(t.size)
+    run = run_of(t=t, y=np.exp(-0.5 * t) - 0.02 + noise)
+    found, held = attempt(decaying, [run]), attempt(decaying.having(rest=0.0), [run])
+    assert [b.name for b in found.certificate.at_bound] == ["rest"]
+    # The walk is two standard deviations long, of one degree of freedom more.
+    np.testing.assert_allclose(found.certificate.shape, held.certificate.shape, rtol=5e-4)
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.optimize import least_squares
 
 from casest import (
     Residual,
@@ -346,3 +347,62 @@ def test_what_is_linear_has_one_valley_and_no_other_is_looked_for():
     expected = np.polynomial.polynomial.polyfit(x[:, 0], y[:, 0], 1)
     found = [float(plain.values[n]) for n in ("zero", "slope")]
     np.testing.assert_allclose(found, expected, rtol=1e-9)
+
+
+class Luring:
+    """A problem whose cost is seen too low where a search begins: as much as integration errs."""
+
+    def __init__(self, problem, start):
+        self._problem, self._start = problem, start
+
+    def __getattr__(self, name):
+        return getattr(self._problem, name)
+
+    def cost(self, point):
+        low = np.array_equal(point.x, self._start.x)
+        return self._problem.cost(point) * (1 - 4e-9 * low)
+
+    def normal(self, point):
+        return self._problem.normal(point)._replace(cost=self.cost(point))
+
+    def factor(self, point):
+        R, t, _ = self._problem.factor(point)
+        return R, t, float(np.sqrt(max(2 * self.cost(point) - t @ t, 0.0)))
+
+
+def test_a_cost_that_is_low_by_its_error_alone_holds_no_search_back_from_where_slopes_end():
+    rng = np.random.default_rng(0)
+    x = rng.uniform(0, 1, (40, 1))
+    y = 2 + 3 * x + 0.01 * rng.standard_normal((40, 1))
+    problem = Problem(straight, (Run.raw("r", {"x": x, "y": y}, units={"x": "m", "y": "V"}),))
+    zero, slope = np.polynomial.polynomial.polyfit(x[:, 0], y[:, 0], 1)
+    begun = problem.point({"zero": zero + 2e-7, "slope": slope})  # 1e-4 standard deviations away
+    end = trust_region(Luring(problem, begun), begun, damping=1e-7)
+    np.testing.assert_allclose(
+        end.point.x, problem.point({"zero": zero, "slope": slope}).x, rtol=1e-10
+    )
+
+
+@model
+def decays(t=signal(), y=signal(), *, size=param(3, start=[0.5, 0.7, 1.0]),
+           rate=param(3, start=[0.7, 4.2, 6.2], bounds=(0, None))):  # fmt: skip
+    return Residual(measured=y, predicted=size.T @ exp(-rate * t))
+
+
+def test_ipopt_ends_at_the_optimum_also_where_the_cost_falls_ten_million_times():
+    """Lanczos' three exponentials (1956), in four decimals; SciPy says where the least cost is."""
+    t = np.arange(24) / 20
+    y = np.round(np.exp(-np.outer(t, [1, 3, 5])) @ [0.0951, 0.8607, 1.5576], 4)
+    problem = Problem(decays, (as_run(t=t, y=y),))
+    found = ipopt(problem, problem.start(), exact=True)
+    assert found.claims_success
+
+    def residual(x):
+        return np.exp(-np.outer(t, x[3:])) @ x[:3] - y
+
+    best = least_squares(
+        residual, [0.1, 0.9, 1.6, 1, 3, 5], "3-point", xtol=1e-15, ftol=1e-15, gtol=1e-15
+    )
+    assert best.cost < 1e-7 * problem.cost(problem.start())
+    # A hundredth of a standard deviation.
+    assert found.cost - best.cost < 0.5e-4 * 2 * best.cost / (len(t) - 6)

@@ -23,7 +23,7 @@ from casest.solve.ipopt import ipopt
 from casest.solve.others import METHODS, scipy_solver, sqpmethod
 from casest.solve.outcome import Outcome
 from casest.solve.shooting import shot
-from casest.solve.trust_region import trust_region
+from casest.solve.trust_region import settled, trust_region
 
 #: Solvers of the least-squares problem, from a start.
 SOLVERS: dict[str, Callable[[Problem, Point], Outcome]] = {
@@ -33,12 +33,28 @@ SOLVERS: dict[str, Callable[[Problem, Point], Outcome]] = {
     "trust-region": trust_region,
     **{f"scipy-{method}": partial(scipy_solver, method=method) for method in METHODS},
 }
+
+
+def _integrated(
+    transcription: Callable[[Problem, Point], Outcome | None], problem: Problem, start: Point
+) -> Outcome | None:
+    """Where it ends, a success if the integrated equations have settled there too.
+
+    It minimises something else, to a tolerance that is no deviation's.
+    """
+    found = transcription(problem, start)
+    if found is None or not found.claims_success or settled(problem, found.point):
+        return found
+    status = "not settled in the integrated equations"
+    return replace(found, claims_success=False, status=status)
+
+
 #: Beside them for differential equations: along the record, from many beginnings at once, and with
 #: the equations as constraints. The cost is that of the integrated equations where each ends.
 TRANSCRIPTIONS: dict[str, Callable[[Problem, Point], Outcome | None]] = {
     "growing-horizon": grown,
-    "multiple-shooting": shot,
-    "collocation": collocated,
+    "multiple-shooting": partial(_integrated, shot),
+    "collocation": partial(_integrated, collocated),
 }
 #: A run of the spread is stopped after this many times the solver's time from the same start, but
 #: not before so many seconds: what is lost by then is not found later.

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from casest.engine.chain import chained
 from casest.engine.compiled import Compiled
+from casest.engine.direct import Direct
 from casest.engine.kernel import by_workers, evaluated
 from casest.engine.lanes import stretches
 from casest.engine.normal import (
@@ -25,6 +26,7 @@ from casest.engine.replay import Columns, Plan, Replay, Samples
 __all__ = [
     "Columns",
     "Compiled",
+    "Direct",
     "Normal",
     "Plan",
     "Recursion",

@@ -10,6 +10,7 @@ Environment: as for the kernels.
 from __future__ import annotations
 
 import ctypes
+import math
 import os
 from collections.abc import Sequence
 from typing import Any
@@ -18,11 +19,12 @@ import casadi as ca
 import numpy as np
 
 from casest.engine import lanes
+from casest.engine.direct import Bound
 from casest.engine.kernel import library
 from casest.engine.operations import Floats
 
 #: Steps that CasADi runs in one call, at most.
-CHUNK = 500
+CHUNK = 512
 #: Steps from which on the cache is looked at, and from which on a compiler is worthwhile.
 LOOK, WORTHWHILE = 5_000, 60_000
 #: No contraction: the digits are those of the virtual machine.
@@ -69,7 +71,8 @@ class Recursion:
         self._replayed = 0
         self._library: ctypes.CDLL | None = None
         self._looked = self._built = False
-        self._chunks: dict[int, Any] = {}
+        #: Chunks by their length, those that are not in use.
+        self._chunks: dict[int, list[_Chunk]] = {}
         self._beside: dict[tuple[int, bool], Any] = {}
 
     def __call__(
@@ -175,27 +178,46 @@ class Recursion:
         self, state: Floats, given: Sequence[Floats], found: list[Floats], keep: bool
     ) -> Floats:
         """The last state; every output in `found`, states only with `keep`."""
-        count = max(map(len, given))
-        chunk = _chunk(count)
-        if chunk not in self._chunks:
-            self._chunks[chunk] = self._step.mapaccum("steps", chunk)
-        # CasADi's matrices are column by column: a row of these arrays is one of its columns.
-        buffer, run = self._chunks[chunk].buffer()
-        parts = [np.empty((chunk, size)) for size in self.sizes]
-        for i, part in enumerate(parts):
-            buffer.set_res(i, memoryview(part))  # type: ignore[arg-type]
-        for k in range(0, count, chunk):
-            size = min(chunk, count - k)
-            own = [state, *(_of_chunk(p, k, chunk, count) for p in given)]
-            for i, array in enumerate(own):
-                if array.size:  # a view of nothing has no address
-                    buffer.set_arg(i, memoryview(array))  # type: ignore[arg-type]
-            run()
+        k, count = 0, max(map(len, given))
+        while k < count:
+            length = _length(count - k)
+            idle = self._chunks.setdefault(length, [])
+            # Taken off the shelf while in use: two threads never share one.
+            chunk = idle.pop() if idle else _Chunk(self._step, length)
+            span = slice(k, min(k + length, count))
+            parts = chunk.run(state, given, span, count)
             for i, part in enumerate(parts):
                 if keep or i:
-                    found[i][k : k + size] = part[:size]
-            state = parts[0][size - 1].copy()
+                    found[i][span] = part[: span.stop - k]
+            state = parts[0][span.stop - k - 1].copy()
+            idle.append(chunk)
+            k = span.stop
         return state
+
+
+class _Chunk:
+    """So many steps in one call of CasADi's, and the arrays that it reads and writes."""
+
+    def __init__(self, step: ca.Function, length: int) -> None:
+        self._all = Bound(step.mapaccum("steps", length))
+        self._state, *self._given = self._all.given
+
+    def run(
+        self, state: Floats, parts: Sequence[Floats], span: slice, count: int
+    ) -> Sequence[Floats]:
+        """Every output of the steps of a span of all `count`; of those beyond it, no matter what.
+
+        The arrays are overwritten by the next call.
+        """
+        self._state[0] = state
+        size = span.stop - span.start
+        for own, part in zip(self._given, parts, strict=True):
+            missing = count - len(part)
+            late = min(max(missing - span.start, 0), size)
+            own[:late] = 0.0
+            own[late:size] = part[span.start + late - missing : span.stop - missing]
+            own[size:] = own[size - 1]
+        return self._all()
 
 
 def _shared(step: ca.Function, name: str) -> ca.Function:
@@ -219,18 +241,10 @@ def _either(step: ca.Function, instead: ca.Function) -> ca.Function:
 def _rows(part: Floats) -> Floats:
     """An array (N, …) as rows of numbers that lie one after the other; how far apart they are is of
     no matter."""
-    size = int(np.prod(part.shape[1:]))
+    size = math.prod(part.shape[1:])
     rows = np.asarray(part, float).reshape(len(part), size)
     even = rows.strides[0] % 8 == 0 and (size < 2 or rows.strides[1] == 8)
     return rows if even else np.ascontiguousarray(rows)
-
-
-def _of_chunk(part: Floats, first: int, chunk: int, count: int) -> Floats:
-    """What `chunk` of `count` steps are given of a part; those beyond the last what that is."""
-    steps = np.minimum(np.arange(first, first + chunk), count - 1) - (count - len(part))
-    found = np.zeros((chunk, part.shape[1]))
-    found[steps >= 0] = part[steps[steps >= 0]]
-    return found
 
 
 def _given(state: Floats, parts: Sequence[Floats], count: int) -> list[Any]:
@@ -253,6 +267,6 @@ def _longs(numbers: Sequence[int]) -> Any:
     return (ctypes.c_long * max(len(numbers), 1))(*numbers)
 
 
-def _chunk(count: int) -> int:
-    """Steps in one call for so many in all: those beyond them are for nothing."""
-    return min(CHUNK, 1 << max(count - 1, 7).bit_length())
+def _length(left: int) -> int:
+    """Steps in one call where so many are left: a power of two, so that few kinds are made."""
+    return min(CHUNK, 1 << max(left.bit_length() - 1, 2))

@@ -139,7 +139,6 @@ def _combined(weights: Mapping[int, float], k: list[Any]) -> Any:
 
 def error(fifth: Floats, third: Floats, scale: Floats) -> Floats:
     """Error of each of N steps over what is allowed, (N,), of differences (N, n); scale (n,)."""
-    five = np.sum((fifth / scale) ** 2, axis=1)
-    three = np.sum((third / scale) ** 2, axis=1)
-    whole = five + 0.01 * three
+    five = ((fifth / scale) ** 2).sum(axis=1)
+    whole = five + 0.01 * ((third / scale) ** 2).sum(axis=1)
     return np.where(whole > 0, five / np.sqrt(np.where(whole > 0, whole, 1) * fifth.shape[1]), 0.0)

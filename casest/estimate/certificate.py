@@ -289,10 +289,11 @@ def _shape(
     than that is a curve, for which standard deviations and correlations mean nothing. Where a bound
     comes first the walk ends there, as the interval will.
     """
-    wide = np.zeros((len(R), problem.unknowns))
-    wide[:, free] = R
-    norms = np.where(free, np.linalg.norm(wide, axis=0), 1.0)
-    _, singular, Vt = np.linalg.svd(wide / norms)
+    norms = np.ones(problem.unknowns)
+    norms[free] = np.linalg.norm(R, axis=0)
+    # What is on a bound stays there exactly: by its rounding a walk would leave the bounds at once.
+    Vt = np.zeros((len(R), problem.unknowns))
+    _, singular, Vt[:, free] = np.linalg.svd(R / norms[free])
     ratios, against, few = [1.0], [], _few_around(problem, best.point, sigma)
     for k in range(len(R) - 1, -1, -1):
         for sign in (1, -1):

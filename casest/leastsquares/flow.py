@@ -24,7 +24,7 @@ from casest.declaration.flow import Flow
 from casest.declaration.physics import SX
 from casest.declaration.shapes import Array
 from casest.declaration.tracing import Traced
-from casest.engine import Recursion
+from casest.engine import Direct, Recursion
 from casest.engine.runge_kutta import ORDER, error
 from casest.leastsquares.stepping import HELD, Inputs, Switched, Way, numbers, switched
 from casest.leastsquares.stiff import Stiff
@@ -72,6 +72,35 @@ class Mesh:
 
     counts: Index | None = None
     stiff: bool = False
+    _laid: Laid | None = None
+
+    def laid(self, counts: Index, time: Array) -> Laid:
+        """Where so many steps lie; what was asked for last is kept."""
+        if self._laid is None or self._laid.counts is not counts:
+            self._laid = Laid.of(counts, time)
+        return self._laid
+
+
+@dataclass(frozen=True)
+class Laid:
+    """Steps (S,) one after the other: the interval of each, its place there and its width as shares
+    of that, its length in s; after how many of them each time (N,) is reached."""
+
+    counts: Index
+    reached: Index
+    place: Index
+    part: Array
+    width: Array
+    length: Array
+
+    @classmethod
+    def of(cls, counts: Index, time: Array) -> Laid:
+        """So many steps in each interval between times (N,)."""
+        reached = np.concatenate([[0], np.cumsum(counts)])
+        place = np.repeat(np.arange(len(counts)), counts)
+        part = (np.arange(len(place)) - reached[place]) / counts[place]
+        width = 1.0 / counts[place]
+        return cls(counts, reached, place, part, width, np.diff(time)[place] * width)
 
 
 @dataclass(frozen=True)
@@ -116,7 +145,7 @@ class Integrator:
         course = self._from_zero(course) if leads else course
         if mesh.counts is None:
             mesh.counts = np.ones(len(course.time) - 1, dtype=int)
-        start = np.array(self._start(parameters)).ravel()
+        (start,) = self._start(parameters)
         if mesh.stiff:
             found = self._implicit(start, parameters, course)
             mesh.stiff = not self._mild(found[:, :n], parameters, course)
@@ -124,28 +153,27 @@ class Integrator:
                 return self._unpacked(found[int(leads) :])
             mesh.counts = np.ones_like(mesh.counts)
         for _ in range(ROUNDS):
-            counts = mesh.counts * finer
-            states, errors, held = self._run(start, parameters, course, counts)
+            counts = mesh.counts if finer == 1 else mesh.counts * finer
+            laid = mesh.laid(counts, course.time)
+            states, errors, held = self._run(start, parameters, course, laid)
             if finer > 1:
                 break
-            x = np.vstack([start[None, :n], states[:, :n]])
-            wanted = self._wanted(x, errors, held, counts)
-            settled = bool(np.all(wanted <= counts))
-            if settled and np.sum(wanted) > 0.8 * np.sum(counts):
+            wanted = self._wanted(states[:, :n], errors, held, laid)
+            settled, many = bool((wanted <= counts).all()), int(wanted.sum())
+            if settled and many > 0.8 * (len(states) - 1):
                 break
-            if np.sum(wanted) > MANY + 4 * len(counts) and self._stiff is not None:
+            if many > MANY + 4 * len(counts) and self._stiff is not None:
                 found = self._implicit(start, parameters, course)
                 mesh.stiff = bool(np.isfinite(found).all())
                 if mesh.stiff:
                     return self._unpacked(found[int(leads) :])
-            if np.sum(wanted) > MOST + len(counts):
-                states = self._cut_off(states, counts, wanted)
+            if many > MOST + len(counts):
+                states = self._cut_off(states, laid, wanted)
                 break
             mesh.counts = wanted
             if settled:
                 break  # the next time with fewer
-        ends = np.cumsum(counts) - 1
-        return self._unpacked(np.vstack([start[None], states[ends]])[int(leads) :])
+        return self._unpacked(states[laid.reached[int(leads) :]])
 
     def _unpacked(self, found: Array) -> tuple[Array, Array]:
         """States (N, n) and slopes (N, n, p) of [x, X] (N, n + n·p)."""
@@ -210,26 +238,22 @@ class Integrator:
         )
 
     def _run(
-        self, start: Array, parameters: Array, course: Course, counts: Index
+        self, start: Array, parameters: Array, course: Course, laid: Laid
     ) -> tuple[Array, tuple[Array, Array], NDArray[np.bool_]]:
-        """[x, X] after every step, its fifth- and third-order differences, and was it held?"""
+        """[x, X] at the start and after every step, of each its fifth- and third-order differences,
+        and was it held?"""
+        n, _, p = self.sizes
         held = np.array(self.flow.held, dtype=bool)
-        place = np.repeat(np.arange(len(counts)), counts)
-        part = (np.arange(len(place)) - np.repeat(np.cumsum(counts) - counts, counts)) / counts[
-            place
-        ]
-        width = 1.0 / counts[place]
-        columns = []
-        for values, keep in (
-            (course.inputs, held),
-            (course.slopes.reshape(len(course.time), -1), np.repeat(held, self.sizes[2])),
-        ):
-            if values is course.inputs or self.fed:
-                rise = np.where(keep, 0.0, np.diff(values, axis=0))[place]
-                columns += [values[place] + rise * part[:, None], rise * width[:, None]]
-        h = np.diff(course.time)[place] * width
-        columns += [h[:, None], np.broadcast_to(parameters, (len(place), len(parameters)))]
-        n, rows = self.sizes[0], np.hstack(columns)
+        columns, kinds = [laid.length[:, None]], []
+        if held.size:
+            kinds.append((course.inputs, held))
+        if self.fed:
+            kinds.append((course.slopes.reshape(len(course.time), -1), np.repeat(held, p)))
+        for values, keep in kinds:
+            rise = np.where(keep, 0.0, np.diff(values, axis=0))[laid.place]
+            columns += [values[laid.place] + rise * laid.part[:, None], rise * laid.width[:, None]]
+        given = np.hstack(columns) if len(columns) > 1 else columns[0]
+        rows = [given, np.broadcast_to(parameters, (len(given), len(parameters)))]
         with np.errstate(all="ignore"):
             crosses = "_crossing" in vars(self)
             if not crosses:
@@ -238,23 +262,23 @@ class Integrator:
             if crosses:
                 states, errors = self._crossing(start, rows)
                 errors[errors[:, 2 * n] == 1, :n] = FAILED
+        states = np.concatenate([start[None], states])
         return states, (errors[:, :n], errors[:, n : 2 * n]), errors[:, 2 * n] == HELD
 
     def _wanted(
-        self, x: Array, errors: tuple[Array, Array], held: NDArray[np.bool_], counts: Index
+        self, x: Array, errors: tuple[Array, Array], held: NDArray[np.bool_], laid: Laid
     ) -> Index:
         """Steps for each interval by which errors are as large as allowed, at least one."""
-        good = np.isfinite(x).all(axis=1)
-        bad = np.flatnonzero(~good)
+        counts, ends, finite = laid.counts, laid.reached[1:], np.isfinite(x)
+        bad = np.flatnonzero(~finite.all(axis=1)) if not finite.all() else np.zeros(0, int)
         steps = len(x) - 1 if not bad.size else int(bad[0]) - 1
-        size = np.max(np.abs(x[: steps + 1]), axis=0)
+        size = np.abs(x[: steps + 1]).max(axis=0)
         allowed = TOLERANCE * np.where(size > 0, size, 1.0)
-        ends = np.cumsum(counts)
         share = error(errors[0][:steps], errors[1][:steps], allowed)
-        worst = np.zeros(len(counts))
-        place = np.repeat(np.arange(len(counts)), counts)[:steps]
-        np.maximum.at(worst, place, share)
-        cut = np.clip(MARGIN * worst ** (1 / ORDER), 0.0, CUT)
+        if bad.size:
+            share = np.concatenate([share, np.zeros(len(x) - 1 - steps)])
+        worst = np.maximum.reduceat(share, laid.reached[:-1])
+        cut = np.minimum(MARGIN * worst ** (1 / ORDER), CUT)
         wanted: Index = np.maximum(np.ceil(counts * cut - 1e-9).astype(int), 1)
         if bad.size:
             first = int(np.searchsorted(ends, steps, side="right"))
@@ -265,20 +289,20 @@ class Integrator:
         return wanted
 
     @staticmethod
-    def _cut_off(states: Array, counts: Index, wanted: Index) -> Array:
+    def _cut_off(states: Array, laid: Laid, wanted: Index) -> Array:
         """Nothing from the first interval on that would take too many steps."""
         states = states.copy()
-        first = int(np.argmax(wanted > counts))
-        states[int(np.cumsum(counts)[first] - counts[first]) :] = np.nan
+        first = int(np.argmax(wanted > laid.counts))
+        states[int(laid.reached[first]) + 1 :] = np.nan
         return states
 
     @cached_property
-    def _start(self) -> ca.Function:
+    def _start(self) -> Direct:
         """θ -> [x, X] at the beginning."""
         both = [self.flow.start, ca.jacobian(self.flow.start, self._coordinates)]
         whole = ca.vertcat(*(ca.vec(ca.densify(part)) for part in both))
         parameters = ca.vertcat(self.traced.coordinates, self.traced.references)
-        return ca.Function("start", [parameters], [ca.densify(whole)])
+        return Direct(ca.Function("start", [parameters], [ca.densify(whole)]))
 
     @cached_property
     def _held(self) -> Switched:
@@ -311,9 +335,9 @@ class Integrator:
         # Slopes of inputs lie row by row, as arrays do.
         fed = [ca.vec(given.U.T), ca.vec(given.faster.T)] if self.fed else []
         parameters = ca.vertcat(self.traced.coordinates, self.traced.references)
-        row = ca.vertcat(given.u, given.du, *fed, h, parameters)
+        row = ca.vertcat(h, given.u, given.du, *fed)
         outputs = [ca.densify(after), ca.densify(ca.vertcat(differences, mark))]
-        return ca.Function("step", [y, row], outputs)
+        return ca.Function("step", [y, row, parameters], outputs)
 
 
 def flows(stages: Sequence[object]) -> list[Flow]:

@@ -10,6 +10,8 @@ the integrated equations are fitted from there.
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -30,6 +32,8 @@ from casest.solve.outcome import Outcome
 DEGREE, FEWEST, MOST = 4, 60, 1500
 #: Iterations, and seconds that a start may take at most.
 ITERATIONS, SECONDS = 400, 30.0
+#: Programs kept for the next problem of their kind.
+KEPT = 4
 
 
 @dataclass(frozen=True)
@@ -90,7 +94,7 @@ def collocated(problem: Problem, start: Point, seconds: float = SECONDS) -> Outc
     return Outcome(
         "collocation",
         point,
-        problem.cost(point),
+        problem.cost(point),  # where slopes are too large for numbers there still is one
         found.iterations,
         found.iterations,
         found.success,
@@ -107,88 +111,151 @@ class _Found:
     status: str
 
 
-class _Made:
-    """The nonlinear program of a problem, and where its unknowns begin."""
+@dataclass(frozen=True)
+class _Kind:
+    """All that the nonlinear program of a problem depends on but numbers, which it is given.
 
-    def __init__(self, problem: Problem, parts: Parts, start: Point) -> None:
-        self.problem, self.parts, self.start = problem, parts, start
-        size = np.abs(start.x)
-        self.scale = np.where(size > 0, size, 1.0)
-        self.v = ca.MX.sym("v", problem.unknowns)
-        self.unknowns, self.first = [self.v], [start.x / self.scale]
-        self.equalities: list[Any] = []
-        self.cost: Any = 0.0
-        #: Half the squares of residuals as if states stayed where they begin.
-        self.unit = 0.0
-        for r in range(len(problem.runs)):
-            self._add(r)
+    `runs`: of each the unknowns that it sees, how many references, where in its pieces the samples
+    are, and how many pieces.
+    """
 
-    def _add(self, r: int) -> None:
-        """One run: its states, what ties them together, and its residuals."""
-        problem, parts = self.problem, self.parts
-        own, ref = problem.seen(r)
-        parameters = ca.vertcat(
-            (self.v * self.scale)[own.tolist()], ca.DM(self.start.references[ref])
-        )
-        at = problem.parameters(self.start, r)
-        grid = Grid.of(problem, r, parts, at)
-        n, size = parts.flow.x.numel(), grid.size
-        z = ca.MX.sym("x", n, grid.pieces * DEGREE)
-        x = z * size
+    model: Model
+    unknowns: int
+    runs: tuple[tuple[tuple[int, ...], int, tuple[int, ...], int], ...]
+    seconds: float
+
+
+class _Program:
+    """IPOPT on the program of a kind."""
+
+    def __init__(self, kind: _Kind) -> None:
+        parts = parts_of(kind.model)
+        assert parts is not None
+        self._parts, self._kind = parts, kind
+        v, scale = (ca.MX.sym(name, kind.unknowns) for name in ("v", "scale"))
+        unit = ca.MX.sym("unit")
+        self._unknowns, self._given = [v], [scale, unit]
+        self._equalities: list[Any] = []
+        self._cost: Any = 0.0
+        for run in kind.runs:
+            self._add(v * scale, *run)
+        nlp = {
+            "x": ca.vertcat(*self._unknowns),
+            "p": ca.vertcat(*map(ca.vec, self._given)),
+            "f": self._cost / unit,
+            "g": ca.vertcat(*self._equalities),
+        }
+        settings = {
+            "print_level": 0,
+            "sb": "yes",
+            "max_iter": ITERATIONS,
+            "max_wall_time": kind.seconds,
+            "tol": 1e-8,
+            "mu_init": 1e-2,
+        }
+        options = {
+            "ipopt": settings,
+            "print_time": False,
+            "show_eval_warnings": False,
+            "calc_lam_p": False,
+        }
+        self.solver = ca.nlpsol("collocation", "ipopt", nlp, options)
+
+    def _add(
+        self, x: Any, own: tuple[int, ...], references: int, nodes: tuple[int, ...], pieces: int
+    ) -> None:
+        """One run: its states, what ties them together, and its residuals; numbers in the order of
+        `Grid.numbers`."""
+        parts, count = self._parts, pieces * DEGREE
+        n, (inputs, _) = parts.flow.x.numel(), parts.rates.size_in(1)
+        axes, (width, _) = parts.residual.size1_out(0), parts.residual.size_in(1)
+        shapes = {
+            "references": (references, 1),
+            "steps": (1, pieces),
+            "inputs": (inputs, count),
+            "samples": (width, len(nodes)),
+            "there": (axes, len(nodes)),
+            "size": (n, 1),
+        }
+        given = {name: ca.MX.sym(name, *shape) for name, shape in shapes.items()}
+        self._given += given.values()
+        parameters = ca.vertcat(x[list(own)], given["references"])
+        z, size = ca.MX.sym("x", n, count), given["size"]
+        states = z * ca.repmat(size, 1, count)
         begin = parts.start(parameters)
-        ends = x[:, DEGREE - 1 :: DEGREE]
+        ends = states[:, DEGREE - 1 :: DEGREE]
         before = ca.horzcat(begin, ends[:, :-1])
-        rates = parts.rates.map(grid.pieces * DEGREE)(
-            x, grid.inputs.T, ca.repmat(parameters, 1, grid.pieces * DEGREE)
-        )
+        rates = parts.rates.map(count)(states, given["inputs"], ca.repmat(parameters, 1, count))
         slope, first = _radau()
+        lengths = ca.repmat(given["steps"], n, 1) / ca.repmat(size, 1, pieces)
         for k in range(DEGREE):
             moved = first[k] * before
             for j in range(DEGREE):
-                moved = moved + slope[j][k] * x[:, j::DEGREE]
-            tied = moved - rates[:, k::DEGREE] * ca.repmat(ca.DM(grid.steps).T, n, 1)
-            self.equalities.append(ca.vec(tied / ca.repmat(ca.DM(size), 1, grid.pieces)))
-        seen = ca.horzcat(begin, ends)[:, grid.nodes.tolist()]
-        count = len(grid.samples)
-        residual = parts.residual.map(count)(
-            seen, np.nan_to_num(grid.samples).T, ca.repmat(parameters, 1, count)
+                moved = moved + slope[j][k] * states[:, j::DEGREE]
+            tied = moved / ca.repmat(size, 1, pieces) - rates[:, k::DEGREE] * lengths
+            self._equalities.append(ca.vec(tied))
+        seen = ca.horzcat(begin, ends)[:, list(nodes)]
+        residual = parts.residual.map(len(nodes))(
+            seen, given["samples"], ca.repmat(parameters, 1, len(nodes))
         )[0]
-        self.cost += 0.5 * ca.sumsqr(residual * ca.DM(grid.there.T.astype(float)))
-        self.unit += grid.still
-        self.unknowns.append(ca.vec(z))
-        self.first.append((grid.guess / size).ravel())
+        self._cost += 0.5 * ca.sumsqr(residual * given["there"])
+        self._unknowns.append(ca.vec(z))
+
+
+_idle: dict[_Kind, list[_Program]] = {}
+
+
+@contextmanager
+def _program(kind: _Kind) -> Iterator[_Program]:
+    """The program of this kind; making it takes longer than solving it, so it is kept.
+
+    Taken off the shelf while in use: two threads never share one.
+    """
+    shelf = _idle.pop(kind, [])
+    program = shelf.pop() if shelf else _Program(kind)
+    yield program
+    _idle[kind] = [*_idle.pop(kind, shelf), program]  # what was used last is the last
+    while len(_idle) > KEPT:
+        with suppress(KeyError, StopIteration):
+            del _idle[next(iter(_idle))]
+
+
+class _Made:
+    """The numbers of a problem's nonlinear program, and where its unknowns begin."""
+
+    def __init__(self, problem: Problem, parts: Parts, start: Point) -> None:
+        self.problem, size = problem, np.abs(start.x)
+        self.scale = np.where(size > 0, size, 1.0)
+        every = range(len(problem.runs))
+        grids = [Grid.of(problem, r, parts, problem.parameters(start, r)) for r in every]
+        self.first = [start.x / self.scale, *((g.guess / g.size).ravel() for g in grids)]
+        #: Half the squares of residuals as if states stayed where they begin.
+        unit = max(sum(g.still for g in grids), 1e-300)
+        self.given, kinds = [self.scale, np.array([unit])], []
+        for r, grid in zip(every, grids, strict=True):
+            own, ref = problem.seen(r)
+            references = start.references[ref]
+            self.given += [references, *grid.numbers()]
+            nodes = tuple(grid.nodes.tolist())
+            kinds.append((tuple(own.tolist()), len(references), nodes, grid.pieces))
+        self.runs = tuple(kinds)
 
     def solved(self, seconds: float) -> _Found:
-        """What IPOPT finds in this time."""
-        w, w0 = ca.vertcat(*self.unknowns), np.concatenate(self.first)
-        lower, upper = (b / self.scale for b in self.problem.bounds)
+        """What IPOPT finds in this time, which is rounded up to whole seconds."""
+        w0, lower_upper = np.concatenate(self.first), self.problem.bounds
+        lower, upper = (b / self.scale for b in lower_upper)
         free = np.full(len(w0) - self.problem.unknowns, np.inf)
-        g = ca.vertcat(*self.equalities)
-        solver = ca.nlpsol(
-            "collocation",
-            "ipopt",
-            {"x": w, "f": self.cost / max(self.unit, 1e-300), "g": g},
-            {
-                "ipopt": {
-                    "print_level": 0,
-                    "sb": "yes",
-                    "max_iter": ITERATIONS,
-                    "max_wall_time": seconds,
-                    "tol": 1e-8,
-                    "mu_init": 1e-2,
-                },
-                "print_time": False,
-                "show_eval_warnings": False,
-            },
-        )
-        found = solver(
-            x0=w0,
-            lbx=np.concatenate([lower, -free]),
-            ubx=np.concatenate([upper, free]),
-            lbg=0,
-            ubg=0,
-        )
-        stats = solver.stats()
+        kind = _Kind(self.problem.model, self.problem.unknowns, self.runs, float(np.ceil(seconds)))
+        with _program(kind) as program:
+            found = program.solver(
+                x0=w0,
+                p=np.concatenate(self.given),
+                lbx=np.concatenate([lower, -free]),
+                ubx=np.concatenate([upper, free]),
+                lbg=0,
+                ubg=0,
+            )
+            stats = program.solver.stats()
         return _Found(
             np.array(found["x"]).ravel(),
             int(stats.get("iter_count", 0)),
@@ -219,6 +286,12 @@ class Grid:
     def pieces(self) -> int:
         """How many."""
         return len(self.steps)
+
+    def numbers(self) -> list[Array]:
+        """What the program is given of it, each matrix column by column."""
+        there = self.there.astype(float)
+        rows = self.steps, self.inputs, np.nan_to_num(self.samples), there, self.size
+        return [np.ravel(part) for part in rows]
 
     @classmethod
     def of(cls, problem: Problem, r: int, parts: Parts, at: Array) -> Grid:

@@ -23,7 +23,7 @@ from casest.solve.collocation import collocated
 from casest.solve.horizon import ALONG, grown
 from casest.solve.outcome import Outcome
 from casest.solve.shooting import shot
-from casest.solve.trust_region import LITTLE, trust_region
+from casest.solve.trust_region import LITTLE, slight, trust_region
 
 #: Rows of all runs up to which collocation is asked in any case.
 SHORT = 600
@@ -73,12 +73,13 @@ def by_collocation(problem: Problem, first: Point, seconds: float) -> Iterator[O
     near = collocated(problem, first, seconds)
     if near is None or not np.isfinite(near.cost):
         return
-    yield _polished(problem, near)
+    # What becomes the answer is polished once it is.
+    yield _polished(problem, near, slight(problem))
 
 
-def _polished(problem: Problem, near: Outcome) -> Outcome:
+def _polished(problem: Problem, near: Outcome, tolerance: float = 0.0) -> Outcome:
     """The optimum of the integrated equations beside what a way has led to."""
-    found = trust_region(problem, near.point, damping=LITTLE)
+    found = trust_region(problem, near.point, damping=LITTLE, tolerance=tolerance)
     return replace(
         found,
         solver=near.solver,

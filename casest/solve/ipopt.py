@@ -26,6 +26,16 @@ KEPT = 32
 #: Settings where a polish follows: of long products of rotations the cost stands still earlier, and
 #: the line search would fight rounding two hundred times.
 STANDSTILL = {"acceptable_tol": 1e-6, "acceptable_obj_change_tol": 1e-13, "acceptable_iter": 2}
+#: And from where other ways have led already: a barrier and multipliers as they are there, so that
+#: an optimum is not left to be found again.
+CLOSE_BY = STANDSTILL | {
+    "mu_init": 1e-10,
+    "bound_mult_init_method": "mu-based",
+    "bound_push": 1e-9,
+    "bound_frac": 1e-9,
+}
+#: Share of the first cost below which tolerance and barrier, shares of that, are too large.
+FALLEN = 1e-4
 #: Evaluations after which a search is given up: three for each iteration allowed. From wild starts
 #: the line search may halve its step thirty times in every iteration, and get nowhere.
 PATIENCE = 1500
@@ -42,7 +52,7 @@ def ipopt(
     """Minimise the cost from `start`. `exact` uses the exact Hessian instead of JᵀJ.
 
     Unknowns are scaled by their Jacobian columns and the cost by its start value. `options` are
-    IPOPT's own; after so many evaluations as `patience` it is given up.
+    IPOPT's own, where a polish follows; after so many evaluations as `patience` it is given up.
     """
     settings = {
         "print_level": 0,
@@ -57,7 +67,26 @@ def ipopt(
         **(options or {}),
     }
     found = run_nlpsol("ipopt", problem, start, settings, exact=exact, patience=patience)
+    if options is None and found.claims_success and 0 < found.cost < FALLEN * problem.cost(start):
+        found = _closer(problem, found, settings, exact, patience - found.evaluations)
     return replace(found, solver="ipopt-exact") if exact else found
+
+
+def _closer(
+    problem: Problem, end: Outcome, settings: dict[str, Any], exact: bool, patience: int
+) -> Outcome:
+    """Where it goes on to from its end: tolerance and barrier are shares of the cost at the start.
+
+    At rounding it may not go on, and the end stays.
+    """
+    found = run_nlpsol("ipopt", problem, end.point, settings, exact=exact, patience=patience)
+    better = found.claims_success and found.cost <= end.cost
+    return replace(
+        found if better else end,
+        iterations=end.iterations + found.iterations,
+        evaluations=end.evaluations + found.evaluations,
+        seconds=end.seconds + found.seconds,
+    )
 
 
 def run_nlpsol(
@@ -104,13 +133,13 @@ class _Scaled:
         columns = np.sqrt(np.maximum(np.diag(first.matrix), 0.0))
         usable = np.isfinite(columns) & (columns > 0)
         self.scale = np.where(usable, np.sqrt(2 * self.unit) / np.where(usable, columns, 1.0), 1.0)
-        self.evaluations = 0
-        self._z: Array | None = None
+        self.evaluations = 1
+        self._z = start.x / self.scale
         self._point, self._normal = start, first
 
     def normal(self, z: Array) -> Any:
         """Normal equations at z (cached: IPOPT asks for cost, gradient, Hessian in turn)."""
-        if self._z is None or not np.array_equal(z, self._z):
+        if not np.array_equal(z, self._z):
             self._z, self._point = z.copy(), self.point(z)
             self._normal = self.problem.normal(self._point)
             self.evaluations += 1
@@ -123,7 +152,7 @@ class _Scaled:
     def reached(self, z: Array) -> Point:
         """The point in charts around itself; the one evaluated last where that is the same."""
         flat = not any(slot.parameter.shape.curved for slot in self.problem.slots)
-        if flat and self._z is not None and np.array_equal(z, self._z):
+        if flat and np.array_equal(z, self._z):
             return self._point
         return self.problem.moved(self.start, self.scale * z - self.start.x)
 

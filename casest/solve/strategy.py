@@ -12,6 +12,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -26,11 +27,11 @@ from casest.leastsquares.problem import Point, Problem
 from casest.leastsquares.weights import has_noise_effects, weights
 from casest.solve.equations import OPINION as OPINIONS
 from casest.solve.equations import allowed, by_equations, by_shooting
+from casest.solve.ipopt import CLOSE_BY, STANDSTILL, ipopt
 from casest.solve.ipopt import PATIENCE as EVALUATIONS
-from casest.solve.ipopt import STANDSTILL, ipopt
 from casest.solve.multipliers import kept
 from casest.solve.outcome import Outcome
-from casest.solve.trust_region import LITTLE, trust_region
+from casest.solve.trust_region import LITTLE, slight, trust_region
 
 #: Iterations after which a second opinion has nothing to say.
 OPINION = 50
@@ -38,7 +39,7 @@ OPINION = 50
 PATIENCE = 1000
 #: Evaluations by IPOPT where equations have been fitted already: where steps are chosen anew at
 #: every point (`leastsquares.stiff`) its line search would fight their rounding.
-CLOSE_BY = 60
+LITTLE_LEFT = 60
 #: More starts, and their spread as a share of each unknown: what reveals 19 of 20 false optima of
 #: NIST's problems (studies/nist.md).
 STARTS, SPREAD = 8, 0.3
@@ -147,7 +148,7 @@ def _ways_of_equations(
             )
         others.insert(0, several)
     with suppress(GivenUp), for_seconds(allowed(others, OPINIONS)):  # else an opinion less
-        direct = trust_region(problem, first, max_iterations=OPINION, tolerance=_fine(problem))
+        direct = trust_region(problem, first, max_iterations=OPINION, tolerance=slight(problem))
         others.append(direct)
         if solver != "multiple-shooting":
             others.insert(0, _asked_for(problem, best_of((*others,)), solver))
@@ -158,7 +159,7 @@ def _asked_for(problem: Problem, near: Outcome, solver: str) -> Outcome:
     """The solver asked for, from where other ways have led."""
     if solver == "trust-region" or not np.isfinite(near.cost) or _singular(problem, near.point):
         return trust_region(problem, near.point, damping=LITTLE)
-    return _ipopt(problem, near.point, solver, patience=CLOSE_BY)
+    return _ipopt(problem, near.point, solver, CLOSE_BY, LITTLE_LEFT)
 
 
 def _other_starts(problem: Problem, first: Point, automatic: bool) -> Sequence[Point]:
@@ -200,10 +201,16 @@ def valleys(outcomes: Sequence[Outcome]) -> int:
     return 1 + sum(apart)
 
 
-def _ipopt(problem: Problem, start: Point, solver: str, patience: int = EVALUATIONS) -> Outcome:
+def _ipopt(
+    problem: Problem,
+    start: Point,
+    solver: str,
+    options: dict[str, Any] = STANDSTILL,
+    patience: int = EVALUATIONS,
+) -> Outcome:
     """Where IPOPT ends from there, polished."""
     exact = solver == "ipopt-exact"
-    found = ipopt(problem, start, exact=exact, options=STANDSTILL, patience=patience)
+    found = ipopt(problem, start, exact=exact, options=options, patience=patience)
     return _polished(problem, found)
 
 
@@ -235,7 +242,7 @@ def _nearby(
         thinned,
         start,
         max_iterations=PATIENCE if wary else OPINION,
-        tolerance=1e4 * _fine(thinned),
+        tolerance=1e4 * slight(thinned),
         wary=wary,
     )
     there = problem.cost(few.point)
@@ -287,7 +294,7 @@ def _followed(problem: Problem, near: Outcome) -> Outcome:
         problem,
         near.point,
         max_iterations=OPINION,
-        tolerance=_fine(problem),
+        tolerance=slight(problem),
         damping=LITTLE if near.iterations else 1e-3,
     )
     return replace(found, seconds=near.seconds + found.seconds)
@@ -297,7 +304,7 @@ def _wary(problem: Problem, start: Point) -> Outcome:
     """Where short steps lead from a start, however long it takes."""
     near, _ = _nearby(problem, start, wary=True)
     found = trust_region(
-        problem, near.point, max_iterations=PATIENCE, tolerance=_fine(problem), wary=True
+        problem, near.point, max_iterations=PATIENCE, tolerance=slight(problem), wary=True
     )
     return replace(found, seconds=near.seconds + found.seconds)
 
@@ -310,11 +317,6 @@ def _singular(problem: Problem, first: Point) -> bool:
     R = problem.factor(reached)[0]
     # Where a derivative overflows nothing is determined.
     return not np.isfinite(R).all() or rank(R) < problem.unknowns
-
-
-def _fine(problem: Problem) -> float:
-    """Gain over cost from which on a step is below 0.001 standard deviations."""
-    return 1e-6 / max(problem.residual_count, 1)
 
 
 def _perturbations(problem: Problem, first: Point, seed: int) -> Iterator[Point]:

@@ -22,10 +22,17 @@ ROUGH = 1e-5
 LITTLE = 1e-7
 #: Residuals from which on a QR factor is too dear for a step far away.
 LONG = 5000
+#: Residuals up to which their cost alone takes as long as with slopes.
+BRIEF = 500
 #: Share of the residual in the Jacobian's reach that is left to rounding.
 SETTLED = 1e-12
 #: Share of the cost below which no gain shows in it: whether it was one nobody can tell.
 HIDDEN = 1e-16
+#: Share of the cost that integration moves it by where steps are chosen anew at every point: lower
+#: by less than this is no better than where the slope ends.
+ASTRAY = 1e-8
+#: Dampings of the steps from a place that is asked whether it has settled.
+DAMPED = (0.0, 1e-8, 1e-6, 1e-4, 1e-2, 1.0)
 #: Range of dampings in which a wary run looks for that of its radius.
 DAMPINGS = (1e-24, 1e24)
 
@@ -120,6 +127,7 @@ def trust_region(
     size = float(np.linalg.norm(scale * start.x)) or float(np.sqrt(2 * here.cost))
     radius = size if wary else np.inf
     growth, evaluations, status = 2.0, 1, "iteration limit"
+    brief = problem.residual_count <= BRIEF
     iterations = 0
     while iterations < max_iterations:
         iterations += 1
@@ -143,8 +151,9 @@ def trust_region(
             status = "converged"
             break
         trial = problem.moved(point, step)
-        # Far away most steps descend, and their slope is wanted with the cost.
-        normal = None if precise else problem.normal(trial)
+        # Most steps descend, and their slope is wanted with the cost: far away in any case, near
+        # the end where that takes hardly longer.
+        normal = problem.normal(trial) if brief or not precise else None
         there = problem.cost(trial) if normal is None else normal.cost
         evaluations += 1
         ratio = (here.cost - there) / max(gain, 1e-300) if np.isfinite(there) else -1.0
@@ -173,6 +182,24 @@ def trust_region(
     return Outcome(
         "trust-region", point, here.cost, iterations, evaluations, claims, status, seconds
     )
+
+
+def slight(problem: LeastSquares) -> float:
+    """Gain over cost from which on a step is below 0.001 standard deviations: a `tolerance`."""
+    return 1e-6 / max(problem.residual_count, 1)
+
+
+def settled(problem: LeastSquares, point: Point) -> bool:
+    """Does no step from there, within bounds, promise what one of 0.01 standard deviations does?
+
+    Steps are damped more and more: an undamped one that ends at a bound may promise nothing.
+    """
+    here = _fine(problem, point)
+    if not here.finite():
+        return False
+    scale = here.norms()
+    steps = (_bounded_step(problem, point, here, scale, damping) for damping in DAMPED)
+    return max(map(here.gain, steps)) <= 100 * slight(problem) * here.cost
 
 
 def _damping_within(
@@ -289,8 +316,7 @@ def _refine(problem: LeastSquares, point: Point, here: _Fine, scale: Array) -> t
             break
         trial = problem.moved(point, step)
         there = _fine(problem, trial)
-        # Where residuals are small beside the readings, rounding moves the cost by 1e-11 of itself.
-        better = _slope(there) < _slope(here) and there.cost <= here.cost * (1 + 1e-10)
+        better = _slope(there) < _slope(here) and there.cost <= here.cost * (1 + ASTRAY)
         if not (np.isfinite(there.cost) and better):
             break
         point, here = trial, there
