@@ -115,7 +115,11 @@ MUTANTS = tuple(
         ),
         # -- the covariance ------------------------------------------------------------------------
         ("estimate/covariance.py", "correlated_over * plain * bread", "plain * bread"),
-        ("estimate/covariance.py", "bread=bread) @ bread", "bread=None) @ bread"),
+        (
+            "leastsquares/sums.py",
+            "residual = _without_leverage(block, moved)",
+            "residual = block.residual",
+        ),
         ("estimate/covariance.py", "10 * correlated_over", "1 * correlated_over"),
         ("estimate/covariance.py", "groups / (groups - 1)", "(groups - 1) / groups"),
         ("estimate/correlation.py", "2 * pairs.sum() - 1", "pairs.sum()"),
@@ -167,7 +171,7 @@ MUTANTS = tuple(
         (CROSS, "spread < LEVELS.uncertain * part", "spread < 1e9 * part"),
         (PARTS, "rest = A - X[own].T @ X[own]", "rest = A"),
         (PARTS, "b - X[own].T @ seen[own]", "b"),
-        (PARTS, "np.sum(b**2) - np.sum(a**2)", "np.sum(b**2) + np.sum(a**2)"),
+        (PARTS, "gained = float(np.sum(b**2)) - left", "gained = float(np.sum(b**2)) + left"),
         (PARTS, "max(float(np.sum(wide**2)), white)", "white"),
         (PARTS, "max(float(np.sum(wide**2)), white)", "float(np.sum(wide**2))"),
         (PARTS, "return np.clip(e, -far, far) if linear.series else e", "return e"),
