@@ -412,11 +412,11 @@ def _corrected_range(estimate: Estimate) -> Corrected | None:
     if name is None:
         return None
     declared = ca.densify(ca.vec(estimate.model.along.quantities[name].declared))
-    pieces = estimate.problem.evaluated_pieces(estimate.point, {"c": declared})
-    finite = [own for own in (values[0][np.isfinite(values[0])] for values in pieces) if own.size]
-    if not finite:
-        return Corrected(name)
-    return Corrected(name, float(min(map(np.min, finite))), float(max(map(np.max, finite))))
+    low, high = np.inf, -np.inf
+    for (values,) in estimate.problem.evaluated_pieces(estimate.point, {"c": declared}):
+        finite = values[np.isfinite(values)]
+        low, high = min(low, finite.min(initial=low)), max(high, finite.max(initial=high))
+    return Corrected(name) if low > high else Corrected(name, float(low), float(high))
 
 
 def _correction(
