@@ -205,3 +205,13 @@ def test_an_effect_that_differs_from_sensor_to_sensor_is_named(tmp_path, capsys,
     # what is left is the noise that was put in, when each has its own
     assert found["own"]["sigma_after"] == pytest.approx(fleets.SIGMA, rel=0.01)
     assert found["own"]["sigma_before"] > 1.02 * fleets.SIGMA
+
+
+def test_where_poses_are_too_few_for_a_spread_that_is_said(tmp_path, capsys):
+    file = tmp_path / "a.parquet"
+    pq.write_table(fleets.wide(fleets.readings(60, 1, poses=13), fleets.names(60)), file)
+    assert close(file, "-o", str(tmp_path / "out")) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "whether each has something in a size of its own was not asked" in said
+    assert "was not asked" in (tmp_path / "out" / "common.html").read_text(encoding="utf-8")
+    assert json.loads((tmp_path / "out" / "common.json").read_text())["own_tried"] == {}

@@ -26,6 +26,8 @@ from casest.leastsquares.per_sample import residual_and_jacobian
 #: Residuals of a sensor beyond its unknowns from which on its own noise is told; and most of them:
 #: a system of so many equations is solved for each sensor.
 SPARE, MOST = 3, 400
+#: Numbers of such systems that are held at once.
+HELD = 4_000_000
 #: Condition of M∘M up to which variances of single residuals are told, and of the columns.
 TOLD, SURVIVES = 1e8, 1e-6
 
@@ -88,9 +90,10 @@ def excess(trial: Trial, values: Array, signals: Sequence[Array]) -> Excess:
     squares = Squares(residual_and_jacobian(trial.extended))
     size, n, q = len(values), values.shape[1], len(trial.null)
     found = Excess(*(np.full(shape, np.nan) for shape in (size, (size, q), (size, q), size, size)))
-    if not n + q + SPARE <= signals[0].shape[1] * squares.residual_count <= MOST:
+    count = signals[0].shape[1] * squares.residual_count
+    if not n + q + SPARE <= count <= MOST:
         return found
-    width = widest(signals[0].shape[1])
+    width = min(widest(signals[0].shape[1]), max(1, HELD // count**2))
     with np.errstate(all="ignore"), one_thread():
         for first in range(0, size, width):
             s = slice(first, min(first + width, size))

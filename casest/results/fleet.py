@@ -209,6 +209,18 @@ class FleetClosed(Result, frozen=True, kw_only=True):
     own_tried: dict[str, float]
 
     @property
+    def not_asked(self) -> str:
+        """Why no spread was asked for, in words; empty where it was."""
+        return (
+            ""
+            if self.own_tried
+            else (
+                "whether each has something in a size of its own was not asked: that takes three "
+                "residuals more in each than unknowns, an effect's included, and 400 at most"
+            )
+        )
+
+    @property
     def said(self) -> str:
         """What the sensors have, in words."""
         names = ", ".join(e.name for e in self.effects)

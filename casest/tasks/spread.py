@@ -107,16 +107,15 @@ def _asked(
     """What the first ASKED sensors say of each effect, where enough of them say something."""
     parts: dict[str, list[Excess]] = {t.effect.name: [] for t in asked}
     total = 0
-    for partition in partitions:
-        for group in groups(job, partition):
-            if total >= ASKED:
-                break
-            fitted = calibrate_many(model, group.signals, noise=job.noise)
-            good = np.flatnonzero(fitted.trusted)[: ASKED - total]
-            total += len(good)
-            readings = [group.signals[s.name][good] for s in model.signals]
-            for trial in asked if len(good) else ():
-                own = excess(trial, unknowns(fitted)[good], readings)
-                parts[trial.effect.name].append(own)
+    for group in (g for partition in partitions for g in groups(job, partition)):
+        fitted = calibrate_many(model, group.signals, noise=job.noise)
+        good = np.flatnonzero(fitted.trusted)[: ASKED - total]
+        total += len(good)
+        readings = [group.signals[s.name][good] for s in model.signals]
+        for trial in asked if len(good) else ():
+            own = excess(trial, unknowns(fitted)[good], readings)
+            parts[trial.effect.name].append(own)
+        if total >= ASKED:
+            break
     found = {name: Excess.joined(own) for name, own in parts.items() if own}
     return {name: e for name, e in found.items() if e.told > SAID * total}

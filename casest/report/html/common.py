@@ -84,4 +84,6 @@ def _tried(result: FleetClosed) -> str:
     if result.invisible:
         names = ", ".join(f"`{name}`" for name in result.invisible)
         parts.append(paragraph(f"No pose could show {names}."))
+    if result.not_asked:
+        parts.append(paragraph(f"{result.not_asked[0].upper()}{result.not_asked[1:]}."))
     return section("tried", "What else was asked", details("Every effect", *parts))

@@ -64,6 +64,8 @@ def common_text(result: FleetClosed, folder: Path | None) -> str:
         lines += ["", *_own_lines(result.own)]
     if result.invisible:
         lines += ["", item(f"no pose could show: {', '.join(result.invisible)}")]
+    if result.not_asked:
+        lines += ["", item(result.not_asked)]
     if folder is not None:
         lines += ["", f"Written: {folder}/{COMMON}, common.html"]
     return "\n".join(lines)
