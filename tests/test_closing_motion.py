@@ -104,6 +104,19 @@ def test_a_planted_effect_is_found_and_named_with_its_size(sensors, label, plant
 
 
 @pytest.mark.long
+@pytest.mark.parametrize("seed", [5, 6, 7])
+def test_what_a_noisy_gyro_leaves_of_a_scale_is_never_claimed_for_another_cause_alone(seed):
+    """Noise that was matched to three gains hid their worth: a drift of one number was claimed."""
+    rng = np.random.default_rng(seed)
+    sigma = {**flights.SIGMA, "omega": np.radians(0.5)}
+    t = np.arange(0, 60, 0.02)
+    run = flights.record(flights.somewhere(rng), t, rng, Sensors(gain=0.01), sigma)
+    closing = close_motion(bias_gravity, run)
+    for effect in closing.effects:
+        assert "gain of a" in (effect.candidate.label, *effect.indistinguishable_from)
+
+
+@pytest.mark.long
 def test_coloured_noise_becomes_a_state_and_nothing_else_is_named():
     closing = close_motion(bias_gravity, flight(Sensors(colour=0.5, coloured=0.03), seed=4))
     assert names(closing) == ["coloured_noise of v"]

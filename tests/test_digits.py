@@ -240,6 +240,12 @@ def test_a_motion_that_grows_beyond_all_numbers_is_refused():
         transitions(system)
 
 
+def test_a_motion_that_is_not_finite_is_refused_like_one_that_grows_beyond_all_numbers():
+    """Trial numbers of an effect can lead there: it ended in an OverflowError."""
+    with pytest.raises(DataError, match=r"from t = 0 s to 1 s the motion grows beyond what"):
+        transitions(held([[np.inf]], [[1.0]], 1.0))
+
+
 def test_a_nonlinear_motion_far_faster_than_its_samples_is_refused():
     @dynamics
     def stiff(y=signal("rad"), *, angle=state("rad")):

@@ -82,11 +82,12 @@ def order_of(size: Array, h: Array) -> int | None:
 def _any(ends: Sequence[Array], h: Array, fast: Array) -> Motions:
     """Slow steps at once, faster ones in as many pieces as they need."""
     n = ends[0].shape[1]
-    found = Motions(*(np.empty((len(h), *s)) for s in ((n, n), (n,), (n, n))))
+    found = Motions(*(np.full((len(h), *s), np.nan) for s in ((n, n), (n,), (n, n))))
     held = ends[4] if ends[4].ndim == 2 else None
     pieces = np.exp2(np.ceil(np.log2(np.maximum(fast / _SLOW[-1], 1.0))))
-    for count in np.unique(np.minimum(pieces, _PIECES)):
-        rows = np.minimum(pieces, _PIECES) == count
+    pieces = np.where(np.isfinite(pieces), np.minimum(pieces, _PIECES), 0)  # no pieces help there
+    for count in np.unique(pieces[pieces > 0]):
+        rows = pieces == count
         own = _cut([e if e is held else e[rows] for e in ends], h[rows], int(count), fast[rows])
         for name in ("Phi", "forced", "Q"):
             getattr(found, name)[rows] = getattr(own, name)

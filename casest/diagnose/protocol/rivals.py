@@ -42,7 +42,9 @@ def _rivals(subject: Subject[F], state: State[F], kept: Kept) -> tuple[State[F],
     nothing = fall.left + fall.gained  # squares without any of them
     rivals = list[Evidence]()
     for e in ranking.causes:
-        if e is mine[0] or e.score < LEVELS.strong or len(rivals) == 2 * LEVELS.contenders:
+        # A score is a promise: noise that was matched to what explains more may hide its worth.
+        weak = e.score < LEVELS.strong and e.gain < mine[0].gain
+        if e is mine[0] or weak or len(rivals) == 2 * LEVELS.contenders:
             continue
         its = foretold(linear, [_in_time(ranking, e)], stretches)
         lost = fall_between_causes(linear, its, best)
