@@ -104,14 +104,18 @@ def test_a_planted_effect_is_found_and_named_with_its_size(sensors, label, plant
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("seed", [5, 6, 7])
+@pytest.mark.parametrize("seed", [7, 80_000, 80_001])
 def test_what_a_noisy_gyro_leaves_of_a_scale_is_never_claimed_for_another_cause_alone(seed):
-    """Noise that was matched to three gains hid their worth: a drift of one number was claimed."""
+    """Noise that was matched to three gains hid their worth: a drift of one number was claimed.
+
+    Alone in the last two of these flights; a rival's refit in the first goes beyond all numbers.
+    """
     rng = np.random.default_rng(seed)
     sigma = {**flights.SIGMA, "omega": np.radians(0.5)}
     t = np.arange(0, 60, 0.02)
     run = flights.record(flights.somewhere(rng), t, rng, Sensors(gain=0.01), sigma)
     closing = close_motion(bias_gravity, run)
+    assert closing.effects
     for effect in closing.effects:
         assert "gain of a" in (effect.candidate.label, *effect.indistinguishable_from)
 
