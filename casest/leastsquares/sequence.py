@@ -147,8 +147,9 @@ class Staged:
         Effects follow the record that the samples were taken from, block by block. `own`: the
         coordinates that slopes are taken in, where not in all.
         """
-        last = _programs(self.model, own)[-1]
-        found = _chained(last, parameters, samples, *self.given(parameters, r, own))
+        last, places = _programs(self.model, own)[-1], self._records[r].places
+        given, moved = self._given(parameters, r, own)
+        found = _chained(last, parameters, samples, given[places], moved[:, places])
         present = self.present(r)
         if present is not None:
             for part in found:
@@ -253,8 +254,8 @@ class Staged:
         self, parameters: Array, r: int, own: tuple[int, ...] | None = None
     ) -> tuple[Array, Array]:
         """What the stages give at the samples of run r (N, k), side by side, and its slopes."""
-        found = self._given(parameters, r, own)
-        return found[0][self._records[r].places], found[1][self._records[r].places]
+        (found, moved), places = self._given(parameters, r, own), self._records[r].places
+        return found[places], moved[:, places].transpose(1, 0, 2)
 
     def followed(self, parameters: Array, r: int) -> Array:
         """States of differential equations along the record of run r, (N, k)."""
@@ -270,7 +271,7 @@ class Staged:
         return {word: LastTurns() for word in ON_THE_WAY}
 
     def _given(self, parameters: Array, r: int, own: tuple[int, ...] | None) -> tuple[Array, Array]:
-        """The same at all samples of the record; what was asked for last is kept."""
+        """The same at all samples of the record, slopes (k, N, n); what was asked last is kept."""
         asked = (r, own, parameters.tobytes())
         if self._last.get("asked") != asked:
             self._last["found"] = self._followed(parameters, r, own)
@@ -290,26 +291,32 @@ class Staged:
         count = self.model.staged.coordinates.numel() if own is None else len(own)
         ends = np.cumsum([0, *(int(stage.given.numel()) for stage in self.model.staged.stages)])
         found = np.empty((len(record.samples), ends[-1]))
-        moved = np.empty((*found.shape, count))
+        moved = np.empty((ends[-1], len(found), count))  # those of a number lie together
         for k, stage in enumerate(stages):
-            given, slopes = found[:, : ends[k]], moved[:, : ends[k]]
+            given, before = found[:, : ends[k]], moved[: ends[k]]
             if stage.word:
-                more = self._of_word(stage, parameters, record, given, slopes)
+                more = self._of_word(stage, parameters, record, given, before)
             elif stage.flow is not None and self.states is not None:
                 known = self.states[r][:, followed : followed + stage.flow.sizes[0]]
                 more, followed = (known, np.zeros((*known.shape, count))), followed + known.shape[1]
             elif stage.flow is not None:
-                taken = given[:, :0], slopes[:, :0]
+                taken = given[:, :0], np.zeros((len(given), 0, count))
                 if stage.flow.sizes[1]:
-                    taken = _chained(stage, parameters, record.samples, given, slopes)
+                    taken = _chained(stage, parameters, record.samples, given, before)
                 mesh = self._meshes.setdefault((r, k), Mesh())
                 more = stage.flow.along(parameters, Course(record.time, *taken), mesh)
             elif stage.memory is None:
                 more = self._late(stage, parameters, record)
             else:
-                taken = _chained(stage, parameters, record.samples, given, slopes)
+                taken = _chained(stage, parameters, record.samples, given, before)
                 more = stage.memory.along(parameters, *taken, record.time, record.run.block)
-            found[:, ends[k] : ends[k + 1]], moved[:, ends[k] : ends[k + 1]] = more
+            found[:, ends[k] : ends[k + 1]] = more[0]
+            here, slopes = moved[ends[k] : ends[k + 1]], more[1].transpose(1, 0, 2)
+            if len(stage.columns) == count:
+                here[:] = slopes
+            else:
+                here[:] = 0.0
+                here[:, :, list(stage.columns)] = slopes
         return found, moved
 
     def _of_word(
@@ -325,10 +332,7 @@ class Staged:
             nothing = np.zeros((len(record.rests.samples), given.shape[1]))
             rate, sloped = stage.taken(parameters, np.hstack([record.rests.samples, nothing]))
             last.keep(asked, followed(rate[:, :, 0], sloped, record.rests))
-        found, moved = last.found
-        wide = np.zeros((*moved.shape[:2], slopes.shape[2]))
-        wide[:, :, list(stage.columns)] = moved
-        return found, wide
+        return last.found
 
     def stopped(self, parameters: Array, r: int) -> str:
         """What could not be followed from which time on, in words; empty where all was."""
@@ -351,7 +355,8 @@ class Staged:
         return ""
 
     def _late(self, stage: Program, parameters: Array, record: Record) -> tuple[Array, Array]:
-        """A signal at the times at which the effect says that it is taken, and its slopes."""
+        """A signal at the times at which the effect says that it is taken, and its slopes in the
+        stage's columns."""
         assert stage.attached is not None
         name = stage.attached.on
         wanted, slope = stage.taken(parameters, record.time[:, None])
@@ -365,9 +370,9 @@ class Program:
     """What is computed of one stage: what it takes, and how it goes on from it.
 
     Of an effect on a signal's time that is the time asked for. The last of a model's is its
-    residual, with no effect behind it. A `word` of the body has no effect either; `columns` are the
-    coordinates in which a turn has slopes, `turning` the parameters that it depends on. `read`:
-    from where to where it reads what the stages before give.
+    residual, with no effect behind it. A `word` of the body has no effect either. `columns`: the
+    coordinates in which what it gives has slopes; `turning`: the parameters that a turn depends on.
+    `read`: from where to where it reads what the stages before give, `through` the columns of that.
     """
 
     attached: Attached | None
@@ -378,6 +383,7 @@ class Program:
     columns: tuple[int, ...] = ()
     turning: tuple[int, ...] = ()
     flow: Integrator | None = None
+    through: tuple[tuple[int, ...], ...] = ()
 
 
 @lru_cache(maxsize=64)
@@ -389,18 +395,22 @@ def _programs(model: Model, own: tuple[int, ...] | None = None) -> tuple[Program
     def slopes(expression: SX, *of: SX) -> list[SX]:
         return [ca.densify(expression), *(ca.jacobian(expression, x) for x in of)]
 
-    def replay(expression: SX) -> tuple[Replay, tuple[int, int]]:
+    every = tuple(range(coordinates.numel()))
+    reach: list[tuple[int, ...]] = []  # of each number that a stage gives
+
+    def program(attached: Attached | None, expression: SX, **how: Any) -> Program:
         sample = ca.vertcat(sample_symbol(model, traced), given)
-        reached = _reaching(expression, given) if coordinates.numel() else ()
+        reached = _reaching(expression, given) if every else ()
         read = (min(reached), max(reached) + 1) if reached else (0, 0)
         outputs = slopes(expression, coordinates, given[slice(*read)])
-        return _replay("stage", [parameters, sample], outputs), read
+        taken = _replay("stage", [parameters, sample], outputs)
+        through = tuple(reach[slice(*read)])
+        return Program(attached, taken, read, columns=every, through=through, **how)
 
     for stage in traced.stages:
         if isinstance(stage, Flow):
             fed = ca.depends_on(stage.taken, ca.vertcat(coordinates, given))
-            flow = Integrator(traced, stage, own, fed)
-            found.append(Program(None, *replay(stage.taken), flow=flow))
+            found.append(program(None, stage.taken, flow=Integrator(traced, stage, own, fed)))
         elif stage.word in ON_THE_WAY:
             if ca.depends_on(stage.taken, ca.vertcat(given, ca.SX.sym("none"))):
                 raise DeclarationError(
@@ -412,18 +422,20 @@ def _programs(model: Model, own: tuple[int, ...] | None = None) -> tuple[Program
             rate = _replay("rate", [parameters, sample], outputs)
             found.append(Program(None, rate, word=stage.word, columns=columns, turning=turning))
         elif stage.word:
-            found.append(Program(None, *replay(stage.taken), word=stage.word))
+            found.append(program(None, stage.taken, word=stage.word))
         elif stage.attached is not None and stage.attached.kind == "time":
             t = ca.SX.sym("t")
             moment = ca.SX(stage.attached.apply(t, traced.symbols))
-            outputs = slopes(moment, coordinates)
+            columns = _reaching(moment, coordinates)
+            outputs = slopes(moment, coordinates[list(columns)])
             f = _replay("moment", [parameters, t], outputs)
-            found.append(Program(stage.attached, f))
+            found.append(Program(stage.attached, f, columns=columns))
         else:
             memory = Memory(model, stage, own)
-            found.append(Program(stage.attached, *replay(stage.taken), memory=memory))
+            found.append(program(stage.attached, stage.taken, memory=memory))
+        reach += [found[-1].columns] * stage.given.numel()
         given = ca.vertcat(given, stage.given)
-    return (*found, Program(traced.stages[-1].attached, *replay(traced.expression)))
+    return (*found, program(traced.stages[-1].attached, traced.expression))
 
 
 def _reaching(expression: SX, variables: SX) -> tuple[int, ...]:
@@ -477,8 +489,19 @@ def _replay(name: str, inputs: list[SX], outputs: list[SX]) -> Replay:
 def _chained(
     stage: Program, parameters: Array, samples: Array, given: Array, slopes: Array
 ) -> tuple[Array, Array]:
-    """Values (N, m) and slopes in the parameters (N, m, n), also by way of the stages before."""
-    value, direct, through = stage.taken(parameters, Columns([samples, given]))
-    if through.size:
-        direct += through @ slopes[:, slice(*stage.read)]
+    """Values (N, m) and slopes in the parameters (N, m, n), also by way of the stages before, whose
+    slopes are (k, N, n)."""
+    taken, first = stage.taken, stage.read[0]
+    value, direct = (np.zeros((len(samples), *shape)) for shape in taken.shapes[:2])
+    own, (row, column) = taken.sparsity[1], taken.sparsity[2]
+    for span, (v, d, through) in taken.blocks(parameters, Columns([samples, given])):
+        value[span, :, 0] = v.T
+        direct[span, own[0], own[1]] = d.T
+        for i, j, slope in zip(row, column, through, strict=True):
+            columns, before = stage.through[j], slopes[first + j, span]
+            if len(columns) == direct.shape[2]:
+                direct[span, i] += slope[:, None] * before
+            else:
+                for c in columns:
+                    direct[span, i, c] += slope * before[:, c]
     return value[:, :, 0], direct
