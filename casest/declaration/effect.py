@@ -64,7 +64,8 @@ class Effect:
     what each begins from (the value acted on, or a number); `otherwise` the form that it takes in a
     model where it is not applicable as it stands; `once`: it happened in the record that it was
     found in, and has "passed" (in another one it is not there) or "stayed" (in another one nobody
-    knows how much of it is there).
+    knows how much of it is there); `foreign_to` kinds of reading, by a unit each, of which no
+    sensor has it: there it is tried only where it is asked for.
     """
 
     name: str
@@ -91,6 +92,7 @@ class Effect:
     #: Python text of one that the loop wrote, to be given again.
     source: str = ""
     once: Once = ""
+    foreign_to: tuple[str, ...] = ()
 
     def __reduce__(self) -> tuple[Any, ...]:
         """To pickle: its function by name."""
@@ -157,6 +159,7 @@ def effect(
     memory: Mapping[str, str | float] | None = None,
     otherwise: Effect | None = None,
     once: Once = "",
+    foreign_to: Sequence[str] = (),
 ) -> Callable[[Callable[..., Any]], Effect]:
     """Declare an effect: first argument the value acted on, further ones signals or columns.
 
@@ -224,6 +227,7 @@ def effect(
             tuple((memory or {}).items()),
             otherwise,
             once=once,
+            foreign_to=tuple(foreign_to),
         )
 
     return declare

@@ -304,7 +304,8 @@ class Model:
         try:
             return self.with_effect(replace(added, otherwise=None), on=on, columns=columns)
         except UsageError:
-            told = {n: getattr(added, n) for n in ("name", "on", "typical", "shown_by")}
+            same = ("name", "on", "typical", "shown_by", "foreign_to")
+            told = {n: getattr(added, n) for n in same}
             said = form.formula or added.formula
             return self.with_effect(replace(form, **told, formula=said), on=on, columns=columns)
 

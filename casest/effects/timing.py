@@ -79,6 +79,8 @@ def low_pass(y: SX, t: SX = signal("s"), *, tau: SX = param("s")) -> SX:
     shown_by="a step of the input, held for several times tau",
     formula="y − k·(y − lowpass(y, tau))",
     memory={"gap": 0.0, "before": "y"},
+    # What gives way slowly is a spring, or what heat has to reach: no field, no turn, no proof mass.
+    foreign_to=("T", "rad/s", "m/s^2"),
 )
 def creep(
     y: SX,
@@ -130,6 +132,7 @@ def _looped(
     shown_by="the same input approached from above and from below",
     formula="y − k·sign(dy/dt)",
     otherwise=_looped,
+    foreign_to=("rad/s",),  # turned one way or the other, a gyroscope comes back to where it was
 )
 def hysteresis(y: SX, t: SX = signal("s"), *, k: SX = param(each, "[y]")) -> SX:
     """A reading that lags behind by k, whichever way it moves: a loop 2k high.

@@ -14,7 +14,7 @@ from casest.declaration.physics import SX
 from casest.declaration.shapes import Array, each
 from casest.declaration.symbols import param
 from casest.diagnose.candidates.axes import axes_of
-from casest.diagnose.candidates.candidates import Candidate, Skipped, candidates
+from casest.diagnose.candidates.candidates import Candidate, Skipped, candidates, foreign
 from casest.diagnose.candidates.grid import Seen, nearer, on_grid
 from casest.diagnose.candidates.motion_columns import columns_of_motion
 from casest.diagnose.candidates.slopes import slopes
@@ -55,7 +55,16 @@ class Tried:
     def found(self, fit: Fit) -> tuple[list[Candidate], list[Skipped]]:
         """What could be missing, and what does not apply here."""
         catalogue = [e for e in self.catalogue if self._in_time or e.kind not in OVER_TIME]
-        return self._found.of(fit.model, lambda: candidates(fit.model, self.rows.runs, catalogue))
+        return self._found.of(fit.model, lambda: self._known_here(fit.model, catalogue))
+
+    def _known_here(
+        self, model: Model, catalogue: Sequence[Effect]
+    ) -> tuple[list[Candidate], list[Skipped]]:
+        """Without what no such sensor has, unless it is asked for."""
+        found, skipped = candidates(model, self.rows.runs, catalogue)
+        why = {c.label: foreign(c, model, self.rows.runs) for c in found if not self.asked(c)}
+        skipped += [Skipped(label, reason) for label, reason in why.items() if reason]
+        return [c for c in found if not why.get(c.label)], skipped
 
     def like(self, fit: Fit, what: Candidate) -> Candidate | None:
         """The candidate of that label, as it could be missing in a fit."""

@@ -1,0 +1,65 @@
+"""What no sensor of a kind has is tried there only where it is asked for."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from casest import Residual, Run, close, model, param, quantity, signal
+from casest.effects import creep, hysteresis
+
+
+def one_channel(unit):
+    """A sensor against a reference of its own unit, read as 0.2 + 3 x."""
+
+    @model
+    def sensor(x=signal(unit), y=signal(unit), *, zero=param(unit), gain=param(start=1.0)):
+        """A straight line."""
+        met = quantity("met", x, unit)
+        reading = quantity("reading", zero + gain * met, unit)
+        return Residual(measured=y, predicted=reading, corrected=met)
+
+    return sensor
+
+
+def creeping(unit):
+    """Steps held for 20 s, each of which 5 % come late, with a time constant of 6 s."""
+    rng = np.random.default_rng(7)
+    t = np.arange(1200) / 5
+    x = np.repeat(rng.uniform(-2, 2, 12), 100)
+    late = np.zeros_like(x)
+    for k in range(1, len(x)):
+        late[k] = x[k] + (late[k - 1] - x[k]) * np.exp(-0.2 / 6)
+    y = 0.2 + 3 * (0.95 * x + 0.05 * late) + 0.01 * rng.standard_normal(len(x))
+    units = {"x": unit, "y": unit}
+    return Run.raw("r", {"x": x[:, None], "y": y[:, None]}, units=units, time=t)
+
+
+def closed(unit, effect, **how):
+    return close(one_channel(unit), [creeping(unit)], catalogue=(effect,), **how)
+
+
+def names(closing):
+    return [e.candidate.name for e in closing.effects]
+
+
+@pytest.mark.parametrize("unit", ["N", "degC", "mV"])
+def test_creep_is_found_where_sensors_creep(unit):
+    assert names(closed(unit, creep)) == ["creep"]
+
+
+@pytest.mark.parametrize("unit", ["uT", "gauss", "deg/s", "m/s^2", "g"])
+def test_creep_of_a_field_a_turn_or_a_proof_mass_is_not_tried(unit):
+    found = closed(unit, creep)
+    assert not names(found)
+    (reason,) = [s.reason for s in found.skipped if s.name == "creep"]
+    assert reason == f"no sensor that reads {unit} is known to have it; ask for it by name"
+
+
+def test_it_is_tried_where_the_user_says_that_it_is_there():
+    assert names(closed("uT", creep, known=("creep",))) == ["creep"]
+
+
+def test_a_gyroscope_has_no_hysteresis_and_a_magnetometer_may():
+    reasons = {unit: {s.name for s in closed(unit, hysteresis).skipped} for unit in ("deg/s", "uT")}
+    assert reasons == {"deg/s": {"hysteresis"}, "uT": set()}
