@@ -79,7 +79,7 @@ def low_pass(y: SX, t: SX = signal("s"), *, tau: SX = param("s")) -> SX:
     shown_by="a step of the input, held for several times tau",
     formula="y − k·(y − lowpass(y, tau))",
     memory={"gap": 0.0, "before": "y"},
-    # What gives way slowly is a spring, or what heat has to reach: no field, no turn, no proof mass.
+    # A spring gives way slowly, and heat arrives slowly: a field, a turn, a proof mass do neither.
     foreign_to=("T", "rad/s", "m/s^2"),
 )
 def creep(
