@@ -396,7 +396,8 @@ class Model:
                 return "quantity", found.dims, found.unit
             self._check_sequence(added)
             return "sequence", found.dims, found.unit
-        signals = {s.name: s for s in self.signals}
+        # What another effect alone reads goes when that goes, and says nothing of the sensor.
+        signals = {s.name: s for s in self.declared if isinstance(s, Signal)}
         if added.kind == "time":
             return "time", (), self._checked_recorded(added, target)
         if target in signals:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from casest.declaration.effect import RANDOM_WALK
 from casest.declaration.shapes import Array
 from casest.diagnose.candidates.candidates import Candidate
+from casest.diagnose.levels import LEVELS
 
 #: What is refused where nothing can be held out.
 HELD_OUT_DATA = "held-out data"
@@ -54,6 +55,12 @@ class Undecided:
     names: tuple[str, ...]
     share: float
     moves: Mapping[str, Mapping[str, Array]] = field(default_factory=dict)
+
+    @property
+    def explains(self) -> bool:
+        """Would any of them take away what can be printed? A likelihood may ask for what does not,
+        where noise is coloured or held-out parts deny it."""
+        return bool(self.moves) or self.share >= LEVELS.told_share
 
 
 @dataclass(frozen=True)

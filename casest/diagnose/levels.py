@@ -40,6 +40,7 @@ class Levels:
         that noise of an input counts, since a few draws tell its size.
     seen, unseen: noncentrality of the score from which on an effect is found nearly always, and
         below which (three standard deviations) nobody could.
+    told_share: of the variance, below which what causes explain alike is printed as 0 %.
     misfit: chance of each kind of misfit, or of a colour of noise, where there is none; share: of
         the variance, from which on one counts. blocks, block: means that are compared, and the rows
         in each at least.
@@ -95,6 +96,7 @@ class Levels:
     seen: float = 45.0
     unseen: float = 9.0
     share: float = 0.02
+    told_share: float = 0.005
     misfit: float = 0.001
     blocks: int = 60
     block: int = 20

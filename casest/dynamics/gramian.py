@@ -346,8 +346,9 @@ def _subject(
             same = all(abs(a - along[0]) < residue * abs(along[0]) for a in along)
             how = "move together" if same else "move in proportion"
             return f"{names} along the body axis ({axis}) {how}", False
-    largest = np.abs(direction).max()
-    moved = [(model.names[i], value / largest) for i, value in enumerate(direction) if value]
+    # Of several that are as large but for rounding the first has a plus.
+    first = np.flatnonzero(np.abs(direction) > 0.999 * np.abs(direction).max())[0]
+    moved = [(model.names[i], v / direction[first]) for i, v in enumerate(direction) if v]
     if len(moved) == 1:
         return moved[0][0], True
     return ", ".join(f"{label} {value:+.3g}" for label, value in moved), False

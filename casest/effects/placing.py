@@ -159,7 +159,10 @@ def angles(model: Model, runs: Sequence[Run]) -> list[str]:
     axis_wobble.
     """
     recorded = [n for n in (runs[0].columns if runs else ()) if _angle(n, runs[0].units.get(n))]
-    own = [s.name for s in model.signals if s.size == 1 and _angle(s.name, s.unit)]
+    units = runs[0].units if runs else {}
+    # A body that takes any unit has that of the record.
+    own = [s.name for s in model.signals
+           if s.size == 1 and any(_angle(s.name, u) for u in (s.unit, units.get(s.name)) if u)]  # fmt: skip
     inner = [n for n, q in model.quantities.items() if not q.dims and _angle(n, q.unit)]
     found = dict.fromkeys([*recorded, *own, *inner])
     return [n for n in found if n != "angle" or n not in model.quantities]

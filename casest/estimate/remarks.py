@@ -36,7 +36,7 @@ def notes(
         count = sum(len(run) for run in problem.runs)
         yield (
             f"residuals are correlated over {correlated:.3g} samples: the {count} samples count as "
-            f"{count / correlated:.0f}, and standard deviations come from batches of samples"
+            f"{count / correlated:.0f}, and standard deviations allow for that"
         )
     if bias > NOTABLE_BIAS:
         yield (

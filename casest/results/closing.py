@@ -262,7 +262,7 @@ def _effect(found: Found, closing: Closing) -> Effect:
 
 def _unexplained(closing: Closing) -> Unexplained:
     """What is left, and causes of which none was added: the parameters hang on which it is."""
-    left = closing.undecided
+    left = closing.undecided if closing.undecided and closing.undecided.explains else None
     names = left.names if left else ()
     moves = left.moves if left else {}
     return Unexplained(

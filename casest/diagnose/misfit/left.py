@@ -27,6 +27,7 @@ from casest.diagnose.noise.slow_course import slow_course
 from casest.diagnose.noise.spectral_line import strongest_line
 from casest.effects.placing import prepared
 from casest.estimate.before import against_prior
+from casest.estimate.correlation import TABLE
 from casest.estimate.estimate import Estimate
 from casest.leastsquares.agreement import between_runs
 from casest.leastsquares.problem import Point, Problem
@@ -107,7 +108,10 @@ def left_over(
     fraction = max(0.0, 1 - sigma**2 / variance) if variance > 0 else 0.0
     fraction = max([fraction, *(f.share for f in found)])
     where = [f.where for f in found[:3]]
-    if undecided is not None:
+    if undecided is not None and not undecided.explains:
+        asked = " or ".join(undecided.names[:3])
+        where.append(f"likelier with {asked}, which would explain none of it")
+    elif undecided is not None:
         fraction = max(fraction, undecided.share)
         several = " and other shapes" if len(undecided.names) == 1 else ""
         they = f"{' or '.join(undecided.names[:3])}{several} explain"
@@ -263,9 +267,10 @@ def _follows(
         return []
     read = variables(problem, point, usable_columns(problem.model, problem.runs))
     read = [v for v in read if in_time or not v.clock]
-    found = [
-        s for s in structures(clipped, read) if s.p_value < LEVELS.misfit and s.share > LEVELS.share
-    ]
+    rows = sum(map(len, problem.runs))
+    table = rows < TABLE and all(run.time is None for run in problem.runs)
+    every = structures(clipped, read, table=table)
+    found = [s for s in every if s.p_value < LEVELS.misfit and s.share > LEVELS.share]
     if not found:
         return []
     best = max(found, key=lambda s: s.share)

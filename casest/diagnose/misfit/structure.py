@@ -16,8 +16,10 @@ from casest.declaration.shapes import Array
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.misfit.variables import Variable
 
-#: Means at least, and rows in each.
+#: Means at least, and rows in each of a series, whose noise may have a colour.
 FEWEST, SHORTEST = 8, 4
+#: Rows of a table at least, each of which is measured by itself.
+FEW_ROWS = 12
 
 
 @dataclass(frozen=True)
@@ -29,24 +31,31 @@ class Structure:
     p_value: float
 
 
-def structures(residuals: Sequence[Array], variables: Sequence[Variable]) -> list[Structure]:
-    """Of every variable, the least likely first; residuals (N, m) of each run, clipped."""
+def structures(
+    residuals: Sequence[Array], variables: Sequence[Variable], *, table: bool = False
+) -> list[Structure]:
+    """Of every variable, the least likely first; residuals (N, m) of each run, clipped.
+
+    Rows of a `table` are looked at one by one: means of so few blocks are never unlikely.
+    """
     r = np.concatenate(residuals)
     found = []
     for variable in variables:
         x = np.concatenate(variable.values)
         if variable.turns:
             x = np.mod(x, 2 * np.pi)
-        found.append(_structure(variable.name, r[np.argsort(x, kind="stable")], len(variables)))
+        ordered = r[np.argsort(x, kind="stable")]
+        found.append(_structure(variable.name, ordered, len(variables), table))
     return sorted((f for f in found if f is not None), key=lambda f: f.p_value)
 
 
-def _structure(name: str, r: Array, tried: int) -> Structure | None:
+def _structure(name: str, r: Array, tried: int, table: bool) -> Structure | None:
     from scipy.special import ndtr
 
-    size = max(min(LEVELS.block, len(r) // FEWEST), len(r) // LEVELS.blocks)
-    count = len(r) // size if size >= SHORTEST else 0
-    if count < FEWEST:
+    rows, fewest, shortest = (1, FEW_ROWS, 1) if table else (LEVELS.block, FEWEST, SHORTEST)
+    size = max(min(rows, len(r) // fewest), len(r) // LEVELS.blocks)
+    count = len(r) // size if size >= shortest else 0
+    if count < fewest:
         return None
     means = r[: count * size].reshape(count, size, -1).mean(axis=1)
     steps = np.mean(np.diff(means, axis=0) ** 2, axis=0) / 2

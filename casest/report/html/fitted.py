@@ -231,7 +231,7 @@ def _noise(result: Fitted) -> Iterator[str]:
     if residuals.correlated_over > 1:
         yield (
             f"Residuals are correlated over {number(residuals.correlated_over)} samples; standard "
-            "deviations come from batches of samples."
+            "deviations allow for that."
         )
     if isinstance(noise, NoiseModel) and noise.outlier_share:
         yield f"Outliers: {noise.outlier_share:.2%} of the samples."
