@@ -73,3 +73,37 @@ def test_few_rows_say_nothing():
     x = np.random.default_rng(7).uniform(0, 1, 32)
     assert of(10 * x[:31], x=x[:31]) == []
     assert len(of(10 * x, x=x)) == 1
+
+
+def of_table(r, x):
+    read = [Variable("place", (np.arange(len(r), dtype=float),), clock=True), Variable("x", (x,))]
+    return structures([np.reshape(r, (len(r), 1))], read, table=True)
+
+
+def beside_a_line(x, r):
+    """What a straight line leaves of it, the largest counted as less, as a fit does."""
+    left = r - np.polyval(np.polyfit(x, r, 1), x)
+    far = 3.5 * 1.4826 * np.median(np.abs(left))
+    return np.clip(left, -far, far)
+
+
+@pytest.mark.parametrize("rows", [40, 94, 200])
+def test_a_bend_is_seen_in_a_table_of_any_length(rows):
+    """Means of eight blocks were never unlikely enough: a bend without noise was called noise."""
+    x = np.linspace(0, 1, rows)
+    assert of_table(beside_a_line(x, np.sin(5 * x)), x)[0].p_value < LEVELS.misfit
+
+
+@pytest.mark.parametrize("rows", [12, 20, 60, 300])
+def test_noise_of_a_table_follows_nothing_whatever_its_tails_and_where_it_is_larger(rows):
+    rng, alarms = np.random.default_rng(rows), 0
+    for k in range(3000):
+        x = np.sort(rng.uniform(0.1, 3, rows))
+        noise = rng.standard_t(3, rows) if k % 2 else rng.standard_normal(rows)
+        left = beside_a_line(x, noise * (x if k % 3 else 1.0))
+        alarms += of_table(left, x)[0].p_value < LEVELS.misfit
+    assert alarms <= stats.binom.ppf(1 - 5e-4, 3000, LEVELS.misfit)
+
+
+def test_five_rows_are_too_few_to_follow_anything():
+    assert not of_table(np.arange(5.0), np.arange(5.0))

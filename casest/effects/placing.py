@@ -12,7 +12,7 @@ from casest.data.run import Run
 from casest.declaration.effect import Attached, Effect
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
-from casest.declaration.symbols import Parameter
+from casest.declaration.symbols import Parameter, Signal
 from casest.effects.lateness import likely_lag
 from casest.errors import CasestError, UnitError
 from casest.units import conversion, known, size
@@ -160,9 +160,12 @@ def angles(model: Model, runs: Sequence[Run]) -> list[str]:
     """
     recorded = [n for n in (runs[0].columns if runs else ()) if _angle(n, runs[0].units.get(n))]
     units = runs[0].units if runs else {}
-    # A body that takes any unit has that of the record.
-    own = [s.name for s in model.signals
-           if s.size == 1 and any(_angle(s.name, u) for u in (s.unit, units.get(s.name)) if u)]  # fmt: skip
+
+    def turns(signal: Signal) -> bool:  # a body that takes any unit has that of the record
+        both = (signal.unit, units.get(signal.name))
+        return signal.size == 1 and any(_angle(signal.name, unit) for unit in both)
+
+    own = [s.name for s in model.signals if turns(s)]
     inner = [n for n, q in model.quantities.items() if not q.dims and _angle(n, q.unit)]
     found = dict.fromkeys([*recorded, *own, *inner])
     return [n for n in found if n != "angle" or n not in model.quantities]

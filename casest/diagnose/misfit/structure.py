@@ -2,7 +2,8 @@
 
 Rows are put in the order of a variable and averaged over blocks; the squared differences of
 neighbouring means against their variance (J. von Neumann, 1941) are 1 on average for what follows
-nothing.
+nothing. Of a table's single rows, whose noise may be larger at one end and have any tails, the
+products of neighbours are summed, against their own squares: that is normal whatever the sizes are.
 """
 
 from __future__ import annotations
@@ -52,14 +53,20 @@ def structures(
 def _structure(name: str, r: Array, tried: int, table: bool) -> Structure | None:
     from scipy.special import ndtr
 
-    rows, fewest, shortest = (1, FEW_ROWS, 1) if table else (LEVELS.block, FEWEST, SHORTEST)
-    size = max(min(rows, len(r) // fewest), len(r) // LEVELS.blocks)
+    fewest, shortest = (FEW_ROWS, 1) if table else (FEWEST, SHORTEST)
+    size = 1 if table else max(min(LEVELS.block, len(r) // fewest), len(r) // LEVELS.blocks)
     count = len(r) // size if size >= shortest else 0
     if count < fewest:
         return None
     means = r[: count * size].reshape(count, size, -1).mean(axis=1)
     steps = np.mean(np.diff(means, axis=0) ** 2, axis=0) / 2
     variance = np.maximum(means.var(axis=0, ddof=1), 1e-300)
-    z = (1 - steps / variance) / np.sqrt((count - 2) / (count**2 - 1.0))
+    if table:
+        products = np.prod(
+            [means[1:] - means.mean(axis=0), means[:-1] - means.mean(axis=0)], axis=0
+        )
+        z = products.sum(axis=0) / np.sqrt(np.maximum((products**2).sum(axis=0), 1e-300))
+    else:
+        z = (1 - steps / variance) / np.sqrt((count - 2) / (count**2 - 1.0))
     share = float(np.maximum(variance - steps, 0).sum() / max(r.var(axis=0).sum(), 1e-300))
     return Structure(name, share, float(min(1.0, ndtr(-z.max()) * len(z) * tried)))
