@@ -511,3 +511,27 @@ def test_memory_does_not_grow_with_the_number_of_samples():
         peak = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
         assert peak < 20e6  # bytes; the samples are 80 MB
+
+
+def test_replays_that_are_kept_share_one_bound_of_memory():
+    """Whoever keeps many models keeps their instructions, not a block of samples of each."""
+    from casest.engine import replay as module
+
+    x = ca.SX.sym("x", 3)
+    samples = np.random.default_rng(0).normal(size=(module.BLOCK, 3))
+
+    def of(k):
+        outputs = [ca.vertcat(*[ca.sin(x * j + k) for j in range(40)])]
+        function = ca.Function("f", [ca.SX.sym("p", 0), x], outputs, ["parameters", "sample"], ["o"])
+        return Replay(function)
+
+    kept = [of(k) for k in range(40)]
+    first = kept[0](np.zeros(0), samples)[0]
+    for each in kept:
+        each(np.zeros(0), samples)
+    plans = [p for each in kept for p in each._plans.values()]
+    waiting = [w for p in plans for w in p._idle]
+    assert sum(w.n_bytes for w in waiting) <= module.IDLE_BYTES
+    assert 0 < len(waiting) < len(plans)  # without the bound 340 MB
+    assert plans[-1]._idle  # what was used last is used again
+    np.testing.assert_array_equal(kept[0](np.zeros(0), samples)[0], first)

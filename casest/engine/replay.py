@@ -11,9 +11,12 @@ The way down: `Replay` (what users hold) > `Plan` (which values to compute, and 
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Callable, Collection, Iterator, Sequence
 from functools import wraps
+from threading import Lock
 from typing import Any, TypeVar
+from weakref import ref
 
 import numpy as np
 from numpy.typing import NDArray
@@ -137,6 +140,7 @@ class Plan:
                 yield span, workspace.run(samples[span])
         finally:
             self._idle[:] = [workspace]
+            _keep(workspace)
 
     def _take(self, length: int) -> _Workspace:
         # Taken off the list while in use, so that interleaved iterations do not share a buffer.
@@ -145,6 +149,48 @@ class Plan:
             if workspace.length == length:
                 return workspace
         return _Workspace(self, length)
+
+    def forget(self, workspace: _Workspace) -> None:
+        """Let go of a workspace that waits for another call; one in use is not among them."""
+        self._idle[:] = [kept for kept in self._idle if kept is not workspace]
+
+
+#: Bytes of all workspaces that wait for another call, of whatever plans.
+IDLE_BYTES = 128 * 2**20
+#: Those that wait, by their identity, the one used longest ago first; and a bound on their bytes.
+_waiting: OrderedDict[int, ref[_Workspace]] = OrderedDict()
+_counted = 0
+_lock = Lock()
+
+
+def _keep(workspace: _Workspace) -> None:
+    """Count a workspace among those that wait; beyond `IDLE_BYTES` the oldest go.
+
+    A closed loop makes a plan for each cause that it tries, and whatever keeps such a model would
+    keep its blocks of samples. Referred to weakly: a workspace still goes when its plan goes.
+    """
+    global _counted
+    with _lock:
+        found = _waiting.get(id(workspace))
+        if found is not None and found() is workspace:
+            _waiting.move_to_end(id(workspace))
+            return
+        _waiting[id(workspace)] = ref(workspace)
+        _waiting.move_to_end(id(workspace))
+        _counted += workspace.n_bytes
+        if _counted <= IDLE_BYTES:
+            return
+        # Counted again only here, so that a call costs one look: some have gone with their plans.
+        alive = [(key, kept) for key, r in _waiting.items() if (kept := r()) is not None]
+        _counted = sum(kept.n_bytes for _, kept in alive)
+        _waiting.clear()
+        for k, (key, kept) in enumerate(alive):
+            # To half, so that the next ones need not count again; the newest stays in any case.
+            if _counted > IDLE_BYTES // 2 and k < len(alive) - 1:
+                kept.plan.forget(kept)
+                _counted -= kept.n_bytes
+            else:
+                _waiting[key] = ref(kept)
 
 
 class _Workspace:
@@ -159,6 +205,7 @@ class _Workspace:
         self._inputs = aligned(len(plan.inputs), length)
         self._registers = aligned(plan.n_registers, length)
         self._bound: dict[int, list[tuple[Kernel, tuple[Floats, ...]]]] = {}
+        self.n_bytes = self._results.nbytes + self._inputs.nbytes + self._registers.nbytes
 
     def set_parameters(self, parameters: Floats) -> None:
         """Evaluate once what does not depend on the sample."""
