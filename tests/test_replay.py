@@ -521,8 +521,9 @@ def test_replays_that_are_kept_share_one_bound_of_memory():
     samples = np.random.default_rng(0).normal(size=(module.BLOCK, 3))
 
     def of(k):
-        outputs = [ca.vertcat(*[ca.sin(x * j + k) for j in range(40)])]
-        function = ca.Function("f", [ca.SX.sym("p", 0), x], outputs, ["parameters", "sample"], ["o"])
+        outputs = [ca.vertcat(*[ca.sin(x * j + k) for j in range(100)])]
+        names = ["parameters", "sample"], ["values"]
+        function = ca.Function("f", [ca.SX.sym("p", 0), x], outputs, *names)
         return Replay(function)
 
     kept = [of(k) for k in range(40)]
@@ -532,6 +533,8 @@ def test_replays_that_are_kept_share_one_bound_of_memory():
     plans = [p for each in kept for p in each._plans.values()]
     waiting = [w for p in plans for w in p._idle]
     assert sum(w.n_bytes for w in waiting) <= module.IDLE_BYTES
-    assert 0 < len(waiting) < len(plans)  # without the bound 340 MB
+    one = plans[-1]._idle[0].n_bytes
+    assert one * len(plans) > 2 * module.IDLE_BYTES  # what they would keep without it
+    assert 0 < len(waiting) < len(plans)
     assert plans[-1]._idle  # what was used last is used again
     np.testing.assert_array_equal(kept[0](np.zeros(0), samples)[0], first)
