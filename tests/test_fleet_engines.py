@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import sys
 from pathlib import Path
 
 import fleets
@@ -59,7 +60,10 @@ def same_as_in_memory(v, found):
     assert [offsets[name] for name in fleets.names(len(v))] == direct.tolist()
 
 
-def test_spark_calls_it(tmp_path):
+# Warnings of these engines about themselves are theirs.
+@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::ResourceWarning")
+def test_spark_calls_it(tmp_path, monkeypatch):
+    monkeypatch.setenv("PYSPARK_PYTHON", sys.executable)  # its workers need casest too
     sql = pytest.importorskip("pyspark.sql", reason="Spark is not installed")
     v = fleets.readings(40)
     pq.write_table(fleets.wide(v, fleets.names(40)), tmp_path / "line.parquet")
@@ -70,6 +74,7 @@ def test_spark_calls_it(tmp_path):
     spark.stop()
 
 
+@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::ResourceWarning")
 def test_ray_calls_it(tmp_path):
     ray = pytest.importorskip("ray", reason="Ray is not installed")
     data = pytest.importorskip("ray.data", reason="Ray is not installed")
