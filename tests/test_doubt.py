@@ -52,11 +52,6 @@ def test_an_undeclared_effect_is_seen_and_where():
     assert found[0].p_value < 0.0025
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="nothing is asked of fewer than 160 rows: means of 20 rows, eight of them at least; the "
-    "pressures come again eight times, but not one after the other, which alone counts as repeats",
-)
 @pytest.mark.parametrize("order", [None, 5])
 def test_a_temperature_that_moves_a_sensor_by_a_hundred_deviations_is_a_doubt(order):
     """As `close` says of it, which finds both effects."""

@@ -273,7 +273,9 @@ def _follows(
     found = [s for s in every if s.p_value < LEVELS.misfit and s.share > LEVELS.share]
     if not found:
         return []
-    best = max(found, key=lambda s: s.share)
+    # In the order of the record lies whatever was changed with it: what has a name comes first.
+    clocks = {v.name for v in read if v.clock}
+    best = max(found, key=lambda s: (round(s.share, 2), s.name not in clocks))
     where = f"{100 * best.share:.0f} % of it follows {best.name}"
     left = sigma * float(np.sqrt(1 - min(best.share, 1)))
     return [Finding(where, best.p_value, left, best.share)]
