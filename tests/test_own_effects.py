@@ -11,6 +11,7 @@ from casest import (
     DeclarationError,
     Residual,
     Run,
+    UsageError,
     close,
     constant,
     effect,
@@ -21,8 +22,18 @@ from casest import (
     signal,
 )
 from casest.diagnose.candidates.candidates import candidates
-from casest.effects import bias_course, harmonic, pulse, warm_up
-from casest.effects.placing import prepared
+from casest.effects import (
+    bias_course,
+    bias_drift,
+    harmonic,
+    pulse,
+    quadratic,
+    second_harmonic,
+    time_delay,
+    warm_up,
+)
+from casest.effects.placing import placed_in, prepared
+from casest.results.find import find_model
 
 
 @model
@@ -102,6 +113,32 @@ def test_a_reading_is_no_angle_that_its_own_error_could_go_with():
     )
     found, _ = candidates(encoder, prepared(encoder, [run]), [harmonic])
     assert [c.label for c in found] == ["harmonic(shaft)"]
+
+
+def test_an_angle_that_a_model_of_any_unit_reads_has_harmonics_by_the_unit_of_the_record():
+    """A resolver against an encoder: its error goes round once or twice with the very reference."""
+    linear = find_model("linear")
+    rng = np.random.default_rng(2)
+    turn = rng.uniform(0, 360, (400, 1))
+    told = turn + 1.7 * np.sin(2 * np.deg2rad(turn) + 0.4) + 0.02 * rng.standard_normal((400, 1))
+    for unit, known in (("deg", ["harmonic(reference)"]), ("mV", [])):
+        run = Run.raw("r", {"reference": turn, "reading": told}, units={"reference": unit})
+        found, _ = candidates(linear, prepared(linear, [run]), [harmonic])
+        assert [c.label for c in found] == known
+    run = Run.raw(
+        "r", {"reference": turn, "reading": told}, units=dict.fromkeys(run.signals, "deg")
+    )
+    closing = close(linear, [run], catalogue=(harmonic, second_harmonic, quadratic))
+    assert [e.candidate.label for e in closing.effects] == ["second_harmonic(reference)"]
+    size = [closing.after.values[f"second_harmonic(reference).{n}"] for n in ("cosine", "sine")]
+    assert np.hypot(*size) == pytest.approx(1.7, rel=0.01)
+
+
+def test_a_clock_that_another_effect_alone_reads_cannot_be_late():
+    """Were that effect taken out again, it would be late of nothing: an internal error."""
+    drifting = placed_in(bias_drift, cell)
+    with pytest.raises(UsageError, match="it acts on 't'"):
+        cell.with_effect(drifting).with_effect(time_delay)
 
 
 def test_a_harmonic_of_a_column_without_a_unit_is_not_tried_and_says_why():

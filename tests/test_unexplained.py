@@ -7,7 +7,11 @@ import json
 import numpy as np
 import pytest
 
+from casest import Residual, Run, model, param, quantity, signal
 from casest.cli import run
+from casest.diagnose.found import Undecided
+from casest.diagnose.misfit.left import left_over
+from casest.leastsquares.problem import Problem
 
 REST = """
 import casest as c
@@ -27,6 +31,18 @@ def compass(b=c.signal(3, "uT"), m=c.signal(3, "uT"), *, hard=c.param(3, "uT")):
     reading = c.quantity("reading", field + hard, "uT")
     return c.Residual(measured=m, predicted=reading, corrected=field)
 """
+
+
+@model
+def resting(v=signal(3, "m/s^2"), *, bias=param(3, "m/s^2")):
+    """A sensor at rest."""
+    return Residual(measured=v, predicted=quantity("reading", bias, "m/s^2"))
+
+
+def still():
+    """300 readings of white noise."""
+    v = 0.02 * np.random.default_rng(3).standard_normal((300, 3))
+    return Run.raw("still", {"v": v - v.mean(axis=0)}, units={}, time=0.1 * np.arange(300.0))
 
 
 def closed(folder, model, columns, *values):
@@ -93,3 +109,18 @@ def test_a_slow_course_is_said_to_be_of_the_reference_or_of_the_offset(
     assert result["verdict"] == "unexplained"
     assert result["unexplained"]["described_by"] == [name]
     assert f"its slow course is best described by {name} ({words}" in result["unexplained"]["where"]
+
+
+def test_causes_that_explain_nothing_are_not_said_to_explain_alike():
+    """A likelihood may ask for what takes nothing away: that is said, and no more."""
+    names = ("vibration", "hysteresis")
+    assert not Undecided(names, 0.001).explains
+    assert Undecided(names, 0.02).explains
+    assert Undecided(names, 0.001, {"vibration": {"bias": np.ones(3)}}).explains
+    problem = Problem(resting, (still(),))
+    batches = [np.arange(0, 300, 30)]
+    left = left_over(problem, problem.start(), batches, problem.residuals(problem.start()),
+                     undecided=Undecided(names, 0.001))  # fmt: skip
+    assert left.significant
+    assert "likelier with vibration or hysteresis, which would explain none of it" in left.where
+    assert "alike" not in left.where
