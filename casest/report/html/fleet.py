@@ -64,7 +64,7 @@ def _yield(result: FleetResult, drawn: Drawn, figures: Figures) -> str:
 
 
 def _misfit(drawn: Drawn, figures: Figures) -> str:
-    """Chances of the largest residual: of sound sensors they are nearly even."""
+    """Chances of the largest residual: of sound sensors nearly even, but for those that are one."""
     chance = drawn.misfit[np.isfinite(drawn.misfit)]
     if not chance.size:
         return ""
@@ -78,7 +78,8 @@ def _misfit(drawn: Drawn, figures: Figures) -> str:
     )
     few = 100 * float(np.mean(chance < 0.001))
     text = (
-        f"Of sound sensors nearly even; {few:.2g} % lie below 0.001, where noise puts 0.1 %. "
+        "Of sound sensors nearly even but for the last bar: a chance shared among all residuals of "
+        f"a sensor is one at most. {few:.2g} % lie below 0.001, where noise puts 0.1 %. "
         "A peak at the left: poses that were knocked, levels misread, an effect that is missing."
     )
     return figures.add("misfit", ("The largest residual of each sensor.", text), [drawn_panel])
