@@ -8,7 +8,9 @@ that nothing is written, and no success reported, after it was pressed.
 
 from __future__ import annotations
 
+import os
 import signal
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -56,6 +58,21 @@ def remember() -> None:
     """
     if callable(signal.getsignal(signal.SIGINT)):  # else started with Ctrl-C switched off
         signal.signal(signal.SIGINT, _interrupt)
+        sys.unraisablehook = _again
+
+
+def _again(lost: sys.UnraisableHookArgs) -> None:
+    """Where Python can only drop an exception (a finaliser, a weak reference), Ctrl-C is repeated.
+
+    A moment later: raised in this very function it would be dropped once more.
+    """
+    if not isinstance(lost.exc_value, KeyboardInterrupt):
+        sys.__unraisablehook__(lost)
+        return
+    signal.signal(signal.SIGINT, _interrupt)
+    repeat = threading.Timer(0.01, os.kill, (os.getpid(), signal.SIGINT))
+    repeat.daemon = True
+    repeat.start()
 
 
 def _interrupt(_number: int, _frame: Any) -> None:

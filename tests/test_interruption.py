@@ -121,6 +121,22 @@ def test_a_ctrl_c_that_a_model_swallows_still_writes_nothing(tmp_path):
     assert not list((tmp_path / "o").glob("*"))
 
 
+def test_a_ctrl_c_that_python_itself_drops_is_repeated(tmp_path):
+    """Where a weak reference dies Python prints an exception and goes on: here for a minute."""
+    path = tmp_path / "dropped.py"
+    path.write_text(
+        "import os, signal as signals, time, weakref\n"
+        "class Thing: pass\n"
+        "thing = Thing()\n"
+        "kept = weakref.ref(thing, lambda _: os.kill(os.getpid(), signals.SIGINT))\n"
+        "del thing\n"
+        "time.sleep(60)\n"
+    )
+    with started("calibrate", str(path), str(WHEEL), "-o", str(tmp_path / "o")) as process:
+        _, said = process.communicate(timeout=30)
+    assert (process.returncode, said.strip()) == (130, SAID)
+
+
 # -- from Python -----------------------------------------------------------------------------------
 
 
