@@ -8,7 +8,7 @@ looked at in each of several passes.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -45,7 +45,9 @@ def empty(names: Any) -> NDArray[np.bool_]:
 
     gone = names.is_null()
     if pyarrow.types.is_string(names.type) or pyarrow.types.is_large_string(names.type):
-        blank = pyarrow.compute.equal(pyarrow.compute.utf8_trim_whitespace(names), "")
+        blank = pyarrow.compute.or_(
+            pyarrow.compute.equal(names, ""), pyarrow.compute.utf8_is_space(names)
+        )
         gone = pyarrow.compute.or_(gone, pyarrow.compute.fill_null(blank, True))
     return np.asarray(gone.to_numpy(zero_copy_only=False), dtype=bool)
 
@@ -80,7 +82,9 @@ def numbers_of(names: Any) -> Numbers:
     length = np.diff(bounds)
     place = np.arange(bounds[0], bounds[-1]) - np.repeat(bounds[:-1], length)
     weights = np.random.default_rng(20_24).integers(0, 2**64, LONGEST + 1, dtype=np.uint64)
-    terms = (data[bounds[0] : bounds[-1]].astype(np.uint64) + 1) * weights[place % LONGEST]
+    if length.max(initial=0) > LONGEST:
+        place %= LONGEST
+    terms = (data[bounds[0] : bounds[-1]].astype(np.uint64) + 1) * weights[place]
     total = np.concatenate([np.zeros(1, np.uint64), np.cumsum(terms, dtype=np.uint64)])
     ends = bounds - bounds[0]
     return _mixed(total[ends[1:]] - total[ends[:-1]] + length.astype(np.uint64) * weights[-1])
@@ -115,12 +119,20 @@ def runs(pieces: Iterable[Any]) -> Iterator[Names]:
         row, last = row + len(names), code[-1]
 
 
-def twice(read: Callable[[], Iterator[tuple[int, Names]]], total: int) -> dict[str, list[Any]]:
+def twice(
+    read: Callable[[], Iterator[tuple[int, Names]]],
+    total: int,
+    known: Sequence[Numbers] | None = None,
+) -> dict[str, list[Any]]:
     """Names that are there more than once, each with its places (file's number, row).
 
-    `read` goes through the names of all files, `total` of them, and is called again for each pass.
+    `read` goes through the names of all files, `total` of them, and is called again for each pass;
+    not at all where their numbers are `known` and none occurs twice.
     """
-    alike = np.unique(np.concatenate([_alike(read, k, total) for k in range(_passes(total))]))
+    if known is None:
+        alike = np.unique(np.concatenate([_alike(read, k, total) for k in range(passes(total))]))
+    else:
+        alike = _repeated(known)
     if not alike.size:
         return {}
     places: dict[str, list[Any]] = {}
@@ -131,17 +143,22 @@ def twice(read: Callable[[], Iterator[tuple[int, Names]]], total: int) -> dict[s
     return {name: found for name, found in places.items() if len(found) > 1}
 
 
-def _passes(total: int) -> int:
+def passes(total: int) -> int:
+    """How often so many names are read, so that not too many are sorted at once."""
     return max(1, -(-total // SORTED))
 
 
 def _alike(read: Callable[[], Iterator[tuple[int, Names]]], k: int, total: int) -> Numbers:
     """Numbers that occur more than once, of those that belong to pass k."""
-    passes = np.uint64(_passes(total))
+    parts = np.uint64(passes(total))
     kept = []
     for _, (names, _rows) in read():
         own = numbers_of(names)[~empty(names)]
-        kept.append(own if passes == 1 else own[(own >> np.uint64(1)) % passes == k])
+        kept.append(own if parts == 1 else own[(own >> np.uint64(1)) % parts == k])
+    return _repeated(kept)
+
+
+def _repeated(kept: Sequence[Numbers]) -> Numbers:
     found = np.concatenate(kept) if kept else np.zeros(0, np.uint64)
     found.sort()
     return np.asarray(np.unique(found[1:][found[1:] == found[:-1]]))

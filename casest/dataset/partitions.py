@@ -16,7 +16,7 @@ import numpy as np
 from casest.data.options import Options
 from casest.dataset.files import File, files_of, footer_digest, opened, unreadable
 from casest.dataset.layout import Layout, differing, layout_of
-from casest.dataset.names import MOST, PIECE, Names, empty, plain, runs, twice
+from casest.dataset.names import MOST, PIECE, Names, empty, numbers_of, passes, plain, runs, twice
 from casest.declaration.symbols import Signal
 from casest.errors import DataError
 
@@ -132,9 +132,16 @@ def _named(
 ) -> tuple[list[_Open], list[tuple[str, str]], int, Mapping[str, list[Any]]]:
     """Files whose names can be read, those that cannot, number of sensors, and who is twice."""
     good, bad, total = [], [], 0
+    several = layout.named_by_folder and not layout.wide  # several files of one folder
+    known: list[Any] | None = [] if not several and _few(files) else None
     for own in files:
+        rows, numbers = [], []
         try:
-            rows = [names.rows[~empty(names.names)] for names in _names(own, layout)]
+            for names in _names(own, layout):
+                there = ~empty(names.names)
+                rows.append(names.rows[there])
+                if known is not None:
+                    numbers.append(numbers_of(names.names)[there])
         except Exception as error:  # a damaged file can fail anywhere in the library
             bad.append((own.file.name, str(unreadable(own.file, error))))
             continue
@@ -142,18 +149,20 @@ def _named(
         total += len(begins)
         own.begins = begins if not layout.wide else own.begins
         good.append(own)
+        if known is not None:
+            known += numbers
 
     def read() -> Iterator[tuple[int, Names]]:
         last = None
         for k, own in enumerate(good):
-            if layout.named_by_folder and not layout.wide:  # several files of one folder
+            if several:
                 last, before = own.file.folder_value(layout.sensor), last
                 if last == before:
                     continue
             for names in _names(own, layout):
                 yield k, names
 
-    places = twice(read, total)
+    places = twice(read, total, known)
     if len(places) > MOST:
         name, found = next(iter(places.items()))
         raise DataError(
@@ -162,6 +171,11 @@ def _named(
             "the rows of a sensor stand together; sort them, or name another column with --sensor"
         )
     return good, bad, total, places
+
+
+def _few(files: Sequence[_Open]) -> bool:
+    """Can the names of all rows be held and sorted at once?"""
+    return passes(sum(own.groups[-1] for own in files)) == 1
 
 
 def _names(own: _Open, layout: Layout) -> Iterator[Names]:

@@ -320,12 +320,16 @@ class Squares:
         for span, s, values in self._residual.chunks(x, sensors):
             square, own = np.einsum("mps,mps->ps", values, values), np.arange(values.shape[2])
             total[s] += square.sum(axis=0)
-            sizes, samples = [*best[:, s]], [*places[:, s]]
+            sizes, samples = [], []
             for _ in range(min(2, len(square))):
                 k = square.argmax(axis=0)
                 sizes.append(square[k, own])
                 samples.append(k + span.start)
                 square[k, own] = -1.0
+            if span.start == 0:
+                best[: len(sizes), s], places[: len(sizes), s] = sizes, samples
+                continue
+            sizes, samples = [*best[:, s], *sizes], [*places[:, s], *samples]
             order = np.argsort(sizes, axis=0, kind="stable")[-1:-3:-1]
             best[:, s] = np.take_along_axis(np.array(sizes), order, axis=0)
             places[:, s] = np.take_along_axis(np.array(samples), order, axis=0)

@@ -17,10 +17,10 @@ from casest.tasks.job import Job
 class Rows:
     """Room for the rows of S sensors, filled group by group; unknown numbers are null."""
 
-    def __init__(self, model: Model, size: int) -> None:
+    def __init__(self, model: Model, size: int, covariance: bool) -> None:
         n = sum(p.shape.size for p in model.parameters)
         self.x, self.std = np.full((2, n, size), np.nan)
-        self.covariance = np.full((n * (n + 1) // 2, size), np.nan)
+        self.covariance = np.full((n * (n + 1) // 2, size), np.nan) if covariance else None
         self.rms, self.misfit, self.variance = np.full((3, size), np.nan)
         self.trusted = np.zeros(size, bool)
         self.reasons: dict[int, str] = {}
@@ -34,7 +34,8 @@ class Rows:
             entry: Any = (slice(None), *index)
             self.x[k, places] = batch.values[name][entry]
             self.std[k, places] = batch.std[name][entry]
-        self.covariance[:, places] = batch.covariance[:, self._lower[0], self._lower[1]].T
+        if self.covariance is not None:
+            self.covariance[:, places] = batch.covariance[:, self._lower[0], self._lower[1]].T
         self.rms[places], self.variance[places] = batch.rmse, batch.sigma**2
         self.misfit[places] = np.nan if batch.misfit is None else batch.misfit
         self.trusted[places] = batch.trusted
@@ -92,7 +93,7 @@ def record_batch(job: Job, block: Block, rows: Rows, chosen: Any, form: Any) -> 
     columns: list[Any] = [block.names.take(pyarrow.array(chosen))]
     for x, std in zip(rows.x, rows.std, strict=True):
         columns += [numbers(x), numbers(std)]
-    if job.covariance:
+    if rows.covariance is not None:
         flat = pyarrow.array(np.ascontiguousarray(rows.covariance[:, chosen].T).ravel())
         gone, size = pyarrow.array(~trusted), len(rows.covariance)
         columns.append(pyarrow.FixedSizeListArray.from_arrays(flat, size, mask=gone))

@@ -70,7 +70,7 @@ def calibrated(
 ) -> None:
     """Calibrate a block, write its rows, count."""
     signals = bound(block, job.layout, job.model.in_records, job.options)
-    rows = Rows(job.model, len(block.counts))
+    rows = Rows(job.model, len(block.counts), job.covariance)
     chosen = _named(block, twice, tally)
     ends = np.concatenate([[0], np.cumsum(block.counts)])
     usable = np.setdiff1d(chosen, np.array([*block.bad], dtype=int))
