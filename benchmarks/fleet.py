@@ -5,7 +5,9 @@ A data set is written first, 100 000 sensors in a file. Then in turns, seconds o
 that other work on the machine counts less): `calibrate_many` on arrays, with and without `misfit`,
 and the command from Parquet to Parquet in a process of its own, whose start is counted; its largest
 memory; and what two processes take together, beside two commands at the same time with half of the
-files each. Last, what a sensor costs whose readings are sent to a
+files each. The machine's speed changes from minute to minute; so what the command spends is also
+compared within its own process with `calibrate_many` of the same readings, called once more without
+`misfit` and taken off again. Last, what a sensor costs whose readings are sent to a
 Dask worker rather than read by it.
 """
 
@@ -37,6 +39,28 @@ from casest.fleet.calibrate_many import calibrate_many
 
 EACH, TURNS, ROWS = 100_000, 3, 50_000
 CODE = "import sys; from casest.cli import main; main(sys.argv[1:])"
+#: The same in one process; prints seconds of the processor: without and with `misfit` in
+#: `calibrate_many`, and all that the command spends.
+WITHIN = """
+import contextlib, io, sys
+from time import process_time
+from casest.cli import run
+from casest.tasks import task
+calibrate, spent = task.calibrate_many, [0.0, 0.0]
+def timed(*given, misfit, **how):
+    moments = [process_time()]
+    for asked in (False, misfit):
+        found = calibrate(*given, misfit=asked, **how)
+        moments.append(process_time())
+    for k in range(2):
+        spent[k] += moments[k + 1] - moments[k]
+    return found
+task.calibrate_many = timed
+with contextlib.redirect_stdout(io.StringIO()):
+    code = run(sys.argv[1:])
+print(*spent, process_time() - spent[0])
+sys.exit(code)
+"""
 
 
 def table(v: Any, first: int) -> Any:
@@ -82,6 +106,16 @@ def commands(
     after, took = resource.getrusage(resource.RUSAGE_CHILDREN), perf_counter() - began
     spent = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
     return spent, took, most
+
+
+def within(dataset: Path, out: Path) -> tuple[float, float]:
+    """Shares of what the command spends that `calibrate_many` takes, without and with `misfit`."""
+    shutil.rmtree(out, ignore_errors=True)
+    words = ["fleet", "norm-triangular", dataset, "-o", out, "--set", f"norm={GRAVITY} m/s^2"]
+    argv = [sys.executable, "-c", WITHIN, *map(str, words), "--processes", "1"]
+    said = subprocess.run(argv, check=True, capture_output=True, text=True).stdout
+    plain, asked, all_of_it = map(float, said.split())
+    return plain / all_of_it, asked / all_of_it
 
 
 def halves(dataset: Path) -> list[Path]:
@@ -158,6 +192,8 @@ def main() -> None:
                 f"it; {took:.1f} s, {memory:.0f} MB",
                 flush=True,
             )
+            shares = within(dataset, out)
+            print(f"  within one process: {shares[0]:.2f} and {shares[1]:.2f} of it", flush=True)
             if size > EACH:
                 one = spent
                 spent, took, memory = command(dataset, out, 2)

@@ -17,7 +17,7 @@ MODELS = str(ROOT / "studies" / "record_models.py")
 
 #: Kinds of names that say the same of a record.
 LAG = frozenset({"time_delay", "signal_lag", "axis_delay"})
-SKEW = frozenset({"cross_axis", "soft_iron"})
+SKEW = frozenset({"cross_axis", "soft_iron", "gain_matrix"})
 IRON = SKEW | {"axis_gain", "table_angle"}
 MEMORY = frozenset({"low_pass", "creep", "hysteresis"}) | LAG
 SLOW = frozenset({"bias_drift", "bias_course", "warm_up", "bias_step", "pulse"})

@@ -420,7 +420,7 @@ def test_effects_of_time_and_of_single_inputs_fit_a_model_of_one_axis():
             fits.add(effect.name)
         except CasestError:
             continue
-    three = {"cross_axis", "soft_iron", "cross_quadratic", "g_sensitivity"}
+    three = {"cross_axis", "soft_iron", "gain_matrix", "cross_quadratic", "g_sensitivity"}
     wheels = {"imbalance", "speed_polynomial", "table_angle", "lever_arm"}
     rates = {e.name for e in effects.CATALOGUE if e.on == RATES}  # of differential equations
     recorded = {"signal_lag"}  # of a signal besides the time and what is measured: there is none

@@ -63,7 +63,7 @@ def test_an_effect_that_no_sensor_shows_is_named_by_three_thousand(tmp_path, cap
         assert abs(value) < 0.25 * std * np.sqrt(count)  # what one sensor shows of it
     assert effect["sigma_after"] < effect["sigma_before"]
     assert effect["sigma_after"] == pytest.approx(fleets.SIGMA, rel=0.01)
-    assert {"soft_iron", "cross_axis"} <= set(found["invisible"])
+    assert {"gain_matrix", "cross_axis"} <= set(found["invisible"])
 
 
 def test_one_such_sensor_alone_shows_nothing():
@@ -201,7 +201,7 @@ def test_an_effect_that_differs_from_sensor_to_sensor_is_named(tmp_path, capsys,
     assert [e["name"] for e in found["effects"]] == (["cubic"] if common else [])
     assert "cubic" in {found["own"]["name"], *found["own"]["indistinguishable_from"]}
     assert found["own"]["name"] == "cubic" or not common
-    assert not {"axis_gain", "soft_iron"} & set(found["own"]["indistinguishable_from"])
+    assert not {"axis_gain", "gain_matrix"} & set(found["own"]["indistinguishable_from"])
     # what is left is the noise that was put in, when each has its own
     assert found["own"]["sigma_after"] == pytest.approx(fleets.SIGMA, rel=0.01)
     assert found["own"]["sigma_before"] > 1.02 * fleets.SIGMA

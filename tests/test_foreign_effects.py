@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from casest import Residual, Run, close, model, param, quantity, signal
-from casest.effects import creep, hysteresis
+from casest.effects import creep, gain_matrix, hysteresis, low_pass, soft_iron
+from casest.effects.kinds import foreign
 
 
 def one_channel(unit):
@@ -63,3 +64,42 @@ def test_it_is_tried_where_the_user_says_that_it_is_there():
 def test_a_gyroscope_has_no_hysteresis_and_a_magnetometer_may():
     reasons = {unit: {s.name for s in closed(unit, hysteresis).skipped} for unit in ("deg/s", "uT")}
     assert reasons == {"deg/s": {"hysteresis"}, "uT": set()}
+
+
+# -- what only sensors of a kind have -------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("units", "creeps"),
+    [(["uT"], False), (["uT", "deg/s"], False), (["uT", "K"], True), ([None], True), ([], True)],
+)
+def test_what_is_foreign_to_some_readings_may_be_of_the_others(units, creeps):
+    assert (foreign(creep, units) == "") is creeps
+
+
+@pytest.mark.parametrize(
+    ("units", "iron"), [(["gauss"], True), (["m/s^2"], False), (["count"], False), ([None], False)]
+)
+def test_iron_bends_fields_alone_and_elsewhere_it_is_a_matrix_of_gains(units, iron):
+    assert (foreign(soft_iron, units) == "") is iron
+    assert (foreign(gain_matrix, units) == "") is not iron
+
+
+# -- what a memory began from ----------------------------------------------------------------------
+
+
+def warming(odd, rows):
+    """A thermometer on a bath that warms evenly, whose first reading is off by `odd`."""
+    rng, t = np.random.default_rng(1), 20.0 * np.arange(rows)
+    x = 20 + 0.01 * t
+    y = 0.5 + 1.01 * x + 0.01 * rng.standard_normal(rows)
+    y[0] += odd
+    signals = {"x": x[:, None], "y": y[:, None]}
+    return Run.raw("r", signals, units={"x": "degC", "y": "degC"}, time=t)
+
+
+@pytest.mark.parametrize(("odd", "rows"), [(0.08, 35), (0.08, 60), (0.2, 60), (0.2, 120)])
+def test_one_odd_reading_at_the_beginning_is_no_lag(odd, rows):
+    """Behind an even rise a lag, which begins at rest, is an offset of all but the first row."""
+    found = close(one_channel("degC"), [warming(odd, rows)], catalogue=(low_pass, creep))
+    assert not names(found)

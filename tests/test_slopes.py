@@ -79,13 +79,19 @@ def by_differences(candidate: Candidate, runs, size):
 
 
 def test_the_slopes_of_every_candidate_are_those_of_the_residual(runs):
-    """All of the catalogue that applies, also what acts on the sequence of samples."""
+    """All of the catalogue that applies, also what acts on the sequence of samples.
+
+    What that began from is no evidence: the first row of a run is given the slopes of the second.
+    """
     problem = Problem(cell, runs)
     point, listed = problem.point(VALUES), list(found_on(runs))
     seen, wrong = set(), []
     with np.errstate(all="ignore"):
         for candidate, columns in slopes(problem, point, listed, rows_of(runs, 10**6)):
             expected = by_differences(candidate, runs, 1e-6)
+            if candidate.effect is not None and candidate.effect.kind == "sequence":
+                for first in (0, 150):
+                    expected[first] = expected[first + 1]
             away = np.abs(columns - expected).max() / (np.abs(expected).max() + 1e-9)
             wrong += [(candidate.label, away)] if not away < 1e-4 else []
             seen.add(candidate.name)

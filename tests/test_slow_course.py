@@ -95,6 +95,53 @@ def test_the_prompt_says_how_much_of_the_residual_it_is_and_over_how_long(tmp_pa
     assert "nothing in the residual speaks against the model" not in said
 
 
+@model
+def probe(reference=signal("K"), y=signal("K"), *, gain=param(start=1.0), zero=param("K")):
+    """A thermometer that is compared with another one."""
+    return Residual(measured=y, predicted=quantity("reading", zero + gain * reference, "K"))
+
+
+def short_record(rows, seed, misfit):
+    """So many readings of a bath that goes up and down: noise of 0.1 K, and a misfit."""
+    rng, s = np.random.default_rng([rows, seed, 11]), np.linspace(0, 1, rows)
+    bath = 20 + 15 * np.sin(2 * np.pi * 1.7 * s) + 5 * np.sin(2 * np.pi * 4.1 * s)
+    y = 1.02 * bath - 0.4 + misfit(s) + 0.1 * rng.standard_normal(rows)
+    signals = {"reference": bath[:, None], "y": y[:, None]}
+    return Run.raw("bath", signals, units={"reference": "K", "y": "K"}, time=10.0 * np.arange(rows))
+
+
+def wave(s):
+    return 0.3 * np.sin(2 * np.pi * 2.3 * s)
+
+
+def bump(s):
+    return np.exp(-(((s - 0.6) / 0.1) ** 2))
+
+
+@pytest.mark.parametrize(
+    ("rows", "misfit"),
+    [*((n, wave) for n in (40, 60, 99, 100, 130, 220)), *((n, bump) for n in (60, 99, 100, 220))],
+)
+def test_a_plain_misfit_of_a_short_series_is_seen(rows, misfit):
+    """Eight means, or none, were never unlikely enough. (Of a bump in forty rows ten say so.)"""
+    for seed in range(3):
+        assert doubts(attempt(probe, [short_record(rows, seed, misfit)]))
+
+
+@pytest.mark.parametrize("rows", [40, 99, 100, 220])
+def test_a_short_series_without_one_leaves_noise(rows):
+    """Each question has a chance of 0.001, and there are five at most."""
+    none = [bool(doubts(attempt(probe, [short_record(rows, s, np.zeros_like)]))) for s in range(60)]
+    assert sum(none) <= 3
+
+
+@pytest.mark.parametrize("rows", [100, 160, 220])
+def test_colour_over_a_fiftieth_of_a_short_series_is_no_slow_course(rows):
+    kept = np.exp(-48 / rows)
+    alarms = sum(seen(filtered([1], [1, -kept], [s, rows], rows)) for s in range(400))
+    assert alarms <= 4
+
+
 # -- its size --------------------------------------------------------------------------------------
 
 

@@ -20,6 +20,7 @@ def fleet_closing(model_name: str, data: Sequence[str], options: CloseOptions) -
     from casest.cli.fleets import FleetOptions, planned
     from casest.diagnose.levels import LEVELS
     from casest.effects import CATALOGUE
+    from casest.effects.kinds import foreign, readings
     from casest.fleet.calibrate_many import refuse_equations
     from casest.fleet.common import CHANCE
     from casest.report.html.common import PAGE, common_page
@@ -44,7 +45,9 @@ def fleet_closing(model_name: str, data: Sequence[str], options: CloseOptions) -
         output=options.output or Path("out"),
     )
     plan, job = planned(model, data[0], asked)
-    catalogue = (*CATALOGUE, *own)
+    units = dict(job.layout.units)
+    read = [units.get(name) for name in readings(model)]
+    catalogue = (*(e for e in CATALOGUE if not foreign(e, read)), *own)
     told = common(job, plan.partitions, catalogue, chance=CHANCE, clear=LEVELS.clear, say=progress)
     unseen = {name for name, _, seen in told.tried if not seen}
     spreads = own_sizes(

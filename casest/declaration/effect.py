@@ -65,7 +65,7 @@ class Effect:
     model where it is not applicable as it stands; `once`: it happened in the record that it was
     found in, and has "passed" (in another one it is not there) or "stayed" (in another one nobody
     knows how much of it is there); `foreign_to` kinds of reading, by a unit each, of which no
-    sensor has it: there it is tried only where it is asked for.
+    sensor has it, `only_of` those that alone have it: elsewhere it is tried where it is asked for.
     """
 
     name: str
@@ -93,6 +93,7 @@ class Effect:
     source: str = ""
     once: Once = ""
     foreign_to: tuple[str, ...] = ()
+    only_of: tuple[str, ...] = ()
 
     def __reduce__(self) -> tuple[Any, ...]:
         """To pickle: its function by name."""
@@ -160,6 +161,7 @@ def effect(
     otherwise: Effect | None = None,
     once: Once = "",
     foreign_to: Sequence[str] = (),
+    only_of: Sequence[str] = (),
 ) -> Callable[[Callable[..., Any]], Effect]:
     """Declare an effect: first argument the value acted on, further ones signals or columns.
 
@@ -228,6 +230,7 @@ def effect(
             otherwise,
             once=once,
             foreign_to=tuple(foreign_to),
+            only_of=tuple(only_of),
         )
 
     return declare

@@ -304,7 +304,7 @@ class Model:
         try:
             return self.with_effect(replace(added, otherwise=None), on=on, columns=columns)
         except UsageError:
-            same = ("name", "on", "typical", "shown_by", "foreign_to")
+            same = ("name", "on", "typical", "shown_by", "foreign_to", "only_of")
             told = {n: getattr(added, n) for n in same}
             said = form.formula or added.formula
             return self.with_effect(replace(form, **told, formula=said), on=on, columns=columns)

@@ -15,6 +15,10 @@ def three_axes(u: SX) -> None:
         raise UsageError(f"not applicable: it needs three axes, and there are {u.numel()}")
 
 
+#: All of a 3×3 matrix, row by row.
+MATRIX = "u + K·u, K of three rows: k[0] k[1] k[2]; k[3] k[4] k[5]; k[6] k[7] k[8]"
+
+
 @effect(
     on="input",
     typical={"k": 0.01},
@@ -30,7 +34,7 @@ def cross_axis(u: SX, *, k: SX = param(3)) -> SX:
     return vertcat(u[0], u[1] + k[0] * u[0], u[2] + k[1] * u[0] + k[2] * u[1])
 
 
-# Without a typical size, as soft_iron: what a declared gain or scale takes up is not hidden in it.
+# Without a typical size, as gain_matrix: what a declared gain takes up is not hidden in it.
 @effect(
     on="input",
     shown_by="inputs of known size along each axis",
@@ -44,7 +48,8 @@ def axis_gain(u: SX, *, k: SX = param(each)) -> SX:
 @effect(
     on="input",
     shown_by="known directions that cover the sphere (a norm sees six of the nine)",
-    formula="u + K·u, K of three rows: k[0] k[1] k[2]; k[3] k[4] k[5]; k[6] k[7] k[8]",
+    formula=MATRIX,
+    only_of=("T",),
 )
 def soft_iron(u: SX, *, k: SX = param(9)) -> SX:
     """Every axis sees every other: iron that turns with the sensor bends the field into them.
@@ -52,6 +57,25 @@ def soft_iron(u: SX, *, k: SX = param(9)) -> SX:
     K row by row (Vasconcelos et al. 2011, C_SI − 1), gains on its diagonal. As much of it is
     determined as the declared gains, axes and mounting leave.
     """
+    return _matrix(u, k)
+
+
+@effect(
+    on="input",
+    shown_by="known directions that cover the sphere (a norm sees six of the nine)",
+    formula=MATRIX,
+    foreign_to=("T",),  # there it is soft_iron
+)
+def gain_matrix(u: SX, *, k: SX = param(9)) -> SX:
+    """Every axis sees every other, each with a gain of its own: scale, skew and turn at once.
+
+    K row by row, gains on its diagonal. As much of it is determined as the declared gains, axes
+    and mounting leave.
+    """
+    return _matrix(u, k)
+
+
+def _matrix(u: SX, k: SX) -> SX:
     three_axes(u)
     return u + vertcat(*(dot(k[row : row + 3], u) for row in (0, 3, 6)))
 

@@ -22,7 +22,6 @@ from casest.effects import shipped
 from casest.effects.placing import angles, placed_in, with_numbers
 from casest.errors import CasestError, UsageError
 from casest.leastsquares.kinds import noises
-from casest.units import known, size
 
 #: Columns whose name or unit says that they are temperatures.
 _TEMPERATURE = re.compile(r"temp|(^|_)t_?(deg)?c$|celsius|kelvin", re.IGNORECASE)
@@ -322,16 +321,6 @@ def _tried(candidate: Candidate, model: Model, runs: Sequence[Run]) -> Candidate
     # In the form that it takes in this model.
     own = replace(extended.effects[-1].effect, on=effect.on)
     return replace(candidate, effect=own)
-
-
-def foreign(candidate: Candidate, model: Model, runs: Sequence[Run]) -> str:
-    """Why no sensor of such readings has this effect, in words; empty where one may."""
-    effect = candidate.effect
-    kinds = {size(unit)[1] for unit in effect.foreign_to} if effect is not None else set()
-    readings = model.traced.readings or tuple(s.name for s in model.signals if s.kind == "plain")
-    units = (runs[0].units.get(name) for name in readings)
-    own = next((u for u in units if u and known(u) and size(u)[1] in kinds), "")
-    return f"no sensor that reads {own} is known to have it; ask for it by name" if own else ""
 
 
 def _refuse_more_than_data(extended: Model, runs: Sequence[Run]) -> None:

@@ -194,12 +194,26 @@ def _through_record(
     names = {p.name for p in own}
     parts = []
     for r, chosen in enumerate(rows):
-        part = wide.columns(at, r, names)[chosen]
+        part = wide.columns(at, r, names)
+        if candidate.effect is not None and candidate.effect.kind == "sequence":
+            _as_the_next(part, problem.runs[r].block)
+        part = part[chosen]
         if problem.weights is not None:
             part = part * np.sqrt(problem.weights[r][chosen])[:, :, None]
         parts.append(np.nan_to_num(part))
     per_run = [p.scope == "run" for p in own for _ in range(p.shape.coordinates)]
     return _side_by_side(parts, np.array(per_run, bool))
+
+
+def _as_the_next(part: Array, block: Index) -> None:
+    """The first row of each stretch like its second, in place.
+
+    What an effect with a memory began from nobody recorded, and it begins at rest: where the input
+    is already on its way that moves the first row alone, and one odd reading is no evidence.
+    """
+    first = np.flatnonzero(np.r_[True, block[1:] != block[:-1]][:-1])
+    first = first[block[first] == block[first + 1]]
+    part[first] = part[first + 1]
 
 
 def _secant(

@@ -27,7 +27,7 @@ from casest.diagnose.noise.slow_course import slow_course
 from casest.diagnose.noise.spectral_line import strongest_line
 from casest.effects.placing import prepared
 from casest.estimate.before import against_prior
-from casest.estimate.correlation import TABLE
+from casest.estimate.correlation import TABLE, is_series
 from casest.estimate.estimate import Estimate
 from casest.leastsquares.agreement import between_runs
 from casest.leastsquares.problem import Point, Problem
@@ -267,8 +267,7 @@ def _follows(
         return []
     read = variables(problem, point, usable_columns(problem.model, problem.runs))
     read = [v for v in read if in_time or not v.clock]
-    rows = sum(map(len, problem.runs))
-    table = rows < TABLE and all(run.time is None for run in problem.runs)
+    table = sum(map(len, problem.runs)) < TABLE and not any(map(is_series, problem.runs))
     every = structures(clipped, read, table=table)
     found = [s for s in every if s.p_value < LEVELS.misfit and s.share > LEVELS.share]
     if not found:

@@ -17,8 +17,9 @@ from casest.declaration.shapes import Array
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.misfit.variables import Variable
 
-#: Means at least, and rows in each of a series, whose noise may have a colour.
-FEWEST, SHORTEST = 8, 4
+#: Means at least, as many as are wanted, and rows in each of a series, whose noise may have a
+#: colour. Of eight means no order is unlikely enough.
+FEWEST, WANTED, SHORTEST = 8, 24, 4
 #: Rows of a table at least, each of which is measured by itself.
 FEW_ROWS = 12
 
@@ -53,10 +54,10 @@ def structures(
 def _structure(name: str, r: Array, tried: int, table: bool) -> Structure | None:
     from scipy.special import ndtr
 
-    fewest, shortest = (FEW_ROWS, 1) if table else (FEWEST, SHORTEST)
-    size = 1 if table else max(min(LEVELS.block, len(r) // fewest), len(r) // LEVELS.blocks)
-    count = len(r) // size if size >= shortest else 0
-    if count < fewest:
+    size = max(SHORTEST, min(LEVELS.block, len(r) // WANTED), len(r) // LEVELS.blocks)
+    size = 1 if table else size
+    count = len(r) // size
+    if count < (FEW_ROWS if table else FEWEST):
         return None
     means = r[: count * size].reshape(count, size, -1).mean(axis=1)
     steps = np.mean(np.diff(means, axis=0) ** 2, axis=0) / 2

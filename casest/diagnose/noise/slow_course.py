@@ -3,7 +3,8 @@
 Colour is kinship of near neighbours: noise that remembers as exp(−k/MEMORY), or less, is nearly as
 strong at any period beyond SLOW samples as at those from FAST to SLOW. A smooth wave, a lag, an
 offset that wanders are far stronger at the slow ones. The colour is not estimated: estimated from
-a residual with a wave in it, it would explain the wave.
+a residual with a wave in it, it would explain the wave. A record must be FEWEST such periods long:
+of a shorter one all three are less, in proportion.
 """
 
 from __future__ import annotations
@@ -20,6 +21,8 @@ from casest.estimate.correlation import is_series
 
 #: Periods in samples from which on a course is slow, and that it is compared with.
 SLOW, FAST = 60, 12
+#: Slow periods in a record at least.
+FEWEST = 4
 #: Memory in samples of the longest colour that is no slow course (0.82 between neighbours).
 MEMORY = 5
 #: Power of such noise at the slowest over that at periods from FAST to SLOW:
@@ -55,7 +58,8 @@ def slow_course(runs: Sequence[Run], residuals: Sequence[Array]) -> SlowCourse |
         return None
     frequency = np.concatenate([np.arange(1, len(r)) / (2 * len(r)) for r in series])
     power = np.concatenate([_power(r) for r in series])
-    found = [_of_axis(frequency, power, a) for a in range(power.shape[1])]
+    slow = min(1.0, max(map(len, series)) / (FEWEST * SLOW)) * SLOW
+    found = [_of_axis(frequency, power, a, slow) for a in range(power.shape[1])]
     large = [f for f in found if f.share >= LEVELS.share]
     return min(large or found, key=lambda f: (f.p_value, -f.share))
 
@@ -66,14 +70,14 @@ def _power(r: Array) -> Array:
     return np.asarray(np.abs(np.fft.rfft(mirrored, axis=0)[1 : len(r)]) ** 2 / (2 * len(r)))
 
 
-def _of_axis(frequency: Array, every: Array, axis: int) -> SlowCourse:
-    """Octaves of the slow periods against the fast ones, by F tests."""
+def _of_axis(frequency: Array, every: Array, axis: int, longest: float) -> SlowCourse:
+    """Octaves of the slow periods, of `longest` samples or more, against the fast ones: F tests."""
     from scipy.special import fdtrc
 
-    power, slow = every[:, axis], frequency < 1 / SLOW
-    level = power[~slow & (frequency < 1 / FAST)]
+    power, slow = every[:, axis], frequency < 1 / longest
+    level = power[~slow & (frequency < SLOW / FAST / longest)]
     least, chance, octaves = float(frequency.min()), 1.0, 0
-    while least < 1 / SLOW:
+    while least < 1 / longest:
         own = power[slow & (frequency >= least) & (frequency < 2 * least)]
         if own.size:
             F = own.mean() / max(level.mean(), 1e-300) / COLOUR

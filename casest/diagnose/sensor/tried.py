@@ -14,7 +14,7 @@ from casest.declaration.physics import SX
 from casest.declaration.shapes import Array, each
 from casest.declaration.symbols import param
 from casest.diagnose.candidates.axes import axes_of
-from casest.diagnose.candidates.candidates import Candidate, Skipped, candidates, foreign
+from casest.diagnose.candidates.candidates import Candidate, Skipped, candidates
 from casest.diagnose.candidates.grid import Seen, nearer, on_grid
 from casest.diagnose.candidates.motion_columns import columns_of_motion
 from casest.diagnose.candidates.slopes import slopes
@@ -24,6 +24,7 @@ from casest.diagnose.sensor.fits import Fit, problem_of
 from casest.diagnose.sensor.recent import Recent
 from casest.diagnose.sensor.rows import Rows
 from casest.effects import shipped
+from casest.effects.kinds import foreign, readings
 from casest.effects.lateness import likely_lag
 from casest.effects.on_axes import restricted
 from casest.effects.placing import placed_in
@@ -62,7 +63,9 @@ class Tried:
     ) -> tuple[list[Candidate], list[Skipped]]:
         """Without what no such sensor has, unless it is asked for."""
         found, skipped = candidates(model, self.rows.runs, catalogue)
-        why = {c.label: foreign(c, model, self.rows.runs) for c in found if not self.asked(c)}
+        units = [self.rows.runs[0].units.get(name) for name in readings(model)]
+        asked = (c for c in found if c.effect is not None and not self.asked(c))
+        why = {c.label: foreign(c.effect, units) for c in asked if c.effect is not None}
         skipped += [Skipped(label, reason) for label, reason in why.items() if reason]
         return [c for c in found if not why.get(c.label)], skipped
 

@@ -147,5 +147,9 @@ def _detectable(result: Closed) -> Iterator[str]:
 def _notes(result: Closed) -> Iterator[str]:
     yield from (item(note) for note in result.notes)
     yield from (item(words) for words in list(refusals(result))[:SHOWN])
-    for skipped in of_the_user(result.not_tried):
+    own = of_the_user(result.not_tried)
+    for skipped in own:
         yield item(f"{skipped.name} was not tried: {skipped.reason}")
+    shipped = dict.fromkeys(s.name for s in result.not_tried if s not in own)
+    if shipped:
+        yield item(f"not tried, why is in result.json: {', '.join(shipped)}")
