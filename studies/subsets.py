@@ -32,8 +32,8 @@ NORM = {"xsens-imutk/xsens_acc.mat": 9.81744, "mpu9150-mikoff/imu4.log": 9.80665
 HEAD = """# Skew on subsets of rest positions
 
 Made by `python studies/subsets.py {number}`: {number} random subsets of each size, `norm-diagonal`
-closed on each; a right answer names `cross_axis` or `soft_iron`. Goal: {goal:.0%}. Largest p-value:
-of the F test of nine unknowns against six, by SciPy, over the same subsets.
+closed on each; a right answer names `cross_axis` or `gain_matrix`. Goal: {goal:.0%}. Largest
+p-value: of the F test of nine unknowns against six, by SciPy, over the same subsets.
 
 | record | positions | named | adequate | a formula | largest p-value of the F test |
 | --- | --- | --- | --- | --- | --- |

@@ -50,8 +50,8 @@ KINDS: dict[str, Kind] = {
     "soft iron, gain per axis": Kind(
         partial(soft_iron, one=False), (1e-3, 0.1), ("soft_iron", "cross_axis")
     ),
-    "gains unlike": Kind(unlike_axes, (1e-4, 3e-2), ("axis_gain", "soft_iron")),
-    "few poses, skew": Kind(few_poses, (4e-4, 3e-2), ("cross_axis", "soft_iron")),
+    "gains unlike": Kind(unlike_axes, (1e-4, 3e-2), ("axis_gain", "soft_iron", "gain_matrix")),
+    "few poses, skew": Kind(few_poses, (4e-4, 3e-2), ("cross_axis", "soft_iron", "gain_matrix")),
     "motor current": Kind(motor, (2e-3, 0.2), ("channel_bias(current)",)),
     "magnet comes and goes": Kind(magnet, (2e-3, 0.2), ("pulse",)),
     "field that sways": Kind(sway, (5e-4, 2e-2), ("reference_wander",)),
