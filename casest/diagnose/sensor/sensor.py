@@ -233,8 +233,9 @@ class Sensor(Subject[Fit]):
     def _looked_at_anew(
         self, fit: Fit, what: Candidate
     ) -> tuple[Fit, Trial, Evidence, Likelihood] | None:
-        base = self.without(fit, what)
-        whole = None if base is None else self._whole(fit, base, what)
+        # Whether there is more of it hangs on the model alone; the fit without it is dear.
+        whole = None if what.freed else self._whole(fit, _less(fit, what), what)
+        base = None if whole is None else self.without(fit, what)
         if base is None or whole is None:
             return None
         likelihood = Likelihood(self.linear(base))
