@@ -52,6 +52,7 @@ def structures(
 
 
 def _structure(name: str, r: Array, tried: int, table: bool) -> Structure | None:
+    """What rows (N, m) in the order of a variable say, one by one or in means of several."""
     from scipy.special import ndtr
 
     size = max(SHORTEST, min(LEVELS.block, len(r) // WANTED), len(r) // LEVELS.blocks)
@@ -62,12 +63,18 @@ def _structure(name: str, r: Array, tried: int, table: bool) -> Structure | None
     means = r[: count * size].reshape(count, size, -1).mean(axis=1)
     steps = np.mean(np.diff(means, axis=0) ** 2, axis=0) / 2
     variance = np.maximum(means.var(axis=0, ddof=1), 1e-300)
-    if table:
-        products = np.prod(
-            [means[1:] - means.mean(axis=0), means[:-1] - means.mean(axis=0)], axis=0
-        )
-        z = products.sum(axis=0) / np.sqrt(np.maximum((products**2).sum(axis=0), 1e-300))
-    else:
-        z = (1 - steps / variance) / np.sqrt((count - 2) / (count**2 - 1.0))
+    z = _of_products(means) if table else _of_ratios(steps / variance, count)
     share = float(np.maximum(variance - steps, 0).sum() / max(r.var(axis=0).sum(), 1e-300))
     return Structure(name, share, float(min(1.0, ndtr(-z.max()) * len(z) * tried)))
+
+
+def _of_products(rows: Array) -> Array:
+    """Normal where rows (N, m) follow nothing, whatever their sizes are; (m,)."""
+    away = rows - rows.mean(axis=0)
+    products = away[1:] * away[:-1]
+    return np.asarray(products.sum(axis=0) / np.sqrt(np.maximum((products**2).sum(axis=0), 1e-300)))
+
+
+def _of_ratios(ratio: Array, count: int) -> Array:
+    """Von Neumann's ratios of so many means of one size, as standard normals."""
+    return np.asarray((1 - ratio) / np.sqrt((count - 2) / (count**2 - 1.0)))
