@@ -404,3 +404,31 @@ def test_of_causes_that_pull_the_same_way_the_one_between_them_is_the_lesser_evi
     thirds = [(0.16 + 0.01) / 3, (0.16 + 0.09) / 3, (0.01 + 0.09) / 3]
     assert loss / size**2 == pytest.approx(thirds, rel=1e-3)
     assert none / size**2 == pytest.approx((1 + 0.36 + 0.81) / 3, rel=1e-3)
+
+
+def gains_of_axes(rows, seed, truth, sigma=0.01):
+    """Poses with a gain for each axis, one of which the declared gain takes."""
+    rng = np.random.default_rng(seed)
+    u = rng.standard_normal((rows, 3))
+    u /= np.linalg.norm(u, axis=1)[:, None]
+    residual = (u**2) @ truth + sigma * rng.standard_normal(rows)
+    declared = np.column_stack([np.sum(u**2, axis=1), u])
+    return residual - np.linalg.lstsq(declared, residual, rcond=None)[0] @ declared.T, declared, u
+
+
+@pytest.mark.parametrize("size", [0.1, 0.3, 10.0])
+def test_a_large_cause_of_poses_is_on_all_the_axes_that_it_takes(size):
+    """What an axis leaves is counted, not what it takes beside the noise that all of them leave."""
+    for seed in range(20):
+        truth = size * np.array([1.0, -0.6, 0.0])
+        residual, declared, u = gains_of_axes(40, seed, truth)
+        likelihood = Likelihood(linear_of(residual, declared, in_time=False))
+        trial = trial_of((u**2)[:, None, :], axes=np.arange(3))
+        found = judged([trial], likelihood, likelihood.beside())
+        kept = on_fewer_axes(found, likelihood)
+        assert len(kept) == 2
+        best = {}
+        for axes in ([0], [1], [2], [0, 1], [0, 2], [1, 2]):
+            part = trial_of((u**2)[:, None, axes], axes=np.array(axes))
+            best[tuple(axes)] = judged([part], likelihood, likelihood.beside()).score
+        assert best[tuple(kept)] > max(best[(k,)] for k in range(3)) + LEVELS.strong

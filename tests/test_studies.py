@@ -192,3 +192,15 @@ def test_parameters_further_off_by_more_than_their_scatter_are_harmed(study):
     # √(900/2) = 21.2 standard deviations a unit: 3.09 times their scatter of √(2/2) is 0.146.
     assert not table.harmed({**record, "off_after": 0.195})
     assert table.harmed({**record, "off_after": 0.197})
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("kind", "seed", "name"),
+    [("gains unlike", 210003, "axis_gain"), ("magnet comes and goes", 210010, "pulse")],
+)
+def test_what_a_study_found_named_wrongly_is_named(study, kind, seed, name):
+    """A dead zone and a cubic for two gains; a step and a temperature for a magnet in between."""
+    said = study("loop_worlds").one_world(kind, seed, True)
+    assert (said["verdict"], [f["name"] for f in said["found"]]) == ("extended", [name])
+    assert said["later_after"] < 1.05 * said["later_oracle"]

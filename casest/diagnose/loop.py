@@ -317,7 +317,9 @@ def _undecided(sensor: Sensor, state: State[Fit]) -> Undecided | None:
     if not state.open:
         return None
     best = state.open[0]
-    names = tuple(dict.fromkeys(label for e in state.open for label in e.families))
+    # Of a pair each explains something beside the other: neither does alone what both do.
+    alone = [e for e in state.open if len(e.trials) == 1] or state.open[:1]
+    names = tuple(dict.fromkeys(label for e in alone for label in e.families))
     moves = {
         r.evidence.families[0]: sensor.moved_by(r.before, r.fit)
         for r in state.torn

@@ -8,6 +8,9 @@ from casest.declaration.shapes import each
 from casest.declaration.symbols import constant, param, signal
 from casest.effects.course import legendre
 
+#: Frequency (rad/s) below which nothing shakes.
+SHAKES = 0.6
+
 
 @effect(
     on="angle",
@@ -90,7 +93,10 @@ def vibration(
     *,
     sine: SX = param(each, "[y]"),
     cosine: SX = param(each, "[y]"),
-    frequency: SX = param("rad/s"),
+    frequency: SX = param("rad/s", bounds=(SHAKES, None)),
 ) -> SX:
-    """A line in the spectrum that belongs to no declared motion."""
+    """A line in the spectrum that belongs to no declared motion.
+
+    Once in ten seconds or faster: what is slower is a course, a load that is cycled, a day.
+    """
     return y + sine * sin(frequency * t) + cosine * cos(frequency * t)

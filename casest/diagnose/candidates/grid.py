@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from casest.declaration.shapes import Array
+from casest.declaration.symbols import Parameter
 from casest.diagnose.candidates.candidates import Candidate
 from casest.diagnose.evidence.linear import Index, Linear
 
@@ -46,11 +47,22 @@ def on_grid(candidate: Candidate, seen: Seen, likely: float = 0.0) -> list[Candi
     profile = dict(candidate.effect.profile) if candidate.effect else {}
     if not profile:
         return [candidate]
-    values, trials = searched(tuple(profile.values()), seen, likely)
+    values, trials = searched(tuple(profile.values()), seen, likely, _lowest(candidate, profile))
     return [
         replace(candidate, held=_held(dict(zip(profile, v, strict=True))), trials=int(trials))
         for v in values
     ]
+
+
+def _lowest(candidate: Candidate, profile: Mapping[str, str]) -> float:
+    """The least frequency that the effect may have."""
+    assert candidate.effect is not None
+    said = [
+        d.lower[0]
+        for name, d in candidate.effect.declarations
+        if profile.get(name) == "frequency" and isinstance(d, Parameter)
+    ]
+    return max(said, default=0.0)
 
 
 def _held(values: Mapping[str, float]) -> tuple[tuple[str, float], ...]:
@@ -60,8 +72,13 @@ def _held(values: Mapping[str, float]) -> tuple[tuple[str, float], ...]:
 Values = tuple[list[tuple[float, ...]], float]
 
 
-def searched(kinds: tuple[str, ...], seen: Seen, likely: float = 0.0) -> Values:
-    """Values to look at for what is searched over, and among how many they were chosen."""
+def searched(
+    kinds: tuple[str, ...], seen: Seen, likely: float = 0.0, lowest: float = 0.0
+) -> Values:
+    """Values to look at for what is searched over, and among how many they were chosen.
+
+    `lowest`: the least frequency (rad/s).
+    """
     if kinds == ("level",):
         return _levels(seen)
     if seen.time is None:
@@ -75,7 +92,7 @@ def searched(kinds: tuple[str, ...], seen: Seen, likely: float = 0.0) -> Values:
     if kinds == ("time", "time"):
         return _pulses(seen)
     if kinds == ("frequency",):
-        return _lines(seen)
+        return _lines(seen, lowest)
     return _constants(seen)
 
 
@@ -174,7 +191,7 @@ def _lags(seen: Seen, likely: float) -> Values:
     return [(float(v),) for v in found], len(found)
 
 
-def _lines(seen: Seen) -> Values:
+def _lines(seen: Seen, lowest: float) -> Values:
     """Frequencies (rad/s) that stand out of their neighbourhood, of the longest span."""
     assert seen.time is not None
     if not seen.linear.spans:
@@ -192,7 +209,8 @@ def _lines(seen: Seen) -> Values:
     even[place] = (r - r.mean(axis=0)) / (r.std(axis=0) + 1e-300)
     power = (np.abs(np.fft.rfft(even, axis=0)) ** 2).sum(axis=1)
     # The slowest are a course; the fastest one is the sampling's own.
-    power[: max(5, length // 200)] = 0
+    slowest = int(np.ceil(lowest * length * step / (2 * np.pi)))
+    power[: max(5, length // 200, slowest)] = 0
     power[-max(2, length // 200) :] = 0
     width = max(8, length // 200)
     level = np.convolve(power, np.ones(2 * width + 1) / (2 * width + 1), "same")

@@ -113,7 +113,7 @@ def screened(trial: Trial, likelihood: Likelihood, white: tuple[Array, Array, Ar
     if not alive.any():
         return -np.inf
     gain, freedom = _gain(G[:, alive].T @ G[:, alive], G[:, alive].T @ r)
-    return worth(gain, freedom, 0.0, likelihood)
+    return worth(_in_logs(gain, r, likelihood), freedom, 0.0, likelihood)
 
 
 def whitened(likelihood: Likelihood, none: Explained) -> tuple[Array, Array, Array]:
@@ -132,6 +132,17 @@ def _gain(H: Array, g: Array) -> tuple[float, int]:
     values, vectors = np.linalg.eigh(H / np.outer(size, size))
     good = values > 1e-6 * values.max(initial=0.0)
     return float(np.sum((vectors[:, good].T @ (g / size)) ** 2 / values[good])), int(good.sum())
+
+
+def _in_logs(gain: float, residual: Array, likelihood: Likelihood) -> float:
+    """2 log L over none, of what is taken from the squares of a whitened residual.
+
+    Where the noise is white its variance falls with them; beside a colour the spectrum is held.
+    """
+    if likelihood.linear.coloured:
+        return gain
+    left = 1 - gain / max(float(residual @ residual), 1e-300)
+    return -len(likelihood.residual) * float(np.log(max(left, 1e-15)))
 
 
 def judged(
@@ -211,7 +222,7 @@ def on_fewer_axes(evidence: Evidence, likelihood: Likelihood) -> list[int] | Non
             gain, freedom = _gain(H[np.ix_(own, own)], g[own]) if alive[own].all() else (0.0, 0)
             if freedom < len(own):
                 continue  # what the unknowns, or other axes, can do has no size of its own
-            score = worth(gain, freedom, searched, likelihood)
+            score = worth(_in_logs(gain, r, likelihood), freedom, searched, likelihood)
             if score > best[0] + 1e-9:
                 best = (score, [int(k) for k in kept])
     return None if best[1] is None or len(best[1]) == len(names) else best[1]

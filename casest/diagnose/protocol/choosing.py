@@ -53,7 +53,8 @@ def with_the_best(
         if over or not held or not (left or asked):
             break
         asked, left = [], left or beyond
-    for evidence in [e for e in options if e not in tried][:2]:
+    alone = [e for e in options if len(e.trials) == 1 and e not in tried]
+    for evidence in alone[:2]:
         why = NOT_HELD_OUT if evidence in beyond else FOLLOWED
         state = state.refusing(evidence.trials[0].what, why)
     missing = sorted([*options, *ranking.followed], key=lambda e: -e.score)

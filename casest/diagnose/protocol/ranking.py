@@ -30,14 +30,33 @@ from casest.diagnose.protocol.subject import Subject
 def ranked(subject: Subject[F], fit: F) -> Ranking:
     """Every cause beside a fit: the best variants of each family, each with a noise of its own."""
     ranking = ranked_of(subject.linear(fit), list(subject.trials(fit)))
+    whole = {e.trials[0].family: e for e in ranking.found}
     found = tuple(_on_its_axes(subject, fit, e, ranking) for e in ranking.found)
     found = without_feigned(subject, fit, ranking.likelihood, found, ranking.families)
     ranking = _about_the_best(replace(ranking, found=_best_first(found)))
     near = [e for e in ranking.causes[: LEVELS.contenders] if e.score > -LEVELS.clear]
-    finer = {e.trials[0].family: sharpened(subject, fit, ranking, e) for e in near}
+    finer = {e.trials[0].family: _finer(subject, fit, ranking, e, whole) for e in near}
     found = tuple(finer.get(e.trials[0].family, e) for e in ranking.found)
     found = without_feigned(subject, fit, ranking.likelihood, found, ranking.families)
     return replace(ranking, found=_best_first(found))
+
+
+def _finer(
+    subject: Subject[F],
+    fit: F,
+    ranking: Ranking,
+    evidence: Evidence,
+    whole: Mapping[str, Evidence],
+) -> Evidence:
+    """At the best value near that of the grid: also on all axes first, since on which it shows is
+    seen at that value alone."""
+    found = sharpened(subject, fit, ranking, evidence)
+    every = whole[evidence.trials[0].family]
+    if found.trials[0] is evidence.trials[0] or every.freedom == evidence.freedom:
+        return found
+    every = sharpened(subject, fit, ranking, every)
+    every = _on_its_axes(subject, fit, every, ranking)
+    return every if every.score > found.score else found
 
 
 def without_feigned(

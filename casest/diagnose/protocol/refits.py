@@ -17,6 +17,9 @@ from casest.diagnose.protocol.ranking import sharpened, without_feigned
 from casest.diagnose.protocol.state import F, Ranking, Refit, State
 from casest.diagnose.protocol.subject import Subject
 
+#: Why what holds out and has strong evidence is not added.
+AS_MUCH = "a slow course of unknown cause explains as much"
+
 
 def refitted(
     subject: Subject[F], state: State[F], ranking: Ranking, options: Sequence[Evidence]
@@ -42,6 +45,8 @@ def refitted(
         enough = beyond_courses(ranking, kept) and _strong(ranking, _gaining(evidence, least))
         if enough or subject.asked(evidence.trials[0].what):
             found.append(Refit(state.fit, better, kept))
+        elif len(evidence.trials) == 1 and _strong(ranking, _gaining(evidence, least)):
+            state = state.refusing(evidence.trials[0].what, AS_MUCH)
     found.sort(key=lambda r: -r.evidence.score)
     near = [r.evidence for r in _near(found)]
     if len(near) > 1:
