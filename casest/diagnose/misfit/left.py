@@ -109,8 +109,9 @@ def left_over(
     fraction = max([fraction, *(f.share for f in found)])
     where = [f.where for f in found[:3]]
     if undecided is not None and not undecided.explains:
-        asked = " or ".join(undecided.names[:3])
-        where.append(f"likelier with {asked}, which would explain none of it")
+        if where:  # a likelihood that held-out data deny is no misfit by itself
+            asked = " or ".join(undecided.names[:3])
+            where.append(f"likelier with {asked}, which would explain none of it")
     elif undecided is not None:
         fraction = max(fraction, undecided.share)
         several = " and other shapes" if len(undecided.names) == 1 else ""
