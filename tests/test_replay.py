@@ -515,10 +515,11 @@ def test_memory_does_not_grow_with_the_number_of_samples():
 
 def test_replays_that_are_kept_share_one_bound_of_memory():
     """Whoever keeps many models keeps their instructions, not a block of samples of each."""
-    from casest.engine import replay as module
+    from casest.engine.replay import BLOCK
+    from casest.engine.waiting import WAITING
 
     x = ca.SX.sym("x", 3)
-    samples = np.random.default_rng(0).normal(size=(module.BLOCK, 3))
+    samples = np.random.default_rng(0).normal(size=(BLOCK, 3))
 
     def of(k):
         outputs = [ca.vertcat(*[ca.sin(x * j + k) for j in range(100)])]
@@ -532,9 +533,9 @@ def test_replays_that_are_kept_share_one_bound_of_memory():
         each(np.zeros(0), samples)
     plans = [p for each in kept for p in each._plans.values()]
     waiting = [w for p in plans for w in p._idle]
-    assert sum(w.n_bytes for w in waiting) <= module.IDLE_BYTES
+    assert sum(w.n_bytes for w in waiting) <= WAITING.most
     one = plans[-1]._idle[0].n_bytes
-    assert one * len(plans) > 2 * module.IDLE_BYTES  # what they would keep without it
+    assert one * len(plans) > 2 * WAITING.most  # what they would keep without it
     assert 0 < len(waiting) < len(plans)
     assert plans[-1]._idle  # what was used last is used again
     np.testing.assert_array_equal(kept[0](np.zeros(0), samples)[0], first)

@@ -11,12 +11,9 @@ The way down: `Replay` (what users hold) > `Plan` (which values to compute, and 
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Callable, Collection, Iterator, Sequence
 from functools import wraps
-from threading import Lock
 from typing import Any, TypeVar
-from weakref import ref
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +22,7 @@ from casest.engine.graph import PARAMETER, SAMPLE, Graph
 from casest.engine.grouping import group
 from casest.engine.operations import BY_CODE, Floats, Kernel
 from casest.engine.scalars import Scalars
+from casest.engine.waiting import WAITING
 from casest.errors import CasestError
 
 T = TypeVar("T")
@@ -140,7 +138,7 @@ class Plan:
                 yield span, workspace.run(samples[span])
         finally:
             self._idle[:] = [workspace]
-            _keep(workspace)
+            WAITING.keep(workspace, workspace.n_bytes, self.forget)
 
     def _take(self, length: int) -> _Workspace:
         # Taken off the list while in use, so that interleaved iterations do not share a buffer.
@@ -153,44 +151,6 @@ class Plan:
     def forget(self, workspace: _Workspace) -> None:
         """Let go of a workspace that waits for another call; one in use is not among them."""
         self._idle[:] = [kept for kept in self._idle if kept is not workspace]
-
-
-#: Bytes of all workspaces that wait for another call, of whatever plans.
-IDLE_BYTES = 128 * 2**20
-#: Those that wait, by their identity, the one used longest ago first; and a bound on their bytes.
-_waiting: OrderedDict[int, ref[_Workspace]] = OrderedDict()
-_counted = 0
-_lock = Lock()
-
-
-def _keep(workspace: _Workspace) -> None:
-    """Count a workspace among those that wait; beyond `IDLE_BYTES` the oldest go.
-
-    A closed loop makes a plan for each cause that it tries, and whatever keeps such a model would
-    keep its blocks of samples. Referred to weakly: a workspace still goes when its plan goes.
-    """
-    global _counted
-    with _lock:
-        found = _waiting.get(id(workspace))
-        if found is not None and found() is workspace:
-            _waiting.move_to_end(id(workspace))
-            return
-        _waiting[id(workspace)] = ref(workspace)
-        _waiting.move_to_end(id(workspace))
-        _counted += workspace.n_bytes
-        if _counted <= IDLE_BYTES:
-            return
-        # Counted again only here, so that a call costs one look: some have gone with their plans.
-        alive = [(key, kept) for key, r in _waiting.items() if (kept := r()) is not None]
-        _counted = sum(kept.n_bytes for _, kept in alive)
-        _waiting.clear()
-        for k, (key, kept) in enumerate(alive):
-            # To half, so that the next ones need not count again; the newest stays in any case.
-            if _counted > IDLE_BYTES // 2 and k < len(alive) - 1:
-                kept.plan.forget(kept)
-                _counted -= kept.n_bytes
-            else:
-                _waiting[key] = ref(kept)
 
 
 class _Workspace:
