@@ -42,7 +42,7 @@ class Waiting(Generic[T]):
                 self._let_go()
 
     def _let_go(self) -> None:
-        """The oldest, down to half, so that the next ones need not count again; never the newest."""
+        """The oldest, down to half, so that the next need not count again; never the newest."""
         there = {key: own for key, own in self._waiting.items() if own[0]() is not None}
         self._counted = sum(size for _, size, _ in there.values())
         self._waiting = OrderedDict(there)
