@@ -10,6 +10,8 @@ import numpy as np
 
 from casest.declaration.shapes import Array
 from casest.errors import NotTrusted
+from casest.estimate.evidence import Evidence
+from casest.leastsquares.neighbours import scatter
 from casest.leastsquares.problem import Point, Problem
 from casest.leastsquares.stated import at_true_values, settles
 from casest.leastsquares.weights import has_noise_effects
@@ -31,7 +33,11 @@ def solved(
     if settles(problem.model) and problem.parabolic and not has_noise_effects(problem.model):
         near = 1e-6 / problem.residual_count  # the turns go on from there
         return problem, (trust_region(problem, first, tolerance=near),)
-    return solve(problem, first, solver=solver, seed=seed, automatic=automatic)
+
+    def vouched(point: Point) -> bool:
+        return Evidence(scatter(problem, point)).vouched
+
+    return solve(problem, first, solver=solver, seed=seed, automatic=automatic, vouched=vouched)
 
 
 def with_errors_of_inputs(

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from typing import Any
@@ -56,15 +56,23 @@ SOLVERS = ("ipopt", "ipopt-exact", "trust-region", "multiple-shooting")
 
 
 def solve(
-    problem: Problem, first: Point, *, solver: str = "ipopt", seed: int = 0, automatic: bool = True
+    problem: Problem,
+    first: Point,
+    *,
+    solver: str = "ipopt",
+    seed: int = 0,
+    automatic: bool = True,
+    vouched: Callable[[Point], bool] = lambda _: False,
 ) -> tuple[Problem, tuple[Outcome, ...]]:
     """All outcomes, that of the solver asked for first; the problem with its final weights.
 
-    `automatic` says that `first` is the model's own start, not the user's.
+    `automatic` says that `first` is the model's own start, not the user's; `vouched` whether the
+    readings themselves say that nothing is left at a point: differential equations are then
+    followed in no more ways.
     """
     if solver not in SOLVERS:
         raise UsageError(f"unknown solver {solver!r}; there are {', '.join(SOLVERS)}")
-    outcomes = _ways(problem, first, solver, seed, automatic)
+    outcomes = _ways(problem, first, solver, seed, automatic, vouched)
     if problem.constraints is not None:
         problem, point = kept(problem, best_of(outcomes).point)
         outcomes = _ways(problem, point, solver, seed, automatic=True)
@@ -94,7 +102,12 @@ def _cost(outcome: Outcome) -> float:
 
 
 def _ways(
-    problem: Problem, first: Point, solver: str, seed: int, automatic: bool
+    problem: Problem,
+    first: Point,
+    solver: str,
+    seed: int,
+    automatic: bool,
+    vouched: Callable[[Point], bool] = lambda _: False,
 ) -> tuple[Outcome, ...]:
     """The solver asked for with a polish, and a second way that must agree with it.
 
@@ -106,7 +119,7 @@ def _ways(
             f"multiple-shooting is for differential equations, and {problem.model.name} has none"
         )
     if problem.model.traced.integrates:
-        return _ways_of_equations(problem, first, solver, automatic)
+        return _ways_of_equations(problem, first, solver, automatic, vouched)
     if solver == "trust-region" or _singular(problem, first):
         # IPOPT wanders along a direction that changes nothing; the damped steps do not.
         main = trust_region(problem, first)
@@ -131,9 +144,22 @@ def _ways(
 
 
 def _ways_of_equations(
-    problem: Problem, first: Point, solver: str, automatic: bool
+    problem: Problem,
+    first: Point,
+    solver: str,
+    automatic: bool,
+    vouched: Callable[[Point], bool],
 ) -> tuple[Outcome, ...]:
-    """The solver asked for from where the record leads that is followed, and others beside it."""
+    """The solver asked for from where the record leads that is followed, and others beside it.
+
+    A plain descent comes first; where readings vouch for its end the solver goes on from there.
+    """
+    direct = list[Outcome]()
+    with suppress(GivenUp), for_seconds(OPINIONS):  # else an opinion less
+        end = trust_region(problem, first, max_iterations=OPINION, tolerance=slight(problem))
+        direct.append(end)
+        if solver != "multiple-shooting" and vouched(end.point):
+            return (_asked_for(problem, end, solver), end)
     others = [
         o
         for start in _other_starts(problem, first, automatic)
@@ -148,8 +174,7 @@ def _ways_of_equations(
             )
         others.insert(0, several)
     with suppress(GivenUp), for_seconds(allowed(others, OPINIONS)):  # else an opinion less
-        direct = trust_region(problem, first, max_iterations=OPINION, tolerance=slight(problem))
-        others.append(direct)
+        others += direct
         if solver != "multiple-shooting":
             others.insert(0, _asked_for(problem, best_of((*others,)), solver))
     return (*others,)
