@@ -23,6 +23,7 @@ from casest.diagnose.levels import LEVELS
 from casest.diagnose.misfit.left import predictions
 from casest.diagnose.noise.tails import outliers_p_value
 from casest.diagnose.protocol import Kept, State, search
+from casest.diagnose.protocol.choosing import NOT_HELD_OUT
 from casest.diagnose.sensor import NOT_FINITE, Fit, Sensor
 from casest.diagnose.sensor.courses import courses
 from casest.diagnose.visibility import Visible, visible
@@ -36,6 +37,7 @@ from casest.estimate.estimate import Estimate
 from casest.estimate.reasons import Code
 from casest.leastsquares.kinds import noises
 from casest.leastsquares.problem import Problem
+from casest.leastsquares.weights import robust_scale
 
 #: What no effect that is added could mend.
 HOPELESS = Code.READING | Code.NOT_FINITE | Code.NO_REDUNDANCY | Code.NOT_DETERMINED
@@ -184,10 +186,10 @@ def _closed(sensor: Sensor, before: Estimate, folds: Folds, say: Callable[[str],
     after = before
     if state.fit is not declared:
         state, after = certified(sensor, state, before)
+    state, after, hidden = _foretelling(sensor, declared, state, before, after, folds)
     effects = [] if outliers is None else [outliers]
     effects += [_found(sensor, state, k, after) for k in state.kept]
     effects += [Found(Candidate(e), 0.0, 0.0) for e in _declared_walks(sensor)]
-    hidden = [held_out(sensor, fit, folds) for fit in (declared, state.fit)]
     return Closing(
         before,
         after,
@@ -201,6 +203,40 @@ def _closed(sensor: Sensor, before: Estimate, folds: Folds, say: Callable[[str],
         _undecided(sensor, state),
         courses(sensor, state.fit, state.last) if state.last else (),
     )
+
+
+def _foretelling(
+    sensor: Sensor,
+    declared: Fit,
+    state: State[Fit],
+    before: Estimate,
+    after: Estimate,
+    folds: Folds,
+) -> tuple[State[Fit], Estimate, list[tuple[Array, ...]]]:
+    """Without causes that came last, as long as held-out data are foretold no better with them.
+
+    By fits that did not see their part: what columns or one refit promised may be another thing.
+    What the user says is there stays. The last: held-out residuals before and after.
+    """
+    hidden = [held_out(sensor, fit, folds) for fit in (declared, state.fit)]
+    while state.kept and not any(sensor.asked(k.what) for k in state.kept):
+        less = sensor.without(state.fit, state.kept[-1].what)
+        if less is None or _better(*_on_the_same_samples(*hidden)):
+            break
+        state = replace(state, fit=less, kept=state.kept[:-1]).refusing(
+            state.kept[-1].what, NOT_HELD_OUT
+        )
+        state, after = certified(sensor, state, before)
+        hidden[1] = held_out(sensor, state.fit, folds)
+    return state, after, hidden
+
+
+def _better(before: Sequence[Array], after: Sequence[Array]) -> bool:
+    """Are residuals smaller, those far out before counted as less?"""
+    there = [np.isfinite(b) for b in before]
+    b, a = (np.concatenate([r[k] for r, k in zip(x, there, strict=True)]) for x in (before, after))
+    far = LEVELS.far * robust_scale([b])
+    return bool(np.sum(np.clip(a, -far, far) ** 2) < np.sum(np.clip(b, -far, far) ** 2))
 
 
 def _declared_walks(sensor: Sensor) -> list[Effect]:

@@ -86,7 +86,8 @@ def searched(
     if kinds == ("lag",):
         return _lags(seen, likely)
     if kinds == ("share",):
-        return [(float(v),) for v in SHARES], len(SHARES)
+        turned = _turned_back(seen)
+        return [(float(v),) for v in SHARES if v <= turned], len(SHARES)
     if kinds == ("time",):
         return _moments(seen)
     if kinds == ("time", "time"):
@@ -108,6 +109,20 @@ def _levels(seen: Seen) -> Values:
     # Rows of one pose are predicted alike: what nothing exceeds but by rounding is no level.
     levels = [float(v) for v in several if np.count_nonzero(size > v * (1 + 1e-6)) >= FEWEST]
     return [(v,) for v in levels], max(len(levels), 1)
+
+
+def _turned_back(seen: Seen) -> float:
+    """How far the reading comes back, up and down again or the other way, as a share of its span.
+
+    A loop that nothing turned round in is a bend at the beginning.
+    """
+    if seen.reading is None:
+        return 1.0
+    y = seen.reading
+    up = (y - np.minimum.accumulate(y, axis=0)).max(axis=0)
+    down = (np.maximum.accumulate(y, axis=0) - y).max(axis=0)
+    span = np.maximum(np.ptp(y, axis=0), 1e-300)
+    return float((np.minimum(up, down) / span).max(initial=0.0))
 
 
 def _edge(count: int) -> int:

@@ -94,6 +94,42 @@ def p_value(gain: float, freedom: int, searched: float, likelihood: Likelihood) 
     return float(min(1.0, fdtrc(freedom, rest, F) * np.exp(min(searched, 700.0))))
 
 
+def without_a_row(evidence: Evidence, likelihood: Likelihood, families: int) -> float:
+    """The chance of the F test in poses, at its largest of all that leave one row out.
+
+    One reading that is off alone is told by whatever is largest there.
+    """
+    from scipy.special import fdtrc
+
+    rows, axes = likelihood.shape
+    Q = likelihood.declared
+    q, n = evidence.freedom, len(likelihood.residual) - axes
+    rest = n - Q.shape[1] - q
+    if rest < 1 or q < 1:
+        return 1.0
+    costs = [
+        _without_each_row(X, likelihood.residual, rows, axes)
+        for X in (Q, np.concatenate([Q, evidence.basis], axis=1))
+    ]
+    F = (costs[0] / np.maximum(costs[1], 1e-300) - 1) * rest / q
+    searched = float(np.exp(min(_searched(evidence.trials, families), 700.0)))
+    return float(min(1.0, fdtrc(q, rest, np.maximum(F, 0.0)).max() * searched))
+
+
+def _without_each_row(X: Array, y: Array, rows: int, axes: int) -> Array:
+    """What least squares by orthonormal columns leaves where a row is left out, for each, (rows,).
+
+    NaN-free: a row that the rest does not tell leaves no more than it did.
+    """
+    left = y - X @ (X.T @ y)
+    own, r = X.reshape(rows, axes, -1), left.reshape(rows, axes, 1)
+    free = np.eye(axes) - own @ own.transpose(0, 2, 1)
+    values, vectors = np.linalg.eigh(free)
+    turned = (vectors.transpose(0, 2, 1) @ r)[:, :, 0] ** 2
+    taken = np.where(values > 1e-9, turned / np.maximum(values, 1e-9), 0.0).sum(axis=1)
+    return np.asarray(np.maximum(float(left @ left) - taken, 0.0))
+
+
 def screened(trial: Trial, likelihood: Likelihood, white: tuple[Array, Array, Array]) -> float:
     """The gain of a trial under the noise beside none, less its price.
 

@@ -20,8 +20,10 @@ from casest.diagnose.misfit.variables import Variable
 #: Means at least, as many as are wanted, and rows in each of a series, whose noise may have a
 #: colour. Of eight means no order is unlikely enough.
 FEWEST, WANTED, SHORTEST = 8, 24, 4
-#: Rows of a table at least, each of which is measured by itself.
-FEW_ROWS = 12
+#: Rows of a table at least, each of which is measured by itself; and from which on products of so
+#: few can be unlikely. Of fewer von Neumann's ratio is asked: beside noise that grows in proportion
+#: along the order it says so in two of a thousand tables.
+FEW_ROWS, PRODUCTS = 12, 30
 
 
 @dataclass(frozen=True)
@@ -63,7 +65,7 @@ def _structure(name: str, r: Array, tried: int, table: bool) -> Structure | None
     means = r[: count * size].reshape(count, size, -1).mean(axis=1)
     steps = np.mean(np.diff(means, axis=0) ** 2, axis=0) / 2
     variance = np.maximum(means.var(axis=0, ddof=1), 1e-300)
-    z = _of_products(means) if table else _of_ratios(steps / variance, count)
+    z = _of_products(means) if count >= PRODUCTS and table else _of_ratios(steps / variance, count)
     share = float(np.maximum(variance - steps, 0).sum() / max(r.var(axis=0).sum(), 1e-300))
     return Structure(name, share, float(min(1.0, ndtr(-z.max()) * len(z) * tried)))
 
