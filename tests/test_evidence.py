@@ -21,6 +21,7 @@ from casest.diagnose.evidence.score import (
     screened,
     shift,
     whitened,
+    without_a_row,
 )
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.noise.louder import louder
@@ -432,3 +433,37 @@ def test_a_large_cause_of_poses_is_on_all_the_axes_that_it_takes(size):
             part = trial_of((u**2)[:, None, axes], axes=np.array(axes))
             best[tuple(axes)] = judged([part], likelihood, likelihood.beside()).score
         assert best[tuple(kept)] > max(best[(k,)] for k in range(3)) + LEVELS.strong
+
+
+@pytest.mark.parametrize("axes", [1, 2])
+def test_without_a_row_the_chance_is_that_of_the_f_test_on_the_others(axes):
+    """The largest of all that leave one out, by NumPy's least squares and SciPy's F."""
+    rng = np.random.default_rng(axes)
+    for _ in range(20):
+        X, G = rng.standard_normal((16, axes, 3)), rng.standard_normal((16, axes, 2))
+        y = rng.standard_normal((16, axes)) + G @ np.array([0.6, 0.0])
+        likelihood = Likelihood(linear_of(y, X, in_time=False))
+        found = judged([trial_of(G, variants=3.0)], likelihood, likelihood.beside(), families=4)
+        chances = []
+        for k in range(16):
+            kept = np.arange(16) != k
+            flat = [a[kept].reshape(15 * axes, -1) for a in (y, X, G)]
+            c0, c1 = squares(flat[0][:, 0], flat[1]), squares(flat[0][:, 0], np.hstack(flat[1:]))
+            rest = 15 * axes - 5
+            chances.append(stats.f.sf((c0 - c1) / 2 / (c1 / rest), 2, rest))
+        expected = min(1.0, 12 * max(chances))
+        assert without_a_row(found, likelihood, 4) == pytest.approx(expected, rel=1e-6)
+
+
+def test_one_odd_reading_is_no_evidence_of_a_bend():
+    """Twenty readings on a line and one beyond, which is off: by the F test a cubic, until that is
+    left out."""
+    x = np.append(np.linspace(-1, 0, 20), 1.5)
+    residual = 0.05 * np.random.default_rng(2).standard_normal(21)
+    residual[-1] += 0.5
+    X = np.column_stack([np.ones(21), x])
+    ranking = ranked_of(linear_of(residual, X, in_time=False), [trial_of(x**3, "cubic")])
+    (cubic,) = ranking.found
+    assert cubic.p_value < LEVELS.chance
+    assert not ranking.says(cubic)
+    assert ranking.of_one_row(cubic)

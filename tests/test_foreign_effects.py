@@ -6,7 +6,17 @@ import numpy as np
 import pytest
 
 from casest import Residual, Run, close, model, param, quantity, signal
-from casest.effects import creep, gain_matrix, hysteresis, low_pass, soft_iron
+from casest.diagnose import loop
+from casest.diagnose.candidates.grid import Seen, searched
+from casest.effects import (
+    creep,
+    gain_matrix,
+    hysteresis,
+    low_pass,
+    quadratic,
+    signed_quadratic,
+    soft_iron,
+)
 from casest.effects.kinds import foreign
 
 
@@ -103,3 +113,40 @@ def test_one_odd_reading_at_the_beginning_is_no_lag(odd, rows):
     """Behind an even rise a lag, which begins at rest, is an offset of all but the first row."""
     found = close(one_channel("degC"), [warming(odd, rows)], catalogue=(low_pass, creep))
     assert not names(found)
+
+
+# -- what a record cannot show ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("back", "tried"), [(0.0, 0), (0.05, 3), (0.5, 5)])
+def test_a_loop_that_nothing_turned_round_in_is_not_tried(back, tried):
+    """A sweep that comes back by a part of its span: loops up to that part are tried."""
+    reading = np.concatenate([np.linspace(0, 1, 60), np.linspace(1, 1 - back, 20)])[:, None]
+    assert len(searched(("share",), Seen(reading, reading, reading[:, 0], None))[0]) == tried
+
+
+def test_of_readings_above_zero_what_goes_by_their_sign_is_no_rival():
+    rng, x = np.random.default_rng(5), np.linspace(1, 10, 60)
+    y = 0.2 + 3 * x + 0.02 * x**2 + 0.01 * rng.standard_normal(60)
+    run = Run.raw("r", {"x": x[:, None], "y": y[:, None]}, units={"x": "N", "y": "N"})
+    found = close(one_channel("N"), [run], catalogue=(quadratic, signed_quadratic))
+    (effect,) = found.effects
+    assert effect.candidate.name == "quadratic"
+    assert not effect.indistinguishable_from
+
+
+def test_what_held_out_data_are_foretold_worse_with_is_taken_out_again(monkeypatch):
+    """Whatever columns and refits have promised: the errors that are printed must fall."""
+    held_out = loop.held_out
+
+    def worse(sensor, fit, folds):
+        found = held_out(sensor, fit, folds)
+        return tuple(100 * r for r in found) if fit.model.effects else found
+
+    monkeypatch.setattr(loop, "held_out", worse)
+    found = closed("N", creep)
+    assert not names(found)
+    assert found.after is found.before or not found.after.model.effects
+    assert {r.reason for r in found.refused} == {"held-out data do not confirm it"}
+    monkeypatch.undo()
+    assert names(closed("N", creep)) == ["creep"]

@@ -87,7 +87,7 @@ def beside_a_line(x, r):
     return np.clip(left, -far, far)
 
 
-@pytest.mark.parametrize("rows", [40, 94, 200])
+@pytest.mark.parametrize("rows", [16, 20, 29, 30, 40, 94, 200])
 def test_a_bend_is_seen_in_a_table_of_any_length(rows):
     """Means of eight blocks were never unlikely enough: a bend without noise was called noise."""
     x = np.linspace(0, 1, rows)

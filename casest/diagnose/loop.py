@@ -232,11 +232,15 @@ def _foretelling(
 
 
 def _better(before: Sequence[Array], after: Sequence[Array]) -> bool:
-    """Are residuals smaller, those far out before counted as less?"""
+    """Are residuals smaller, counted as less where both are far out?"""
     there = [np.isfinite(b) for b in before]
-    b, a = (np.concatenate([r[k] for r, k in zip(x, there, strict=True)]) for x in (before, after))
-    far = LEVELS.far * robust_scale([b])
-    return bool(np.sum(np.clip(a, -far, far) ** 2) < np.sum(np.clip(b, -far, far) ** 2))
+    b, a = (
+        np.abs(np.concatenate([r[k] for r, k in zip(x, there, strict=True)]))
+        for x in (before, after)
+    )
+    nearer = np.minimum(a, b)
+    beyond = nearer - np.minimum(nearer, LEVELS.far * robust_scale([b]))
+    return bool(np.sum((a - beyond) ** 2) < np.sum((b - beyond) ** 2))
 
 
 def _declared_walks(sensor: Sensor) -> list[Effect]:

@@ -29,7 +29,7 @@ from casest.diagnose.protocol.subject import Subject
 
 def ranked(subject: Subject[F], fit: F) -> Ranking:
     """Every cause beside a fit: the best variants of each family, each with a noise of its own."""
-    ranking = ranked_of(subject.linear(fit), _once(subject, fit))
+    ranking = ranked_of(subject.linear(fit), once(subject, fit))
     whole = {e.trials[0].family: e for e in ranking.found}
     found = tuple(_on_its_axes(subject, fit, e, ranking) for e in ranking.found)
     found = without_feigned(subject, fit, ranking.likelihood, found, ranking.families)
@@ -41,7 +41,7 @@ def ranked(subject: Subject[F], fit: F) -> Ranking:
     return replace(ranking, found=_best_first(found))
 
 
-def _once(subject: Subject[F], fit: F) -> list[Trial]:
+def once(subject: Subject[F], fit: F) -> list[Trial]:
     """Trials without those that are an earlier one under another name: of readings above zero |u|
     is u."""
     seen, found = dict[bytes, str](), []

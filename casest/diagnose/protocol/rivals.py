@@ -9,7 +9,7 @@ from casest.diagnose.evidence.held_out import Fall, fall_between_causes, foretol
 from casest.diagnose.evidence.linear import alike
 from casest.diagnose.evidence.score import Evidence
 from casest.diagnose.levels import LEVELS
-from casest.diagnose.protocol.ranking import ranked_of
+from casest.diagnose.protocol.ranking import once, ranked_of
 from casest.diagnose.protocol.state import F, Kept, Ranking, Rival, State
 from casest.diagnose.protocol.subject import Subject
 
@@ -28,7 +28,7 @@ def _rivals(subject: Subject[F], state: State[F], kept: Kept) -> tuple[State[F],
     apart, base = subject.apart(state.fit, kept), subject.without(state.fit, kept.what)
     if apart is None or base is None:
         return state, []
-    linear, own, others = subject.linear(base), apart[1], list(subject.trials(base))
+    linear, own, others = subject.linear(base), apart[1], once(subject, base)
     if own.columns.shape[:2] != linear.residual.shape:  # rows that moved in time are others
         (own, *_) = [t for t in others if t.family == own.family]
     # Slopes and grids are those of the fit without it: in its own, others follow it.
