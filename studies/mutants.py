@@ -214,7 +214,7 @@ MUTANTS = tuple(
         ),
         (LIKELIHOOD, "np.sum(np.log(S) + left**2 / S)", "np.sum(left**2 / S)"),
         (LIKELIHOOD, "kept = values > max(self.linear.least**2,", "kept = values > min(0.0,"),
-        ("diagnose/misfit/structure.py", "(1 - steps / variance)", "(1 - 0.9 * steps / variance)"),
+        ("diagnose/misfit/structure.py", "(1 - ratio)", "(1 - 0.9 * ratio)"),
         ("diagnose/misfit/structure.py", "* len(z) * tried", "* tried"),
         # -- filters -------------------------------------------------------------------------------
         ("dynamics/between.py", "X1 - tau * (X1 - X0)", "X1"),
