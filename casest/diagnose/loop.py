@@ -301,7 +301,10 @@ def without_outliers(
 
 
 def certified(sensor: Sensor, state: State[Fit], before: Estimate) -> tuple[State[Fit], Estimate]:
-    """The last estimate, with intervals; without effects that leave one without an end."""
+    """The last estimate, with intervals; without effects that leave one without an end.
+
+    In the place of such a one comes what explains as much, if there is any.
+    """
     while True:
         with only_tried(False):
             model = state.fit.model.having(**noises(sensor.model))  # as they are beside it
@@ -310,11 +313,16 @@ def certified(sensor: Sensor, state: State[Fit], before: Estimate) -> tuple[Stat
             return state, after
         if not state.kept:
             return state, before
-        last = state.kept[-1]
+        last, why = state.kept[-1], f"its fit is refused: {after.certificate.reasons[0]}"
+        if last.rivals:
+            first, *others = last.rivals
+            kept = replace(last, what=first.what, rivals=tuple(others))
+            state = replace(state, fit=first.fit, kept=(*state.kept[:-1], kept))
+            state = state.refusing(last.what, why)
+            continue
         fit = sensor.without(state.fit, last.what)
         if fit is None:
             return state, before
-        why = f"its fit is refused: {after.certificate.reasons[0]}"
         state = replace(state, fit=fit, kept=state.kept[:-1], open=(last.evidence, *state.open))
         state = state.refusing(last.what, why)
 
