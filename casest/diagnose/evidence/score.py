@@ -17,7 +17,7 @@ import numpy as np
 
 from casest.declaration.shapes import Array
 from casest.diagnose.evidence.likelihood import Explained, Likelihood
-from casest.diagnose.evidence.linear import Index
+from casest.diagnose.evidence.linear import Index, Linear
 
 
 @dataclass(frozen=True)
@@ -94,37 +94,35 @@ def p_value(gain: float, freedom: int, searched: float, likelihood: Likelihood) 
     return float(min(1.0, fdtrc(freedom, rest, F) * np.exp(min(searched, 700.0))))
 
 
-def without_a_row(evidence: Evidence, likelihood: Likelihood, families: int) -> float:
-    """The chance of the F test in poses, at its largest of all that leave one row out.
+def without_a_row(before: Linear, after: Linear, evidence: Evidence, families: int) -> float:
+    """The chance of the F test between two fits of poses, at its largest of all that leave one row
+    out, each fit linear about itself.
 
     One reading that is off alone is told by whatever is largest there.
     """
     from scipy.special import fdtrc
 
-    rows, axes = likelihood.shape
-    Q = likelihood.declared
-    q, n = evidence.freedom, len(likelihood.residual) - axes
-    rest = n - Q.shape[1] - q
+    rows, axes = before.residual.shape
+    q = after.basis.shape[1] - before.basis.shape[1]
+    rest = (rows - 1) * axes - after.basis.shape[1]
     if rest < 1 or q < 1:
         return 1.0
-    costs = [
-        _without_each_row(X, likelihood.residual, rows, axes)
-        for X in (Q, np.concatenate([Q, evidence.basis], axis=1))
-    ]
-    F = (costs[0] / np.maximum(costs[1], 1e-300) - 1) * rest / q
+    none, whole = (_without_each_row(x) for x in (before, after))
+    F = np.maximum((none / np.maximum(whole, 1e-300) - 1) * rest / q, 0.0)
     searched = float(np.exp(min(_searched(evidence.trials, families), 700.0)))
-    return float(min(1.0, fdtrc(q, rest, np.maximum(F, 0.0)).max() * searched))
+    return float(min(1.0, fdtrc(q, rest, F).max() * searched))
 
 
-def _without_each_row(X: Array, y: Array, rows: int, axes: int) -> Array:
-    """What least squares by orthonormal columns leaves where a row is left out, for each, (rows,).
+def _without_each_row(linear: Linear) -> Array:
+    """Squares that a fit leaves where a row is left out and it is made again, for each, (rows,).
 
-    NaN-free: a row that the rest does not tell leaves no more than it did.
+    A row that the rest says nothing of leaves no more than it did.
     """
-    left = y - X @ (X.T @ y)
-    own, r = X.reshape(rows, axes, -1), left.reshape(rows, axes, 1)
-    free = np.eye(axes) - own @ own.transpose(0, 2, 1)
-    values, vectors = np.linalg.eigh(free)
+    rows, axes = linear.residual.shape
+    Q, y = linear.basis, linear.residual.ravel()
+    left = y - Q @ (Q.T @ y)
+    own, r = Q.reshape(rows, axes, -1), left.reshape(rows, axes, 1)
+    values, vectors = np.linalg.eigh(np.eye(axes) - own @ own.transpose(0, 2, 1))
     turned = (vectors.transpose(0, 2, 1) @ r)[:, :, 0] ** 2
     taken = np.where(values > 1e-9, turned / np.maximum(values, 1e-9), 0.0).sum(axis=1)
     return np.asarray(np.maximum(float(left @ left) - taken, 0.0))

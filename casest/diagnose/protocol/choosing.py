@@ -16,8 +16,6 @@ from casest.diagnose.protocol.subject import Subject
 
 #: Why a cause with strong evidence is not added.
 NOT_HELD_OUT = "held-out data do not confirm it"
-#: And in poses.
-ONE_ROW = "without one of the rows there is no evidence of it"
 #: Why one of a pair is not, beside a column of the motion.
 FOLLOWED = "what only follows a column explains nearly as much"
 
@@ -59,10 +57,7 @@ def with_the_best(
     for evidence in alone[:2]:
         why = NOT_HELD_OUT if evidence in beyond else FOLLOWED
         state = state.refusing(evidence.trials[0].what, why)
-    told = [e for e in ranking.causes if ranking.of_one_row(e)]
-    for evidence in told[:2]:
-        state = state.refusing(evidence.trials[0].what, ONE_ROW)
-    missing = sorted([*options, *ranking.followed, *told], key=lambda e: -e.score)
+    missing = sorted([*options, *ranking.followed], key=lambda e: -e.score)
     return replace(state, open=tuple(missing[: LEVELS.contenders]))
 
 

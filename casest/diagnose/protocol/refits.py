@@ -9,7 +9,7 @@ import numpy as np
 
 from casest.declaration.shapes import Array
 from casest.diagnose.evidence.likelihood import rises
-from casest.diagnose.evidence.score import Evidence, Trial, expected_loss, judged
+from casest.diagnose.evidence.score import Evidence, Trial, expected_loss, judged, without_a_row
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.noise.louder import louder
 from casest.diagnose.protocol.confirming import falls, falls_of_refit, holds_out
@@ -17,6 +17,8 @@ from casest.diagnose.protocol.ranking import sharpened, without_feigned
 from casest.diagnose.protocol.state import F, Ranking, Refit, State
 from casest.diagnose.protocol.subject import Subject
 
+#: Why a cause in poses is not added.
+ONE_ROW = "without one of the rows there is no evidence of it"
 #: Why what holds out and has strong evidence is not added.
 AS_MUCH = "a slow course of unknown cause explains as much"
 
@@ -43,8 +45,11 @@ def refitted(
     for (evidence, better), gain, least in zip(fits, gains, even, strict=True):
         kept = _gaining(evidence, gain)
         enough = beyond_courses(ranking, kept) and _strong(ranking, _gaining(evidence, least))
-        if enough or subject.asked(evidence.trials[0].what):
+        of_one_row = enough and not _of_several_rows(subject, ranking, kept, better)
+        if (enough and not of_one_row) or subject.asked(evidence.trials[0].what):
             found.append(Refit(state.fit, better, kept))
+        elif of_one_row:
+            state = state.failing(evidence, ONE_ROW)
         elif len(evidence.trials) == 1 and _strong(ranking, _gaining(evidence, least)):
             state = state.refusing(evidence.trials[0].what, AS_MUCH)
     found.sort(key=lambda r: -r.evidence.score)
@@ -57,6 +62,15 @@ def refitted(
         found = [best, *[r for r in found if r is not best]]
         found = _plainest_first(found)
     return state, found
+
+
+def _of_several_rows(subject: Subject[F], ranking: Ranking, evidence: Evidence, fit: F) -> bool:
+    """Is it seen in poses whichever row is left out?"""
+    after = subject.linear(fit)
+    if ranking.linear.series or after.residual.shape != ranking.linear.residual.shape:
+        return True
+    chance = without_a_row(ranking.linear, after, evidence, ranking.families)
+    return chance < LEVELS.chance
 
 
 def _gaining(evidence: Evidence, gain: float) -> Evidence:

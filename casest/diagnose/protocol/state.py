@@ -11,7 +11,7 @@ from casest.diagnose.evidence.held_inputs import Held
 from casest.diagnose.evidence.held_out import Fall
 from casest.diagnose.evidence.likelihood import Explained, Likelihood
 from casest.diagnose.evidence.linear import Linear
-from casest.diagnose.evidence.score import Evidence, without_a_row
+from casest.diagnose.evidence.score import Evidence
 from casest.diagnose.levels import LEVELS
 
 F = TypeVar("F")
@@ -29,21 +29,11 @@ class Ranking:
     order: Mapping[str, int] = field(default_factory=dict, repr=False)
 
     def says(self, evidence: Evidence) -> bool:
-        """Strong evidence in a series; in poses the F test, shared among all that was tried, and
-        whichever row is left out."""
+        """Strong evidence in a series; in poses the F test, shared among all that was tried."""
         if not self.linear.series:
-            return evidence.p_value < LEVELS.chance and self._of_several_rows(evidence)
+            return evidence.p_value < LEVELS.chance
         strong = evidence.score > LEVELS.strong
         return strong and (self._held is None or self._held.says(evidence.trials))
-
-    def of_one_row(self, evidence: Evidence) -> bool:
-        """Is it strong evidence in poses, and none without one of the rows?"""
-        if self.linear.series or evidence.p_value >= LEVELS.chance:
-            return False
-        return not self._of_several_rows(evidence)
-
-    def _of_several_rows(self, evidence: Evidence) -> bool:
-        return without_a_row(evidence, self.likelihood, self.families) < LEVELS.chance
 
     @cached_property
     def _held(self) -> Held | None:
