@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from casest import Residual, Run, close, model, param, quantity, signal
+from casest import Residual, Run, close, cos, effect, model, param, quantity, signal, sin
 from casest.diagnose import loop
 from casest.diagnose.candidates.grid import Seen, searched
 from casest.effects import (
@@ -123,6 +123,25 @@ def test_a_loop_that_nothing_turned_round_in_is_not_tried(back, tried):
     """A sweep that comes back by a part of its span: loops up to that part are tried."""
     reading = np.concatenate([np.linspace(0, 1, 60), np.linspace(1, 1 - back, 20)])[:, None]
     assert len(searched(("share",), Seen(reading, reading, reading[:, 0], None))[0]) == tried
+
+
+@effect(on="output", profile={"frequency": "frequency"})
+def tide(y, t=signal("s"), *, sine=param("[y]"), cosine=param("[y]"), frequency=param("rad/s")):
+    """A line of any frequency."""
+    return y + sine * sin(frequency * t) + cosine * cos(frequency * t)
+
+
+def test_a_line_of_ones_own_may_be_as_slow_as_it_likes():
+    """An effect that states no least frequency has none."""
+    rng, t = np.random.default_rng(6), 60.0 * np.arange(900)
+    x = rng.uniform(-2, 2, len(t))
+    y = 0.2 + 3 * x + 0.1 * np.sin(2 * np.pi * t / 3600) + 0.05 * rng.standard_normal(len(t))
+    units = {"x": "N", "y": "N"}
+    run = Run.raw("r", {"x": x[:, None], "y": y[:, None]}, units=units, time=t)
+    found = close(one_channel("N"), [run], catalogue=(tide,))
+    assert names(found) == ["tide"]
+    size = found.after.values["tide.frequency"]
+    assert abs(float(size)) == pytest.approx(2 * np.pi / 3600, rel=1e-3)
 
 
 def test_of_readings_above_zero_what_goes_by_their_sign_is_no_rival():

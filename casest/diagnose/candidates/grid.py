@@ -62,7 +62,7 @@ def _lowest(candidate: Candidate, profile: Mapping[str, str]) -> float:
         for name, d in candidate.effect.declarations
         if profile.get(name) == "frequency" and isinstance(d, Parameter)
     ]
-    return max(said, default=0.0)
+    return max([0.0, *said])
 
 
 def _held(values: Mapping[str, float]) -> tuple[tuple[str, float], ...]:
