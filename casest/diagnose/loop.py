@@ -315,6 +315,7 @@ def certified(sensor: Sensor, state: State[Fit], before: Estimate) -> tuple[Stat
             return state, before
         last, why = state.kept[-1], f"its fit is refused: {after.certificate.reasons[0]}"
         if last.rivals:
+            # Its evidence stays that of the one that it replaces: they differ by little.
             first, *others = last.rivals
             kept = replace(last, what=first.what, rivals=tuple(others))
             state = replace(state, fit=first.fit, kept=(*state.kept[:-1], kept))

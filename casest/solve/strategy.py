@@ -158,7 +158,7 @@ def _ways_of_equations(
     with suppress(GivenUp), for_seconds(OPINIONS):  # else an opinion less
         end = trust_region(problem, first, max_iterations=OPINION, tolerance=slight(problem))
         direct.append(end)
-        if solver != "multiple-shooting" and vouched(end.point):
+        if solver != "multiple-shooting" and np.isfinite(end.cost) and vouched(end.point):
             return (_asked_for(problem, end, solver), end)
     others = [
         o

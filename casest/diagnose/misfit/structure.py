@@ -3,7 +3,8 @@
 Rows are put in the order of a variable and averaged over blocks; the squared differences of
 neighbouring means against their variance (J. von Neumann, 1941) are 1 on average for what follows
 nothing. Of a table's single rows, whose noise may be larger at one end and have any tails, the
-products of neighbours are summed, against their own squares: that is normal whatever the sizes are.
+products of neighbours are summed, against their own squares: that is normal whatever the sizes are,
+and says nothing of fewer than PRODUCTS rows, which are asked by that ratio as well.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from casest.diagnose.misfit.variables import Variable
 FEWEST, WANTED, SHORTEST = 8, 24, 4
 #: Rows of a table at least, each of which is measured by itself; and from which on products of so
 #: few can be unlikely. Of fewer von Neumann's ratio is asked: beside noise that grows in proportion
-#: along the order it says so in two of a thousand tables.
+#: along the order it says so in one to three of a thousand tables.
 FEW_ROWS, PRODUCTS = 12, 30
 
 
