@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter1d
 
 from casest import Residual, Run, model, param, quantity, signal
 from casest.cli import run
@@ -110,6 +111,45 @@ def test_a_slow_course_is_said_to_be_of_the_reference_or_of_the_offset(
     assert result["verdict"] == "unexplained"
     assert result["unexplained"]["described_by"] == [name]
     assert f"its slow course is best described by {name} ({words}" in result["unexplained"]["where"]
+
+
+LENGTH = """
+import casest as c
+
+
+@c.model
+def length(m=c.signal(3, "uT"), *, hard=c.param(3, "uT"), size=c.constant(48.0, "uT")):
+    field = c.quantity("field", m - hard, "uT")
+    return c.Residual(implicit=c.norm_2(field) - size, unit="uT", corrected=field, axes=("length",))
+"""
+
+
+@pytest.mark.parametrize(
+    ("of_field", "of_offset", "turning", "names"),
+    [
+        (0.006, 0.0, 5, {"reference_wander"}),
+        pytest.param(0.006, 0.0, 40, {"reference_wander"}, marks=pytest.mark.long),
+        (0.0, 0.25, 5, {"bias_course"}),  # which is slow in no residual
+        pytest.param(0.0, 0.25, 15, {"bias_course"}, marks=pytest.mark.long),
+    ],
+)
+def test_a_length_alone_tells_a_course_of_the_reference_from_one_of_the_offset(
+    tmp_path, of_field, of_offset, turning, names
+):
+    """By how it goes with the direction, where that turns."""
+    rng = np.random.default_rng(5)
+    t = 0.1 * np.arange(1500)
+    x = 2 * t / t[-1] - 1
+    course = np.sin(25 * x) + 0.4 * np.cos(50 * x)
+    b = gaussian_filter1d(rng.standard_normal((1500, 3)), turning, axis=0)
+    b *= 48 / np.linalg.norm(b, axis=1)[:, None]
+    m = b * (1 + of_field * course)[:, None] + np.outer(
+        course, of_offset * np.array([1, -0.5, 0.8])
+    )
+    m += [5, -8, 2] + 0.05 * rng.standard_normal((1500, 3))
+    result = closed(tmp_path, LENGTH, "t [s],m_x [uT],m_y [uT],m_z [uT]", t, m)
+    assert result["verdict"] == "unexplained"
+    assert set(result["unexplained"]["described_by"]) == names
 
 
 def test_causes_that_explain_nothing_are_not_said_to_explain_alike():
