@@ -24,6 +24,8 @@ LAGS = 8
 SHARES = (0.003, 0.01, 0.03, 0.1, 0.3)
 #: The shortest time constant, in samples: a shorter one is a delay.
 SHORTEST = 3.0
+#: Share of a shift's squares that the unknowns may leave and it still counts as seen.
+UNSEEN = 1e-3
 #: Share of the readings that the lowest level lets through, and fewest beyond the highest.
 LOWEST, FEWEST = 0.7, 6
 
@@ -31,12 +33,14 @@ LOWEST, FEWEST = 0.7, 6
 @dataclass(frozen=True)
 class Seen:
     """What a grid is laid over: the push Pᵀr (N, q) of the residual on what the sensor gives, the
-    prediction (N, q) if there is one, the time (N,) if there is one, and the linear problem."""
+    prediction (N, q) if there is one, the time (N,) if there is one, the linear problem, and P
+    (N, m, q), the residual's slope in a shift of what the sensor gives, where it is not −1."""
 
     push: Array
     reading: Array | None
     time: Array | None
     linear: Linear
+    shift: Array | None = None
 
 
 def on_grid(candidate: Candidate, seen: Seen, likely: float = 0.0) -> list[Candidate]:
@@ -129,14 +133,37 @@ def _edge(count: int) -> int:
     return max(4, count // 100)
 
 
-def _bends(push: Array) -> tuple[Array, Array]:
-    """Cumulative sums of the push, each axis by its own size; gain of a step before each row."""
-    z = push - push.mean(axis=0)
-    z = z / (z.std(axis=0) + 1e-300)
-    n = len(z)
-    sums = np.vstack([np.zeros((1, z.shape[1])), np.cumsum(z, axis=0)])
-    i = np.arange(1, n)
-    return sums, (sums[1:-1] ** 2).sum(axis=1) / (i * (n - i) / n)
+class Shifts:
+    """What a shift of what the sensor gives takes from the squares, on rows a to b and no others.
+
+    By least squares beside the unknowns, from sums over the rows before each: a reading's length
+    shows of a shift what lies along it, and that turns.
+    """
+
+    def __init__(self, seen: Seen) -> None:
+        r, basis = seen.linear.residual, seen.linear.basis
+        n, axes = r.shape
+        P = np.tile(np.eye(axes), (n, 1, 1)) if seen.shift is None else seen.shift
+        left = (r.ravel() - basis @ (basis.T @ r.ravel())).reshape(r.shape)
+        rows = basis.reshape(n, axes, -1)
+        self._s, self._S, self._K = (
+            np.concatenate([np.zeros((1, *each.shape[1:])), np.cumsum(each, axis=0)])
+            for each in (
+                np.einsum("nmq,nm->nq", P, left),
+                np.einsum("nmq,nmk->nqk", P, P),
+                np.einsum("nmp,nmq->npq", rows, P),
+            )
+        )
+
+    def gain(self, a: Index, b: Index) -> Array:
+        """For each pair of rows, in squares of the residual."""
+        s, S, K = (x[b] - x[a] for x in (self._s, self._S, self._K))
+        size = np.sqrt(np.maximum(np.einsum("...qq->...q", S), 1e-300))
+        beside = S - np.einsum("...pq,...pk->...qk", K, K)
+        beside = beside / (size[..., :, None] * size[..., None, :])
+        s = s / size
+        found = np.linalg.solve(beside + UNSEEN * np.eye(s.shape[-1]), s[..., None])
+        return np.asarray(np.sum(s * found[..., 0], axis=-1))
 
 
 def _between(time: Array, k: int) -> float:
@@ -148,8 +175,8 @@ def _moments(seen: Seen) -> Values:
     n, edge = len(seen.time), _edge(len(seen.time))
     if n < 4 * edge:
         return [], 1
-    gain = _bends(seen.push)[1]
-    best = edge + int(np.argmax(gain[edge - 1 : n - edge]))
+    rows = np.arange(edge, n - edge + 1)
+    best = edge + int(np.argmax(Shifts(seen).gain(rows, np.full_like(rows, n))))
     even = np.linspace(edge, n - edge, MOMENTS).astype(int)
     chosen = sorted({best, *even.tolist()})
     return [(_between(seen.time, k),) for k in chosen if 0 < k < n], n
@@ -161,15 +188,10 @@ def _pulses(seen: Seen) -> Values:
     edge = _edge(n)
     if n < 8 * edge:
         return [], 1
-    sums = _bends(seen.push)[0]
-
-    def gain(a: Index, b: Index) -> Array:
-        inside = np.maximum(b - a, 1)
-        moved = ((sums[b] - sums[a]) ** 2).sum(axis=-1) / (inside * (1 - inside / n) + 1e-9)
-        return np.asarray(np.where(b - a >= edge, moved, 0.0))
-
+    gain = Shifts(seen).gain
     grid = np.unique(np.linspace(edge, n - edge, EDGES).astype(int))
     a, b = (g.ravel() for g in np.meshgrid(grid, grid, indexing="ij"))
+    a, b = a[b - a >= edge], b[b - a >= edge]
     best = int(np.argmax(gain(a, b)))
     first, last = int(a[best]), int(b[best])
     reach = max(2, n // EDGES)

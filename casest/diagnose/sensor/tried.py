@@ -141,7 +141,7 @@ class Tried:
         times = [run.time for run in self.rows.runs if run.time is not None]
         if len(times) == len(self.rows.runs):
             time = self.rows.of(times)
-        return Seen(push, reading, time, linear)
+        return Seen(push, reading, time, linear, None if shift is None else shift[1])
 
     def shift(self, fit: Fit) -> tuple[str, Array] | None:
         """What the sensor gives, and the residual's slope (N, m, axes) in a shift of it."""
