@@ -18,6 +18,7 @@ from casest.effects import CATALOGUE
 from casest.leastsquares.problem import Problem
 from casest.results.closing import Effect, Unexplained, closing_result
 from casest.results.find import find_model
+from casest.results.fitted import Samples
 from casest.results.verdict import sentence, undecided
 
 
@@ -342,11 +343,17 @@ def test_a_residual_that_resembles_itself_over_many_samples_is_not_called_noise_
                    would_separate=[], instead_would_move={})  # fmt: skip
     said = [
         sentence(changed(result, verdict="extended", effects=[added], not_tried=[],
+                         samples=[Samples("table", count, count)],
                          noise=changed(result.noise, correlated_over_samples=over)))
-        for over in (1.0, 33.2)
+        for over, count in ((1.0, 2000), (33.2, 2000), (1.0, 19))
     ]  # fmt: skip
     assert said[0] == "extended: vibration was missing; what is left is noise"
     assert said[1].endswith("what is left is coloured noise (alike over 33 samples), or a lag")
+    few = [Samples("table", 19, 19)]
+    short = sentence(
+        changed(result, verdict="extended", effects=[added], not_tried=[], samples=few)
+    )
+    assert short.endswith("what is left is noise as far as 19 rows can tell")
 
 
 @pytest.mark.long

@@ -9,6 +9,7 @@ from casest.diagnose.found import HELD_OUT_DATA
 from casest.diagnose.levels import LEVELS
 from casest.effects import CATALOGUE
 from casest.results.closing import Closed, Effect, Shifts, Unexplained
+from casest.results.fitted import Samples
 from casest.results.result import Number, Parameter
 
 #: Samples that resemble each other from which on noise may as well be a lag or a hysteresis.
@@ -32,7 +33,7 @@ def sentence(result: Closed) -> str:
         return f"adequate: {said}{noise}{untried}"
     if result.verdict == "extended":
         verb = "was" if len(names) == 1 else "were"
-        left = _remaining_noise(result.noise.correlated_over_samples)
+        left = _remaining_noise(result.noise.correlated_over_samples, result.samples)
         return f"extended: {', '.join(names)} {verb} missing; what is left is {left}{untried}"
     found = f"beside {', '.join(names)} " if names else ""
     causes = result.unexplained.one_of
@@ -42,12 +43,12 @@ def sentence(result: Closed) -> str:
     return f"unexplained: {found}a misfit remains that no candidate explains"
 
 
-def _remaining_noise(correlated_over: Number) -> str:
-    """What noise is called that resembles itself over so many samples."""
-    over = correlated_over or 1
-    return (
-        "noise" if over < COLOURED else f"coloured noise (alike over {over:.0f} samples), or a lag"
-    )
+def _remaining_noise(correlated_over: Number, samples: Sequence[Samples]) -> str:
+    """What noise is called that resembles itself over so many samples, and of how few it is."""
+    over, count = correlated_over or 1, sum(s.samples for s in samples)
+    if over >= COLOURED:
+        return f"coloured noise (alike over {over:.0f} samples), or a lag"
+    return "noise" if count >= LEVELS.series else f"noise as far as {count} rows can tell"
 
 
 def consequence(result: Closed) -> str:
