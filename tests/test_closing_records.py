@@ -202,6 +202,14 @@ def test_beside_a_lag_the_soft_iron_is_whole_and_no_axis_of_the_motion_a_cause(c
     assert result["after"]["rmse_holdout"] < 0.75
 
 
+@pytest.mark.long
+def test_what_is_better_alone_comes_before_a_pair_of_others(closed):
+    """A magnet that came and went, and iron: not products of two axes with a step."""
+    found = labels(closed(f"{MODELS}:compass", "broad/mag32s.csv"))
+    assert found[:3] == ["pulse", "signal_lag", "soft_iron"]
+    assert not {"cross_quadratic", "cubic", "vibration"} & set(found)
+
+
 @pytest.fixture(scope="module")
 def cut(shared_data, tmp_path_factory):
     """Tables that are made from the records: of MAG3 until the copter falls, of two gyros."""

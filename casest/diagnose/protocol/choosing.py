@@ -8,7 +8,7 @@ from math import inf
 
 from casest.diagnose.evidence.score import Evidence, again, judged
 from casest.diagnose.levels import LEVELS
-from casest.diagnose.protocol.confirming import FAR_AWAY, falls, passing
+from casest.diagnose.protocol.confirming import FAR_AWAY, falls, holds_out, passing
 from casest.diagnose.protocol.ranking import pairs, ranked, without_feigned
 from casest.diagnose.protocol.refits import best_refits, refitted, shown, torn_between
 from casest.diagnose.protocol.state import F, Kept, Ranking, Refit, State
@@ -30,7 +30,7 @@ def with_the_best(
     options.sort(key=lambda e: -e.score)
     formulas = [] if asked else [subject.formula(state.fit, ranking)]
     described = next(iter(_without_noise(subject, state.fit, ranking, formulas)), None)
-    beyond = _beyond_columns(ranking, options)
+    beyond = _not_instead(ranking, _beyond_columns(ranking, options))
     left, tried = beyond, list[Evidence]()
     while True:
         held = asked or passing(ranking, left)
@@ -89,6 +89,25 @@ def _beyond_columns(ranking: Ranking, options: Sequence[Evidence]) -> list[Evide
         return pair.score > max(beside[f] for f in pair.families) + LEVELS.clear
 
     return [e for e in options if len(e.trials) == 1 or clear(e)]
+
+
+def _not_instead(ranking: Ranking, options: Sequence[Evidence]) -> list[Evidence]:
+    """Without pairs of which a cause that alone is better than either can take the place of one:
+    it comes first, and the other one beside it."""
+    alone = {e.families[0]: e for e in options if len(e.trials) == 1}
+    together = {frozenset(e.families): e.score for e in options if len(e.trials) > 1}
+
+    def instead(pair: Evidence) -> bool:
+        best = max((alone[f].score for f in pair.families if f in alone), default=-inf)
+        return any(
+            one.score > best
+            and family not in pair.families
+            and max(together.get(frozenset((family, f)), -inf) for f in pair.families) > pair.score
+            and holds_out(falls(ranking, one), ranking.linear)
+            for family, one in alone.items()
+        )
+
+    return [e for e in options if len(e.trials) == 1 or not instead(e)]
 
 
 def _first_certified(

@@ -31,7 +31,7 @@ def ranked(subject: Subject[F], fit: F) -> Ranking:
     """Every cause beside a fit: the best variants of each family, each with a noise of its own."""
     ranking = ranked_of(subject.linear(fit), once(subject, fit))
     whole = {e.trials[0].family: e for e in ranking.found}
-    found = tuple(_on_its_axes(subject, fit, e, ranking) for e in ranking.found)
+    found = tuple(on_its_axes(subject, fit, e, ranking) for e in ranking.found)
     found = without_feigned(subject, fit, ranking.likelihood, found, ranking.families)
     ranking = _about_the_best(replace(ranking, found=_best_first(found)))
     near = [e for e in ranking.causes[: LEVELS.contenders] if e.score > -LEVELS.clear]
@@ -66,7 +66,7 @@ def _finer(
     if found.trials[0] is evidence.trials[0] or every.freedom == evidence.freedom:
         return found
     every = sharpened(subject, fit, ranking, every)
-    every = _on_its_axes(subject, fit, every, ranking)
+    every = on_its_axes(subject, fit, every, ranking)
     return every if every.score > found.score else found
 
 
@@ -121,7 +121,7 @@ def _best_first(found: Sequence[Evidence]) -> tuple[Evidence, ...]:
     return tuple(sorted(found, key=lambda e: -e.score))
 
 
-def _on_its_axes(subject: Subject[F], fit: F, evidence: Evidence, ranking: Ranking) -> Evidence:
+def on_its_axes(subject: Subject[F], fit: F, evidence: Evidence, ranking: Ranking) -> Evidence:
     """Without the axes that are not worth their price."""
     axes = on_fewer_axes(evidence, ranking.likelihood)
     if axes is None:

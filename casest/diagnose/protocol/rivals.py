@@ -9,7 +9,7 @@ from casest.diagnose.evidence.held_out import Fall, fall_between_causes, foretol
 from casest.diagnose.evidence.linear import alike
 from casest.diagnose.evidence.score import Evidence
 from casest.diagnose.levels import LEVELS
-from casest.diagnose.protocol.ranking import once, ranked_of
+from casest.diagnose.protocol.ranking import on_its_axes, once, ranked_of
 from casest.diagnose.protocol.state import F, Kept, Ranking, Rival, State
 from casest.diagnose.protocol.subject import Subject
 
@@ -42,9 +42,13 @@ def _rivals(subject: Subject[F], state: State[F], kept: Kept) -> tuple[State[F],
     nothing = fall.left + fall.gained  # squares without any of them
     rivals = list[Evidence]()
     for e in ranking.causes:
+        if e is mine[0] or len(rivals) == 2 * LEVELS.contenders:
+            continue
+        if not linear.series:  # each unknown costs: what was added is on its axes as well
+            e = on_its_axes(subject, base, e, ranking)
         # A score is a promise: noise that was matched to what explains more may hide its worth.
-        weak = e.score < LEVELS.strong and e.gain < mine[0].gain
-        if e is mine[0] or weak or len(rivals) == 2 * LEVELS.contenders:
+        strong = e.score >= LEVELS.strong if linear.series else ranking.says(e)
+        if not strong and e.gain < mine[0].gain:
             continue
         its = foretold(linear, [_in_time(ranking, e)], stretches)
         lost = fall_between_causes(linear, its, best)
