@@ -256,7 +256,7 @@ class Sensor(Subject[Fit]):
         """The linear problem as if an effect were not there, and the effect as a trial of it."""
         what: Candidate = kept.what
         problem, _ = problem_of(fit, self.runs)
-        names = {p.name for p in what.parameters(fit.model)}
+        names = {p.name for p in what.free().parameters(fit.model)}  # a lag is its delay alone
         own = [(s.x, s.parameter.name) for s in problem.slots if s.parameter.name in names]
         if not own:
             return None
