@@ -27,7 +27,6 @@ from casest.estimate.reasons import Code
 from casest.estimate.valley import searchable
 from casest.fleet.fit import Bounds, Places, minimise, padded
 from casest.fleet.judge import Judge
-from casest.fleet.outlying import outlying
 from casest.fleet.records import Records
 from casest.fleet.sums import NARROWEST, Sensors, Squares, widest
 from casest.fleet.valley import Doubt, Ended
@@ -113,7 +112,7 @@ def calibrate_many(
     `noise` is the standard deviation of one residual that a sound sensor has: one with
     significantly more is refused. Up to `retry` refused sensors are calibrated once more one by
     one, with IPOPT and second opinions. `misfit` asks of each whether its largest residual is
-    larger than noise makes it (`fleet.outlying`), which costs a fifth of the time.
+    larger than noise makes it (`fleet.outlying`), which costs a tenth of the time.
 
     The samples of a sensor are taken as independent of each other (poses, not a time series); from
     a hundred of them on a sensor whose neighbouring residuals are alike is refused.
@@ -127,7 +126,7 @@ def calibrate_many(
     if model.traced.integrates:
         _each_alone(Records(model, readings, lengths, start, noise), result)
         return result.batch(model)
-    job = _Job(model, readings, lengths, start or model.starter_of_many, noise)
+    job = _Job(model, readings, lengths, start or model.starter_of_many, noise, misfit)
     width = widest(samples)
     with np.errstate(all="ignore"), one_thread():
         for first in range(0, size, width):
@@ -325,13 +324,14 @@ class _Job:
     counts: Array | None
     start: Start | None
     noise: float | None
+    misfit: bool
     squares: Squares = field(init=False)
     judge: Judge = field(init=False)
     doubt: Doubt | None = field(init=False)
 
     def __post_init__(self) -> None:
         self.squares = Squares(residual_and_jacobian(self.model))
-        self.judge = Judge(self.model, self.squares, self.noise)
+        self.judge = Judge(self.model, self.squares, self.noise, self.misfit)
         stated = self.start is not None
         doubt = Doubt(self.model, self.squares, self.judge, stated)
         self.doubt = doubt if searchable(self.model) else None
@@ -349,8 +349,8 @@ class _Job:
         result.sigma[span] = judged.sigma[:size]
         result.rmse[span] = judged.rmse[:size]
         result.verdicts.put(span, judged)
-        if result.misfit is not None:
-            result.misfit[span] = outlying(self.squares, sensors, fits)[:size]
+        if result.misfit is not None and judged.misfit is not None:
+            result.misfit[span] = judged.misfit[:size]
         if self.doubt is not None:
             ended = Ended(sensors, x, fits, bounds)
             doubtful = self.doubt(ended, judged, lambda k: self._as_run(span.start + k), size)

@@ -38,6 +38,7 @@ from casest.fleet.fit import Bounds, Fits, Flags, Places, minimise, residual_cou
 from casest.fleet.linear import cholesky, dot, form, times, whole
 from casest.fleet.local import Local, groups, local, rounding
 from casest.fleet.on_bounds import bounded
+from casest.fleet.outlying import outlying
 from casest.fleet.sums import Hold, Sensors, Squares
 from casest.fleet.verdicts import Judged
 from casest.leastsquares.per_sample import laplacian, slope_in_sample
@@ -53,8 +54,11 @@ SAFETY = 3.5
 class Judge:
     """Verdicts on fits of one model."""
 
-    def __init__(self, model: Model, squares: Squares, noise: float | None) -> None:
-        self.model, self.squares, self.expected = model, squares, noise
+    def __init__(
+        self, model: Model, squares: Squares, noise: float | None, misfit: bool = False
+    ) -> None:
+        """`noise`: σ of a sound sensor's residuals; `misfit`: is each asked for an outlying one?"""
+        self.model, self.squares, self.expected, self.misfit = model, squares, noise, misfit
         positive = [p.shape.positive_diagonal for p in model.parameters for _ in p.entry_names]
         # A bound is no answer for these: the residual is open towards it.
         self.never: Flags = np.array(positive, dtype=bool) | model.implicit
@@ -68,6 +72,9 @@ class Judge:
         found.step[:] = np.sqrt(fits.left) * np.minimum(fits.shrink, 1.0) / here.noise
         self._readings(found, sensors)
         self._determined(found, here)
+        residuals = self._residuals(here, sensors, self.misfit)
+        if self.misfit and residuals is not None:
+            found.misfit = outlying(self.squares, sensors, here, count, residuals)
         here, held = bounded(found, here, sensors, bounds, self.squares, self.never)
         found.add(Code.NO_REDUNDANCY, freedom <= 0)
         found.add(Code.NOT_FINITE, ~np.isfinite(fits.cost))
@@ -77,9 +84,9 @@ class Judge:
         found.add(Code.NOT_SETTLED, np.logical_not(settled))
         if self.expected is not None:
             found.add(Code.LOUD, self._loud(here.sigma, freedom))
-        self._independent(found, here, sensors)
+        self._independent(found, here, sensors, residuals)
         self._shape(found, here, sensors, bounds)
-        shift = self._second_order(found, here, sensors, count)
+        shift = self._second_order(found, here, sensors, count, residuals)
         unit = here.sigma / here.scale
         np.multiply(here.inverse, unit[:, None], out=found.covariance)
         found.covariance *= unit
@@ -107,10 +114,16 @@ class Judge:
         found = Judged.of(x.shape, here.sigma, np.sqrt(2 * fits.cost / count))
         if self.expected is not None:
             found.add(Code.LOUD, self._loud(here.sigma, freedom))
-        self._independent(found, here, sensors)
+        self._independent(found, here, sensors, self._residuals(here, sensors))
         return found
 
     # -- questions to every sensor -----------------------------------------------------------------
+
+    def _residuals(self, here: Local, sensors: Sensors, asked: bool = False) -> Array | None:
+        """Every residual (m, N, W) where it is `asked` for or records are long, else None."""
+        if not asked and sensors.samples.shape[1] < ENOUGH:
+            return None
+        return self.squares.residuals(here.fits.x, sensors)
 
     def _readings(self, found: Judged, sensors: Sensors) -> None:
         total = np.add.reduce(np.add.reduce(sensors.samples, axis=0), axis=0)
@@ -154,11 +167,12 @@ class Judge:
         limit = np.sqrt(chi2.isf(TOO_LARGE, counts) / counts)[which] * self.expected
         return np.asarray(sigma > limit)
 
-    def _independent(self, found: Judged, here: Local, sensors: Sensors) -> None:
+    def _independent(
+        self, found: Judged, here: Local, sensors: Sensors, residuals: Array | None
+    ) -> None:
         """Neighbours alike: a time series, whose samples say less than their number."""
-        if sensors.samples.shape[1] < ENOUGH:
+        if residuals is None or residuals.shape[1] < ENOUGH:
             return
-        residuals = self.squares.residuals(here.fits.x, sensors)
         along = np.einsum("mns,mns->s", residuals[:, 1:], residuals[:, :-1])
         share = along / (2 * here.fits.cost)
         exact = here.sigma < 10 * rounding(here.fits, np.ones(len(along)))
@@ -253,13 +267,13 @@ class Judge:
     # -- the noise -------------------------------------------------------------------------------
 
     def _second_order(
-        self, found: Judged, here: Local, sensors: Sensors, count: Array
+        self, found: Judged, here: Local, sensors: Sensors, count: Array, residuals: Array | None
     ) -> Array | None:
         """What an implicit residual neglects of the noise; its shift's square (n, n, W), if any."""
         if not self.model.implicit:
             return None
         enough = np.minimum(SECOND_ORDER, NOTABLE_BIAS / np.sqrt(count)) / SAFETY
-        found.second[:] = self._screened(here, sensors)
+        found.second[:] = self._screened(here, sensors, residuals)
         suspect = ~(found.second <= enough) & ~found.refused
         shift = None
         for k in groups(suspect):
@@ -273,12 +287,19 @@ class Judge:
             shift[:, :, k] = np.where(notable, bias * bias[:, None], 0.0)
         return shift
 
-    def _screened(self, here: Local, sensors: Sensors) -> Array:
-        """Size of ½σ²·∂²r over σ along one direction of the readings' noise per sample, (W,)."""
-        some = _thinned(sensors)
+    def _screened(self, here: Local, sensors: Sensors, residuals: Array | None) -> Array:
+        """Size of ½σ²·∂²r over σ along one direction of the readings' noise per sample, (W,).
+
+        `residuals` (m, N, W) where they are known.
+        """
+        every = _every(sensors)
+        some = _thinned(sensors, every)
         number = np.arange(some.samples.shape[1])
         total = np.zeros(len(here.sigma))
-        middle = self.squares.residuals(here.fits.x, some)
+        if residuals is None:
+            middle = self.squares.residuals(here.fits.x, some)
+        else:
+            middle = residuals[:, ::every]
         first = 0
         for s in self.model.signals:
             own = slice(first, first + s.size)
@@ -340,9 +361,13 @@ def _another(here: Local, other: Fits) -> Flags:
     return np.asarray((near & (away > APART)) | lower)
 
 
-def _thinned(sensors: Sensors) -> Sensors:
-    """A third of the samples, at least eight of them."""
-    every = max(1, min(3, sensors.samples.shape[1] // 8))
+def _every(sensors: Sensors) -> int:
+    """Which samples are enough for a screen: a third of them, at least eight."""
+    return max(1, min(3, int(sensors.samples.shape[1]) // 8))
+
+
+def _thinned(sensors: Sensors, every: int) -> Sensors:
+    """One sample in so many."""
     mask = None if sensors.mask is None else sensors.mask[::every]
     return Sensors(np.ascontiguousarray(sensors.samples[:, ::every]), mask)
 

@@ -12,19 +12,20 @@ from casest.fleet.linear import cholesky, inverse, lengths
 
 
 class Local(NamedTuple):
-    """Fits with what follows from them: lengths of J's columns (n, W), (JᵀJ)⁻¹ in units of those
-    (n, n, W), σ (W,), and σ or rounding, whichever is larger (W,)."""
+    """Fits with what follows from them: lengths of J's columns (n, W); in units of those the
+    Cholesky factor of JᵀJ and (JᵀJ)⁻¹ (n, n, W); σ (W,), and σ or rounding, whichever is larger
+    (W,)."""
 
     fits: Fits
     scale: Array
+    factor: Array
     inverse: Array
     sigma: Array
     noise: Array
 
     def some(self, k: Places) -> Local:
         """Those of the sensors at these places."""
-        fits = self.fits.some(k)
-        return Local(fits, self.scale[:, k], self.inverse[:, :, k], self.sigma[k], self.noise[k])
+        return Local(self.fits.some(k), *(part[..., k] for part in self[1:]))
 
 
 def local(fits: Fits, count: Array) -> tuple[Local, Array]:
@@ -35,7 +36,7 @@ def local(fits: Fits, count: Array) -> tuple[Local, Array]:
     freedom = count - len(scale)
     sigma = np.sqrt(2 * fits.cost / np.where(freedom > 0, freedom, np.nan))
     noise = np.maximum(np.where(np.isfinite(sigma), sigma, 0.0), rounding(fits, count))
-    return Local(fits, scale, inverse(factor), sigma, noise), freedom
+    return Local(fits, scale, factor, inverse(factor), sigma, noise), freedom
 
 
 def rounding(fits: Fits, count: Array) -> Array:

@@ -91,7 +91,7 @@ def chunk(samples: int) -> int:
 
 def panel(samples: int) -> int:
     """Sensors that are evaluated at once, for records of so many samples."""
-    return NUMBERS // max(chunk(samples), 8) // NARROWEST * NARROWEST
+    return NUMBERS // max(chunk(samples), 3) // NARROWEST * NARROWEST
 
 
 def widest(samples: int) -> int:
@@ -193,18 +193,16 @@ def _call(plan: Plan, i: int, place: dict[int, Array]) -> tuple[Kernel, tuple[Ar
 def _left(L: Array, J: Array, columns: list[int]) -> Array:
     """1 − h, what is left of each residual, (P, w); rows J (k, P, w) have only these columns.
 
-    h = ‖L⁻¹Jᵀ‖², by substitution in the place of J.
+    h = ‖L⁻¹Jᵀ‖², by substitution.
     """
-    left, part = np.ones(J.shape[1:]), np.empty(J.shape[1:])
-    done: dict[int, Array] = {}
-    for i in range(columns[0] if columns else len(L), len(L)):
-        own = J[columns.index(i)] if i in columns else np.zeros_like(left)
-        for k, before in done.items():
-            own -= np.multiply(L[i, k], before, out=part)
-        own /= L[i, i]
-        left -= np.square(own, out=part)
-        done[i] = own
-    return np.maximum(left, 1e-12, out=left)
+    first = columns[0] if columns else len(L)
+    y = np.zeros((len(L), *J.shape[1:]))
+    y[columns] = J
+    for i in range(first, len(L)):
+        if i > first:
+            y[i] -= np.einsum("ks,kps->ps", L[i, first:i], y[first:i])
+        y[i] /= L[i, i]
+    return np.asarray(np.maximum(1 - np.einsum("kps,kps->ps", y, y), 1e-12))
 
 
 def _adjacent(places: list[int]) -> slice | list[int]:
@@ -300,8 +298,11 @@ class Squares:
                 total[columns, s] += np.einsum("ps,jps->js", own, part)
         return total[: self.n]
 
-    def studentised(self, x: Array, sensors: Sensors, factor: Array) -> Array:
-        """Largest r²/(1 − h) of every sensor, (W,), h the leverage; factor L (n, n, W) of JᵀJ."""
+    def studentised(self, x: Array, sensors: Sensors, factor: Array, scale: Array) -> Array:
+        """Largest r²/(1 − h) of every sensor, (W,), h the leverage.
+
+        `factor` L (n, n, W) of JᵀJ in units of `scale` (n, W).
+        """
         largest = np.zeros(x.shape[1])
         for _, s, values in self._all.chunks(x, sensors):
             first, L = 0, factor[..., s]
@@ -309,31 +310,9 @@ class Squares:
                 own = values[first : first + len(columns)]
                 first += len(columns)
                 square = np.square(own[-1])
-                square /= _left(L, own[:-1], columns[:-1])
+                square /= _left(L, own[:-1] / scale[columns[:-1], None, s], columns[:-1])
                 np.maximum(largest[s], square.max(axis=0), out=largest[s])
         return largest
-
-    def largest(self, x: Array, sensors: Sensors) -> tuple[Array, NDArray[np.intp]]:
-        """Σr² (W,), and the two samples of every sensor whose residuals are largest, (2, W)."""
-        total, best = np.zeros(x.shape[1]), np.full((2, x.shape[1]), -1.0)
-        places = np.zeros((2, x.shape[1]), dtype=np.intp)
-        for span, s, values in self._residual.chunks(x, sensors):
-            square, own = np.einsum("mps,mps->ps", values, values), np.arange(values.shape[2])
-            total[s] += square.sum(axis=0)
-            sizes, samples = [], []
-            for _ in range(min(2, len(square))):
-                k = square.argmax(axis=0)
-                sizes.append(square[k, own])
-                samples.append(k + span.start)
-                square[k, own] = -1.0
-            if span.start == 0:
-                best[: len(sizes), s], places[: len(sizes), s] = sizes, samples
-                continue
-            sizes, samples = [*best[:, s], *sizes], [*places[:, s], *samples]
-            order = np.argsort(sizes, axis=0, kind="stable")[-1:-3:-1]
-            best[:, s] = np.take_along_axis(np.array(sizes), order, axis=0)
-            places[:, s] = np.take_along_axis(np.array(samples), order, axis=0)
-        return total, places
 
     def residuals(self, x: Array, sensors: Sensors) -> Array:
         """Every residual, (m, N, W)."""

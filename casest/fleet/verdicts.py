@@ -61,11 +61,15 @@ def _blank(n: int, width: int) -> _Figures:
 
 @dataclass
 class Judged(_Figures):
-    """Figures of a block with what its sensors are given: std (n, W), covariance, rmse (W,)."""
+    """Figures of a block with what its sensors are given: std (n, W), covariance, rmse (W,).
+
+    `misfit` (W,) where it was asked for: how probable as large a largest residual is.
+    """
 
     std: Array
     covariance: Array
     rmse: Array
+    misfit: Array | None = None
 
     @classmethod
     def of(cls, shape: tuple[int, ...], sigma: Array, rmse: Array) -> Judged:
