@@ -63,7 +63,8 @@ def bound(
     A sensor whose readings cannot be converted is put among the bad ones; its numbers are NaN.
     """
     places = np.arange(len(block.counts))
-    found = {s.name: np.full((int(block.counts.sum()), s.size), np.nan) for s in signals}
+    # In memory each column lies by itself, as in the file.
+    found = {s.name: np.empty((s.size, int(block.counts.sum()))).T for s in signals}
     ends = np.concatenate([[0], np.cumsum(block.counts)])
     _fill(found, block, places, ends, _Binding(layout, tuple(signals), options))
     return found
@@ -313,6 +314,8 @@ def _fill(
     except CasestError as error:
         if len(places) == 1:
             block.bad[int(places[0])] = _without_file(str(error), block.file)
+            for values in found.values():
+                values[first:stop] = np.nan
             return
         for half in np.array_split(places, 2):
             _fill(found, block, half, ends, binding)

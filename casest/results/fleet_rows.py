@@ -181,16 +181,15 @@ def _outlying(
 ) -> tuple[Outlier, ...]:
     """The most outlying of all trusted sensors, the furthest first."""
     found: list[Outlier] = []
+    unit = np.where(scale > 0, scale, np.inf)[:, None]  # what nowhere differs is far from nothing
     for batch in _batches(job, partitions, ["sensor", *names]):
         values = np.array([_numbers(batch.column(n)) for n in names])
-        with np.errstate(all="ignore"):
-            away = np.nan_to_num((values - centre[:, None]) / scale[:, None], posinf=0, neginf=0)
-        worst = np.abs(away).argmax(axis=0)
-        far = np.abs(away[worst, np.arange(len(worst))])
-        for k in np.argsort(-far, kind="stable")[:NAMED]:
-            if far[k] >= OUTLYING:
-                i = int(worst[k])
-                sensor = str(batch.column("sensor")[int(k)].as_py())
-                found.append(Outlier(sensor, names[i], float(values[i, k]), float(away[i, k])))
+        away = (values - centre[:, None]) / unit
+        far = np.fmax.reduce(np.abs(away), axis=0)
+        some = np.flatnonzero(far >= OUTLYING)
+        for k in some[np.argsort(-far[some], kind="stable")[:NAMED]]:
+            i = int(np.nanargmax(np.abs(away[:, k])))
+            sensor = str(batch.column("sensor")[int(k)].as_py())
+            found.append(Outlier(sensor, names[i], float(values[i, k]), float(away[i, k])))
         found = sorted(found, key=lambda o: -abs(o.away))[:NAMED]
     return tuple(found)

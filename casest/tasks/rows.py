@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from casest.dataset.readings import Block
 from casest.declaration.model import Model
@@ -28,20 +29,28 @@ class Rows:
         self._entries = [(p.name, k) for p in model.parameters for k in p.shape.entries]
         self._lower = np.tril_indices(n)
 
-    def put(self, places: Any, batch: Batch) -> None:
+    def put(self, places: NDArray[np.int_], batch: Batch) -> None:
         """Take over what was found of the sensors at these places."""
+        own = adjacent(places)
         for k, (name, index) in enumerate(self._entries):
             entry: Any = (slice(None), *index)
-            self.x[k, places] = batch.values[name][entry]
-            self.std[k, places] = batch.std[name][entry]
+            self.x[k, own] = batch.values[name][entry]
+            self.std[k, own] = batch.std[name][entry]
         if self.covariance is not None:
-            self.covariance[:, places] = batch.covariance[:, self._lower[0], self._lower[1]].T
-        self.rms[places], self.variance[places] = batch.rmse, batch.sigma**2
-        self.misfit[places] = np.nan if batch.misfit is None else batch.misfit
-        self.trusted[places] = batch.trusted
+            self.covariance[:, own] = batch.covariance[:, self._lower[0], self._lower[1]].T
+        self.rms[own], self.variance[own] = batch.rmse, batch.sigma**2
+        self.misfit[own] = np.nan if batch.misfit is None else batch.misfit
+        self.trusted[own] = batch.trusted
         for i in np.flatnonzero(~batch.trusted):
             self.reasons[int(places[i])] = batch.reasons[int(i)][0]
             self.codes[int(places[i])] = _first(batch.reasons, int(i))
+
+
+def adjacent(places: NDArray[np.int_]) -> slice | NDArray[np.int_]:
+    """The same places in their order, as a slice where they follow each other: no copies then."""
+    if not len(places) or places[-1] - places[0] != len(places) - 1:
+        return places
+    return slice(int(places[0]), int(places[-1]) + 1)
 
 
 def _first(reasons: Any, i: int) -> str:
@@ -84,13 +93,19 @@ def record_batch(job: Job, block: Block, rows: Rows, chosen: Any, form: Any) -> 
     """The chosen rows of a block as an Arrow record batch."""
     import pyarrow
 
-    trusted = rows.trusted[chosen]
+    place = adjacent(chosen)
+    trusted = rows.trusted[place]
 
     def numbers(values: Array) -> Any:
-        own = values[chosen]
-        return pyarrow.array(own, mask=~np.isfinite(own) | ~trusted)
+        own = values[place]
+        return pyarrow.array(own, mask=~(np.isfinite(own) & trusted))
 
-    columns: list[Any] = [block.names.take(pyarrow.array(chosen))]
+    def taken(column: Any) -> Any:
+        if isinstance(place, slice):
+            return column.slice(place.start, len(chosen))
+        return column.take(pyarrow.array(chosen))
+
+    columns: list[Any] = [taken(block.names)]
     for x, std in zip(rows.x, rows.std, strict=True):
         columns += [numbers(x), numbers(std)]
     if rows.covariance is not None:
@@ -103,7 +118,7 @@ def record_batch(job: Job, block: Block, rows: Rows, chosen: Any, form: Any) -> 
         numbers(rows.rms),
         numbers(rows.misfit),
     ]
-    columns += [block.kept[name].take(pyarrow.array(chosen)) for name in job.layout.kept]
+    columns += [taken(block.kept[name]) for name in job.layout.kept]
     return pyarrow.RecordBatch.from_arrays(columns, schema=form)
 
 

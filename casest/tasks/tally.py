@@ -38,7 +38,8 @@ class Moments(msgspec.Struct, frozen=True):
     @classmethod
     def of(cls, values: Array) -> Moments:
         """Of an array; what is not finite does not count."""
-        values = values[np.isfinite(values)]
+        finite = np.isfinite(values)
+        values = values if finite.all() else values[finite]
         if not values.size:
             return cls()
         mean = float(values.mean())

@@ -21,7 +21,7 @@ from casest.errors import DataError
 from casest.fleet.calibrate_many import calibrate_many
 from casest.fleet.population import calibrate_with
 from casest.tasks.job import Job
-from casest.tasks.rows import Rows, record_batch, schema
+from casest.tasks.rows import Rows, adjacent, record_batch, schema
 from casest.tasks.tally import FILE, NAMELESS, READINGS, REFUSED, TWICE, Moments, Rejected, Tally
 
 #: Up to so many readings sensors of one number are calibrated together; beyond, numbers that are
@@ -73,7 +73,9 @@ def calibrated(
     rows = Rows(job.model, len(block.counts), job.covariance)
     chosen = _named(block, twice, tally)
     ends = np.concatenate([[0], np.cumsum(block.counts)])
-    usable = np.setdiff1d(chosen, np.array([*block.bad], dtype=int))
+    fit = np.ones(len(block.counts), bool)
+    fit[[*block.bad]] = False
+    usable = chosen[fit[chosen]]
     for places in alike(block.counts, usable):
         given, counts = side_by_side(signals, block.counts, ends, places)
         if job.prior is None:
@@ -141,15 +143,15 @@ def side_by_side(
 ) -> tuple[dict[str, Array], Array | None]:
     """Readings (S, N, size) of a group, and how many of each count where that differs."""
     longest = _padded(int(counts[places[0]]))
-    # Rows beyond a sensor's own are never looked at: any will do.
+    first, stop = int(ends[places[0]]), int(ends[places[-1] + 1])
+    if longest <= FEW and stop - first == longest * len(places):
+        shape = (len(places), longest, -1)
+        return {n: v[first:stop].reshape(shape) for n, v in signals.items()}, None
     rows = ends[places][:, None] + np.arange(longest)
-    own = counts[places]
     if longest <= FEW:
-        first = int(ends[places[0]])
-        stop = first + longest * len(places)
-        whole = np.array_equal(ends[places], np.arange(first, stop, longest))
-        cut = slice(first, stop) if whole else rows.ravel()
-        return {n: v[cut].reshape(len(places), longest, -1) for n, v in signals.items()}, None
+        return {n: v[rows] for n, v in signals.items()}, None
+    # Rows beyond a sensor's own are never looked at: any will do.
+    own = counts[places]
     rows = np.minimum(rows, (ends[places] + own - 1)[:, None])
     return {n: v[rows] for n, v in signals.items()}, own.astype(float)
 
@@ -159,8 +161,9 @@ def _measure(job: Job, rows: Rows, tally: Tally) -> None:
     names = [name for p in job.model.parameters for name in p.entry_names]
     measured = dict(zip(names, rows.x, strict=True)) | {"rms": rows.rms, "variance": rows.variance}
     measured |= {f"{n}_std": v for n, v in zip(names, rows.std, strict=True)}
+    trusted = adjacent(np.flatnonzero(rows.trusted))
     for name, values in measured.items():
-        if (own := Moments.of(values[rows.trusted])).count:
+        if (own := Moments.of(values[trusted])).count:
             tally.moments[name] = tally.moments.get(name, Moments()).joined(own)
 
 
