@@ -31,9 +31,15 @@ def refuse_constant(file: str, name: str, values: Array, columns: tuple[str, ...
         )
 
 
+def _largest(values: Array) -> float:
+    """Largest magnitude, NaN aside; without an array of magnitudes."""
+    high, low = (f.reduce(values, axis=None, initial=0.0) for f in (np.fmax, np.fmin))
+    return float(max(high, -low))
+
+
 def refuse_too_large(file: str, purpose: str, column: str, values: Array) -> None:
     """Raise DataError where the squares of a column leave the range of numbers; NaN is none."""
-    largest = float(np.nanmax(np.abs(values), initial=0.0))
+    largest = _largest(values)
     if largest > MOST:
         raise DataError(
             f"{file}: column {column} reaches {largest:.3g}, too large to compute with for "
@@ -43,7 +49,7 @@ def refuse_too_large(file: str, purpose: str, column: str, values: Array) -> Non
 
 def refuse_too_small(file: str, name: str, values: Array, columns: tuple[str, ...]) -> None:
     """Raise DataError where the squares of a whole signal (N, size) are zero to the computer."""
-    largest = float(np.nanmax(np.abs(values), initial=0.0))
+    largest = _largest(values)
     if 0.0 < largest < LEAST:
         raise DataError(
             f"{file}: signal {name} (columns {' '.join(columns)}) is nowhere larger than "

@@ -14,8 +14,9 @@ from casest.errors import DataError, library
 
 #: Endings of files that are taken from a folder.
 ENDINGS = (".parquet", ".pq", ".parq")
-#: Bytes that are read ahead of a column: a row group need not be in memory as a whole.
-BUFFER = 1 << 20
+#: Bytes that are read ahead of a column, for a row group need not be in memory as a whole: from
+#: this machine so few that they stay in the cache, from elsewhere so many that requests are few.
+NEAR, FAR = 1 << 16, 1 << 20
 #: What remote stores call the version of an object's content.
 _TAGS = ("ETag", "etag", "md5Hash", "generation", "content_md5")
 
@@ -65,8 +66,8 @@ def opened(file: File) -> Any:
     """A `pyarrow.parquet.ParquetFile`; DataError where it cannot be read as one."""
     parquet = library("pyarrow.parquet", "parquet", f"{file.name}: a Parquet file")
     try:
-        source = _stream(file) if file.remote else file.name
-        return parquet.ParquetFile(source, pre_buffer=False, buffer_size=BUFFER)
+        source, ahead = (_stream(file), FAR) if file.remote else (file.name, NEAR)
+        return parquet.ParquetFile(source, pre_buffer=False, buffer_size=ahead)
     except Exception as error:  # a damaged file can fail anywhere in the library
         raise unreadable(file, error) from error
 

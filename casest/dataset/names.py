@@ -9,6 +9,7 @@ looked at in each of several passes.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,8 +21,9 @@ Numbers = NDArray[np.uint64]
 
 #: Names that are sorted at once: 400 MB.
 SORTED = 50_000_000
-#: Rows of names that are read at once.
-PIECE = 1 << 17
+#: Rows of names that are read at once; and of which the bytes are looked at at once: few enough to
+#: stay in the cache.
+PIECE, FEW = 1 << 17, 1 << 13
 #: Names that are there twice, of which more would be a wrong column.
 MOST = 100_000
 
@@ -79,15 +81,28 @@ def numbers_of(names: Any) -> Numbers:
     bounds = np.frombuffer(names.buffers()[1], np.int64)[names.offset :][: len(names) + 1]
     content = names.buffers()[2]
     data = np.frombuffer(content, np.uint8) if content is not None else np.zeros(0, np.uint8)
-    length = np.diff(bounds)
+    sums = [_sums(data, bounds[k : k + FEW + 1]) for k in range(0, len(names), FEW)]
+    return _mixed(np.concatenate([np.zeros(0, np.uint64), *sums]))
+
+
+def _sums(data: NDArray[np.uint8], bounds: NDArray[np.int64]) -> Numbers:
+    """The sum of each name, (N,), whose bytes begin and end at these places of `data`, (N + 1,)."""
+    weights, length = _weights(), np.diff(bounds)
     place = np.arange(bounds[0], bounds[-1]) - np.repeat(bounds[:-1], length)
-    weights = np.random.default_rng(20_24).integers(0, 2**64, LONGEST + 1, dtype=np.uint64)
     if length.max(initial=0) > LONGEST:
         place %= LONGEST
     terms = (data[bounds[0] : bounds[-1]].astype(np.uint64) + 1) * weights[place]
     total = np.concatenate([np.zeros(1, np.uint64), np.cumsum(terms, dtype=np.uint64)])
     ends = bounds - bounds[0]
-    return _mixed(total[ends[1:]] - total[ends[:-1]] + length.astype(np.uint64) * weights[-1])
+    return np.asarray(
+        total[ends[1:]] - total[ends[:-1]] + length.astype(np.uint64) * weights[-1], np.uint64
+    )
+
+
+@lru_cache(maxsize=1)
+def _weights() -> Numbers:
+    """A random number for each place of a byte in a name, and one for its length."""
+    return np.random.default_rng(20_24).integers(0, 2**64, LONGEST + 1, dtype=np.uint64)
 
 
 def _mixed(values: Numbers) -> Numbers:

@@ -136,14 +136,14 @@ def wide_block(layout: Layout, piece: Piece, row: int, batch: Any) -> Block:
         names = plain(batch.column(layout.sensor))
     else:
         names = pyarrow.array([piece.name] * len(batch), pyarrow.large_string())
-    lengths = np.stack([_lengths(batch.column(r.field)) for r in layout.readings], axis=1)
+    lengths = np.stack([_lengths(batch.column(r.field)) for r in layout.readings])
     bad: dict[int, str] = {}
-    for k in np.flatnonzero((lengths != lengths[:, :1]).any(axis=1) | (lengths[:, 0] < 1)):
-        bad[int(k)] = _ragged(layout, lengths[k])
+    for k in np.flatnonzero((lengths != lengths[0]).any(axis=0) | (lengths[0] < 1)):
+        bad[int(k)] = _ragged(layout, lengths[:, k])
     vectors = [r for r in layout.readings if r.size]
     for r in vectors:
         _refuse_ragged_vectors(batch.column(r.field), r, bad)
-    counts = lengths[:, 0].copy()
+    counts = lengths[0].copy()
     if bad:
         good = np.ones(len(batch), bool)
         good[[*bad]] = False

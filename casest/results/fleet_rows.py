@@ -68,7 +68,8 @@ def drawn(job: Job, partitions: Sequence[Partition], sensors: int) -> Drawn:
     parts, first = [], 0
     for batch in _batches(job, partitions, columns):
         chosen = np.arange(-first % step, len(batch), step)
-        parts.append([_numbers(batch.column(c))[chosen] for c in columns] + [first + chosen])
+        own = batch.take(pyarrow_array(chosen))
+        parts.append([_numbers(own.column(c)) for c in columns] + [first + chosen])
         first += len(batch)
     whole = [np.concatenate(own) for own in zip(*parts, strict=True)]
     values, trusted = np.array(whole[: len(names)]), whole[len(names) + 2].astype(bool)
