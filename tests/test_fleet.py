@@ -207,6 +207,20 @@ def test_names_are_found_twice_in_several_passes(monkeypatch):
     assert found == {"7": [(0, 7), (0, 500)], "x" * 300: [(0, 501), (0, 502)]}
 
 
+def test_the_number_of_a_name_does_not_depend_on_its_place():
+    """Beside names of any length, in whichever piece, and in a part of an array."""
+    rng = np.random.default_rng(0)
+    words = [f"{k:x}" * int(rng.integers(0, 30)) for k in range(2 * naming.FEW + 77)]
+    words[5], words[naming.FEW] = "x" * 300, "µ-7"
+    sensors = naming.plain(pa.array(words))
+    found = naming.numbers_of(sensors)
+    assert np.array_equal(naming.numbers_of(sensors.slice(3)), found[3:])
+    for k in (0, 5, 6, naming.FEW - 1, naming.FEW, naming.FEW + 1, len(words) - 1):
+        assert naming.numbers_of(naming.plain(pa.array([words[k]])))[0] == found[k]
+    assert len(np.unique(found)) == len(set(words))
+    assert naming.numbers_of(sensors.slice(0, 0)).shape == (0,)
+
+
 @pytest.mark.parametrize("left", [60, 0.5])
 def test_a_truncated_file_is_named_and_the_others_have_the_same_bits(tmp_path, left):
     fleets.dataset(tmp_path / "in", files=3)

@@ -193,11 +193,12 @@ def _call(plan: Plan, i: int, place: dict[int, Array]) -> tuple[Kernel, tuple[Ar
 def _left(L: Array, J: Array, columns: list[int]) -> Array:
     """1 − h, what is left of each residual, (P, w); rows J (k, P, w) have only these columns.
 
-    h = ‖L⁻¹Jᵀ‖², by substitution.
+    h = ‖L⁻¹Jᵀ‖², by substitution, in the place of J where that has all columns.
     """
-    first = columns[0] if columns else len(L)
-    y = np.zeros((len(L), *J.shape[1:]))
-    y[columns] = J
+    first, y = columns[0] if columns else len(L), J
+    if len(columns) < len(L):
+        y = np.zeros((len(L), *J.shape[1:]))
+        y[columns] = J
     for i in range(first, len(L)):
         if i > first:
             y[i] -= np.einsum("ks,kps->ps", L[i, first:i], y[first:i])

@@ -182,7 +182,8 @@ def _outlying(
 ) -> tuple[Outlier, ...]:
     """The most outlying of all trusted sensors, the furthest first."""
     found: list[Outlier] = []
-    unit = np.where(scale > 0, scale, np.inf)[:, None]  # what nowhere differs is far from nothing
+    # Of an unknown whose quartiles are one number no sensor is far: it has no scale.
+    unit = np.where(scale > 0, scale, np.inf)[:, None]
     for batch in _batches(job, partitions, ["sensor", *names]):
         values = np.array([_numbers(batch.column(n)) for n in names])
         away = (values - centre[:, None]) / unit
