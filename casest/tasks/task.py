@@ -147,13 +147,12 @@ def side_by_side(
     if longest <= FEW and stop - first == longest * len(places):
         shape = (len(places), longest, -1)
         return {n: v[first:stop].reshape(shape) for n, v in signals.items()}, None
-    rows = ends[places][:, None] + np.arange(longest)
-    if longest <= FEW:
-        return {n: v[rows] for n, v in signals.items()}, None
-    # Rows beyond a sensor's own are never looked at: any will do.
-    own = counts[places]
-    rows = np.minimum(rows, (ends[places] + own - 1)[:, None])
-    return {n: v[rows] for n, v in signals.items()}, own.astype(float)
+    rows, own = ends[places][:, None] + np.arange(longest), counts[places]
+    if longest > FEW:  # rows beyond a sensor's own are never looked at: any will do
+        rows = np.minimum(rows, (ends[places] + own - 1)[:, None])
+    # Column by column: NumPy takes numbers from one faster than rows from a table.
+    given = {n: np.take(v.T, rows, axis=1).transpose(1, 2, 0) for n, v in signals.items()}
+    return given, own.astype(float) if longest > FEW else None
 
 
 def _measure(job: Job, rows: Rows, tally: Tally) -> None:
