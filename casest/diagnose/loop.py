@@ -186,7 +186,7 @@ def _closed(sensor: Sensor, before: Estimate, folds: Folds, say: Callable[[str],
     after = before
     if state.fit is not declared:
         state, after = certified(sensor, state, before)
-        # What was missing is no noise: the parts that are held out are as long as what is left asks.
+        # What was missing is no noise: parts that are held out are as long as what is left asks.
         folds = folded(sensor.runs, after.correlated_over, sensor.seed)
     state, after, hidden = _foretelling(sensor, declared, state, before, after, folds)
     effects = [] if outliers is None else [outliers]
