@@ -116,11 +116,20 @@ def beyond_courses(ranking: Ranking, evidence: Evidence) -> bool:
 
 
 def _more_than(course: Evidence, evidence: Evidence, ranking: Ranking) -> bool:
-    if evidence.score > course.score + LEVELS.clear:
+    if evidence.score > course.score + LEVELS.clear or _foretells(course, evidence, ranking):
         return True
     own = [t for t in evidence.trials if not any(t is c for c in course.trials)]
     both = _together(course, own, ranking)
     return both is not None and both.score > course.score + LEVELS.strong
+
+
+def _foretells(course: Evidence, evidence: Evidence, ranking: Ranking) -> bool:
+    """Is it as likely, and are whole stretches foretold much better than by the course, or by
+    nothing? A course bends as the record does, and ends with what was seen of it."""
+    if not ranking.linear.series or evidence.score < course.score:
+        return False
+    its, own = (falls(ranking, e)["stretches"].ratio for e in (course, evidence))
+    return own < LEVELS.nested * min(its, 1.0)
 
 
 def _together(course: Evidence, trials: Sequence[Trial], ranking: Ranking) -> Evidence | None:
