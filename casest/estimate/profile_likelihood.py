@@ -21,7 +21,7 @@ CLOSE, TRIES, LONGEST = 0.01, 25, 300
 NEAR = 1e-6
 #: First step outwards and where to stop, in linear intervals: beyond, standard deviations mean
 #: nothing.
-FIRST, REACH = 0.25, 4.0
+FIRST, REACH = 0.5, 4.0
 
 
 @dataclass(frozen=True)
@@ -164,7 +164,7 @@ class Profile:
                 outside = size + step, reached
             else:
                 size, height, here = size + step, reached, there or here
-            step = _next(size, height, outside, wanted, step)
+            step = _next(size, height, outside, wanted, step, 1 / std)
         return None
 
     def held_at(self, point: Point, j: int, distance: float) -> Point | None:
@@ -176,17 +176,28 @@ class Profile:
         row = np.zeros(len(point.x))
         row[j] = self.sigma / np.sqrt(self.covariance[j, j])
         along = self.covariance[:, j] / self.covariance[j, j]
-        step = (value - point.x[j]) * along
+        gone = float(point.x[j] - self.best.x[j])
+        # The valley leaves the best point along `along`, and is bent as it was on the way here.
+        bent = (point.x - self.best.x - gone * along) / gone**2 if gone else np.zeros_like(along)
+        step = self.best.x + distance * along + distance**2 * bent - point.x
         return profiled(self.problem, point, step, row, max_iterations=LONGEST)
 
 
 def _next(
-    size: float, height: float, outside: tuple[float, float] | None, wanted: float, step: float
+    size: float,
+    height: float,
+    outside: tuple[float, float] | None,
+    wanted: float,
+    step: float,
+    slope: float,
 ) -> float:
-    """The next step outwards: by the slope so far, and within what is known to be too far."""
-    slope = height / size if size else 0.0
+    """The next step outwards: within what is known to be too far, else where a height that begins
+    with this slope, and is bent as it was so far, comes to what is wanted."""
     if outside is None:
-        return min(2 * step, 1.05 * (wanted - height) / slope) if slope else 2 * step
+        bent = (height - slope * size) / size**2 if size else 0.0
+        root = slope**2 + 4 * bent * wanted
+        there = 2 * wanted / (slope + np.sqrt(root)) if root >= 0 else np.inf
+        return min(2 * step, float(there) - size) if there > size else 2 * step
     room = outside[0] - size
     if not np.isfinite(outside[1]):
         return 0.5 * room
