@@ -41,7 +41,7 @@ class Evidence:
     """For a valley: the scatter of neighbours at the best point, and the search, where one was.
 
     `equal`: other points that are the same function of the inputs; `aliases`: rates that the rows
-    cannot tell from those given.
+    cannot tell from those given; of differential equations where another course through them is.
     """
 
     scatter: Scatter | None
@@ -195,7 +195,13 @@ def remarks(problem: Problem, evidence: Evidence | None) -> Iterator[str]:
         return
     if evidence.search is not None and evidence.scatter is not None and evidence.misfit:
         yield _misfit(evidence.scatter)
-    if evidence.aliases:
+    if evidence.aliases and problem.model.traced.integrates:
+        yield (
+            "these rows are met as well by a faster course, which turns whole turns more between "
+            f"them ({evidence.aliases[0]}): what is given is the slowest, or that most like the "
+            "stated start; bounds leave the others out"
+        )
+    elif evidence.aliases:
         yield (
             f"evenly spaced rows cannot tell rates that turn whole turns more from one row to the "
             f"next: {', '.join(evidence.aliases)} (and multiples) fits alike; what is given is "

@@ -3,23 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
 
 from casest.declaration.model import Model
 from casest.estimate.evidence import Evidence
+from casest.leastsquares.flow import GivenUp, for_seconds
 from casest.leastsquares.neighbours import scatter
 from casest.leastsquares.per_sample import linear
 from casest.leastsquares.problem import Point, Problem
 from casest.leastsquares.sums import rounding
 from casest.leastsquares.weights import has_noise_effects
 from casest.solve.aliases import folded, others, without_turns
-from casest.solve.equations import SEARCH, allowed, arrived, from_elsewhere
+from casest.solve.equations import ALIKE, OPINION, SEARCH, allowed, arrived, from_elsewhere
 from casest.solve.equivalent import between_rows, limit_of, roughness, same_on
 from casest.solve.global_search import EFFORTS, ROWS, Search, rivals_of, search, some_rows, unlike
 from casest.solve.outcome import Outcome
-from casest.solve.reach import neighbouring, turning
+from casest.solve.pace import pace_of, slower, turning
+from casest.solve.reach import neighbouring
+from casest.solve.reach import turning as turning_of_rows
 from casest.solve.strategy import best_of, valleys
 from casest.solve.trust_region import LITTLE, trust_region
 
@@ -38,7 +42,7 @@ def looked_for(
     no reading row by row. `stated`: the start is the user's own.
     """
     if problem.model.traced.integrates and np.isfinite(best_of(outcomes).cost):
-        return _looked_for_in_equations(problem, first, outcomes, seed)
+        return _looked_for_in_equations(problem, first, outcomes, seed, stated)
     if not searchable(problem.model) or not np.isfinite(best_of(outcomes).cost):
         return outcomes, None
     allowed = rows_can_follow(problem, first, stated)
@@ -56,14 +60,30 @@ def looked_for(
 
 
 def _looked_for_in_equations(
-    problem: Problem, first: Point, outcomes: tuple[Outcome, ...], seed: int
+    problem: Problem, first: Point, outcomes: tuple[Outcome, ...], seed: int, stated: bool
 ) -> tuple[tuple[Outcome, ...], Evidence]:
-    """The same of differential equations: unless readings vouch, ways from starts elsewhere."""
+    """The same of differential equations: unless readings vouch, ways from starts elsewhere; and
+    in any case the course found at a slower pace, which readings would vouch for as well."""
+    found, ends = None, list[Outcome]()
+    evidence = Evidence(scatter(problem, best_of(outcomes).point))
+    if not evidence.vouched and problem.model.starter is None:
+        outcomes, found, ends = _from_elsewhere(problem, first, outcomes, seed)
+    known = best_of(outcomes)
+    outcomes, alias = _at_one_pace(problem, first, outcomes, ends, stated)
     best = best_of(outcomes)
-    evidence = Evidence(scatter(problem, best.point))
-    if evidence.vouched or problem.model.starter is not None:
-        return outcomes, evidence
-    ends, given_up = from_elsewhere(problem, first, best, seed, allowed(outcomes, SEARCH))
+    if best is not known:
+        found = None if found is None else replace(found, outcome=best)
+    if found is not None or best is not known:
+        evidence = Evidence(scatter(problem, best.point), found)
+    return outcomes, replace(evidence, aliases=alias)
+
+
+def _from_elsewhere(
+    problem: Problem, first: Point, outcomes: tuple[Outcome, ...], seed: int
+) -> tuple[tuple[Outcome, ...], Search, list[Outcome]]:
+    """The outcomes with the lowest in front, the search, and where its starts ended."""
+    best = best_of(outcomes)
+    ends, given_up = from_elsewhere(problem, first, outcomes, seed, allowed(outcomes, SEARCH))
     lowest = best_of((best, *ends))
     if lowest is not best:
         best = trust_region(problem, lowest.point, damping=LITTLE)
@@ -79,14 +99,59 @@ def _looked_for_in_equations(
         rivals_of(problem, best, finite),
         given_up,
     )
-    return outcomes, Evidence(scatter(problem, best.point), found)
+    return outcomes, found, finite
+
+
+def _at_one_pace(
+    problem: Problem,
+    first: Point,
+    outcomes: tuple[Outcome, ...],
+    ends: list[Outcome],
+    stated: bool,
+) -> tuple[tuple[Outcome, ...], tuple[str, ...]]:
+    """Outcomes whose courses agree in all rows and not between them, as one; and another, in words.
+
+    The slowest is meant, or that most like a start that was `stated`. Also `ends` that a search
+    has led to are looked at.
+    """
+    if not stated:
+        with suppress(GivenUp), for_seconds(OPINION):  # else it is not asked
+            outcomes = (*outcomes, *slower(problem, best_of(outcomes)))
+    best = best_of(outcomes)
+    far = [o for o in (*outcomes, *ends) if o.cost <= best.cost * (1 + ALIKE) + 1e-300]
+    far = [o for o in far if not _near(o.point, best.point)]
+    if not far:
+        return outcomes, ()
+    limit, moved = limit_of(problem, best), between_rows(problem)
+    far = [o for o in far if same_on(problem, o.point, best.point, limit)]
+    far = [o for o in far if not same_on(moved, o.point, best.point, limit)]
+    if not far:
+        return outcomes, ()
+
+    def pace(o: Outcome) -> float:
+        if stated:
+            return unlike(o.point.x, first.x)[1]
+        if pace_of(problem.model) is None:
+            return roughness(problem, moved, o.point)
+        return turning(problem, o.point)
+
+    meant = min((best, *far), key=pace)
+    other = next(o for o in (*far, best) if not _near(o.point, meant.point))
+    alike = {id(o) for o in far} | {id(o) for o in outcomes if _near(o.point, best.point)}
+    if meant is not best:
+        meant = trust_region(problem, meant.point, damping=LITTLE)
+    as_one = [
+        replace(o, point=meant.point, cost=meant.cost) if id(o) in alike else o for o in outcomes
+    ]
+    pairs = zip(problem.names, other.point.x, strict=True)
+    return (meant, *as_one), (", ".join(f"`{name}` = {x:.6g}" for name, x in pairs),)
 
 
 def rows_can_follow(problem: Problem, first: Point, stated: bool) -> Callable[[Point], bool]:
     """May a solution count? No faster than the rows can follow, or the declared start is."""
     near = neighbouring(problem)
-    fastest = max(FASTEST, turning(problem, first, near))
-    return lambda point: stated or turning(problem, point, near) <= fastest
+    fastest = max(FASTEST, turning_of_rows(problem, first, near))
+    return lambda point: stated or turning_of_rows(problem, point, near) <= fastest
 
 
 def _searched(

@@ -9,6 +9,7 @@ too where what is known of the noise leaves it open whether something better is 
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -16,12 +17,13 @@ from dataclasses import replace
 import numpy as np
 
 from casest.declaration.shapes import Array
-from casest.leastsquares.flow import GivenUp, for_seconds
+from casest.leastsquares.flow import GivenUp, for_seconds, left
 from casest.leastsquares.growth import UNSTABLE, growth
 from casest.leastsquares.problem import Point, Problem
 from casest.solve.collocation import collocated
 from casest.solve.horizon import ALONG, grown
 from casest.solve.outcome import Outcome
+from casest.solve.pace import FASTEST, pace_of, slowed, turning
 from casest.solve.shooting import shot
 from casest.solve.trust_region import LITTLE, slight, trust_region
 
@@ -33,6 +35,11 @@ STARTS, ENOUGH, DECADES = 16, 6, 1.5
 #: Seconds after which a search, another opinion, and IPOPT's part of one are given up, and how many
 #: times as much as the way along the record takes, where that is more, up to the longest.
 SEARCH, OPINION, COLLOCATED, TIMES, LONGEST = 60.0, 20.0, 4.0, 4.0, 200.0
+#: Seconds after which one start of a search is given up, and TIMES as many as those that arrived at
+#: the best took, where that is more.
+EACH = 2.0
+#: Gain of a step that ends a descent of a search, in those that are slight: 0.01 deviations.
+NEAR = 100.0
 #: Ends whose costs differ by no more than this share are one.
 ALIKE = 1e-3
 
@@ -89,15 +96,21 @@ def _polished(problem: Problem, near: Outcome, tolerance: float = 0.0) -> Outcom
 
 
 def from_elsewhere(
-    problem: Problem, first: Point, best: Outcome, seed: int, seconds: float
+    problem: Problem, first: Point, known: Sequence[Outcome], seed: int, seconds: float
 ) -> tuple[list[Outcome], bool]:
     """Where both ways lead from starts over decades around the first, and: was it given up, the
-    seconds being over?"""
+    seconds being over?
+
+    `known`: where ways have led before. What takes far longer than those that arrived has no end.
+    """
     found = list[Outcome]()
     try:
         with for_seconds(seconds):
-            for count, ends in enumerate(_ends(problem, first, seed, found), 1):
-                found += ends
+            for count, start in enumerate(_starts(problem, first, seed), 1):
+                found += _ends(problem, start, count, [*known, *found])
+                best = min(
+                    (*known, *found), key=lambda o: o.cost if np.isfinite(o.cost) else np.inf
+                )
                 if count == ENOUGH and arrived(best, found) == len(found):
                     break
     except GivenUp:
@@ -105,16 +118,22 @@ def from_elsewhere(
     return found, False
 
 
-def _ends(
-    problem: Problem, first: Point, seed: int, known: Sequence[Outcome]
-) -> Iterator[list[Outcome]]:
-    """Where each start leads, collocation every fourth of a short record; `known` from before."""
-    short = sum(map(len, problem.runs)) <= SHORT
-    for k, start in enumerate(_starts(problem, first, seed)):
-        if short and k % 4 == 3:
-            yield list(by_collocation(problem, start, allowed(known, COLLOCATED)))
-        else:
-            yield [grown(problem, start)]
+def _ends(problem: Problem, start: Point, count: int, known: Sequence[Outcome]) -> list[Outcome]:
+    """Where a start leads, collocation every fourth of a short record; `known` from before."""
+    lowest = min((o.cost for o in known if np.isfinite(o.cost)), default=np.inf)
+    there = [o for o in known if o.cost <= lowest * (1 + ALIKE)]
+    began = time.perf_counter()
+    try:
+        with for_seconds(max(EACH, TIMES * max((o.seconds for o in there), default=np.inf))):
+            if count % 4 == 0 and sum(map(len, problem.runs)) <= SHORT:
+                seconds = min(allowed(there, COLLOCATED), max(left(), 1.0))
+                return list(by_collocation(problem, start, seconds))
+            return [grown(problem, start, NEAR * slight(problem))]
+    except GivenUp:
+        if left() <= 0:  # the time of all starts together is over
+            raise
+    seconds = time.perf_counter() - began
+    return [Outcome(ALONG, start, np.inf, 0, 0, False, "given up", seconds)]
 
 
 def arrived(best: Outcome, others: list[Outcome]) -> int:
@@ -124,7 +143,11 @@ def arrived(best: Outcome, others: list[Outcome]) -> int:
 
 def _starts(problem: Problem, first: Point, seed: int) -> Iterator[Point]:
     """Every unknown constant multiplied by a power of ten, one that begins at zero moved by as much
-    as changes the residual by its own length; where states begin, data say."""
+    as changes the residual by its own length; where states begin, data say.
+
+    What would turn faster than rows can follow, and than the first does, is slowed as a whole.
+    """
+    fastest = max(FASTEST, turning(problem, first)) if pace_of(problem.model) else FASTEST
     rng = np.random.default_rng(seed)
     normal = problem.normal(first)
     size = np.sqrt(2 * normal.cost) / np.sqrt(np.maximum(np.diag(normal.matrix), 1e-300))
@@ -133,4 +156,5 @@ def _starts(problem: Problem, first: Point, seed: int) -> Iterator[Point]:
         moved: Array = np.where(
             first.x != 0, first.x * factor, size * rng.standard_normal(problem.unknowns)
         )
-        yield Point(problem.inside(np.nan_to_num(moved)), first.references)
+        start = Point(problem.inside(np.nan_to_num(moved)), first.references)
+        yield slowed(problem, start, fastest)

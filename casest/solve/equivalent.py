@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from casest.data.run import Run
 from casest.declaration.shapes import Array
 from casest.declaration.tracing import reached_signals
 from casest.leastsquares.problem import Point, Problem
@@ -22,8 +23,13 @@ EXACT = 1e-7
 
 
 def between_rows(problem: Problem, seed: int = 0) -> Problem:
-    """The problem with its inputs moved off the rows, by up to the mean distance of two."""
+    """The problem with its inputs moved off the rows, by up to the mean distance of two.
+
+    Differential equations are read at times between the rows.
+    """
     model, rng = problem.model, np.random.default_rng(seed)
+    if model.traced.integrates:
+        return Problem(model, tuple(_later(run, rng) for run in problem.runs))
     assert model.traced.predicted is not None
     read = reached_signals(model, model.traced, model.traced.predicted) - {model.traced.measured}
     runs = []
@@ -35,6 +41,15 @@ def between_rows(problem: Problem, seed: int = 0) -> Problem:
             moved[name] = values + gap * rng.uniform(-1, 1, values.shape)
         runs.append(replace(run, signals=moved))
     return Problem(model, tuple(runs))
+
+
+def _later(run: Run, rng: np.random.Generator) -> Run:
+    """The run with every row but the last at some time before the next."""
+    time = np.asarray(run.time, float)
+    gaps = np.diff(time, append=time[-1])
+    return replace(
+        run, time=time + rng.uniform(0.1, 0.9, len(time)) * gaps, whole=None, places=None
+    )
 
 
 def same_on(where: Problem, a: Point, b: Point, limit: float) -> bool:
