@@ -134,14 +134,14 @@ class Profile:
             if there is None:
                 return
             here = there
-            yield 2 * (self.problem.cost(here) - self.cost) / self.sigma**2
+            yield self._rise(here)
 
     def _end_or_bound(self, j: int, sign: int, rise: float) -> float | None:
         """The end, or the distance to the bound where the cost has not risen so far there."""
         room = float(abs(self.problem.bounds[0 if sign < 0 else 1][j] - self.best.x[j]))
         if np.isfinite(room) and room < REACH * np.sqrt(rise * self.covariance[j, j]):
             there = self.held_at(self.best, j, sign * room * (1 - 1e-9))
-            if there is None or 2 * (self.problem.cost(there) - self.cost) < rise * self.sigma**2:
+            if there is None or self._rise(there) < rise:
                 return room
         return self._end(j, sign, rise)
 
@@ -156,7 +156,7 @@ class Profile:
             if size + step > REACH * linear:
                 return None
             there = self.held_at(here, j, sign * (size + step))
-            square = 2 * (self.problem.cost(there) - self.cost) / self.sigma**2 if there else -1.0
+            square = self._rise(there) if there else -1.0
             reached = float(np.sqrt(square)) if square >= height**2 else float("inf")
             if abs(reached / wanted - 1) < CLOSE:
                 return (size + step) * wanted / reached
@@ -166,6 +166,10 @@ class Profile:
                 size, height, here = size + step, reached, there or here
             step = _next(size, height, outside, wanted, step, 1 / std)
         return None
+
+    def _rise(self, there: Point) -> float:
+        """Rise of 2·cost over σ² at a point whose normal equations were asked for on the way."""
+        return 2 * (self.problem.normal(there).cost - self.cost) / self.sigma**2
 
     def held_at(self, point: Point, j: int, distance: float) -> Point | None:
         """Best point with unknown j at a distance from its best value; None outside the bounds."""

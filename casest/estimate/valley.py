@@ -125,7 +125,10 @@ def _at_one_pace(
     limit, moved = limit_of(problem, best), between_rows(problem)
     far = [o for o in far if same_on(problem, o.point, best.point, limit)]
     far = [o for o in far if not same_on(moved, o.point, best.point, limit)]
-    if not far:
+    # What had only stopped on its way along a flat valley is no other course.
+    there = [trust_region(problem, o.point, damping=LITTLE) for o in far]
+    both = [(o, e) for o, e in zip(far, there, strict=True) if not _near(e.point, best.point)]
+    if not both:
         return outcomes, ()
 
     def pace(o: Outcome) -> float:
@@ -135,11 +138,9 @@ def _at_one_pace(
             return roughness(problem, moved, o.point)
         return turning(problem, o.point)
 
-    meant = min((best, *far), key=pace)
-    other = next(o for o in (*far, best) if not _near(o.point, meant.point))
-    alike = {id(o) for o in far} | {id(o) for o in outcomes if _near(o.point, best.point)}
-    if meant is not best:
-        meant = trust_region(problem, meant.point, damping=LITTLE)
+    meant = min((best, *(e for _, e in both)), key=pace)
+    other = next(o for o in (*(e for _, e in both), best) if not _near(o.point, meant.point))
+    alike = {id(o) for o, _ in both} | {id(o) for o in outcomes if _near(o.point, best.point)}
     as_one = [
         replace(o, point=meant.point, cost=meant.cost) if id(o) in alike else o for o in outcomes
     ]

@@ -117,16 +117,24 @@ def _in_time(problem: Problem, point: Point) -> Scatter | None:
             there = np.flatnonzero(np.isfinite(y[:, axis]))[some_of(len(y))]
             if len(there) < FEWEST:
                 continue
-            C = predictors(time[there][:, None])
+            C, free = _in_order(time[there].tobytes())
             own, left, rows = y[there, axis], e[there, axis], C.shape[0]
             squares += [np.sum((C @ own) ** 2), np.sum((C @ left) ** 2), np.var(own) * rows]
-            dof += float(freedom_of(C)[0])
+            dof += free
             count += rows
     if count < FEWEST:
         return None
     residual = float(2 * problem.cost(point) / freedom)
     neighbours, left, spread = (float(s) / count for s in squares)
     return Scatter(neighbours, residual, spread, left, (float(freedom), dof))
+
+
+@lru_cache(maxsize=8)
+def _in_order(time: bytes) -> tuple[Any, float]:
+    """Predictors of readings at these times (N,), and their degrees of freedom: the same for every
+    reading and every point that is asked about."""
+    C = predictors(np.frombuffer(time)[:, None])
+    return C, float(freedom_of(C)[0])
 
 
 @lru_cache(maxsize=64)

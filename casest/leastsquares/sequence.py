@@ -273,6 +273,9 @@ class Staged:
     def _given(self, parameters: Array, r: int, own: tuple[int, ...] | None) -> tuple[Array, Array]:
         """The same at all samples of the record, slopes (k, N, n); what was asked last is kept."""
         asked = (r, own, parameters.tobytes())
+        if own == () and self._last.get("asked") == (r, None, parameters.tobytes()):
+            given, moved = self._last["found"]  # with slopes that nobody asks for now
+            return given, moved[:, :, :0]
         if self._last.get("asked") != asked:
             self._last["found"] = self._followed(parameters, r, own)
             self._last["asked"] = asked

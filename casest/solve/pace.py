@@ -66,6 +66,7 @@ class Pace:
         return Point(x, point.references)
 
 
+@lru_cache(maxsize=64)
 def pace_of(model: Model) -> Pace | None:
     """How the model's equations are made faster or slower; None where nothing does it.
 
@@ -73,11 +74,19 @@ def pace_of(model: Model) -> Pace | None:
     the beginning is multiplied by s^b, and predictions stay as they are. Where the rates have
     inputs, or a constant that is known, there are none.
     """
-    return _pace_of(model)
+    system = _system(model)
+    if system is None:
+        return None
+    powers, *_ = np.linalg.lstsq(system[:, :-1], system[:, -1], rcond=1e-10)
+    if np.max(np.abs(system[:, :-1] @ powers - system[:, -1])) > NONE:
+        return None
+    own: Array = powers[: model.staged.coordinates.numel()].astype(float)
+    return Pace(own, bool(np.allclose(own, np.round(own), atol=1e-6)))
 
 
-@lru_cache(maxsize=64)
-def _pace_of(model: Model) -> Pace | None:
+def _system(model: Model) -> Array | None:
+    """Rows [A c] of what powers (a, b) have to keep to, A·(a, b) = c, each of length one: slopes of
+    both sides in s at s = 1, at several places."""
     traced = model.staged
     (flow,) = traced.stages if len(traced.stages) == 1 else (None,)
     if not isinstance(flow, Flow) or flow.inputs.numel() or traced.predicted is None:
@@ -104,12 +113,7 @@ def _pace_of(model: Model) -> Pace | None:
     system = np.vstack(found)
     size = np.linalg.norm(system, axis=1)
     system = system[size > 0] / size[size > 0, None]
-    if not len(system):
-        return None
-    powers, *_ = np.linalg.lstsq(system[:, :-1], system[:, -1], rcond=1e-10)
-    if np.max(np.abs(system[:, :-1] @ powers - system[:, -1])) > NONE:
-        return None
-    return Pace(powers[:-n], bool(np.allclose(powers, np.round(powers), atol=1e-6)))
+    return system if len(system) else None
 
 
 def turning(problem: Problem, point: Point) -> float:
@@ -180,7 +184,7 @@ class _Course:
 def _steps(problem: Problem, point: Point, r: int) -> Index | None:
     """Steps in each interval between rows of a run; None where it cannot be followed."""
     mesh, time = Mesh(), np.asarray(problem.runs[r].time, float)
-    x, _ = _follow(problem.model).along(problem.parameters(point, r), _free(problem, time), mesh)
+    x, _ = _follow(problem.model).along(problem.parameters(point, r), _free(time), mesh)
     if mesh.counts is None or mesh.stiff or not np.isfinite(x).all():
         return None
     return mesh.counts
@@ -201,11 +205,11 @@ def _course(
     length = np.repeat(np.diff(knots) / (steps * FINER), steps * FINER)
     time = np.concatenate([[0.0], np.cumsum(length)])
     free = replace(follow, flow=replace(follow.flow, anchored=False)) if sign < 0 else follow
-    x, _ = free.along(problem.parameters(point, r), _free(problem, sign * time), Mesh())
+    x, _ = free.along(problem.parameters(point, r), _free(sign * time), Mesh())
     return _Course(time, x)
 
 
-def _free(problem: Problem, time: Array) -> Course:
+def _free(time: Array) -> Course:
     """Times of equations without inputs."""
     return Course(time, np.zeros((len(time), 0)), np.zeros((len(time), 0, 0)))
 
@@ -255,7 +259,8 @@ def _where(problem: Problem, point: Point, pace: Pace) -> Iterator[float]:
 def _costs(problem: Problem, point: Point, r: int, course: _Course, s: Array) -> Array:
     """Sums of squares (S,) of a run whose course is passed through s times as fast."""
     samples, time = problem.samples[r].dense, np.asarray(problem.runs[r].time, float)
-    rows = np.unique(np.linspace(0, len(time) - 1, min(len(time), ROWS)).astype(int))
+    # At random: every k-th of even rows would be met by slower courses that the others are not.
+    rows = np.sort(np.random.default_rng(0).permutation(len(time))[:ROWS])
     begins = 0.0 if _follow(problem.model).flow.anchored else time[0]
     samples, time, present = samples[rows], time[rows] - begins, problem.present[r]
     there = np.ones((len(rows), len(problem.model.axes)), bool)
