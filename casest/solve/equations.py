@@ -37,7 +37,7 @@ STARTS, ENOUGH, DECADES = 16, 6, 1.5
 SEARCH, OPINION, COLLOCATED, TIMES, LONGEST = 60.0, 20.0, 4.0, 4.0, 200.0
 #: Seconds after which one start of a search is given up, and TIMES as many as those that arrived at
 #: the best took, where that is more.
-EACH = 2.0
+EACH = 0.5
 #: Gain of a step that ends a descent of a search, in those that are slight: 0.01 deviations.
 NEAR = 100.0
 #: Ends whose costs differ by no more than this share are one.
