@@ -310,8 +310,10 @@ def test_rows_of_a_sensor_that_do_not_stand_together_are_named(tmp_path):
     order = np.r_[0:30, 60:96, 30:60]
     pq.write_table(table.take(order), tmp_path / "a.parquet")
     assert fleet(tmp_path / "a.parquet", tmp_path / "out") == 0
-    said = {(r["sensor"], r["kind"]) for r in fleets.rejected(tmp_path / "out")}
+    found = fleets.rejected(tmp_path / "out")
+    said = {(r["sensor"], r["kind"]) for r in found}
     assert said == {("S000001", "twice"), ("S000002", "twice")}
+    assert all("the rows of a sensor stand together: sort them" in r["reason"] for r in found)
 
 
 def test_a_folder_within_the_data_set_is_refused(tmp_path, capsys):
@@ -337,6 +339,34 @@ def test_no_sensor_trusted_is_exit_code_2_and_everything_is_written(tmp_path, ca
     found = json.loads((tmp_path / "out" / "fleet.json").read_text())
     assert (found["sensors"], found["trusted"], found["rejected"]) == (4, 0, {"refused": 4})
     assert len(fleets.rejected(tmp_path / "out")) == 4
+
+
+def test_where_no_row_is_left_everything_is_written_all_the_same(tmp_path, capsys):
+    """Rows of all sensors mixed: each is there many times, and none has a result."""
+    table = fleets.long(fleets.readings(3), fleets.names(3))
+    mixed = np.arange(len(table)).reshape(3, -1).T.ravel()
+    pq.write_table(table.take(mixed), tmp_path / "a.parquet")
+    assert fleet(tmp_path / "a.parquet", tmp_path / "out") == 2
+    assert "rejected.parquet says why" in capsys.readouterr().err
+    found = json.loads((tmp_path / "out" / "fleet.json").read_text())
+    assert (found["sensors"], found["rejected"]) == (0, {"twice": len(table)})
+    assert (tmp_path / "out" / "fleet.html").is_file()
+
+
+def test_a_file_of_which_no_name_can_be_read_is_said_to_be_damaged(tmp_path, capsys):
+    file = tmp_path / "a.parquet"
+    pq.write_table(fleets.long(fleets.readings(40), fleets.names(40)), file)
+    column = pq.ParquetFile(file).metadata.row_group(0).column(0)
+    with file.open("r+b") as stream:
+        stream.seek(column.dictionary_page_offset or column.data_page_offset)
+        stream.write(b"\xff" * 40)
+    said = refused(capsys, *fleets.WORDS, file, "-o", tmp_path / "out")
+    assert "none of its 1 files can be read" in said
+
+
+def test_without_a_folder_for_what_it_finds_it_says_so(tmp_path, capsys):
+    pq.write_table(fleets.wide(fleets.readings(3), fleets.names(3)), tmp_path / "a.parquet")
+    assert "Missing option '-o'" in refused(capsys, *fleets.WORDS, tmp_path / "a.parquet")
 
 
 def test_counts_are_said_in_one_line(tmp_path, capsys):
@@ -390,6 +420,19 @@ def test_misfit_is_the_chance_of_the_prediction_of_a_reading_left_out():
     assert (found.misfit > np.array(exact) * (1 - 1e-6)).all()
     assert np.mean(found.misfit < np.array(exact) * (1 + 1e-6)) > 0.9
     assert found.misfit[3] < 1e-3
+
+
+def test_a_sensor_with_a_knocked_pose_is_named_among_sound_ones(tmp_path, capsys):
+    v = fleets.readings(200)
+    pq.write_table(fleets.wide(v, fleets.names(200)), tmp_path / "sound.parquet")
+    assert fleet(tmp_path / "sound.parquet", tmp_path / "sound") == 0
+    assert "a reading is far off" not in capsys.readouterr().out
+    v[77, 5] *= 1.03
+    pq.write_table(fleets.wide(v, fleets.names(200)), tmp_path / "a.parquet")
+    assert fleet(tmp_path / "a.parquet", tmp_path / "out") == 0
+    assert "of one trusted sensor a reading is far off" in capsys.readouterr().out
+    page = (tmp_path / "out" / "fleet.html").read_text()
+    assert "S000077" in page.partition("one reading is further off")[2]
 
 
 def test_the_page_shows_yield_outlying_sensors_and_drift_over_the_date(tmp_path):

@@ -79,6 +79,8 @@ def _words(option: Field[Any]) -> dict[str, Any]:
     how: dict[str, Any] = option.metadata["how"]
     if option.default == ():
         return {"multiple": True, **how}
+    if how.get("required"):  # to click a default of None is one: it would never be missing
+        return how
     return {"default": option.default, "is_flag": option.default is False, **how}
 
 

@@ -111,11 +111,12 @@ def fleet(model_name: str, dataset: str, options: FleetOptions) -> int:
     write_rejected(job, plan.partitions, plan.unreadable)
     write(options.output / FLEET, as_json(result.content()))
     progress("drawing")
-    write(options.output / PAGE, fleet_page(result, drawn(job, plan.partitions, total.sensors)))
+    looks = drawn(job, plan.partitions, total.sensors)
+    write(options.output / PAGE, fleet_page(result, looks))
     if options.as_json:
         echo(as_json(result.content()), nl=False)
     else:
-        echo(fleet_text(result, options.output), verdict=True)
+        echo(fleet_text(result, options.output, looks.misread.count), verdict=True)
     if not result.trusted:
         echo("casest: no sensor is trusted; rejected.parquet says why", err=True)
         return NotTrusted.exit_code

@@ -102,9 +102,16 @@ def plan(
         raise DataError(f"{dataset}: none of its {len(bad)} files can be read: {bad[0][1]}")
     found, damaged, sensors, places = _named(found, layout)
     if not sensors:
-        raise DataError(f"{dataset}: holds no row that names a sensor; check the export")
-    cut = _cut(found, layout)
-    parts = tuple(replace(p, twice=tuple(_said(p, places, found))) if places else p for p in cut)
+        why = "holds no row that names a sensor; check the export"
+        if damaged and not found:
+            why = f"none of its {len(bad) + len(damaged)} files can be read: {damaged[0][1]}"
+        raise DataError(f"{dataset}: {why}")
+    cut, way_out = _cut(found, layout), "keep one"
+    if not layout.wide:
+        way_out = "in long form the rows of a sensor stand together: sort them by it, or keep one"
+    if places:
+        cut = [replace(p, twice=tuple(_said(p, places, found, way_out))) for p in cut]
+    parts = tuple(cut)
     return Plan(layout, parts, (*bad, *damaged), sensors)
 
 
@@ -202,7 +209,7 @@ def _names(own: _Open, layout: Layout) -> Iterator[Names]:
 
 
 def _said(
-    part: Partition, places: Mapping[str, list[Any]], files: Sequence[_Open]
+    part: Partition, places: Mapping[str, list[Any]], files: Sequence[_Open], way_out: str
 ) -> Iterator[tuple[str, str]]:
     """Names in this partition that are there more than once, with a sentence each."""
     inside = {(p.file.name, p.first, p.stop) for p in part.pieces}
@@ -211,7 +218,7 @@ def _said(
         if any(f == file and a <= row < b for file, row in where for f, a, b in inside):
             listed = " and ".join(f"row {row} of {file}" for file, row in where[:3])
             more = f" and {len(where) - 3} more" if len(where) > 3 else ""
-            yield name, f"sensor {name} is there {_times(len(where))}: {listed}{more}; keep one"
+            yield name, f"sensor {name} is there {_times(len(where))}: {listed}{more}; {way_out}"
 
 
 def _times(count: int) -> str:

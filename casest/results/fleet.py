@@ -22,6 +22,25 @@ from casest.tasks.tally import Moments, Total
 
 FLEET, COMMON = "fleet.json", "common.json"
 
+#: What first speaks against a sensor, by the code that `fleet.json` counts it under.
+AGAINST = {
+    "readings": "readings that cannot be used",
+    "reading": "a reading that is no number",
+    "not_finite": "a residual that is not finite",
+    "no_redundancy": "too few readings for the unknowns",
+    "not_determined": "an unknown that the readings do not determine",
+    "bound": "an unknown on a bound of its own",
+    "not_settled": "no stationary point",
+    "no_minimum": "no minimum",
+    "misshapen": "a cost that is no parabola",
+    "ambiguous": "another solution",
+    "noise": "noise that the residual bends with",
+    "loud": "more noise than a sound sensor has",
+    "correlated": "readings that resemble their neighbours",
+    "poor_valley": "several valleys, and a poor fit",
+    "model": "what the model says of it",
+}
+
 
 class Spread(Struct, frozen=True, kw_only=True):
     """An unknown over the trusted sensors: mean and standard deviation, least and largest.

@@ -21,6 +21,8 @@ DRAWN, LOOKED_AT = 200_000, 20_000_000
 ESTIMATED, FEWEST = 5_000, 5
 #: Outlying sensors that are named, and from how many standard deviations of the fleet on.
 NAMED, OUTLYING = 20, 5.0
+#: Chance that any of so many sound sensors has a largest residual like that of one which is named.
+MISREAD = 0.01
 #: Standard deviations of a normal distribution between its quartiles.
 QUARTILES = 1.349
 
@@ -36,11 +38,21 @@ class Outlier:
 
 
 @dataclass(frozen=True)
+class Misread:
+    """Trusted sensors of which one reading is far off: how many, the least likely ones by name,
+    each with the chance of its largest residual."""
+
+    count: int = 0
+    named: tuple[tuple[str, float], ...] = ()
+
+
+@dataclass(frozen=True)
 class Drawn:
     """S sensors of the fleet in the order of `at`: unknowns (n, S), NaN where refused.
 
     `at` is the place in the data set, or what `over` names, in s since `since`. `centre` and
-    `scale` (n,) are median and standard deviation by the quartiles. `outlying` are of `looked_at`.
+    `scale` (n,) are median and standard deviation by the quartiles. `outlying` and `misread` are of
+    `looked_at`.
     """
 
     names: tuple[str, ...]
@@ -54,6 +66,7 @@ class Drawn:
     centre: Array
     scale: Array
     outlying: tuple[Outlier, ...]
+    misread: Misread
     looked_at: int
 
 
@@ -71,11 +84,12 @@ def drawn(job: Job, partitions: Sequence[Partition], sensors: int) -> Drawn:
         own = batch.take(pyarrow_array(chosen))
         parts.append([_numbers(own.column(c)) for c in columns] + [first + chosen])
         first += len(batch)
-    whole = [np.concatenate(own) for own in zip(*parts, strict=True)]
+    none = [np.zeros(0)] * (len(columns) + 1)  # every sensor may have been rejected
+    whole = [np.concatenate(own) for own in zip(none, *parts, strict=True)]
     values, trusted = np.array(whole[: len(names)]), whole[len(names) + 2].astype(bool)
     at = whole[len(names) + 3].astype(float)
     since = ""
-    if over:
+    if over and at.size:
         least = np.nanmin(at)
         since, at = str(np.datetime64(int(least), "s")), at - least
     order = np.argsort(at, kind="stable")
@@ -94,6 +108,7 @@ def drawn(job: Job, partitions: Sequence[Partition], sensors: int) -> Drawn:
         centre,
         scale,
         outlying,
+        _misread(job, partitions, sensors) if few else Misread(),
         sensors if few else 0,
     )
 
@@ -171,6 +186,20 @@ def _quartiles(values: Array) -> Array:
     if not len(values):
         return np.full(3, np.nan)
     return np.asarray(np.quantile(values, (0.25, 0.5, 0.75)))
+
+
+def _misread(job: Job, partitions: Sequence[Partition], sensors: int) -> Misread:
+    """Of all trusted sensors those with a largest residual that no sound one of them would have."""
+    count, found = 0, list[tuple[str, float]]()
+    for batch in _batches(job, partitions, ["sensor", "misfit", "trusted"]):
+        chance = _numbers(batch.column("misfit"))
+        trusted = _numbers(batch.column("trusted")).astype(bool)
+        some = np.flatnonzero(trusted & (chance * sensors < MISREAD))
+        count += len(some)
+        few = some[np.argsort(chance[some], kind="stable")[:NAMED]]
+        found += [(str(batch.column("sensor")[int(k)].as_py()), float(chance[k])) for k in few]
+        found = sorted(found, key=lambda one: one[1])[:NAMED]
+    return Misread(count, tuple(found))
 
 
 def _outlying(

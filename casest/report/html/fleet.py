@@ -11,8 +11,8 @@ from casest.report.html.figures import BAND, Figures, axis, panel
 from casest.report.html.frame import whole
 from casest.report.html.numbers import number, printed, printed_unit, two_digits
 from casest.report.html.page import paragraph, section, table
-from casest.results.fleet import FleetResult, Spread
-from casest.results.fleet_rows import OUTLYING, Drawn
+from casest.results.fleet import AGAINST, FleetResult, Spread
+from casest.results.fleet_rows import MISREAD, NAMED, OUTLYING, Drawn
 from casest.results.rounding import rounded
 
 PAGE = "fleet.html"
@@ -51,7 +51,7 @@ def fleet_page(result: FleetResult, drawn: Drawn) -> str:
 
 def _yield(result: FleetResult, drawn: Drawn, figures: Figures) -> str:
     rejected = [[REJECTED[kind], f"{n:,}"] for kind, n in result.rejected.items()]
-    reasons = [[f"`{code}`", f"{n:,}"] for code, n in result.reasons.items()]
+    reasons = [[AGAINST.get(code, code), f"{n:,}"] for code, n in result.reasons.items()]
     share = 100 * result.trusted / max(result.sensors, 1)
     return section(
         "yield",
@@ -169,17 +169,28 @@ def _drift(result: FleetResult, drawn: Drawn, figures: Figures) -> str:
 
 
 def _outlying(drawn: Drawn) -> str:
-    if not drawn.looked_at:
+    """Sensors that are unlike the others, and those of which one reading is far off."""
+    if not drawn.looked_at and len(drawn.at):
         text = f"Not looked for among so many: drawn are {len(drawn.at):,} sensors."
         return section("outlying", "Outlying sensors", paragraph(text))
-    if not drawn.outlying:
-        text = f"No trusted sensor lies {OUTLYING:g} standard deviations of the fleet away."
-        return section("outlying", "Outlying sensors", paragraph(text))
-    rows = [
-        [o.sensor, f"`{o.unknown}`", number(o.value, 5), number(o.away, 3)] for o in drawn.outlying
-    ]
-    head = ["sensor", "unknown", "value", "standard deviations of the fleet"]
-    return section("outlying", "Outlying sensors", table(head, rows, [2, 3]))
+    far = paragraph(f"No trusted sensor lies {OUTLYING:g} standard deviations of the fleet away.")
+    if drawn.outlying:
+        rows = [
+            [o.sensor, f"`{o.unknown}`", number(o.value, 5), number(o.away, 3)]
+            for o in drawn.outlying
+        ]
+        head = ["sensor", "unknown", "value", "standard deviations of the fleet"]
+        far = table(head, rows, [2, 3])
+    misread = ""
+    if drawn.misread.count:
+        first = f", the first {NAMED}" if drawn.misread.count > NAMED else ""
+        misread = paragraph(
+            f"Of {drawn.misread.count:,} trusted sensors one reading is further off than any of so "
+            f"many sound ones would be, but for one fleet in {1 / MISREAD:.0f}{first}:"
+        )
+        rows = [[sensor, number(chance, 2)] for sensor, chance in drawn.misread.named]
+        misread += table(["sensor", "chance of its largest residual"], rows, [1])
+    return section("outlying", "Outlying sensors", far, misread)
 
 
 def _versions(result: FleetResult) -> str:

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from casest.report.text.layout import WIDTH, item
-from casest.results.fleet import COMMON, CommonEffect, FleetClosed, FleetResult, OwnEffect
+from casest.results.fleet import AGAINST, COMMON, CommonEffect, FleetClosed, FleetResult, OwnEffect
 from casest.results.rounding import percent, rounded
 
 #: Kinds of what is rejected, in words for one and for several.
@@ -20,12 +20,19 @@ KINDS = {
 }
 
 
-def fleet_text(result: FleetResult, folder: Path) -> str:
-    """Head, parameters over the fleet, why sensors are refused, what was written."""
+def fleet_text(result: FleetResult, folder: Path, misread: int = 0) -> str:
+    """Head, parameters over the fleet, why sensors are refused, what was written.
+
+    `misread`: trusted sensors of which one reading is far off.
+    """
     lines = [textwrap.fill(_head(result), WIDTH), "", *_table(result)]
     if result.reasons:
         lines += ["", "Refused for:"]
-        lines += [f"  {n:>8} {code.replace('_', ' ')}" for code, n in result.reasons.items()]
+        lines += [f"  {n:>8} {AGAINST.get(code, code)}" for code, n in result.reasons.items()]
+    if misread:
+        one = "one trusted sensor" if misread == 1 else f"{misread:,} trusted sensors"
+        said = f"of {one} a reading is far off (misfit): see fleet.html; --noise refuses such"
+        lines += ["", item(said)]
     where = f"Written: {folder}/fleet.json, fleet.html, results/, rejected.parquet"
     return "\n".join([*lines, "", textwrap.fill(where, WIDTH)])
 
