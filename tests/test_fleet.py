@@ -15,7 +15,9 @@ from casest.cli import run
 from casest.dataset import names as naming
 from casest.dataset import partitions
 from casest.declaration.physics import Residual
+from casest.estimate.reasons import Code
 from casest.results.find import find_model
+from casest.results.fleet import AGAINST
 
 NORM = find_model("norm-triangular").having(norm=fleets.GRAVITY)
 
@@ -420,6 +422,10 @@ def test_misfit_is_the_chance_of_the_prediction_of_a_reading_left_out():
     assert (found.misfit > np.array(exact) * (1 - 1e-6)).all()
     assert np.mean(found.misfit < np.array(exact) * (1 + 1e-6)) > 0.9
     assert found.misfit[3] < 1e-3
+
+
+def test_every_reason_against_a_sensor_has_words():
+    assert {code.name.lower() for code in Code} <= set(AGAINST)
 
 
 def test_a_sensor_with_a_knocked_pose_is_named_among_sound_ones(tmp_path, capsys):

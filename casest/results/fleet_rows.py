@@ -95,7 +95,9 @@ def drawn(job: Job, partitions: Sequence[Partition], sensors: int) -> Drawn:
     order = np.argsort(at, kind="stable")
     quartiles = np.array([_quartiles(own[trusted]) for own in values])
     centre, scale = quartiles[:, 1], (quartiles[:, 2] - quartiles[:, 0]) / QUARTILES
-    outlying = _outlying(job, partitions, names, centre, scale) if few else ()
+    unlike: tuple[tuple[Outlier, ...], Misread] = (), Misread()
+    if few:
+        unlike = _unlike(job, partitions, names, centre, scale, sensors)
     return Drawn(
         names,
         values[:, order],
@@ -107,8 +109,7 @@ def drawn(job: Job, partitions: Sequence[Partition], sensors: int) -> Drawn:
         since,
         centre,
         scale,
-        outlying,
-        _misread(job, partitions, sensors) if few else Misread(),
+        *unlike,
         sensors if few else 0,
     )
 
@@ -188,39 +189,40 @@ def _quartiles(values: Array) -> Array:
     return np.asarray(np.quantile(values, (0.25, 0.5, 0.75)))
 
 
-def _misread(job: Job, partitions: Sequence[Partition], sensors: int) -> Misread:
-    """Of all trusted sensors those with a largest residual that no sound one of them would have."""
-    count, found = 0, list[tuple[str, float]]()
-    for batch in _batches(job, partitions, ["sensor", "misfit", "trusted"]):
-        chance = _numbers(batch.column("misfit"))
-        trusted = _numbers(batch.column("trusted")).astype(bool)
-        some = np.flatnonzero(trusted & (chance * sensors < MISREAD))
-        count += len(some)
-        few = some[np.argsort(chance[some], kind="stable")[:NAMED]]
-        found += [(str(batch.column("sensor")[int(k)].as_py()), float(chance[k])) for k in few]
-        found = sorted(found, key=lambda one: one[1])[:NAMED]
-    return Misread(count, tuple(found))
-
-
-def _outlying(
+def _unlike(
     job: Job,
     partitions: Sequence[Partition],
     names: tuple[str, ...],
     centre: Array,
     scale: Array,
-) -> tuple[Outlier, ...]:
-    """The most outlying of all trusted sensors, the furthest first."""
-    found: list[Outlier] = []
+    sensors: int,
+) -> tuple[tuple[Outlier, ...], Misread]:
+    """Of all trusted sensors the most outlying, the furthest first; and those with a largest
+    residual that no sound one of so many would have."""
+    found, count, misread = list[Outlier](), 0, list[tuple[str, float]]()
     # Of an unknown whose quartiles are one number no sensor is far: it has no scale.
     unit = np.where(scale > 0, scale, np.inf)[:, None]
-    for batch in _batches(job, partitions, ["sensor", *names]):
+    for batch in _batches(job, partitions, ["sensor", *names, "misfit", "trusted"]):
         values = np.array([_numbers(batch.column(n)) for n in names])
         away = (values - centre[:, None]) / unit
         far = np.fmax.reduce(np.abs(away), axis=0)
-        some = np.flatnonzero(far >= OUTLYING)
-        for k in some[np.argsort(-far[some], kind="stable")[:NAMED]]:
+        for k in _first(-far, far >= OUTLYING):
             i = int(np.nanargmax(np.abs(away[:, k])))
-            sensor = str(batch.column("sensor")[int(k)].as_py())
-            found.append(Outlier(sensor, names[i], float(values[i, k]), float(away[i, k])))
+            found.append(Outlier(_name(batch, k), names[i], float(values[i, k]), float(away[i, k])))
         found = sorted(found, key=lambda o: -abs(o.away))[:NAMED]
-    return tuple(found)
+        chance = _numbers(batch.column("misfit"))
+        off = _numbers(batch.column("trusted")).astype(bool) & (chance * sensors < MISREAD)
+        count += int(np.count_nonzero(off))
+        misread += [(_name(batch, k), float(chance[k])) for k in _first(chance, off)]
+        misread = sorted(misread, key=lambda one: one[1])[:NAMED]
+    return tuple(found), Misread(count, tuple(misread))
+
+
+def _first(order: Array, some: NDArray[np.bool_]) -> Sequence[int]:
+    """Places of those that are named of `some`, in their order."""
+    places = np.flatnonzero(some)
+    return [int(k) for k in places[np.argsort(order[places], kind="stable")[:NAMED]]]
+
+
+def _name(batch: Any, k: int) -> str:
+    return str(batch.column("sensor")[k].as_py())
