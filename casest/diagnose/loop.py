@@ -21,9 +21,12 @@ from casest.diagnose.evidence.score import Evidence
 from casest.diagnose.found import HELD_OUT_DATA, Found, Undecided
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.misfit.left import predictions
+from casest.diagnose.noise.slow_course import slow_squares
 from casest.diagnose.noise.tails import outliers_p_value
 from casest.diagnose.protocol import Kept, State, search
 from casest.diagnose.protocol.choosing import NOT_HELD_OUT
+from casest.diagnose.protocol.ranking import ranked
+from casest.diagnose.protocol.refits import AS_MUCH
 from casest.diagnose.sensor import NOT_FINITE, Fit, Sensor
 from casest.diagnose.sensor.courses import courses
 from casest.diagnose.visibility import Visible, visible
@@ -188,6 +191,9 @@ def _closed(sensor: Sensor, before: Estimate, folds: Folds, say: Callable[[str],
         state, after = certified(sensor, state, before)
         # What was missing is no noise: parts that are held out are as long as what is left asks.
         folds = folded(sensor.runs, after.correlated_over, sensor.seed)
+    less = _without_events_of_a_course(sensor, state)
+    if less is not state:
+        state, after = certified(sensor, less, before)
     state, after, hidden = _foretelling(sensor, declared, state, before, after, folds)
     effects = [] if outliers is None else [outliers]
     effects += [_found(sensor, state, k, after) for k in state.kept]
@@ -205,6 +211,28 @@ def _closed(sensor: Sensor, before: Estimate, folds: Folds, say: Callable[[str],
         _undecided(sensor, state),
         courses(sensor, state.fit, state.last) if state.last else (),
     )
+
+
+def _without_events_of_a_course(sensor: Sensor, state: State[Fit]) -> State[Fit]:
+    """Without events that explain less than the slow course they leave: slow noise has a largest
+    excursion as well, and moments were looked for. The smallest goes first."""
+    while events := [k for k in state.kept if _is_event(k) and not sensor.asked(k.what)]:
+        least = min(events, key=lambda k: _fall(state.fit, k))
+        less = sensor.without(state.fit, least.what)
+        left = slow_squares(sensor.runs, state.fit.residuals)
+        if less is None or _fall(state.fit, least) > left:
+            break
+        kept = tuple(k for k in state.kept if k is not least)
+        state = replace(state, fit=less, kept=kept, open=(least.evidence, *state.open))
+        state = state.refusing(least.what, AS_MUCH)
+        state = replace(state, last=ranked(sensor, less))
+    return state
+
+
+def _is_event(kept: Kept) -> bool:
+    """Does it begin, or end, at a moment of its own?"""
+    effect = kept.what.effect
+    return effect is not None and "time" in dict(effect.profile).values()
 
 
 def _foretelling(
@@ -334,15 +362,20 @@ def _found(sensor: Sensor, state: State[Fit], kept: Kept, after: Estimate) -> Fo
     """An added effect with its evidence, and what would have been in its place."""
     candidate: Candidate = sensor.final(state.fit, kept.what)
     names = tuple(p.name for p in candidate.parameters(after.model))
-    ratio = kept.falls["pieces"].ratio
-    fall = (1 - ratio) / max(ratio, 1e-300) * state.fit.noise**2
+    fall = _fall(state.fit, kept)
     added = {k.what.label for k in state.kept}
     rivals = {
         r.what.label: sensor.moved_by(state.fit, r.fit)
         for r in kept.rivals
         if r.what.label not in added
     }
-    return Found(candidate, kept.evidence.p_value, float(fall), names, rivals)
+    return Found(candidate, kept.evidence.p_value, fall, names, rivals)
+
+
+def _fall(fit: Fit, kept: Kept) -> float:
+    """By which an effect lets the mean square of what is held out fall."""
+    ratio = kept.falls["pieces"].ratio
+    return float((1 - ratio) / max(ratio, 1e-300) * fit.noise**2)
 
 
 def _refused(sensor: Sensor, state: State[Fit], declared: Fit) -> tuple[Skipped, ...]:

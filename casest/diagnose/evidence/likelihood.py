@@ -10,7 +10,7 @@ white noise.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -151,10 +151,10 @@ class Likelihood:
             Xw = X * root[:, None]
             values, taken = _solved(Xw, R * root)
             left = R - X @ values
-            S = self._spectrum(left, 1 - taken)
+            S = self.spectrum(left, 1 - taken)
         return Explained(float(np.sum(np.log(S) + left**2 / S)), S, left, values)
 
-    def _spectrum(self, left: Array, free: Array) -> Array:
+    def spectrum(self, left: Array, free: Array) -> Array:
         """Of every axis, from what is left and the share that the fit leaves free."""
         power, free = (left**2).reshape(self.shape), np.clip(free, LEFT, 1).reshape(self.shape)
         return self._bands.curves(power, free).ravel()
@@ -174,10 +174,17 @@ def far_out(residual: Array) -> Array:
     return np.asarray(residual - np.clip(residual, middle - far, middle + far))
 
 
-def rises(less: Linear, fits: Sequence[Linear]) -> list[float]:
+def beside_a_colour(likelihood: Likelihood) -> float:
+    """−2 log L where the noise has a spectrum of its own, and no more."""
+    return likelihood.beside().cost
+
+
+def rises(
+    less: Linear, fits: Sequence[Linear], of: Callable[[Likelihood], float] = beside_a_colour
+) -> list[float]:
     """2 log of the likelihood of each fit over that of one with less in it; each has its own noise.
 
-    What the fit with the least noise leaves far out is cut from all of them.
+    What the fit with the least noise leaves far out is cut from all of them. `of`: −2 log L.
     """
     less, *fits = alike([less, *fits])
     best = min(fits, key=lambda x: float(np.sum(np.log(robust_sd(x.residual)))))
@@ -185,7 +192,7 @@ def rises(less: Linear, fits: Sequence[Linear]) -> list[float]:
     def cost(linear: Linear) -> float:
         alike = linear.residual.shape == best.residual.shape  # rows that moved in time are others
         cut = far_out(best.residual) if alike and linear.series else None
-        return Likelihood(linear, cut).beside().cost
+        return of(Likelihood(linear, cut))
 
     none = cost(less)
     return [none - cost(fit) for fit in fits]

@@ -64,6 +64,17 @@ def slow_course(runs: Sequence[Run], residuals: Sequence[Array]) -> SlowCourse |
     return min(large or found, key=lambda f: (f.p_value, -f.share))
 
 
+def slow_squares(runs: Sequence[Run], residuals: Sequence[Array]) -> float:
+    """Mean square (over all axes) of the slow courses that are beyond doubt."""
+    total, axes = 0.0, int(residuals[0].shape[1])
+    for k in range(axes):
+        own = [r[:, [k]] for r in residuals]
+        found = slow_course(runs, own)
+        if found is not None and found.p_value < LEVELS.misfit:
+            total += found.share * float(np.mean(np.concatenate(own) ** 2))
+    return total / axes
+
+
 def _power(r: Array) -> Array:
     """Squares (n − 1, m) of the components along cosines of ½, 1, … periods."""
     mirrored = np.concatenate([r, r[::-1]])

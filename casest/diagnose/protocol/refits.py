@@ -41,16 +41,18 @@ def refitted(
     refits = [fit for _, fit in fits]
     gains = subject.rises(state.fit, refits) if fits else []
     even = _where_noise_is_louder(subject, ranking, refits) or gains
+    slow = (refits and subject.rises_beside_a_wander(state.fit, refits)) or gains
     found: list[Refit[F]] = []
-    for (evidence, better), gain, least in zip(fits, gains, even, strict=True):
+    for (evidence, better), gain, *noisier in zip(fits, gains, even, slow, strict=True):
         kept = _gaining(evidence, gain)
-        enough = beyond_courses(ranking, kept) and _strong(ranking, _gaining(evidence, least))
+        least = _gaining(evidence, min(noisier))
+        enough = beyond_courses(ranking, kept) and _strong(ranking, least)
         of_one_row = enough and not _of_several_rows(subject, ranking, kept, better)
         if (enough and not of_one_row) or subject.asked(evidence.trials[0].what):
             found.append(Refit(state.fit, better, kept))
         elif of_one_row:
             state = state.failing(evidence, ONE_ROW)
-        elif len(evidence.trials) == 1 and _strong(ranking, _gaining(evidence, least)):
+        elif len(evidence.trials) == 1 and _strong(ranking, kept):
             state = state.refusing(evidence.trials[0].what, AS_MUCH)
     found.sort(key=lambda r: -r.evidence.score)
     near = [r.evidence for r in _near(found)]

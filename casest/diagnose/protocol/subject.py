@@ -52,6 +52,10 @@ class Subject(Protocol[F]):
         """2 log of the likelihood of each fit over that of one with less in it."""
         ...
 
+    def rises_beside_a_wander(self, less: F, fits: Sequence[F]) -> list[float]:
+        """The same where an offset may wander that is slow in no residual; none where it cannot."""
+        return []
+
     def certified(self, fit: F) -> F | str:
         """The fit, proved; or why it is refused."""
         return fit

@@ -6,10 +6,9 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from casest.data.run import Run
 from casest.declaration.shapes import Array
 from casest.diagnose.candidates.candidates import Candidate
-from casest.diagnose.evidence.linear import Index, Linear
+from casest.diagnose.evidence.linear import Linear
 from casest.diagnose.evidence.score import Evidence, Trial, judged
 from casest.diagnose.found import Course
 from casest.diagnose.levels import LEVELS
@@ -17,6 +16,7 @@ from casest.diagnose.misfit.reference import swell
 from casest.diagnose.noise.slow_course import FAST, slow_course
 from casest.diagnose.protocol.state import Ranking
 from casest.diagnose.sensor.fits import Fit
+from casest.diagnose.sensor.rows import Rows
 from casest.diagnose.sensor.sensor import Sensor
 from casest.diagnose.sensor.tried import offset
 from casest.effects.course import bias_course, reference_wander
@@ -36,7 +36,7 @@ def courses(sensor: Sensor, fit: Fit, ranking: Ranking) -> tuple[Course, ...]:
     carriers = _carriers(sensor, fit)
     best: dict[str, Evidence] = {}
     for what, carrier in carriers:
-        for evidence in _evidences(what, carrier, sensor.runs, sensor.rows.index, ranking):
+        for evidence in _evidences(what, carrier, sensor.rows, ranking):
             if evidence.score > LEVELS.strong and (
                 what.label not in best or evidence.score > best[what.label].score
             ):
@@ -73,7 +73,7 @@ def _of_a_length(
         return ()
     cost: dict[str, float] = {}
     for what, carrier in carriers:
-        every = _columns(carrier, sensor.runs, sensor.rows.index, linear.residual.size)
+        every = _columns(carrier, sensor.rows, linear.residual.size)
         cost[what.label] = min((_cost(linear, columns) for columns in every), default=np.inf)
     near = min(cost.values(), default=np.inf) + FAST * LEVELS.clear
     return tuple(Course(what) for what, _ in carriers if cost[what.label] < near)
@@ -95,36 +95,19 @@ def _share(evidence: Evidence, ranking: Ranking) -> float:
     return max(0.0, 1 - taken / float(np.sum(r**2)))
 
 
-def _evidences(
-    what: Candidate, carrier: Array, runs: Sequence[Run], index: Sequence[Index], ranking: Ranking
-) -> Iterator[Evidence]:
-    for columns in _columns(carrier, runs, index, ranking.linear.residual.size):
+def _evidences(what: Candidate, carrier: Array, rows: Rows, ranking: Ranking) -> Iterator[Evidence]:
+    for columns in _columns(carrier, rows, ranking.linear.residual.size):
         trial = Trial(what, what.label, columns, len(WAVES))
         found = judged([trial], ranking.likelihood, ranking.none, families=ranking.families)
         if found is not None:
             yield found
 
 
-def _columns(
-    carrier: Array, runs: Sequence[Run], index: Sequence[Index], residuals: int
-) -> Iterator[Array]:
+def _columns(carrier: Array, rows: Rows, residuals: int) -> Iterator[Array]:
     """A carrier (N, m, k) times cosines, more and more of them: (N, m, k · waves · runs)."""
     for waves in WAVES:
-        shapes = _shapes(runs, index, waves)
+        shapes = rows.cosines(waves)
         if shapes.shape[1] * carrier.shape[2] * RESIDUALS > residuals:
             return
         columns = carrier[:, :, :, None] * shapes[:, None, None, :]
         yield columns.reshape(*carrier.shape[:2], -1)
-
-
-def _shapes(runs: Sequence[Run], index: Sequence[Index], waves: int) -> Array:
-    """Cosines (N, waves · runs) of the rows that are looked at, each of one run."""
-    found = np.zeros((sum(map(len, index)), len(runs), waves))
-    first = 0
-    for k, (run, rows) in enumerate(zip(runs, index, strict=True)):
-        time = np.arange(len(run)) if run.time is None else np.asarray(run.time)
-        share = (time[rows] - time[0]) / max(float(np.ptp(time)), 1e-300)
-        own = slice(first, first + len(rows))
-        found[own, k] = np.cos(np.pi * share[:, None] * np.arange(1, waves + 1))
-        first += len(rows)
-    return found.reshape(len(found), -1)

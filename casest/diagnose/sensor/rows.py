@@ -64,6 +64,18 @@ class Rows:
             J[here] = own * root[:, :, None]
         return r, np.nan_to_num(J)
 
+    def cosines(self, waves: int) -> Array:
+        """(N, runs · waves): 1, 2, … half waves over each run, in the rows that are looked at."""
+        found = np.zeros((sum(map(len, self.index)), len(self.runs), waves))
+        first = 0
+        for k, (run, rows) in enumerate(zip(self.runs, self.index, strict=True)):
+            time = np.arange(len(run)) if run.time is None else np.asarray(run.time)
+            share = (time[rows] - time[0]) / max(float(np.ptp(time)), 1e-300)
+            own = slice(first, first + len(rows))
+            found[own, k] = np.cos(np.pi * share[:, None] * np.arange(1, waves + 1))
+            first += len(rows)
+        return found.reshape(len(found), -1)
+
     @cached_property
     def _numbers(self) -> tuple[Index, Index]:
         """Block and run of each row."""

@@ -16,6 +16,7 @@ from casest.diagnose.candidates.candidates import Candidate
 from casest.diagnose.evidence.likelihood import Likelihood, rises
 from casest.diagnose.evidence.linear import Linear
 from casest.diagnose.evidence.score import Evidence, Trial, judged, on_fewer_axes
+from casest.diagnose.evidence.wandering import wandering_cost
 from casest.diagnose.formula.search import NAME, described, readable, with_sizes
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.protocol import Kept, Ranking, Subject
@@ -33,6 +34,8 @@ from casest.leastsquares.problem import Problem
 
 #: Why there is no refit.
 NOT_FINITE = "its refit fails: the residual is not finite"
+#: Half waves over all runs of an offset that wanders: what is faster is noise.
+WANDER = 12
 
 
 @dataclass(frozen=True)
@@ -163,6 +166,23 @@ class Sensor(Subject[Fit]):
     def rises(self, less: Fit, fits: Sequence[Fit]) -> list[float]:
         """2 log of the likelihood of each fit over that of one with less in it."""
         return rises(self.linear(less), [self.linear(fit) for fit in fits])
+
+    def rises_beside_a_wander(self, less: Fit, fits: Sequence[Fit]) -> list[float]:
+        """The same where the offset of a length may wander; none of other readings, or of poses."""
+        linears = [self.linear(fit) for fit in fits]
+        linear, shift = self.linear(less), self.tried.shift(less)
+        same = {x.residual.shape for x in linears} == {linear.residual.shape}
+        if not (same and linear.coloured) or shift is None or linear.residual.shape[1] > 1:
+            return []
+        slope = shift[1]
+        if np.ptp(slope, axis=0).max() < LEVELS.survives * np.abs(slope).max():
+            return []  # a reading of its own, in which the offset's noise is as slow as it is
+        waves = max(2, WANDER // len(self.runs))
+        shapes = self.rows.cosines(waves) / np.sqrt(
+            np.tile(np.arange(1, waves + 1), len(self.runs))
+        )
+        course = (slope[:, :, :, None] * shapes[:, None, None, :]).reshape(*slope.shape[:2], -1)
+        return rises(linear, linears, lambda likelihood: wandering_cost(likelihood, course))
 
     def certified(self, fit: Fit) -> Fit | str:
         """The fit, if the data determine it and it is at rest; or why it is refused."""
