@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from flights import Sensors
 from scipy.integrate import solve_ivp
+from scipy.linalg import solve_triangular
 
 from casest import DataError, Run, cli, cross, norm_2, signal, sin
 from casest.diagnose.motion.candidates import candidates
@@ -118,6 +119,23 @@ def test_what_a_noisy_gyro_leaves_of_a_scale_is_never_claimed_for_another_cause_
     assert closing.effects
     for effect in closing.effects:
         assert "gain of a" in (effect.candidate.label, *effect.indistinguishable_from)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    "sensors",
+    [Sensors(lever=(0.1, -0.05, 0.07)), Sensors(gyro_bias=(0.002, -0.001, 0.0015))],
+    ids=["lever arm", "gyro bias"],
+)
+def test_what_is_far_less_likely_is_not_called_alike(sensors):
+    """Innovations in the deviations of each fit are one in the mean: held-out squares said nothing,
+    and what was hundreds behind in likelihood was "not told apart"."""
+    rng = np.random.default_rng(360_000)
+    motion = flights.somewhere(rng)
+    run = flights.record(motion, np.arange(0, 60, 0.02), rng, sensors)
+    (effect,) = close_motion(bias_gravity, run).effects
+    assert effect.candidate.label in ("lever_arm of v", "bias of omega")
+    assert effect.indistinguishable_from == ()
 
 
 @pytest.mark.long
@@ -299,6 +317,24 @@ def test_noise_that_an_effect_would_take_away_is_no_evidence_for_it(std):
             assert better.startswith("it would leave 0.0")
         else:
             assert abs(rise(better, fit)) < 0.5
+
+
+def test_innovations_of_one_fit_in_the_deviations_of_another():
+    """Those of a filter with the wrong bias, by the covariances of the right one."""
+    run = standing(0.05)
+    model = sledge.sensing(a=0.05**2 * 0.02)
+    subject = Innovations(with_columns(model, run), ())
+    fit = fitted(model, subject.run, filtered(model, run).smoothed)
+    stiff = model.sensing(a=1e-6 * 0.05**2 * 0.02)
+    other = fitted(stiff, subject.run, filtered(stiff, run).smoothed, bounded=True)
+    there = subject.linear_in(fit, other)
+    expected = [
+        solve_triangular(np.linalg.cholesky(S), nu, lower=True)
+        for S, nu in zip(fit.found.S, other.found.innovations, strict=True)
+    ]
+    np.testing.assert_allclose(there.residual, expected, rtol=1e-8, atol=1e-10)
+    assert np.std(subject.linear(other).residual) == pytest.approx(1, rel=0.1)
+    assert np.std(there.residual) > 1.1 * np.std(subject.linear(fit).residual)
 
 
 def test_a_true_input_is_found_from_its_reading_however_large_the_effect_is():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from casest.diagnose.evidence.linear import Linear, Parts, parts_of, spans_of
 from casest.diagnose.evidence.score import Trial
 from casest.diagnose.motion import grid
 from casest.diagnose.motion.fit import Fit, fitted, rise
-from casest.diagnose.motion.sensitivity import sensitivity
+from casest.diagnose.motion.sensitivity import gains, sensitivity
 from casest.diagnose.protocol import Kept, Subject
 from casest.effects.moving import Candidate
 from casest.errors import DataError
@@ -35,24 +35,35 @@ class Innovations(Subject[Fit]):
 
     run: Run
     tried: tuple[Candidate, ...]
+    _parts: dict[bytes, Parts] = field(default_factory=dict, compare=False, repr=False)
 
     def linear(self, fit: Fit) -> Linear:
         """Whitened innovations, and their answers to the numbers that were added."""
+        if "linear" not in fit.__dict__:  # asked for many times of each fit
+            fit.__dict__["linear"] = self._linear(fit)
+        found: Linear = fit.__dict__["linear"]
+        return found
+
+    def _linear(self, fit: Fit) -> Linear:
         rest = [c for c, _ in fit.added]
         found = fit.answers or sensitivity(fit.base, fit.added, rest, fit.run, fit.found)
         rows = _rows(fit)
         block = fit.run.block[rows]
-        spans = spans_of(block, np.zeros_like(block))
-        return Linear(found.z[rows], -found.H[rows], spans, self._parts(fit, rows))
+        spans, key = spans_of(block, np.zeros_like(block)), rows.tobytes()
+        if key not in self._parts:
+            self._parts[key] = _parts(fit, rows)
+        return Linear(found.z[rows], -found.H[rows], spans, self._parts[key])
 
-    def _parts(self, fit: Fit, rows: NDArray[np.int_]) -> Parts:
-        """Regions are those of the inputs: of what the body did."""
-        measured = set(fit.base.measured_signals)
-        names = [s.name for s in fit.base.signals if s.name not in measured and s.name != "t"]
-        inputs = [np.nan_to_num(fit.run.signals[n]) for n in names]
-        met = np.hstack(inputs) if inputs else np.zeros((len(fit.run), 1))
-        block = fit.run.block[rows]
-        return parts_of(block, np.zeros_like(block), met[rows])
+    def linear_in(self, fit: Fit, other: Fit) -> Linear:
+        """Its innovations in the standard deviations of this one's: in its own those of any fit are
+        one in the mean, however large they are."""
+        linear, rows = self.linear(other), _rows(other)
+        if not np.array_equal(rows, _rows(fit)):
+            return linear
+        back, own = gains(fit.found).back[rows], gains(other.found).L[rows]
+        turn = back @ own
+        residual = np.einsum("nij,nj->ni", turn, linear.residual)
+        return replace(linear, residual=residual, slopes=turn @ linear.slopes)
 
     def trials(self, fit: Fit) -> list[Trial]:
         """Every effect that is not there, in what the innovations answer to it."""
@@ -124,6 +135,16 @@ def _taken_away(fit: Fit) -> str:
         if left < LEFT:
             return f"it would leave {left:.2g} of {candidate.on}"
     return ""
+
+
+def _parts(fit: Fit, rows: NDArray[np.int_]) -> Parts:
+    """Regions are those of the inputs: of what the body did."""
+    measured = set(fit.base.measured_signals)
+    names = [s.name for s in fit.base.signals if s.name not in measured and s.name != "t"]
+    inputs = [np.nan_to_num(fit.run.signals[n]) for n in names]
+    met = np.hstack(inputs) if inputs else np.zeros((len(fit.run), 1))
+    block = fit.run.block[rows]
+    return parts_of(block, np.zeros_like(block), met[rows])
 
 
 def _rows(fit: Fit) -> NDArray[np.int_]:

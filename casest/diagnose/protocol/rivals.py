@@ -63,7 +63,7 @@ def _rivals(subject: Subject[F], state: State[F], kept: Kept) -> tuple[State[F],
             continue
         ours, theirs = subject.rises(base, [state.fit, fit])
         behind = (mine[0].score - mine[0].gain + ours) - (e.score - e.gain + theirs)
-        other = subject.linear(fit)
+        other = subject.linear_in(state.fit, fit)
         again: Fall | None = None
         if {x.residual.shape for x in (linear, after, other)} == {linear.residual.shape}:
             own_errors, its_errors = (foretold(x, [], stretches) for x in alike([after, other]))

@@ -21,7 +21,17 @@ def search(
     say: Callable[[str], None] = lambda _: None,
     begun: State[F] | None = None,
 ) -> State[F]:
-    """Add what is missing, one cause or a pair at a time, until nothing is confirmed any more."""
+    """Add what is missing until nothing is confirmed any more; then what explains as much."""
+    return with_rivals(subject, searched(subject, fit, say, begun))
+
+
+def searched(
+    subject: Subject[F],
+    fit: F,
+    say: Callable[[str], None] = lambda _: None,
+    begun: State[F] | None = None,
+) -> State[F]:
+    """The same, one cause or a pair at a time, without the rivals of what was added."""
     state = State(fit) if begun is None else replace(begun, fit=fit)
     before: State[F] | None = None
     for _ in range(LEVELS.rounds):
@@ -42,7 +52,7 @@ def search(
         left = on_all_axes(subject, left, needed=False)
     if len(left.kept) < len(state.kept):
         left = replace(left, last=ranked(subject, left.fit))
-    return with_rivals(subject, left)
+    return left
 
 
 def _small(subject: Subject[F], before: State[F], state: State[F]) -> bool:

@@ -21,6 +21,10 @@ class Subject(Protocol[F]):
         """The fit as a linear problem."""
         ...
 
+    def linear_in(self, fit: F, other: F) -> Linear:
+        """Another fit as a linear problem, its residuals in the units of this one's."""
+        return self.linear(other)
+
     def trials(self, fit: F) -> Sequence[Trial]:
         """All that could be missing, in its columns; of what has a grid, one for each value."""
         ...
