@@ -609,7 +609,7 @@ def model(function: Callable[..., Residual]) -> Model:
     return made
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=512)
 def _traced(made: Model) -> Traced:
     found = trace(made)
     if made.noise is not None:
@@ -620,7 +620,7 @@ def _traced(made: Model) -> Traced:
     return sampson(made, found, trace(made, straight=True))
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=512)
 def _staged(made: Model) -> Traced:
     found = trace(made, staged=True)
     return found if made.noise is None else in_units_of_noise(found, made.noise)

@@ -132,7 +132,7 @@ class Stage:
         return self.taken
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=512)
 def trace(
     model: Declared,
     cut: str | None = None,
