@@ -177,7 +177,8 @@ def _closed(sensor: Sensor, before: Estimate, folds: Folds, say: Callable[[str],
     declared = sensor.fitted(before.model, before.values)
     if declared is None:
         raise NotTrusted("the residual is not finite at the optimum")
-    state, outliers = State(declared), None
+    # First, while what is tried beside it is at hand.
+    seen, state, outliers = _visible(sensor, declared), State(declared), None
     if spoilt(declared.residuals):
         state, outliers = without_outliers(sensor, state, folds)
     first = state = search(sensor, state.fit, say, state)
@@ -206,7 +207,7 @@ def _closed(sensor: Sensor, before: Estimate, folds: Folds, say: Callable[[str],
         tuple(sensor.tried.found(declared)[1]),
         _refused(sensor, state, declared),
         folds,
-        _visible(sensor, declared),
+        seen,
         sensor.runs,
         _undecided(sensor, state),
         courses(sensor, state.fit, state.last) if state.last else (),

@@ -62,10 +62,10 @@ class Columns:
 
     @property
     def dense(self) -> Floats:
-        """All of it in one array, (N, k)."""
+        """All of it in one array, (N, k), the numbers of a column together."""
         if not self.columns:
             return np.zeros((self._length, 0))
-        return np.column_stack([np.asarray(c, dtype=np.float64) for c in self.columns])
+        return np.array(self.columns, dtype=np.float64).T
 
 
 Samples = Floats | Columns

@@ -18,7 +18,7 @@ from casest.data.run import Index
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
 from casest.declaration.tracing import function_of, sample_symbol
-from casest.engine import Replay
+from casest.engine import Columns, Replay
 from casest.engine.graph import Graph
 from casest.engine.operations import BY_CODE
 from casest.leastsquares.problem import Problem
@@ -65,16 +65,16 @@ def _normals(problem: Problem, references: Array, x: Array, of: Index) -> Normal
         wanted = [j for j, unknown in enumerate(own) if unknown in set(of.tolist())]
         place = np.array([np.flatnonzero(of == own[j])[0] for j in wanted], dtype=int)
         count = len(samples)
-        beside = np.column_stack(
-            [np.tile(samples.dense, (points, 1)), np.repeat(x[:, own], count, axis=0)]
-        )
+        every = [np.tile(column, points) for column in samples.dense.T]
+        beside = Columns([*every, *(np.repeat(x[:, j], count) for j in own)])
         fixed = np.concatenate([references[ref], whole[:1]])
-        residual, J = _at_points(problem.model, tuple(wanted))(fixed, beside)
-        residual = residual.reshape(points, -1)
-        J = J.reshape(points, residual.shape[1], len(wanted))
-        total += 0.5 * np.einsum("pi,pi->p", residual, residual)
-        slope[:, place] += (residual[:, None, :] @ J)[:, 0]
-        matrix[:, place[:, None], place] += J.transpose(0, 2, 1) @ J
+        found = _at_points(problem.model, tuple(wanted)).by_entry(fixed, beside)
+        for axis, slopes in zip(*found, strict=True):
+            residual = axis.reshape(points, count, 1)
+            J = slopes.reshape(-1, points, count).transpose(1, 0, 2)
+            total += 0.5 * np.einsum("pik,pik->p", residual, residual)
+            slope[:, place] += (J @ residual)[:, :, 0]
+            matrix[:, place[:, None], place] += J @ J.transpose(0, 2, 1)
     return Normals(total, slope, matrix)
 
 

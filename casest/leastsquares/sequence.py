@@ -64,6 +64,7 @@ class Record:
         if model.traced.integrates:
             _refuse_going_back(whole)
         samples = np.hstack([np.asarray(whole.signals[s.name], float) for s in model.columns])
+        samples = np.asfortranarray(samples)  # they are read column by column
         rests = Rests.of(model, whole) if model.resting else None
         return cls(whole, samples, np.asarray(whole.time, float), places, rests)
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from casest.declaration.shapes import Array
-from casest.diagnose.evidence.linear import Index, Linear, robust_sd
+from casest.diagnose.evidence.linear import Index, Linear
 from casest.diagnose.levels import LEVELS
 
 
@@ -31,18 +31,32 @@ def foretold(linear: Linear, columns: Sequence[Array], parts: Index) -> Array:
 
     What the rest of the record leaves open of the columns is taken to be nothing.
     """
-    flat = [_flat(c, linear) for c in columns]
-    E = np.concatenate(flat, axis=1) if flat else np.zeros((linear.residual.size, 0))
-    X, p = np.concatenate([linear.basis, E], axis=1), linear.basis.shape[1]
-    y, seen = linear.residual.ravel(), clipped(linear).ravel()
+    if columns:
+        return _foretold(linear, columns, _rows(linear, parts))
+    if id(parts) not in linear.foretold:  # each cause is compared with none
+        linear.foretold[id(parts)] = parts, _foretold(linear, (), _rows(linear, parts))
+    found: Array = linear.foretold[id(parts)][1]
+    return found
+
+
+def _rows(linear: Linear, parts: Index) -> list[Index]:
+    """Of all residuals those of each part."""
     row = np.repeat(parts, linear.residual.shape[1])
-    A, b, found = X.T @ X, X.T @ seen, np.empty(len(y))
-    for k in np.unique(parts):
-        own = np.flatnonzero(row == k)
-        rest = A - X[own].T @ X[own]
+    return [np.flatnonzero(row == k) for k in np.unique(parts)]
+
+
+def _foretold(linear: Linear, columns: Sequence[Array], rows: Sequence[Index]) -> Array:
+    p = linear.basis.shape[1]
+    X = np.concatenate([linear.basis, *(_flat(c, linear) for c in columns)], axis=1)
+    y, seen = linear.residual.ravel(), clipped(linear).ravel()
+    several = [(own, X[own]) for own in rows]
+    squares = [(part.T @ part, part.T @ seen[own]) for own, part in several]
+    A, b, found = sum(s for s, _ in squares), sum(s for _, s in squares), np.empty(len(y))
+    for (own, part), (square, product) in zip(several, squares, strict=True):
+        rest = A - square
         T = _determined(A, rest, p)
-        values = T @ np.linalg.lstsq(T.T @ rest @ T, T.T @ (b - X[own].T @ seen[own]), 1e-9)[0]
-        found[own] = y[own] - X[own] @ values
+        values = T @ np.linalg.lstsq(T.T @ rest @ T, T.T @ (b - product), 1e-9)[0]
+        found[own] = y[own] - part @ values
     return found.reshape(linear.residual.shape)
 
 
@@ -119,7 +133,7 @@ def standard_errors(gained: Array) -> float:
 
 def _near(linear: Linear, e: Array) -> Array:
     """Errors (N, m), those far out counted as less: by what is far before."""
-    far = LEVELS.far * robust_sd(linear.residual)
+    far = LEVELS.far * linear.deviation
     return np.clip(e, -far, far) if linear.series else e
 
 
@@ -127,7 +141,7 @@ def clipped(linear: Linear) -> Array:
     """Residuals that fits are made to: those far out brought near."""
     if not linear.series:
         return linear.residual
-    far = LEVELS.far * LEVELS.clip * robust_sd(linear.residual)
+    far = LEVELS.far * LEVELS.clip * linear.deviation
     return np.clip(linear.residual, -far, far)
 
 

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,6 +66,16 @@ class Linear:
     def series(self) -> bool:
         """Are there rows enough for tests from part to part?"""
         return len(self.residual) >= LEVELS.series
+
+    @cached_property
+    def deviation(self) -> Array:
+        """Robust standard deviation of each axis (m,)."""
+        return robust_sd(self.residual)
+
+    @cached_property
+    def foretold(self) -> dict[int, Any]:
+        """What the unknowns foretell of parts that are held out, by the identity of these."""
+        return {}
 
     @cached_property
     def basis(self) -> Array:

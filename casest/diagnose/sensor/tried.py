@@ -48,7 +48,7 @@ class Tried:
     catalogue: tuple[Effect, ...]
     known: frozenset[str]
     _found: Recent[Model, tuple[list[Candidate], list[Skipped]]] = field(
-        default_factory=Recent, repr=False
+        default_factory=lambda: Recent(16), repr=False
     )
     _looked: Recent[Fit, Seen] = field(default_factory=Recent, repr=False)
     _trials: Recent[Fit, list[Trial]] = field(default_factory=lambda: Recent(1), repr=False)
