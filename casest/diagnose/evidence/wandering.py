@@ -24,30 +24,32 @@ def wandering_cost(likelihood: Likelihood, course: Array) -> float:
 
     With Schwarz's price of the course's size; without a course where it is not worth that.
     """
-    X, W = likelihood.declared, likelihood.by_frequency(course)
-    without, R = likelihood.beside(), likelihood.residual
+    without, W = likelihood.beside(), likelihood.by_frequency(course)
     S = without.spectrum
-    for last in [False] * ROUNDS + [True]:
-        root = 1 / np.sqrt(S)
-        Q, _ = np.linalg.qr(X * root[:, None])
-        whole, r = W * root[:, None], R * root
-        beside, r = whole - Q @ (Q.T @ whole), r - Q @ (Q.T @ r)
-        values, vectors = np.linalg.eigh(beside.T @ beside)
-        values = np.maximum(values, 0.0)
-        along = vectors.T @ (beside.T @ r)
-        spread = np.maximum(np.linalg.eigvalsh(whole.T @ whole), 0.0)
-        sizes = SIZES * (float(r @ r) / max(float(spread.sum()), 1e-300))
-        costs = [
-            float(np.log1p(a * spread).sum() - (along**2 * a / (1 + a * values)).sum())
-            for a in sizes
-        ]
-        a, cost = sizes[int(np.argmin(costs))], min(costs)
-        if last:
-            break
-        kept = a / (1 + a * values)
-        left = r - beside @ (vectors @ (along * kept))
-        taken = np.einsum("ij,ij->i", Q, Q)
-        taken += np.einsum("ij,ij->i", beside @ (vectors * kept), beside @ vectors)
-        S = likelihood.spectrum(left / root, 1 - taken)
-    price = float(np.log(max(len(R) - X.shape[1], 2)))
-    return min(without.cost, float(np.log(S).sum() + r @ r) + cost + price)
+    for _ in range(ROUNDS):
+        _, left, taken = _beside(likelihood, W, S)
+        S = likelihood.spectrum(left, 1 - taken)
+    cost, _, _ = _beside(likelihood, W, S)
+    price = float(np.log(max(len(S) - likelihood.declared.shape[1], 2)))
+    return min(without.cost, cost + price)
+
+
+def _beside(likelihood: Likelihood, W: Array, S: Array) -> tuple[float, Array, Array]:
+    """−2 log L with the likeliest size of the course under a spectrum S; what unknowns and course
+    leave (N·m,), and the share of each row that they take."""
+    root = 1 / np.sqrt(S)
+    Q, _ = np.linalg.qr(likelihood.declared * root[:, None])
+    whole, r = W * root[:, None], likelihood.residual * root
+    beside, r = whole - Q @ (Q.T @ whole), r - Q @ (Q.T @ r)
+    values, vectors = np.linalg.eigh(beside.T @ beside)
+    values, along = np.maximum(values, 0.0), vectors.T @ (beside.T @ r)
+    spread = np.maximum(np.linalg.eigvalsh(whole.T @ whole), 0.0)
+    sizes = SIZES[:, None] * (float(r @ r) / max(float(spread.sum()), 1e-300))
+    costs = np.log1p(sizes * spread).sum(axis=1)
+    costs -= (along**2 * sizes / (1 + sizes * values)).sum(axis=1)
+    size = float(sizes[int(np.argmin(costs)), 0])
+    kept = size / (1 + size * values)
+    left = r - beside @ (vectors @ (along * kept))
+    taken = np.einsum("ij,ij->i", Q, Q)
+    taken += np.einsum("ij,ij->i", beside @ (vectors * kept), beside @ vectors)
+    return float(np.log(S).sum() + r @ r + costs.min()), left / root, taken
