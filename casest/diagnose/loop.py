@@ -23,7 +23,7 @@ from casest.diagnose.levels import LEVELS
 from casest.diagnose.misfit.left import predictions
 from casest.diagnose.noise.slow_course import slow_squares
 from casest.diagnose.noise.tails import outliers_p_value
-from casest.diagnose.protocol import Kept, State, search
+from casest.diagnose.protocol import Kept, State, search, with_rivals
 from casest.diagnose.protocol.choosing import NOT_HELD_OUT
 from casest.diagnose.protocol.ranking import ranked
 from casest.diagnose.protocol.refits import AS_MUCH
@@ -187,6 +187,7 @@ def _closed(sensor: Sensor, before: Estimate, folds: Folds, say: Callable[[str],
         state, outliers = without_outliers(sensor, state, folds)
     if state is not first:
         state = search(sensor, state.fit, say, state)
+    state = with_rivals(sensor, state)
     after = before
     if state.fit is not declared:
         state, after = certified(sensor, state, before)

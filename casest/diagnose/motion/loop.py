@@ -26,7 +26,7 @@ from casest.diagnose.motion.innovations import Innovations
 from casest.diagnose.motion.sensitivity import sensitivity
 from casest.diagnose.motion.visibility import Visible, visible
 from casest.diagnose.motion.whiteness import Whiteness, whiteness
-from casest.diagnose.protocol import Kept, State, searched, with_rivals
+from casest.diagnose.protocol import Kept, State, search, with_rivals
 from casest.dynamics.declare import Dynamics
 from casest.dynamics.filter import filtered
 from casest.dynamics.likelihood import first_guess, likelihood
@@ -113,7 +113,7 @@ def close_motion(
         state, undecided = _searched(subject, state, folds, say)
         current, colour = _coloured(state.fit, run, folds, say)
         if colour is not None:
-            state = searched(subject, current, say, state)
+            state = search(subject, current, say, state)
             state, undecided = _searched(subject, state, folds, say)
         state = with_rivals(subject, state)
     plain = [c for c in subject.tried if not c.held]
@@ -162,7 +162,7 @@ def _searched(
                 say(f"{what.label}: held-out time is more likely")
                 kept = Kept(what, replace(evidence, gain=gain, score=score), {})
                 state = replace(state, fit=better, kept=(*state.kept, kept))
-                state = searched(subject, better, say, state)
+                state = search(subject, better, say, state)
                 break
             names.append(_where(what))
         else:
@@ -183,11 +183,11 @@ def _begun(subject: Innovations, before: Fit, say: Callable[[str], None]) -> Sta
     if _loud(before):
         free = fitted(before.base, run, filtered(before.base, run).smoothed, bounded=False)
         if _rms(before) > LOST * _rms(free):
-            state = searched(subject, free, say)
+            state = search(subject, free, say)
             fit = state.fit
             fit = fitted(fit.base, subject.run, fit.found.smoothed, added=fit.added)
-            return searched(subject, fit, say, state)
-    return searched(subject, before, say)
+            return search(subject, fit, say, state)
+    return search(subject, before, say)
 
 
 def _rms(fit: Fit) -> float:

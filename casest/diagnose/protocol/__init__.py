@@ -9,11 +9,11 @@ dropped leaves no trace. Imports evidence, levels.
 from casest.diagnose.protocol.confirming import falls, holds_out
 from casest.diagnose.protocol.ranking import pairs, ranked, ranked_of
 from casest.diagnose.protocol.rivals import with_rivals
-from casest.diagnose.protocol.rounds import search, searched
+from casest.diagnose.protocol.rounds import search
 from casest.diagnose.protocol.state import Kept, Ranking, Rival, State
 from casest.diagnose.protocol.subject import Subject
 
 __all__ = [
     "Kept", "Ranking", "Rival", "State", "Subject", "falls", "holds_out", "pairs", "ranked",
-    "ranked_of", "search", "searched", "with_rivals",
+    "ranked_of", "search", "with_rivals",
 ]  # fmt: skip

@@ -1,4 +1,4 @@
-"""The search: rounds of ranking and choosing, then elimination and rivals."""
+"""The search: rounds of ranking and choosing, then elimination."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from casest.diagnose.levels import LEVELS
 from casest.diagnose.protocol.choosing import with_the_best
 from casest.diagnose.protocol.elimination import eliminated, on_all_axes
 from casest.diagnose.protocol.ranking import ranked
-from casest.diagnose.protocol.rivals import with_rivals
 from casest.diagnose.protocol.state import F, Ranking, State
 from casest.diagnose.protocol.subject import Subject
 
@@ -21,17 +20,7 @@ def search(
     say: Callable[[str], None] = lambda _: None,
     begun: State[F] | None = None,
 ) -> State[F]:
-    """Add what is missing until nothing is confirmed any more; then what explains as much."""
-    return with_rivals(subject, searched(subject, fit, say, begun))
-
-
-def searched(
-    subject: Subject[F],
-    fit: F,
-    say: Callable[[str], None] = lambda _: None,
-    begun: State[F] | None = None,
-) -> State[F]:
-    """The same, one cause or a pair at a time, without the rivals of what was added."""
+    """Add what is missing, one cause or a pair at a time, until nothing is confirmed any more."""
     state = State(fit) if begun is None else replace(begun, fit=fit)
     before: State[F] | None = None
     for _ in range(LEVELS.rounds):
