@@ -168,7 +168,7 @@ class Sensor(Subject[Fit]):
         return rises(self.linear(less), [self.linear(fit) for fit in fits])
 
     def rises_beside_a_wander(self, less: Fit, fits: Sequence[Fit]) -> list[float]:
-        """The same where the offset of a length may wander; none of other readings, or of poses."""
+        """The same where the offset of a length may wander; none of other readings, or a table."""
         linears = [self.linear(fit) for fit in fits]
         linear, shift = self.linear(less), self.tried.shift(less)
         same = {x.residual.shape for x in linears} == {linear.residual.shape}
