@@ -20,8 +20,8 @@ from casest.diagnose.evidence.score import (
     on_fewer_axes,
     screened,
     shift,
+    whatever_sizes,
     whitened,
-    without_a_row,
 )
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.noise.louder import louder
@@ -436,8 +436,8 @@ def test_a_large_cause_of_poses_is_on_all_the_axes_that_it_takes(size):
 
 
 @pytest.mark.parametrize("axes", [1, 2])
-def test_without_a_row_the_chance_is_that_of_the_f_test_on_the_others(axes):
-    """The largest of all that leave one out, by NumPy's least squares and SciPy's F."""
+def test_the_chance_whatever_the_sizes_is_wald_s_with_the_jackknife_s_variance(axes):
+    """Each row left out and all fitted again, by NumPy's least squares and SciPy's F."""
     rng = np.random.default_rng(axes)
     for _ in range(20):
         X, G = rng.standard_normal((16, axes, 3)), rng.standard_normal((16, axes, 2))
@@ -445,27 +445,76 @@ def test_without_a_row_the_chance_is_that_of_the_f_test_on_the_others(axes):
         before, both = linear_of(y, X, in_time=False), np.concatenate([X, G], axis=2)
         likelihood = Likelihood(before)
         found = judged([trial_of(G, variants=3.0)], likelihood, likelihood.beside(), families=4)
-        after = linear_of(y, both, in_time=False)
-        chances = []
-        for k in range(16):
-            kept = np.arange(16) != k
-            flat = [a[kept].reshape(15 * axes, -1) for a in (y, X, G)]
-            c0, c1 = squares(flat[0][:, 0], flat[1]), squares(flat[0][:, 0], np.hstack(flat[1:]))
-            rest = 15 * axes - 5
-            chances.append(stats.f.sf((c0 - c1) / 2 / (c1 / rest), 2, rest))
-        expected = min(1.0, 12 * max(chances))
-        assert without_a_row(before, after, found, 4) == pytest.approx(expected, rel=1e-6)
+        left = y.ravel() - both.reshape(-1, 5) @ np.linalg.lstsq(both.reshape(-1, 5), y.ravel())[0]
+        start = y.ravel() - projected(y.ravel(), X.reshape(-1, 3))
+        before = linear_of(start.reshape(y.shape), X, in_time=False)
+        after = linear_of(left.reshape(y.shape), both, in_time=False)
+
+        def sizes(kept, both=both, y=y):
+            return np.linalg.lstsq(both[kept].reshape(-1, 5), y[kept].ravel())[0][3:]
+
+        whole = sizes(np.full(16, True))
+        moved = np.array([sizes(np.arange(16) != k) - whole for k in range(16)])
+        F = whole @ np.linalg.solve(moved.T @ moved, whole) / 2
+        expected = min(1.0, 12 * stats.f.sf(F, 2, 16 * axes - 5))
+        assert whatever_sizes(before, after, found, 4) == pytest.approx(expected, rel=1e-6)
+
+
+def projected(y, X):
+    return X @ np.linalg.lstsq(X, y)[0]
+
+
+def bent(residual, x):
+    """A line and a cubic beside it: the problem before and after, and the evidence."""
+    X = np.column_stack([np.ones(len(x)), x])
+    both = np.column_stack([X, x**3])
+    before = linear_of(residual - projected(residual, X), X, in_time=False)
+    after = linear_of(residual - projected(residual, both), both, in_time=False)
+    likelihood = Likelihood(before)
+    return before, after, judged([trial_of(x**3, "cubic")], likelihood, likelihood.beside())
 
 
 def test_one_odd_reading_is_no_evidence_of_a_bend():
-    """Twenty readings on a line and one beyond, which is off: by the F test a cubic, until that is
-    left out."""
+    """Twenty readings on a line and one beyond, which is off: by the F test a cubic."""
     x = np.append(np.linspace(-1, 0, 20), 1.5)
     residual = 0.05 * np.random.default_rng(2).standard_normal(21)
     residual[-1] += 0.5
-    X = np.column_stack([np.ones(21), x])
-    before = linear_of(residual, X, in_time=False)
-    after = linear_of(residual, np.column_stack([X, x**3]), in_time=False)
-    (cubic,) = ranked_of(before, [trial_of(x**3, "cubic")]).found
+    before, after, cubic = bent(residual, x)
     assert cubic.p_value < LEVELS.chance / 10
-    assert without_a_row(before, after, cubic, 1) > 0.1
+    assert whatever_sizes(before, after, cubic, 1) > 0.1
+
+
+@pytest.mark.parametrize("rows", [19, 36])
+def test_noise_that_is_larger_at_one_end_is_a_bend_no_more_often_than_the_chance(rows):
+    """Errors in proportion to the square of the reading: the F test alone says so too often."""
+    rng, alone, alarms = np.random.default_rng(rows), 0, 0
+    x = np.linspace(0.05, 1, rows)
+    for _ in range(1500):
+        before, after, cubic = bent(x**2 * rng.standard_normal(rows), x)
+        F = cubic.p_value < LEVELS.chance
+        alone += F
+        alarms += F and whatever_sizes(before, after, cubic, 1) < LEVELS.chance
+    assert alone > 2 * 1500 * LEVELS.chance
+    assert alarms <= stats.binom.ppf(1 - 5e-4, 1500, LEVELS.chance)
+
+
+def test_a_bend_is_one_where_noise_is_larger_at_one_end_as_well():
+    rng, x = np.random.default_rng(3), np.linspace(0.05, 1, 36)
+    for _ in range(50):
+        before, after, cubic = bent(2.0 * x**3 + 0.1 * x * rng.standard_normal(36), x)
+        assert whatever_sizes(before, after, cubic, 1) < LEVELS.chance
+
+
+def test_what_one_row_alone_says_is_no_evidence():
+    """A column that is nothing but one row: left out, nobody knows its size."""
+    x = np.linspace(-1, 1, 20)
+    residual = 0.1 * np.random.default_rng(4).standard_normal(20)
+    residual[7] += 5.0
+    X, pulse = np.column_stack([np.ones(20), x]), np.eye(20)[:, 7]
+    both = np.column_stack([X, pulse])
+    before = linear_of(residual - projected(residual, X), X, in_time=False)
+    after = linear_of(residual - projected(residual, both), both, in_time=False)
+    likelihood = Likelihood(before)
+    found = judged([trial_of(pulse, "pulse")], likelihood, likelihood.beside())
+    assert found.p_value < 1e-6
+    assert whatever_sizes(before, after, found, 1) > 0.5

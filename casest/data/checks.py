@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -78,20 +80,22 @@ def clipped(values: Array, columns: tuple[str, ...]) -> list[str]:
     in steps far above the resolution while the other components keep changing, or the same
     happens at the opposite extreme (a symmetric full scale).
     """
-    notes = []
-    for i, column in enumerate(columns):
+    return [
+        f"{columns[i]}: {count} readings at the {'largest' if sign > 0 else 'smallest'} value "
+        f"{extreme:.6g} — clipped at full scale?"
+        for i, sign, extreme, count in full_scales(values)
+    ]
+
+
+def full_scales(values: Array) -> Iterator[tuple[int, int, float, int]]:
+    """Component, sign, value and count of readings (N, size) at a full scale, by those signs."""
+    for i in range(values.shape[1]):
         others = np.delete(values, i, axis=1)
         found = {sign: _suspect(sign * values[:, i], sign * others) for sign in (1, -1)}
         symmetric = all(count for count, _ in found.values()) and _symmetric(values[:, i])
         for sign, (count, moving) in found.items():
             if count and (moving or symmetric):
-                extreme = sign * (sign * values[:, i]).max()
-                which = "largest" if sign > 0 else "smallest"
-                notes.append(
-                    f"{column}: {count} readings at the {which} value {extreme:.6g} "
-                    f"— clipped at full scale?"
-                )
-    return notes
+                yield i, sign, float(sign * (sign * values[:, i]).max()), count
 
 
 def _symmetric(x: Array) -> bool:

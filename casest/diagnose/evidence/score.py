@@ -94,38 +94,42 @@ def p_value(gain: float, freedom: int, searched: float, likelihood: Likelihood) 
     return float(min(1.0, fdtrc(freedom, rest, F) * np.exp(min(searched, 700.0))))
 
 
-def without_a_row(before: Linear, after: Linear, evidence: Evidence, families: int) -> float:
-    """The chance of the F test between two fits of poses, at its largest of all that leave one row
-    out, each fit linear about itself.
+def whatever_sizes(before: Linear, after: Linear, evidence: Evidence, families: int) -> float:
+    """The chance of what a refit of poses adds, where each row's error has a size of its own.
 
-    One reading that is off alone is told by whatever is largest there.
+    Wald's F with the variance that the jackknife gives (HC3; MacKinnon & White 1985), each fit
+    linear about itself: a row that is off alone, or noise that is larger at one end, makes an
+    effect of whatever is largest there.
     """
     from scipy.special import fdtrc
 
     rows, axes = before.residual.shape
     q = after.basis.shape[1] - before.basis.shape[1]
-    rest = (rows - 1) * axes - after.basis.shape[1]
+    rest = rows * axes - after.basis.shape[1]
     if rest < 1 or q < 1:
         return 1.0
-    none, whole = (_without_each_row(x) for x in (before, after))
-    F = np.maximum((none / np.maximum(whole, 1e-300) - 1) * rest / q, 0.0)
+    beyond = after.basis - before.basis @ (before.basis.T @ after.basis)
+    C = np.linalg.svd(beyond, full_matrices=False)[0][:, :q]
+    added = C.T @ (before.residual - after.residual).ravel()
+    moved = _by_each_row(after, C)
+    F = float(added @ np.linalg.lstsq(moved.T @ moved, added, rcond=None)[0]) / q
     searched = float(np.exp(min(_searched(evidence.trials, families), 700.0)))
-    return float(min(1.0, fdtrc(q, rest, F).max() * searched))
+    return float(min(1.0, fdtrc(q, rest, F) * searched))
 
 
-def _without_each_row(linear: Linear) -> Array:
-    """Squares that a fit leaves where a row is left out and it is made again, for each, (rows,).
+def _by_each_row(linear: Linear, C: Array) -> Array:
+    """By how much the coefficients of columns C (N·m, q) move where a row is left out, (rows, q).
 
-    A row that the rest says nothing of leaves no more than it did.
+    A row that the rest says nothing of, and that says something of them, moves them any far.
     """
     rows, axes = linear.residual.shape
-    Q, y = linear.basis, linear.residual.ravel()
-    left = y - Q @ (Q.T @ y)
-    own, r = Q.reshape(rows, axes, -1), left.reshape(rows, axes, 1)
+    own, e = linear.basis.reshape(rows, axes, -1), linear.residual[:, :, None]
     values, vectors = np.linalg.eigh(np.eye(axes) - own @ own.transpose(0, 2, 1))
-    turned = (vectors.transpose(0, 2, 1) @ r)[:, :, 0] ** 2
-    taken = np.where(values > 1e-9, turned / np.maximum(values, 1e-9), 0.0).sum(axis=1)
-    return np.asarray(np.maximum(float(left @ left) - taken, 0.0))
+    along = (vectors.transpose(0, 2, 1) @ e)[:, :, 0]
+    free = values > 1e-9
+    along = np.where(free, along / np.where(free, values, 1.0), 1e6 * np.abs(e).max())
+    away = vectors @ along[:, :, None]
+    return np.asarray(np.einsum("nmq,nm->nq", C.reshape(rows, axes, -1), away[:, :, 0]))
 
 
 def screened(trial: Trial, likelihood: Likelihood, white: tuple[Array, Array, Array]) -> float:
@@ -216,6 +220,13 @@ def less(evidence: Evidence, gain: float, likelihood: Likelihood, families: int)
     return replace(evidence, trials=trials, gain=gain,
                    score=worth(gain, freedom, searched, likelihood),
                    p_value=p_value(gain, freedom, searched, likelihood))  # fmt: skip
+
+
+def with_chance(evidence: Evidence, likelihood: Likelihood, families: int) -> Evidence:
+    """With the chance of what it gains now."""
+    searched = _searched(evidence.trials, families)
+    chance = p_value(evidence.gain, evidence.freedom, searched, likelihood)
+    return replace(evidence, p_value=chance)
 
 
 def _searched(trials: Sequence[Trial], families: int) -> float:

@@ -269,8 +269,10 @@ def _follows(
     read = variables(problem, point, usable_columns(problem.model, problem.runs))
     read = [v for v in read if in_time or not v.clock]
     table = sum(map(len, problem.runs)) < TABLE and not any(map(is_series, problem.runs))
-    every = structures(clipped, read, table=table)
-    found = [s for s in every if s.p_value < LEVELS.misfit and s.share > LEVELS.share]
+    every = structures(clipped, read, unknowns=_taken(problem, point) if table else None)
+    # Of few rows no chance is small: it is that of naming anything in poses.
+    chance = LEVELS.chance if table else LEVELS.misfit
+    found = [s for s in every if s.p_value < chance and s.share > LEVELS.share]
     if not found:
         return []
     # In the order of the record lies whatever was changed with it: what has a name comes first.
@@ -279,6 +281,13 @@ def _follows(
     where = f"{100 * best.share:.0f} % of it follows {best.name}"
     left = sigma * float(np.sqrt(1 - min(best.share, 1)))
     return [Finding(where, best.p_value, left, best.share)]
+
+
+def _taken(problem: Problem, point: Point) -> Array:
+    """Orthonormal columns (N·m, p) of what the unknowns of a small problem take."""
+    J = np.nan_to_num(problem.jacobian(point))
+    U, s, _ = np.linalg.svd(J / np.maximum(np.linalg.norm(J, axis=0), 1e-300), full_matrices=False)
+    return np.asarray(U[:, s > 1e-9 * s.max(initial=0.0)])
 
 
 def _runs(problem: Problem, point: Point, correlated_over: float, sigma: float) -> list[Finding]:

@@ -4,7 +4,9 @@ Rows are put in the order of a variable and averaged over blocks; the squared di
 neighbouring means against their variance (J. von Neumann, 1941) are 1 on average for what follows
 nothing. Of a table's single rows, whose noise may be larger at one end and have any tails, the
 products of neighbours are summed, against their own squares: that is normal whatever the sizes are,
-and says nothing of fewer than PRODUCTS rows, which are asked by that ratio as well.
+and says nothing of fewer than PRODUCTS rows, which are asked by that ratio. A fit to few rows has
+taken from their residual what is smooth, and neighbours of noise are unlike: of a table both count
+beside its unknowns, the ratio by its exact law (Durbin & Watson 1971, by Imhof's 1961 integral).
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from casest.declaration.shapes import Array
+from casest.diagnose.evidence.linear import Index
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.misfit.variables import Variable
 
@@ -22,8 +25,7 @@ from casest.diagnose.misfit.variables import Variable
 #: colour. Of eight means no order is unlikely enough.
 FEWEST, WANTED, SHORTEST = 8, 24, 4
 #: Rows of a table at least, each of which is measured by itself; and from which on products of so
-#: few can be unlikely. Of fewer von Neumann's ratio is asked: beside noise that grows in proportion
-#: along the order it says so in one to three of a thousand tables.
+#: few can be unlikely.
 FEW_ROWS, PRODUCTS = 12, 30
 
 
@@ -37,45 +39,113 @@ class Structure:
 
 
 def structures(
-    residuals: Sequence[Array], variables: Sequence[Variable], *, table: bool = False
+    residuals: Sequence[Array], variables: Sequence[Variable], *, unknowns: Array | None = None
 ) -> list[Structure]:
     """Of every variable, the least likely first; residuals (N, m) of each run, clipped.
 
-    Rows of a `table` are looked at one by one: means of so few blocks are never unlikely.
+    `unknowns`: of a table, orthonormal columns (N·m, p) of what its fit has taken. Rows of a table
+    are looked at one by one: means of so few blocks are never unlikely.
     """
     r = np.concatenate(residuals)
-    found = []
-    for variable in variables:
-        x = np.concatenate(variable.values)
-        if variable.turns:
-            x = np.mod(x, 2 * np.pi)
-        ordered = r[np.argsort(x, kind="stable")]
-        found.append(_structure(variable.name, ordered, len(variables), table))
+    values = [np.concatenate(v.values) for v in variables]
+    values = [
+        np.mod(x, 2 * np.pi) if v.turns else x for v, x in zip(variables, values, strict=True)
+    ]
+    orders = [np.argsort(x, kind="stable") for x in values]
+    # Of variables that put the rows in one order, or the other way round, one is asked.
+    tried = len({min(k.tobytes(), k[::-1].tobytes()) for k in orders})
+    found = [
+        _of_means(v.name, r[k], tried)
+        if unknowns is None
+        else _of_rows(v.name, r, unknowns, k, tried)
+        for v, k in zip(variables, orders, strict=True)
+    ]
     return sorted((f for f in found if f is not None), key=lambda f: f.p_value)
 
 
-def _structure(name: str, r: Array, tried: int, table: bool) -> Structure | None:
-    """What rows (N, m) in the order of a variable say, one by one or in means of several."""
+def _of_means(name: str, r: Array, tried: int) -> Structure | None:
+    """What rows (N, m) in the order of a variable say in means of several."""
     from scipy.special import ndtr
 
     size = max(SHORTEST, min(LEVELS.block, len(r) // WANTED), len(r) // LEVELS.blocks)
-    size = 1 if table else size
     count = len(r) // size
-    if count < (FEW_ROWS if table else FEWEST):
+    if count < FEWEST:
         return None
     means = r[: count * size].reshape(count, size, -1).mean(axis=1)
-    steps = np.mean(np.diff(means, axis=0) ** 2, axis=0) / 2
-    variance = np.maximum(means.var(axis=0, ddof=1), 1e-300)
-    z = _of_products(means) if count >= PRODUCTS and table else _of_ratios(steps / variance, count)
-    share = float(np.maximum(variance - steps, 0).sum() / max(r.var(axis=0).sum(), 1e-300))
-    return Structure(name, share, float(min(1.0, ndtr(-z.max()) * len(z) * tried)))
+    z = _of_ratios(_steps(means) / _variance(means), count)
+    return _structure(name, r, means, float(ndtr(-z.max())) * len(z) * tried)
 
 
-def _of_products(rows: Array) -> Array:
-    """Normal where rows (N, m) follow nothing, whatever their sizes are; (m,)."""
-    away = rows - rows.mean(axis=0)
-    products = away[1:] * away[:-1]
-    return np.asarray(products.sum(axis=0) / np.sqrt(np.maximum((products**2).sum(axis=0), 1e-300)))
+def _of_rows(name: str, r: Array, unknowns: Array, order: Index, tried: int) -> Structure | None:
+    """What rows (N, m) of a table say in the order of a variable, each axis by itself."""
+    from scipy.special import ndtr
+
+    count, axes = r.shape
+    if count < FEW_ROWS:
+        return None
+    taken = unknowns.reshape(count, axes, -1)[order]
+    ordered, chances = r[order], []
+    for k in range(axes):
+        away, own = ordered[:, k] - ordered[:, k].mean(), taken[:, k]
+        if count < PRODUCTS:
+            chances.append(_of_ratio(away, own))
+        else:
+            chances.append(float(ndtr(-_of_products(away, own))))
+    return _structure(name, r, ordered, min(chances) * axes * tried)
+
+
+def _structure(name: str, r: Array, means: Array, chance: float) -> Structure:
+    share = np.maximum(_variance(means) - _steps(means), 0).sum() / max(r.var(axis=0).sum(), 1e-300)
+    return Structure(name, float(share), min(1.0, chance))
+
+
+def _steps(means: Array) -> Array:
+    """Variance (m,) of means (N, m) by the differences of neighbours."""
+    return np.asarray(np.mean(np.diff(means, axis=0) ** 2, axis=0) / 2)
+
+
+def _variance(means: Array) -> Array:
+    return np.asarray(np.maximum(means.var(axis=0, ddof=1), 1e-300))
+
+
+def _of_products(r: Array, unknowns: Array) -> float:
+    """Normal where rows (N,) follow nothing, whatever their sizes are.
+
+    `unknowns` (N, p): what the fit has taken, by which products of neighbours are below zero.
+    """
+    left = np.eye(len(r)) - unknowns @ unknowns.T
+    expected = float(np.sum(left[1:] * left[:-1] * r**2))
+    products = r[1:] * r[:-1]
+    return float((products.sum() - expected) / np.sqrt(max(np.sum(products**2), 1e-300)))
+
+
+def _of_ratio(r: Array, unknowns: Array) -> float:
+    """Chance of neighbours (N,) as alike, in noise of one size that a fit has taken its unknowns'
+    columns (N, p) from."""
+    size = float(r @ r)
+    if not size > 0:
+        return 1.0
+    n = len(r)
+    differences = np.diff(np.eye(n), axis=0)
+    form = differences.T @ differences - float(np.sum(np.diff(r) ** 2)) / size * np.eye(n)
+    values, vectors = np.linalg.eigh(np.eye(n) - unknowns @ unknowns.T)
+    root = vectors * np.sqrt(np.clip(values, 0.0, 1.0))
+    return _below_zero(np.linalg.eigvalsh(root.T @ form @ root))
+
+
+def _below_zero(weights: Array) -> float:
+    """Chance that Σ λ·χ²₁ is below zero, by Imhof's integral."""
+    from scipy.integrate import quad
+
+    w = weights[np.abs(weights) > 1e-9 * np.abs(weights).max()]
+    w = w / np.abs(w).max()
+
+    def density(u: float) -> float:
+        angle = 0.5 * float(np.arctan(w * u).sum())
+        return float(np.sin(angle) / (u * np.exp(0.25 * np.log1p((w * u) ** 2).sum())))
+
+    whole = quad(density, 0, np.inf, limit=400, epsabs=1e-9)[0]
+    return float(np.clip(0.5 - whole / np.pi, 0.0, 1.0))
 
 
 def _of_ratios(ratio: Array, count: int) -> Array:

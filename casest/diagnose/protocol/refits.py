@@ -9,7 +9,14 @@ import numpy as np
 
 from casest.declaration.shapes import Array
 from casest.diagnose.evidence.likelihood import rises
-from casest.diagnose.evidence.score import Evidence, Trial, expected_loss, judged, without_a_row
+from casest.diagnose.evidence.score import (
+    Evidence,
+    Trial,
+    expected_loss,
+    judged,
+    whatever_sizes,
+    with_chance,
+)
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.noise.louder import louder
 from casest.diagnose.protocol.confirming import falls, falls_of_refit, holds_out
@@ -18,7 +25,7 @@ from casest.diagnose.protocol.state import F, Ranking, Refit, State
 from casest.diagnose.protocol.subject import Subject
 
 #: Why a cause in poses is not added.
-ONE_ROW = "without one of the rows there is no evidence of it"
+FEW_ROWS = "a row or a few carry it: no evidence where each has an error of its own size"
 #: Why what holds out and has strong evidence is not added.
 AS_MUCH = "a slow course of unknown cause explains as much"
 
@@ -47,11 +54,11 @@ def refitted(
         kept = _gaining(evidence, gain)
         least = _gaining(evidence, min(noisier))
         enough = beyond_courses(ranking, kept) and _strong(ranking, least)
-        of_one_row = enough and not _of_several_rows(subject, ranking, kept, better)
-        if (enough and not of_one_row) or subject.asked(evidence.trials[0].what):
+        of_few_rows = enough and not _whatever_sizes(subject, ranking, kept, better)
+        if (enough and not of_few_rows) or subject.asked(evidence.trials[0].what):
             found.append(Refit(state.fit, better, kept))
-        elif of_one_row:
-            state = state.failing(evidence, ONE_ROW)
+        elif of_few_rows:
+            state = state.failing(evidence, FEW_ROWS)
         elif len(evidence.trials) == 1 and _strong(ranking, kept):
             state = state.refusing(evidence.trials[0].what, AS_MUCH)
     found.sort(key=lambda r: -r.evidence.score)
@@ -66,12 +73,12 @@ def refitted(
     return state, found
 
 
-def _of_several_rows(subject: Subject[F], ranking: Ranking, evidence: Evidence, fit: F) -> bool:
-    """Is it seen in poses whichever row is left out?"""
+def _whatever_sizes(subject: Subject[F], ranking: Ranking, evidence: Evidence, fit: F) -> bool:
+    """Is it seen in poses whatever the sizes of their errors are?"""
     after = subject.linear(fit)
     if ranking.linear.series or after.residual.shape != ranking.linear.residual.shape:
         return True
-    chance = without_a_row(ranking.linear, after, evidence, ranking.families)
+    chance = whatever_sizes(ranking.linear, after, evidence, ranking.families)
     return chance < LEVELS.chance
 
 
@@ -241,7 +248,8 @@ def shown(
             state = state if evidence is None else state.failing(evidence, str(better))
             continue
         gain, *_ = subject.rises(state.fit, [better, *(r.fit for r in beside)])
-        kept = _gaining(evidence, gain)
+        # Its columns say little of it: the chance is that of its refit.
+        kept = with_chance(_gaining(evidence, gain), ranking.likelihood, ranking.families)
         seen = falls_of_refit(ranking.linear, subject.linear(better))
         if beyond_courses(ranking, kept) and holds_out(seen, ranking.linear):
             found.append(Refit(state.fit, better, kept, seen))

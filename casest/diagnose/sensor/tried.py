@@ -8,6 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
+from casest.data.checks import full_scales
 from casest.declaration.effect import NOISE, OVER_TIME, Effect, effect
 from casest.declaration.model import Model
 from casest.declaration.physics import SX
@@ -84,7 +85,8 @@ class Tried:
         return [c for one in self.found(fit)[0] for c in on_grid(one, seen, self._likely(fit, one))]
 
     def shown(self, fit: Fit) -> list[Trial]:
-        """Long lags that the records show by themselves: a slope does not reach as far."""
+        """Long lags and full scales that the records show by themselves: a slope does not reach as
+        far as the one, and what is cut off has spoilt the fit without the other."""
         times = [run.time for run in self.rows.runs if run.time is not None and len(run) > 1]
         step = float(np.median(np.diff(times[0]))) if times else np.inf
         found = []
@@ -92,7 +94,19 @@ class Tried:
             lag = self._likely(fit, candidate)
             if abs(lag) > 2 * step:
                 found.append(replace(candidate, held=(("delay", lag),), trials=len(times[0])))
+            profile = dict(candidate.effect.profile) if candidate.effect else {}
+            if set(profile.values()) == {"level"}:
+                held = ([(name, level) for name in profile] for level in self._full_scales(fit))
+                found += [replace(candidate, held=tuple(h)) for h in held]
         return self.of(fit, found)
+
+    def _full_scales(self, fit: Fit) -> set[float]:
+        """Sizes at which readings stand still while the input goes on."""
+        measured = fit.model.traced.measured
+        if not measured or fit.model.implicit:
+            return set()
+        readings = np.concatenate([run.signals[measured] for run in self.rows.runs])
+        return {abs(extreme) for _, _, extreme, _ in full_scales(readings)}
 
     def of(self, fit: Fit, several: Sequence[Candidate]) -> list[Trial]:
         """These candidates in their columns, without those that have none here."""
