@@ -7,10 +7,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import simulators as sim
 from scipy.stats import norm
 
 from casest import Residual, Run, effect, model, param, quantity, signal
-from casest.diagnose.cross_validation import check_folds, cross_fitted, folded
+from casest.diagnose.cross_validation import cross_fitted, determined, folded
 from casest.diagnose.evidence.held_out import fall, fall_between_causes, foretold
 from casest.diagnose.evidence.linear import Linear, parts_of
 from casest.diagnose.levels import LEVELS
@@ -22,6 +23,7 @@ from casest.errors import DataError
 from casest.estimate.calibrate import attempt, calibrate
 from casest.estimate.held_out import residuals, split
 from casest.leastsquares.problem import Problem
+from casest_problems.norm import norm_triangular
 
 HUGE = 1e9
 UNITS = {"x": "V", "y": "V"}
@@ -444,8 +446,9 @@ def test_every_run_is_held_out_a_part_at_a_time():
             assert len(np.unique(found[runs == run])) >= 5
 
 
-def test_what_a_fit_to_the_rest_cannot_foretell_is_refused():
-    """A slope that one pose alone shows: without it nothing is known of what is held out."""
+def test_a_pose_that_alone_determines_something_is_never_held_out():
+    """A slope that one pose alone shows: without it nothing is known of it. The others are held
+    out one by one."""
     rng = np.random.default_rng(7)
     run = positions(rng)
     x = np.zeros((24, 1))
@@ -453,11 +456,23 @@ def test_what_a_fit_to_the_rest_cannot_foretell_is_refused():
     x[5] = 100.0
     run = replace(run, signals={"x": x, "y": 2 * x + 0.1 * rng.standard_normal((24, 1))})
     before = calibrate(line, [run])
-    with pytest.raises(DataError, match="without one part in 4 of the record"):
-        check_folds(before, (run,), folded((run,)))
+    folds = determined(before, (run,))
+    assert folds.of[0].tolist() == [-1 if k == 5 else k for k in range(24)]
+    (foretold_,) = cross_fitted(line, (run,), before.values, folds)
+    assert np.flatnonzero(np.isnan(foretold_[:, 0])).tolist() == [5]
     even = positions(rng)
-    assert check_folds(attempt(line, [even]), (even,), folded((even,))) is None
+    assert determined(attempt(line, [even]), (even,)).count == LEVELS.refits
     assert Problem(line, (even,)).residual_count == 24
+
+
+def test_poses_of_which_most_determine_something_alone_are_refused():
+    """Nine positions for nine unknowns: without one of them there are too few equations."""
+    rng = np.random.default_rng(8)
+    v = sim.accelerometer(rng).read(sim.spread_poses(9, rng), 5e-3, rng)
+    run = Run.raw("poses", {"v": v}, units={"v": "m/s^2"})
+    before = attempt(norm_triangular.having(norm=sim.GRAVITY), [run])
+    with pytest.raises(DataError, match="too few equations; record more orientations"):
+        determined(before, (run,))
 
 
 def test_what_nothing_foretells_is_no_part_of_an_error_and_a_dash_on_the_page():

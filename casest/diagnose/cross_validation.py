@@ -37,6 +37,35 @@ class Folds:
     count: int
 
 
+def determined(before: Estimate, runs: Sequence[Run], seed: int = 0) -> Folds:
+    """Folds of which the rest determines the model: the usual ones, of poses else one for each.
+
+    Poses that alone determine something are never held out then, if they are the fewer. Raises
+    DataError where most are such, or nothing can be held out.
+    """
+    folds = folded(runs, before.correlated_over, seed)
+    open_ = _undetermined(before, runs, folds)
+    if open_ and sum(map(len, runs)) < LEVELS.series:
+        each = _one_each(runs)
+        alone = list(_undetermined(before, runs, each))
+        of = tuple(np.where(np.isin(fold, alone), -1, fold) for fold in each.of)
+        if np.mean(np.concatenate(of) < 0) < 0.5:
+            return Folds(of, each.batches, each.count)
+    for words in open_.values():
+        raise DataError(words)
+    return folds
+
+
+def _one_each(runs: Sequence[Run]) -> Folds:
+    """A fold for every pose, or every row where there are few."""
+    of = []
+    for run in runs:
+        whole = np.cumsum(np.r_[False, run.block[1:] != run.block[:-1]], dtype=np.int_)
+        of.append(whole if whole[-1] >= 2 * LEVELS.refits else np.arange(len(run)))
+    batches = [np.flatnonzero(_changes(run, f)) for run, f in zip(runs, of, strict=True)]
+    return Folds(tuple(of), tuple(batches), max(int(f[-1]) + 1 for f in of))
+
+
 def folded(runs: Sequence[Run], correlated_over: float = 1.0, seed: int = 0) -> Folds:
     """Folds of interleaved stretches, poses or bursts; batches are those stretches.
 
@@ -115,12 +144,13 @@ def rms(residuals: Sequence[Array]) -> float:
     return float(np.sqrt(np.mean(there**2))) if there.size else float("nan")
 
 
-def check_folds(before: Estimate, runs: Sequence[Run], folds: Folds) -> None:
-    """Raise DataError where the rest of a record does not determine what a part is held out for.
+def _undetermined(before: Estimate, runs: Sequence[Run], folds: Folds) -> dict[int, str]:
+    """Folds of which the rest of a record does not determine what they are held out for, and why.
 
     What a fit to the rest leaves uncertain of the part, in variances of the noise, is the trace
     of JᵀJ of the part times the inverse of that of the rest.
     """
+    found = {}
     for k in range(folds.count):
         parts = [
             tuple(run.take((fold == k) == held) for run, fold in zip(runs, folds.of, strict=True))
@@ -128,25 +158,30 @@ def check_folds(before: Estimate, runs: Sequence[Run], folds: Folds) -> None:
         ]
         if any(len(run) == 0 for run in parts[0]) or not sum(map(len, parts[1])):
             continue  # the fits themselves say so
-        rest, part = (
-            whitened(one, one.point(before.values))
-            for one in (Problem(before.model, p) for p in parts)
-        )
-        words = "there are too few equations"
-        if rest.residual_count >= rest.unknowns:
-            words = undetermined(rest, before.values)
-        if not words:
-            point = rest.point(before.values)
-            own = part.normal(part.point(before.values)).matrix
-            spread = float(np.trace(np.linalg.solve(rest.normal(point).matrix, own)))
-            if spread < LEVELS.uncertain * part.residual_count:
-                continue
-            deviations = np.sqrt(spread / part.residual_count)
-            words = f"the part is foretold to {deviations:.2g} standard deviations of the noise"
-        raise DataError(
-            f"without one part in {folds.count} of the record {words}; record more orientations, "
-            "or each of them twice"
-        )
+        if words := _why(before, *parts):
+            found[k] = (
+                f"without one part in {folds.count} of the record {words}; record more "
+                "orientations, or each of them twice"
+            )
+    return found
+
+
+def _why(before: Estimate, rest: tuple[Run, ...], part: tuple[Run, ...]) -> str:
+    seen, held = (
+        whitened(one, one.point(before.values))
+        for one in (Problem(before.model, p) for p in (rest, part))
+    )
+    if seen.residual_count < seen.unknowns:
+        return "there are too few equations"
+    if words := undetermined(seen, before.values):
+        return words
+    own = held.normal(held.point(before.values)).matrix
+    whole = seen.normal(seen.point(before.values)).matrix
+    spread = float(np.trace(np.linalg.solve(whole, own)))
+    if spread < LEVELS.uncertain * held.residual_count:
+        return ""
+    deviations = np.sqrt(spread / held.residual_count)
+    return f"the part is foretold to {deviations:.2g} standard deviations of the noise"
 
 
 def undetermined(problem: Problem, values: Mapping[str, Array]) -> str:

@@ -15,7 +15,7 @@ from casest.declaration.shapes import Array
 from casest.declaration.symbols import Constant
 from casest.diagnose.candidates.candidates import Candidate, Skipped
 from casest.diagnose.closing import Closing
-from casest.diagnose.cross_validation import Folds, check_folds, cross_fitted, folded, rms
+from casest.diagnose.cross_validation import Folds, cross_fitted, determined, folded, rms
 from casest.diagnose.evidence.linear import robust_sd
 from casest.diagnose.evidence.score import Evidence
 from casest.diagnose.found import HELD_OUT_DATA, Found, Undecided
@@ -156,8 +156,7 @@ def _searched(
     with np.errstate(all="ignore"), one_thread(), only_tried():
         ready = prepared(model, runs)
         try:
-            folds = folded(ready, before.correlated_over, seed)
-            check_folds(before, ready, folds)
+            folds = determined(before, ready, seed)
         except DataError as error:
             return _as_it_is(before, ready, str(error))
         sensor = Sensor(model, ready, tuple(catalogue), frozenset(known), seed)
@@ -192,7 +191,8 @@ def _closed(sensor: Sensor, before: Estimate, folds: Folds, say: Callable[[str],
     if state.fit is not declared:
         state, after = certified(sensor, state, before)
         # What was missing is no noise: parts that are held out are as long as what is left asks.
-        folds = folded(sensor.runs, after.correlated_over, sensor.seed)
+        if folds.count == LEVELS.refits:
+            folds = folded(sensor.runs, after.correlated_over, sensor.seed)
     less = _without_events_of_a_course(sensor, state)
     if less is not state:
         state, after = certified(sensor, less, before)
