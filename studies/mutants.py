@@ -168,7 +168,7 @@ MUTANTS = tuple(
             "weighted(Problem(model, tuple(runs)), values)",
         ),
         (CROSS, "10 * correlated_over", "0.1 * correlated_over"),
-        (CROSS, "spread < LEVELS.uncertain * part", "spread < 1e9 * part"),
+        (CROSS, "spread < LEVELS.uncertain * held", "spread < 1e9 * held"),
         (PARTS, "rest = A - square", "rest = A"),
         (PARTS, "(b - product)", "b"),
         (PARTS, "gained = float(np.sum(b**2)) - left", "gained = float(np.sum(b**2)) + left"),

@@ -233,8 +233,9 @@ RECORDS = (
         "Ferraris session, six positions (NilsPod)",
         "norm-diagonal",
         "imucal/example_ferraris_session.csv",
-        "A refusal: six unknowns from six positions leave none to hold out.",
-        Right((None,)),
+        "Nothing with a name: six unknowns from six positions. Rests of one position differ by up "
+        "to ten of their standard errors, so a misfit there is.",
+        Right((None, "unexplained")),
         {
             "columns": {"v": ("acc_x", "acc_y", "acc_z")},
             "units": {"v": "m/s^2"},
