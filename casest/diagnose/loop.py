@@ -186,16 +186,13 @@ def _closed(sensor: Sensor, before: Estimate, folds: Folds, say: Callable[[str],
         state, outliers = without_outliers(sensor, state, folds)
     if state is not first:
         state = search(sensor, state.fit, say, state)
-    state = with_rivals(sensor, state)
+    state = with_rivals(sensor, _without_events_of_a_course(sensor, state))
     after = before
     if state.fit is not declared:
         state, after = certified(sensor, state, before)
         # What was missing is no noise: parts that are held out are as long as what is left asks.
         if folds.count == LEVELS.refits:
             folds = folded(sensor.runs, after.correlated_over, sensor.seed)
-    less = _without_events_of_a_course(sensor, state)
-    if less is not state:
-        state, after = certified(sensor, less, before)
     state, after, hidden = _foretelling(sensor, declared, state, before, after, folds)
     effects = [] if outliers is None else [outliers]
     effects += [_found(sensor, state, k, after) for k in state.kept]
