@@ -9,7 +9,7 @@ USABLE := $(VENV)/.usable
 .PHONY: demo test test-long lint types format wheel bench study study-imu study-metrology \
 	study-metrology-coverage study-starts study-nist study-loop \
 	study-motion study-flights study-inputs study-records study-halves study-asked study-slow study-coverage \
-	study-deceptive study-deceptive-many study-fleet study-mutation study-worlds study-noises \
+	study-deceptive study-deceptive-many study-fleet study-mutation study-worlds study-noises study-tables \
 	study-structural study-check study-plans study-equations study-equations-coverage study-frictions \
 	study-told-apart study-sequential study-mag-gyro study-mag-imu \
 	figures docs clean
@@ -79,6 +79,9 @@ study-worlds: $(READY)
 
 study-noises: $(READY)
 	$(BIN)/python studies/noises.py
+
+study-tables: $(READY)
+	$(BIN)/python studies/tables.py
 
 study-motion: $(READY)
 	$(BIN)/python studies/flight.py

@@ -154,6 +154,8 @@ def _describes(
     causes.
     """
     best = max((r.evidence.score for r in names), default=0.0)
+    if not ranking.linear.series:  # what a row or a few carry has a name all the same
+        best = max([best, *(e.score for e in ranking.causes[:1])])
     if formula.score < best + LEVELS.described or not ranking.says(formula):
         return False
     seen = falls(ranking, formula)
