@@ -57,12 +57,12 @@ def _rivals(subject: Subject[F], state: State[F], kept: Kept) -> tuple[State[F],
     after = subject.linear(state.fit)
     found = list[Rival]()
     for e in rivals:  # what the columns promise, a refit must keep
-        fit = _in_its_place(subject, state, kept, base, e)
-        if isinstance(fit, str):
-            state = state.failing(e, f"in the place of {own.family} {fit}")
+        before = mine[0].score - mine[0].gain - (e.score - e.gain)
+        place = _in_its_place(subject, state, kept, base, e, before)
+        if isinstance(place, str):
+            state = state.failing(e, f"in the place of {own.family} {place}")
             continue
-        ours, theirs = subject.rises(base, [state.fit, fit])
-        behind = (mine[0].score - mine[0].gain + ours) - (e.score - e.gain + theirs)
+        fit, behind = place
         other = subject.linear_in(state.fit, fit)
         again: Fall | None = None
         if {x.residual.shape for x in (linear, after, other)} == {linear.residual.shape}:
@@ -74,19 +74,24 @@ def _rivals(subject: Subject[F], state: State[F], kept: Kept) -> tuple[State[F],
 
 
 def _in_its_place(
-    subject: Subject[F], state: State[F], kept: Kept, base: F, evidence: Evidence
-) -> F | str:
-    """The better refit of two: without the cause, another one may have gone far to stand in for it,
-    and not find its way back."""
-    several = [
-        subject.refit(base, evidence.trials),
-        subject.instead(state.fit, kept.what, evidence.trials),
-    ]
-    fits = [fit for fit in several if not isinstance(fit, str)]
-    if len(fits) < 2:
-        return fits[0] if fits else several[0]
-    first, second = subject.rises(base, fits)
-    return fits[0] if first >= second else fits[1]
+    subject: Subject[F], state: State[F], kept: Kept, base: F, evidence: Evidence, before: float
+) -> tuple[F, float] | str:
+    """The better refit of two, and how far behind in score, of which `before` is the price: without
+    the cause, another one may have gone far to stand in for it, and not find its way back."""
+    found, why = list[tuple[F, float]](), ""
+    for there in (True, False):
+        if there:
+            fit = subject.refit(base, evidence.trials)
+        else:
+            fit = subject.instead(state.fit, kept.what, evidence.trials)
+        if isinstance(fit, str):
+            why = why or fit
+            continue
+        ours, theirs = subject.rises(base, [state.fit, fit])
+        found.append((fit, before + ours - theirs))
+        if found[-1][1] < LEVELS.clear:
+            break  # as well already
+    return min(found, key=lambda f: f[1]) if found else why
 
 
 def _in_time(ranking: Ranking, evidence: Evidence) -> Array:
