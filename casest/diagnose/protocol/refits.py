@@ -183,20 +183,19 @@ def _contains(wide: Evidence, narrow: Evidence) -> bool:
 
 
 def _different(refits: Sequence[Refit[F]]) -> list[Refit[F]]:
-    """Those of which none does all that an earlier one does, and no more."""
+    """Those of which none does all that an earlier one does, nor the other way round."""
     found: list[Refit[F]] = []
     for refit in refits:
         own = refit.evidence.basis
-        if not any(_same(own, other.evidence.basis) for other in found):
+        if not any(_nested(own, other.evidence.basis) for other in found):
             found.append(refit)
     return found
 
 
-def _same(one: Array, other: Array) -> bool:
-    """Do orthonormal columns (n, k) span the same?"""
-    if one.shape != other.shape:
-        return False
-    return bool(np.linalg.norm(one - other @ (other.T @ one)) < 1e-3)
+def _nested(one: Array, other: Array) -> bool:
+    """Does what orthonormal columns (n, k) span contain what the others do?"""
+    wide, narrow = (one, other) if one.shape[1] >= other.shape[1] else (other, one)
+    return bool(np.linalg.norm(narrow - wide @ (wide.T @ narrow)) < 1e-3)
 
 
 def _near(refits: Sequence[Refit[F]]) -> list[Refit[F]]:
