@@ -96,20 +96,18 @@ def test_a_bend_is_seen_in_a_table_of_any_length(rows):
     assert of_table(beside_a_line(x, np.sin(5 * x)), x)[0].p_value < LEVELS.misfit
 
 
-@pytest.mark.parametrize("rows", [12, 20, 29, 30, 60, 300])
+@pytest.mark.parametrize("rows", [12, 20, 40, 100, 300])
 def test_noise_of_a_table_follows_nothing_whatever_its_tails_and_where_it_is_larger(rows):
-    """Of fewer than thirty rows the ratio's law is that of one size: noise that grows thirtyfold
-    along the order is said to follow it in 3 of 100 tables, not in 1."""
+    """Also of noise that grows thirtyfold along the order: in 2 of 100 tables at most, not in 1."""
     rng, alarms, larger = np.random.default_rng(rows), 0, 0
-    for k in range(3000):
+    for k in range(1200):
         x = np.sort(rng.uniform(0.1, 3, rows))
         noise = rng.standard_t(3, rows) if k % 2 else rng.standard_normal(rows)
         grows = k % 3 != 0
         said = of_table(beside_a_line(x, noise * (x if grows else 1.0)), x)[0].p_value < 0.01
         alarms, larger = alarms + (said and not grows), larger + (said and grows)
-    assert alarms <= stats.binom.ppf(1 - 5e-4, 1000, LEVELS.chance)
-    known = LEVELS.chance if rows >= 30 else 0.03
-    assert larger <= stats.binom.ppf(1 - 5e-4, 2000, known)
+    assert alarms <= stats.binom.ppf(1 - 5e-4, 400, LEVELS.chance)
+    assert larger <= stats.binom.ppf(1 - 5e-4, 800, 2 * LEVELS.chance)
 
 
 @pytest.mark.parametrize(("rows", "unknowns"), [(12, 2), (20, 4), (29, 6)])
@@ -117,7 +115,7 @@ def test_of_few_rows_the_chance_is_exact_beside_what_the_fit_has_taken(rows, unk
     """Noise less a polynomial: neighbours are unlike, and as alike as chance has it."""
     rng, x = np.random.default_rng(rows), np.linspace(-1, 1, rows)
     Q, p = np.linalg.qr(np.vander(x, unknowns))[0], []
-    for _ in range(2000):
+    for _ in range(1000):
         noise = rng.standard_normal(rows)
         left = (noise - Q @ (Q.T @ noise)).reshape(-1, 1)
         p.append(structures([left], [Variable("x", (x,))], unknowns=Q)[0].p_value)
@@ -133,7 +131,7 @@ def test_a_jump_beside_a_bend_is_seen_in_twenty_four_rows():
         y = 15.0 * (x > 0.1) + rng.standard_normal(24)
         left = (y - Q @ (Q.T @ y)).reshape(-1, 1)
         seen += structures([left], [Variable("x", (x,))], unknowns=Q)[0].p_value < LEVELS.chance
-    assert seen > 160
+    assert seen > 150
 
 
 def test_variables_of_one_order_are_one_question():
@@ -146,7 +144,7 @@ def test_variables_of_one_order_are_one_question():
         for several in ([("x", x)], [("x", x), ("u", -(x**2))], [("x", x), ("z", other)])
     )
     chance = {f.name: f.p_value for f in two}["x"]
-    assert same[0].p_value == one[0].p_value
+    assert same[0].p_value == pytest.approx(one[0].p_value, abs=1e-9)
     assert chance == pytest.approx(min(1.0, 2 * one[0].p_value))
 
 

@@ -2,11 +2,10 @@
 
 Rows are put in the order of a variable and averaged over blocks; the squared differences of
 neighbouring means against their variance (J. von Neumann, 1941) are 1 on average for what follows
-nothing. Of a table's single rows, whose noise may be larger at one end and have any tails, the
-products of neighbours are summed, against their own squares: that is normal whatever the sizes are,
-and says nothing of fewer than PRODUCTS rows, which are asked by that ratio. A fit to few rows has
-taken from their residual what is smooth, and neighbours of noise are unlike: of a table both count
-beside its unknowns, the ratio by its exact law (Durbin & Watson 1971, by Imhof's 1961 integral).
+nothing. Of a table's single rows that ratio has an exact law, which counts that a fit to few rows
+has taken what is smooth, and neighbours of noise are unlike then (Durbin & Watson 1971, by Imhof's
+1961 integral), and that noise may be larger at one end. Of MANY rows and more the products of
+neighbours are summed, against their own squares: normal whatever the sizes are.
 """
 
 from __future__ import annotations
@@ -24,9 +23,15 @@ from casest.diagnose.misfit.variables import Variable
 #: Means at least, as many as are wanted, and rows in each of a series, whose noise may have a
 #: colour. Of eight means no order is unlikely enough.
 FEWEST, WANTED, SHORTEST = 8, 24, 4
-#: Rows of a table at least, each of which is measured by itself; and from which on products of so
-#: few can be unlikely.
-FEW_ROWS, PRODUCTS = 12, 30
+#: Rows of a table at least, each of which is measured by itself; and from which on products are as
+#: good as the ratio, whose law takes long there.
+FEW_ROWS, MANY = 12, 100
+#: Share of the rows over which the size of a table's noise is told, from the row's neighbours.
+NEIGHBOURS = 0.6
+#: Where Imhof's integrand is asked: it is smooth in log u, and nothing at both ends.
+LOGS = np.linspace(-25.0, 15.0, 801)
+#: Share of a row's variance that the fit leaves, at least.
+LEAST = 0.2
 
 
 @dataclass(frozen=True)
@@ -87,7 +92,7 @@ def _of_rows(name: str, r: Array, unknowns: Array, order: Index, tried: int) -> 
     ordered, chances = r[order], []
     for k in range(axes):
         away, own = ordered[:, k] - ordered[:, k].mean(), taken[:, k]
-        if count < PRODUCTS:
+        if count < MANY:
             chances.append(_of_ratio(away, own))
         else:
             chances.append(float(ndtr(-_of_products(away, own))))
@@ -120,31 +125,33 @@ def _of_products(r: Array, unknowns: Array) -> float:
 
 
 def _of_ratio(r: Array, unknowns: Array) -> float:
-    """Chance of neighbours (N,) as alike, in noise of one size that a fit has taken its unknowns'
-    columns (N, p) from."""
-    size = float(r @ r)
-    if not size > 0:
+    """Chance of neighbours (N,) as alike, in noise of the sizes that they have, from which a fit
+    has taken its unknowns' columns (N, p)."""
+    squares = float(r @ r)
+    if not squares > 0:
         return 1.0
     n = len(r)
+    left = np.eye(n) - unknowns @ unknowns.T
     differences = np.diff(np.eye(n), axis=0)
-    form = differences.T @ differences - float(np.sum(np.diff(r) ** 2)) / size * np.eye(n)
-    values, vectors = np.linalg.eigh(np.eye(n) - unknowns @ unknowns.T)
-    root = vectors * np.sqrt(np.clip(values, 0.0, 1.0))
-    return _below_zero(np.linalg.eigvalsh(root.T @ form @ root))
+    form = differences.T @ differences - float(np.sum(np.diff(r) ** 2)) / squares * np.eye(n)
+    size = np.sqrt(_around(r**2 / np.maximum(np.diag(left), LEAST)))
+    return _below_zero(np.linalg.eigvalsh(size[:, None] * (left @ form @ left) * size))
+
+
+def _around(values: Array) -> Array:
+    """Means of values (N,) and their neighbours, over the whole."""
+    width = max(5, int(NEIGHBOURS * len(values)) | 1)
+    padded = np.pad(values, width // 2, mode="reflect")
+    found = np.convolve(padded, np.ones(width) / width, "valid")
+    return np.asarray(found / found.mean())
 
 
 def _below_zero(weights: Array) -> float:
-    """Chance that Σ λ·χ²₁ is below zero, by Imhof's integral."""
-    from scipy.integrate import quad
-
+    """Chance that Σ λ·χ²₁ is below zero, by Imhof's integral over log u."""
     w = weights[np.abs(weights) > 1e-9 * np.abs(weights).max()]
-    w = w / np.abs(w).max()
-
-    def density(u: float) -> float:
-        angle = 0.5 * float(np.arctan(w * u).sum())
-        return float(np.sin(angle) / (u * np.exp(0.25 * np.log1p((w * u) ** 2).sum())))
-
-    whole = quad(density, 0, np.inf, limit=400, epsabs=1e-9)[0]
+    u = np.exp(LOGS)[:, None] * w / np.abs(w).max()
+    angle, size = 0.5 * np.arctan(u).sum(axis=1), 0.25 * np.log1p(u**2).sum(axis=1)
+    whole = float(np.sum(np.sin(angle) * np.exp(-size))) * (LOGS[1] - LOGS[0])
     return float(np.clip(0.5 - whole / np.pi, 0.0, 1.0))
 
 
