@@ -213,6 +213,45 @@ def test_a_bend_over_levels_that_follow_each_other_is_a_lack_of_fit(bend, timed)
     assert np.sum(np.array(p) < 0.001) >= 9
 
 
+def swept(rng, sizes, bend=0.0, sweeps=3):
+    """Eleven levels, up and up again, of the noise that each has: the test's p-value."""
+    level = np.linspace(-1, 1, 11)
+    x = np.tile(level, sweeps)
+    y = x + bend * x**2 + np.tile(sizes, sweeps) * rng.standard_normal(len(x))
+    run = Run.raw("r", {"x": x[:, None], "y": y[:, None]}, units={})
+    problem = Problem(one_channel, prepared(one_channel, [run]))
+    point = trust_region(problem, problem.start()).point
+    found = pure_error(problem, point, problem.residuals(point), problem.unknowns)
+    return None if found is None else found.p_value
+
+
+SIZES = {"one": np.ones(11), "from a hundredth to one": np.geomspace(0.01, 1, 11)}
+
+
+@pytest.mark.parametrize("sizes", SIZES.values(), ids=SIZES)
+def test_repeats_in_several_sweeps_do_not_lack_fit_whatever_their_sizes(sizes):
+    rng = np.random.default_rng(3)
+    p = np.array([swept(rng, sizes) for _ in range(400)])
+    assert np.sum(p < 0.01) <= 11  # 4 are expected; twelve come once in a thousand tries
+
+
+def test_a_bend_is_a_lack_of_fit_of_several_sweeps():
+    """Of three times the noise at both ends."""
+    rng = np.random.default_rng(4)
+    p = np.array([swept(rng, np.ones(11), bend=6.0) for _ in range(20)])
+    assert np.sum(p < 0.001) >= 19
+
+
+def test_readings_that_are_written_down_twice_are_no_repeats():
+    rng, x = np.random.default_rng(5), np.linspace(-1, 1, 18)
+    y = x + 0.1 * rng.standard_normal(18)
+    twice = {"x": np.tile(x, 2)[:, None], "y": np.tile(y, 2)[:, None]}
+    run = Run.raw("r", twice, units={})
+    problem = Problem(one_channel, prepared(one_channel, [run]))
+    point = trust_region(problem, problem.start()).point
+    assert pure_error(problem, point, problem.residuals(point), problem.unknowns) is None
+
+
 def test_a_narrow_line_is_a_misfit_with_its_frequency():
     def hum(t, **_):
         return 0.4 * np.sin(2 * np.pi * 17 * t)
@@ -402,3 +441,17 @@ def test_a_reference_that_stays_gives_no_alarm(seeds):
     """At most as often as the level of a kind of misfit, 0.001, allows: of 980 four (99.6 %)."""
     alarms = sum(bool(of_the_reference(np.random.default_rng(s), np.zeros(2000))) for s in seeds)
     assert alarms <= (0 if len(seeds) == 20 else 4)
+
+
+def test_an_axis_that_stands_still_on_one_level_has_the_noise_of_rounding():
+    """Nothing but zero and one step in 500 readings: no outlier, and no colour of the others."""
+    rng = np.random.default_rng(6)
+    r = np.column_stack([0.005 * rng.standard_normal((500, 2)), np.zeros(500)])
+    r[:, :2] = np.round(r[:, :2], 3)
+    r[77, 2] = -0.01
+    r -= r.mean(axis=0)
+    run = Run.raw("r", {"y": r}, units={}, time=0.02 * np.arange(500))
+    found = noise_model([run], [r], [np.arange(0, 500, 12)], measured="y")
+    assert found.sigma[2] == pytest.approx(0.01 / np.sqrt(12))
+    assert found.outliers == 0
+    assert found.colour_p > 0.001

@@ -339,3 +339,9 @@ def test_the_chart_of_a_rotation_stays_on_so3_and_measures_angles():
         angle = np.arccos((np.trace(start.T @ moved) - 1) / 2)
         assert angle == pytest.approx(2 * np.arctan(np.linalg.norm(step) / 2), abs=1e-7)
         np.testing.assert_allclose(start.T @ moved @ step, step, atol=1e-13)
+
+
+@pytest.mark.parametrize("declared", [signal, param])
+def test_a_unit_before_how_many_is_said_the_other_way_round(declared):
+    with pytest.raises(DeclarationError, match=r"before its unit, as in \w+\(3, 'deg/s'\)"):
+        declared("deg/s", 3)

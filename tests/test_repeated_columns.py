@@ -88,3 +88,33 @@ def test_a_second_clock_is_the_time(record):
     closing = close("linear", {**record, "reading": drifting, "millis": clock})
     assert [e.candidate.label for e in closing.effects] == ["bias_drift"]
     assert "copy of t" in skipped(closing)["millis"]
+
+
+def bent_table(rows=35):
+    """A foot, a slope and a plateau, as of an attenuator: no shape of the catalogue."""
+    rng, x = np.random.default_rng(8), np.linspace(-1, 1, rows)
+    return x, 100 * np.tanh(2 * x) + rng.normal(0, 1.0, rows), rng
+
+
+def test_of_few_rows_a_column_that_goes_with_the_input_is_no_influence():
+    """A position on a stage, in proportion to the input but for 15 %: its curve is the bend's."""
+    x, y, rng = bent_table()
+    position = 1000 * (x + 0.1 * rng.standard_normal(len(x)))
+    closing = close("linear", {"reference": x, "reading": y, "position": position})
+    assert "could be a bend" in skipped(closing)["position"]
+    assert not [e for e in closing.effects if e.candidate.column]
+
+
+def test_a_column_that_is_named_as_an_uncertainty_is_no_influence():
+    x, y, rng = bent_table()
+    error = 2 + 0.05 * np.abs(y) + rng.normal(0, 1.5, len(x))
+    closing = close("linear", {"reference": x, "reading": y, "std err": error})
+    assert "uncertainty" in skipped(closing)["std err"]
+
+
+def test_of_few_rows_an_influence_that_does_not_go_with_the_input_is_found():
+    rng, x = np.random.default_rng(9), np.linspace(-1, 1, 40)
+    temperature = rng.uniform(10, 40, 40)
+    y = 0.2 + 3 * x + 0.02 * (temperature - 25) + rng.normal(0, 0.02, 40)
+    closing = close("linear", {"reference": x, "reading": y, "temperature": temperature})
+    assert [e.candidate.label for e in closing.effects] == ["temperature_bias(temperature)"]

@@ -49,6 +49,11 @@ def signal(
     as a gyroscope's does; rest is looked for in its noise alone. `std`: of one reading, in the
     signal's unit, one number or one for each component: what `--sensor-noise` says without it.
     """
+    if isinstance(shape, str) and unit is not None:
+        raise DeclarationError(
+            f"signal({shape!r}, {unit!r}): how many numbers it has comes before its unit, as in "
+            f"signal({unit!r}, {shape!r})"
+        )
     size, own = (1, shape) if isinstance(shape, str) else (shape, unit)
     known = None if std is None else tuple(map(float, stated(std, (size,)).std))
     return Signal("", size, own, held=held, wanders=wanders, std=known)
@@ -153,6 +158,11 @@ def param(
     has its own.
     """
     if isinstance(shape, str):
+        if unit:
+            raise DeclarationError(
+                f"param({shape!r}, {unit!r}): its shape comes before its unit, as in "
+                f"param({unit!r}, {shape!r})"
+            )
         form, unit = array_shape(None), shape
     else:
         form = array_shape(shape)

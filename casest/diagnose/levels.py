@@ -34,6 +34,8 @@ class Levels:
     uncertain: variance that a fit to the rest may leave of a part, in those of the noise.
     repeated: share of a column's deviation that a signal does not tell, up to which the column is
         that signal once more: two meters of one quantity agree so far, an influence does not.
+    stand_in: share of a column's variance that a signal does not tell, up to which, in poses and
+        tables, its curve could be a bend over that signal.
     fades: time constants that a record must span for a memory to be seen to fade.
     survives: share of a cause's length that the declared unknowns must leave; over_noise: an
         implicit residual's slopes contain its noise, of which so many must survive. jitter: times
@@ -89,6 +91,7 @@ class Levels:
     told: float = 0.2
     uncertain: float = 10.0
     repeated: float = 0.01
+    stand_in: float = 0.1
     fades: float = 2.0
     survives: float = 1e-3
     over_noise: float = 5.0

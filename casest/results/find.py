@@ -116,7 +116,7 @@ def find_effects(name: str) -> tuple[Effect, ...]:
         hint = _meant(name, list(shipped))
         raise UsageError(
             f"--effects {name}: no shipped effect{hint} (`casest list` has them; or give the path "
-            "of a .py file)"
+            f"of a .py file; a constant of the model is freed by --free {name})"
         )
     path, _, wanted = name.partition(":")
     module = load_file(Path(path))

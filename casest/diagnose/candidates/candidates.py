@@ -36,6 +36,10 @@ WARM = {"temperature": (True,), "other": (False,), "any": (True, False)}
 _LABELS = re.compile(
     r"^(run|pose|index|(first_|last_)?row|count|sample|seq|id|nr|no)$", re.IGNORECASE
 )
+#: Columns that are called as the uncertainty of another is.
+_UNCERTAIN = re.compile(
+    r"(^|[_ ])(err|errors?|std|stdev|sd|sigma|unc|uncert|uncertainty)([_ ]|$)", re.IGNORECASE
+)
 #: Columns that are called as a clock is.
 _CLOCK = re.compile(
     r"time|clock|tick|epoch|utc|milli|micro|(^|_)(t|s|sec|seconds|ms|us|ns)$", re.IGNORECASE
@@ -282,7 +286,7 @@ def channels(
         x = np.concatenate([run.signals[name][:, 0] for run in runs])
         # An angle that grows with time still turns.
         others = {**clock, **values} if _CLOCK.search(name) else values
-        why = _useless(x, others) or reads.again(x)
+        why = _useless(x, others) or _named(name) or reads.again(x)
         if why:
             skipped.append(Skipped(name, why))
             continue
@@ -290,6 +294,13 @@ def channels(
         unit = runs[0].column_units.get(name) or ""
         found[name] = bool(_TEMPERATURE.search(name)) or unit in _DEGREES
     return found, skipped
+
+
+def _named(name: str) -> str:
+    """Why a column of that name is no influence; else empty."""
+    if _UNCERTAIN.search(name):
+        return "column is named as the uncertainty of another is, which is no influence"
+    return ""
 
 
 def _useless(x: Array, others: Mapping[str, Array]) -> str:

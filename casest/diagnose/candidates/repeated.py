@@ -3,6 +3,7 @@ magnitude that was computed from the axes.
 
 Such a column differs from the signal by the noise of the one or the other. A cause that follows it
 would take the place of the declared response, and explain the noise of a reading by that reading.
+Of few rows also what only goes with a signal is none: its curve is a bend of the response.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ class Signal:
 
     def apart(self, x: Array) -> float:
         """Share of a column's squares (N,) that is not computed from it; inf where more is left
-        than its rounding.
+        than its rounding, or of few rows a part that counts.
 
         Of a reading that the inputs do not tell, all may be what the column does to it: there the
         column must have its noise as well.
@@ -39,7 +40,8 @@ class Signal:
         unit = _scaled(x)
         left = (1 - float(np.sum((self.basis.T @ unit) ** 2))) * N / (N - p)
         own = self.noise is None or any(_one_noise(x, y) for y in self.noise.T)
-        return left if own and left < LEVELS.repeated**2 + _rounding(unit) else np.inf
+        most = LEVELS.stand_in if LEVELS.series > N else LEVELS.repeated**2 + _rounding(unit)
+        return left if own and left < most else np.inf
 
 
 @dataclass(frozen=True)
@@ -54,8 +56,11 @@ class Reads:
         x = x[self.rows]
         near = {s.name: s.apart(x) for s in self.signals if np.ptp(x) > 0}
         name = min(near, key=lambda n: near[n], default="")
-        found = bool(name) and np.isfinite(near[name])
-        return f"column is {name} once more, or computed from it" if found else ""
+        if not name or not np.isfinite(near[name]):
+            return ""
+        if near[name] < LEVELS.repeated:
+            return f"column is {name} once more, or computed from it"
+        return f"column goes with {name}: in so few rows what follows it could be a bend over that"
 
 
 def reads_of(model: Model, runs: Sequence[Run]) -> Reads:

@@ -21,7 +21,7 @@ from casest.diagnose.evidence.held_inputs import held_stretches
 from casest.diagnose.evidence.linear import Index
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.noise.slow_course import MEMORY
-from casest.estimate.correlation import is_series
+from casest.estimate.correlation import TABLE, is_series
 from casest.leastsquares.per_sample import slope_in_sample
 from casest.leastsquares.problem import Point, Problem
 
@@ -113,14 +113,30 @@ def _between_repeats(
     if met is None or problem.sequential:
         return None
     levels = [v[0].reshape(len(v[0]), -1) for v in problem.evaluate(point, {"met": met})]
+    series = any(is_series(run) for run in problem.runs)
     groups = [
         r[a:b]
         for run, r, level in zip(problem.runs, residuals, levels, strict=True)
         for a, b in _repeats(run, level)
     ]
+    if len(groups) < GROUPS and not series and sum(map(len, residuals)) < TABLE:
+        groups = _anywhere(np.concatenate(residuals), np.concatenate(levels))
     if len(groups) < GROUPS:
         return None
-    return _lack_of_fit(groups, rank, any(is_series(run) for run in problem.runs))
+    return _lack_of_fit(groups, rank, series)
+
+
+def _anywhere(residual: Array, level: Array) -> list[Array]:
+    """Rows of a table (N, m) at which one level (N, q) is met, wherever they are.
+
+    None if most of them agree to the last digit: those are one reading, written down again.
+    """
+    scale = np.maximum(np.ptp(level, axis=0), 1e-300)
+    _, place = np.unique(np.round(level / scale, 9), axis=0, return_inverse=True)
+    each = [residual[place.ravel() == k] for k in range(int(place.max(initial=-1)) + 1)]
+    groups = [g for g in each if len(g) > 1]
+    same = sum(bool(np.all(np.ptp(g, axis=0) <= 1e-9 * np.abs(residual).max())) for g in groups)
+    return [] if 2 * same > len(groups) else groups
 
 
 def _repeats(run: Run, level: Array) -> Iterator[tuple[int, int]]:
@@ -139,7 +155,7 @@ def _lack_of_fit(groups: Sequence[Array], rank: int, series: bool) -> PureError 
     dof = len(groups) * axes - rank
     if dof < GROUPS or not within.sum() > 0:
         return None
-    inflation = _inflation(groups, series)
+    inflation = _inflation(groups, series) if np.median(sizes) >= LEVELS.repeats else np.ones(1)
     pooled = within.sum() / ((sizes.sum() - len(groups)) * axes)
     own = within / ((sizes - 1) * axes)
     squares = float(np.sum(sizes[:, None] * means**2))

@@ -135,7 +135,8 @@ def _of_ratio(r: Array, unknowns: Array) -> float:
     differences = np.diff(np.eye(n), axis=0)
     form = differences.T @ differences - float(np.sum(np.diff(r) ** 2)) / squares * np.eye(n)
     size = np.sqrt(_around(r**2 / np.maximum(np.diag(left), LEAST)))
-    return _below_zero(np.linalg.eigvalsh(size[:, None] * (left @ form @ left) * size))
+    sized = size[:, None] * (left @ form @ left) * size
+    return _below_zero(np.asarray(np.linalg.eigvalsh(sized), float))
 
 
 def _around(values: Array) -> Array:

@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 from casest.data.run import Run
 from casest.declaration.shapes import Array
 from casest.diagnose.levels import LEVELS
-from casest.diagnose.noise.tails import even_scale, outlier_share, tails
+from casest.diagnose.noise.tails import even_scale, outlier_share, scales, tails
 from casest.estimate.correlation import is_series
-from casest.leastsquares.weights import robust_scale
 
 #: Batches of a record that its slow wander is judged by, and the fewest.
 SLICES, FEWEST = 64, 24
@@ -80,7 +79,7 @@ def noise_model(
     levels: Sequence[Array] | None = None,
 ) -> NoiseModel:
     """The noise of residuals (N, m) per run; `measured` names the signal that was read."""
-    sigma = _sigma(residuals)
+    sigma = scales(residuals)
     clipped = [np.clip(r / sigma, -LEVELS.clip, LEVELS.clip) for r in residuals]
     unequal_p = equal_noise(clipped, batches)
     unequal = unequal_p < LEVELS.misfit
@@ -102,11 +101,6 @@ def noise_model(
         unequal=_ratio(clipped, batches) if unequal else 1.0,
         unequal_p=unequal_p,
     )
-
-
-def _sigma(residuals: Sequence[Array]) -> Array:
-    axes = residuals[0].shape[1]
-    return np.array([robust_scale([r[:, k] for r in residuals]) for k in range(axes)])
 
 
 # -- colour ------------------------------------------------------------------------------------

@@ -98,6 +98,23 @@ def _contaminated(q: Array, normal: float) -> tuple[float, Array]:
     return likelihood, far
 
 
+def scales(residuals: Sequence[Array]) -> Array:
+    """Standard deviation (m,) of each axis, from the median of what residuals (N, m) are.
+
+    Where most are one value the reading stands still on one level: it has the noise of rounding.
+    """
+    every = np.concatenate(residuals)
+    found = np.array([robust_scale([column]) for column in every.T])
+    for k, column in enumerate(every.T):
+        near = 1e-9 * float(np.ptp(column))
+        values = np.sort(column)
+        gaps = np.diff(values)
+        still = np.mean(np.abs(column - np.median(column)) <= near)
+        if still > 0.5 and np.any(gaps > near):
+            found[k] = max(found[k], float(gaps[gaps > near].min()) / np.sqrt(12))
+    return found
+
+
 def even_scale(
     residuals: Sequence[Array], batches: Sequence[NDArray[np.int_]], unequal: bool
 ) -> tuple[Array, ...]:
@@ -105,14 +122,13 @@ def even_scale(
 
     A position that shakes has large residuals and no outliers.
     """
-    axes = residuals[0].shape[1]
-    scale = np.array([robust_scale([r[:, k] for r in residuals]) for k in range(axes)])
+    scale = scales(residuals)
     even = [r / scale for r in residuals]
     if not unequal:
         return tuple(even)
     for r, first in zip(even, batches, strict=True):
         for start, end in zip(first, np.append(first[1:], len(r)), strict=True):
-            if (end - start) * axes >= OWN_SCALE:
+            if r[start:end].size >= OWN_SCALE:
                 r[start:end] /= robust_scale([r[start:end]])
     return tuple(even)
 

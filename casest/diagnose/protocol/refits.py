@@ -25,7 +25,7 @@ from casest.diagnose.protocol.state import F, Ranking, Refit, State
 from casest.diagnose.protocol.subject import Subject
 
 #: Why a cause in poses is not added.
-FEW_ROWS = "a row or a few carry it: no evidence where each has an error of its own size"
+FEW_ROWS = "a row or a few carry it: left out one by one, they move its size too far"
 #: Why what holds out and has strong evidence is not added.
 AS_MUCH = "a slow course of unknown cause explains as much"
 
