@@ -34,7 +34,7 @@ from casest import NotTrusted, Run, close  # noqa: E402
 from casest_problems.one_channel import linear  # noqa: E402
 
 KEPT, TABLE = ROOT / "out" / "tables.jsonl", ROOT / "studies" / "tables.md"
-COUNT, FIRST, ROWS = 100, 0, (12, 60)
+COUNT, FIRST, ROWS = 60, 720_000, (12, 60)
 BENDS = {
     "quadratic",
     "cubic",
