@@ -150,3 +150,10 @@ def test_variables_of_one_order_are_one_question():
 
 def test_five_rows_are_too_few_to_follow_anything():
     assert not of_table(np.arange(5.0), np.arange(5.0))
+
+
+def test_a_fit_that_takes_everything_leaves_no_question():
+    x, rng = np.linspace(0, 1, 12), np.random.default_rng(10)
+    left = 1e-17 * rng.standard_normal((12, 1))
+    found = structures([left], [Variable("x", (x,))], unknowns=np.eye(12))
+    assert found[0].p_value > LEVELS.chance

@@ -149,7 +149,9 @@ def _around(values: Array) -> Array:
 
 def _below_zero(weights: Array) -> float:
     """Chance that Σ λ·χ²₁ is below zero, by Imhof's integral over log u."""
-    w = weights[np.abs(weights) > 1e-9 * np.abs(weights).max()]
+    w = weights[np.abs(weights) > 1e-9 * np.abs(weights).max(initial=0.0)]
+    if not w.size:
+        return 0.5
     u = np.exp(LOGS)[:, None] * w / np.abs(w).max()
     angle, size = 0.5 * np.arctan(u).sum(axis=1), 0.25 * np.log1p(u**2).sum(axis=1)
     whole = float(np.sum(np.sin(angle) * np.exp(-size))) * (LOGS[1] - LOGS[0])
