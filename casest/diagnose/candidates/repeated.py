@@ -23,15 +23,17 @@ from casest.diagnose.levels import LEVELS
 @dataclass(frozen=True)
 class Signal:
     """What is computed from a signal: an orthonormal basis (N, p) of its elements, their products
-    and its length; `noise` are the elements (N, q) of a reading that the inputs do not tell."""
+    and its length; `noise` are the elements (N, q) of a reading that the inputs do not tell. Is it
+    an `input`: does nothing that is recorded beside it drive it?"""
 
     name: str
     basis: Array = field(repr=False)
     noise: Array | None = field(default=None, repr=False)
+    input: bool = False
 
     def apart(self, x: Array) -> float:
         """Share of a column's squares (N,) that is not computed from it; inf where more is left
-        than its rounding, or of few rows a part that counts.
+        than its rounding, or of few rows of an input a part that counts.
 
         Of a reading that the inputs do not tell, all may be what the column does to it: there the
         column must have its noise as well.
@@ -40,7 +42,8 @@ class Signal:
         unit = _scaled(x)
         left = (1 - float(np.sum((self.basis.T @ unit) ** 2))) * N / (N - p)
         own = self.noise is None or any(_one_noise(x, y) for y in self.noise.T)
-        most = LEVELS.stand_in if LEVELS.series > N else LEVELS.repeated**2 + _rounding(unit)
+        few = self.input and LEVELS.series > N
+        most = LEVELS.stand_in if few else LEVELS.repeated**2 + _rounding(unit)
         return left if own and left < most else np.inf
 
 
@@ -67,11 +70,17 @@ def reads_of(model: Model, runs: Sequence[Run]) -> Reads:
     """What a column of these runs (prepared) may be once more."""
     declared = {s.name for s in model.declared if s.name != "t"}
     measured = declared & {*model.traced.readings} if model.traced.predicted is not None else set()
-    return signals_of(declared - measured, measured, runs)
+    inputs = declared - measured if measured else set()  # of an implicit model nobody knows which
+    return signals_of(declared - measured, measured, runs, inputs)
 
 
-def signals_of(inputs: Collection[str], readings: Collection[str], runs: Sequence[Run]) -> Reads:
-    """The same of these signals, as far as the runs have them."""
+def signals_of(
+    inputs: Collection[str],
+    readings: Collection[str],
+    runs: Sequence[Run],
+    only: Collection[str] = (),
+) -> Reads:
+    """The same of these signals, as far as the runs have them; `only`: inputs and nothing else."""
     rows = slice(None, None, -(-sum(map(len, runs)) // LEVELS.rows) or 1)
     each = {}
     for name in sorted({*inputs, *readings}):
@@ -84,7 +93,7 @@ def signals_of(inputs: Collection[str], readings: Collection[str], runs: Sequenc
         basis = _computed(x)
         if basis is not None:
             noise = x if name in readings and not _told(x, driving) else None
-            found.append(Signal(name, basis, noise))
+            found.append(Signal(name, basis, noise, name in only))
     return Reads(tuple(found), rows)
 
 
