@@ -61,7 +61,7 @@ class Reads:
         name = min(near, key=lambda n: near[n], default="")
         if not name or not np.isfinite(near[name]):
             return ""
-        if near[name] < LEVELS.repeated:
+        if len(x) >= LEVELS.series or near[name] < LEVELS.repeated**2:
             return f"column is {name} once more, or computed from it"
         return f"column goes with {name}: in so few rows what follows it could be a bend over that"
 
@@ -70,17 +70,14 @@ def reads_of(model: Model, runs: Sequence[Run]) -> Reads:
     """What a column of these runs (prepared) may be once more."""
     declared = {s.name for s in model.declared if s.name != "t"}
     measured = declared & {*model.traced.readings} if model.traced.predicted is not None else set()
-    inputs = declared - measured if measured else set()  # of an implicit model nobody knows which
-    return signals_of(declared - measured, measured, runs, inputs)
+    return signals_of(declared - measured, measured, runs)
 
 
-def signals_of(
-    inputs: Collection[str],
-    readings: Collection[str],
-    runs: Sequence[Run],
-    only: Collection[str] = (),
-) -> Reads:
-    """The same of these signals, as far as the runs have them; `only`: inputs and nothing else."""
+def signals_of(inputs: Collection[str], readings: Collection[str], runs: Sequence[Run]) -> Reads:
+    """The same of these signals, as far as the runs have them.
+
+    Without `readings`, as of an implicit model, nobody knows which of them are inputs.
+    """
     rows = slice(None, None, -(-sum(map(len, runs)) // LEVELS.rows) or 1)
     each = {}
     for name in sorted({*inputs, *readings}):
@@ -93,7 +90,8 @@ def signals_of(
         basis = _computed(x)
         if basis is not None:
             noise = x if name in readings and not _told(x, driving) else None
-            found.append(Signal(name, basis, noise, name in only))
+            drives = bool(readings) and name not in readings
+            found.append(Signal(name, basis, noise, drives))
     return Reads(tuple(found), rows)
 
 
