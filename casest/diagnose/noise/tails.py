@@ -103,15 +103,14 @@ def scales(residuals: Sequence[Array]) -> Array:
 
     Where most are one value the reading stands still on one level: it has the noise of rounding.
     """
+    from casest.data.stillness import resolution
+
     every = np.concatenate(residuals)
     found = np.array([robust_scale([column]) for column in every.T])
     for k, column in enumerate(every.T):
-        near = 1e-9 * float(np.ptp(column))
-        values = np.sort(column)
-        gaps = np.diff(values)
-        still = np.mean(np.abs(column - np.median(column)) <= near)
-        if still > 0.5 and np.any(gaps > near):
-            found[k] = max(found[k], float(gaps[gaps > near].min()) / np.sqrt(12))
+        away = np.abs(column - np.median(column))
+        if np.mean(away <= 1e-9 * away.max()) > 0.5:
+            found[k] = max(found[k], resolution(column) / np.sqrt(12))
     return found
 
 
