@@ -52,7 +52,7 @@ def straight(rng: np.random.Generator, x: np.ndarray) -> np.ndarray:
 
 
 def bent(rng: np.random.Generator, x: np.ndarray) -> np.ndarray:
-    """A divider under load: its bend is 15 to 40 times the noise at most."""
+    """A divider under load: 25 to 62 times the noise beside a line, at most."""
     size = rng.uniform(0.15, 0.4)
     return straight(rng, x) / (1 + size * x / 10) * (1 + size)
 
@@ -64,12 +64,6 @@ def warmed(rng: np.random.Generator, x: np.ndarray) -> np.ndarray:
 def jumped(rng: np.random.Generator, x: np.ndarray) -> np.ndarray:
     """Two ranges that differ by six to twelve times the noise."""
     return straight(rng, x) + 0.01 * rng.uniform(6, 12) * (x > rng.uniform(3, 7))
-
-
-def cut(rng: np.random.Generator, x: np.ndarray) -> np.ndarray:
-    """A full scale that a tenth to four tenths of the rows reach."""
-    y = straight(rng, x)
-    return np.minimum(y, np.quantile(y, 1 - rng.uniform(0.1, 0.4)))
 
 
 def odd(rng: np.random.Generator, x: np.ndarray) -> np.ndarray:
@@ -92,33 +86,44 @@ def heavy(rng: np.random.Generator, x: np.ndarray) -> np.ndarray:
     return 0.01 * rng.standard_t(3, len(x)) / np.sqrt(3)
 
 
-#: Kind -> response, noise, step of the reading, causes that are right, verdicts that are.
+def shown(rng: np.random.Generator, y: np.ndarray) -> np.ndarray:
+    return y
+
+
+def rounded(rng: np.random.Generator, y: np.ndarray) -> np.ndarray:
+    return np.round(y / 0.02) * 0.02
+
+
+def cut(rng: np.random.Generator, y: np.ndarray) -> np.ndarray:
+    """A full scale that a tenth to four tenths of the rows reach."""
+    return np.minimum(y, np.quantile(y, 1 - rng.uniform(0.1, 0.4)))
+
+
+#: Kind -> response, noise, what the reading shows of both, causes and verdicts that are right.
 NOTHING, ANY = ("adequate", "unexplained"), ("extended", "unexplained")
-Kind = tuple[Callable[..., Any], Callable[..., Any], float, set[str], tuple[str, ...]]
+Kind = tuple[Callable[..., Any], Callable[..., Any], Callable[..., Any], set[str], tuple[str, ...]]
 KINDS: dict[str, Kind] = {
-    "nothing, white noise": (straight, white, 0.0, set(), ("adequate",)),
-    "nothing, noise that grows": (straight, growing, 0.0, set(), ("adequate",)),
-    "nothing, Student's t noise (3)": (straight, heavy, 0.0, set(), ("adequate",)),
-    "nothing, steps of two sigma": (straight, white, 0.02, set(), ("adequate",)),
-    "one odd row": (odd, white, 0.0, set(), NOTHING),
-    "a divider under load": (bent, white, 0.0, BENDS, ANY),
-    "a divider under load, noise that grows": (bent, growing, 0.0, BENDS, ANY),
-    "an exponential": (warmed, white, 0.0, BENDS, ANY),
-    "two ranges, a jump between them": (jumped, white, 0.0, set(), ("unexplained",)),
-    "a full scale": (cut, white, 0.0, {"saturation"}, ANY),
+    "nothing, white noise": (straight, white, shown, set(), ("adequate",)),
+    "nothing, noise that grows": (straight, growing, shown, set(), ("adequate",)),
+    "nothing, Student's t noise (3)": (straight, heavy, shown, set(), ("adequate",)),
+    "nothing, steps of two sigma": (straight, white, rounded, set(), ("adequate",)),
+    "one odd row": (odd, white, shown, set(), NOTHING),
+    "a divider under load": (bent, white, shown, BENDS, ANY),
+    "a divider under load, noise that grows": (bent, growing, shown, BENDS, ANY),
+    "an exponential": (warmed, white, shown, BENDS, ANY),
+    "two ranges, a jump between them": (jumped, white, shown, set(), ("unexplained",)),
+    "a full scale": (straight, white, cut, {"saturation"}, ANY),
 }  # fmt: skip
 
 
 def table_of(kind: str, seed: int) -> Table:
-    """Reference and reading (N,); references anywhere or in even steps, in any order."""
-    response, noise, step, *_ = KINDS[kind]
+    """Reference and reading (N,); references in even steps or anywhere, from low to high."""
+    response, noise, reading, *_ = KINDS[kind]
     rng = np.random.default_rng([list(KINDS).index(kind), seed])
     rows = int(rng.integers(ROWS[0], ROWS[1] + 1))
     x = np.linspace(0, 10, rows) if rng.random() < 0.7 else np.sort(rng.uniform(0, 10, rows))
     y = response(rng, x)
-    ends = kind == "a full scale"
-    y = np.where(y < y.max(), y + noise(rng, x), y) if ends else y + noise(rng, x)
-    return x, np.round(y / step) * step if step else np.minimum(y, y.max())
+    return x, reading(rng, y + noise(rng, x))
 
 
 def one_table(kind: str, seed: int) -> dict[str, Any]:
