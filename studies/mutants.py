@@ -209,10 +209,10 @@ MUTANTS = tuple(
         (SCORE, "weight = np.exp(0.5 * (scores - scores.max()))", "weight = np.ones_like(scores)"),
         (
             LIKELIHOOD,
-            "S = self.spectrum(left, 1 - taken)",
-            "S = self.spectrum(left, 1 + 0 * taken)",
+            "np.clip(1 - taken / self.sums.count, LEFT, 1)",
+            "np.ones_like(taken)",
         ),
-        (LIKELIHOOD, "np.sum(np.log(S) + left**2 / S)", "np.sum(left**2 / S)"),
+        (LIKELIHOOD, "self.sums.count * np.log(S) + power / S", "power / S"),
         (LIKELIHOOD, "kept = values > max(self.linear.least**2,", "kept = values > min(0.0,"),
         ("diagnose/misfit/structure.py", "(1 - ratio)", "(1 - 0.9 * ratio)"),
         ("diagnose/misfit/structure.py", "* len(z) * tried", "* tried"),

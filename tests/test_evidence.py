@@ -11,7 +11,7 @@ from scipy.integrate import quad
 from scipy.linalg import solve_triangular, toeplitz
 from scipy.signal import lfilter
 
-from casest.diagnose.evidence.likelihood import Likelihood
+from casest.diagnose.evidence.likelihood import Beyond, Likelihood
 from casest.diagnose.evidence.linear import Linear, parts_of
 from casest.diagnose.evidence.score import (
     Trial,
@@ -21,7 +21,6 @@ from casest.diagnose.evidence.score import (
     screened,
     shift,
     whatever_sizes,
-    whitened,
 )
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.noise.louder import louder
@@ -319,7 +318,7 @@ def test_a_cause_that_the_unknowns_can_do_is_not_judged():
     likelihood = Likelihood(linear_of(rng.standard_normal(200), X))
     none = likelihood.beside()
     assert judged([trial_of(X @ [1.0, 2.0, -1.0])], likelihood, none) is None
-    assert screened(trial_of(X[:, 0]), likelihood, whitened(likelihood, none)) == -np.inf
+    assert screened(Beyond(likelihood, trial_of(X[:, 0]).columns), likelihood, none) == -np.inf
     half = judged([trial_of(np.c_[X[:, 1], rng.standard_normal(200)])], likelihood, none)
     assert half.freedom == 1
 

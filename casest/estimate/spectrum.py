@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 
 from casest.declaration.shapes import Array
 
+Index = NDArray[np.int_]
+
 #: Bands of frequencies over which powers are put together before the curve is fitted.
 BANDS = 40
 #: Frequencies in the first band; within it the spectrum is taken as flat.
@@ -55,6 +57,17 @@ class Part(NamedTuple):
     jacobian: Array
 
 
+def band_edges(count: float, *, finer: int = 1) -> Index:
+    """Where bands of so many frequencies begin, evenly over their logarithm beyond the first one.
+
+    `finer`: into how many each is cut, and the first one into its frequencies.
+    """
+    bands = finer * (BANDS - 1) + 1
+    edges = np.unique(np.round(np.geomspace(FIRST, max(count, FIRST), bands)).astype(int))
+    first = np.arange(FIRST) if finer > 1 else np.arange(1)
+    return np.concatenate([first[first < count], edges[edges < count]])
+
+
 def by_frequency(stretch: Stretch, bread: Array) -> Iterator[Part]:
     """The cosine transform of each axis of a stretch; `bread` (n, n) is (JᵀJ)⁻¹ of the problem."""
     from scipy.fft import dct
@@ -71,20 +84,27 @@ def by_frequency(stretch: Stretch, bread: Array) -> Iterator[Part]:
 
 
 class Bands:
-    """Frequencies (N,) in cycles per sample, put together in bands once for all curves."""
+    """Frequencies (N,) in cycles per sample, put together in bands once for all curves.
 
-    def __init__(self, frequency: Array) -> None:
+    `many` (N,): how many frequencies each stands for, whose powers come in one sum.
+    """
+
+    def __init__(self, frequency: Array, many: Array | None = None) -> None:
         order = np.argsort(frequency, kind="stable")
         log = np.log(frequency[order])
+        many = np.ones(len(log)) if many is None else many[order]
         # Of one stretch they are in order: no copies then.
         self._order: Any = slice(None) if np.all(np.diff(frequency) >= 0) else order
-        edges = np.unique(np.round(np.geomspace(FIRST, max(len(log), FIRST), BANDS)).astype(int))
-        self._edges = np.concatenate([[0], edges[edges < len(log)]])
-        self._size = np.diff(np.append(self._edges, len(log)))
+        before = np.cumsum(many)
+        # A band begins where so many frequencies are before it.
+        edges = np.searchsorted(before, band_edges(before[-1])[1:]) + 1
+        self._edges = np.unique(np.concatenate([[0], edges[edges < len(log)]]))
+        self._size = np.add.reduceat(many, self._edges)
         self._log = np.log(frequency)
-        middle = np.add.reduceat(log, self._edges) / self._size
+        middle = np.add.reduceat(log * many, self._edges) / self._size
         # Flat to the first band's end: nothing holds a curve between its middle and there.
-        middle[0] = max(float(log[min(FIRST, len(log)) - 1]), middle[0])
+        first = int(np.searchsorted(before, min(FIRST, before[-1])))
+        middle[0] = max(float(log[first]), middle[0])
         self._middle = middle
         self._first = np.flatnonzero(self._log < middle[0])
         self._slow = self._log[self._first] - middle[0]
@@ -209,6 +229,6 @@ def _most_likely(shapes: Array, mean: Array, count: Array) -> Array:
             length[longer] /= 2
             after, share = at(b - length[:, None, None] * step)
         b, before, here = b - length[:, None, None] * step, here, after
-        if (before - here < 1e-6).all():
+        if (before - here < 1e-4).all():
             break
     return np.asarray(b[:, :, 0].T)

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from casest.declaration.shapes import Array
-from casest.diagnose.evidence.likelihood import Likelihood
+from casest.diagnose.evidence.likelihood import Beyond, Likelihood
 from casest.diagnose.evidence.score import Evidence
 from casest.diagnose.levels import LEVELS
 
@@ -30,15 +30,17 @@ def feigned(
     `draws`: the problem and the evidence's columns (N, m, k) with noise added to that input.
     """
     columns = np.concatenate(evidence.columns, axis=2)
-    left = likelihood.remainder(columns)
-    values = likelihood.orthonormal(left) @ evidence.explained.values[-evidence.freedom :]
+    here = Beyond(likelihood, columns)
+    left = likelihood.remains(here.flat)
+    values = here.mix @ evidence.explained.values[-evidence.freedom :]
     root = 1 / np.sqrt(evidence.explained.spectrum)
     size = np.linalg.norm(columns.reshape(len(root), -1), axis=0)
     explained = float(np.sum((root * (left @ values)) ** 2))
     together = []
     for noisy, moved in draws:
         own = np.linalg.norm(moved.reshape(len(root), -1), axis=0) / np.maximum(size, 1e-300)
-        change = root * ((noisy.remainder(moved) * own - left) @ values)
+        there = noisy.remains(Beyond(noisy, moved).flat)
+        change = root * ((there * own - left) @ values)
         more = (noisy.linear.residual - likelihood.linear.residual)[:, :, None]
         added = root * likelihood.by_frequency(more)[:, 0]
         together.append(float(change @ added))

@@ -11,17 +11,15 @@ white noise.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from casest.declaration.shapes import Array
 from casest.diagnose.evidence.linear import Index, Linear, alike, robust_sd
+from casest.diagnose.evidence.sums import Narrow
 from casest.diagnose.levels import LEVELS
-from casest.estimate.spectrum import Bands
 
 #: Rounds in which coefficients and spectrum follow each other: more change nothing.
 REWEIGHTED = 2
@@ -31,15 +29,76 @@ LEFT = 0.05
 
 @dataclass(frozen=True)
 class Explained:
-    """−2 log L beside some columns; the spectrum S and what is left (N·m,), by frequency.
+    """−2 log L beside some columns; the noise's `powers` (K,) in each narrow band and axis.
 
     `values`: of the orthonormal declared unknowns, then of the columns (p + k,).
     """
 
     cost: float
-    spectrum: Array
-    left: Array
+    powers: Array
     values: Array
+    likelihood: Likelihood = field(repr=False)
+    beyond: Beyond | None = field(default=None, repr=False)
+
+    @cached_property
+    def spectrum(self) -> Array:
+        """(N·m,), by frequency."""
+        return self.likelihood.sums.at_rows(self.powers)
+
+    @cached_property
+    def left(self) -> Array:
+        """Of the residual (N·m,), by frequency."""
+        return self.likelihood.residual - self._taken
+
+    @cached_property
+    def course(self) -> Array:
+        """What unknowns and columns explain, (N, m) in time."""
+        return self.likelihood.in_time(self._taken[:, None])[:, :, 0]
+
+    @property
+    def _taken(self) -> Array:
+        p = self.likelihood.declared.shape[1]
+        taken = self.likelihood.declared @ self.values[:p]
+        return taken if self.beyond is None else taken + self.beyond.basis @ self.values[p:]
+
+
+class Beyond:
+    """What columns (N, m, q) do that the unknowns cannot: `mix` (q, k) is of the columns, each of
+    length one, and what remains of them is orthonormal."""
+
+    def __init__(self, likelihood: Likelihood, columns: Array) -> None:
+        flat = columns.reshape(likelihood.residual.size, -1)
+        size = np.maximum(np.linalg.norm(flat, axis=0), 1e-300)
+        self.flat = likelihood.by_frequency((flat / size).reshape(columns.shape))
+        self._likelihood = likelihood
+        self.on = likelihood.declared.T @ self.flat
+        self.mix = likelihood.orthonormal(self.flat.T @ self.flat - self.on.T @ self.on)
+
+    @property
+    def freedom(self) -> int:
+        """How many of them are told apart from the unknowns, and from each other."""
+        return int(self.mix.shape[1])
+
+    @cached_property
+    def basis(self) -> Array:
+        """Orthonormal columns (N·m, k) by frequency."""
+        return self._likelihood.remains(self.flat) @ self.mix
+
+    @cached_property
+    def among(self) -> tuple[Array, Array]:
+        """Sums over narrow bands of products of the unknowns (K, p, q), and of the columns
+        (K, q, q), with the columns."""
+        own = self._likelihood
+        p, both = own.declared.shape[1], np.concatenate([own.declared, self.flat], axis=1)
+        found = own.sums.of(both, self.flat)
+        return found[:, :p], found[:, p:]
+
+    @cached_property
+    def frame(self) -> Array:
+        """The unknowns and the orthonormal columns (p + q, p + k) as combinations of the unknowns
+        and the columns."""
+        p, q = self.on.shape
+        return np.block([[np.eye(p), -self.on @ self.mix], [np.zeros((q, p)), self.mix]])
 
 
 class Likelihood:
@@ -54,15 +113,34 @@ class Likelihood:
         self.shape = linear.residual.shape
         self.cut = far_out(linear.residual) if cut is None and linear.series else cut
 
+    def cutting(self, cut: Array) -> Likelihood:
+        """The same problem where something else is cut."""
+        other = Likelihood(self.linear, cut)
+        for name in ("sums", "declared", "_declared_sums"):
+            other.__dict__[name] = getattr(self, name)
+        return other
+
     @cached_property
-    def _bands(self) -> Bands:
-        frequency = np.empty(self.shape[0])
+    def sums(self) -> Narrow:
+        """Over narrow bands of frequencies; where noise is white all rows are one band."""
+        frequency = np.ones(self.shape[0])
         for span in self.linear.spans:
             n = span.stop - span.start
             frequency[span] = (np.arange(n) + 0.5) / (2 * n)
-        means = self._means
-        frequency[means] = (np.arange(len(means)) + 0.5) / (2 * self.shape[0])
-        return Bands(frequency)
+        if self.linear.coloured:
+            means = self._means
+            frequency[means] = (np.arange(len(means)) + 0.5) / (2 * self.shape[0])
+        return Narrow(frequency, self.shape[1], flat=not self.linear.coloured)
+
+    @cached_property
+    def _declared_sums(self) -> Array:
+        """Of products of the unknowns with each other (K, p, p)."""
+        return self.sums.of(self.declared, self.declared)
+
+    @cached_property
+    def _residual_sums(self) -> tuple[Array, Array]:
+        """Of products of the unknowns (K, p), and of the residual (K,), with the residual."""
+        return self.sums.along(self.declared, self.residual), self.sums.summed(self.residual**2)
 
     @cached_property
     def _means(self) -> Index:
@@ -112,57 +190,66 @@ class Likelihood:
             found[span] = idct(columns[span], axis=0, norm="ortho")
         return found
 
-    def beyond(self, columns: Array) -> Array:
-        """Orthonormal (N·m, k) of what columns (N, m, q) do that the unknowns cannot."""
-        left = self.remainder(columns)
-        return np.asarray(left @ self.orthonormal(left))
+    def spectrum(self, left: Array, free: Array) -> Array:
+        """Of every axis (N·m,), from what is left and the share that the fit leaves free."""
+        power, free = self.sums.summed(left**2), self.sums.summed(np.clip(free, LEFT, 1))
+        return self.sums.at_rows(self.sums.spectrum(power, free))
 
-    def remainder(self, columns: Array) -> Array:
-        """(N·m, q): columns (N, m, q), each of length one, without what the unknowns can do."""
-        flat = columns.reshape(self.residual.size, -1)
-        size = np.maximum(np.linalg.norm(flat, axis=0), 1e-300)
-        flat = self.by_frequency((flat / size).reshape(*self.shape, -1))
+    def remains(self, flat: Array) -> Array:
+        """Columns (N·m, q) by frequency without what the unknowns can do."""
         Q = self.declared
         left = flat - Q @ (Q.T @ flat)
         left -= Q @ (Q.T @ left)
         return np.asarray(left)
 
-    def orthonormal(self, left: Array) -> Array:
-        """(q, k): combinations of such remainders that are orthonormal, where enough is left."""
-        values, vectors = np.linalg.eigh(left.T @ left)
+    def orthonormal(self, products: Array) -> Array:
+        """(q, k): combinations that are orthonormal of what remains of columns, of products (q, q)
+        with each other, where enough does."""
+        values, vectors = np.linalg.eigh(products)
         kept = values > max(self.linear.least**2, 1e-8 * values.max(initial=0.0))
         return np.asarray(vectors[:, kept] / np.sqrt(values[kept]))
 
     def beside(
-        self, columns: Sequence[Array] = (), start: Array | None = None, rounds: int = REWEIGHTED
+        self,
+        beyond: Beyond | None = None,
+        start: Explained | None = None,
+        rounds: int = REWEIGHTED,
     ) -> Explained:
-        """The residual beside the unknowns and orthonormal columns (N·m, k) each."""
-        X = np.concatenate([self.declared, *columns], axis=1)
-        R, S = self.residual, start
-        if S is None:
-            S, rounds = np.ones_like(R), rounds + 1
+        """The residual beside the unknowns and columns."""
         if not self.linear.coloured:
-            values = X.T @ R if not columns else np.linalg.lstsq(X, R, rcond=None)[0]
-            left = R - X @ values
-            power = max(float(left @ left) / len(R), 1e-300)
-            return Explained(len(R) * np.log(power), np.full_like(R, power), left, values)
-        for _ in range(rounds):
-            root = 1 / np.sqrt(S)
-            Xw = X * root[:, None]
-            values, taken = _solved(Xw, R * root)
-            left = R - X @ values
-            S = self.spectrum(left, 1 - taken)
-        return Explained(float(np.sum(np.log(S) + left**2 / S)), S, left, values)
+            return self._in_white_noise(beyond)
+        S = np.ones(len(self.sums.count)) if start is None else start.powers
+        products = _Products(self, beyond)
+        for _ in range(rounds + (start is None)):
+            values, power, taken = products.solved(1 / S)
+            free = np.clip(1 - taken / self.sums.count, LEFT, 1) * self.sums.count
+            S = self.sums.spectrum(power, free)
+        cost = float(np.sum(self.sums.count * np.log(S) + power / S))
+        return Explained(cost, S, values, self, beyond)
 
-    def spectrum(self, left: Array, free: Array) -> Array:
-        """Of every axis, from what is left and the share that the fit leaves free."""
-        power, free = (left**2).reshape(self.shape), np.clip(free, LEFT, 1).reshape(self.shape)
-        return self._bands.curves(power, free).ravel()
+    def _in_white_noise(self, beyond: Beyond | None) -> Explained:
+        R, X = self.residual, self.declared
+        if beyond is not None:
+            X = np.concatenate([X, beyond.basis], axis=1)
+        values = np.asarray(X.T @ R if beyond is None else np.linalg.lstsq(X, R, rcond=None)[0])
+        left = R - X @ values
+        power = max(float(left @ left) / len(R), 1e-300)
+        powers = np.full(self.shape[1], power)
+        return Explained(len(R) * np.log(power), powers, values, self, beyond)
 
-    def course(self, explained: Explained, columns: Sequence[Array]) -> Array:
-        """What unknowns and columns explain, (N, m) in time."""
-        X = np.concatenate([self.declared, *columns], axis=1)
-        return self.in_time((X @ explained.values)[:, None])[:, :, 0]
+    def partly(self, beyond: Beyond, noise: Explained) -> tuple[Array, Array, Array, float]:
+        """Whitened by a noise, beside the unknowns: products of the columns with each other (q, q),
+        before and after, and with the residual (q,); the residual's square."""
+        w, (QG, GG), (QR, RR) = 1 / noise.powers, beyond.among, self._residual_sums
+        A, B, G = (_weighted(w, products) for products in (self._declared_sums, QG, GG))
+        a, b, square = w @ QR, w @ self._with_residual(beyond), float(w @ RR)
+        on = np.linalg.solve(A, np.column_stack([B, a]))
+        C, c = on[:, :-1], on[:, -1]
+        return G, G - B.T @ C, b - B.T @ c, square - float(a @ c)
+
+    def _with_residual(self, beyond: Beyond) -> Array:
+        """Sums of products of columns with the residual (K, q)."""
+        return self.sums.along(beyond.flat, self.residual)
 
 
 def far_out(residual: Array) -> Array:
@@ -198,10 +285,50 @@ def rises(
     return [none - cost(fit) for fit in fits]
 
 
-def _solved(X: Array, y: Array) -> tuple[Array, NDArray[Any]]:
-    """Least squares, and the leverage of each row."""
-    A = X.T @ X
-    size = np.sqrt(np.maximum(np.diag(A), 1e-300))
-    inverse = np.linalg.inv(A / np.outer(size, size) + 1e-12 * np.eye(len(A)))
-    inverse /= np.outer(size, size)
-    return inverse @ (X.T @ y), np.einsum("ij,ij->i", X @ inverse, X)
+def _weighted(w: Array, products: Array) -> Array:
+    """Their sum over bands (a, b), each with a weight (K,)."""
+    return np.asarray(np.tensordot(w, products, 1))
+
+
+class _Products:
+    """Of unknowns, columns and residual with each other, over narrow bands."""
+
+    def __init__(self, likelihood: Likelihood, beyond: Beyond | None) -> None:
+        self._QQ = likelihood._declared_sums
+        self._QR, self._RR = likelihood._residual_sums
+        self._p = self._QQ.shape[1]
+        self._frame = np.eye(self._p)
+        self._more: tuple[Array, Array, Array] | None = None
+        if beyond is not None:
+            self._frame = beyond.frame
+            self._more = (*beyond.among, likelihood._with_residual(beyond))
+
+    def solved(self, w: Array) -> tuple[Array, Array, Array]:
+        """Least squares with a weight of each band: the values (p + k,); of each band the power
+        that is left, and how many of its rows the fit takes."""
+        A, b = _weighted(w, self._QQ), w @ self._QR
+        if self._more is not None:
+            QG, GG, GR = self._more
+            C = _weighted(w, QG)
+            A = np.block([[A, C], [C.T, _weighted(w, GG)]])
+            b = np.concatenate([b, w @ GR])
+        F = self._frame
+        A, b = F.T @ A @ F, F.T @ b
+        size = np.sqrt(np.maximum(np.diag(A), 1e-300))
+        inverse = np.linalg.inv(A / np.outer(size, size) + 1e-12 * np.eye(len(A)))
+        inverse /= np.outer(size, size)
+        values = inverse @ b
+        v = F @ values
+        power = self._RR + self._summed(np.outer(v, v)) - 2 * self._QR @ v[: self._p]
+        if self._more is not None:
+            power -= 2 * self._more[2] @ v[self._p :]
+        return values, np.maximum(power, 0.0), w * self._summed(F @ inverse @ F.T)
+
+    def _summed(self, among: Array) -> Array:
+        """Of each band (K,), products times a symmetric matrix (p + q, p + q), all together."""
+        p = self._p
+        found = np.tensordot(self._QQ, among[:p, :p], 2)
+        if self._more is not None:
+            QG, GG, _ = self._more
+            found += 2 * np.tensordot(QG, among[:p, p:], 2) + np.tensordot(GG, among[p:, p:], 2)
+        return np.asarray(found)

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from casest.declaration.shapes import Array
-from casest.diagnose.evidence.likelihood import Explained, Likelihood
+from casest.diagnose.evidence.likelihood import Beyond, Explained, Likelihood
 from casest.diagnose.evidence.linear import Index, Linear
 
 
@@ -43,12 +43,11 @@ class Trial:
 class Evidence:
     """A trial (several, if they come together) with what it is worth.
 
-    gain: 2 log L over none, less what is feigned; freedom: unknowns; score: gain less the price;
-    `basis` orthonormal columns (N·m, k) by frequency.
+    gain: 2 log L over none, less what is feigned; freedom: unknowns; score: gain less the price.
     """
 
     trials: tuple[Trial, ...]
-    basis: Array = field(repr=False)
+    beyond: Beyond = field(repr=False)
     explained: Explained = field(repr=False)
     gain: float = 0.0
     freedom: int = 0
@@ -69,6 +68,11 @@ class Evidence:
     def columns(self) -> list[Array]:
         """(N, m, k) of each trial."""
         return [t.columns for t in self.trials]
+
+    @property
+    def basis(self) -> Array:
+        """Orthonormal (N·m, k) by frequency, of what they do that the unknowns cannot."""
+        return self.beyond.basis
 
 
 def worth(gain: float, freedom: int, searched: float, likelihood: Likelihood) -> float:
@@ -132,36 +136,14 @@ def _by_each_row(linear: Linear, C: Array) -> Array:
     return np.asarray(np.einsum("nmq,nm->nq", C.reshape(rows, axes, -1), away[:, :, 0]))
 
 
-def screened(trial: Trial, likelihood: Likelihood, white: tuple[Array, Array, Array]) -> float:
-    """The gain of a trial under the noise beside none, less its price.
-
-    Cheap, to choose among variants. `white`: 1/√S of none, orthonormal whitened unknowns and the
-    whitened residual beyond them.
-    """
-    root, Q, r = white
-    flat = trial.columns.reshape(len(root), -1)
-    size = np.linalg.norm(flat, axis=0)
-    if not np.any(size > 0):
-        return -np.inf
-    G = (flat[:, size > 0] / size[size > 0]).reshape(*likelihood.shape, -1)
-    G = likelihood.by_frequency(G) * root[:, None]
-    before = (G**2).sum(axis=0)
-    G = G - Q @ (Q.T @ G)
-    alive = (G**2).sum(axis=0) > likelihood.linear.least**2 * before
+def screened(beyond: Beyond, likelihood: Likelihood, none: Explained) -> float:
+    """The gain of columns under the noise beside none, less its price: to choose among variants."""
+    before, H, g, square = likelihood.partly(beyond, none)
+    alive = np.diag(H) > likelihood.linear.least**2 * np.diag(before)
     if not alive.any():
         return -np.inf
-    gain, freedom = _gain(G[:, alive].T @ G[:, alive], G[:, alive].T @ r)
-    return worth(_in_logs(gain, r, likelihood), freedom, 0.0, likelihood)
-
-
-def whitened(likelihood: Likelihood, none: Explained) -> tuple[Array, Array, Array]:
-    """What `screened` needs of the fit as it is."""
-    root = 1 / np.sqrt(none.spectrum)
-    Q = likelihood.declared * root[:, None]
-    if Q.shape[1]:
-        Q = np.linalg.solve(np.linalg.cholesky(Q.T @ Q), Q.T).T
-    r = likelihood.residual * root
-    return root, Q, r - Q @ (Q.T @ r)
+    gain, freedom = _gain(H[np.ix_(alive, alive)], g[alive])
+    return worth(_in_logs(gain, square, likelihood), freedom, 0.0, likelihood)
 
 
 def _gain(H: Array, g: Array) -> tuple[float, int]:
@@ -172,14 +154,14 @@ def _gain(H: Array, g: Array) -> tuple[float, int]:
     return float(np.sum((vectors[:, good].T @ (g / size)) ** 2 / values[good])), int(good.sum())
 
 
-def _in_logs(gain: float, residual: Array, likelihood: Likelihood) -> float:
-    """2 log L over none, of what is taken from the squares of a whitened residual.
+def _in_logs(gain: float, square: float, likelihood: Likelihood) -> float:
+    """2 log L over none, of what is taken from the square of a whitened residual.
 
     Where the noise is white its variance falls with them; beside a colour the spectrum is held.
     """
     if likelihood.linear.coloured:
         return gain
-    left = 1 - gain / max(float(residual @ residual), 1e-300)
+    left = 1 - gain / max(square, 1e-300)
     return -len(likelihood.residual) * float(np.log(max(left, 1e-15)))
 
 
@@ -191,12 +173,17 @@ def judged(
     start: Explained | None = None,
     families: int = 1,
     rounds: int = 2,
+    beyond: Beyond | None = None,
 ) -> Evidence | None:
-    """Trials together, beside a noise of their own; None where the unknowns do all that they do."""
-    basis = likelihood.beyond(np.concatenate([t.columns for t in trials], axis=2))
-    if not basis.shape[1] or not _leaves_enough(basis.shape[1], likelihood):
+    """Trials together, beside a noise of their own; None where the unknowns do all that they do.
+
+    `beyond`: of their columns, where that is known.
+    """
+    if beyond is None:
+        beyond = Beyond(likelihood, np.concatenate([t.columns for t in trials], axis=2))
+    if not beyond.freedom or not _leaves_enough(beyond.freedom, likelihood):
         return None
-    before = Evidence(tuple(trials), basis, start or none)
+    before = Evidence(tuple(trials), beyond, start or none)
     return again(before, likelihood, none, families, rounds)
 
 
@@ -204,8 +191,8 @@ def again(
     evidence: Evidence, likelihood: Likelihood, none: Explained, families: int, rounds: int = 2
 ) -> Evidence:
     """The same where the likelihood has changed."""
-    found = likelihood.beside([evidence.basis], evidence.explained.spectrum, rounds)
-    gain, freedom = none.cost - found.cost - evidence.feigned, evidence.basis.shape[1]
+    found = likelihood.beside(evidence.beyond, evidence.explained, rounds)
+    gain, freedom = none.cost - found.cost - evidence.feigned, evidence.beyond.freedom
     searched = _searched(evidence.trials, families)
     score = worth(gain, freedom, searched, likelihood)
     return replace(evidence, explained=found, gain=gain, freedom=freedom, score=score,
@@ -251,13 +238,8 @@ def on_fewer_axes(evidence: Evidence, likelihood: Likelihood) -> list[int] | Non
     names = np.unique(trial.axes)
     if len(names) < 2:
         return None
-    root, Q, r = whitened(likelihood, evidence.explained)
-    size = np.linalg.norm(trial.columns.reshape(-1, trial.columns.shape[2]), axis=0)
-    G = likelihood.by_frequency(trial.columns / np.maximum(size, 1e-300)) * root[:, None]
-    before = (G**2).sum(axis=0)
-    G = G - Q @ (Q.T @ G)
-    alive = (G**2).sum(axis=0) > likelihood.linear.least**2 * before
-    H, g = G.T @ G, G.T @ r
+    before, H, g, square = likelihood.partly(evidence.beyond, evidence.explained)
+    alive = np.diag(H) > likelihood.linear.least**2 * np.diag(before)
     best: tuple[float, list[int] | None] = (-np.inf, None)
     for count in range(1, len(names) + 1):
         ways = list(combinations(names, count))
@@ -267,7 +249,7 @@ def on_fewer_axes(evidence: Evidence, likelihood: Likelihood) -> list[int] | Non
             gain, freedom = _gain(H[np.ix_(own, own)], g[own]) if alive[own].all() else (0.0, 0)
             if freedom < len(own):
                 continue  # what the unknowns, or other axes, can do has no size of its own
-            score = worth(_in_logs(gain, r, likelihood), freedom, searched, likelihood)
+            score = worth(_in_logs(gain, square, likelihood), freedom, searched, likelihood)
             if score > best[0] + 1e-9:
                 best = (score, [int(k) for k in kept])
     return None if best[1] is None or len(best[1]) == len(names) else best[1]

@@ -21,7 +21,7 @@ from casest.declaration.symbols import Signal
 from casest.declaration.tracing import flat
 from casest.diagnose.candidates.candidates import Candidate, usable_columns
 from casest.diagnose.evidence.likelihood import Explained, Likelihood
-from casest.diagnose.evidence.score import Evidence, Trial, judged, on_fewer_axes, whitened
+from casest.diagnose.evidence.score import Evidence, Trial, judged, on_fewer_axes
 from casest.diagnose.formula.terms import Shape, Term, Variable, formula_effect, library
 from casest.diagnose.levels import LEVELS
 from casest.engine import Columns, Replay
@@ -74,7 +74,10 @@ def _pursued(
     read: Read, shapes: Sequence[Shape], likelihood: Likelihood, none: Explained
 ) -> list[Shape]:
     """Shapes in the order in which they explain most, each on all axes (orthogonal pursuit)."""
-    root, Q, r = whitened(likelihood, none)
+    root = 1 / np.sqrt(none.spectrum)
+    Q = np.linalg.qr(likelihood.declared * root[:, None])[0]
+    r = likelihood.residual * root
+    r -= Q @ (Q.T @ r)
     Z = []
     for shape in shapes:
         flat = read.columns(shape)

@@ -10,7 +10,7 @@ import numpy as np
 
 from casest.declaration.shapes import Array
 from casest.diagnose.evidence.input_noise import feigned
-from casest.diagnose.evidence.likelihood import Likelihood, far_out
+from casest.diagnose.evidence.likelihood import Beyond, Likelihood, far_out
 from casest.diagnose.evidence.linear import Linear
 from casest.diagnose.evidence.score import (
     Evidence,
@@ -20,7 +20,6 @@ from casest.diagnose.evidence.score import (
     less,
     on_fewer_axes,
     screened,
-    whitened,
 )
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.protocol.state import F, Ranking
@@ -29,16 +28,20 @@ from casest.diagnose.protocol.subject import Subject
 
 def ranked(subject: Subject[F], fit: F) -> Ranking:
     """Every cause beside a fit: the best variants of each family, each with a noise of its own."""
-    ranking = ranked_of(subject.linear(fit), once(subject, fit))
+    return refined(subject, fit, ranked_of(subject.linear(fit), once(subject, fit)))
+
+
+def refined(subject: Subject[F], fit: F, ranking: Ranking) -> Ranking:
+    """Each on the axes that it needs, near its best values, less what noise of inputs feigns."""
     whole = {e.trials[0].family: e for e in ranking.found}
     found = tuple(on_its_axes(subject, fit, e, ranking) for e in ranking.found)
     found = without_feigned(subject, fit, ranking.likelihood, found, ranking.families)
-    ranking = _about_the_best(replace(ranking, found=_best_first(found)))
+    ranking = _about_the_best(replace(ranking, found=best_first(found)))
     near = [e for e in ranking.causes[: LEVELS.contenders] if e.score > -LEVELS.clear]
     finer = {e.trials[0].family: _finer(subject, fit, ranking, e, whole) for e in near}
     found = tuple(finer.get(e.trials[0].family, e) for e in ranking.found)
     found = without_feigned(subject, fit, ranking.likelihood, found, ranking.families)
-    return replace(ranking, found=_best_first(found))
+    return replace(ranking, found=best_first(found))
 
 
 def once(subject: Subject[F], fit: F) -> list[Trial]:
@@ -105,19 +108,24 @@ def ranked_of(linear: Linear, trials: Sequence[Trial]) -> Ranking:
     likelihood = Likelihood(linear)
     none = likelihood.beside()
     families = max(len({t.family for t in trials}), 1)
-    white = whitened(likelihood, none)
-    best: dict[str, tuple[float, Trial]] = {}
+    best: dict[str, tuple[float, Trial, Beyond]] = {}
     for trial in trials:
-        promise = screened(trial, likelihood, white)
-        if promise > best.get(trial.family, (-np.inf, trial))[0]:
-            best[trial.family] = (promise, trial)
-    found = [judged([trial], likelihood, none, families=families) for _, trial in best.values()]
-    several = _best_first([e for e in found if e is not None])
+        beyond = Beyond(likelihood, trial.columns)
+        promise = screened(beyond, likelihood, none)
+        if trial.family not in best or promise > best[trial.family][0]:
+            best[trial.family] = (promise, trial, beyond)
+    found = [
+        judged([trial], likelihood, none, families=families, beyond=beyond)
+        for promise, trial, beyond in best.values()
+        if promise > -np.inf
+    ]
+    several = best_first([e for e in found if e is not None])
     order = {family: k for k, family in enumerate(dict.fromkeys(t.family for t in trials))}
     return Ranking(linear, likelihood, none, several, families, order)
 
 
-def _best_first(found: Sequence[Evidence]) -> tuple[Evidence, ...]:
+def best_first(found: Sequence[Evidence]) -> tuple[Evidence, ...]:
+    """By score."""
     return tuple(sorted(found, key=lambda e: -e.score))
 
 
@@ -140,11 +148,10 @@ def _about_the_best(ranking: Ranking) -> Ranking:
     best, families = ranking.found[0], ranking.families
     if best.score < 0:
         return ranking
-    course = ranking.likelihood.course(best.explained, [best.basis])
-    likelihood = Likelihood(ranking.linear, far_out(ranking.linear.residual - course))
-    likelihood.__dict__["declared"] = ranking.likelihood.declared
-    none = likelihood.beside(start=ranking.none.spectrum)
-    found = _best_first([again(e, likelihood, none, families, 1) for e in ranking.found])
+    cut = far_out(ranking.linear.residual - best.explained.course)
+    likelihood = ranking.likelihood.cutting(cut)
+    none = likelihood.beside(start=ranking.none)
+    found = best_first([again(e, likelihood, none, families, 1) for e in ranking.found])
     return replace(ranking, likelihood=likelihood, none=none, found=found)
 
 

@@ -7,9 +7,9 @@ from dataclasses import replace
 from casest.declaration.shapes import Array
 from casest.diagnose.evidence.held_out import Fall, fall_between_causes, foretold
 from casest.diagnose.evidence.linear import alike
-from casest.diagnose.evidence.score import Evidence
+from casest.diagnose.evidence.score import Evidence, judged
 from casest.diagnose.levels import LEVELS
-from casest.diagnose.protocol.ranking import on_its_axes, once, ranked_of
+from casest.diagnose.protocol.ranking import best_first, on_its_axes, once, ranked_of
 from casest.diagnose.protocol.state import F, Kept, Ranking, Rival, State
 from casest.diagnose.protocol.subject import Subject
 
@@ -25,39 +25,41 @@ def with_rivals(subject: Subject[F], state: State[F]) -> State[F]:
 
 def _rivals(subject: Subject[F], state: State[F], kept: Kept) -> tuple[State[F], list[Rival]]:
     """By evidence, or by held-out stretches (Vuong 1989): a score alone does not say so."""
-    apart, base = subject.apart(state.fit, kept), subject.without(state.fit, kept.what)
-    if apart is None or base is None:
+    apart, there = subject.apart(state.fit, kept), _without(subject, state, kept)
+    if apart is None or there is None:
         return state, []
-    linear, own, others = subject.linear(base), apart[1], once(subject, base)
-    if own.columns.shape[:2] != linear.residual.shape:  # rows that moved in time are others
-        (own, *_) = [t for t in others if t.family == own.family]
-    # Slopes and grids are those of the fit without it: in its own, others follow it.
-    ranking = ranked_of(linear, [own, *(t for t in others if t.family != own.family)])
-    mine = [e for e in ranking.found if e.trials[0] is own]
-    if not mine:
+    base, ranking = there
+    linear, own = ranking.linear, apart[1]
+    others = [e for e in ranking.found if e.trials[0].family != own.family]
+    if own.columns.shape[:2] == linear.residual.shape:
+        mine = judged([own], ranking.likelihood, ranking.none, families=ranking.families)
+    else:  # rows that moved in time are others
+        mine = next((e for e in ranking.found if e.trials[0].family == own.family), None)
+    if mine is None:
         return state, []
+    ranking = replace(ranking, found=best_first([mine, *others]))
     stretches = linear.parts.stretches
-    without, best = (foretold(linear, c, stretches) for c in ([], [_in_time(ranking, mine[0])]))
+    without, best = (foretold(linear, c, stretches) for c in ([], [_in_time(ranking, mine)]))
     fall = fall_between_causes(linear, without, best)
     nothing = fall.left + fall.gained  # squares without any of them
     rivals = list[Evidence]()
     for e in ranking.causes:
-        if e is mine[0] or len(rivals) == 2 * LEVELS.contenders:
+        if e is mine or len(rivals) == 2 * LEVELS.contenders:
             continue
         if not linear.series:  # each unknown costs: what was added is on its axes as well
             e = on_its_axes(subject, base, e, ranking)
         # A score is a promise: noise that was matched to what explains more may hide its worth.
         strong = e.score >= LEVELS.strong if linear.series else ranking.says(e)
-        if not strong and e.gain < mine[0].gain:
+        if not strong and e.gain < mine.gain:
             continue
         its = foretold(linear, [_in_time(ranking, e)], stretches)
         lost = fall_between_causes(linear, its, best)
-        if _as_well(mine[0].score - e.score, lost, nothing):
+        if _as_well(mine.score - e.score, lost, nothing):
             rivals.append(e)
     after = subject.linear(state.fit)
     found = list[Rival]()
     for e in rivals:  # what the columns promise, a refit must keep
-        before = mine[0].score - mine[0].gain - (e.score - e.gain)
+        before = mine.score - mine.gain - (e.score - e.gain)
         place = _in_its_place(subject, state, kept, base, e, before)
         if isinstance(place, str):
             state = state.failing(e, f"in the place of {own.family} {place}")
@@ -71,6 +73,17 @@ def _rivals(subject: Subject[F], state: State[F], kept: Kept) -> tuple[State[F],
         if _as_well(behind, again, nothing):
             found.append(Rival(e.trials[0].what, fit))
     return state, found
+
+
+def _without(subject: Subject[F], state: State[F], kept: Kept) -> tuple[F, Ranking] | None:
+    """The fit without a cause, and all causes beside it: slopes and grids are those of that fit,
+    in its own others follow it."""
+    others = tuple(k.what for k in state.kept if k is not kept)
+    for seen in state.rounds:
+        if seen.causes == others:
+            return seen.fit, seen.ranking
+    base = subject.without(state.fit, kept.what)
+    return None if base is None else (base, ranked_of(subject.linear(base), once(subject, base)))
 
 
 def _in_its_place(

@@ -9,8 +9,8 @@ from casest.diagnose.evidence.score import Evidence
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.protocol.choosing import with_the_best
 from casest.diagnose.protocol.elimination import eliminated, on_all_axes
-from casest.diagnose.protocol.ranking import ranked
-from casest.diagnose.protocol.state import F, Ranking, State
+from casest.diagnose.protocol.ranking import once, ranked, ranked_of, refined
+from casest.diagnose.protocol.state import F, Ranking, Round, State
 from casest.diagnose.protocol.subject import Subject
 
 
@@ -21,12 +21,15 @@ def search(
     begun: State[F] | None = None,
 ) -> State[F]:
     """Add what is missing, one cause or a pair at a time, until nothing is confirmed any more."""
-    state = State(fit) if begun is None else replace(begun, fit=fit)
+    state = State(fit) if begun is None else replace(begun, fit=fit, rounds=())
     before: State[F] | None = None
     for _ in range(LEVELS.rounds):
         # Else what lies on an axis that was nothing before would look like another cause.
         state = on_all_axes(subject, state, needed=True)
-        ranking = ranked(subject, state.fit)
+        plain = ranked_of(subject.linear(state.fit), once(subject, state.fit))
+        seen = Round(state.fit, tuple(k.what for k in state.kept), plain)
+        state = replace(state, rounds=(*state.rounds, seen))
+        ranking = refined(subject, state.fit, plain)
         if before is not None and _small(subject, before, state) and _left(ranking):
             state = _as_before(before, state)
             break

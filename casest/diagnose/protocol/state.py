@@ -102,11 +102,20 @@ class Refused:
 
 
 @dataclass(frozen=True)
+class Round(Generic[F]):
+    """A fit that was looked at: with these causes in it, and by their columns alone, all others."""
+
+    fit: F
+    causes: tuple[Any, ...]
+    ranking: Ranking = field(repr=False)
+
+
+@dataclass(frozen=True)
 class State(Generic[F]):
     """A search as it stands: the fit, what it has been given, what was refused.
 
     `open`: causes of which one is there, but not one to add; `torn`: their refits, where each would
-    do more harm than none if it is the wrong one.
+    do more harm than none if it is the wrong one; `rounds`: what this search has looked at.
     """
 
     fit: F
@@ -116,6 +125,7 @@ class State(Generic[F]):
     torn: tuple[Refit[F], ...] = ()
     first: Ranking | None = None
     last: Ranking | None = None
+    rounds: tuple[Round[F], ...] = field(default=(), repr=False)
 
     def refusing(self, what: Any, why: str) -> State[F]:
         """The state with a refusal, which is said once."""
