@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -9,9 +10,9 @@ import pytest
 from scipy import stats
 from scipy.integrate import quad
 from scipy.linalg import solve_triangular, toeplitz
-from scipy.signal import lfilter
+from scipy.signal import butter, lfilter
 
-from casest.diagnose.evidence.likelihood import Beyond, Likelihood
+from casest.diagnose.evidence.likelihood import Beyond, Likelihood, _by_squares, rises
 from casest.diagnose.evidence.linear import Linear, parts_of
 from casest.diagnose.evidence.score import (
     Trial,
@@ -124,6 +125,44 @@ def test_a_cause_is_not_taken_for_noise_of_its_own():
         without.append(np.log(none.spectrum[4]))
     assert abs(np.mean(beside)) < 0.5
     assert np.mean(without) > 2
+
+
+def fitted_to(y, x):
+    """What a fit of y to a + b·x leaves, as a linear problem."""
+    X = np.c_[np.ones(len(x)), x]
+    return linear_of(y - X @ np.linalg.lstsq(X, y, rcond=None)[0], X)
+
+
+def test_a_lag_of_a_noisy_reference_is_likelier_than_a_smooth_residual():
+    """The reading is smooth and the reference noisy: with the wrong lag next to nothing follows the
+    reference, and what is left is as smooth as the reading, and as likely."""
+    rng = np.random.default_rng(30)
+    for late in (25, 40, 60):
+        u = lfilter(*butter(2, 0.02), rng.standard_normal(2400))[400:] * 10
+        reference = u + 0.05 * rng.standard_normal(2000)
+        y = np.roll(u, late) + 0.001 * rng.standard_normal(2000)
+        declared, lagged = fitted_to(y, reference), fitted_to(y, np.roll(reference, late))
+        gain = rises(declared, [lagged])[0]
+        assert gain > 100
+        assert Likelihood(declared).beside().cost < Likelihood(lagged).beside().cost  # smooth
+        # Never more than white noise would say, of which every sample counts.
+        before, after = (float(np.sum(x.residual**2)) for x in (declared, lagged))
+        assert gain < 2000 * np.log(before / after)
+
+
+@pytest.mark.parametrize("rho", [0.99, 1.0])
+def test_one_slow_course_does_not_take_another_by_its_squares(rho):
+    """Of two walks one takes half of the other's squares in one case of six."""
+    rng, n, most, claimed = np.random.default_rng(31), 600, 0, 0
+    for _ in range(400):
+        y, x = lfilter([1], [1, -rho], rng.standard_normal((2, n)))
+        before, after = fitted_to(y, np.zeros(n)), fitted_to(y, x)
+        after = replace(after, slopes=before.slopes)
+        most += np.sum(after.residual**2) < LEVELS.most * np.sum(before.residual**2)
+        gain = _by_squares(*(Likelihood(x, np.zeros((n, 1))) for x in (before, after)))
+        claimed += gain > LEVELS.strong + np.log(n)
+    assert (most > 40) == (rho == 1)
+    assert claimed <= 7  # 1 %, and what chance adds to it
 
 
 def wandering(rng, n):

@@ -37,6 +37,7 @@ class Levels:
     stand_in: share of a column's variance that a signal does not tell, up to which, in poses and
         tables, its curve could be a bend over that signal.
     fades: time constants that a record must span for a memory to be seen to fade.
+    most: share of the squares below which what is left says more than how likely a slow course is;
     survives: share of a cause's length that the declared unknowns must leave; over_noise: an
         implicit residual's slopes contain its noise, of which so many must survive. jitter: times
         that noise of an input counts, since a few draws tell its size.
@@ -94,6 +95,7 @@ class Levels:
     stand_in: float = 0.1
     fades: float = 2.0
     survives: float = 1e-3
+    most: float = 0.5
     over_noise: float = 5.0
     jitter: float = 3.0
     seen: float = 45.0

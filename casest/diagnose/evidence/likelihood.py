@@ -271,18 +271,38 @@ def rises(
 ) -> list[float]:
     """2 log of the likelihood of each fit over that of one with less in it; each has its own noise.
 
-    What the fit with the least noise leaves far out is cut from all of them. `of`: −2 log L.
+    What the fit with the least noise leaves far out is cut from all of them. `of`: −2 log L. Of a
+    fit that takes most of the squares at least what these say: where the other instrument is the
+    noisy one, a residual that has little of it in it is likely as a smooth course of its own,
+    however large it is.
     """
     less, *fits = alike([less, *fits])
     best = min(fits, key=lambda x: float(np.sum(np.log(robust_sd(x.residual)))))
 
-    def cost(linear: Linear) -> float:
+    def cutting(linear: Linear) -> Likelihood:
         alike = linear.residual.shape == best.residual.shape  # rows that moved in time are others
-        cut = far_out(best.residual) if alike and linear.series else None
-        return of(Likelihood(linear, cut))
+        return Likelihood(linear, far_out(best.residual) if alike and linear.series else None)
 
-    none = cost(less)
-    return [none - cost(fit) for fit in fits]
+    none = cutting(less)
+    cost, several = of(none), [cutting(fit) for fit in fits]
+    return [max(cost - of(one), _by_squares(none, one)) for one in several]
+
+
+def _by_squares(less: Likelihood, more: Likelihood) -> float:
+    """2 log of the likelihood ratio of squares, of as many samples as are independent.
+
+    As many as noise of the spectrum of all that there was would leave of what is taken away
+    (Bartlett 1935): what is missing counts as noise, so they are too few. Nothing where less than
+    most of the squares are taken.
+    """
+    if not less.linear.coloured or less.shape != more.shape:
+        return -np.inf
+    before, after = less.residual, more.residual
+    taken, b, a = before - after, float(before @ before), float(after @ after)
+    if a > LEVELS.most * b:
+        return -np.inf
+    noise = float(less.beside().powers @ less.sums.summed(taken**2))
+    return b * float(taken @ taken) / max(noise, 1e-300) * float(np.log(b / max(a, 1e-300)))
 
 
 def _weighted(w: Array, products: Array) -> Array:

@@ -142,6 +142,8 @@ def _hypotheses(
             state = state.refusing(evidence.trials[0].what, why)
         elif falls(ranking, alone)["pieces"].ratio < 1:
             found.append(alone)
+        else:
+            state = state.refusing(evidence.trials[0].what, NOT_HELD_OUT)
     return state, sorted(found, key=lambda e: -e.score)
 
 
