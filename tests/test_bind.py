@@ -311,6 +311,44 @@ def test_many_dropped_rows_in_a_row_are_a_gap_without_a_time_too(tmp_path: Path)
     assert run.block.tolist() == [0] * 8 + [1] * 5
 
 
+def three_axes(seed: int, count: int = 400, step: float = 0.0) -> np.ndarray:
+    """Readings of a moving sensor, to `step` if there is one."""
+    rng = np.random.default_rng(seed)
+    found = np.cumsum(rng.standard_normal((count, 3)), axis=0) + 40
+    return np.round(found / step) * step if step else found
+
+
+def written(values: np.ndarray) -> str:
+    return "vx,vy,vz\n" + "\n".join(",".join(f"{x:.12g}" for x in row) for row in values) + "\n"
+
+
+def test_what_a_waiting_logger_writes_again_is_no_reading(tmp_path: Path) -> None:
+    """Zeros are none from the first on; of the last reading that is written again the first is."""
+    padded = three_axes(1)
+    padded[392:] = 0
+    run = run_of(tmp_path, written(padded))
+    assert run.rows.tolist() == list(range(392))
+    (note,) = [n for n in run.notes if "dropped" in n]
+    assert note.startswith("8 of 400 rows dropped: 8 repeat vx vy vz")
+    assert note.endswith("the first row 392")
+    waiting = three_axes(2)
+    waiting[100:110] = waiting[99]
+    run = run_of(tmp_path, written(waiting))
+    assert run.rows.tolist() == [*range(100), *range(110, 400)]
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_readings_that_come_twice_for_another_reason_stay(tmp_path: Path, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    quiet = np.round(rng.standard_normal((400, 3)) * 0.4)  # at rest, on few levels
+    held = np.repeat(three_axes(seed, 100), 4, axis=0)  # a slower sensor, written four times
+    for values in (quiet, held, three_axes(seed, step=1.0), three_axes(seed)):
+        assert len(run_of(tmp_path, written(values))) == 400
+    short = three_axes(seed, 30)
+    short[10:14] = short[10]  # of a table nobody knows
+    assert len(run_of(tmp_path, written(short))) == 30
+
+
 def test_a_record_without_one_whole_row_is_refused(tmp_path: Path) -> None:
     said = refusal(DataError, tmp_path, "vx,vy,vz\n,2,3\n4,,6\n7,8,\n")
     assert "no row has every number that is needed (3 of 3 rows dropped: 3 without vx vy vz" in said

@@ -66,6 +66,28 @@ def test_raw_counts_of_a_reading_that_no_input_tells_explain_nothing(record):
     assert not close("linear", given).effects
 
 
+@pytest.mark.parametrize("whole", [True, False])
+def test_what_rises_wherever_the_reading_does_explains_nothing(record, whole):
+    """The reading is a logarithm of it, to the next count or not."""
+    raw = 1e3 * np.exp(record["reading"] / 5)
+    closing = close("linear", {**record, "raw": np.round(raw) if whole else -raw})
+    assert not closing.effects
+    assert closing.after.values["gain"] == pytest.approx(3, abs=0.005)
+    assert "column is reading once more" in skipped(closing)["raw"]
+
+
+def test_of_columns_that_go_with_the_input_none_is_claimed_where_the_response_bends(record):
+    """Set value, current and meter of a lamp: what they do can be a bend, and is one."""
+    rng = np.random.default_rng(3)
+    x = record["reference"]
+    lamp = {f"c{k}": x + 0.01 * k * x**2 + rng.normal(0, 0.1, ROWS) for k in (1, -1)}
+    reading = record["reading"] + 0.03 * x**2
+    closing = close("linear", {**record, **lamp, "reading": reading})
+    assert [e.candidate.label for e in closing.effects] == ["quadratic"]
+    for name in lamp:
+        assert "goes with reference: what follows it could be a bend" in skipped(closing)[name]
+
+
 @pytest.mark.parametrize("digits", [6, 2])
 def test_a_magnitude_that_was_computed_from_the_axes_explains_nothing(digits):
     """As telephones log it."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -177,7 +177,8 @@ def _runs(table: Table, signals: Sequence[Signal], options: Options) -> list[Run
     sources = {name for names in bound.sources.values() for name in names}
     dates = {name for name in bound.time_source if table.columns[name].is_text}
     sources |= {name for name in (*bound.time_source, *groups.values()) if name} - dates
-    complete, dropped = _complete(table, bound, options)
+    plain = {bound.sources[s.name] for s in signals if s.kind == "plain" and not is_time(s)}
+    complete, dropped = _complete(table, bound, options, plain)
     others, other_units, notes = _others(table, sources, options, complete)
     labels = _labels(table, groups["run"])
     pose = _labels(table, groups["pose"])
@@ -243,8 +244,13 @@ def _bind(table: Table, signals: Sequence[Signal], options: Options) -> _Bound:
     return _with_time_column(table, signals, options, found)
 
 
-def _complete(table: Table, bound: _Bound, options: Options) -> tuple[NDArray[np.bool_], list[str]]:
-    """Which rows have every number that matters, and a note on those that have not."""
+def _complete(
+    table: Table, bound: _Bound, options: Options, plain: Collection[tuple[str, ...]]
+) -> tuple[NDArray[np.bool_], list[str]]:
+    """Which rows have every number that matters, and a note on those that have not.
+
+    `plain`: sources of signals that are no attitudes: these are commanded, and stand still.
+    """
     needed = {name: bound.sources[name] for name in bound.signals if name not in options.gaps}
     parts = {names: bound.signals[name] for name, names in needed.items()}
     if bound.time is not None and bound.time_source:
@@ -259,7 +265,14 @@ def _complete(table: Table, bound: _Bound, options: Options) -> tuple[NDArray[np
         if absent.any():
             first = int(np.flatnonzero(absent)[0])
             said.append(f"{int(absent.sum())} without {' '.join(names)}, the first row {first}")
-        complete &= ~absent
+        again = checks.stalled(values) if names in plain else np.zeros_like(absent)
+        if again.any():
+            first = int(np.flatnonzero(again)[0])
+            said.append(
+                f"{int(again.sum())} repeat {' '.join(names)} as no others do (a logger that "
+                f"waits, or no reading), the first row {first}"
+            )
+        complete &= ~(absent | again)
     if not said:
         return complete, []
     left = table.n_rows - int(complete.sum())

@@ -15,6 +15,9 @@ LEAST, MOST = 1e-140, 1e140  # sums of squares beyond are 0 or infinite
 _FEWEST = 8  # readings at an extreme before it is called clipping
 _CROWDING = 5.0  # times as many as on the levels next to it (a smooth crest gives 2.4)
 _STEEP = 3.0  # resolutions jumped on the way in (rest toggles by one)
+_STALLED = 3  # equal rows in a row that chance does not leave, where two in a row are this rare:
+_BY_CHANCE = 0.01  # expected stretches of as many by chance, ...
+_FEW = 0.05  # ... and no more of the rows than this: else rows come twice for another reason
 
 
 def without_gaps(values: Array) -> Array:
@@ -96,6 +99,32 @@ def full_scales(values: Array) -> Iterator[tuple[int, int, float, int]]:
         for sign, (count, moving) in found.items():
             if count and (moving or symmetric):
                 yield i, sign, float(sign * (sign * values[:, i]).max()), count
+
+
+def stalled(values: Array) -> NDArray[np.bool_]:
+    """Which rows (N,) of several components (N, size) only repeat the one before.
+
+    A logger that waits writes its last reading again, or zeros, which are none from the first on.
+    Noise on several components at once does not: stretches of _STALLED rows and more where two
+    equal ones hardly ever come.
+    """
+    none = np.zeros(len(values), dtype=np.bool_)
+    if values.shape[1] < 2 or len(values) < 2:
+        return none
+    again = np.concatenate([[False], (values[1:] == values[:-1]).all(axis=1)])
+    if not (again[2:] & again[1:-1]).any():  # long before anything is counted
+        return none
+    first = np.flatnonzero(~again)
+    length = np.diff(np.append(first, len(values)))
+    twos = int(np.count_nonzero((length > 1) & (length < _STALLED)))
+    long = length >= _STALLED
+    chance = max(twos, 1) / len(values)
+    if chance ** (_STALLED - 1) * len(values) > _BY_CHANCE:
+        return none
+    found = again & np.repeat(long, length)
+    zeros = first[long & ~values[first].any(axis=1)]
+    found[zeros] = True
+    return found if found.mean() <= _FEW else none
 
 
 def _symmetric(x: Array) -> bool:

@@ -3,7 +3,7 @@ magnitude that was computed from the axes.
 
 Such a column differs from the signal by the noise of the one or the other. A cause that follows it
 would take the place of the declared response, and explain the noise of a reading by that reading.
-Of few rows also what only goes with a signal is none: its curve is a bend of the response.
+Also what only goes with an input is none, of few rows sooner: its curve is a bend of the response.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ class Signal:
     an `input`: does nothing that is recorded beside it drive it?"""
 
     name: str
+    elements: Array = field(repr=False)
     basis: Array = field(repr=False)
     noise: Array | None = field(default=None, repr=False)
     input: bool = False
@@ -39,11 +40,16 @@ class Signal:
         column must have its noise as well.
         """
         N, p = self.basis.shape
+        if any(_follows(x, y) for y in self.elements.T):
+            return 0.0
         unit = _scaled(x)
         left = (1 - float(np.sum((self.basis.T @ unit) ** 2))) * N / (N - p)
         own = self.noise is None or any(_one_noise(x, y) for y in self.noise.T)
-        few = self.input and LEVELS.series > N
-        most = LEVELS.stand_in if few else LEVELS.repeated**2 + _rounding(unit)
+        most = LEVELS.repeated**2 + _rounding(unit)
+        if self.input and LEVELS.series > N:
+            most = LEVELS.stand_in
+        elif self.input and self.elements.shape[1] == 1:
+            most = LEVELS.repeated
         return left if own and left < most else np.inf
 
 
@@ -61,9 +67,10 @@ class Reads:
         name = min(near, key=lambda n: near[n], default="")
         if not name or not np.isfinite(near[name]):
             return ""
-        if len(x) >= LEVELS.series or near[name] < LEVELS.repeated**2:
+        if near[name] < LEVELS.repeated**2 + _rounding(_scaled(x)):
             return f"column is {name} once more, or computed from it"
-        return f"column goes with {name}: in so few rows what follows it could be a bend over that"
+        few = "in so few rows " if len(x) < LEVELS.series else ""
+        return f"column goes with {name}: {few}what follows it could be a bend over that"
 
 
 def reads_of(model: Model, runs: Sequence[Run]) -> Reads:
@@ -91,7 +98,7 @@ def signals_of(inputs: Collection[str], readings: Collection[str], runs: Sequenc
         if basis is not None:
             noise = x if name in readings and not _told(x, driving) else None
             drives = bool(readings) and name not in readings
-            found.append(Signal(name, basis, noise, drives))
+            found.append(Signal(name, x, basis, noise, drives))
     return Reads(tuple(found), rows)
 
 
@@ -111,6 +118,16 @@ def _computed(x: Array) -> Array | None:
         return None
     left, values, _ = np.linalg.svd(np.column_stack(chosen), full_matrices=False)
     return np.asarray(left[:, values > 1e-9 * values[0]])
+
+
+def _follows(x: Array, y: Array) -> bool:
+    """Does one rise, or fall, wherever the other does? A logarithm, a table: not a sum of noises.
+
+    What is rounded still does; what has few levels may by chance.
+    """
+    if len(x) < LEVELS.series or len(np.unique(x)) < LEVELS.series / 2:
+        return False
+    return any(np.all(np.diff(s[np.lexsort((s, y))]) >= 0) for s in (x, -x))
 
 
 def _scaled(x: Array) -> Array:

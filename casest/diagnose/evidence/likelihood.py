@@ -235,7 +235,7 @@ class Likelihood:
         left = R - X @ values
         power = max(float(left @ left) / len(R), 1e-300)
         powers = np.full(self.shape[1], power)
-        return Explained(len(R) * np.log(power), powers, values, self, beyond)
+        return Explained(len(R) * float(np.log(power)), powers, values, self, beyond)
 
     def partly(self, beyond: Beyond, noise: Explained) -> tuple[Array, Array, Array, float]:
         """Whitened by a noise, beside the unknowns: products of the columns with each other (q, q),

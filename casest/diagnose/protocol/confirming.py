@@ -41,8 +41,11 @@ def passing(ranking: Ranking, options: Sequence[Evidence]) -> list[Evidence]:
     """Those that hold out, down to where none has any weight beside the best of them.
 
     A linear promise may be far from a refit's: of causes alone the first few count in any case.
+    None in the place of one that explains more wherever it is held out, though too unevenly to be
+    confirmed.
     """
     found: list[Evidence] = []
+    uneven: list[tuple[Evidence, dict[str, Fall]]] = []
     alone = 0
     for evidence in options:
         far = bool(found) and evidence.score < found[0].score - 2 * LEVELS.strong
@@ -52,11 +55,24 @@ def passing(ranking: Ranking, options: Sequence[Evidence]) -> list[Evidence]:
         alone += not several
         seen = falls(ranking, evidence)
         if not holds_out(seen, ranking.linear):
+            if not several and ranking.linear.series:
+                uneven.append((evidence, seen))
+            continue
+        if any(_in_its_place(evidence, seen, *other) for other in uneven):
             continue
         if several and not _better_than_its_parts(evidence, seen, ranking):
             continue
         found.append(evidence)
     return found
+
+
+def _in_its_place(
+    evidence: Evidence, seen: dict[str, Fall], more: Evidence, its: dict[str, Fall]
+) -> bool:
+    """Would it stand for a cause that is clearly likelier, and explains more of all parts?"""
+    if more.score < evidence.score + LEVELS.clear:
+        return False
+    return all(1 - f.ratio < (1 - LEVELS.alike) * (1 - its[k].ratio) for k, f in seen.items())
 
 
 def _better_than_its_parts(both: Evidence, seen: dict[str, Fall], ranking: Ranking) -> bool:
