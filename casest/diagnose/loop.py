@@ -25,8 +25,10 @@ from casest.diagnose.noise.slow_course import slow_squares
 from casest.diagnose.noise.tails import outliers_p_value
 from casest.diagnose.protocol import Kept, State, search, with_rivals
 from casest.diagnose.protocol.choosing import NOT_HELD_OUT
+from casest.diagnose.protocol.confirming import falls
 from casest.diagnose.protocol.ranking import ranked
 from casest.diagnose.protocol.refits import AS_MUCH
+from casest.diagnose.protocol.state import Ranking
 from casest.diagnose.sensor import NOT_FINITE, Fit, Sensor
 from casest.diagnose.sensor.courses import courses
 from casest.diagnose.visibility import Visible, visible
@@ -408,15 +410,15 @@ def _undecided(sensor: Sensor, state: State[Fit]) -> Undecided | None:
         for r in state.torn
         if len(r.evidence.families) == 1  # of a pair none moves them alone
     }
-    return Undecided(names, _share(best, state), moves)
+    return Undecided(names, _share(best, state.last), moves)
 
 
-def _share(best: Evidence, state: State[Fit]) -> float:
-    """Of the mean square, that a cause takes away: in coloured noise its likelihood is no share."""
-    if state.last is None:
+def _share(best: Evidence, last: Ranking | None) -> float:
+    """Of the held-out squares, that a cause takes away: in coloured noise its likelihood is no
+    share, and what is likeliest there lets the squares be what they are."""
+    if last is None or len(best.basis) != last.linear.residual.size:
         return 0.0
-    left = float(np.sum(best.explained.left**2))
-    return max(0.0, 1 - left / float(np.sum(state.last.none.left**2)))
+    return max(0.0, 1 - falls(last, best)["pieces"].ratio)
 
 
 __all__ = ["Closing", "Found", "close", "rms"]

@@ -111,7 +111,7 @@ def left_over(
     if undecided is not None and not undecided.explains:
         if where:  # a likelihood that held-out data deny is no misfit by itself
             asked = " or ".join(undecided.names[:3])
-            where.append(f"likelier with {asked}, which would explain none of it")
+            where.append(f"{asked} may be there besides, and would take none of it away")
     elif undecided is not None:
         fraction = max(fraction, undecided.share)
         several = " and other shapes" if len(undecided.names) == 1 else ""
