@@ -164,7 +164,10 @@ def trace(
     running.stages = _with_inputs(model, running, symbols, [*coordinates, *references])
     readings = tuple(_name_of(s, symbols) or "" for s in residual.signals if s is not None)
     if "" in readings:
-        raise DeclarationError(f"model {model.name}: measured= must be one of the model's signals")
+        raise DeclarationError(
+            f"model {model.name}: measured= must be one of the model's signals; what is computed "
+            "from one, a logarithm say, is a column of its own"
+        )
     if readings:
         units = {model[name].unit or "" for name in readings}
         residual = _with_named_prediction(residual, running, units.pop() if len(units) == 1 else "")

@@ -23,7 +23,7 @@ def restricted(effect: Effect, kept: Sequence[int], model: Model) -> Effect:
         if not isinstance(parameter, Parameter) or len(parameter.shape.dims) != 1:
             declarations.append((name, declared))
             continue
-        names = [f"{name}_{axis_name(i, parameter.shape.size)}" for i in kept]
+        names = [f"{name}_{entry_name(effect, i, parameter.shape.size)}" for i in kept]
         vectors[name] = (parameter.shape.size, dict(zip(kept, names, strict=True)))
         declarations += [
             (n, make_parameter(Shape("array", ()), parameter.units[i], None, None, parameter.scope))
@@ -75,8 +75,9 @@ def _size(effect: Effect, model: Model) -> int:
     return next((s.size for s in model.signals if s.name == effect.on and s.size > 1), 0)
 
 
-def axis_name(i: int, size: int) -> str:
-    """As in the names of the restricted unknowns; of a 3x3 matrix by row and column."""
+def entry_name(effect: Effect, i: int, size: int) -> str:
+    """As in the names of the restricted unknowns: the axis, of a 3x3 matrix row and column; the
+    number where the effect's formula counts its terms, which are no axes."""
     if size == 9:
         return "xyz"[i // 3] + "xyz"[i % 3]
-    return "xyz"[i] if size == 3 else str(i)
+    return "xyz"[i] if size == 3 and f"[{i}]" not in effect.formula else str(i)

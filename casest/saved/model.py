@@ -14,7 +14,7 @@ from casest import effects
 from casest.declaration.effect import Effect, label_of
 from casest.declaration.model import Model
 from casest.declaration.symbols import constant
-from casest.effects.on_axes import axis_name, lengths, restricted
+from casest.effects.on_axes import entry_name, lengths, restricted
 from casest.errors import DataError, UsageError
 from casest.results.find import find_effects, find_model
 
@@ -107,5 +107,5 @@ def _as_it_was(effect: Effect, saved: Mapping[str, Any], own: set[str], model: M
         return effect
     placed, ends = replace(effect, on=saved["on"]), {n.rpartition("_")[2] for n in own}
     size = max(lengths(placed, model))
-    kept = [i for i in range(size) if axis_name(i, size) in ends]
+    kept = [i for i in range(size) if entry_name(placed, i, size) in ends]
     return replace(restricted(placed, kept, model), on=effect.on)

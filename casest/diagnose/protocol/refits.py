@@ -69,8 +69,7 @@ def refitted(
         usual = [min(ranking.order.get(f, 0) for f in e.families) for e in near]
         best = found[min(range(len(near)), key=lambda k: (float(f"{loss[k]:.3g}"), usual[k]))]
         found = [best, *[r for r in found if r is not best]]
-        found = _plainest_first(found)
-    return state, found
+    return state, _plainest_first(found, ranking)
 
 
 def _whatever_sizes(subject: Subject[F], ranking: Ranking, evidence: Evidence, fit: F) -> bool:
@@ -160,20 +159,34 @@ def _with_parts(options: Sequence[Evidence], ranking: Ranking) -> list[Evidence]
     return [*options, *more]
 
 
-def _plainest_first(refits: list[Refit[F]]) -> list[Refit[F]]:
-    """What the first one contains, and explains as much, comes before it."""
+def _plainest_first(refits: list[Refit[F]], ranking: Ranking) -> list[Refit[F]]:
+    """What the first one contains, and explains as much or foretells as much, comes before it."""
+    if not refits:
+        return refits
     first = refits[0].evidence
     inside = [
         r
         for r in refits[1:]
-        if r.evidence.score > first.score - LEVELS.strong
-        and r.evidence.freedom < first.freedom
+        if r.evidence.freedom < first.freedom
         and _contains(first, r.evidence)
+        and (
+            r.evidence.score > first.score - LEVELS.strong
+            or _foretells_as_much(r.evidence, first, ranking)
+        )
     ]
     if not inside:
         return refits
     best = max(inside, key=lambda r: r.evidence.score)
     return [best, *[r for r in refits if r is not best]]
+
+
+def _foretells_as_much(plain: Evidence, other: Evidence, ranking: Ranking) -> bool:
+    """Are parts that are held out foretold as well, but for what is printed as nothing? Beside slow
+    noise a likelihood may ask for a bend of which they know nothing."""
+    if not ranking.linear.series:
+        return False
+    ours, theirs = falls(ranking, plain), falls(ranking, other)
+    return all(f.ratio < theirs[k].ratio + LEVELS.told_share for k, f in ours.items())
 
 
 def _contains(wide: Evidence, narrow: Evidence) -> bool:
@@ -219,14 +232,14 @@ def torn_between(refits: Sequence[Refit[F]], ranking: Ranking) -> list[Refit[F]]
     return near if none < loss.min() and loss.min() > noise else []
 
 
-def best_refits(refits: Sequence[Refit[F]]) -> list[Refit[F]]:
-    """The first stays, unless another one is clearly worth more."""
-    if not refits:
-        return []
-    best = max(refits, key=lambda r: r.evidence.score)
-    clear = best.evidence.score > refits[0].evidence.score + LEVELS.clear
-    first = best if clear else refits[0]
-    return [first, *[r for r in refits if r is not first]]
+def best_refits(refits: Sequence[Refit[F]], more: Sequence[Refit[F]]) -> list[Refit[F]]:
+    """All of them. The first stays, unless one of the others is clearly worth more."""
+    several = [*refits, *sorted(more, key=lambda r: -r.evidence.score)]
+    if refits and more:
+        best = several[len(refits)]
+        if best.evidence.score > refits[0].evidence.score + LEVELS.clear:
+            return [best, *[r for r in several if r is not best]]
+    return several
 
 
 def shown(
