@@ -58,8 +58,13 @@ class Read:
 def described(
     read: Read, likelihood: Likelihood, none: Explained, families: int
 ) -> Evidence | None:
-    """The best description: terms are added while they are worth their price."""
-    shapes = library([v for v in read.variables if v.half > 0])
+    """The best description: terms are added while they are worth their price.
+
+    None of the output alone: a bend of the response would stand for its gain and its offset, which
+    would say nothing of the sensor any more. That there is one is said without it.
+    """
+    every = library([v for v in read.variables if v.half > 0])
+    shapes = [s for s in every if {v.name for v in s.variables} != {read.on}]
     if not shapes:
         return None
     chosen, best = _pursued(read, shapes, likelihood, none), None
