@@ -12,7 +12,7 @@ from scipy.integrate import quad
 from scipy.linalg import solve_triangular, toeplitz
 from scipy.signal import butter, lfilter
 
-from casest.diagnose.evidence.likelihood import Beyond, Likelihood, _by_squares, rises
+from casest.diagnose.evidence.likelihood import Beyond, Likelihood, rise_of_squares, rises
 from casest.diagnose.evidence.linear import Linear, parts_of
 from casest.diagnose.evidence.score import (
     Trial,
@@ -159,7 +159,7 @@ def test_one_slow_course_does_not_take_another_by_its_squares(rho):
         before, after = fitted_to(y, np.zeros(n)), fitted_to(y, x)
         after = replace(after, slopes=before.slopes)
         most += np.sum(after.residual**2) < LEVELS.most * np.sum(before.residual**2)
-        gain = _by_squares(*(Likelihood(x, np.zeros((n, 1))) for x in (before, after)))
+        gain = rise_of_squares(before, after)
         claimed += gain > LEVELS.strong + np.log(n)
     assert (most > 40) == (rho == 1)
     assert claimed <= 7  # 1 %, and what chance adds to it

@@ -227,6 +227,12 @@ class Likelihood:
         cost = float(np.sum(self.sums.count * np.log(S) + power / S))
         return Explained(cost, S, values, self, beyond)
 
+    def plainly(self, beyond: Beyond) -> Explained:
+        """By least squares alone, as if all noise were white."""
+        values, power, _ = _Products(self, beyond).solved(np.ones(len(self.sums.count)))
+        white = float(power.sum()) / float(self.sums.count.sum())
+        return Explained(np.nan, np.full(len(power), max(white, 1e-300)), values, self, beyond)
+
     def _in_white_noise(self, beyond: Beyond | None) -> Explained:
         R, X = self.residual, self.declared
         if beyond is not None:
@@ -279,29 +285,31 @@ def rises(
     less, *fits = alike([less, *fits])
     best = min(fits, key=lambda x: float(np.sum(np.log(robust_sd(x.residual)))))
 
-    def cutting(linear: Linear) -> Likelihood:
+    def cut(linear: Linear) -> Array | None:
         alike = linear.residual.shape == best.residual.shape  # rows that moved in time are others
-        return Likelihood(linear, far_out(best.residual) if alike and linear.series else None)
+        return far_out(best.residual) if alike and linear.series else None
 
-    none = cutting(less)
-    cost, several = of(none), [cutting(fit) for fit in fits]
-    return [max(cost - of(one), _by_squares(none, one)) for one in several]
+    none, far = of(Likelihood(less, cut(less))), cut(less)
+    return [
+        max(none - of(Likelihood(fit, cut(fit))), rise_of_squares(less, fit, far)) for fit in fits
+    ]
 
 
-def _by_squares(less: Likelihood, more: Likelihood) -> float:
+def rise_of_squares(less: Linear, more: Linear, cut: Array | None = None) -> float:
     """2 log of the likelihood ratio of squares, of as many samples as are independent.
 
     As many as noise of the spectrum of all that there was would leave of what is taken away
     (Bartlett 1935): what is missing counts as noise, so they are too few. Nothing where less than
-    most of the squares are taken.
+    most of the squares are taken. `cut`: as of a likelihood.
     """
-    if not less.linear.coloured or less.shape != more.shape:
+    if not less.coloured or less.residual.shape != more.residual.shape:
         return -np.inf
-    before, after = less.residual, more.residual
+    without, beside = Likelihood(less, cut), Likelihood(more, cut)
+    before, after = without.residual, beside.residual
     taken, b, a = before - after, float(before @ before), float(after @ after)
     if a > LEVELS.most * b:
         return -np.inf
-    noise = float(less.beside().powers @ less.sums.summed(taken**2))
+    noise = float(without.beside().powers @ without.sums.summed(taken**2))
     return b * float(taken @ taken) / max(noise, 1e-300) * float(np.log(b / max(a, 1e-300)))
 
 

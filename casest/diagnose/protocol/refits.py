@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from casest.declaration.shapes import Array
-from casest.diagnose.evidence.likelihood import rises
+from casest.diagnose.evidence.likelihood import rise_of_squares, rises
+from casest.diagnose.evidence.linear import alike
 from casest.diagnose.evidence.score import (
     Evidence,
     Trial,
@@ -242,6 +243,24 @@ def best_refits(refits: Sequence[Refit[F]], more: Sequence[Refit[F]]) -> list[Re
     return several
 
 
+def _takes_most(evidence: Evidence, ranking: Ranking) -> bool:
+    """Are most of the squares explained by its columns?"""
+    left = ranking.likelihood.plainly(evidence.beyond).powers[0]
+    return bool(left < LEVELS.most * np.mean(ranking.likelihood.residual**2))
+
+
+def _by_squares(
+    subject: Subject[F], state: State[F], ranking: Ranking, evidence: Evidence, fit: F
+) -> Evidence:
+    """By what its refit takes of the squares, less what noise of the inputs may feign of these: a
+    likelihood beside smooth noise weighs what is quick, and that may be all noise."""
+    plain = ranking.likelihood.plainly(evidence.beyond)
+    seen = replace(evidence, explained=plain, score=np.inf)
+    (seen,) = without_feigned(subject, state.fit, ranking.likelihood, [seen], ranking.families)
+    before, after = alike([ranking.linear, subject.linear(fit)])
+    return _gaining(replace(evidence, trials=seen.trials), rise_of_squares(before, after))
+
+
 def shown(
     subject: Subject[F], state: State[F], ranking: Ranking, beside: Sequence[Refit[F]]
 ) -> tuple[State[F], list[Refit[F]]]:
@@ -253,15 +272,19 @@ def shown(
             (evidence,) = without_feigned(
                 subject, state.fit, ranking.likelihood, [evidence], ranking.families
             )
-        if trial.what.held and (evidence is None or evidence.score <= 0):
+        small = evidence is None or (evidence.score <= 0 and not _takes_most(evidence, ranking))
+        if trial.what.held and small:
             continue  # its columns are those of that very value: nothing to wait for from a refit
         better = subject.refit(state.fit, [trial])
         if evidence is None or isinstance(better, str):
             state = state if evidence is None else state.failing(evidence, str(better))
             continue
         gain, *_ = subject.rises(state.fit, [better, *(r.fit for r in beside)])
+        kept = _gaining(evidence, gain)
+        if not _strong(ranking, kept):
+            kept = _by_squares(subject, state, ranking, evidence, better)
         # Its columns say little of it: the chance is that of its refit.
-        kept = with_chance(_gaining(evidence, gain), ranking.likelihood, ranking.families)
+        kept = with_chance(kept, ranking.likelihood, ranking.families)
         seen = falls_of_refit(ranking.linear, subject.linear(better))
         if beyond_courses(ranking, kept) and holds_out(seen, ranking.linear):
             found.append(Refit(state.fit, better, kept, seen))
