@@ -182,12 +182,13 @@ def _plainest_first(refits: list[Refit[F]], ranking: Ranking) -> list[Refit[F]]:
 
 
 def _foretells_as_much(plain: Evidence, other: Evidence, ranking: Ranking) -> bool:
-    """Are parts that are held out foretold as well, but for what is printed as nothing? Beside slow
-    noise a likelihood may ask for a bend of which they know nothing."""
+    """Is what is held out foretold as well, but for what is printed as nothing of that? Beside slow
+    noise a likelihood may ask for a bend of which it knows nothing."""
     if not ranking.linear.series:
         return False
     ours, theirs = falls(ranking, plain), falls(ranking, other)
-    return all(f.ratio < theirs[k].ratio + LEVELS.told_share for k, f in ours.items())
+    least = 1 - LEVELS.told_share
+    return all(1 - f.ratio > least * (1 - theirs[k].ratio) for k, f in ours.items())
 
 
 def _contains(wide: Evidence, narrow: Evidence) -> bool:
