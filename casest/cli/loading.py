@@ -201,7 +201,7 @@ def asked_effects(
     known, own, followed = catalogue & {*asked}, [], dict[str, None]()
     for text in asked:
         for effect, column in find_asked(text) if text not in known else ():
-            if column and effect.name in catalogue:
+            if (column or effect.kind == "time") and effect.name in catalogue:
                 known.add(text)
             followed |= {column: None} if column else {}
             columns = tuple((name, f"={column}") for name, _ in effect.columns)
