@@ -144,7 +144,17 @@ class Sensor(Subject[Fit]):
             return f"its refit fails: {error}"
         if found is None:
             return NOT_FINITE
-        return self._too_slow(found, added) or found
+        return self._too_slow(found, added) or self._at_one_input(found, added) or found
+
+    def _at_one_input(self, fit: Fit, added: Sequence[Trial]) -> str:
+        """Why a cut-off is none: one value alone lies beyond it, which may be off itself; else
+        empty."""
+        for what in (t.what for t in added if _plain(t.what) is not None):
+            beyond = self._residual_without(fit, what) - self.linear(fit).residual
+            size = np.abs(beyond).max(initial=0.0)
+            if size > 0 and len(np.unique(np.round(beyond[beyond != 0] / size, 6))) < 2:
+                return f"one input alone lies beyond the level of {what.label}"
+        return ""
 
     def _too_slow(self, fit: Fit, added: Sequence[Trial]) -> str:
         """Why the records are too short for a memory: nobody saw it fade; else empty."""
