@@ -45,6 +45,17 @@ def test_a_second_meter_of_the_reference_explains_nothing(record):
     assert "column is reference once more" in skipped(closing)["meter"]
 
 
+def test_a_meter_beside_the_reading_explains_nothing(record):
+    """Of two thermometers in one box each tells the other better than the weather station does."""
+    rng = np.random.default_rng(6)
+    box = record["reference"] + 1.5 * np.sin(0.7 * record["t"])  # what the station does not see
+    reading = 0.2 + 3 * box + rng.normal(0, 0.02, ROWS)
+    given = {**record, "reading": reading, "beside": box + rng.normal(0, 0.3, ROWS)}
+    closing = close("linear", given)
+    assert "column tells reading better than its inputs do" in skipped(closing)["beside"]
+    assert closing.after.values["gain"] == pytest.approx(3, abs=0.1)
+
+
 def test_a_temperature_that_is_most_of_the_reading_is_found_where_the_load_hardly_moves(record):
     """Then the reading follows it within a part in a thousand, and is not that temperature."""
     still = 0.01 * record["reference"]

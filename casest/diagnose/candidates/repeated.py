@@ -19,18 +19,27 @@ from casest.declaration.model import Model
 from casest.declaration.shapes import Array
 from casest.diagnose.levels import LEVELS
 
+#: Of a reading's variance: where inputs leave so much, something else may be what moves it.
+MOST = 0.5
+
 
 @dataclass(frozen=True)
 class Signal:
     """What is computed from a signal: an orthonormal basis (N, p) of its elements, their products
     and its length; `noise` are the elements (N, q) of a reading that the inputs do not tell. Is it
-    an `input`: does nothing that is recorded beside it drive it?"""
+    an `input`: does nothing that is recorded beside it drive it? `left`: share of a reading's
+    variance that the inputs do not tell, where they tell nearly all of it; else nothing."""
 
     name: str
     elements: Array = field(repr=False)
     basis: Array = field(repr=False)
     noise: Array | None = field(default=None, repr=False)
     input: bool = False
+    left: float = 0.0
+
+    def told_better(self, x: Array) -> bool:
+        """Does a column (N,) tell a reading better than its inputs do? Another meter does."""
+        return self.left > 0 and _untold(self.elements, [x]) < self.left
 
     def apart(self, x: Array) -> float:
         """Share of a column's squares (N,) that is not computed from it; inf where more is left
@@ -66,7 +75,8 @@ class Reads:
         near = {s.name: s.apart(x) for s in self.signals if np.ptp(x) > 0}
         name = min(near, key=lambda n: near[n], default="")
         if not name or not np.isfinite(near[name]):
-            return ""
+            better = next((s.name for s in self.signals if s.told_better(x)), "")
+            return better and f"column tells {better} better than its inputs do: another meter"
         if near[name] < LEVELS.repeated**2 + _rounding(_scaled(x)):
             return f"column is {name} once more, or computed from it"
         few = "in so few rows " if len(x) < LEVELS.series else ""
@@ -96,9 +106,11 @@ def signals_of(inputs: Collection[str], readings: Collection[str], runs: Sequenc
     for name, x in each.items():
         basis = _computed(x)
         if basis is not None:
-            noise = x if name in readings and not _told(x, driving) else None
+            untold = _untold(x, driving) if name in readings else 1.0
+            noise = x if name in readings and untold >= MOST else None
             drives = bool(readings) and name not in readings
-            found.append(Signal(name, x, basis, noise, drives))
+            own = len(x) >= LEVELS.series and untold < LEVELS.stand_in
+            found.append(Signal(name, x, basis, noise, drives, untold if own else 0.0))
     return Reads(tuple(found), rows)
 
 
@@ -149,16 +161,16 @@ def _rounding(unit: Array) -> float:
     return share if share < 0.01 else 0.0
 
 
-def _told(reading: Array, inputs: Sequence[Array]) -> bool:
-    """Do the inputs and their squares tell at least half of a reading's (N, q) variance?"""
+def _untold(reading: Array, inputs: Sequence[Array]) -> float:
+    """Share of a reading's (N, q) variance that inputs and their squares do not tell."""
     scaled = [_scaled(x) for x in inputs]
     columns = np.column_stack([np.ones(len(reading)), *scaled, *(x**2 for x in scaled)])
     freedom = len(reading) - columns.shape[1]
     if not inputs or freedom < 1 or not reading.size:
-        return False
+        return 1.0
     units = np.column_stack([_scaled(y) for y in reading.T])
     left = units - columns @ np.linalg.lstsq(columns, units, rcond=None)[0]
-    return bool(np.sum(left**2) / freedom < 0.5 * units.shape[1] / len(reading))
+    return float(np.mean(np.sum(left**2, axis=0)) * len(reading) / freedom)
 
 
 def _one_noise(x: Array, y: Array) -> bool:
