@@ -25,6 +25,8 @@ from casest.diagnose.levels import LEVELS
 REWEIGHTED = 2
 #: Share of the power at a frequency that a fit leaves, at least.
 LEFT = 0.05
+#: Share of its square that a difference of sums over a band loses to rounding.
+LOST = 1e-12
 
 
 @dataclass(frozen=True)
@@ -350,7 +352,8 @@ class _Products:
         power = self._RR + self._summed(np.outer(v, v)) - 2 * self._QR @ v[: self._p]
         if self._more is not None:
             power -= 2 * self._more[2] @ v[self._p :]
-        return values, np.maximum(power, 0.0), w * self._summed(F @ inverse @ F.T)
+        # Where a fit takes all, differences of sums are their rounding.
+        return values, np.maximum(power, LOST * self._RR), w * self._summed(F @ inverse @ F.T)
 
     def _summed(self, among: Array) -> Array:
         """Of each band (K,), products times a symmetric matrix (p + q, p + q), all together."""
