@@ -88,7 +88,7 @@ def creep(
     before: SX,
     dt: SX,
     *,
-    k: SX = param(each, bounds=(None, 1.0)),  # no more than all of it comes late
+    k: SX = param(each),
     tau: SX = param("s", start=10.0, bounds=(0.0, None)),
 ) -> tuple[SX, ...]:
     """A part k of each axis' response comes late, with the time constant tau (creep, slow warming).
