@@ -1,9 +1,9 @@
 """The catalogue: physical effects that a model may lack, each a few lines with its source.
 
-An effect on "input" applies to the quantity that a model declares as `corrected`, or else, as one
-on "output", to what it predicts (an implicit model: to what it corrects), one on "rate of a state"
-to that of any state of differential equations; others to the quantity or signal of that name. So a
-user's own model gets every effect whose quantity it has.
+An effect on "input" applies to the quantity that a model declares as `corrected`, one on "output"
+to what it predicts (an implicit model: to what it corrects), one on "rate of a state" to that of
+any state of differential equations; others to the quantity or signal of that name. So a user's own
+model gets every effect whose quantity it has.
 """
 
 from __future__ import annotations

@@ -54,7 +54,7 @@ def placed_in(effect: Effect, model: Model) -> Effect:
         None,
     )
     if effect.on == "input":
-        place = corrected or predicted  # a bend of what is read, where nothing is corrected
+        place = corrected
     elif effect.on == "output":
         place = predicted or (corrected if model.implicit else None)
     else:
