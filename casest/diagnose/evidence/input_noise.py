@@ -14,7 +14,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from casest.declaration.shapes import Array
-from casest.diagnose.evidence.likelihood import Beyond, Likelihood
+from casest.diagnose.evidence.likelihood import Likelihood
 from casest.diagnose.evidence.score import Evidence
 from casest.diagnose.levels import LEVELS
 
@@ -29,17 +29,16 @@ def feigned(
 
     `draws`: the problem and the evidence's columns (N, m, k) with noise added to that input.
     """
-    columns = np.concatenate(evidence.columns, axis=2)
-    here = Beyond(likelihood, columns)
-    left = likelihood.remains(here.flat)
-    values = here.mix @ evidence.explained.values[-evidence.freedom :]
+    columns, beyond = np.concatenate(evidence.columns, axis=2), evidence.beyond
+    left = likelihood.remains(beyond.flat)
+    values = beyond.mix @ evidence.explained.values[-evidence.freedom :]
     root = 1 / np.sqrt(evidence.explained.spectrum)
     size = np.linalg.norm(columns.reshape(len(root), -1), axis=0)
     explained = float(np.sum((root * (left @ values)) ** 2))
     together = []
     for noisy, moved in draws:
         own = np.linalg.norm(moved.reshape(len(root), -1), axis=0) / np.maximum(size, 1e-300)
-        there = noisy.remains(Beyond(noisy, moved).flat)
+        there = noisy.remains(noisy.flat(moved))
         change = root * ((there * own - left) @ values)
         more = (noisy.linear.residual - likelihood.linear.residual)[:, :, None]
         added = root * likelihood.by_frequency(more)[:, 0]

@@ -69,9 +69,7 @@ class Beyond:
     length one, and what remains of them is orthonormal."""
 
     def __init__(self, likelihood: Likelihood, columns: Array) -> None:
-        flat = columns.reshape(likelihood.residual.size, -1)
-        size = np.maximum(np.linalg.norm(flat, axis=0), 1e-300)
-        self.flat = likelihood.by_frequency((flat / size).reshape(columns.shape))
+        self.flat = likelihood.flat(columns)
         self._likelihood = likelihood
         self.on = likelihood.declared.T @ self.flat
         self.mix = likelihood.orthonormal(self.flat.T @ self.flat - self.on.T @ self.on)
@@ -177,6 +175,12 @@ class Likelihood:
             found.reshape(flat.shape[0], -1)[:, told] = flat
             columns = found
         return columns.reshape(columns.shape[0] * columns.shape[1], -1)
+
+    def flat(self, columns: Array) -> Array:
+        """Columns (N, m, q), each of length one, by frequency (N·m, q)."""
+        flat = columns.reshape(self.residual.size, -1)
+        size = np.maximum(np.linalg.norm(flat, axis=0), 1e-300)
+        return self.by_frequency((flat / size).reshape(columns.shape))
 
     def in_time(self, columns: Array) -> Array:
         """(N·m, k) as (N, m, k) again."""
