@@ -12,8 +12,9 @@ from scipy.integrate import quad
 from scipy.linalg import solve_triangular, toeplitz
 from scipy.signal import butter, lfilter
 
-from casest.diagnose.evidence.likelihood import Beyond, Likelihood, rise_of_squares, rises
+from casest.diagnose.evidence.likelihood import Beyond, Likelihood
 from casest.diagnose.evidence.linear import Linear, parts_of
+from casest.diagnose.evidence.rises import rise_of_squares, rises
 from casest.diagnose.evidence.score import (
     Trial,
     expected_loss,

@@ -11,8 +11,9 @@ import pytest
 
 from casest import close
 from casest.diagnose.evidence import wandering
-from casest.diagnose.evidence.likelihood import Likelihood, rises
+from casest.diagnose.evidence.likelihood import Likelihood
 from casest.diagnose.evidence.linear import Linear, parts_of
+from casest.diagnose.evidence.rises import rises
 from casest.diagnose.evidence.wandering import SIZES, wandering_cost
 from casest.diagnose.noise.slow_course import slow_squares
 

@@ -10,14 +10,13 @@ white noise.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 
 from casest.declaration.shapes import Array
-from casest.diagnose.evidence.linear import Index, Linear, alike, robust_sd
+from casest.diagnose.evidence.linear import Index, Linear, robust_sd
 from casest.diagnose.evidence.sums import Narrow
 from casest.diagnose.levels import LEVELS
 
@@ -271,52 +270,6 @@ def far_out(residual: Array) -> Array:
     """
     far, middle = LEVELS.clip * robust_sd(residual), np.median(residual, axis=0)
     return np.asarray(residual - np.clip(residual, middle - far, middle + far))
-
-
-def beside_a_colour(likelihood: Likelihood) -> float:
-    """−2 log L where the noise has a spectrum of its own, and no more."""
-    return likelihood.beside().cost
-
-
-def rises(
-    less: Linear, fits: Sequence[Linear], of: Callable[[Likelihood], float] = beside_a_colour
-) -> list[float]:
-    """2 log of the likelihood of each fit over that of one with less in it; each has its own noise.
-
-    What the fit with the least noise leaves far out is cut from all of them. `of`: −2 log L. Of a
-    fit that takes most of the squares at least what these say: where the other instrument is the
-    noisy one, a residual that has little of it in it is likely as a smooth course of its own,
-    however large it is.
-    """
-    less, *fits = alike([less, *fits])
-    best = min(fits, key=lambda x: float(np.sum(np.log(robust_sd(x.residual)))))
-
-    def cut(linear: Linear) -> Array | None:
-        alike = linear.residual.shape == best.residual.shape  # rows that moved in time are others
-        return far_out(best.residual) if alike and linear.series else None
-
-    none, far = of(Likelihood(less, cut(less))), cut(less)
-    return [
-        max(none - of(Likelihood(fit, cut(fit))), rise_of_squares(less, fit, far)) for fit in fits
-    ]
-
-
-def rise_of_squares(less: Linear, more: Linear, cut: Array | None = None) -> float:
-    """2 log of the likelihood ratio of squares, of as many samples as are independent.
-
-    As many as noise of the spectrum of all that there was would leave of what is taken away
-    (Bartlett 1935): what is missing counts as noise, so they are too few. Nothing where less than
-    most of the squares are taken. `cut`: as of a likelihood.
-    """
-    if not less.coloured or less.residual.shape != more.residual.shape:
-        return -np.inf
-    without, beside = Likelihood(less, cut), Likelihood(more, cut)
-    before, after = without.residual, beside.residual
-    taken, b, a = before - after, float(before @ before), float(after @ after)
-    if a > LEVELS.most * b:
-        return -np.inf
-    noise = float(without.beside().powers @ without.sums.summed(taken**2))
-    return b * float(taken @ taken) / max(noise, 1e-300) * float(np.log(b / max(a, 1e-300)))
 
 
 def _weighted(w: Array, products: Array) -> Array:

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from casest.declaration.shapes import Array
-from casest.diagnose.evidence.likelihood import rise_of_squares, rises
 from casest.diagnose.evidence.linear import alike
+from casest.diagnose.evidence.rises import rise_of_squares, rises
 from casest.diagnose.evidence.score import (
     Evidence,
     Trial,

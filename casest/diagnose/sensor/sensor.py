@@ -13,8 +13,9 @@ from casest.declaration.effect import Effect
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
 from casest.diagnose.candidates.candidates import Candidate
-from casest.diagnose.evidence.likelihood import Likelihood, rises
+from casest.diagnose.evidence.likelihood import Likelihood
 from casest.diagnose.evidence.linear import Linear
+from casest.diagnose.evidence.rises import rises
 from casest.diagnose.evidence.score import Evidence, Trial, judged, on_fewer_axes
 from casest.diagnose.evidence.wandering import wandering_cost
 from casest.diagnose.formula.search import NAME, described, readable, with_sizes
