@@ -44,6 +44,8 @@ class Closing:
     def misfit(self) -> Misfit:
         """What is left after the loop, tested beside the noise as it is."""
         problem = Problem(self.after.model, self.runs)
+        evidence = self.after.evidence
+        shared = evidence.scatter if evidence is not None and evidence.misfit else None
         with np.errstate(all="ignore"):
             return left_over(
                 problem,
@@ -54,6 +56,7 @@ class Closing:
                 self.undecided,
                 self.described,
                 wanders=any(f.wanders for f in self.effects),
+                shared=shared,
             )
 
     @property

@@ -20,6 +20,12 @@ from casest.units import conversion, known, size
 #: How a name says the unit of an angle: theta_rad.
 _ENDING = re.compile(r"[_ ](rad|deg)$", re.IGNORECASE)
 
+#: Why an effect on an input, or on the output, has no place, and the way out.
+MISSING = {
+    "input": "declares no corrected quantity: Residual(…, corrected=…) says on which it could act",
+    "output": "names no prediction: predicted=quantity(…) gives it a name",
+}
+
 
 def prepared(model: Model, runs: Sequence[Run]) -> tuple[Run, ...]:
     """Runs whose time and usable columns can be read like signals."""
@@ -60,8 +66,7 @@ def placed_in(effect: Effect, model: Model) -> Effect:
     else:
         place = effect.on
     if place is None:
-        word = "declares no corrected quantity" if effect.on == "input" else "names no prediction"
-        raise CasestError(f"model {model.name} {word}")
+        raise CasestError(f"model {model.name} {MISSING[effect.on]}")
     return replace(effect, on=place)
 
 

@@ -8,6 +8,7 @@ from typing import Any, Protocol, TypeVar
 from casest.diagnose.found import HELD_OUT_DATA
 from casest.diagnose.levels import LEVELS
 from casest.effects import CATALOGUE
+from casest.effects.placing import MISSING
 from casest.results.closing import Closed, Effect, Shifts, Unexplained
 from casest.results.fitted import Samples
 from casest.results.result import Number, Parameter
@@ -96,6 +97,21 @@ def refusals(result: Closed) -> Iterator[str]:
     for r in result.refused:
         what = "nothing was" if r.name == HELD_OUT_DATA else f"{r.name} was not"
         yield f"{what} added: {r.reason}"
+
+
+def untried(result: Closed) -> Iterator[str]:
+    """What was not tried: the user's own with the reason, what the declaration lacks with the way
+    out, the others by name."""
+    own = of_the_user(result.not_tried)
+    yield from (f"{s.name} was not tried: {s.reason}" for s in own)
+    left = {s.name: s.reason for s in result.not_tried if s not in own}
+    for why in MISSING.values():
+        names = [name for name, reason in left.items() if reason.endswith(why)]
+        if names:
+            yield f"not tried: {', '.join(names)}: {left[names[0]]}"
+        left = {name: reason for name, reason in left.items() if name not in names}
+    if left:
+        yield f"not tried, why is in result.json: {', '.join(left)}"
 
 
 def judged(gain: str) -> str:

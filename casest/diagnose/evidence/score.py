@@ -17,7 +17,7 @@ import numpy as np
 
 from casest.declaration.shapes import Array
 from casest.diagnose.evidence.likelihood import Beyond, Explained, Likelihood
-from casest.diagnose.evidence.linear import Index, Linear
+from casest.diagnose.evidence.linear import Index
 
 
 @dataclass(frozen=True)
@@ -98,42 +98,10 @@ def p_value(gain: float, freedom: int, searched: float, likelihood: Likelihood) 
     return float(min(1.0, fdtrc(freedom, rest, F) * np.exp(min(searched, 700.0))))
 
 
-def whatever_sizes(before: Linear, after: Linear, evidence: Evidence, families: int) -> float:
-    """The chance of what a refit of poses adds, where each row's error has a size of its own.
-
-    Wald's F with the variance that the jackknife gives (HC3; MacKinnon & White 1985), each fit
-    linear about itself: a row that is off alone, or noise that is larger at one end, makes an
-    effect of whatever is largest there.
-    """
-    from scipy.special import fdtrc
-
-    rows, axes = before.residual.shape
-    q = after.basis.shape[1] - before.basis.shape[1]
-    rest = rows * axes - after.basis.shape[1]
-    if rest < 1 or q < 1:
-        return 1.0
-    beyond = after.basis - before.basis @ (before.basis.T @ after.basis)
-    C = np.linalg.svd(beyond, full_matrices=False)[0][:, :q]
-    added = C.T @ (before.residual - after.residual).ravel()
-    moved = _by_each_row(after, C)
-    F = float(added @ np.linalg.lstsq(moved.T @ moved, added, rcond=None)[0]) / q
-    searched = float(np.exp(min(_searched(evidence.trials, families), 700.0)))
-    return float(min(1.0, fdtrc(q, rest, F) * searched))
-
-
-def _by_each_row(linear: Linear, C: Array) -> Array:
-    """By how much the coefficients of columns C (N·m, q) move where a row is left out, (rows, q).
-
-    A row that the rest says nothing of, and that says something of them, moves them any far.
-    """
-    rows, axes = linear.residual.shape
-    own, e = linear.basis.reshape(rows, axes, -1), linear.residual[:, :, None]
-    values, vectors = np.linalg.eigh(np.eye(axes) - own @ own.transpose(0, 2, 1))
-    along = (vectors.transpose(0, 2, 1) @ e)[:, :, 0]
-    free = values > 1e-9
-    along = np.where(free, along / np.where(free, values, 1.0), 1e6 * np.abs(e).max())
-    away = vectors @ along[:, :, None]
-    return np.asarray(np.einsum("nmq,nm->nq", C.reshape(rows, axes, -1), away[:, :, 0]))
+def shared_chance(chance: float, evidence: Evidence, families: int) -> float:
+    """A chance shared among what was looked through to find the evidence."""
+    searched = min(_searched(evidence.trials, families), 700.0)
+    return float(min(1.0, chance * np.exp(searched)))
 
 
 def screened(beyond: Beyond, likelihood: Likelihood, none: Explained) -> float:

@@ -23,19 +23,24 @@ from casest.diagnose.misfit.reference import along_reference
 from casest.diagnose.misfit.structure import structures
 from casest.diagnose.misfit.variables import variables
 from casest.diagnose.noise.noise_model import noise_model, step_of
-from casest.diagnose.noise.slow_course import slow_course
+from casest.diagnose.noise.slow_course import MEMORY, slow_course
 from casest.diagnose.noise.spectral_line import strongest_line
 from casest.effects.placing import prepared
 from casest.estimate.before import against_prior
 from casest.estimate.correlation import TABLE, is_series
 from casest.estimate.estimate import Estimate
 from casest.leastsquares.agreement import between_runs
+from casest.leastsquares.neighbours import Scatter
 from casest.leastsquares.problem import Point, Problem
 from casest.leastsquares.stated import chi_square
 from casest.leastsquares.weights import robust_scale, weighted
 
 #: Longer records are not asked by `calibrate`: all residuals are looked at at once.
 LONGEST = 200_000
+#: Variance of neighbours' differences from the line between them, in that of the noise, where noise
+#: remembers as exp(−k/MEMORY).
+_KIN = float(np.exp(-1 / MEMORY))
+OF_COLOUR = (1.5 - 2 * _KIN + 0.5 * _KIN**2) / 1.5
 
 
 @dataclass(frozen=True)
@@ -88,8 +93,12 @@ def left_over(
     described: Sequence[Course] = (),
     *,
     wanders: bool = False,
+    shared: Scatter | None = None,
 ) -> Misfit:
-    """The misfit of a closed model, with the noise beside it."""
+    """The misfit of a closed model, with the noise beside it.
+
+    `shared`: what rows with nearly the same inputs share, where the model does not explain all.
+    """
     noise = noise_model(
         problem.runs,
         problem.residuals(point),
@@ -99,6 +108,7 @@ def left_over(
         levels=predictions(problem, point),
     )
     found = findings(problem, point, correlated_over, wanders=wanders)
+    found += [] if shared is None else _of_neighbours(shared)
     everything = np.concatenate([r.ravel() for r in held_out])
     everything = everything[np.isfinite(everything)]  # the rest nothing foretells
     if everything.size:
@@ -130,6 +140,23 @@ def left_over(
         where.append(f"its slow course is best described by {looks}")
     names = tuple(c.what.label for c in said)
     return Misfit(bool(where), float(fraction), "; ".join(where), noise.content, names)
+
+
+def _of_neighbours(found: Scatter) -> list[Finding]:
+    """A course that rows with nearly the same inputs share, beyond what neighbours in time share of
+    noise with a colour, and the model does not have."""
+    from scipy.special import fdtrc
+
+    within = found.left / OF_COLOUR
+    chance = float(fdtrc(*found.freedom, found.residual / max(within, 1e-300)))
+    if chance >= LEVELS.misfit:
+        return []
+    where = (
+        f"the residual is {np.sqrt(found.residual / max(found.left, 1e-300)):.3g} times what it "
+        "differs by between rows with nearly the same inputs"
+    )
+    share = 1 - found.left / found.residual
+    return [Finding(where, chance, float(np.sqrt(found.left)), share)]
 
 
 def _looks_like(candidate: Candidate) -> str:

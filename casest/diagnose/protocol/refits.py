@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from casest.declaration.shapes import Array
+from casest.diagnose.evidence.by_row import chance_by_row
 from casest.diagnose.evidence.linear import alike
 from casest.diagnose.evidence.rises import rise_of_squares, rises
 from casest.diagnose.evidence.score import (
@@ -15,7 +16,7 @@ from casest.diagnose.evidence.score import (
     Trial,
     expected_loss,
     judged,
-    whatever_sizes,
+    shared_chance,
     with_chance,
 )
 from casest.diagnose.levels import LEVELS
@@ -26,7 +27,10 @@ from casest.diagnose.protocol.state import F, Ranking, Refit, State
 from casest.diagnose.protocol.subject import Subject
 
 #: Why a cause in poses is not added.
-FEW_ROWS = "a row or a few carry it: left out one by one, they move its size too far"
+FEW_ROWS = (
+    "a row or a few carry it, or neighbouring rows go together: its size is not as sure as the F "
+    "test has it"
+)
 #: Why what holds out and has strong evidence is not added.
 AS_MUCH = "a slow course of unknown cause explains as much"
 
@@ -55,7 +59,7 @@ def refitted(
         kept = _gaining(evidence, gain)
         least = _gaining(evidence, min(noisier))
         enough = beyond_courses(ranking, kept) and _strong(ranking, least)
-        of_few_rows = enough and not _whatever_sizes(subject, ranking, kept, better)
+        of_few_rows = enough and not _row_by_row(subject, ranking, kept, better)
         if (enough and not of_few_rows) or subject.asked(evidence.trials[0].what):
             found.append(Refit(state.fit, better, kept))
         elif of_few_rows:
@@ -73,13 +77,13 @@ def refitted(
     return state, _plainest_first(found, ranking)
 
 
-def _whatever_sizes(subject: Subject[F], ranking: Ranking, evidence: Evidence, fit: F) -> bool:
-    """Is it seen in poses whatever the sizes of their errors are?"""
+def _row_by_row(subject: Subject[F], ranking: Ranking, evidence: Evidence, fit: F) -> bool:
+    """Is it seen in poses whatever the sizes of their errors are, and if neighbours' are alike?"""
     after = subject.linear(fit)
     if ranking.linear.series or after.residual.shape != ranking.linear.residual.shape:
         return True
-    chance = whatever_sizes(ranking.linear, after, evidence, ranking.families)
-    return chance < LEVELS.chance
+    chance = chance_by_row(ranking.linear, after)
+    return shared_chance(chance, evidence, ranking.families) < LEVELS.chance
 
 
 def _gaining(evidence: Evidence, gain: float) -> Evidence:

@@ -12,7 +12,15 @@ from casest.report.next_command import following
 from casest.report.text.layout import WIDTH, held_lines, item, value_table
 from casest.results.closing import Closed
 from casest.results.rounding import percent
-from casest.results.verdict import instead, largest, of_the_user, refusals, sentence, undecided
+from casest.results.verdict import (
+    instead,
+    largest,
+    of_the_user,
+    refusals,
+    sentence,
+    undecided,
+    untried,
+)
 
 #: Lists longer than this are left to result.json.
 SHOWN = 4
@@ -118,7 +126,8 @@ def _invisible(result: Closed) -> Iterator[str]:
         moves = ", ".join(f"{n} by {v:.2g}" for n, v in i.would_move.items())
         units = {n: "" if u == "1" else f" {u}" for n, u in i.units.items()}
         size = ", ".join(f"{n} = {v:.3g}{units[n]}" for n, v in i.typical.items())
-        yield item(f"{i.name} ({size}): {moves}; shown by {i.shown_by}")
+        where = f"({i.column})" if i.column else ""
+        yield item(f"{i.name}{where} ({size}): {moves}; shown by {i.shown_by}")
     if len(hidden) > SHOWN:
         yield f"  - and {len(hidden) - SHOWN} more, in result.json"
 
@@ -147,9 +156,4 @@ def _detectable(result: Closed) -> Iterator[str]:
 def _notes(result: Closed) -> Iterator[str]:
     yield from (item(note) for note in result.notes)
     yield from (item(words) for words in list(refusals(result))[:SHOWN])
-    own = of_the_user(result.not_tried)
-    for skipped in own:
-        yield item(f"{skipped.name} was not tried: {skipped.reason}")
-    shipped = dict.fromkeys(s.name for s in result.not_tried if s not in own)
-    if shipped:
-        yield item(f"not tried, why is in result.json: {', '.join(shipped)}")
+    yield from (item(words) for words in untried(result))
