@@ -15,14 +15,16 @@ from casest.diagnose.levels import LEVELS
 
 #: Correlation of neighbours at most: of few rows nobody can tell more from it.
 LIKEST = 0.95
+#: Standard errors of that correlation from which on it is beyond chance, one-sided 1 %.
+BEYOND = 2.33
 
 
-def chance_by_row(before: Linear, after: Linear) -> float:
+def chance_by_row(before: Linear, after: Linear, *, together: bool = False) -> float:
     """The chance of what a refit of poses adds to another.
 
     Wald's F with the variance that the jackknife gives (HC3; MacKinnon & White 1985), each fit
-    linear about itself, and with what neighbours that are alike make of that variance and of the
-    count of the rows (noise that remembers as ρᵏ).
+    linear about itself; `together`: and with what neighbours that are alike make of that variance
+    (noise that remembers as ρᵏ). Nothing else may be missing then: it would be alike as well.
     """
     from scipy.special import fdtrc
 
@@ -36,9 +38,8 @@ def chance_by_row(before: Linear, after: Linear) -> float:
     added = C.T @ (before.residual - after.residual).ravel()
     moved = _by_each_row(after, C)
     F = float(added @ np.linalg.lstsq(moved.T @ moved, added, rcond=None)[0]) / q
-    rho = kinship(after)
-    count = max(rest * (1 - rho) / (1 + rho), 1.0)
-    return float(fdtrc(q, count, F / _by_neighbours(C, rows, rho)))
+    larger = _by_neighbours(C, rows, kinship(after)) if together else 1.0
+    return float(fdtrc(q, rest, F / larger))
 
 
 def _by_each_row(linear: Linear, C: Array) -> Array:
@@ -75,4 +76,5 @@ def kinship(linear: Linear) -> float:
     products, squares = np.sum(e[1:] * e[:-1], axis=0), np.sum(e**2, axis=0)
     free = rows - np.einsum("nmp,nmp->m", own, own)
     rho = (products - taken * squares / np.maximum(free, 1.0)) / np.maximum(squares, 1e-300)
-    return min(max(float(np.mean(rho)), 0.0), LIKEST)
+    mean = float(np.mean(rho))
+    return min(mean, LIKEST) if mean * np.sqrt(rows * axes) > BEYOND else 0.0

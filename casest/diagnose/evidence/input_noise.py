@@ -15,6 +15,7 @@ import numpy as np
 
 from casest.declaration.shapes import Array
 from casest.diagnose.evidence.likelihood import Likelihood
+from casest.diagnose.evidence.linear import Linear, alike
 from casest.diagnose.evidence.score import Evidence
 from casest.diagnose.levels import LEVELS
 
@@ -46,4 +47,27 @@ def feigned(
     both = max(float(np.mean(together)) if together else 0.0, 0.0)
     all_there = float(np.sum((root * likelihood.residual) ** 2))
     share = LEVELS.jitter * both**2 / max(explained * all_there, 1e-300)
+    return len(root) * min(MOST, -float(np.log1p(-min(share, 1 - 1e-12))))
+
+
+def feigned_by_refit(
+    before: Linear, after: Linear, draws: Sequence[tuple[Array, Array]]
+) -> float | None:
+    """The same of a refit, by the noise of an input that it takes from the residual; None where the
+    refits are of other rows.
+
+    `draws`: what noise of that input adds to the residuals (N, m) of both. A lag leaves that noise
+    as large as it was, however much a slope in the lag magnifies it.
+    """
+    one, other = alike([before, after])
+    if one.residual.shape != other.residual.shape:
+        return None
+    likelihood = Likelihood(other)
+    root = 1 / np.sqrt(likelihood.beside().spectrum)
+
+    def squares(residual: Array) -> float:
+        return float(np.sum((root * likelihood.by_frequency(residual[:, :, None])[:, 0]) ** 2))
+
+    taken = float(np.mean([squares(less) - squares(more) for less, more in draws]))
+    share = LEVELS.jitter * max(taken, 0.0) / max(squares(one.residual), 1e-300)
     return len(root) * min(MOST, -float(np.log1p(-min(share, 1 - 1e-12))))

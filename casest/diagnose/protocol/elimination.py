@@ -7,12 +7,17 @@ from typing import Any
 
 import numpy as np
 
+from casest.diagnose.evidence.by_row import chance_by_row
 from casest.diagnose.evidence.likelihood import Likelihood
 from casest.diagnose.evidence.score import p_value, worth
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.protocol.confirming import falls_of_refit
 from casest.diagnose.protocol.state import F, Kept, State
 from casest.diagnose.protocol.subject import Subject
+
+#: Why a cause that was added goes again.
+LATER = "no longer needed beside what came later"
+TOGETHER = "neighbouring rows go together: its size is not as sure as the F test has it"
 
 
 def on_all_axes(subject: Subject[F], state: State[F], *, needed: bool) -> State[F]:
@@ -50,27 +55,30 @@ def _certified(subject: Subject[F], found: tuple[Any, F] | None) -> tuple[Any, F
 def eliminated(subject: Subject[F], state: State[F]) -> State[F]:
     """Each cause must earn its place again beside the others; the weakest goes first.
 
-    Also the last one, where another has gone: of a pair each was judged beside the other.
+    Also the last one, where another has gone: of a pair each was judged beside the other. And in
+    poses, where nothing else is found, by how neighbours go together.
     """
-    count = len(state.kept)
-    while len(state.kept) > 1 or (state.kept and len(state.kept) < count):
+    count, poses = len(state.kept), not subject.linear(state.fit).series
+    while len(state.kept) > 1 or (state.kept and (len(state.kept) < count or poses)):
         weak = []
         for kept in state.kept:
             base = subject.without(state.fit, kept.what)
-            score = None if base is None else _beside_the_others(subject, state, kept, base)
-            if score is not None:
-                weak.append((score, kept, base))
+            found = None if base is None else _beside_the_others(subject, state, kept, base)
+            if found is not None:
+                weak.append((*found, kept, base))
         if not weak:
             return state
-        _, gone, fit = min(weak, key=lambda w: w[0])
+        _, why, gone, fit = min(weak, key=lambda w: w[0])
         assert fit is not None
         state = replace(state, fit=fit, kept=tuple(k for k in state.kept if k is not gone))
-        state = state.refusing(gone.what, "no longer needed beside what came later")
+        state = state.refusing(gone.what, why)
     return state
 
 
-def _beside_the_others(subject: Subject[F], state: State[F], kept: Kept, base: F) -> float | None:
-    """What a cause is worth that does not earn its place as the last one; None if it does.
+def _beside_the_others(
+    subject: Subject[F], state: State[F], kept: Kept, base: F
+) -> tuple[float, str] | None:
+    """What a cause is worth that does not earn its place as the last one, and why; None if it does.
 
     `base` is the fit without it.
     """
@@ -80,14 +88,16 @@ def _beside_the_others(subject: Subject[F], state: State[F], kept: Kept, base: F
     families = state.first.families if state.first else 1
     searched = float(np.log(kept.evidence.trials[0].variants * families))
     score = worth(gain, freedom, searched, none)
-    strong = (
-        score > LEVELS.strong
-        if linear.series
-        else (p_value(gain, freedom, searched, none) < LEVELS.chance)
-    )
-    if strong and (subject.asked(kept.what) or linear.residual.shape != whole.residual.shape):
+    chance, why = p_value(gain, freedom, searched, none), LATER
+    strong = score > LEVELS.strong if linear.series else chance < LEVELS.chance
+    same = linear.residual.shape == whole.residual.shape
+    if strong and same and not linear.series and not subject.asked(kept.what):
+        together = chance_by_row(linear, whole, together=True)
+        if together * np.exp(min(searched, 700.0)) >= LEVELS.chance:
+            strong, why = False, TOGETHER
+    if strong and (subject.asked(kept.what) or not same):
         return None  # rows that moved in time are others
     # What was confirmed once stays, unless some held-out part is clearly worse with it.
     seen = falls_of_refit(linear, whole)
     worse = any(f.t < -LEVELS.confirmed for f in seen.values()) if linear.series else False
-    return None if strong and seen["pieces"].ratio < 1 and not worse else score
+    return None if strong and seen["pieces"].ratio < 1 and not worse else (score, why)

@@ -9,6 +9,7 @@ import numpy as np
 
 from casest.declaration.shapes import Array
 from casest.diagnose.evidence.by_row import chance_by_row
+from casest.diagnose.evidence.input_noise import feigned_by_refit
 from casest.diagnose.evidence.linear import alike
 from casest.diagnose.evidence.rises import rise_of_squares, rises
 from casest.diagnose.evidence.score import (
@@ -27,10 +28,7 @@ from casest.diagnose.protocol.state import F, Ranking, Refit, State
 from casest.diagnose.protocol.subject import Subject
 
 #: Why a cause in poses is not added.
-FEW_ROWS = (
-    "a row or a few carry it, or neighbouring rows go together: its size is not as sure as the F "
-    "test has it"
-)
+FEW_ROWS = "a row or a few carry it: left out one by one, they move its size too far"
 #: Why what holds out and has strong evidence is not added.
 AS_MUCH = "a slow course of unknown cause explains as much"
 
@@ -56,6 +54,7 @@ def refitted(
     slow = (refits and subject.rises_beside_a_wander(state.fit, refits)) or gains
     found: list[Refit[F]] = []
     for (evidence, better), gain, *noisier in zip(fits, gains, even, slow, strict=True):
+        evidence = _charged(subject, state.fit, evidence, better)
         kept = _gaining(evidence, gain)
         least = _gaining(evidence, min(noisier))
         enough = beyond_courses(ranking, kept) and _strong(ranking, least)
@@ -78,12 +77,25 @@ def refitted(
 
 
 def _row_by_row(subject: Subject[F], ranking: Ranking, evidence: Evidence, fit: F) -> bool:
-    """Is it seen in poses whatever the sizes of their errors are, and if neighbours' are alike?"""
+    """Is it seen in poses whatever the sizes of their errors are?"""
     after = subject.linear(fit)
     if ranking.linear.series or after.residual.shape != ranking.linear.residual.shape:
         return True
     chance = chance_by_row(ranking.linear, after)
     return shared_chance(chance, evidence, ranking.families) < LEVELS.chance
+
+
+def _charged(subject: Subject[F], before: F, evidence: Evidence, fit: F) -> Evidence:
+    """With what noise of the inputs may feign of this refit, where it may of its columns."""
+    if not evidence.feigned:
+        return evidence
+    one, other = subject.linear(before), subject.linear(fit)
+    gains = [feigned_by_refit(one, other, draws) for draws in subject.noise_in(before, fit)]
+    known = [g for g in gains if g is not None]
+    if not known:
+        return evidence
+    own = max(known) / len(evidence.trials)
+    return replace(evidence, trials=tuple(replace(t, feigned=own) for t in evidence.trials))
 
 
 def _gaining(evidence: Evidence, gain: float) -> Evidence:
@@ -285,6 +297,7 @@ def shown(
             state = state if evidence is None else state.failing(evidence, str(better))
             continue
         gain, *_ = subject.rises(state.fit, [better, *(r.fit for r in beside)])
+        evidence = _charged(subject, state.fit, evidence, better)
         kept = _gaining(evidence, gain)
         if not _strong(ranking, kept):
             kept = _by_squares(subject, state, ranking, evidence, better)

@@ -38,11 +38,36 @@ def jittered(rows: Rows, fit: Fit, trials: Sequence[Trial]) -> list[list[Draw]]:
     Of an implicit model each signal may be the one with the noise.
     """
     rng = np.random.default_rng(0)
-    count = int(np.clip(-(-2 * LEVELS.series // sum(map(len, rows.index))), 1, DRAWS))
     return [
-        [_draw(rows, fit, trials, name, size, rng) for _ in range(count)]
+        [_draw(rows, fit, trials, name, size, rng) for _ in range(_count(rows))]
         for name, size in _inputs(rows, fit)
     ]
+
+
+def in_refit(rows: Rows, before: Fit, after: Fit) -> list[list[tuple[Array, Array]]]:
+    """For each input a few draws: what such noise adds to the residuals (N, m) of the two fits."""
+    rng, found = np.random.default_rng(0), []
+    for name, size in _inputs(rows, before):
+        draws = [
+            tuple(_noisier(r, name, size, rng) for r in rows.runs) for _ in range(_count(rows))
+        ]
+        found.append([(_added(rows, before, runs), _added(rows, after, runs)) for runs in draws])
+    return found
+
+
+def _count(rows: Rows) -> int:
+    return int(np.clip(-(-2 * LEVELS.series // sum(map(len, rows.index))), 1, DRAWS))
+
+
+def _added(rows: Rows, fit: Fit, runs: tuple[Run, ...]) -> Array:
+    """What is added to the weighted residuals (N, m) of a fit by other inputs."""
+    problem, point = problem_of(fit, rows.runs)
+    noisy = Problem(fit.model, runs)
+    more = zip(noisy.residuals(point), problem.residuals(point), strict=True)
+    change = [n - r for n, r in more]
+    if problem.weights is not None:
+        change = [c * np.sqrt(w) for c, w in zip(change, problem.weights, strict=True)]
+    return rows.of(change)
 
 
 def _inputs(rows: Rows, fit: Fit) -> Iterator[tuple[str, float]]:

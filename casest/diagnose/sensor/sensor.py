@@ -22,7 +22,7 @@ from casest.diagnose.formula.search import NAME, described, readable, with_sizes
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.protocol import Kept, Ranking, Subject
 from casest.diagnose.sensor.fits import Fit, certified, fitted, problem_of, simpler, starts
-from casest.diagnose.sensor.jitter import Draw, jittered
+from casest.diagnose.sensor.jitter import Draw, in_refit, jittered
 from casest.diagnose.sensor.recent import Recent
 from casest.diagnose.sensor.rows import Rows
 from casest.diagnose.sensor.tried import Tried, on_axes
@@ -105,6 +105,10 @@ class Sensor(Subject[Fit]):
     def jittered(self, fit: Fit, trials: Sequence[Trial]) -> Sequence[Sequence[Draw]]:
         """The same where inputs have more noise."""
         return jittered(self.rows, fit, trials)
+
+    def noise_in(self, before: Fit, after: Fit) -> Sequence[Sequence[tuple[Array, Array]]]:
+        """What noise of each input adds to the residuals of two fits."""
+        return in_refit(self.rows, before, after)
 
     def nearer(self, fit: Fit, trial: Trial, scale: float) -> list[Trial]:
         """Values of a grid around the trial's."""
@@ -313,8 +317,7 @@ class Sensor(Subject[Fit]):
             model = fit.model.having(**{what.freed: held if held.ndim else float(held)})
             own = {what.freed}
         else:
-            left = tuple(a for a in fit.model.effects if a.label != what.label)
-            model = replace(fit.model, effects=left)
+            model = _less(fit, what).model
         values = {n: v for n, v in fit.values.items() if n not in own}
         problem = Problem(model, self.runs)
         point = problem.point(values)
@@ -354,10 +357,17 @@ class Sensor(Subject[Fit]):
 
 def _less(fit: Fit, what: Candidate) -> Fit:
     """An effect taken out, all else where it is."""
-    own = fit.model.unknowns_of(what.label)
-    left = tuple(a for a in fit.model.effects if a.label != what.label)
-    values = {n: v for n, v in fit.values.items() if n not in own}
-    return replace(fit, model=replace(fit.model, effects=left), values=values)
+    left = [a for a in fit.model.effects if a.label != what.label]
+    while True:
+        model = replace(fit.model, effects=tuple(left))
+        # A lag of a column that only this effect read goes with it.
+        there = {s.name for s in (*model.signals, *fit.model.declared)} | {*fit.model.quantities}
+        kept = [a for a in left if a.on in there]
+        if len(kept) == len(left):
+            break
+        left = kept
+    names = {p.name for p in model.parameters}
+    return replace(fit, model=model, values={n: v for n, v in fit.values.items() if n in names})
 
 
 def _is_lag(candidate: Candidate) -> bool:
