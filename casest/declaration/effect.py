@@ -65,7 +65,8 @@ class Effect:
     model where it is not applicable as it stands; `once`: it happened in the record that it was
     found in, and has "passed" (in another one it is not there) or "stayed" (in another one nobody
     knows how much of it is there); `foreign_to` kinds of reading, by a unit each, of which no
-    sensor has it, `only_of` those that alone have it: elsewhere it is tried where it is asked for.
+    sensor has it, `only_of` those that alone have it: elsewhere it is tried where it is asked for;
+    `most` sizes of parameters beyond which it is another effect than its name says.
     """
 
     name: str
@@ -94,6 +95,7 @@ class Effect:
     once: Once = ""
     foreign_to: tuple[str, ...] = ()
     only_of: tuple[str, ...] = ()
+    most: tuple[tuple[str, float], ...] = ()
 
     def __reduce__(self) -> tuple[Any, ...]:
         """To pickle: its function by name."""
@@ -162,6 +164,7 @@ def effect(
     once: Once = "",
     foreign_to: Sequence[str] = (),
     only_of: Sequence[str] = (),
+    most: Mapping[str, float] | None = None,
 ) -> Callable[[Callable[..., Any]], Effect]:
     """Declare an effect: first argument the value acted on, further ones signals or columns.
 
@@ -189,7 +192,7 @@ def effect(
             )
         for word, given in (
             ("null", null), ("typical", typical), ("profile", profile), ("plain", plain),
-            ("numbers", numbers),
+            ("numbers", numbers), ("most", most),
         ):  # fmt: skip
             _refuse_unknown(function.__name__, word, given or {}, [name for name, _ in keyword])
         if uncertain := [s.name for s in extras if s.std is not None]:
@@ -231,6 +234,7 @@ def effect(
             once=once,
             foreign_to=tuple(foreign_to),
             only_of=tuple(only_of),
+            most=tuple((most or {}).items()),
         )
 
     return declare

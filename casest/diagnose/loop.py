@@ -31,6 +31,7 @@ from casest.diagnose.protocol.refits import AS_MUCH
 from casest.diagnose.protocol.state import Ranking
 from casest.diagnose.sensor import NOT_FINITE, Fit, Sensor
 from casest.diagnose.sensor.courses import courses
+from casest.diagnose.sensor.fits import too_large
 from casest.diagnose.visibility import Visible, visible
 from casest.effects import CATALOGUE
 from casest.effects.placing import prepared
@@ -340,23 +341,35 @@ def certified(sensor: Sensor, state: State[Fit], before: Estimate) -> tuple[Stat
         with only_tried(False):
             model = state.fit.model.having(**noises(sensor.model))  # as they are beside it
             after = attempt(model, sensor.runs, start=state.fit.values, seed=sensor.seed)
-        if after.certificate.trusted:
+        last, why = _at_fault(state, after)
+        if not why:
             return state, after
-        if not state.kept:
+        if last is None:
             return state, before
-        last, why = state.kept[-1], f"its fit is refused: {after.certificate.reasons[0]}"
         if last.rivals:
             # Its evidence stays that of the one that it replaces: they differ by little.
             first, *others = last.rivals
-            kept = replace(last, what=first.what, rivals=tuple(others))
-            state = replace(state, fit=first.fit, kept=(*state.kept[:-1], kept))
+            other = replace(last, what=first.what, rivals=tuple(others))
+            several = tuple(other if k is last else k for k in state.kept)
+            state = replace(state, fit=first.fit, kept=several)
             state = state.refusing(last.what, why)
             continue
         fit = sensor.without(state.fit, last.what)
         if fit is None:
             return state, before
-        state = replace(state, fit=fit, kept=state.kept[:-1], open=(last.evidence, *state.open))
+        kept = tuple(k for k in state.kept if k is not last)
+        state = replace(state, fit=fit, kept=kept, open=(last.evidence, *state.open))
         state = state.refusing(last.what, why)
+
+
+def _at_fault(state: State[Fit], after: Estimate) -> tuple[Kept | None, str]:
+    """Which cause a proved estimate speaks against, and why: one that is not what it is called, or
+    the last one where it is refused."""
+    if not after.certificate.trusted:
+        last = state.kept[-1] if state.kept else None
+        return last, f"its fit is refused: {after.certificate.reasons[0]}"
+    label, why = too_large(after.model, after.values)
+    return next((k for k in state.kept if k.what.label == label), None), why
 
 
 def _found(sensor: Sensor, state: State[Fit], kept: Kept, after: Estimate) -> Found:

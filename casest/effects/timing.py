@@ -79,6 +79,8 @@ def low_pass(y: SX, t: SX = signal("s"), *, tau: SX = param("s")) -> SX:
     shown_by="a step of the input, held for several times tau",
     formula="y − k·(y − lowpass(y, tau))",
     memory={"gap": 0.0, "before": "y"},
+    # More than all of a response comes late where it is delayed, or late twice.
+    most={"k": 1.0},
     # A spring gives way slowly, and heat arrives slowly: a field, a turn, a proof mass do neither.
     foreign_to=("T", "rad/s", "m/s^2"),
 )

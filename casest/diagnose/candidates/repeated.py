@@ -21,6 +21,8 @@ from casest.diagnose.levels import LEVELS
 
 #: Of a reading's variance: where inputs leave so much, something else may be what moves it.
 MOST = 0.5
+#: Of an input at least: of fewer any two slow courses are alike.
+SWINGS = 3
 
 
 @dataclass(frozen=True)
@@ -36,6 +38,18 @@ class Signal:
     noise: Array | None = field(default=None, repr=False)
     input: bool = False
     left: float = 0.0
+    shift: int = 0
+
+    def at_other_times(self, x: Array) -> bool:
+        """Is a column (N,) nothing but the input, now and a quarter of a swing before and after? In
+        one sine its integral is that: what follows it could be a lag of the input."""
+        if not self.shift:
+            return False
+        k, u = self.shift, _scaled(self.elements[:, 0])
+        later = np.column_stack([u[: -2 * k], u[k:-k], u[2 * k :], np.ones(len(u) - 2 * k)])
+        own = _scaled(x[k:-k])
+        left = own - later @ np.linalg.lstsq(later, own, rcond=None)[0]
+        return float(left @ left) < LEVELS.repeated
 
     def told_better(self, x: Array) -> bool:
         """Does a column (N,) tell a reading better than its inputs do? Another meter does."""
@@ -76,7 +90,10 @@ class Reads:
         name = min(near, key=lambda n: near[n], default="")
         if not name or not np.isfinite(near[name]):
             better = next((s.name for s in self.signals if s.told_better(x)), "")
-            return better and f"column tells {better} better than its inputs do: another meter"
+            if better:
+                return f"column tells {better} better than its inputs do: another meter"
+            late = next((s.name for s in self.signals if s.at_other_times(x)), "")
+            return late and f"column is {late} at other times: what follows it could be a lag of it"
         if near[name] < LEVELS.repeated**2 + _rounding(_scaled(x)):
             return f"column is {name} once more, or computed from it"
         few = "in so few rows " if len(x) < LEVELS.series else ""
@@ -110,8 +127,19 @@ def signals_of(inputs: Collection[str], readings: Collection[str], runs: Sequenc
             noise = x if name in readings and untold >= MOST else None
             drives = bool(readings) and name not in readings
             own = len(x) >= LEVELS.series and untold < LEVELS.stand_in
-            found.append(Signal(name, x, basis, noise, drives, untold if own else 0.0))
+            shift = _quarter(x[:, 0]) if drives and x.shape[1] == 1 else 0
+            found.append(Signal(name, x, basis, noise, drives, untold if own else 0.0, shift))
     return Reads(tuple(found), rows)
+
+
+def _quarter(x: Array) -> int:
+    """Rows after which a series (N,) is no longer like itself; 0 of one that swings a few times."""
+    if len(x) < LEVELS.series:
+        return 0
+    spectrum = np.abs(np.fft.rfft(_scaled(x), 2 * len(x))) ** 2
+    alike = np.fft.irfft(spectrum)[: len(x)]
+    gone = int(np.argmax(alike < 0))
+    return gone if 0 < gone <= len(x) // (4 * SWINGS) else 0
 
 
 def _computed(x: Array) -> Array | None:

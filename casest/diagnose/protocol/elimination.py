@@ -72,6 +72,8 @@ def eliminated(subject: Subject[F], state: State[F]) -> State[F]:
         assert fit is not None
         state = replace(state, fit=fit, kept=tuple(k for k in state.kept if k is not gone))
         state = state.refusing(gone.what, why)
+        if why == TOGETHER:
+            state = replace(state, open=(gone.evidence, *state.open))
     return state
 
 

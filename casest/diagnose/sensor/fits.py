@@ -83,6 +83,24 @@ def _held(problem: Problem, point: Point) -> NDArray[np.bool_]:
     return np.asarray(held)
 
 
+def too_large(model: Model, values: Mapping[str, Array]) -> tuple[str, str]:
+    """Label of an effect that is not what its name says at these values, and why; else empty."""
+    for attached in model.effects:
+        for name, most in attached.effect.most:
+            own = [v for n, v in values.items() if _is_of(n, attached.label, name)]
+            size = max((float(np.max(v)) for v in own), default=most)
+            if size > most:
+                why = f"{attached.label} would have {name} = {size:.3g}, above {most:g}"
+                return attached.label, f"{why}: it is another effect"
+    return "", ""
+
+
+def _is_of(full: str, label: str, name: str) -> bool:
+    """`creep.k`, and `creep.k_1` where the axes have sizes of their own."""
+    own = full.removeprefix(f"{label}.")
+    return own != full and own.partition("_")[0] == name
+
+
 def starts(model: Model, runs: tuple[Run, ...], values: Mapping[str, Array]) -> dict[str, Array]:
     """These values as far as the model has them, its own start for the others."""
     problem = Problem(model, runs)

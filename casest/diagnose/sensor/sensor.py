@@ -21,7 +21,15 @@ from casest.diagnose.evidence.wandering import wandering_cost
 from casest.diagnose.formula.search import NAME, described, readable, with_sizes
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.protocol import Kept, Ranking, Subject
-from casest.diagnose.sensor.fits import Fit, certified, fitted, problem_of, simpler, starts
+from casest.diagnose.sensor.fits import (
+    Fit,
+    certified,
+    fitted,
+    problem_of,
+    simpler,
+    starts,
+    too_large,
+)
 from casest.diagnose.sensor.jitter import Draw, in_refit, jittered
 from casest.diagnose.sensor.recent import Recent
 from casest.diagnose.sensor.rows import Rows
@@ -149,7 +157,8 @@ class Sensor(Subject[Fit]):
             return f"its refit fails: {error}"
         if found is None:
             return NOT_FINITE
-        return self._too_slow(found, added) or self._at_one_input(found, added) or found
+        why = self._too_slow(found, added) or too_large(found.model, found.values)[1]
+        return why or self._at_one_input(found, added) or found
 
     def _at_one_input(self, fit: Fit, added: Sequence[Trial]) -> str:
         """Why a cut-off is none: one value alone lies beyond it, which may be off itself; else
@@ -311,16 +320,14 @@ class Sensor(Subject[Fit]):
 
     def _residual_without(self, fit: Fit, what: Candidate) -> Array:
         """Residuals (N, m) of the model without an effect, at the values of the fit."""
-        own = fit.model.unknowns_of(what.label)
+        less = _less(fit, what)
         if what.freed:
             held = self.model[what.freed].array
             model = fit.model.having(**{what.freed: held if held.ndim else float(held)})
-            own = {what.freed}
-        else:
-            model = _less(fit, what).model
-        values = {n: v for n, v in fit.values.items() if n not in own}
-        problem = Problem(model, self.runs)
-        point = problem.point(values)
+            values = {n: v for n, v in fit.values.items() if n != what.freed}
+            less = replace(fit, model=model, values=values)
+        problem = Problem(less.model, self.runs)
+        point = problem.point(less.values)
         residuals = whitened(problem, point).residuals(point)
         weights = problem_of(fit, self.runs)[0].weights
         if weights is not None:
