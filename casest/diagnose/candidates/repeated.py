@@ -10,13 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
-from itertools import combinations_with_replacement
+from itertools import combinations_with_replacement, product
 
 import numpy as np
 
 from casest.data.run import Run
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
+from casest.diagnose.candidates.errors import is_error
 from casest.diagnose.levels import LEVELS
 
 #: Of a reading's variance: where inputs leave so much, something else may be what moves it.
@@ -86,6 +87,8 @@ class Reads:
     def again(self, x: Array) -> str:
         """Which of them a column (N,) is once more, in words; else empty."""
         x = x[self.rows]
+        if of := self._error_of(x):
+            return f"column is the error of {of[0]} against {of[1]}, computed from both"
         near = {s.name: s.apart(x) for s in self.signals if np.ptp(x) > 0}
         name = min(near, key=lambda n: near[n], default="")
         if not name or not np.isfinite(near[name]):
@@ -98,6 +101,15 @@ class Reads:
             return f"column is {name} once more, or computed from it"
         few = "in so few rows " if len(x) < LEVELS.series else ""
         return f"column goes with {name}: {few}what follows it could be a bend over that"
+
+    def _error_of(self, x: Array) -> tuple[str, str] | None:
+        """A reading and an input of one element each of which it is the error; None without."""
+        single = [s for s in self.signals if s.elements.shape[1] == 1]
+        for reading, given in product(single, single):
+            one = given.input and not reading.input
+            if one and is_error(x, reading.elements[:, 0], given.elements[:, 0]):
+                return reading.name, given.name
+        return None
 
 
 def reads_of(model: Model, runs: Sequence[Run]) -> Reads:

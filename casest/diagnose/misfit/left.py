@@ -14,10 +14,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from casest.declaration.effect import TAILS
 from casest.declaration.shapes import Array
 from casest.diagnose.candidates.candidates import Candidate, usable_columns
 from casest.diagnose.found import Course, Undecided
 from casest.diagnose.levels import LEVELS
+from casest.diagnose.misfit.few_rows import few_rows
 from casest.diagnose.misfit.pure_error import pure_error
 from casest.diagnose.misfit.reference import along_reference
 from casest.diagnose.misfit.structure import structures
@@ -188,6 +190,7 @@ def findings(
     sigma = robust_scale(residuals) * float(np.sqrt(problem.residual_count / freedom))
     clipped = _clipped(problem, residuals, sigma)
     found = _before(problem, point) + _stated(problem, point)
+    found += _few_rows(problem, point)
     found += _repeats(problem, point, clipped, wanders=wanders)
     slow = [] if wanders else _slow(problem, point, clipped, sigma)
     follows = _follows(problem, point, clipped, sigma, in_time=not (slow or wanders))
@@ -218,6 +221,22 @@ def _repeats(
         "within them explains"
     )
     return [Finding(where, tested.p_value, tested.sigma)]
+
+
+def _few_rows(problem: Problem, point: Point) -> list[Finding]:
+    """Rows of a table that the others speak against, and that hold most of what is left."""
+    runs, tails = problem.runs, any(a.effect.seen_in == TAILS for a in problem.model.effects)
+    if sum(map(len, runs)) >= LEVELS.series or tails or problem.sequential:
+        return []
+    residual = np.concatenate(problem.residuals(point))
+    J = np.nan_to_num(problem.jacobian(point)).reshape(*residual.shape, -1)
+    found = few_rows(residual, J)
+    if found is None:
+        return []
+    names = [f"row {int(k)} of {run.name}" for run in runs for k in run.rows]
+    listed = " and ".join(names[k] for k in found.rows)
+    where = f"{100 * found.share:.0f} % of it is in {listed}, which the others speak against"
+    return [Finding(where, found.p_value, found.sigma, found.share)]
 
 
 def _before(problem: Problem, point: Point) -> list[Finding]:

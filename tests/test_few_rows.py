@@ -1,0 +1,65 @@
+"""Rows of a table that the others speak against: found though they hide each other."""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from casest.diagnose.levels import LEVELS
+from casest.diagnose.misfit.few_rows import few_rows
+
+
+def table(rng, rows, axes, unknowns, off=()):
+    """Normal noise of size one beside so many unknowns; `off`: rows and by how much."""
+    X = rng.standard_normal((rows, axes, unknowns))
+    y = rng.standard_normal((rows, axes))
+    for row, size in off:
+        y[row] += size
+    flat = X.reshape(-1, unknowns)
+    r = y.ravel() - flat @ np.linalg.lstsq(flat, y.ravel())[0]
+    return r.reshape(rows, axes), X
+
+
+@pytest.mark.parametrize(("rows", "axes", "unknowns"), [(9, 1, 2), (20, 3, 4), (40, 1, 3)])
+def test_of_normal_noise_no_row_is_spoken_against(rows, axes, unknowns):
+    rng, alarms = np.random.default_rng(rows), 0
+    for _ in range(150):
+        alarms += few_rows(*table(rng, rows, axes, unknowns)) is not None
+    assert alarms <= stats.binom.ppf(1 - 5e-4, 150, LEVELS.misfit)
+
+
+def test_both_ends_of_a_line_are_off_and_neither_stands_out():
+    """Nine rows on a line, the first and the last off by 30 standard deviations of the others."""
+    rng, x = np.random.default_rng(3), np.arange(9.0)
+    y = 0.01 * rng.standard_normal(9)
+    y[0] += 0.36
+    y[8] -= 0.40
+    X = np.column_stack([np.ones(9), x])
+    r = y - X @ np.linalg.lstsq(X, y)[0]
+    assert np.abs(r).max() < 2.5 * r.std()
+    found = few_rows(r[:, None], X[:, None, :])
+    assert list(found.rows) == [0, 8]
+    assert found.p_value < 1e-3
+    assert found.sigma == pytest.approx(0.01, rel=0.6)
+    assert found.share > 0.95
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_rows_are_those_of_all_that_could_be_chosen(seed):
+    """Every choice of two rows of fourteen, by NumPy's least squares."""
+    rng = np.random.default_rng(seed)
+    r, X = table(rng, 14, 1, 3, off=[(4, 9.0), (11, 12.0)])
+
+    def left(gone):
+        kept = np.setdiff1d(np.arange(14), gone)
+        return np.linalg.lstsq(X[kept, 0], r[kept, 0])[1][0]
+
+    best = min(combinations(range(14), 2), key=left)
+    found = few_rows(r, X)
+    assert tuple(found.rows) == best == (4, 11)
+    F = (np.sum(r**2) - left(best)) / 2 / (left(best) / 9)
+    assert found.p_value == pytest.approx(stats.f.sf(F, 2, 9) * 91 * 3)
+    assert found.sigma**2 == pytest.approx(left(best) / 9)
