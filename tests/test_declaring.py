@@ -235,6 +235,15 @@ def test_an_unknown_unit_of_a_signal_is_refused_by_name():
             return Residual(measured=y, predicted=p)
 
 
+def test_a_number_in_the_place_of_a_reading_is_named_with_the_way_out():
+    @model
+    def known(x=signal("V"), *, a=param("V")):
+        return Residual(measured=100.0, predicted=quantity("seen", a + x, "V"))
+
+    with pytest.raises(DeclarationError, match=r"measured=100\.0 is no signal .* implicit="):
+        known.traced  # noqa: B018
+
+
 def test_a_quantity_outside_a_model_is_refused():
     with pytest.raises(DeclarationError, match=r"quantity\('force', …\) belongs in the body"):
         quantity("force", 1.0, "N")

@@ -243,6 +243,12 @@ class Residual:
             raise DeclarationError("Residual takes measured= and predicted=, or implicit= alone")
         several = isinstance(measured, tuple | list)
         self.signals: tuple[SX, ...] = tuple(measured) if several else (measured,)
+        for given in self.signals if explicit else ():
+            if not isinstance(given, ca.SX):
+                raise DeclarationError(
+                    f"measured={given!r} is no signal of the model; where a known number is what "
+                    "readings should give, say implicit=quantity(…) − that number"
+                )
         self.predicted = _side_by_side(predicted) if several else predicted
         self.measured = _side_by_side(measured) if several else measured
         self.std = None if std is None else _side_by_side(std) if several else ca.SX(std)

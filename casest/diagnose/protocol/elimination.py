@@ -66,6 +66,8 @@ def eliminated(subject: Subject[F], state: State[F]) -> State[F]:
             found = None if base is None else _beside_the_others(subject, state, kept, base)
             if found is not None:
                 weak.append((*found, kept, base))
+        if len(state.kept) == count == 1:  # the rest of it was asked when it was added
+            weak = [w for w in weak if w[1] == TOGETHER]
         if not weak:
             return state
         _, why, gone, fit = min(weak, key=lambda w: w[0])

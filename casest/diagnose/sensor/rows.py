@@ -64,6 +64,19 @@ class Rows:
             J[here] = own * root[:, :, None]
         return r, np.nan_to_num(J)
 
+    def turns(self, fit: Fit) -> bool:
+        """Does anything that the sensor meets go there and back in a run, beyond a tenth of its
+        way?"""
+        met, runs = self._met(fit), self._numbers[1]
+        for k in range(len(self.runs)):
+            own = met[runs == k]
+            back = np.maximum.accumulate(own, axis=0) - own
+            forth = own - np.minimum.accumulate(own, axis=0)
+            least = np.minimum(back.max(axis=0), forth.max(axis=0))
+            if np.any(least > LEVELS.alike * np.ptp(own, axis=0)):
+                return True
+        return False
+
     def cosines(self, waves: int) -> Array:
         """(N, runs · waves): 1, 2, … half waves over each run, in the rows that are looked at."""
         found = np.zeros((sum(map(len, self.index)), len(self.runs), waves))
