@@ -377,8 +377,8 @@ def _less(fit: Fit, what: Candidate) -> Fit:
     while True:
         model = replace(fit.model, effects=tuple(left))
         # A lag of a column that only this effect read goes with it.
-        there = {s.name for s in (*model.signals, *fit.model.declared)} | {*fit.model.quantities}
-        kept = [a for a in left if a.on in there]
+        gone = {s.name for s in fit.model.signals} - {s.name for s in model.signals}
+        kept = [a for a in left if a.on not in gone]
         if len(kept) == len(left):
             break
         left = kept
