@@ -151,3 +151,57 @@ def test_of_few_rows_an_influence_that_does_not_go_with_the_input_is_found():
     y = 0.2 + 3 * x + 0.02 * (temperature - 25) + rng.normal(0, 0.02, 40)
     closing = close("linear", {"reference": x, "reading": y, "temperature": temperature})
     assert [e.candidate.label for e in closing.effects] == ["temperature_bias(temperature)"]
+
+
+@pytest.mark.parametrize("kind", ["difference", "sheet's sign", "percent", "size"])
+def test_the_error_that_a_sheet_computed_is_no_influence(kind):
+    """A meter beside its reference, 30 readings to two digits, and their errors beside them."""
+    rng = np.random.default_rng(9)
+    reference = np.round(rng.uniform(90, 240, 30), 2)
+    reading = np.round(reference + rng.normal(0.3, 0.6, 30), 2)
+    error = {
+        "difference": reading - reference,
+        "sheet's sign": reference - reading,
+        "percent": 100 * (reading - reference) / reference,
+        "size": np.abs(reading - reference),
+    }[kind]
+    closing = close("linear", {"reference": reference, "reading": reading, "e": np.round(error, 3)})
+    assert not closing.effects
+    assert "column is the error of reading against reference" in skipped(closing)["e"]
+
+
+def test_an_influence_that_makes_nearly_all_of_the_error_is_one():
+    rng = np.random.default_rng(10)
+    reference, warmth = rng.uniform(0, 10, 60), rng.uniform(10, 40, 60)
+    reading = reference + 0.05 * (warmth - 20) + rng.normal(0, 0.01, 60)
+    closing = close("linear", {"reference": reference, "reading": reading, "temp": warmth})
+    assert "temp" not in skipped(closing)
+    assert any("temp" in e.candidate.label for e in closing.effects)
+
+
+def swung(rng, frequencies, late=0.007, step=0.002, rows=3000):
+    """A motor's rate and angle, and a gyroscope that is late by so much, in closed form."""
+    t = np.arange(rows) * step
+    rate = sum(30 * np.cos(2 * np.pi * f * t + f) for f in frequencies)
+    angle = sum(30 / (2 * np.pi * f) * np.sin(2 * np.pi * f * t + f) for f in frequencies)
+    seen = sum(30 * np.cos(2 * np.pi * f * (t - late) + f) for f in frequencies)
+    gyro = 0.4 + 0.257 * seen + rng.normal(0, 0.3, rows)
+    noisy = rate + rng.normal(0, 0.3, rows)
+    return {"t": t, "reference": noisy, "reading": gyro, "angle": np.round(angle, 3)}
+
+
+def test_in_one_sine_the_angle_is_the_rate_at_another_time():
+    """A bias over the angle would explain all of the lag, with a size that goes as f²."""
+    closing = close("linear", swung(np.random.default_rng(11), [5.0]))
+    assert "column is reference at other times" in skipped(closing)["angle"]
+    assert {e.candidate.label for e in closing.effects} <= {"signal_lag(reference)", "low_pass"}
+    assert closing.after.values["gain"] == pytest.approx(0.257, rel=0.03)
+
+
+def test_in_a_motion_of_several_frequencies_the_angle_is_a_column_of_its_own():
+    record = swung(np.random.default_rng(12), [0.7, 2.3, 5.0])
+    closing = close("linear", record)
+    assert "angle" not in skipped(closing)
+    assert [e.candidate.label for e in closing.effects] == ["signal_lag(reference)"]
+    lag = closing.after.values["signal_lag(reference).delay"]
+    assert lag == pytest.approx(0.007, abs=0.001)

@@ -1,0 +1,61 @@
+"""What a refit would have to be that is not what the effect's name says; what goes with it."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from casest import Residual, Run, close, model, param, quantity, signal
+from casest.diagnose.sensor.fits import fitted
+from casest.diagnose.sensor.sensor import _less
+from casest.effects import channel_bias, outliers, signal_lag
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_delay_is_no_creep_of_more_than_all_of_the_response(seed):
+    """A reading behind a wandering reference by six samples: k = 1.6 imitates that."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(1500.0)
+    knots = rng.normal(0, 1, 340).cumsum()
+    given = 10 + np.interp(t, 5.0 * np.arange(340), knots)
+    late = 10 + np.interp(t - 6.0, 5.0 * np.arange(340), knots)
+    reading = 0.5 + 1.4 * late + rng.normal(0, 0.1, len(t))
+    closing = close("linear", {"t": t, "reference": given, "reading": reading})
+    names = [e.candidate.label for e in closing.effects]
+    assert "signal_lag(reference)" in names
+    assert "creep" not in names
+    assert closing.after.values["signal_lag(reference).delay"] == pytest.approx(6.0, abs=0.4)
+
+
+def test_a_ramp_that_never_turns_shows_no_play():
+    """A wheel that stands still below some command, on a ramp of commands from end to end."""
+    rng = np.random.default_rng(4)
+    t, command = np.arange(110.0), np.linspace(-540, 550, 110)
+    still = (command > -30) & (command < 160)
+    reading = np.where(still, 0.0, 15 + 0.97 * command) + rng.normal(0, 3, 110)
+    closing = close("linear", {"t": t, "reference": command, "reading": reading})
+    assert "hysteresis" not in [e.candidate.label for e in closing.effects]
+
+
+@model
+def line(x=signal("V"), y=signal("V"), *, slope=param(start=1.0), level=param("V")):
+    """A reading over its input."""
+    return Residual(measured=y, predicted=quantity("reading", level + slope * x, "V"))
+
+
+def test_with_an_effect_goes_what_acts_on_a_column_that_it_alone_brought():
+    """Not what acts on the noise, or on a signal of the model."""
+    rng, t = np.random.default_rng(5), np.arange(300) * 0.01
+    x, angle = rng.normal(0, 1, 300), np.sin(t)
+    signals = {"x": x[:, None], "y": (1 + x + 0.2 * angle)[:, None], "angle": angle[:, None]}
+    run = Run.raw("r", signals, units={"x": "V", "y": "V", "angle": "rad"}, time=t)
+    bare = line.with_effect(outliers).with_effect(signal_lag, on="x")
+    columns = {channel_bias.extras[0].name: "angle"}
+    with_column = bare.with_effect(channel_bias, on="reading", columns=columns)
+    fit = fitted(with_column.with_effect(signal_lag, on="angle"), (run,), {})
+    label = with_column.effects[-1].label
+    less = _less(fit, SimpleNamespace(label=label))
+    assert [a.label for a in less.model.effects] == [a.label for a in bare.effects]
+    assert set(less.values) == {p.name for p in less.model.parameters}
