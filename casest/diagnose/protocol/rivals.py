@@ -42,6 +42,8 @@ def _rivals(subject: Subject[F], state: State[F], kept: Kept) -> tuple[State[F],
     without, best = (foretold(linear, c, stretches) for c in ([], [_in_time(ranking, mine)]))
     fall = fall_between_causes(linear, without, best)
     nothing = fall.left + fall.gained  # squares without any of them
+    # What a slope does not reach as far as is asked by its refit, whatever its columns say.
+    shown = {t.family for t in subject.shown(base) if t.what.held}
     rivals = list[Evidence]()
     for e in ranking.causes:
         if e is mine or len(rivals) == 2 * LEVELS.contenders:
@@ -54,7 +56,7 @@ def _rivals(subject: Subject[F], state: State[F], kept: Kept) -> tuple[State[F],
             continue
         its = foretold(linear, [_in_time(ranking, e)], stretches)
         lost = fall_between_causes(linear, its, best)
-        if _as_well(mine.score - e.score, lost, nothing):
+        if e.trials[0].family in shown or _as_well(mine.score - e.score, lost, nothing):
             rivals.append(e)
     after = subject.linear(state.fit)
     found = list[Rival]()
