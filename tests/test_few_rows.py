@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from casest import close
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.misfit.few_rows import few_rows
 
@@ -63,3 +64,20 @@ def test_the_rows_are_those_of_all_that_could_be_chosen(seed):
     F = (np.sum(r**2) - left(best)) / 2 / (left(best) / 9)
     assert found.p_value == pytest.approx(stats.f.sf(F, 2, 9) * 91 * 3)
     assert found.sigma**2 == pytest.approx(left(best) / 9)
+
+
+def test_a_reading_that_is_rounded_speaks_against_no_row():
+    """Integers on a line of slope one, three of twelve a step off: that is rounding."""
+    x = np.arange(12.0)
+    y = np.round(x + 0.2)
+    y[[3, 7, 8]] += 1
+    X = np.column_stack([np.ones(12), x])
+    r = y - X @ np.linalg.lstsq(X, y)[0]
+    assert few_rows(r[:, None], X[:, None, :]) is not None
+    assert few_rows(r[:, None], X[:, None, :], rounding=1 / np.sqrt(12)) is None
+
+
+def test_a_table_whose_readings_are_rounded_is_adequate():
+    x = np.arange(12.0)
+    y = x + np.isin(x, [3, 7])
+    assert close("linear", {"reference": x, "reading": y}).verdict == "adequate"

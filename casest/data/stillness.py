@@ -118,6 +118,15 @@ def resolution(x: Array) -> float:
     return float(steps.min()) if steps.size else 0.0
 
 
+def last_decimal(x: Array) -> float:
+    """Return the last decimal place that values (N,) are written to, 0 where they fill them all."""
+    size = float(np.abs(x).max(initial=0.0))
+    for step in 10.0 ** -np.arange(-3, 10):
+        if np.all(np.abs(x - step * np.round(x / step)) <= 1e-9 * size):
+            return float(step)
+    return 0.0
+
+
 def _level(variance: Array, channels: Array) -> Array:
     """Return the log of the mean over channels of variance / its own floor, (n,)."""
     variance = variance + _noise_floor(channels) ** 2 / 12  # what a fixed reading may hide

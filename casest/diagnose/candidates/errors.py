@@ -10,6 +10,7 @@ from itertools import product
 
 import numpy as np
 
+from casest.data.stillness import last_decimal
 from casest.declaration.shapes import Array
 
 #: Rows at least, and steps of its digits that a column must vary by (standard deviation).
@@ -26,22 +27,13 @@ def is_error(x: Array, reading: Array, given: Array) -> bool:
     if len(x) < FEWEST or not np.any(x):
         return False
     error = reading - given
-    digits = _digit(reading) + _digit(given)
+    digits = last_decimal(reading) + last_decimal(given)
     for of, size in product((np.ones_like(x), reading, given), (1.0, 100.0)):
         if not np.all(of) or (size == 100.0 and np.ptp(of) == 0):
             continue
-        candidate, off = size * error / of, 1.01 * (_digit(x) + size * digits / np.abs(of))
+        candidate, off = size * error / of, 1.01 * (last_decimal(x) + size * digits / np.abs(of))
         if np.std(x) < STEPS * np.median(off):
             continue
         if any(np.all(np.abs(x - c) <= off) for c in (candidate, -candidate, np.abs(candidate))):
             return True
     return False
-
-
-def _digit(x: Array) -> float:
-    """The last decimal to which values (N,) are written; 0 where it is no round one."""
-    size = float(np.abs(x).max())
-    for step in 10.0 ** -np.arange(-3, 10):
-        if np.all(np.abs(x - step * np.round(x / step)) <= 1e-9 * size):
-            return float(step)
-    return 0.0

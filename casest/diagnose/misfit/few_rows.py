@@ -33,9 +33,9 @@ class FewRows:
     sigma: float
 
 
-def few_rows(residual: Array, slopes: Array) -> FewRows | None:
+def few_rows(residual: Array, slopes: Array, rounding: float = 0.0) -> FewRows | None:
     """Of residuals (N, m) and their slopes (N, m, p); None where no few rows hold most of it, or
-    noise may have done that."""
+    noise may have done that, which is at least what `rounding` makes (a standard deviation)."""
     from scipy.special import fdtrc
 
     rows, axes = residual.shape
@@ -52,10 +52,11 @@ def few_rows(residual: Array, slopes: Array) -> FewRows | None:
             break
         kept = _least(residual, J, rows - k)
         before, least = least, _left(residual, J, kept)[1]
-        one = (before - least) / axes / max(least / rest, 1e-300)
+        noise = least / rest + rounding**2
+        one = (before - least) / axes / max(noise, 1e-300)
         if best is not None and float(fdtrc(axes, rest, one)) * (rows - k) > LEVELS.chance:
             break  # one more is the furthest of the others, as one of them is
-        F = (whole - least) / (axes * k) / max(least / rest, 1e-300)
+        F = (whole - least) / (axes * k) / max(noise, 1e-300)
         chance = min(1.0, float(fdtrc(axes * k, rest, F)) * comb(rows, k) * most)
         share = 1 - least / max(whole, 1e-300)
         if share > LEVELS.most and chance < LEVELS.misfit:

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from casest.data.stillness import last_decimal
 from casest.declaration.effect import TAILS
 from casest.declaration.shapes import Array
 from casest.diagnose.candidates.candidates import Candidate, usable_columns
@@ -230,13 +231,26 @@ def _few_rows(problem: Problem, point: Point) -> list[Finding]:
         return []
     residual = np.concatenate(problem.residuals(point))
     J = np.nan_to_num(problem.jacobian(point)).reshape(*residual.shape, -1)
-    found = few_rows(residual, J)
+    found = few_rows(residual, J, _rounding(problem))
     if found is None:
         return []
-    names = [f"row {int(k)} of {run.name}" for run in runs for k in run.rows]
+    names = [
+        f"{'rest interval' if run.spread else 'row'} {int(k)} of {run.name}"
+        for run in runs
+        for k in run.rows
+    ]
     listed = " and ".join(names[k] for k in found.rows)
     where = f"{100 * found.share:.0f} % of it is in {listed}, which the others speak against"
     return [Finding(where, found.p_value, found.sigma, found.share)]
+
+
+def _rounding(problem: Problem) -> float:
+    """Standard deviation of what rounding to the last decimal leaves of a reading; 0 unknown."""
+    measured = problem.model.traced.measured
+    if not measured or problem.noise_scale is not None:
+        return 0.0
+    readings = np.concatenate([run.signals[measured].ravel() for run in problem.runs])
+    return last_decimal(readings[np.isfinite(readings)]) / float(np.sqrt(12))
 
 
 def _before(problem: Problem, point: Point) -> list[Finding]:
