@@ -33,14 +33,16 @@ LOWEST, FEWEST = 0.7, 6
 @dataclass(frozen=True)
 class Seen:
     """What a grid is laid over: the push Pᵀr (N, q) of the residual on what the sensor gives, the
-    prediction (N, q) if there is one, the time (N,) if there is one, the linear problem, and P
-    (N, m, q), the residual's slope in a shift of what the sensor gives, where it is not −1."""
+    prediction (N, q) if there is one, the time (N,) if there is one, the linear problem, P
+    (N, m, q), the residual's slope in a shift of what the sensor gives, where it is not −1, and
+    what the sensor met (N, d), if that is known."""
 
     push: Array
     reading: Array | None
     time: Array | None
     linear: Linear
     shift: Array | None = None
+    met: Array | None = None
 
 
 def on_grid(candidate: Candidate, seen: Seen, likely: float = 0.0) -> list[Candidate]:
@@ -116,13 +118,14 @@ def _levels(seen: Seen) -> Values:
 
 
 def _turned_back(seen: Seen) -> float:
-    """How far the reading comes back, up and down again or the other way, as a share of its span.
+    """How far what the sensor met comes back, up and down again or the other way, as a share of its
+    span.
 
     A loop that nothing turned round in is a bend at the beginning.
     """
-    if seen.reading is None:
+    y = seen.reading if seen.met is None else seen.met
+    if y is None:
         return 1.0
-    y = seen.reading
     up = (y - np.minimum.accumulate(y, axis=0)).max(axis=0)
     down = (np.maximum.accumulate(y, axis=0) - y).max(axis=0)
     span = np.maximum(np.ptp(y, axis=0), 1e-300)

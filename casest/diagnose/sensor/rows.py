@@ -34,7 +34,7 @@ class Rows:
 
     def _linear(self, fit: Fit) -> Linear:
         residual, J = self.slopes(*problem_of(fit, self.runs))
-        met = self._met(fit)
+        met = self.met(fit)
         parts, held = parts_of(*self._numbers, met), plateaus_of(met, self._spans)
         return Linear(residual, J, self._spans, parts, self._least(fit), held)
 
@@ -63,19 +63,6 @@ class Rows:
             own[:, :, block.x] = block.jacobian[local]
             J[here] = own * root[:, :, None]
         return r, np.nan_to_num(J)
-
-    def turns(self, fit: Fit) -> bool:
-        """Does anything that the sensor meets go there and back in a run, beyond a tenth of its
-        way?"""
-        met, runs = self._met(fit), self._numbers[1]
-        for k in range(len(self.runs)):
-            own = met[runs == k]
-            back = np.maximum.accumulate(own, axis=0) - own
-            forth = own - np.minimum.accumulate(own, axis=0)
-            least = np.minimum(back.max(axis=0), forth.max(axis=0))
-            if np.any(least > LEVELS.alike * np.ptp(own, axis=0)):
-                return True
-        return False
 
     def cosines(self, waves: int) -> Array:
         """(N, runs · waves): 1, 2, … half waves over each run, in the rows that are looked at."""
@@ -119,7 +106,7 @@ class Rows:
         noise = fit.noise / max(min(sizes, default=np.inf), 1e-300)
         return max(LEVELS.survives, LEVELS.over_noise * noise)
 
-    def _met(self, fit: Fit) -> Array:
+    def met(self, fit: Fit) -> Array:
         """What the sensor met in each row (N, q): the corrected quantity, or the prediction."""
         traced = fit.model.along
         name = traced.corrected
@@ -129,7 +116,7 @@ class Rows:
         problem, point = problem_of(fit, self.runs)
         over_time = any(a.kind in OVER_TIME for a in fit.model.effects)
         if over_time and not traced.integrates:
-            return self._met(instant(fit))  # what it met is that without a memory as well
+            return self.met(instant(fit))  # what it met is that without a memory as well
         found = problem.evaluate(point, {"q": value})
         return np.nan_to_num(self.of([f[0].reshape(len(f[0]), -1) for f in found]))
 

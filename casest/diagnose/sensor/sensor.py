@@ -157,8 +157,7 @@ class Sensor(Subject[Fit]):
             return f"its refit fails: {error}"
         if found is None:
             return NOT_FINITE
-        why = self._too_slow(found, added) or self._one_way(found, added)
-        why = why or too_large(found.model, found.values)[1]
+        why = self._too_slow(found, added) or too_large(found.model, found.values)[1]
         return why or self._at_one_input(found, added) or found
 
     def _at_one_input(self, fit: Fit, added: Sequence[Trial]) -> str:
@@ -180,14 +179,6 @@ class Sensor(Subject[Fit]):
                 value = float(np.max(fit.values.get(f"{what.label}.{name}", 0.0)))
                 if value > max(spans, default=np.inf) / LEVELS.fades:
                     return f"its refit fails: {name} = {value:.3g} s is over half of the record"
-        return ""
-
-    def _one_way(self, fit: Fit, added: Sequence[Trial]) -> str:
-        """Why a play is none: what the sensor meets goes one way all along; else empty."""
-        for what in (t.what for t in added if t.what.effect is not None):
-            wide = [n for n, kind in what.effect.profile if kind == "share"]
-            if wide and not self.rows.turns(fit):
-                return f"what the sensor meets never turns round: {what.label} does not show"
         return ""
 
     def _with(

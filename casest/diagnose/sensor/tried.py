@@ -155,7 +155,9 @@ class Tried:
         times = [run.time for run in self.rows.runs if run.time is not None]
         if len(times) == len(self.rows.runs):
             time = self.rows.of(times)
-        return Seen(push, reading, time, linear, None if shift is None else shift[1])
+        slope = None if shift is None else shift[1]
+        met = self.rows.met(fit)
+        return Seen(push, reading, time, linear, slope, met if np.ptp(met) > 0 else None)
 
     def shift(self, fit: Fit) -> tuple[str, Array] | None:
         """What the sensor gives, and the residual's slope (N, m, axes) in a shift of it."""
