@@ -39,19 +39,21 @@ def few_rows(residual: Array, slopes: Array, rounding: float = 0.0) -> FewRows |
     from scipy.special import fdtrc
 
     rows, axes = residual.shape
-    live = np.linalg.norm(slopes.reshape(-1, slopes.shape[2]), axis=0) > 0
-    J, most = slopes[:, :, live], min(MOST_ROWS, int(SHARE * rows))
-    freedom = residual.size - J.shape[2]
+    most = min(MOST_ROWS, int(SHARE * rows))
+    flat = slopes.reshape(residual.size, -1)
+    length = np.maximum(np.linalg.norm(flat, axis=0), 1e-300)
+    U, size, _ = np.linalg.svd(flat / length, full_matrices=False)
+    Q = U[:, size > 1e-12 * size.max(initial=0.0)].reshape(rows, axes, -1)
+    freedom = residual.size - Q.shape[2]
     if rows < FEWEST or freedom < 1:
         return None
-    least = _left(residual, J, np.arange(rows))[1]
+    least = float(_left(residual, Q, np.arange(rows)[None])[1][0])
     whole, best = least, None
     for k in range(1, most + 1):
         rest = freedom - axes * k
         if rest < 2:
             break
-        kept = _least(residual, J, rows - k)
-        before, least = least, _left(residual, J, kept)[1]
+        before, (kept, least) = least, _least(residual, Q, rows - k)
         noise = least / rest + rounding**2
         one = (before - least) / axes / max(noise, 1e-300)
         if best is not None and float(fdtrc(axes, rest, one)) * (rows - k) > LEVELS.chance:
@@ -65,29 +67,32 @@ def few_rows(residual: Array, slopes: Array, rounding: float = 0.0) -> FewRows |
     return best
 
 
-def _left(residual: Array, J: Array, kept: Index) -> tuple[Array, float]:
-    """What a fit to some rows leaves of each (N, m), and its sum of squares in these."""
-    flat = J[kept].reshape(-1, J.shape[2])
-    size = np.maximum(np.linalg.norm(flat, axis=0), 1e-300)
-    step = np.linalg.lstsq(flat / size, residual[kept].ravel(), rcond=1e-12)[0] / size
-    after = residual - J @ step
-    return after, float(np.sum(after[kept] ** 2))
+def _left(residual: Array, Q: Array, kept: Index) -> tuple[Array, Array]:
+    """What fits to several choices of rows (S, n) leave of each row, (S, N, m), and the sums of
+    squares (S,) in these; `Q` (N, m, p): what the unknowns do."""
+    own = Q[kept].reshape(len(kept), -1, Q.shape[2])
+    turned, there = own.transpose(0, 2, 1), residual[kept].reshape(len(kept), -1, 1)
+    step = np.linalg.pinv(turned @ own, rcond=1e-12, hermitian=True) @ (turned @ there)
+    after = residual - np.einsum("nmp,sp->snm", Q, step[:, :, 0])
+    squares = np.sum(after**2, axis=2)
+    return after, np.take_along_axis(squares, kept, axis=1).sum(axis=1)
 
 
-def _least(residual: Array, J: Array, count: int) -> Index:
+def _least(residual: Array, Q: Array, count: int) -> tuple[Index, float]:
     """So many rows whose own fit leaves them the least squares, by steps that only fall."""
     rng, rows = np.random.default_rng(0), len(residual)
-    few = min(count, J.shape[2] // residual.shape[1] + 1)
-    found: tuple[float, Index] = (np.inf, np.arange(count))
-    starts = [np.arange(rows), *(rng.permutation(rows)[:few] for _ in range(STARTS))]
-    for chosen in starts:
-        squares = np.inf
-        for _ in range(STEPS):
-            after, _ = _left(residual, J, chosen)
-            nearest = np.sort(np.argsort(np.sum(after**2, axis=1), kind="stable")[:count])
-            now = _left(residual, J, nearest)[1]
-            if now >= squares:
-                break
-            chosen, squares = nearest, now
-        found = min(found, (squares, chosen), key=lambda f: f[0])
-    return found[1]
+    few = min(count, Q.shape[2] // residual.shape[1] + 1)
+    after, _ = _left(residual, Q, np.arange(rows)[None])
+    starts = np.array([rng.permutation(rows)[:few] for _ in range(STARTS)])
+    after = np.concatenate([after, _left(residual, Q, starts)[0]])
+    least = np.full(len(after), np.inf)
+    chosen = np.zeros((len(after), count), dtype=int)
+    for _ in range(STEPS):
+        order = np.argsort(np.sum(after**2, axis=2), axis=1, kind="stable")[:, :count]
+        after, squares = _left(residual, Q, order)
+        if np.all(squares >= least):
+            break
+        chosen = np.where((squares < least)[:, None], order, chosen)
+        least = np.minimum(squares, least)
+    best = int(np.argmin(least))
+    return np.sort(chosen[best]), float(least[best])
