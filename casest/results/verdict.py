@@ -30,6 +30,8 @@ def sentence(result: Closed) -> str:
         said = "nothing that these data can show is missing"
         if not names and not result.smallest_detectable:
             said = f"nothing is found; {len(result.not_tried)} effects do not apply here"
+        elif any(s.reason.endswith(MISSING["input"]) for s in result.not_tried):
+            said = "nothing that was tried is missing; bends were not (see below)"
         noise = f"; {', '.join(names)} belong to the noise" if names else ""
         return f"adequate: {said}{noise}{untried}"
     if result.verdict == "extended":
