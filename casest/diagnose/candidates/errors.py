@@ -20,7 +20,8 @@ FEWEST, STEPS = 5, 3.0
 def is_error(x: Array, reading: Array, given: Array) -> bool:
     """Is a column (N,) reading − given, or that in parts or percent of either, to its digits?
 
-    Of either sign, or without one. An influence has another size, and is nought elsewhere.
+    Of either sign, or without one. What moves a reading is in no fixed proportion to the error, and
+    is not nought where that is.
     """
     there = np.isfinite(x) & np.isfinite(reading) & np.isfinite(given)
     x, reading, given = x[there], reading[there], given[there]

@@ -22,7 +22,7 @@ from casest.diagnose.levels import LEVELS
 
 #: Of a reading's variance: where inputs leave so much, something else may be what moves it.
 MOST = 0.5
-#: Of an input at least: of fewer any two slow courses are alike.
+#: Swings of an input in the record at least: of fewer any two slow courses are alike.
 SWINGS = 3
 
 
@@ -31,7 +31,9 @@ class Signal:
     """What is computed from a signal: an orthonormal basis (N, p) of its elements, their products
     and its length; `noise` are the elements (N, q) of a reading that the inputs do not tell. Is it
     an `input`: does nothing that is recorded beside it drive it? `left`: share of a reading's
-    variance that the inputs do not tell, where they tell nearly all of it; else nothing."""
+    variance that the inputs do not tell, where they tell nearly all of it; else nothing.
+    `shift`: rows after which an input of one element that swings has turned a quarter; else 0.
+    """
 
     name: str
     elements: Array = field(repr=False)
