@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from casest import Residual, Run, close, model, param, quantity, signal
-from casest.diagnose.sensor.fits import fitted
+from casest.diagnose.sensor.fits import fitted, too_large
 from casest.diagnose.sensor.sensor import _less
-from casest.effects import channel_bias, outliers, signal_lag
+from casest.effects import channel_bias, creep, outliers, signal_lag
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -59,3 +59,13 @@ def test_with_an_effect_goes_what_acts_on_a_column_that_it_alone_brought():
     less = _less(fit, SimpleNamespace(label=label))
     assert [a.label for a in less.model.effects] == [a.label for a in bare.effects]
     assert set(less.values) == {p.name for p in less.model.parameters}
+
+
+def test_a_creep_that_the_user_declared_is_the_user_s_word():
+    model = line.with_effect(creep, on="reading")
+    own = model.effects[-1].label
+    values = {f"{own}.{n}": np.array([v]) for n, v in {"k": 1.3, "tau": 2.0}.items()}
+    label, why = too_large(model, values, line)
+    assert label == own
+    assert "k = 1.3, above 1" in why
+    assert too_large(model, values, model) == ("", "")

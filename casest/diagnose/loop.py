@@ -341,7 +341,7 @@ def certified(sensor: Sensor, state: State[Fit], before: Estimate) -> tuple[Stat
         with only_tried(False):
             model = state.fit.model.having(**noises(sensor.model))  # as they are beside it
             after = attempt(model, sensor.runs, start=state.fit.values, seed=sensor.seed)
-        last, why = _at_fault(state, after)
+        last, why = _at_fault(sensor, state, after)
         if not why:
             return state, after
         if last is None:
@@ -362,13 +362,13 @@ def certified(sensor: Sensor, state: State[Fit], before: Estimate) -> tuple[Stat
         state = state.refusing(last.what, why)
 
 
-def _at_fault(state: State[Fit], after: Estimate) -> tuple[Kept | None, str]:
+def _at_fault(sensor: Sensor, state: State[Fit], after: Estimate) -> tuple[Kept | None, str]:
     """Which cause a proved estimate speaks against, and why: one that is not what it is called, or
     the last one where it is refused."""
     if not after.certificate.trusted:
         last = state.kept[-1] if state.kept else None
         return last, f"its fit is refused: {after.certificate.reasons[0]}"
-    label, why = too_large(after.model, after.values)
+    label, why = too_large(after.model, after.values, sensor.model)
     return next((k for k in state.kept if k.what.label == label), None), why
 
 

@@ -83,9 +83,13 @@ def _held(problem: Problem, point: Point) -> NDArray[np.bool_]:
     return np.asarray(held)
 
 
-def too_large(model: Model, values: Mapping[str, Array]) -> tuple[str, str]:
-    """Label of an effect that is not what its name says at these values, and why; else empty."""
-    for attached in model.effects:
+def too_large(model: Model, values: Mapping[str, Array], declared: Model) -> tuple[str, str]:
+    """Label of an effect that is not what its name says at these values, and why; else empty.
+
+    What the `declared` model has already is the user's word.
+    """
+    given = {a.label for a in declared.effects}
+    for attached in (a for a in model.effects if a.label not in given):
         for name, most in attached.effect.most:
             own = [v for n, v in values.items() if _is_of(n, attached.label, name)]
             size = max((float(np.max(v)) for v in own), default=most)

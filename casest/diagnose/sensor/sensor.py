@@ -157,7 +157,7 @@ class Sensor(Subject[Fit]):
             return f"its refit fails: {error}"
         if found is None:
             return NOT_FINITE
-        why = self._too_slow(found, added) or too_large(found.model, found.values)[1]
+        why = self._too_slow(found, added) or too_large(found.model, found.values, self.model)[1]
         return why or self._at_one_input(found, added) or found
 
     def _at_one_input(self, fit: Fit, added: Sequence[Trial]) -> str:
