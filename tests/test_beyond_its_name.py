@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from casest import Residual, Run, close, model, param, quantity, signal
-from casest.diagnose.sensor.fits import fitted, too_large
+from casest.diagnose.sensor.fits import another, fitted
 from casest.diagnose.sensor.sensor import _less
 from casest.effects import channel_bias, creep, outliers, signal_lag
 
@@ -27,6 +27,30 @@ def test_a_delay_is_no_creep_of_more_than_all_of_the_response(seed):
     assert "signal_lag(reference)" in names
     assert "creep" not in names
     assert closing.after.values["signal_lag(reference).delay"] == pytest.approx(6.0, abs=0.4)
+
+
+def staircase(seed: int, beyond: float) -> dict[str, np.ndarray]:
+    """A reading of 150 inputs that above 40 answers with so much of its gain."""
+    rng = np.random.default_rng(seed)
+    given = np.linspace(10, 55, 150)
+    response = np.where(given > 40, 40 + beyond * (given - 40), given)
+    return {"reference": given, "reading": 0.3 + 1.01 * response + rng.normal(0, 0.05, 150)}
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_gain_that_bends_is_no_saturation(seed):
+    """It loses a twentieth of its gain: nothing is cut off, and nothing is compressed."""
+    closing = close("linear", staircase(seed, beyond=0.95))
+    assert "saturation" not in [e.candidate.label for e in closing.effects]
+    assert closing.verdict != "adequate"
+    assert "saturation" not in (closing.undecided.names if closing.undecided else ())
+    assert any("another effect" in d.reason for d in closing.refused)
+
+
+@pytest.mark.parametrize("beyond", [0.0, 0.2])
+def test_what_is_cut_off_or_compressed_is(beyond):
+    closing = close("linear", staircase(1, beyond))
+    assert [e.candidate.label for e in closing.effects] == ["saturation"]
 
 
 def test_a_ramp_that_never_turns_shows_no_play():
@@ -65,7 +89,7 @@ def test_a_creep_that_the_user_declared_is_the_user_s_word():
     model = line.with_effect(creep, on="reading")
     own = model.effects[-1].label
     values = {f"{own}.{n}": np.array([v]) for n, v in {"k": 1.3, "tau": 2.0}.items()}
-    label, why = too_large(model, values, line)
+    label, why = another(model, values, line)
     assert label == own
     assert "k = 1.3, above 1" in why
-    assert too_large(model, values, model) == ("", "")
+    assert another(model, values, model) == ("", "")

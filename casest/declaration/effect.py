@@ -66,7 +66,7 @@ class Effect:
     found in, and has "passed" (in another one it is not there) or "stayed" (in another one nobody
     knows how much of it is there); `foreign_to` kinds of reading, by a unit each, of which no
     sensor has it, `only_of` those that alone have it: elsewhere it is tried where it is asked for;
-    `most` sizes of parameters beyond which it is another effect than its name says.
+    `within` sizes (least, most) of parameters out of which it is another effect than its name says.
     """
 
     name: str
@@ -95,7 +95,7 @@ class Effect:
     once: Once = ""
     foreign_to: tuple[str, ...] = ()
     only_of: tuple[str, ...] = ()
-    most: tuple[tuple[str, float], ...] = ()
+    within: tuple[tuple[str, tuple[float, float]], ...] = ()
 
     def __reduce__(self) -> tuple[Any, ...]:
         """To pickle: its function by name."""
@@ -164,7 +164,7 @@ def effect(
     once: Once = "",
     foreign_to: Sequence[str] = (),
     only_of: Sequence[str] = (),
-    most: Mapping[str, float] | None = None,
+    within: Mapping[str, tuple[float, float]] | None = None,
 ) -> Callable[[Callable[..., Any]], Effect]:
     """Declare an effect: first argument the value acted on, further ones signals or columns.
 
@@ -192,7 +192,7 @@ def effect(
             )
         for word, given in (
             ("null", null), ("typical", typical), ("profile", profile), ("plain", plain),
-            ("numbers", numbers), ("most", most),
+            ("numbers", numbers), ("within", within),
         ):  # fmt: skip
             _refuse_unknown(function.__name__, word, given or {}, [name for name, _ in keyword])
         if uncertain := [s.name for s in extras if s.std is not None]:
@@ -234,7 +234,7 @@ def effect(
             once=once,
             foreign_to=tuple(foreign_to),
             only_of=tuple(only_of),
-            most=tuple((most or {}).items()),
+            within=tuple((within or {}).items()),
         )
 
     return declare

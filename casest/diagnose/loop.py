@@ -31,7 +31,7 @@ from casest.diagnose.protocol.refits import AS_MUCH
 from casest.diagnose.protocol.state import Ranking
 from casest.diagnose.sensor import NOT_FINITE, Fit, Sensor
 from casest.diagnose.sensor.courses import courses
-from casest.diagnose.sensor.fits import too_large
+from casest.diagnose.sensor.fits import another
 from casest.diagnose.visibility import Visible, visible
 from casest.effects import CATALOGUE
 from casest.effects.placing import prepared
@@ -368,7 +368,7 @@ def _at_fault(sensor: Sensor, state: State[Fit], after: Estimate) -> tuple[Kept 
     if not after.certificate.trusted:
         last = state.kept[-1] if state.kept else None
         return last, f"its fit is refused: {after.certificate.reasons[0]}"
-    label, why = too_large(after.model, after.values, sensor.model)
+    label, why = another(after.model, after.values, sensor.model)
     return next((k for k in state.kept if k.what.label == label), None), why
 
 

@@ -155,6 +155,8 @@ def cross_quadratic(u: SX, *, k: SX = param(3, "1/[u]")) -> SX:
     null={"level": inf},
     shown_by="readings that reach the end of the range",
     formula="y − share·sign(y)·max(|y| − level, 0)",
+    # Where less than half is lost the reading goes on: a bend with a kink.
+    within={"share": (0.5, inf)},
 )
 def saturation(y: SX, *, share: SX = param(each, bounds=(0, None)), level: SX = param("[y]")) -> SX:
     """Readings beyond ±level are cut off (share 1), or compressed (share below 1)."""

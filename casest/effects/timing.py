@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from casest.declaration.effect import RECORDED, effect
-from casest.declaration.physics import SX, der, exp, fabs, fmax, fmin, sqrt
+from casest.declaration.physics import SX, der, exp, fabs, fmax, fmin, inf, sqrt
 from casest.declaration.shapes import each
 from casest.declaration.symbols import param, signal
 
@@ -80,7 +80,7 @@ def low_pass(y: SX, t: SX = signal("s"), *, tau: SX = param("s")) -> SX:
     formula="y − k·(y − lowpass(y, tau))",
     memory={"gap": 0.0, "before": "y"},
     # More than all of a response comes late where it is delayed, or late twice.
-    most={"k": 1.0},
+    within={"k": (-inf, 1.0)},
     # A spring gives way slowly, and heat arrives slowly: a field, a turn, a proof mass do neither.
     foreign_to=("T", "rad/s", "m/s^2"),
 )

@@ -26,8 +26,8 @@ from casest.leastsquares.kinds import noises
 #: Columns whose name or unit says that they are temperatures.
 _TEMPERATURE = re.compile(r"temp|(^|_)t_?(deg)?c$|celsius|kelvin", re.IGNORECASE)
 _DEGREES = {"degC", "K", "kelvin", "degree_Celsius", "°C"}
-#: What is searched over first and fitted then: an effect is smooth in it.
-SMOOTH = ("frequency", "timescale", "lag")
+#: What is searched over first and fitted then: an effect is smooth in it, or bends with it.
+SMOOTH = ("frequency", "timescale", "lag", "level")
 #: Where effects act that go with what a sensor gives.
 READINGS = ("input", "output")
 #: Which columns an effect asks for: temperatures, others, both.

@@ -57,7 +57,8 @@ def with_the_best(
     for evidence in alone[:2]:
         why = NOT_HELD_OUT if evidence in beyond else FOLLOWED
         state = state.refusing(evidence.trials[0].what, why)
-    missing = sorted([*options, *ranking.followed], key=lambda e: -e.score)
+    missing = [e for e in (*options, *ranking.followed) if not state.unlike(e)]
+    missing.sort(key=lambda e: -e.score)
     return replace(state, open=tuple(missing[: LEVELS.contenders]))
 
 

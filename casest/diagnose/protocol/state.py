@@ -93,12 +93,21 @@ class Kept:
     rivals: tuple[Rival, ...] = ()
 
 
+#: Ends the reason against what is not what its name says, at the sizes of its refit.
+ANOTHER = "it is another effect"
+
+
 @dataclass(frozen=True)
 class Refused:
     """What explained much but was not added, and why."""
 
     what: Any
     why: str
+
+    @property
+    def another(self) -> bool:
+        """Is it not what its name says?"""
+        return ANOTHER in self.why
 
 
 @dataclass(frozen=True)
@@ -132,6 +141,12 @@ class State(Generic[F]):
         if any(r.what == what and r.why == why for r in self.refused):
             return self
         return replace(self, refused=(*self.refused, Refused(what, why)))
+
+    def unlike(self, evidence: Evidence) -> bool:
+        """Is it a cause that is not what its name says? It explains nothing under that name."""
+        what = evidence.trials[0].what
+        alone = len(evidence.trials) == 1
+        return alone and any(r.another and r.what.label == what.label for r in self.refused)
 
     def failing(self, evidence: Evidence, why: str) -> State[F]:
         """The state that says of each of these causes why there is no refit with them."""

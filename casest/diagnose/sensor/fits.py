@@ -12,6 +12,7 @@ from casest.data.run import Run
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
 from casest.diagnose.cross_validation import ENOUGH, ITERATIONS, undetermined
+from casest.diagnose.protocol.state import ANOTHER
 from casest.leastsquares.problem import Point, Problem
 from casest.leastsquares.weights import robust_scale, weighted
 from casest.solve.trust_region import trust_region
@@ -83,19 +84,21 @@ def _held(problem: Problem, point: Point) -> NDArray[np.bool_]:
     return np.asarray(held)
 
 
-def too_large(model: Model, values: Mapping[str, Array], declared: Model) -> tuple[str, str]:
+def another(model: Model, values: Mapping[str, Array], declared: Model) -> tuple[str, str]:
     """Label of an effect that is not what its name says at these values, and why; else empty.
 
-    What the `declared` model has already is the user's word.
+    Of axes that have sizes of their own the largest decides. What the `declared` model has already
+    is the user's word.
     """
     given = {a.label for a in declared.effects}
     for attached in (a for a in model.effects if a.label not in given):
-        for name, most in attached.effect.most:
+        for name, (least, most) in attached.effect.within:
             own = [v for n, v in values.items() if _is_of(n, attached.label, name)]
             size = max((float(np.max(v)) for v in own), default=most)
-            if size > most:
-                why = f"{attached.label} would have {name} = {size:.3g}, above {most:g}"
-                return attached.label, f"{why}: it is another effect"
+            if not least <= size <= most:
+                beyond = f"above {most:g}" if size > most else f"below {least:g}"
+                why = f"{attached.label} would have {name} = {size:.3g}, {beyond}"
+                return attached.label, f"{why}: {ANOTHER}"
     return "", ""
 
 

@@ -23,12 +23,12 @@ from casest.diagnose.levels import LEVELS
 from casest.diagnose.protocol import Kept, Ranking, Subject
 from casest.diagnose.sensor.fits import (
     Fit,
+    another,
     certified,
     fitted,
     problem_of,
     simpler,
     starts,
-    too_large,
 )
 from casest.diagnose.sensor.jitter import Draw, in_refit, jittered
 from casest.diagnose.sensor.recent import Recent
@@ -157,7 +157,7 @@ class Sensor(Subject[Fit]):
             return f"its refit fails: {error}"
         if found is None:
             return NOT_FINITE
-        why = self._too_slow(found, added) or too_large(found.model, found.values, self.model)[1]
+        why = self._too_slow(found, added) or another(found.model, found.values, self.model)[1]
         return why or self._at_one_input(found, added) or found
 
     def _at_one_input(self, fit: Fit, added: Sequence[Trial]) -> str:
