@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from casest import Residual, Run, model, param, quantity, signal
 from casest.diagnose.cross_validation import folded
-from casest.diagnose.misfit.left import Misfit, findings, left_over
+from casest.diagnose.misfit.findings import findings
+from casest.diagnose.misfit.left import Misfit, left_over
 from casest.diagnose.misfit.pure_error import pure_error
 from casest.diagnose.noise.noise_model import equal_noise, lag_one, noise_model
 from casest.diagnose.noise.spectral_line import strongest_line

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from casest import Residual, Run, close, model, param, quantity, signal
-from casest.diagnose.sensor.fits import another, fitted
+from casest.diagnose.sensor.fits import fitted
 from casest.diagnose.sensor.sensor import _less
+from casest.diagnose.sensor.unlike import another
 from casest.effects import channel_bias, creep, outliers, signal_lag
 
 

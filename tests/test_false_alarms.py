@@ -17,7 +17,7 @@ from casest import Residual, Run, model, param, signal
 from casest.diagnose.evidence.linear import Linear, parts_of
 from casest.diagnose.evidence.score import Trial
 from casest.diagnose.levels import LEVELS
-from casest.diagnose.misfit.left import findings
+from casest.diagnose.misfit.findings import findings
 from casest.diagnose.protocol import falls, holds_out, ranked_of
 from casest.leastsquares.agreement import between_runs
 from casest.leastsquares.problem import Problem

@@ -31,7 +31,7 @@ from casest.diagnose.protocol.refits import AS_MUCH
 from casest.diagnose.protocol.state import Ranking
 from casest.diagnose.sensor import NOT_FINITE, Fit, Sensor
 from casest.diagnose.sensor.courses import courses
-from casest.diagnose.sensor.fits import another
+from casest.diagnose.sensor.unlike import another
 from casest.diagnose.visibility import Visible, visible
 from casest.effects import CATALOGUE
 from casest.effects.placing import prepared

@@ -7,7 +7,7 @@ import io
 from collections.abc import Sequence
 from functools import cached_property
 
-from casest.diagnose.misfit.left import Finding
+from casest.diagnose.misfit.findings import Finding
 from casest.effects.placing import prepared
 from casest.estimate.estimate import Estimate
 from casest.results.file import plain

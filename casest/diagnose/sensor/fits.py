@@ -12,7 +12,6 @@ from casest.data.run import Run
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
 from casest.diagnose.cross_validation import ENOUGH, ITERATIONS, undetermined
-from casest.diagnose.protocol.state import ANOTHER
 from casest.leastsquares.problem import Point, Problem
 from casest.leastsquares.weights import robust_scale, weighted
 from casest.solve.trust_region import trust_region
@@ -82,30 +81,6 @@ def _held(problem: Problem, point: Point) -> NDArray[np.bool_]:
     for slot in problem.slots:
         held[slot.x] &= slot.parameter.name not in effects
     return np.asarray(held)
-
-
-def another(model: Model, values: Mapping[str, Array], declared: Model) -> tuple[str, str]:
-    """Label of an effect that is not what its name says at these values, and why; else empty.
-
-    Of axes that have sizes of their own the largest decides. What the `declared` model has already
-    is the user's word.
-    """
-    given = {a.label for a in declared.effects}
-    for attached in (a for a in model.effects if a.label not in given):
-        for name, (least, most) in attached.effect.within:
-            own = [v for n, v in values.items() if _is_of(n, attached.label, name)]
-            size = max((float(np.max(v)) for v in own), default=most)
-            if not least <= size <= most:
-                beyond = f"above {most:g}" if size > most else f"below {least:g}"
-                why = f"{attached.label} would have {name} = {size:.3g}, {beyond}"
-                return attached.label, f"{why}: {ANOTHER}"
-    return "", ""
-
-
-def _is_of(full: str, label: str, name: str) -> bool:
-    """`creep.k`, and `creep.k_1` where the axes have sizes of their own."""
-    own = full.removeprefix(f"{label}.")
-    return own != full and own.partition("_")[0] == name
 
 
 def starts(model: Model, runs: tuple[Run, ...], values: Mapping[str, Array]) -> dict[str, Array]:

@@ -23,7 +23,6 @@ from casest.diagnose.levels import LEVELS
 from casest.diagnose.protocol import Kept, Ranking, Subject
 from casest.diagnose.sensor.fits import (
     Fit,
-    another,
     certified,
     fitted,
     problem_of,
@@ -34,6 +33,7 @@ from casest.diagnose.sensor.jitter import Draw, in_refit, jittered
 from casest.diagnose.sensor.recent import Recent
 from casest.diagnose.sensor.rows import Rows
 from casest.diagnose.sensor.tried import Tried, on_axes
+from casest.diagnose.sensor.unlike import another, at_one_input, too_slow
 from casest.engine.kernel import only_tried
 from casest.errors import CasestError
 from casest.estimate.calibrate import attempt
@@ -157,29 +157,15 @@ class Sensor(Subject[Fit]):
             return f"its refit fails: {error}"
         if found is None:
             return NOT_FINITE
-        why = self._too_slow(found, added) or another(found.model, found.values, self.model)[1]
-        return why or self._at_one_input(found, added) or found
-
-    def _at_one_input(self, fit: Fit, added: Sequence[Trial]) -> str:
-        """Why a cut-off is none: one value alone lies beyond it, which may be off itself; else
-        empty."""
-        for what in (t.what for t in added if _plain(t.what) is not None):
-            beyond = self._residual_without(fit, what) - self.linear(fit).residual
-            size = np.abs(beyond).max(initial=0.0)
-            if size > 0 and len(np.unique(np.round(beyond[beyond != 0] / size, 6))) < 2:
-                return f"one input alone lies beyond the level of {what.label}"
-        return ""
-
-    def _too_slow(self, fit: Fit, added: Sequence[Trial]) -> str:
-        """Why the records are too short for a memory: nobody saw it fade; else empty."""
+        what = [t.what for t in added]
         spans = [float(np.ptp(run.time)) for run in self.runs if run.time is not None]
-        for what in (t.what for t in added if t.what.effect is not None):
-            slow = [n for n, kind in what.effect.profile if kind == "timescale"]
-            for name in slow:
-                value = float(np.max(fit.values.get(f"{what.label}.{name}", 0.0)))
-                if value > max(spans, default=np.inf) / LEVELS.fades:
-                    return f"its refit fails: {name} = {value:.3g} s is over half of the record"
-        return ""
+        why = too_slow(found.values, what, spans)
+        why = why or another(found.model, found.values, self.model)[1]
+        for cut in (w for w in what if not why and _plain(w) is not None):
+            why = at_one_input(
+                cut, self._residual_without(found, cut) - self.linear(found).residual
+            )
+        return why or found
 
     def _with(
         self, fit: Fit, added: Sequence[Candidate], values: Mapping[str, Array]

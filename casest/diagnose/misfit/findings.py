@@ -1,0 +1,243 @@
+"""What of a fit's residual is no noise: each test, and what it found in words."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from casest.data.stillness import last_decimal
+from casest.declaration.effect import TAILS
+from casest.declaration.shapes import Array
+from casest.diagnose.candidates.candidates import usable_columns
+from casest.diagnose.levels import LEVELS
+from casest.diagnose.misfit.few_rows import few_rows
+from casest.diagnose.misfit.pure_error import pure_error
+from casest.diagnose.misfit.reference import along_reference
+from casest.diagnose.misfit.structure import structures
+from casest.diagnose.misfit.variables import variables
+from casest.diagnose.noise.noise_model import step_of
+from casest.diagnose.noise.slow_course import MEMORY, slow_course
+from casest.diagnose.noise.spectral_line import strongest_line
+from casest.estimate.before import against_prior
+from casest.estimate.correlation import TABLE, is_series
+from casest.leastsquares.agreement import between_runs
+from casest.leastsquares.neighbours import Scatter
+from casest.leastsquares.problem import Point, Problem
+from casest.leastsquares.stated import chi_square
+from casest.leastsquares.weights import robust_scale, weighted
+
+#: Variance of neighbours' differences from the line between them, in that of the noise, where noise
+#: remembers as exp(−k/MEMORY).
+_KIN = float(np.exp(-1 / MEMORY))
+OF_COLOUR = (1.5 - 2 * _KIN + 0.5 * _KIN**2) / 1.5
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Evidence of a misfit: where, in words, σ of the noise beside it, its share if known; `slow`:
+    it is a course of unknown cause."""
+
+    where: str
+    p_value: float
+    sigma: float
+    share: float = 0.0
+    slow: bool = False
+
+
+def findings(
+    problem: Problem, point: Point, correlated_over: float = 1.0, *, wanders: bool = False
+) -> list[Finding]:
+    """All that is significant: between repeats, in time, over what is recorded, between runs.
+
+    Of noise that was declared to wander no slow course is asked, and none from repeat to repeat.
+    """
+    residuals = problem.residuals(point)
+    problem = weighted(problem, problem.values(point))
+    freedom = max(problem.residual_count - problem.unknowns, 1)
+    sigma = robust_scale(residuals) * float(np.sqrt(problem.residual_count / freedom))
+    clipped = _clipped(problem, residuals, sigma)
+    found = _before(problem, point) + _stated(problem, point)
+    found += _few_rows(problem, point)
+    found += _repeats(problem, point, clipped, wanders=wanders)
+    slow = [] if wanders else _slow(problem, point, clipped, sigma)
+    follows = _follows(problem, point, clipped, sigma, in_time=not (slow or wanders))
+    found += follows + slow
+    line = strongest_line(problem.runs, clipped)
+    if line is not None and line.p_value < LEVELS.misfit:
+        found.append(Finding(f"a line at {line.frequency:.4g} {line.unit}", line.p_value, sigma))
+    if not any(f.slow for f in found):
+        found += _runs(problem, point, correlated_over, sigma)
+    return found
+
+
+def _clipped(problem: Problem, residuals: Sequence[Array], sigma: float) -> list[Array]:
+    """Residuals, those far out counted as less, as the fit does."""
+    limit, kept = LEVELS.clip * sigma, problem.weights
+    found = [np.clip(r, -limit, limit) for r in residuals]
+    return found if kept is None else [r * w for r, w in zip(found, kept, strict=True)]
+
+
+def _repeats(
+    problem: Problem, point: Point, clipped: Sequence[Array], *, wanders: bool
+) -> list[Finding]:
+    tested = pure_error(problem, point, clipped, problem.unknowns, wanders=wanders)
+    if tested is None or tested.p_value >= LEVELS.misfit:
+        return []
+    where = (
+        f"between {tested.between}: the residual is {np.sqrt(tested.F):.1f} times what the scatter "
+        "within them explains"
+    )
+    return [Finding(where, tested.p_value, tested.sigma)]
+
+
+def _few_rows(problem: Problem, point: Point) -> list[Finding]:
+    """Rows of a table that the others speak against, and that hold most of what is left."""
+    runs, tails = problem.runs, any(a.effect.seen_in == TAILS for a in problem.model.effects)
+    if sum(map(len, runs)) >= LEVELS.series or tails or problem.sequential:
+        return []
+    residual = np.concatenate(problem.residuals(point))
+    J = np.nan_to_num(problem.jacobian(point)).reshape(*residual.shape, -1)
+    found = few_rows(residual, J, _rounding(problem))
+    if found is None:
+        return []
+    names = [
+        f"{'rest interval' if run.spread else 'row'} {int(k)} of {run.name}"
+        for run in runs
+        for k in run.rows
+    ]
+    listed = " and ".join(names[k] for k in found.rows)
+    where = f"{100 * found.share:.0f} % of it is in {listed}, which the others speak against"
+    return [Finding(where, found.p_value, found.sigma, found.share)]
+
+
+def _rounding(problem: Problem) -> float:
+    """Standard deviation of what rounding to the last decimal leaves of a reading; 0 unknown."""
+    measured = problem.model.traced.measured
+    if not measured or problem.noise_scale is not None:
+        return 0.0
+    readings = np.concatenate([run.signals[measured].ravel() for run in problem.runs])
+    return last_decimal(readings[np.isfinite(readings)]) / float(np.sqrt(12))
+
+
+def _before(problem: Problem, point: Point) -> list[Finding]:
+    """Data that do not agree with what was known before."""
+    found, scale = against_prior(problem, point), problem.noise_scale
+    if found is None or scale is None or found.agrees:
+        return []
+    return [Finding(found.words, found.chi_square.larger, scale)]
+
+
+def _stated(problem: Problem, point: Point) -> list[Finding]:
+    """A residual that is larger than the noise that was stated, by χ²."""
+    found, scale = chi_square(problem, point, problem.unknowns), problem.noise_scale
+    if found is None or scale is None or found.larger >= LEVELS.misfit:
+        return []
+    where = (
+        f"chi-square is {found.value:.4g} with {found.degrees_of_freedom} degrees of freedom: the "
+        f"residual is {found.times:.2g} times the stated noise"
+    )
+    return [Finding(where, found.larger, scale)]
+
+
+def _slow(problem: Problem, point: Point, clipped: Sequence[Array], sigma: float) -> list[Finding]:
+    """A slow course of unknown cause, of an axis or along the reference.
+
+    What rounding to a step leaves of a slow input is known.
+    """
+    along = along_reference(problem, point, clipped)
+    if along:
+        clipped = [np.hstack(both) for both in zip(clipped, along, strict=True)]
+    found = slow_course(problem.runs, clipped)
+    if found is None or found.p_value >= LEVELS.misfit or found.share < LEVELS.share:
+        return []
+    if sigma < LEVELS.rounded * step_of(problem.runs, problem.model.traced.measured):
+        return []
+    it = (
+        "what of it goes with the size of the input"
+        if found.axis == len(problem.model.axes)
+        else "it"
+    )
+    where = (
+        f"{100 * found.share:.0f} % of {it} is a slow course over about {found.samples} samples"
+        f"{_when(problem, clipped, found.samples)}, of unknown cause"
+    )
+    left = sigma * float(np.sqrt(1 - min(found.share, 1)))
+    return [Finding(where, found.p_value, left, found.share, slow=True)]
+
+
+def _when(problem: Problem, clipped: Sequence[Array], samples: int) -> str:
+    """Where it is strongest: a stretch of time."""
+    best: tuple[float, str] = (0.0, "")
+    for run, r in zip(problem.runs, clipped, strict=True):
+        if run.time is None or len(r) < 3 * samples:
+            continue
+        edges = np.arange(0, len(r) - samples + 1, max(samples // 2, 1))
+        sums = np.vstack([np.zeros((1, r.shape[1])), np.cumsum(r, axis=0)])
+        size = np.sum((sums[edges + samples] - sums[edges]) ** 2, axis=1)
+        k = int(np.argmax(size))
+        if size[k] > best[0]:
+            a, b = run.time[edges[k]], run.time[min(edges[k] + samples, len(r) - 1)]
+            best = (float(size[k]), f", strongest from t = {a:.4g} to {b:.4g} s")
+    return best[1]
+
+
+def _follows(
+    problem: Problem,
+    point: Point,
+    clipped: Sequence[Array],
+    sigma: float,
+    *,
+    in_time: bool,
+) -> list[Finding]:
+    """What it follows: a column, a quantity; the time only where no slow course says so."""
+    if any(run.spread for run in problem.runs):
+        return []
+    read = variables(problem, point, usable_columns(problem.model, problem.runs))
+    read = [v for v in read if in_time or not v.clock]
+    table = sum(map(len, problem.runs)) < TABLE and not any(map(is_series, problem.runs))
+    every = structures(clipped, read, unknowns=_taken(problem, point) if table else None)
+    # Of few rows no chance is small: it is that of naming anything in poses.
+    chance = LEVELS.chance if table else LEVELS.misfit
+    found = [s for s in every if s.p_value < chance and s.share > LEVELS.share]
+    if not found:
+        return []
+    # In the order of the record lies whatever was changed with it: what has a name comes first.
+    clocks = {v.name for v in read if v.clock}
+    best = max(found, key=lambda s: (round(s.share, 2), s.name not in clocks))
+    where = f"{100 * best.share:.0f} % of it follows {best.name}"
+    left = sigma * float(np.sqrt(1 - min(best.share, 1)))
+    return [Finding(where, best.p_value, left, best.share)]
+
+
+def _taken(problem: Problem, point: Point) -> Array:
+    """Orthonormal columns (N·m, p) of what the unknowns of a small problem take."""
+    J = np.nan_to_num(problem.jacobian(point))
+    U, s, _ = np.linalg.svd(J / np.maximum(np.linalg.norm(J, axis=0), 1e-300), full_matrices=False)
+    return np.asarray(U[:, s > 1e-9 * s.max(initial=0.0)])
+
+
+def _runs(problem: Problem, point: Point, correlated_over: float, sigma: float) -> list[Finding]:
+    scatter = between_runs(problem, point, correlated_over)
+    if scatter is None or scatter.p_value >= LEVELS.misfit:
+        return []
+    where = f"between runs: {scatter.worst} is {scatter.away:.0f} standard deviations off"
+    return [Finding(where, scatter.p_value, sigma)]
+
+
+def shared_by_neighbours(found: Scatter) -> list[Finding]:
+    """A course that rows with nearly the same inputs share, beyond what neighbours in time share of
+    noise with a colour, and the model does not have."""
+    from scipy.special import fdtrc
+
+    within = found.left / OF_COLOUR
+    chance = float(fdtrc(*found.freedom, found.residual / max(within, 1e-300)))
+    if chance >= LEVELS.misfit:
+        return []
+    where = (
+        f"the residual is {np.sqrt(found.residual / max(found.left, 1e-300)):.3g} times what it "
+        "differs by between rows with nearly the same inputs"
+    )
+    share = 1 - found.left / found.residual
+    return [Finding(where, chance, float(np.sqrt(found.left)), share)]
