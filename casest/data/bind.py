@@ -482,7 +482,14 @@ def _checked(run: Run, signals: Sequence[Signal], sources: Mapping[str, tuple[st
         values, columns = run.signals[signal.name], sources[signal.name]
         values = checks.without_gaps(values)
         checks.refuse_constant(run.file, signal.name, values, columns)
-        notes += checks.constant_columns(values, columns) + checks.clipped(values, columns)
+        others = [
+            run.signals[s.name]
+            for s in signals
+            if s is not signal and s.kind == "plain" and not is_time(s)
+        ]
+        beside = np.column_stack(others) if others and len(values) == len(run) else None
+        notes += checks.constant_columns(values, columns)
+        notes += checks.clipped(values, columns, beside)
     return replace(run, notes=(*run.notes, *notes))
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ LEAST, MOST = 1e-140, 1e140  # sums of squares beyond are 0 or infinite
 _FEWEST = 8  # readings at an extreme before it is called clipping
 _CROWDING = 5.0  # times as many as on the levels next to it (a smooth crest gives 2.4)
 _STEEP = 3.0  # resolutions jumped on the way in (rest toggles by one)
+_FOLLOWS = 0.9  # correlation with an input from which on a reading stands still where it does not
 _STALLED = 3  # equal rows in a row that chance does not leave, where two in a row are this rare:
 _BY_CHANCE = 0.01  # expected stretches of as many by chance, ...
 _FEW = 0.05  # ... and no more of the rows than this: else rows come twice for another reason
@@ -75,26 +76,31 @@ def constant_columns(values: Array, columns: tuple[str, ...]) -> list[str]:
     ]
 
 
-def clipped(values: Array, columns: tuple[str, ...]) -> list[str]:
+def clipped(values: Array, columns: tuple[str, ...], beside: Array | None = None) -> list[str]:
     """Return a note for each component of (N, size) that looks clipped at full scale.
 
     An extreme is suspect where its value is repeated far more than the levels next to it. At rest
     that happens too (a quiet reading on one level), so besides, either the readings jump onto it
-    in steps far above the resolution while the other components keep changing, or the same
-    happens at the opposite extreme (a symmetric full scale).
+    in steps far above the resolution while the other components keep changing, or what they follow
+    `beside` (N, k) goes on, or the same happens at the opposite extreme (a symmetric full scale).
     """
     return [
         f"{columns[i]}: {count} readings at the {'largest' if sign > 0 else 'smallest'} value "
         f"{extreme:.6g} — clipped at full scale?"
-        for i, sign, extreme, count in full_scales(values)
+        for i, sign, extreme, count in full_scales(values, beside)
     ]
 
 
-def full_scales(values: Array) -> Iterator[tuple[int, int, float, int]]:
+def full_scales(
+    values: Array, beside: Array | None = None
+) -> Iterator[tuple[int, int, float, int]]:
     """Component, sign, value and count of readings (N, size) at a full scale, by those signs."""
     for i in range(values.shape[1]):
         others = np.delete(values, i, axis=1)
-        found = {sign: _suspect(sign * values[:, i], sign * others) for sign in (1, -1)}
+        found = {
+            sign: _suspect(sign * values[:, i], sign * others, () if beside is None else beside.T)
+            for sign in (1, -1)
+        }
         symmetric = all(count for count, _ in found.values()) and _symmetric(values[:, i])
         for sign, (count, moving) in found.items():
             if count and (moving or symmetric):
@@ -132,7 +138,7 @@ def _symmetric(x: Array) -> bool:
     return bool(abs(x.max() + x.min()) < 0.01 * (x.max() - x.min()))
 
 
-def _suspect(x: Array, others: Array) -> tuple[int, bool]:
+def _suspect(x: Array, others: Array, beside: Iterable[Array]) -> tuple[int, bool]:
     """Return how many readings crowd at the largest value, and whether that was in motion."""
     if np.count_nonzero(x == x.max()) < _FEWEST:  # long before all are put in order
         return 0, False
@@ -145,7 +151,20 @@ def _suspect(x: Array, others: Array) -> tuple[int, bool]:
     floats = counts[:-1].max() == 1  # no other level repeats: nothing is quantised
     jumps = levels[-1] - x[entries]
     steep = floats or (jumps.size > 0 and float(np.median(jumps)) > _STEEP * resolution)
-    return int(counts[-1]), bool(steep and _changing(others, at_top))
+    moving = steep and _changing(others, at_top)
+    moving = moving or any(_goes_on(x, given, at_top, resolution) for given in beside)
+    return int(counts[-1]), bool(moving)
+
+
+def _goes_on(x: Array, given: Array, at_top: NDArray[np.bool_], resolution: float) -> bool:
+    """Whether what a component follows moves where it stands still, by more than its resolution."""
+    both = np.isfinite(given)
+    span = float(np.ptp(given[both])) if both.any() else 0.0
+    if span == 0.0 or abs(np.corrcoef(x[both], given[both])[0, 1]) < _FOLLOWS:
+        return False
+    there = given[both & at_top]
+    moved = float(np.ptp(there)) / span * float(np.ptp(x)) if there.size else 0.0
+    return moved > _STEEP * resolution
 
 
 def _changing(others: Array, at_top: NDArray[np.bool_]) -> bool:

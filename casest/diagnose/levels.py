@@ -36,6 +36,7 @@ class Levels:
         that signal once more: two meters of one quantity agree so far, an influence does not.
     stand_in: share of a column's variance that a signal does not tell, up to which, in poses and
         tables, its curve could be a bend over that signal.
+    stays: share of what inputs do to a reading that must stay beside a column's influence.
     fades: time constants that a record must span for a memory to be seen to fade.
     most: share of the squares below which what is left says more than how likely a slow course is;
     survives: share of a cause's length that the declared unknowns must leave; over_noise: an
@@ -93,6 +94,7 @@ class Levels:
     uncertain: float = 10.0
     repeated: float = 0.01
     stand_in: float = 0.1
+    stays: float = 0.5
     fades: float = 2.0
     survives: float = 1e-3
     most: float = 0.5

@@ -26,6 +26,7 @@ from casest.diagnose.noise.tails import outliers_p_value
 from casest.diagnose.protocol import Kept, State, search, with_rivals
 from casest.diagnose.protocol.choosing import NOT_HELD_OUT
 from casest.diagnose.protocol.confirming import falls
+from casest.diagnose.protocol.elimination import chance_alone
 from casest.diagnose.protocol.ranking import ranked
 from casest.diagnose.protocol.refits import AS_MUCH
 from casest.diagnose.protocol.state import Ranking
@@ -383,7 +384,7 @@ def _found(sensor: Sensor, state: State[Fit], kept: Kept, after: Estimate) -> Fo
         for r in kept.rivals
         if r.what.label not in added
     }
-    return Found(candidate, kept.evidence.p_value, fall, names, rivals)
+    return Found(candidate, chance_alone(sensor, state, kept), fall, names, rivals)
 
 
 def _fall(fit: Fit, kept: Kept) -> float:

@@ -27,12 +27,17 @@ def sentence(result: Closed) -> str:
         return held_out if result.trusted else "no trustworthy estimate"
     untried = _untried(result)
     if result.verdict == "adequate":
-        said = "nothing that these data can show is missing"
+        rows = sum(s.samples for s in result.samples)
+        few = "" if rows >= LEVELS.series else f"{rows} rows"
+        said = f"nothing that {few or 'these data'} can show is missing"
         if not names and not result.smallest_detectable:
             said = f"nothing is found; {len(result.not_tried)} effects do not apply here"
         elif any(s.reason.endswith(MISSING["input"]) for s in result.not_tried):
             said = "nothing that was tried is missing; bends were not (see below)"
         noise = f"; {', '.join(names)} belong to the noise" if names else ""
+        over = result.noise.correlated_over_samples or 1
+        if over >= COLOURED:
+            noise += f"; the noise has a colour (alike over {over:.0f} samples)"
         return f"adequate: {said}{noise}{untried}"
     if result.verdict == "extended":
         verb = "was" if len(names) == 1 else "were"
@@ -41,9 +46,18 @@ def sentence(result: Closed) -> str:
     found = f"beside {', '.join(names)} " if names else ""
     causes = result.unexplained.one_of
     if causes:
-        several = " or ".join(causes) if 1 < len(causes) < 4 else "several causes"
-        return f"unexplained: {found}a misfit remains that {several} explain alike"
+        return f"unexplained: {found}a misfit remains that {_several(causes)} explain alike"
     return f"unexplained: {found}a misfit remains that no candidate explains"
+
+
+def _several(causes: Sequence[str]) -> str:
+    """Causes by name, the first of many."""
+    if len(causes) < 2:
+        return f"{causes[0]} and other shapes"
+    first = causes[: NAMED - 1]
+    more = len(causes) - len(first)
+    others = f", or {more} other{'s' * (more > 1)}," if more else ""
+    return (", " if more else " or ").join(first) + others
 
 
 def _remaining_noise(correlated_over: Number, samples: Sequence[Samples]) -> str:
@@ -84,7 +98,7 @@ _N = TypeVar("_N", bound=_Named)
 def of_the_user(named: Sequence[_N]) -> list[_N]:
     """Those that are not shipped: what the user gave."""
     shipped = {e.name for e in CATALOGUE}
-    return [n for n in named if n.name.partition("(")[0] not in shipped]
+    return [n for n in named if n.name.partition("(")[0].partition("@")[0] not in shipped]
 
 
 def _untried(result: Closed) -> str:

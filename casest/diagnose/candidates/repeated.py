@@ -30,9 +30,9 @@ SWINGS = 3
 class Signal:
     """What is computed from a signal: an orthonormal basis (N, p) of its elements, their products
     and its length; `noise` are the elements (N, q) of a reading that the inputs do not tell. Is it
-    an `input`: does nothing that is recorded beside it drive it? `left`: share of a reading's
-    variance that the inputs do not tell, where they tell nearly all of it; else nothing.
-    `shift`: rows after which an input of one element that swings has turned a quarter; else 0.
+    an `input`: does nothing that is recorded beside it drive it? `shift`: rows after which an input
+    of one element that swings has turned a quarter; else 0. `driving`: what inputs (N, k) may do to
+    a reading, about its mean.
     """
 
     name: str
@@ -40,8 +40,8 @@ class Signal:
     basis: Array = field(repr=False)
     noise: Array | None = field(default=None, repr=False)
     input: bool = False
-    left: float = 0.0
     shift: int = 0
+    driving: Array | None = field(default=None, repr=False)
 
     def at_other_times(self, x: Array) -> bool:
         """Is a column (N,) nothing but the input, now and a quarter of a swing before and after? In
@@ -54,9 +54,20 @@ class Signal:
         left = own - later @ np.linalg.lstsq(later, own, rcond=None)[0]
         return float(left @ left) < LEVELS.repeated
 
-    def told_better(self, x: Array) -> bool:
-        """Does a column (N,) tell a reading better than its inputs do? Another meter does."""
-        return self.left > 0 and _untold(self.elements, [x]) < self.left
+    def taken_by(self, x: Array) -> bool:
+        """Would a column (N,) and its square take the place of inputs that tell most of a reading,
+        and tell most of what these leave?"""
+        if self.driving is None or len(x) < LEVELS.series:
+            return False
+        given, column = self.driving, _scaled(x)
+        both = np.column_stack([given, column, _scaled(column**2)])
+        y = self.elements - self.elements.mean(axis=0)
+        alone, beside = (np.linalg.lstsq(A, y, rcond=None)[0] for A in (given, both))
+        response, kept = given @ alone, given @ beside[: given.shape[1]]
+        left, less = (float(np.sum((y - A @ b) ** 2)) for A, b in ((given, alone), (both, beside)))
+        part = float(np.sum(response * kept)) / max(float(np.sum(response**2)), 1e-300)
+        tells = left < LEVELS.most * float(np.sum(y**2))
+        return tells and part < LEVELS.stays and less < LEVELS.most * left
 
     def apart(self, x: Array) -> float:
         """Share of a column's squares (N,) that is not computed from it; inf where more is left
@@ -94,7 +105,7 @@ class Reads:
         near = {s.name: s.apart(x) for s in self.signals if np.ptp(x) > 0}
         name = min(near, key=lambda n: near[n], default="")
         if not name or not np.isfinite(near[name]):
-            better = next((s.name for s in self.signals if s.told_better(x)), "")
+            better = next((s.name for s in self.signals if s.taken_by(x)), "")
             if better:
                 return f"column tells {better} better than its inputs do: another meter"
             late = next((s.name for s in self.signals if s.at_other_times(x)), "")
@@ -140,9 +151,9 @@ def signals_of(inputs: Collection[str], readings: Collection[str], runs: Sequenc
             untold = _untold(x, driving) if name in readings else 1.0
             noise = x if name in readings and untold >= MOST else None
             drives = bool(readings) and name not in readings
-            own = len(x) >= LEVELS.series and untold < LEVELS.stand_in
             shift = _quarter(x[:, 0]) if drives and x.shape[1] == 1 else 0
-            found.append(Signal(name, x, basis, noise, drives, untold if own else 0.0, shift))
+            moved = _driving(driving) if name in readings else None
+            found.append(Signal(name, x, basis, noise, drives, shift, moved))
     return Reads(tuple(found), rows)
 
 
@@ -213,6 +224,12 @@ def _untold(reading: Array, inputs: Sequence[Array]) -> float:
     units = np.column_stack([_scaled(y) for y in reading.T])
     left = units - columns @ np.linalg.lstsq(columns, units, rcond=None)[0]
     return float(np.mean(np.sum(left**2, axis=0)) * len(reading) / freedom)
+
+
+def _driving(inputs: Sequence[Array]) -> Array | None:
+    """Inputs and their squares side by side (N, k), scaled; None without any."""
+    scaled = [_scaled(x) for x in inputs]
+    return np.column_stack([*scaled, *(_scaled(x**2) for x in scaled)]) if scaled else None
 
 
 def _one_noise(x: Array, y: Array) -> bool:

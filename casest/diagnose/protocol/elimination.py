@@ -79,6 +79,26 @@ def eliminated(subject: Subject[F], state: State[F]) -> State[F]:
     return state
 
 
+def chance_alone(subject: Subject[F], state: State[F], kept: Kept) -> float:
+    """p of a cause beside all others: of a pair the evidence is both's."""
+    base = subject.without(state.fit, kept.what) if len(kept.evidence.trials) > 1 else None
+    return kept.evidence.p_value if base is None else _alone(subject, state, kept, base)[1]
+
+
+def _alone(subject: Subject[F], state: State[F], kept: Kept, base: F) -> tuple[float, float, float]:
+    """Score and p of a cause beside the others, `base` being the fit without it, and the log of
+    what was looked through for it."""
+    linear, whole = subject.linear(base), subject.linear(state.fit)
+    none, gain = Likelihood(linear), subject.rises(base, [state.fit])[0]
+    freedom = max(whole.basis.shape[1] - linear.basis.shape[1], 1)
+    families = state.first.families if state.first else 1
+    trials = kept.evidence.trials
+    own = [t.variants for t in trials if t.what == kept.what] or [t.variants for t in trials]
+    searched = float(np.log(max(own) * families))
+    score, chance = (f(gain, freedom, searched, none) for f in (worth, p_value))
+    return score, chance, searched
+
+
 def _beside_the_others(
     subject: Subject[F], state: State[F], kept: Kept, base: F
 ) -> tuple[float, str] | None:
@@ -87,12 +107,8 @@ def _beside_the_others(
     `base` is the fit without it.
     """
     linear, whole = subject.linear(base), subject.linear(state.fit)
-    none, gain = Likelihood(linear), subject.rises(base, [state.fit])[0]
-    freedom = max(whole.basis.shape[1] - linear.basis.shape[1], 1)
-    families = state.first.families if state.first else 1
-    searched = float(np.log(kept.evidence.trials[0].variants * families))
-    score = worth(gain, freedom, searched, none)
-    chance, why = p_value(gain, freedom, searched, none), LATER
+    score, chance, searched = _alone(subject, state, kept, base)
+    why = LATER
     strong = score > LEVELS.strong if linear.series else chance < LEVELS.chance
     same = linear.residual.shape == whole.residual.shape
     if strong and same and not linear.series and not subject.asked(kept.what):

@@ -28,7 +28,7 @@ from casest.diagnose.protocol.subject import Subject
 
 def ranked(subject: Subject[F], fit: F) -> Ranking:
     """Every cause beside a fit: the best variants of each family, each with a noise of its own."""
-    return refined(subject, fit, ranked_of(subject.linear(fit), once(subject, fit)))
+    return refined(subject, fit, ranked_of(subject.linear(fit), subject.trials(fit)))
 
 
 def refined(subject: Subject[F], fit: F, ranking: Ranking) -> Ranking:
@@ -42,17 +42,6 @@ def refined(subject: Subject[F], fit: F, ranking: Ranking) -> Ranking:
     found = tuple(finer.get(e.trials[0].family, e) for e in ranking.found)
     found = without_feigned(subject, fit, ranking.likelihood, found, ranking.families)
     return replace(ranking, found=best_first(found))
-
-
-def once(subject: Subject[F], fit: F) -> list[Trial]:
-    """Trials without those that are an earlier one under another name: of readings above zero |u|
-    is u."""
-    seen, found = dict[bytes, str](), []
-    for trial in subject.trials(fit):
-        first = seen.setdefault(trial.columns.tobytes(), trial.family)
-        if first == trial.family or subject.asked(trial.what):
-            found.append(trial)
-    return found
 
 
 def _finer(

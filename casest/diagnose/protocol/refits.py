@@ -177,15 +177,15 @@ def _with_parts(options: Sequence[Evidence], ranking: Ranking) -> list[Evidence]
 
 
 def _plainest_first(refits: list[Refit[F]], ranking: Ranking) -> list[Refit[F]]:
-    """What the first one contains, and explains as much or foretells as much, comes before it."""
+    """What the first one contains, and explains as much or foretells as much, comes before it: also
+    what does the same with fewer unknowns, of which a record tells no more."""
     if not refits:
         return refits
     first = refits[0].evidence
     inside = [
         r
         for r in refits[1:]
-        if r.evidence.freedom < first.freedom
-        and _contains(first, r.evidence)
+        if _plainer(r.evidence, first)
         and (
             r.evidence.score > first.score - LEVELS.strong
             or _foretells_as_much(r.evidence, first, ranking)
@@ -195,6 +195,19 @@ def _plainest_first(refits: list[Refit[F]], ranking: Ranking) -> list[Refit[F]]:
         return refits
     best = max(inside, key=lambda r: r.evidence.score)
     return [best, *[r for r in refits if r is not best]]
+
+
+def _plainer(one: Evidence, other: Evidence) -> bool:
+    """Is one a part of the other, or the same with fewer unknowns?"""
+    if one.freedom < other.freedom:
+        return _contains(other, one)
+    fewer = _unknowns(one) < _unknowns(other)
+    return one.freedom == other.freedom and fewer and _nested(one.basis, other.basis)
+
+
+def _unknowns(evidence: Evidence) -> int:
+    """Sizes that it has, whether the record tells them or not."""
+    return sum(t.columns.shape[2] for t in evidence.trials)
 
 
 def _foretells_as_much(plain: Evidence, other: Evidence, ranking: Ranking) -> bool:

@@ -9,7 +9,7 @@ from casest.diagnose.evidence.held_out import Fall, fall_between_causes, foretol
 from casest.diagnose.evidence.linear import alike
 from casest.diagnose.evidence.score import Evidence, judged
 from casest.diagnose.levels import LEVELS
-from casest.diagnose.protocol.ranking import best_first, on_its_axes, once, ranked_of
+from casest.diagnose.protocol.ranking import best_first, on_its_axes, ranked_of
 from casest.diagnose.protocol.state import F, Kept, Ranking, Rival, State
 from casest.diagnose.protocol.subject import Subject
 
@@ -85,7 +85,7 @@ def _without(subject: Subject[F], state: State[F], kept: Kept) -> tuple[F, Ranki
         if seen.causes == others:
             return seen.fit, seen.ranking
     base = subject.without(state.fit, kept.what)
-    return None if base is None else (base, ranked_of(subject.linear(base), once(subject, base)))
+    return None if base is None else (base, ranked_of(subject.linear(base), subject.trials(base)))
 
 
 def _in_its_place(

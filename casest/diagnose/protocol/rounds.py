@@ -9,7 +9,7 @@ from casest.diagnose.evidence.score import Evidence
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.protocol.choosing import with_the_best
 from casest.diagnose.protocol.elimination import eliminated, on_all_axes
-from casest.diagnose.protocol.ranking import once, ranked, ranked_of, refined
+from casest.diagnose.protocol.ranking import ranked, ranked_of, refined
 from casest.diagnose.protocol.state import F, Ranking, Round, State
 from casest.diagnose.protocol.subject import Subject
 
@@ -26,7 +26,7 @@ def search(
     for _ in range(LEVELS.rounds):
         # Else what lies on an axis that was nothing before would look like another cause.
         state = on_all_axes(subject, state, needed=True)
-        plain = ranked_of(subject.linear(state.fit), once(subject, state.fit))
+        plain = ranked_of(subject.linear(state.fit), subject.trials(state.fit))
         seen = Round(state.fit, tuple(k.what for k in state.kept), plain)
         state = replace(state, rounds=(*state.rounds, seen))
         ranking = refined(subject, state.fit, plain)

@@ -93,8 +93,10 @@ class Kept:
     rivals: tuple[Rival, ...] = ()
 
 
-#: Ends the reason against what is not what its name says, at the sizes of its refit.
+#: End the reasons against what is not what its name says, at the sizes of its refit, or tells what
+#: the model tells itself.
 ANOTHER = "it is another effect"
+STANDS_IN = "its columns stand in their place"
 
 
 @dataclass(frozen=True)
@@ -107,7 +109,7 @@ class Refused:
     @property
     def another(self) -> bool:
         """Is it not what its name says?"""
-        return ANOTHER in self.why
+        return ANOTHER in self.why or STANDS_IN in self.why
 
 
 @dataclass(frozen=True)

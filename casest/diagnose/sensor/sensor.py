@@ -33,7 +33,7 @@ from casest.diagnose.sensor.jitter import Draw, in_refit, jittered
 from casest.diagnose.sensor.recent import Recent
 from casest.diagnose.sensor.rows import Rows
 from casest.diagnose.sensor.tried import Tried, on_axes
-from casest.diagnose.sensor.unlike import another, at_one_input, too_slow
+from casest.diagnose.sensor.unlike import another, at_one_input, stands_in, too_slow
 from casest.engine.kernel import only_tried
 from casest.errors import CasestError
 from casest.estimate.calibrate import attempt
@@ -161,6 +161,7 @@ class Sensor(Subject[Fit]):
         spans = [float(np.ptp(run.time)) for run in self.runs if run.time is not None]
         why = too_slow(found.values, what, spans)
         why = why or another(found.model, found.values, self.model)[1]
+        why = why or stands_in(fit, found, what, self.rows)
         for cut in (w for w in what if not why and _plain(w) is not None):
             why = at_one_input(
                 cut, self._residual_without(found, cut) - self.linear(found).residual

@@ -21,9 +21,11 @@ from casest.diagnose.candidates.motion_columns import columns_of_motion
 from casest.diagnose.candidates.slopes import slopes
 from casest.diagnose.evidence.linear import Index
 from casest.diagnose.evidence.score import Trial
+from casest.diagnose.levels import LEVELS
 from casest.diagnose.sensor.fits import Fit, problem_of
 from casest.diagnose.sensor.recent import Recent
 from casest.diagnose.sensor.rows import Rows
+from casest.diagnose.sensor.twins import bend, twins
 from casest.effects import shipped
 from casest.effects.kinds import foreign, readings
 from casest.effects.lateness import likely_lag
@@ -51,13 +53,23 @@ class Tried:
     _found: Recent[Model, tuple[list[Candidate], list[Skipped]]] = field(
         default_factory=lambda: Recent(16), repr=False
     )
+    #: Beside the first fit that is looked at: what is declared.
+    _twins: list[dict[str, str]] = field(default_factory=list, repr=False)
     _looked: Recent[Fit, Seen] = field(default_factory=Recent, repr=False)
     _trials: Recent[Fit, list[Trial]] = field(default_factory=lambda: Recent(1), repr=False)
 
     def found(self, fit: Fit) -> tuple[list[Candidate], list[Skipped]]:
         """What could be missing, and what does not apply here."""
         catalogue = [e for e in self.catalogue if self._in_time or e.kind not in OVER_TIME]
-        return self._found.of(fit.model, lambda: self._known_here(fit.model, catalogue))
+        found, skipped = self._found.of(fit.model, lambda: self._known_here(fit.model, catalogue))
+        if not self._twins:
+            problem, point = problem_of(fit, self.rows.runs)
+            bends = slopes(problem, point, [c for c in found if bend(c)], self.rows.index)
+            columns = [(c, s) for c, s in bends if not isinstance(s, CasestError)]
+            self._twins.append(twins(self.rows.linear(fit), columns))
+        same = {k: v for k, v in self._twins[0].items() if k not in self.known}
+        skipped = [*skipped, *(Skipped(k, f"does here what {v} does") for k, v in same.items())]
+        return [c for c in found if c.label not in same], skipped
 
     def _known_here(
         self, model: Model, catalogue: Sequence[Effect]
@@ -105,21 +117,36 @@ class Tried:
         measured = fit.model.traced.measured
         if not measured or fit.model.implicit:
             return set()
-        readings = np.concatenate([run.signals[measured] for run in self.rows.runs])
-        return {abs(extreme) for _, _, extreme, _ in full_scales(readings)}
+        names = [s.name for s in fit.model.signals if s.kind == "plain" and s.name != "t"]
+        given = [n for n in names if n not in fit.model.traced.readings]
+        signals = {n: np.concatenate([run.signals[n] for run in self.rows.runs]) for n in names}
+        beside = np.column_stack([signals[n] for n in given]) if given else None
+        return {abs(extreme) for _, _, extreme, _ in full_scales(signals[measured], beside)}
 
     def of(self, fit: Fit, several: Sequence[Candidate]) -> list[Trial]:
         """These candidates in their columns, without those that have none here."""
         problem, point = problem_of(fit, self.rows.runs)
         found, motion = [], columns_of_motion(fit.model, self.rows.runs)
         for candidate, columns in slopes(problem, point, several, self.rows.index):
-            if isinstance(columns, CasestError):
+            if isinstance(columns, CasestError) or self._scales(fit, candidate, columns):
                 continue
             axes = _axes(fit, candidate, columns.shape[2])
             describes = self._describes(candidate, motion) and not self.asked(candidate)
             family, trials = candidate.label, candidate.trials
             found.append(Trial(candidate, family, columns, trials, axes, describes))
         return found
+
+    def _scales(self, fit: Fit, candidate: Candidate, columns: Array) -> bool:
+        """Does a gain of a reading, from rest to rest, do nothing beside the unknowns but scale
+        what is left? At rest that is the reading's own noise."""
+        if not candidate.declared_on:
+            return False
+        own = candidate.parameters(candidate.traced_on(fit.model))
+        linear = self.rows.linear(fit)
+        X = columns.reshape(linear.residual.size, -1)
+        X = X - linear.basis @ (linear.basis.T @ X)
+        most = LEVELS.over_noise * float(np.linalg.norm(linear.residual))
+        return not any(p.unit for p in own) and bool(np.linalg.norm(X, axis=0).max() < most)
 
     @staticmethod
     def _describes(candidate: Candidate, motion: Collection[str]) -> bool:

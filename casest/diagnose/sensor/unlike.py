@@ -1,16 +1,21 @@
-"""Why what a refit found is not what its name says."""
+"""Why what a refit found is not what its name says, or takes the place of what is declared."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
+from casest.data.run import Run
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
 from casest.diagnose.candidates.candidates import Candidate
 from casest.diagnose.levels import LEVELS
-from casest.diagnose.protocol.state import ANOTHER
+from casest.diagnose.protocol.state import ANOTHER, STANDS_IN
+from casest.diagnose.sensor.fits import Fit, problem_of
+from casest.diagnose.sensor.rows import Rows, instant
+from casest.leastsquares.problem import Problem
 
 
 def another(model: Model, values: Mapping[str, Array], declared: Model) -> tuple[str, str]:
@@ -59,3 +64,48 @@ def too_slow(
             if value > max(spans, default=np.inf) / LEVELS.fades:
                 return f"its refit fails: {name} = {value:.3g} s is over half of the record"
     return ""
+
+
+def stands_in(before: Fit, after: Fit, added: Sequence[Candidate], rows: Rows) -> str:
+    """Why columns are no influence: what inputs did to the reading, and was most of it, is theirs
+    now; else empty.
+
+    So is another output of the sensor, or of a second one: it tells the reading better than the
+    input does, whatever that has to do with it.
+    """
+    if not any(what.columns or (what.effect is not None and what.effect.extras) for what in added):
+        return ""
+    measured = before.model.traced.measured
+    ours, theirs = (_response(fit, rows) for fit in (before, after))
+    if not measured or ours is None or theirs is None:
+        return ""
+    reading = rows.of([run.signals[measured] for run in rows.runs])
+    size = float(np.sum(ours**2))
+    share = float(np.sum(ours * theirs)) / max(size, 1e-300)
+    little = size < LEVELS.most * float(np.sum((reading - reading.mean(axis=0)) ** 2))
+    if little or share > LEVELS.stays:
+        return ""
+    return f"of what the inputs do to the reading {max(share, 0.0):.0%} is left: {STANDS_IN}"
+
+
+def _response(fit: Fit, rows: Rows) -> Array | None:
+    """What inputs do to the prediction (N, m), about its mean; None where nobody can tell."""
+    model, traced = fit.model, fit.model.along
+    own = {s.name for s in model.declared} - {"t", *traced.readings}
+    names = [s.name for s in model.signals if s.kind == "plain" and s.name in own]
+    if traced.predicted is None or traced.integrates or model.resting or not names:
+        return None
+    fit = instant(fit)
+    problem, point = problem_of(fit, rows.runs)
+    still = Problem(fit.model, tuple(_still(run, names) for run in rows.runs))
+    moving, resting = (
+        rows.of([f[0][:, :, 0] for f in p.evaluate(point, {"p": p.model.along.predicted})])
+        for p in (problem, still)
+    )
+    found = np.nan_to_num(moving - resting)
+    return np.asarray(found - found.mean(axis=0))
+
+
+def _still(run: Run, names: Sequence[str]) -> Run:
+    means = {n: np.full_like(x, x.mean(axis=0)) for n, x in run.signals.items() if n in names}
+    return replace(run, signals={**run.signals, **means})
