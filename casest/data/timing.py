@@ -19,6 +19,7 @@ Array = NDArray[np.float64]
 
 GAP = 5.0  # times the usual step
 USUAL = 0.8  # share of the steps that do not exceed it
+_BACK = 0.1  # share of steps back from which on a column is no time
 _EVEN = 20  # steps that show whether a record is evenly sampled
 
 #: What a note says of a time without a unit.
@@ -54,11 +55,21 @@ def find_time(table: Table) -> tuple[str, ...]:
 
 
 def _by_name(table: Table) -> str | None:
-    for name in _NAMES:
-        found = find_by_name(table, name)
-        if found and not _is_temperature(table.columns[found]):
-            return found
-    return next((name for name in table.columns if _unit_in_name(name)), None)
+    found = [find_by_name(table, name) for name in _NAMES]
+    called = [f for f in found if f and not _is_temperature(table.columns[f])]
+    # What is called t and goes back again and again is something else where there is a time.
+    for name in called:
+        if not _wanders(table.columns[name]):
+            return name
+    return next(iter(called), None) or next((n for n in table.columns if _unit_in_name(n)), None)
+
+
+def _wanders(column: Column) -> bool:
+    """Do numbers go back in more steps than separate records would?"""
+    if column.is_text:
+        return False
+    steps = np.diff(np.asarray(column.values, float))
+    return bool(np.mean(steps[np.isfinite(steps)] < 0) > _BACK) if steps.size else False
 
 
 def _kinds(table: Table) -> dict[str, str]:

@@ -119,7 +119,12 @@ def untried(result: Closed) -> Iterator[str]:
     """What was not tried: the user's own with the reason, what the declaration lacks with the way
     out, the others by name."""
     own = of_the_user(result.not_tried)
-    yield from (f"{s.name} was not tried: {s.reason}" for s in own)
+    together: dict[str, list[str]] = {}
+    for s in own:
+        together.setdefault(s.reason, []).append(s.name)
+    for reason, names in together.items():
+        verb = "were" if len(names) > 1 else "was"
+        yield f"{', '.join(names)} {verb} not tried: {reason}"
     left = {s.name: s.reason for s in result.not_tried if s not in own}
     for why in MISSING.values():
         names = [name for name, reason in left.items() if reason.endswith(why)]

@@ -55,8 +55,12 @@ class Signal:
         return float(left @ left) < LEVELS.repeated
 
     def taken_by(self, x: Array) -> bool:
-        """Would a column (N,) and its square take the place of inputs that tell most of a reading,
-        and tell most of what these leave?"""
+        """Would a column (N,) and its square tell most of what inputs leave of a reading, and take
+        the place of these?
+
+        Of inputs that tell most of it, less than half of their part would be left; of others less
+        than what nobody tells, and the column has the reading's noise.
+        """
         if self.driving is None or len(x) < LEVELS.series:
             return False
         given, column = self.driving, _scaled(x)
@@ -66,8 +70,11 @@ class Signal:
         response, kept = given @ alone, given @ beside[: given.shape[1]]
         left, less = (float(np.sum((y - A @ b) ** 2)) for A, b in ((given, alone), (both, beside)))
         part = float(np.sum(response * kept)) / max(float(np.sum(response**2)), 1e-300)
-        tells = left < LEVELS.most * float(np.sum(y**2))
-        return tells and part < LEVELS.stays and less < LEVELS.most * left
+        if part >= LEVELS.stays or less >= LEVELS.most * left:
+            return False
+        if left < LEVELS.most * float(np.sum(y**2)):
+            return True
+        return float(np.sum(kept**2)) < less and any(_one_noise(x, own) for own in y.T)
 
     def apart(self, x: Array) -> float:
         """Share of a column's squares (N,) that is not computed from it; inf where more is left
