@@ -41,7 +41,7 @@ def test_a_model_that_names_no_input_is_told_how_to_name_it():
 
 def test_with_it_bends_are_tried_and_found():
     text = said(casest.close(told, record(0.0)))
-    assert "adequate: nothing that these data can show is missing" in text
+    assert "adequate: nothing that 60 rows can show is missing" in text
     assert "corrected=…" not in text
     found = [e.candidate.label for e in casest.close(told, record(0.1)).effects]
     assert found == ["cubic"]

@@ -19,7 +19,10 @@ ROUNDING = 1e-6
 
 def twins(linear: Linear, several: Iterable[tuple[Candidate, Array]]) -> dict[str, str]:
     """Labels of bends, given in their columns (N, m, p), with the one whose columns they have: a
-    constant of the model, which has a name there, or an earlier one of the catalogue."""
+    constant of the model, which has a name there, or an earlier one of the catalogue.
+
+    What the unknowns do themselves is none: it stays invisible, under each of its names.
+    """
     first: list[tuple[str, Array, Array]] = []
     found = {}
     for candidate, columns in sorted(several, key=lambda one: not one[0].freed):
@@ -29,7 +32,7 @@ def twins(linear: Linear, several: Iterable[tuple[Candidate, Array]]) -> dict[st
         label = next(alike, "")
         if label and not candidate.freed:
             found[candidate.label] = label
-        else:
+        elif basis.size:
             first.append((candidate.label, columns, basis))
     return found
 

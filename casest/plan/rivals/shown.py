@@ -29,7 +29,7 @@ def shown_or_not(
     UsageError where the effect does not apply, acts on the sequence of samples, or has no size that
     is typical.
     """
-    sensor = Sensor(model, prepared(model, tuple(runs)), CATALOGUE)
+    sensor = Sensor(model, prepared(model, tuple(runs)), CATALOGUE, frozenset([name]))
     base = sensor.fitted(model, model.among(values))
     if base is None:
         raise UsageError(f"{model.name}: its fit to the record fails; close the loop again")
