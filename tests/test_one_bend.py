@@ -1,4 +1,4 @@
-"""What does the same has one name: bends over inputs of one sign, an angle of a few degrees; and what
+"""What does the same has one name: bends over inputs of one sign, an angle of a few degrees; what
 stands in the place of the inputs, or still where they go on, is called what it is."""
 
 from __future__ import annotations
