@@ -69,7 +69,8 @@ def _wanders(column: Column) -> bool:
     if column.is_text:
         return False
     steps = np.diff(np.asarray(column.values, float))
-    return bool(np.mean(steps[np.isfinite(steps)] < 0) > _BACK) if steps.size else False
+    steps = steps[np.isfinite(steps)]
+    return steps.size > 0 and bool(np.mean(steps < 0) > _BACK)
 
 
 def _kinds(table: Table) -> dict[str, str]:
