@@ -157,16 +157,20 @@ class Sensor(Subject[Fit]):
             return f"its refit fails: {error}"
         if found is None:
             return NOT_FINITE
-        what = [t.what for t in added]
+        return self._unlike(fit, found, [t.what for t in added]) or found
+
+    def _unlike(self, before: Fit, after: Fit, added: Sequence[Candidate]) -> str:
+        """Why a refit is not what its names say, or is what the model says itself; else empty."""
         spans = [float(np.ptp(run.time)) for run in self.runs if run.time is not None]
-        why = too_slow(found.values, what, spans)
-        why = why or another(found.model, found.values, self.model)[1]
-        why = why or stands_in(fit, found, what, self.rows)
-        for cut in (w for w in what if not why and _plain(w) is not None):
-            why = at_one_input(
-                cut, self._residual_without(found, cut) - self.linear(found).residual
-            )
-        return why or found
+        why = (
+            too_slow(after.values, added, spans)
+            or another(after.model, after.values, self.model)[1]
+            or stands_in(before, after, added, self.rows)
+        )
+        for what in (w for w in added if _plain(w) is not None):
+            beyond = self._residual_without(after, what) - self.linear(after).residual
+            why = why or at_one_input(what, beyond)
+        return why
 
     def _with(
         self, fit: Fit, added: Sequence[Candidate], values: Mapping[str, Array]
