@@ -65,6 +65,11 @@ _ATOMS: dict[str, _Size] = {
     "kg": _si(1.0, kg=1),
     "N": _si(1.0, kg=1, m=1, s=-2),
     "kN": _si(1e3, kg=1, m=1, s=-2),
+    "Nm": _si(1.0, kg=1, m=2, s=-2),  # of a torque, not the yarn's number
+    "kNm": _si(1e3, kg=1, m=2, s=-2),
+    "mNm": _si(1e-3, kg=1, m=2, s=-2),
+    "Ncm": _si(1e-2, kg=1, m=2, s=-2),
+    "Nmm": _si(1e-3, kg=1, m=2, s=-2),
     "Pa": _si(1.0, kg=1, m=-1, s=-2),
     "hPa": _si(1e2, kg=1, m=-1, s=-2),
     "kPa": _si(1e3, kg=1, m=-1, s=-2),

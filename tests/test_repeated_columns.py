@@ -205,3 +205,14 @@ def test_in_a_motion_of_several_frequencies_the_angle_is_a_column_of_its_own():
     assert [e.candidate.label for e in closing.effects] == ["signal_lag(reference)"]
     lag = closing.after.values["signal_lag(reference).delay"]
     assert lag == pytest.approx(0.007, abs=0.001)
+
+
+def test_a_quotient_of_the_reading_and_another_column_explains_nothing(record):
+    """A log of a motor holds its torque over its current; the current itself is an influence."""
+    rng = np.random.default_rng(7)
+    current = 2 + np.sin(0.9 * record["t"]) + rng.normal(0, 0.02, ROWS)
+    reading = record["reading"] + 0.5 * current
+    given = {**record, "reading": reading, "current": current, "constant": reading / current}
+    closing = close("linear", given)
+    assert [e.candidate.label for e in closing.effects] == ["channel_bias(current)"]
+    assert skipped(closing)["constant"].startswith("column is made of reading and current")

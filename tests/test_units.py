@@ -63,6 +63,8 @@ SPELLINGS = [
     ("dps/s", "(deg/s)/s"),
     ("m/s²/√Hz", "m/s^2/sqrt(Hz)"),
     ("", "1"),
+    ("Nm", "Nm"),
+    ("N·m", "N*m"),
 ]
 
 

@@ -157,14 +157,18 @@ def _suspect(x: Array, others: Array, beside: Iterable[Array]) -> tuple[int, boo
 
 
 def _goes_on(x: Array, given: Array, at_top: NDArray[np.bool_], resolution: float) -> bool:
-    """Whether what a component follows moves where it stands still, by more than its resolution."""
+    """Whether what a component follows moves where it stands still, by more than its resolution and
+    than it differs from that elsewhere."""
     both = np.isfinite(given)
-    span = float(np.ptp(given[both])) if both.any() else 0.0
-    if span == 0.0 or abs(np.corrcoef(x[both], given[both])[0, 1]) < _FOLLOWS:
+    if not both.any() or np.ptp(given[both]) == 0.0:
         return False
-    there = given[both & at_top]
-    moved = float(np.ptp(there)) / span * float(np.ptp(x)) if there.size else 0.0
-    return moved > _STEEP * resolution
+    if abs(np.corrcoef(x[both], given[both])[0, 1]) < _FOLLOWS:
+        return False
+    there, rest = given[both & at_top], both & ~at_top
+    slope, level = np.polyfit(given[rest], x[rest], 1)
+    differs = 1.5 * float(np.median(np.abs(x[rest] - level - slope * given[rest])))
+    moved = abs(slope) * float(np.ptp(there)) if there.size else 0.0
+    return moved > _STEEP * max(resolution, differs)
 
 
 def _changing(others: Array, at_top: NDArray[np.bool_]) -> bool:

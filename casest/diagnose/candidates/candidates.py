@@ -147,16 +147,23 @@ class Skipped:
     reason: str
 
 
+#: Columns that measure something (is it a temperature?), and those that cannot be used.
+Channels = tuple[dict[str, bool], list[Skipped]]
+
+
 def candidates(
-    model: Model, runs: Sequence[Run], catalogue: Sequence[Effect]
+    model: Model,
+    runs: Sequence[Run],
+    catalogue: Sequence[Effect],
+    known: Channels | None = None,
 ) -> tuple[list[Candidate], list[Skipped]]:
     """All that can be tried on these data, and what cannot with the reason.
 
-    `runs` come from `prepared`.
+    `runs` come from `prepared`; `known` are their channels, which hang on what is declared alone.
     """
     found: list[Candidate] = []
     skipped: list[Skipped] = []
-    measured, unusable = _channels(model, runs)
+    measured, unusable = known or channels_of(model, runs)
     # A reading follows its own residual: its noise is in both.
     unfit = {*(s.name for s in unusable), *model.traced.readings}
     turning = [n for n in angles(model, runs) if n not in unfit]
@@ -257,20 +264,18 @@ def _columns_for(
 
 def usable_columns(model: Model, runs: Sequence[Run]) -> list[str]:
     """Columns that measure something and are no signal of the model's. `runs` are prepared."""
-    return list(_channels(model, runs)[0])
+    return list(channels_of(model, runs)[0])
 
 
-def _channels(model: Model, runs: Sequence[Run]) -> tuple[dict[str, bool], list[Skipped]]:
-    """Columns that measure something (is it a temperature?), and those that cannot be used."""
+def channels_of(model: Model, runs: Sequence[Run]) -> Channels:
+    """The columns of these runs that a model does not read itself."""
     # A column that an effect reads already may be the cause of another one as well.
     read = {column for attached in model.effects for _, column in dict(attached.columns).items()}
     used = {s.name for s in model.signals} - read | {"t"}
     return channels(used, runs, reads_of(model, runs))
 
 
-def channels(
-    used: Collection[str], runs: Sequence[Run], reads: Reads
-) -> tuple[dict[str, bool], list[Skipped]]:
+def channels(used: Collection[str], runs: Sequence[Run], reads: Reads) -> Channels:
     """The same of columns that are not `used`, and are nothing once more that is read."""
     found: dict[str, bool] = {}
     skipped: list[Skipped] = []

@@ -8,7 +8,7 @@ Also what only goes with an input is none, of few rows sooner: its curve is a be
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations_with_replacement, product
 
@@ -17,7 +17,7 @@ import numpy as np
 from casest.data.run import Run
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
-from casest.diagnose.candidates.errors import is_error
+from casest.diagnose.candidates.errors import is_error, is_quotient
 from casest.diagnose.levels import LEVELS
 
 #: Of a reading's variance: where inputs leave so much, something else may be what moves it.
@@ -103,6 +103,7 @@ class Reads:
 
     signals: tuple[Signal, ...]
     rows: slice
+    columns: Mapping[str, Array] = field(default_factory=dict, repr=False)
 
     def again(self, x: Array) -> str:
         """Which of them a column (N,) is once more, in words; else empty."""
@@ -115,12 +116,27 @@ class Reads:
             better = next((s.name for s in self.signals if s.taken_by(x)), "")
             if better:
                 return f"column tells {better} better than its inputs do: another meter"
+            if made := self._made_of(x):
+                return f"column is made of {made[0]} and {made[1]}, computed from both"
             late = next((s.name for s in self.signals if s.at_other_times(x)), "")
             return late and f"column is {late} at other times: what follows it could be a lag of it"
         if near[name] < LEVELS.repeated**2 + _rounding(_scaled(x)):
             return f"column is {name} once more, or computed from it"
         few = "in so few rows " if len(x) < LEVELS.series else ""
         return f"column goes with {name}: {few}what follows it could be a bend over that"
+
+    def _made_of(self, x: Array) -> tuple[str, str] | None:
+        """A reading of one element and another column of which it is the quotient or product."""
+        single = [s for s in self.signals if s.elements.shape[1] == 1]
+        others = {s.name: s.elements[:, 0] for s in single} | dict(self.columns)
+        for reading, (name, y) in product(single, others.items()):
+            if reading.input or name == reading.name or y is x or np.array_equal(x, y):
+                continue
+            read = reading.elements[:, 0]
+            # Of the three numbers that one was computed which has the reading's noise.
+            if is_quotient(x, read, y) and _noise_alike(x, read) > _noise_alike(y, read):
+                return reading.name, name
+        return None
 
     def _error_of(self, x: Array) -> tuple[str, str] | None:
         """A reading and an input of one element each of which it is the error; None without."""
@@ -161,7 +177,12 @@ def signals_of(inputs: Collection[str], readings: Collection[str], runs: Sequenc
             shift = _quarter(x[:, 0]) if drives and x.shape[1] == 1 else 0
             moved = _driving(driving) if name in readings else None
             found.append(Signal(name, x, basis, noise, drives, shift, moved))
-    return Reads(tuple(found), rows)
+    columns = {
+        name: np.concatenate([run.signals[name][:, 0] for run in runs])[rows]
+        for name in (runs[0].columns if runs else ())
+        if name not in each and all(name in run.signals for run in runs)
+    }
+    return Reads(tuple(found), rows, columns)
 
 
 def _quarter(x: Array) -> int:
@@ -240,11 +261,16 @@ def _driving(inputs: Sequence[Array]) -> Array | None:
 
 
 def _one_noise(x: Array, y: Array) -> bool:
-    """Do the third differences of two series, which are all but noise, go the same way?
+    """Is half of the noise of two series one?"""
+    return len(x) >= LEVELS.series and _noise_alike(x, y) > 0.5
 
-    Their signs, so that a few steps do not count: alike in three of four if half of it is one.
+
+def _noise_alike(x: Array, y: Array) -> float:
+    """How much oftener the third differences of two series, which are all but noise, go the same
+    way than not, or the other way.
+
+    Their signs, so that a few steps do not count: 0.5, alike in three of four, if half is one.
     """
-    if len(x) < LEVELS.series:
-        return False
-    alike = np.mean(np.sign(np.diff(x, 3)) * np.sign(np.diff(y, 3)))
-    return bool(abs(alike) > 0.5)
+    if len(x) < 4:
+        return 0.0
+    return float(abs(np.mean(np.sign(np.diff(x, 3)) * np.sign(np.diff(y, 3)))))

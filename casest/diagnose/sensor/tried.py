@@ -15,7 +15,13 @@ from casest.declaration.physics import SX
 from casest.declaration.shapes import Array, each
 from casest.declaration.symbols import param
 from casest.diagnose.candidates.axes import axes_of
-from casest.diagnose.candidates.candidates import Candidate, Skipped, candidates
+from casest.diagnose.candidates.candidates import (
+    Candidate,
+    Channels,
+    Skipped,
+    candidates,
+    channels_of,
+)
 from casest.diagnose.candidates.grid import Seen, nearer, on_grid
 from casest.diagnose.candidates.motion_columns import columns_of_motion
 from casest.diagnose.candidates.slopes import slopes
@@ -53,7 +59,8 @@ class Tried:
     _found: Recent[Model, tuple[list[Candidate], list[Skipped]]] = field(
         default_factory=lambda: Recent(16), repr=False
     )
-    #: Beside the first fit that is looked at: what is declared.
+    #: Of the first fit that is looked at: what is declared.
+    _channels: list[Channels] = field(default_factory=list, repr=False)
     _twins: list[dict[str, str]] = field(default_factory=list, repr=False)
     _looked: Recent[Fit, Seen] = field(default_factory=Recent, repr=False)
     _trials: Recent[Fit, list[Trial]] = field(default_factory=lambda: Recent(1), repr=False)
@@ -75,7 +82,7 @@ class Tried:
         self, model: Model, catalogue: Sequence[Effect]
     ) -> tuple[list[Candidate], list[Skipped]]:
         """Without what no such sensor has, unless it is asked for."""
-        found, skipped = candidates(model, self.rows.runs, catalogue)
+        found, skipped = candidates(model, self.rows.runs, catalogue, self._read(model))
         units = [self.rows.runs[0].units.get(name) for name in readings(model)]
         asked = (c for c in found if c.effect is not None and not self.asked(c))
         why = {c.label: foreign(c.effect, units) for c in asked if c.effect is not None}
@@ -85,8 +92,15 @@ class Tried:
     def like(self, fit: Fit, what: Candidate) -> Candidate | None:
         """The candidate of that label, as it could be missing in a fit."""
         own = [e for e in self.catalogue if e.name == what.name]
-        several = candidates(fit.model, self.rows.runs, own)[0] if what.effect is not None else []
+        if what.effect is None:
+            return None
+        several, _ = candidates(fit.model, self.rows.runs, own, self._read(fit.model))
         return next((c for c in several if c.label == what.label), None)
+
+    def _read(self, model: Model) -> Channels:
+        if not self._channels:
+            self._channels.append(channels_of(model, self.rows.runs))
+        return self._channels[0]
 
     def trials(self, fit: Fit) -> list[Trial]:
         """Every candidate in its columns, over its grid."""
