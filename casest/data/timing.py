@@ -27,7 +27,7 @@ ASSUMED = "no unit stated, taken as s"
 #: How the note begins that tells why a time column was left aside.
 UNUSED = "time not used: "
 
-_NAMES = ("t", "time", "timestamp", "timestamps")
+_NAMES = ("t", "time", "timestamp", "timestamps", "unixtime")
 _CLOCKS = {"millis": "ms", "milliseconds": "ms", "micros": "us", "microseconds": "us"}
 #: A column that was said to be the time may be called by its unit alone, or end in it: tick_us.
 _UNITS = ("s", "sec", "ms", "msec", "us", "usec", "ns")
@@ -40,8 +40,8 @@ _RATE_NAMES = ("fs", "rate", "samplerate", "samplingrate", "samplefrequency", "s
 def find_time(table: Table) -> tuple[str, ...]:
     """Return the column that holds the time, or a date and a time of day; () where none does.
 
-    It is called t, time or timestamp, or such with a unit; else it is the only column of times of
-    day, with the only column of dates if there is one.
+    It is called t, time, timestamp or unix_time, or such with a unit; else it is the only column of
+    times of day, with the only column of dates if there is one.
     """
     kinds = _kinds(table)
     named = _by_name(table)
