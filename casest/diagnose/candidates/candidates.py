@@ -159,7 +159,7 @@ def candidates(
 ) -> tuple[list[Candidate], list[Skipped]]:
     """All that can be tried on these data, and what cannot with the reason.
 
-    `runs` come from `prepared`; `known` are their channels, which hang on what is declared alone.
+    `runs` come from `prepared`; `known` are their channels, which hang on what the model reads.
     """
     found: list[Candidate] = []
     skipped: list[Skipped] = []
@@ -269,10 +269,14 @@ def usable_columns(model: Model, runs: Sequence[Run]) -> list[str]:
 
 def channels_of(model: Model, runs: Sequence[Run]) -> Channels:
     """The columns of these runs that a model does not read itself."""
-    # A column that an effect reads already may be the cause of another one as well.
-    read = {column for attached in model.effects for _, column in dict(attached.columns).items()}
-    used = {s.name for s in model.signals} - read | {"t"}
-    return channels(used, runs, reads_of(model, runs))
+    return channels(read_by(model), runs, reads_of(model, runs))
+
+
+def read_by(model: Model) -> frozenset[str]:
+    """What a model reads itself. A column that an effect of the catalogue reads may be the cause of
+    another one as well; what a formula reads is in it."""
+    followed = {column for attached in model.effects for column in dict(attached.columns).values()}
+    return frozenset({s.name for s in model.signals} - followed | {"t"})
 
 
 def channels(used: Collection[str], runs: Sequence[Run], reads: Reads) -> Channels:

@@ -21,6 +21,7 @@ from casest.diagnose.candidates.candidates import (
     Skipped,
     candidates,
     channels_of,
+    read_by,
 )
 from casest.diagnose.candidates.grid import Seen, nearer, on_grid
 from casest.diagnose.candidates.motion_columns import columns_of_motion
@@ -59,8 +60,9 @@ class Tried:
     _found: Recent[Model, tuple[list[Candidate], list[Skipped]]] = field(
         default_factory=lambda: Recent(16), repr=False
     )
-    #: Of the first fit that is looked at: what is declared.
-    _channels: list[Channels] = field(default_factory=list, repr=False)
+    #: By what a model reads itself.
+    _channels: dict[frozenset[str], Channels] = field(default_factory=dict, repr=False)
+    #: Beside the first fit that is looked at: what is declared.
     _twins: list[dict[str, str]] = field(default_factory=list, repr=False)
     _looked: Recent[Fit, Seen] = field(default_factory=Recent, repr=False)
     _trials: Recent[Fit, list[Trial]] = field(default_factory=lambda: Recent(1), repr=False)
@@ -98,9 +100,10 @@ class Tried:
         return next((c for c in several if c.label == what.label), None)
 
     def _read(self, model: Model) -> Channels:
-        if not self._channels:
-            self._channels.append(channels_of(model, self.rows.runs))
-        return self._channels[0]
+        own = read_by(model)
+        if own not in self._channels:
+            self._channels[own] = channels_of(model, self.rows.runs)
+        return self._channels[own]
 
     def trials(self, fit: Fit) -> list[Trial]:
         """Every candidate in its columns, over its grid."""
