@@ -8,6 +8,7 @@ import pytest
 
 from casest import close
 from casest.cli import run
+from casest.data.checks import full_scales
 
 
 def names(closing):
@@ -72,6 +73,19 @@ def test_a_ramp_that_ends_at_a_full_scale(tmp_path, capsys, top):
     run(["calibrate", "linear", str(file), "-o", str(tmp_path / "out")])
     count = np.count_nonzero(reading == top)
     assert f"{count} readings at the largest value {top:g}" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("given", "count"),
+    [
+        (np.arange(120.0), 1),
+        (np.r_[np.full(78, np.nan), np.arange(42.0)], 0),  # nothing beside what stands still
+        (np.r_[np.zeros(78), np.arange(42.0)], 0),
+    ],
+)
+def test_readings_that_stand_still_are_told_by_an_input_that_is_known_elsewhere_too(given, count):
+    reading = np.r_[np.repeat(np.arange(40.0), 2), np.full(40, 39.0)]
+    assert len(list(full_scales(reading[:, None], given[:, None]))) == count
 
 
 def test_other_outputs_of_the_sensor_do_not_take_the_place_of_what_it_measures():

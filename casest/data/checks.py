@@ -160,15 +160,14 @@ def _goes_on(x: Array, given: Array, at_top: NDArray[np.bool_], resolution: floa
     """Whether what a component follows moves where it stands still, by more than its resolution and
     than it differs from that elsewhere."""
     both = np.isfinite(given)
-    if not both.any() or np.ptp(given[both]) == 0.0:
+    there, rest = given[both & at_top], both & ~at_top
+    if not there.size or not rest.any() or min(np.ptp(given[rest]), np.ptp(x[rest])) == 0.0:
         return False
     if abs(np.corrcoef(x[both], given[both])[0, 1]) < _FOLLOWS:
         return False
-    there, rest = given[both & at_top], both & ~at_top
     slope, level = np.polyfit(given[rest], x[rest], 1)
     differs = 1.5 * float(np.median(np.abs(x[rest] - level - slope * given[rest])))
-    moved = abs(slope) * float(np.ptp(there)) if there.size else 0.0
-    return moved > _STEEP * max(resolution, differs)
+    return bool(abs(slope) * np.ptp(there) > _STEEP * max(resolution, differs))
 
 
 def _changing(others: Array, at_top: NDArray[np.bool_]) -> bool:

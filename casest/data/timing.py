@@ -57,11 +57,10 @@ def find_time(table: Table) -> tuple[str, ...]:
 def _by_name(table: Table) -> str | None:
     found = [find_by_name(table, name) for name in _NAMES]
     called = [f for f in found if f and not _is_temperature(table.columns[f])]
+    called += [name for name in table.columns if _unit_in_name(name)]
     # What is called t and goes back again and again is something else where there is a time.
-    for name in called:
-        if not _wanders(table.columns[name]):
-            return name
-    return next(iter(called), None) or next((n for n in table.columns if _unit_in_name(n)), None)
+    steady = (name for name in called if not _wanders(table.columns[name]))
+    return next(steady, None) or next(iter(called), None)
 
 
 def _wanders(column: Column) -> bool:
