@@ -157,7 +157,8 @@ PAGE = """# The loop in motion on simulated flights
 Made by `python studies/flight_loop.py` (`make study-flights`), {count} flights and {minutes:.0f}
 minutes of processor time. Flights of 60 s by closed forms (`tests/flights.py`), Batista's sensor
 noises; `casest close bias-gravity` as it is shipped, with the published intensities as its start.
-Seeds from {first} on were looked at by no rule. {aim}
+Seeds from {first} on were looked at by no rule. Flights are kept as they were closed: a table that
+grew over some time has rows of several states of the loop. {aim}
 
 ## Nothing missing
 
