@@ -354,6 +354,14 @@ def test_a_residual_that_resembles_itself_over_many_samples_is_not_called_noise_
         changed(result, verdict="extended", effects=[added], not_tried=[], samples=few)
     )
     assert short.endswith("what is left is noise as far as 19 rows can tell")
+    words = changed(added, name="formula")
+    for effects, missing in (
+        ([words], "a formula describes what was missing, of unknown cause"),
+        ([added, words],
+         "vibration was missing, and a formula describes what else was, of unknown cause"),
+    ):  # fmt: skip
+        said = sentence(changed(result, verdict="extended", effects=effects, not_tried=[]))
+        assert said.startswith(f"extended: {missing}; what is left is ")
 
 
 @pytest.mark.long

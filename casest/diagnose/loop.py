@@ -347,30 +347,53 @@ def certified(sensor: Sensor, state: State[Fit], before: Estimate) -> tuple[Stat
             return state, after
         if last is None:
             return state, before
-        if last.rivals:
-            # Its evidence stays that of the one that it replaces: they differ by little.
-            first, *others = last.rivals
-            other = replace(last, what=first.what, rivals=tuple(others))
-            several = tuple(other if k is last else k for k in state.kept)
-            state = replace(state, fit=first.fit, kept=several)
-            state = state.refusing(last.what, why)
+        state = state.refusing(last.what, why)
+        instead = _replaced(sensor, state, last)
+        if instead is not None:
+            state = instead
             continue
         fit = sensor.without(state.fit, last.what)
         if fit is None:
             return state, before
         kept = tuple(k for k in state.kept if k is not last)
         state = replace(state, fit=fit, kept=kept, open=(last.evidence, *state.open))
-        state = state.refusing(last.what, why)
+
+
+def _replaced(sensor: Sensor, state: State[Fit], kept: Kept) -> State[Fit] | None:
+    """The state with the first rival of a cause in its place that is not refused at a glance.
+
+    Its evidence stays that of the one that it replaces: they differ by little.
+    """
+    for k, rival in enumerate(kept.rivals):
+        fit = sensor.replaced(state.fit, kept.what, rival.what, rival.fit)
+        if fit is not None and not isinstance(sensor.certified(fit), str):
+            other = replace(kept, what=rival.what, rivals=kept.rivals[k + 1 :])
+            several = tuple(other if one is kept else one for one in state.kept)
+            return replace(state, fit=fit, kept=several)
+    return None
 
 
 def _at_fault(sensor: Sensor, state: State[Fit], after: Estimate) -> tuple[Kept | None, str]:
     """Which cause a proved estimate speaks against, and why: one that is not what it is called, or
-    the last one where it is refused."""
+    where it is refused the one that the data determine least, else the last."""
     if not after.certificate.trusted:
-        last = state.kept[-1] if state.kept else None
-        return last, f"its fit is refused: {after.certificate.reasons[0]}"
+        return _least(state, after), f"its fit is refused: {after.certificate.reasons[0]}"
     label, why = another(after.model, after.values, sensor.model)
     return next((k for k in state.kept if k.what.label == label), None), why
+
+
+def _least(state: State[Fit], after: Estimate) -> Kept | None:
+    """The cause that has most of the direction of which the data say least, or is on a bound."""
+    owner = {p.name: a.label for a in after.model.effects for p in a.parameters}
+    at_bound = Code.BOUND in after.certificate.code
+    direction = (~after.free).astype(float) if at_bound else after.identifiability.least
+    parts = dict.fromkeys((k.what.label for k in state.kept), 0.0)
+    for slot in after.problem.slots:
+        label = owner.get(slot.parameter.name, "")
+        if label in parts:
+            parts[label] += float(np.sum(direction[slot.x] ** 2))
+    # Of equal parts the last one.
+    return max(reversed(state.kept), key=lambda k: parts[k.what.label], default=None)
 
 
 def _found(sensor: Sensor, state: State[Fit], kept: Kept, after: Estimate) -> Found:

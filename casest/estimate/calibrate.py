@@ -190,7 +190,9 @@ def _refused(problem: Problem, point: Point, code: Code, reason: str, began: flo
         Noise(nan, nan, None, problem.residual_count - problem.unknowns),
         nan,
         Certificate(False, (reason,), nan, nan, nan, 0, 0, (nan, nan), (), code=code),
-        Identifiability(0, problem.unknowns, nothing[0], nothing, (), everything, ""),
+        Identifiability(
+            0, problem.unknowns, nothing[0], nothing, (), everything, nothing[:, 0], ""
+        ),
         (),
         (),
         time.perf_counter() - began,

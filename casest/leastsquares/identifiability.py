@@ -38,8 +38,8 @@ class Identifiability:
     """Rank of the Jacobian among the unknowns, and what it lacks.
 
     `null` (n, k) is an orthonormal basis of the null space in the unknowns (unscaled); `touched`
-    marks the unknowns that it moves; `weakest` describes the direction of the smallest singular
-    value.
+    marks the unknowns that it moves; `least` (n,) is the direction of the smallest singular value,
+    of columns of unit length, and `weakest` describes it.
     """
 
     rank: int
@@ -48,6 +48,7 @@ class Identifiability:
     null: Array
     unobservable: tuple[str, ...]
     touched: Array
+    least: Array
     weakest: str
 
 
@@ -82,7 +83,7 @@ def identify(problem: Problem, point: Point, R: Array | None = None) -> Identifi
             touched[slot.x] = True
     basis = unscaled / np.where(norms > 0, norms, 1)
     weakest = _combination(problem, Vt[-1], scale)
-    return Identifiability(rank, problem.unknowns, singular, basis, words, touched, weakest)
+    return Identifiability(rank, problem.unknowns, singular, basis, words, touched, Vt[-1], weakest)
 
 
 def _null_words(problem: Problem, point: Point, null: Array, scale: Array) -> Iterator[str]:

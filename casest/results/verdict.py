@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Protocol, TypeVar
 
+from casest.diagnose.formula.search import NAME as FORMULA
 from casest.diagnose.found import HELD_OUT_DATA
 from casest.diagnose.levels import LEVELS
 from casest.effects import CATALOGUE
@@ -40,14 +41,28 @@ def sentence(result: Closed) -> str:
             noise += f"; the noise has a colour (alike over {over:.0f} samples)"
         return f"adequate: {said}{noise}{untried}"
     if result.verdict == "extended":
-        verb = "was" if len(names) == 1 else "were"
         left = _remaining_noise(result.noise.correlated_over_samples, result.samples)
-        return f"extended: {', '.join(names)} {verb} missing; what is left is {left}{untried}"
+        return f"extended: {_missing(names)}; what is left is {left}{untried}"
     found = f"beside {', '.join(names)} " if names else ""
     causes = result.unexplained.one_of
     if causes:
         return f"unexplained: {found}a misfit remains that {_several(causes)} explain alike"
     return f"unexplained: {found}a misfit remains that no candidate explains"
+
+
+def _missing(names: Sequence[str]) -> str:
+    """What was missing: a formula that the loop found says what it looks like, and is no cause."""
+    causes = [name for name in names if name != FORMULA]
+    verb = "were" if len(causes) > 1 or causes == ["outliers"] else "was"
+    said = f"{', '.join(causes)} {verb} missing"
+    if len(causes) == len(names):
+        return said
+    more = (
+        f"{said}, and a formula describes what else was"
+        if causes
+        else ("a formula describes what was missing")
+    )
+    return f"{more}, of unknown cause"
 
 
 def _several(causes: Sequence[str]) -> str:

@@ -220,6 +220,17 @@ class Sensor(Subject[Fit]):
         """The fit with these in the place of an effect that was added, from where it is."""
         return "it is no effect" if what.freed else self._refit(_less(fit, what), added)
 
+    def replaced(self, fit: Fit, what: Candidate, other: Candidate, seen: Fit) -> Fit | None:
+        """The fit with another effect in the place of one that was added, as it was fitted there
+        when the rest of the model may have been another."""
+        labels = {a.label for a in fit.model.effects} - {what.label} | {other.label}
+        if {a.label for a in seen.model.effects} == labels:
+            return seen
+        less = _less(fit, what)
+        own = [a for a in seen.model.effects if a.label == other.label]
+        model = replace(less.model, effects=(*less.model.effects, *own))
+        return self.fitted(model, starts(model, self.runs, {**seen.values, **less.values}))
+
     def wider(self, fit: Fit, what: Candidate) -> tuple[Candidate, Fit] | None:
         """An effect that was added on some axes only, and the fit with it on all of them.
 

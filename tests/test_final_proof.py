@@ -1,0 +1,79 @@
+"""What the last proof speaks against: the cause at fault goes, not the one that came last."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from casest import Run, attempt
+from casest.diagnose.evidence.likelihood import Likelihood
+from casest.diagnose.evidence.score import judged
+from casest.diagnose.loop import certified
+from casest.diagnose.protocol.state import Kept, State
+from casest.diagnose.sensor import Sensor
+from casest.effects import CATALOGUE
+from casest.effects.placing import prepared
+from casest_problems.one_channel import linear
+
+
+def record(signals, t, warm):
+    run = Run.raw("r", signals, units={"reference": "V", "reading": "V"}, time=t)
+    run = replace(run, columns={"warm": warm}, column_units={"warm": "degC"})
+    return prepared(linear, [run])
+
+
+@pytest.fixture(scope="module")
+def searched():
+    """A search's subject, its fit, causes by name and the estimate, of a line with a square, a
+    drift and an offset over temperature; and the same record in which no temperature changes."""
+    rng = np.random.default_rng(0)
+    t = 0.1 * np.arange(400.0)
+    x, warm = rng.uniform(-1, 1, 400), np.sin(0.3 * t)
+    y = 0.2 + 1.1 * x + 0.01 * t + 0.3 * x**2 + 0.05 * warm + 0.01 * rng.standard_normal(400)
+    signals = {"reference": x[:, None], "reading": y[:, None]}
+    sensor = Sensor(linear, record(signals, t, warm), CATALOGUE)
+    still = {**sensor.runs[0].signals, "warm": np.zeros((400, 1))}
+    cold = Sensor(linear, (replace(sensor.runs[0], signals=still),), CATALOGUE)
+    before = attempt(linear, sensor.runs)
+    fit = sensor.fitted(before.model, before.values)
+    trials = {t.family: t for t in sensor.trials(fit) if not t.what.held}
+    return sensor, cold, fit, trials, before
+
+
+def kept_of(sensor, fit, trial):
+    likelihood = Likelihood(sensor.linear(fit))
+    return Kept(trial.what, judged([trial], likelihood, likelihood.beside()), {})
+
+
+def begun(searched, *names):
+    """A state in which these causes were added."""
+    sensor, _, fit, trials, _ = searched
+    kept = tuple(kept_of(sensor, fit, trials[n]) for n in names)
+    return State(sensor.refit(fit, [trials[n] for n in names]), kept)
+
+
+def test_a_cause_goes_that_the_data_do_not_determine_though_another_came_last(searched):
+    _, cold, _, _, before = searched
+    state = begun(searched, "temperature_bias(warm)", "bias_drift", "quadratic")
+    state, after = certified(cold, state, before)
+    assert [k.what.label for k in state.kept] == ["bias_drift", "quadratic"]
+    assert after.certificate.trusted
+    # Of the reference, which the gain multiplies.
+    assert after.values["quadratic.k"] == pytest.approx(0.3 / 1.1, abs=0.01)
+    ((refused, why),) = [(r.what.label, r.why) for r in state.refused]
+    assert refused == "temperature_bias(warm)"
+    assert "temperature_bias(warm).k" in why
+
+
+def test_what_takes_the_place_of_a_cause_does_not_bring_back_another_that_has_gone(searched):
+    sensor, _, _, trials, _ = searched
+    three = begun(searched, "temperature_bias(warm)", "bias_drift", "quadratic")
+    drift = next(k.what for k in three.kept if k.what.label == "bias_drift")
+    seen = sensor.instead(three.fit, drift, [trials["cubic"]])
+    two = sensor.without(three.fit, three.kept[0].what)
+    found = sensor.replaced(two, drift, trials["cubic"].what, seen)
+    assert [a.label for a in found.model.effects] == ["quadratic", "cubic"]
+    # Where nothing has gone it is the fit that was seen.
+    assert sensor.replaced(three.fit, drift, trials["cubic"].what, seen) is seen
