@@ -10,7 +10,7 @@ import pytest
 from casest import Run, attempt
 from casest.diagnose.evidence.likelihood import Likelihood
 from casest.diagnose.evidence.score import judged
-from casest.diagnose.loop import certified
+from casest.diagnose.loop import NO_SIZE, _left_in, certified
 from casest.diagnose.protocol.state import Kept, State
 from casest.diagnose.sensor import Sensor
 from casest.effects import CATALOGUE
@@ -77,3 +77,31 @@ def test_what_takes_the_place_of_a_cause_does_not_bring_back_another_that_has_go
     assert [a.label for a in found.model.effects] == ["quadratic", "cubic"]
     # Where nothing has gone it is the fit that was seen.
     assert sensor.replaced(three.fit, drift, trials["cubic"].what, seen) is seen
+
+
+def test_what_the_last_fit_makes_nothing_of_is_not_kept(searched):
+    """No cube is in the record, whatever had spoken for one."""
+    sensor, _, _, _, before = searched
+    state = begun(searched, "cubic", "quadratic", "bias_drift")
+    assert (
+        abs(state.fit.values["cubic.k"])
+        < 2 * attempt(state.fit.model, sensor.runs, start=state.fit.values).plain["cubic.k"]
+    )
+    state, after = certified(sensor, state, before)
+    assert [k.what.label for k in state.kept] == ["quadratic", "bias_drift"]
+    assert [(r.what.label, r.why) for r in state.refused] == [("cubic", NO_SIZE)]
+    assert "cubic.k" not in after.values
+
+
+def test_with_a_cause_goes_the_lag_of_a_column_that_it_alone_read(searched):
+    sensor, _, fit, trials, _ = searched
+    lag = next(e for e in CATALOGUE if e.name == "signal_lag")
+    model = trials["temperature_bias(warm)"].what.added_to(fit.model)
+    model = model.with_effect(lag, on="warm")
+    with_lag = sensor.fitted(model, {**fit.values, "temperature_bias(warm).k": np.array(0.05)})
+    both = begun(searched, "temperature_bias(warm)")
+    late = replace(both.kept[0].what, effect=lag, declared_on="warm", columns=())
+    state = State(with_lag, (*both.kept, replace(both.kept[0], what=late)))
+    less = sensor.without(with_lag, both.kept[0].what)
+    assert less.model.effects == ()
+    assert _left_in(state, less).kept == ()

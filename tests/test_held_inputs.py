@@ -8,10 +8,13 @@ import numpy as np
 import pytest
 
 import casest
-from casest.diagnose.evidence.held_inputs import held_stretches, plateaus_of
+from casest.diagnose.candidates.candidates import Candidate
+from casest.diagnose.evidence.held_inputs import Held, held_stretches, plateaus_of, settled_rows
 from casest.diagnose.evidence.linear import Linear, parts_of
 from casest.diagnose.evidence.score import Trial
 from casest.diagnose.protocol import ranked_of
+from casest.diagnose.sensor.unlike import between_levels
+from casest.effects import CATALOGUE
 
 UP = np.arange(7) / 6
 WEIGHTS = np.concatenate([UP, UP[::-1]])
@@ -175,6 +178,69 @@ def waved(rng):
 def test_what_moves_is_never_cut_into_levels(moving):
     rng = np.random.default_rng(5)
     assert sum(len(stretches(moving(rng))) for _ in range(30)) <= 1
+
+
+def test_rows_that_count_less_are_still_one_plateau():
+    """Six weights, each off by itself, and readings of which some count for little: a fit with
+    weights. A bend has nothing to say within a plateau, whatever its rows weigh."""
+    rng = np.random.default_rng(8)
+    load = np.repeat(np.arange(6.0), 50)
+    own = np.repeat([4.0, -4.0, -2.0, 1.0, -4.0, 5.0], 50)
+    roots = np.sqrt(rng.uniform(0.2, 1.0, len(load)))[:, None]
+    y = own + 0.3 * rng.standard_normal(len(load))
+    X = np.stack([np.ones_like(load), load], axis=1) * roots
+    left = y[:, None] * roots - X @ np.linalg.lstsq(X, y[:, None] * roots, rcond=None)[0]
+    number, spans = np.zeros(len(load), dtype=int), (slice(0, len(load)),)
+    parts = parts_of(number, number, load[:, None])
+    linear = Linear(left, X[:, None, :], spans, parts, plateaus=plateaus_of(load[:, None], spans))
+    bend = Trial("quadratic", "quadratic", (load**2)[:, None, None] * roots[:, :, None])
+    told = Held(replace(linear, roots=roots), 1)
+    assert not told.says([bend])
+    assert Held(linear, 1).says([bend])  # as if weights were part of the course
+    # What goes on within each of them is seen all the same.
+    since = np.tile(np.exp(-np.arange(50) / 10.0), 6)
+    course = replace(linear, roots=roots, residual=left + since[:, None] * roots)
+    assert Held(course, 1).says([Trial("settles", "settles", (since[:, None] * roots)[:, :, None])])
+
+
+def stepped(rng, bend=0.0):
+    """A current read back at −100, 0 and 100 A, each for 40 rows, and a meter of it that is asked
+    some ms later: on its way from one level to the next the two are of different moments."""
+    levels = rng.choice([-100.0, 0.0, 100.0], 60)
+    reference = np.repeat(levels, 40) + 0.01 * rng.standard_normal(2400)
+    true = np.repeat(levels, 40)
+    for k in 40 * np.arange(1, 60):
+        before, after = levels[k // 40 - 1], levels[k // 40]
+        reference[k] = before + (after - before) * rng.uniform()
+        true[k] = before + (after - before) * np.sqrt(rng.uniform())
+    reading = true + bend * true * np.abs(true) + 0.01 * rng.standard_normal(2400)
+    return {"t": 0.034 * np.arange(2400), "reference": reference, "reading": reading}
+
+
+def test_what_rows_between_levels_show_is_no_bend():
+    """So a current meter of a public record was called bent, with a gain of 1.27 (strangers.md)."""
+    closing = casest.close("linear", stepped(np.random.default_rng(0)))
+    bends = {"signed_quadratic", "quadratic", "cubic", "signed_cubic", "dead_zone", "gain_by_sign"}
+    assert not bends & {e.candidate.label for e in closing.effects}
+    assert closing.after.values["gain"] == pytest.approx(1.0, abs=1e-2)
+
+
+def test_a_bend_that_the_levels_show_is_not_refused_for_the_rows_between():
+    rng = np.random.default_rng(1)
+    load = np.repeat(rng.uniform(-1, 1, 60), 40)
+    X = np.stack([np.ones_like(load), load], axis=1)
+    quadratic = (load**2)[:, None, None]
+    settled = settled_rows(load[:, None], ())
+    assert 0.7 < settled.mean() < 1
+    number = np.zeros(len(load), dtype=int)
+    what = next(e for e in CATALOGUE if e.name == "quadratic")
+    trial = Trial(Candidate(what), "quadratic", quadratic)
+    for course, refused in ((load**2, False), (np.where(settled, 0.0, load**2), True)):
+        y = course + 0.01 * rng.standard_normal(len(load))
+        left = y - X @ np.linalg.lstsq(X, y, rcond=None)[0]
+        parts = parts_of(number, number, load[:, None])
+        linear = Linear(left[:, None], X[:, None, :], (slice(0, len(load)),), parts)
+        assert bool(between_levels(trial, linear, settled)) is refused
 
 
 def test_levels_read_back_that_are_off_are_unexplained():

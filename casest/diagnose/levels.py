@@ -37,6 +37,7 @@ class Levels:
     stand_in: share of a column's variance that a signal does not tell, up to which, in poses and
         tables, its curve could be a bend over that signal.
     stays: share of what inputs do to a reading that must stay beside a column's influence.
+    passing: share of a record's rows up to which inputs that are held else go from level to level.
     fades: time constants that a record must span for a memory to be seen to fade.
     most: share of the squares below which what is left says more than how likely a slow course is;
     survives: share of a cause's length that the declared unknowns must leave; over_noise: an
@@ -95,6 +96,7 @@ class Levels:
     repeated: float = 0.01
     stand_in: float = 0.1
     stays: float = 0.5
+    passing: float = 0.25
     fades: float = 2.0
     survives: float = 1e-3
     most: float = 0.5

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from casest.data.run import Run
-from casest.declaration.effect import RANDOM_WALK, TAILS, Effect
+from casest.declaration.effect import RANDOM_WALK, TAILS, Attached, Effect
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
 from casest.declaration.symbols import Constant
@@ -48,6 +48,9 @@ from casest.leastsquares.weights import robust_scale
 
 #: What no effect that is added could mend.
 HOPELESS = Code.READING | Code.NOT_FINITE | Code.NO_REDUNDANCY | Code.NOT_DETERMINED
+
+#: Why an effect is not kept that the last fit makes nothing of.
+NO_SIZE = "in the end its size may as well be nothing"
 
 
 def close(
@@ -225,8 +228,8 @@ def _without_events_of_a_course(sensor: Sensor, state: State[Fit]) -> State[Fit]
         left = slow_squares(sensor.runs, state.fit.residuals)
         if less is None or _fall(state.fit, least) > left:
             break
-        kept = tuple(k for k in state.kept if k is not least)
-        state = replace(state, fit=less, kept=kept, open=(least.evidence, *state.open))
+        left_in = _left_in(state, less)
+        state = replace(left_in, fit=less, open=(least.evidence, *state.open))
         state = state.refusing(least.what, AS_MUCH)
         state = replace(state, last=ranked(sensor, less))
     return state
@@ -256,9 +259,8 @@ def _foretelling(
         less = sensor.without(state.fit, state.kept[-1].what)
         if less is None or _better(*_on_the_same_samples(*hidden)):
             break
-        state = replace(state, fit=less, kept=state.kept[:-1]).refusing(
-            state.kept[-1].what, NOT_HELD_OUT
-        )
+        last = state.kept[-1].what
+        state = replace(_left_in(state, less), fit=less).refusing(last, NOT_HELD_OUT)
         state, after = certified(sensor, state, before)
         hidden[1] = held_out(sensor, state.fit, folds)
     return state, after, hidden
@@ -348,15 +350,23 @@ def certified(sensor: Sensor, state: State[Fit], before: Estimate) -> tuple[Stat
         if last is None:
             return state, before
         state = state.refusing(last.what, why)
-        instead = _replaced(sensor, state, last)
+        instead = None if why == NO_SIZE else _replaced(sensor, state, last)
         if instead is not None:
             state = instead
             continue
         fit = sensor.without(state.fit, last.what)
         if fit is None:
             return state, before
-        kept = tuple(k for k in state.kept if k is not last)
-        state = replace(state, fit=fit, kept=kept, open=(last.evidence, *state.open))
+        left = _left_in(state, fit)
+        state = replace(left, fit=fit, open=(last.evidence, *state.open))
+
+
+def _left_in(state: State[Fit], fit: Fit) -> State[Fit]:
+    """With the causes that are in a fit still: with one goes the lag of a column that it alone
+    read."""
+    there = {a.label for a in fit.model.effects}
+    kept = tuple(k for k in state.kept if k.what.freed or k.what.label in there)
+    return replace(state, kept=kept)
 
 
 def _replaced(sensor: Sensor, state: State[Fit], kept: Kept) -> State[Fit] | None:
@@ -369,7 +379,8 @@ def _replaced(sensor: Sensor, state: State[Fit], kept: Kept) -> State[Fit] | Non
         if fit is not None and not isinstance(sensor.certified(fit), str):
             other = replace(kept, what=rival.what, rivals=kept.rivals[k + 1 :])
             several = tuple(other if one is kept else one for one in state.kept)
-            return replace(state, fit=fit, kept=several)
+            still = tuple(e for e in state.open if rival.what.label not in e.families)
+            return replace(state, fit=fit, kept=several, open=still)
     return None
 
 
@@ -379,7 +390,21 @@ def _at_fault(sensor: Sensor, state: State[Fit], after: Estimate) -> tuple[Kept 
     if not after.certificate.trusted:
         return _least(state, after), f"its fit is refused: {after.certificate.reasons[0]}"
     label, why = another(after.model, after.values, sensor.model)
+    if not why:
+        claimed = (a for k in reversed(state.kept) if not sensor.asked(k.what)
+                   for a in after.model.effects if a.label == k.what.label)  # fmt: skip
+        label = next((a.label for a in claimed if _is_nothing(a, after)), "")
+        why = label and NO_SIZE
     return next((k for k in state.kept if k.what.label == label), None), why
+
+
+def _is_nothing(attached: Attached, after: Estimate) -> bool:
+    """Is each of an effect's sizes within two standard deviations of none, were noise alike
+    everywhere? Then only rows that count less, or a colour of the noise, had spoken for it."""
+    searched = dict(attached.effect.profile)
+    sizes = [p.name for p in attached.parameters if p.name.rpartition(".")[2] not in searched]
+    z = [np.abs(after.values[n]) / after.plain[n] for n in sizes if n in after.plain]
+    return bool(z) and all(bool(np.all(one < LEVELS.apart)) for one in z)
 
 
 def _least(state: State[Fit], after: Estimate) -> Kept | None:

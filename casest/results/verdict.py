@@ -16,6 +16,8 @@ from casest.results.result import Number, Parameter
 
 #: Samples that resemble each other from which on noise may as well be a lag or a hysteresis.
 COLOURED = 20
+#: The effect whose sign says which of two instruments is slower.
+LOW_PASS = "low_pass"
 #: Measurements that would tell causes apart, of which so many are named.
 NAMED = 4
 
@@ -158,6 +160,13 @@ def judged(gain: str) -> str:
     )
 
 
+def sided(effect: Effect) -> Iterator[str]:
+    """On which side of two instruments a cause is, where its sign says so."""
+    tau = effect.parameters.get("tau")
+    if effect.name == LOW_PASS and tau is not None and _first_of(tau.value) < 0:
+        yield "tau is below zero: the reading leads, what it is compared with is the slower one"
+
+
 def instead(effect: Effect, parameters: Mapping[str, Parameter]) -> Iterator[str]:
     """What hangs on which of the causes it is."""
     for label, shifts in effect.instead_would_move.items():
@@ -184,6 +193,10 @@ def _moved_by(shifts: Shifts, parameters: Mapping[str, Parameter]) -> str:
         f"{name} by {size:.2g} {_first(parameters[name].unit)}".removesuffix(" 1").rstrip()
         for name, size in shifts.items()
     )
+
+
+def _first_of(value: Any) -> float:
+    return _first_of(value[0]) if isinstance(value, list) else float(value or 0.0)
 
 
 def _first(unit: Any) -> str:

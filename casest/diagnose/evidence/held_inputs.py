@@ -70,14 +70,30 @@ def plateaus_of(met: Array, spans: Sequence[slice]) -> Index | None:
 
     Where plateaus are many, their errors are a noise as any other.
     """
-    breaks = np.zeros(len(met) - 1, dtype=bool)
-    breaks[[span.start - 1 for span in spans if span.start]] = True
+    breaks = _breaks(met, spans)
     held = held_stretches(met, breaks)
     moves = (held[1:] < 0) & np.any(np.diff(met, axis=0) != 0, axis=1)
     number = np.concatenate([[0], np.cumsum(breaks | moves | (np.diff(held) != 0))])
     count = int(number[-1]) + 1
     few = 1 < count < LEVELS.series and count * LEVELS.jitters <= len(met)
     return number if few else None
+
+
+def settled_rows(met: Array, spans: Sequence[slice]) -> NDArray[np.bool_]:
+    """In which rows (N,) what the sensor met (N, q) is held, and was and will be some rows off."""
+    breaks = _breaks(met, spans)
+    held = held_stretches(met, breaks)
+    settled = held >= 0
+    for k in np.flatnonzero(~breaks & (np.diff(held) != 0)):
+        settled[max(0, k + 1 - LEVELS.jitters) : k + 1 + LEVELS.jitters] = False
+    return settled
+
+
+def _breaks(met: Array, spans: Sequence[slice]) -> NDArray[np.bool_]:
+    """Behind which rows (N − 1,) a span ends."""
+    breaks = np.zeros(len(met) - 1, dtype=bool)
+    breaks[[span.start - 1 for span in spans if span.start]] = True
+    return breaks
 
 
 @dataclass(frozen=True)
@@ -102,7 +118,7 @@ class Held:
         N, m = self.linear.residual.shape
         own = np.zeros((N, m, self._count, m))
         for axis in range(m):
-            own[np.arange(N), axis, self._number, axis] = 1.0
+            own[np.arange(N), axis, self._number, axis] = self.linear.root[:, axis]
         slopes = np.concatenate([self.linear.slopes, own.reshape(N, m, -1)], axis=2)
         return _beside_none(replace(self.linear, slopes=slopes))
 
@@ -124,11 +140,12 @@ class Held:
         return int(self._number[-1]) + 1
 
     def _means(self, values: Array) -> Array:
-        """Of rows (N, …) on each plateau (U, …)."""
-        flat = values.reshape(len(values), -1)
-        sums = np.stack([np.bincount(self._number, column) for column in flat.T], axis=1)
-        found = sums / np.bincount(self._number)[:, None]
-        return np.asarray(found.reshape(self._count, *values.shape[1:]))
+        """Of rows (N, m, …) on each plateau (U, m, …), by their weights."""
+        found = np.zeros((self._count, *values.shape[1:]))
+        sizes = np.zeros((self._count, values.shape[1]))
+        np.add.at(found, self._number, (values.T * self.linear.root.T).T)
+        np.add.at(sizes, self._number, self.linear.root**2)
+        return np.asarray((found.T / np.maximum(sizes, 1e-300).T).T)
 
 
 def _beside_none(linear: Linear) -> tuple[Likelihood, Explained]:

@@ -48,6 +48,7 @@ class Linear:
     `spans` are stretches of evenly spaced rows: their noise may have a colour. Without any, rows
     are poses, or of a table, and their noise is white. `least`: share of a cause's length that must
     survive beside the unknowns. `plateaus`: the number of each row's (N,), where inputs are held.
+    `roots` (N, m): what rows are multiplied by, the root of their weights; None: by one.
     """
 
     residual: Array
@@ -56,6 +57,12 @@ class Linear:
     parts: Parts
     least: float = LEVELS.survives
     plateaus: Index | None = None
+    roots: Array | None = None
+
+    @property
+    def root(self) -> Array:
+        """What each residual (N, m) is multiplied by."""
+        return np.ones_like(self.residual) if self.roots is None else self.roots
 
     @property
     def coloured(self) -> bool:
@@ -92,7 +99,7 @@ class Linear:
     def evened(self, size: Array) -> Linear:
         """The problem in the sizes (N,) that the noise has at each row."""
         r, J = self.residual / size[:, None], self.slopes / size[:, None, None]
-        return replace(self, residual=r, slopes=J)
+        return replace(self, residual=r, slopes=J, roots=self.root / size[:, None])
 
     def without(self, columns: Array, part: Array) -> Linear:
         """The problem as if some unknowns were not there: `columns` (N, m, p − k) are the slopes of

@@ -129,7 +129,7 @@ def _draw(
     if whole.weights is not None:
         problem = problem.with_weights(whole.weights)
     point = problem.point(fit.values)
-    residual, J = rows.slopes(problem, point)
+    residual, J, _ = rows.slopes(problem, point)
     linear = replace(rows.linear(fit), residual=residual, slopes=J)
     found = {
         id(what): columns

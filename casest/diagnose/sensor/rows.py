@@ -7,12 +7,13 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from casest.data.run import Run
 from casest.declaration.effect import OVER_TIME
 from casest.declaration.shapes import Array
 from casest.diagnose.candidates.slopes import rows_of
-from casest.diagnose.evidence.held_inputs import plateaus_of
+from casest.diagnose.evidence.held_inputs import plateaus_of, settled_rows
 from casest.diagnose.evidence.linear import Index, Linear, parts_of, spans_of
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.sensor.fits import Fit, problem_of
@@ -33,10 +34,10 @@ class Rows:
         return self._linears.of(fit, lambda: self._linear(fit))
 
     def _linear(self, fit: Fit) -> Linear:
-        residual, J = self.slopes(*problem_of(fit, self.runs))
+        residual, J, roots = self.slopes(*problem_of(fit, self.runs))
         met = self.met(fit)
         parts, held = parts_of(*self._numbers, met), plateaus_of(met, self._spans)
-        return Linear(residual, J, self._spans, parts, self._least(fit), held)
+        return Linear(residual, J, self._spans, parts, self._least(fit), held, roots)
 
     def of(self, values: Sequence[Array]) -> Array:
         """Values of each run (N, …) in the rows that are looked at, one run after the other."""
@@ -47,22 +48,23 @@ class Rows:
         """Rows of each run that are looked at."""
         return rows_of(self.runs, LEVELS.rows)
 
-    def slopes(self, problem: Problem, point: Point) -> tuple[Array, Array]:
-        """Residuals (N, m) and their slopes (N, m, p) in these rows."""
+    def slopes(self, problem: Problem, point: Point) -> tuple[Array, Array, Array]:
+        """Residuals (N, m), their slopes (N, m, p) and the roots of their weights in these rows."""
         axes = len(problem.model.axes)
         offsets = np.cumsum([0, *map(len, self.index)])
         r, J = np.zeros((offsets[-1], axes)), np.zeros((offsets[-1], axes, problem.unknowns))
+        roots = np.ones_like(r)
         for block in problem.blocks(point):
             rows = self.index[block.run]
             inside = (rows >= block.span.start) & (rows < block.span.stop)
             here, chosen = offsets[block.run] + np.flatnonzero(inside), rows[inside]
             local = chosen - block.span.start
             root = np.ones((1, 1)) if block.weights is None else np.sqrt(block.weights[local])
-            r[here] = block.residual[local] * root
+            r[here], roots[here] = block.residual[local] * root, root
             own = np.zeros((len(here), axes, problem.unknowns))
             own[:, :, block.x] = block.jacobian[local]
             J[here] = own * root[:, :, None]
-        return r, np.nan_to_num(J)
+        return r, np.nan_to_num(J), roots
 
     def cosines(self, waves: int) -> Array:
         """(N, runs · waves): 1, 2, … half waves over each run, in the rows that are looked at."""
@@ -105,6 +107,10 @@ class Rows:
         ]
         noise = fit.noise / max(min(sizes, default=np.inf), 1e-300)
         return max(LEVELS.survives, LEVELS.over_noise * noise)
+
+    def settled(self, fit: Fit) -> NDArray[np.bool_]:
+        """In which rows (N,) what the sensor met is held at a level, and has been."""
+        return settled_rows(self.met(fit), self._spans)
 
     def met(self, fit: Fit) -> Array:
         """What the sensor met in each row (N, q): the corrected quantity, or the prediction."""

@@ -33,7 +33,14 @@ from casest.diagnose.sensor.jitter import Draw, in_refit, jittered
 from casest.diagnose.sensor.recent import Recent
 from casest.diagnose.sensor.rows import Rows
 from casest.diagnose.sensor.tried import Tried, on_axes
-from casest.diagnose.sensor.unlike import another, at_one_input, stands_in, too_slow
+from casest.diagnose.sensor.unlike import (
+    another,
+    at_one_input,
+    between_levels,
+    leaves_out,
+    stands_in,
+    too_slow,
+)
 from casest.engine.kernel import only_tried
 from casest.errors import CasestError
 from casest.estimate.calibrate import attempt
@@ -157,16 +164,22 @@ class Sensor(Subject[Fit]):
             return f"its refit fails: {error}"
         if found is None:
             return NOT_FINITE
-        return self._unlike(fit, found, [t.what for t in added]) or found
+        return self._unlike(fit, found, added) or found
 
-    def _unlike(self, before: Fit, after: Fit, added: Sequence[Candidate]) -> str:
+    def _unlike(self, before: Fit, after: Fit, trials: Sequence[Trial]) -> str:
         """Why a refit is not what its names say, or is what the model says itself; else empty."""
         spans = [float(np.ptp(run.time)) for run in self.runs if run.time is not None]
+        added = [t.what for t in trials]
         why = (
             too_slow(after.values, added, spans)
             or another(after.model, after.values, self.model)[1]
             or stands_in(before, after, added, self.rows)
+            or leaves_out(before, after, self.runs)
         )
+        if self.linear(before).series:
+            settled = self.rows.settled(before)
+            levels = (between_levels(t, self.linear(before), settled) for t in trials)
+            why = why or next(filter(None, levels), "")
         for what in (w for w in added if _plain(w) is not None):
             beyond = self._residual_without(after, what) - self.linear(after).residual
             why = why or at_one_input(what, beyond)

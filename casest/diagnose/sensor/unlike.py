@@ -6,16 +6,21 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from casest.data.run import Run
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
 from casest.diagnose.candidates.candidates import Candidate
+from casest.diagnose.evidence.linear import Linear
+from casest.diagnose.evidence.score import Trial
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.protocol.state import ANOTHER, STANDS_IN
 from casest.diagnose.sensor.fits import Fit, problem_of
 from casest.diagnose.sensor.rows import Rows, instant
+from casest.diagnose.sensor.twins import bend
 from casest.leastsquares.problem import Problem
+from casest.leastsquares.weights import has_noise_effects, weights
 
 
 def another(model: Model, values: Mapping[str, Array], declared: Model) -> tuple[str, str]:
@@ -64,6 +69,48 @@ def too_slow(
             if value > max(spans, default=np.inf) / LEVELS.fades:
                 return f"its refit fails: {name} = {value:.3g} s is over half of the record"
     return ""
+
+
+def leaves_out(before: Fit, after: Fit, runs: tuple[Run, ...]) -> str:
+    """Why a refit explains nothing: readings that counted before lie further off and count no more,
+    as far out; else empty."""
+    if not has_noise_effects(after.model):
+        return ""
+    (r, w), (other, its) = ((_flat(f.residuals), _weights(f, runs)) for f in (before, after))
+    lost = int(np.sum((w > 0.5) & (its < 0.5) & (np.abs(other) > np.abs(r))))
+    if lost <= LEVELS.share * len(r):
+        return ""
+    return f"its refit fails: {lost} of {len(r)} readings lie further off and count no more"
+
+
+def _weights(fit: Fit, runs: tuple[Run, ...]) -> Array:
+    problem = Problem(fit.model, runs)
+    return _flat(weights(problem, problem.point(fit.values)))
+
+
+def _flat(parts: Sequence[Array]) -> Array:
+    return np.concatenate([part.ravel() for part in parts])
+
+
+def between_levels(trial: Trial, linear: Linear, settled: NDArray[np.bool_]) -> str:
+    """Why a bend is none: the rows show it in which an input goes from one level to the next, and
+    not the `settled` ones (N,), which are nearly all; else empty."""
+    if not bend(trial.what) or np.mean(settled) < 1 - LEVELS.passing or settled.all():
+        return ""
+    falls = [_fall(linear.residual[rows], linear.slopes[rows], trial.columns[rows])
+             for rows in (settled, slice(None))]  # fmt: skip
+    if falls[0] >= LEVELS.alike * falls[1]:
+        return ""
+    moving = int(np.sum(~settled))
+    return f"{moving} rows between levels show {trial.family}, the levels do not: {ANOTHER}"
+
+
+def _fall(residual: Array, slopes: Array, columns: Array) -> float:
+    """Of the squares, that columns take away beside the unknowns."""
+    r, J = residual.ravel(), slopes.reshape(residual.size, -1)
+    both = np.concatenate([J, columns.reshape(residual.size, -1)], axis=1)
+    without, beside = (r - X @ np.linalg.lstsq(X, r, rcond=None)[0] for X in (J, both))
+    return float(without @ without - beside @ beside)
 
 
 def stands_in(before: Fit, after: Fit, added: Sequence[Candidate], rows: Rows) -> str:

@@ -28,7 +28,7 @@ from casest.results.closing import Closed, Effect
 from casest.results.residuals import Residuals
 from casest.results.result import Parameter
 from casest.results.rounding import percent, rounded
-from casest.results.verdict import consequence, instead, judged, sentence, undecided
+from casest.results.verdict import consequence, instead, judged, sentence, sided, undecided
 
 
 def closing_page(result: Closed, folder: str = "out") -> str:
@@ -162,6 +162,7 @@ def _effect(e: Effect, result: Closed) -> str:
         squared = f"{own}^2" if re.fullmatch(r"\w+", own) else f"({own})^2"
         unit = "" if own == "1" else f" {printed_unit(squared)}"
         evidence.append(judged(f"{number(e.holdout_gain)}{unit}"))
+    evidence += [in_words(f"{w[0].upper()}{w[1:]}.") for w in sided(e)]
     if e.indistinguishable_from:
         names = ", ".join(f"`{n}`" for n in e.indistinguishable_from)
         more = ", ".join(f"`{n}`" for n in e.less_likely)

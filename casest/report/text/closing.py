@@ -18,6 +18,7 @@ from casest.results.verdict import (
     of_the_user,
     refusals,
     sentence,
+    sided,
     undecided,
     untried,
 )
@@ -81,6 +82,7 @@ def _effects(result: Closed) -> Iterator[str]:
     for e in result.effects:
         column = f" of column {e.column}" if e.column else ""
         yield item(f"{e.name} on {e.on}{column} (p = {e.p_value:.1g}): {e.formula}")
+        yield from map(item, sided(e))
         if e.indistinguishable_from:
             also = f" (less likely: {', '.join(e.less_likely)})" if e.less_likely else ""
             yield item(f"not told apart from {', '.join(e.indistinguishable_from)}{also}")
