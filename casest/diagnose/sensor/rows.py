@@ -28,6 +28,7 @@ class Rows:
 
     runs: tuple[Run, ...]
     _linears: Recent[Fit, Linear] = field(default_factory=Recent, repr=False)
+    _settled: Recent[Fit, NDArray[np.bool_]] = field(default_factory=Recent, repr=False)
 
     def linear(self, fit: Fit) -> Linear:
         """Residuals and slopes in the rows that are looked at."""
@@ -110,7 +111,7 @@ class Rows:
 
     def settled(self, fit: Fit) -> NDArray[np.bool_]:
         """In which rows (N,) what the sensor met is held at a level, and has been."""
-        return settled_rows(self.met(fit), self._spans)
+        return self._settled.of(fit, lambda: settled_rows(self.met(fit), self._spans))
 
     def met(self, fit: Fit) -> Array:
         """What the sensor met in each row (N, q): the corrected quantity, or the prediction."""

@@ -33,6 +33,7 @@ from casest.diagnose.sensor.jitter import Draw, in_refit, jittered
 from casest.diagnose.sensor.recent import Recent
 from casest.diagnose.sensor.rows import Rows
 from casest.diagnose.sensor.tried import Tried, on_axes
+from casest.diagnose.sensor.twins import bend
 from casest.diagnose.sensor.unlike import (
     another,
     at_one_input,
@@ -176,10 +177,11 @@ class Sensor(Subject[Fit]):
             or stands_in(before, after, added, self.rows)
             or leaves_out(before, after, self.runs)
         )
-        if self.linear(before).series:
+        bends = [t for t in trials if bend(t.what)] if self.linear(before).series else []
+        if bends and not why:
             settled = self.rows.settled(before)
-            levels = (between_levels(t, self.linear(before), settled) for t in trials)
-            why = why or next(filter(None, levels), "")
+            levels = (between_levels(t, self.linear(before), settled) for t in bends)
+            why = next(filter(None, levels), "")
         for what in (w for w in added if _plain(w) is not None):
             beyond = self._residual_without(after, what) - self.linear(after).residual
             why = why or at_one_input(what, beyond)

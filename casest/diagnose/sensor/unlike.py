@@ -18,7 +18,6 @@ from casest.diagnose.levels import LEVELS
 from casest.diagnose.protocol.state import ANOTHER, STANDS_IN
 from casest.diagnose.sensor.fits import Fit, problem_of
 from casest.diagnose.sensor.rows import Rows, instant
-from casest.diagnose.sensor.twins import bend
 from casest.leastsquares.problem import Problem
 from casest.leastsquares.weights import has_noise_effects, weights
 
@@ -95,7 +94,7 @@ def _flat(parts: Sequence[Array]) -> Array:
 def between_levels(trial: Trial, linear: Linear, settled: NDArray[np.bool_]) -> str:
     """Why a bend is none: the rows show it in which an input goes from one level to the next, and
     not the `settled` ones (N,), which are nearly all; else empty."""
-    if not bend(trial.what) or np.mean(settled) < 1 - LEVELS.passing or settled.all():
+    if np.mean(settled) < 1 - LEVELS.passing or settled.all():
         return ""
     falls = [_fall(linear.residual[rows], linear.slopes[rows], trial.columns[rows])
              for rows in (settled, slice(None))]  # fmt: skip
