@@ -466,7 +466,10 @@ def _undecided(sensor: Sensor, state: State[Fit]) -> Undecided | None:
     best = state.open[0]
     # Of a pair each explains something beside the other: neither does alone what both do.
     alone = [e for e in state.open if len(e.trials) == 1] or state.open[:1]
-    names = tuple(dict.fromkeys(label for e in alone for label in e.families))
+    there = {k.what.label for k in state.kept}
+    names = tuple(dict.fromkeys(n for e in alone for n in e.families if n not in there))
+    if not names:
+        return None
     moves = {
         r.evidence.families[0]: sensor.moved_by(r.before, r.fit)
         for r in state.torn
