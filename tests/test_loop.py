@@ -362,6 +362,10 @@ def test_a_residual_that_resembles_itself_over_many_samples_is_not_called_noise_
     ):  # fmt: skip
         said = sentence(changed(result, verdict="extended", effects=effects, not_tried=[]))
         assert said.startswith(f"extended: {missing}; what is left is ")
+    for count in (3, 4):
+        said = sentence(changed(result, verdict="unexplained", effects=[added] * count))
+        assert said.startswith("unexplained: beside vibration, ")
+        assert said.endswith("one that is not among them") is (count == 4)
 
 
 @pytest.mark.long

@@ -18,6 +18,8 @@ from casest.results.result import Number, Parameter
 COLOURED = 20
 #: The effect whose sign says which of two instruments is slower.
 LOW_PASS = "low_pass"
+#: Effects from which on, where a misfit remains, they are a description more than causes.
+MANY = 4
 #: Measurements that would tell causes apart, of which so many are named.
 NAMED = 4
 
@@ -47,9 +49,11 @@ def sentence(result: Closed) -> str:
         return f"extended: {_missing(names)}; what is left is {left}{untried}"
     found = f"beside {', '.join(names)} " if names else ""
     causes = result.unexplained.one_of
-    if causes:
-        return f"unexplained: {found}a misfit remains that {_several(causes)} explain alike"
-    return f"unexplained: {found}a misfit remains that no candidate explains"
+    explains = f"{_several(causes)} explain alike" if causes else "no candidate explains"
+    many = ""
+    if len(names) >= MANY:
+        many = f"; {len(names)} effects together may stand for one that is not among them"
+    return f"unexplained: {found}a misfit remains that {explains}{many}"
 
 
 def _missing(names: Sequence[str]) -> str:
