@@ -38,7 +38,6 @@ from casest.diagnose.sensor.unlike import (
     another,
     at_one_input,
     between_levels,
-    leaves_out,
     stands_in,
     too_slow,
 )
@@ -175,7 +174,6 @@ class Sensor(Subject[Fit]):
             too_slow(after.values, added, spans)
             or another(after.model, after.values, self.model)[1]
             or stands_in(before, after, added, self.rows)
-            or leaves_out(before, after, self.runs)
         )
         bends = [t for t in trials if bend(t.what)] if self.linear(before).series else []
         if bends and not why:

@@ -19,7 +19,6 @@ from casest.diagnose.protocol.state import ANOTHER, STANDS_IN
 from casest.diagnose.sensor.fits import Fit, problem_of
 from casest.diagnose.sensor.rows import Rows, instant
 from casest.leastsquares.problem import Problem
-from casest.leastsquares.weights import has_noise_effects, weights
 
 
 def another(model: Model, values: Mapping[str, Array], declared: Model) -> tuple[str, str]:
@@ -68,27 +67,6 @@ def too_slow(
             if value > max(spans, default=np.inf) / LEVELS.fades:
                 return f"its refit fails: {name} = {value:.3g} s is over half of the record"
     return ""
-
-
-def leaves_out(before: Fit, after: Fit, runs: tuple[Run, ...]) -> str:
-    """Why a refit explains nothing: readings that counted before lie further off and count no more,
-    as far out; else empty."""
-    if not has_noise_effects(after.model):
-        return ""
-    (r, w), (other, its) = ((_flat(f.residuals), _weights(f, runs)) for f in (before, after))
-    lost = int(np.sum((w > 0.5) & (its < 0.5) & (np.abs(other) > np.abs(r))))
-    if lost <= LEVELS.share * len(r):
-        return ""
-    return f"its refit fails: {lost} of {len(r)} readings lie further off and count no more"
-
-
-def _weights(fit: Fit, runs: tuple[Run, ...]) -> Array:
-    problem = Problem(fit.model, runs)
-    return _flat(weights(problem, problem.point(fit.values)))
-
-
-def _flat(parts: Sequence[Array]) -> Array:
-    return np.concatenate([part.ravel() for part in parts])
 
 
 def between_levels(trial: Trial, linear: Linear, settled: NDArray[np.bool_]) -> str:
