@@ -267,9 +267,9 @@ def usable_columns(model: Model, runs: Sequence[Run]) -> list[str]:
     return list(channels_of(model, runs)[0])
 
 
-def channels_of(model: Model, runs: Sequence[Run]) -> Channels:
+def channels_of(model: Model, runs: Sequence[Run], asked: Collection[str] = ()) -> Channels:
     """The columns of these runs that a model does not read itself."""
-    return channels(read_by(model), runs, reads_of(model, runs))
+    return channels(read_by(model), runs, reads_of(model, runs), asked)
 
 
 def read_by(model: Model) -> frozenset[str]:
@@ -279,8 +279,11 @@ def read_by(model: Model) -> frozenset[str]:
     return frozenset({s.name for s in model.signals} - followed | {"t"})
 
 
-def channels(used: Collection[str], runs: Sequence[Run], reads: Reads) -> Channels:
-    """The same of columns that are not `used`, and are nothing once more that is read."""
+def channels(
+    used: Collection[str], runs: Sequence[Run], reads: Reads, asked: Collection[str] = ()
+) -> Channels:
+    """The same of columns that are not `used`, and are nothing once more that is read: unless
+    somebody has `asked` for one by name."""
     found: dict[str, bool] = {}
     skipped: list[Skipped] = []
     times = [run.time for run in runs if run.time is not None]
@@ -295,7 +298,9 @@ def channels(used: Collection[str], runs: Sequence[Run], reads: Reads) -> Channe
         x = np.concatenate([run.signals[name][:, 0] for run in runs])
         # An angle that grows with time still turns.
         others = {**clock, **values} if _CLOCK.search(name) else values
-        why = _useless(x, others) or _named(name) or reads.again(x)
+        why = _useless(x, others)
+        if not why and name not in asked:
+            why = _named(name) or reads.again(x)
         if why:
             skipped.append(Skipped(name, why))
             continue

@@ -137,7 +137,9 @@ def _hypotheses(
     asked = [e for e in ranking.found if subject.asked(e.trials[0].what)]
     found = []
     for evidence in asked:
-        alone = again(evidence, ranking.likelihood, ranking.none, len(asked), 1)
+        # Noise of the inputs may do it as well: but here somebody knows that it is there.
+        own = replace(evidence, trials=tuple(replace(t, feigned=0.0) for t in evidence.trials))
+        alone = again(own, ranking.likelihood, ranking.none, len(asked), 1)
         if alone.p_value >= LEVELS.chance:
             why = f"no more of it than noise would have (p = {alone.p_value:.2g})"
             state = state.refusing(evidence.trials[0].what, why)

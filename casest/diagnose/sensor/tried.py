@@ -102,7 +102,7 @@ class Tried:
     def _read(self, model: Model) -> Channels:
         own = read_by(model)
         if own not in self._channels:
-            self._channels[own] = channels_of(model, self.rows.runs)
+            self._channels[own] = channels_of(model, self.rows.runs, self._asked_columns)
         return self._channels[own]
 
     def trials(self, fit: Fit) -> list[Trial]:
@@ -236,6 +236,11 @@ class Tried:
         if what.effect is None:
             return what.freed in self.known
         return what.among(self.known) or what.name in self._own
+
+    @cached_property
+    def _asked_columns(self) -> frozenset[str]:
+        """`current` of `channel_bias(current)`."""
+        return frozenset(name.partition("(")[2].removesuffix(")") for name in self.known)
 
     @cached_property
     def _own(self) -> frozenset[str]:

@@ -13,8 +13,9 @@ from casest.declaration.shapes import Array
 from casest.diagnose.candidates.candidates import Candidate
 from casest.diagnose.evidence.linear import Linear
 
-#: Share of its length that may tell a bend's columns from another's: rounding.
-ROUNDING = 1e-6
+#: Share of its length that may tell a bend's columns from another's: rounding, and an offset of the
+#: sensor at nothing, by which inputs of one sign are a little of the other.
+ROUNDING = 1e-3
 
 
 def twins(linear: Linear, several: Iterable[tuple[Candidate, Array]]) -> dict[str, str]:

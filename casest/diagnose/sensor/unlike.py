@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -92,42 +93,59 @@ def _fall(residual: Array, slopes: Array, columns: Array) -> float:
 
 def stands_in(before: Fit, after: Fit, added: Sequence[Candidate], rows: Rows) -> str:
     """Why columns are no influence: what inputs did to the reading, and was most of it, is theirs
-    now; else empty.
+    now, or stands against them; else empty.
 
     So is another output of the sensor, or of a second one: it tells the reading better than the
-    input does, whatever that has to do with it.
+    input does, whatever that has to do with it. Of an implicit model it is what the readings do to
+    each axis of what is corrected.
     """
     if not any(what.columns or (what.effect is not None and what.effect.extras) for what in added):
         return ""
-    measured = before.model.traced.measured
+    measured, implicit = before.model.traced.measured, before.model.implicit
     ours, theirs = (_response(fit, rows) for fit in (before, after))
-    if not measured or ours is None or theirs is None:
+    if ours is None or theirs is None or not (measured or implicit):
         return ""
-    reading = rows.of([run.signals[measured] for run in rows.runs])
-    size = float(np.sum(ours**2))
-    share = float(np.sum(ours * theirs)) / max(size, 1e-300)
-    little = size < LEVELS.most * float(np.sum((reading - reading.mean(axis=0)) ** 2))
-    if little or share > LEVELS.stays:
+    size = np.sum(ours**2, axis=0)
+    shares = np.sum(ours * theirs, axis=0) / np.maximum(size, 1e-300)
+    if not implicit:
+        reading = rows.of([run.signals[str(measured)] for run in rows.runs])
+        much = LEVELS.most * np.sum((reading - reading.mean(axis=0)) ** 2, axis=0)
+        shares = shares[size >= much]
+    share = float(max(shares, key=lambda one: abs(one - 1), default=1.0))
+    if abs(share - 1) <= LEVELS.stays:
         return ""
-    return f"of what the inputs do to the reading {max(share, 0.0):.0%} is left: {STANDS_IN}"
+    what = "readings do to what is corrected" if implicit else "inputs do to the reading"
+    if share > 1:
+        return f"what the {what} would be {share:.2g} times as much: {STANDS_IN}"
+    return f"of what the {what} {max(share, 0.0):.0%} is left: {STANDS_IN}"
 
 
 def _response(fit: Fit, rows: Rows) -> Array | None:
-    """What inputs do to the prediction (N, m), about its mean; None where nobody can tell."""
+    """What inputs do to the prediction (N, m), of an implicit model readings to what is corrected,
+    about its mean; None where nobody can tell."""
     model, traced = fit.model, fit.model.along
-    own = {s.name for s in model.declared} - {"t", *traced.readings}
+    own = {s.name for s in model.declared} - {"t"}
+    own = own if model.implicit else own - {*traced.readings}
     names = [s.name for s in model.signals if s.kind == "plain" and s.name in own]
-    if traced.predicted is None or traced.integrates or model.resting or not names:
+    if _told(fit) is None or traced.integrates or model.resting or not names:
         return None
     fit = instant(fit)
     problem, point = problem_of(fit, rows.runs)
     still = Problem(fit.model, tuple(_still(run, names) for run in rows.runs))
+    told = _told(fit)
     moving, resting = (
-        rows.of([f[0][:, :, 0] for f in p.evaluate(point, {"p": p.model.along.predicted})])
-        for p in (problem, still)
+        rows.of([f[0][:, :, 0] for f in p.evaluate(point, {"p": told})]) for p in (problem, still)
     )
     found = np.nan_to_num(moving - resting)
     return np.asarray(found - found.mean(axis=0))
+
+
+def _told(fit: Fit) -> Any:
+    """The prediction, or what is corrected, as an expression; None where there is neither."""
+    traced = fit.model.along
+    if not fit.model.implicit or traced.corrected is None:
+        return traced.predicted
+    return traced.quantities[traced.corrected].value
 
 
 def _still(run: Run, names: Sequence[str]) -> Run:
