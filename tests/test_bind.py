@@ -116,6 +116,18 @@ def test_a_missing_column_is_answered_with_what_to_type(
     assert words in refusal(DataError, tmp_path, text, **options)
 
 
+def test_a_unit_that_the_header_does_not_have_is_refused_with_the_way_out(tmp_path: Path) -> None:
+    """As a header with its unit is written, but of another unit, or of none."""
+    signals = [Signal("level", 1, None)]
+    asked = {"columns": {"level": "volt [V]"}}
+    for header, says in (("volt,ppm", "no unit"), ("volt [mV],ppm", "mV")):
+        message = refusal(DataError, tmp_path, f"{header}\n1,2\n2,3\n", signals, **asked)
+        assert f"the header of volt says {says}" in message
+        assert "--unit SIGNAL=V" in message
+    (run,) = runs_of(tmp_path, "volt [V],ppm\n1,2\n2,3\n", signals, **asked)
+    assert run.units["level"] == "V"
+
+
 def test_a_near_scalar_column_is_suggested(tmp_path: Path) -> None:
     text = "temp,b\n20,1\n21,2\n"
     message = refusal(DataError, tmp_path, text, [TEMPERATURE])

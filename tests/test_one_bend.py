@@ -33,6 +33,16 @@ def test_over_inputs_above_zero_a_square_has_one_name(seed):
     assert "signed_quadratic" not in skipped(both)
 
 
+def test_an_offset_of_the_reference_at_nothing_makes_no_second_bend():
+    """Of a pyranometer, which reads a little less than nothing at night (strangers.md)."""
+    rng = np.random.default_rng(7)
+    x = np.r_[rng.uniform(1, 9, 150), np.full(150, -0.03)]
+    reading = 0.4 + 1.02 * x + 0.02 * x**2 + rng.normal(0, 0.03, 300)
+    closing = close("linear", {"reference": x, "reading": reading})
+    assert names(closing) == ["quadratic"]
+    assert skipped(closing)["signed_quadratic"] == "does here what quadratic does"
+
+
 def test_a_constant_of_the_model_comes_before_an_effect_that_does_the_same():
     """A crystal's frequency over its temperature: a polynomial of the third degree."""
     rng = np.random.default_rng(1)

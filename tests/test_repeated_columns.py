@@ -216,3 +216,34 @@ def test_a_quotient_of_the_reading_and_another_column_explains_nothing(record):
     closing = close("linear", given)
     assert [e.candidate.label for e in closing.effects] == ["channel_bias(current)"]
     assert skipped(closing)["constant"].startswith("column is made of reading and current")
+
+
+def test_a_column_that_is_asked_for_by_name_is_tried_whatever_it_resembles(record):
+    """As of the meter in the box above: the user says that it is no meter of the reading."""
+    rng = np.random.default_rng(6)
+    box = record["reference"] + 1.5 * np.sin(0.7 * record["t"])
+    reading = 0.2 + 3 * box + rng.normal(0, 0.02, ROWS)
+    given = {**record, "reading": reading, "beside": box + rng.normal(0, 0.3, ROWS)}
+    asked = close("linear", given, known=["channel_bias(beside)"])
+    assert "beside" not in skipped(asked)
+    said = {e.candidate.label for e in asked.effects} | {s.name for s in asked.refused}
+    assert "channel_bias(beside)" in said
+
+
+def test_a_lag_that_is_asked_for_is_judged_by_its_own_f_test():
+    """Of 85 rows behind a reference that is read with noise: that noise may feign a lag, and
+    nothing is claimed. Who knows that there is one asks for it, and gets it."""
+    rng = np.random.default_rng(8)
+    t = 300.0 * np.arange(85)
+    course = np.cumsum(rng.normal(size=8500)) / 10
+    fine = 3.0 * np.arange(8500)
+    light = np.interp(t, fine, course) + rng.normal(0, 0.05, 85)
+    counts = 2 * np.interp(t - 170, fine, course) + rng.normal(0, 0.3, 85)
+    given = {"t": t, "reference": light, "reading": counts}
+    asked = close("linear", given, known=["signal_lag(reference)"])
+    assert [e.candidate.label for e in asked.effects] == ["signal_lag(reference)"]
+    assert asked.after.values["signal_lag(reference).delay"] == pytest.approx(170, abs=60)
+    # Where there is none it is not there for the asking.
+    counts = 2 * np.interp(t, fine, course) + rng.normal(0, 0.3, 85)
+    closing = close("linear", {**given, "reading": counts}, known=["signal_lag(reference)"])
+    assert not closing.effects

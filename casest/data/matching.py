@@ -5,21 +5,38 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
+from casest import units
 from casest.data.column import name_and_unit
 from casest.data.table import Table
+from casest.errors import DataError
 
 _WORD = re.compile(r"[A-ZÄÖÜ]?[a-zäöüß]+|[A-ZÄÖÜ]+(?![a-zäöüß])|\d+")
 _AXES = ("xyz", "012", "123")
 
 
 def find_by_name(table: Table, name: str) -> str | None:
-    """Return the column called so: exactly, else without regard to case and punctuation."""
+    """Return the column called so: exactly, else without regard to case and punctuation.
+
+    Raises DataError where it is named with a unit that its header does not have.
+    """
     if name in table.columns:
         return name
-    bare = name_and_unit(name)[0]  # as the header is written, unit and all
+    bare, unit = name_and_unit(name)  # as the header is written, unit and all
     if bare in table.columns:
+        own = table.columns[bare].unit
+        if unit and not _one_unit(own, unit):
+            raise DataError(
+                f"{name}: the header of {bare} says {own or 'no unit'}; name the column alone, and "
+                f"its unit beside: --unit SIGNAL={unit}"
+            )
         return bare
     return next((have for have in table.columns if plain(have) == plain(name)), None)
+
+
+def _one_unit(one: str | None, other: str) -> bool:
+    if one is None or not (units.known(one) and units.known(other)):
+        return one == other
+    return units.size(one) == units.size(other)
 
 
 def plain(name: str) -> str:

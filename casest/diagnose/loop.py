@@ -408,7 +408,10 @@ def _is_nothing(attached: Attached, after: Estimate) -> bool:
 
 
 def _least(state: State[Fit], after: Estimate) -> Kept | None:
-    """The cause that has most of the direction of which the data say least, or is on a bound."""
+    """The cause that has most of the direction of which the data say least, or is on a bound; the
+    last one, where only the way to the solution is too long."""
+    if after.certificate.code == Code.NOT_SETTLED:
+        return state.kept[-1] if state.kept else None
     owner = {p.name: a.label for a in after.model.effects for p in a.parameters}
     at_bound = Code.BOUND in after.certificate.code
     direction = (~after.free).astype(float) if at_bound else after.identifiability.least

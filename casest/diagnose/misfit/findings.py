@@ -28,6 +28,8 @@ from casest.leastsquares.problem import Point, Problem
 from casest.leastsquares.stated import chi_square
 from casest.leastsquares.weights import robust_scale, weighted
 
+#: Residual over the scatter from which on that is rounding: readings that only repeat.
+REPEATED = 1e6
 #: Variance of neighbours' differences from the line between them, in that of the noise, where noise
 #: remembers as exp(−k/MEMORY).
 _KIN = float(np.exp(-1 / MEMORY))
@@ -85,10 +87,11 @@ def _repeats(
     tested = pure_error(problem, point, clipped, problem.unknowns, wanders=wanders)
     if tested is None or tested.p_value >= LEVELS.misfit:
         return []
-    where = (
-        f"between {tested.between}: the residual is {np.sqrt(tested.F):.1f} times what the scatter "
-        "within them explains"
-    )
+    ratio = float(np.sqrt(tested.F))
+    where = f"between {tested.between}: the residual is {ratio:.1f} times what the scatter "
+    where += "within them explains"
+    if ratio > REPEATED:
+        where = f"between {tested.between}: within them readings only repeat, and explain nothing"
     return [Finding(where, tested.p_value, tested.sigma)]
 
 

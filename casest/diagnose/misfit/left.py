@@ -114,7 +114,7 @@ def left_over(
         looks = " or ".join(_looks_like(c.what) for c in said)
         where.append(f"its slow course is best described by {looks}")
     names = tuple(c.what.label for c in said)
-    return Misfit(bool(where), float(fraction), "; ".join(where), noise.content, names)
+    return Misfit(bool(where), min(float(fraction), 1.0), "; ".join(where), noise.content, names)
 
 
 def _looks_like(candidate: Candidate) -> str:

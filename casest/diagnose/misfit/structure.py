@@ -101,7 +101,7 @@ def _of_rows(name: str, r: Array, unknowns: Array, order: Index, tried: int) -> 
 
 def _structure(name: str, r: Array, means: Array, chance: float) -> Structure:
     share = np.maximum(_variance(means) - _steps(means), 0).sum() / max(r.var(axis=0).sum(), 1e-300)
-    return Structure(name, float(share), min(1.0, chance))
+    return Structure(name, min(float(share), 1.0), min(1.0, chance))
 
 
 def _steps(means: Array) -> Array:
