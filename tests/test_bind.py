@@ -116,16 +116,20 @@ def test_a_missing_column_is_answered_with_what_to_type(
     assert words in refusal(DataError, tmp_path, text, **options)
 
 
-def test_a_unit_that_the_header_does_not_have_is_refused_with_the_way_out(tmp_path: Path) -> None:
-    """As a header with its unit is written, but of another unit, or of none."""
+def test_a_unit_behind_a_column_is_that_of_the_signal(tmp_path: Path) -> None:
+    """As a header with its unit is written: of none it is stated so, of another it is refused."""
     signals = [Signal("level", 1, None)]
     asked = {"columns": {"level": "volt [V]"}}
-    for header, says in (("volt,ppm", "no unit"), ("volt [mV],ppm", "mV")):
-        message = refusal(DataError, tmp_path, f"{header}\n1,2\n2,3\n", signals, **asked)
-        assert f"the header of volt says {says}" in message
-        assert "--unit SIGNAL=V" in message
-    (run,) = runs_of(tmp_path, "volt [V],ppm\n1,2\n2,3\n", signals, **asked)
-    assert run.units["level"] == "V"
+    message = refusal(DataError, tmp_path, "volt [mV],ppm\n1,2\n2,3\n", signals, **asked)
+    assert "the header of volt says mV" in message
+    assert "--unit SIGNAL=V" in message
+    for header in ("volt [V],ppm", "volt,ppm"):
+        (run,) = runs_of(tmp_path, f"{header}\n1,2\n2,3\n", signals, **asked)
+        assert run.units["level"] == "V"
+    (run,) = runs_of(tmp_path, "volt,ppm\n1,2\n2,3\n", signals, units={"level": "mV"}, **asked)
+    assert run.units["level"] == "mV"
+    (run,) = runs_of(tmp_path, "ax,ay,az\n1,2,3\n2,3,5\n", columns={"v": "ax,ay,az [g]"})
+    np.testing.assert_allclose(run.signals["v"][0], 9.80665 * np.array([1.0, 2.0, 3.0]))
 
 
 def test_a_near_scalar_column_is_suggested(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from casest.data.joining import joined, shared_out
 from casest.data.logs import file_and_topics, parts_of
 from casest.data.matching import find_by_name
 from casest.data.merging import merged, one_clock_each
-from casest.data.options import Options, refuse_unknown_names, stated_unit
+from casest.data.options import Options, refuse_unknown_names, stated_unit, units_beside
 from casest.data.rest import at_rest as averaged_at_rest
 from casest.data.run import Array, Labels, Run
 from casest.data.scaling import parse_scale
@@ -68,8 +68,9 @@ def load_runs(
     A path `a.csv+b.csv` is one run of two files, each with a clock of its own: at the samples of a,
     within what b recorded too, the columns of b are interpolated.
 
-    * columns: per signal its columns by name or position, {"v": ("ax", "ay", "az")}; also
-      "t", "run" and "pose" where those columns are called otherwise.
+    * columns: per signal its columns by name or position, {"v": ("ax", "ay", "az")}, with a unit
+      behind the last where the header has none, {"v": "ax,ay,az [g]"}; also "t", "run" and "pose"
+      where those columns are called otherwise.
     * units: per signal or column the unit of its values, where the file states none or a wrong one.
     * scales: per signal or column how raw counts become values, {"temp": "int16/256+25"}.
     * rate: samples per second, instead of a time column or a rate stated above the table.
@@ -92,12 +93,12 @@ def load_runs(
     for name, said in (("columns", columns), ("units", units), ("scales", scales)):
         _refuse_no_mapping(name, said)
     wanted = tuple(signals.values() if isinstance(signals, Mapping) else signals)
-    listed = listed_data(paths)
+    listed, stated = listed_data(paths), {**units_beside(columns or {}), **(units or {})}
     if not listed:
         raise UsageError("no data file given; name at least one")
     options = Options(
         dict(columns or {}),
-        {name: stated_unit(name, unit) for name, unit in (units or {}).items()},
+        {name: stated_unit(name, unit) for name, unit in stated.items()},
         {name: parse_scale(text) for name, text in (scales or {}).items()},
         None if rate is None else timing.checked_rate(rate),
         time_zero,

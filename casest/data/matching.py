@@ -17,24 +17,24 @@ _AXES = ("xyz", "012", "123")
 def find_by_name(table: Table, name: str) -> str | None:
     """Return the column called so: exactly, else without regard to case and punctuation.
 
-    Raises DataError where it is named with a unit that its header does not have.
+    Raises DataError where it is named with another unit than its header has.
     """
     if name in table.columns:
         return name
     bare, unit = name_and_unit(name)  # as the header is written, unit and all
     if bare in table.columns:
         own = table.columns[bare].unit
-        if unit and not _one_unit(own, unit):
+        if own and unit and not _one_unit(own, unit):
             raise DataError(
-                f"{name}: the header of {bare} says {own or 'no unit'}; name the column alone, and "
-                f"its unit beside: --unit SIGNAL={unit}"
+                f"{name}: the header of {bare} says {own}; if that is wrong name the column alone, "
+                f"and its unit beside: --unit SIGNAL={unit}"
             )
         return bare
     return next((have for have in table.columns if plain(have) == plain(name)), None)
 
 
-def _one_unit(one: str | None, other: str) -> bool:
-    if one is None or not (units.known(one) and units.known(other)):
+def _one_unit(one: str, other: str) -> bool:
+    if not (units.known(one) and units.known(other)):
         return one == other
     return units.size(one) == units.size(other)
 

@@ -9,13 +9,16 @@ from dataclasses import dataclass
 from typing import Literal
 
 from casest import units as unit_names
-from casest.data.finding import Choice
+from casest.data.finding import Choice, as_names
 from casest.data.logs import file_and_topics
 from casest.data.matching import find_by_name
 from casest.data.scaling import Scale
 from casest.data.table import Table
 from casest.declaration.symbols import Signal
 from casest.errors import UnitError, UsageError
+
+#: What is no signal, and has no unit.
+_LABELS = ("run", "pose")
 
 
 @dataclass(frozen=True)
@@ -34,6 +37,13 @@ class Options:
     between: frozenset[str] | None = None
     #: Signals that may be the same in all rows: settings of an experiment, the noise of a reading.
     steady: frozenset[str] = frozenset()
+
+
+def units_beside(columns: Choice) -> dict[str, str]:
+    """The unit that stands behind a signal's last column: {"v": "ax,ay,az [g]"} is {"v": "g"}."""
+    last = {name: as_names(choice)[-1] for name, choice in columns.items() if as_names(choice)}
+    found = {name: re.search(r"\s\[([^\[\]]+)\]$", text) for name, text in last.items()}
+    return {name: unit[1] for name, unit in found.items() if unit and name not in _LABELS}
 
 
 def stated_unit(name: str, unit: str) -> str:
