@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Protocol, TypeVar
 
+from casest.declaration.effect import NOISE
 from casest.diagnose.formula.search import NAME as FORMULA
 from casest.diagnose.found import HELD_OUT_DATA
 from casest.diagnose.levels import LEVELS
@@ -169,6 +171,13 @@ def sided(effect: Effect) -> Iterator[str]:
     tau = effect.parameters.get("tau")
     if effect.name == LOW_PASS and tau is not None and _first_of(tau.value) < 0:
         yield "tau is below zero: the reading leads, what it is compared with is the slower one"
+
+
+def chained(effects: Sequence[Effect]) -> Iterator[str]:
+    """Where several act on one thing."""
+    places = Counter(e.on for e in effects if e.on not in (None, NOISE))
+    for place in (p for p, count in places.items() if count > 1):
+        yield f"effects on {place} act one after the other, each on what the last one leaves"
 
 
 def instead(effect: Effect, parameters: Mapping[str, Parameter]) -> Iterator[str]:

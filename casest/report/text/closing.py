@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import textwrap
-from collections import Counter
 from collections.abc import Iterator
 from itertools import combinations
 from pathlib import Path
 
 from casest.data.logs import file_name
-from casest.declaration.effect import NOISE
 from casest.report.next_command import following
 from casest.report.text.layout import WIDTH, held_lines, item, value_table
 from casest.results.closing import Closed
 from casest.results.result import Number
 from casest.results.rounding import percent
 from casest.results.verdict import (
+    chained,
     instead,
     largest,
     of_the_user,
@@ -91,9 +90,7 @@ def _effects(result: Closed) -> Iterator[str]:
             yield item(f"not told apart from {', '.join(e.indistinguishable_from)}{also}")
             yield from (item(f"to tell it from {w}") for w in e.would_separate[:SHOWN])
             yield from (item(words) for words in instead(e, result.after.parameters))
-    places = Counter(e.on for e in result.effects if e.on not in (None, NOISE))
-    for place in (str(p) for p, count in places.items() if count > 1):
-        yield item(f"effects on {place} act one after the other, each on what the last one leaves")
+    yield from map(item, chained(result.effects))
 
 
 def _chance(p_value: Number) -> str:
