@@ -156,7 +156,8 @@ def _effect(e: Effect, result: Closed) -> str:
         [f"`{name}`", *_value(p), printed_unit(" ".join(_list(p.unit)))]
         for name, p in e.parameters.items()
     ]
-    evidence = [f"Chance of as much by noise alone: p = {number(e.p_value, 2)}."]
+    chance = f"p = {number(e.p_value, 2)}" if e.p_value else "below 1e-300"
+    evidence = [f"Chance of as much by noise alone: {chance}."]
     if e.holdout_gain:
         own = result.noise.unit
         squared = f"{own}^2" if re.fullmatch(r"\w+", own) else f"({own})^2"
