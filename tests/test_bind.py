@@ -123,6 +123,9 @@ def test_a_unit_behind_a_column_is_that_of_the_signal(tmp_path: Path) -> None:
     message = refusal(DataError, tmp_path, "volt [mV],ppm\n1,2\n2,3\n", signals, **asked)
     assert "the header of volt says mV" in message
     assert "--unit SIGNAL=V" in message
+    warm = [Signal("warmth", 1, None)]
+    message = refusal(DataError, tmp_path, "T [degC]\n1\n2\n", warm, columns={"warmth": "T [K]"})
+    assert "the header of T says degC" in message  # of one size, and of another zero
     for header in ("volt [V],ppm", "volt,ppm"):
         (run,) = runs_of(tmp_path, f"{header}\n1,2\n2,3\n", signals, **asked)
         assert run.units["level"] == "V"

@@ -184,7 +184,7 @@ def units_of(model: Model, plan: Plan) -> dict[str, str]:
 def read_options(options: ReadingOptions) -> Options:
     """How columns become signals, checked."""
     from casest.data import timing
-    from casest.data.options import Options, stated_unit, units_beside
+    from casest.data.options import Options, stated_units
     from casest.data.scaling import parse_scale
 
     if options.at_rest:
@@ -192,10 +192,9 @@ def read_options(options: ReadingOptions) -> Options:
             "--at-rest finds rests in one record; a fleet's rows are poses: average each rest first"
         )
     given = options.keywords()
-    stated = {**units_beside(given["columns"] or {}), **given["units"]}
     return Options(
         given["columns"],
-        {name: stated_unit(name, unit) for name, unit in stated.items()},
+        stated_units(given["columns"], given["units"]),
         {name: parse_scale(text) for name, text in given["scales"].items()},
         None if options.rate is None else timing.checked_rate(options.rate),
         options.time_zero,

@@ -20,7 +20,7 @@ from casest.data.joining import joined, shared_out
 from casest.data.logs import file_and_topics, parts_of
 from casest.data.matching import find_by_name
 from casest.data.merging import merged, one_clock_each
-from casest.data.options import Options, refuse_unknown_names, stated_unit, units_beside
+from casest.data.options import Options, refuse_unknown_names, stated_units
 from casest.data.rest import at_rest as averaged_at_rest
 from casest.data.run import Array, Labels, Run
 from casest.data.scaling import parse_scale
@@ -93,12 +93,12 @@ def load_runs(
     for name, said in (("columns", columns), ("units", units), ("scales", scales)):
         _refuse_no_mapping(name, said)
     wanted = tuple(signals.values() if isinstance(signals, Mapping) else signals)
-    listed, stated = listed_data(paths), {**units_beside(columns or {}), **(units or {})}
+    listed = listed_data(paths)
     if not listed:
         raise UsageError("no data file given; name at least one")
     options = Options(
         dict(columns or {}),
-        {name: stated_unit(name, unit) for name, unit in stated.items()},
+        stated_units(columns, units),
         {name: parse_scale(text) for name, text in (scales or {}).items()},
         None if rate is None else timing.checked_rate(rate),
         time_zero,

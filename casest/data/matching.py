@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from casest import units
 from casest.data.column import name_and_unit
 from casest.data.table import Table
-from casest.errors import DataError
+from casest.errors import DataError, UnitError
 
 _WORD = re.compile(r"[A-ZÄÖÜ]?[a-zäöüß]+|[A-ZÄÖÜ]+(?![a-zäöüß])|\d+")
 _AXES = ("xyz", "012", "123")
@@ -26,17 +26,18 @@ def find_by_name(table: Table, name: str) -> str | None:
         own = table.columns[bare].unit
         if own and unit and not _one_unit(own, unit):
             raise DataError(
-                f"{name}: the header of {bare} says {own}; if that is wrong name the column alone, "
-                f"and its unit beside: --unit SIGNAL={unit}"
+                f"{table.file}: {name}: the header of {bare} says {own}; if that is wrong name the "
+                f"column alone, and its unit beside: --unit SIGNAL={unit}"
             )
         return bare
     return next((have for have in table.columns if plain(have) == plain(name)), None)
 
 
 def _one_unit(one: str, other: str) -> bool:
-    if not (units.known(one) and units.known(other)):
-        return one == other
-    return units.size(one) == units.size(other)
+    try:
+        return one == other or units.conversion(other, one) == (1.0, 0.0)  # K is not degC
+    except UnitError:
+        return False
 
 
 def plain(name: str) -> str:

@@ -39,14 +39,20 @@ class Options:
     steady: frozenset[str] = frozenset()
 
 
-def units_beside(columns: Choice) -> dict[str, str]:
+def stated_units(columns: Choice | None, units: Mapping[str, str] | None) -> dict[str, str]:
+    """The canonical units that a user states, also behind a signal's columns."""
+    stated = {**_units_beside(columns or {}), **(units or {})}
+    return {name: _stated_unit(name, unit) for name, unit in stated.items()}
+
+
+def _units_beside(columns: Choice) -> dict[str, str]:
     """The unit that stands behind a signal's last column: {"v": "ax,ay,az [g]"} is {"v": "g"}."""
     last = {name: as_names(choice)[-1] for name, choice in columns.items() if as_names(choice)}
     found = {name: re.search(r"\s\[([^\[\]]+)\]$", text) for name, text in last.items()}
     return {name: unit[1] for name, unit in found.items() if unit and name not in _LABELS}
 
 
-def stated_unit(name: str, unit: str) -> str:
+def _stated_unit(name: str, unit: str) -> str:
     """Return the canonical name of a unit the user states; a UnitError names the option."""
     try:
         return unit_names.canonical(unit)

@@ -36,7 +36,8 @@ class Levels:
         that signal once more: two meters of one quantity agree so far, an influence does not.
     stand_in: share of a column's variance that a signal does not tell, up to which, in poses and
         tables, its curve could be a bend over that signal.
-    stays: share of what inputs do to a reading by which it may change beside a column's influence.
+    stays: share of what inputs do to a reading that must stay beside a column's influence, and by
+        which it may change.
     passing: share of a record's rows up to which inputs that are held else go from level to level.
     fades: time constants that a record must span for a memory to be seen to fade.
     most: share of the squares below which what is left says more than how likely a slow course is;

@@ -228,8 +228,7 @@ def _without_events_of_a_course(sensor: Sensor, state: State[Fit]) -> State[Fit]
         left = slow_squares(sensor.runs, state.fit.residuals)
         if less is None or _fall(state.fit, least) > left:
             break
-        left_in = _left_in(state, less)
-        state = replace(left_in, fit=less, open=(least.evidence, *state.open))
+        state = replace(_left_in(state, less), open=(least.evidence, *state.open))
         state = state.refusing(least.what, AS_MUCH)
         state = replace(state, last=ranked(sensor, less))
     return state
@@ -260,7 +259,7 @@ def _foretelling(
         if less is None or _better(*_on_the_same_samples(*hidden)):
             break
         last = state.kept[-1].what
-        state = replace(_left_in(state, less), fit=less).refusing(last, NOT_HELD_OUT)
+        state = _left_in(state, less).refusing(last, NOT_HELD_OUT)
         state, after = certified(sensor, state, before)
         hidden[1] = held_out(sensor, state.fit, folds)
     return state, after, hidden
@@ -357,16 +356,14 @@ def certified(sensor: Sensor, state: State[Fit], before: Estimate) -> tuple[Stat
         fit = sensor.without(state.fit, last.what)
         if fit is None:
             return state, before
-        left = _left_in(state, fit)
-        state = replace(left, fit=fit, open=(last.evidence, *state.open))
+        state = replace(_left_in(state, fit), open=(last.evidence, *state.open))
 
 
 def _left_in(state: State[Fit], fit: Fit) -> State[Fit]:
-    """With the causes that are in a fit still: with one goes the lag of a column that it alone
-    read."""
+    """At a fit with less in it: with a cause goes the lag of a column that it alone read."""
     there = {a.label for a in fit.model.effects}
     kept = tuple(k for k in state.kept if k.what.freed or k.what.label in there)
-    return replace(state, kept=kept)
+    return replace(state, fit=fit, kept=kept)
 
 
 def _replaced(sensor: Sensor, state: State[Fit], kept: Kept) -> State[Fit] | None:

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from casest.data.options import Options, stated_unit
+from casest.data.options import Options, stated_units
 from casest.dataset.files import File
 from casest.dataset.layout import layout_of
 from casest.dataset.partitions import Piece
@@ -54,8 +54,7 @@ def calibrate_arrow(
     check_model(model)
     if isinstance(table, pyarrow.RecordBatch):
         table = pyarrow.Table.from_batches([table])
-    stated = {name: stated_unit(name, unit) for name, unit in (units or {}).items()}
-    options = Options(dict(columns or {}), stated, {}, None, "first", ())
+    options = Options(dict(columns or {}), stated_units(columns, units), {}, None, "first", ())
     file = File("table", False, 0)
     layout = layout_of(file, _Held(table), model.in_records, options, sensor=sensor, kept=keep)
     if not layout.wide:

@@ -72,7 +72,7 @@ def too_slow(
 
 def between_levels(trial: Trial, linear: Linear, settled: NDArray[np.bool_]) -> str:
     """Why a bend is none: the rows show it in which an input goes from one level to the next, and
-    not the `settled` ones (N,), which are nearly all; else empty."""
+    not the `settled` ones (N,), which are most; else empty."""
     if np.mean(settled) < 1 - LEVELS.passing or settled.all():
         return ""
     falls = [_fall(linear.residual[rows], linear.slopes[rows], trial.columns[rows])
