@@ -128,6 +128,21 @@ class Model:
         return self if self.noise is None else replace(self, noise=None)
 
     @cached_property
+    def as_read(self) -> Model:
+        """Of a predicted reading: its residual at the readings themselves, over the noise there."""
+        return self._with_noise(as_read=True)
+
+    @cached_property
+    def at_true_values(self) -> Model:
+        """With the residual at the likeliest true values, as noise that was stated has it."""
+        return self._with_noise(as_read=False)
+
+    def _with_noise(self, as_read: bool) -> Model:
+        if self.noise is None or self.implicit:
+            return self
+        return replace(self, noise=replace(self.noise, as_read=as_read))
+
+    @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
         """Declared parameters, then those of the effects (`quadratic.k`)."""
         own = [p for p in self.declared if isinstance(p, Parameter)]

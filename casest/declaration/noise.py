@@ -35,7 +35,8 @@ class Stated:
 
     `residuals` is their number m, `scale` a usual residual's standard deviation: so a residual in
     units of its noise stays one in the unit of the reading. `groups`: signals whose noise is
-    correlated stand together, in the order of `signals`; empty where each is for itself.
+    correlated stand together, in the order of `signals`; empty where each is for itself. `as_read`:
+    e = V^(-1/2)r(x, s), at the readings themselves: to look for what is missing.
     """
 
     signals: tuple[str, ...]
@@ -43,6 +44,7 @@ class Stated:
     # No part of the relation: what was built for one record serves the next, of other noise.
     scale: float = field(default=1.0, compare=False)
     groups: tuple[tuple[str, ...], ...] = ()
+    as_read: bool = False
 
     @property
     def together(self) -> tuple[tuple[str, ...], ...]:
@@ -63,13 +65,23 @@ def root_of(group: tuple[str, ...]) -> str:
 
 def in_units_of_noise(traced: Traced, noise: Stated) -> Traced:
     """The trace with its residual divided by what the stated noise makes of it."""
-    reading = ca.vertcat(*[flat(traced.symbols[name]) for name in noise.signals])
-    true, m = traced.symbols[TRUE], noise.residuals
+    m, w, stages = noise.residuals, traced.expression, traced.stages
     whitening = ca.reshape(traced.symbols[WHITENING], m, m).T
-    slope = ca.reshape(traced.symbols[SLOPE], reading.numel(), m).T
-    w = ca.substitute(traced.expression, reading, true) + slope @ (reading - true)
-    w -= traced.symbols[MEAN]
-    return replace(traced, expression=ca.densify(ca.tril(whitening) @ w))
+    if not noise.as_read:
+        # A signal at another time is read there, and has a true value there.
+        late = {s.attached.on: s.given for s in stages if s.attached and s.attached.kind == "time"}
+        reading = ca.vertcat(*[late.get(n, flat(traced.symbols[n])) for n in noise.signals])
+        slope, true = ca.reshape(traced.symbols[SLOPE], reading.numel(), m).T, traced.symbols[TRUE]
+        w = ca.substitute(w, reading, true) + slope @ (reading - true) - traced.symbols[MEAN]
+        # What looks at other samples takes true values there: their noise is in G(s - ξ) once.
+        stages = tuple(replace(s, taken=ca.substitute(s.taken, reading, true)) for s in stages)
+    return replace(traced, expression=ca.densify(ca.tril(whitening) @ w), stages=stages)
+
+
+def at_true(traced: Traced, noise: Stated, value: SX) -> SX:
+    """A value of the trace at the true values of its noisy signals."""
+    reading = ca.vertcat(*[flat(traced.symbols[name]) for name in noise.signals])
+    return ca.substitute(value, reading, traced.symbols[TRUE])
 
 
 def slope_in_noisy(traced: Traced, names: tuple[str, ...]) -> SX:

@@ -14,6 +14,7 @@ from casest.diagnose.cross_validation import Folds
 from casest.diagnose.found import Course, Found, Undecided
 from casest.diagnose.misfit.left import Misfit, left_over
 from casest.diagnose.visibility import Visible
+from casest.effects.placing import prepared
 from casest.estimate.estimate import Estimate
 from casest.leastsquares.problem import Problem
 
@@ -43,7 +44,7 @@ class Closing:
     @cached_property
     def misfit(self) -> Misfit:
         """What is left after the loop, tested beside the noise as it is."""
-        problem = Problem(self.after.model, self.runs)
+        problem = Problem(self.after.model, prepared(self.after.model, self.after.problem.runs))
         evidence = self.after.evidence
         shared = evidence.scatter if evidence is not None and evidence.misfit else None
         with np.errstate(all="ignore"):

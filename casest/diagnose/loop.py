@@ -32,6 +32,7 @@ from casest.diagnose.protocol.refits import AS_MUCH
 from casest.diagnose.protocol.state import Ranking
 from casest.diagnose.sensor import NOT_FINITE, Fit, Sensor
 from casest.diagnose.sensor.courses import courses
+from casest.diagnose.sensor.fits import problem_of
 from casest.diagnose.sensor.unlike import another
 from casest.diagnose.visibility import Visible, visible
 from casest.effects import CATALOGUE
@@ -43,7 +44,6 @@ from casest.estimate.calibrate import attempt
 from casest.estimate.estimate import Estimate
 from casest.estimate.reasons import Code
 from casest.leastsquares.kinds import noises
-from casest.leastsquares.problem import Problem
 from casest.leastsquares.weights import robust_scale
 
 #: What no effect that is added could mend.
@@ -92,11 +92,11 @@ def _once(
 ) -> Closing:
     before = attempt(model, runs, start=start, seed=seed)
     if before.certificate.trusted:
-        return _searched(before, model, runs, catalogue, known, seed, say)
+        return _searched(before, model, catalogue, known, seed, say)
     error = NotTrusted("no trustworthy estimate: " + "; ".join(before.certificate.reasons))
     error.estimate = before
     if not before.certificate.code & HOPELESS:  # what is missing may be why
-        closing = _searched(before, model, runs, catalogue, known, seed, say)
+        closing = _searched(before, model, catalogue, known, seed, say)
         if closing.effects and closing.after.certificate.trusted:
             return closing
     raise error
@@ -153,7 +153,6 @@ def _on_all_axes(what: Candidate, catalogue: Sequence[Effect]) -> Candidate:
 def _searched(
     before: Estimate,
     model: Model,
-    runs: Sequence[Run],
     catalogue: Sequence[Effect],
     known: Collection[str],
     seed: int,
@@ -161,11 +160,14 @@ def _searched(
 ) -> Closing:
     """The loop from a declared fit."""
     with np.errstate(all="ignore"), one_thread(), only_tried():
-        ready = prepared(model, runs)
+        # Stated noise is that at this fit: a start knows no more than its own slopes.
+        ready = prepared(model, before.problem.runs)
         try:
             folds = determined(before, ready, seed)
         except DataError as error:
             return _as_it_is(before, ready, str(error))
+        # True values are pulled towards a model that lacks something: it is looked for as read.
+        model = model.as_read
         sensor = Sensor(model, ready, tuple(catalogue), frozenset(known), seed)
         return _closed(sensor, before, folds, say)
 
@@ -180,7 +182,7 @@ def _as_it_is(before: Estimate, runs: tuple[Run, ...], why: str) -> Closing:
 
 
 def _closed(sensor: Sensor, before: Estimate, folds: Folds, say: Callable[[str], None]) -> Closing:
-    declared = sensor.fitted(before.model, before.values)
+    declared = sensor.fitted(sensor.model, before.values)
     if declared is None:
         raise NotTrusted("the residual is not finite at the optimum")
     # First, while what is tried beside it is at hand.
@@ -284,7 +286,8 @@ def _declared_walks(sensor: Sensor) -> list[Effect]:
 
 def held_out(sensor: Sensor, fit: Fit, folds: Folds) -> tuple[Array, ...]:
     """Residuals (N, m) of each run, each from a fit that did not see its part."""
-    return cross_fitted(fit.model, sensor.runs, fit.values, folds)
+    problem, _ = problem_of(fit, sensor.runs)
+    return cross_fitted(fit.model, problem.runs, fit.values, folds)
 
 
 def _on_the_same_samples(
@@ -319,8 +322,8 @@ def without_outliers(
     fit, effect = state.fit, next((e for e in sensor.catalogue if e.seen_in == TAILS), None)
     if effect is None or any(a.label == effect.name for a in fit.model.effects):
         return state, None
-    problem = Problem(fit.model, sensor.runs)
-    levels = predictions(problem, problem.point(fit.values))
+    problem, point = problem_of(fit, sensor.runs)
+    levels = predictions(problem, point)
     p_value = outliers_p_value(fit.residuals, folds.batches, levels)
     if p_value is None:
         return state, None
@@ -342,6 +345,7 @@ def certified(sensor: Sensor, state: State[Fit], before: Estimate) -> tuple[Stat
     while True:
         with only_tried(False):
             model = state.fit.model.having(**noises(sensor.model))  # as they are beside it
+            model = model.at_true_values
             after = attempt(model, sensor.runs, start=state.fit.values, seed=sensor.seed)
         last, why = _at_fault(sensor, state, after)
         if not why:

@@ -16,7 +16,6 @@ import casadi as ca
 import numpy as np
 
 from casest.data.run import Run
-from casest.declaration.effect import OVER_TIME
 from casest.declaration.model import Model
 from casest.declaration.physics import chart
 from casest.declaration.prior import root
@@ -444,7 +443,7 @@ class Problem:
     def smooth(self) -> bool:
         """Are residuals smooth functions of the unknowns, as far as it is known? Not what effects
         with a memory make of them: a hysteresis has corners."""
-        return not any(a.kind in OVER_TIME for a in self.model.effects)
+        return not any(a.kind == "sequence" for a in self.model.effects)
 
     @cached_property
     def _with_jacobian(self) -> Replay:
@@ -455,6 +454,14 @@ class Problem:
         the readings of the turn between."""
         assert self._staged is not None
         return self._staged.slopes_in_readings(self.parameters(point, r), r)
+
+    def as_taken(self, point: Point, r: int) -> Run:
+        """One run with its signals at the times at which effects take them."""
+        run = self.runs[r]
+        if self._staged is None:
+            return run
+        late = self._staged.late(self.parameters(point, r), r)
+        return replace(run, signals={**run.signals, **late}) if late else run
 
     def origin(self, r: int) -> tuple[Run, Any]:
         """The record that the samples of one run were taken from, and which of it they are."""

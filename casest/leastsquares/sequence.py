@@ -358,6 +358,15 @@ class Staged:
                 )
         return ""
 
+    def late(self, parameters: Array, r: int) -> dict[str, Array]:
+        """Signals (N, k) of run r that are taken at another time, as it was recorded there."""
+        record = self._records[r]
+        return {
+            stage.attached.on: self._late(stage, parameters, record)[0][record.places]
+            for stage in _programs(self.model, ())[:-1]
+            if stage.attached is not None and stage.attached.kind == "time"
+        }
+
     def _late(self, stage: Program, parameters: Array, record: Record) -> tuple[Array, Array]:
         """A signal at the times at which the effect says that it is taken, and its slopes in the
         stage's columns."""

@@ -284,7 +284,10 @@ def settles(model: Model) -> bool:
 
     It need not where the residual is as steep in the noisy signals everywhere.
     """
-    return model.noise is not None and _steepness_varies(model.without_noise, model.noise)
+    noise = model.noise
+    if noise is None or noise.as_read:
+        return False
+    return _steepness_varies(model.without_noise, noise)
 
 
 @lru_cache(maxsize=64)
@@ -308,17 +311,17 @@ def at_true_values(problem: Problem, point: Point) -> Problem:
     assert noise is not None
     runs = []
     for r, run in enumerate(problem.runs):
-        parameters = problem.parameters(point, r)
+        parameters, read = problem.parameters(point, r), problem.as_taken(point, r)
         if _straight(model, noise.signals):
             # One step leads there, G and V are the same there, and b is zero.
-            part = _linearised(model, parameters, run, noise)
+            part = _linearised(model, parameters, read, noise)
             runs.append(_with(part, run, noise, part.likeliest))
             continue
         pieces = [slice(i, i + PIECE) for i in range(0, len(run), PIECE)]
-        found = [_likeliest(model, parameters, run.take(own), noise) for own in pieces]
-        run = replace(run, signals={**run.signals, TRUE: np.concatenate(found, axis=1).T})
-        part = _linearised(model, parameters, run, noise)
-        mean = _mean(model, parameters, run, part) if problem.model.implicit else None
+        found = [_likeliest(model, parameters, read.take(own), noise) for own in pieces]
+        read = replace(read, signals={**read.signals, TRUE: np.concatenate(found, axis=1).T})
+        part = _linearised(model, parameters, read, noise)
+        mean = _mean(model, parameters, read, part) if problem.model.implicit else None
         runs.append(_with(part, run, noise, mean=mean))
     return replace(problem, runs=tuple(runs))
 
@@ -371,7 +374,8 @@ def shifts_of_curvature(problem: Problem, point: Point) -> Iterator[Array]:
             yield np.zeros_like(run.signals[MEAN])
             continue
         parameters = problem.parameters(point, r)
-        mean = _mean(model, parameters, run, _linearised(model, parameters, run, noise))
+        read = problem.as_taken(point, r)
+        mean = _mean(model, parameters, read, _linearised(model, parameters, read, noise))
         whitening = run.signals[WHITENING].reshape(*mean.shape, -1)
         yield np.einsum("nij,nj->ni", whitening, mean)
 

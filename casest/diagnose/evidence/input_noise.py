@@ -2,9 +2,10 @@
 
 Slopes are taken at inputs as they were recorded. Noise of an input is in the residual and in the
 slopes: a column that would be none beside the unknowns is that noise there, and explains it. (In a
-ramp at an even pace time tells the reference better than a noisy meter did.) So the same columns
-are looked at with so much noise more: as far as what changes in them goes with what was added to
-the residual, that column explains noise of that input, and as much of it may be its whole gain.
+ramp at an even pace time tells the reference better than a noisy meter did.) How much of what a
+column explains is that noise is the covariance of the two, and that of normal noise with any
+function of it is its variance times the mean slope (Stein 1981): so the same columns are looked at
+with a little more noise.
 """
 
 from __future__ import annotations
@@ -19,6 +20,8 @@ from casest.diagnose.evidence.linear import Linear, alike
 from casest.diagnose.evidence.score import Evidence
 from casest.diagnose.levels import LEVELS
 
+#: Noise that is added, in that of the input: little, for a slope.
+LITTLE = 0.1
 #: Twice the log of a ratio of likelihoods, for each residual, that no cause reaches.
 MOST = 20.0
 
@@ -28,14 +31,14 @@ def feigned(
 ) -> float:
     """Gain that noise of an input may give: MOST of each residual where a cause is all noise.
 
-    `draws`: the problem and the evidence's columns (N, m, k) with noise added to that input.
+    `draws`: the problem and the evidence's columns (N, m, k) with LITTLE of its noise added to that
+    input.
     """
     columns, beyond = np.concatenate(evidence.columns, axis=2), evidence.beyond
     left = likelihood.remains(beyond.flat)
     values = beyond.mix @ evidence.explained.values[-evidence.freedom :]
     root = 1 / np.sqrt(evidence.explained.spectrum)
     size = np.linalg.norm(columns.reshape(len(root), -1), axis=0)
-    explained = float(np.sum((root * (left @ values)) ** 2))
     together = []
     for noisy, moved in draws:
         own = np.linalg.norm(moved.reshape(len(root), -1), axis=0) / np.maximum(size, 1e-300)
@@ -43,11 +46,20 @@ def feigned(
         change = root * ((there * own - left) @ values)
         more = (noisy.linear.residual - likelihood.linear.residual)[:, :, None]
         added = root * likelihood.by_frequency(more)[:, 0]
-        together.append(float(change @ added))
-    both = max(float(np.mean(together)) if together else 0.0, 0.0)
-    all_there = float(np.sum((root * likelihood.residual) ** 2))
-    share = LEVELS.jitter * both**2 / max(explained * all_there, 1e-300)
-    return len(root) * min(MOST, -float(np.log1p(-min(share, 1 - 1e-12))))
+        together.append(float(change @ added) / LITTLE**2)
+    both = float(np.mean(together)) if together else 0.0
+    return _at_most(both, float(np.sum((root * likelihood.residual) ** 2)), len(root))
+
+
+def _at_most(taken: float, everything: float, count: int) -> float:
+    """Gain of so many residuals that is feigned, where noise explains so much of all their squares.
+
+    A gain that is G without chance is (√G + z)² with it, z normal: where what is left after it must
+    be z² to say anything, G + 2·z·√G is to be taken away.
+    """
+    share = min(max(taken, 0.0) / max(everything, 1e-300), 1 - 1e-12)
+    gain = -count * float(np.log1p(-share))
+    return min(MOST * count, gain + 2 * float(np.sqrt(LEVELS.strong * gain)))
 
 
 def feigned_by_refit(
@@ -68,6 +80,5 @@ def feigned_by_refit(
     def squares(residual: Array) -> float:
         return float(np.sum((root * likelihood.by_frequency(residual[:, :, None])[:, 0]) ** 2))
 
-    taken = float(np.mean([squares(less) - squares(more) for less, more in draws]))
-    share = LEVELS.jitter * max(taken, 0.0) / max(squares(one.residual), 1e-300)
-    return len(root) * min(MOST, -float(np.log1p(-min(share, 1 - 1e-12))))
+    taken = float(np.mean([squares(less) - squares(more) for less, more in draws])) / LITTLE**2
+    return _at_most(taken, squares(one.residual), len(root))

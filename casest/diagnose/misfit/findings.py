@@ -13,6 +13,7 @@ from casest.declaration.shapes import Array
 from casest.diagnose.candidates.candidates import usable_columns
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.misfit.few_rows import few_rows
+from casest.diagnose.misfit.noisy_inputs import beside_noise_of_inputs
 from casest.diagnose.misfit.pure_error import pure_error
 from casest.diagnose.misfit.reference import along_reference
 from casest.diagnose.misfit.structure import structures
@@ -197,13 +198,26 @@ def _follows(
     """What it follows: a column, a quantity; the time only where no slow course says so."""
     if any(run.spread for run in problem.runs):
         return []
-    read = variables(problem, point, usable_columns(problem.model, problem.runs))
-    read = [v for v in read if in_time or not v.clock]
+    columns = usable_columns(problem.model, problem.runs)
+    read = [v for v in variables(problem, point, columns) if in_time or not v.clock]
     table = sum(map(len, problem.runs)) < TABLE and not any(map(is_series, problem.runs))
     every = structures(clipped, read, unknowns=_taken(problem, point) if table else None)
     # Of few rows no chance is small: it is that of naming anything in poses.
     chance = LEVELS.chance if table else LEVELS.misfit
     found = [s for s in every if s.p_value < chance and s.share > LEVELS.share]
+    if found and not table:
+        one = {v.name: v for v in read}
+        beside = [
+            s
+            for f in found
+            for s in structures(
+                beside_noise_of_inputs(
+                    problem, point, clipped, one[f.name], lambda p: variables(p, point, columns)
+                ),
+                [one[f.name]],
+            )
+        ]
+        found = [s for s in beside if s.p_value * len(read) < chance and s.share > LEVELS.share]
     if not found:
         return []
     # In the order of the record lies whatever was changed with it: what has a name comes first.

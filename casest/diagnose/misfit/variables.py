@@ -10,6 +10,7 @@ import casadi as ca
 import numpy as np
 
 from casest.data.run import Run
+from casest.declaration.noise import at_true
 from casest.declaration.shapes import Array
 from casest.declaration.tracing import function_of, reading_symbol, sample_symbol
 from casest.engine import Replay
@@ -57,6 +58,8 @@ def _quantities(problem: Problem, point: Point) -> Iterator[Variable]:
             continue
         if implicit:
             value = _consistent(problem, value)
+        if problem.model.noise is not None:  # at true values the noise of inputs is no order
+            value = at_true(traced, problem.model.noise, value)
         replay = Replay(function_of(problem.model, {"q": ca.densify(value)}))
         per_run = [
             replay(problem.parameters(point, r), s)[0][:, :, 0]

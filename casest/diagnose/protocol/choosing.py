@@ -8,7 +8,13 @@ from math import inf
 
 from casest.diagnose.evidence.score import Evidence, again, judged
 from casest.diagnose.levels import LEVELS
-from casest.diagnose.protocol.confirming import FAR_AWAY, falls, holds_out, passing
+from casest.diagnose.protocol.confirming import (
+    FAR_AWAY,
+    falls,
+    falls_of_refit,
+    holds_out,
+    passing,
+)
 from casest.diagnose.protocol.ranking import pairs, ranked, without_feigned
 from casest.diagnose.protocol.refits import best_refits, refitted, shown, torn_between
 from casest.diagnose.protocol.state import F, Kept, Ranking, Refit, State
@@ -122,7 +128,7 @@ def _first_certified(
     for k, refit in enumerate(refits):
         fit = subject.certified(refit.fit)
         if not isinstance(fit, str):
-            return _with_kept(state, ranking, replace(refit, fit=fit), say), True
+            return _with_kept(subject, state, ranking, replace(refit, fit=fit), say), True
         state = state.refusing(refit.evidence.trials[0].what, fit)
         later = refits[k + 1].evidence.score if k + 1 < len(refits) else 0.0
         if len(refit.evidence.trials) == 1 and refit.evidence.score > later + LEVELS.clear:
@@ -137,11 +143,12 @@ def _hypotheses(
     asked = [e for e in ranking.found if subject.asked(e.trials[0].what)]
     found = []
     for evidence in asked:
-        # Noise of the inputs may do it as well: but here somebody knows that it is there.
         own = replace(evidence, trials=tuple(replace(t, feigned=0.0) for t in evidence.trials))
         alone = again(own, ranking.likelihood, ranking.none, len(asked), 1)
+        (alone,) = without_feigned(subject, state.fit, ranking.likelihood, [alone], len(asked))
         if alone.p_value >= LEVELS.chance:
-            why = f"no more of it than noise would have (p = {alone.p_value:.2g})"
+            noise = "noise of the inputs" if alone.feigned else "noise"
+            why = f"no more of it than {noise} would have (p = {alone.p_value:.2g})"
             state = state.refusing(evidence.trials[0].what, why)
         elif falls(ranking, alone)["pieces"].ratio < 1:
             found.append(alone)
@@ -177,9 +184,16 @@ def _describes(
 
 
 def _with_kept(
-    state: State[F], ranking: Ranking, refit: Refit[F], say: Callable[[str], None]
+    subject: Subject[F],
+    state: State[F],
+    ranking: Ranking,
+    refit: Refit[F],
+    say: Callable[[str], None],
 ) -> State[F]:
-    seen, kept = refit.falls or falls(ranking, refit.evidence), state.kept
+    seen, kept = (
+        refit.falls or falls_of_refit(ranking.linear, subject.linear(refit.fit)),
+        state.kept,
+    )
     for trial in refit.evidence.trials:
         say(f"{trial.family}: held-out error falls")
         kept = (*kept, Kept(trial.what, refit.evidence, seen))

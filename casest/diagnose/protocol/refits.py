@@ -86,9 +86,7 @@ def _row_by_row(subject: Subject[F], ranking: Ranking, evidence: Evidence, fit: 
 
 
 def _charged(subject: Subject[F], before: F, evidence: Evidence, fit: F) -> Evidence:
-    """With what noise of the inputs may feign of this refit, where it may of its columns."""
-    if not evidence.feigned:
-        return evidence
+    """With what noise of the inputs may feign of this refit, in the place of its columns."""
     one, other = subject.linear(before), subject.linear(fit)
     gains = [feigned_by_refit(one, other, draws) for draws in subject.noise_in(before, fit)]
     known = [g for g in gains if g is not None]

@@ -16,6 +16,7 @@ from casest.diagnose.candidates.slopes import rows_of
 from casest.diagnose.evidence.held_inputs import plateaus_of, settled_rows
 from casest.diagnose.evidence.linear import Index, Linear, parts_of, spans_of
 from casest.diagnose.levels import LEVELS
+from casest.diagnose.noise.of_inputs import at_once
 from casest.diagnose.sensor.fits import Fit, problem_of
 from casest.diagnose.sensor.recent import Recent
 from casest.leastsquares.kinds import noises
@@ -130,7 +131,5 @@ class Rows:
 
 def instant(fit: Fit) -> Fit:
     """The fit without what looks at other samples."""
-    kept = tuple(a for a in fit.model.effects if a.kind not in OVER_TIME)
-    model = replace(fit.model, effects=kept)
-    own = {p.name for p in model.parameters}
-    return replace(fit, model=model, values={n: v for n, v in fit.values.items() if n in own})
+    model = at_once(fit.model)
+    return replace(fit, model=model, values=model.among(fit.values))

@@ -101,7 +101,8 @@ class Sensor(Subject[Fit]):
     def proved(self, fit: Fit) -> Estimate:
         """An estimate whose trust is known; its intervals are left for the end."""
         with only_tried(False):
-            return attempt(fit.model, self.runs, start=fit.values, seed=self.seed, intervals=False)
+            model = fit.model.at_true_values
+            return attempt(model, self.runs, start=fit.values, seed=self.seed, intervals=False)
 
     def linear(self, fit: Fit) -> Linear:
         """Residuals and slopes in the rows that are looked at."""
