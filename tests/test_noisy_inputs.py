@@ -11,7 +11,7 @@ import pytest
 from scipy.stats import chi2
 
 from casest import Residual, calibrate, close, model, param, quantity, signal
-from casest.effects import creep, low_pass, signal_lag
+from casest.effects import low_pass, signal_lag
 
 GAIN, OFFSET = 3.0, 0.2
 
@@ -119,7 +119,7 @@ def test_noise_of_a_reference_that_is_held_is_no_misfit(seed, noise):
 
 @pytest.mark.parametrize(
     ("effect", "on"),
-    [(signal_lag, "ref"), (low_pass, "p"), (creep, "p")],
+    [(signal_lag, "ref"), (low_pass, "p")],
     ids=lambda e: getattr(e, "name", ""),
 )
 def test_stated_noise_of_an_input_counts_once_beside_a_memory(effect, on):
