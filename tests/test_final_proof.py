@@ -10,9 +10,9 @@ import pytest
 from casest import Run, attempt
 from casest.diagnose.evidence.likelihood import Likelihood
 from casest.diagnose.evidence.score import judged
-from casest.diagnose.loop import NO_SIZE, _left_in, certified
 from casest.diagnose.protocol.state import Kept, State
 from casest.diagnose.sensor import Sensor
+from casest.diagnose.sensor.final import NO_SIZE, certified, left_in
 from casest.effects import CATALOGUE
 from casest.effects.placing import prepared
 from casest_problems.one_channel import linear
@@ -104,4 +104,4 @@ def test_with_a_cause_goes_the_lag_of_a_column_that_it_alone_read(searched):
     state = State(with_lag, (*both.kept, replace(both.kept[0], what=late)))
     less = sensor.without(with_lag, both.kept[0].what)
     assert less.model.effects == ()
-    assert _left_in(state, less).kept == ()
+    assert left_in(state, less).kept == ()

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from casest import Residual, Run, close, cos, effect, model, param, quantity, signal, sin
-from casest.diagnose import loop
 from casest.diagnose.candidates.grid import Seen, searched
+from casest.diagnose.sensor import foretelling
 from casest.effects import (
     creep,
     gain_matrix,
@@ -156,13 +156,13 @@ def test_of_readings_above_zero_what_goes_by_their_sign_is_no_rival():
 
 def test_what_held_out_data_are_foretold_worse_with_is_taken_out_again(monkeypatch):
     """Whatever columns and refits have promised: the errors that are printed must fall."""
-    held_out = loop.held_out
+    held_out = foretelling.held_out
 
     def worse(sensor, fit, folds):
         found = held_out(sensor, fit, folds)
         return tuple(100 * r for r in found) if fit.model.effects else found
 
-    monkeypatch.setattr(loop, "held_out", worse)
+    monkeypatch.setattr(foretelling, "held_out", worse)
     found = closed("N", creep)
     assert not names(found)
     assert found.after is found.before or not found.after.model.effects

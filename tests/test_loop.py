@@ -12,7 +12,8 @@ from msgspec.structs import replace as changed
 
 import casest as c
 from casest import Run
-from casest.diagnose.loop import close, rms
+from casest.diagnose.cross_validation import rms
+from casest.diagnose.loop import close
 from casest.diagnose.misfit.left import predictions
 from casest.effects import CATALOGUE
 from casest.leastsquares.problem import Problem

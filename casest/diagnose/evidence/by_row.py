@@ -1,4 +1,5 @@
-"""What a refit adds in poses, whatever the sizes of their errors, and where neighbours go together.
+"""Which rows carry what a refit adds: in poses, whatever the sizes of their errors, and where
+neighbours go together; in a series, whether more than a few do.
 
 The classical F test takes every row's error to be of one size and for itself. A row that is off
 alone, noise that is larger at one end, or a sweep in which each reading is off as the one before
@@ -17,6 +18,8 @@ from casest.diagnose.levels import LEVELS
 LIKEST = 0.95
 #: Standard errors of that correlation from which on it is beyond chance, one-sided 1 %.
 BEYOND = 2.33
+#: Share of the rows of a series that are few.
+FEW = 0.01
 
 
 def chance_by_row(before: Linear, after: Linear, *, together: bool = False) -> float:
@@ -78,3 +81,10 @@ def kinship(linear: Linear) -> float:
     rho = (products - taken * squares / np.maximum(free, 1.0)) / np.maximum(squares, 1e-300)
     mean = float(np.mean(rho))
     return min(mean, LIKEST) if mean * np.sqrt(rows * axes) > BEYOND else 0.0
+
+
+def carried_by_few(before: Linear, after: Linear) -> bool:
+    """Do FEW of the rows hold nearly all by which the squares of a series fall from fit to fit?"""
+    fallen = np.sum(before.residual**2 - after.residual**2, axis=1)
+    most = np.sort(fallen)[-max(1, int(np.ceil(FEW * len(fallen)))) :]
+    return bool(most.sum() > (1 - LEVELS.alike) * fallen.sum())

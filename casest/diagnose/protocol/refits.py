@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from casest.declaration.shapes import Array
-from casest.diagnose.evidence.by_row import chance_by_row
+from casest.diagnose.evidence.by_row import carried_by_few, chance_by_row
 from casest.diagnose.evidence.input_noise import feigned_by_refit
 from casest.diagnose.evidence.linear import alike
 from casest.diagnose.evidence.rises import rise_of_squares, rises
@@ -29,6 +29,8 @@ from casest.diagnose.protocol.subject import Subject
 
 #: Why a cause in poses is not added.
 FEW_ROWS = "a row or a few carry it: left out one by one, they move its size too far"
+#: Why an influence in a series is not.
+FEW_OF_MANY = "one in a hundred rows or fewer carry it: look at those that are far out first"
 #: Why what holds out and has strong evidence is not added.
 AS_MUCH = "a slow course of unknown cause explains as much"
 
@@ -58,11 +60,11 @@ def refitted(
         kept = _gaining(evidence, gain)
         least = _gaining(evidence, min(noisier))
         enough = beyond_courses(ranking, kept) and _strong(ranking, least)
-        of_few_rows = enough and not _row_by_row(subject, ranking, kept, better)
-        if (enough and not of_few_rows) or subject.asked(evidence.trials[0].what):
+        few = _by_few_rows(subject, ranking, kept, better) if enough else ""
+        if (enough and not few) or subject.asked(evidence.trials[0].what):
             found.append(Refit(state.fit, better, kept))
-        elif of_few_rows:
-            state = state.failing(evidence, FEW_ROWS)
+        elif few:
+            state = state.failing(evidence, few)
         elif len(evidence.trials) == 1 and _strong(ranking, kept):
             state = state.refusing(evidence.trials[0].what, AS_MUCH)
     found.sort(key=lambda r: -r.evidence.score)
@@ -76,13 +78,17 @@ def refitted(
     return state, _plainest_first(found, ranking)
 
 
-def _row_by_row(subject: Subject[F], ranking: Ranking, evidence: Evidence, fit: F) -> bool:
-    """Is it seen in poses whatever the sizes of their errors are?"""
+def _by_few_rows(subject: Subject[F], ranking: Ranking, evidence: Evidence, fit: F) -> str:
+    """Why it is none where it hangs on a few rows; empty where it is seen in poses whatever the
+    sizes of their errors are, in a series in many rows."""
     after = subject.linear(fit)
-    if ranking.linear.series or after.residual.shape != ranking.linear.residual.shape:
-        return True
+    if after.residual.shape != ranking.linear.residual.shape:
+        return ""
+    if ranking.linear.series:
+        influence = all(subject.everywhere(t.what) for t in evidence.trials)
+        return FEW_OF_MANY if influence and carried_by_few(ranking.linear, after) else ""
     chance = chance_by_row(ranking.linear, after)
-    return shared_chance(chance, evidence, ranking.families) < LEVELS.chance
+    return "" if shared_chance(chance, evidence, ranking.families) < LEVELS.chance else FEW_ROWS
 
 
 def _charged(subject: Subject[F], before: F, evidence: Evidence, fit: F) -> Evidence:
@@ -292,9 +298,11 @@ def _by_squares(
 def shown(
     subject: Subject[F], state: State[F], ranking: Ranking, beside: Sequence[Refit[F]]
 ) -> tuple[State[F], list[Refit[F]]]:
-    """What the records show by themselves, refitted: held-out parts by the refit itself."""
-    found = []
-    for trial in subject.shown(state.fit):
+    """What the records show by themselves, and what slopes say little of, refitted: held-out parts
+    by the refit itself."""
+    found, there = [], {f for r in beside for f in r.evidence.families}
+    bent = [e.trials[0] for e in ranking.found if subject.bends(e.trials[0].what)]
+    for trial in (*subject.shown(state.fit), *(t for t in bent if t.family not in there)):
         evidence = judged([trial], ranking.likelihood, ranking.none, families=ranking.families)
         if evidence is not None:
             (evidence,) = without_feigned(

@@ -33,6 +33,14 @@ class Subject(Protocol[F]):
         """What is refitted whatever its columns promise."""
         return ()
 
+    def bends(self, what: Any) -> bool:
+        """May its refit be far from what its slopes at nothing promise?"""
+        return False
+
+    def everywhere(self, what: Any) -> bool:
+        """Is it an influence that is there in every row, and no event or threshold?"""
+        return False
+
     def jittered(
         self, fit: F, trials: Sequence[Trial]
     ) -> Sequence[Sequence[tuple[Linear, Mapping[int, Array]]]]:

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from casest.data.run import Run
-from casest.declaration.effect import Effect
+from casest.declaration.effect import OVER_TIME, Effect
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
 from casest.diagnose.candidates.candidates import Candidate
@@ -117,6 +117,18 @@ class Sensor(Subject[Fit]):
         what rates may lack, since a trajectory bends in it."""
         rates = [t for t in self.trials(fit) if _on_rate(t.what)]
         return [*self.tried.shown(fit), *rates]
+
+    def bends(self, what: Candidate) -> bool:
+        """A memory whose time has no grid: its slopes are those of a short one."""
+        effect = what.effect
+        return effect is not None and effect.kind == "sequence" and not effect.profile
+
+    def everywhere(self, what: Candidate) -> bool:
+        """What acts at once, at no moment or level of its own."""
+        effect = what.effect
+        if effect is None or effect.kind in OVER_TIME:
+            return False
+        return not {"time", "level"} & set(dict(effect.profile).values())
 
     def jittered(self, fit: Fit, trials: Sequence[Trial]) -> Sequence[Sequence[Draw]]:
         """The same where inputs have more noise."""

@@ -1,0 +1,110 @@
+"""The last proof of what the loop added: without what leaves an estimate no end, or no size."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from casest.declaration.effect import Attached
+from casest.diagnose.levels import LEVELS
+from casest.diagnose.protocol import Kept, State
+from casest.diagnose.sensor.fits import Fit
+from casest.diagnose.sensor.sensor import Sensor
+from casest.diagnose.sensor.unlike import another
+from casest.engine.kernel import only_tried
+from casest.estimate.calibrate import attempt
+from casest.estimate.estimate import Estimate
+from casest.estimate.reasons import Code
+from casest.leastsquares.kinds import noises
+
+#: Why an effect is not kept that the last fit makes nothing of.
+NO_SIZE = "in the end its size may as well be nothing"
+
+
+def certified(sensor: Sensor, state: State[Fit], before: Estimate) -> tuple[State[Fit], Estimate]:
+    """The last estimate, with intervals; without effects that leave one without an end.
+
+    In the place of such a one comes what explains as much, if there is any.
+    """
+    while True:
+        with only_tried(False):
+            model = state.fit.model.having(**noises(sensor.model))  # as they are beside it
+            model = model.at_true_values
+            after = attempt(model, sensor.runs, start=state.fit.values, seed=sensor.seed)
+        last, why = _at_fault(sensor, state, after)
+        if not why:
+            return state, after
+        if last is None:
+            return state, before
+        state = state.refusing(last.what, why)
+        instead = None if why == NO_SIZE else _replaced(sensor, state, last)
+        if instead is not None:
+            state = instead
+            continue
+        fit = sensor.without(state.fit, last.what)
+        if fit is None:
+            return state, before
+        state = replace(left_in(state, fit), open=(last.evidence, *state.open))
+
+
+def left_in(state: State[Fit], fit: Fit) -> State[Fit]:
+    """At a fit with less in it: with a cause goes the lag of a column that it alone read."""
+    there = {a.label for a in fit.model.effects}
+    kept = tuple(k for k in state.kept if k.what.freed or k.what.label in there)
+    return replace(state, fit=fit, kept=kept)
+
+
+def _replaced(sensor: Sensor, state: State[Fit], kept: Kept) -> State[Fit] | None:
+    """The state with the first rival of a cause in its place that is not refused at a glance.
+
+    Its evidence stays that of the one that it replaces: they differ by little.
+    """
+    for k, rival in enumerate(kept.rivals):
+        fit = sensor.replaced(state.fit, kept.what, rival.what, rival.fit)
+        if fit is not None and not isinstance(sensor.certified(fit), str):
+            other = replace(kept, what=rival.what, rivals=kept.rivals[k + 1 :])
+            several = tuple(other if one is kept else one for one in state.kept)
+            still = tuple(e for e in state.open if rival.what.label not in e.families)
+            return replace(state, fit=fit, kept=several, open=still)
+    return None
+
+
+def _at_fault(sensor: Sensor, state: State[Fit], after: Estimate) -> tuple[Kept | None, str]:
+    """Which cause a proved estimate speaks against, and why: one that is not what it is called, or
+    where it is refused the one that the data determine least, else the last."""
+    if not after.certificate.trusted:
+        return _least(state, after), f"its fit is refused: {after.certificate.reasons[0]}"
+    label, why = another(after.model, after.values, sensor.model)
+    if not why:
+        claimed = (a for k in reversed(state.kept) if not sensor.asked(k.what)
+                   for a in after.model.effects if a.label == k.what.label)  # fmt: skip
+        label = next((a.label for a in claimed if _is_nothing(a, after)), "")
+        why = label and NO_SIZE
+    return next((k for k in state.kept if k.what.label == label), None), why
+
+
+def _is_nothing(attached: Attached, after: Estimate) -> bool:
+    """Is each of an effect's sizes within two standard deviations of none, were noise alike
+    everywhere? Then only rows that count less, or a colour of the noise, had spoken for it."""
+    searched = dict(attached.effect.profile)
+    sizes = [p.name for p in attached.parameters if p.name.rpartition(".")[2] not in searched]
+    z = [np.abs(after.values[n]) / after.plain[n] for n in sizes if n in after.plain]
+    return bool(z) and all(bool(np.all(one < LEVELS.apart)) for one in z)
+
+
+def _least(state: State[Fit], after: Estimate) -> Kept | None:
+    """The cause that has most of the direction of which the data say least, or is on a bound; the
+    last one, where only the way to the solution is too long."""
+    if after.certificate.code == Code.NOT_SETTLED:
+        return state.kept[-1] if state.kept else None
+    owner = {p.name: a.label for a in after.model.effects for p in a.parameters}
+    at_bound = Code.BOUND in after.certificate.code
+    direction = (~after.free).astype(float) if at_bound else after.identifiability.least
+    parts = dict.fromkeys((k.what.label for k in state.kept), 0.0)
+    for slot in after.problem.slots:
+        label = owner.get(slot.parameter.name, "")
+        if label in parts:
+            parts[label] += float(np.sum(direction[slot.x] ** 2))
+    # Of equal parts the last one.
+    return max(reversed(state.kept), key=lambda k: parts[k.what.label], default=None)
