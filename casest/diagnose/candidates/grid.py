@@ -295,4 +295,7 @@ def _steps(kind: str, value: float, seen: Seen, scale: float) -> list[float]:
     gap = float(np.median(np.diff(seen.time)))
     reach = max(1, round(len(seen.time) / MOMENTS / 2 * scale))
     steps = sorted({max(1, round(reach * s)) for s in (0.25, 0.5, 1)})
-    return [value + way * k * gap for k in steps for way in (-1, 1)]
+    edge = _edge(len(seen.time))
+    inside = seen.time[edge - 1], seen.time[-edge]
+    moved = [value + way * k * gap for k in steps for way in (-1, 1)]
+    return [moment for moment in moved if inside[0] <= moment <= inside[1]]
