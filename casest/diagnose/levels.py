@@ -42,8 +42,7 @@ class Levels:
     fades: time constants that a record must span for a memory to be seen to fade.
     most: share of the squares below which what is left says more than how likely a slow course is;
     survives: share of a cause's length that the declared unknowns must leave; over_noise: an
-        implicit residual's slopes contain its noise, of which so many must survive. jitter: times
-        that noise of an input counts, since a few draws tell its size.
+        implicit residual's slopes contain its noise, of which so many must survive.
     seen, unseen: noncentrality of the score from which on an effect is found nearly always, and
         below which (three standard deviations) nobody could.
     told_share: of the variance, below which what causes explain alike is printed as 0 %.
@@ -102,7 +101,6 @@ class Levels:
     survives: float = 1e-3
     most: float = 0.5
     over_noise: float = 5.0
-    jitter: float = 3.0
     seen: float = 45.0
     unseen: float = 9.0
     share: float = 0.02

@@ -156,7 +156,8 @@ def _after_fit(typed: Typed, output: str | Path | None, trusted: bool, applies: 
         return
     if typed.name == "calibrate":
         into = Path(output) / "closed" if output else "out"
-        yield "does the model lack an effect?", typed.keeping("close", flags).into(into).lines()
+        own = [flag for flag in flags if flag != "--noise-law"]  # that is calibrate's
+        yield "does the model lack an effect?", typed.keeping("close", own).into(into).lines()
     if output is None:
         yield "keep the result", typed.keeping(typed.name, flags).into("out").lines()
     elif applies:

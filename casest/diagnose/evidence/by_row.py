@@ -84,7 +84,10 @@ def kinship(linear: Linear) -> float:
 
 
 def carried_by_few(before: Linear, after: Linear) -> bool:
-    """Do FEW of the rows hold nearly all by which the squares of a series fall from fit to fit?"""
-    fallen = np.sum(before.residual**2 - after.residual**2, axis=1)
-    most = np.sort(fallen)[-max(1, int(np.ceil(FEW * len(fallen)))) :]
-    return bool(most.sum() > (1 - LEVELS.alike) * fallen.sum())
+    """Do FEW of the rows of a series hold nearly all that one fit predicts otherwise than another?
+
+    Squares of that: by which those of the residuals fall is noise from row to row.
+    """
+    moved = np.sum((before.residual - after.residual) ** 2, axis=1)
+    most = np.sort(moved)[-max(1, int(np.ceil(FEW * len(moved)))) :]
+    return bool(most.sum() > (1 - LEVELS.alike) * moved.sum())

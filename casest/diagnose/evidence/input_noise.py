@@ -63,13 +63,15 @@ def _at_most(taken: float, everything: float, count: int) -> float:
 
 
 def feigned_by_refit(
-    before: Linear, after: Linear, draws: Sequence[tuple[Array, Array]]
+    before: Linear, after: Linear, draws: Sequence[tuple[float, Array, Array]]
 ) -> float | None:
     """The same of a refit, by the noise of an input that it takes from the residual; None where the
     refits are of other rows.
 
-    `draws`: what noise of that input adds to the residuals (N, m) of both. A lag leaves that noise
-    as large as it was, however much a slope in the lag magnifies it.
+    `draws`: how much noise, in that of the input, and what it adds to the residuals (N, m) of both.
+    A lag leaves that noise as large as it was, however much a slope in the lag magnifies it. What
+    the refit changes goes with the noise as its mean slope says, which little noise shows; how
+    large that change is, no more than either shows: a play turns within the noise, and is bounded.
     """
     one, other = alike([before, after])
     if one.residual.shape != other.residual.shape:
@@ -77,8 +79,15 @@ def feigned_by_refit(
     likelihood = Likelihood(other)
     root = 1 / np.sqrt(likelihood.beside().spectrum)
 
-    def squares(residual: Array) -> float:
-        return float(np.sum((root * likelihood.by_frequency(residual[:, :, None])[:, 0]) ** 2))
+    def whitened(residual: Array) -> Array:
+        return np.asarray(root * likelihood.by_frequency(residual[:, :, None])[:, 0])
 
-    taken = float(np.mean([squares(less) - squares(more) for less, more in draws])) / LITTLE**2
-    return _at_most(taken, squares(one.residual), len(root))
+    together = dict[float, list[float]]()
+    change = dict[float, list[float]]()
+    for size, more, less in draws:
+        was, moved = whitened(more) / size, whitened(more - less) / size
+        together.setdefault(size, []).append(float(was @ moved))
+        change.setdefault(size, []).append(float(moved @ moved))
+    taken = 2 * np.mean(together[LITTLE]) - min(np.mean(c) for c in change.values())
+    everything = whitened(one.residual)
+    return _at_most(float(taken), float(everything @ everything), len(root))

@@ -215,9 +215,10 @@ def _follows(
                     problem, point, clipped, one[f.name], lambda p: variables(p, point, columns)
                 ),
                 [one[f.name]],
+                among=read,
             )
         ]
-        found = [s for s in beside if s.p_value * len(read) < chance and s.share > LEVELS.share]
+        found = [s for s in beside if s.p_value < chance and s.share > LEVELS.share]
     if not found:
         return []
     # In the order of the record lies whatever was changed with it: what has a name comes first.

@@ -13,7 +13,7 @@ from itertools import accumulate, pairwise
 import numpy as np
 
 from casest.declaration.shapes import Array
-from casest.diagnose.evidence.linear import Index
+from casest.diagnose.misfit.structure import order_of
 from casest.diagnose.misfit.variables import Variable
 from casest.diagnose.noise.of_inputs import noise_like, noise_of_inputs, with_noise
 from casest.leastsquares.problem import Point, Problem
@@ -49,20 +49,16 @@ def beside_noise_of_inputs(
             if moved is None or all(map(np.array_equal, moved.values, variable.values)):
                 break
             more = zip(noisy.residuals(point), problem.residuals(point), strict=True)
-            course += np.concatenate([n - o for n, o in more])[_order(moved)]
+            course += np.concatenate([n - o for n, o in more])[order_of(moved)]
         courses.append(_smooth(course))
     if not courses:
         return list(residuals)
-    order = _order(variable)
+    order = order_of(variable)
     left = r.copy()
     for k in range(r.shape[1]):
         X = np.stack([c[:, k] for c in courses], axis=1)
         left[order, k] -= X @ np.maximum(np.linalg.lstsq(X, r[order, k], rcond=1e-9)[0], 0.0)
     return np.split(left, ends[1:-1])
-
-
-def _order(variable: Variable) -> Index:
-    return np.argsort(np.concatenate(variable.values), kind="stable")
 
 
 def _smooth(course: Array) -> Array:

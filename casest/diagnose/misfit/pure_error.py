@@ -34,8 +34,8 @@ RHO = (0.3, 0.5, 0.7, 0.8, 0.9, 0.95, 0.98)
 SHARES = (0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 1.0)
 #: Log-likelihood of a standard deviation.
 NEAR = 0.5
-#: Groups of repeats below which nothing is said.
-GROUPS = 5
+#: Groups of repeats below which nothing is said: what two levels show, a line goes through.
+GROUPS = 3
 
 
 @dataclass(frozen=True)
@@ -153,7 +153,7 @@ def _lack_of_fit(groups: Sequence[Array], rank: int, series: bool) -> PureError 
     means = np.array([g.mean(axis=0) for g in groups])
     within = np.array([np.sum((g - g.mean(axis=0)) ** 2) for g in groups])
     dof = len(groups) * axes - rank
-    if dof < GROUPS or not within.sum() > 0:
+    if dof < 1 or not within.sum() > 0:
         return None
     inflation = _inflation(groups, series) if np.median(sizes) >= LEVELS.repeats else np.ones(1)
     pooled = within.sum() / ((sizes.sum() - len(groups)) * axes)

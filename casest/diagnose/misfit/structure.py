@@ -44,21 +44,22 @@ class Structure:
 
 
 def structures(
-    residuals: Sequence[Array], variables: Sequence[Variable], *, unknowns: Array | None = None
+    residuals: Sequence[Array],
+    variables: Sequence[Variable],
+    *,
+    unknowns: Array | None = None,
+    among: Sequence[Variable] = (),
 ) -> list[Structure]:
     """Of every variable, the least likely first; residuals (N, m) of each run, clipped.
 
     `unknowns`: of a table, orthonormal columns (N·m, p) of what its fit has taken. Rows of a table
-    are looked at one by one: means of so few blocks are never unlikely.
+    are looked at one by one: means of so few blocks are never unlikely. `among`: those that were
+    looked through to find these, where they are more.
     """
-    r = np.concatenate(residuals)
-    values = [np.concatenate(v.values) for v in variables]
-    values = [
-        np.mod(x, 2 * np.pi) if v.turns else x for v, x in zip(variables, values, strict=True)
-    ]
-    orders = [np.argsort(x, kind="stable") for x in values]
+    r, orders = np.concatenate(residuals), [order_of(v) for v in variables]
     # Of variables that put the rows in one order, or the other way round, one is asked.
-    tried = len({min(k.tobytes(), k[::-1].tobytes()) for k in orders})
+    through = [order_of(v) for v in among] or orders
+    tried = len({min(k.tobytes(), k[::-1].tobytes()) for k in through})
     found = [
         _of_means(v.name, r[k], tried)
         if unknowns is None
@@ -66,6 +67,12 @@ def structures(
         for v, k in zip(variables, orders, strict=True)
     ]
     return sorted((f for f in found if f is not None), key=lambda f: f.p_value)
+
+
+def order_of(variable: Variable) -> Index:
+    """Its rows from the least to the largest; of an angle that goes round, within a turn."""
+    x = np.concatenate(variable.values)
+    return np.argsort(np.mod(x, 2 * np.pi) if variable.turns else x, kind="stable")
 
 
 def _of_means(name: str, r: Array, tried: int) -> Structure | None:

@@ -20,8 +20,12 @@ from casest.leastsquares.weights import robust_scale
 
 #: Third differences of white noise that say no more than one that stands alone: 1 + 2 Σ ρ².
 ALIKE = 1 + 2 * (15**2 + 6**2 + 1) / 20**2
-#: Chance that the noise of few rows is less than the bound that is taken.
-SURE = 0.95
+#: Chance that the noise of few rows is less than the bound that is taken; standard errors by which
+#: that of many may be more than it seems.
+SURE, ABOVE = 0.95, 2.0
+#: Third differences that say as much of their spread by its median as one without it (the median
+#: deviation's efficiency), and the normal deviate of a lower quarter.
+BY_MEDIAN, QUARTER = 0.37, 0.674
 
 
 def noise_of_inputs(
@@ -80,8 +84,8 @@ def with_noise(runs: Sequence[Run], name: str, noise: Sequence[Array]) -> tuple[
 
 def _white(values: Array, spans: Sequence[slice], most: float) -> float:
     """The noise of rows by their third differences, in which what is slower has little part, in the
-    calmest quarter of the record: elsewhere a quick motion is in them. Of few rows by all of them,
-    and as much as it may be.
+    calmest quarter of the record: elsewhere a quick motion is in them. Of few rows by all of them.
+    As much as it may be.
     """
     from scipy.special import chdtri
 
@@ -92,4 +96,11 @@ def _white(values: Array, spans: Sequence[slice], most: float) -> float:
     else:
         blocks = [b for d in third for b in np.array_split(d, max(1, len(d) // LEVELS.series))]
         noise = np.quantile([robust_scale([b]) for b in blocks], 0.25)
+        one, calm = _error(len(blocks[0])), _error(sum(map(len, third)) / 4)
+        noise *= (1 + ABOVE * calm) / (1 - QUARTER * one)
     return min(most, float(noise) / float(np.sqrt(20)))
+
+
+def _error(count: float) -> float:
+    """Of the spread of so many third differences by their median, as a share of it."""
+    return float(np.sqrt(ALIKE / (2 * BY_MEDIAN * count)))

@@ -143,12 +143,11 @@ def _hypotheses(
     asked = [e for e in ranking.found if subject.asked(e.trials[0].what)]
     found = []
     for evidence in asked:
+        # What noise of the inputs may do of it is asked of its refit: slopes may magnify that.
         own = replace(evidence, trials=tuple(replace(t, feigned=0.0) for t in evidence.trials))
         alone = again(own, ranking.likelihood, ranking.none, len(asked), 1)
-        (alone,) = without_feigned(subject, state.fit, ranking.likelihood, [alone], len(asked))
         if alone.p_value >= LEVELS.chance:
-            noise = "noise of the inputs" if alone.feigned else "noise"
-            why = f"no more of it than {noise} would have (p = {alone.p_value:.2g})"
+            why = f"no more of it than noise would have (p = {alone.p_value:.2g})"
             state = state.refusing(evidence.trials[0].what, why)
         elif falls(ranking, alone)["pieces"].ratio < 1:
             found.append(alone)

@@ -31,6 +31,8 @@ from casest.diagnose.protocol.subject import Subject
 FEW_ROWS = "a row or a few carry it: left out one by one, they move its size too far"
 #: Why an influence in a series is not.
 FEW_OF_MANY = "one in a hundred rows or fewer carry it: look at those that are far out first"
+#: Why what somebody asked for is not.
+FEIGNED = "no more of it than noise of the inputs would have (p = {:.2g})"
 #: Why what holds out and has strong evidence is not added.
 AS_MUCH = "a slow course of unknown cause explains as much"
 
@@ -61,7 +63,13 @@ def refitted(
         least = _gaining(evidence, min(noisier))
         enough = beyond_courses(ranking, kept) and _strong(ranking, least)
         few = _by_few_rows(subject, ranking, kept, better) if enough else ""
-        if (enough and not few) or subject.asked(evidence.trials[0].what):
+        if subject.asked(evidence.trials[0].what):
+            chance = with_chance(kept, ranking.likelihood, 1).p_value if kept.feigned else 0.0
+            if chance < LEVELS.chance:
+                found.append(Refit(state.fit, better, kept))
+            else:
+                state = state.failing(evidence, FEIGNED.format(chance))
+        elif enough and not few:
             found.append(Refit(state.fit, better, kept))
         elif few:
             state = state.failing(evidence, few)
@@ -302,7 +310,8 @@ def shown(
     by the refit itself."""
     found, there = [], {f for r in beside for f in r.evidence.families}
     bent = [e.trials[0] for e in ranking.found if subject.bends(e.trials[0].what)]
-    for trial in (*subject.shown(state.fit), *(t for t in bent if t.family not in there)):
+    bent = [t for t in bent if t.family not in there]
+    for trial in (*subject.shown(state.fit), *bent):
         evidence = judged([trial], ranking.likelihood, ranking.none, families=ranking.families)
         if evidence is not None:
             (evidence,) = without_feigned(
@@ -318,7 +327,7 @@ def shown(
         gain, *_ = subject.rises(state.fit, [better, *(r.fit for r in beside)])
         evidence = _charged(subject, state.fit, evidence, better)
         kept = _gaining(evidence, gain)
-        if not _strong(ranking, kept):
+        if not _strong(ranking, kept) and not any(trial is t for t in bent):
             kept = _by_squares(subject, state, ranking, evidence, better)
         # Its columns say little of it: the chance is that of its refit.
         kept = with_chance(kept, ranking.likelihood, ranking.families)

@@ -48,9 +48,9 @@ class Subject(Protocol[F]):
         their identity, where the input has as much more noise as would be all of the residual's."""
         return ()
 
-    def noise_in(self, before: F, after: F) -> Sequence[Sequence[tuple[Array, Array]]]:
-        """For each noisy input a few draws: what such noise adds to the residuals (N, m) of two
-        fits."""
+    def noise_in(self, before: F, after: F) -> Sequence[Sequence[tuple[float, Array, Array]]]:
+        """For each noisy input a few draws: how much of its noise, and what that adds to the
+        residuals (N, m) of two fits."""
         return ()
 
     def nearer(self, fit: F, trial: Trial, scale: float) -> Sequence[Trial]:

@@ -38,12 +38,17 @@ def jittered(rows: Rows, fit: Fit, trials: Sequence[Trial]) -> list[list[Draw]]:
     ]
 
 
-def in_refit(rows: Rows, before: Fit, after: Fit) -> list[list[tuple[Array, Array]]]:
-    """For each input a few draws: what such noise adds to the residuals (N, m) of the two fits."""
+def in_refit(rows: Rows, before: Fit, after: Fit) -> list[list[tuple[float, Array, Array]]]:
+    """For each input draws of LITTLE noise and of all: how much, and what it adds to the residuals
+    (N, m) of the two fits."""
     rng, found = np.random.default_rng(0), []
-    for name, size in _inputs(rows, before):
-        draws = [noise_like(rows.runs, name, LITTLE * size, rng) for _ in range(_count(rows))]
-        found.append([(_added(rows, before, name, n), _added(rows, after, name, n)) for n in draws])
+    for name, noise in _inputs(rows, before):
+        draws = []
+        for size in (LITTLE, 1.0) * _count(rows):
+            drawn = noise_like(rows.runs, name, size * noise, rng)
+            more, less = (_added(rows, fit, name, drawn) for fit in (before, after))
+            draws.append((size, more, less))
+        found.append(draws)
     return found
 
 

@@ -20,6 +20,9 @@ from casest.diagnose.protocol import State
 from casest.diagnose.sensor.fits import Fit, problem_of
 from casest.diagnose.sensor.sensor import NOT_FINITE, Sensor
 
+#: Why outliers that somebody asked for are none.
+AS_NOISE = "noise with heavy tails has as much of it, or they come together, as an event does"
+
 
 def spoilt(residuals: Sequence[Array]) -> bool:
     """Are most of the squares those of single samples, each far out between two that are not?"""
@@ -44,9 +47,10 @@ def without_outliers(
     problem, point = problem_of(fit, sensor.runs)
     levels = predictions(problem, point)
     p_value = outliers_p_value(fit.residuals, folds.batches, levels)
-    if p_value is None:
-        return state, None
     candidate = Candidate(effect)
+    if p_value is None:
+        asked = sensor.asked(candidate)
+        return state.refusing(candidate, AS_NOISE) if asked else state, None
     better = sensor.fitted(fit.model.with_effect(effect), fit.values)
     if better is None:
         return state.refusing(candidate, NOT_FINITE), None

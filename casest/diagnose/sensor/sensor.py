@@ -134,7 +134,7 @@ class Sensor(Subject[Fit]):
         """The same where inputs have more noise."""
         return jittered(self.rows, fit, trials)
 
-    def noise_in(self, before: Fit, after: Fit) -> Sequence[Sequence[tuple[Array, Array]]]:
+    def noise_in(self, before: Fit, after: Fit) -> Sequence[Sequence[tuple[float, Array, Array]]]:
         """What noise of each input adds to the residuals of two fits."""
         return in_refit(self.rows, before, after)
 
