@@ -31,6 +31,8 @@ from casest.leastsquares.weights import robust_scale, weighted
 
 #: Residual over the scatter from which on that is rounding: readings that only repeat.
 REPEATED = 1e6
+#: Of a step of the reading: as far is each from what it rounds.
+HALF = 0.5
 #: Variance of neighbours' differences from the line between them, in that of the noise, where noise
 #: remembers as exp(−k/MEMORY).
 _KIN = float(np.exp(-1 / MEMORY))
@@ -76,8 +78,9 @@ def findings(
 
 
 def _clipped(problem: Problem, residuals: Sequence[Array], sigma: float) -> list[Array]:
-    """Residuals, those far out counted as less, as the fit does."""
-    limit, kept = LEVELS.clip * sigma, problem.weights
+    """Residuals, those far out counted as less, as the fit does: none that a step away may be."""
+    least = HALF * step_of(problem.runs, problem.model.traced.measured)
+    limit, kept = LEVELS.clip * max(sigma, least), problem.weights
     found = [np.clip(r, -limit, limit) for r in residuals]
     return found if kept is None else [r * w for r, w in zip(found, kept, strict=True)]
 
@@ -88,6 +91,9 @@ def _repeats(
     tested = pure_error(problem, point, clipped, problem.unknowns, wanders=wanders)
     if tested is None or tested.p_value >= LEVELS.misfit:
         return []
+    size = float(np.sqrt(np.mean(np.concatenate(clipped) ** 2)))
+    if size < HALF * step_of(problem.runs, problem.model.traced.measured):
+        return []  # what is held between two steps is read as one of them
     ratio = float(np.sqrt(tested.F))
     where = f"between {tested.between}: the residual is {ratio:.1f} times what the scatter "
     where += "within them explains"
