@@ -34,8 +34,8 @@ class Levels:
     uncertain: variance that a fit to the rest may leave of a part, in those of the noise.
     repeated: share of a column's deviation that a signal does not tell, up to which the column is
         that signal once more: two meters of one quantity agree so far, an influence does not.
-    stand_in: share of a column's variance that a signal does not tell, up to which, in poses and
-        tables, its curve could be a bend over that signal.
+    stand_in: share of a column's variance that a signal does not tell, up to which its curve
+        could be a bend over that signal: of an input of one number, and of any in poses and tables.
     stays: share of what inputs do to a reading that must stay beside a column's influence, and by
         which it may change.
     passing: share of a record's rows up to which inputs that are held else go from level to level.

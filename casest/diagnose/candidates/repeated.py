@@ -90,10 +90,8 @@ class Signal:
         left = (1 - float(np.sum((self.basis.T @ unit) ** 2))) * N / (N - p)
         own = self.noise is None or any(_one_noise(x, y) for y in self.noise.T)
         most = LEVELS.repeated**2 + _rounding(unit)
-        if self.input and LEVELS.series > N:
+        if self.input and (LEVELS.series > N or self.elements.shape[1] == 1):
             most = LEVELS.stand_in
-        elif self.input and self.elements.shape[1] == 1:
-            most = LEVELS.repeated
         return left if own and left < most else np.inf
 
 
@@ -112,18 +110,17 @@ class Reads:
             return f"column is the error of {of[0]} against {of[1]}, computed from both"
         near = {s.name: s.apart(x) for s in self.signals if np.ptp(x) > 0}
         name = min(near, key=lambda n: near[n], default="")
-        if not name or not np.isfinite(near[name]):
-            better = next((s.name for s in self.signals if s.taken_by(x)), "")
-            if better:
-                return f"column tells {better} better than its inputs do: another meter"
-            if made := self._made_of(x):
-                return f"column is made of {made[0]} and {made[1]}, computed from both"
-            late = next((s.name for s in self.signals if s.at_other_times(x)), "")
-            return late and f"column is {late} at other times: what follows it could be a lag of it"
-        if near[name] < LEVELS.repeated**2 + _rounding(_scaled(x)):
+        if name and near[name] < LEVELS.repeated**2 + _rounding(_scaled(x)):
             return f"column is {name} once more, or computed from it"
-        few = "in so few rows " if len(x) < LEVELS.series else ""
-        return f"column goes with {name}: {few}what follows it could be a bend over that"
+        if better := next((s.name for s in self.signals if s.taken_by(x)), ""):
+            return f"column tells {better} better than its inputs do: another meter"
+        if name and np.isfinite(near[name]):
+            few = "in so few rows " if len(x) < LEVELS.series else ""
+            return f"column goes with {name}: {few}what follows it could be a bend over that"
+        if made := self._made_of(x):
+            return f"column is made of {made[0]} and {made[1]}, computed from both"
+        late = next((s.name for s in self.signals if s.at_other_times(x)), "")
+        return late and f"column is {late} at other times: what follows it could be a lag of it"
 
     def _made_of(self, x: Array) -> tuple[str, str] | None:
         """A reading of one element and another column of which it is the quotient or product."""
