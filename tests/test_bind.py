@@ -1092,3 +1092,18 @@ def test_the_unit_1_stands_behind_a_space_and_an_index_does_not(tmp_path: Path) 
     run = run_of(tmp_path, "counted [1],v[1]\n1,2\n2,5\n", [count])
     assert run.signals["counted"][:, 0].tolist() == [1.0, 2.0]
     assert "v[1]" in run.columns
+
+
+def test_a_few_readings_far_off_all_others_are_named(tmp_path: Path) -> None:
+    """Also of an input, of which no residual tells; what moves now and then is none of these."""
+    values = circling()
+    values[[7, 90], 1] = -8388608, 65535
+    np.savetxt(tmp_path / "imu.csv", values, delimiter=",", header="vx,vy,vz", fmt="%.10g")
+    (run,) = load_runs([tmp_path / "imu.csv"], [ANY])
+    (note,) = [note for note in run.notes if "faults?" in note]
+    assert note.startswith(f"vy: 2 of {len(values)} readings, like -8.38861e+06 (row 7, 90), are ")
+    still = 0.01 * np.random.default_rng(3).standard_normal(values.shape)
+    still[40:140] += 5.0  # 2.5 % of the rows
+    np.savetxt(tmp_path / "imu.csv", still, delimiter=",", header="vx,vy,vz", fmt="%.10g")
+    (run,) = load_runs([tmp_path / "imu.csv"], [ANY])
+    assert not [note for note in run.notes if "faults?" in note]

@@ -16,6 +16,8 @@ _FEWEST = 8  # readings at an extreme before it is called clipping
 _CROWDING = 5.0  # times as many as on the levels next to it (a smooth crest gives 2.4)
 _STEEP = 3.0  # resolutions jumped on the way in (rest toggles by one)
 _FOLLOWS = 0.9  # correlation with an input from which on a reading stands still where it does not
+_WILD = 50.0  # widths of the middle half from the middle, beyond which a reading is wild, ...
+_RARE = 0.01  # ... where no more of the rows than this are
 _STALLED = 3  # equal rows in a row that chance does not leave, where two in a row are this rare:
 _BY_CHANCE = 0.01  # expected stretches of as many by chance, ...
 _FEW = 0.05  # ... and no more of the rows than this: else rows come twice for another reason
@@ -89,6 +91,26 @@ def clipped(values: Array, columns: tuple[str, ...], beside: Array | None = None
         f"{extreme:.6g} — clipped at full scale?"
         for i, sign, extreme, count in full_scales(values, beside)
     ]
+
+
+def wild(values: Array, columns: tuple[str, ...], rows: NDArray[np.int_] | range) -> list[str]:
+    """Return a note for each component of (N, size) of which a few readings lie far off all others:
+    a lost bit, a mark for none. An input has no residual that would tell. `rows` (N,) of the file.
+    """
+    found = []
+    for i, column in enumerate(columns):
+        x = values[:, i]
+        low, middle, high = np.nanquantile(x, (0.25, 0.5, 0.75))
+        away = np.abs(x - middle) / max(high - low, 1e-300)
+        far = np.flatnonzero(away > _WILD)
+        if high > low and 0 < len(far) <= max(1, len(x) * _RARE):
+            named = ", ".join(str(int(rows[k])) for k in far[:3]) + (", …" if len(far) > 3 else "")
+            more = f"like {x[far[0]]:.6g}" if len(far) > 1 else f"of {x[far[0]]:.6g}"
+            found.append(
+                f"{column}: {len(far)} of {len(x)} readings, {more} (row {named}), are "
+                f"{away[far].min():.2g} times as far off as half of them: faults? Leave them out"
+            )
+    return found
 
 
 def full_scales(
