@@ -298,7 +298,7 @@ def test_of_what_is_asked_for_it_is_said_why_it_is_not_there():
     assert reasons["temperature_bias"] == "the data have no column that it could follow"
     assert "is not applicable" in reasons["table_angle"]
     assert "no more of it than noise" in reasons["bias_drift"]
-    assert "outliers" not in reasons
+    assert "no more are far out" in reasons["outliers"]
 
 
 @c.model
