@@ -1,4 +1,4 @@
-"""Levels that are read many times: what lies between them, and what rounding alone makes of them."""
+"""Levels that are read many times: what lies between them, and what rounding makes of them."""
 
 from __future__ import annotations
 

@@ -21,7 +21,9 @@ from casest.diagnose.sensor.fits import Fit, problem_of
 from casest.diagnose.sensor.sensor import NOT_FINITE, Sensor
 
 #: Why outliers that somebody asked for are none.
-AS_NOISE = "no more are far out than noise with heavy tails has, or they come together, as in an event"
+AS_NOISE = (
+    "no more are far out than noise with heavy tails has, or they come together, as events do"
+)
 
 
 def spoilt(residuals: Sequence[Array]) -> bool:
