@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import simulators as sim
 
-from casest import Residual, Run, constant, cos, model, param, quantity, signal, sin, vertcat
+from casest import Residual, Run, constant, cos, exp, model, param, quantity, signal, sin, vertcat
 from casest.estimate.calibrate import attempt
 from casest.leastsquares.identifiability import identify
 from casest.leastsquares.problem import Problem
@@ -210,3 +210,18 @@ def test_orthogonal_parameters_are_not_called_weak():
     x = np.linspace(-1, 1, 30)
     rng = np.random.default_rng(0)
     assert attempt(straight, [as_run(x=x, y=x + 0.1 * rng.standard_normal(30))]).weak == ()
+
+
+def test_a_parameter_that_only_the_best_fit_does_without_is_said_so():
+    """Readings below zero of a model that has none: its size ends at nothing, and its rate with it;
+    that the data do not contain these would be wrong."""
+
+    @model
+    def fading(x=signal(), y=signal(), *, size=param(start=1.0, bounds=(0, None)), rate=param()):
+        return Residual(measured=y, predicted=size * exp(-rate * x))
+
+    rng, x = np.random.default_rng(0), np.linspace(0, 2, 40)
+    found = attempt(fading, [as_run(x=x, y=-1 + 0.1 * rng.standard_normal(40))])
+    assert not found.certificate.trusted
+    (words,) = [w for w in found.identifiability.unobservable if "`rate`" in w]
+    assert words.startswith("`rate` changes no residual at the best fit, though it does where")

@@ -133,12 +133,24 @@ def _combination(problem: Problem, scaled: Array, scale: Array) -> str:
     movers = [int(i) for i in order if abs(scaled[i]) > 0.02]
     names = [problem.names[i] for i in movers]
     if len(movers) == 1:
-        return f"`{names[0]}` changes no residual: these data do not contain it"
+        return f"`{names[0]}` changes no residual{_where(problem, movers[0])}"
     change = scaled[movers] / scale[movers]
     change = change / change[0]
     ratio = ", ".join(f"{n} {c:+.3g}" for n, c in zip(names[1:], change[1:], strict=True))
     together = " and ".join([", ".join(f"`{n}`" for n in names[:-1]), f"`{names[-1]}`"])
     return f"{together} cannot be told apart ({names[0]} +1 goes with {ratio})"
+
+
+def _where(problem: Problem, mover: int) -> str:
+    """Does an unknown (by number) do nothing at all, or only where the fit has ended?"""
+    with np.errstate(all="ignore"):
+        begun = problem.normal(problem.start()).matrix[mover, mover]
+    if np.isfinite(begun) and begun > 0:
+        return (
+            " at the best fit, though it does where the fit begins: the model fits these data best "
+            "where it is none; check what is set, columns and units, or turn the sensor further"
+        )
+    return ": these data do not contain it"
 
 
 def weak_directions(problem: Problem, R: Array, sigma: float, rank: int) -> tuple[Weak, ...]:
