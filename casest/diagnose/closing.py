@@ -44,7 +44,10 @@ class Closing:
     @cached_property
     def misfit(self) -> Misfit:
         """What is left after the loop, tested beside the noise as it is."""
-        problem = Problem(self.after.model, prepared(self.after.model, self.after.problem.runs))
+        model, runs = self.after.model, self.runs
+        if model.noise is not None:  # with true values, and noise, as they are there
+            runs = prepared(model, self.after.problem.runs)
+        problem = Problem(model, runs)
         evidence = self.after.evidence
         shared = evidence.scatter if evidence is not None and evidence.misfit else None
         with np.errstate(all="ignore"):

@@ -84,11 +84,11 @@ def _once(
 ) -> Closing:
     before = attempt(model, runs, start=start, seed=seed)
     if before.certificate.trusted:
-        return _searched(before, model, catalogue, known, seed, say)
+        return _searched(before, model, runs, catalogue, known, seed, say)
     error = NotTrusted("no trustworthy estimate: " + "; ".join(before.certificate.reasons))
     error.estimate = before
     if not before.certificate.code & HOPELESS:  # what is missing may be why
-        closing = _searched(before, model, catalogue, known, seed, say)
+        closing = _searched(before, model, runs, catalogue, known, seed, say)
         if closing.effects and closing.after.certificate.trusted:
             return closing
     raise error
@@ -145,6 +145,7 @@ def _on_all_axes(what: Candidate, catalogue: Sequence[Effect]) -> Candidate:
 def _searched(
     before: Estimate,
     model: Model,
+    runs: Sequence[Run],
     catalogue: Sequence[Effect],
     known: Collection[str],
     seed: int,
@@ -153,7 +154,7 @@ def _searched(
     """The loop from a declared fit."""
     with np.errstate(all="ignore"), one_thread(), only_tried():
         # Stated noise is that at this fit: a start knows no more than its own slopes.
-        ready = prepared(model, before.problem.runs)
+        ready = prepared(model, runs if model.noise is None else before.problem.runs)
         try:
             folds = determined(before, ready, seed)
         except DataError as error:
@@ -174,7 +175,7 @@ def _as_it_is(before: Estimate, runs: tuple[Run, ...], why: str) -> Closing:
 
 
 def _closed(sensor: Sensor, before: Estimate, folds: Folds, say: Callable[[str], None]) -> Closing:
-    declared = sensor.fitted(sensor.model, before.values)
+    declared = sensor.fitted(before.model.as_read, before.values)
     if declared is None:
         raise NotTrusted("the residual is not finite at the optimum")
     # First, while what is tried beside it is at hand.

@@ -189,10 +189,10 @@ def _with_kept(
     refit: Refit[F],
     say: Callable[[str], None],
 ) -> State[F]:
-    seen, kept = (
-        refit.falls or falls_of_refit(ranking.linear, subject.linear(refit.fit)),
-        state.kept,
-    )
+    after, kept, seen = subject.linear(refit.fit), state.kept, refit.falls
+    if seen is None and after.residual.shape == ranking.linear.residual.shape:
+        seen = falls_of_refit(ranking.linear, after)
+    seen = seen or falls(ranking, refit.evidence)
     for trial in refit.evidence.trials:
         say(f"{trial.family}: held-out error falls")
         kept = (*kept, Kept(trial.what, refit.evidence, seen))
