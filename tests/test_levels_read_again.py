@@ -20,8 +20,8 @@ def said(level, read, wave=0.0, noise=0.6, seed=0, decimals=0):
 
 @pytest.mark.parametrize(("level", "read", "noise"), [(3, 300, 0.6), (8, 300, 0.6), (4, 100, 0.3)])
 def test_rounding_is_no_misfit_between_levels(level, read, noise):
-    """Most readings are one step's then, and what is a step off is not far out. Before, in 31 of 40
-    records of eight levels."""
+    """Most readings are one step's then, and what is a step off is not far out. Before, in five of
+    these six records of eight levels."""
     assert sum(bool(said(level, read, noise=noise, seed=seed)) for seed in range(6)) == 0
 
 

@@ -108,7 +108,7 @@ def cells(seed, lag=0.0, rows=900):
 @pytest.mark.parametrize("seed", [0, 1, pytest.param(2, marks=pytest.mark.long)])
 def test_noise_of_a_reference_that_is_held_is_no_misfit(seed, noise):
     """In the order of its readings the residual falls within each level, and a play of a width like
-    the noise takes that noise away: before, hysteresis with p = 2e-42, or a course over `p`."""
+    the noise takes that noise away: before, hysteresis with p = 2e-29, or a course over `p`."""
     closing = close(two, cells(seed), sensor_noise=noise)
     assert closing.result.verdict == "adequate"
     if noise is None:
@@ -123,7 +123,8 @@ def test_noise_of_a_reference_that_is_held_is_no_misfit(seed, noise):
     ids=lambda e: getattr(e, "name", ""),
 )
 def test_stated_noise_of_an_input_counts_once_beside_a_memory(effect, on):
-    """Chi-square of a right model, with what is not there beside it; before, 2017 of 897."""
+    """Chi-square of a right model, with what is not there beside it; before, 1716 of 897
+    beside the low pass."""
     found = calibrate(
         two.with_effect(effect, on=on), cells(3), sensor_noise={"ref": 75, "cell": 75}
     ).noise.chi_square

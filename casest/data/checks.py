@@ -100,10 +100,12 @@ def wild(values: Array, columns: tuple[str, ...], rows: NDArray[np.int_] | range
     found = []
     for i, column in enumerate(columns):
         x = values[:, i]
+        if not np.isfinite(x).any():
+            continue
         low, middle, high = np.nanquantile(x, (0.25, 0.5, 0.75))
         away = np.abs(x - middle) / max(high - low, 1e-300)
         far = np.flatnonzero(away > _WILD)
-        if high > low and 0 < len(far) <= max(1, len(x) * _RARE):
+        if high > low and 0 < len(far) <= len(x) * _RARE:
             named = ", ".join(str(int(rows[k])) for k in far[:3]) + (", …" if len(far) > 3 else "")
             more = f"like {x[far[0]]:.6g}" if len(far) > 1 else f"of {x[far[0]]:.6g}"
             found.append(

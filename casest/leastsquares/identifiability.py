@@ -148,7 +148,7 @@ def _where(problem: Problem, mover: int) -> str:
     if np.isfinite(begun) and begun > 0:
         return (
             " at the best fit, though it does where the fit begins: the model fits these data best "
-            "where it is none; check what is set, columns and units, or turn the sensor further"
+            "where it is none; check what is set, columns and units, or record more that differs"
         )
     return ": these data do not contain it"
 

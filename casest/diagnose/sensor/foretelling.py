@@ -12,7 +12,7 @@ from casest.diagnose.levels import LEVELS
 from casest.diagnose.protocol import State
 from casest.diagnose.protocol.choosing import NOT_HELD_OUT
 from casest.diagnose.sensor.final import certified, left_in
-from casest.diagnose.sensor.fits import Fit, problem_of
+from casest.diagnose.sensor.fits import Fit
 from casest.diagnose.sensor.sensor import Sensor
 from casest.estimate.estimate import Estimate
 from casest.leastsquares.weights import robust_scale
@@ -57,8 +57,7 @@ def _better(before: Sequence[Array], after: Sequence[Array]) -> bool:
 
 def held_out(sensor: Sensor, fit: Fit, folds: Folds) -> tuple[Array, ...]:
     """Residuals (N, m) of each run, each from a fit that did not see its part."""
-    problem, _ = problem_of(fit, sensor.runs)
-    return cross_fitted(fit.model, problem.runs, fit.values, folds)
+    return cross_fitted(fit.model, sensor.runs, fit.values, folds)
 
 
 def on_the_same_samples(

@@ -8,6 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from casest.data.run import Run
 from casest.declaration.shapes import Array
 from casest.diagnose.candidates.slopes import slopes
 from casest.diagnose.evidence.input_noise import LITTLE
@@ -18,7 +19,7 @@ from casest.diagnose.noise.of_inputs import noise_like, noise_of_inputs, with_no
 from casest.diagnose.sensor.fits import Fit, problem_of
 from casest.diagnose.sensor.rows import Rows
 from casest.errors import CasestError
-from casest.leastsquares.problem import Problem
+from casest.leastsquares.problem import Point, Problem
 
 #: Draws of noise at most: of few rows one says little of its size.
 DRAWS = 8
@@ -42,11 +43,13 @@ def in_refit(rows: Rows, before: Fit, after: Fit) -> list[list[tuple[float, Arra
     """For each input draws of LITTLE noise and of all: how much, and what it adds to the residuals
     (N, m) of the two fits."""
     rng, found = np.random.default_rng(0), []
+    problems = [problem_of(fit, rows.runs) for fit in (before, after)]
+    quiet = [problem.residuals(point) for problem, point in problems]
     for name, noise in _inputs(rows, before):
         draws = []
         for size in (LITTLE, 1.0) * _count(rows):
-            drawn = noise_like(rows.runs, name, size * noise, rng)
-            more, less = (_added(rows, fit, name, drawn) for fit in (before, after))
+            runs = with_noise(rows.runs, name, noise_like(rows.runs, name, size * noise, rng))
+            more, less = (_added(rows, *p, runs, r) for p, r in zip(problems, quiet, strict=True))
             draws.append((size, more, less))
         found.append(draws)
     return found
@@ -56,12 +59,12 @@ def _count(rows: Rows) -> int:
     return int(np.clip(-(-2 * LEVELS.series // sum(map(len, rows.index))), 1, DRAWS))
 
 
-def _added(rows: Rows, fit: Fit, name: str, noise: Sequence[Array]) -> Array:
-    """What noise (N, k) of one input adds to the weighted residuals (N, m) of a fit."""
-    problem, point = problem_of(fit, rows.runs)
-    noisy = Problem(fit.model, with_noise(problem.runs, name, noise))
-    more = zip(noisy.residuals(point), problem.residuals(point), strict=True)
-    change = [n - r for n, r in more]
+def _added(
+    rows: Rows, problem: Problem, point: Point, runs: tuple[Run, ...], quiet: Sequence[Array]
+) -> Array:
+    """What noisy runs add to the weighted residuals (N, m) of a fit, `quiet` without that noise."""
+    noisy = Problem(problem.model, runs).residuals(point)
+    change = [n - r for n, r in zip(noisy, quiet, strict=True)]
     if problem.weights is not None:
         change = [c * np.sqrt(w) for c, w in zip(change, problem.weights, strict=True)]
     return rows.of(change)
