@@ -10,7 +10,8 @@ import numpy as np
 
 from casest.declaration.model import Model
 from casest.declaration.symbols import Parameter
-from casest.diagnose.candidates.candidates import Candidate, typical_sizes
+from casest.diagnose.candidates.candidates import Candidate
+from casest.diagnose.candidates.typical import largest_of, typical_sizes
 from casest.diagnose.closing import Closing
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.visibility import Visible
@@ -47,12 +48,13 @@ def invisible(closing: Closing) -> list[Invisible]:
     """Candidates whose typical size the data could not have shown."""
     model, added = closing.before.model, {f.candidate.label for f in closing.effects}
     found: dict[str, Invisible] = {}
+    largest = largest_of(closing.before.problem, closing.before.point)
     for score in closing.visible:
         candidate = score.candidate
         if candidate.label in added or candidate.label in found:
             continue
         parameters = _own(candidate, model)
-        typical = typical_sizes(candidate, parameters, model)
+        typical = typical_sizes(candidate, parameters, model, largest)
         if typical is None or len(typical) > len(score.survives):
             continue
         seen = np.diag(score.information)[: len(typical)] * typical**2

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -356,18 +355,3 @@ def _refuse_more_than_data(extended: Model, runs: Sequence[Run]) -> None:
     residuals = sum(map(len, runs)) * len(extended.axes)
     if unknowns >= residuals:
         raise UsageError(f"with it there are {unknowns} unknowns for {residuals} residuals")
-
-
-def typical_sizes(candidate: Candidate, parameters: Sequence[Parameter], model: Model) -> Any:
-    """A typical size of each of its unknowns (packed), or None where nobody knows one."""
-    if candidate.freed:
-        value = model[candidate.freed].array
-        return None if value.ndim else np.array([0.01 * abs(float(value)) or 1.0])
-    assert candidate.effect is not None
-    typical = dict(candidate.effect.typical)
-    sizes = [typical.get(p.name.rpartition(".")[2]) for p in parameters]
-    if any(size is None for size in sizes):
-        return None
-    return np.concatenate(
-        [np.full(p.shape.coordinates, s) for p, s in zip(parameters, sizes, strict=True)]
-    )

@@ -10,8 +10,10 @@ from casest.data.run import Run
 from casest.declaration.effect import OVER_TIME
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
-from casest.diagnose.candidates.candidates import Candidate, typical_sizes
+from casest.diagnose.candidates.candidates import Candidate
+from casest.diagnose.candidates.typical import largest_of, typical_sizes
 from casest.diagnose.sensor import Sensor
+from casest.diagnose.sensor.fits import problem_of
 from casest.effects import CATALOGUE
 from casest.effects.placing import prepared
 from casest.errors import UsageError
@@ -37,7 +39,8 @@ def shown_or_not(
     found = [what for what in tried.values() if what.among([name])]
     if not found:
         raise UsageError(f"--show {name}: of this record there is {', '.join(tried)}")
-    with_it, size = _of_typical_size(found[0], model)
+    largest = largest_of(*problem_of(base, sensor.runs))
+    with_it, size = _of_typical_size(found[0], model, largest)
     if any(a.kind in OVER_TIME for a in with_it.effects):
         raise UsageError(f"--show {name}: it acts on the sequence of samples: one shows none of it")
     fit = sensor.fitted(with_it, base.values)
@@ -47,11 +50,13 @@ def shown_or_not(
     return [rival_of(label, fit, sensor.runs, sigma), rival_of(ALONE, base, sensor.runs, sigma)]
 
 
-def _of_typical_size(candidate: Candidate, model: Model) -> tuple[Model, str]:
+def _of_typical_size(
+    candidate: Candidate, model: Model, largest: Mapping[str, float]
+) -> tuple[Model, str]:
     """The model with the effect held, and `k = 0.001`."""
     extended = candidate.added_to(model)
     parameters = candidate.parameters(extended)
-    typical = typical_sizes(candidate, parameters, model)
+    typical = typical_sizes(candidate, parameters, model, largest)
     if typical is None or candidate.freed:
         raise UsageError(f"--show {candidate.label}: nobody knows a size of it that is typical")
     ends = np.cumsum([p.shape.coordinates for p in parameters])[:-1]
