@@ -92,5 +92,5 @@ def test_a_creep_that_the_user_declared_is_the_user_s_word():
     values = {f"{own}.{n}": np.array([v]) for n, v in {"k": 1.3, "tau": 2.0}.items()}
     label, why = another(model, values, line)
     assert label == own
-    assert "k = 1.3, above 1" in why
+    assert "k = 1.3, above 1.02" in why
     assert another(model, values, model) == ("", "")

@@ -232,7 +232,7 @@ def test_an_own_effect_on_the_noise_is_used_where_readings_lie_far_out():
         ),
         (
             {"profile": {"k": "moment"}},
-            "effect sag: profile= says 'moment': give frequency or time or timescale or level",
+            "effect sag: profile= says 'moment': give frequency or time or timescale or memory",
         ),
         (
             {"seen_in": "tails"},

@@ -9,6 +9,7 @@ import pytest
 
 from casest import Residual, Run, model, param, quantity, signal
 from casest.diagnose.candidates.candidates import Candidate, candidates
+from casest.diagnose.candidates.grid import FROM_NOTHING
 from casest.diagnose.candidates.slopes import rows_of, slopes
 from casest.effects import CATALOGUE
 from casest.effects.placing import prepared
@@ -44,6 +45,8 @@ def found_on(runs):
         profile = dict(candidate.effect.profile) if candidate.effect else {}
         if "lag" in profile.values():
             continue  # searched by secants: at no lag at all the slope is another
+        if set(profile.values()) <= FROM_NOTHING:
+            profile = {}  # by secants as well, but for the slope at nothing
         moments = iter((4.0, 11.0))
         held = {n: next(moments) if k == "time" else HELD[k] for n, k in profile.items()}
         yield replace(candidate, held=tuple(held.items()))

@@ -232,7 +232,7 @@ class FitOptions:
         "--noise-law",
         show_default=True,
         metavar="normal|t|t:NU",
-        help="Noise with heavy tails: Student's t, NU degrees of freedom or as the residual shows.",
+        help="Of calibrate alone. Heavy tails: Student's t, NU degrees of freedom or as it shows.",
     )
     seed: int = flag(0, "--seed", show_default=True, help="For random restarts.")
     output: Path | None = flag(None, "-o", "--output", **RESULTS)

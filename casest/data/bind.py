@@ -491,7 +491,7 @@ def _checked(run: Run, signals: Sequence[Signal], sources: Mapping[str, tuple[st
         beside = np.column_stack(others) if others and len(values) == len(run) else None
         notes += checks.constant_columns(values, columns)
         notes += checks.clipped(values, columns, beside)
-        notes += checks.wild(run.signals[signal.name], columns, run.rows)
+        notes += checks.wild(run.signals[signal.name], columns, run.rows, beside)
     return replace(run, notes=(*run.notes, *notes))
 
 

@@ -93,18 +93,26 @@ def clipped(values: Array, columns: tuple[str, ...], beside: Array | None = None
     ]
 
 
-def wild(values: Array, columns: tuple[str, ...], rows: NDArray[np.int_] | range) -> list[str]:
+def wild(
+    values: Array,
+    columns: tuple[str, ...],
+    rows: NDArray[np.int_] | range,
+    beside: Array | None = None,
+) -> list[str]:
     """Return a note for each component of (N, size) of which a few readings lie far off all others:
     a lost bit, a mark for none. An input has no residual that would tell. `rows` (N,) of the file.
+
+    None of rows in which one of the other signals, `beside` (N, k), is at its own end as well.
     """
     found = []
+    goes_along = np.zeros(len(values), bool) if beside is None else _at_an_end(beside)
     for i, column in enumerate(columns):
         x = values[:, i]
         if not np.isfinite(x).any():
             continue
         low, middle, high = np.nanquantile(x, (0.25, 0.5, 0.75))
         away = np.abs(x - middle) / max(high - low, 1e-300)
-        far = np.flatnonzero(away > _WILD)
+        far = np.flatnonzero((away > _WILD) & ~goes_along)
         if high > low and 0 < len(far) <= len(x) * _RARE:
             named = ", ".join(str(int(rows[k])) for k in far[:3]) + (", …" if len(far) > 3 else "")
             more = f"like {x[far[0]]:.6g}" if len(far) > 1 else f"of {x[far[0]]:.6g}"
@@ -113,6 +121,12 @@ def wild(values: Array, columns: tuple[str, ...], rows: NDArray[np.int_] | range
                 f"{away[far].min():.2g} times as far off as half of them: faults? Leave them out"
             )
     return found
+
+
+def _at_an_end(values: Array) -> NDArray[np.bool_]:
+    """In which rows is one of (N, k) among its few largest or smallest?"""
+    least, most = np.nanquantile(values, (_RARE, 1 - _RARE), axis=0)
+    return np.asarray(((values > most) | (values < least)).any(axis=1))
 
 
 def full_scales(

@@ -35,7 +35,9 @@ NOISE = "noise"
 #: grid; and of where one on the noise shows itself.
 COLUMNS = ("temperature", "other", "any", "angle", "acceleration", "itself", "state")
 NUMBERS = ("mean", "least", "greatest", "duration", "radian")
-PROFILES = ("frequency", "time", "timescale", "level", "share", "lag")
+PROFILES = (
+    "frequency", "time", "timescale", "memory", "level", "threshold", "band", "share", "lag",
+)  # fmt: skip
 TAILS, RANDOM_WALK = "tails", "random walk"
 
 
@@ -118,11 +120,13 @@ class Effect:
         return replace(self, declarations=held, otherwise=self._other("holding", values))
 
     def starting(self, **values: float) -> Effect:
-        """The same effect with other start values of scalar parameters."""
-        moved = tuple(
-            (n, replace(d, start=(float(values[n]),)) if n in values else d)
-            for n, d in self.declarations
-        )
+        """The same effect with other start values of scalar parameters, or of all axes alike."""
+
+        def begun(declared: Any, value: float) -> Any:
+            alike = isinstance(declared, Undecided)
+            return replace(declared, start=float(value) if alike else (float(value),))
+
+        moved = tuple((n, begun(d, values[n]) if n in values else d) for n, d in self.declarations)
         return replace(self, declarations=moved, otherwise=self._other("starting", values))
 
     def _other(self, changed: str, values: Mapping[str, float]) -> Effect | None:

@@ -318,7 +318,7 @@ class Model:
             return self._with_effect(added, place, dict(columns or {}), on)
         try:
             return self.with_effect(replace(added, otherwise=None), on=on, columns=columns)
-        except UsageError:
+        except (UsageError, DeclarationError):  # of another quantity, or of other axes
             same = ("name", "on", "typical", "shown_by", "foreign_to", "only_of")
             told = {n: getattr(added, n) for n in same}
             said = form.formula or added.formula

@@ -187,7 +187,9 @@ class Undecided:
     def decided(self, dims: tuple[int, ...]) -> Parameter:
         """The parameter for a quantity with value of shape `dims`."""
         scope: Scope = "run" if self.per == "run" else "all"
-        return make_parameter(Shape("array", dims), self.unit, self.start, self.bounds, scope)
+        one = np.ndim(self.start) == 0 and self.start is not None
+        start = np.full(dims, self.start) if one else self.start
+        return make_parameter(Shape("array", dims), self.unit, start, self.bounds, scope)
 
 
 def make_parameter(

@@ -125,6 +125,7 @@ COLOURED = "coloured_noise"
 CALM = " (calm)"
 #: What an effect of a sensor may be searched over here.
 SEARCHED: tuple[set[str], ...] = (set(), {"time"}, {"frequency"})
+BAND = {"width": "threshold"}
 #: Rounds that find the true input from its reading: each leaves the square of what was wrong.
 ROUNDS = 3
 #: Samples at which it is looked at what an effect leaves of its signal.
@@ -137,9 +138,11 @@ def of_sensors() -> list[Effect]:
     Not those without a size of their own, which gain and misalignment are already; nor those that
     describe a course; nor those on a model's own quantities or on the sequence of samples.
     """
+    # What is read is what is met here: of a band on either side one is enough, from no width on.
+    sensors = [replace(e, profile=()) if dict(e.profile) == BAND else e for e in SENSORS]
     return [
         e
-        for e in SENSORS
+        for e in sensors
         if e.kind == "quantity"
         and e.on in ("input", "output")
         and (e.typical or e.columns)

@@ -15,8 +15,28 @@ def three_axes(u: SX) -> None:
         raise UsageError(f"not applicable: it needs three axes, and there are {u.numel()}")
 
 
-#: All of a 3×3 matrix, row by row.
+def _two_axes(u: SX) -> None:
+    if u.numel() != 2:
+        raise UsageError(f"not applicable: it needs two or three axes, and there are {u.numel()}")
+
+
+#: All of a matrix, row by row.
 MATRIX = "u + K·u, K of three rows: k[0] k[1] k[2]; k[3] k[4] k[5]; k[6] k[7] k[8]"
+IN_A_PLANE = "u + K·u, K of two rows: k[0] k[1]; k[2] k[3]"
+
+
+@effect(on="input", formula="y + k·x")
+def _crossed_in_a_plane(u: SX, *, k: SX = param()) -> SX:
+    """Two axes that are not orthogonal: y sees k of x."""
+    _two_axes(u)
+    return vertcat(u[0], u[1] + k * u[0])
+
+
+@effect(on="input", formula=IN_A_PLANE)
+def _matrix_in_a_plane(u: SX, *, k: SX = param(4)) -> SX:
+    """Both axes see each other, each with a gain of its own: K row by row."""
+    _two_axes(u)
+    return u + vertcat(*(dot(k[row : row + 2], u) for row in (0, 2)))
 
 
 @effect(
@@ -24,6 +44,7 @@ MATRIX = "u + K·u, K of three rows: k[0] k[1] k[2]; k[3] k[4] k[5]; k[6] k[7] k
     typical={"k": 0.01},
     shown_by="a second mounting or tilt (wheel), poses that cover the sphere (norm)",
     formula="y + k[0]·x; z + k[1]·x + k[2]·y",
+    otherwise=_crossed_in_a_plane,
 )
 def cross_axis(u: SX, *, k: SX = param(3)) -> SX:
     """Axes that are not orthogonal: y sees k[0] of x; z sees k[1] of x and k[2] of y.
@@ -49,6 +70,7 @@ def axis_gain(u: SX, *, k: SX = param(each)) -> SX:
     on="input",
     shown_by="known directions that cover the sphere (a norm sees six of the nine)",
     formula=MATRIX,
+    otherwise=_matrix_in_a_plane,
     only_of=("T",),
 )
 def soft_iron(u: SX, *, k: SX = param(9)) -> SX:
@@ -64,6 +86,7 @@ def soft_iron(u: SX, *, k: SX = param(9)) -> SX:
     on="input",
     shown_by="known directions that cover the sphere (a norm sees six of the nine)",
     formula=MATRIX,
+    otherwise=_matrix_in_a_plane,
     foreign_to=("T",),  # there it is soft_iron
 )
 def gain_matrix(u: SX, *, k: SX = param(9)) -> SX:
@@ -148,6 +171,21 @@ def cross_quadratic(u: SX, *, k: SX = param(3, "1/[u]")) -> SX:
 
 
 @effect(
+    on="input",
+    typical={"width": 0.02},
+    profile={"width": "band"},
+    shown_by="inputs close to zero, of both signs",
+    formula="sign(u)·max(|u| − width, 0)",
+)
+def dead_band(u: SX, *, width: SX = param(each, "[u]", bounds=(0, None))) -> SX:
+    """An input within ±width does nothing, and lacks it beyond: a motor's or a spring's breakaway.
+
+    Unlike a dead zone, what is read of nothing is the offset.
+    """
+    return sign(u) * fmax(fabs(u) - width, 0)
+
+
+@effect(
     on="output",
     typical={"share": 1.0},
     profile={"level": "level"},
@@ -166,6 +204,7 @@ def saturation(y: SX, *, share: SX = param(each, bounds=(0, None)), level: SX = 
 @effect(
     on="output",
     typical={"width": 0.02},
+    profile={"width": "threshold"},
     shown_by="readings close to zero, of both signs",
     formula="sign(y)·max(|y| − width, 0)",
 )

@@ -39,6 +39,7 @@ def axis_delay(y: SX, t: SX = signal("s"), *, delay: SX = param(each, "s")) -> S
 @effect(
     on="output",
     kind="sequence",
+    profile={"tau": "memory"},
     memory={"rate": 0.0, "before": "y"},
     formula="y − tau·lowpass(dy/dt, tau)",
 )
@@ -79,8 +80,9 @@ def low_pass(y: SX, t: SX = signal("s"), *, tau: SX = param("s")) -> SX:
     shown_by="a step of the input, held for several times tau",
     formula="y − k·(y − lowpass(y, tau))",
     memory={"gap": 0.0, "before": "y"},
-    # More than all of a response comes late where it is delayed, or late twice.
-    within={"k": (-inf, 1.0)},
+    # More than all of a response comes late where it is delayed, or late twice. (All of it is a
+    # low pass, and a share that is found is not exactly one.)
+    within={"k": (-inf, 1.02)},
     # A spring gives way slowly, and heat arrives slowly: a field, a turn, a proof mass do neither.
     foreign_to=("T", "rad/s", "m/s^2"),
 )

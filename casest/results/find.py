@@ -24,7 +24,7 @@ from casest.effects import ASKED, CATALOGUE
 from casest.errors import CasestError, DeclarationError, UsageError
 
 #: Values of effects that a fit finds from where they start, without a grid.
-STARTED = ("timescale", "share", "lag")
+STARTED = ("timescale", "memory", "threshold", "band", "share", "lag")
 #: Shipped models: name on the command line -> module and attribute in `casest_problems`.
 SHIPPED = {
     "wheel": ("wheel", "wheel"),

@@ -17,7 +17,7 @@ from casest.results.fitted import Samples
 from casest.results.result import Number, Parameter
 
 #: Samples that resemble each other from which on noise may as well be a lag or a hysteresis.
-COLOURED = 20
+COLOURED = 5
 #: The effect whose sign says which of two instruments is slower.
 LOW_PASS = "low_pass"
 #: Effects from which on, where a misfit remains, they are a description more than causes.

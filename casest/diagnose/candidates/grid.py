@@ -24,10 +24,14 @@ LAGS = 8
 SHARES = (0.003, 0.01, 0.03, 0.1, 0.3)
 #: The shortest time constant, in samples: a shorter one is a delay.
 SHORTEST = 3.0
+#: What has a slope at nothing as well: as long as it is short, or narrow.
+FROM_NOTHING = {"memory", "threshold", "band"}
 #: Share of a shift's squares that the unknowns may leave and it still counts as seen.
 UNSEEN = 1e-3
 #: Share of the readings that the lowest level lets through, and fewest beyond the highest.
 LOWEST, FEWEST = 0.7, 6
+#: Share of the readings that the widest threshold holds back.
+BELOW = 0.6
 
 
 @dataclass(frozen=True)
@@ -54,10 +58,13 @@ def on_grid(candidate: Candidate, seen: Seen, likely: float = 0.0) -> list[Candi
     if not profile:
         return [candidate]
     values, trials = searched(tuple(profile.values()), seen, likely, _lowest(candidate, profile))
-    return [
+    found = [
         replace(candidate, held=_held(dict(zip(profile, v, strict=True))), trials=int(trials))
         for v in values
     ]
+    if set(profile.values()) <= FROM_NOTHING:
+        found.append(replace(candidate, trials=max(int(trials), 1)))
+    return found
 
 
 def _lowest(candidate: Candidate, profile: Mapping[str, str]) -> float:
@@ -87,6 +94,8 @@ def searched(
     """
     if kinds == ("level",):
         return _levels(seen)
+    if kinds in (("threshold",), ("band",)):
+        return _thresholds(seen.reading if kinds == ("threshold",) else seen.met)
     if seen.time is None:
         return [], 1
     if kinds == ("lag",):
@@ -115,6 +124,16 @@ def _levels(seen: Seen) -> Values:
     # Rows of one pose are predicted alike: what nothing exceeds but by rounding is no level.
     levels = [float(v) for v in several if np.count_nonzero(size > v * (1 + 1e-6)) >= FEWEST]
     return [(v,) for v in levels], max(len(levels), 1)
+
+
+def _thresholds(values: Array | None) -> Values:
+    """Sizes that a part of the values stays below, up to most of them."""
+    size = np.zeros(0) if values is None else np.abs(values).ravel()
+    if not np.any(size > 0):
+        return [], 1
+    several = np.quantile(size[size > 0], np.linspace(0, BELOW, CONSTANTS + 1)[1:])
+    widths = np.unique([float(f"{v:.6g}") for v in several])
+    return [(float(v),) for v in widths], len(widths)
 
 
 def _turned_back(seen: Seen) -> float:
@@ -288,7 +307,7 @@ def nearer(candidate: Candidate, seen: Seen, scale: float) -> list[Candidate]:
 def _steps(kind: str, value: float, seen: Seen, scale: float) -> list[float]:
     if kind == "level":
         return [value * (1 + s * 0.06 * scale) for s in (-1, -0.5, 0.5, 1)]
-    if kind in ("timescale", "share", "lag"):
+    if kind in ("timescale", "memory", "threshold", "band", "share", "lag"):
         return [value * float(np.exp(s * 0.7 * scale)) for s in (-1, -0.5, 0.5, 1)]
     if kind == "frequency" or seen.time is None:
         return []

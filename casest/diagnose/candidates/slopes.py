@@ -45,7 +45,7 @@ def slopes(
     Per-run unknowns have columns of their own for each run.
     """
     axes = len(problem.model.axes)
-    direct = [c for c in found if not _sequential(c, problem)]
+    direct = [c for c in found if not (_sequential(c, problem) or _all_held(c, problem))]
     size = max(1, WIDEST // (3 * axes))
     given = [problem.given(point, r) for r in range(len(problem.runs))] if direct else []
     for k in range(0, len(direct), size):
@@ -78,6 +78,16 @@ def _sequential(candidate: Candidate, problem: Problem) -> bool:
     places = _coordinates(extended)
     own = ca.vertcat(*(places[p.name] for p in candidate.parameters(extended)))
     return bool(ca.jacobian(taken, own).nnz())
+
+
+def _all_held(candidate: Candidate, problem: Problem) -> bool:
+    """Is nothing of it unknown but what is held?"""
+    if not candidate.held:
+        return False
+    try:
+        return not candidate.parameters(candidate.traced_on(problem.model))
+    except CasestError:
+        return False  # it is said why where its slope is asked for
 
 
 def _moves_states(candidate: Candidate, extended: Model) -> bool:
@@ -224,10 +234,15 @@ def _secant(
     candidate: Candidate,
     rows: Sequence[Index],
 ) -> Array:
-    """What a held lag changes, per second of it: it may be longer than any slope reaches."""
+    """What it changes where all of it is held, for each unit of that: a lag, or a time constant,
+    may be longer than any slope reaches."""
     ((_, size),) = candidate.held
     pairs = zip(wide.residuals(at), problem.residuals(point), strict=True)
-    parts = [(a - b)[chosen] / size for (a, b), chosen in zip(pairs, rows, strict=True)]
+    changes = [(a - b) / size for a, b in pairs]
+    if candidate.effect is not None and candidate.effect.kind == "sequence":
+        for change, run in zip(changes, problem.runs, strict=True):
+            _as_the_next(change, run.block)
+    parts = [change[chosen] for change, chosen in zip(changes, rows, strict=True)]
     if problem.weights is not None:
         weights = zip(parts, problem.weights, rows, strict=True)
         parts = [part * np.sqrt(w[chosen]) for part, w, chosen in weights]

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from casest.declaration.shapes import Array
-from casest.diagnose.evidence.likelihood import Likelihood
+from casest.diagnose.evidence.likelihood import LEFT, Explained, Likelihood
 from casest.diagnose.evidence.linear import Linear, alike
 from casest.diagnose.evidence.score import Evidence
 from casest.diagnose.levels import LEVELS
@@ -48,46 +48,70 @@ def feigned(
         added = root * likelihood.by_frequency(more)[:, 0]
         together.append(float(change @ added) / LITTLE**2)
     both = float(np.mean(together)) if together else 0.0
-    return _at_most(both, float(np.sum((root * likelihood.residual) ** 2)), len(root))
+    everything = float(np.sum((root * likelihood.residual) ** 2))
+    return at_most(_of_all(both, everything, len(root)), len(root))
 
 
-def _at_most(taken: float, everything: float, count: int) -> float:
-    """Gain of so many residuals that is feigned, where noise explains so much of all their squares.
+def at_most(gain: float, count: int) -> float:
+    """Of so many residuals what noise may gain that gains so much on average.
 
     A gain that is G without chance is (√G + z)² with it, z normal: where what is left after it must
     be z² to say anything, G + 2·z·√G is to be taken away.
     """
-    share = min(max(taken, 0.0) / max(everything, 1e-300), 1 - 1e-12)
-    gain = -count * float(np.log1p(-share))
     return min(MOST * count, gain + 2 * float(np.sqrt(LEVELS.strong * gain)))
 
 
-def feigned_by_refit(
-    before: Linear, after: Linear, draws: Sequence[tuple[float, Array, Array]]
-) -> float | None:
-    """The same of a refit, by the noise of an input that it takes from the residual; None where the
-    refits are of other rows.
+def _of_all(taken: float, everything: float, count: int) -> float:
+    """Gain of so many residuals that is feigned, where noise explains so much of all squares."""
+    share = min(max(taken, 0.0) / max(everything, 1e-300), 1 - 1e-12)
+    return -count * float(np.log1p(-share))
 
-    `draws`: how much noise, in that of the input, and what it adds to the residuals (N, m) of both.
-    A lag leaves that noise as large as it was, however much a slope in the lag magnifies it. What
-    the refit changes goes with the noise as its mean slope says, which little noise shows; how
-    large that change is, no more than either shows: a play turns within the noise, and is bounded.
+
+def feigned_by_refit(
+    before: Linear, after: Linear, draws: Sequence[tuple[float, Array, Array, Array]]
+) -> float | None:
+    """What noise of an input gains in a refit on average; None where the refits are of other rows.
+
+    `draws`: how much noise, in that of the input, and what it adds to the residuals (N, m) of both,
+    and to those without what was added where all else is as after it. A lag leaves that noise as
+    large as it was, however much a slope in the lag magnifies it. What the refit changes goes with
+    the noise as its mean slope says, which little noise shows; how large that change is, no more
+    than either shows: a play turns within the noise, and is bounded. Noise that inputs lose to
+    another cause counts by its part of all that there was. What a cause itself smooths makes a
+    residual likelier, whatever else it explains.
     """
     one, other = alike([before, after])
     if one.residual.shape != other.residual.shape:
         return None
     likelihood = Likelihood(other)
-    root = 1 / np.sqrt(likelihood.beside().spectrum)
+    beside = likelihood.beside()
 
-    def whitened(residual: Array) -> Array:
-        return np.asarray(root * likelihood.by_frequency(residual[:, :, None])[:, 0])
+    def powers(residual: Array) -> Array:
+        return np.asarray(likelihood.by_frequency(residual[:, :, None])[:, 0])
 
-    together = dict[float, list[float]]()
-    change = dict[float, list[float]]()
-    for size, more, less in draws:
-        was, moved = whitened(more) / size, whitened(more - less) / size
-        together.setdefault(size, []).append(float(was @ moved))
-        change.setdefault(size, []).append(float(moved @ moved))
-    taken = 2 * np.mean(together[LITTLE]) - min(np.mean(c) for c in change.values())
-    everything = whitened(one.residual)
-    return _at_most(float(taken), float(everything @ everything), len(root))
+    own, smoothed = list[tuple[float, Array, Array]](), list[tuple[float, Array, Array]]()
+    for size, more, less, plain in draws:
+        now = powers(less)
+        for found, was in ((own, powers(more)), (smoothed, powers(plain))):
+            moved = (was - now) / size
+            both = likelihood.sums.summed(was / size * moved)
+            found.append((size, both, likelihood.sums.summed(moved**2)))
+    everything = float(np.sum(powers(one.residual) ** 2 / beside.spectrum))
+    taken = float(np.sum(_taken(own) / beside.powers))
+    gain = _of_all(taken, everything, len(beside.spectrum))
+    return max(gain, _likelier(beside, _taken(smoothed))) if one.coloured else gain
+
+
+def _taken(draws: Sequence[tuple[float, Array, Array]]) -> Array:
+    """Noise (K,) in each band that a refit takes away."""
+    together = np.mean([t for size, t, _ in draws if size == LITTLE], axis=0)
+    sizes = {size for size, *_ in draws}
+    change = [np.mean([c for s, _, c in draws if s == size], axis=0) for size in sizes]
+    return np.asarray(2 * together - min(change, key=lambda c: float(c.sum())))
+
+
+def _likelier(after: Explained, taken: Array) -> float:
+    """By how much what is left is likelier than it would be with noise of powers `taken` (K,)."""
+    own = after.likelihood
+    left = own.sums.summed(after.left**2)
+    return max(own.cost_of(np.maximum(left + taken, LEFT * left)) - own.cost_of(left), 0.0)

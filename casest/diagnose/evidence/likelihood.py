@@ -78,6 +78,14 @@ class Beyond:
         """How many of them are told apart from the unknowns, and from each other."""
         return int(self.mix.shape[1])
 
+    @property
+    def share(self) -> float:
+        """Of the residual's squares, that they take away."""
+        own = self._likelihood
+        r = own.residual
+        along = self.flat.T @ r - self.on.T @ (own.declared.T @ r)
+        return float(np.sum((self.mix.T @ along) ** 2)) / max(float(r @ r), 1e-300)
+
     @cached_property
     def basis(self) -> Array:
         """Orthonormal columns (N·m, k) by frequency."""
@@ -231,6 +239,12 @@ class Likelihood:
             S = self.sums.spectrum(power, free)
         cost = float(np.sum(self.sums.count * np.log(S) + power / S))
         return Explained(cost, S, values, self, beyond)
+
+    def cost_of(self, power: Array) -> float:
+        """−2 log L of coloured noise that leaves so much power in each narrow band (K,)."""
+        count = self.sums.count
+        S = self.sums.spectrum(power, count)
+        return float(np.sum(count * np.log(S) + power / S))
 
     def plainly(self, beyond: Beyond) -> Explained:
         """By least squares alone, as if all noise were white."""

@@ -229,7 +229,8 @@ def _follows(
         return []
     # In the order of the record lies whatever was changed with it: what has a name comes first.
     clocks = {v.name for v in read if v.clock}
-    best = max(found, key=lambda s: (round(s.share, 2), s.name not in clocks))
+    most = (1 - LEVELS.alike) * max(s.share for s in found)
+    best = max(found, key=lambda s: (s.share > most and s.name not in clocks, s.share))
     where = f"{100 * best.share:.0f} % of it follows {best.name}"
     left = sigma * float(np.sqrt(1 - min(best.share, 1)))
     return [Finding(where, best.p_value, left, best.share)]

@@ -70,9 +70,14 @@ def structures(
 
 
 def order_of(variable: Variable) -> Index:
-    """Its rows from the least to the largest; of an angle that goes round, within a turn."""
+    """Its rows from the least to the largest; of an angle that goes round, within a turn.
+
+    Rows of one value are in no order: in that of the record a slow course would follow it.
+    """
     x = np.concatenate(variable.values)
-    return np.argsort(np.mod(x, 2 * np.pi) if variable.turns else x, kind="stable")
+    x = np.mod(x, 2 * np.pi) if variable.turns else x
+    by_chance = np.random.default_rng(0).permutation(len(x))
+    return by_chance[np.argsort(x[by_chance], kind="stable")]
 
 
 def _of_means(name: str, r: Array, tried: int) -> Structure | None:

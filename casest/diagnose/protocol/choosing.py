@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from math import inf
 
-from casest.diagnose.evidence.score import Evidence, again, judged
+from casest.diagnose.evidence.score import Evidence, judged
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.protocol.confirming import (
     FAR_AWAY,
@@ -16,12 +16,16 @@ from casest.diagnose.protocol.confirming import (
     passing,
 )
 from casest.diagnose.protocol.ranking import pairs, ranked, without_feigned
-from casest.diagnose.protocol.refits import best_refits, refitted, shown, torn_between
+from casest.diagnose.protocol.refits import (
+    NOT_HELD_OUT,
+    best_refits,
+    refitted,
+    shown,
+    torn_between,
+)
 from casest.diagnose.protocol.state import F, Kept, Ranking, Refit, State
 from casest.diagnose.protocol.subject import Subject
 
-#: Why a cause with strong evidence is not added.
-NOT_HELD_OUT = "held-out data do not confirm it"
 #: Why one of a pair is not, beside a column of the motion.
 FOLLOWED = "what only follows a column explains nearly as much"
 
@@ -30,7 +34,7 @@ def with_the_best(
     subject: Subject[F], state: State[F], ranking: Ranking, say: Callable[[str], None]
 ) -> State[F]:
     """The state with the best cause that held-out parts confirm; as it is if none is."""
-    state, asked = _hypotheses(subject, state, ranking)
+    asked = [e for e in ranking.found if subject.asked(e.trials[0].what)]
     options = [e for e in ranking.causes if ranking.says(e)]
     options += _without_noise(subject, state.fit, ranking, pairs(ranking))
     options.sort(key=lambda e: -e.score)
@@ -55,17 +59,22 @@ def with_the_best(
             return bigger
         state, tried = bigger, [*tried, *held]
         # A linear promise that no refit keeps: what comes after it.
-        left = [] if asked else [e for e in left if e not in held]
+        left = [] if asked else [e for e in left if not _among(e, held)]
         if over or not held or not (left or asked):
             break
         asked, left = [], left or beyond
-    alone = [e for e in options if len(e.trials) == 1 and e not in tried]
+    alone = [e for e in options if len(e.trials) == 1 and not _among(e, tried)]
     for evidence in alone[:2]:
-        why = NOT_HELD_OUT if evidence in beyond else FOLLOWED
+        why = NOT_HELD_OUT if _among(evidence, beyond) else FOLLOWED
         state = state.refusing(evidence.trials[0].what, why)
     missing = [e for e in (*options, *ranking.followed) if not state.unlike(e)]
     missing.sort(key=lambda e: -e.score)
     return replace(state, open=tuple(missing[: LEVELS.contenders]))
+
+
+def _among(evidence: Evidence, several: Sequence[Evidence]) -> bool:
+    """Is it one of them? Arrays are not compared."""
+    return any(evidence is e for e in several)
 
 
 def _without_noise(
@@ -134,26 +143,6 @@ def _first_certified(
         if len(refit.evidence.trials) == 1 and refit.evidence.score > later + LEVELS.clear:
             return state, True  # what explains clearly less is not the cause
     return state, False
-
-
-def _hypotheses(
-    subject: Subject[F], state: State[F], ranking: Ranking
-) -> tuple[State[F], list[Evidence]]:
-    """What the user says is there: a hypothesis that was there before the data, by its F test."""
-    asked = [e for e in ranking.found if subject.asked(e.trials[0].what)]
-    found = []
-    for evidence in asked:
-        # What noise of the inputs may do of it is asked of its refit: slopes may magnify that.
-        own = replace(evidence, trials=tuple(replace(t, feigned=0.0) for t in evidence.trials))
-        alone = again(own, ranking.likelihood, ranking.none, len(asked), 1)
-        if alone.p_value >= LEVELS.chance:
-            why = f"no more of it than noise would have (p = {alone.p_value:.2g})"
-            state = state.refusing(evidence.trials[0].what, why)
-        elif falls(ranking, alone)["pieces"].ratio < 1:
-            found.append(alone)
-        else:
-            state = state.refusing(evidence.trials[0].what, NOT_HELD_OUT)
-    return state, sorted(found, key=lambda e: -e.score)
 
 
 def _describes(

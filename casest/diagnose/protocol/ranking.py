@@ -98,8 +98,12 @@ def ranked_of(linear: Linear, trials: Sequence[Trial]) -> Ranking:
     none = likelihood.beside()
     families = max(len({t.family for t in trials}), 1)
     best: dict[str, tuple[float, Trial, Beyond]] = {}
+    most: dict[str, tuple[float, Trial]] = {}
     for trial in trials:
         beyond = Beyond(likelihood, trial.columns)
+        if linear.series and not trial.describes:
+            known, share = most.get(trial.family, (LEVELS.most, trial)), beyond.share
+            most[trial.family] = (share, trial) if share > known[0] else known
         promise = screened(beyond, likelihood, none)
         if trial.family not in best or promise > best[trial.family][0]:
             best[trial.family] = (promise, trial, beyond)
@@ -110,7 +114,8 @@ def ranked_of(linear: Linear, trials: Sequence[Trial]) -> Ranking:
     ]
     several = best_first([e for e in found if e is not None])
     order = {family: k for k, family in enumerate(dict.fromkeys(t.family for t in trials))}
-    return Ranking(linear, likelihood, none, several, families, order)
+    taking = sorted((m for m in most.values() if m[0] > LEVELS.most), key=lambda m: -m[0])
+    return Ranking(linear, likelihood, none, several, families, order, tuple(t for _, t in taking))
 
 
 def best_first(found: Sequence[Evidence]) -> tuple[Evidence, ...]:

@@ -9,8 +9,8 @@ import numpy as np
 
 from casest.declaration.shapes import Array
 from casest.diagnose.evidence.by_row import carried_by_few, chance_by_row
-from casest.diagnose.evidence.input_noise import feigned_by_refit
-from casest.diagnose.evidence.linear import alike
+from casest.diagnose.evidence.input_noise import at_most, feigned_by_refit
+from casest.diagnose.evidence.linear import Linear, alike
 from casest.diagnose.evidence.rises import rise_of_squares, rises
 from casest.diagnose.evidence.score import (
     Evidence,
@@ -31,8 +31,10 @@ from casest.diagnose.protocol.subject import Subject
 FEW_ROWS = "a row or a few carry it: left out one by one, they move its size too far"
 #: Why an influence in a series is not.
 FEW_OF_MANY = "one in a hundred rows or fewer carry it: look at those that are far out first"
-#: Why what somebody asked for is not.
+#: Why what somebody asked for is not: noise, that of the inputs, or what was held out.
+NONE_OF_IT = "no more of it than noise would have (p = {:.2g})"
 FEIGNED = "no more of it than noise of the inputs would have (p = {:.2g})"
+NOT_HELD_OUT = "held-out data do not confirm it"
 #: Why what holds out and has strong evidence is not added.
 AS_MUCH = "a slow course of unknown cause explains as much"
 
@@ -60,16 +62,20 @@ def refitted(
     for (evidence, better), gain, *noisier in zip(fits, gains, even, slow, strict=True):
         evidence = _charged(subject, state.fit, evidence, better)
         kept = _gaining(evidence, gain)
+        if subject.asked(evidence.trials[0].what):
+            kept = with_chance(kept, ranking.likelihood, 1)
+            plain = with_chance(_gaining(evidence, gain + evidence.feigned), ranking.likelihood, 1)
+            why = NONE_OF_IT.format(plain.p_value) if plain.p_value >= LEVELS.chance else ""
+            why = why or _refused(kept, subject.linear(state.fit), subject.linear(better))
+            if why:
+                state = state.failing(evidence, why)
+            else:
+                found.append(Refit(state.fit, better, kept))
+            continue
         least = _gaining(evidence, min(noisier))
         enough = beyond_courses(ranking, kept) and _strong(ranking, least)
         few = _by_few_rows(subject, ranking, kept, better) if enough else ""
-        if subject.asked(evidence.trials[0].what):
-            chance = with_chance(kept, ranking.likelihood, 1).p_value if kept.feigned else 0.0
-            if chance < LEVELS.chance:
-                found.append(Refit(state.fit, better, kept))
-            else:
-                state = state.failing(evidence, FEIGNED.format(chance))
-        elif enough and not few:
+        if enough and not few:
             found.append(Refit(state.fit, better, kept))
         elif few:
             state = state.failing(evidence, few)
@@ -84,6 +90,15 @@ def refitted(
         best = found[min(range(len(near)), key=lambda k: (float(f"{loss[k]:.3g}"), usual[k]))]
         found = [best, *[r for r in found if r is not best]]
     return state, _plainest_first(found, ranking)
+
+
+def _refused(evidence: Evidence, before: Linear, after: Linear) -> str:
+    """Why what somebody says is there is none, by the F test of its refit; else empty."""
+    if evidence.p_value >= LEVELS.chance:
+        return FEIGNED.format(evidence.p_value)
+    same = before.residual.shape == after.residual.shape
+    unseen = same and falls_of_refit(before, after)["pieces"].ratio >= 1
+    return NOT_HELD_OUT if unseen else ""
 
 
 def _by_few_rows(subject: Subject[F], ranking: Ranking, evidence: Evidence, fit: F) -> str:
@@ -101,13 +116,18 @@ def _by_few_rows(subject: Subject[F], ranking: Ranking, evidence: Evidence, fit:
 
 def _charged(subject: Subject[F], before: F, evidence: Evidence, fit: F) -> Evidence:
     """With what noise of the inputs may feign of this refit, in the place of its columns."""
-    one, other = subject.linear(before), subject.linear(fit)
-    gains = [feigned_by_refit(one, other, draws) for draws in subject.noise_in(before, fit)]
-    known = [g for g in gains if g is not None]
-    if not known:
+    gain = feigned_between(subject, before, fit)
+    if gain is None:
         return evidence
-    own = max(known) / len(evidence.trials)
+    own = at_most(gain, evidence.explained.left.size) / len(evidence.trials)
     return replace(evidence, trials=tuple(replace(t, feigned=own) for t in evidence.trials))
+
+
+def feigned_between(subject: Subject[F], before: F, after: F) -> float | None:
+    """What noise of the inputs gains in a refit on average; None where there is no saying."""
+    one, other = subject.linear(before), subject.linear(after)
+    gains = [feigned_by_refit(one, other, draws) for draws in subject.noise_in(before, after)]
+    return max((g for g in gains if g is not None), default=None)
 
 
 def _gaining(evidence: Evidence, gain: float) -> Evidence:
@@ -285,12 +305,6 @@ def best_refits(refits: Sequence[Refit[F]], more: Sequence[Refit[F]]) -> list[Re
     return several
 
 
-def _takes_most(evidence: Evidence, ranking: Ranking) -> bool:
-    """Are most of the squares explained by its columns?"""
-    left = ranking.likelihood.plainly(evidence.beyond).powers[0]
-    return bool(left < LEVELS.most * np.mean(ranking.likelihood.residual**2))
-
-
 def _by_squares(
     subject: Subject[F], state: State[F], ranking: Ranking, evidence: Evidence, fit: F
 ) -> Evidence:
@@ -306,18 +320,17 @@ def _by_squares(
 def shown(
     subject: Subject[F], state: State[F], ranking: Ranking, beside: Sequence[Refit[F]]
 ) -> tuple[State[F], list[Refit[F]]]:
-    """What the records show by themselves, and what slopes say little of, refitted: held-out parts
-    by the refit itself."""
+    """What the records show by themselves, and what takes most of the squares though it is no
+    likelier (a slow residual is likely as it is), refitted: held-out parts by the refit itself."""
     found, there = [], {f for r in beside for f in r.evidence.families}
-    bent = [e.trials[0] for e in ranking.found if subject.bends(e.trials[0].what)]
-    bent = [t for t in bent if t.family not in there]
-    for trial in (*subject.shown(state.fit), *bent):
+    most = [t for t in ranking.most if t.family not in there][: LEVELS.contenders]
+    for trial in (*subject.shown(state.fit), *most):
         evidence = judged([trial], ranking.likelihood, ranking.none, families=ranking.families)
         if evidence is not None:
             (evidence,) = without_feigned(
                 subject, state.fit, ranking.likelihood, [evidence], ranking.families
             )
-        small = evidence is None or (evidence.score <= 0 and not _takes_most(evidence, ranking))
+        small = evidence is None or (evidence.score <= 0 and evidence.beyond.share < LEVELS.most)
         if trial.what.held and small:
             continue  # its columns are those of that very value: nothing to wait for from a refit
         better = subject.refit(state.fit, [trial])
@@ -327,7 +340,7 @@ def shown(
         gain, *_ = subject.rises(state.fit, [better, *(r.fit for r in beside)])
         evidence = _charged(subject, state.fit, evidence, better)
         kept = _gaining(evidence, gain)
-        if not _strong(ranking, kept) and not any(trial is t for t in bent):
+        if not _strong(ranking, kept):
             kept = _by_squares(subject, state, ranking, evidence, better)
         # Its columns say little of it: the chance is that of its refit.
         kept = with_chance(kept, ranking.likelihood, ranking.families)

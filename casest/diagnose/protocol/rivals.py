@@ -6,10 +6,12 @@ from dataclasses import replace
 
 from casest.declaration.shapes import Array
 from casest.diagnose.evidence.held_out import Fall, fall_between_causes, foretold
+from casest.diagnose.evidence.input_noise import at_most
 from casest.diagnose.evidence.linear import alike
 from casest.diagnose.evidence.score import Evidence, judged
 from casest.diagnose.levels import LEVELS
-from casest.diagnose.protocol.ranking import best_first, on_its_axes, ranked_of
+from casest.diagnose.protocol.ranking import best_first, on_its_axes, ranked_of, sharpened
+from casest.diagnose.protocol.refits import feigned_between
 from casest.diagnose.protocol.state import F, Kept, Ranking, Rival, State
 from casest.diagnose.protocol.subject import Subject
 
@@ -48,15 +50,19 @@ def _rivals(subject: Subject[F], state: State[F], kept: Kept) -> tuple[State[F],
     for e in ranking.causes:
         if e is mine or len(rivals) == 2 * LEVELS.contenders:
             continue
+        if e.trials[0].what.held and e.gain > LEVELS.nested * mine.gain:
+            e = sharpened(subject, base, ranking, e)  # its grid is coarse
         if not linear.series:  # each unknown costs: what was added is on its axes as well
             e = on_its_axes(subject, base, e, ranking)
         # A score is a promise: noise that was matched to what explains more may hide its worth.
-        strong = e.score >= LEVELS.strong if linear.series else ranking.says(e)
-        if not strong and e.gain < mine.gain:
+        # What noise of the inputs may have of it is asked of its refit.
+        score, gain = e.score + e.feigned, e.gain + e.feigned
+        strong = score >= LEVELS.strong if linear.series else ranking.says(e)
+        if not strong and gain < mine.gain:
             continue
         its = foretold(linear, [_in_time(ranking, e)], stretches)
         lost = fall_between_causes(linear, its, best)
-        if e.trials[0].family in shown or _as_well(mine.score - e.score, lost, nothing):
+        if e.trials[0].family in shown or _as_well(mine.score - score, lost, nothing):
             rivals.append(e)
     after = subject.linear(state.fit)
     found = list[Rival]()
@@ -103,10 +109,25 @@ def _in_its_place(
             why = why or fit
             continue
         ours, theirs = subject.rises(base, [state.fit, fit])
-        found.append((fit, before + ours - theirs))
+        behind = before + ours - theirs
+        if behind >= LEVELS.clear:
+            behind -= _by_noise(subject, base, state.fit, fit)
+        found.append((fit, behind))
         if found[-1][1] < LEVELS.clear:
             break  # as well already
     return min(found, key=lambda f: f[1]) if found else why
+
+
+def _by_noise(subject: Subject[F], base: F, own: F, other: F) -> float:
+    """How much of the lead of a cause over another noise of the inputs may be."""
+    (more, most), (less, _) = (_feigned(subject, base, fit) for fit in (own, other))
+    return most - less if more > less else 0.0
+
+
+def _feigned(subject: Subject[F], base: F, fit: F) -> tuple[float, float]:
+    """What noise of the inputs gains in a refit on average, and at most."""
+    gain = feigned_between(subject, base, fit) or 0.0
+    return gain, at_most(gain, subject.linear(fit).residual.size)
 
 
 def _in_time(ranking: Ranking, evidence: Evidence) -> Array:

@@ -11,7 +11,7 @@ from casest.diagnose.evidence.held_inputs import Held
 from casest.diagnose.evidence.held_out import Fall
 from casest.diagnose.evidence.likelihood import Explained, Likelihood
 from casest.diagnose.evidence.linear import Linear
-from casest.diagnose.evidence.score import Evidence
+from casest.diagnose.evidence.score import Evidence, Trial
 from casest.diagnose.levels import LEVELS
 
 F = TypeVar("F")
@@ -19,7 +19,11 @@ F = TypeVar("F")
 
 @dataclass(frozen=True)
 class Ranking:
-    """Causes by what they are worth, beside one fit; the best of each family, best first."""
+    """Causes by what they are worth, beside one fit; the best of each family, best first.
+
+    `most`: of each family that takes most of the squares the trial that takes most, whatever its
+    likelihood says.
+    """
 
     linear: Linear
     likelihood: Likelihood = field(repr=False)
@@ -27,6 +31,7 @@ class Ranking:
     found: tuple[Evidence, ...]
     families: int
     order: Mapping[str, int] = field(default_factory=dict, repr=False)
+    most: tuple[Trial, ...] = ()
 
     def says(self, evidence: Evidence) -> bool:
         """Strong evidence in a series; in poses the F test, shared among all that was tried."""

@@ -33,10 +33,6 @@ class Subject(Protocol[F]):
         """What is refitted whatever its columns promise."""
         return ()
 
-    def bends(self, what: Any) -> bool:
-        """May its refit be far from what its slopes at nothing promise?"""
-        return False
-
     def everywhere(self, what: Any) -> bool:
         """Is it an influence that is there in every row, and no event or threshold?"""
         return False
@@ -48,7 +44,9 @@ class Subject(Protocol[F]):
         their identity, where the input has as much more noise as would be all of the residual's."""
         return ()
 
-    def noise_in(self, before: F, after: F) -> Sequence[Sequence[tuple[float, Array, Array]]]:
+    def noise_in(
+        self, before: F, after: F
+    ) -> Sequence[Sequence[tuple[float, Array, Array, Array]]]:
         """For each noisy input a few draws: how much of its noise, and what that adds to the
         residuals (N, m) of two fits."""
         return ()

@@ -9,6 +9,7 @@ import numpy as np
 from casest.declaration.effect import Attached
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.protocol import Kept, State
+from casest.diagnose.protocol.ranking import ranked
 from casest.diagnose.sensor.fits import Fit
 from casest.diagnose.sensor.sensor import Sensor
 from casest.diagnose.sensor.unlike import another
@@ -46,6 +47,7 @@ def certified(sensor: Sensor, state: State[Fit], before: Estimate) -> tuple[Stat
         if fit is None:
             return state, before
         state = replace(left_in(state, fit), open=(last.evidence, *state.open))
+        state = replace(state, last=ranked(sensor, fit))  # what it leaves, it explains again
 
 
 def left_in(state: State[Fit], fit: Fit) -> State[Fit]:

@@ -10,7 +10,7 @@ from casest.declaration.shapes import Array
 from casest.diagnose.cross_validation import Folds, cross_fitted
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.protocol import State
-from casest.diagnose.protocol.choosing import NOT_HELD_OUT
+from casest.diagnose.protocol.refits import NOT_HELD_OUT
 from casest.diagnose.sensor.final import certified, left_in
 from casest.diagnose.sensor.fits import Fit
 from casest.diagnose.sensor.sensor import Sensor

@@ -39,18 +39,20 @@ def jittered(rows: Rows, fit: Fit, trials: Sequence[Trial]) -> list[list[Draw]]:
     ]
 
 
-def in_refit(rows: Rows, before: Fit, after: Fit) -> list[list[tuple[float, Array, Array]]]:
+def in_refit(rows: Rows, before: Fit, after: Fit) -> list[list[tuple[float, Array, Array, Array]]]:
     """For each input draws of LITTLE noise and of all: how much, and what it adds to the residuals
-    (N, m) of the two fits."""
+    (N, m) of the two fits, and of the first where its unknowns are as in the second."""
     rng, found = np.random.default_rng(0), []
-    problems = [problem_of(fit, rows.runs) for fit in (before, after)]
+    moved = replace(before, values={**before.values, **before.model.among(after.values)})
+    problems = [problem_of(fit, rows.runs) for fit in (before, after, moved)]
     quiet = [problem.residuals(point) for problem, point in problems]
     for name, noise in _inputs(rows, before):
         draws = []
         for size in (LITTLE, 1.0) * _count(rows):
             runs = with_noise(rows.runs, name, noise_like(rows.runs, name, size * noise, rng))
-            more, less = (_added(rows, *p, runs, r) for p, r in zip(problems, quiet, strict=True))
-            draws.append((size, more, less))
+            added = (_added(rows, *p, runs, r) for p, r in zip(problems, quiet, strict=True))
+            more, less, plain = added
+            draws.append((size, more, less, plain))
         found.append(draws)
     return found
 

@@ -118,11 +118,6 @@ class Sensor(Subject[Fit]):
         rates = [t for t in self.trials(fit) if _on_rate(t.what)]
         return [*self.tried.shown(fit), *rates]
 
-    def bends(self, what: Candidate) -> bool:
-        """A memory whose time has no grid: its slopes are those of a short one."""
-        effect = what.effect
-        return effect is not None and effect.kind == "sequence" and not effect.profile
-
     def everywhere(self, what: Candidate) -> bool:
         """What acts at once, at no moment or level of its own."""
         effect = what.effect
@@ -134,7 +129,9 @@ class Sensor(Subject[Fit]):
         """The same where inputs have more noise."""
         return jittered(self.rows, fit, trials)
 
-    def noise_in(self, before: Fit, after: Fit) -> Sequence[Sequence[tuple[float, Array, Array]]]:
+    def noise_in(
+        self, before: Fit, after: Fit
+    ) -> Sequence[Sequence[tuple[float, Array, Array, Array]]]:
         """What noise of each input adds to the residuals of two fits."""
         return in_refit(self.rows, before, after)
 
@@ -162,8 +159,7 @@ class Sensor(Subject[Fit]):
 
     def _refit(self, fit: Fit, added: Sequence[Trial]) -> Fit | str:
         try:
-            first = [t.what.free() if _is_lag(t.what) else t.what for t in added]
-            found = self._with(fit, first, fit.values)
+            found = self._at_grid(fit, [t.what for t in added])
             if found is not None and any(t.what.free() is not t.what for t in added):
                 # From the sizes at the value of the grid: at nothing, no slope tells a frequency.
                 found = self._with(fit, [t.what.free() for t in added], found.values)
@@ -197,6 +193,21 @@ class Sensor(Subject[Fit]):
             beyond = self._residual_without(after, what) - self.linear(after).residual
             why = why or at_one_input(what, beyond)
         return why
+
+    def _at_grid(self, fit: Fit, added: Sequence[Candidate]) -> Fit | None:
+        """The fit beside these effects as they are held. A lag is held by nothing but its start."""
+        model, held = fit.model, dict[str, Array]()
+        for what in added:
+            alone = bool(what.held) and not what.parameters(what.traced_on(fit.model))
+            model = (what.free() if alone else what).added_to(model)
+            if alone and not _is_lag(what):
+                new = [p for p in what.free().parameters(model) if p.name not in fit.values]
+                sizes = {f"{what.label}.{n}": v for n, v in what.held}
+                held |= {p.name: np.full(p.shape.dims, sizes[p.name]) for p in new}
+        begun = starts(model, self.runs, fit.values)
+        begun = {name: value for name, value in begun.items() if name not in held}
+        found = self.fitted(model.having(**held), begun)
+        return found if found is None else replace(found, values={**found.values, **held})
 
     def _with(
         self, fit: Fit, added: Sequence[Candidate], values: Mapping[str, Array]
