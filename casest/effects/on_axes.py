@@ -17,6 +17,10 @@ from casest.declaration.symbols import Parameter, Undecided, make_parameter
 def restricted(effect: Effect, kept: Sequence[int], model: Model) -> Effect:
     """The effect with one scalar unknown per kept axis, `k_x`, in place of every vector `k`."""
     size = _size(effect, model)
+    other = effect.otherwise and replace(effect.otherwise, on=effect.on)
+    sizes_there = lengths(other, model) if other else set()
+    if sizes_there and max(kept, default=0) >= max(sizes_there):
+        other = None  # the form that it has on fewer axes
     vectors, declarations = {}, []
     for name, declared in effect.declarations:
         parameter = declared.decided((size,)) if isinstance(declared, Undecided) else declared
@@ -56,8 +60,7 @@ def restricted(effect: Effect, kept: Sequence[int], model: Model) -> Effect:
         null=tuple(sorted({**null, **more}.items())),
         typical=tuple({**typical, **sizes}.items()),
         plain=tuple(plain.items()),
-        otherwise=effect.otherwise
-        and restricted(replace(effect.otherwise, on=effect.on), kept, model),
+        otherwise=other and restricted(other, kept, model),
     )
 
 

@@ -345,6 +345,7 @@ def shown(
         # Its columns say little of it: the chance is that of its refit.
         kept = with_chance(kept, ranking.likelihood, ranking.families)
         seen = falls_of_refit(ranking.linear, subject.linear(better))
-        if beyond_courses(ranking, kept) and holds_out(seen, ranking.linear):
+        clear = beyond_courses(ranking, kept) and ranking.stands_out(kept)
+        if clear and holds_out(seen, ranking.linear):
             found.append(Refit(state.fit, better, kept, seen))
     return state, found

@@ -37,8 +37,11 @@ class Ranking:
         """Strong evidence in a series; in poses the F test, shared among all that was tried."""
         if not self.linear.series:
             return evidence.p_value < LEVELS.chance
-        strong = evidence.score > LEVELS.strong
-        return strong and (self._held is None or self._held.says(evidence.trials))
+        return evidence.score > LEVELS.strong and self.stands_out(evidence)
+
+    def stands_out(self, evidence: Evidence) -> bool:
+        """Of the errors that levels have in common, where inputs are held."""
+        return self._held is None or self._held.says(evidence.trials)
 
     @cached_property
     def _held(self) -> Held | None:
