@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from casest.declaration.effect import RECORDED, effect
-from casest.declaration.physics import SX, der, exp, fabs, fmax, fmin, inf, sqrt
+from casest.declaration.physics import SX, der, exp, fabs, fmax, fmin, sqrt
 from casest.declaration.shapes import each
 from casest.declaration.symbols import param, signal
 
@@ -81,8 +81,8 @@ def low_pass(y: SX, t: SX = signal("s"), *, tau: SX = param("s")) -> SX:
     formula="y − k·(y − lowpass(y, tau))",
     memory={"gap": 0.0, "before": "y"},
     # More than all of a response comes late where it is delayed, or late twice. (All of it is a
-    # low pass, and a share that is found is not exactly one.)
-    within={"k": (-inf, 1.02)},
+    # low pass, and a share that is found is not exactly one.) Nor too early.
+    within={"k": (-1.0, 1.02)},
     # A spring gives way slowly, and heat arrives slowly: a field, a turn, a proof mass do neither.
     foreign_to=("T", "rad/s", "m/s^2"),
 )
