@@ -101,7 +101,7 @@ def ranked_of(linear: Linear, trials: Sequence[Trial]) -> Ranking:
     most: dict[str, tuple[float, Trial]] = {}
     for trial in trials:
         beyond = Beyond(likelihood, trial.columns)
-        if linear.series and not trial.describes:
+        if not trial.describes:
             known, share = most.get(trial.family, (LEVELS.most, trial)), beyond.share
             most[trial.family] = (share, trial) if share > known[0] else known
         promise = screened(beyond, likelihood, none)

@@ -63,7 +63,7 @@ def too_slow(
     """Why records of these spans (s) are too short for a memory: nobody saw it fade; else empty."""
     for what in added:
         profile = what.effect.profile if what.effect is not None else ()
-        for name in (n for n, kind in profile if kind in ("timescale", "memory")):
+        for name in (n for n, kind in profile if kind == "timescale"):
             value = float(np.max(values.get(f"{what.label}.{name}", 0.0)))
             if value > max(spans, default=np.inf) / LEVELS.fades:
                 return f"its refit fails: {name} = {value:.3g} s is over half of the record"
