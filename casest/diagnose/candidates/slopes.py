@@ -196,8 +196,10 @@ def _through_record(
         whitening=problem.whitening,
         states=None if moves else states,
     )
-    held = {f"{candidate.label}.{name}": np.array(value) for name, value in candidate.held}
-    at = wide.point({**wide.values(wide.start()), **problem.values(point), **held})
+    begun, known = wide.values(wide.start()), dict(candidate.held)
+    held = {f"{candidate.label}.{name}": value for name, value in known.items()}
+    sizes = {n: np.full(np.shape(begun[n]), value) for n, value in held.items() if n in begun}
+    at = wide.point({**begun, **problem.values(point), **sizes})
     own = candidate.parameters(extended)
     if not own:
         return _secant(problem, point, wide, at, candidate, rows)
@@ -257,6 +259,8 @@ def slope_of(
     traced, base = _traced(extended), _traced(model)
     held = {f"{candidate.label}.{name}": value for name, value in candidate.held}
     own = {p.name for p in candidate.parameters(extended)}
+    if not own:
+        raise CasestError(f"{candidate.label}: nothing of it is unknown, and it has no slope")
     more = [s for s in extended.columns if s.name not in symbols]
     for s in more:
         symbols[s.name] = ca.SX.sym(s.name, s.size)
@@ -266,7 +270,9 @@ def slope_of(
         if p.name in own:
             mine.append(here[p.name])
             scopes += [p.scope == "run"] * p.shape.coordinates
-        start = p.start_value() if p.name in own else held.get(p.name)
+        start = p.start_value() if p.name in own else None
+        if p.name in held:
+            start = np.full(p.shape.coordinates, held[p.name])
         new.append(there[p.name] if start is None else ca.DM(start))
     slope = ca.jacobian(traced.expression, ca.vertcat(*mine))
     old = [traced.coordinates, traced.references]

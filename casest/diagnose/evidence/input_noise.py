@@ -86,17 +86,17 @@ def feigned_by_refit(
     likelihood = Likelihood(other)
     beside = likelihood.beside()
 
-    def powers(residual: Array) -> Array:
+    def by_frequency(residual: Array) -> Array:
         return np.asarray(likelihood.by_frequency(residual[:, :, None])[:, 0])
 
     own, smoothed = list[tuple[float, Array, Array]](), list[tuple[float, Array, Array]]()
     for size, more, less, plain in draws:
-        now = powers(less)
-        for found, was in ((own, powers(more)), (smoothed, powers(plain))):
+        now = by_frequency(less)
+        for found, was in ((own, by_frequency(more)), (smoothed, by_frequency(plain))):
             moved = (was - now) / size
             both = likelihood.sums.summed(was / size * moved)
             found.append((size, both, likelihood.sums.summed(moved**2)))
-    everything = float(np.sum(powers(one.residual) ** 2 / beside.spectrum))
+    everything = float(np.sum(by_frequency(one.residual) ** 2 / beside.spectrum))
     taken = float(np.sum(_taken(own) / beside.powers))
     gain = _of_all(taken, everything, len(beside.spectrum))
     return max(gain, _likelier(beside, _taken(smoothed))) if one.coloured else gain

@@ -27,7 +27,8 @@ class Trial:
     `what` it is to whom asks; `family` its name for all that is a variant of it; `variants`: how
     many were looked through; `axes` (k,): the axis that each column belongs to, where that is a
     matter of axes; `describes`: it is no cause, but what a cause must explain more than; `feigned`:
-    gain that noise of the inputs alone may give it.
+    gain that noise of the inputs alone may give it; `secant`: all of it is held, and the columns
+    are what it changes at that value, not a slope.
     """
 
     what: Any
@@ -37,6 +38,7 @@ class Trial:
     axes: Index | None = None
     describes: bool = False
     feigned: float = 0.0
+    secant: bool = False
 
 
 @dataclass(frozen=True)

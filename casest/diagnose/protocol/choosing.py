@@ -47,7 +47,7 @@ def with_the_best(
         state, refits = refitted(subject, state, ranking, held)
         if not asked and not tried:
             state, more = shown(subject, state, ranking, refits)
-            refits = best_refits(refits, more)
+            refits = best_refits(refits, more, ranking.order)
         torn = [] if asked else torn_between(refits, ranking)
         if torn:
             return replace(state, open=tuple(r.evidence for r in torn), torn=tuple(torn))

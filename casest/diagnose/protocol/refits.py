@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -59,13 +59,15 @@ def refitted(
     even = _where_noise_is_louder(subject, ranking, refits) or gains
     slow = (refits and subject.rises_beside_a_wander(state.fit, refits)) or gains
     found: list[Refit[F]] = []
+    asked = max(sum(subject.asked(e.trials[0].what) for e, _ in fits), 1)
     for (evidence, better), gain, *noisier in zip(fits, gains, even, slow, strict=True):
         evidence = _charged(subject, state.fit, evidence, better)
         kept = _gaining(evidence, gain)
         if subject.asked(evidence.trials[0].what):
-            kept = with_chance(kept, ranking.likelihood, 1)
-            plain = with_chance(_gaining(evidence, gain + evidence.feigned), ranking.likelihood, 1)
-            why = NONE_OF_IT.format(plain.p_value) if plain.p_value >= LEVELS.chance else ""
+            kept = with_chance(kept, ranking.likelihood, asked)
+            plain = _gaining(evidence, gain + evidence.feigned)
+            chance = with_chance(plain, ranking.likelihood, asked).p_value
+            why = NONE_OF_IT.format(chance) if chance >= LEVELS.chance else ""
             why = why or _refused(kept, subject.linear(state.fit), subject.linear(better))
             if why:
                 state = state.failing(evidence, why)
@@ -295,9 +297,20 @@ def torn_between(refits: Sequence[Refit[F]], ranking: Ranking) -> list[Refit[F]]
     return near if none < loss.min() and loss.min() > noise else []
 
 
-def best_refits(refits: Sequence[Refit[F]], more: Sequence[Refit[F]]) -> list[Refit[F]]:
-    """All of them. The first stays, unless one of the others is clearly worth more."""
-    several = [*refits, *sorted(more, key=lambda r: -r.evidence.score)]
+def best_refits(
+    refits: Sequence[Refit[F]], more: Sequence[Refit[F]], order: Mapping[str, int]
+) -> list[Refit[F]]:
+    """All of them. The first stays, unless one of the others is clearly worth more; of others that
+    are worth as much the first of the catalogue: what is met more often."""
+    top = max((r.evidence.score for r in more), default=0.0)
+
+    def place(refit: Refit[F]) -> tuple[float, float]:
+        score = refit.evidence.score
+        if score > top - LEVELS.strong:
+            return -top, min(order.get(f, 0) for f in refit.evidence.families)
+        return -score, 0.0
+
+    several = [*refits, *sorted(more, key=place)]
     if refits and more:
         best = several[len(refits)]
         if best.evidence.score > refits[0].evidence.score + LEVELS.clear:

@@ -50,7 +50,7 @@ def _rivals(subject: Subject[F], state: State[F], kept: Kept) -> tuple[State[F],
     for e in ranking.causes:
         if e is mine or len(rivals) == 2 * LEVELS.contenders:
             continue
-        if e.trials[0].what.held and e.gain > LEVELS.nested * mine.gain:
+        if e.trials[0].secant and e.gain > LEVELS.nested * mine.gain:
             e = sharpened(subject, base, ranking, e)  # its grid is coarse
         if not linear.series:  # each unknown costs: what was added is on its axes as well
             e = on_its_axes(subject, base, e, ranking)

@@ -150,7 +150,9 @@ class Tried:
             axes = _axes(fit, candidate, columns.shape[2])
             describes = self._describes(candidate, motion) and not self.asked(candidate)
             family, trials = candidate.label, candidate.trials
-            found.append(Trial(candidate, family, columns, trials, axes, describes))
+            own = candidate.parameters(candidate.traced_on(fit.model)) if candidate.held else True
+            trial = Trial(candidate, family, columns, trials, axes, describes, secant=not own)
+            found.append(trial)
         return found
 
     def _scales(self, fit: Fit, candidate: Candidate, columns: Array) -> bool:
