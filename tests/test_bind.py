@@ -1107,3 +1107,30 @@ def test_a_few_readings_far_off_all_others_are_named(tmp_path: Path) -> None:
     np.savetxt(tmp_path / "imu.csv", still, delimiter=",", header="vx,vy,vz", fmt="%.10g")
     (run,) = load_runs([tmp_path / "imu.csv"], [ANY])
     assert not [note for note in run.notes if "faults?" in note]
+
+
+def told_of_faults(tmp_path: Path, reference: Any, reading: Any) -> list[str]:
+    """Which of a reading and its reference are said to have readings far off."""
+    both = np.column_stack([reference, reading])
+    np.savetxt(tmp_path / "motor.csv", both, delimiter=",", header="reference,reading", comments="")
+    signals = [Signal(name, 1, None) for name in ("reference", "reading")]
+    (run,) = load_runs([tmp_path / "motor.csv"], signals)
+    return [note.partition(":")[0] for note in run.notes if "faults?" in note]
+
+
+def test_a_reading_that_goes_where_its_input_goes_is_no_fault(tmp_path: Path) -> None:
+    """A motor that stands, and is run for a few rows: nearly always nothing, then 1500 rpm."""
+    command, rng = np.zeros(2000), np.random.default_rng(6)
+    command[700:712] = -1500.0
+    motor = command + 6 * rng.standard_normal(2000)
+    assert told_of_faults(tmp_path, command, motor) == []
+    motor[40] = 32767.0
+    assert told_of_faults(tmp_path, command, motor) == ["reading"]
+
+
+def test_a_row_that_is_lost_in_all_columns_is_still_a_fault(tmp_path: Path) -> None:
+    rng = np.random.default_rng(7)
+    reference = rng.uniform(0, 10, 2000)
+    reading = 2 * reference + 0.1 * rng.standard_normal(2000)
+    reference[40] = reading[40] = -9999.0
+    assert told_of_faults(tmp_path, reference, reading) == ["reference", "reading"]

@@ -102,18 +102,18 @@ def wild(
     """Return a note for each component of (N, size) of which a few readings lie far off all others:
     a lost bit, a mark for none. An input has no residual that would tell. `rows` (N,) of the file.
 
-    None of rows in which one of the other signals, `beside` (N, k), is at its own end as well.
+    None of rows in which one of the other signals, `beside` (N, k), is at its own end as well: it
+    goes there. Unless that is far off all others too: then the row is.
     """
     found = []
-    goes_along = np.zeros(len(values), bool) if beside is None else _at_an_end(beside)
+    goes_along = np.zeros(len(values), bool)
+    for other in () if beside is None else beside.T:
+        goes_along |= _at_an_end(other) & ~(_away(other) > _WILD)
     for i, column in enumerate(columns):
         x = values[:, i]
-        if not np.isfinite(x).any():
-            continue
-        low, middle, high = np.nanquantile(x, (0.25, 0.5, 0.75))
-        away = np.abs(x - middle) / max(high - low, 1e-300)
+        away = _away(x)
         far = np.flatnonzero((away > _WILD) & ~goes_along)
-        if high > low and 0 < len(far) <= len(x) * _RARE:
+        if 0 < len(far) <= len(x) * _RARE:
             named = ", ".join(str(int(rows[k])) for k in far[:3]) + (", …" if len(far) > 3 else "")
             more = f"like {x[far[0]]:.6g}" if len(far) > 1 else f"of {x[far[0]]:.6g}"
             found.append(
@@ -123,10 +123,20 @@ def wild(
     return found
 
 
-def _at_an_end(values: Array) -> NDArray[np.bool_]:
-    """In which rows is one of (N, k) among its few largest or smallest?"""
-    least, most = np.nanquantile(values, (_RARE, 1 - _RARE), axis=0)
-    return np.asarray(((values > most) | (values < least)).any(axis=1))
+def _away(x: Array) -> Array:
+    """How far readings (N,) are from the middle, in widths of the middle half; none without one."""
+    if not np.isfinite(x).any():
+        return np.zeros(len(x))
+    low, middle, high = np.nanquantile(x, (0.25, 0.5, 0.75))
+    return np.asarray(np.abs(x - middle) / (high - low if high > low else np.inf))
+
+
+def _at_an_end(x: Array) -> NDArray[np.bool_]:
+    """Which readings (N,) are among the few largest or smallest?"""
+    if not np.isfinite(x).any():
+        return np.zeros(len(x), bool)
+    least, most = np.nanquantile(x, (_RARE, 1 - _RARE))
+    return np.asarray((x > most) | (x < least))
 
 
 def full_scales(

@@ -125,7 +125,6 @@ COLOURED = "coloured_noise"
 CALM = " (calm)"
 #: What an effect of a sensor may be searched over here.
 SEARCHED: tuple[set[str], ...] = (set(), {"time"}, {"frequency"})
-BAND = {"width": "threshold"}
 #: Rounds that find the true input from its reading: each leaves the square of what was wrong.
 ROUNDS = 3
 #: Samples at which it is looked at what an effect leaves of its signal.
@@ -138,8 +137,8 @@ def of_sensors() -> list[Effect]:
     Not those without a size of their own, which gain and misalignment are already; nor those that
     describe a course; nor those on a model's own quantities or on the sequence of samples.
     """
-    # What is read is what is met here: of a band on either side one is enough, from no width on.
-    sensors = [replace(e, profile=()) if dict(e.profile) == BAND else e for e in SENSORS]
+    # A threshold is tried from nothing on, and one of the input is no other: what is read is met.
+    sensors = [replace(e, profile=()) if _threshold(e) else e for e in SENSORS]
     return [
         e
         for e in sensors
@@ -151,6 +150,10 @@ def of_sensors() -> list[Effect]:
         and len(e.profile) < 2
         and {s.name for s in e.extras} <= {"t", *(name for name, _ in e.columns)}
     ]
+
+
+def _threshold(effect: Effect) -> bool:
+    return {kind for _, kind in effect.profile} == {"threshold"}
 
 
 def listed() -> list[tuple[str, str, str]]:

@@ -131,6 +131,10 @@ class Candidate:
         left = tuple((n, v) for n, v in self.held if n not in smooth)
         return replace(self, effect=self.effect.starting(**begun), held=left, traced=None)
 
+    def all_held(self, model: Model) -> bool:
+        """Is nothing of it unknown but what is held? Raises where it does not apply."""
+        return bool(self.held) and not self.parameters(self.traced_on(model))
+
     def parameters(self, extended: Model) -> list[Parameter]:
         """Its unknowns in the extended model."""
         own = extended.unknowns_of(self.label)

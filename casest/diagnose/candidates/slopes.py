@@ -81,11 +81,8 @@ def _sequential(candidate: Candidate, problem: Problem) -> bool:
 
 
 def _all_held(candidate: Candidate, problem: Problem) -> bool:
-    """Is nothing of it unknown but what is held?"""
-    if not candidate.held:
-        return False
     try:
-        return not candidate.parameters(candidate.traced_on(problem.model))
+        return candidate.all_held(problem.model)
     except CasestError:
         return False  # it is said why where its slope is asked for
 

@@ -198,7 +198,7 @@ class Sensor(Subject[Fit]):
         """The fit beside these effects as they are held. A lag is held by nothing but its start."""
         model, held = fit.model, dict[str, Array]()
         for what in added:
-            alone = bool(what.held) and not what.parameters(what.traced_on(fit.model))
+            alone = what.all_held(fit.model)
             model = (what.free() if alone else what).added_to(model)
             if alone and not _is_lag(what):
                 new = [p for p in what.free().parameters(model) if p.name not in fit.values]

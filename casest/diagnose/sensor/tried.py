@@ -150,9 +150,8 @@ class Tried:
             axes = _axes(fit, candidate, columns.shape[2])
             describes = self._describes(candidate, motion) and not self.asked(candidate)
             family, trials = candidate.label, candidate.trials
-            own = candidate.parameters(candidate.traced_on(fit.model)) if candidate.held else True
-            trial = Trial(candidate, family, columns, trials, axes, describes, secant=not own)
-            found.append(trial)
+            secant = candidate.all_held(fit.model)
+            found.append(Trial(candidate, family, columns, trials, axes, describes, secant=secant))
         return found
 
     def _scales(self, fit: Fit, candidate: Candidate, columns: Array) -> bool:
