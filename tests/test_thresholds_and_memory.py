@@ -12,15 +12,15 @@ def motor(seed):
     """Speed of a motor after steps of the voltage: dry friction takes the first 0.19 V of them, and
     the speed follows within 1.5 s, by the exact law between samples of a held voltage.
     """
-    rng, dt, tau = np.random.default_rng([20261127, seed]), 0.02, 1.5
+    rng, dt, tau, rows = np.random.default_rng([20261127, seed]), 0.04, 1.5, 200
     runs = []
-    for volts in (0.2, 0.5, 0.7, 1.0, 1.2, 1.5, 1.7, 2.0):
-        t = dt * np.arange(400)
+    for volts in (0.2, 0.5, 1.0, 1.5, 2.0):
+        t = dt * np.arange(rows)
         met = np.where(t < 0.5, 0.0, volts)
-        end, speed = 1.8 * np.maximum(met - 0.19, 0.0), np.zeros(400)
-        for k in range(1, 400):
+        end, speed = 1.8 * np.maximum(met - 0.19, 0.0), np.zeros(rows)
+        for k in range(1, rows):
             speed[k] = end[k - 1] + (speed[k - 1] - end[k - 1]) * np.exp(-dt / tau)
-        noise = 0.01 * rng.standard_normal(400)
+        noise = 0.01 * rng.standard_normal(rows)
         runs.append({"t": t, "reference": met, "reading": 0.003 + speed + noise})
     return runs
 
