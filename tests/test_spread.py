@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy import signal as signal_processing
 from scipy import stats
 
 from casest import Residual, Run, calibrate_many, model, param, signal
@@ -16,7 +17,7 @@ from casest.estimate.covariance import sandwich
 from casest.leastsquares.problem import Problem
 from casest.leastsquares.weights import variance_factor, weights
 
-TRUTH = np.array([2.0, 1.0])
+TRUTH, NAMES = np.array([2.0, 1.0]), ("slope", "level")
 OUTLIERS = next(e for e in CATALOGUE if e.name == "outliers")
 
 
@@ -160,8 +161,8 @@ def of_colour(share):
 def test_correlated_noise_widens_the_std_as_much_as_it_spreads_the_estimates():
     """AR(1) of 0.8: a level is known nine times less well than from as many white readings."""
     error, std, found = fits(180, of_colour(0.8), 800)
-    ratio = np.sqrt(np.mean(std[:, 1] ** 2) / np.mean(error[:, 1] ** 2))
-    assert 0.87 < ratio < 1.13
+    for own in (error / std).T:  # of the slope too, over an input that is white
+        assert 0.85 < rms(own) < 1.15
     over = np.mean([f.correlated_over for f in found])
     assert over == pytest.approx((1 + 0.8) / (1 - 0.8), rel=0.12)
 
@@ -170,8 +171,56 @@ def test_correlated_noise_widens_the_std_as_much_as_it_spreads_the_estimates():
 def test_correlated_noise_in_few_batches_widens_it_too():
     error, std, found = fits(180, of_colour(0.8), 240)
     assert np.median([240 / (10 * f.correlated_over) for f in found]) < 30
-    ratio = np.sqrt(np.mean(std[:, 1] ** 2) / np.mean(error[:, 1] ** 2))
-    assert 0.8 < ratio < 1.15
+    for own in (error / std).T:
+        assert 0.85 < rms(own) < 1.15
+
+
+def remembered(memory, share, spikes=0.0):
+    """Noise of which a share is forgotten as exp(−k/memory), with spikes of thirty times its size
+    in so many rows."""
+
+    def noise(rng, x):
+        n, kept = len(x), np.exp(-1 / memory)
+        kicks = rng.standard_normal(n) * np.sqrt(1 - kept**2)
+        kicks[0] = rng.standard_normal()
+        slow = signal_processing.lfilter([1], [1, -kept], kicks)
+        both = np.sqrt(share) * slow + np.sqrt(1 - share) * rng.standard_normal(n)
+        return 0.1 * (both + 30 * (rng.random(n) < spikes))[:, None]
+
+    return noise
+
+
+def held(declared, noise, n, count=60):
+    """Share of the 95 % intervals (2,) that hold slope and level of a slow input, and the rms of
+    errors in printed standard deviations."""
+    rng, inside, scores = np.random.default_rng(7), [], []
+    t = np.arange(n)
+    x = np.sin(2 * np.pi * 2.5 * t / n + 0.3) + 0.3 * np.sin(2 * np.pi * t / 23)
+    for _ in range(count):
+        y = 1 + 2 * x + noise(rng, x)[:, 0]
+        run = Run.raw("r", {"x": x[:, None], "y": y[:, None]}, units={}, time=t * 0.01)
+        found = attempt(declared, [run], solver="trust-region")
+        low, high = found.interval_reach
+        error = np.array([found.values[k] - v for k, v in zip(NAMES, TRUTH, strict=True)])
+        inside.append([-high[k] <= e <= low[k] for k, e in zip(NAMES, error, strict=True)])
+        scores.append(error / [found.std[k] for k in NAMES])
+    return np.mean(inside, axis=0), np.sqrt(np.mean(np.square(scores), axis=0))
+
+
+@pytest.mark.parametrize("spikes", [0.0, 0.01])
+@pytest.mark.parametrize(("n", "memory"), [(200, 50), (1000, 50)])
+def test_a_record_of_few_memories_of_its_noise_says_so(n, memory, spikes):
+    """Four memories, and twenty: σ²(JᵀJ)⁻¹ times their correlation held 0.67 and 0.89 of levels."""
+    declared = line.with_effect(OUTLIERS) if spikes else line
+    inside, _ = held(declared, remembered(memory, 0.6, spikes), n)
+    assert np.all(inside >= 0.88)  # 1 in 100 below that, of 60
+
+
+def test_outliers_take_nothing_from_what_correlation_adds():
+    """Huber's variance alone is that of independent residuals, here 1 : 50."""
+    inside, scores = held(line.with_effect(OUTLIERS), remembered(50, 0.6, 0.01), 4000)
+    assert np.all(inside >= 0.86)
+    assert np.all((scores > 0.75) & (scores < 1.3))
 
 
 @pytest.mark.long

@@ -230,10 +230,11 @@ def _estimate(
     free = free_of(problem.unknowns, on_bounds(problem, point, factor, noise.sigma))
     normal = problem.model.prior is not None or (noise.known and correlated <= 1)
     by = as_stated if normal else covariance_of
-    covariance = by(problem, point, R, noise.sigma, correlated, free)
+    spread = by(problem, point, R, noise.sigma, correlated, free)
     if noise.known and not normal:
         known = as_stated(problem, point, R, noise.sigma, correlated, free)
-        covariance = no_less(covariance, known)
+        spread = no_less(spread, known)
+    covariance = spread.covariance
     bias = second_order_bias(problem, point, noise.sigma, inverse_normal(R, free))
     relative = float(np.max(np.abs(bias[free]) / np.sqrt(np.diag(covariance)[free]), initial=0.0))
     shift = np.outer(bias, bias) if relative > NOTABLE_BIAS else 0.0
@@ -270,6 +271,7 @@ def _estimate(
         relative,
         shift,
         inputs=inputs,
+        colour_freedom=spread.freedom,
     )
 
 

@@ -45,7 +45,10 @@ def is_series(run: Run) -> bool:
 def _stretches(problem: Problem, point: Point) -> list[list[Array]]:
     """Residuals of each run: all of them, or of a long record every k-th stretch."""
     if problem.sequential or problem.residual_count <= SAMPLED:
-        return [[residual] for residual in problem.residuals(point)]
+        residuals = list(problem.residuals(point))
+        if problem.weights is not None:  # outliers are alike over no time
+            residuals = [r * np.sqrt(w) for r, w in zip(residuals, problem.weights, strict=True)]
+        return [[residual] for residual in residuals]
     every = -(-problem.residual_count // SAMPLED)
     found: list[list[Array]] = [[] for _ in problem.runs]
     for k, (run, _, residual) in enumerate(problem.residual_blocks(point)):

@@ -2,24 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from casest.declaration.shapes import Array
 from casest.estimate.correlation import batches
-from casest.estimate.spectrum import Stretch, by_frequency, noise_spectrum
+from casest.estimate.remembering import remembering
+from casest.estimate.spectrum import Part, Stretch, by_frequency, noise_spectrum
 from casest.leastsquares.problem import Point, Problem
 from casest.leastsquares.sums import squares_of_batches, squares_of_gradients
 from casest.leastsquares.weights import has_noise_effects, variance_factor
 
-#: Batches per unknown from which on those say enough of correlated noise by themselves; and of all,
-#: below which neither they nor a spectrum do: the plain covariance is then widened as a whole.
-MANY_BATCHES, FEWEST_BATCHES = 20, 30
+#: Batches per unknown from which on those say enough of correlated noise by themselves.
+MANY_BATCHES = 20
 #: Residuals for each unknown from which on the robust form is as sharp as the plain one, and right
 #: where the noise differs from place to place. Of fewer the plain one makes more.
 MANY_RESIDUALS = 10
+
+
+@dataclass(frozen=True)
+class Spread:
+    """A covariance (n, n), and degrees of freedom (n,) of its variances where these are fewer than
+    those of the fit, because little is known of the noise's colour."""
+
+    covariance: Array
+    freedom: Array | None = None
 
 
 def covariance_of(
@@ -29,22 +39,47 @@ def covariance_of(
     sigma: float,
     correlated_over: float,
     free: NDArray[np.bool_] | None = None,
-) -> Array:
-    """The covariance (n, n) that is printed: robust, but for few residuals in all or of an unknown.
+) -> Spread:
+    """The covariance that is printed: robust, but for few residuals in all or of an unknown.
 
     Unknowns that are not `free` are held where they are, and have none.
     """
     if has_noise_effects(problem.model):
-        plain = problem.with_weights(None).factor(point)[0]
-        return np.asarray(variance_factor(problem, point) * inverse_normal(plain, free))
+        return _of_outliers(problem, point, R, correlated_over, free)
     many = problem.residual_count >= MANY_RESIDUALS * problem.unknowns
     if correlated_over > 1 or many:
         robust, told_by = _sandwich(problem, point, R, correlated_over, free)
         if told_by is None:
             return robust
         plain = sigma**2 * np.diag(inverse_normal(R, free))
-        return as_plain(robust, plain, told_by < MANY_RESIDUALS)
-    return np.asarray(sigma**2 * inverse_normal(R, free))
+        return Spread(as_plain(robust.covariance, plain, told_by < MANY_RESIDUALS))
+    return Spread(sigma**2 * inverse_normal(R, free))
+
+
+def _of_outliers(
+    problem: Problem,
+    point: Point,
+    R: Array,
+    correlated_over: float,
+    free: NDArray[np.bool_] | None,
+) -> Spread:
+    """That of residuals that count less the further out they lie: Huber's, and as many times that
+    as their correlation makes of the covariance of weighted ones."""
+    plain = problem.with_weights(None).factor(point)[0]
+    alone = np.asarray(variance_factor(problem, point) * inverse_normal(plain, free))
+    if correlated_over <= 1:
+        return Spread(alone)
+    robust, _ = _sandwich(problem, point, R, correlated_over, free)
+    own, alike = np.diag(alone), np.diag(_plainly(problem, point, inverse_normal(R, free)))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        size = np.where(alike > 0, np.sqrt(own / alike), 1.0)
+    return replace(robust, covariance=robust.covariance * size[:, None] * size[None])
+
+
+def _plainly(problem: Problem, point: Point, bread: Array) -> Array:
+    """The covariance of independent noise that is alike everywhere."""
+    left = max(problem.residual_count - problem.unknowns, 1)
+    return np.asarray(2 * problem.cost(point) / left * bread)
 
 
 def as_plain(robust: Array, plain: Array, few: NDArray[np.bool_]) -> Array:
@@ -63,16 +98,16 @@ def as_stated(
     sigma: float,
     correlated_over: float,
     free: NDArray[np.bool_] | None = None,
-) -> Array:
-    """The covariance (n, n) of independent noise that was stated of every reading."""
-    return np.asarray(sigma**2 * inverse_normal(R, free))
+) -> Spread:
+    """The covariance of independent noise that was stated of every reading."""
+    return Spread(sigma**2 * inverse_normal(R, free))
 
 
-def no_less(robust: Array, stated: Array) -> Array:
-    """The robust covariance (n, n), no variance below that of the noise that was stated: where
-    residuals look correlated by chance, their batches know less of it than who stated it."""
-    own = np.diag(stated)
-    return as_plain(robust, own, np.diag(robust) < own)
+def no_less(robust: Spread, other: Spread) -> Spread:
+    """The robust covariance, no variance below another's, as that of the noise that was stated:
+    where residuals look correlated by chance, they know less of it than who stated it."""
+    own, less = np.diag(other.covariance), np.diag(robust.covariance)
+    return replace(robust, covariance=as_plain(robust.covariance, own, less < own))
 
 
 def inverse_normal(R: Array, free: NDArray[np.bool_] | None = None) -> Array:
@@ -101,9 +136,10 @@ def sandwich(
 
     HC3 (MacKinnon & White 1985). Of correlated residuals over batches of samples at least ten
     correlation times long (Liang & Zeger 1986); where there are too few of those for n² numbers,
-    JᵀSJ by frequencies, with a smooth spectrum S of the noise.
+    JᵀSJ by frequencies, S the spectrum of noise that is `remembering`, or a smooth one:
+    the larger variance of the two.
     """
-    return _sandwich(problem, point, R, correlated_over, free)[0]
+    return _sandwich(problem, point, R, correlated_over, free)[0].covariance
 
 
 def _sandwich(
@@ -112,7 +148,7 @@ def _sandwich(
     R: Array,
     correlated_over: float,
     free: NDArray[np.bool_] | None,
-) -> tuple[Array, Array | None]:
+) -> tuple[Spread, Array | None]:
     """The same, and of independent residuals how many say what each unknown is.
 
     It takes a look at every residual, and who prints it asks again: the last one is kept.
@@ -128,26 +164,25 @@ def _sandwich(
 
 def _baked(
     problem: Problem, point: Point, bread: Array, correlated_over: float
-) -> tuple[Array, Array | None]:
+) -> tuple[Spread, Array | None]:
     if correlated_over <= 1:
         middle, told_by = squares_of_gradients(problem, point, bread)
-        return np.asarray(bread @ middle @ bread), told_by
+        return Spread(bread @ middle @ bread), told_by
     least, enough = 10 * correlated_over, MANY_BATCHES * problem.unknowns
     longest = min(len(run) for run in problem.runs) * len(problem.runs) / (2 * enough)
     firsts = [batches(run, int(np.ceil(max(least, longest)))) for run in problem.runs]
     groups = sum(len(first) for first in firsts)
     if groups >= enough:
         middle = groups / (groups - 1) * squares_of_batches(problem, point, firsts)
-        return np.asarray(bread @ middle @ bread), None
-    if groups < FEWEST_BATCHES:
-        plain = 2 * problem.cost(point) / max(problem.residual_count - problem.unknowns, 1)
-        return np.asarray(correlated_over * plain * bread), None
-    return np.asarray(bread @ _by_frequencies(problem, point, bread) @ bread), None
-
-
-def _by_frequencies(problem: Problem, point: Point, bread: Array) -> Array:
-    """JᵀSJ (n, n): S the covariance of noise with a smooth spectrum, of each axis its own."""
+        return Spread(bread @ middle @ bread), None
     parts = [part for block in stretches(problem, point) for part in by_frequency(block, bread)]
+    # Each of the two has colours that it does not know: pink noise, and a knee with little below.
+    smooth = np.asarray(bread @ _by_frequencies(problem, parts) @ bread)
+    return no_less(Spread(*remembering(parts, bread)), Spread(smooth)), None
+
+
+def _by_frequencies(problem: Problem, parts: Sequence[Part]) -> Array:
+    """JᵀSJ (n, n): S the covariance of noise with a smooth spectrum, of each axis its own."""
     axes = range(len(problem.model.axes))
     spectra = [noise_spectrum([part.powers for part in parts if part.axis == k]) for k in axes]
     middle = np.zeros((problem.unknowns, problem.unknowns))

@@ -63,7 +63,8 @@ class Estimate:
     are several runs). `std` is `robust`, the sandwich form, where residuals are correlated over
     more than one sample or are many for each unknown, else `plain`. All are taken at the
     least-squares `optimum`, where `point` is not it; `shift` (n, n) is what second-order noise
-    adds, a bias of up to `bias` standard deviations, and what uncertain `inputs` do.
+    adds, a bias of up to `bias` standard deviations, and what uncertain `inputs` do. Of a
+    record that is few memories of its noise long, `colour_freedom` (n,) is what its variances have.
     `covariance` (n, n) is of the unknowns `names`. Where the data do not determine a value its std
     is NaN.
     """
@@ -86,6 +87,7 @@ class Estimate:
     optimum: Point | None = None
     evidence: Evidence | None = None
     inputs: Inputs | None = None
+    colour_freedom: Array | None = None
     extra: Mapping[str, Any] = field(default_factory=dict)
 
     @property
@@ -197,14 +199,16 @@ class Estimate:
     def _squared_reach(self) -> tuple[Array, Array]:
         """Squares of the reach below and above, (n, n) each as a covariance, as if unbounded."""
         profile = self.certificate.profile
+        half = np.array([half_width(freedom) for freedom in self.effective_freedom])
         if profile is None:
-            half = np.array([half_width(freedom) for freedom in self.effective_freedom])
             linear = np.outer(half, half) * self.covariance
             return linear.copy(), linear.copy()
         R = self.problem.factor(self.optimum or self.point)[0]
         plain = self.noise.sigma**2 * np.diag(inverse_normal(R, self.free))
         with np.errstate(invalid="ignore", divide="ignore"):
             wider = np.sqrt(np.diag(self.covariance) / plain)
+        if self.correlated_over > 1:
+            wider = wider * np.maximum(half / half_width(self.noise.degrees_of_freedom), 1.0)
         return np.diag((wider * profile[:, 0]) ** 2), np.diag((wider * profile[:, 1]) ** 2)
 
     @property
@@ -216,6 +220,8 @@ class Estimate:
         most, own = self.noise.degrees_of_freedom, freedom(self.problem, self.optimum or self.point)
         each = np.full(self.problem.unknowns, most) if own is None else np.minimum(own, most)
         each = np.trunc(each / self.correlated_over)
+        if self.colour_freedom is not None:
+            each = np.minimum(each, self.colour_freedom)
         if self.noise.known and self.correlated_over <= 1:
             each[:] = UNLIMITED
         if self.inputs is not None:

@@ -11,7 +11,7 @@ from casest.diagnose.levels import LEVELS
 from casest.diagnose.protocol.confirming import (
     FAR_AWAY,
     falls,
-    falls_of_refit,
+    falls_with,
     holds_out,
     passing,
 )
@@ -178,10 +178,8 @@ def _with_kept(
     refit: Refit[F],
     say: Callable[[str], None],
 ) -> State[F]:
-    after, kept, seen = subject.linear(refit.fit), state.kept, refit.falls
-    if seen is None and after.residual.shape == ranking.linear.residual.shape:
-        seen = falls_of_refit(ranking.linear, after)
-    seen = seen or falls(ranking, refit.evidence)
+    kept, seen = state.kept, refit.falls
+    seen = seen or falls_with(subject, state, ranking, refit.evidence, refit.fit)
     for trial in refit.evidence.trials:
         say(f"{trial.family}: held-out error falls")
         kept = (*kept, Kept(trial.what, refit.evidence, seen))

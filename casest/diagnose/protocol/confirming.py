@@ -8,7 +8,8 @@ from casest.diagnose.evidence.held_out import Fall, fall, fall_between
 from casest.diagnose.evidence.linear import Linear, alike
 from casest.diagnose.evidence.score import Evidence
 from casest.diagnose.levels import LEVELS
-from casest.diagnose.protocol.state import Ranking
+from casest.diagnose.protocol.state import F, Ranking, State
+from casest.diagnose.protocol.subject import Subject
 
 #: Parts that are held out whole.
 FAR_AWAY = ("stretches", "regions")
@@ -24,6 +25,17 @@ def falls_of_refit(before: Linear, after: Linear) -> dict[str, Fall]:
     """Held-out squares of two fits, each near its own optimum."""
     before, after = alike([before, after])
     return {k: fall_between(before, after, parts) for k, parts in before.parts.each.items()}
+
+
+def falls_with(
+    subject: Subject[F], state: State[F], ranking: Ranking, evidence: Evidence, fit: F
+) -> dict[str, Fall]:
+    """What a cause does to each kind of held-out squares by its refit, in the deviations of the fit
+    without it; by its columns where the refit is one to other rows, as where readings came late."""
+    after = subject.linear_in(state.fit, fit)
+    if after.residual.shape != ranking.linear.residual.shape:
+        return falls(ranking, evidence)
+    return falls_of_refit(ranking.linear, after)
 
 
 def holds_out(found: dict[str, Fall], linear: Linear) -> bool:

@@ -22,7 +22,7 @@ from casest.diagnose.evidence.score import (
 )
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.noise.louder import louder
-from casest.diagnose.protocol.confirming import falls, falls_of_refit, holds_out
+from casest.diagnose.protocol.confirming import falls, falls_of_refit, falls_with, holds_out
 from casest.diagnose.protocol.ranking import sharpened, without_feigned
 from casest.diagnose.protocol.state import F, Ranking, Refit, State
 from casest.diagnose.protocol.subject import Subject
@@ -357,7 +357,7 @@ def shown(
             kept = _by_squares(subject, state, ranking, evidence, better)
         # Its columns say little of it: the chance is that of its refit.
         kept = with_chance(kept, ranking.likelihood, ranking.families)
-        seen = falls_of_refit(ranking.linear, subject.linear(better))
+        seen = falls_with(subject, state, ranking, kept, better)
         clear = beyond_courses(ranking, kept) and ranking.stands_out(kept)
         if clear and holds_out(seen, ranking.linear):
             found.append(Refit(state.fit, better, kept, seen))
