@@ -69,10 +69,13 @@ def test_a_threshold_of_the_input_is_told_beside_an_offset(seed):
     assert float(np.ravel(width)[0]) == pytest.approx(1.1, abs=0.12)
 
 
-def test_a_threshold_whose_best_size_is_that_of_a_row_is_named_and_not_added():
-    """The cost has a kink there, and no slope that would prove a least one."""
+def test_a_threshold_whose_best_size_is_that_of_a_row_is_added_too():
+    """The cost has a kink there, and no slope is zero: it was named and not added."""
     closing = close("linear", spring(0))
-    assert closing.undecided.names[0] == "dead_band"
+    assert names(closing) == {"dead_band"}
+    width = float(np.ravel(closing.after.values["dead_band.width"])[0])
+    assert np.min(np.abs(np.linspace(0, 8, 60) - width)) < 1e-6
+    assert any("kink" in reason for reason in closing.after.certificate.reasons)
 
 
 def late(seed, lag=0.0, tau=0.0, noise=0.05):

@@ -16,7 +16,7 @@ from casest.engine.threads import one_thread
 from casest.errors import DataError, NotTrusted, UsageError
 from casest.estimate import reasons as words
 from casest.estimate.by_estimator import by_estimator
-from casest.estimate.certificate import Certificate, certify
+from casest.estimate.certificate import Certificate, certify, settled, slope_and_step
 from casest.estimate.correlation import correlation_time
 from casest.estimate.covariance import as_stated, covariance_of, inverse_normal, no_less
 from casest.estimate.errors_of_inputs import solved, with_errors_of_inputs
@@ -24,6 +24,7 @@ from casest.estimate.estimate import Estimate as Estimate
 from casest.estimate.estimate import Noise
 from casest.estimate.evidence import judged
 from casest.estimate.keeping import keeping
+from casest.estimate.kink import at_kink
 from casest.estimate.on_bounds import free_of, on_bounds
 from casest.estimate.propagation import propagated
 from casest.estimate.reasons import POOR, STARTS, WORTH, Code
@@ -215,6 +216,7 @@ def _estimate(
     outcomes = [
         best if o is found else o if _beside(o, best) else _canonical(problem, o) for o in outcomes
     ]
+    best = _at_kink(problem, best)
     point = best.point
     if problem.parabolic:
         problem.looked_at(point)  # judged by the samples there, not by what follows from elsewhere
@@ -273,6 +275,23 @@ def _estimate(
         inputs=inputs,
         colour_freedom=spread.freedom,
     )
+
+
+def _at_kink(problem: Problem, best: Outcome) -> Outcome:
+    """The outcome; where its slope is none of a least cost, the least cost at a kink nearby."""
+    if problem.parabolic or not np.isfinite(best.cost):
+        return best
+    R, t, rest = problem.factor(best.point)
+    if not np.isfinite(R).all():
+        return best
+    freedom = max(problem.residual_count - problem.unknowns, 1)
+    sigma = float(np.sqrt(2 * best.cost / freedom))
+    if not sigma > 0 or settled(*slope_and_step((R, t, rest), sigma, 0.0)):
+        return best
+    found = at_kink(problem, best.point, sigma)
+    if found is None or problem.cost(found) > best.cost:
+        return best
+    return replace(best, point=found, cost=problem.cost(found))
 
 
 def _told_apart(problem: Problem, point: Point, R: Array) -> Array:

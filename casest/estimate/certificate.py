@@ -21,6 +21,7 @@ from casest.declaration.shapes import Array
 from casest.declaration.symbols import Signal
 from casest.estimate import reasons as words
 from casest.estimate.covariance import inverse_normal
+from casest.estimate.kink import left_at_kink
 from casest.estimate.on_bounds import OnBound, free_of, of_the_free, on_bounds
 from casest.estimate.profile_likelihood import Profile, half_width, profiled
 from casest.estimate.reasons import (
@@ -111,7 +112,8 @@ def certify(
     free = free_of(problem.unknowns, at_bound)
     whole, factor = factor[0], of_the_free(factor, free)
     R = factor[0]
-    slope, step = _slope_and_step(factor, sigma, rounding)
+    slope, step = slope_and_step(factor, sigma, rounding)
+    kinked = ""
     # What cannot be told from rounding is no slope, however small the residual.
     exact = float(np.linalg.norm(factor[1])) <= 10 * rounding * np.sqrt(problem.residual_count)
     amplified = growth(problem, best.point) if np.isfinite(best.cost) else 1.0
@@ -130,9 +132,15 @@ def certify(
         against.append((Code.NO_REDUNDANCY, words.no_redundancy(*counts, way)))
     if not np.isfinite(best.cost):
         against.append((Code.NOT_FINITE, words.not_finite()))
-    elif slope > SLOPE and step > STEP and not exact and not against:
-        smallest = identified.singular_values[-1] / identified.singular_values[0]
-        against.append((Code.NOT_SETTLED, words.not_settled(step, smallest, identified.weakest)))
+    elif not settled(slope, step) and not exact and not against:
+        kink = left_at_kink(problem, best.point, sigma) if free.all() else None
+        if kink is None:
+            smallest = identified.singular_values[-1] / identified.singular_values[0]
+            said = words.not_settled(step, smallest, identified.weakest)
+            against.append((Code.NOT_SETTLED, said))
+        else:
+            step, kinked = kink
+            slope = step * sigma / max(float(np.hypot(step * sigma, factor[2])), 1e-300)
     curvature = _curvature(problem, best.point, R, free) if not against else float("nan")
     if not against and not curvature > CURVATURE:
         against.append((Code.NO_MINIMUM, words.no_minimum(curvature)))
@@ -154,7 +162,7 @@ def certify(
         against += misshapen or _ambiguous(problem, best, others, whole, sigma)
     against.sort(key=lambda reason: reason[0])
     speaking_for = (
-        words.stationary(step),
+        words.stationary(step, kink=kinked),
         words.minimum(curvature),
         words.agreement(agreeing, len(others)),
         _intervals(shape, profile is not None),
@@ -225,7 +233,12 @@ def _profile(
     return found
 
 
-def _slope_and_step(
+def settled(slope: float, step: float) -> bool:
+    """Is as good as nothing left of either?"""
+    return slope <= SLOPE or step <= STEP
+
+
+def slope_and_step(
     factor: tuple[Array, Array, float], sigma: float, rounding: float
 ) -> tuple[float, float]:
     """Share of the residual still in the Jacobian's reach; the step left in standard deviations."""

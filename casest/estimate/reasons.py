@@ -276,9 +276,12 @@ def from_optimum(estimator: str, name: str, deviations: float) -> str:
 # -- words for -------------------------------------------------------------------------------------
 
 
-def stationary(step: float, at_most: bool = False) -> str:
-    """The step left, in standard deviations."""
-    return f"stationary: the step left is {'at most ' * at_most}{step:.1g} standard deviations"
+def stationary(step: float, at_most: bool = False, kink: str = "") -> str:
+    """The step left, in standard deviations; where an unknown is at a kink of the cost, that of a
+    slope between those of its two sides."""
+    where = f" at a kink over `{kink}`, to both sides of which the cost rises" if kink else ""
+    left = f"the step left is {'at most ' * at_most}{step:.1g} standard deviations"
+    return f"stationary{where}: {left}"
 
 
 def minimum(curvature: float | None = None) -> str:

@@ -12,6 +12,7 @@ from casest.data.run import Run
 from casest.declaration.model import Model
 from casest.declaration.shapes import Array
 from casest.diagnose.cross_validation import ENOUGH, ITERATIONS, undetermined
+from casest.estimate.kink import at_kink
 from casest.leastsquares.problem import Point, Problem
 from casest.leastsquares.weights import robust_scale, weighted
 from casest.solve.trust_region import trust_region
@@ -68,7 +69,11 @@ def certified(fit: Fit, runs: tuple[Run, ...]) -> Fit | str:
     step = np.linalg.lstsq(matrix, slope, rcond=1e-12)[0]
     length = float(np.sqrt(max(float(step @ slope), 0.0)))
     if not why and length > RESTLESS * fit.noise:
-        why = "not a stationary point"
+        kink = at_kink(problem, found.point, fit.noise)
+        if kink is None:
+            why = "not a stationary point"
+        else:
+            values = problem.values(kink)
     return f"its fit is refused: {why}" if why else replace(fit, values=values)
 
 
