@@ -50,7 +50,7 @@ def test_a_kink_is_found_and_proved_where_no_threshold_around_fits_better(fits):
         assert squares(run, best) <= least + 1e-4 * found.noise.sigma**2
         row = np.min(np.abs(WEIGHTS - best)) < 1e-5
         assert row == ("kink" in found.certificate.reasons[0])
-    assert kinks >= 3  # one in eight or so
+    assert kinks >= 1  # one in thirty or so
 
 
 def test_intervals_of_thresholds_hold_the_truth(fits):
