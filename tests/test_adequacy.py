@@ -236,6 +236,20 @@ def test_repeats_in_several_sweeps_do_not_lack_fit_whatever_their_sizes(sizes):
     assert np.sum(p < 0.01) <= 11  # 4 are expected; twelve come once in a thousand tries
 
 
+def test_a_level_at_a_full_scale_says_nothing_of_the_noise():
+    """There both instruments stand still; what others scatter is none of its misfit's size."""
+    rng, p = np.random.default_rng(6), []
+    for _ in range(40):
+        x = np.repeat(np.linspace(-1, 1, 12), 20)
+        y = x + rng.standard_normal(len(x))
+        y[-60:] = np.repeat(y[-60::20], 20)
+        run = Run.raw("r", {"x": x[:, None], "y": y[:, None]}, units={}, time=0.1 * np.arange(240))
+        problem = Problem(one_channel, prepared(one_channel, [run]))
+        point = trust_region(problem, problem.start()).point
+        p.append(pure_error(problem, point, problem.residuals(point), problem.unknowns).p_value)
+    assert np.sum(np.array(p) < 0.01) <= 3
+
+
 def test_a_bend_is_a_lack_of_fit_of_several_sweeps():
     """Of three times the noise at both ends."""
     rng = np.random.default_rng(4)

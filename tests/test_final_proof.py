@@ -105,3 +105,31 @@ def test_with_a_cause_goes_the_lag_of_a_column_that_it_alone_read(searched):
     less = sensor.without(with_lag, both.kept[0].what)
     assert less.model.effects == ()
     assert left_in(state, less).kept == ()
+
+
+@pytest.mark.parametrize("seed", [1, 3, 4])
+def test_a_cause_goes_that_is_none_by_its_printed_standard_deviation(seed):
+    """A slow course of unknown cause beside a slow column: as if it were white noise, k is four
+    standard deviations and more."""
+    rng, t = np.random.default_rng([7, seed]), 0.1 * np.arange(800.0)
+    kicks, slow = 0.01 * rng.standard_normal(800), np.zeros(800)
+    for k in range(1, 800):
+        slow[k] = np.exp(-1 / 150) * slow[k - 1] + kicks[k]
+    x, warm = rng.uniform(-1, 1, 800), np.sin(0.15 * t)
+    y = 0.2 + 1.1 * x + slow + 0.01 * rng.standard_normal(800)
+    signals = {"reference": x[:, None], "reading": y[:, None]}
+    sensor = Sensor(linear, record(signals, t, warm), CATALOGUE)
+    before = attempt(linear, sensor.runs)
+    fit = sensor.fitted(before.model, before.values)
+    trials = {t.family: t for t in sensor.trials(fit) if not t.what.held}
+    trial = trials["temperature_bias(warm)"]
+    both = sensor.refit(fit, [trial])
+    found = attempt(both.model, sensor.runs)
+    name = "temperature_bias(warm).k"
+    assert abs(found.values[name]) > 4 * found.plain[name]
+    assert abs(found.values[name]) < 2 * found.std[name]
+    state, after = certified(sensor, State(both, (kept_of(sensor, fit, trial),)), before)
+    assert not state.kept
+    assert name not in after.values
+    ((_, why),) = [(r.what.label, r.why) for r in state.refused]
+    assert why == NO_SIZE

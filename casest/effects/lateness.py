@@ -25,6 +25,8 @@ TOGETHER = 0.3
 #: Steps over which a change is averaged: from sample to sample a noisy signal is lively by its
 #: noise.
 WIDTHS = (1, 4, 16, 64)
+#: Parts of a step between which it is seen how alike they are: tops lie between steps.
+FINER = 4
 #: Standard errors of such a correlation that chance does not reach, of means of independent steps.
 SEEN = 4.0
 
@@ -53,7 +55,7 @@ def likely_lag(
     grid = np.arange(first, max(run.time[-1], other.time[-1]), step)
     longest = int(FARTHEST * min(np.ptp(run.time), np.ptp(other.time)) / step)
     rates = [_rate(curve, grid) for curve in (mine, its)]
-    best, most = 0, -np.inf
+    best, most = 0.0, -np.inf
     for width in WIDTHS:
         lag, alike = _together(rates, width, longest)
         enough = SEEN * np.sqrt(2 * width / len(grid)) if width > 1 else 0.0
@@ -69,11 +71,15 @@ def _together(rates: Sequence[tuple[Array, NDArray[np.bool_]]], width: int, long
     a, b = (_liveliness(rate, there, width) for rate, there in rates)
     size = 2 * len(a)
     product = np.fft.rfft(a, size) * np.conj(np.fft.rfft(b, size))
-    together = np.fft.irfft(product, size)
-    lags = np.arange(-longest, longest + 1)
-    best = int(lags[np.argmax(together[lags])])
-    alone = float(np.linalg.norm(a) * np.linalg.norm(b))
-    return best, float(together[best]) / max(alone, 1e-300)
+    together = FINER * np.fft.irfft(product, FINER * size)
+    lags = np.arange(-longest * FINER, longest * FINER + 1)
+    alone = max(float(np.linalg.norm(a) * np.linalg.norm(b)), 1e-300)
+    alike = together[lags] / alone
+    # Of what comes again and again the nearest: periods later it is as alike but for chance.
+    top = np.append(alike[:-1] >= alike[1:], True) & np.append(True, alike[1:] >= alike[:-1])
+    top &= alike >= alike.max() - np.sqrt(2 * width / len(a))
+    best = int(min(lags[top], key=abs))
+    return best / FINER, float(together[best]) / alone
 
 
 def _rate(curve: Curve, grid: Array) -> tuple[Array, NDArray[np.bool_]]:

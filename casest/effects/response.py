@@ -193,8 +193,9 @@ def dead_band(u: SX, *, width: SX = param(each, "[u]", bounds=(0, None))) -> SX:
     null={"level": inf},
     shown_by="readings that reach the end of the range",
     formula="y − share·sign(y)·max(|y| − level, 0)",
-    # Where less than half is lost the reading goes on: a bend with a kink.
-    within={"share": (0.5, inf)},
+    # Where less than half is lost the reading goes on: a bend with a kink; where more than all, it
+    # turns back.
+    within={"share": (0.5, 1.5)},
 )
 def saturation(y: SX, *, share: SX = param(each, bounds=(0, None)), level: SX = param("[y]")) -> SX:
     """Readings beyond ±level are cut off (share 1), or compressed (share below 1)."""

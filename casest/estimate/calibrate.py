@@ -230,11 +230,13 @@ def _estimate(
     noise = _noise(problem, point, float(np.sqrt(2 * best.cost)), dof, identified.rank)
     correlated = correlation_time(problem, point)
     free = free_of(problem.unknowns, on_bounds(problem, point, factor, noise.sigma))
-    normal = problem.model.prior is not None or (noise.known and correlated <= 1)
+    # A table's order is nobody's, but where its neighbours are alike they are not independent.
+    alike = max(correlated, correlation_time(problem, point, tables=True))
+    normal = problem.model.prior is not None or (noise.known and alike <= 1)
     by = as_stated if normal else covariance_of
-    spread = by(problem, point, R, noise.sigma, correlated, free)
+    spread = by(problem, point, R, noise.sigma, alike, free)
     if noise.known and not normal:
-        known = as_stated(problem, point, R, noise.sigma, correlated, free)
+        known = as_stated(problem, point, R, noise.sigma, alike, free)
         spread = no_less(spread, known)
     covariance = spread.covariance
     bias = second_order_bias(problem, point, noise.sigma, inverse_normal(R, free))

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casest.declaration.shapes import Array
-from casest.estimate.correlation import batches
+from casest.estimate.correlation import batches, is_series
 from casest.estimate.remembering import remembering
 from casest.estimate.spectrum import Part, Stretch, by_frequency, noise_spectrum
 from casest.leastsquares.problem import Point, Problem
@@ -172,7 +172,7 @@ def _baked(
     longest = min(len(run) for run in problem.runs) * len(problem.runs) / (2 * enough)
     firsts = [batches(run, int(np.ceil(max(least, longest)))) for run in problem.runs]
     groups = sum(len(first) for first in firsts)
-    if groups >= enough:
+    if groups >= enough and all(is_series(run) for run in problem.runs):
         middle = groups / (groups - 1) * squares_of_batches(problem, point, firsts)
         return Spread(bread @ middle @ bread), None
     parts = [part for block in stretches(problem, point) for part in by_frequency(block, bread)]

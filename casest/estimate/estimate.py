@@ -241,13 +241,13 @@ class Estimate:
 
 
 def _of_tables(problem: Problem, point: Point) -> Iterator[str]:
-    """That neighbouring rows of a table are alike, in case they followed each other in time."""
+    """That neighbouring rows of a table are alike, as if they followed each other in time."""
     if not any(run.time is None and ENOUGH <= len(run) < TABLE for run in problem.runs):
         return
     over = correlation_time(problem, point, tables=True)
     if over > 1:
         yield (
-            f"residuals of neighbouring rows are alike (over {over:.2g} rows), which counts for "
-            "nothing in rows without a time; if they followed each other, say so with --rate: "
-            f"standard deviations grow by about {np.sqrt(over):.2g}"
+            f"residuals of neighbouring rows are alike (over {over:.2g} rows): standard deviations "
+            "allow for that, causes do not in rows without a time; if they followed each other, "
+            "say so with --rate"
         )

@@ -18,6 +18,8 @@ from casest.leastsquares.problem import Point, Problem
 #: How far from a point slopes are taken that count as its own, in standard deviations of an
 #: unknown: as far as the longest step that counts as none; and of those that lead to a kink.
 BESIDE, NEARBY = STEP, 0.01
+#: How many times the distance a slope has to change over it, which is twice where it is smooth.
+JUMP = 4.0
 #: Steps to a kink, and halvings of one of them.
 STEPS, HALVINGS = 60, 20
 #: Weight of the sum of shares, which is one, against the slopes in a least-squares problem.
@@ -67,14 +69,14 @@ def left_at_kink(problem: Problem, point: Point, sigma: float) -> tuple[float, s
 def _kinks(
     problem: Problem, point: Point, R: Array, distance: float
 ) -> dict[int, tuple[Array, Array]]:
-    """Unknowns towards which the cost falls from both sides, and its slopes there: `distance` over
-    the length of an unknown's column of J away."""
+    """Unknowns towards which the cost falls from both sides by a slope that jumps, and its slopes
+    there: `distance` over the length of an unknown's column of J away."""
     found = {}
     for j, size in enumerate(np.linalg.norm(R, axis=0)):
         step = np.zeros(len(point.x))
         step[j] = distance / size
         below, above = (problem.normal(problem.moved(point, s)).gradient for s in (-step, step))
-        if below[j] < 0 < above[j]:
+        if below[j] < 0 < above[j] and above[j] - below[j] > JUMP * distance * size:
             found[j] = below, above
     return found
 

@@ -11,7 +11,7 @@ from casest.leastsquares.agreement import between_runs
 from casest.leastsquares.problem import LOOKED, Point, Problem
 from casest.leastsquares.stated import UNLIKELY, ChiSquare
 from casest.leastsquares.sums import repeat_noise, rounding, some_residuals
-from casest.leastsquares.weights import robust_scale
+from casest.leastsquares.weights import scale_of_readings
 
 #: Second-order shift, in standard deviations, from which on it is added to them.
 NOTABLE_BIAS = 0.3
@@ -111,7 +111,7 @@ def _runs_that_disagree(problem: Problem, point: Point, correlated: float) -> It
 
 def _furthest_out(problem: Problem, point: Point) -> Iterator[str]:
     """The sample that lies far outside what the others show."""
-    scale = robust_scale(some_residuals(problem, point))
+    scale = scale_of_readings(some_residuals(problem, point))
     size, k, row = max(_largest(block) for block in problem.residual_blocks(point))
     exact = 10 * rounding(problem, point)  # noise-free data have no outliers
     if problem.residual_count > 2 * problem.unknowns and size > FAR_OUT * max(scale, exact):

@@ -33,10 +33,16 @@ def robust_scale(residuals: Sequence[Array]) -> float:
     return max(float(np.median(everything)) / 0.6745, 1e-300)
 
 
+def scale_of_readings(residuals: Sequence[Array]) -> float:
+    """The same without those that are exactly zero: there nothing was read."""
+    read = [r[r != 0] for r in residuals]
+    return robust_scale(read if any(r.size for r in read) else residuals)
+
+
 def weights(problem: Problem, point: Point) -> tuple[Array, ...]:
     """Weight of every residual at a point, (N, m) per run."""
     residuals = problem.residuals(point)
-    scale, curve = robust_scale(residuals), _curve(problem.model)
+    scale, curve = scale_of_readings(residuals), _curve(problem.model)
     return tuple(
         curve(np.zeros(0), (r / scale).reshape(-1, 1))[0].reshape(r.shape) for r in residuals
     )
@@ -78,7 +84,7 @@ def variance_factor(problem: Problem, point: Point) -> float:
     than FEW for each unknown that is too little, and `_reach` takes the place of K/mean(ψ′).
     """
     residuals = some_residuals(problem, point)
-    scale = robust_scale(residuals)
+    scale = scale_of_readings(residuals)
     r = np.concatenate([x.ravel() for x in residuals]) / scale
     w, slope = (out.ravel() for out in _curve(problem.model)(np.zeros(0), r.reshape(-1, 1)))
     count, dof = len(r), max(len(r) - problem.unknowns, 1)

@@ -32,7 +32,7 @@ def typical_sizes(
     """
     if candidate.freed:
         value = model[candidate.freed].array
-        return None if value.ndim else np.array([0.01 * abs(float(value)) or 1.0])
+        return None if value.ndim or not np.any(value) else np.array([0.01 * abs(float(value))])
     effect = candidate.effect
     assert effect is not None
     typical = dict(effect.typical)

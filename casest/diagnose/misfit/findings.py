@@ -27,7 +27,7 @@ from casest.leastsquares.agreement import between_runs
 from casest.leastsquares.neighbours import Scatter
 from casest.leastsquares.problem import Point, Problem
 from casest.leastsquares.stated import chi_square
-from casest.leastsquares.weights import robust_scale, weighted
+from casest.leastsquares.weights import scale_of_readings, weighted
 
 #: Residual over the scatter from which on that is rounding: readings that only repeat.
 REPEATED = 1e6
@@ -61,7 +61,7 @@ def findings(
     residuals = problem.residuals(point)
     problem = weighted(problem, problem.values(point))
     freedom = max(problem.residual_count - problem.unknowns, 1)
-    sigma = robust_scale(residuals) * float(np.sqrt(problem.residual_count / freedom))
+    sigma = scale_of_readings(residuals) * float(np.sqrt(problem.residual_count / freedom))
     clipped = _clipped(problem, residuals, sigma)
     found = _before(problem, point) + _stated(problem, point)
     found += _few_rows(problem, point)

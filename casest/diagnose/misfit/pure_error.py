@@ -149,6 +149,10 @@ def _repeats(run: Run, level: Array) -> Iterator[tuple[int, int]]:
 
 
 def _lack_of_fit(groups: Sequence[Array], rank: int, series: bool) -> PureError | None:
+    # At a full scale readings do not scatter, whatever their noise.
+    groups = [g for g in groups if len(g) < LEVELS.repeats or np.any(np.ptp(g, axis=0) > 0)]
+    if len(groups) < GROUPS:
+        return None
     axes, sizes = groups[0].shape[1], np.array([len(g) for g in groups], float)
     means = np.array([g.mean(axis=0) for g in groups])
     within = np.array([np.sum((g - g.mean(axis=0)) ** 2) for g in groups])

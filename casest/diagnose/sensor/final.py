@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from scipy.special import fdtrc, ndtr
 
 from casest.declaration.effect import Attached
 from casest.diagnose.levels import LEVELS
@@ -88,11 +89,21 @@ def _at_fault(sensor: Sensor, state: State[Fit], after: Estimate) -> tuple[Kept 
 
 def _is_nothing(attached: Attached, after: Estimate) -> bool:
     """Is each of an effect's sizes within two standard deviations of none, were noise alike
-    everywhere? Then only rows that count less, or a colour of the noise, had spoken for it."""
+    everywhere? Then only rows that count less, or a colour of the noise, had spoken for it. Or are
+    all of them together, by the standard deviations that are printed?"""
     searched = dict(attached.effect.profile)
-    sizes = [p.name for p in attached.parameters if p.name.rpartition(".")[2] not in searched]
+    sizes = {p.name for p in attached.parameters if p.name.rpartition(".")[2] not in searched}
     z = [np.abs(after.values[n]) / after.plain[n] for n in sizes if n in after.plain]
-    return bool(z) and all(bool(np.all(one < LEVELS.apart)) for one in z)
+    if z and all(bool(np.all(one < LEVELS.apart)) for one in z):
+        return True
+    own = [s.x for s in after.problem.slots if s.parameter.name in sizes]
+    x = np.concatenate([np.arange(s.start, s.stop) for s in own] or [np.zeros(0, int)])
+    covariance, values = after.covariance[np.ix_(x, x)], after.point.x[x]
+    if not x.size or not np.isfinite(covariance).all():
+        return False
+    F = float(values @ np.linalg.lstsq(covariance, values, rcond=1e-12)[0]) / len(x)
+    freedom = float(np.min(np.array(after.effective_freedom)[x]))
+    return bool(fdtrc(len(x), max(freedom, 1.0), F) > 2 * ndtr(-LEVELS.apart))
 
 
 def _least(state: State[Fit], after: Estimate) -> Kept | None:

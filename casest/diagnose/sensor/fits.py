@@ -14,7 +14,7 @@ from casest.declaration.shapes import Array
 from casest.diagnose.cross_validation import ENOUGH, ITERATIONS, undetermined
 from casest.estimate.kink import at_kink
 from casest.leastsquares.problem import Point, Problem
-from casest.leastsquares.weights import robust_scale, weighted
+from casest.leastsquares.weights import scale_of_readings, weighted
 from casest.solve.trust_region import trust_region
 
 #: Iterations of a fit that is to stay, and standard deviations that a step may be long there.
@@ -45,7 +45,7 @@ def fitted(model: Model, runs: tuple[Run, ...], values: Mapping[str, Array]) -> 
     if not all(np.all(np.isfinite(r)) for r in residuals):
         return None
     freedom = max(problem.residual_count - problem.unknowns, 1)
-    noise = robust_scale(residuals) * float(np.sqrt(count / freedom))
+    noise = scale_of_readings(residuals) * float(np.sqrt(count / freedom))
     return Fit(model, problem.values(point), tuple(residuals), noise, problem.unknowns)
 
 
