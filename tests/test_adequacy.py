@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from casest import Residual, Run, model, param, quantity, signal
+from casest import Residual, Run, close, model, param, quantity, signal
 from casest.diagnose.cross_validation import folded
 from casest.diagnose.misfit.findings import findings
 from casest.diagnose.misfit.left import Misfit, left_over
@@ -470,3 +470,14 @@ def test_an_axis_that_stands_still_on_one_level_has_the_noise_of_rounding():
     assert found.sigma[2] == pytest.approx(0.01 / np.sqrt(12))
     assert found.outliers == 0
     assert found.colour_p > 0.001
+
+
+@pytest.mark.parametrize(("share", "verdict"), [(0.03, "adequate"), (0.25, "unexplained")])
+def test_every_fourth_row_far_out_is_no_fault_of_a_reading(share, verdict):
+    rng = np.random.default_rng(8)
+    x = rng.uniform(-1, 1, 2000)
+    far = rng.random(2000) < share
+    y = 0.2 + 1.1 * x + 0.01 * rng.standard_normal(2000) + far * rng.laplace(0, 0.3, 2000)
+    closing = close("linear", {"t": 0.1 * np.arange(2000), "reference": x, "reading": y})
+    assert closing.verdict == verdict
+    assert ("too many to be faults" in closing.misfit.where) == (share > 0.1)

@@ -39,6 +39,10 @@ _KIN = float(np.exp(-1 / MEMORY))
 OF_COLOUR = (1.5 - 2 * _KIN + 0.5 * _KIN**2) / 1.5
 
 
+#: Share of faults among readings, at most: 1 to 10 % are usual (F. Hampel et al., 1986, 1.2c).
+FAULTS = 0.1
+
+
 @dataclass(frozen=True)
 class Finding:
     """Evidence of a misfit: where, in words, σ of the noise beside it, its share if known; `slow`:
@@ -64,7 +68,7 @@ def findings(
     sigma = scale_of_readings(residuals) * float(np.sqrt(problem.residual_count / freedom))
     clipped = _clipped(problem, residuals, sigma)
     found = _before(problem, point) + _stated(problem, point)
-    found += _few_rows(problem, point)
+    found += _few_rows(problem, point) + _far_out(problem, sigma)
     found += _repeats(problem, point, clipped, wanders=wanders)
     slow = [] if wanders else _slow(problem, point, clipped, sigma)
     follows = _follows(problem, point, clipped, sigma, in_time=not (slow or wanders))
@@ -100,6 +104,17 @@ def _repeats(
     if ratio > REPEATED:
         where = f"between {tested.between}: within them readings only repeat, and explain nothing"
     return [Finding(where, tested.p_value, tested.sigma)]
+
+
+def _far_out(problem: Problem, sigma: float) -> list[Finding]:
+    """More rows that count for nothing, far out as they are, than faults are among readings."""
+    if problem.weights is None or not any(a.effect.seen_in == TAILS for a in problem.model.effects):
+        return []
+    share = float(np.mean(np.concatenate([(w <= 0).any(axis=1) for w in problem.weights])))
+    if share <= FAULTS:
+        return []
+    where = f"{100 * share:.0f} % of the rows are far out: too many to be faults"
+    return [Finding(where, 0.0, sigma)]
 
 
 def _few_rows(problem: Problem, point: Point) -> list[Finding]:
