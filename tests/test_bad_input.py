@@ -220,6 +220,12 @@ def test_an_unknown_unit_is_named_by_file_and_parameter(refused):
     assert "model line: r has unknown unit 'ohmm'" in text
 
 
+@pytest.mark.parametrize("unit", ["F", "C"])
+def test_what_may_be_meant_by_farad_or_coulomb_is_said_where_degrees_do_not_fit(refused, unit):
+    text = refused_model(refused, HEADER.replace("'ohm'", f"'{unit}'") + BODY)
+    assert "F and C are degrees here: write farad and coulomb" in text
+
+
 def test_a_unit_that_does_not_fit_is_named_by_model_and_symbols(refused):
     text = refused_model(refused, HEADER.replace("'ohm'", "'kg'") + BODY)
     assert "model line" in text

@@ -283,7 +283,10 @@ def refuse_unless_fits(a: Size, b: Size, where: str) -> None:
     if dict(a.powers) == dict(b.powers) and same_factor:
         return
     sides = [f"{s}" + (f" (from {', '.join(sorted(s.names))})" if s.names else "") for s in (a, b)]
-    raise UnitError(f"{where}: units do not fit: {sides[0]} against {sides[1]}; {_way_out(a, b)}")
+    said = f"{where}: units do not fit: {sides[0]} against {sides[1]}; {_way_out(a, b)}"
+    if re.search(r"\[[FC]\]|declared in [FC]\b", said):
+        said += "; F and C are degrees here: write farad and coulomb"
+    raise UnitError(said)
 
 
 def _way_out(a: Size, b: Size) -> str:
