@@ -52,6 +52,19 @@ def test_a_lag_beside_a_slower_sensor_is_found_without_its_image(tmp_path):
     assert sum(delays) == pytest.approx(0.02, abs=0.002)
 
 
+def test_of_what_stays_the_same_for_long_readings_remain(tmp_path):
+    """Sunshine by the hour, in a log of quarters: at night it is zero, and is read all the same."""
+    rng, hours = np.random.default_rng(4), np.arange(500)
+    sun = np.maximum(np.sin(2 * np.pi * hours / 24), 0) * rng.uniform(0.2, 1, 500)
+    columns = {
+        "t": 900.0 * np.arange(2000),
+        "reference": np.repeat(sun, 4),
+        "reading": rng.standard_normal(2000),
+    }
+    (run,) = load_runs([written(tmp_path / "house.csv", columns)], SIGNALS)
+    assert 495 <= len(run) <= 500
+
+
 def slow_and_rounded(rng):
     """A temperature that stays for any number of rows."""
     return np.round(20 + np.cumsum(0.03 * rng.standard_normal(3000)), 1)

@@ -282,7 +282,7 @@ def _complete(
             )
         complete &= ~(absent | again)
     for names, rows in _held(bound, options, [n for n in parts if n in plain]):
-        again = checks.written_again(parts[names])
+        again = checks.written_again(parts[names], rows)
         said.append(f"{int(again.sum())} repeat {' '.join(names)}, {HELD.format(rows)}")
         complete &= ~again
     if not said:
@@ -320,7 +320,7 @@ def _renewed(bound: _Bound, options: Options) -> list[str]:
         values = bound.signals[name]
         rows = checks.renewed_every(values)
         if rows > 1:
-            again = checks.written_again(values)
+            again = checks.written_again(values, rows)
             bound.signals[name] = np.where(again[:, None], np.nan, values)
             source = " ".join(bound.sources[name])
             said.append(f"{int(again.sum())} rows repeat {source}, {HELD.format(rows)}")

@@ -205,9 +205,11 @@ def renewed_every(values: Array) -> int:
     return usual if sooner < _SELDOM and near > _MOSTLY else 1
 
 
-def written_again(values: Array) -> NDArray[np.bool_]:
-    """Which rows (N,) are as the one before."""
-    return np.concatenate([[False], (values[1:] == values[:-1]).all(axis=1)])
+def written_again(values: Array, rows: int) -> NDArray[np.bool_]:
+    """Which rows (N,) only repeat one that is read every `rows`: a reading may stay the same."""
+    again = np.concatenate([[False], (values[1:] == values[:-1]).all(axis=1)])
+    first = np.maximum.accumulate(np.where(again, 0, np.arange(len(values))))
+    return np.asarray((np.arange(len(values)) - first) % rows != 0)
 
 
 def _symmetric(x: Array) -> bool:

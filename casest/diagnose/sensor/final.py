@@ -8,6 +8,8 @@ import numpy as np
 from scipy.special import fdtrc, ndtr
 
 from casest.declaration.effect import Attached
+from casest.declaration.shapes import Array
+from casest.diagnose.evidence.linear import Index
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.protocol import Kept, State
 from casest.diagnose.protocol.ranking import ranked
@@ -22,6 +24,8 @@ from casest.leastsquares.kinds import noises
 
 #: Why an effect is not kept that the last fit makes nothing of.
 NO_SIZE = "in the end its size may as well be nothing"
+#: Chance of what is two standard deviations from none.
+TWO_SIDED = float(2 * ndtr(-LEVELS.apart))
 
 
 def certified(sensor: Sensor, state: State[Fit], before: Estimate) -> tuple[State[Fit], Estimate]:
@@ -90,20 +94,42 @@ def _at_fault(sensor: Sensor, state: State[Fit], after: Estimate) -> tuple[Kept 
 def _is_nothing(attached: Attached, after: Estimate) -> bool:
     """Is each of an effect's sizes within two standard deviations of none, were noise alike
     everywhere? Then only rows that count less, or a colour of the noise, had spoken for it. Or are
-    all of them together, by the standard deviations that are printed?"""
-    searched = dict(attached.effect.profile)
-    sizes = {p.name for p in attached.parameters if p.name.rpartition(".")[2] not in searched}
+    all of them together, by the standard deviations that are printed, and would not be if the other
+    effects were known? Then what came later has taken its place."""
+    sizes = _sizes(attached)
     z = [np.abs(after.values[n]) / after.plain[n] for n in sizes if n in after.plain]
     if z and all(bool(np.all(one < LEVELS.apart)) for one in z):
         return True
-    own = [s.x for s in after.problem.slots if s.parameter.name in sizes]
-    x = np.concatenate([np.arange(s.start, s.stop) for s in own] or [np.zeros(0, int)])
-    covariance, values = after.covariance[np.ix_(x, x)], after.point.x[x]
-    if not x.size or not np.isfinite(covariance).all():
+    others = {p.name for a in after.model.effects if a is not attached for p in a.parameters}
+    own, rest = _places(sizes, after), _places(others, after)
+    both = np.concatenate([own, rest])
+    covariance = after.covariance[np.ix_(both, both)]
+    if not (own.size and rest.size) or not np.isfinite(covariance).all():
         return False
-    F = float(values @ np.linalg.lstsq(covariance, values, rcond=1e-12)[0]) / len(x)
-    freedom = float(np.min(np.array(after.effective_freedom)[x]))
-    return bool(fdtrc(len(x), max(freedom, 1.0), F) > 2 * ndtr(-LEVELS.apart))
+    n = len(own)
+    C, between, known = covariance[:n, :n], covariance[:n, n:], covariance[n:, n:]
+    alone = C - between @ np.linalg.lstsq(known, between.T, rcond=1e-12)[0]
+    values, freedom = after.point.x[own], np.array(after.effective_freedom)[own]
+    by_chance = [_by_chance(values, c, float(freedom.min())) for c in (C, alone)]
+    return by_chance[0] > TWO_SIDED > by_chance[1]
+
+
+def _sizes(attached: Attached) -> set[str]:
+    """Parameters of an effect that are none where it is none."""
+    searched = dict(attached.effect.profile)
+    return {p.name for p in attached.parameters if p.name.rpartition(".")[2] not in searched}
+
+
+def _places(names: set[str], after: Estimate) -> Index:
+    """Numbers of the unknowns of these parameters."""
+    own = [np.arange(s.x.start, s.x.stop) for s in after.problem.slots if s.parameter.name in names]
+    return np.concatenate([*own, np.zeros(0, int)])
+
+
+def _by_chance(values: Array, covariance: Array, freedom: float) -> float:
+    """The chance of values (k,) that far from none, by their F test."""
+    F = float(values @ np.linalg.lstsq(covariance, values, rcond=1e-12)[0]) / len(values)
+    return float(fdtrc(len(values), max(freedom, 1.0), max(F, 0.0)))
 
 
 def _least(state: State[Fit], after: Estimate) -> Kept | None:
