@@ -27,15 +27,18 @@ SHARES = (0.0, 0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 0.95, 0.98, 1.0)
 SINGLE, BANDS = 24, 60
 #: What the intervals hold; degrees of freedom at least, and from which on they are as many as any.
 HELD, FEWEST, MANY = 0.95, 1.0, 1e4
+#: Halvings in which a number is found to all its digits.
+HALVINGS = 60
 
 
 class _Axis(NamedTuple):
-    """Noise of one axis: how likely each colour is (K,), its power (K, B) in bands of frequencies,
-    and JᵀJ (B, n, n) of these."""
+    """One axis of all stretches: how likely each colour of its noise is (K,), the noise's power
+    (K, B) in bands of frequencies, and which band each frequency of every stretch is in."""
 
+    parts: list[Part]
+    bands: list[NDArray[np.int_]]
     weight: Array
     power: Array
-    normal: Array
 
 
 def remembering(parts: Sequence[Part], bread: Array) -> tuple[Array, Array]:
@@ -45,25 +48,34 @@ def remembering(parts: Sequence[Part], bread: Array) -> tuple[Array, Array]:
     Each axis has noise of its own.
     """
     n = len(bread)
-    covariance, size, doubt = np.zeros((n, n)), np.zeros(n), np.zeros(n)
+    middle, size, doubt = np.zeros((n, n)), np.zeros(n), np.zeros(n)
     for k in sorted({part.axis for part in parts}):
-        axis = _axis([part for part in parts if part.axis == k], n)
-        each = axis.power @ np.einsum("ia,bac,ic->bi", bread, axis.normal, bread)
-        each = np.maximum(each, 0.0)
+        axis = _axis([part for part in parts if part.axis == k])
+        each = axis.power @ _pulls(axis, bread)
         with np.errstate(divide="ignore"):
             own = np.exp(axis.weight @ np.log(each))
-        middle = np.einsum("b,bac->ac", axis.weight @ axis.power, axis.normal)
-        covariance += bread @ middle @ bread
+        mean = axis.weight @ axis.power
+        for part, band in zip(axis.parts, axis.bands, strict=True):
+            middle[np.ix_(part.x, part.x)] += (part.jacobian.T * mean[band]) @ part.jacobian
         size += own
         doubt += own**2 / _freedom(axis.weight, each, own)
+    covariance = bread @ middle @ bread
     with np.errstate(divide="ignore", invalid="ignore"):
         scale = np.sqrt(np.where(size > 0, size / np.diag(covariance), 0.0))
         freedom = np.where(doubt > 0, size**2 / doubt, MANY)
     return covariance * np.outer(scale, scale), freedom
 
 
-def _axis(parts: Sequence[Part], n: int) -> _Axis:
-    """One axis of all stretches, its frequencies in order."""
+def _pulls(axis: _Axis, bread: Array) -> Array:
+    """Squares (B, n) of what each band does to the unknowns, for noise of power one."""
+    found = np.zeros((axis.power.shape[1], len(bread)))
+    for part, band in zip(axis.parts, axis.bands, strict=True):
+        np.add.at(found, band, (part.jacobian @ bread[part.x]) ** 2)
+    return found
+
+
+def _axis(parts: list[Part]) -> _Axis:
+    """Which colours one axis may have by all of its stretches."""
     every = zip(*(part.powers for part in parts), strict=True)
     frequency, power, left = (np.concatenate(column) for column in every)
     order = np.argsort(frequency, kind="stable")
@@ -72,19 +84,14 @@ def _axis(parts: Sequence[Part], n: int) -> _Axis:
     edges = np.unique(np.concatenate([np.arange(min(SINGLE, count)), fast[fast < count]]))
     band = np.empty(count, int)
     band[order] = np.searchsorted(edges, np.arange(count), side="right") - 1
-    normal, first = np.zeros((len(edges), n, n)), 0
-    for part in parts:
-        own = band[first : first + len(part.jacobian)]
-        for b in np.unique(own):
-            J = part.jacobian[own == b]
-            normal[b][np.ix_(part.x, part.x)] += J.T @ J
-        first += len(own)
-    shapes = _shapes(frequency[order], edges, max(len(part.jacobian) for part in parts))
+    lengths = [len(part.jacobian) for part in parts]
+    shapes = _shapes(frequency[order], edges, max(lengths))
     told: Array = np.bincount(band, left).astype(float)
     told = np.where(told > LEFT * np.bincount(band), told, 0.0)
     squares = np.where(told > 0, np.bincount(band, power), 0.0)
     weight, sizes = _likely(shapes, told, squares)
-    return _Axis(weight, shapes * sizes[:, None], normal)
+    bands = np.split(band, np.cumsum(lengths)[:-1])
+    return _Axis(parts, bands, weight, shapes * sizes[:, None])
 
 
 def _shapes(frequency: Array, edges: NDArray[np.int_], longest: int) -> Array:
@@ -112,18 +119,18 @@ def _freedom(weight: Array, each: Array, own: Array) -> Array:
     mixture of normal errors of variances `each` (K, n)."""
     from scipy.special import ndtr, stdtrit
 
-    found = np.full(len(own), MANY)
-    for i in np.flatnonzero(own > 0):
-        deviation = np.sqrt(np.maximum(each[:, i], 1e-300))
-        low, high = 0.0, 10 * float(deviation.max())
-        for _ in range(60):
-            middle = (low + high) / 2
-            held = weight @ (2 * ndtr(middle / deviation) - 1)
-            low, high = (middle, high) if held < HELD else (low, middle)
-        reach, few, many = high / np.sqrt(own[i]), FEWEST, MANY
-        for _ in range(60):
-            middle = np.sqrt(few * many)
-            further = stdtrit(middle, (1 + HELD) / 2) > reach
-            few, many = (middle, many) if further else (few, middle)
-        found[i] = few
+    there = own > 0
+    found, size = np.full(len(own), MANY), np.sqrt(own[there])
+    deviation = np.sqrt(np.maximum(each[:, there], 1e-300))
+    low, high = np.zeros_like(size), 10 * deviation.max(axis=0)
+    for _ in range(HALVINGS):
+        middle = (low + high) / 2
+        less = weight @ (2 * ndtr(middle / deviation) - 1) < HELD
+        low, high = np.where(less, middle, low), np.where(less, high, middle)
+    few, many = np.full_like(size, FEWEST), np.full_like(size, MANY)
+    for _ in range(HALVINGS):
+        middle = np.sqrt(few * many)
+        further = stdtrit(middle, (1 + HELD) / 2) * size > high
+        few, many = np.where(further, middle, few), np.where(further, many, middle)
+    found[there] = few
     return found
