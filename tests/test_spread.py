@@ -216,6 +216,20 @@ def test_a_record_of_few_memories_of_its_noise_says_so(n, memory, spikes):
     assert np.all(inside >= 0.88)  # 1 in 100 below that, of 60
 
 
+def test_a_table_whose_neighbours_are_alike_has_the_std_of_a_series():
+    """A list in the order in which it was read, without a time; what is printed is `robust`."""
+    rng, inside = np.random.default_rng(9), []
+    for _ in range(60):
+        x = np.sin(2 * np.pi * 2.5 * np.arange(300) / 300)[:, None]
+        y = 1 + 2 * x + remembered(8, 0.8)(rng, x)
+        found = attempt(line, [Run.raw("table", {"x": x, "y": y}, units={})], solver="trust-region")
+        low, high = found.interval_reach
+        error = {k: found.values[k] - v for k, v in zip(NAMES, TRUTH, strict=True)}
+        inside.append([-high[k] <= error[k] <= low[k] for k in NAMES])
+        assert found.std["slope"] == found.robust["slope"] > found.plain["slope"]
+    assert np.all(np.mean(inside, axis=0) >= 0.88)
+
+
 def test_outliers_take_nothing_from_what_correlation_adds():
     """Huber's variance alone is that of independent residuals, here 1 : 50."""
     inside, scores = held(line.with_effect(OUTLIERS), remembered(50, 0.6, 0.01), 4000)

@@ -17,7 +17,7 @@ from casest.errors import DataError, NotTrusted, UsageError
 from casest.estimate import reasons as words
 from casest.estimate.by_estimator import by_estimator
 from casest.estimate.certificate import Certificate, certify, settled, slope_and_step
-from casest.estimate.correlation import correlation_time
+from casest.estimate.correlation import alike_over, correlation_time
 from casest.estimate.covariance import as_stated, covariance_of, inverse_normal, no_less
 from casest.estimate.errors_of_inputs import solved, with_errors_of_inputs
 from casest.estimate.estimate import Estimate as Estimate
@@ -230,8 +230,7 @@ def _estimate(
     noise = _noise(problem, point, float(np.sqrt(2 * best.cost)), dof, identified.rank)
     correlated = correlation_time(problem, point)
     free = free_of(problem.unknowns, on_bounds(problem, point, factor, noise.sigma))
-    # A table's order is nobody's, but where its neighbours are alike they are not independent.
-    alike = max(correlated, correlation_time(problem, point, tables=True))
+    alike = alike_over(problem, point, correlated)
     normal = problem.model.prior is not None or (noise.known and alike <= 1)
     by = as_stated if normal else covariance_of
     spread = by(problem, point, R, noise.sigma, alike, free)

@@ -35,6 +35,14 @@ def correlation_time(problem: Problem, point: Point, tables: bool = False) -> fl
     return float(np.dot(times, weights) / total) if times and total > 0 else 1.0
 
 
+def alike_over(problem: Problem, point: Point, correlated_over: float) -> float:
+    """Samples per independent residual for a standard deviation, where series have so many: a
+    table's order is nobody's, but where its neighbours are alike they are not independent."""
+    if all(is_series(run) for run in problem.runs):
+        return correlated_over
+    return max(correlated_over, correlation_time(problem, point, tables=True))
+
+
 def is_series(run: Run) -> bool:
     """Are there enough samples, in their order, to see correlation between neighbours?"""
     if run.spread:

@@ -14,7 +14,7 @@ from casest.declaration.model import Model
 from casest.declaration.shapes import Array
 from casest.estimate.before import against_prior
 from casest.estimate.certificate import Certificate, one_sided
-from casest.estimate.correlation import ENOUGH, TABLE, correlation_time
+from casest.estimate.correlation import ENOUGH, TABLE, alike_over, correlation_time
 from casest.estimate.covariance import inverse_normal, sandwich
 from casest.estimate.evidence import Evidence, remarks
 from casest.estimate.on_bounds import free_of
@@ -110,7 +110,8 @@ class Estimate:
             return self.std
         at = self.optimum or self.point
         R = self.problem.factor(at)[0]
-        return self._spread(sandwich(self.problem, at, R, self.correlated_over, self.free))
+        alike = alike_over(self.problem, at, self.correlated_over)
+        return self._spread(sandwich(self.problem, at, R, alike, self.free))
 
     @cached_property
     def information(self) -> Array:
@@ -220,10 +221,10 @@ class Estimate:
         most, own = self.noise.degrees_of_freedom, freedom(self.problem, self.optimum or self.point)
         each = np.full(self.problem.unknowns, most) if own is None else np.minimum(own, most)
         each = np.trunc(each / self.correlated_over)
-        if self.colour_freedom is not None:
-            each = np.minimum(each, self.colour_freedom)
         if self.noise.known and self.correlated_over <= 1:
             each[:] = UNLIMITED
+        if self.colour_freedom is not None:
+            each = np.minimum(each, self.colour_freedom)
         if self.inputs is not None:
             variance, known = np.diag(self.covariance), np.diag(self.inputs.carried)
             with np.errstate(invalid="ignore", divide="ignore"):
