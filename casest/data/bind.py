@@ -21,6 +21,7 @@ from casest.data.logs import file_and_topics, parts_of
 from casest.data.matching import find_by_name
 from casest.data.merging import merged, one_clock_each
 from casest.data.options import Options, refuse_unknown_names, stated_units
+from casest.data.renewing import Renewed, renewed
 from casest.data.rest import at_rest as averaged_at_rest
 from casest.data.run import Array, Labels, Run
 from casest.data.scaling import parse_scale
@@ -29,11 +30,6 @@ from casest.declaration.symbols import Signal
 from casest.errors import DataError, UnitError, UsageError
 
 Path_ = str | os.PathLike[str]
-#: What is said of a source that is new every so many rows.
-HELD = (
-    "which is new every {} rows: what is written again is no reading (of a command that is held "
-    "that long, log what is measured at its pace)"
-)
 #: A table in memory: a data frame of any library, a mapping of arrays, an array.
 Frame = Any
 
@@ -184,9 +180,9 @@ def _runs(table: Table, signals: Sequence[Signal], options: Options) -> list[Run
     dates = {name for name in bound.time_source if table.columns[name].is_text}
     sources |= {name for name in (*bound.time_source, *groups.values()) if name} - dates
     plain = {bound.sources[s.name] for s in signals if s.kind == "plain" and not is_time(s)}
-    renewed = _renewed(bound, options)
+    repeated = _without_repeats(bound, options)
     complete, dropped = _complete(table, bound, options, plain)
-    dropped = [*dropped, *renewed]
+    dropped = [*dropped, *repeated]
     others, other_units, notes = _others(table, sources, options, complete)
     labels = _labels(table, groups["run"])
     pose = _labels(table, groups["pose"])
@@ -281,10 +277,9 @@ def _complete(
                 f"waits, or no reading), the first row {first}"
             )
         complete &= ~(absent | again)
-    for names, rows in _held(bound, options, [n for n in parts if n in plain]):
-        again = checks.written_again(parts[names], rows)
-        said.append(f"{int(again.sum())} repeat {' '.join(names)}, {HELD.format(rows)}")
-        complete &= ~again
+    for slow in _slowest(bound, options, plain):
+        said.append(str(slow))
+        complete &= ~slow.again
     if not said:
         return complete, []
     left = table.n_rows - int(complete.sum())
@@ -297,34 +292,28 @@ def _complete(
     return complete, [note]
 
 
-def _held(
+def _slowest(
     bound: _Bound, options: Options, several: Collection[tuple[str, ...]]
-) -> list[tuple[tuple[str, ...], int]]:
-    """The source that is written longest before it is new, and every how many rows that is.
+) -> list[Renewed]:
+    """The source that is written longest before it is new, if any.
 
     Without a time rows in twos and threes are repeats of a table. Outputs that may be missing are
     so where they are no readings; inputs beside them are known in every row.
     """
     if options.gaps or (bound.time is None and options.rate is None):
         return []
-    sources = {bound.sources[name]: values for name, values in bound.signals.items()}
-    found = [(checks.renewed_every(sources[names]), names) for names in several if names in sources]
-    rows, names = max(found, default=(1, ()))
-    return [(names, rows)] if rows > 1 else []
+    sources = {bound.sources[n]: v for n, v in bound.signals.items() if bound.sources[n] in several}
+    return sorted(renewed(sources), key=lambda one: -one.rows)[:1]
 
 
-def _renewed(bound: _Bound, options: Options) -> list[str]:
+def _without_repeats(bound: _Bound, options: Options) -> list[str]:
     """Outputs that may be missing are so where the reading before is written again: says which."""
-    said = []
-    for name in sorted(options.gaps & set(bound.signals)):
-        values = bound.signals[name]
-        rows = checks.renewed_every(values)
-        if rows > 1:
-            again = checks.written_again(values, rows)
-            bound.signals[name] = np.where(again[:, None], np.nan, values)
-            source = " ".join(bound.sources[name])
-            said.append(f"{int(again.sum())} rows repeat {source}, {HELD.format(rows)}")
-    return said
+    outputs = {bound.sources[n]: n for n in sorted(options.gaps & set(bound.signals))}
+    found = list(renewed({source: bound.signals[n] for source, n in outputs.items()}))
+    for one in found:
+        values = bound.signals[outputs[one.source]]
+        bound.signals[outputs[one.source]] = np.where(one.again[:, None], np.nan, values)
+    return [f"of {one.again.size} rows {one}" for one in found]
 
 
 def is_time(signal: Signal) -> bool:

@@ -155,11 +155,6 @@ def full_scales(
                 yield i, sign, float(sign * (sign * values[:, i]).max()), count
 
 
-#: Changes from which on it is seen that a signal is renewed every so many rows; as many at most,
-#: since commands are held too; how often it may come sooner, and how often just then.
-_RENEWED, _HELD, _SELDOM, _MOSTLY = 100, 10, 0.02, 0.6
-
-
 def stalled(values: Array) -> NDArray[np.bool_]:
     """Which rows (N,) of several components (N, size) only repeat the one before.
 
@@ -184,32 +179,6 @@ def stalled(values: Array) -> NDArray[np.bool_]:
     zeros = first[long & ~values[first].any(axis=1)]
     found[zeros] = True
     return found if found.mean() <= _FEW else none
-
-
-def renewed_every(values: Array) -> int:
-    """Of how many rows one (N, size) is read, where it is written in others again; 1 of all.
-
-    So does a log that is faster than a sensor in it: hardly ever are two changes nearer than some
-    rows, and most are just that far apart. Set points last longer, or are few; a slow reading that
-    is rounded stays for any number of rows.
-    """
-    changes = np.flatnonzero((values[1:] != values[:-1]).any(axis=1))
-    between = np.diff(changes)
-    if len(between) < _RENEWED:
-        return 1
-    usual = int(np.median(between))
-    if not 2 <= usual <= _HELD:
-        return 1
-    sooner = np.mean(between < usual - 1) if usual > 2 else np.mean(between < usual)
-    near = np.mean(np.abs(between - usual) <= (usual > 2))
-    return usual if sooner < _SELDOM and near > _MOSTLY else 1
-
-
-def written_again(values: Array, rows: int) -> NDArray[np.bool_]:
-    """Which rows (N,) only repeat one that is read every `rows`: a reading may stay the same."""
-    again = np.concatenate([[False], (values[1:] == values[:-1]).all(axis=1)])
-    first = np.maximum.accumulate(np.where(again, 0, np.arange(len(values))))
-    return np.asarray((np.arange(len(values)) - first) % rows != 0)
 
 
 def _symmetric(x: Array) -> bool:

@@ -1,0 +1,67 @@
+"""Logs that are faster than a sensor in them: a reading is written again until there is a new one.
+
+A sensor that is read every third row is one and two rows old in the others: late, in steps at a
+rate of its own. Only the row counts in which it is new.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from casest.data.run import Array
+
+#: Changes from which on it is seen that a signal is renewed every so many rows, and of how many at
+#: most, since commands are held too.
+ENOUGH, LONGEST = 100, 10
+#: Share of changes that come sooner, at most, and just then, at least.
+SELDOM, MOSTLY = 0.02, 0.6
+
+
+class Renewed(NamedTuple):
+    """A source that is new every so many rows, and in which rows (N,) it is written again."""
+
+    source: tuple[str, ...]
+    rows: int
+    again: NDArray[np.bool_]
+
+    def __str__(self) -> str:
+        return (
+            f"{int(self.again.sum())} repeat {' '.join(self.source)}, which is new every "
+            f"{self.rows} rows: what is written again is no reading (of a command that is held "
+            "that long, log what is measured at its pace)"
+        )
+
+
+def renewed(sources: Mapping[tuple[str, ...], Array]) -> Iterable[Renewed]:
+    """The sources (N, size) that are renewed less often than written."""
+    for source, values in sources.items():
+        rows = renewed_every(values)
+        if rows > 1:
+            yield Renewed(source, rows, _written_again(values, rows))
+
+
+def renewed_every(values: Array) -> int:
+    """Of how many rows one (N, size) is read, where it is written in others again; 1 of all.
+
+    Hardly ever are two changes nearer than some rows then, and most are just that far apart. Set
+    points last longer, or are few; a slow reading that is rounded stays for any number of rows.
+    """
+    between = np.diff(np.flatnonzero((values[1:] != values[:-1]).any(axis=1)))
+    usual = int(np.median(between)) if len(between) >= ENOUGH else 1
+    if not 2 <= usual <= LONGEST:
+        return 1
+    late = usual > 2  # a clock of its own may come a row sooner or later
+    sooner = np.mean(between < usual - late)
+    near = np.mean(np.abs(between - usual) <= late)
+    return usual if sooner < SELDOM and near > MOSTLY else 1
+
+
+def _written_again(values: Array, rows: int) -> NDArray[np.bool_]:
+    """Which rows (N,) only repeat one that is read every `rows`: a reading may stay the same."""
+    again = np.concatenate([[False], (values[1:] == values[:-1]).all(axis=1)])
+    first = np.maximum.accumulate(np.where(again, 0, np.arange(len(values))))
+    return np.asarray((np.arange(len(values)) - first) % rows != 0)
