@@ -30,7 +30,10 @@ def at_kink(problem: Problem, point: Point, sigma: float) -> Point | None:
     """The least cost nearby where it has a kink there; None where it has none. `sigma`: standard
     deviation of one residual."""
     R = problem.factor(point)[0]
-    if not np.isfinite(R).all() or np.linalg.matrix_rank(R) < len(R):
+    lengths = np.linalg.norm(R, axis=0)
+    if not (
+        np.isfinite(R).all() and lengths.all() and np.linalg.matrix_rank(R / lengths) == len(R)
+    ):
         return None
     lower, upper = problem.bounds
     if not _kinks(problem, point, R, NEARBY * sigma):
