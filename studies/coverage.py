@@ -25,6 +25,7 @@ sys.path.insert(0, str(ROOT / "tests"))
 import resumed  # noqa: E402
 import simulators as sim  # noqa: E402
 import worlds  # noqa: E402
+from scipy.signal import lfilter  # noqa: E402
 
 from casest import (  # noqa: E402
     Model,
@@ -37,6 +38,7 @@ from casest import (  # noqa: E402
     quantity,
     signal,
 )
+from casest.effects.noise import outliers  # noqa: E402
 from casest.results.find import find_model  # noqa: E402
 
 KEPT, TABLE = ROOT / "out" / "coverage.jsonl", ROOT / "studies" / "coverage.md"
@@ -74,6 +76,28 @@ def lines(n: int, size: Size) -> Callable[[np.random.Generator], Drawn]:
             Run.raw("line", {"x": x[:, None], "y": y[:, None]}, units={}),
             {"a": 1.0, "b": 2.0},
         )
+
+    return drawn
+
+
+def slow(
+    n: int, memory: float, *, spikes: float = 0.0, timed: bool = True
+) -> Callable[[np.random.Generator], Drawn]:
+    """A slow input; of the noise 0.6 is forgotten as exp(−k/memory), the rest is white, and a share
+    of the readings is thirty times as far off."""
+
+    def drawn(rng: np.random.Generator) -> Drawn:
+        t = np.arange(n)
+        x = np.sin(2 * np.pi * 2.5 * t / n + 0.3) + 0.3 * np.sin(2 * np.pi * t / 23)
+        kept = np.exp(-1 / memory)
+        kicks = rng.standard_normal(n) * np.sqrt(1 - kept**2)
+        kicks[0] = rng.standard_normal()
+        noise = np.sqrt(0.6) * lfilter([1], [1, -kept], kicks)
+        noise += np.sqrt(0.4) * rng.standard_normal(n) + 30 * (rng.random(n) < spikes)
+        signals = {"x": x[:, None], "y": (1 + 2 * x + 0.1 * noise)[:, None]}
+        run = Run.raw("slow", signals, units={}, time=0.01 * t if timed else None)
+        declared = line.with_effect(outliers) if spikes else line
+        return declared, run, {"a": 1.0, "b": 2.0}
 
     return drawn
 
@@ -131,6 +155,12 @@ ROWS: dict[str, Callable[[np.random.Generator], Drawn]] = {
     "norm, 24 poses, equal noise": norms("white", 24),
     "norm, 72 poses, equal noise": norms("white", 72),
     "norm, 72 poses, unequal noise": norms("unequal", 72),
+    "line, 200 samples, memory of 50": slow(200, 50),
+    "line, 1000 samples, memory of 50": slow(1000, 50),
+    "line, 16 000 samples, memory of 50": slow(16_000, 50),
+    "line, 300 rows without a time, memory of 8": slow(300, 8, timed=False),
+    "line, 200 samples, memory of 50, outliers": slow(200, 50, spikes=0.01),
+    "line, 4000 samples, memory of 50, outliers": slow(4000, 50, spikes=0.01),
     "wheel, 12 s, white noise": wheels("white", 12.0, 50.0),
     "wheel, 12 s, AR(1) of 0.6": wheels("ar1", 12.0, 50.0),
     "wheel, 24 s, AR(1) of 0.6": wheels("ar1", 24.0, 100.0),
