@@ -29,6 +29,8 @@ WIDTHS = (1, 4, 16, 64)
 FINER = 4
 #: Standard errors of such a correlation that chance does not reach, of means of independent steps.
 SEEN = 4.0
+#: Of a signal with itself so much later: more is once more the same, as a wave's next period.
+SAME = 0.9
 
 
 def likely_lag(
@@ -64,6 +66,39 @@ def likely_lag(
     if name not in run.elsewhere and most < TOGETHER:
         return 0.0
     return float(step * best)
+
+
+def comes_again(runs: Sequence[Run], name: str, *, rotation: bool = False) -> float:
+    """Time in s after which a recorded signal is the same once more; inf of what never is.
+
+    By how much a steady wave is late can be told up to whole periods of it. Of several runs the
+    longest is asked.
+    """
+    told = [r for r in runs if r.time is not None and len(r) > 3 and name in r.signals]
+    if not told:
+        return np.inf
+    run = max(told, key=lambda r: float(np.ptp(np.asarray(r.time))))
+    assert run.time is not None
+    step = max(float(np.median(np.diff(run.time))), float(np.ptp(run.time)) / GRID)
+    curve = Curve.through(run.time, run.signals[name], run.block, rotation=rotation)
+    grid = np.arange(run.time[0], run.time[-1], step)
+    there = curve.covers(grid)
+    values = curve.at(grid, curve.nearest(grid))[0]
+    values = np.where(there[:, None], values - values[there].mean(axis=0), 0.0)
+
+    def with_itself(x: Array) -> Array:
+        power = np.abs(np.fft.rfft(x, 2 * len(x), axis=0)) ** 2
+        return np.asarray(np.fft.irfft(power, axis=0)[: int(FARTHEST * len(x))].sum(axis=1))
+
+    pairs = with_itself(there[:, None].astype(float))
+    alike = with_itself(values) / np.maximum(pairs, 1.0)
+    away = np.flatnonzero(alike < 0.0)
+    back = np.flatnonzero(alike[away[0] :] > SAME * alike[0]) if len(away) else away
+    if not len(back):
+        return np.inf
+    first = int(away[0] + back[0])
+    top = alike[first : first + int(away[0]) + 1]
+    return float(step * (first + np.argmax(top)))
 
 
 def _together(rates: Sequence[tuple[Array, NDArray[np.bool_]]], width: int, longest: int) -> Any:

@@ -49,15 +49,19 @@ class Seen:
     met: Array | None = None
 
 
-def on_grid(candidate: Candidate, seen: Seen, likely: float = 0.0) -> list[Candidate]:
+def on_grid(
+    candidate: Candidate, seen: Seen, likely: float = 0.0, again: float = np.inf
+) -> list[Candidate]:
     """The candidate at values of what it is searched over, `trials` saying among how many.
 
-    `likely`: a lag that the records show by themselves.
+    `likely`: a lag that the records show by themselves; `again`: after what time (s) what may be
+    late is the same once more.
     """
     profile = dict(candidate.effect.profile) if candidate.effect else {}
     if not profile:
         return [candidate]
-    values, trials = searched(tuple(profile.values()), seen, likely, _lowest(candidate, profile))
+    kinds, lowest = tuple(profile.values()), _lowest(candidate, profile)
+    values, trials = searched(kinds, seen, likely, lowest, again)
     found = [
         replace(candidate, held=_held(dict(zip(profile, v, strict=True))), trials=int(trials))
         for v in values
@@ -86,11 +90,15 @@ Values = tuple[list[tuple[float, ...]], float]
 
 
 def searched(
-    kinds: tuple[str, ...], seen: Seen, likely: float = 0.0, lowest: float = 0.0
+    kinds: tuple[str, ...],
+    seen: Seen,
+    likely: float = 0.0,
+    lowest: float = 0.0,
+    again: float = np.inf,
 ) -> Values:
     """Values to look at for what is searched over, and among how many they were chosen.
 
-    `lowest`: the least frequency (rad/s).
+    `lowest`: the least frequency (rad/s); `likely` and `again`: as in `on_grid`.
     """
     if kinds == ("level",):
         return _levels(seen)
@@ -99,7 +107,7 @@ def searched(
     if seen.time is None:
         return [], 1
     if kinds == ("lag",):
-        return _lags(seen, likely)
+        return _lags(seen, likely, again)
     if kinds == ("share",):
         turned = _turned_back(seen)
         return [(float(v),) for v in SHARES if v <= turned], len(SHARES)
@@ -238,8 +246,9 @@ def _constants(seen: Seen) -> Values:
     return [(float(v),) for v in np.geomspace(SHORTEST * step, longest, CONSTANTS)], CONSTANTS
 
 
-def _lags(seen: Seen, likely: float) -> Values:
-    """From half a sample on, in steps of a factor, both ways; and what the records show."""
+def _lags(seen: Seen, likely: float, again: float) -> Values:
+    """From half a sample on, in steps of a factor, both ways; and what the records show. Within half
+    a period of that: nothing tells one of a wave's periods from the next."""
     assert seen.time is not None
     step = float(np.median(np.diff(seen.time))) if len(seen.time) > 1 else 0.0
     longest = float(np.ptp(seen.time)) / 40
@@ -247,7 +256,8 @@ def _lags(seen: Seen, likely: float) -> Values:
         return [], 1
     sizes = step * np.geomspace(0.5, max(longest / step, 1.0), LAGS)
     found = [*(-sizes), *sizes, *([likely] if likely else [])]
-    return [(float(v),) for v in found], len(found)
+    near = [v for v in found if abs(v - likely) < again / 2]
+    return [(float(v),) for v in near], max(len(near), 1)
 
 
 def _lines(seen: Seen, lowest: float) -> Values:

@@ -21,6 +21,7 @@ from casest.diagnose.evidence.wandering import wandering_cost
 from casest.diagnose.formula.search import NAME, described, readable, with_sizes
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.protocol import Kept, Ranking, Subject
+from casest.diagnose.sensor.driven import driven
 from casest.diagnose.sensor.fits import (
     Fit,
     certified,
@@ -183,6 +184,7 @@ class Sensor(Subject[Fit]):
             too_slow(after.values, added, spans)
             or another(after.model, after.values, self.model)[1]
             or stands_in(before, after, added, self.rows)
+            or driven(before, after, added, self.rows)
         )
         bends = [t for t in trials if bend(t.what)] if self.linear(before).series else []
         if bends and not why:

@@ -35,7 +35,7 @@ from casest.diagnose.sensor.rows import Rows
 from casest.diagnose.sensor.twins import bend, twins
 from casest.effects import shipped
 from casest.effects.kinds import foreign, readings
-from casest.effects.lateness import likely_lag
+from casest.effects.lateness import comes_again, likely_lag
 from casest.effects.on_axes import restricted
 from casest.effects.placing import placed_in
 from casest.errors import CasestError
@@ -111,7 +111,7 @@ class Tried:
 
     def _expanded(self, fit: Fit) -> list[Candidate]:
         seen = self.seen(fit)
-        return [c for one in self.found(fit)[0] for c in on_grid(one, seen, self._likely(fit, one))]
+        return [c for one in self.found(fit)[0] for c in on_grid(one, seen, *self._late(fit, one))]
 
     def shown(self, fit: Fit) -> list[Trial]:
         """Long lags and full scales that the records show by themselves: a slope does not reach as
@@ -120,7 +120,7 @@ class Tried:
         step = float(np.median(np.diff(times[0]))) if times else np.inf
         found = []
         for candidate in self.found(fit)[0]:
-            lag = self._likely(fit, candidate)
+            lag, _ = self._late(fit, candidate)
             if abs(lag) > 2 * step:
                 found.append(replace(candidate, held=(("delay", lag),), trials=len(times[0])))
             profile = dict(candidate.effect.profile) if candidate.effect else {}
@@ -224,13 +224,15 @@ class Tried:
         blocks = sum(len(np.unique(run.block)) for run in self.rows.runs)
         return sum(map(len, self.rows.runs)) >= LONGEST_POSE * blocks
 
-    def _likely(self, fit: Fit, candidate: Candidate) -> float:
-        """A lag that two records show by how lively each of them is."""
+    def _late(self, fit: Fit, candidate: Candidate) -> tuple[float, float]:
+        """A lag that two records show by how lively each of them is, and the period in which what
+        is late comes again; in s."""
         if candidate.effect is None or candidate.effect.kind != "time":
-            return 0.0
-        name, measured = candidate.on, fit.model.traced.measured
+            return 0.0, np.inf
+        name, measured, runs = candidate.on, fit.model.traced.measured, self.rows.runs
         rotation = any(s.name == name and s.kind == "rotation" for s in fit.model.signals)
-        return likely_lag(self.rows.runs, measured or "", name, within=True, rotation=rotation)
+        lag = likely_lag(runs, measured or "", name, within=True, rotation=rotation)
+        return lag, comes_again(runs, name, rotation=rotation)
 
     def asked(self, what: Candidate) -> bool:
         """Is it the user's own, or named as there?"""
