@@ -20,11 +20,10 @@ from casest.diagnose.found import HELD_OUT_DATA, Found, Undecided
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.noise.slow_course import slow_squares
 from casest.diagnose.protocol import Kept, State, search, with_rivals
-from casest.diagnose.protocol.confirming import falls
+from casest.diagnose.protocol.confirming import falls_of_refit
 from casest.diagnose.protocol.elimination import chance_alone
 from casest.diagnose.protocol.ranking import ranked
 from casest.diagnose.protocol.refits import AS_MUCH
-from casest.diagnose.protocol.state import Ranking
 from casest.diagnose.sensor import Fit, Sensor
 from casest.diagnose.sensor.courses import courses
 from casest.diagnose.sensor.final import certified, left_in
@@ -282,11 +281,17 @@ def _undecided(sensor: Sensor, state: State[Fit]) -> Undecided | None:
     """Strong evidence for causes that were not added."""
     if not state.open:
         return None
-    best = state.open[0]
     # Of a pair each explains something beside the other: neither does alone what both do.
     alone = [e for e in state.open if len(e.trials) == 1] or state.open[:1]
     there = {k.what.label for k in state.kept}
-    names = tuple(dict.fromkeys(n for e in alone for n in e.families if n not in there))
+    shares = {
+        e.families: share
+        for e in alone
+        if not there.issuperset(e.families) and (share := _share(sensor, state, e)) is not None
+    }
+    most = LEVELS.nested * max(shares.values(), default=0.0)
+    shares = {families: share for families, share in shares.items() if share >= most}
+    names = tuple(dict.fromkeys(n for families in shares for n in families if n not in there))
     if not names:
         return None
     moves = {
@@ -294,15 +299,19 @@ def _undecided(sensor: Sensor, state: State[Fit]) -> Undecided | None:
         for r in state.torn
         if len(r.evidence.families) == 1  # of a pair none moves them alone
     }
-    return Undecided(names, _share(best, state.last), moves)
+    return Undecided(names, next(iter(shares.values())), moves)
 
 
-def _share(best: Evidence, last: Ranking | None) -> float:
-    """Of the held-out squares, that a cause takes away: in coloured noise its likelihood is no
-    share, and what is likeliest there lets the squares be what they are."""
-    if last is None or len(best.basis) != last.linear.residual.size:
+def _share(sensor: Sensor, state: State[Fit], evidence: Evidence) -> float | None:
+    """Of the held-out squares, that a cause takes away when it is refitted: its columns promise what
+    no refit may keep, and in coloured noise its likelihood is no share. None without a refit."""
+    fit = sensor.refit(state.fit, evidence.trials)
+    if isinstance(fit, str):
+        return None
+    before, after = sensor.linear(state.fit), sensor.linear_in(state.fit, fit)
+    if before.residual.shape != after.residual.shape:
         return 0.0
-    return max(0.0, 1 - falls(last, best)["pieces"].ratio)
+    return max(0.0, 1 - falls_of_refit(before, after)["pieces"].ratio)
 
 
 __all__ = ["Closing", "Found", "close"]

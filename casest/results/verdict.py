@@ -28,7 +28,7 @@ NAMED = 4
 
 def sentence(result: Closed) -> str:
     """The verdict in one sentence."""
-    names = [e.name + (f" ({e.column})" if e.column else "") for e in result.effects]
+    names = list(map(_named, result.effects))
     if result.verdict is None:
         held_out = "no verdict: nothing can be held out"
         return held_out if result.trusted else "no trustworthy estimate"
@@ -48,7 +48,7 @@ def sentence(result: Closed) -> str:
         return f"adequate: {said}{noise}{untried}"
     if result.verdict == "extended":
         left = _remaining_noise(result.noise.correlated_over_samples, result.samples)
-        return f"extended: {_missing(names)}; what is left is {left}{untried}"
+        return f"extended: {_missing(result.effects)}; what is left is {left}{untried}"
     found = f"beside {', '.join(names)} " if names else ""
     causes = result.unexplained.one_of
     explains = f"{_several(causes)} explain alike" if causes else "no candidate explains"
@@ -58,12 +58,13 @@ def sentence(result: Closed) -> str:
     return f"unexplained: {found}a misfit remains that {explains}{many}"
 
 
-def _missing(names: Sequence[str]) -> str:
-    """What was missing: a formula that the loop found says what it looks like, and is no cause."""
-    causes = [name for name in names if name != FORMULA]
-    verb = "were" if len(causes) > 1 or causes == ["outliers"] else "was"
-    said = f"{', '.join(causes)} {verb} missing"
-    if len(causes) == len(names):
+def _missing(effects: Sequence[Effect]) -> str:
+    """What was missing, beside what explains as much in its place: a formula that the loop found
+    says what it looks like, and is no cause."""
+    causes = [e for e in effects if e.name != FORMULA]
+    verb = "were" if len(causes) > 1 or [e.name for e in causes] == ["outliers"] else "was"
+    said = f"{', '.join(map(_with_rivals, causes))} {verb} missing"
+    if len(causes) == len(effects):
         return said
     more = (
         f"{said}, and a formula describes what else was"
@@ -71,6 +72,16 @@ def _missing(names: Sequence[str]) -> str:
         else ("a formula describes what was missing")
     )
     return f"{more}, of unknown cause"
+
+
+def _named(effect: Effect) -> str:
+    return effect.name + (f" ({effect.column})" if effect.column else "")
+
+
+def _with_rivals(effect: Effect) -> str:
+    """An effect, or what it is not told apart from."""
+    rivals = " or ".join(effect.indistinguishable_from)
+    return f"{_named(effect)} (or {rivals})" if rivals else _named(effect)
 
 
 def _several(causes: Sequence[str]) -> str:

@@ -8,10 +8,12 @@ from typing import Any
 import numpy as np
 
 from casest.diagnose.evidence.by_row import chance_by_row
+from casest.diagnose.evidence.input_noise import at_most
 from casest.diagnose.evidence.likelihood import Likelihood
 from casest.diagnose.evidence.score import p_value, worth
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.protocol.confirming import falls_of_refit
+from casest.diagnose.protocol.refits import feigned_between
 from casest.diagnose.protocol.state import F, Kept, State
 from casest.diagnose.protocol.subject import Subject
 
@@ -85,11 +87,24 @@ def chance_alone(subject: Subject[F], state: State[F], kept: Kept) -> float:
     return kept.evidence.p_value if base is None else _alone(subject, state, kept, base)[1]
 
 
-def _alone(subject: Subject[F], state: State[F], kept: Kept, base: F) -> tuple[float, float, float]:
+def on_its_own(subject: Subject[F], state: State[F], kept: Kept) -> tuple[float, float] | None:
+    """Score and p of a cause beside all others, less what noise of the inputs may have of it; None
+    where there is no fit without it."""
+    base = subject.without(state.fit, kept.what)
+    if base is None:
+        return None
+    feigned = feigned_between(subject, base, state.fit) or 0.0
+    count = subject.linear(state.fit).residual.size
+    return _alone(subject, state, kept, base, at_most(feigned, count))[:2]
+
+
+def _alone(
+    subject: Subject[F], state: State[F], kept: Kept, base: F, feigned: float = 0.0
+) -> tuple[float, float, float]:
     """Score and p of a cause beside the others, `base` being the fit without it, and the log of
     what was looked through for it."""
     linear, whole = subject.linear(base), subject.linear(state.fit)
-    none, gain = Likelihood(linear), subject.rises(base, [state.fit])[0]
+    none, gain = Likelihood(linear), subject.rises(base, [state.fit])[0] - feigned
     freedom = max(whole.basis.shape[1] - linear.basis.shape[1], 1)
     families = state.first.families if state.first else 1
     trials = kept.evidence.trials

@@ -12,6 +12,7 @@ from casest.declaration.shapes import Array
 from casest.diagnose.evidence.linear import Index
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.protocol import Kept, State
+from casest.diagnose.protocol.elimination import on_its_own
 from casest.diagnose.protocol.ranking import ranked
 from casest.diagnose.sensor.fits import Fit
 from casest.diagnose.sensor.sensor import Sensor
@@ -63,17 +64,20 @@ def left_in(state: State[Fit], fit: Fit) -> State[Fit]:
 
 
 def _replaced(sensor: Sensor, state: State[Fit], kept: Kept) -> State[Fit] | None:
-    """The state with the first rival of a cause in its place that is not refused at a glance.
-
-    Its evidence stays that of the one that it replaces: they differ by little.
-    """
+    """The state with the first rival of a cause in its place that is not refused at a glance, and
+    has strong evidence of its own."""
     for k, rival in enumerate(kept.rivals):
         fit = sensor.replaced(state.fit, kept.what, rival.what, rival.fit)
-        if fit is not None and not isinstance(sensor.certified(fit), str):
-            other = replace(kept, what=rival.what, rivals=kept.rivals[k + 1 :])
-            several = tuple(other if one is kept else one for one in state.kept)
-            still = tuple(e for e in state.open if rival.what.label not in e.families)
-            return replace(state, fit=fit, kept=several, open=still)
+        if fit is None or isinstance(sensor.certified(fit), str):
+            continue
+        other = replace(kept, what=rival.what, rivals=kept.rivals[k + 1 :])
+        several = tuple(other if one is kept else one for one in state.kept)
+        still = tuple(e for e in state.open if rival.what.label not in e.families)
+        found = replace(state, fit=fit, kept=several, open=still)
+        score, chance = on_its_own(sensor, found, other) or (-np.inf, 1.0)
+        if score > (LEVELS.strong if sensor.linear(fit).series else 0.0):
+            own = replace(other, evidence=replace(other.evidence, p_value=chance))
+            return replace(found, kept=tuple(own if one is other else one for one in several))
     return None
 
 
