@@ -86,7 +86,9 @@ def test_the_result_of_a_loop_that_grew_follows_the_published_schema(closed):
 
 def test_the_verdict_of_a_closed_loop_is_one_sentence_on_top(browser, closed):
     browser.open(closed / "report.html")
-    assert text(browser, "h1") == "Extended: imbalance was missing; what is left is noise."
+    assert text(browser, "h1") == (
+        "Extended: imbalance (or axis_wobble) was missing; what is left is noise."
+    )
     top = "document.querySelector('h1').getBoundingClientRect().bottom"
     assert browser.ask(top) < 300
 

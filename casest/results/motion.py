@@ -173,7 +173,7 @@ def motion_result(
 
 def sentence(result: MotionClosed) -> str:
     """The verdict in one sentence."""
-    names = [called(e) for e in result.effects]
+    names = list(map(_with_rivals, result.effects))
     if result.verdict is None:
         return "no trustworthy estimate"
     if result.verdict == "adequate":
@@ -183,6 +183,12 @@ def sentence(result: MotionClosed) -> str:
         return f"extended: {', '.join(names)} {verb} missing; what is left is noise"
     beside = f" beside {', '.join(names)}" if names else ""
     return f"unexplained: {_unexplained(result.closing)}{beside}"
+
+
+def _with_rivals(effect: MotionEffect) -> str:
+    """An effect, or the first of what it is not told apart from."""
+    rivals = " or ".join(effect.indistinguishable_from[: LEVELS.nearest])
+    return f"{called(effect)} (or {rivals})" if rivals else called(effect)
 
 
 def _unexplained(closing: MotionClosing) -> str:

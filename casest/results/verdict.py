@@ -49,7 +49,7 @@ def sentence(result: Closed) -> str:
     if result.verdict == "extended":
         left = _remaining_noise(result.noise.correlated_over_samples, result.samples)
         return f"extended: {_missing(result.effects)}; what is left is {left}{untried}"
-    found = f"beside {', '.join(names)} " if names else ""
+    found = f"beside {', '.join(map(_with_rivals, result.effects))} " if names else ""
     causes = result.unexplained.one_of
     explains = f"{_several(causes)} explain alike" if causes else "no candidate explains"
     many = ""

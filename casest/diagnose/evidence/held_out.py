@@ -99,10 +99,7 @@ def fall_of(linear: Linear, b: Array, a: Array) -> Fall:
     Σ(δ² + 2aδ): the error of the fall is that of 2Σaδ, from batch to batch of the record, and not
     below that of white noise. So what is gained in a few places only is a gain as well.
     """
-    moved, nearer = b - a, np.abs(a) < np.abs(b)
-    # What is far from both is neither's; what one of them is far from counts in full.
-    least = _near(linear, np.where(nearer, a, b))
-    a, b = np.where(nearer, least, least - moved), np.where(nearer, least + moved, least)
+    moved, (b, a) = b - a, _counted(linear, b, a)
     left = float(np.sum(a**2))
     gained = float(np.sum(b**2)) - left
     wide = np.bincount(linear.parts.batches, np.sum(2 * a * moved, axis=1))
@@ -120,7 +117,7 @@ def fall_between_causes(linear: Linear, b: Array, a: Array) -> Fall:
     """
     if not linear.coloured:
         return fall_of(linear, b, a)
-    before, after = (np.sum(_near(linear, e) ** 2, axis=1) for e in (b, a))
+    before, after = (np.sum(e**2, axis=1) for e in _counted(linear, b, a))
     fallen = np.asarray(np.bincount(linear.parts.stretches, before - after), float)
     return Fall(float(fallen.sum()), float(after.sum()), standard_errors(fallen))
 
@@ -131,10 +128,15 @@ def standard_errors(gained: Array) -> float:
     return float(gained.sum() / max(spread, 1e-300))
 
 
-def _near(linear: Linear, e: Array) -> Array:
-    """Errors (N, m), those far out counted as less: by what is far before."""
+def _counted(linear: Linear, b: Array, a: Array) -> tuple[Array, Array]:
+    """Errors (N, m) of two causes, those far out counted as less: what is far from both is neither's;
+    what one of them is far from counts in full."""
+    if not linear.series:
+        return b, a
+    moved, nearer = b - a, np.abs(a) < np.abs(b)
     far = LEVELS.far * linear.deviation
-    return np.clip(e, -far, far) if linear.series else e
+    least = np.clip(np.where(nearer, a, b), -far, far)
+    return np.where(nearer, least + moved, least), np.where(nearer, least, least - moved)
 
 
 def clipped(linear: Linear) -> Array:

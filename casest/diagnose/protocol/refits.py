@@ -359,6 +359,10 @@ def shown(
         kept = with_chance(kept, ranking.likelihood, ranking.families)
         seen = falls_with(subject, state, ranking, kept, better)
         clear = beyond_courses(ranking, kept) and ranking.stands_out(kept)
-        if clear and holds_out(seen, ranking.linear):
+        if not (clear and holds_out(seen, ranking.linear)):
+            continue
+        if few := _by_few_rows(subject, ranking, kept, better):
+            state = state.failing(evidence, few)
+        else:
             found.append(Refit(state.fit, better, kept, seen))
     return state, found
