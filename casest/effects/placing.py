@@ -26,6 +26,9 @@ MISSING = {
     "output": "names no prediction: predicted=quantity(…) gives it a name",
 }
 
+#: The same of an effect that remembers.
+UNTIMED = "rows without a time are in no order: --rate 1 says that each was read after the one before"
+
 
 def prepared(model: Model, runs: Sequence[Run]) -> tuple[Run, ...]:
     """Runs whose time and usable columns can be read like signals."""

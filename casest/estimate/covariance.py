@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from casest.declaration.shapes import Array
 from casest.estimate.correlation import batches, is_series
 from casest.estimate.remembering import remembering
+from casest.estimate.spells import by_spells, contradicted
 from casest.estimate.spectrum import Part, Stretch, by_frequency, noise_spectrum
 from casest.leastsquares.problem import Point, Problem
 from casest.leastsquares.sums import squares_of_batches, squares_of_gradients
@@ -52,7 +53,8 @@ def covariance_of(
         if told_by is None:
             return robust
         plain = sigma**2 * np.diag(inverse_normal(R, free))
-        return Spread(as_plain(robust.covariance, plain, told_by < MANY_RESIDUALS))
+        few = told_by < MANY_RESIDUALS
+        return replace(robust, covariance=as_plain(robust.covariance, plain, few))
     return Spread(sigma**2 * inverse_normal(R, free))
 
 
@@ -157,9 +159,23 @@ def _sandwich(
     if problem.judged and problem.judged[0] is point and problem.judged[1] == asked:
         robust, told_by = problem.judged[2]
         return robust, told_by
-    robust, told_by = _baked(problem, point, inverse_normal(R, free), correlated_over)
+    bread = inverse_normal(R, free)
+    robust, told_by = _baked(problem, point, bread, correlated_over)
+    robust = _beside_spells(robust, by_spells(problem, point, bread))
     problem.judged[:] = [point, asked, (robust, told_by)]
     return robust, told_by
+
+
+def _beside_spells(robust: Spread, several: Sequence[tuple[Array, Array]]) -> Spread:
+    """With the variances by spells of what these contradict."""
+    if not several:
+        return robust
+    own = np.diag(robust.covariance)
+    more, variance, freedom = contradicted(own, several)
+    if not more.any():
+        return robust
+    known = np.full(len(own), np.inf) if robust.freedom is None else robust.freedom
+    return Spread(as_plain(robust.covariance, variance, more), np.minimum(known, freedom))
 
 
 def _baked(

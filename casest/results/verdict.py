@@ -11,7 +11,7 @@ from casest.diagnose.formula.search import NAME as FORMULA
 from casest.diagnose.found import HELD_OUT_DATA
 from casest.diagnose.levels import LEVELS
 from casest.effects import CATALOGUE
-from casest.effects.placing import MISSING
+from casest.effects.placing import MISSING, UNTIMED
 from casest.results.closing import Closed, Effect, Shifts, Unexplained
 from casest.results.fitted import Samples
 from casest.results.result import Number, Parameter
@@ -160,7 +160,7 @@ def untried(result: Closed) -> Iterator[str]:
         verb = "were" if len(names) > 1 else "was"
         yield f"{', '.join(names)} {verb} not tried: {reason}"
     left = {s.name: s.reason for s in result.not_tried if s not in own}
-    for why in MISSING.values():
+    for why in (*MISSING.values(), UNTIMED):
         names = [name for name, reason in left.items() if reason.endswith(why)]
         if names:
             yield f"not tried: {', '.join(names)}: {left[names[0]]}"

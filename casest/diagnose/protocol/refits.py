@@ -28,7 +28,7 @@ from casest.diagnose.protocol.state import F, Ranking, Refit, State
 from casest.diagnose.protocol.subject import Subject
 
 #: Why a cause in poses is not added.
-FEW_ROWS = "a row or a few carry it: left out one by one, they move its size too far"
+FEW_ROWS = "a row or a few may carry it: by its size without each of them, chance has p = {:.2g}"
 #: Why an influence in a series is not.
 FEW_OF_MANY = "one in a hundred rows or fewer carry it: look at those that are far out first"
 #: Why what somebody asked for is not: noise, that of the inputs, or what was held out.
@@ -113,7 +113,8 @@ def _by_few_rows(subject: Subject[F], ranking: Ranking, evidence: Evidence, fit:
         influence = all(subject.everywhere(t.what) for t in evidence.trials)
         return FEW_OF_MANY if influence and carried_by_few(ranking.linear, after) else ""
     chance = chance_by_row(ranking.linear, after)
-    return "" if shared_chance(chance, evidence, ranking.families) < LEVELS.chance else FEW_ROWS
+    chance = shared_chance(chance, evidence, ranking.families)
+    return "" if chance < LEVELS.chance else FEW_ROWS.format(chance)
 
 
 def _charged(subject: Subject[F], before: F, evidence: Evidence, fit: F) -> Evidence:

@@ -36,10 +36,13 @@ from casest.diagnose.sensor.twins import bend, twins
 from casest.effects import shipped
 from casest.effects.kinds import foreign, readings
 from casest.effects.lateness import comes_again, likely_lag
+from casest.effects.placing import UNTIMED
 from casest.effects.on_axes import restricted
 from casest.effects.placing import placed_in
 from casest.errors import CasestError
 
+#: Why what remembers is not tried.
+BEGUN_ANEW = "each pose begins anew: nothing is remembered from the one before"
 #: Samples of a block up to which it is a pose.
 LONGEST_POSE = 32
 
@@ -69,16 +72,31 @@ class Tried:
 
     def found(self, fit: Fit) -> tuple[list[Candidate], list[Skipped]]:
         """What could be missing, and what does not apply here."""
-        catalogue = [e for e in self.catalogue if self._in_time or e.kind not in OVER_TIME]
-        found, skipped = self._found.of(fit.model, lambda: self._known_here(fit.model, catalogue))
+        catalogue, skipped = self._in_order
+        found, unfit = self._found.of(fit.model, lambda: self._known_here(fit.model, catalogue))
         if not self._twins:
             problem, point = problem_of(fit, self.rows.runs)
             bends = slopes(problem, point, [c for c in found if bend(c)], self.rows.index)
             columns = [(c, s) for c, s in bends if not isinstance(s, CasestError)]
             self._twins.append(twins(self.rows.linear(fit), columns))
         same = {k: v for k, v in self._twins[0].items() if k not in self.known}
-        skipped = [*skipped, *(Skipped(k, f"does here what {v} does") for k, v in same.items())]
+        skipped = [*skipped, *unfit]
+        skipped += (Skipped(k, f"does here what {v} does") for k, v in same.items())
         return [c for c in found if c.label not in same], skipped
+
+    @cached_property
+    def _in_order(self) -> tuple[list[Effect], list[Skipped]]:
+        """The catalogue without what looks at the rows before, where nothing says what was before.
+        """
+        if self._in_time:
+            return list(self.catalogue), []
+        why = UNTIMED if any(run.time is None for run in self.rows.runs) else BEGUN_ANEW
+        left = {e.name for e in self.catalogue if e.kind in OVER_TIME}
+        if why == UNTIMED:
+            others = ((e.name, e.otherwise) for e in self.catalogue)
+            left |= {name for name, o in others if o is not None and o.kind in OVER_TIME}
+        kept = [e for e in self.catalogue if e.name not in left]
+        return kept, [Skipped(e.name, why) for e in self.catalogue if e.name in left]
 
     def _known_here(
         self, model: Model, catalogue: Sequence[Effect]
