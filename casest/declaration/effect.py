@@ -36,7 +36,8 @@ NOISE = "noise"
 COLUMNS = ("temperature", "other", "any", "angle", "acceleration", "itself", "state")
 NUMBERS = ("mean", "least", "greatest", "duration", "radian")
 PROFILES = (
-    "frequency", "time", "timescale", "memory", "level", "threshold", "band", "share", "lag",
+    "frequency", "time", "timescale", "memory", "level", "floor", "threshold", "band", "share",
+    "lag",
 )  # fmt: skip
 TAILS, RANDOM_WALK = "tails", "random walk"
 
@@ -53,7 +54,7 @@ class Effect:
     `null` maps each parameter to the value at which the effect vanishes (0 unless told).
     For tracing a residual: `typical` sizes of the parameters, each in its unit; `profile` the
     parameters that are searched over a grid (name -> "frequency", "time", "timescale", "level",
-    "share" or "lag"), because the effect is not smooth in them or has many valleys; `shown_by` the
+    "floor", "share" or "lag"), because the effect is not smooth in them or has many valleys; `shown_by` the
     measurement that shows it; `plain` the form that it is tried in once it was found; `columns` the
     argument for which a recorded column is looked for (name -> "temperature", "other", "any",
     "angle", which is also a scalar signal or quantity of the model in rad or deg, or

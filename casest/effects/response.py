@@ -204,6 +204,21 @@ def saturation(y: SX, *, share: SX = param(each, bounds=(0, None)), level: SX = 
 
 @effect(
     on="output",
+    typical={"share": 1.0},
+    profile={"level": "floor"},
+    plain={"share": 1.0},
+    null={"level": -inf},
+    shown_by="readings that reach the lower end of the range",
+    formula="y + share·max(level − y, 0)",
+    within={"share": (0.5, 1.5)},  # as above
+)
+def floor(y: SX, *, share: SX = param(each, bounds=(0, None)), level: SX = param("[y]")) -> SX:
+    """Readings below a level are cut off (share 1), or compressed: the lower end of a range."""
+    return y + share * fmax(level - y, 0)
+
+
+@effect(
+    on="output",
     typical={"width": 0.02},
     profile={"width": "threshold"},
     shown_by="readings close to zero, of both signs",

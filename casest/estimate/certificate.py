@@ -151,7 +151,9 @@ def certify(
         against.append((Code.NOISE, words.noise(second)))
     profile = None
     if not against:
-        shape, misshapen = _shape(problem, best, R, max(sigma, rounding), free)
+        # By rounding alone a sum of squares does not rise: so far that it does.
+        least = 10 * rounding * float(np.sqrt(problem.residual_count)) if exact else rounding
+        shape, misshapen = _shape(problem, best, R, max(sigma, least), free)
         if not LINEAR[0] <= shape[0] <= shape[1] <= LINEAR[1]:
             if not intervals and _has_likelihood(problem):
                 misshapen = []

@@ -117,10 +117,11 @@ def _furthest_out(problem: Problem, point: Point) -> Iterator[str]:
     if problem.residual_count > 2 * problem.unknowns and size > FAR_OUT * max(scale, exact):
         run = problem.runs[k]
         what = "rest interval" if run.spread else "row"
+        counted = "" if run.spread else " (rows count from 0)"
         away = size / max(scale, exact)
         yield (
-            f"{what} {int(run.rows[row])} of {run.name} is off by {away:.3g} robust standard "
-            "deviations of the residual: look at it first"
+            f"{what} {int(run.rows[row])} of {run.name}{counted} is off by {away:.3g} robust "
+            "standard deviations of the residual: look at it first"
         )
 
 

@@ -26,7 +26,7 @@ from casest.leastsquares.kinds import noises
 _TEMPERATURE = re.compile(r"temp|(^|_)t_?(deg)?c$|celsius|kelvin", re.IGNORECASE)
 _DEGREES = {"degC", "K", "kelvin", "degree_Celsius", "°C"}
 #: What is searched over first and fitted then: an effect is smooth in it, or bends with it.
-SMOOTH = ("frequency", "timescale", "memory", "lag", "level", "threshold", "band")
+SMOOTH = ("frequency", "timescale", "memory", "lag", "level", "floor", "threshold", "band")
 #: Where effects act that go with what a sensor gives.
 READINGS = ("input", "output")
 #: Which columns an effect asks for: temperatures, others, both.

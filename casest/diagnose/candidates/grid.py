@@ -30,8 +30,8 @@ FROM_NOTHING = {"memory", "threshold", "band"}
 UNSEEN = 1e-3
 #: Share of the readings that the lowest level lets through, and fewest beyond the highest.
 LOWEST, FEWEST = 0.7, 6
-#: Share of the readings that the widest threshold holds back.
-BELOW = 0.6
+#: Share of the readings that the widest threshold holds back, and that the highest floor does.
+BELOW, CUT = 0.6, 0.5
 
 
 @dataclass(frozen=True)
@@ -102,6 +102,8 @@ def searched(
     """
     if kinds == ("level",):
         return _levels(seen)
+    if kinds == ("floor",):
+        return _floors(seen)
     if kinds in (("threshold",), ("band",)):
         return _thresholds(seen.reading if kinds == ("threshold",) else seen.met)
     if seen.time is None:
@@ -132,6 +134,17 @@ def _levels(seen: Seen) -> Values:
     # Rows of one pose are predicted alike: what nothing exceeds but by rounding is no level.
     levels = [float(v) for v in several if np.count_nonzero(size > v * (1 + 1e-6)) >= FEWEST]
     return [(v,) for v in levels], max(len(levels), 1)
+
+
+def _floors(seen: Seen) -> Values:
+    """Values that so many readings are predicted below, up to half of them."""
+    several = np.zeros(0) if seen.reading is None else np.sort(seen.reading.ravel())
+    if CUT * len(several) <= FEWEST:
+        return [], 1
+    below = np.unique(np.geomspace(FEWEST, CUT * len(several), LEVELS_TRIED).astype(int))
+    floors = np.unique([float(f"{several[k]:.6g}") for k in below])
+    floors = floors[np.searchsorted(several, floors) >= FEWEST]
+    return [(float(v),) for v in floors], max(len(floors), 1)
 
 
 def _thresholds(values: Array | None) -> Values:
@@ -317,6 +330,9 @@ def nearer(candidate: Candidate, seen: Seen, scale: float) -> list[Candidate]:
 def _steps(kind: str, value: float, seen: Seen, scale: float) -> list[float]:
     if kind == "level":
         return [value * (1 + s * 0.06 * scale) for s in (-1, -0.5, 0.5, 1)]
+    if kind == "floor":
+        span = 0.0 if seen.reading is None else float(np.ptp(seen.reading))
+        return [value + s * 0.06 * scale * span for s in (-1, -0.5, 0.5, 1)]
     if kind in ("timescale", "memory", "threshold", "band", "share", "lag"):
         return [value * float(np.exp(s * 0.7 * scale)) for s in (-1, -0.5, 0.5, 1)]
     if kind == "frequency" or seen.time is None:

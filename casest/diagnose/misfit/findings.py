@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
 from casest.data.stillness import last_decimal
+from casest.data.timing import blocks
 from casest.declaration.effect import TAILS
 from casest.declaration.shapes import Array
 from casest.diagnose.candidates.candidates import usable_columns
@@ -27,10 +30,13 @@ from casest.leastsquares.agreement import between_runs
 from casest.leastsquares.neighbours import Scatter
 from casest.leastsquares.problem import Point, Problem
 from casest.leastsquares.stated import chi_square
+from casest.leastsquares.sums import rounding
 from casest.leastsquares.weights import scale_of_readings, weighted
 
 #: Residual over the scatter from which on that is rounding: readings that only repeat.
 REPEATED = 1e6
+#: Residuals of so many rounding errors of one are exact.
+ROUNDED = 10.0
 #: Of a step of the reading: as far is each from what it rounds.
 HALF = 0.5
 #: Variance of neighbours' differences from the line between them, in that of the noise, where noise
@@ -63,6 +69,8 @@ def findings(
     Of noise that was declared to wander no slow course is asked, and none from repeat to repeat.
     """
     residuals = problem.residuals(point)
+    if scale_of_readings(residuals) <= ROUNDED * rounding(problem, point):
+        return []  # nothing but the computer's own last digits is left
     problem = weighted(problem, problem.values(point))
     freedom = max(problem.residual_count - problem.unknowns, 1)
     sigma = scale_of_readings(residuals) * float(np.sqrt(problem.residual_count / freedom))
@@ -193,19 +201,31 @@ def _slow(problem: Problem, point: Point, clipped: Sequence[Array], sigma: float
 
 
 def _when(problem: Problem, clipped: Sequence[Array], samples: int) -> str:
-    """Where it is strongest: a stretch of time."""
+    """Where it is strongest: a stretch of time, across no gap."""
     best: tuple[float, str] = (0.0, "")
     for run, r in zip(problem.runs, clipped, strict=True):
         if run.time is None or len(r) < 3 * samples:
             continue
-        edges = np.arange(0, len(r) - samples + 1, max(samples // 2, 1))
         sums = np.vstack([np.zeros((1, r.shape[1])), np.cumsum(r, axis=0)])
-        size = np.sum((sums[edges + samples] - sums[edges]) ** 2, axis=1)
-        k = int(np.argmax(size))
-        if size[k] > best[0]:
-            a, b = run.time[edges[k]], run.time[min(edges[k] + samples, len(r) - 1)]
-            best = (float(size[k]), f", strongest from t = {a:.4g} to {b:.4g} s")
+        first, last = _windows(blocks(run.time, run.block, np.arange(len(r))), samples)
+        taken = np.sum((sums[last] - sums[first]) ** 2, axis=1) / (last - first)
+        k = int(np.argmax(taken))
+        if taken[k] > best[0]:
+            a, b = run.time[first[k]], run.time[min(last[k], len(r)) - 1]
+            best = (float(taken[k]), f", strongest from t = {a:.4g} to {b:.4g} s")
     return best[1]
+
+
+def _windows(stretch: NDArray[np.int_], samples: int) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
+    """First rows and ends of windows of so many samples, half over each other; shorter stretches
+    are one each."""
+    found = list[tuple[int, int]]()
+    starts = np.flatnonzero(np.diff(stretch, prepend=stretch[0] - 1)).tolist()
+    for a, b in pairwise([*starts, len(stretch)]):
+        edges = range(a, max(b - samples, a) + 1, max(samples // 2, 1))
+        found += [(edge, min(edge + samples, b)) for edge in edges]
+    first, last = np.array(found).T
+    return first, last
 
 
 def _follows(

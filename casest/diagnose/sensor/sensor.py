@@ -124,7 +124,7 @@ class Sensor(Subject[Fit]):
         effect = what.effect
         if effect is None or effect.kind in OVER_TIME:
             return False
-        return not {"time", "level"} & set(dict(effect.profile).values())
+        return not {"time", "level", "floor"} & set(dict(effect.profile).values())
 
     def jittered(self, fit: Fit, trials: Sequence[Trial]) -> Sequence[Sequence[Draw]]:
         """The same where inputs have more noise."""
