@@ -16,6 +16,7 @@ TESTS: dict[str, tuple[str, ...]] = {
     "estimate/covariance": ("spread", "norm_statistics"),
     "estimate/correlation": ("spread", "adequacy"),
     "estimate/remembering": ("spread",),
+    "estimate/spells": ("spells",),
     "estimate/held_out": ("cross_validation",),
     "leastsquares/weights": ("spread", "effect_kinds"),
     "leastsquares/sums": ("spread", "certificate_limits", "norm_limits"),
@@ -180,7 +181,7 @@ MUTANTS = tuple(
         (PARTS, "gained = float(np.sum(b**2)) - left", "gained = float(np.sum(b**2)) + left"),
         (PARTS, "max(float(np.sum(wide**2)), white)", "white"),
         (PARTS, "max(float(np.sum(wide**2)), white)", "float(np.sum(wide**2))"),
-        (PARTS, "return np.clip(e, -far, far) if linear.series else e", "return e"),
+        (PARTS, "np.clip(np.where(nearer, a, b), -far, far)", "np.where(nearer, a, b)"),
         (
             LINEAR,
             "stretches = place * LEVELS.stretches // size",

@@ -19,7 +19,7 @@ from casest.leastsquares.problem import Point, Problem
 
 #: Spells that a record is cut into, and the rows in each at least.
 SPELLS, ROWS = (10, 20, 40), 10
-#: Chance, over all cuts, that an unknown's spells scatter so much more than its variance says.
+#: Chance, over all cuts and unknowns, that spells scatter so much more than a variance says.
 CHANCE = 0.01
 #: Spells whose gradients count as so many equal ones at least: of fewer nobody knows a scatter.
 FEWEST = 3.0
@@ -89,7 +89,7 @@ def contradicted(
     more, found, free = np.zeros(len(variance), bool), variance.copy(), np.full(len(variance), np.inf)
     for own, freedom in several:
         freedom = np.maximum(freedom, 1e-9)
-        most = chdtri(freedom, CHANCE / len(several)) / freedom * variance
+        most = chdtri(freedom, CHANCE / len(several) / len(variance)) / freedom * variance
         better = (freedom >= FEWEST) & (own > most) & (own > found)
         found, free = np.where(better, own, found), np.where(better, freedom, free)
         more |= better
