@@ -1,4 +1,4 @@
-"""A line in the spectrum that belongs to the motion is no vibration, and one that does not is one."""
+"""A line in the spectrum is a vibration unless it belongs to the motion."""
 
 from __future__ import annotations
 

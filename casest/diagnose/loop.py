@@ -15,7 +15,7 @@ from casest.declaration.symbols import Constant
 from casest.diagnose.candidates.candidates import Candidate, Skipped
 from casest.diagnose.closing import Closing
 from casest.diagnose.cross_validation import Folds, cross_fitted, determined, folded
-from casest.diagnose.evidence.score import Evidence
+from casest.diagnose.evidence.score import Trial
 from casest.diagnose.found import HELD_OUT_DATA, Found, Undecided
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.noise.slow_course import slow_squares
@@ -284,11 +284,14 @@ def _undecided(sensor: Sensor, state: State[Fit]) -> Undecided | None:
     # Of a pair each explains something beside the other: neither does alone what both do.
     alone = [e for e in state.open if len(e.trials) == 1] or state.open[:1]
     there = {k.what.label for k in state.kept}
-    shares = {
-        e.families: share
-        for e in alone
-        if not there.issuperset(e.families) and (share := _share(sensor, state, e)) is not None
-    }
+    shares = dict[tuple[str, ...], float]()
+    for evidence in (e for e in alone if not there.issuperset(e.families)):
+        share = _share(sensor, state, evidence.trials)
+        if share is not None:
+            shares[evidence.families] = share
+        elif len(evidence.trials) > 1:  # both may stand in for the model where one does not
+            parts = {(t.family,): _share(sensor, state, [t]) for t in evidence.trials}
+            shares |= {family: one for family, one in parts.items() if one is not None}
     most = LEVELS.nested * max(shares.values(), default=0.0)
     shares = {families: share for families, share in shares.items() if share >= most}
     names = tuple(dict.fromkeys(n for families in shares for n in families if n not in there))
@@ -302,10 +305,10 @@ def _undecided(sensor: Sensor, state: State[Fit]) -> Undecided | None:
     return Undecided(names, next(iter(shares.values())), moves)
 
 
-def _share(sensor: Sensor, state: State[Fit], evidence: Evidence) -> float | None:
-    """Of the held-out squares, that a cause takes away when it is refitted: its columns promise what
-    no refit may keep, and in coloured noise its likelihood is no share. None without a refit."""
-    fit = sensor.refit(state.fit, evidence.trials)
+def _share(sensor: Sensor, state: State[Fit], trials: Sequence[Trial]) -> float | None:
+    """Of the held-out squares, that a cause takes away when it is refitted: its columns promise
+    what no refit may keep, and in coloured noise a likelihood is no share. None without a refit."""
+    fit = sensor.refit(state.fit, trials)
     if isinstance(fit, str):
         return None
     before, after = sensor.linear(state.fit), sensor.linear_in(state.fit, fit)

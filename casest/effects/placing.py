@@ -27,7 +27,9 @@ MISSING = {
 }
 
 #: The same of an effect that remembers.
-UNTIMED = "rows without a time are in no order: --rate 1 says that each was read after the one before"
+UNTIMED = (
+    "rows without a time are in no order: --rate 1 says that each was read after the one before"
+)
 
 
 def prepared(model: Model, runs: Sequence[Run]) -> tuple[Run, ...]:

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from casest.declaration.shapes import Array
 from casest.estimate.correlation import batches, is_series
 from casest.estimate.remembering import remembering
-from casest.estimate.spells import by_spells, contradicted
 from casest.estimate.spectrum import Part, Stretch, by_frequency, noise_spectrum
+from casest.estimate.spells import by_spells, contradicted
 from casest.leastsquares.problem import Point, Problem
 from casest.leastsquares.sums import squares_of_batches, squares_of_gradients
 from casest.leastsquares.weights import has_noise_effects, variance_factor

@@ -86,7 +86,11 @@ def contradicted(
     that says so most clearly the variance (n,) and its degrees of freedom (n,)."""
     from scipy.special import chdtri
 
-    more, found, free = np.zeros(len(variance), bool), variance.copy(), np.full(len(variance), np.inf)
+    more, found, free = (
+        np.zeros(len(variance), bool),
+        variance.copy(),
+        np.full(len(variance), np.inf),
+    )
     for own, freedom in several:
         freedom = np.maximum(freedom, 1e-9)
         most = chdtri(freedom, CHANCE / len(several) / len(variance)) / freedom * variance

@@ -260,8 +260,8 @@ def _constants(seen: Seen) -> Values:
 
 
 def _lags(seen: Seen, likely: float, again: float) -> Values:
-    """From half a sample on, in steps of a factor, both ways; and what the records show. Within half
-    a period of that: nothing tells one of a wave's periods from the next."""
+    """From half a sample on, in steps of a factor, both ways; and what the records show. Within
+    half a period of that: nothing tells one of a wave's periods from the next."""
     assert seen.time is not None
     step = float(np.median(np.diff(seen.time))) if len(seen.time) > 1 else 0.0
     longest = float(np.ptp(seen.time)) / 40

@@ -129,8 +129,8 @@ def standard_errors(gained: Array) -> float:
 
 
 def _counted(linear: Linear, b: Array, a: Array) -> tuple[Array, Array]:
-    """Errors (N, m) of two causes, those far out counted as less: what is far from both is neither's;
-    what one of them is far from counts in full."""
+    """Errors (N, m) of two causes, those far out counted as less: what is far from both is
+    neither's; what one of them is far from counts in full."""
     if not linear.series:
         return b, a
     moved, nearer = b - a, np.abs(a) < np.abs(b)

@@ -36,9 +36,8 @@ from casest.diagnose.sensor.twins import bend, twins
 from casest.effects import shipped
 from casest.effects.kinds import foreign, readings
 from casest.effects.lateness import comes_again, likely_lag
-from casest.effects.placing import UNTIMED
 from casest.effects.on_axes import restricted
-from casest.effects.placing import placed_in
+from casest.effects.placing import UNTIMED, placed_in
 from casest.errors import CasestError
 
 #: Why what remembers is not tried.
@@ -86,8 +85,7 @@ class Tried:
 
     @cached_property
     def _in_order(self) -> tuple[list[Effect], list[Skipped]]:
-        """The catalogue without what looks at the rows before, where nothing says what was before.
-        """
+        """The catalogue without what looks at the rows before, where nothing tells them."""
         if self._in_time:
             return list(self.catalogue), []
         why = UNTIMED if any(run.time is None for run in self.rows.runs) else BEGUN_ANEW
