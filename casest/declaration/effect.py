@@ -57,9 +57,9 @@ class Effect:
     "floor", "share" or "lag"), because the effect is not smooth in them or has many valleys;
     `shown_by` the measurement that shows it; `plain` the form that it is tried in once it was
     found; `columns` the argument for which a recorded column is looked for (name -> "temperature",
-    "other", "any", "angle", which is also a scalar signal or quantity of the model in rad or deg, or
-    "acceleration", another measured signal of three axes; on a rate "itself", the state whose rate
-    it is, or "state", any other); `numbers` those
+    "other", "any", "angle", which is also a scalar signal or quantity of the model in rad or deg,
+    or "acceleration", another measured signal of three axes; on a rate "itself", the state whose
+    rate it is, or "state", any other); `numbers` those
     that data tell (name -> "mean", "least" or "greatest" of that column, "radian": rad for each of
     its unit, or "duration" of the record); `seen_in` where an effect on the noise shows itself: the
     "tails" of the residuals, or a "random walk" in them; `describes`: it says what a course looks
