@@ -50,7 +50,8 @@ def _told(fit: Fit, frequency: float, rows: Rows) -> bool:
         return False
     span = max(linear.spans, key=lambda s: s.stop - s.start)
     times = [np.zeros(len(run)) if run.time is None else run.time for run in rows.runs]
-    turn = frequency * (rows.of(times)[span] - rows.of(times)[span][0])
+    time = rows.of(times)[span]
+    turn = frequency * (time - time[0])
     windows = min(WINDOWS, int(turn[-1] / (np.pi * TURNS)) - 1)
     if windows < FEWEST:
         return False
@@ -106,7 +107,7 @@ def _powers(met: Array, turn: Array) -> Array:
     ]
     time = np.linspace(-1, 1, len(x))[:, None]
     found = np.column_stack([np.gradient(x, turn, axis=0), time * x, time**2 * x, *powers])
-    return np.asarray(found - found.mean(axis=0))
+    return np.asarray(np.nan_to_num(found - found.mean(axis=0)))
 
 
 def _basis(columns: NDArray[np.complex128]) -> NDArray[np.complex128]:
