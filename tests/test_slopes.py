@@ -35,7 +35,9 @@ def recorded(name, count, seed):
 
 
 #: One value of what is searched over; others are held at what they are told.
-HELD = {"time": 6.0, "level": 12.0, "frequency": 2.3, "timescale": 1.7, "share": 0.05}
+HELD = {
+    "time": 6.0, "level": 12.0, "floor": 3.0, "frequency": 2.3, "timescale": 1.7, "share": 0.05,
+}  # fmt: skip
 VALUES = {"zero": np.array([0.31, -0.19]), "gain": np.array([0.49, 0.52])}
 
 
@@ -58,7 +60,8 @@ def runs():
 
 
 def by_differences(candidate: Candidate, runs, size):
-    """Central differences (N, m, k) of the residual in each of its numbers, from null.
+    """Central differences (N, m, k) of the residual in each of its numbers, from null; of what is
+    nothing at its lower bound those upwards.
 
     Shared numbers first, then those of the first run, and so on.
     """
@@ -71,12 +74,13 @@ def by_differences(candidate: Candidate, runs, size):
         for k in np.ndindex(null.shape):
             step = np.zeros(null.shape)
             step[k] = size
+            back = 0.0 if p.lower[0] >= null[k] else 1.0
             up, down = (
                 np.concatenate(wide.residuals(wide.point({**start, p.name: null + s})))
-                for s in (step, -step)
+                for s in (step, -back * step)
             )
             run = k[0] if p.scope == "run" else -1
-            columns.append((run, number, k, (up - down) / (2 * size)))
+            columns.append((run, number, k, (up - down) / ((1 + back) * size)))
     columns.sort(key=lambda column: column[:3])
     return np.stack([difference for *_, difference in columns], axis=2)
 
