@@ -74,7 +74,7 @@ def by_differences(candidate: Candidate, runs, size):
         for k in np.ndindex(null.shape):
             step = np.zeros(null.shape)
             step[k] = size
-            back = 0.0 if p.lower[0] >= null[k] else 1.0
+            back = 0.0 if p.lower[0] > null[k] - size else 1.0
             up, down = (
                 np.concatenate(wide.residuals(wide.point({**start, p.name: null + s})))
                 for s in (step, -back * step)
