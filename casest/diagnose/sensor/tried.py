@@ -64,6 +64,8 @@ class Tried:
     )
     #: By what a model reads itself.
     _channels: dict[frozenset[str], Channels] = field(default_factory=dict, repr=False)
+    #: Of each signal that may be late: the records say it, whatever the fit.
+    _lags: dict[tuple[str, str], tuple[float, float]] = field(default_factory=dict, repr=False)
     #: Beside the first fit that is looked at: what is declared.
     _twins: list[dict[str, str]] = field(default_factory=list, repr=False)
     _looked: Recent[Fit, Seen] = field(default_factory=Recent, repr=False)
@@ -245,10 +247,12 @@ class Tried:
         is late comes again; in s."""
         if candidate.effect is None or candidate.effect.kind != "time":
             return 0.0, np.inf
-        name, measured, runs = candidate.on, fit.model.traced.measured, self.rows.runs
-        rotation = any(s.name == name and s.kind == "rotation" for s in fit.model.signals)
-        lag = likely_lag(runs, measured or "", name, within=True, rotation=rotation)
-        return lag, comes_again(runs, name, rotation=rotation)
+        name, measured, runs = candidate.on, fit.model.traced.measured or "", self.rows.runs
+        if (name, measured) not in self._lags:
+            rotation = any(s.name == name and s.kind == "rotation" for s in fit.model.signals)
+            lag = likely_lag(runs, measured, name, within=True, rotation=rotation)
+            self._lags[name, measured] = lag, comes_again(runs, name, rotation=rotation)
+        return self._lags[name, measured]
 
     def asked(self, what: Candidate) -> bool:
         """Is it the user's own, or named as there?"""
