@@ -739,6 +739,48 @@ def test_a_bad_time_that_no_signal_needs_is_only_noted(tmp_path: Path) -> None:
     assert any(note.startswith("time not used:") for note in run.notes)
 
 
+def stamped(stamps: Sequence[float]) -> str:
+    """Rows whose readings tell when they were made."""
+    return "t,vx,vy,vz\n" + "".join(f"{t:g},{t:g},2,3\n" for t in stamps)
+
+
+@pytest.mark.parametrize(
+    ("stamps", "said"),
+    [
+        (np.arange(60.0)[::-1], "the newest row comes first"),
+        (np.roll(np.arange(60.0), 20), "the log wraps: it begins at row 20"),
+        ([*range(30), 31, 30, *range(32, 60)], "1 row came late, the first row 31"),
+        ([*range(30), 35, 30, 31, 32, 33, 34, *range(36, 60)], "5 rows came late"),
+    ],
+)
+def test_rows_that_a_log_has_in_another_order_are_put_in_that_of_time(
+    tmp_path: Path, stamps: Sequence[float], said: str
+) -> None:
+    for wanted in ([T, V], [V]):
+        run = run_of(tmp_path, stamped(stamps), wanted)
+        assert run.time is not None
+        np.testing.assert_array_equal(run.time, np.arange(60.0))
+        np.testing.assert_array_equal(run.signals["v"][:, 0], np.arange(60.0))
+        np.testing.assert_array_equal(np.asarray(stamps)[run.rows], np.arange(60.0))
+        assert len(np.unique(run.block)) == 1
+        assert any(said in note for note in run.notes)
+
+
+@pytest.mark.parametrize(
+    "stamps",
+    [
+        [*range(40), *range(30)],  # started again
+        [*range(40), *np.arange(0.5, 30)],  # and at other times
+        [*range(50), 7.5, *range(51, 60)],  # one wrong stamp
+    ],
+)
+def test_times_of_which_nobody_can_tell_the_order_are_not_put_in_one(
+    tmp_path: Path, stamps: Sequence[float]
+) -> None:
+    assert "goes backward" in refusal(DataError, tmp_path, stamped(stamps), [T, V])
+    assert run_of(tmp_path, stamped(stamps), [V]).time is None
+
+
 @pytest.mark.parametrize(
     ("text", "kind", "words"),
     [

@@ -29,7 +29,7 @@ def test_of_normal_noise_no_row_is_spoken_against(rows, axes, unknowns):
     rng, alarms = np.random.default_rng(rows), 0
     for _ in range(150):
         alarms += few_rows(*table(rng, rows, axes, unknowns)) is not None
-    assert alarms <= stats.binom.ppf(1 - 5e-4, 150, LEVELS.misfit)
+    assert alarms <= stats.binom.ppf(1 - 5e-4, 150, LEVELS.chance)
 
 
 def test_both_ends_of_a_line_are_off_and_neither_stands_out():

@@ -377,3 +377,18 @@ def test_a_lag_of_the_response_is_no_wandering_offset():
     closing = close(declared(world), [record(world, identity)])
     assert labels(closing) == ["hysteresis"]
     assert rms(closing.after_held_out) < 1.01 * world.sigma
+
+
+@pytest.mark.parametrize("bent", [False, True])
+def test_errors_that_go_to_and_fro_are_not_called_noise_alone(tmp_path, bent):
+    """Those of a reading that was differentiated: the next one has the other sign (ρ = −½)."""
+    rng = np.random.default_rng(8)
+    x = np.repeat(rng.uniform(1, 3, 300), 4) + 0.2 * rng.standard_normal(1200)
+    y = 1 + 2 * x + 0.2 * bent * x**2 + np.diff(0.05 * rng.standard_normal(1201))
+    table = np.column_stack([0.01 * np.arange(1200), x, y])
+    path = tmp_path / "differences.csv"
+    np.savetxt(path, table, delimiter=",", header="t,reference,reading", comments="")
+    said = sentence(c.close("linear", path).result)
+    assert said.startswith("extended: " if bent else "adequate: ")
+    told = float(said.partition("errors go to and fro: of neighbours ρ = ")[2][:5])
+    assert told == pytest.approx(-0.5, abs=0.06)

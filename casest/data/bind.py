@@ -195,6 +195,7 @@ def _runs(table: Table, signals: Sequence[Signal], options: Options) -> list[Run
         notes += [f"run {label} left out: none of its rows is complete" for label in empty]
     for label in in_order:
         every = np.arange(table.n_rows) if labels is None else np.flatnonzero(labels == label)
+        every, order_notes = _in_time(bound, every)
         rows = every[complete[every]]
         part = {name: values[rows] for name, values in bound.signals.items()}
         time, time_notes = _run_time(table, bound, every, signals, options)
@@ -214,7 +215,7 @@ def _runs(table: Table, signals: Sequence[Signal], options: Options) -> list[Run
             block=timing.blocks(time, None if pose is None else pose[rows], rows - every[0]),
             count=np.ones(len(rows), dtype=np.int_),
             spread={},
-            notes=(*table.notes, *bound.notes, *dropped, *notes, *time_notes),
+            notes=(*table.notes, *bound.notes, *dropped, *notes, *order_notes, *time_notes),
         )
         varying = [s for s in signals if s.name not in options.steady]
         runs.append(_checked(run, varying, bound.sources))
@@ -380,6 +381,19 @@ def _seconds(
     time, notes = timing.seconds(table, columns[0], stated, scale)
     checks.refuse_too_large(table.file, "the time", names[0], time)
     return time, notes
+
+
+def _in_time(bound: _Bound, rows: NDArray[np.int_]) -> tuple[NDArray[np.int_], list[str]]:
+    """The rows of a run as they followed each other, and a note where a file has another order."""
+    if bound.time is None:
+        return rows, []
+    there = rows[np.isfinite(bound.time[rows])]
+    found = timing.in_order(bound.time[there])
+    if found is None:
+        return rows, []
+    order, why = found
+    name = " and ".join(bound.time_source)
+    return there[order], [f"{name}: {why}; rows are taken in the order of time"]
 
 
 def _run_time(

@@ -20,6 +20,7 @@ Array = NDArray[np.float64]
 GAP = 5.0  # times the usual step
 USUAL = 0.8  # share of the steps that do not exceed it
 _BACK = 0.1  # share of steps back from which on a column is no time
+_LATE = 20  # places by which a row that comes late may be off
 _EVEN = 20  # steps that show whether a record is evenly sampled
 
 #: What a note says of a time without a unit.
@@ -248,6 +249,30 @@ def checked_rate(rate: float) -> float:
     if not (np.isfinite(rate) and rate > 0):
         raise UsageError(f"rate {rate} Hz makes no sense; give samples per second, for example 100")
     return float(rate)
+
+
+def in_order(time: Array) -> tuple[NDArray[np.int_], str] | None:
+    """How rows follow each other where a log begins with its end, wraps, or has some that come
+    late, and what to say of that.
+
+    time (N,), s. None where there is nothing to do, or no telling: where it starts again, the parts
+    are records of their own, and a stamp far from its neighbours' is wrong.
+    """
+    back = np.flatnonzero(~(np.diff(time) > 0)) + 1
+    if not back.size:
+        return None
+    order = np.argsort(time, kind="stable")
+    if not (np.diff(time[order]) > 0).all():
+        return None
+    if back.size == len(time) - 1:
+        return order, "the newest row comes first"
+    if back.size == 1 and time[-1] < time[0]:
+        return order, f"the log wraps: it begins at row {back[0]}, behind which it was overwritten"
+    away = np.abs(order - np.arange(len(order)))
+    if away.max() > _LATE or np.mean(time < np.maximum.accumulate(time)) > _BACK:
+        return None
+    late = int(np.sum(time < np.maximum.accumulate(time)))
+    return order, f"{_counted(late, 'row')} came late, the first row {back[0]}"
 
 
 def refuse_unordered(file: str, column: str, time: Array, rows: NDArray[np.int_]) -> None:

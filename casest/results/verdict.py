@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Protocol, TypeVar
 
+from casest.data.timing import UNUSED
 from casest.declaration.effect import NOISE
 from casest.diagnose.formula.search import NAME as FORMULA
 from casest.diagnose.found import HELD_OUT_DATA
@@ -13,11 +14,13 @@ from casest.diagnose.levels import LEVELS
 from casest.effects import CATALOGUE
 from casest.effects.placing import MISSING, UNTIMED
 from casest.results.closing import Closed, Effect, Shifts, Unexplained
-from casest.results.fitted import Samples
-from casest.results.result import Number, Parameter
+from casest.results.fitted import NoiseModel, Samples
+from casest.results.result import Parameter
 
 #: Samples that resemble each other from which on noise may as well be a lag or a hysteresis.
 COLOURED = 5
+#: Correlation of neighbours below which errors go to and fro: one tells a tenth of the next.
+TO_AND_FRO = -0.32
 #: The effect whose sign says which of two instruments is slower.
 LOW_PASS = "low_pass"
 #: Effects from which on, where a misfit remains, they are a description more than causes.
@@ -45,9 +48,11 @@ def sentence(result: Closed) -> str:
         over = result.noise.correlated_over_samples or 1
         if over >= COLOURED:
             noise += f"; the noise has a colour (alike over {over:.0f} samples)"
+        elif _goes_to_and_fro(result.noise):
+            noise += f"; the noise has a colour ({_to_and_fro(result.noise)})"
         return f"adequate: {said}{noise}{untried}"
     if result.verdict == "extended":
-        left = _remaining_noise(result.noise.correlated_over_samples, result.samples)
+        left = _remaining_noise(result.noise, result.samples)
         return f"extended: {_missing(result.effects)}; what is left is {left}{untried}"
     found = f"beside {', '.join(map(_with_rivals, result.effects))} " if names else ""
     causes = result.unexplained.one_of
@@ -94,12 +99,26 @@ def _several(causes: Sequence[str]) -> str:
     return (", " if more else " or ").join(first) + others
 
 
-def _remaining_noise(correlated_over: Number, samples: Sequence[Samples]) -> str:
+def _remaining_noise(noise: NoiseModel, samples: Sequence[Samples]) -> str:
     """What noise is called that resembles itself over so many samples, and of how few it is."""
-    over, count = correlated_over or 1, sum(s.samples for s in samples)
+    over, count = noise.correlated_over_samples or 1, sum(s.samples for s in samples)
     if over >= COLOURED:
         return f"coloured noise (alike over {over:.0f} samples), or a lag"
+    if _goes_to_and_fro(noise):
+        return f"coloured noise ({_to_and_fro(noise)})"
     return "noise" if count >= LEVELS.series else f"noise as far as {count} rows can tell"
+
+
+def _goes_to_and_fro(noise: NoiseModel) -> bool:
+    """Is an error followed by one of the other sign, as where a reading was differentiated, or is
+    late by a part of a sample?"""
+    chance, rho = noise.colour_p_value, noise.lag1_correlation
+    told = chance is not None and chance < LEVELS.misfit
+    return told and rho is not None and rho < TO_AND_FRO
+
+
+def _to_and_fro(noise: NoiseModel) -> str:
+    return f"errors go to and fro: of neighbours ρ = {noise.lag1_correlation:.2f}"
 
 
 def consequence(result: Closed) -> str:
@@ -136,10 +155,11 @@ def of_the_user(named: Sequence[_N]) -> list[_N]:
 
 
 def _untried(result: Closed) -> str:
-    """The user's own effects that could not be tried."""
+    """The user's own effects that could not be tried, and a time that was left aside."""
     own = of_the_user(result.not_tried)
     names = [s.name for s in own if not s.reason.startswith("column ")]
-    return f"; {', '.join(names)} could not be tried" if names else ""
+    said = f"; {', '.join(names)} could not be tried" if names else ""
+    return said + "; its time was not used (see below)" * any(UNUSED in n for n in result.notes)
 
 
 def refusals(result: Closed) -> Iterator[str]:

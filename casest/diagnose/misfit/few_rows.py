@@ -61,7 +61,7 @@ def few_rows(residual: Array, slopes: Array, rounding: float = 0.0) -> FewRows |
         F = (whole - least) / (axes * k) / max(noise, 1e-300)
         chance = min(1.0, float(fdtrc(axes * k, rest, F)) * comb(rows, k) * most)
         share = 1 - least / max(whole, 1e-300)
-        if share > LEVELS.most and chance < LEVELS.misfit:
+        if share > LEVELS.most and chance < LEVELS.chance:
             gone = np.setdiff1d(np.arange(rows), kept)
             best = FewRows(gone, share, chance, float(np.sqrt(least / rest)))
     return best

@@ -82,9 +82,11 @@ def eliminated(subject: Subject[F], state: State[F]) -> State[F]:
 
 
 def chance_alone(subject: Subject[F], state: State[F], kept: Kept) -> float:
-    """p of a cause beside all others: of a pair the evidence is both's."""
-    base = subject.without(state.fit, kept.what) if len(kept.evidence.trials) > 1 else None
-    return kept.evidence.p_value if base is None else _alone(subject, state, kept, base)[1]
+    """p of a cause beside all others, by its refit: of a pair the evidence is both's."""
+    if len(state.kept) == len(kept.evidence.trials) == 1:
+        return kept.evidence.p_value
+    found = on_its_own(subject, state, kept)
+    return kept.evidence.p_value if found is None else found[1]
 
 
 def on_its_own(subject: Subject[F], state: State[F], kept: Kept) -> tuple[float, float] | None:
@@ -106,12 +108,21 @@ def _alone(
     linear, whole = subject.linear(base), subject.linear(state.fit)
     none, gain = Likelihood(linear), subject.rises(base, [state.fit])[0] - feigned
     freedom = max(whole.basis.shape[1] - linear.basis.shape[1], 1)
-    families = state.first.families if state.first else 1
+    families = _looked_through(subject, state, kept)
     trials = kept.evidence.trials
     own = [t.variants for t in trials if t.what == kept.what] or [t.variants for t in trials]
     searched = float(np.log(max(own) * families))
     score, chance = (f(gain, freedom, searched, none) for f in (worth, p_value))
     return score, chance, searched
+
+
+def _looked_through(subject: Subject[F], state: State[F], kept: Kept) -> int:
+    """Among how many its chance is shared: of what was asked for those that were."""
+    if state.first is None:
+        return 1
+    if not subject.asked(kept.what):
+        return state.first.families
+    return max(1, sum(subject.asked(e.trials[0].what) for e in state.first.found))
 
 
 def _beside_the_others(

@@ -74,6 +74,7 @@ def refitted(
             else:
                 found.append(Refit(state.fit, better, kept))
             continue
+        kept = with_chance(kept, ranking.likelihood, ranking.families)
         least = _gaining(evidence, min(noisier))
         enough = beyond_courses(ranking, kept) and _strong(ranking, least)
         few = _by_few_rows(subject, ranking, kept, better) if enough else ""
