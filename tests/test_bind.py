@@ -766,6 +766,27 @@ def test_rows_that_a_log_has_in_another_order_are_put_in_that_of_time(
         assert any(said in note for note in run.notes)
 
 
+def test_rows_of_one_stamp_of_a_coarse_clock_are_spread_over_its_step(tmp_path: Path) -> None:
+    """250 rows at 2.5 Hz, by a clock of whole seconds: each is off by less than one."""
+    true = np.arange(250) / 2.5
+    run = run_of(tmp_path, stamped(np.floor(true)), [V])
+    assert run.time is not None
+    assert np.all(np.diff(run.time) > 0)
+    assert np.abs(run.time - true).max() < 0.5
+    assert any("stamps are 1 s apart, and 250 of 250 rows share one" in n for n in run.notes)
+
+
+@pytest.mark.parametrize(
+    "stamps",
+    [
+        np.repeat(np.arange(30.0), 3),  # repeats of a table
+        [*range(60), 59.001, 59.001, *range(60, 120)],  # a fine clock, and a row twice
+    ],
+)
+def test_rows_of_one_stamp_are_else_in_no_order(tmp_path: Path, stamps: Sequence[float]) -> None:
+    assert run_of(tmp_path, stamped(stamps), [V]).time is None
+
+
 @pytest.mark.parametrize(
     "stamps",
     [

@@ -9,6 +9,7 @@ import pytest
 from scipy import stats
 
 from casest import close
+from casest.cli import run
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.misfit.few_rows import few_rows
 
@@ -81,3 +82,27 @@ def test_a_table_whose_readings_are_rounded_is_adequate():
     x = np.arange(12.0)
     y = x + np.isin(x, [3, 7])
     assert close("linear", {"reference": x, "reading": y}).verdict == "adequate"
+
+
+def stopped(rng, path):
+    """A gyroscope on a turntable in 30 directions; in two of them the table stands still."""
+    n = rng.standard_normal((30, 3))
+    omega = 4.712 * n / np.linalg.norm(n, axis=1)[:, None]
+    omega[[2, 27]] = 0.0
+    read = omega * [1.02, 0.97, 1.01] + [0.02, -0.03, 0.01] + 0.005 * rng.standard_normal((30, 3))
+    np.savetxt(path, read, delimiter=",", header="wx [rad/s],wy [rad/s],wz [rad/s]", comments="")
+    return str(path)
+
+
+@pytest.mark.parametrize("verb", ["calibrate", "close"])
+@pytest.mark.parametrize("model", ["norm-diagonal", "norm-triangular"])
+def test_rows_that_led_an_estimate_astray_are_named_where_it_is_refused(
+    tmp_path, capsys, verb, model
+):
+    """Of a public record (studies/strangers.md) it was said that the readings cover too little."""
+    path = stopped(np.random.default_rng(0), tmp_path / "table.csv")
+    code = run([verb, model, path, "--columns", "v=wx,wy,wz", "--set", "norm=4.712 rad/s"])
+    assert code == 2
+    said = capsys.readouterr().err
+    assert "of the residual is in rows 2" in said
+    assert "27 of table, which the others speak against: look at these first; " in said

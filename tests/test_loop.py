@@ -369,6 +369,25 @@ def test_a_residual_that_resembles_itself_over_many_samples_is_not_called_noise_
         assert said.endswith("one that is not among them") is (count == 4)
 
 
+@pytest.mark.parametrize(
+    ("left", "said"),
+    [
+        (Unexplained(0.9, "", [], {}, []), "a misfit remains that no candidate explains"),
+        (Unexplained(0.9, "", ["cubic", "quadratic"], {}, [], share=0.85),
+         "a misfit remains that cubic or quadratic explain alike"),
+        (Unexplained(0.9, "", ["cubic", "quadratic"], {}, [], share=0.03),
+         "a misfit remains, of which cubic or quadratic explain 3 %"),
+        (Unexplained(0.9, "", ["cubic", "quadratic"], {}, [], in_rows="row 7 of bath", share=0.85),
+         "a misfit remains in row 7 of bath, which the others speak against"),
+    ],
+)  # fmt: skip
+def test_the_headline_says_how_much_of_a_misfit_candidates_explain(left, said):
+    """Of a small part of it they are no answer (studies/strangers.md)."""
+    world = worlds.made("norm", [6], {})
+    result = closing_result(close(declared(world), [record(world)]), model_name="norm", data=[])
+    assert sentence(changed(result, verdict="unexplained", unexplained=left)).endswith(said)
+
+
 @pytest.mark.long
 def test_a_lag_of_the_response_is_no_wandering_offset():
     """A tenth of it is slow, and that a walk explains as well; the rest it cannot."""

@@ -82,7 +82,7 @@ def calibration(
     profile: bool = False,
 ) -> int:
     """Read, fit, save, print; the exit code says whether the estimate is trusted."""
-    from casest.diagnose.misfit.left import doubts
+    from casest.diagnose.misfit.left import doubts, refused_for
     from casest.estimate.calibrate import attempt
     from casest.estimate.held_out import score
     from casest.report.html.calibration import calibration_page
@@ -119,8 +119,7 @@ def calibration(
     else:
         echo(calibration_text(result, options.output), verdict=True)
     if not found.certificate.trusted:
-        reason = found.certificate.reasons[0]
-        echo(f"casest: no trustworthy estimate: {reason}", err=True)
+        echo(f"casest: no trustworthy estimate: {refused_for(found)}", err=True)
         return NotTrusted.exit_code
     return 0
 

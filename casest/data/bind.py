@@ -432,7 +432,13 @@ def _from_column(
     except DataError as error:
         if needed:
             raise
-        return None, [f"{timing.UNUSED}{error}"]
+        found = timing.within_stamps(time[there])
+        if found is None:
+            return None, [f"{timing.UNUSED}{error}"]
+        spread, why = found
+        time = time.copy()
+        time[there] = spread
+        return time, [f"{name}: {why}"]
     return time, timing.interruptions(name, time[there], rows[there])
 
 

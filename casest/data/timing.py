@@ -21,6 +21,7 @@ GAP = 5.0  # times the usual step
 USUAL = 0.8  # share of the steps that do not exceed it
 _BACK = 0.1  # share of steps back from which on a column is no time
 _LATE = 20  # places by which a row that comes late may be off
+_LOG = 100  # rows from which on those of one stamp are a log's, no repeats of a table
 _EVEN = 20  # steps that show whether a record is evenly sampled
 
 #: What a note says of a time without a unit.
@@ -273,6 +274,26 @@ def in_order(time: Array) -> tuple[NDArray[np.int_], str] | None:
         return None
     late = int(np.sum(time < np.maximum.accumulate(time)))
     return order, f"{_counted(late, 'row')} came late, the first row {back[0]}"
+
+
+def within_stamps(time: Array) -> tuple[Array, str] | None:
+    """Times (N,), s, of rows that a coarse clock gave one stamp, evenly over its step, and what to
+    say of that; None where stamps go back, or where the clock is fine and a row is there twice."""
+    steps = np.diff(time)
+    again = steps == 0
+    if len(time) < _LOG or not again.any() or (steps < 0).any() or again.all():
+        return None
+    tick, usual = float(steps[~again].min()), float(np.median(steps[~again]))
+    if tick < 0.5 * usual:
+        return None
+    _, first, count = np.unique(time, return_index=True, return_counts=True)
+    place = np.arange(len(time)) - np.repeat(first, count)
+    spread = time + tick * place / np.repeat(count, count)
+    shared = int(count[count > 1].sum())
+    return spread, (
+        f"its stamps are {tick:.6g} s apart, and {shared} of {len(time)} rows share one: these are "
+        "taken as evenly spaced over it"
+    )
 
 
 def refuse_unordered(file: str, column: str, time: Array, rows: NDArray[np.int_]) -> None:

@@ -18,6 +18,7 @@ from casest.diagnose.cross_validation import Folds, cross_fitted, determined, fo
 from casest.diagnose.evidence.score import Trial
 from casest.diagnose.found import HELD_OUT_DATA, Found, Undecided
 from casest.diagnose.levels import LEVELS
+from casest.diagnose.misfit.left import refused_for
 from casest.diagnose.noise.slow_course import slow_squares
 from casest.diagnose.protocol import Kept, State, search, with_rivals
 from casest.diagnose.protocol.confirming import falls_of_refit
@@ -84,7 +85,7 @@ def _once(
     before = attempt(model, runs, start=start, seed=seed)
     if before.certificate.trusted:
         return _searched(before, model, runs, catalogue, known, seed, say)
-    error = NotTrusted("no trustworthy estimate: " + "; ".join(before.certificate.reasons))
+    error = NotTrusted("no trustworthy estimate: " + refused_for(before))
     error.estimate = before
     if not before.certificate.code & HOPELESS:  # what is missing may be why
         closing = _searched(before, model, runs, catalogue, known, seed, say)

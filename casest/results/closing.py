@@ -85,7 +85,9 @@ class Hidden(Struct, frozen=True):
 class Unexplained(Struct, frozen=True):
     """What is left: share of the held-out variance, where; causes of which none was added.
 
-    `described_by`: effects that a slow course looks like, and that name no cause.
+    `described_by`: effects that a slow course looks like, and that name no cause; `in_rows`: the
+    few rows that most of it is in, in words; `share`: of the held-out variance, that `one_of`
+    explain, null where there are none.
     """
 
     fraction: Number
@@ -94,6 +96,8 @@ class Unexplained(Struct, frozen=True):
     would_move: dict[str, Shifts]
     would_separate: list[str]
     described_by: list[str] = []
+    in_rows: str = ""
+    share: Number = None
 
 
 class Detectable(Struct, frozen=True):
@@ -272,6 +276,8 @@ def _unexplained(closing: Closing) -> Unexplained:
         {label: _shifts(moves[label], closing) for label in names if label in moves},
         _measurements(names, closing) if len(names) > 1 else [],
         list(closing.misfit.described),
+        closing.misfit.rows,
+        plain(left.share) if left else None,
     )
 
 

@@ -16,6 +16,7 @@ from casest.effects.placing import MISSING, UNTIMED
 from casest.results.closing import Closed, Effect, Shifts, Unexplained
 from casest.results.fitted import NoiseModel, Samples
 from casest.results.result import Parameter
+from casest.results.rounding import percent
 
 #: Samples that resemble each other from which on noise may as well be a lag or a hysteresis.
 COLOURED = 5
@@ -55,12 +56,21 @@ def sentence(result: Closed) -> str:
         left = _remaining_noise(result.noise, result.samples)
         return f"extended: {_missing(result.effects)}; what is left is {left}{untried}"
     found = f"beside {', '.join(map(_with_rivals, result.effects))} " if names else ""
-    causes = result.unexplained.one_of
-    explains = f"{_several(causes)} explain alike" if causes else "no candidate explains"
     many = ""
     if len(names) >= MANY:
         many = f"; {len(names)} effects together may stand for one that is not among them"
-    return f"unexplained: {found}a misfit remains that {explains}{many}"
+    return f"unexplained: {found}a misfit remains{_which(result.unexplained)}{many}"
+
+
+def _which(left: Unexplained) -> str:
+    """What is known of a misfit: where it is, or what explains it alike."""
+    if left.in_rows:
+        return f" in {left.in_rows}, which the others speak against"
+    if not left.one_of:
+        return " that no candidate explains"
+    part = (left.share or 0.0) < LEVELS.most * (left.fraction or 0.0)
+    alike = f"{_several(left.one_of)} explain"
+    return f", of which {alike} {percent(left.share or 0.0)}" if part else f" that {alike} alike"
 
 
 def _missing(effects: Sequence[Effect]) -> str:

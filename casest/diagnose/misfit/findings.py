@@ -9,6 +9,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from casest.data.run import Run
 from casest.data.stillness import last_decimal
 from casest.data.timing import blocks
 from casest.declaration.effect import TAILS
@@ -52,13 +53,14 @@ FAULTS = 0.1
 @dataclass(frozen=True)
 class Finding:
     """Evidence of a misfit: where, in words, σ of the noise beside it, its share if known; `slow`:
-    it is a course of unknown cause."""
+    it is a course of unknown cause; `rows`: the few that it is in, in words."""
 
     where: str
     p_value: float
     sigma: float
     share: float = 0.0
     slow: bool = False
+    rows: str = ""
 
 
 def findings(
@@ -76,7 +78,7 @@ def findings(
     sigma = scale_of_readings(residuals) * float(np.sqrt(problem.residual_count / freedom))
     clipped = _clipped(problem, residuals, sigma)
     found = _before(problem, point) + _stated(problem, point)
-    found += _few_rows(problem, point) + _far_out(problem, sigma)
+    found += in_few_rows(problem, point) + _far_out(problem, sigma)
     found += _repeats(problem, point, clipped, wanders=wanders)
     slow = [] if wanders else _slow(problem, point, clipped, sigma)
     follows = _follows(problem, point, clipped, sigma, in_time=not (slow or wanders))
@@ -125,7 +127,7 @@ def _far_out(problem: Problem, sigma: float) -> list[Finding]:
     return [Finding(where, 0.0, sigma)]
 
 
-def _few_rows(problem: Problem, point: Point) -> list[Finding]:
+def in_few_rows(problem: Problem, point: Point) -> list[Finding]:
     """Rows of a table that the others speak against, and that hold most of what is left."""
     runs, tails = problem.runs, any(a.effect.seen_in == TAILS for a in problem.model.effects)
     if sum(map(len, runs)) >= LEVELS.series or tails or problem.sequential:
@@ -135,14 +137,23 @@ def _few_rows(problem: Problem, point: Point) -> list[Finding]:
     found = few_rows(residual, J, _rounding(problem))
     if found is None:
         return []
-    names = [
-        f"{'rest interval' if run.spread else 'row'} {int(k)} of {run.name}"
-        for run in runs
-        for k in run.rows
-    ]
-    listed = " and ".join(names[k] for k in found.rows)
+    listed = " and ".join(_named(runs, found.rows))
     where = f"{100 * found.share:.0f} % of it is in {listed}, which the others speak against"
-    return [Finding(where, found.p_value, found.sigma, found.share)]
+    return [Finding(where, found.p_value, found.sigma, found.share, rows=listed)]
+
+
+def _named(runs: Sequence[Run], rows: NDArray[np.int_]) -> list[str]:
+    """Rows, counted through all runs, as they are called in their files."""
+    said, first = [], 0
+    for run in runs:
+        own = run.rows[rows[(rows >= first) & (rows < first + len(run))] - first]
+        if own.size:
+            what = "rest interval" if run.spread else "row"
+            *most, last = map(str, own)
+            several = f"{what}s {', '.join(most)} and" if most else what
+            said.append(f"{several} {last} of {run.name}")
+        first += len(run)
+    return said
 
 
 def _rounding(problem: Problem) -> float:

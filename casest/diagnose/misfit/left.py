@@ -18,7 +18,12 @@ from casest.declaration.shapes import Array
 from casest.diagnose.candidates.candidates import Candidate
 from casest.diagnose.found import Course, Undecided
 from casest.diagnose.levels import LEVELS
-from casest.diagnose.misfit.findings import Finding, findings, shared_by_neighbours
+from casest.diagnose.misfit.findings import (
+    Finding,
+    findings,
+    in_few_rows,
+    shared_by_neighbours,
+)
 from casest.diagnose.noise.noise_model import noise_model
 from casest.effects.placing import prepared
 from casest.estimate.estimate import Estimate
@@ -43,12 +48,26 @@ def doubts(estimate: Estimate) -> list[Finding] | None:
         return findings(problem, problem.point(estimate.values), estimate.correlated_over)
 
 
+def refused_for(estimate: Estimate) -> str:
+    """Why an estimate is refused; first the few rows that most of its residual is in: they may have
+    led it astray (a table that stood still in two of thirty rests)."""
+    problem, why = estimate.problem, list(estimate.certificate.reasons)
+    with np.errstate(all="ignore"):
+        point = problem.point(estimate.values)
+        few = sum(map(len, problem.runs)) < LEVELS.series
+        if few and all(np.isfinite(r).all() for r in problem.residuals(point)):
+            found = in_few_rows(problem, point)
+            where = [f.where.replace("of it", "of the residual", 1) for f in found]
+            why = [*(f"{w}: look at these first" for w in where), *why]
+    return "; ".join(why)
+
+
 @dataclass(frozen=True)
 class Misfit:
     """What is left beyond noise: share of the held-out variance, and where it lives.
 
     `noise` holds what is known of the noise itself; `described` names what a slow
-    course in it looks like.
+    course in it looks like; `rows`: the few that most of it is in, in words.
     """
 
     significant: bool
@@ -56,6 +75,7 @@ class Misfit:
     where: str
     noise: Mapping[str, Any]
     described: tuple[str, ...] = ()
+    rows: str = ""
 
 
 def left_over(
@@ -114,7 +134,9 @@ def left_over(
         looks = " or ".join(_looks_like(c.what) for c in said)
         where.append(f"its slow course is best described by {looks}")
     names = tuple(c.what.label for c in said)
-    return Misfit(bool(where), min(float(fraction), 1.0), "; ".join(where), noise.content, names)
+    rows = next((f.rows for f in found if f.rows), "")
+    fraction = min(float(fraction), 1.0)
+    return Misfit(bool(where), fraction, "; ".join(where), noise.content, names, rows)
 
 
 def _looks_like(candidate: Candidate) -> str:

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from math import inf
 
+from casest.diagnose.evidence.held_out import Fall
 from casest.diagnose.evidence.score import Evidence, judged
 from casest.diagnose.levels import LEVELS
 from casest.diagnose.protocol.confirming import (
@@ -48,6 +49,7 @@ def with_the_best(
         if not asked and not tried:
             state, more = shown(subject, state, ranking, refits)
             refits = best_refits(refits, more, ranking.order)
+            refits = _best_foretold_first(subject, state, ranking, refits)
         torn = [] if asked else torn_between(refits, ranking)
         if torn:
             return replace(state, open=tuple(r.evidence for r in torn), torn=tuple(torn))
@@ -70,6 +72,29 @@ def with_the_best(
     missing = [e for e in (*options, *ranking.followed) if not state.unlike(e)]
     missing.sort(key=lambda e: -e.score)
     return replace(state, open=tuple(missing[: LEVELS.contenders]))
+
+
+def _best_foretold_first(
+    subject: Subject[F], state: State[F], ranking: Ranking, refits: list[Refit[F]]
+) -> list[Refit[F]]:
+    """None comes before one that leaves less than half of what it leaves, wherever it is held out:
+    what a steady motion leaves is lines, and to a likelihood these are noise however large."""
+    if not ranking.linear.series or len(refits) < 2:
+        return refits
+    seen = [
+        {k: f.ratio for k, f in (r.falls or _falls(subject, state, ranking, r)).items()}
+        for r in refits
+    ]
+    most = {k: LEVELS.most * ratio for k, ratio in seen[0].items()}
+    better = [r for r, own in zip(refits, seen, strict=True) if all(own[k] < most[k] for k in most)]
+    best = max(better, key=lambda r: r.evidence.score, default=refits[0])
+    return [best, *[r for r in refits if r is not best]]
+
+
+def _falls(
+    subject: Subject[F], state: State[F], ranking: Ranking, refit: Refit[F]
+) -> dict[str, Fall]:
+    return falls_with(subject, state, ranking, refit.evidence, refit.fit)
 
 
 def _among(evidence: Evidence, several: Sequence[Evidence]) -> bool:
@@ -179,7 +204,7 @@ def _with_kept(
     say: Callable[[str], None],
 ) -> State[F]:
     kept, seen = state.kept, refit.falls
-    seen = seen or falls_with(subject, state, ranking, refit.evidence, refit.fit)
+    seen = seen or _falls(subject, state, ranking, refit)
     for trial in refit.evidence.trials:
         say(f"{trial.family}: held-out error falls")
         kept = (*kept, Kept(trial.what, refit.evidence, seen))

@@ -85,8 +85,8 @@ def chance_alone(subject: Subject[F], state: State[F], kept: Kept) -> float:
     """p of a cause beside all others, by its refit: of a pair the evidence is both's."""
     if len(state.kept) == len(kept.evidence.trials) == 1:
         return kept.evidence.p_value
-    found = on_its_own(subject, state, kept)
-    return kept.evidence.p_value if found is None else found[1]
+    base = subject.without(state.fit, kept.what)
+    return kept.evidence.p_value if base is None else _alone(subject, state, kept, base)[1]
 
 
 def on_its_own(subject: Subject[F], state: State[F], kept: Kept) -> tuple[float, float] | None:
