@@ -24,6 +24,7 @@ from casest import (
 from casest.correction.inverse import Correction
 from casest.estimate.calibrate import attempt
 from casest.leastsquares.problem import Problem
+from casest.results.find import find_model
 
 N, DT = 400, 0.01
 TIME = np.arange(N) * DT
@@ -307,6 +308,11 @@ def test_two_effects_on_one_signal_act_in_the_order_of_their_addition():
     both = chain.with_effect(shift).with_effect(stretch)
     found = both(t=0.0, y=0.0, x=2.0, gain=1.0, **{"shift.k": 1.0, "stretch.m": 1.0})
     assert found["predicted"].item() == (2.0 + 1.0) * 2
+
+
+def test_where_all_readings_cannot_be_late_it_is_said_what_can_be():
+    with pytest.raises(UsageError, match=r"late: signal_lag\(reference\)$"):
+        find_model("linear").with_effect(time_delay)
 
 
 def test_a_signal_effect_on_a_signal_that_the_body_does_not_use_is_not_applicable():

@@ -41,6 +41,8 @@ def test_a_magnet_that_came_and_went_is_in_no_other_record(tmp_path, capsys, aga
     # The declared model takes the pulse for a part of the level, 5/6 mV of it.
     assert found["before"]["rmse_holdout"] > 0.8
     assert found["after"]["rmse_holdout"] == pytest.approx(0.1, rel=0.1)
+    assert found["holdout"] == [files[2]]
+    assert "    held-out, other.csv " in capsys.readouterr().out
     note = "pulse: happened in the record of the fit; another one is foretold without what passed"
     assert any(note in n for n in found["notes"]) == (not again)
 

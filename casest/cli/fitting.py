@@ -208,7 +208,12 @@ def closing(
         return refused(error, model_name, data, options, command)
     hidden = scored(found, apart) if apart else None
     result = closing_result(
-        found, model_name=model_name, data=data, command=command, held_out=hidden and hidden[1:]
+        found,
+        model_name=model_name,
+        data=data,
+        command=command,
+        held_out=hidden and hidden[1:],
+        apart=options.holdout,
     )
     if options.output:
         progress(f"writing {options.output}")

@@ -418,9 +418,11 @@ class Model:
         if target in signals:
             dims = () if signals[target].size == 1 else (signals[target].size,)
             return "signal", dims, signals[target].unit or f"[{target}]"
+        late = target == "t" and self.recorded
         raise UsageError(
             f"effect {added.name} is not applicable to model {self.name}: "
             f"it acts on {target!r}, and the model has {', '.join([*self.quantities, *signals])}"
+            + (f"; what is recorded late: signal_lag({self.recorded[0]})" if late else "")
         )
 
     @property

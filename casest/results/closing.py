@@ -131,6 +131,7 @@ class WholeRecord(Struct, frozen=True):
 class Closed(Fitted, frozen=True, kw_only=True, dict=True):
     """The content of `result.json` of `close`.
 
+    `holdout`: the files of another record that held-out errors are those of, where one was given.
     Beside the file: `docs`, what each added effect says of itself; `closing`, what the loop left.
     """
 
@@ -147,6 +148,7 @@ class Closed(Fitted, frozen=True, kw_only=True, dict=True):
     refused: list[Explained]
     not_tried: list[Explained]
     whole_record: WholeRecord | UnsetType = UNSET
+    holdout: list[str] | UnsetType = UNSET
     docs: dict[str, str]
     closing: Closing
 
@@ -168,10 +170,12 @@ def closing_result(
     data: Sequence[str],
     command: str = "",
     held_out: tuple[Sequence[Array], Sequence[Array]] | None = None,
+    apart: Sequence[str] = (),
 ) -> Closed:
     """What `close` leaves: see the design, 10.
 
-    `held_out` are residuals before and after on a record of its own; else the cross-fitted ones.
+    `held_out` are residuals before and after on a record of its own, in the files `apart`; else the
+    cross-fitted ones.
     """
     left, shared = closing.misfit, fitted_content(closing.after, model_name, data, command)
     units: dict[str, str] = shared["units"]
@@ -202,6 +206,7 @@ def closing_result(
         ],
         refused=[Explained(s.name, s.reason) for s in closing.refused],
         not_tried=[Explained(s.name, s.reason) for s in closing.skipped],
+        holdout=list(apart) or UNSET,
         docs={f.candidate.name: getattr(f.candidate.effect, "doc", "") for f in closing.effects},
         closing=closing,
     )

@@ -146,10 +146,10 @@ def _named(runs: Sequence[Run], rows: NDArray[np.int_]) -> list[str]:
     """Rows, counted through all runs, as they are called in their files."""
     said, first = [], 0
     for run in runs:
-        own = run.rows[rows[(rows >= first) & (rows < first + len(run))] - first]
-        if own.size:
+        own = [str(run.rows[k - first]) for k in rows if first <= k < first + len(run)]
+        if own:
             what = "rest interval" if run.spread else "row"
-            *most, last = map(str, own)
+            *most, last = own
             several = f"{what}s {', '.join(most)} and" if most else what
             said.append(f"{several} {last} of {run.name}")
         first += len(run)

@@ -6,6 +6,9 @@ import re
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from msgspec import UnsetType
+
+from casest.data.logs import file_name
 from casest.report.html.applied import application
 from casest.report.html.calibration import by_axis, error_picture
 from casest.report.html.figures import Figures
@@ -104,8 +107,9 @@ def _errors(result: Closed, figures: Figures) -> str:
         single = [[c[0], c[2], c[4]] for c in cells]
         shown = table(["residual, rms", "size", "unit"], single, [1])
     said = paragraph(
-        "Held-out: every block of the record is predicted by a fit to the others, or a record of "
-        "its own was given with --holdout."
+        "Held-out: every block of the record is predicted by a fit to the others."
+        if isinstance(result.holdout, UnsetType)
+        else f"Held-out: {', '.join(map(file_name, result.holdout))}, which no fit has seen."
     )
     picture = error_picture(figures, [r[0] for r in rows], sides, unit)
     return section("error", "Error before and after" if two else "Error", said, shown, picture)

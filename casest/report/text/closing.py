@@ -7,6 +7,8 @@ from collections.abc import Iterator
 from itertools import combinations
 from pathlib import Path
 
+from msgspec import UnsetType
+
 from casest.data.logs import file_name
 from casest.report.next_command import following
 from casest.report.text.layout import WIDTH, held_lines, item, value_table
@@ -63,7 +65,7 @@ def _errors(result: Closed) -> Iterator[str]:
     yield f"  residual rms{unit:<12} {'before':>12} {'after':>12}"
     rows = [
         ("fit", before.rmse_fit, after.rmse_fit),
-        ("held-out", before.rmse_holdout, after.rmse_holdout),
+        (_held_out(result), before.rmse_holdout, after.rmse_holdout),
     ]
     for word, one, other in rows:
         yield f"    {word:<22} {_figure(one)} {_figure(other)}"
@@ -72,6 +74,14 @@ def _errors(result: Closed) -> Iterator[str]:
         for axis, value in axes.items():
             there = after.rmse_holdout_by_axis[axis]
             yield f"    held-out, {axis:<12} {_figure(value)} {_figure(there)}"
+
+
+def _held_out(result: Closed) -> str:
+    """Held out of the record itself, or another one, by the name of its file."""
+    if isinstance(result.holdout, UnsetType):
+        return "held-out"
+    first, *more = map(file_name, result.holdout)
+    return f"held-out, {first}" + (f" and {len(more)} more" if more else "")
 
 
 def _figure(value: float | None) -> str:
