@@ -91,6 +91,35 @@ def test_what_is_rounded_or_set_is_left_alone(tmp_path, drawn):
     assert len(run) == 3000
 
 
+def two_loops(rng, rounded=False):
+    """A logger at 93 Hz of a force plate that is new at 50 Hz: each row once, twice or three times;
+    `rounded`: of slow thermometers, by their last decimal, at 0.1 K."""
+    t = np.cumsum(rng.uniform(0.009, 0.0125, 3000))
+    at = np.floor(50 * t).astype(int)
+    course = np.sin(0.06 * np.arange(at[-1] + 1))
+    plate = {n: course + 0.1 * rng.standard_normal(course.size) for n in ("reference", "reading")}
+    columns = {n: v[at] for n, v in plate.items()}
+    more = {f"f{k}": rng.standard_normal(course.size)[at] for k in range(4)}
+    if rounded:
+        slow = {n: np.cumsum(rng.standard_normal(3000)) / 30 for n in (*columns, *more)}
+        columns, more = {}, {n: np.round(v, 1) for n, v in slow.items()}
+    return {"t": t, **columns, **more}, np.concatenate([[True], np.diff(at) > 0])
+
+
+def test_rows_that_repeat_all_of_the_row_before_are_written_again(tmp_path):
+    columns, new = two_loops(np.random.default_rng(6))
+    (run,) = load_runs([written(tmp_path / "log.csv", columns)], SIGNALS)
+    np.testing.assert_array_equal(run.rows, np.flatnonzero(new))
+    (said,) = (n for n in run.notes if "written again" in n)
+    assert f"{np.sum(~new)} repeat all that is recorded of the row before" in said
+
+
+def test_columns_that_stay_each_at_times_of_its_own_are_read(tmp_path):
+    columns, _ = two_loops(np.random.default_rng(7), rounded=True)
+    (run,) = load_runs([written(tmp_path / "log.csv", columns)], SIGNALS)
+    assert len(run) == 3000
+
+
 def test_rows_in_threes_of_a_table_are_repeats(tmp_path):
     columns = gyro_beside_encoder(600)
     del columns["t"]

@@ -21,7 +21,7 @@ from casest.data.logs import file_and_topics, parts_of
 from casest.data.matching import find_by_name
 from casest.data.merging import merged, one_clock_each
 from casest.data.options import Options, refuse_unknown_names, stated_units
-from casest.data.renewing import Renewed, renewed
+from casest.data.renewing import Renewed, renewed, whole_rows_again
 from casest.data.rest import at_rest as averaged_at_rest
 from casest.data.run import Array, Labels, Run
 from casest.data.scaling import parse_scale
@@ -278,7 +278,15 @@ def _complete(
                 f"waits, or no reading), the first row {first}"
             )
         complete &= ~(absent | again)
-    for slow in _slowest(bound, options, plain):
+    twice = _rows_again(table, bound, options)
+    if twice is not None:
+        first = int(np.flatnonzero(twice)[0])
+        said.append(
+            f"{int(twice.sum())} repeat all that is recorded of the row before: written again, "
+            f"they are no readings, the first row {first}"
+        )
+        complete &= ~twice
+    for slow in _slowest(bound, options, plain) if twice is None else []:
         said.append(str(slow))
         complete &= ~slow.again
     if not said:
@@ -305,6 +313,16 @@ def _slowest(
         return []
     sources = {bound.sources[n]: v for n, v in bound.signals.items() if bound.sources[n] in several}
     return sorted(renewed(sources), key=lambda one: -one.rows)[:1]
+
+
+def _rows_again(table: Table, bound: _Bound, options: Options) -> NDArray[np.bool_] | None:
+    """Rows of a log that are written again as a whole; of a table they are repeats."""
+    if options.gaps or (bound.time is None and options.rate is None):
+        return None
+    columns = (c for name, c in table.columns.items() if name not in bound.time_source)
+    return whole_rows_again(
+        np.asarray(c.values, float) for c in columns if not c.is_text and c.bad is None
+    )
 
 
 def _without_repeats(bound: _Bound, options: Options) -> list[str]:

@@ -21,6 +21,12 @@ ENOUGH, LONGEST = 100, 10
 SELDOM, MOSTLY = 0.02, 0.6
 
 
+#: Of whole rows that are written again: columns at least that say so, the share of its rows in
+#: which one repeats, the rows that repeat all of them, in those that repeat one, and how much longer
+#: than usual a row stays in one of a hundred: what is slow, or rounded, stays for any time.
+COLUMNS, REPEATS, TOGETHER, LONGER = 3, (0.02, 0.9), 0.95, 2.0
+
+
 class Renewed(NamedTuple):
     """A source that is new every so many rows, and in which rows (N,) it is written again."""
 
@@ -58,6 +64,22 @@ def renewed_every(values: Array) -> int:
     sooner = np.mean(between < usual - late)
     near = np.mean(np.abs(between - usual) <= late)
     return usual if sooner < SELDOM and near > MOSTLY else 1
+
+
+def whole_rows_again(columns: Iterable[Array]) -> NDArray[np.bool_] | None:
+    """Which rows (N,) only repeat all numbers of the one before, as where two loops of a logger go
+    at paces of their own; None where rows do not, or where each column has repeats of its own."""
+    repeats = [np.concatenate([[False], c[1:] == c[:-1]]) for c in columns]
+    low, high = REPEATS
+    own = np.array([r for r in repeats if r.size and low < np.mean(r) < high])
+    if len(own) < COLUMNS:
+        return None
+    again: NDArray[np.bool_] = own.all(axis=0)
+    between = np.diff(np.flatnonzero(~again))
+    if again.sum() < max(ENOUGH, TOGETHER * float(np.median(own.sum(axis=1)))):
+        return None
+    stays = np.quantile(between, 0.99) > LONGER * np.median(between)
+    return None if stays else again
 
 
 def _written_again(values: Array, rows: int) -> NDArray[np.bool_]:

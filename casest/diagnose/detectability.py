@@ -14,6 +14,7 @@ from casest.diagnose.candidates.candidates import Candidate
 from casest.diagnose.candidates.typical import largest_of, typical_sizes
 from casest.diagnose.closing import Closing
 from casest.diagnose.levels import LEVELS
+from casest.diagnose.noise.attenuation import attenuated
 from casest.diagnose.visibility import Visible
 
 
@@ -72,8 +73,23 @@ def invisible(closing: Closing) -> list[Invisible]:
                 _shown_by(candidate),
                 {n: p.units[0] for n, p in zip(names, parameters, strict=True)},
             )
+    several = [*found.values(), *_noise_of_inputs(closing)]
     # What would do most harm comes first; shares that are rounding say nothing of order.
-    return sorted(found.values(), key=lambda i: -_harm(closing, i))
+    return sorted(several, key=lambda i: -_harm(closing, i))
+
+
+def _noise_of_inputs(closing: Closing) -> Iterator[Invisible]:
+    """Inputs whose own noise would have moved declared parameters."""
+    if not closing.after.certificate.trusted:
+        return
+    declared = {p.name for p in closing.before.model.parameters}
+    for name, size, moved in attenuated(closing.after):
+        moves = {n: shift for n, shift in moved.items() if n in declared}
+        if moves:
+            shown_by = f"its scatter where it is held, stated as --sensor-noise {name}=STD"
+            unit = closing.after.model[name].unit or f"[{name}]"
+            yield Invisible(f"noise of {name}", None, {"std": size}, moves, 1.0, shown_by,
+                            {"std": unit})  # fmt: skip
 
 
 def _harm(closing: Closing, hidden: Invisible) -> float:
