@@ -22,8 +22,8 @@ SELDOM, MOSTLY = 0.02, 0.6
 
 
 #: Of whole rows that are written again: columns at least that say so, the share of its rows in
-#: which one repeats, the rows that repeat all of them, in those that repeat one, and how much longer
-#: than usual a row stays in one of a hundred: what is slow, or rounded, stays for any time.
+#: which one repeats, the rows that repeat all of them in those that repeat one, and how much longer
+#: than usual one of a hundred rows stays: what is slow, or rounded, stays for any time.
 COLUMNS, REPEATS, TOGETHER, LONGER = 3, (0.02, 0.9), 0.95, 2.0
 
 
