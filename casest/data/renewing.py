@@ -74,7 +74,7 @@ def whole_rows_again(columns: Iterable[Array]) -> NDArray[np.bool_] | None:
     own = np.array([r for r in repeats if r.size and low < np.mean(r) < high])
     if len(own) < COLUMNS:
         return None
-    again: NDArray[np.bool_] = own.all(axis=0)
+    again = np.asarray(own.all(axis=0), np.bool_)
     between = np.diff(np.flatnonzero(~again))
     if again.sum() < max(ENOUGH, TOGETHER * float(np.median(own.sum(axis=1)))):
         return None
