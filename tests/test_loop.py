@@ -377,6 +377,8 @@ def test_a_residual_that_resembles_itself_over_many_samples_is_not_called_noise_
          "a misfit remains that cubic or quadratic explain alike"),
         (Unexplained(0.9, "", ["cubic", "quadratic"], {}, [], share=0.03),
          "a misfit remains, of which cubic or quadratic explain 3 %"),
+        (Unexplained(0.9, "", ["cubic", "quadratic"], {}, [], share=0.008),
+         "a misfit remains that no candidate explains"),
         (Unexplained(0.9, "", ["cubic", "quadratic"], {}, [], in_rows="row 7 of bath", share=0.85),
          "a misfit remains in row 7 of bath, which the others speak against"),
     ],

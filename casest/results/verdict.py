@@ -66,11 +66,11 @@ def _which(left: Unexplained) -> str:
     """What is known of a misfit: where it is, or what explains it alike."""
     if left.in_rows:
         return f" in {left.in_rows}, which the others speak against"
-    if not left.one_of:
+    share, alike = left.share or 0.0, f"{_several(left.one_of)} explain" if left.one_of else ""
+    if not alike or share < LEVELS.share:
         return " that no candidate explains"
-    part = (left.share or 0.0) < LEVELS.most * (left.fraction or 0.0)
-    alike = f"{_several(left.one_of)} explain"
-    return f", of which {alike} {percent(left.share or 0.0)}" if part else f" that {alike} alike"
+    part = share < LEVELS.most * (left.fraction or 0.0)
+    return f", of which {alike} {percent(share)}" if part else f" that {alike} alike"
 
 
 def _missing(effects: Sequence[Effect]) -> str:
