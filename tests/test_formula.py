@@ -11,6 +11,7 @@ import worlds
 
 from casest import Run
 from casest.cli import run
+from casest.diagnose.formula.terms import Shape, Term, Variable, formula_effect
 from casest.diagnose.loop import close
 from casest.results.find import find_model
 
@@ -308,3 +309,15 @@ def test_where_the_refit_of_a_candidate_fails_it_is_named_and_the_loop_goes_on(
     assert result["effects"][0]["name"] == "formula"
     reasons = {s["name"]: s["reason"] for s in result["refused"]}
     assert reasons["temperature_bias(temperature)"] == "its refit fails: singular matrix"
+
+
+@pytest.mark.parametrize("name", ["Solar (W/m²)", "µ", "2nd", "class", "k1", "Größe", "½ x"])
+def test_a_column_may_have_any_name(name):
+    """A superscript is part of a word, and no part of a name of Python's: it was a SyntaxError."""
+    shape = Shape("power", (Variable(name, None, "W/m^2", 300.0, 200.0),), 1)
+    made = formula_effect([Term(shape, None)], 1, "reading", "V")
+    assert [s.name for s in made.extras] == [name]
+    found = find_model("linear").with_effect(replace(made, on="predicted"), on="predicted")
+    value = found(reference=1.0, reading=0.0, offset=0.0, gain=1.0,
+                  **{name: 500.0, "formula.k1": 2.0})  # fmt: skip
+    assert value["predicted"].item() == pytest.approx(3.0)

@@ -209,8 +209,8 @@ def _arguments(terms: Sequence[Term], on: str) -> dict[str, str]:
 
 
 def _identifier(name: str, taken: set[str]) -> str:
-    """The name as Python can have it."""
-    found = re.sub(r"\W", "_", name)
+    """The name as Python can have it, and reads it back: m² and µ are no part of one."""
+    found = re.sub(r"\W", "_", name, flags=re.ASCII)
     found = found if found.isidentifier() else f"_{found}"
     while found in taken or keyword.iskeyword(found) or re.fullmatch(r"k\d+", found):
         found += "_"
